@@ -1,0 +1,1 @@
+"""Batched Bayesian filters in torch."""

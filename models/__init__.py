@@ -1,0 +1,1 @@
+"""Networks, their shipped weights and graphs. Nothing here is imported at run time but file paths."""

@@ -1,0 +1,1 @@
+"""Shipped weights (safetensors), graphs (ONNX) and their model cards."""

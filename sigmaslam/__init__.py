@@ -1,0 +1,1 @@
+"""Stereo visual SLAM whose covariance can be believed."""
