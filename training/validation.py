@@ -1,0 +1,47 @@
+"""How well a network matches held-out renders, in the terms of the field."""
+
+from __future__ import annotations
+
+import torch
+
+from sigmaslam.models.extractor import FeatureExtractor
+from sigmaslam.models.network import FeatureNetwork
+from sigmaslam.synthetic.pairs import HomographyPairs
+from sigmaslam.training.step import transfer
+
+_PAIRS = 48
+_KEYPOINTS = 256
+
+
+@torch.no_grad()
+def matching_accuracy(
+    network: FeatureNetwork, seed: int, pairs: int = _PAIRS, size: int = 224
+) -> dict[str, float]:
+    """Mutual nearest neighbours on held-out homography pairs.
+
+    Returns:
+        mma_1, mma_3: share of the matches within 1 and 3 px of the truth (mean over pairs); correct_3: number of
+        matches within 3 px; repeatability_1: share of the keypoints seen again within 1 px.
+    """
+    was_training = network.training
+    network.eval()
+    extractor = FeatureExtractor(network, _KEYPOINTS)
+    stream = HomographyPairs(seed, size)
+    sums = {"mma_1": 0.0, "mma_3": 0.0, "correct_3": 0.0, "repeatability_1": 0.0}
+    for index in range(pairs):
+        pair = stream.pair(index)
+        keypoints0, _, descriptors0 = extractor(torch.from_numpy(pair.image0)[None, None])
+        keypoints1, _, descriptors1 = extractor(torch.from_numpy(pair.image1)[None, None])
+        similarity = descriptors0 @ descriptors1.T
+        best1 = similarity.argmax(dim=1)
+        mutual = similarity.argmax(dim=0)[best1] == torch.arange(len(best1))
+        places = transfer(torch.from_numpy(pair.H_1_0).float()[None], keypoints0[None])[0]
+        error = (places - keypoints1[best1]).norm(dim=1)[mutual]
+        seen = ((places >= 8) & (places < size - 8)).all(dim=1)
+        nearest = torch.cdist(places, keypoints1).amin(dim=1)
+        sums["mma_1"] += float((error < 1).float().mean())
+        sums["mma_3"] += float((error < 3).float().mean())
+        sums["correct_3"] += float((error < 3).sum())
+        sums["repeatability_1"] += float((nearest[seen] < 1).float().mean()) if bool(seen.any()) else 0.0
+    network.train(was_training)
+    return {name: value / pairs for name, value in sums.items()}
