@@ -20,6 +20,11 @@ app = typer.Typer(
 )
 
 
+@app.callback()
+def _root() -> None:
+    """Stereo visual SLAM: poses with an honest covariance, a sparse map, on a plain CPU."""
+
+
 @app.command()
 def train(
     out: Annotated[
