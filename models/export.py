@@ -1,0 +1,236 @@
+"""Exports the network and the filter to ONNX and checks the graphs against torch at sizes that were not traced."""
+
+from __future__ import annotations
+
+import json
+import logging
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+import torch
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from sigmaslam.errors import InputError, SigmaSlamError
+from sigmaslam.files import atomic_path
+from sigmaslam.filters.stereo_pose import STATE_SIZE, Innovate, Predict, Update
+from sigmaslam.models.extractor import FeatureExtractor
+from sigmaslam.models.network import FeatureNetwork
+
+MAX_KEYPOINTS = 2048
+_OPSET = 20
+# ONNX Runtime and torch may order sums differently; more than this is a wrong graph.
+_FEATURE_TOLERANCE = 1e-4
+_FILTER_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class _Graph:
+    """A module with inputs to trace it, others to check it, and which axes are free."""
+
+    module: nn.Module
+    traced: tuple[Tensor, ...]
+    checked: tuple[Tensor, ...]
+    inputs: list[str]
+    outputs: list[str]
+    dynamic: tuple[dict[int, Any], ...]
+
+
+def load_network(weights: Path) -> FeatureNetwork:
+    """The network with trained weights, in evaluation mode.
+
+    Raises:
+        InputError: the file is missing or holds another network.
+    """
+    if not weights.is_file():
+        raise InputError(f"{weights} does not exist: train first, or give the path of a .safetensors file")
+    network = FeatureNetwork()
+    try:
+        network.load_state_dict(load_file(weights))
+    except (RuntimeError, ValueError) as error:
+        raise InputError(f"{weights} does not hold the weights of this network: {error}") from error
+    return network.eval()
+
+
+def export_features(weights: Path, out: Path) -> float:
+    """Writes the feature graph and returns the largest difference of descriptors or keypoints from torch."""
+    extractor = FeatureExtractor(load_network(weights), MAX_KEYPOINTS).eval()
+    height = torch.export.Dim("height_sixteenths", min=5, max=512)
+    width = torch.export.Dim("width_sixteenths", min=5, max=512)
+    rng = np.random.default_rng(0)
+    image = _smooth_noise(rng, 240, 320)
+    other = _smooth_noise(rng, 176, 400)
+    graph = _Graph(
+        extractor,
+        (image,),
+        (other,),
+        ["image"],
+        ["keypoints", "scores", "descriptors"],
+        ({2: 16 * height, 3: 16 * width},),
+    )
+    return _export(graph, out, _FEATURE_TOLERANCE)
+
+
+def export_filter(folder: Path) -> dict[str, float]:
+    """Writes the three filter graphs and returns the largest difference of each from torch."""
+    return {
+        name: _export(graph, folder / f"{name}.onnx", _FILTER_TOLERANCE) for name, graph in _filter_graphs().items()
+    }
+
+
+def export_all(weights: Path, card: Path, out: Path) -> dict[str, float]:
+    """Everything the runtime needs, into one folder: graphs, weights and card.
+
+    Args:
+        weights: safetensors file of a training run.
+        card: its JSON card; the differences found here are added to the copy in `out`.
+        out: folder that gets features.onnx, pose_*.onnx, features.safetensors and features.json.
+    """
+    if not card.is_file():
+        raise InputError(f"{card} does not exist: weights ship only with the card of the run that made them")
+    content = json.loads(card.read_text())
+    out.mkdir(parents=True, exist_ok=True)
+    differences = {"features": export_features(weights, out / "features.onnx"), **export_filter(out)}
+    content["onnx_minus_torch"] = differences
+    copied = weights.read_bytes()
+    with atomic_path(out / "features.safetensors") as path:
+        path.write_bytes(copied)
+    with atomic_path(out / "features.json") as path:
+        path.write_text(json.dumps(content, indent=2) + "\n")
+    return differences
+
+
+def _smooth_noise(rng: np.random.Generator, height: int, width: int) -> Tensor:
+    coarse = torch.from_numpy(rng.random((1, 1, height // 4, width // 4), np.float32))
+    return nn.functional.interpolate(coarse, scale_factor=4.0, mode="bicubic").clamp(0, 1)
+
+
+def _filter_graphs() -> dict[str, _Graph]:
+    points = torch.export.Dim("points", min=1, max=100_000)
+    state = ["pose", "clone", "offset", "covariance", "intrinsics", "landmarks", "landmark_covariance"]
+    fixed: dict[int, Any] = {}
+    free = {0: points}
+    return {
+        "pose_predict": _Graph(
+            Predict(),
+            _predict_example(0),
+            _predict_example(1),
+            ["pose", "twist", "covariance", "step", "densities"],
+            ["predicted_pose", "predicted_covariance"],
+            (fixed,) * 5,
+        ),
+        "pose_innovate": _Graph(
+            Innovate(),
+            _innovate_example(0, 40),
+            _innovate_example(1, 17),
+            [*state, "noise"],
+            ["predicted", "innovation_covariance", "in_front"],
+            (*(fixed,) * 5, free, free, free),
+        ),
+        "pose_update": _Graph(
+            Update(),
+            _update_example(0, 40),
+            _update_example(1, 23),
+            [*state[:2], "twist", *state[2:], "measurement", "noise", "weight"],
+            [
+                "new_pose",
+                "new_clone",
+                "new_twist",
+                "new_offset",
+                "new_covariance",
+                "nis",
+                "log_likelihood",
+                "squared_residual",
+            ],
+            (*(fixed,) * 6, *(free,) * 5),
+        ),
+    }
+
+
+def _predict_example(seed: int) -> tuple[Tensor, ...]:
+    pose, _, twist, _, covariance = _state_example(seed)
+    generator = torch.Generator().manual_seed(seed + 10)
+    densities = 0.1 + torch.rand(3, generator=generator, dtype=torch.float64)
+    return pose, twist, covariance, torch.tensor(0.1 + 0.2 * seed, dtype=torch.float64), densities
+
+
+def _innovate_example(seed: int, count: int) -> tuple[Tensor, ...]:
+    pose, clone, _, offset, covariance = _state_example(seed)
+    intrinsics, landmarks, landmark_covariance, _, noise, _ = _points_example(seed, count)
+    return pose, clone, offset, covariance, intrinsics, landmarks, landmark_covariance, noise
+
+
+def _update_example(seed: int, count: int) -> tuple[Tensor, ...]:
+    pose, clone, twist, offset, covariance = _state_example(seed)
+    intrinsics, landmarks, landmark_covariance, measurement, noise, weight = _points_example(seed, count)
+    return (
+        *(pose, clone, twist, offset, covariance),
+        *(intrinsics, landmarks, landmark_covariance, measurement, noise, weight),
+    )
+
+
+def _state_example(seed: int) -> tuple[Tensor, ...]:
+    from sigmaslam.filters.lie import exp_se3
+
+    generator = torch.Generator().manual_seed(seed)
+
+    def random(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    clone = exp_se3(0.3 * random(6))
+    pose = clone @ exp_se3(0.05 * random(6))
+    root = 0.02 * random(STATE_SIZE, STATE_SIZE)
+    return pose, clone, random(6), 0.1 * random(1), root @ root.T
+
+
+def _points_example(seed: int, count: int) -> tuple[Tensor, ...]:
+    generator = torch.Generator().manual_seed(seed + 20)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    intrinsics = torch.tensor([400.0, 410.0, 320.0, 240.0, 80.0], dtype=torch.float64)
+    landmarks = torch.stack([640 * uniform(count), 480 * uniform(count), 1 + 40 * uniform(count)], dim=-1)
+    measurement = landmarks + 2.0 * uniform(count, 3)
+    root = 0.3 * torch.eye(3, dtype=torch.float64) + 0.1 * uniform(count, 3, 3)
+    noise = root @ root.transpose(1, 2)
+    weight = torch.ones(count, 3, dtype=torch.float64)
+    weight[::3, 2] = 0.0
+    weight[::5] = 0.0
+    return intrinsics, landmarks, 0.5 * noise, measurement, noise, weight
+
+
+def _export(graph: _Graph, out: Path, tolerance: float) -> float:
+    with warnings.catch_warnings(), atomic_path(out) as path:
+        warnings.simplefilter("ignore")
+        logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+        program = torch.onnx.export(
+            graph.module.eval(),
+            graph.traced,
+            dynamo=True,
+            input_names=graph.inputs,
+            output_names=graph.outputs,
+            dynamic_shapes=graph.dynamic,
+            opset_version=_OPSET,
+            verbose=False,
+        )
+        assert program is not None
+        program.save(path, external_data=False)
+        difference = _difference(graph, path)
+        if not difference <= tolerance:
+            raise SigmaSlamError(f"{out.name} differs from torch by {difference:.2e}, more than {tolerance:.0e}: not written")
+    return difference
+
+
+def _difference(graph: _Graph, path: Path) -> float:
+    """Largest absolute difference between ONNX Runtime and torch on inputs of another size than the traced ones."""
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    feed = {name: value.numpy() for name, value in zip(graph.inputs, graph.checked, strict=True)}
+    found = session.run(None, feed)
+    with torch.no_grad():
+        expected = graph.module(*graph.checked)
+    return max(float(np.abs(a - b.numpy()).max()) for a, b in zip(found, expected, strict=True))

@@ -1,0 +1,515 @@
+"""Cameras: interior orientation (9.28)-(9.30), the stereo pair, and the rectified pair of (9.34)."""
+
+import os
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Self, cast, get_args
+
+import numpy as np
+import yaml
+
+from sigmaslam.errors import CalibrationError, InputError
+
+DistortionModel = Literal["none", "radtan", "equidistant"]
+
+COEFFICIENT_COUNTS: dict[str, tuple[int, ...]] = {"none": (0,), "radtan": (4, 5, 8), "equidistant": (4,)}
+
+# How far a rotation may be from orthonormal: files carry six or seven digits.
+ORTHONORMAL_TOLERANCE = 1e-4
+# A pair counts as rectified when rows agree to about 0.01 px: angles in rad, offsets relative to baseline.
+RECTIFIED_ANGLE = 1e-5
+RECTIFIED_OFFSET = 1e-4
+
+_NEWTON_STEPS = 50
+_NEWTON_RESIDUAL = 1e-11
+
+
+@dataclass(frozen=True, slots=True)
+class CameraModel:
+    """One camera: K of eq. (9.29) with shear, and lens distortion by OpenCV's models, eq. (9.30).
+
+    Attributes:
+        width, height: image size, pixels.
+        fx, fy, cx, cy: focal lengths and principal point, pixels; (0, 0) is the centre of the top-left pixel.
+        skew: K[0, 1], pixels.
+        distortion_model: 'none', 'radtan' (OpenCV's) or 'equidistant' (cv2.fisheye's).
+        distortion: coefficients: k1 k2 p1 p2 [k3 [k4 k5 k6]] for 'radtan', k1 k2 k3 k4 for 'equidistant'.
+
+    Raises:
+        CalibrationError: a size or focal length is not positive, a value is not finite, or the number of
+            coefficients does not fit the model.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    skew: float = 0.0
+    distortion_model: DistortionModel = "none"
+    distortion: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "distortion", tuple(float(value) for value in self.distortion))
+        if self.width <= 0 or self.height <= 0:
+            raise CalibrationError(f"image size is {self.width}x{self.height}; width and height must be positive")
+        numbers = (self.fx, self.fy, self.cx, self.cy, self.skew, *self.distortion)
+        if not np.all(np.isfinite(numbers)):
+            raise CalibrationError(f"fx, fy, cx, cy, skew, distortion must be finite numbers, got {numbers}")
+        if self.fx <= 0 or self.fy <= 0:
+            raise CalibrationError(f"focal lengths must be positive pixels, got fx={self.fx}, fy={self.fy}")
+        if self.distortion_model not in COEFFICIENT_COUNTS:
+            known = ", ".join(get_args(DistortionModel))
+            raise CalibrationError(f"distortion_model is {self.distortion_model!r}; use one of {known}")
+        counts = COEFFICIENT_COUNTS[self.distortion_model]
+        if len(self.distortion) not in counts:
+            raise CalibrationError(
+                f"distortion has {len(self.distortion)} coefficients; model {self.distortion_model!r} "
+                f"takes {' or '.join(map(str, counts))}"
+            )
+
+    @classmethod
+    def from_chapter(
+        cls,
+        alpha_u: float,
+        alpha_v: float,
+        shear: float,
+        scale_difference: float,
+        u0: float,
+        v0: float,
+        *,
+        width: int,
+        height: int,
+        distortion_model: DistortionModel = "none",
+        distortion: tuple[float, ...] = (),
+    ) -> Self:
+        """Camera with the chapter's K, (9.29): skew = shear alpha_v, fy = alpha_v (1 + scale_difference)."""
+        return cls(
+            width=width,
+            height=height,
+            fx=alpha_u,
+            fy=alpha_v * (1.0 + scale_difference),
+            cx=u0,
+            cy=v0,
+            skew=shear * alpha_v,
+            distortion_model=distortion_model,
+            distortion=distortion,
+        )
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """K, (3, 3) float64."""
+        return np.array([[self.fx, self.skew, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Pixels of points in the camera frame.
+
+        Args:
+            points: (..., 3) metres. Only Z > 0 has a meaning; nothing is checked, so that whole clouds can be
+                projected and masked afterwards.
+
+        Returns:
+            (..., 2) pixels (u, v), in the floating type of `points`.
+        """
+        points, dtype = _as_float64(points, 3, "points")
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            x, y = self._distort_rays(points)
+            pixels = np.stack([self.fx * x + self.skew * y + self.cx, self.fy * y + self.cy], axis=-1)
+        return pixels.astype(dtype)
+
+    def unproject(self, pixels: np.ndarray) -> np.ndarray:
+        """Rays of unit depth through pixels; the inverse of `project` to 1e-6 px, by Newton's method.
+
+        Args:
+            pixels: (..., 2) pixels (u, v).
+
+        Returns:
+            (..., 3) points with Z = 1 in the camera frame, in the floating type of `pixels`; NaN where no
+            ray in front of the camera has this pixel (beyond the fold of the distortion, or 90 degrees).
+        """
+        pixels, dtype = _as_float64(pixels, 2, "pixels")
+        y = (pixels[..., 1] - self.cy) / self.fy
+        x = (pixels[..., 0] - self.cx - self.skew * y) / self.fx
+        if self.distortion_model == "radtan":
+            x, y = _undistort_radtan(x, y, self.distortion)
+        elif self.distortion_model == "equidistant":
+            x, y = _undistort_equidistant(x, y, self.distortion)
+        return np.stack([x, y, np.ones_like(x)], axis=-1).astype(dtype)
+
+    def _distort_rays(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        X, Y, Z = points[..., 0], points[..., 1], points[..., 2]
+        if self.distortion_model == "equidistant":
+            radius = np.hypot(X, Y)
+            theta = np.arctan2(radius, Z)
+            theta_d, _ = _equidistant_polynomial(theta, self.distortion)
+            # On the axis the ratio is 0 / 0; its limit is 1 / Z.
+            scale = np.where(radius > 0, theta_d / radius, 1.0 / Z)
+            return X * scale, Y * scale
+        x, y = X / Z, Y / Z
+        if self.distortion_model == "radtan":
+            x, y, _ = _distort_radtan(x, y, self.distortion)
+        return x, y
+
+
+def _as_float64(array: np.ndarray, last: int, name: str) -> tuple[np.ndarray, np.dtype]:
+    array = np.asarray(array)
+    if array.ndim == 0 or array.shape[-1] != last:
+        raise ValueError(f"{name} must have shape (..., {last}), got {array.shape}")
+    dtype = array.dtype if np.issubdtype(array.dtype, np.floating) else np.dtype(np.float64)
+    return array.astype(np.float64), dtype
+
+
+def _distort_radtan(
+    x: np.ndarray, y: np.ndarray, coefficients: Sequence[float]
+) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Distorted normalised coordinates and the Jacobian's (0, 0), (0, 1) = (1, 0) and (1, 1) entries."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, *(0.0,) * (8 - len(coefficients)))
+    r2 = x * x + y * y
+    top, bottom = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    radial = top / bottom
+    slope = (k1 + r2 * (2 * k2 + 3 * k3 * r2) - radial * (k4 + r2 * (2 * k5 + 3 * k6 * r2))) / bottom
+    x_distorted = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    y_distorted = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    jacobian = (
+        radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x,
+        2 * x * y * slope + 2 * p1 * x + 2 * p2 * y,
+        radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x,
+    )
+    return x_distorted, y_distorted, jacobian
+
+
+def _undistort_radtan(
+    x_distorted: np.ndarray, y_distorted: np.ndarray, coefficients: Sequence[float]
+) -> tuple[np.ndarray, np.ndarray]:
+    x, y = x_distorted.copy(), y_distorted.copy()
+    with np.errstate(all="ignore"):
+        for _ in range(_NEWTON_STEPS):
+            x_now, y_now, (a, b, d) = _distort_radtan(x, y, coefficients)
+            error_x, error_y = x_now - x_distorted, y_now - y_distorted
+            determinant = a * d - b * b
+            x = x - (d * error_x - b * error_y) / determinant
+            y = y - (a * error_y - b * error_x) / determinant
+            if not np.any(np.hypot(error_x, error_y) > 1e-15):
+                break
+        x_now, y_now, (a, b, d) = _distort_radtan(x, y, coefficients)
+        residual = np.hypot(x_now - x_distorted, y_now - y_distorted)
+        # Both eigenvalues positive: not beyond the fold, where the image runs backwards.
+        found = (residual < _NEWTON_RESIDUAL) & (a * d - b * b > 0) & (a + d > 0)
+    return np.where(found, x, np.nan), np.where(found, y, np.nan)
+
+
+def _equidistant_polynomial(theta: np.ndarray, coefficients: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Distorted angle theta (1 + k1 theta^2 + ...) and its derivative."""
+    k1, k2, k3, k4 = coefficients
+    t2 = theta * theta
+    value = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+    return value, 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+
+
+def _undistort_equidistant(
+    x_distorted: np.ndarray, y_distorted: np.ndarray, coefficients: Sequence[float]
+) -> tuple[np.ndarray, np.ndarray]:
+    theta_d = np.hypot(x_distorted, y_distorted)
+    theta = theta_d.copy()
+    with np.errstate(all="ignore"):
+        for _ in range(_NEWTON_STEPS):
+            value, slope = _equidistant_polynomial(theta, coefficients)
+            theta = theta - (value - theta_d) / slope
+            if not np.any(np.abs(value - theta_d) > 1e-15):
+                break
+        value, slope = _equidistant_polynomial(theta, coefficients)
+        found = (np.abs(value - theta_d) < _NEWTON_RESIDUAL) & (slope > 0) & (theta >= 0) & (theta < np.pi / 2)
+        scale = np.where(theta_d > 0, np.tan(theta) / theta_d, 1.0)
+    scale = np.where(found, scale, np.nan)
+    return x_distorted * scale, y_distorted * scale
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StereoCamera:
+    """A stereo pair as calibrated.
+
+    Attributes:
+        left, right: the two cameras.
+        T_left_right: (4, 4) float64, read-only; maps right-camera points into the left frame, metres. Its
+            translation is the position of the right camera in the left frame.
+
+    Raises:
+        CalibrationError: T_left_right is no rigid transformation, or the right camera is not to the right.
+    """
+
+    left: CameraModel
+    right: CameraModel
+    T_left_right: np.ndarray
+
+    def __post_init__(self) -> None:
+        T = np.array(self.T_left_right, dtype=np.float64)
+        if T.shape != (4, 4):
+            raise CalibrationError(f"T_left_right must be a 4x4 matrix, got shape {T.shape}")
+        if not np.all(np.isfinite(T)):
+            raise CalibrationError(f"T_left_right must be finite, got\n{T}")
+        if not np.allclose(T[3], [0, 0, 0, 1], atol=1e-9):
+            raise CalibrationError(f"the last row of T_left_right must be 0 0 0 1, got {T[3]}")
+        defect = float(np.abs(T[:3, :3].T @ T[:3, :3] - np.eye(3)).max())
+        if defect > ORTHONORMAL_TOLERANCE or np.linalg.det(T[:3, :3]) < 0:
+            raise CalibrationError(
+                f"the rotation in T_left_right is not orthonormal with determinant +1 (off by {defect:.2g}):\n{T}"
+            )
+        x, y, z = T[:3, 3]
+        if x <= 0:
+            raise CalibrationError(
+                f"left and right look swapped: T_left_right puts the right camera at x = {x:.6g} m in the "
+                "left frame, it must be positive; swap the cameras or invert the matrix"
+            )
+        if max(abs(y), abs(z)) > x:
+            raise CalibrationError(
+                f"the right camera lies at ({x:.4g}, {y:.4g}, {z:.4g}) m in the left frame: not beside the "
+                "left camera; only horizontal stereo pairs are supported"
+            )
+        T.setflags(write=False)
+        object.__setattr__(self, "T_left_right", T)
+
+    @property
+    def baseline(self) -> float:
+        """Distance between the two centres of projection, metres."""
+        return float(np.linalg.norm(self.T_left_right[:3, 3]))
+
+    @property
+    def is_rectified(self) -> bool:
+        """Whether the images can be used as they are: equal K, undistorted, parallel, pure x baseline."""
+        left, right = self.left, self.right
+        if left.distortion_model != "none" or right.distortion_model != "none" or left.skew or right.skew:
+            return False
+        K_left, K_right = left.matrix, right.matrix
+        return bool(
+            (left.width, left.height) == (right.width, right.height)
+            and np.allclose(K_left, K_right, rtol=0, atol=1e-6 * left.fx)
+            and np.abs(self.T_left_right[:3, :3] - np.eye(3)).max() < RECTIFIED_ANGLE
+            and np.abs(self.T_left_right[1:3, 3]).max() < RECTIFIED_OFFSET * self.baseline
+        )
+
+    @classmethod
+    def from_yaml(cls, path: str | os.PathLike[str]) -> Self:
+        """Read a calibration file.
+
+        The form (sizes and K in pixels, lengths in metres; further keys at the top are ignored)::
+
+            left: {width: 752, height: 480, fx: 458.654, fy: 457.296, cx: 367.215, cy: 248.375,
+                   skew: 0.0,                      # optional, 0
+                   distortion_model: radtan,       # optional, none | radtan | equidistant
+                   distortion: [-0.283, 0.0740, 0.0002, 0.00002]}   # optional, []
+            right: {...}
+            T_left_right: [[1, 0, 0, 0.11], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+
+        Raises:
+            CalibrationError: the file cannot be read, a key is missing or wrong; names file, key and value.
+        """
+        content = CalibrationYaml.read(path)
+        left, right = (_camera_from_yaml(content.section(eye)) for eye in ("left", "right"))
+        T_left_right = content.numbers("T_left_right", (4, 4))
+        try:
+            return cls(left, right, T_left_right)
+        except CalibrationError as error:
+            raise content.error(str(error)) from None
+
+    def to_yaml(self, path: str | os.PathLike[str]) -> None:
+        """Write the form that `from_yaml` reads, exactly; the file appears whole or not at all.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        content = {
+            "left": _camera_to_yaml(self.left),
+            "right": _camera_to_yaml(self.right),
+            "T_left_right": self.T_left_right.tolist(),
+        }
+        text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=200)
+        target = Path(path)
+        partial = target.with_name(f".{target.name}.{os.getpid()}")
+        try:
+            partial.write_text(text, encoding="utf-8")
+            partial.replace(target)
+        except OSError as error:
+            partial.unlink(missing_ok=True)
+            raise InputError(f"{path}: cannot write the calibration: {error.strerror}") from None
+
+
+def _camera_from_yaml(section: "CalibrationYaml") -> CameraModel:
+    required = ("fx", "fy", "cx", "cy")
+    section.reject_unknown(("width", "height", *required, "skew", "distortion_model", "distortion"))
+    values: dict[str, Any] = {key: section.integer(key) for key in ("width", "height")}
+    values |= {key: section.number(key) for key in required}
+    values["skew"] = section.number("skew", 0.0)
+    values["distortion_model"] = section.text("distortion_model", "none")
+    values["distortion"] = tuple(section.numbers("distortion", (None,), []).tolist())
+    try:
+        return CameraModel(**values)
+    except CalibrationError as error:
+        raise section.error(str(error)) from None
+
+
+def _camera_to_yaml(camera: CameraModel) -> dict[str, Any]:
+    values: dict[str, Any] = {"width": int(camera.width), "height": int(camera.height)}
+    values |= {key: float(getattr(camera, key)) for key in ("fx", "fy", "cx", "cy", "skew")}
+    return values | {
+        "distortion_model": camera.distortion_model,
+        "distortion": [float(value) for value in camera.distortion],
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class RectifiedStereo:
+    """A parallel pair with the same pinhole camera in both eyes, the geometry of (9.34).
+
+    Attributes:
+        fx, fy, cx, cy: intrinsics, pixels.
+        baseline: metres.
+        width, height: image size, pixels.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    baseline: float
+    width: int
+    height: int
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """K of both eyes, (3, 3) float64."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Pixels of points, the inverse of `triangulate`.
+
+        Args:
+            points: (..., 3) in the left camera frame, metres; Z must be positive (not checked).
+
+        Returns:
+            (..., 3) (u_left, v, disparity), pixels.
+        """
+        points = np.asarray(points)
+        X, Y, Z = points[..., 0], points[..., 1], points[..., 2]
+        u, v = self.fx * X / Z + self.cx, self.fy * Y / Z + self.cy
+        return np.stack([u, v, self.fx * self.baseline / Z], axis=-1)
+
+    def triangulate(self, uvd: np.ndarray) -> np.ndarray:
+        """Points from a rectified pair, eq. (9.34).
+
+        Args:
+            uvd: (..., 3) (u_left, v, disparity), pixels; disparity u_left - u_right must be positive.
+
+        Returns:
+            (..., 3) points in the left camera frame, metres.
+
+        Raises:
+            ValueError: a disparity is not positive (the message gives how many and the first index).
+        """
+        uvd = np.asarray(uvd)
+        disparity = uvd[..., 2]
+        wrong = ~(disparity > 0)
+        if np.any(wrong):
+            first = tuple(int(i) for i in np.argwhere(wrong)[0])
+            raise ValueError(
+                f"{np.count_nonzero(wrong)} of {disparity.size} disparities are not positive; the first is "
+                f"{disparity[first]} at index {first if len(first) != 1 else first[0]}; drop those points"
+            )
+        Z = self.fx * self.baseline / disparity
+        return np.stack([(uvd[..., 0] - self.cx) * Z / self.fx, (uvd[..., 1] - self.cy) * Z / self.fy, Z], axis=-1)
+
+
+_REQUIRED: Any = object()
+
+
+class CalibrationYaml:
+    """A YAML calibration file whose getters raise errors that name file, key and what was expected."""
+
+    def __init__(self, path: Path, entries: dict[str, Any], prefix: str = "") -> None:
+        self.path = path
+        self.entries = entries
+        self.prefix = prefix
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> Self:
+        """Read a file; OpenCV's '%YAML:1.0' first line, which is no YAML, is skipped."""
+        path = Path(path)
+        try:
+            text = path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise CalibrationError(f"{path}: cannot read the calibration: {error}") from None
+        first, _, rest = text.partition("\n")
+        if first.startswith("%YAML:"):
+            text = "\n" + rest
+        try:
+            entries = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise CalibrationError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
+        if not isinstance(entries, dict):
+            raise CalibrationError(f"{path}: expected keys with values, found {type(entries).__name__}")
+        return cls(path, entries)
+
+    def error(self, message: str) -> CalibrationError:
+        """The error to raise about this section."""
+        return CalibrationError(f"{self.path}: {self.prefix.rstrip('.') + ': ' if self.prefix else ''}{message}")
+
+    def section(self, key: str) -> "CalibrationYaml":
+        """The mapping under a key."""
+        entries = self._get(key, "a mapping")
+        if not isinstance(entries, dict):
+            raise self._wrong(key, "a mapping", entries)
+        return CalibrationYaml(self.path, entries, f"{self.prefix}{key}.")
+
+    def text(self, key: str, default: str = _REQUIRED) -> str:
+        """A word."""
+        value = self._get(key, "a word", default)
+        # YAML reads a bare `none` as a string, but `null` and `~` as None.
+        return "none" if value is None else str(value)
+
+    def number(self, key: str, default: float = _REQUIRED) -> float:
+        """A finite number."""
+        return float(self.numbers(key, (), default))
+
+    def integer(self, key: str) -> int:
+        """A whole number."""
+        value = self.number(key)
+        if value != int(value):
+            raise self._wrong(key, "a whole number", value)
+        return int(value)
+
+    def numbers(self, key: str, shape: tuple[int | None, ...], default: Any = _REQUIRED) -> np.ndarray:
+        """A float64 array of nested lists; None in `shape` stands for any length."""
+        size = "x".join("any" if n is None else str(n) for n in shape)
+        expected = "a number" if not shape else "a list of numbers" if size == "any" else f"{size} numbers in lists"
+        value = self._get(key, expected, default)
+        try:
+            # Through str: YAML 1.1 reads 1e-5 as text; booleans are no numbers.
+            array = np.array(value, dtype=str) if value != [] else np.zeros(0, dtype=str)
+            numbers = array.astype(np.float64)
+        except ValueError:
+            raise self._wrong(key, expected, value) from None
+        fits = numbers.ndim == len(shape) and all(
+            n is None or n == m for n, m in zip(shape, numbers.shape, strict=True)
+        )
+        if not fits or not np.all(np.isfinite(numbers)):
+            found = "x".join(map(str, numbers.shape)) or "one number"
+            raise self._wrong(key, expected, value, f" (size {found})")
+        return cast(np.ndarray, numbers)
+
+    def reject_unknown(self, known: Collection[str]) -> None:
+        """Refuse keys that nobody would read, as a misspelt optional key would pass unseen."""
+        unknown = [str(key) for key in self.entries if key not in known]
+        if unknown:
+            raise self.error(f"unknown key {', '.join(unknown)}; known are {', '.join(known)}")
+
+    def _get(self, key: str, expected: str, default: Any = _REQUIRED) -> Any:
+        if key in self.entries:
+            return self.entries[key]
+        if default is not _REQUIRED:
+            return default
+        raise CalibrationError(f"{self.path}: key '{self.prefix}{key}' is missing; expected {expected}")
+
+    def _wrong(self, key: str, expected: str, value: Any, detail: str = "") -> CalibrationError:
+        shown = str(value) if len(str(value)) <= 80 else str(value)[:77] + "..."
+        return CalibrationError(f"{self.path}: key '{self.prefix}{key}' must be {expected}, got {shown}{detail}")

@@ -1,0 +1,176 @@
+"""Image files: reading one, making it grey 8-bit, and a list of left and right files as a source of pairs."""
+
+import logging
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from sigmaslam.errors import FrameError, InputError
+
+logger = logging.getLogger(__name__)
+
+IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"})
+
+# So many pairs in a row may fail before the sequence is given up.
+MAX_FAILURES = 20
+
+
+@dataclass(frozen=True, slots=True)
+class RawPair:
+    """A pair as it was stored: any number of channels, 8 or 16 bits.
+
+    Attributes:
+        index: number of the pair in the sequence.
+        timestamp: seconds.
+        left, right: (H, W) or (H, W, C) images.
+        left_name, right_name: where they came from, for messages.
+    """
+
+    index: int
+    timestamp: float
+    left: np.ndarray
+    right: np.ndarray
+    left_name: str
+    right_name: str
+
+
+@dataclass(frozen=True, slots=True)
+class SkippedFrame:
+    """A pair that could not be used: its index, timestamp (seconds) and why."""
+
+    index: int
+    timestamp: float
+    reason: str
+
+
+def read_image(path: Path) -> np.ndarray:
+    """Read an image as it is stored.
+
+    Returns:
+        (H, W) or (H, W, C) array, colours in OpenCV's order.
+
+    Raises:
+        FrameError: the file is missing, empty, truncated or no image.
+    """
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise FrameError(f"{path}: file is missing") from None
+    except OSError as error:
+        raise FrameError(f"{path}: cannot be read ({error.strerror})") from None
+    if not content:
+        raise FrameError(f"{path}: file is empty (0 bytes)")
+    # OpenCV 4 fills the rest of a truncated JPEG with grey; its end marker must come after its last scan.
+    if content[:2] == b"\xff\xd8" and content.rfind(b"\xff\xd9") < content.rfind(b"\xff\xda"):
+        raise FrameError(f"{path}: JPEG is truncated")
+    try:
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        image = None
+    if image is None:
+        raise FrameError(f"{path}: not an image, or truncated ({len(content)} bytes)")
+    return image
+
+
+class GreyConverter:
+    """Makes every image of one sequence grey and 8-bit by the same rule, and says once that it does.
+
+    16-bit images are scaled by one factor from the significant bits (8 to 16) of the first one seen, so that
+    brightness does not jump within the sequence; brighter pixels later on saturate.
+    """
+
+    def __init__(self) -> None:
+        self.significant_bits: int | None = None
+        self._colour_warned = False
+
+    def convert(self, image: np.ndarray, name: str) -> np.ndarray:
+        """Convert (H, W) or (H, W, 1 to 4) uint8 or uint16 to (H, W) uint8.
+
+        Raises:
+            FrameError: another pixel type or number of channels.
+        """
+        if image.dtype not in (np.uint8, np.uint16):
+            raise FrameError(f"{name}: pixel type {image.dtype} is neither 8- nor 16-bit unsigned")
+        if image.ndim == 3 and image.shape[2] > 4:
+            raise FrameError(f"{name}: {image.shape[2]} channels; expected grey, BGR or BGR with alpha")
+        if image.ndim == 3:
+            image = self._to_grey(image, name)
+        if image.dtype == np.uint16:
+            if self.significant_bits is None:
+                self.significant_bits = max(8, int(image.max()).bit_length())
+                logger.warning(
+                    "%s: 16-bit image, %d significant bits; the whole sequence is scaled to 8 bits by 255/%d",
+                    name,
+                    self.significant_bits,
+                    2**self.significant_bits - 1,
+                )
+            image = cv2.convertScaleAbs(image, alpha=255.0 / (2**self.significant_bits - 1))
+        return image
+
+    def _to_grey(self, image: np.ndarray, name: str) -> np.ndarray:
+        channels = image.shape[2]
+        if channels <= 2:
+            return np.ascontiguousarray(image[..., 0])
+        if not self._colour_warned:
+            self._colour_warned = True
+            logger.warning("%s: colour image; the whole sequence is converted to grey", name)
+        return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY if channels == 3 else cv2.COLOR_BGRA2GRAY)
+
+
+class ImagePairs:
+    """Left and right image files with their timestamps, as a source of pairs.
+
+    Attributes:
+        timestamps: seconds, strictly increasing.
+        length: number of pairs.
+
+    Raises:
+        InputError: there is no pair, or a timestamp is not finite or not later than the one before.
+    """
+
+    def __init__(self, files: Sequence[tuple[Path, Path]], timestamps: Sequence[float], source: Path) -> None:
+        if not files:
+            raise InputError(f"{source}: no pair of left and right images")
+        if len(files) != len(timestamps):
+            raise InputError(f"{source}: {len(files)} pairs but {len(timestamps)} timestamps")
+        steps = np.diff(timestamps, prepend=-np.inf)
+        wrong = np.flatnonzero(~((steps > 0) & np.isfinite(timestamps)))
+        if len(wrong):
+            first = int(wrong[0])
+            raise InputError(
+                f"{source}: timestamp of pair {first} ({files[first][0].name}) is {timestamps[first]!r}, the "
+                f"one before {timestamps[first - 1] if first else None!r}; they must be finite and increase"
+            )
+        self.files = list(files)
+        self.timestamps: list[float] | None = list(timestamps)
+        self.length: int | None = len(files)
+        self._source = source
+
+    @cached_property
+    def first_pair(self) -> RawPair:
+        """The first pair that can be read.
+
+        Raises:
+            InputError: none of the first pairs can.
+        """
+        tried = 0
+        reason = ""
+        for tried, item in enumerate(self, start=1):
+            if isinstance(item, RawPair):
+                return item
+            reason = reason or item.reason
+            if tried > MAX_FAILURES:
+                break
+        raise InputError(f"{self._source}: none of the first {tried} pairs can be read; the first: {reason}")
+
+    def __iter__(self) -> Iterator[RawPair | SkippedFrame]:
+        assert self.timestamps is not None
+        for index, ((left, right), timestamp) in enumerate(zip(self.files, self.timestamps, strict=True)):
+            try:
+                yield RawPair(index, timestamp, read_image(left), read_image(right), str(left), str(right))
+            except FrameError as error:
+                yield SkippedFrame(index, timestamp, str(error))

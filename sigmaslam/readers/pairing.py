@@ -1,0 +1,172 @@
+"""Which left image belongs to which right image, and when it was taken."""
+
+import logging
+import re
+from collections.abc import Collection, Mapping, Sequence
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+
+from sigmaslam.errors import InputError
+from sigmaslam.readers.images import IMAGE_SUFFIXES
+
+logger = logging.getLogger(__name__)
+
+DEFAULT_RATE_HZ = 10.0
+STAMP_TOLERANCE_NS = 5_000_000
+# Nanoseconds since 1970 have 19 digits; 16 leave room for clocks that start elsewhere.
+STAMP_DIGITS = 16
+
+Key = tuple[int, ...] | str
+
+
+def list_images(folder: Path) -> list[Path]:
+    """Image files of a folder by name; hidden files are left out.
+
+    Raises:
+        InputError: the folder is missing or has no image.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder")
+    files = sorted(
+        path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
+    )
+    if not files:
+        raise InputError(f"{folder}: no image files ({' '.join(sorted(IMAGE_SUFFIXES))})")
+    return files
+
+
+def pair_by_name(left_folder: Path, right_folder: Path) -> list[tuple[Path, Path]]:
+    """Pairs of equal frame numbers (all the numbers in a name), in their order.
+
+    Where a name has no number, or a folder has the same numbers twice, whole names are compared.
+
+    Raises:
+        InputError: an image has no partner; the message gives both counts and the first names.
+    """
+    folders = (left_folder, right_folder)
+    files = [list_images(folder) for folder in folders]
+    keys: list[list[Key]] = [[_numbers(path) for path in side] for side in files]
+    if any(() in side or len(set(side)) < len(side) for side in keys):
+        keys = [[path.stem for path in side] for side in files]
+    left, right = (dict(zip(side_keys, side, strict=True)) for side_keys, side in zip(keys, files, strict=True))
+    alone = [sorted(path.name for key, path in a.items() if key not in b) for a, b in ((left, right), (right, left))]
+    if any(alone):
+        parts = [
+            f"{len(names)} in {folder.name} without partner (first: {', '.join(names[:3])})"
+            for names, folder in zip(alone, folders, strict=True)
+            if names
+        ]
+        raise InputError(
+            f"unequal left and right images: {len(left)} in {left_folder}, {len(right)} in {right_folder}; "
+            f"{'; '.join(parts)}; images of a pair must have the same number in their names"
+        )
+    return [(left[key], right[key]) for key in sorted(left)]
+
+
+def _numbers(path: Path) -> tuple[int, ...]:
+    return tuple(int(digits) for digits in re.findall(r"\d+", path.stem))
+
+
+def frame_numbers(files: Sequence[tuple[Path, Path]]) -> list[int] | None:
+    """The frame numbers of pairs named by nothing but a number, else None."""
+    stems = [left.stem for left, _ in files]
+    return [int(stem) for stem in stems] if all(stem.isdecimal() for stem in stems) else None
+
+
+def is_stamp(stem: str) -> bool:
+    """Whether a file name is a time in nanoseconds."""
+    return stem.isdecimal() and len(stem) >= STAMP_DIGITS
+
+
+def pair_by_stamp(
+    left: Mapping[int, Path], right: Mapping[int, Path], source: Path
+) -> tuple[list[tuple[Path, Path]], list[float]]:
+    """Pairs of mutually nearest stamps, at most 5 ms apart; others are left out with one warning.
+
+    Args:
+        left, right: files by time stamp, nanoseconds.
+        source: for messages.
+
+    Returns:
+        The pairs in order and the left stamps in seconds.
+
+    Raises:
+        InputError: the counts differ by more than 10 %, or nothing pairs.
+    """
+    if abs(len(left) - len(right)) > 0.1 * max(len(left), len(right)):
+        raise InputError(
+            f"{source}: unequal left and right images: {len(left)} left, {len(right)} right; copy the missing files"
+        )
+    left_stamps, right_stamps = np.array(sorted(left), np.int64), np.array(sorted(right), np.int64)
+    to_right, to_left = _nearest(left_stamps, right_stamps), _nearest(right_stamps, left_stamps)
+    mutual = to_left[to_right] == np.arange(len(left_stamps))
+    close = np.abs(right_stamps[to_right] - left_stamps) <= STAMP_TOLERANCE_NS
+    chosen = np.flatnonzero(mutual & close)
+    if not len(chosen):
+        raise InputError(
+            f"{source}: none of {len(left)} left images has a right one within "
+            f"{STAMP_TOLERANCE_NS / 1e6:g} ms ({len(right)} right); are both from the same recording?"
+        )
+    unpaired = len(left) + len(right) - 2 * len(chosen)
+    if unpaired:
+        logger.warning("%s: %d images without a partner within 5 ms are left out", source, unpaired)
+    pairs = [(left[int(left_stamps[i])], right[int(right_stamps[to_right[i]])]) for i in chosen]
+    # Division of Python integers is rounded once; 19 digits are more than a float holds.
+    return pairs, [int(left_stamps[i]) / 1_000_000_000 for i in chosen]
+
+
+def _nearest(stamps: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Index of the nearest of the sorted `others` for each stamp."""
+    after = np.clip(np.searchsorted(others, stamps), 0, len(others) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.where(np.abs(others[before] - stamps) <= np.abs(others[after] - stamps), before, after)
+
+
+def read_times(path: Path, count: int, numbers: Collection[int] | None = None) -> list[float]:
+    """Timestamps of a times file: seconds, or KITTI raw's dates, one a line.
+
+    Args:
+        path: text file.
+        count: number of pairs.
+        numbers: frame numbers of the pairs; a file of a whole recording is then indexed by them.
+
+    Returns:
+        Seconds, one per pair.
+
+    Raises:
+        InputError: a line is no time, or the number of lines does not fit.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot read the timestamps: {error}") from None
+    times = []
+    for number, line in enumerate(lines, start=1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        try:
+            times.append(_seconds(line.strip()))
+        except ValueError:
+            raise InputError(f"{path}: line {number} is not a time in seconds: {line!r}") from None
+    if len(times) == count:
+        return times
+    if numbers is not None and len(times) > max(numbers):
+        return [times[number] for number in numbers]
+    raise InputError(f"{path}: {len(times)} timestamps for {count} image pairs; one line per pair is needed")
+
+
+def _seconds(text: str) -> float:
+    date, _, clock = text.partition(" ")
+    if not clock:
+        return float(text)
+    # Nine decimals, which datetime does not read.
+    whole, _, decimals = clock.partition(".")
+    return datetime.fromisoformat(f"{date} {whole}+00:00").timestamp() + float(f"0.{decimals or 0}")
+
+
+def default_times(numbers: Sequence[int], source: Path) -> list[float]:
+    """Times at 10 Hz from frame numbers, so that a gap in the numbers is a gap in time; logs a warning."""
+    logger.warning("%s: no timestamps; %g Hz is taken", source, DEFAULT_RATE_HZ)
+    return [(number - numbers[0]) / DEFAULT_RATE_HZ for number in numbers]

@@ -1,0 +1,153 @@
+"""Rotations and rigid transforms as small vectorised functions on numpy arrays.
+
+Quaternions are (x, y, z, w), Hamilton convention. The tangent of SE(3) is (translation, rotation), as in
+Barfoot, "State Estimation for Robotics", chapter 8.
+"""
+
+import numpy as np
+
+
+def skew(vectors: np.ndarray) -> np.ndarray:
+    """Cross-product matrices: `skew(a) @ b == cross(a, b)`; (..., 3) -> (..., 3, 3)."""
+    v = np.asarray(vectors)
+    matrix = np.zeros((*v.shape[:-1], 3, 3), dtype=v.dtype)
+    matrix[..., 0, 1], matrix[..., 0, 2] = -v[..., 2], v[..., 1]
+    matrix[..., 1, 0], matrix[..., 1, 2] = v[..., 2], -v[..., 0]
+    matrix[..., 2, 0], matrix[..., 2, 1] = -v[..., 1], v[..., 0]
+    return matrix
+
+
+def quaternion_to_matrix(quaternions: np.ndarray) -> np.ndarray:
+    """Rotation matrices of quaternions, which are normalised first.
+
+    Args:
+        quaternions: (..., 4) as (x, y, z, w), any length but zero.
+    Returns:
+        (..., 3, 3) rotation matrices.
+    Raises:
+        ValueError: a quaternion is zero or not finite.
+    """
+    q = np.asarray(quaternions, dtype=np.float64)
+    length = np.linalg.norm(q, axis=-1, keepdims=True)
+    if not np.all(np.isfinite(length) & (length > 0)):
+        raise ValueError("a quaternion is zero or not finite, so it has no rotation")
+    q = q / length
+    v, w = q[..., :3], q[..., 3, None, None]
+    outer = v[..., :, None] * v[..., None, :]
+    square = np.sum(v * v, axis=-1)[..., None, None]
+    return np.asarray((1.0 - 2.0 * square) * np.eye(3) + 2.0 * outer + 2.0 * w * skew(v))
+
+
+def matrix_to_quaternion(rotations: np.ndarray) -> np.ndarray:
+    """Unit quaternions (x, y, z, w) with w >= 0; accurate at every angle, 180 degrees included.
+
+    The rows of 4 q q^T follow from the matrix without division (Shepperd, 1978); the one with the largest
+    diagonal entry is normalised.
+
+    Args:
+        rotations: (..., 3, 3) rotation matrices.
+    Returns:
+        (..., 4) unit quaternions.
+    """
+    m = np.asarray(rotations, dtype=np.float64)
+    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
+    xw, yw, zw = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
+    rows = [
+        np.stack([1 + xx - yy - zz, xy, xz, xw], axis=-1),
+        np.stack([xy, 1 - xx + yy - zz, yz, yw], axis=-1),
+        np.stack([xz, yz, 1 - xx - yy + zz, zw], axis=-1),
+        np.stack([xw, yw, zw, 1 + xx + yy + zz], axis=-1),
+    ]
+    outer = np.stack(rows, axis=-2)
+    best = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
+    q = np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.asarray(np.where(q[..., 3:] < 0, -q, q))
+
+
+def rotation_log(rotations: np.ndarray) -> np.ndarray:
+    """Rotation vectors of rotation matrices; (..., 3, 3) -> (..., 3) radians, length in [0, pi]."""
+    q = matrix_to_quaternion(rotations)
+    v, w = q[..., :3], q[..., 3:]
+    sine = np.linalg.norm(v, axis=-1, keepdims=True)
+    # angle / sin(angle / 2) tends to 2 as the angle goes to zero (w is then 1).
+    factor = np.where(sine > 0, 2.0 * np.arctan2(sine, w) / np.where(sine > 0, sine, 1.0), 2.0)
+    return np.asarray(factor * v)
+
+
+def rotation_exp(vectors: np.ndarray) -> np.ndarray:
+    """Rotation matrices of rotation vectors; (..., 3) radians -> (..., 3, 3)."""
+    phi = np.asarray(vectors, dtype=np.float64)
+    angle = np.linalg.norm(phi, axis=-1, keepdims=True)
+    q = np.concatenate([0.5 * np.sinc(angle / (2 * np.pi)) * phi, np.cos(angle / 2)], axis=-1)
+    return quaternion_to_matrix(q)
+
+
+def nearest_rotation(matrices: np.ndarray) -> np.ndarray:
+    """The rotation closest in the Frobenius norm to each matrix; (..., 3, 3) -> (..., 3, 3)."""
+    u, _, vt = np.linalg.svd(np.asarray(matrices, dtype=np.float64))
+    sign = np.ones((*u.shape[:-2], 3))
+    sign[..., 2] = np.sign(np.linalg.det(u @ vt))
+    return np.asarray((u * sign[..., None, :]) @ vt)
+
+
+def se3_inverse(T: np.ndarray) -> np.ndarray:
+    """Inverses of rigid transforms; (..., 4, 4) -> (..., 4, 4)."""
+    T = np.asarray(T)
+    inverse = np.zeros_like(T)
+    rotation = np.swapaxes(T[..., :3, :3], -1, -2)
+    inverse[..., :3, :3] = rotation
+    inverse[..., :3, 3] = -(rotation @ T[..., :3, 3:])[..., 0]
+    inverse[..., 3, 3] = 1.0
+    return inverse
+
+
+def se3_adjoint(T: np.ndarray) -> np.ndarray:
+    """Adjoints of rigid transforms: `T exp(x) T^-1 == exp(adjoint @ x)`, x = (translation, rotation).
+
+    Args:
+        T: (..., 4, 4) rigid transforms.
+    Returns:
+        (..., 6, 6) adjoint matrices, eq. (8.50).
+    """
+    T = np.asarray(T)
+    adjoint = np.zeros((*T.shape[:-2], 6, 6), dtype=T.dtype)
+    rotation = T[..., :3, :3]
+    adjoint[..., :3, :3] = rotation
+    adjoint[..., 3:, 3:] = rotation
+    adjoint[..., :3, 3:] = skew(T[..., :3, 3]) @ rotation
+    return adjoint
+
+
+def se3_exp(tangent: np.ndarray) -> np.ndarray:
+    """Rigid transforms of tangent vectors (translation, rotation); (..., 6) -> (..., 4, 4)."""
+    xi = np.asarray(tangent, dtype=np.float64)
+    phi = xi[..., 3:]
+    angle = np.linalg.norm(phi, axis=-1)[..., None, None]
+    square = angle * angle
+    series = 1 / 6 - square / 120 + square**2 / 5040 - square**3 / 362880
+    safe = np.where(angle > 0.1, angle, 1.0)
+    second = np.where(angle > 0.1, (safe - np.sin(safe)) / safe**3, series)
+    cross = skew(phi)
+    left_jacobian = np.eye(3) + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * cross + second * (cross @ cross)
+    T = np.zeros((*xi.shape[:-1], 4, 4))
+    T[..., :3, :3] = rotation_exp(phi)
+    T[..., :3, 3] = (left_jacobian @ xi[..., :3, None])[..., 0]
+    T[..., 3, 3] = 1.0
+    return T
+
+
+def se3_log(T: np.ndarray) -> np.ndarray:
+    """Tangent vectors (translation, rotation) of rigid transforms; (..., 4, 4) -> (..., 6)."""
+    T = np.asarray(T, dtype=np.float64)
+    phi = rotation_log(T[..., :3, :3])
+    angle = np.linalg.norm(phi, axis=-1)[..., None, None]
+    square = angle * angle
+    series = 1 / 12 + square / 720 + square**2 / 30240 + square**3 / 1209600
+    safe = np.where(angle > 0.1, angle, 1.0)
+    second = np.where(angle > 0.1, (1 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2, series)
+    cross = skew(phi)
+    inverse_jacobian = np.eye(3) - 0.5 * cross + second * (cross @ cross)
+    rho = (inverse_jacobian @ T[..., :3, 3:])[..., 0]
+    return np.concatenate([rho, phi], axis=-1)

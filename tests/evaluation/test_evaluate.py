@@ -1,0 +1,148 @@
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sigmaslam.errors import InputError
+from sigmaslam.evaluation.evaluate import evaluate_run, format_evaluation
+from sigmaslam.rotation import se3_adjoint, se3_exp, se3_inverse
+from sigmaslam.trajectory import Trajectory, read_kitti, read_trajectory, write_kitti, write_tum
+
+
+def _data(name: str) -> Path:
+    folder = Path(os.environ.get("SIGMASLAM_DATA", "shared/data")) / name
+    if not folder.exists():
+        pytest.skip(f"{folder} is not there; set SIGMASLAM_DATA")
+    return folder
+
+
+def make_run(folder: Path, truth: Trajectory, seed: int = 0) -> None:
+    """A run folder with a drifting estimate of the truth and the covariance of that drift."""
+    generator = np.random.default_rng(seed)
+    sigma = np.array([0.01, 0.01, 0.015, 4e-4, 4e-4, 4e-4])
+    motions = se3_inverse(truth.poses[:-1]) @ truth.poses[1:]
+    poses, covariance = [np.eye(4)], [np.zeros((6, 6))]
+    for motion in motions:
+        adjoint = se3_adjoint(se3_inverse(motion))
+        poses.append(poses[-1] @ motion @ se3_exp(sigma * generator.normal(size=6)))
+        covariance.append(adjoint @ covariance[-1] @ adjoint.T + np.diag(sigma**2))
+    write_tum(folder / "trajectory.tum", Trajectory(truth.timestamps, np.array(poses)))
+    np.save(folder / "covariance.npy", np.array(covariance))
+
+
+@pytest.fixture
+def drive(tmp_path) -> tuple[Path, Path]:
+    """A run folder over real KITTI motion, and the truth with its times."""
+    source = _data("kitti_raw_0926_0039_a")
+    (tmp_path / "run").mkdir()
+    make_run(tmp_path / "run", read_trajectory(source / "poses.txt"))
+    return tmp_path / "run", source / "poses.txt"
+
+
+def test_run_folder_gives_every_number(drive):
+    run, truth = drive
+    evaluation = evaluate_run(run, truth)
+    assert (evaluation.matched, evaluation.frames, evaluation.association) == (186, 186, "time")
+    assert evaluation.path_length == pytest.approx(154, abs=1)
+    assert 0 < evaluation.ate.rmse <= evaluation.ate_origin.rmse
+    assert evaluation.kitti.lengths.tolist() == [100.0]
+    assert evaluation.nees is not None
+    assert len(evaluation.nees.per_frame) == 185
+    assert 0.3 < evaluation.nees.mean < 3
+    assert evaluation.figure_path == run / "evaluation.png"
+    assert evaluation.figure_path.read_bytes().startswith(b"\x89PNG")
+    assert sorted(path.name for path in run.iterdir()) == [
+        "covariance.npy",
+        "evaluation.png",
+        "trajectory.tum",
+    ]
+
+
+def test_dictionary_is_json_and_table_shows_the_same(drive):
+    evaluation = evaluate_run(*drive, lengths=(20, 50), plot=False)
+    content = json.loads(json.dumps(evaluation.to_dict(), allow_nan=False))
+    assert content["ate"]["rmse"] == evaluation.ate.rmse
+    assert content["nees"]["count"] == 185
+    assert content["kitti"]["lengths"] == [20, 50]
+    assert content["coverage"] == 1.0
+    table = format_evaluation(evaluation)
+    assert f"{evaluation.ate.rmse:.4f}" in table
+    assert f"{evaluation.kitti.mean_translation_percent:.3f}" in table
+    assert f"overconfident): {evaluation.nees.mean:.2f}" in table
+    assert max(map(len, table.splitlines()[2:])) <= 160
+
+
+def test_missing_frames_lower_the_coverage(drive):
+    run, truth = drive
+    full = read_trajectory(run / "trajectory.tum")
+    kept = np.setdiff1d(np.arange(186), np.arange(60, 90))
+    write_tum(run / "trajectory.tum", full.subset(kept))
+    np.save(run / "covariance.npy", np.load(run / "covariance.npy")[kept])
+    assert evaluate_run(run, truth, plot=False).coverage == pytest.approx(156 / 186, abs=0.01)
+    (run / "frames.csv").write_text("timestamp,status\n" + "0,tracking\n" * 186)
+    assert evaluate_run(run, truth, plot=False).coverage == 156 / 186
+
+
+def test_kitti_truth_without_times_is_paired_by_index_when_counts_agree(tmp_path):
+    truth = read_kitti(_data("kitti_gt_trajectories") / "04.txt")
+    write_kitti(tmp_path / "truth.txt", truth)
+    write_tum(tmp_path / "estimate.tum", Trajectory(1.4e9 + 0.1036 * np.arange(len(truth)), truth.poses))
+    evaluation = evaluate_run(tmp_path / "estimate.tum", tmp_path / "truth.txt")
+    assert (evaluation.association, evaluation.matched) == ("index", 271)
+    assert evaluation.ate.rmse == pytest.approx(0, abs=1e-6)
+    assert evaluation.nees is None
+    assert (tmp_path / "evaluation.png").is_file()
+
+
+def test_kitti_truth_without_times_never_pairs_wrong_frames(tmp_path):
+    truth = read_kitti(_data("kitti_gt_trajectories") / "04.txt")
+    write_kitti(tmp_path / "truth.txt", truth)
+    kept = np.arange(0, 260)
+    write_tum(tmp_path / "at_10_hz.tum", truth.subset(kept))
+    evaluation = evaluate_run(tmp_path / "at_10_hz.tum", tmp_path / "truth.txt", plot=False)
+    assert (evaluation.association, evaluation.matched, evaluation.frames) == ("time at 10 Hz", 260, 271)
+    write_tum(tmp_path / "drifting.tum", Trajectory(0.1036 * kept, truth.poses[kept]))
+    with pytest.raises(InputError, match=r"truth\.txt.*times\.txt"):
+        evaluate_run(tmp_path / "drifting.tum", tmp_path / "truth.txt", plot=False)
+
+
+def test_euroc_truth_at_its_own_rate(tmp_path):
+    truth_path = _data("euroc_v1_01_keyframes_a") / "groundtruth.csv"
+    write_tum(tmp_path / "estimate.tum", read_trajectory(truth_path))
+    evaluation = evaluate_run(tmp_path / "estimate.tum", truth_path)
+    assert (evaluation.matched, evaluation.frames) == (60, 60)
+    assert evaluation.ate.rmse == pytest.approx(0, abs=1e-9)
+
+
+def test_standing_still_has_no_segments(tmp_path):
+    truth_path = _data("euroc_v1_01_static") / "groundtruth.csv"
+    write_tum(tmp_path / "estimate.tum", read_trajectory(truth_path))
+    evaluation = evaluate_run(tmp_path / "estimate.tum", truth_path)
+    assert evaluation.to_dict()["kitti"]["mean_translation_percent"] is None
+    assert "none, the path is shorter" in format_evaluation(evaluation)
+
+
+def test_folder_without_trajectory_is_named(tmp_path):
+    with pytest.raises(InputError, match=r"holds no trajectory\.tum"):
+        evaluate_run(tmp_path, tmp_path / "truth.txt")
+
+
+def test_covariance_of_another_run_is_refused(drive):
+    run, truth = drive
+    np.save(run / "covariance.npy", np.zeros((5, 6, 6)))
+    with pytest.raises(InputError, match=r"covariance\.npy.*\(5, 6, 6\).*186"):
+        evaluate_run(run, truth)
+    (run / "covariance.npy").write_text("no array")
+    with pytest.raises(InputError, match=r"covariance\.npy: is no numpy array"):
+        evaluate_run(run, truth)
+
+
+def test_clocks_that_do_not_meet_stop_the_evaluation(drive, tmp_path):
+    run, truth = drive
+    shutil.copy(truth, tmp_path / "poses.txt")
+    (tmp_path / "times.txt").write_text("".join(f"{1e6 + 0.1 * k:.3f}\n" for k in range(186)))
+    with pytest.raises(InputError, match="no timestamps"):
+        evaluate_run(run, tmp_path / "poses.txt")
