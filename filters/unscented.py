@@ -98,17 +98,18 @@ def iterated_update(measure: Measure, measurement: Tensor, whitener: Tensor, siz
         deviations = whitener @ torch.cat([odd, even], dim=-1)
         innovation = (whitener @ (measurement - predicted + odd @ mean).unsqueeze(-1)).squeeze(-1)
         deviations = deviations.flatten(0, 1)
-        innovation = innovation.flatten()
+        # Rows, not vectors: ONNX Runtime's transpose fusion is wrong for a product with a one-dimensional operand.
+        innovation = innovation.reshape(1, -1)
         information = deviations.transpose(0, 1) @ deviations
         inverse, log_determinant = inverse_and_log_determinant(
             information + torch.eye(2 * size, dtype=information.dtype, device=information.device)
         )
-        projected = deviations.transpose(0, 1) @ innovation
-        solution = inverse @ projected
+        projected = innovation @ deviations
+        solution = projected @ inverse
         if iteration == 0:
-            nis = innovation @ innovation - projected @ solution
+            nis = (innovation * innovation).sum() - (projected * solution).sum()
             log_likelihood = -0.5 * (nis + log_determinant)
-        mean = solution[:size]
+        mean = solution[0, :size]
         covariance = inverse[:size, :size]
         if iteration + 1 < iterations:
             spread = cholesky(covariance)

@@ -1,0 +1,55 @@
+"""ONNX Runtime sessions as this project needs them: one place for options and for the shipped graphs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from importlib.resources import as_file, files
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+
+from sigmaslam.errors import InputError
+
+# This fusion moves a constant factor into a float32 attribute of the product, also when the product is float64: the
+# covariances of the filter would be wrong in the eighth digit.
+_DISABLED = ["MatMulScaleFusion"]
+
+
+class OnnxGraph:
+    """A loaded graph that is called with named arrays.
+
+    Args:
+        path: .onnx file.
+        threads: within one operator; results are the same bit for bit as long as it does not change.
+    Raises:
+        InputError: the file is missing or no usable graph.
+    """
+
+    def __init__(self, path: Path, threads: int = 1) -> None:
+        if not path.is_file():
+            raise InputError(f"{path} does not exist: reinstall the package, or export the graph again")
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = threads
+        options.inter_op_num_threads = 1
+        # Several sessions take turns: one that spins while it waits halves the speed of the others.
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        options.log_severity_level = 3
+        try:
+            self._session = onnxruntime.InferenceSession(
+                path, options, providers=["CPUExecutionProvider"], disabled_optimizers=_DISABLED
+            )
+        except Exception as error:  # onnxruntime raises its own types, none of them public
+            raise InputError(f"{path} is not a graph that ONNX Runtime can load: {error}") from error
+        self.outputs: Sequence[str] = [output.name for output in self._session.get_outputs()]
+
+    def __call__(self, feed: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+        """Outputs in the order of the graph."""
+        found: list[np.ndarray] = self._session.run(None, dict(feed))
+        return found
+
+
+def shipped_weights(name: str) -> Path:
+    """Path of a file in the package's folder of weights and graphs."""
+    with as_file(files("sigmaslam.models.weights") / name) as path:
+        return Path(path)
