@@ -1,0 +1,39 @@
+"""The shipped graphs' torch twins behind the same call, for `--backend torch`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import nn
+
+from sigmaslam.filters.stereo_pose import Innovate, Predict, Update
+from sigmaslam.models.export import MAX_KEYPOINTS, load_network
+from sigmaslam.models.extractor import FeatureExtractor
+
+
+class TorchModule:
+    """A module that is called with named arrays, in the order of its arguments."""
+
+    def __init__(self, module: nn.Module) -> None:
+        self._module = module.eval()
+
+    def __call__(self, feed: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+        """Outputs in the order of the module."""
+        with torch.inference_mode():
+            found = self._module(*(torch.from_numpy(np.asarray(value)) for value in feed.values()))
+        return [value.numpy() for value in found]
+
+
+class TorchFeatures(TorchModule):
+    """The feature extractor from its weights."""
+
+    def __init__(self, weights: Path) -> None:
+        super().__init__(FeatureExtractor(load_network(weights), MAX_KEYPOINTS))
+
+
+def filter_module(name: str) -> TorchModule:
+    """pose_predict, pose_innovate or pose_update."""
+    return TorchModule({"pose_predict": Predict(), "pose_innovate": Innovate(), "pose_update": Update()}[name])

@@ -1,0 +1,6 @@
+"""Front-ends: images in, correspondences out."""
+
+from sigmaslam.frontend.build import FRONTENDS, build_frontend
+from sigmaslam.frontend.types import Features, Frontend, StereoView, TemporalMatches
+
+__all__ = ["FRONTENDS", "Features", "Frontend", "StereoView", "TemporalMatches", "build_frontend"]

@@ -1,0 +1,33 @@
+"""The front-ends by name."""
+
+from __future__ import annotations
+
+from sigmaslam.errors import InputError
+from sigmaslam.frontend.classical import OrbDetector, SiftDetector
+from sigmaslam.frontend.descriptor import DescriptorFrontend
+from sigmaslam.frontend.klt import KltFrontend
+from sigmaslam.frontend.learned import LearnedDetector
+from sigmaslam.frontend.types import Frontend
+
+FRONTENDS = ("learned", "sift", "orb", "klt")
+
+
+def build_frontend(name: str, max_keypoints: int, backend: str = "onnx") -> Frontend:
+    """The front-end of that name.
+
+    Args:
+        name: one of FRONTENDS.
+        max_keypoints: per image.
+        backend: "onnx" or "torch", for the learned one.
+    Raises:
+        InputError: there is no front-end of that name.
+    """
+    if name == "learned":
+        return DescriptorFrontend(name, LearnedDetector(max_keypoints, backend), ratio=0.95)
+    if name == "sift":
+        return DescriptorFrontend(name, SiftDetector(max_keypoints), ratio=0.9)
+    if name == "orb":
+        return DescriptorFrontend(name, OrbDetector(max_keypoints), ratio=0.95)
+    if name == "klt":
+        return KltFrontend(max_keypoints)
+    raise InputError(f"there is no front-end '{name}': choose one of {', '.join(FRONTENDS)}")

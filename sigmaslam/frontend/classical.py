@@ -1,0 +1,51 @@
+"""SIFT and ORB as baselines and fall-backs, through the same interface as the learned features."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from sigmaslam.frontend.types import Features
+
+
+class SiftDetector:
+    """OpenCV's SIFT with RootSIFT descriptors (Arandjelovic & Zisserman 2012)."""
+
+    def __init__(self, max_keypoints: int) -> None:
+        self._sift = cv2.SIFT_create(nfeatures=max_keypoints)
+
+    def __call__(self, image: np.ndarray) -> Features:
+        """Features of an (H, W) uint8 image."""
+        keypoints, descriptors = self._sift.detectAndCompute(image, None)
+        if descriptors is None:
+            return _no_features(128)
+        root = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-12))
+        return _features(keypoints, root.astype(np.float32))
+
+
+class OrbDetector:
+    """OpenCV's ORB; its 256 bits become +-1/16, so that the dot product is 1 - Hamming distance / 128."""
+
+    def __init__(self, max_keypoints: int) -> None:
+        self._orb = cv2.ORB_create(nfeatures=max_keypoints)
+
+    def __call__(self, image: np.ndarray) -> Features:
+        """Features of an (H, W) uint8 image."""
+        keypoints, descriptors = self._orb.detectAndCompute(image, None)
+        if descriptors is None:
+            return _no_features(256)
+        bits = np.unpackbits(descriptors, axis=1).astype(np.float32)
+        return _features(keypoints, (2.0 * bits - 1.0) / 16.0)
+
+
+def _features(keypoints: list[cv2.KeyPoint], descriptors: np.ndarray) -> Features:
+    places = np.array([keypoint.pt for keypoint in keypoints], np.float32)
+    scores = np.array([keypoint.response for keypoint in keypoints], np.float32)
+    # OpenCV may return the same place twice with two orientations: the first stays, matches must be one to one.
+    _, first = np.unique(places, axis=0, return_index=True)
+    order = first[np.argsort(-scores[first], kind="stable")]
+    return Features(places[order], descriptors[order], scores[order])
+
+
+def _no_features(size: int) -> Features:
+    return Features(np.zeros((0, 2), np.float32), np.zeros((0, size), np.float32), np.zeros(0, np.float32))

@@ -1,0 +1,69 @@
+"""Front-end for keypoints with descriptors, learned or classical: detect, match, refine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from sigmaslam.frontend.matching import match_near, match_rows
+from sigmaslam.frontend.refine import refine
+from sigmaslam.frontend.types import Features, StereoView, TemporalMatches
+
+_ROW_TOLERANCE = 2.0
+# A little below zero, so that points at infinity survive a disparity offset.
+_LEAST_DISPARITY = -2.0
+# Share of the image width that disparity may reach.
+_MOST_DISPARITY = 0.25
+_SIGMA_REFINED = 0.5
+_SIGMA_DETECTED = 1.0
+
+Detector = Callable[[np.ndarray], Features]
+
+
+class DescriptorFrontend:
+    """Matches by mutual nearest descriptor, refined by one Lucas-Kanade level.
+
+    Args:
+        name: for reports.
+        detect: image (H, W) uint8 to features.
+        ratio: nearest over second nearest descriptor distance that is still accepted.
+    """
+
+    def __init__(self, name: str, detect: Detector, ratio: float) -> None:
+        self.name = name
+        self._detect = detect
+        self._ratio = ratio
+
+    def observe(self, left: np.ndarray, right: np.ndarray) -> StereoView:
+        """Features of both images, matched along the rows."""
+        features, other = self._detect(left), self._detect(right)
+        disparity = np.full(len(features.keypoints), np.nan)
+        index_left, index_right = match_rows(
+            features.keypoints,
+            other.keypoints,
+            features.descriptors,
+            other.descriptors,
+            _ROW_TOLERANCE,
+            (_LEAST_DISPARITY, _MOST_DISPARITY * left.shape[1]),
+            self._ratio,
+        )
+        points_left = features.keypoints[index_left]
+        places, moved = refine(left, right, points_left, other.keypoints[index_right])
+        level = moved & (np.abs(places[:, 1] - points_left[:, 1]) <= _ROW_TOLERANCE)
+        disparity[index_left[level]] = points_left[level, 0] - places[level, 0]
+        return StereoView(left, right, features, disparity)
+
+    def match(
+        self, key: StereoView, index: np.ndarray, view: StereoView, predicted: np.ndarray, radius: np.ndarray
+    ) -> TemporalMatches:
+        """Mutual nearest neighbours within the search radius."""
+        wanted = key.features.select(index)
+        first, second = match_near(
+            predicted, radius, view.features.keypoints, wanted.descriptors, view.features.descriptors, self._ratio
+        )
+        points = view.features.keypoints[second]
+        places, moved = refine(key.left, view.left, wanted.keypoints[first], points)
+        return TemporalMatches(
+            index[first], places, view.disparity[second], np.where(moved, _SIGMA_REFINED, _SIGMA_DETECTED)
+        )

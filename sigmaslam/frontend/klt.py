@@ -1,0 +1,70 @@
+"""Corners followed by pyramidal Lucas-Kanade, without descriptors."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from sigmaslam.frontend.refine import lucas_kanade
+from sigmaslam.frontend.types import Features, StereoView, TemporalMatches
+
+_WINDOW = 15
+_LEVELS = 4
+_ROW_TOLERANCE = 2.0
+_FORWARD_BACKWARD = 0.7
+_SIGMA = 0.5
+
+
+class KltFrontend:
+    """Shi-Tomasi corners tracked forward and backward.
+
+    Args:
+        max_keypoints: corners per keyframe.
+    """
+
+    name = "klt"
+
+    def __init__(self, max_keypoints: int) -> None:
+        self._max_keypoints = max_keypoints
+
+    def observe(self, left: np.ndarray, right: np.ndarray) -> StereoView:
+        """Corners of the left image, followed into the right one."""
+        distance = max(5.0, 0.5 * np.sqrt(left.size / self._max_keypoints))
+        found = cv2.goodFeaturesToTrack(left, self._max_keypoints, 0.003, distance, blockSize=5)
+        keypoints = np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
+        features = Features(
+            keypoints,
+            np.zeros((len(keypoints), 0), np.float32),
+            np.linspace(1, 0, len(keypoints), dtype=np.float32),
+        )
+        return StereoView(left, right, features, _disparity(left, right, keypoints))
+
+    def match(
+        self, key: StereoView, index: np.ndarray, view: StereoView, predicted: np.ndarray, radius: np.ndarray
+    ) -> TemporalMatches:
+        """Corners of the keyframe followed into the current left image, then into the right one."""
+        points = key.features.keypoints[index]
+        places, found = _follow(key.left, view.left, points, predicted)
+        found &= np.linalg.norm(places - predicted, axis=1) <= radius
+        places = places[found]
+        return TemporalMatches(
+            index[found], places, _disparity(view.left, view.right, places), np.full(len(places), _SIGMA)
+        )
+
+
+def _follow(
+    image0: np.ndarray, image1: np.ndarray, points0: np.ndarray, guess1: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Places in image 1 and whether the way back ends where it began."""
+    height, width = image1.shape
+    guess1 = np.clip(guess1, 0, (width - 1, height - 1))
+    places, found = lucas_kanade(image0, image1, points0, guess1, _WINDOW, _LEVELS)
+    back, returned = lucas_kanade(image1, image0, places, points0, _WINDOW, 1)
+    return places, found & returned & (np.linalg.norm(back - points0, axis=1) <= _FORWARD_BACKWARD)
+
+
+def _disparity(left: np.ndarray, right: np.ndarray, points: np.ndarray) -> np.ndarray:
+    places, found = _follow(left, right, points, points)
+    disparity = points[:, 0] - places[:, 0]
+    level = found & (np.abs(places[:, 1] - points[:, 1]) <= _ROW_TOLERANCE) & (disparity > -2.0)
+    return np.where(level, disparity, np.nan)

@@ -1,0 +1,49 @@
+"""Our trained features: the shipped ONNX graph, or the same network in torch."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from sigmaslam.frontend.types import Features
+from sigmaslam.session import OnnxGraph, shipped_weights
+
+_SIZE_MULTIPLE = 16
+_BORDER = 8
+
+
+class LearnedDetector:
+    """Keypoints, scores and descriptors from the network, best first.
+
+    Args:
+        max_keypoints: at most as many as the graph was exported for (2,048).
+        backend: "onnx", or "torch" (needs the extra `train`).
+        threads: of ONNX Runtime.
+    """
+
+    def __init__(self, max_keypoints: int, backend: str = "onnx", threads: int = 2) -> None:
+        self._max_keypoints = max_keypoints
+        if backend == "torch":
+            from sigmaslam.models.torch_runtime import TorchFeatures
+
+            self._graph: OnnxGraph | TorchFeatures = TorchFeatures(shipped_weights("features.safetensors"))
+        else:
+            self._graph = OnnxGraph(shipped_weights("features.onnx"), threads)
+
+    def __call__(self, image: np.ndarray) -> Features:
+        """Features of an (H, W) uint8 image of any size from 96 pixels."""
+        height, width = image.shape
+        bottom, right = -height % _SIZE_MULTIPLE, -width % _SIZE_MULTIPLE
+        padded = cv2.copyMakeBorder(image, 0, bottom, 0, right, cv2.BORDER_REPLICATE)
+        keypoints, scores, descriptors = self._graph({"image": padded[None, None].astype(np.float32) / 255.0})
+        # The padding has no corners of its own, but its seam may.
+        inside = (keypoints[:, 0] < width - _BORDER) & (keypoints[:, 1] < height - _BORDER)
+        kept = np.flatnonzero((scores > 0) & inside)[: self._max_keypoints]
+        return Features(keypoints[kept], descriptors[kept], scores[kept])
+
+
+def weights_path() -> Path:
+    """The shipped weights, for hashes in reports."""
+    return shipped_weights("features.onnx")

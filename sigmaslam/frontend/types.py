@@ -1,0 +1,84 @@
+"""What passes between the front-end and the tracker."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+
+@dataclass(frozen=True, slots=True)
+class Features:
+    """Keypoints of one image, best first.
+
+    Attributes:
+        keypoints: (N, 2) float32 pixel coordinates (u, v).
+        descriptors: (N, D) float32 of unit length; their dot product is the similarity. D = 0 for trackers without.
+        scores: (N,) float32, larger is better.
+    """
+
+    keypoints: np.ndarray
+    descriptors: np.ndarray
+    scores: np.ndarray
+
+    def select(self, index: np.ndarray) -> Features:
+        """The features of that index or mask."""
+        return Features(self.keypoints[index], self.descriptors[index], self.scores[index])
+
+
+@dataclass(frozen=True, slots=True)
+class StereoView:
+    """One rectified stereo pair with what was found in it.
+
+    Attributes:
+        left, right: (H, W) uint8.
+        features: of the left image.
+        disparity: (N,) float64 in pixels, NaN where the keypoint was not found in the right image.
+    """
+
+    left: np.ndarray
+    right: np.ndarray
+    features: Features
+    disparity: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
+class TemporalMatches:
+    """Where keypoints of a keyframe are in the current view.
+
+    Attributes:
+        key_index: (M,) index into the keyframe's features, each at most once.
+        points: (M, 2) float64 pixel coordinates in the current left image.
+        disparity: (M,) float64 there, NaN where unknown.
+        sigma: (M,) standard deviation of the points per axis, pixels.
+    """
+
+    key_index: np.ndarray
+    points: np.ndarray
+    disparity: np.ndarray
+    sigma: np.ndarray
+
+
+class Frontend(Protocol):
+    """Turns images into correspondences; the tracker knows nothing else of them."""
+
+    name: str
+
+    def observe(self, left: np.ndarray, right: np.ndarray) -> StereoView:
+        """Detects keypoints in a rectified pair and finds their disparity."""
+        ...
+
+    def match(
+        self, key: StereoView, index: np.ndarray, view: StereoView, predicted: np.ndarray, radius: np.ndarray
+    ) -> TemporalMatches:
+        """Finds keypoints of a keyframe in the current view.
+
+        Args:
+            key: the keyframe.
+            index: (K,) which of its keypoints are wanted.
+            view: the current view.
+            predicted: (K, 2) where the filter expects them, pixels.
+            radius: (K,) search radius about the prediction, pixels; infinite when the prediction is worth little.
+        """
+        ...
