@@ -2,34 +2,119 @@
 
 from __future__ import annotations
 
+import json
+import logging
 import sys
+import tempfile
+from enum import StrEnum
+from importlib.metadata import version
+from importlib.resources import as_file, files
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.logging import RichHandler
 
 from sigmaslam.errors import InputError, SigmaSlamError
 
-app = typer.Typer(
-    name="sigmaslam",
-    help="Stereo visual SLAM: poses with an honest covariance, a sparse map, on a plain CPU.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
+app = typer.Typer(name="sigmaslam", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+
+
+class Frontend(StrEnum):
+    """Where correspondences come from."""
+
+    learned = "learned"
+    sift = "sift"
+    orb = "orb"
+    klt = "klt"
+
+
+class Backend(StrEnum):
+    """What runs the network and the filter."""
+
+    onnx = "onnx"
+    torch = "torch"
+
+
+class InputFormat(StrEnum):
+    """Kinds of input."""
+
+    auto = "auto"
+    kitti = "kitti"
+    euroc = "euroc"
+    folder = "folder"
+    video = "video"
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"sigmaslam {version('sigmaslam')}")
+        raise typer.Exit
 
 
 @app.callback()
-def _root() -> None:
-    """Stereo visual SLAM: poses with an honest covariance, a sparse map, on a plain CPU."""
+def _root(
+    show_version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Stereo visual SLAM: poses with an honest covariance and a sparse map, on a plain CPU."""
+
+
+@app.command()
+def demo(
+    out: Annotated[
+        Path | None, typer.Option(help="Run folder, new or empty.", show_default="a new temporary folder")
+    ] = None,
+    frontend: Annotated[Frontend, typer.Option(help="Where correspondences come from.")] = Frontend.learned,
+) -> None:
+    """Track the rendered sequence that ships with the package and print the errors against its exact truth."""
+    from sigmaslam.evaluation.evaluate import evaluate_run, format_evaluation
+
+    folder = out or Path(tempfile.mkdtemp(prefix="sigmaslam-demo-"))
+    with as_file(files("sigmaslam.synthetic") / "demo") as sequence:
+        _track(sequence, folder, InputFormat.kitti, None, frontend, Backend.onnx)
+        typer.echo(format_evaluation(evaluate_run(folder, sequence / "poses.txt")))
+    typer.echo(f"Report: {folder / 'report.html'}\nPicture: {folder / 'evaluation.png'}")
+
+
+@app.command()
+def track(
+    source: Annotated[Path, typer.Argument(metavar="INPUT", help="KITTI, EuRoC or plain folder, or a video.")],
+    out: Annotated[Path, typer.Option(help="Run folder, new or empty.")],
+    format: Annotated[InputFormat, typer.Option(help="Kind of input.")] = InputFormat.auto,
+    calibration: Annotated[
+        Path | None, typer.Option(help="Calibration YAML (or KITTI calib.txt) instead of the input's own.")
+    ] = None,
+    frontend: Annotated[Frontend, typer.Option(help="Where correspondences come from.")] = Frontend.learned,
+    backend: Annotated[Backend, typer.Option(help="What runs network and filter; torch needs 'train'.")] = Backend.onnx,
+) -> None:
+    """Track a stereo sequence: trajectory, covariance, map and report."""
+    summary = _track(source, out, format, calibration, frontend, backend)
+    typer.echo(
+        f"{summary['tracking']} of {summary['frames']} frames tracked, {summary['lost']} lost, "
+        f"{summary['skipped']} skipped; {summary['median_inliers']:.0f} inliers in the median frame, "
+        f"{summary['map_points']} map points.\n{summary['calibration_verdict']}\nReport: {out / 'report.html'}"
+    )
+
+
+@app.command()
+def evaluate(
+    run: Annotated[Path, typer.Argument(metavar="RUN_OR_TRAJECTORY", help="Run folder, or a TUM or KITTI file.")],
+    truth: Annotated[Path, typer.Option(help="Ground truth: TUM, KITTI (with times.txt beside it) or EuRoC csv.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+) -> None:
+    """Compare a trajectory with the truth: ATE, RPE, KITTI t_rel and r_rel, NEES; draws evaluation.png."""
+    from sigmaslam.evaluation.evaluate import evaluate_run, format_evaluation
+
+    evaluation = evaluate_run(run, truth)
+    typer.echo(json.dumps(evaluation.to_dict(), indent=2) if as_json else format_evaluation(evaluation))
 
 
 @app.command()
 def train(
-    out: Annotated[
-        Path, typer.Option(help="Folder for the checkpoint, the log, the weights and their card.")
-    ],
+    out: Annotated[Path, typer.Option(help="Folder for the checkpoint, the log, the weights and their card.")],
     steps: Annotated[int, typer.Option(min=1, help="Optimiser steps; about 3 a second on 2 cores.")] = 4500,
     seed: Annotated[int, typer.Option(min=0, help="Seed of data, weights and sampling.")] = 0,
     workers: Annotated[int, typer.Option(min=0, help="Processes that make training pairs.")] = 1,
@@ -41,7 +126,56 @@ def train(
     from sigmaslam.training.loop import train as run_training
 
     card = run_training(out, TrainingConfig(steps=steps, seed=seed), workers=workers, resume=resume)
-    Console().print_json(data=card)
+    typer.echo(json.dumps(card, indent=2))
+
+
+@app.command()
+def export(
+    run: Annotated[Path, typer.Argument(help="Folder of a finished training run.")],
+    out: Annotated[Path, typer.Option(help="Folder for the graphs, the weights and their card.")],
+) -> None:
+    """Export network and filter to ONNX and check the graphs against torch (needs the extra 'train')."""
+    _need_train_extra()
+    from sigmaslam.models.export import export_all
+    from sigmaslam.training.loop import CARD_NAME, WEIGHTS_NAME
+
+    with Console(stderr=True).status("exporting four graphs (about a minute)"):
+        differences = export_all(run / WEIGHTS_NAME, run / CARD_NAME, out)
+    for name, difference in differences.items():
+        typer.echo(f"{name}.onnx differs from torch by {difference:.1e}")
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    logging.basicConfig(
+        level=logging.WARNING,
+        format="%(message)s",
+        handlers=[RichHandler(console=Console(stderr=True), show_time=False, show_path=False)],
+    )
+    try:
+        app()
+    except SigmaSlamError as error:
+        Console(stderr=True).print(f"error: {error}", style="red", highlight=False, markup=False, soft_wrap=True)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+def _track(
+    source: Path,
+    out: Path,
+    format: InputFormat,
+    calibration: Path | None,
+    frontend: Frontend,
+    backend: Backend,
+) -> dict[str, Any]:
+    from sigmaslam.readers import open_sequence
+    from sigmaslam.run import track_sequence
+
+    if backend is Backend.torch:
+        _need_train_extra()
+    sequence = open_sequence(source, format.value, calibration)
+    return track_sequence(sequence, out, frontend.value, backend.value)
 
 
 def _need_train_extra() -> None:
@@ -52,10 +186,5 @@ def _need_train_extra() -> None:
         raise InputError(f"{error.name} is not installed: pip install 'sigmaslam[train]'") from error
 
 
-def main() -> None:
-    """Entry point of the console script."""
-    try:
-        app()
-    except SigmaSlamError as error:
-        Console(stderr=True).print(f"[bold red]error:[/] {error}", highlight=False, soft_wrap=True)
-        sys.exit(2)
+if __name__ == "__main__":
+    main()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -44,6 +43,3 @@ class LearnedDetector:
         return Features(keypoints[kept], descriptors[kept], scores[kept])
 
 
-def weights_path() -> Path:
-    """The shipped weights, for hashes in reports."""
-    return shipped_weights("features.onnx")

@@ -1,0 +1,5 @@
+"""`python -m sigmaslam`."""
+
+from sigmaslam.cli import main
+
+main()

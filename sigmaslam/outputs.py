@@ -1,0 +1,178 @@
+"""What a run leaves on disk. Rows are on disk as soon as they are known; the rest when the run ends, however it ends."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import platform
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sigmaslam.camera import StereoCamera
+from sigmaslam.errors import InputError
+from sigmaslam.files import atomic_path, atomic_write_text
+from sigmaslam.landmarks import PointMap
+from sigmaslam.report import write_report
+from sigmaslam.session import shipped_weights
+from sigmaslam.tracker import CalibrationEstimate, Estimate
+from sigmaslam.trajectory import Trajectory, write_kitti, write_tum
+
+STAGES = ("read", "features", "match", "filter", "map")
+_COLUMNS = (
+    "timestamp",
+    "status",
+    "matches",
+    "inliers",
+    "nis",
+    "dof",
+    "belief",
+    "disparity_offset",
+    "disparity_offset_sigma",
+    *(f"ms_{stage}" for stage in STAGES),
+)
+_GRAPHS = ("features.onnx", "pose_predict.onnx", "pose_innovate.onnx", "pose_update.onnx")
+
+
+class RunWriter:
+    """Writes a run folder.
+
+    Args:
+        out: folder to make; it must not exist, or be empty.
+    Raises:
+        InputError: the folder holds something, or cannot be made.
+    """
+
+    def __init__(self, out: Path) -> None:
+        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+            raise InputError(f"{out} exists and is not an empty folder: choose another --out, or remove it")
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+            self._table = (out / "frames.csv").open("w", newline="", encoding="utf-8")
+        except OSError as error:
+            raise InputError(f"{out}: cannot be written ({error.strerror}): choose another --out") from error
+        self._out = out
+        self._rows = csv.writer(self._table)
+        self._rows.writerow(_COLUMNS)
+        self._estimates: list[Estimate] = []
+        self._skipped = 0
+
+    def add(self, estimate: Estimate, read_ms: float) -> None:
+        """Takes the result of one frame; its row is on disk when this returns."""
+        milliseconds = {"read": read_ms, **estimate.milliseconds}
+        self._rows.writerow(
+            [
+                f"{estimate.timestamp:.9f}",
+                estimate.status,
+                estimate.matches,
+                estimate.inliers,
+                f"{estimate.nis:.3f}",
+                estimate.dof,
+                f"{estimate.belief:.6f}",
+                f"{estimate.calibration.disparity_offset:.5f}",
+                f"{estimate.calibration.disparity_offset_sigma:.5f}",
+                *(f"{milliseconds[stage]:.2f}" for stage in STAGES),
+            ]
+        )
+        self._table.flush()
+        self._estimates.append(estimate)
+
+    def add_skipped(self, timestamp: float) -> None:
+        """Notes a frame that could not be read."""
+        self._rows.writerow([f"{timestamp:.9f}", "skipped", *[""] * (len(_COLUMNS) - 2)])
+        self._table.flush()
+        self._skipped += 1
+
+    def finish(self, point_map: PointMap, run: dict[str, Any]) -> dict[str, Any]:
+        """Writes trajectory, covariance, map, run.json and report.html.
+
+        Args:
+            point_map: the landmarks.
+            run: what run.json says beside versions, weights and the summary.
+        Returns:
+            The summary.
+        """
+        self._table.close()
+        summary = self._summary(point_map)
+        content = {**run, "versions": _versions(), "weights_sha256": _weight_hashes(), "summary": summary}
+        atomic_write_text(self._out / "run.json", json.dumps(content, indent=2) + "\n")
+        if not self._estimates:
+            return summary
+        trajectory = Trajectory(
+            np.array([estimate.timestamp for estimate in self._estimates]),
+            np.stack([estimate.T_world_camera for estimate in self._estimates]),
+        )
+        write_tum(self._out / "trajectory.tum", trajectory)
+        write_kitti(self._out / "trajectory.kitti", trajectory, self._out / "times.txt")
+        with atomic_path(self._out / "covariance.npy") as path:
+            np.save(path, np.stack([estimate.covariance for estimate in self._estimates]))
+        with atomic_path(self._out / "map.npz") as path:
+            np.savez_compressed(
+                path,
+                points=point_map.points,
+                covariances=point_map.covariances,
+                observations=point_map.observations,
+            )
+        write_ply(self._out / "map.ply", point_map)
+        write_report(self._out)
+        return summary
+
+    def _summary(self, point_map: PointMap) -> dict[str, Any]:
+        statuses = [estimate.status for estimate in self._estimates]
+        tracked = [estimate for estimate in self._estimates if estimate.status == "tracking"]
+        last = self._estimates[-1].calibration if self._estimates else None
+        return {
+            "frames": len(statuses) + self._skipped,
+            "skipped": self._skipped,
+            **{status: statuses.count(status) for status in ("starting", "tracking", "lost")},
+            "median_inliers": float(np.median([e.inliers for e in tracked])) if tracked else 0.0,
+            "map_points": len(point_map.points),
+            "calibration_verdict": calibration_verdict(last) if last else "No frame was read.",
+        }
+
+
+def calibration_verdict(calibration: CalibrationEstimate) -> str:
+    """What the estimated disparity offset means, in words."""
+    offset, sigma = calibration.disparity_offset, calibration.disparity_offset_sigma
+    figure = f"{offset:+.2f} ± {sigma:.2f} px"
+    if sigma > 0.2:
+        return f"The motion says little about the disparity offset ({figure}): move closer to things, or further."
+    if abs(offset) > max(3.0 * sigma, 0.1):
+        return (
+            f"The rectification is off by {figure} of disparity. The poses are corrected for it; depth measured with "
+            "this calibration elsewhere is not: calibrate again."
+        )
+    return f"The disparity offset is {figure}: nothing wrong with the rectification can be seen."
+
+
+def write_ply(path: Path, point_map: PointMap) -> None:
+    """Points as a binary PLY with x, y, z and sigma, the root of the largest eigenvalue of the covariance, metres."""
+    sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(point_map.covariances)[:, -1], 0.0)) if len(point_map.points) else []
+    vertices = np.column_stack([point_map.points, np.reshape(sigma, (-1, 1))]).astype("<f4")
+    names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "sigma"))
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{names}end_header\n"
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(header.encode("ascii") + vertices.tobytes())
+
+
+def describe_camera(camera: StereoCamera) -> dict[str, Any]:
+    """The calibration for run.json."""
+    return {
+        "left": asdict(camera.left),
+        "right": asdict(camera.right),
+        "T_left_right": camera.T_left_right.tolist(),
+        "baseline": camera.baseline,
+    }
+
+
+def _versions() -> dict[str, str]:
+    names = ("sigmaslam", "numpy", "opencv-python-headless", "onnxruntime")
+    return {"python": platform.python_version(), **{name: version(name) for name in names}}
+
+
+def _weight_hashes() -> dict[str, str]:
+    return {name: hashlib.sha256(shipped_weights(name).read_bytes()).hexdigest() for name in _GRAPHS}

@@ -1,0 +1,98 @@
+"""Tracking a whole sequence from disk into a run folder."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from sigmaslam.errors import SigmaSlamError
+from sigmaslam.outputs import RunWriter, describe_camera
+from sigmaslam.readers import StereoSequence
+from sigmaslam.tracker import Estimate, StereoTracker, TrackerConfig
+
+
+def track_sequence(
+    sequence: StereoSequence,
+    out: Path,
+    frontend: str = "learned",
+    backend: str = "onnx",
+    config: TrackerConfig | None = None,
+) -> dict[str, Any]:
+    """Tracks a sequence and writes the run folder; partial results are kept when it is stopped or fails.
+
+    Args:
+        sequence: opened by `sigmaslam.readers.open_sequence`.
+        out: run folder, new or empty.
+        frontend, backend, config: of `StereoTracker`.
+    Returns:
+        The summary that run.json holds.
+    Raises:
+        InputError: the folder is not empty, or the sequence breaks off; what was computed is on disk then.
+        KeyboardInterrupt: passed on after the partial results are written.
+    """
+    tracker = StereoTracker(sequence.camera, frontend, backend, config)
+    writer = RunWriter(out)
+    ended = "complete"
+    try:
+        _track(sequence, tracker, writer)
+    except KeyboardInterrupt:
+        ended = "interrupted"
+        raise
+    except SigmaSlamError as error:
+        ended = f"failed: {error}"
+        raise
+    except BaseException as error:
+        ended = f"crashed: {error!r}"
+        raise
+    finally:
+        summary = writer.finish(
+            tracker.map(),
+            {
+                "input": str(sequence.source),
+                "format": sequence.format,
+                "frontend": frontend,
+                "backend": backend,
+                "ended": ended,
+                "configuration": asdict(tracker.config),
+                "calibration": describe_camera(sequence.camera),
+            },
+        )
+    return summary
+
+
+def _track(sequence: StereoSequence, tracker: StereoTracker, writer: RunWriter) -> None:
+    with Progress(
+        TextColumn("tracking"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}"),
+        console=Console(stderr=True),
+    ) as progress:
+        task = progress.add_task("", total=sequence.length, note="")
+        noted, done = 0, 0
+        began = since = time.perf_counter()
+        for frame in sequence.frames():
+            read_ms = 1e3 * (time.perf_counter() - since)
+            # Frames that could not be read come to light with the next one that could.
+            for skipped in sequence.skipped[noted:]:
+                writer.add_skipped(skipped.timestamp)
+            noted = len(sequence.skipped)
+            estimate = tracker.step(frame.left, frame.right, frame.timestamp)
+            writer.add(estimate, read_ms)
+            done += 1
+            since = time.perf_counter()
+            progress.update(task, completed=done + noted, note=_note(estimate, done / (since - began)))
+        for skipped in sequence.skipped[noted:]:
+            writer.add_skipped(skipped.timestamp)
+        progress.update(task, completed=done + len(sequence.skipped))
+
+
+def _note(estimate: Estimate, rate: float) -> str:
+    return f"{rate:.1f} frames/s, {estimate.inliers} inliers, belief {estimate.belief:.3f}, {estimate.status}"
