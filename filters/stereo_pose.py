@@ -10,7 +10,10 @@ where the trajectory has drifted, and the offset is what a wrong rectification n
 a wrong scale). More clones and calibration terms append to the layout.
 
 A landmark is (u, v, disparity) in the keyframe: its inverse depth enters linearly, so far points and points at infinity
-do no harm. Its covariance is carried into the current view and added to the measurement noise.
+do no harm. Its covariance is carried into the current view and added to the measurement noise, at every sigma point
+anew: the residual is whitened by the noise that belongs to the pose it is computed for, which makes its square the
+likelihood maximised over the landmarks. With the noise of one fixed pose the landmarks would act as regressors without
+error, and where depths hardly differ, the translation comes out short and the disparity offset wrong (attenuation).
 """
 
 from __future__ import annotations
@@ -70,16 +73,19 @@ class Innovate(nn.Module):
         covariance: Tensor,
         intrinsics: Tensor,
         landmarks: Tensor,
-        landmark_covariance: Tensor,
+        landmark_sigma: Tensor,
         noise: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """The measurement's unscented transform (steps 4 and 5 of Table 9.2)."""
         offsets = sigma_offsets(cholesky(covariance))
-        samples, _ = _measure(offsets, pose, clone, offset, intrinsics, landmarks)
+        samples, _, _ = _measure(offsets, pose, clone, offset, intrinsics, landmarks)
         mean, odd, even = odd_and_even(samples)
-        centre, depth = _measure(torch.zeros_like(offsets[:1]), pose, clone, offset, intrinsics, landmarks)
-        total = _effective_noise(pose, clone, offset, intrinsics, landmarks, landmark_covariance, noise)
-        total = total + odd @ odd.transpose(-1, -2) + even @ even.transpose(-1, -2)
+        _, depth, jacobian = _measure(torch.zeros_like(offsets[:1]), pose, clone, offset, intrinsics, landmarks)
+        xx, yx, yy, dx, dy, dd = (entry[0] for entry in _total_noise(noise, jacobian, landmark_sigma))
+        total = torch.stack([xx, yx, dx, yx, yy, dy, dx, dy, dd], dim=-1).unflatten(-1, (3, 3))
+        both = torch.cat([odd, even], dim=-1)
+        spread = torch.stack([(both * both[:, i : i + 1]).sum(dim=-1) for i in range(3)], dim=-1)
+        total = total + spread
         return mean, total, (depth[0] > _NEAREST).to(mean.dtype)
 
 
@@ -88,7 +94,7 @@ class Update(nn.Module):
 
     Shapes:
         pose, clone (4, 4), twist (6,), offset (1,), covariance (19, 19), intrinsics (5,) = (fx, fy, cx, cy, fx
-        baseline), landmarks (m, 3) = (u, v, disparity) in the keyframe, landmark_covariance (m, 3, 3), measurement
+        baseline), landmarks (m, 3) = (u, v, disparity) in the keyframe, landmark_sigma (m, 3) their standard deviations, measurement
         (m, 3), noise (m, 3, 3), weight (m, 3): 1 for a component that takes part, 0 for one that does not
         -> pose, clone, twist, offset, covariance, nis (), log-likelihood (), squared whitened residuals after the
         update (m,); all float64.
@@ -103,21 +109,21 @@ class Update(nn.Module):
         covariance: Tensor,
         intrinsics: Tensor,
         landmarks: Tensor,
-        landmark_covariance: Tensor,
+        landmark_sigma: Tensor,
         measurement: Tensor,
         noise: Tensor,
         weight: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Posterior of the state; the covariance is carried into the chart at the new mean."""
         factor = cholesky(covariance)
-        total = _effective_noise(pose, clone, offset, intrinsics, landmarks, landmark_covariance, noise)
-        whitener = _whitener(total, weight)
 
-        def measure(whitened: Tensor) -> Tensor:
+        def residual(whitened: Tensor) -> Tensor:
             tangent = whitened @ factor.transpose(0, 1)
-            return _measure(tangent, pose, clone, offset, intrinsics, landmarks)[0]
+            predicted, _, jacobian = _measure(tangent, pose, clone, offset, intrinsics, landmarks)
+            total = _total_noise(noise, jacobian, landmark_sigma)
+            return _whiten(total, measurement - predicted, weight).flatten(1)
 
-        result = iterated_update(measure, measurement, whitener, STATE_SIZE, UPDATE_ITERATIONS)
+        result = iterated_update(residual, STATE_SIZE, UPDATE_ITERATIONS, pose)
         correction = factor @ result.mean
         new_pose = exp_se3(correction[POSE]) @ pose
         new_clone = exp_se3(correction[CLONE]) @ clone
@@ -128,8 +134,7 @@ class Update(nn.Module):
         rest = tangent[:, 6:13] - correction[6:13]
         _, posterior = covariance_of(torch.cat([error_pose, rest, error_clone], dim=-1))
         new_offset = offset + correction[CALIBRATION]
-        after, _ = _measure(torch.zeros_like(tangent[:1]), new_pose, new_clone, new_offset, intrinsics, landmarks)
-        residual = (whitener @ (measurement - after[0]).unsqueeze(-1)).squeeze(-1)
+        after = residual(result.mean.unsqueeze(0)).unflatten(-1, (-1, 3))[0]
         return (
             new_pose,
             new_clone,
@@ -138,91 +143,83 @@ class Update(nn.Module):
             posterior,
             result.nis,
             result.log_likelihood,
-            (residual * residual).sum(dim=-1),
+            (after * after).sum(dim=-1),
         )
 
 
 def _measure(
     tangent: Tensor, pose: Tensor, clone: Tensor, offset: Tensor, intrinsics: Tensor, landmarks: Tensor
-) -> tuple[Tensor, Tensor]:
-    """(u, v, disparity) (k, m, 3) of the landmarks for k tangent offsets (k, 19), and relative depths (k, m).
+) -> tuple[Tensor, Tensor, Tensor]:
+    """What k tangent offsets (k, 19) make of m landmarks.
 
     (9.39)-(9.42) with the right eye's column written as disparity, in inverse depth: the point at (u, v) in the
     keyframe is the ray r, and R r + t / z is what the current camera sees of it.
+
+    Returns:
+        (u, v, disparity) (k, m, 3); depths as a share of those in the keyframe (k, m); derivatives of the first by
+        the landmark (k, m, 3, 3).
     """
     relative = invert_se3(exp_se3(tangent[:, POSE]) @ pose) @ exp_se3(tangent[:, CLONE]) @ clone
+    R, t = relative[:, :3, :3], relative[:, :3, 3].unsqueeze(1)
     fx, fy, cx, cy, focal_baseline = (intrinsics[i] for i in range(5))
-    bias = (offset + tangent[:, CALIBRATION]).unsqueeze(-1)
+    bias = offset + tangent[:, CALIBRATION]
     ray = torch.stack(
         [(landmarks[:, 0] - cx) / fx, (landmarks[:, 1] - cy) / fy, torch.ones_like(landmarks[:, 0])], dim=-1
     )
-    inverse_depth = (landmarks[:, 2].unsqueeze(0).unsqueeze(-1) - bias) / focal_baseline
-    turned = ray @ relative[:, :3, :3].transpose(1, 2)
-    seen = turned + inverse_depth * relative[:, :3, 3].unsqueeze(1)
+    inverse_depth = (landmarks[:, 2] - bias) / focal_baseline
+    seen = ray @ R.transpose(1, 2) + inverse_depth.unsqueeze(-1) * t
     depth = seen[..., 2]
-    divisor = depth.clamp_min(0.5 * _NEAREST)
-    predicted = torch.stack(
+    share = 1.0 / depth.clamp_min(0.5 * _NEAREST)
+    ratio_u, ratio_v, ratio_d = seen[..., 0] * share, seen[..., 1] * share, inverse_depth * share
+    predicted = torch.stack([fx * ratio_u + cx, fy * ratio_v + cy, focal_baseline * ratio_d + bias], dim=-1)
+    # Columns: how the seen point moves with u, v and disparity of the landmark.
+    moves = torch.stack([R[:, :, 0] / fx, R[:, :, 1] / fy, t[:, 0] / focal_baseline], dim=-1).unsqueeze(1)
+    lift = torch.tensor([0.0, 0.0, 1.0], dtype=pose.dtype, device=pose.device)
+    jacobian = torch.stack(
         [
-            fx * seen[..., 0] / divisor + cx,
-            fy * seen[..., 1] / divisor + cy,
-            focal_baseline * inverse_depth.squeeze(-1) / divisor + bias.squeeze(-1),
+            fx * (moves[..., 0, :] - ratio_u.unsqueeze(-1) * moves[..., 2, :]),
+            fy * (moves[..., 1, :] - ratio_v.unsqueeze(-1) * moves[..., 2, :]),
+            lift - focal_baseline * ratio_d.unsqueeze(-1) * moves[..., 2, :],
         ],
-        dim=-1,
+        dim=-2,
+    ) * share.unsqueeze(-1).unsqueeze(-1)
+    return predicted, depth, jacobian
+
+
+# The six entries of the lower triangle of a symmetric (3, 3): uu, vu, vv, du, dv, dd. Kept apart, because elementwise
+# arithmetic on (k, m) is many times faster than k m products of tiny matrices.
+_Lower = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+
+
+def _total_noise(noise: Tensor, jacobian: Tensor, landmark_sigma: Tensor) -> _Lower:
+    """Measurement noise (m, 3, 3) plus the landmarks' own, seen through k views (k, m, 3, 3); entries (k, m)."""
+    scaled = jacobian * landmark_sigma.unsqueeze(-2)
+    u, v, d = scaled[..., 0, :], scaled[..., 1, :], scaled[..., 2, :]
+    return (
+        noise[:, 0, 0] + (u * u).sum(dim=-1),
+        noise[:, 1, 0] + (v * u).sum(dim=-1),
+        noise[:, 1, 1] + (v * v).sum(dim=-1),
+        noise[:, 2, 0] + (d * u).sum(dim=-1),
+        noise[:, 2, 1] + (d * v).sum(dim=-1),
+        noise[:, 2, 2] + (d * d).sum(dim=-1),
     )
-    return predicted, depth
 
 
-def _effective_noise(
-    pose: Tensor,
-    clone: Tensor,
-    offset: Tensor,
-    intrinsics: Tensor,
-    landmarks: Tensor,
-    landmark_covariance: Tensor,
-    noise: Tensor,
-) -> Tensor:
-    """Measurement noise plus the landmark's covariance seen in the current view, (m, 3, 3)."""
-    relative = invert_se3(pose) @ clone
-    fx, fy, cx, cy, focal_baseline = (intrinsics[i] for i in range(5))
-    ray = torch.stack(
-        [(landmarks[:, 0] - cx) / fx, (landmarks[:, 1] - cy) / fy, torch.ones_like(landmarks[:, 0])], dim=-1
-    )
-    R, t = relative[:3, :3], relative[:3, 3]
-    inverse_depth = (landmarks[:, 2:] - offset) / focal_baseline
-    seen = ray @ R.transpose(0, 1) + inverse_depth * t
-    depth = seen[:, 2:].clamp_min(0.5 * _NEAREST)
-    # Columns: derivatives of the seen point by u, v and disparity of the landmark.
-    d_seen = torch.stack(
-        [(R[:, 0] / fx).expand_as(seen), (R[:, 1] / fy).expand_as(seen), (t / focal_baseline).expand_as(seen)], dim=-1
-    )
-    d_depth = d_seen[:, 2:, :]
-    ratio = seen[:, :2] / depth
-    d_image = (d_seen[:, :2, :] - ratio.unsqueeze(-1) * d_depth) / depth.unsqueeze(-1)
-    focal = torch.stack([fx, fy]).unsqueeze(-1)
-    last = torch.tensor([0.0, 0.0, 1.0], dtype=pose.dtype, device=pose.device)
-    d_disparity = (last - focal_baseline * inverse_depth / depth * d_depth.squeeze(1)) / depth
-    jacobian = torch.cat([focal * d_image, d_disparity.unsqueeze(1)], dim=1)
-    return noise + jacobian @ landmark_covariance @ jacobian.transpose(1, 2)
-
-
-def _whitener(covariance: Tensor, weight: Tensor) -> Tensor:
-    """Inverse Cholesky factor (m, 3, 3) of each point's noise, with zero rows for the components that are left out."""
-    present = weight.unsqueeze(-1) * weight.unsqueeze(-2)
-    identity = torch.eye(3, dtype=covariance.dtype, device=covariance.device)
-    masked = covariance * present + identity * (1.0 - weight).unsqueeze(-1)
-    a, b, c = masked[:, 0, 0], masked[:, 1, 0], masked[:, 2, 0]
-    l00 = torch.sqrt(a)
-    l10, l20 = b / l00, c / l00
-    l11 = torch.sqrt(masked[:, 1, 1] - l10 * l10)
-    l21 = (masked[:, 2, 1] - l20 * l10) / l11
-    l22 = torch.sqrt(masked[:, 2, 2] - l20 * l20 - l21 * l21)
-    i00, i11, i22 = 1.0 / l00, 1.0 / l11, 1.0 / l22
-    i10 = -l10 * i00 * i11
-    i21 = -l21 * i11 * i22
-    i20 = -(l20 * i00 + l21 * i10) * i22
-    zero = torch.zeros_like(i00)
-    inverse = torch.stack([i00, zero, zero, i10, i11, zero, i20, i21, i22], dim=-1).unflatten(-1, (3, 3))
-    return inverse * weight.unsqueeze(-1)
+def _whiten(covariance: _Lower, residual: Tensor, weight: Tensor) -> Tensor:
+    """Residuals (k, m, 3) over the Cholesky factor of their covariance; zero where the weight (m, 3) is."""
+    uu, vu, vv, du, dv, dd = covariance
+    w0, w1, w2 = weight[:, 0], weight[:, 1], weight[:, 2]
+    # A component that is left out gets unit variance and no covariance with the others.
+    l00 = torch.sqrt(uu * w0 + (1.0 - w0))
+    l10 = vu * (w0 * w1) / l00
+    l20 = du * (w0 * w2) / l00
+    l11 = torch.sqrt(vv * w1 + (1.0 - w1) - l10 * l10)
+    l21 = (dv * (w1 * w2) - l20 * l10) / l11
+    l22 = torch.sqrt(dd * w2 + (1.0 - w2) - l20 * l20 - l21 * l21)
+    first = residual[..., 0] * w0 / l00
+    second = (residual[..., 1] * w1 - l10 * first) / l11
+    third = (residual[..., 2] * w2 - l20 * first - l21 * second) / l22
+    return torch.stack([first, second, third], dim=-1)
 
 
 def _process_noise(pose: Tensor, step: Tensor, densities: Tensor) -> Tensor:

@@ -15,8 +15,7 @@ from torch import Tensor
 
 from sigmaslam.filters.linalg import cholesky, inverse_and_log_determinant, invert_lower
 
-# Chart of a manifold around the current mean: points from tangent offsets (..., k, n), and back.
-Measure = Callable[[Tensor], Tensor]
+Residual = Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,34 +71,31 @@ def covariance_of(samples: Tensor) -> tuple[Tensor, Tensor]:
     return mean, odd @ odd.transpose(-1, -2) + even @ even.transpose(-1, -2)
 
 
-def iterated_update(measure: Measure, measurement: Tensor, whitener: Tensor, size: int, iterations: int) -> WhitenedUpdate:
+def iterated_update(residual: Residual, size: int, iterations: int, like: Tensor) -> WhitenedUpdate:
     """Posterior linearisation (García-Fernández et al. 2015) in the information form; one iteration is the UKF update.
 
     The innovation covariance is never formed: with W the whitened deviations, everything follows from I + W^T W of
     size 2n (Barfoot & McManus 2011), so the cost is linear in the number of measurements.
 
     Args:
-        measure: from whitened state offsets zeta (2n, n) to predicted measurements (2n, m, c), m points of c components.
-        measurement: (m, c).
-        whitener: (m, c, c) inverse square root of each point's noise covariance; rows of components that are missing
-            are zero.
+        residual: from whitened state offsets zeta (2n, n) to whitened residuals (2n, M), measured minus predicted,
+            each with unit noise; a component that is missing is zero.
         size: n, the dimension of the state.
         iterations: linearisations; the second and later are at the posterior of the one before.
+        like: any tensor of the state's dtype and device.
     """
-    identity = torch.eye(size, dtype=measurement.dtype, device=measurement.device)
-    mean = torch.zeros(size, dtype=measurement.dtype, device=measurement.device)
+    identity = torch.eye(size, dtype=like.dtype, device=like.device)
+    mean = torch.zeros(size, dtype=like.dtype, device=like.device)
     spread, inverse_spread = identity, identity
     covariance = identity
     nis = log_likelihood = mean.sum()
     for iteration in range(iterations):
-        predicted, odd, even = odd_and_even(measure(mean + sigma_offsets(spread)))
+        expected, odd, even = odd_and_even(residual(mean + sigma_offsets(spread)))
         if iteration > 0:
             odd = odd @ inverse_spread
-        deviations = whitener @ torch.cat([odd, even], dim=-1)
-        innovation = (whitener @ (measurement - predicted + odd @ mean).unsqueeze(-1)).squeeze(-1)
-        deviations = deviations.flatten(0, 1)
         # Rows, not vectors: ONNX Runtime's transpose fusion is wrong for a product with a one-dimensional operand.
-        innovation = innovation.reshape(1, -1)
+        deviations = torch.cat([-odd, even], dim=-1)
+        innovation = (expected - (odd * mean).sum(dim=-1)).unsqueeze(0)
         information = deviations.transpose(0, 1) @ deviations
         inverse, log_determinant = inverse_and_log_determinant(
             information + torch.eye(2 * size, dtype=information.dtype, device=information.device)

@@ -114,7 +114,7 @@ def _noisy_texture(rng: np.random.Generator, shape: tuple[int, int]) -> Tensor:
 
 def _filter_graphs() -> dict[str, _Graph]:
     points = torch.export.Dim("points", min=1, max=100_000)
-    state = ["pose", "clone", "offset", "covariance", "intrinsics", "landmarks", "landmark_covariance"]
+    state = ["pose", "clone", "offset", "covariance", "intrinsics", "landmarks", "landmark_sigma"]
     fixed: dict[int, Any] = {}
     free = {0: points}
     return {
@@ -163,17 +163,17 @@ def _predict_example(seed: int) -> tuple[Tensor, ...]:
 
 def _innovate_example(seed: int, count: int) -> tuple[Tensor, ...]:
     pose, clone, _, offset, covariance = _state_example(seed)
-    intrinsics, landmarks, landmark_covariance, _, noise, _ = _points_example(seed, count)
-    return pose, clone, offset, covariance, intrinsics, landmarks, landmark_covariance, noise
+    intrinsics, landmarks, landmark_sigma, _, noise, _ = _points_example(seed, count)
+    return pose, clone, offset, covariance, intrinsics, landmarks, landmark_sigma, noise
 
 
 def _update_example(seed: int, count: int) -> tuple[Tensor, ...]:
     pose, clone, twist, offset, covariance = _state_example(seed)
-    intrinsics, landmarks, landmark_covariance, error, noise, weight = _points_example(seed, count)
-    measurement = error + Innovate()(pose, clone, offset, covariance, intrinsics, landmarks, landmark_covariance, noise)[0]
+    intrinsics, landmarks, landmark_sigma, error, noise, weight = _points_example(seed, count)
+    measurement = error + Innovate()(pose, clone, offset, covariance, intrinsics, landmarks, landmark_sigma, noise)[0]
     return (
         *(pose, clone, twist, offset, covariance),
-        *(intrinsics, landmarks, landmark_covariance, measurement, noise, weight),
+        *(intrinsics, landmarks, landmark_sigma, measurement, noise, weight),
     )
 
 
@@ -203,7 +203,7 @@ def _points_example(seed: int, count: int) -> tuple[Tensor, ...]:
     weight = torch.ones(count, 3, dtype=torch.float64)
     weight[::3, 2] = 0.0
     weight[::5] = 0.0
-    return intrinsics, landmarks, 0.5 * noise, error, noise, weight
+    return intrinsics, landmarks, 0.2 + 0.4 * uniform(count, 3), error, noise, weight
 
 
 def _export(

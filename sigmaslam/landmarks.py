@@ -33,15 +33,15 @@ class KeyframeLandmarks:
     Args:
         index: (K,) which of the keyframe's features they are.
         measured: (K, 3) (u, v, disparity).
-        covariance: (K, 3, 3).
+        sigma: (K, 3) standard deviations.
     """
 
-    def __init__(self, index: np.ndarray, measured: np.ndarray, covariance: np.ndarray) -> None:
+    def __init__(self, index: np.ndarray, measured: np.ndarray, sigma: np.ndarray) -> None:
         self.index = index
         self.measured = measured
-        self.covariance = covariance
+        self.sigma = sigma
         self.observations = np.ones(len(index), np.int64)
-        self._information = np.linalg.inv(covariance)
+        self._information = np.eye(3) / (sigma * sigma)[:, None, :]
         self._weighted = np.einsum("kij,kj->ki", self._information, measured)
 
     def observe(self, rows: np.ndarray, measurement: np.ndarray, noise: np.ndarray, T_key_camera: np.ndarray,

@@ -52,20 +52,20 @@ class StereoPoints:
 
     Attributes:
         landmarks: (M, 3) (u, v, disparity) in the keyframe.
-        landmark_covariance: (M, 3, 3).
+        landmark_sigma: (M, 3) their standard deviations.
         measurement: (M, 3) (u, v, disparity) now; the disparity may be NaN.
         noise: (M, 3, 3) covariance of the measurement.
     """
 
     landmarks: np.ndarray
-    landmark_covariance: np.ndarray
+    landmark_sigma: np.ndarray
     measurement: np.ndarray
     noise: np.ndarray
 
     def select(self, index: np.ndarray) -> StereoPoints:
         """The points of that index or mask."""
         return StereoPoints(
-            self.landmarks[index], self.landmark_covariance[index], self.measurement[index], self.noise[index]
+            self.landmarks[index], self.landmark_sigma[index], self.measurement[index], self.noise[index]
         )
 
 
@@ -145,7 +145,7 @@ class PoseFilter:
         self.state = replace(state, pose=pose, covariance=_symmetric(covariance))
 
     def innovate(
-        self, landmarks: np.ndarray, landmark_covariance: np.ndarray, noise: np.ndarray
+        self, landmarks: np.ndarray, landmark_sigma: np.ndarray, noise: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Predicted (u, v, disparity) (M, 3), innovation covariance (M, 3, 3) and whether in front (M,) bool."""
         state = self.state
@@ -157,7 +157,7 @@ class PoseFilter:
                 "covariance": state.covariance,
                 "intrinsics": self._intrinsics,
                 "landmarks": landmarks,
-                "landmark_covariance": landmark_covariance,
+                "landmark_sigma": landmark_sigma,
                 "noise": noise,
             }
         )
@@ -176,7 +176,7 @@ class PoseFilter:
                 "covariance": state.covariance,
                 "intrinsics": self._intrinsics,
                 "landmarks": points.landmarks,
-                "landmark_covariance": points.landmark_covariance,
+                "landmark_sigma": points.landmark_sigma,
                 "measurement": np.where(known, points.measurement, 0.0),
                 "noise": points.noise,
                 "weight": known.astype(np.float64),

@@ -47,13 +47,13 @@ class TrackerConfig:
     """
 
     max_keypoints: int = 1500
-    disparity_sigma: float = 0.5
+    disparity_sigma: float = 0.4
     keyframe_sigma: float = 0.1
     acceleration: float = 0.1
     angular_acceleration: float = 0.5
     start_speed: float = 1.0
     start_turn: float = 1.0
-    offset_sigma: float = 0.5
+    offset_sigma: float = 0.2
     offset_walk: float = 0.02
     least_inliers: int = 15
     keyframe_ratio: float = 0.6
@@ -213,7 +213,7 @@ class StereoTracker:
         assert self._keyframe is not None
         landmarks = self._keyframe.landmarks
         predicted, S, in_front = self._filter.innovate(
-            landmarks.measured, landmarks.covariance, np.tile(np.eye(3), (len(landmarks.index), 1, 1))
+            landmarks.measured, landmarks.sigma, np.tile(np.eye(3), (len(landmarks.index), 1, 1))
         )
         spread = np.linalg.eigvalsh(S[:, :2, :2])[:, 1]
         fit = None
@@ -248,14 +248,14 @@ class StereoTracker:
         noise[:, 0, 0] = noise[:, 1, 1] = found.sigma**2
         noise[:, 2, 2] = self.config.disparity_sigma**2
         measurement = np.column_stack([found.points, found.disparity])
-        return StereoPoints(landmarks.measured[rows], landmarks.covariance[rows], measurement, noise), rows
+        return StereoPoints(landmarks.measured[rows], landmarks.sigma[rows], measurement, noise), rows
 
     def _fit(self, found: TemporalMatches, state: PoseState) -> _Fit | None:
         """Chi-square gate on the innovation, update, gate on the residual, update again."""
         points, rows = self._stereo_points(found)
         if len(rows) < self.config.least_inliers:
             return None
-        predicted, S, in_front = self._filter.innovate(points.landmarks, points.landmark_covariance, points.noise)
+        predicted, S, in_front = self._filter.innovate(points.landmarks, points.landmark_sigma, points.noise)
         innovation = points.measurement - predicted
         known = np.isfinite(innovation)
         # A disparity that is not there: no innovation, unit variance, no covariance with the rest.
@@ -305,6 +305,9 @@ class StereoTracker:
     def _accept(self, fit: _Fit, view: StereoView, timestamp: float) -> None:
         """Takes the posterior over, sharpens the map, and takes a new keyframe when the old one fades."""
         assert self._keyframe is not None
+        if self._keyframe.first_inliers is None:
+            self._keyframe.first_inliers = len(fit.rows)
+        faded = len(fit.rows) < self.config.keyframe_ratio * self._keyframe.first_inliers
         self._filter.state = fit.state
         self._anchor(timestamp)
         self._moving = True
@@ -317,9 +320,6 @@ class StereoTracker:
             self._camera,
             float(fit.state.offset[0]),
         )
-        if self._keyframe.first_inliers is None:
-            self._keyframe.first_inliers = len(fit.rows)
-        faded = len(fit.rows) < self.config.keyframe_ratio * self._keyframe.first_inliers
         if faded:
             self._take_keyframe(view)
 
@@ -340,10 +340,10 @@ class StereoTracker:
         if self._keyframe is not None:
             self._retired.append(self._keyframe_map())
         measured = np.column_stack([view.features.keypoints[index].astype(np.float64), view.disparity[index]])
-        variances = np.array([self.config.keyframe_sigma, self.config.keyframe_sigma, self.config.disparity_sigma]) ** 2
-        covariance = np.tile(np.diag(variances), (len(index), 1, 1))
+        keypoint, disparity = self.config.keyframe_sigma, self.config.disparity_sigma
+        sigma = np.tile([keypoint, keypoint, disparity], (len(index), 1))
         starting = self._keyframe is None
-        self._keyframe = _Keyframe(view, KeyframeLandmarks(index, measured, covariance))
+        self._keyframe = _Keyframe(view, KeyframeLandmarks(index, measured, sigma))
         self._filter.clone_pose()
         self._depth = self._camera.fx * self._camera.baseline / max(float(np.median(view.disparity[index])), 0.5)
         self._densities = np.array(

@@ -15,7 +15,7 @@ _ROW_TOLERANCE = 2.0
 _LEAST_DISPARITY = -2.0
 # Share of the image width that disparity may reach.
 _MOST_DISPARITY = 0.25
-_SIGMA_REFINED = 0.5
+_SIGMA_REFINED = 0.3
 _SIGMA_DETECTED = 1.0
 
 Detector = Callable[[np.ndarray], Features]

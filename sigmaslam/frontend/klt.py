@@ -12,7 +12,7 @@ _WINDOW = 15
 _LEVELS = 4
 _ROW_TOLERANCE = 2.0
 _FORWARD_BACKWARD = 0.7
-_SIGMA = 0.5
+_SIGMA = 0.3
 
 
 class KltFrontend:

@@ -1,0 +1,153 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from sigmaslam.errors import InputError
+from sigmaslam.models import export
+from sigmaslam.models.export import MAX_KEYPOINTS, export_features, export_filter, load_network
+from sigmaslam.models.extractor import FeatureExtractor
+from sigmaslam.models.network import FeatureNetwork
+from sigmaslam.models.torch_runtime import TorchFeatures, filter_module
+from sigmaslam.session import OnnxGraph, shipped_weights
+from sigmaslam.synthetic.textures import dead_leaves
+
+FILTERS = ("pose_predict", "pose_innovate", "pose_update")
+
+
+def shipped(name: str) -> Path:
+    path = shipped_weights(name)
+    if not path.is_file():
+        pytest.skip(f"{name} is not in models/weights")
+    return path
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    """A network that was never trained."""
+    torch.manual_seed(0)
+    path = tmp_path / "random.safetensors"
+    save_file({k: v.contiguous() for k, v in FeatureNetwork().state_dict().items()}, path)
+    return path
+
+
+def noisy_texture(height: int, width: int, seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    grey = dead_leaves((height, width), rng) / 255.0 + 0.02 * rng.standard_normal((height, width))
+    return grey.clip(0, 1).astype(np.float32)[None, None]
+
+
+def assert_same_features(found: list[np.ndarray], expected: list[np.ndarray]) -> None:
+    """Round-off may swap keypoints of nearly equal score: they are paired by place."""
+    distance = np.linalg.norm(expected[0][:, None] - found[0][None], axis=2)
+    distance = distance[expected[1] > 0]
+    nearest = distance.argmin(axis=1)
+    common = distance.min(axis=1) < 1e-2
+    assert common.mean() > 0.98
+    kept = np.flatnonzero(expected[1] > 0)[common]
+    np.testing.assert_allclose(found[2][nearest[common]], expected[2][kept], atol=1e-4)
+    np.testing.assert_allclose(found[1], expected[1], atol=1e-4)
+
+
+@pytest.mark.slow
+def test_exported_features_equal_torch_at_another_size(weights, tmp_path):
+    out = tmp_path / "features.onnx"
+    assert export_features(weights, out) <= 1e-4
+    image = noisy_texture(128, 208, 3)
+    assert_same_features(OnnxGraph(out)({"image": image}), TorchFeatures(weights)({"image": image}))
+
+
+@pytest.mark.slow
+def test_exported_filter_equals_torch(tmp_path):
+    differences = export_filter(tmp_path)
+    assert set(differences) == set(FILTERS)
+    assert max(differences.values()) < 1e-9
+    assert_filter_graphs_equal_torch(tmp_path)
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_shipped_filter_equals_torch(name):
+    shipped(f"{name}.onnx")
+    assert_filter_graphs_equal_torch(shipped(f"{name}.onnx").parent, (name,))
+
+
+def assert_filter_graphs_equal_torch(folder: Path, names: tuple[str, ...] = FILTERS) -> None:
+    """On states and numbers of points that the export neither traced nor checked."""
+    examples = {
+        "pose_predict": [export._predict_example(seed) for seed in (5, 6)],
+        "pose_innovate": [export._innovate_example(seed, count) for seed, count in ((5, 1), (6, 211))],
+        "pose_update": [export._update_example(seed, count) for seed, count in ((5, 3), (6, 211))],
+    }
+    inputs = {name: graph.inputs for name, graph in export._filter_graphs().items()}
+    for name in names:
+        for example in examples[name]:
+            feed = {key: value.numpy() for key, value in zip(inputs[name], example, strict=True)}
+            found, expected = OnnxGraph(folder / f"{name}.onnx")(feed), filter_module(name)(feed)
+            for a, b in zip(found, expected, strict=True):
+                np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9, err_msg=name)
+
+
+def test_shipped_features_equal_the_shipped_weights_in_torch():
+    image = noisy_texture(160, 224, 4)
+    graph = OnnxGraph(shipped("features.onnx"))
+    expected = TorchFeatures(shipped("features.safetensors"))({"image": image})
+    assert_same_features(graph({"image": image}), expected)
+
+
+def test_loaded_network_is_the_saved_one(weights):
+    torch.manual_seed(0)
+    expected = FeatureNetwork().eval()
+    image = torch.from_numpy(noisy_texture(96, 96, 0))
+    with torch.no_grad():
+        found = FeatureExtractor(load_network(weights), 32)(image)
+        for a, b in zip(found, FeatureExtractor(expected, 32)(image), strict=True):
+            torch.testing.assert_close(a, b, rtol=0, atol=0)
+    assert not load_network(weights).training
+
+
+def test_weights_with_missing_keys_are_refused(tmp_path):
+    state = FeatureNetwork().state_dict()
+    del state["quality.bias"]
+    path = tmp_path / "partial.safetensors"
+    save_file({k: v.contiguous() for k, v in state.items()}, path)
+    with pytest.raises(InputError, match=r"partial\.safetensors.*quality\.bias"):
+        load_network(path)
+
+
+def test_weights_of_another_shape_are_refused(tmp_path):
+    path = tmp_path / "other.safetensors"
+    state = FeatureNetwork().state_dict() | {"quality.bias": torch.zeros(2)}
+    save_file({k: v.contiguous() for k, v in state.items()}, path)
+    with pytest.raises(InputError, match=r"other\.safetensors"):
+        load_network(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"no weights at all, but a few bytes", b"\x10\0\0\0\0\0\0\0{not json at all}"])
+def test_a_file_that_holds_no_weights_is_refused(tmp_path, content):
+    path = tmp_path / "broken.safetensors"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"broken\.safetensors"):
+        load_network(path)
+
+
+def test_missing_weights_are_named():
+    with pytest.raises(InputError, match=r"nowhere\.safetensors does not exist"):
+        load_network(Path("nowhere.safetensors"))
+
+
+def test_a_broken_graph_is_refused(tmp_path):
+    path = tmp_path / "broken.onnx"
+    path.write_bytes(b"no graph")
+    with pytest.raises(InputError, match=r"broken\.onnx"):
+        OnnxGraph(path)
+    with pytest.raises(InputError, match=r"missing\.onnx does not exist"):
+        OnnxGraph(tmp_path / "missing.onnx")
+
+
+def test_more_keypoints_than_pixels_allow_is_no_surprise():
+    """The smallest image that the graph takes still has room for all candidates."""
+    with torch.no_grad():
+        keypoints, _, _ = FeatureExtractor(FeatureNetwork().eval(), MAX_KEYPOINTS)(torch.rand(1, 1, 80, 80))
+    assert keypoints.shape == (MAX_KEYPOINTS, 2)

@@ -1,0 +1,114 @@
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from sigmaslam.models.network import FeatureNetwork
+from sigmaslam.training.losses import MatchLoss, match_loss
+from sigmaslam.training.step import pair_loss, transfer
+
+
+def unit(*shape: int, seed: int = 0) -> Tensor:
+    return functional.normalize(torch.randn(*shape, generator=torch.Generator().manual_seed(seed)), dim=-1)
+
+
+def loss_of(descriptors0: Tensor, descriptors1: Tensor, quality: Tensor, visible: Tensor) -> MatchLoss:
+    distractors = unit(*descriptors1.shape, seed=9)
+    return match_loss(descriptors0, descriptors1, distractors, quality, visible, torch.ones_like(visible))
+
+
+EVERYTHING = torch.ones(2, 40, dtype=torch.bool)
+
+
+def test_perfect_descriptors_have_full_recall_and_little_loss():
+    descriptors = unit(2, 40, 64)
+    loss = loss_of(descriptors, descriptors, torch.full((2, 40), 8.0), EVERYTHING)
+    assert float(loss.recall) == 1.0
+    assert float(loss.descriptor) < 0.01
+    assert float(loss.quality) < 0.01
+
+
+def test_unrelated_descriptors_are_no_better_than_chance():
+    loss = loss_of(unit(2, 40, 64), unit(2, 40, 64, seed=1), torch.zeros(2, 40), EVERYTHING)
+    assert float(loss.recall) < 0.2
+    assert float(loss.descriptor) > np.log(40)
+    assert float(loss.quality) == pytest.approx(np.log(2), rel=1e-5)
+
+
+def test_loss_equals_the_definition_written_as_loops():
+    d0, d1, extra = unit(1, 6, 8), unit(1, 6, 8, seed=1), unit(1, 3, 8, seed=2)
+    visible = torch.tensor([[True, False, True, True, True, False]])
+    loss = match_loss(d0, d1, extra, torch.zeros(1, 6), visible, visible, inverse_temperature=5.0)
+    terms = []
+    for i in range(6):
+        if not visible[0, i]:
+            continue
+        columns = [d1[0, j] for j in range(6) if visible[0, j]] + list(extra[0])
+        forward = sum(torch.exp(5 * d0[0, i] @ column) for column in columns)
+        backward = sum(torch.exp(5 * d0[0, j] @ d1[0, i]) for j in range(6))
+        score = torch.exp(5 * d0[0, i] @ d1[0, i])
+        terms.append(-(torch.log(score / forward) + torch.log(score / backward)))
+    assert float(loss.descriptor) == pytest.approx(float(sum(terms)) / len(terms), rel=1e-5)
+
+
+def test_points_that_left_the_image_do_not_matter():
+    """What image 1 shows at the place of an invisible point, and what is thought of it, changes nothing."""
+    d0, d1 = unit(2, 40, 64), unit(2, 40, 64, seed=1)
+    visible = EVERYTHING.clone()
+    visible[:, 5:12] = False
+    quality = torch.randn(2, 40, generator=torch.Generator().manual_seed(3))
+    changed1, changed_quality = d1.clone(), quality.clone()
+    changed1[:, 5:12] = unit(2, 7, 64, seed=4)
+    changed_quality[:, 5:12] = 50.0
+    first, second = loss_of(d0, d1, quality, visible), loss_of(d0, changed1, changed_quality, visible)
+    for name in ("descriptor", "quality", "recall"):
+        torch.testing.assert_close(getattr(first, name), getattr(second, name), rtol=1e-6, atol=1e-6)
+
+
+def test_no_visible_point_gives_zero_and_finite_gradients():
+    d0 = unit(2, 40, 64).requires_grad_()
+    loss = loss_of(d0, unit(2, 40, 64, seed=1), torch.zeros(2, 40), torch.zeros_like(EVERYTHING))
+    (loss.descriptor + loss.quality).backward()
+    assert float(loss.descriptor) == float(loss.quality) == float(loss.recall) == 0
+    assert torch.isfinite(d0.grad).all()
+
+
+def test_quality_is_asked_for_where_the_corner_repeats():
+    descriptors = unit(1, 10, 64)
+    repeated = torch.arange(10)[None] < 5
+    visible = torch.ones(1, 10, dtype=torch.bool)
+    right = torch.where(repeated, 8.0, -8.0)
+    losses = [
+        float(match_loss(descriptors, descriptors, unit(1, 3, 64, seed=2), q, visible, repeated).quality)
+        for q in (right, -right)
+    ]
+    assert losses[0] < 0.01
+    assert losses[1] > 5
+
+
+def test_transfer_equals_opencv():
+    import cv2
+
+    rng = np.random.default_rng(0)
+    H = np.eye(3) + 1e-3 * rng.standard_normal((2, 3, 3))
+    points = rng.uniform(0, 200, (2, 7, 2))
+    found = transfer(torch.from_numpy(H), torch.from_numpy(points)).numpy()
+    for h, p, q in zip(H, points, found, strict=True):
+        np.testing.assert_allclose(q, cv2.perspectiveTransform(p[:, None], h)[:, 0], rtol=1e-9)
+
+
+def test_step_of_the_same_generator_is_the_same_and_reaches_every_weight():
+    torch.manual_seed(0)
+    network = FeatureNetwork()
+    images = torch.rand(2, 1, 96, 96, generator=torch.Generator().manual_seed(1))
+    corners = 10 + 70 * torch.rand(2, 12, 2, generator=torch.Generator().manual_seed(2))
+    H = torch.eye(3).expand(2, 3, 3)
+    losses = [
+        pair_loss(network, images, images, H, corners, corners, torch.Generator().manual_seed(5)) for _ in range(2)
+    ]
+    assert float(losses[0].descriptor) == float(losses[1].descriptor)
+    (losses[0].descriptor + losses[0].quality).backward()
+    for name, parameter in network.named_parameters():
+        assert parameter.grad is not None, name
+        assert torch.isfinite(parameter.grad).all(), name
