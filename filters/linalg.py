@@ -31,7 +31,9 @@ def cholesky(matrix: Tensor) -> Tensor:
     for j in range(size):
         pivot = rest[..., j, j]
         kept = pivot > tolerance * diagonal[..., j]
-        scale = torch.where(kept, torch.rsqrt(torch.where(kept, pivot, torch.ones_like(pivot))), torch.zeros_like(pivot))
+        scale = torch.where(
+            kept, torch.rsqrt(torch.where(kept, pivot, torch.ones_like(pivot))), torch.zeros_like(pivot)
+        )
         column = rest[..., :, j] * below[:, j] * scale.unsqueeze(-1)
         columns.append(column)
         if j + 1 < size:

@@ -94,8 +94,8 @@ class Update(nn.Module):
 
     Shapes:
         pose, clone (4, 4), twist (6,), offset (1,), covariance (19, 19), intrinsics (5,) = (fx, fy, cx, cy, fx
-        baseline), landmarks (m, 3) = (u, v, disparity) in the keyframe, landmark_sigma (m, 3) their standard deviations, measurement
-        (m, 3), noise (m, 3, 3), weight (m, 3): 1 for a component that takes part, 0 for one that does not
+        baseline), landmarks (m, 3) = (u, v, disparity) in the keyframe, landmark_sigma (m, 3) their standard
+        deviations, measurement (m, 3), noise (m, 3, 3), weight (m, 3): 1 for a component that takes part, else 0
         -> pose, clone, twist, offset, covariance, nis (), log-likelihood (), squared whitened residuals after the
         update (m,); all float64.
     """

@@ -233,7 +233,9 @@ def _export(
             expected = [value.numpy() for value in graph.module(*graph.checked)]
         difference = (compare or _relative_difference)(found, expected)
         if not difference <= tolerance:
-            raise SigmaSlamError(f"{out.name} differs from torch by {difference:.2e}, more than {tolerance:.0e}: not written")
+            raise SigmaSlamError(
+                f"{out.name} differs from torch by {difference:.2e}, more than {tolerance:.0e}: not written"
+            )
     return difference
 
 

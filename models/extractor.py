@@ -21,7 +21,7 @@ class FeatureExtractor(nn.Module):
 
     Shapes:
         image (1, 1, H, W) float32 in [0, 1], H and W multiples of 16 and H W >= 2 max_keypoints -> keypoints (N, 2)
-        pixel coordinates (u, v), scores (N,), zero where the image has fewer corners, descriptors (N, 64) of unit length.
+        pixel coordinates (u, v); scores (N,), zero where the image has fewer corners; unit descriptors (N, 64).
     """
 
     def __init__(self, network: FeatureNetwork, max_keypoints: int) -> None:

@@ -35,9 +35,7 @@ class FeatureNetwork(nn.Module):
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
         """Descriptors (not yet of unit length) and quality logits."""
         fine = self.eighth(self.stem(normalize_image(image)))
-        coarse = functional.interpolate(
-            self.sixteenth(fine), scale_factor=2.0, mode="bilinear", align_corners=False
-        )
+        coarse = functional.interpolate(self.sixteenth(fine), scale_factor=2.0, mode="bilinear", align_corners=False)
         merged = self.merge(fine + coarse)
         return self.descriptor(merged), self.quality(merged)
 
@@ -62,9 +60,7 @@ def sample_map(features: Tensor, keypoints: Tensor, stride: int = STRIDE) -> Ten
     u = (2.0 * keypoints[..., 0] + 1.0) / width - 1.0
     v = (2.0 * keypoints[..., 1] + 1.0) / height - 1.0
     grid = torch.stack([u, v], dim=-1).unsqueeze(2)
-    sampled = functional.grid_sample(
-        features, grid, mode="bilinear", padding_mode="border", align_corners=False
-    )
+    sampled = functional.grid_sample(features, grid, mode="bilinear", padding_mode="border", align_corners=False)
     return sampled.squeeze(-1).transpose(1, 2)
 
 

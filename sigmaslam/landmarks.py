@@ -44,8 +44,15 @@ class KeyframeLandmarks:
         self._information = np.eye(3) / (sigma * sigma)[:, None, :]
         self._weighted = np.einsum("kij,kj->ki", self._information, measured)
 
-    def observe(self, rows: np.ndarray, measurement: np.ndarray, noise: np.ndarray, T_key_camera: np.ndarray,
-                camera: RectifiedStereo, offset: float) -> None:
+    def observe(
+        self,
+        rows: np.ndarray,
+        measurement: np.ndarray,
+        noise: np.ndarray,
+        T_key_camera: np.ndarray,
+        camera: RectifiedStereo,
+        offset: float,
+    ) -> None:
         """Adds the views of landmarks `rows` (M,) by a camera at T_key_camera.
 
         Args:
@@ -110,7 +117,9 @@ def _transfer(
 
     def carry(values: np.ndarray) -> np.ndarray:
         inverse_depth = (values[:, 2:] - offset) / (camera.fx * camera.baseline)
-        ray = np.c_[(values[:, 0] - camera.cx) / camera.fx, (values[:, 1] - camera.cy) / camera.fy, np.ones(len(values))]
+        ray = np.c_[
+            (values[:, 0] - camera.cx) / camera.fx, (values[:, 1] - camera.cy) / camera.fy, np.ones(len(values))
+        ]
         seen = ray @ T_to_from[:3, :3].T + inverse_depth * T_to_from[:3, 3]
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.c_[

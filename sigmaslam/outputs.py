@@ -1,4 +1,4 @@
-"""What a run leaves on disk. Rows are on disk as soon as they are known; the rest when the run ends, however it ends."""
+"""What a run leaves on disk: rows as soon as they are known, the rest when the run ends, however it ends."""
 
 from __future__ import annotations
 
@@ -151,8 +151,8 @@ def calibration_verdict(calibration: CalibrationEstimate) -> str:
 
 def write_ply(path: Path, point_map: PointMap) -> None:
     """Points as a binary PLY with x, y, z and sigma, the root of the largest eigenvalue of the covariance, metres."""
-    sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(point_map.covariances)[:, -1], 0.0)) if len(point_map.points) else []
-    vertices = np.column_stack([point_map.points, np.reshape(sigma, (-1, 1))]).astype("<f4")
+    sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(point_map.covariances)[:, -1], 0.0))
+    vertices = np.column_stack([point_map.points, sigma]).astype("<f4")
     names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "sigma"))
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{names}end_header\n"
     with atomic_path(path) as temporary:

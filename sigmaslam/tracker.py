@@ -221,9 +221,7 @@ class StereoTracker:
         rows = np.flatnonzero(in_front & self._in_image(predicted))
         if len(rows) >= self.config.least_inliers and np.median(spread[rows]) < self.config.search_limit**2:
             radius = np.sqrt(_CHI_SQUARE_99_2D * spread[rows]) + 1.0
-            found = self._frontend.match(
-                self._keyframe.view, landmarks.index[rows], view, predicted[rows, :2], radius
-            )
+            found = self._frontend.match(self._keyframe.view, landmarks.index[rows], view, predicted[rows, :2], radius)
             clock.lap("match")
             fit = self._fit(found, self._filter.state)
             clock.lap("filter")
@@ -381,9 +379,7 @@ class StereoTracker:
             inliers=len(fit.rows) if fit is not None else 0,
             nis=fit.result.nis if fit is not None else 0.0,
             dof=fit.result.dof if fit is not None else 0,
-            calibration=CalibrationEstimate(
-                float(state.offset[0]), float(np.sqrt(max(state.covariance[12, 12], 0.0)))
-            ),
+            calibration=CalibrationEstimate(float(state.offset[0]), float(np.sqrt(max(state.covariance[12, 12], 0.0)))),
             milliseconds=milliseconds,
         )
 

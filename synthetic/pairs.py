@@ -96,9 +96,7 @@ def _random_view(rng: np.random.Generator, size: int, strength: float) -> np.nda
 
 
 def _warp(texture: np.ndarray, H: np.ndarray, size: int) -> np.ndarray:
-    image = cv2.warpPerspective(
-        texture, H, (size, size), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
-    )
+    image = cv2.warpPerspective(texture, H, (size, size), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
     return image.astype(np.float32) / 255.0
 
 

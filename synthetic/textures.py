@@ -75,7 +75,7 @@ def _fill(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
     if kind in (2, 3):
         return (base + contrast * noise_texture(shape, rng)).astype(np.float32)
     angle, period = rng.uniform(0, np.pi), np.exp(rng.uniform(np.log(4), np.log(40)))
-    warp = 0.0
+    warp: float | np.ndarray = 0.0
     if rng.random() < 0.5:
         warp = rng.uniform(0.5, 3.0) * noise_texture(shape, rng)
     along = (np.cos(angle) * u + np.sin(angle) * v) / period + warp

@@ -85,11 +85,9 @@ def train(out: Path, config: TrainingConfig, workers: int = 1, resume: bool = Fa
     out.mkdir(parents=True, exist_ok=True)
 
     torch.manual_seed(config.seed)
-    network: nn.Module = FeatureNetwork().to(memory_format=torch.channels_last)
-    assert isinstance(network, FeatureNetwork)
-    optimizer = torch.optim.AdamW(
-        network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
-    )
+    network = FeatureNetwork()
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    optimizer = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimizer, max_lr=config.learning_rate, total_steps=config.steps, pct_start=0.1
     )
@@ -118,26 +116,22 @@ def train(out: Path, config: TrainingConfig, workers: int = 1, resume: bool = Fa
     metrics: dict[str, float] = {}
     with _progress() as progress:
         task = progress.add_task("training", total=config.steps, completed=first, note="")
-        for step, batch in enumerate(loader, start=first):
+        for step, (image0, image1, H_1_0, corners0, corners1) in enumerate(loader, start=first):
             generator = torch.Generator().manual_seed(config.seed * 1_000_000_007 + step)
             network.train()
-            loss = pair_loss(network, *batch, generator)
+            loss = pair_loss(network, image0, image1, H_1_0, corners0, corners1, generator)
             optimizer.zero_grad(set_to_none=True)
             (loss.descriptor + config.quality_weight * loss.quality).backward()
             nn.utils.clip_grad_norm_(network.parameters(), 1.0)
             optimizer.step()
             schedule.step()
             done = step + 1
-            progress.update(
-                task, advance=1, note=f"loss {loss.descriptor.item():.3f} recall {loss.recall.item():.3f}"
-            )
+            progress.update(task, advance=1, note=f"loss {loss.descriptor.item():.3f} recall {loss.recall.item():.3f}")
             if done % 50 == 0 or done == config.steps:
                 _log(out, done, loss.descriptor.item(), loss.quality.item(), loss.recall.item())
             if done % config.validate_every == 0 or done == config.steps:
                 metrics = matching_accuracy(network, config.seed + _VALIDATION_SEED_OFFSET)
-                progress.console.print(
-                    f"step {done}: " + ", ".join(f"{k} {v:.3f}" for k, v in metrics.items())
-                )
+                progress.console.print(f"step {done}: " + ", ".join(f"{k} {v:.3f}" for k, v in metrics.items()))
             if done % config.checkpoint_every == 0 or done == config.steps:
                 state = {
                     "network": network.state_dict(),
@@ -169,9 +163,7 @@ def train(out: Path, config: TrainingConfig, workers: int = 1, resume: bool = Fa
 
 def _log(out: Path, step: int, descriptor: float, quality: float, recall: float) -> None:
     with (out / "log.jsonl").open("a") as log:
-        log.write(
-            json.dumps({"step": step, "descriptor": descriptor, "quality": quality, "recall": recall}) + "\n"
-        )
+        log.write(json.dumps({"step": step, "descriptor": descriptor, "quality": quality, "recall": recall}) + "\n")
 
 
 def _progress() -> Progress:

@@ -61,7 +61,5 @@ def match_loss(
         right = best_forward & best_backward & visible
         target = (right & repeated).to(similarity.dtype)
     # A point that left the image tells nothing about how good it is.
-    quality = (
-        functional.binary_cross_entropy_with_logits(quality0, target, reduction="none") * weight
-    ).sum() / total
+    quality = (functional.binary_cross_entropy_with_logits(quality0, target, reduction="none") * weight).sum() / total
     return MatchLoss(descriptor, quality, right.to(similarity.dtype).sum() / total)

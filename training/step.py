@@ -47,14 +47,10 @@ def pair_loss(
     images = torch.cat([image0, image1]).contiguous(memory_format=torch.channels_last)
     dense, logits = network(images)
     descriptors0 = functional.normalize(sample_map(dense[:batch], corners0), dim=-1)
-    descriptors1 = functional.normalize(
-        sample_map(dense[batch:], torch.cat([jittered, distractors], dim=1)), dim=-1
-    )
+    descriptors1 = functional.normalize(sample_map(dense[batch:], torch.cat([jittered, distractors], dim=1)), dim=-1)
     quality0 = sample_map(logits[:batch], corners0).squeeze(-1)
     count = corners0.shape[1]
-    return match_loss(
-        descriptors0, descriptors1[:, :count], descriptors1[:, count:], quality0, visible, repeated
-    )
+    return match_loss(descriptors0, descriptors1[:, :count], descriptors1[:, count:], quality0, visible, repeated)
 
 
 def transfer(H: Tensor, points: Tensor) -> Tensor:

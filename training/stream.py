@@ -10,7 +10,6 @@ from torch.utils.data import DataLoader, Dataset
 
 from sigmaslam.synthetic.pairs import HomographyPairs
 
-
 # image0 (1, H, W), image1 (1, H, W), H_1_0 (3, 3), corners0 (N, 2), corners1 (N, 2); all float32
 TrainingPair = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 

@@ -14,9 +14,7 @@ _KEYPOINTS = 256
 
 
 @torch.no_grad()
-def matching_accuracy(
-    network: FeatureNetwork, seed: int, pairs: int = _PAIRS, size: int = 224
-) -> dict[str, float]:
+def matching_accuracy(network: FeatureNetwork, seed: int, pairs: int = _PAIRS, size: int = 224) -> dict[str, float]:
     """Mutual nearest neighbours on held-out homography pairs.
 
     Returns:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 
@@ -12,12 +14,12 @@ class SiftDetector:
     """OpenCV's SIFT with RootSIFT descriptors (Arandjelovic & Zisserman 2012)."""
 
     def __init__(self, max_keypoints: int) -> None:
-        self._sift = cv2.SIFT_create(nfeatures=max_keypoints)
+        self._sift = cv2.SIFT.create(nfeatures=max_keypoints)
 
     def __call__(self, image: np.ndarray) -> Features:
         """Features of an (H, W) uint8 image."""
         keypoints, descriptors = self._sift.detectAndCompute(image, None)
-        if descriptors is None:
+        if not keypoints:
             return _no_features(128)
         root = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-12))
         return _features(keypoints, root.astype(np.float32))
@@ -27,18 +29,18 @@ class OrbDetector:
     """OpenCV's ORB; its 256 bits become +-1/16, so that the dot product is 1 - Hamming distance / 128."""
 
     def __init__(self, max_keypoints: int) -> None:
-        self._orb = cv2.ORB_create(nfeatures=max_keypoints)
+        self._orb = cv2.ORB.create(nfeatures=max_keypoints)
 
     def __call__(self, image: np.ndarray) -> Features:
         """Features of an (H, W) uint8 image."""
         keypoints, descriptors = self._orb.detectAndCompute(image, None)
-        if descriptors is None:
+        if not keypoints:
             return _no_features(256)
-        bits = np.unpackbits(descriptors, axis=1).astype(np.float32)
+        bits = np.unpackbits(descriptors.astype(np.uint8, copy=False), axis=1).astype(np.float32)
         return _features(keypoints, (2.0 * bits - 1.0) / 16.0)
 
 
-def _features(keypoints: list[cv2.KeyPoint], descriptors: np.ndarray) -> Features:
+def _features(keypoints: Sequence[cv2.KeyPoint], descriptors: np.ndarray) -> Features:
     places = np.array([keypoint.pt for keypoint in keypoints], np.float32)
     scores = np.array([keypoint.response for keypoint in keypoints], np.float32)
     # OpenCV may return the same place twice with two orientations: the first stays, matches must be one to one.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-
 import cv2
 import numpy as np
 
@@ -41,5 +40,3 @@ class LearnedDetector:
         inside = (keypoints[:, 0] < width - _BORDER) & (keypoints[:, 1] < height - _BORDER)
         kept = np.flatnonzero((scores > 0) & inside)[: self._max_keypoints]
         return Features(keypoints[kept], descriptors[kept], scores[kept])
-
-

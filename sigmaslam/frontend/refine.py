@@ -40,7 +40,12 @@ def lucas_kanade(
 
 
 def refine(
-    image0: np.ndarray, image1: np.ndarray, points0: np.ndarray, points1: np.ndarray, window: int = 11, reach: float = 2.0
+    image0: np.ndarray,
+    image1: np.ndarray,
+    points0: np.ndarray,
+    points1: np.ndarray,
+    window: int = 11,
+    reach: float = 2.0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Matched points moved to where the patches agree, if that is near.
 

@@ -66,6 +66,11 @@ def covariances(count: int, sigma: float, seed: int = 0) -> Tensor:
     return root @ root.mT
 
 
+def sigmas(count: int, typical: float, seed: int = 0) -> Tensor:
+    """Standard deviations of landmarks, (count, 3)."""
+    return typical * (0.5 + torch.rand(count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64))
+
+
 def measure(tangent: Tensor, state: State, landmarks: Tensor) -> tuple[Tensor, Tensor]:
     """(u, v, disparity) (m, 3) and relative depths (m,) at one tangent offset (19,)."""
     found = stereo_pose._measure(tangent[None], state.pose, state.clone, state.offset, INTRINSICS, landmarks)
@@ -80,10 +85,10 @@ def derivative_by_state(state: State, landmarks: Tensor) -> Tensor:
     return jacobian
 
 
-def effective_noise(state: State, landmarks: Tensor, spread: Tensor, noise: Tensor) -> Tensor:
-    """Noise with the landmarks' covariance, through automatic differentiation."""
+def effective_noise(state: State, landmarks: Tensor, sigma: Tensor, noise: Tensor) -> Tensor:
+    """Noise with the landmarks' own (sigma (m, 3)), through automatic differentiation."""
     jacobians = torch.stack([jacrev(lambda x: measure(NOWHERE, state, x[None])[0][0])(x) for x in landmarks])
-    total: Tensor = noise + jacobians @ spread @ jacobians.mT
+    total: Tensor = noise + jacobians @ torch.diag_embed(sigma**2) @ jacobians.mT
     return total
 
 
@@ -219,29 +224,32 @@ def test_points_at_infinity_move_with_rotation_only():
 def test_landmark_covariance_is_carried_by_the_derivative_of_the_measurement():
     state = some_state()
     state.covariance = 0 * state.covariance
-    landmarks, spread, noise = some_landmarks(25), covariances(25, 0.5, seed=1), covariances(25, 0.3, seed=2)
-    _, found, _ = innovate(state, landmarks, spread, noise)
-    torch.testing.assert_close(found, effective_noise(state, landmarks, spread, noise), rtol=1e-10, atol=1e-12)
+    landmarks, sigma, noise = some_landmarks(25), sigmas(25, 0.5), covariances(25, 0.3)
+    _, found, _ = innovate(state, landmarks, sigma, noise)
+    torch.testing.assert_close(found, effective_noise(state, landmarks, sigma, noise), rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize("weight", [(1, 1, 1), (1, 1, 0), (0, 1, 1), (0, 0, 1), (0, 0, 0)])
 def test_squared_residual_is_the_mahalanobis_distance_of_the_components_that_take_part(weight):
     """Nothing to estimate: what is left is the whitening."""
-    state, (landmarks, spread, measurement, noise, _) = problem(count=6)
+    state, (landmarks, sigma, measurement, noise, _) = problem(count=6)
     state.covariance = 0 * state.covariance
-    found = update(state, (landmarks, spread, measurement, noise, tensor(*weight).expand(6, 3)))
+    found = update(state, (landmarks, sigma, measurement, noise, tensor(*weight).expand(6, 3)))
     error = measurement - measure(NOWHERE, state, landmarks)[0]
     kept = np.flatnonzero(weight)
-    total = effective_noise(state, landmarks, spread, noise)
-    expected = [float(e[kept] @ torch.linalg.solve(S[np.ix_(kept, kept)], e[kept])) for e, S in zip(error, total)]
+    total = effective_noise(state, landmarks, sigma, noise)
+    expected = [
+        float(e[kept] @ torch.linalg.solve(S[np.ix_(kept, kept)], e[kept])) for e, S in zip(error, total, strict=True)
+    ]
     np.testing.assert_allclose(found[7].numpy(), expected, rtol=1e-10, atol=1e-12)
     assert float(found[5]) == pytest.approx(sum(expected), rel=1e-10, abs=1e-12)
     torch.testing.assert_close(found[0], state.pose, rtol=0, atol=1e-14)
     torch.testing.assert_close(found[4], state.covariance, rtol=0, atol=1e-15)
 
 
-def innovate(state: State, landmarks: Tensor, spread: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    return Innovate()(*state.seen(), INTRINSICS, landmarks, spread, noise)
+def innovate(state: State, landmarks: Tensor, sigma: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    found: tuple[Tensor, Tensor, Tensor] = Innovate()(*state.seen(), INTRINSICS, landmarks, sigma, noise)
+    return found
 
 
 def test_points_behind_the_camera_are_flagged():
@@ -250,8 +258,7 @@ def test_points_behind_the_camera_are_flagged():
     state.pose = exp_se3(tensor(0, 0, 4, 0, 0, 0))
     depths = tensor(20, 5, 4.5, 4.1, 3.9, 2.0)
     landmarks = torch.stack([tensor(330.0).expand(6), tensor(230.0).expand(6), 80 / depths + 0.3], dim=1)
-    noise = covariances(6, 0.3)
-    predicted, S, in_front = innovate(state, landmarks, noise, noise)
+    predicted, S, in_front = innovate(state, landmarks, sigmas(6, 0.3), covariances(6, 0.3))
     # 4.1 m is in front, but at less than a sixteenth of its depth in the keyframe.
     assert in_front.tolist() == [1, 1, 1, 0, 0, 0]
     assert torch.isfinite(predicted).all()
@@ -267,20 +274,20 @@ def test_a_fresh_clone_makes_no_innovation_however_uncertain_the_world_pose():
     state.clone = state.pose
     state.covariance = choice @ root @ root.T @ choice.T
     landmarks, noise = some_landmarks(20), covariances(20, 0.3)
-    predicted, S, _ = innovate(state, landmarks, 0 * noise, noise)
+    predicted, S, _ = innovate(state, landmarks, torch.zeros(20, 3).double(), noise)
     torch.testing.assert_close(predicted, landmarks, rtol=0, atol=1e-9)
     torch.testing.assert_close(S, noise, rtol=0, atol=1e-12)
 
 
 def problem(count: int = 40, sigma: float = 1e-3, seed: int = 0) -> tuple[State, tuple[Tensor, ...]]:
-    """A state, and landmarks, their covariance, measurement, noise and weight."""
+    """A state, and landmarks, their deviations, measurement, noise and weight."""
     state = some_state(sigma, seed)
     landmarks = some_landmarks(count, seed)
     measurement = true_measurement(state.pose, state.clone, landmarks, 0.3)
     measurement = measurement + 0.5 * random_numbers(count, 3, seed=seed + 9)
     noise = covariances(count, 0.4, seed=seed + 1)
     weight = torch.ones(count, 3, dtype=torch.float64)
-    return state, (landmarks, 0.5 * noise, measurement, noise, weight)
+    return state, (landmarks, sigmas(count, 0.3), measurement, noise, weight)
 
 
 def update(state: State, points: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
@@ -293,9 +300,7 @@ def test_change_of_world_changes_neither_innovation_nor_nis():
     W = exp_se3(tensor(3, -2, 5, 1, -0.5, 0.7))
     A = block_diagonal_adjoint(W)
     moved = State(W @ state.pose, W @ state.clone, state.twist, state.offset, A @ state.covariance @ A.T)
-    for a, b in zip(
-        innovate(state, *points[:2], points[3]), innovate(moved, *points[:2], points[3]), strict=True
-    ):
+    for a, b in zip(innovate(state, *points[:2], points[3]), innovate(moved, *points[:2], points[3]), strict=True):
         torch.testing.assert_close(a, b, rtol=0, atol=1e-6)
     found, other = update(state, points), update(moved, points)
     torch.testing.assert_close(W @ found[0], other[0], rtol=0, atol=1e-7)
@@ -307,16 +312,14 @@ def test_change_of_world_changes_neither_innovation_nor_nis():
 
 
 def test_update_equals_the_dense_kalman_update_when_nearly_linear():
-    state, (landmarks, spread, measurement, noise, weight) = problem(count=12, sigma=1e-5)
+    state, (landmarks, sigma, measurement, noise, weight) = problem(count=12, sigma=1e-5)
     H = derivative_by_state(state, landmarks)
-    R = torch.block_diag(*effective_noise(state, landmarks, spread, noise))
+    R = torch.block_diag(*effective_noise(state, landmarks, sigma, noise))
     S = H @ state.covariance @ H.T + R
     innovation = (measurement - true_measurement(state.pose, state.clone, landmarks, 0.3)).flatten()
     gain = state.covariance @ H.T @ torch.linalg.inv(S)
     correction, covariance = gain @ innovation, state.covariance - gain @ S @ gain.T
-    pose, clone, twist, offset, posterior, nis, _, _ = update(
-        state, (landmarks, spread, measurement, noise, weight)
-    )
+    pose, clone, twist, offset, posterior, nis, _, _ = update(state, (landmarks, sigma, measurement, noise, weight))
     scale = float(state.covariance.max()) ** 0.5
     torch.testing.assert_close(log_se3(pose @ invert_se3(state.pose)), correction[POSE], rtol=0, atol=1e-3 * scale)
     torch.testing.assert_close(log_se3(clone @ invert_se3(state.clone)), correction[CLONE], rtol=0, atol=1e-3 * scale)
@@ -327,14 +330,14 @@ def test_update_equals_the_dense_kalman_update_when_nearly_linear():
 
 
 def test_value_of_a_masked_component_does_not_matter():
-    state, (landmarks, spread, measurement, noise, weight) = problem()
+    state, (landmarks, sigma, measurement, noise, weight) = problem()
     weight = weight.clone()
     weight[::3, 2] = 0.0
     weight[::5] = 0.0
     changed = torch.where(weight > 0, measurement, 1234.5 * torch.ones_like(measurement))
     for a, b in zip(
-        update(state, (landmarks, spread, measurement, noise, weight)),
-        update(state, (landmarks, spread, changed, noise, weight)),
+        update(state, (landmarks, sigma, measurement, noise, weight)),
+        update(state, (landmarks, sigma, changed, noise, weight)),
         strict=True,
     ):
         torch.testing.assert_close(a, b, rtol=0, atol=1e-15)
@@ -354,15 +357,15 @@ def test_a_masked_point_is_a_point_left_out():
 
 
 def test_missing_disparity_counts_as_masked_at_run_time():
-    state, (landmarks, spread, measurement, noise, weight) = problem()
+    state, (landmarks, sigma, measurement, noise, weight) = problem()
     weight = weight.clone()
     weight[::4, 2] = 0.0
-    expected = update(state, (landmarks, spread, measurement, noise, weight))
+    expected = update(state, (landmarks, sigma, measurement, noise, weight))
     missing = measurement.numpy().copy()
     missing[::4, 2] = np.nan
     pose_filter_ = PoseFilter(CAMERA, 0.5, backend="torch")
     pose_filter_.state = pose_filter.PoseState(*(value.numpy() for value in state.all()))
-    points = StereoPoints(landmarks.numpy(), spread.numpy(), missing, noise.numpy())
+    points = StereoPoints(landmarks.numpy(), sigma.numpy(), missing, noise.numpy())
     posterior, result = pose_filter_.evaluate_update(points)
     np.testing.assert_allclose(posterior.pose, expected[0].numpy(), atol=1e-14)
     np.testing.assert_allclose(posterior.covariance, expected[4].numpy(), atol=1e-14)
@@ -379,7 +382,7 @@ def test_posterior_covariance_of_many_precise_points_is_the_inverse_information(
     landmarks = some_landmarks(200)
     noise = 1e-3**2 * torch.eye(3, dtype=torch.float64).expand(200, 3, 3)
     measurement = true_measurement(state.pose, state.clone, landmarks, 0.3)
-    points = (landmarks, 0 * noise, measurement, noise, torch.ones(200, 3, dtype=torch.float64))
+    points = (landmarks, 0 * landmarks, measurement, noise, torch.ones(200, 3, dtype=torch.float64))
     posterior = update(state, points)[4][POSE, POSE]
     H = derivative_by_state(state, landmarks)[:, POSE]
     expected = torch.linalg.inv(H.T @ H / 1e-3**2 + torch.eye(6, dtype=torch.float64) / 1e-2**2)
@@ -427,12 +430,12 @@ def simulate(seed: int, step: float, densities: Tensor, sigma_twist: Tensor, poi
     exact = some_landmarks(points, seed)
     measurement = true_measurement(pose, keyframe, exact, float(offset))
     noise = covariances(points, 0.4, seed=seed + 1)
-    spread = covariances(points, 0.3, seed=seed + 2)
-    landmarks = exact + (torch.linalg.cholesky(spread) @ normal(points, 3, 1)).squeeze(-1)
+    sigma = sigmas(points, 0.3, seed=seed + 2)
+    landmarks = exact + sigma * normal(points, 3)
     measurement = measurement + (torch.linalg.cholesky(noise) @ normal(points, 3, 1)).squeeze(-1)
     weight = torch.ones(points, 3, dtype=torch.float64)
     weight[::7, 2] = 0.0
-    return truth, prior, (landmarks, spread, measurement, noise, weight)
+    return truth, prior, (landmarks, sigma, measurement, noise, weight)
 
 
 def test_filter_is_consistent_from_keyframe_to_frame():
@@ -491,7 +494,7 @@ def test_second_iteration_makes_precise_points_consistent(monkeypatch):
             measurement = measurement + 0.3 * random_numbers(200, 3, seed=1000 + seed)
             noise = 0.3**2 * torch.eye(3, dtype=torch.float64).expand(200, 3, 3)
             weight = torch.ones(200, 3, dtype=torch.float64)
-            pose, _, _, _, covariance, _, _, _ = update(state, (landmarks, 0 * noise, measurement, noise, weight))
+            pose, _, _, _, covariance, _, _, _ = update(state, (landmarks, 0 * landmarks, measurement, noise, weight))
             values.append(normalised_error(log_se3(truth @ invert_se3(pose)), covariance[POSE, POSE]))
         mean[iterations] = np.mean(values)
     assert mean[1] > 20.0

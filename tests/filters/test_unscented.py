@@ -131,9 +131,7 @@ def test_order_of_the_points_does_not_matter(iterations):
     order = torch.tensor([3, 0, 4, 1, 2])
     noise = torch.stack([(i + 1) * NOISE[0] for i in range(5)])
     first = update(bearings(LANDMARKS), STATE, STATE_COVARIANCE, z, whiteners(noise), iterations)
-    second = update(
-        bearings(LANDMARKS[order]), STATE, STATE_COVARIANCE, z[order], whiteners(noise[order]), iterations
-    )
+    second = update(bearings(LANDMARKS[order]), STATE, STATE_COVARIANCE, z[order], whiteners(noise[order]), iterations)
     for a, b in zip((*first[:2], first[2].nis), (*second[:2], second[2].nis), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-11, atol=1e-12)
 
@@ -145,9 +143,7 @@ def test_zero_rows_of_the_whitener_leave_the_measurement_out(iterations):
     whitener[[1, 4]] = 0.0
     masked = update(bearings(LANDMARKS), STATE, STATE_COVARIANCE, z, whitener, iterations)
     kept = torch.tensor([0, 2, 3])
-    without = update(
-        bearings(LANDMARKS[kept]), STATE, STATE_COVARIANCE, z[kept], whiteners(NOISE[kept]), iterations
-    )
+    without = update(bearings(LANDMARKS[kept]), STATE, STATE_COVARIANCE, z[kept], whiteners(NOISE[kept]), iterations)
     for a, b in zip((*masked[:2], masked[2].nis), (*without[:2], without[2].nis), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-11, atol=1e-12)
 

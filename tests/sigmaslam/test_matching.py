@@ -1,0 +1,252 @@
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from sigmaslam import session
+from sigmaslam.errors import InputError
+from sigmaslam.frontend import FRONTENDS, Frontend, StereoView, build_frontend
+from sigmaslam.frontend.classical import OrbDetector, SiftDetector
+from sigmaslam.frontend.learned import LearnedDetector
+from sigmaslam.frontend.matching import match_near, match_rows
+from sigmaslam.frontend.refine import lucas_kanade, refine
+from sigmaslam.readers import open_sequence
+from sigmaslam.synthetic import worlds
+from sigmaslam.synthetic.scene import render
+from sigmaslam.synthetic.sequence import simulate
+
+DEMO = Path(worlds.__file__).resolve().parent / "demo"
+
+
+def unit(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    values = rng.standard_normal(shape)
+    return values / np.linalg.norm(values, axis=-1, keepdims=True)
+
+
+def brute_force(d0: np.ndarray, d1: np.ndarray, allowed: np.ndarray, ratio: float) -> list[tuple[int, int]]:
+    """Mutual nearest neighbours among allowed pairs whose runner-up is clearly further, as loops over distances."""
+    pairs = []
+    for i in range(len(d0)):
+        candidates = sorted((np.linalg.norm(d0[i] - d1[j]), j) for j in range(len(d1)) if allowed[i, j])
+        if not candidates:
+            continue
+        distance, j = candidates[0]
+        rivals = [np.linalg.norm(d0[k] - d1[j]) for k in range(len(d0)) if allowed[k, j]]
+        if distance > min(rivals):
+            continue
+        if len(candidates) == 1 or distance <= ratio * candidates[1][0]:
+            pairs.append((i, j))
+    return pairs
+
+
+# Matching
+
+
+@pytest.mark.parametrize("ratio", [0.7, 0.9, 0.99])
+def test_stereo_matches_equal_brute_force(ratio):
+    rng = np.random.default_rng(0)
+    left, right = rng.uniform(0, 60, (80, 2)), rng.uniform(0, 60, (90, 2))
+    d0, d1 = unit(rng, 80, 6), unit(rng, 90, 6)
+    disparity = left[:, None, 0] - right[None, :, 0]
+    allowed = (np.abs(left[:, None, 1] - right[None, :, 1]) <= 4.0) & (disparity >= -2.0) & (disparity <= 30.0)
+    found = match_rows(left, right, d0, d1, 4.0, (-2.0, 30.0), ratio)
+    expected = brute_force(d0, d1, allowed, ratio)
+    assert list(zip(*(index.tolist() for index in found), strict=True)) == expected
+    assert len(expected) > 5
+
+
+@pytest.mark.parametrize("ratio", [0.7, 0.9, 0.99])
+def test_temporal_matches_equal_brute_force(ratio):
+    rng = np.random.default_rng(1)
+    predicted, keypoints = rng.uniform(0, 60, (80, 2)), rng.uniform(0, 60, (90, 2))
+    radius = np.where(np.arange(80) % 10 == 0, np.inf, rng.uniform(2, 25, 80))
+    d0, d1 = unit(rng, 80, 6), unit(rng, 90, 6)
+    allowed = np.linalg.norm(predicted[:, None] - keypoints[None], axis=2) <= radius[:, None]
+    found = match_near(predicted, radius, keypoints, d0, d1, ratio)
+    expected = brute_force(d0, d1, allowed, ratio)
+    assert list(zip(*(index.tolist() for index in found), strict=True)) == expected
+    assert len(expected) > 5
+
+
+def test_matches_are_one_to_one_and_respect_the_geometry():
+    rng = np.random.default_rng(2)
+    left, right = rng.uniform(0, 100, (200, 2)), rng.uniform(0, 100, (200, 2))
+    first, second = match_rows(left, right, unit(rng, 200, 8), unit(rng, 200, 8), 2.0, (0.0, 40.0), 1.0)
+    assert len(set(first)) == len(first) == len(set(second)) > 20
+    disparity = left[first, 0] - right[second, 0]
+    assert np.abs(left[first, 1] - right[second, 1]).max() <= 2.0
+    assert disparity.min() >= 0.0
+    assert disparity.max() <= 40.0
+
+
+def test_shuffled_copies_find_each_other():
+    rng = np.random.default_rng(3)
+    descriptors, order = unit(rng, 50, 32), rng.permutation(50)
+    places = rng.uniform(0, 100, (50, 2))
+    radius = np.full(50, np.inf)
+    first, second = match_near(places, radius, places[order], descriptors, descriptors[order], 0.9)
+    assert len(first) == 50
+    np.testing.assert_array_equal(order[second], first)
+
+
+def test_two_equal_candidates_are_no_match():
+    rng = np.random.default_rng(4)
+    d0 = unit(rng, 1, 16)
+    first, _ = match_near(np.zeros((1, 2)), np.array([5.0]), np.zeros((2, 2)), d0, np.repeat(d0, 2, axis=0), 0.95)
+    assert len(first) == 0
+
+
+@pytest.mark.parametrize(("count0", "count1"), [(0, 5), (5, 0), (0, 0)])
+def test_nothing_matches_nothing(count0, count1):
+    rng = np.random.default_rng(5)
+    arguments = np.zeros((count0, 2)), np.zeros((count1, 2)), unit(rng, count0, 4), unit(rng, count1, 4)
+    first, second = match_rows(*arguments, 2.0, (0, 10), 0.9)
+    assert len(first) == len(second) == 0
+
+
+# Refinement
+
+
+def shifted_texture(shift: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """A smooth texture and the same moved by a Fourier shift, which no interpolation blurs."""
+    noise = np.random.default_rng(6).standard_normal((128, 128))
+    smooth = cv2.GaussianBlur(noise, (0, 0), 2.0, borderType=cv2.BORDER_REFLECT)
+    spectrum = np.fft.fft2(smooth)
+    v, u = np.meshgrid(np.fft.fftfreq(128), np.fft.fftfreq(128), indexing="ij")
+    moved = np.fft.ifft2(spectrum * np.exp(-2j * np.pi * (u * shift[0] + v * shift[1]))).real
+    low, high = smooth.min(), smooth.max()
+    return tuple(np.round(np.clip((x - low) / (high - low), 0, 1) * 255).astype(np.uint8) for x in (smooth, moved))
+
+
+GRID = np.stack(np.meshgrid(np.arange(24.0, 104, 8), np.arange(24.0, 104, 8)), axis=-1).reshape(-1, 2)
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.3, -0.4), (-0.75, 0.5), (1.2, 0.9)])
+def test_refinement_recovers_a_subpixel_shift(shift):
+    first, second = shifted_texture(shift)
+    places, moved = refine(first, second, GRID, GRID)
+    assert moved.mean() > 0.95
+    error = np.linalg.norm((places - GRID - shift)[moved], axis=1)
+    assert np.median(error) < 0.02
+    assert np.quantile(error, 0.95) < 0.05
+
+
+def test_a_point_that_would_go_too_far_stays():
+    first, second = shifted_texture((3.5, 0.0))
+    places, moved = refine(first, second, GRID, GRID, reach=2.0)
+    np.testing.assert_array_equal(places[~moved], GRID[~moved])
+    assert np.linalg.norm(places - GRID, axis=1).max() <= 2.0
+    assert moved.mean() < 0.2
+
+
+def test_refinement_of_no_points_is_no_points():
+    image = np.zeros((32, 32), np.uint8)
+    places, found = lucas_kanade(image, image, np.zeros((0, 2)), np.zeros((0, 2)), 11, 2)
+    assert places.shape == (0, 2)
+    assert found.shape == (0,)
+
+
+# Front-ends on the shipped demo, whose exact depth the renderer knows
+
+
+def frontend(name: str) -> Frontend:
+    if name == "learned" and not session.shipped_weights("features.onnx").is_file():
+        pytest.skip("features.onnx is not in models/weights")
+    return build_frontend(name, 600)
+
+
+@pytest.fixture(scope="module")
+def demo() -> dict[str, np.ndarray]:
+    """Frames 0 and 4 with the true inverse depth of the left views, and the motion between them."""
+    simulation = simulate("room", 40, 2, 320, 240)
+    frames = [frame for frame in open_sequence(DEMO).frames() if frame.index in (0, 4)]
+    poses = simulation.T_world_camera[[0, 4]]
+    depths = [render(simulation.scene, simulation.left, pose, supersample=1).depth for pose in poses]
+    return {
+        "images": np.array([(frame.left, frame.right) for frame in frames]),
+        "disparity": simulation.left.fx * simulation.baseline / np.array(depths),
+        "K": simulation.left.matrix,
+        "depth": np.array(depths),
+        "T_4_0": np.linalg.inv(poses[1]) @ poses[0],
+    }
+
+
+def at(values: np.ndarray, points: np.ndarray) -> np.ndarray:
+    u, v = np.round(points).astype(int).T
+    return np.asarray(values[v, u])
+
+
+@pytest.mark.parametrize("name", FRONTENDS)
+def test_disparity_of_the_demo_is_within_a_pixel_of_the_truth(demo, name):
+    view = frontend(name).observe(*demo["images"][0])
+    assert view.disparity.shape == (len(view.features.keypoints),)
+    known = np.isfinite(view.disparity)
+    assert known.sum() > 80
+    error = np.abs(view.disparity - at(demo["disparity"][0], view.features.keypoints))[known]
+    assert (error < 1.0).mean() > 0.9
+    assert np.median(error) < 0.2
+
+
+@pytest.mark.parametrize("name", FRONTENDS)
+def test_matches_of_the_demo_follow_the_true_motion(demo, name):
+    """Every match lies within two pixels of where the exact depth and motion put it, or nearly every one."""
+    method = frontend(name)
+    key, view = (method.observe(*images) for images in demo["images"])
+    index = np.flatnonzero(np.isfinite(key.disparity))
+    points = key.features.keypoints[index].astype(float)
+    rays = np.c_[points, np.ones(len(points))] @ np.linalg.inv(demo["K"]).T
+    seen = rays * at(demo["depth"][0], points)[:, None] @ demo["T_4_0"][:3, :3].T + demo["T_4_0"][:3, 3]
+    truth = (seen / seen[:, 2:] @ demo["K"].T)[:, :2]
+    predicted = truth + np.random.default_rng(0).normal(0, 2.0, truth.shape)
+    found = method.match(key, index, view, predicted, np.full(len(index), 12.0))
+    assert len(np.unique(found.key_index)) == len(found.key_index) > 50
+    assert set(found.key_index) <= set(index)
+    assert (found.sigma > 0).all()
+    row = np.searchsorted(index, found.key_index)
+    error = np.linalg.norm(found.points - truth[row], axis=1)
+    assert (error < 2.0).mean() > 0.9
+    assert np.median(error) < 0.4
+
+
+@pytest.mark.parametrize("name", FRONTENDS)
+def test_a_black_image_has_no_features(name):
+    black = np.zeros((120, 160), np.uint8)
+    method = frontend(name)
+    view = method.observe(black, black)
+    assert len(view.features.keypoints) == len(view.disparity) == 0
+    nothing = method.match(view, np.zeros(0, np.int64), view, np.zeros((0, 2)), np.zeros(0))
+    assert nothing.points.shape == (0, 2)
+
+
+@pytest.mark.parametrize("name", FRONTENDS)
+def test_a_textured_keyframe_finds_nothing_in_a_black_view(demo, name):
+    method = frontend(name)
+    key, black = method.observe(*demo["images"][0]), np.zeros((240, 320), np.uint8)
+    empty: StereoView = method.observe(black, black)
+    index = np.arange(min(20, len(key.disparity)))
+    found = method.match(key, index, empty, key.features.keypoints[index], np.full(len(index), 20.0))
+    assert len(found.points) == 0
+
+
+@pytest.mark.parametrize("detector", [SiftDetector, OrbDetector])
+def test_classical_features_are_unit_descriptors_best_first_at_distinct_places(demo, detector):
+    features = detector(300)(demo["images"][0, 0])
+    np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1.0, atol=1e-3)
+    assert (np.diff(features.scores) <= 0).all()
+    assert len(np.unique(features.keypoints, axis=0)) == len(features.keypoints)
+
+
+@pytest.mark.parametrize("shape", [(240, 320), (101, 131)])
+def test_learned_features_lie_in_the_image_whatever_its_size(demo, shape):
+    frontend("learned")
+    image = demo["images"][0, 0][: shape[0], : shape[1]]
+    features = LearnedDetector(200)(image)
+    assert 20 < len(features.keypoints) <= 200
+    assert (features.keypoints >= 0).all()
+    assert (features.keypoints < (shape[1] - 7, shape[0] - 7)).all()
+
+
+def test_an_unknown_front_end_is_refused_with_the_known_ones():
+    with pytest.raises(InputError, match="surf.*learned, sift, orb, klt"):
+        build_frontend("surf", 100)
