@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -21,7 +23,8 @@ def points_in_view(count: int, seed: int = 0) -> np.ndarray:
 def measure(truth: np.ndarray, T_key_camera: np.ndarray, offset: float = OFFSET) -> np.ndarray:
     """What a camera at T_key_camera sees, its disparity too large by the offset."""
     T = se3_inverse(T_key_camera)
-    return np.asarray(CAMERA.project(CAMERA.triangulate(truth) @ T[:3, :3].T + T[:3, 3]) + [0.0, 0.0, offset])
+    seen = CAMERA.triangulate(truth) @ T[:3, :3].T + T[:3, 3]
+    return np.asarray(CAMERA.project(seen) + np.array([0.0, 0.0, offset]))
 
 
 def landmarks_of(measured: np.ndarray, sigma: np.ndarray = SIGMA) -> KeyframeLandmarks:
@@ -70,7 +73,7 @@ def test_every_observation_shrinks_the_covariance():
         np.linalg.det(refined_by_views(truth, views, seed=0).to_map(WORLD, CAMERA, OFFSET, 1).covariances)
         for views in (0, 1, 4, 16)
     ]
-    for before, after in zip(volumes, volumes[1:], strict=False):
+    for before, after in pairwise(volumes):
         assert (after < before).mean() > 0.98
 
 

@@ -248,5 +248,5 @@ def test_learned_features_lie_in_the_image_whatever_its_size(demo, shape):
 
 
 def test_an_unknown_front_end_is_refused_with_the_known_ones():
-    with pytest.raises(InputError, match="surf.*learned, sift, orb, klt"):
+    with pytest.raises(InputError, match=r"surf.*learned, sift, orb, klt"):
         build_frontend("surf", 100)
