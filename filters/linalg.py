@@ -57,11 +57,13 @@ def inverse_and_log_determinant(matrix: Tensor) -> tuple[Tensor, Tensor]:
         pivot = work[..., j, j]
         logs.append(torch.log(pivot))
         # One rank-one update sweeps row, column and pivot at once: (j, j) becomes 1/p, row j is divided by p, column j
-        # by -p, and the rest loses column times row over p.
+        # by -p, and the rest loses column times row over p. Row and column are cleared first: adding to and taking
+        # from the pivot itself would cancel the digits of a small inverse.
         unit = identity[j]
-        column = work[..., :, j] - unit
-        row = (work[..., j, :] + unit) / pivot.unsqueeze(-1)
-        work = work - column.unsqueeze(-1) * row.unsqueeze(-2)
+        others = 1.0 - unit
+        column = work[..., :, j] * others - unit
+        row = (work[..., j, :] * others + unit) / pivot.unsqueeze(-1)
+        work = work * (others.unsqueeze(-1) * others) - column.unsqueeze(-1) * row.unsqueeze(-2)
     return work, torch.stack(logs, dim=-1).sum(dim=-1)
 
 

@@ -135,15 +135,18 @@ class Update(nn.Module):
         _, posterior = covariance_of(torch.cat([error_pose, rest, error_clone], dim=-1))
         new_offset = offset + correction[CALIBRATION]
         after = residual(result.mean.unsqueeze(0)).unflatten(-1, (-1, 3))[0]
+        squared_residual = (after * after).sum(dim=-1)
+        # What remains of the innovation and what the prior paid: e^T S^-1 e, without the noise at far sigma points.
+        nis = (result.mean * result.mean).sum() + squared_residual.sum()
         return (
             new_pose,
             new_clone,
             twist + correction[TWIST],
             new_offset,
             posterior,
-            result.nis,
-            result.log_likelihood,
-            (after * after).sum(dim=-1),
+            nis,
+            -0.5 * (nis + result.log_determinant),
+            squared_residual,
         )
 
 

@@ -54,10 +54,10 @@ def corner_scores(response: Tensor) -> Tensor:
     cells = _EVENING_WINDOW // _EVENING_STRIDE + 1
     local = functional.avg_pool2d(block, cells, stride=1, padding=cells // 2, count_include_pad=False)
     overall = response.mean(dim=(2, 3), keepdim=True)
-    level = functional.interpolate(
-        local + 0.05 * overall, scale_factor=float(_EVENING_STRIDE), mode="bilinear", align_corners=False
-    )
-    evened = response / level.clamp_min(1e-12) ** _EVENING_POWER
+    # The power is taken on the coarse map, where it costs nothing.
+    level = (local + 0.05 * overall).clamp_min(1e-12) ** _EVENING_POWER
+    level = functional.interpolate(level, scale_factor=float(_EVENING_STRIDE), mode="bilinear", align_corners=False)
+    evened = response / level
     kept = torch.where(response >= peak, evened, torch.zeros_like(evened))
     inner = kept[:, :, BORDER:-BORDER, BORDER:-BORDER]
     return functional.pad(inner, (BORDER, BORDER, BORDER, BORDER))

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
@@ -54,7 +55,7 @@ def load_network(weights: Path) -> FeatureNetwork:
     network = FeatureNetwork()
     try:
         network.load_state_dict(load_file(weights))
-    except (RuntimeError, ValueError) as error:
+    except (RuntimeError, ValueError, SafetensorError) as error:
         raise InputError(f"{weights} does not hold the weights of this network: {error}") from error
     return network.eval()
 

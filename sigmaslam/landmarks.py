@@ -122,6 +122,7 @@ def _transfer(
         ]
         seen = ray @ T_to_from[:3, :3].T + inverse_depth * T_to_from[:3, 3]
         with np.errstate(divide="ignore", invalid="ignore"):
+            seen = np.where(seen[:, 2:] > 0, seen, np.nan)  # behind: the caller leaves it out
             return np.c_[
                 camera.fx * seen[:, 0] / seen[:, 2] + camera.cx,
                 camera.fy * seen[:, 1] / seen[:, 2] + camera.cy,

@@ -262,7 +262,7 @@ class StereoTracker:
         innovation = np.where(known, innovation, 0.0)
         distance = np.einsum("mi,mi->m", innovation, np.linalg.solve(S, innovation[..., None])[..., 0])
         kept = in_front & (distance <= _CHI_SQUARE_999[known.sum(axis=1)])
-        for _ in range(3):
+        for _ in range(2):
             if kept.sum() < self.config.least_inliers:
                 return None
             state, result = self._filter.evaluate_update(points.select(kept))
@@ -281,12 +281,12 @@ class StereoTracker:
         if relative is None or relative.inliers.sum() < self.config.least_inliers:
             return None
         before = self._filter.state
-        self._filter.set_pose_from_clone(relative.T_key_camera, np.repeat([0.05 * self._depth, 0.05], 3))
+        self._filter.set_pose_from_clone(relative.T_key_camera, np.repeat([0.01 * self._depth, 0.01], 3))
         # The mean velocity since the last pose, as uncertain as an acceleration over that time makes it.
         elapsed = timestamp - self._tracked_at
         sigma = np.sqrt(np.repeat(self._densities[:2], 3) * elapsed)
         self._filter.set_twist(se3_log(se3_inverse(self._tracked_pose) @ self._filter.state.pose) / elapsed, sigma)
-        fit = self._fit(found, self._filter.state)
+        fit = self._fit(found.select(relative.inliers), self._filter.state)
         if fit is None:
             self._filter.state = before
         return fit

@@ -52,7 +52,7 @@ class TrainingConfig:
         validate_every, checkpoint_every: in steps.
     """
 
-    steps: int = 4500
+    steps: int = 3400
     batch_size: int = 16
     size: int = 224
     points: int = 256
@@ -60,7 +60,7 @@ class TrainingConfig:
     weight_decay: float = 1e-4
     quality_weight: float = 0.5
     seed: int = 0
-    validate_every: int = 900
+    validate_every: int = 1700
     checkpoint_every: int = 250
 
 
@@ -92,6 +92,7 @@ def train(out: Path, config: TrainingConfig, workers: int = 1, resume: bool = Fa
         optimizer, max_lr=config.learning_rate, total_steps=config.steps, pct_start=0.1
     )
     first, seconds = 0, 0.0
+    metrics: dict[str, float] = {}
     if resume:
         state = torch.load(checkpoint_path, weights_only=True)
         if state["config"] != asdict(config):
@@ -101,7 +102,7 @@ def train(out: Path, config: TrainingConfig, workers: int = 1, resume: bool = Fa
         network.load_state_dict(state["network"])
         optimizer.load_state_dict(state["optimizer"])
         schedule.load_state_dict(state["schedule"])
-        first, seconds = int(state["step"]), float(state["seconds"])
+        first, seconds, metrics = int(state["step"]), float(state["seconds"]), dict(state["metrics"])
 
     loader = pair_loader(
         config.seed,
@@ -113,7 +114,6 @@ def train(out: Path, config: TrainingConfig, workers: int = 1, resume: bool = Fa
         workers,
     )
     began = time.monotonic() - seconds
-    metrics: dict[str, float] = {}
     with _progress() as progress:
         task = progress.add_task("training", total=config.steps, completed=first, note="")
         for step, (image0, image1, H_1_0, corners0, corners1) in enumerate(loader, start=first):
@@ -140,6 +140,7 @@ def train(out: Path, config: TrainingConfig, workers: int = 1, resume: bool = Fa
                     "config": asdict(config),
                     "step": done,
                     "seconds": time.monotonic() - began,
+                    "metrics": metrics,
                 }
                 with atomic_path(checkpoint_path) as path:
                     torch.save(state, path)

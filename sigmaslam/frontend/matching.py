@@ -68,6 +68,7 @@ def _mutual(
     # Squared distance of unit vectors is 2 - 2 cos; the runner-up is looked up after the winner is struck out.
     similarity[rows, best1] = -2.0
     second = similarity.max(axis=1)
-    distinct = (1.0 - best) <= ratio * ratio * (1.0 - second)
+    # The margin keeps two identical candidates, both at distance zero, from passing as distinct.
+    distinct = (1.0 - best) + 1e-6 <= ratio * ratio * (1.0 - second)
     chosen = np.flatnonzero(mutual & distinct)
     return chosen, best1[chosen]

@@ -59,6 +59,10 @@ class TemporalMatches:
     disparity: np.ndarray
     sigma: np.ndarray
 
+    def select(self, index: np.ndarray) -> TemporalMatches:
+        """The matches of that index or mask."""
+        return TemporalMatches(self.key_index[index], self.points[index], self.disparity[index], self.sigma[index])
+
 
 class Frontend(Protocol):
     """Turns images into correspondences; the tracker knows nothing else of them."""
