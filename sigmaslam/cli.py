@@ -47,6 +47,12 @@ class InputFormat(StrEnum):
     video = "video"
 
 
+class Benchmark(StrEnum):
+    """Benchmarks by name."""
+
+    sequences = "sequences"
+
+
 def _show_version(wanted: bool) -> None:
     if wanted:
         typer.echo(f"sigmaslam {version('sigmaslam')}")
@@ -143,6 +149,25 @@ def export(
         differences = export_all(run / WEIGHTS_NAME, run / CARD_NAME, out)
     for name, difference in differences.items():
         typer.echo(f"{name}.onnx differs from torch by {difference:.1e}")
+
+
+@app.command()
+def benchmark(
+    name: Annotated[Benchmark, typer.Argument(help="Which benchmark.")],
+    out: Annotated[Path, typer.Option(help="Markdown page to write.")],
+    data: Annotated[
+        Path | None, typer.Option(envvar="SIGMASLAM_DATA", help="Folder of the real data sets; none: the demo alone.")
+    ] = None,
+    frontend: Annotated[
+        list[Frontend] | None, typer.Option(help="Front-ends to compare; may be given more than once.")
+    ] = None,
+) -> None:
+    """Run a benchmark and write its table."""
+    from sigmaslam.evaluation.benchmarks.sequences import write_results
+
+    names = [choice.value for choice in frontend or list(Frontend)]
+    command = f"sigmaslam benchmark {name.value} --out {out}"
+    typer.echo(write_results(out, data, names, command))
 
 
 def main() -> None:

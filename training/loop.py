@@ -84,6 +84,7 @@ def train(out: Path, config: TrainingConfig, workers: int = 1, resume: bool = Fa
         raise InputError(f"{checkpoint_path} does not exist: there is nothing to resume; leave --resume out")
     out.mkdir(parents=True, exist_ok=True)
 
+    commit = _commit()  # before the run: the tree may move on while it lasts
     torch.manual_seed(config.seed)
     network = FeatureNetwork()
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -147,7 +148,7 @@ def train(out: Path, config: TrainingConfig, workers: int = 1, resume: bool = Fa
     card = {
         "config": asdict(config),
         "seed": config.seed,
-        "commit": _commit(),
+        "commit": commit,
         "command": " ".join(["sigmaslam", *sys.argv[1:]]),
         "duration_s": round(time.monotonic() - began, 1),
         "hardware": f"{os.cpu_count()} CPU cores, torch {torch.__version__}",

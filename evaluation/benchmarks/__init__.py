@@ -1,0 +1,1 @@
+"""Benchmarks: thin scripts that write the tables of docs/."""
