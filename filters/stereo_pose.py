@@ -134,10 +134,10 @@ class Update(nn.Module):
         rest = tangent[:, 6:13] - correction[6:13]
         _, posterior = covariance_of(torch.cat([error_pose, rest, error_clone], dim=-1))
         new_offset = offset + correction[CALIBRATION]
-        after = residual(result.mean.unsqueeze(0)).unflatten(-1, (-1, 3))[0]
-        squared_residual = (after * after).sum(dim=-1)
-        # What remains of the innovation and what the prior paid: e^T S^-1 e, without the noise at far sigma points.
-        nis = (result.mean * result.mean).sum() + squared_residual.sum()
+        after = result.residual.unflatten(0, (-1, 3))
+        # The noise differs between sigma points, so the NIS is taken at the posterior, where in a linear model it is
+        # the same: what remains of the innovation and what the prior paid.
+        nis = (result.mean * result.mean).sum() + (after * after).sum()
         return (
             new_pose,
             new_clone,
@@ -145,8 +145,8 @@ class Update(nn.Module):
             new_offset,
             posterior,
             nis,
-            -0.5 * (nis + result.log_determinant),
-            squared_residual,
+            result.log_likelihood + 0.5 * (result.nis - nis),
+            (after * after).sum(dim=-1),
         )
 
 

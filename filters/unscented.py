@@ -25,12 +25,16 @@ class WhitenedUpdate:
     Attributes:
         mean: (n,) posterior mean of zeta.
         covariance: (n, n) posterior covariance of zeta.
-        log_determinant: () of the innovation covariance in units of the noise.
+        residual: (M,) whitened residual at the posterior mean.
+        nis: () normalised innovation squared e^T S^-1 e of the first linearisation, the one at the prior.
+        log_likelihood: () of the same, without the noise's own normalisation (whitening leaves it to the caller).
     """
 
     mean: Tensor
     covariance: Tensor
-    log_determinant: Tensor
+    residual: Tensor
+    nis: Tensor
+    log_likelihood: Tensor
 
 
 def sigma_offsets(factor: Tensor) -> Tensor:
@@ -86,7 +90,7 @@ def iterated_update(residual: Residual, size: int, iterations: int, like: Tensor
     mean = torch.zeros(size, dtype=like.dtype, device=like.device)
     spread, inverse_spread = identity, identity
     covariance = identity
-    log_determinant = mean.sum()
+    nis = log_likelihood = mean.sum()
     for iteration in range(iterations):
         expected, odd, even = odd_and_even(residual(mean + sigma_offsets(spread)))
         if iteration > 0:
@@ -100,9 +104,12 @@ def iterated_update(residual: Residual, size: int, iterations: int, like: Tensor
         )
         projected = innovation @ deviations
         solution = projected @ inverse
+        if iteration == 0:
+            nis = (innovation * innovation).sum() - (projected * solution).sum()
+            log_likelihood = -0.5 * (nis + log_determinant)
         mean = solution[0, :size]
         covariance = inverse[:size, :size]
         if iteration + 1 < iterations:
             spread = cholesky(covariance)
             inverse_spread = invert_lower(spread)
-    return WhitenedUpdate(mean, covariance, log_determinant)
+    return WhitenedUpdate(mean, covariance, residual(mean.unsqueeze(0))[0], nis, log_likelihood)

@@ -17,7 +17,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from sigmaslam.errors import InputError, SigmaSlamError
-from sigmaslam.files import atomic_path
+from sigmaslam.files import atomic_path, atomic_write_text
 from sigmaslam.filters.lie import exp_se3
 from sigmaslam.filters.stereo_pose import STATE_SIZE, Innovate, Predict, Update
 from sigmaslam.models.extractor import FeatureExtractor
@@ -102,9 +102,36 @@ def export_all(weights: Path, card: Path, out: Path) -> dict[str, float]:
     copied = weights.read_bytes()
     with atomic_path(out / "features.safetensors") as path:
         path.write_bytes(copied)
-    with atomic_path(out / "features.json") as path:
-        path.write_text(json.dumps(content, indent=2) + "\n")
+    atomic_write_text(out / "features.json", json.dumps(content, indent=2) + "\n")
+    atomic_write_text(out / "features.md", _card_page(content))
     return differences
+
+
+def _card_page(card: dict[str, Any]) -> str:
+    """The model card for people."""
+    metrics = "".join(f"| {name} | {value} |\n" for name, value in card["metrics_on_held_out_renders"].items())
+    differences = "".join(f"| {name}.onnx | {value:.1e} |\n" for name, value in card["onnx_minus_torch"].items())
+    settings = "".join(f"| {name} | {value} |\n" for name, value in card["config"].items())
+    return f"""# Model card: features
+
+Keypoints (Shi-Tomasi corners, ranked by a learned quality), 64-D descriptors; {card["parameters"]} parameters.
+
+- Data: {card["data"]}.
+- Command: `{card["command"]}`, commit {card["commit"]}, seed {card["seed"]}.
+- Duration: {card["duration_s"] / 60:.0f} minutes on {card["hardware"]}.
+- Figures on real sequences: docs/results.md; none of them was used in training.
+- Limits: grey images; rotation and scale as far as the training homographies go (40 degrees and a factor of 1.6 a
+  view); no covariance of its own yet.
+
+| setting | |
+|---|---|
+{settings}
+| held-out renders (48 pairs, 256 keypoints) | |
+|---|---|
+{metrics}
+| ONNX minus torch | largest difference |
+|---|---|
+{differences}"""
 
 
 def _noisy_texture(rng: np.random.Generator, shape: tuple[int, int]) -> Tensor:

@@ -22,6 +22,8 @@ _LOGGER = logging.getLogger(__name__)
 # 99.9 % quantiles of chi-square with 0, 1, 2 and 3 degrees of freedom.
 _CHI_SQUARE_999 = np.array([0.0, 10.827566170662733, 13.815510557964274, 16.26623619623813])
 _CHI_SQUARE_99_2D = 9.21034037197618
+# A pose that fewer of the matches near the prediction agree with is not believed.
+_LEAST_SHARE = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,7 +225,7 @@ class StereoTracker:
             radius = np.sqrt(_CHI_SQUARE_99_2D * spread[rows]) + 1.0
             found = self._frontend.match(self._keyframe.view, landmarks.index[rows], view, predicted[rows, :2], radius)
             clock.lap("match")
-            fit = self._fit(found, self._filter.state)
+            fit = self._fit(found)
             clock.lap("filter")
         if fit is None:
             anywhere = np.full(len(landmarks.index), np.inf)
@@ -248,7 +250,7 @@ class StereoTracker:
         measurement = np.column_stack([found.points, found.disparity])
         return StereoPoints(landmarks.measured[rows], landmarks.sigma[rows], measurement, noise), rows
 
-    def _fit(self, found: TemporalMatches, state: PoseState) -> _Fit | None:
+    def _fit(self, found: TemporalMatches) -> _Fit | None:
         """Chi-square gate on the innovation, update, gate on the residual, update again."""
         points, rows = self._stereo_points(found)
         if len(rows) < self.config.least_inliers:
@@ -262,15 +264,16 @@ class StereoTracker:
         innovation = np.where(known, innovation, 0.0)
         distance = np.einsum("mi,mi->m", innovation, np.linalg.solve(S, innovation[..., None])[..., 0])
         kept = in_front & (distance <= _CHI_SQUARE_999[known.sum(axis=1)])
-        for _ in range(2):
+        if kept.sum() < self.config.least_inliers:
+            return None
+        state, result = self._filter.evaluate_update(points.select(kept))
+        bad = result.squared_residual > _CHI_SQUARE_999[result.components]
+        if bad.any():
+            kept[np.flatnonzero(kept)[bad]] = False
             if kept.sum() < self.config.least_inliers:
                 return None
             state, result = self._filter.evaluate_update(points.select(kept))
-            bad = result.squared_residual > _CHI_SQUARE_999[result.components]
-            if not bad.any():
-                break
-            kept[np.flatnonzero(kept)[bad]] = False
-        if kept.sum() < max(self.config.least_inliers, 0.3 * len(rows)):
+        if kept.sum() < _LEAST_SHARE * len(rows):
             return None
         return _Fit(state, result, points.select(kept), rows[kept])
 
@@ -286,7 +289,7 @@ class StereoTracker:
         elapsed = timestamp - self._tracked_at
         sigma = np.sqrt(np.repeat(self._densities[:2], 3) * elapsed)
         self._filter.set_twist(se3_log(se3_inverse(self._tracked_pose) @ self._filter.state.pose) / elapsed, sigma)
-        fit = self._fit(found.select(relative.inliers), self._filter.state)
+        fit = self._fit(found.select(relative.inliers))
         if fit is None:
             self._filter.state = before
         return fit

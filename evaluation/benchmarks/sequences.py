@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import tempfile
 from collections.abc import Sequence
@@ -70,9 +71,8 @@ def format_results(results: Sequence[SequenceResult], command: str) -> str:
     lines = [
         "# Results",
         "",
-        f"Made by `{command}` on {platform.processor() or platform.machine()}, one run, front-ends in turn; accuracy is",
-        "the same in every run on one machine, times are wall milliseconds and vary by some 10 %. No setting differs",
-        "between the sequences. The rows of a sequence differ in the front-end alone.",
+        f"Made by `{command}` on {platform.machine()}, {os.cpu_count()} cores, one run, front-ends in turn. Accuracy",
+        "is the same in every run on one machine; times are wall milliseconds. No setting differs between sequences.",
         "",
         "- *tracked*: frames with a pose from the images; the first frame of a run is its origin.",
         "- *ATE*: root mean square position error after the best rigid alignment, metres.",
@@ -102,7 +102,8 @@ def write_results(path: Path, data: Path | None, frontends: Sequence[str], comma
     return page
 
 
-_ACCURACY_HEADER = "| front-end | tracked | ATE m | t_rel % | r_rel deg/100 m | step mm | step deg | inliers | NIS | NEES | offset px |"
+_ACCURACY_COLUMNS = ("front-end", "tracked", "ATE m", "t_rel %", "r_rel deg/100 m", "step mm", "step deg", "inliers")
+_ACCURACY_HEADER = "| " + " | ".join((*_ACCURACY_COLUMNS, "NIS", "NEES", "offset px")) + " |"
 _TIME_HEADER = "| front-end | features | matching | filter | map | total, median (p10 - p90) | frames/s |"
 
 

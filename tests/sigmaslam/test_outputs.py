@@ -1,0 +1,41 @@
+"""What a run says and writes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sigmaslam.landmarks import PointMap
+from sigmaslam.outputs import calibration_verdict, write_ply
+from sigmaslam.tracker import CalibrationEstimate
+
+
+@pytest.mark.parametrize(
+    ("offset", "sigma", "words"),
+    [
+        (0.01, 0.03, "nothing wrong"),
+        (0.27, 0.04, "off by +0.27 ± 0.04 px"),
+        (-0.27, 0.04, "off by -0.27 ± 0.04 px"),
+        (0.09, 0.01, "nothing wrong"),  # certain, but too small to matter
+        (0.3, 0.25, "says little"),
+    ],
+)
+def test_the_verdict_on_the_calibration_is_in_words(offset: float, sigma: float, words: str):
+    assert words in calibration_verdict(CalibrationEstimate(offset, sigma))
+
+
+def test_a_ply_file_round_trips(tmp_path: Path):
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(5, 3, 3))
+    point_map = PointMap(rng.normal(size=(5, 3)), root @ root.transpose(0, 2, 1), np.arange(3, 8))
+    write_ply(tmp_path / "map.ply", point_map)
+    header, _, body = (tmp_path / "map.ply").read_bytes().partition(b"end_header\n")
+    assert header.splitlines()[:3] == [b"ply", b"format binary_little_endian 1.0", b"element vertex 5"]
+    vertices = np.frombuffer(body, "<f4").reshape(5, 4)
+    np.testing.assert_allclose(vertices[:, :3], point_map.points, rtol=1e-6)
+    np.testing.assert_allclose(vertices[:, 3] ** 2, np.linalg.eigvalsh(point_map.covariances)[:, -1], rtol=1e-5)
+
+
+def test_an_empty_map_is_a_valid_file(tmp_path: Path):
+    write_ply(tmp_path / "map.ply", PointMap(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0, np.int64)))
+    assert b"element vertex 0\n" in (tmp_path / "map.ply").read_bytes()
