@@ -35,6 +35,11 @@ class PoseState:
     offset: np.ndarray
     covariance: np.ndarray
 
+    @property
+    def offset_variance(self) -> float:
+        """Variance of the disparity offset, pixels squared."""
+        return max(float(self.covariance[CALIBRATION, CALIBRATION].item()), 0.0)
+
     def body_covariance(self) -> np.ndarray:
         """(6, 6) covariance of the pose relative to the first, in the camera's frame, translation first."""
         return _to_body(self.pose, self.covariance[POSE, POSE])
@@ -129,6 +134,14 @@ class PoseFilter:
         P[:, CLONE] = P[:, POSE]
         P[CLONE, CLONE] = self.state.covariance[POSE, POSE]
         self.state = replace(self.state, clone=self.state.pose, covariance=P)
+
+    def hold_offset(self, offset: np.ndarray, variance: float) -> None:
+        """Replaces what is known of the disparity offset by something independent of the rest."""
+        P = self.state.covariance.copy()
+        P[CALIBRATION, :] = 0.0
+        P[:, CALIBRATION] = 0.0
+        P[CALIBRATION, CALIBRATION] = variance
+        self.state = replace(self.state, offset=offset, covariance=P)
 
     def predict(self, step: float, densities: np.ndarray) -> None:
         """Moves the state on by `step` seconds; densities (3,) as in sigmaslam.filters.stereo_pose.Predict."""

@@ -110,6 +110,8 @@ class Estimate:
 class _Keyframe:
     view: StereoView
     landmarks: KeyframeLandmarks
+    offset: np.ndarray  # disparity offset as it was known before this keyframe, (1,)
+    offset_variance: float
     first_inliers: int | None = None
 
 
@@ -321,8 +323,12 @@ class StereoTracker:
             self._camera,
             float(fit.state.offset[0]),
         )
-        if faded:
-            self._take_keyframe(view)
+        if faded and self._take_keyframe(view):
+            return
+        # Every view of a keyframe repeats the noise of its landmarks. The pose forgets between frames, the offset does
+        # not: it is estimated in each frame from what was known before the keyframe, and only the last view, the one
+        # with the longest baseline, is remembered.
+        self._filter.hold_offset(self._keyframe.offset, self._keyframe.offset_variance)
 
     def _recover(self, view: StereoView, timestamp: float) -> None:
         """Without a pose: wait for a while, then go on from this view with the uncertainty of the prediction."""
@@ -344,8 +350,14 @@ class StereoTracker:
         keypoint, disparity = self.config.keyframe_sigma, self.config.disparity_sigma
         sigma = np.tile([keypoint, keypoint, disparity], (len(index), 1))
         starting = self._keyframe is None
-        self._keyframe = _Keyframe(view, KeyframeLandmarks(index, measured, sigma))
         self._filter.clone_pose()
+        state = self._filter.state
+        self._keyframe = _Keyframe(
+            view,
+            KeyframeLandmarks(index, measured, sigma),
+            state.offset,
+            state.offset_variance,
+        )
         self._depth = self._camera.fx * self._camera.baseline / max(float(np.median(view.disparity[index])), 0.5)
         self._densities = np.array(
             [
@@ -367,6 +379,7 @@ class StereoTracker:
         self, timestamp: float, status: str, matches: int, fit: _Fit | None, milliseconds: dict[str, float]
     ) -> Estimate:
         state = self._filter.state
+        knows = fit.state if fit is not None else state  # the offset as this frame alone adds to it
         # The filter knows the rectified camera; users know the left camera of their calibration.
         T_left_rectified = se3_inverse(self._T_rectified_left)
         adjoint = se3_adjoint(T_left_rectified)
@@ -382,7 +395,7 @@ class StereoTracker:
             inliers=len(fit.rows) if fit is not None else 0,
             nis=fit.result.nis if fit is not None else 0.0,
             dof=fit.result.dof if fit is not None else 0,
-            calibration=CalibrationEstimate(float(state.offset[0]), float(np.sqrt(max(state.covariance[12, 12], 0.0)))),
+            calibration=CalibrationEstimate(float(knows.offset[0]), float(np.sqrt(knows.offset_variance))),
             milliseconds=milliseconds,
         )
 
