@@ -17,24 +17,13 @@ from sigmaslam.camera import StereoCamera
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path, atomic_write_text
 from sigmaslam.landmarks import PointMap
-from sigmaslam.report import write_report
+from sigmaslam.report import COLUMNS, write_report
 from sigmaslam.session import shipped_weights
 from sigmaslam.tracker import CalibrationEstimate, Estimate
 from sigmaslam.trajectory import Trajectory, write_kitti, write_tum
 
 STAGES = ("read", "features", "match", "filter", "map")
-_COLUMNS = (
-    "timestamp",
-    "status",
-    "matches",
-    "inliers",
-    "nis",
-    "dof",
-    "belief",
-    "disparity_offset",
-    "disparity_offset_sigma",
-    *(f"ms_{stage}" for stage in STAGES),
-)
+_COLUMNS = (COLUMNS[0], "status", *COLUMNS[1:], *(f"ms_{stage}" for stage in STAGES))
 _GRAPHS = ("features.onnx", "pose_predict.onnx", "pose_innovate.onnx", "pose_update.onnx")
 
 
