@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from sigmaslam.errors import SigmaSlamError
 from sigmaslam.outputs import RunWriter, describe_camera
@@ -67,10 +67,8 @@ def track_sequence(
 
 def _track(sequence: StereoSequence, tracker: StereoTracker, writer: RunWriter) -> None:
     with Progress(
-        TextColumn("tracking"),
-        BarColumn(),
+        BarColumn(bar_width=16),
         MofNCompleteColumn(),
-        TimeElapsedColumn(),
         TimeRemainingColumn(),
         TextColumn("{task.fields[note]}"),
         console=Console(stderr=True),
@@ -95,4 +93,4 @@ def _track(sequence: StereoSequence, tracker: StereoTracker, writer: RunWriter) 
 
 
 def _note(estimate: Estimate, rate: float) -> str:
-    return f"{rate:.1f} frames/s, {estimate.inliers} inliers, belief {estimate.belief:.3f}, {estimate.status}"
+    return f"{rate:.1f}/s, {estimate.inliers} inliers, belief {estimate.belief:.3f}, {estimate.status}"

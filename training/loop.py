@@ -149,7 +149,8 @@ def train(out: Path, config: TrainingConfig, workers: int = 1, resume: bool = Fa
         "config": asdict(config),
         "seed": config.seed,
         "commit": commit,
-        "command": " ".join(["sigmaslam", *sys.argv[1:]]),
+        # The folder's name alone: where it lay on this machine is nobody's business.
+        "command": " ".join(["sigmaslam", *sys.argv[1:]]).replace(str(out), out.name),
         "duration_s": round(time.monotonic() - began, 1),
         "hardware": f"{os.cpu_count()} CPU cores, torch {torch.__version__}",
         "parameters": sum(p.numel() for p in network.parameters()),
