@@ -40,9 +40,13 @@ class PoseState:
         """Variance of the disparity offset, pixels squared."""
         return max(float(self.covariance[CALIBRATION, CALIBRATION].item()), 0.0)
 
-    def body_covariance(self) -> np.ndarray:
-        """(6, 6) covariance of the pose relative to the first, in the camera's frame, translation first."""
-        return _to_body(self.pose, self.covariance[POSE, POSE])
+    def body_covariance(self, origin: np.ndarray) -> np.ndarray:
+        """(6, 6) covariance of the pose in the camera's frame, translation first.
+
+        Args:
+            origin: (6, 6) covariance of where the filter's certainty began, as `PoseFilter.forget_origin` returns it.
+        """
+        return _to_body(self.pose, self.covariance[POSE, POSE] + origin)
 
     def relative_covariance(self) -> np.ndarray:
         """(6, 6) covariance of the pose relative to the keyframe, in the camera's frame, translation first."""
@@ -126,6 +130,20 @@ class PoseFilter:
         P[:, POSE] = P[:, CLONE]
         P[POSE, POSE] = P[CLONE, CLONE] + adjoint @ np.diag(sigma**2) @ adjoint.T
         self.state = replace(self.state, pose=pose, covariance=P)
+
+    def forget_origin(self) -> np.ndarray:
+        """Takes the current pose for certain and returns the covariance that it had, (6, 6), in the world.
+
+        For a new start from a pose that is hardly known: perturbations from the left that are common to pose and clone
+        cancel in what the images see, but exactly so only while they are small.
+        """
+        P = self.state.covariance.copy()
+        lost = P[POSE, POSE].copy()
+        for block in (POSE, CLONE):
+            P[block, :] = 0.0
+            P[:, block] = 0.0
+        self.state = replace(self.state, covariance=P)
+        return lost
 
     def clone_pose(self) -> None:
         """Makes the current pose the keyframe's."""

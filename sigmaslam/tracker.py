@@ -161,6 +161,7 @@ class StereoTracker:
         self._tracked_at = 0.0
         self._tracked_pose = np.eye(4)  # the pose at that time
         self._moving = False  # a velocity has been estimated
+        self._origin_covariance = np.zeros((6, 6))  # of the pose where tracking last started anew, in the world
 
     def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> Estimate:
         """Takes one stereo pair.
@@ -336,6 +337,7 @@ class StereoTracker:
             _LOGGER.warning(
                 "tracking starts anew at %.3f s, %.2f s after the last pose", timestamp, timestamp - self._tracked_at
             )
+            self._origin_covariance = self._origin_covariance + self._filter.forget_origin()
             self._anchor(timestamp)
             self._forget_twist()
 
@@ -383,12 +385,13 @@ class StereoTracker:
         # The filter knows the rectified camera; users know the left camera of their calibration.
         T_left_rectified = se3_inverse(self._T_rectified_left)
         adjoint = se3_adjoint(T_left_rectified)
-        relative = state.relative_covariance() if status == "tracking" else state.body_covariance()
+        absolute = state.body_covariance(self._origin_covariance)
+        relative = state.relative_covariance() if status == "tracking" else absolute
         belief = 1.0 - np.sqrt(max(np.linalg.eigvalsh(relative)[-1], 0.0))
         return Estimate(
             timestamp=timestamp,
             T_world_camera=T_left_rectified @ state.pose @ self._T_rectified_left,
-            covariance=adjoint @ state.body_covariance() @ adjoint.T,
+            covariance=adjoint @ absolute @ adjoint.T,
             status=status,
             belief=float(np.clip(belief, 0.0, 1.0)),
             matches=matches,

@@ -74,6 +74,33 @@ def test_frames_without_texture_are_lost_not_wrong_and_the_tracker_comes_back(de
         assert error @ np.linalg.solve(estimates[k].covariance, error) < 22.46  # chi-square, 6 dof, 99.9 %
 
 
+def test_a_new_start_after_a_long_loss_is_accurate_from_there_and_uncertain_from_before(demo):
+    """The world turns into its mirror image for good, five seconds pass: nothing matches, tracking starts anew.
+
+    The pose is then hardly known, but motion from there is as well known as ever.
+    """
+    camera, frames, truth = demo
+    mirrored = [
+        StereoFrame(f.index, f.timestamp + 5.0, np.fliplr(f.right).copy(), np.fliplr(f.left).copy())
+        for f in frames[8:20]
+    ]
+    estimates = track(StereoTracker(camera), frames[:8] + mirrored)
+    assert estimates[8].status == "lost"
+    assert [e.status for e in estimates[9:]] == ["tracking"] * 11
+    sigma = [np.sqrt(np.trace(e.covariance[:3, :3])) for e in estimates]
+    assert min(sigma[8:]) > 10 * max(sigma[:8])
+    # The mirrored left camera is the right one: same motion, seen from the baseline's other end, with x turned round.
+    mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
+    to_right = np.eye(4)
+    to_right[0, 3] = camera.baseline
+    right = [mirror @ pose @ to_right @ mirror for pose in truth.poses]
+    expected = se3_inverse(right[8]) @ right[19]
+    found = se3_inverse(estimates[8].T_world_camera) @ estimates[19].T_world_camera
+    error = se3_log(se3_inverse(expected) @ found)
+    assert np.linalg.norm(error[:3]) < 0.03
+    assert np.rad2deg(np.linalg.norm(error[3:])) < 0.3
+
+
 def test_dropped_frames_are_bridged_by_their_time(demo):
     camera, frames, truth = demo
     kept = [k for k in range(len(frames)) if k not in (7, 8, 15, 16, 17, 30)]
