@@ -24,6 +24,9 @@ _CHI_SQUARE_999 = np.array([0.0, 10.827566170662733, 13.815510557964274, 16.2662
 _CHI_SQUARE_99_2D = 9.21034037197618
 # A pose that fewer of the matches near the prediction agree with is not believed.
 _LEAST_SHARE = 0.3
+# A fit near the prediction with a larger NIS per degree of freedom may sit in a wrong place: it is checked against one
+# that does without the prediction.
+_DOUBTFUL_NIS = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,6 +127,10 @@ class _Fit:
     points: StereoPoints
     rows: np.ndarray
 
+    @property
+    def nis_per_dof(self) -> float:
+        return self.result.nis / max(self.result.dof, 1)
+
 
 class StereoTracker:
     """Tracks a moving stereo camera through a static scene, frame by frame, in bounded time.
@@ -160,7 +167,8 @@ class StereoTracker:
         self._timestamp: float | None = None
         self._tracked_at = 0.0
         self._tracked_pose = np.eye(4)  # the pose at that time
-        self._moving = False  # a velocity has been estimated
+        self._moving = False  # there has been a pose from the images
+        self._velocity_known = False  # since the last start
         self._origin_covariance = np.zeros((6, 6))  # of the pose where tracking last started anew, in the world
 
     def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> Estimate:
@@ -221,22 +229,24 @@ class StereoTracker:
             landmarks.measured, landmarks.sigma, np.tile(np.eye(3), (len(landmarks.index), 1, 1))
         )
         spread = np.linalg.eigvalsh(S[:, :2, :2])[:, 1]
-        fit = None
-        found: TemporalMatches | None = None
+        matches, fit = 0, None
         rows = np.flatnonzero(in_front & self._in_image(predicted))
-        if len(rows) >= self.config.least_inliers and np.median(spread[rows]) < self.config.search_limit**2:
+        enough = len(rows) >= self.config.least_inliers
+        if enough and self._velocity_known and np.median(spread[rows]) < self.config.search_limit**2:
             radius = np.sqrt(_CHI_SQUARE_99_2D * spread[rows]) + 1.0
             found = self._frontend.match(self._keyframe.view, landmarks.index[rows], view, predicted[rows, :2], radius)
             clock.lap("match")
-            fit = self._fit(found)
+            matches, fit = len(found.key_index), self._fit(found)
             clock.lap("filter")
-        if fit is None:
+        if fit is None or fit.nis_per_dof > _DOUBTFUL_NIS:
             anywhere = np.full(len(landmarks.index), np.inf)
             found = self._frontend.match(self._keyframe.view, landmarks.index, view, predicted[:, :2], anywhere)
             clock.lap("match")
-            fit = self._fit_without_prediction(found, timestamp)
+            other = self._fit_without_prediction(found, timestamp)
             clock.lap("filter")
-        return len(found.key_index) if found is not None else 0, fit
+            if fit is None or (other is not None and other.nis_per_dof < fit.nis_per_dof):
+                matches, fit = len(found.key_index), other
+        return matches, fit
 
     def _in_image(self, predicted: np.ndarray) -> np.ndarray:
         u, v = predicted[:, 0], predicted[:, 1]
@@ -314,7 +324,7 @@ class StereoTracker:
         faded = len(fit.rows) < self.config.keyframe_ratio * self._keyframe.first_inliers
         self._filter.state = fit.state
         self._anchor(timestamp)
-        self._moving = True
+        self._moving = self._velocity_known = True
         known = np.isfinite(fit.points.measurement[:, 2])
         self._keyframe.landmarks.observe(
             fit.rows[known],
@@ -340,6 +350,7 @@ class StereoTracker:
             self._origin_covariance = self._origin_covariance + self._filter.forget_origin()
             self._anchor(timestamp)
             self._forget_twist()
+            self._velocity_known = False
 
     def _take_keyframe(self, view: StereoView) -> bool:
         """Makes this view the keyframe if it has enough stereo points."""
