@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import yaml
 
+from sigmaslam.camera import CalibrationYaml
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text
 from sigmaslam.rotation import matrix_to_quaternion, nearest_rotation, quaternion_to_matrix
@@ -226,13 +226,10 @@ def _camera_in_body(truth: Path) -> np.ndarray:
             f"{truth}: EuRoC truth is of the body, and no cam0/sensor.yaml or cam0_sensor.yaml with T_BS is "
             f"in {folders[0]} or the two folders above: put it there, or convert the truth to TUM form"
         )
-    # OpenCV's "%YAML:1.0" is no YAML directive, so PyYAML rejects the file with it.
-    lines = sensor.read_text(encoding="utf-8").splitlines()
-    text = "\n".join(line for line in lines if not line.startswith("%YAML"))
+    entries = CalibrationYaml.read(sensor).entries
     try:
-        values = yaml.safe_load(text)["T_BS"]["data"]
-        T_body_camera = np.array(values, dtype=np.float64).reshape(4, 4)
-    except (yaml.YAMLError, KeyError, TypeError, ValueError) as error:
+        T_body_camera = np.array(entries["T_BS"]["data"], dtype=np.float64).reshape(4, 4)
+    except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{sensor}: T_BS: data must be a list of 16 numbers by rows ({error})") from error
     T_body_camera[:3, :3] = nearest_rotation(T_body_camera[:3, :3])
     return T_body_camera
