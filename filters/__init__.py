@@ -1,1 +1,46 @@
-"""Batched Bayesian filters in torch."""
+"""Batched Bayesian filters and inference in torch: see docs/filters.md."""
+
+from sigmaslam.filters.bayes import BayesFilter, ExtendedKalmanFilter, KalmanFilter, UnscentedKalmanFilter
+from sigmaslam.filters.belief import degree_of_belief
+from sigmaslam.filters.failure import FilterError
+from sigmaslam.filters.gaussian import Gaussian
+from sigmaslam.filters.layout import stack
+from sigmaslam.filters.manifolds import SE2, SE3, SO2, SO3, Euclidean, Manifold, Product
+from sigmaslam.filters.models import LinearMeasurement, LinearMotion, MeasurementModel, MotionModel, wrap_angle
+from sigmaslam.filters.noise import BlockDiagonal, Dense, Diagonal
+from sigmaslam.filters.results import Prediction, Update
+from sigmaslam.filters.sequence import Track
+from sigmaslam.filters.sigma_points import Simplex, cubature, julier, merwe
+
+__all__ = [
+    "SE2",
+    "SE3",
+    "SO2",
+    "SO3",
+    "BayesFilter",
+    "BlockDiagonal",
+    "Dense",
+    "Diagonal",
+    "Euclidean",
+    "ExtendedKalmanFilter",
+    "FilterError",
+    "Gaussian",
+    "KalmanFilter",
+    "LinearMeasurement",
+    "LinearMotion",
+    "Manifold",
+    "MeasurementModel",
+    "MotionModel",
+    "Prediction",
+    "Product",
+    "Simplex",
+    "Track",
+    "UnscentedKalmanFilter",
+    "Update",
+    "cubature",
+    "degree_of_belief",
+    "julier",
+    "merwe",
+    "stack",
+    "wrap_angle",
+]

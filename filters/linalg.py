@@ -25,7 +25,8 @@ def cholesky(matrix: Tensor) -> Tensor:
     size = matrix.shape[-1]
     rest = matrix
     columns = []
-    tolerance = torch.tensor(_PIVOT_TOLERANCE, dtype=matrix.dtype, device=matrix.device)
+    share = _PIVOT_TOLERANCE * torch.finfo(matrix.dtype).eps / torch.finfo(torch.float64).eps
+    tolerance = torch.tensor(share, dtype=matrix.dtype, device=matrix.device)
     diagonal = torch.diagonal(matrix, dim1=-2, dim2=-1)
     below = torch.ones(size, size, dtype=matrix.dtype, device=matrix.device).tril()
     for j in range(size):

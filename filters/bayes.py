@@ -1,0 +1,365 @@
+"""Kalman, extended and unscented filters: one Bayes filter (9.21) that differs in how a Gaussian meets a function."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from sigmaslam.filters.factors import apply, finite, multiply, solve_lower_transposed, square, triangularise
+from sigmaslam.filters.failure import POLICIES, OnFailure, jittered, raise_unless_healthy
+from sigmaslam.filters.gaussian import Gaussian
+from sigmaslam.filters.manifolds import Manifold
+from sigmaslam.filters.models import AnyMeasurement, AnyMotion, LinearMeasurement, LinearMotion
+from sigmaslam.filters.noise import Noise, as_noise
+from sigmaslam.filters.results import Prediction, Update
+from sigmaslam.filters.sequence import Track, filter_sequence, smooth
+from sigmaslam.filters.sigma_points import Columns, SigmaPoints, cubature
+from sigmaslam.filters.small import join
+from sigmaslam.filters.transforms import Difference, Exact, Taylor, Transform, Transformed, Unscented
+from sigmaslam.filters.updates import FORMS, Form, Solution, choose_form, log_likelihood, solve
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BayesFilter:
+    """Predict and correct, for any number of filters at once.
+
+    Made by `KalmanFilter`, `ExtendedKalmanFilter` and `UnscentedKalmanFilter`.
+
+    Attributes:
+        transform: how a Gaussian goes through a function.
+        space: manifold of the state; None: R^n.
+        form: of the update, see `sigmaslam.filters.updates`; "auto" chooses by shapes and dtype. "qr" goes on with
+            square roots, "dense" and "low-rank" with covariances.
+        iterations: linearisations of an update, from the second on at the posterior of the one before (posterior
+            linearisation, García-Fernández et al. 2015; with derivatives, the iterated EKF). Take 2 for a start-up.
+        on_failure: see `sigmaslam.filters.failure`.
+    """
+
+    transform: Transform
+    space: Manifold | None = None
+    form: Form | Literal["auto"] = "auto"
+    iterations: int = 1
+    on_failure: OnFailure = "raise"
+
+    def __post_init__(self) -> None:
+        if self.form != "auto" and self.form not in FORMS:
+            raise ValueError(f"form is {self.form!r}; choose auto, {', '.join(FORMS)}")
+        if self.on_failure not in POLICIES:
+            raise ValueError(f"on_failure is {self.on_failure!r}; choose {', '.join(POLICIES)}")
+        if self.iterations < 1:
+            raise ValueError(f"iterations is {self.iterations}; it must be at least 1")
+
+    def predict(self, belief: Gaussian, motion: AnyMotion, *inputs: Tensor) -> Prediction:
+        """The belief after a motion: the "action" of (9.21); (9.22), Table 9.1 and steps 2 and 3 of Table 9.2.
+
+        Args:
+            belief: batch (...,).
+            motion: see `MotionModel`; noise and matrices broadcast over the batch.
+            inputs: passed on to the motion's function, each of batch shape (..., ·): controls, time steps.
+        Raises:
+            FilterError: an element's covariance is not positive semidefinite or not finite, and on_failure is "raise".
+            ValueError: shapes do not fit.
+        """
+        root, healthy = self._root(belief)
+        noise = as_noise(motion.noise)
+        moved = self._move(belief.mean, root, motion, noise, inputs)
+        mean = moved.mean if moved.reference is None else moved.reference
+        columns, entering, noise_matrix = moved.columns, None, None
+        if _is_additive(motion):
+            entering, noise_matrix = noise, motion.noise_matrix
+        else:
+            columns = _with_noise_columns(columns, root.shape[-1])
+        if self._by_root(belief):
+            factor = _predicted_factor(columns, entering, noise_matrix)
+            predicted = Gaussian(mean, factor=factor, factor_is_lower=True)
+        else:
+            predicted = Gaussian(mean, _predicted_covariance(columns, entering, noise_matrix))
+        healthy = _both(finite(mean, predicted.held), healthy)
+        predicted = self._deal_with(healthy, predicted, belief, "predict", {})
+        return Prediction(predicted, healthy, root, columns, entering, noise_matrix)
+
+    def update(self, belief: Gaussian, measurement: AnyMeasurement, value: Tensor, *inputs: Tensor) -> Update:
+        """The belief after a measurement: the "perception" of (9.21); Table 9.1 and steps 4 to 7 of Table 9.2.
+
+        Args:
+            belief: batch (...,).
+            measurement: see `MeasurementModel`; noise and matrices broadcast over the batch.
+            value: (..., m) what was measured; NaN for a component that is missing.
+            inputs: passed on to the measurement's function, each of batch shape (..., ·): landmarks, calibration.
+        Raises:
+            FilterError: an element's covariance or innovation covariance is not positive semidefinite or not finite,
+                and on_failure is "raise".
+            ValueError: shapes do not fit.
+        """
+        root, healthy = self._root(belief)
+        noise = as_noise(measurement.noise)
+        value, mask, count = _without_missing(value, measurement.mask)
+        noise = noise if mask is None else noise.masked(mask)
+        added = noise if _is_additive(measurement) else None
+        solution: Solution | None = None
+        for _ in range(1 if isinstance(measurement, LinearMeasurement) else self.iterations):
+            innovation, columns = self._innovate(belief.mean, root, measurement, noise, value, inputs, solution)
+            if mask is not None:
+                innovation, columns = torch.where(mask, innovation, 0.0), _masked(columns, mask, added is None)
+            form = self._form(belief, columns, innovation.shape[-1], added is not None)
+            previous, solution = solution, solve(form, innovation, columns, added, root)
+            if previous is None:
+                first = (innovation, columns, solution)
+        assert solution is not None
+        posterior = self._correct(belief, solution)
+        healthy = _both(_both(finite(posterior.mean, posterior.held), solution.healthy), healthy)
+        suspects = {} if solution.matrix is None else {"innovation covariance": solution.matrix}
+        posterior = self._deal_with(healthy, posterior, belief, "update", suspects)
+        innovation, columns, at_prior = first
+        evidence = log_likelihood(at_prior, count)
+        return Update(posterior, innovation, at_prior.nis, evidence, healthy, form, count, columns, added, root)
+
+    def filter(
+        self,
+        belief: Gaussian,
+        motion: AnyMotion,
+        measurement: AnyMeasurement,
+        values: Tensor,
+        motion_inputs: Sequence[Tensor] = (),
+        measurement_inputs: Sequence[Tensor] = (),
+    ) -> Track:
+        """A whole sequence of T measurements (T, ..., m), see `sigmaslam.filters.sequence.filter_sequence`."""
+        return filter_sequence(self, belief, motion, measurement, values, motion_inputs, measurement_inputs)
+
+    def smooth(self, track: Track) -> Gaussian:
+        """Beliefs (T, ...) given all measurements, see `sigmaslam.filters.sequence.smooth`."""
+        return smooth(self, track)
+
+    def _by_root(self, belief: Gaussian) -> bool:
+        if self.form != "auto":
+            return self.form == "qr"
+        return belief.is_square_root or torch.finfo(belief.mean.dtype).bits < 64
+
+    def _form(self, belief: Gaussian, columns: Columns, measurements: int, additive: bool) -> Form:
+        if self.form != "auto":
+            return self.form
+        return "qr" if self._by_root(belief) else choose_form(columns, measurements, additive)
+
+    def _root(self, belief: Gaussian) -> tuple[Tensor, Tensor | None]:
+        """Lower root of the covariance (..., n, n), and whether it exists (...,); mended if that is the policy."""
+        root, healthy = belief.checked_factor()
+        if self.on_failure == "jitter" and healthy is not None:
+            root = jittered(belief.covariance, root, healthy)
+        return root, healthy
+
+    @property
+    def chart(self) -> Difference | None:
+        """(points, reference) -> tangent at the reference; None in R^n, where it is their difference."""
+        space = self.space
+        if space is None or space.flat:
+            return None
+        return lambda points, reference: space.local(reference, points)
+
+    def retract(self, point: Tensor, tangent: Tensor) -> Tensor:
+        """point [+] tangent."""
+        return point + tangent if self.space is None else self.space.retract(point, tangent)
+
+    def carry(self, point: Tensor, shift: Tensor | None, root: Tensor, target: Tensor) -> list[Tensor]:
+        """Deviations (..., n, c) in the chart at `target` of a belief in the chart at `point`, with a mean off by `shift`.
+
+        In R^n they are the root itself.
+        """
+        chart = self.chart
+        if chart is None:
+            return [root]
+        return self.transform(
+            lambda offsets: chart(self.retract(point, offsets if shift is None else shift + offsets), target),
+            root,
+            None,
+        ).columns.all()
+
+    def _move(
+        self, mean: Tensor, root: Tensor, motion: AnyMotion, noise: Noise, inputs: tuple[Tensor, ...]
+    ) -> Transformed:
+        if isinstance(motion, LinearMotion):
+            if self.chart is not None:
+                raise TypeError("LinearMotion is for states in R^n; use MotionModel on a manifold")
+            return Transformed(None, motion.function(mean, *inputs), Columns(multiply(motion.matrix, root)))
+        size = root.shape[-1]
+        jacobian = None
+        if isinstance(self.transform, Taylor) and motion.jacobian is not None:
+            jacobian = motion.jacobian(mean, *inputs)
+
+        def evaluate(offsets: Tensor) -> Tensor:
+            if motion.additive:
+                return motion.function(self.retract(mean, offsets), *inputs)
+            return motion.function(self.retract(mean, offsets[..., :size]), offsets[..., size:], *inputs)
+
+        columns = root if motion.additive else _block_diagonal(root, noise.factor())
+        return self.transform(evaluate, columns, self.chart, self.retract, jacobian)
+
+    def _innovate(
+        self,
+        mean: Tensor,
+        root: Tensor,
+        measurement: AnyMeasurement,
+        noise: Noise,
+        value: Tensor,
+        inputs: tuple[Tensor, ...],
+        previous: Solution | None,
+    ) -> tuple[Tensor, Columns]:
+        """Innovation and deviations of a linearisation at the prior, or at the posterior of the previous one."""
+        if isinstance(measurement, LinearMeasurement):
+            if self.chart is not None or inputs:
+                raise TypeError("LinearMeasurement is for states in R^n and takes no inputs; use MeasurementModel")
+            innovation = value - measurement.function(mean)
+            return innovation, Columns(multiply(measurement.matrix, root))
+        size = root.shape[-1]
+        shift = None if previous is None else previous.shift
+        columns = root if previous is None else previous.factor()
+        jacobian = None
+        # A given derivative is in the chart of the point that it is taken at, which is the prior's only at first.
+        in_chart = shift is None or self.chart is None
+        if isinstance(self.transform, Taylor) and measurement.jacobian is not None and in_chart:
+            jacobian = measurement.jacobian(mean if shift is None else mean + shift, *inputs)
+
+        def evaluate(offsets: Tensor) -> Tensor:
+            moved = offsets if measurement.additive else offsets[..., :size]
+            state = self.retract(mean, moved if shift is None else shift + moved)
+            if measurement.additive:
+                return measurement.function(state, *inputs)
+            return measurement.function(state, offsets[..., size:], *inputs)
+
+        offsets = columns if measurement.additive else _block_diagonal(columns, noise.factor())
+        seen = self.transform(evaluate, offsets, measurement.residual, None, jacobian)
+        if seen.mean.shape[-1] != value.shape[-1]:
+            raise ValueError(
+                f"the measurement's function returns {seen.mean.shape[-1]} components, the value has {value.shape[-1]}"
+            )
+        if seen.reference is None or measurement.residual is None:
+            innovation = value - seen.mean
+        else:
+            innovation = measurement.residual(value, seen.reference) - seen.mean
+        found = seen.columns if measurement.additive else _with_noise_columns(seen.columns, size)
+        if shift is None:
+            return innovation, found
+        # The slope was taken along the posterior's root; the update wants it along the prior's.
+        slope = solve_lower_transposed(columns, found.odd.mT).mT
+        odd = multiply(slope, root)
+        return innovation + apply(slope, shift), Columns(odd, found.even, found.negative)
+
+    def _correct(self, belief: Gaussian, solution: Solution) -> Gaussian:
+        """The posterior of the state, with its covariance in the chart at the new mean."""
+        mean = self.retract(belief.mean, solution.shift)
+        if self.chart is None:
+            if solution.root is not None:
+                return Gaussian(mean, factor=solution.root, factor_is_lower=True)
+            return Gaussian(mean, solution.covariance)
+        carried = self.carry(belief.mean, solution.shift, solution.factor(), mean)
+        if solution.root is not None:
+            return Gaussian(mean, factor=triangularise(carried), factor_is_lower=True)
+        return Gaussian(mean, square(carried))
+
+    def _deal_with(
+        self, healthy: Tensor, result: Gaussian, before: Gaussian, stage: str, suspects: dict[str, Tensor]
+    ) -> Gaussian:
+        if self.on_failure == "raise":
+            raise_unless_healthy(healthy, stage, lambda: {"prior covariance": before.covariance, **suspects})
+            return result
+        return result.where(healthy, before)
+
+
+def KalmanFilter(  # noqa: N802 - three names for users, one class
+    *, form: Form | Literal["auto"] = "auto", on_failure: OnFailure = "raise"
+) -> BayesFilter:
+    """For linear models, (9.22)-(9.25)."""
+    return BayesFilter(Exact(), None, form, 1, on_failure)
+
+
+def ExtendedKalmanFilter(  # noqa: N802
+    space: Manifold | None = None,
+    *,
+    form: Form | Literal["auto"] = "auto",
+    iterations: int = 1,
+    on_failure: OnFailure = "raise",
+) -> BayesFilter:
+    """First derivatives at the mean, (9.26) and Table 9.1; attributes as `BayesFilter`."""
+    return BayesFilter(Taylor(), space, form, iterations, on_failure)
+
+
+def UnscentedKalmanFilter(  # noqa: N802
+    space: Manifold | None = None,
+    points: SigmaPoints | None = None,
+    *,
+    form: Form | Literal["auto"] = "auto",
+    iterations: int = 1,
+    on_failure: OnFailure = "raise",
+) -> BayesFilter:
+    """Sigma points, Table 9.2; `points` from `sigmaslam.filters.sigma_points`, by default `cubature()`."""
+    return BayesFilter(Unscented(points or cubature()), space, form, iterations, on_failure)
+
+
+def _is_additive(model: AnyMotion | AnyMeasurement) -> bool:
+    return isinstance(model, LinearMotion | LinearMeasurement) or model.additive
+
+
+def _both(first: Tensor, second: Tensor | None) -> Tensor:
+    return first if second is None else first & second
+
+
+def _with_noise_columns(columns: Columns, size: int) -> Columns:
+    """Columns of a transform of state and noise: those of the noise, after the first `size`, are not the state's."""
+    noise = columns.odd[..., size:]
+    even = noise if columns.even is None else join([noise, columns.even])
+    return Columns(columns.odd[..., :size], even, columns.negative)
+
+
+def _predicted_factor(columns: Columns, noise: Noise | None, noise_matrix: Tensor | None) -> Tensor:
+    if columns.negative is not None:
+        raise ValueError("square roots need sigma weights that are not negative; use form='dense'")
+    if noise is None:
+        return triangularise(columns.all())
+    if noise_matrix is None:
+        return noise.triangularised(columns.all())
+    return triangularise([*columns.all(), multiply(noise_matrix, noise.factor())])
+
+
+def _predicted_covariance(columns: Columns, noise: Noise | None, noise_matrix: Tensor | None) -> Tensor:
+    covariance = square(columns.all())
+    if columns.negative is not None:
+        covariance = covariance - square([columns.negative])
+    if noise is None:
+        return covariance
+    if noise_matrix is None:
+        return covariance + noise.covariance()
+    return covariance + multiply(multiply(noise_matrix, noise.covariance()), noise_matrix.mT)
+
+
+def _without_missing(value: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None, Tensor | int]:
+    """Value with zeros for what is missing, mask (..., m) if anything can be, and the number of components."""
+    present = ~torch.isnan(value)
+    # Whether anything is missing is worth a look on a CPU; compiled or on a GPU the look costs more than the mask.
+    if mask is None and value.device.type == "cpu" and not torch.compiler.is_compiling() and bool(present.all()):
+        return value, None, value.shape[-1]
+    present = present if mask is None else present & mask
+    return torch.where(present, value, 0.0), present, present.sum(dim=-1)
+
+
+def _masked(columns: Columns, mask: Tensor, unit_noise: bool) -> Columns:
+    """Columns with zero rows where the mask is False; with unit noise of their own if no noise is added to them."""
+    rows = mask.unsqueeze(-1)
+    odd = torch.where(rows, columns.odd, 0.0)
+    even = None if columns.even is None else torch.where(rows, columns.even, 0.0)
+    if unit_noise:
+        unit = torch.diag_embed((~mask).to(odd.dtype)).expand(*odd.shape[:-1], odd.shape[-2])
+        even = unit if even is None else join([even, unit])
+    negative = None if columns.negative is None else torch.where(rows, columns.negative, 0.0)
+    return Columns(odd, even, negative)
+
+
+def _block_diagonal(first: Tensor, second: Tensor) -> Tensor:
+    """(..., n, n) and (..., q, q) into (..., n + q, n + q)."""
+    n, q = first.shape[-1], second.shape[-1]
+    batch = torch.broadcast_shapes(first.shape[:-2], second.shape[:-2])
+    upper = torch.nn.functional.pad(first, (0, q)).expand(*batch, n, n + q)
+    lower = torch.nn.functional.pad(second, (n, 0)).expand(*batch, q, n + q)
+    return torch.cat([upper, lower], dim=-2)

@@ -1,0 +1,150 @@
+"""Triangular factors of covariances, by LAPACK or unrolled, whichever suits the shapes; bad elements are flagged.
+
+No function here raises for one bad element of a batch or adds anything to a diagonal (R8).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from sigmaslam.filters import linalg, small
+
+# Round-off of an exact zero, in units of the dtype's epsilon: a clone is a copy of a pose, a first pose is known.
+_TOLERANCE = 450
+
+
+def cholesky(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Lower factor L, L L^T = matrix, of positive semidefinite matrices.
+
+    Args:
+        matrix: (..., n, n) symmetric; the lower triangle is read. Exactly known or copied directions are allowed.
+    Returns:
+        (..., n, n) lower triangular factor; (...,) bool, True where the matrix is positive semidefinite and finite.
+        Where it is not, the factor is arbitrary.
+    """
+    tolerance = _TOLERANCE * torch.finfo(matrix.dtype).eps
+    if small.is_small(matrix):
+        return small.cholesky(matrix, tolerance)
+    factor, failure = torch.linalg.cholesky_ex(matrix)
+    healthy = failure == 0
+    if torch.compiler.is_compiling() or bool(healthy.all()):
+        return factor, healthy
+    # LAPACK knows positive definite matrices only.
+    semidefinite = linalg.cholesky(matrix)
+    error = (semidefinite @ semidefinite.mT - matrix).tril().abs().amax(dim=(-2, -1))
+    scale = torch.diagonal(matrix, dim1=-2, dim2=-1).abs().amax(dim=-1)
+    restored = error <= 4 * tolerance**0.5 * scale  # False for NaN
+    chosen = torch.where(healthy[..., None, None], factor, semidefinite)
+    return chosen, healthy | restored
+
+
+def triangularise(pieces: Sequence[Tensor], diagonal: Tensor | None = None) -> Tensor:
+    """Lower factor L, L L^T = A A^T for A = [pieces side by side, diag(diagonal)], by QR of A^T.
+
+    A A^T is never formed, so float32 keeps its seven digits of the *root* (R7).
+
+    Args:
+        pieces: (..., n, c_i) each, broadcastable in their leading dimensions.
+        diagonal: (..., n), or None.
+    Returns:
+        (..., n, n) lower triangular with a non-negative diagonal; NaN where a piece has one.
+    """
+    pieces = _broadcast(pieces, None if diagonal is None else diagonal.shape[:-1])
+    size = pieces[0].shape[-2]
+    columns = sum(piece.shape[-1] for piece in pieces)
+    if small.is_small(pieces[0], columns):
+        return small.triangularise(pieces, diagonal)
+    if diagonal is not None:
+        pieces = _broadcast([*pieces, torch.diag_embed(diagonal)])
+        columns += size
+    stacked = torch.cat(pieces, dim=-1) if len(pieces) > 1 else pieces[0]
+    # The backward pass needs Q; without one it need not be formed.
+    mode = "reduced" if torch.is_grad_enabled() and stacked.requires_grad else "r"
+    upper = torch.linalg.qr(stacked.mT, mode=mode).R
+    # Signs of a QR are arbitrary. A root does not mind, but sigma points should not depend on the form.
+    sign = 1.0 - 2.0 * torch.signbit(torch.diagonal(upper, dim1=-2, dim2=-1)).to(upper.dtype)
+    lower = (upper * sign.unsqueeze(-1)).mT
+    return torch.nn.functional.pad(lower, (0, size - columns)) if columns < size else lower
+
+
+def solve_lower(factor: Tensor, right: Tensor) -> Tensor:
+    """L^-1 B for lower triangular L (..., n, n) and B (..., n, c); a zero pivot is a known direction."""
+    if small.is_small(factor, right.shape[-1]):
+        return small.solve_lower(factor, right)
+    return torch.linalg.solve_triangular(_without_zero_pivots(factor), right, upper=False)
+
+
+def solve_lower_transposed(factor: Tensor, right: Tensor) -> Tensor:
+    """L^-T B for lower triangular L (..., n, n) and B (..., n, c); a zero pivot is a known direction."""
+    if small.is_small(factor, right.shape[-1]):
+        return small.solve_lower_transposed(factor, right)
+    return torch.linalg.solve_triangular(_without_zero_pivots(factor).mT, right, upper=True)
+
+
+def multiply(left: Tensor, right: Tensor) -> Tensor:
+    """Matrix product (..., r, k) @ (..., k, c)."""
+    if small.is_small(left, right.shape[-1]) or (left.shape[-2] <= small.ROWS and small.is_small(right)):
+        return small.multiply(left, right)
+    return left @ right
+
+
+def square(pieces: Sequence[Tensor]) -> Tensor:
+    """A A^T for A = [pieces side by side], pieces (..., n, c_i) -> (..., n, n)."""
+    total = None
+    for piece in pieces:
+        part = small.multiply(piece, piece.mT) if small.is_small(piece) else piece @ piece.mT
+        total = part if total is None else total + part
+    assert total is not None
+    return total
+
+
+def apply(matrix: Tensor, vector: Tensor) -> Tensor:
+    """Matrix times vector, (..., r, k), (..., k) -> (..., r)."""
+    if small.is_small(matrix) or (matrix.shape[-2] <= small.ROWS and small.is_small(vector.unsqueeze(-2))):
+        return small.apply(matrix, vector)
+    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
+
+
+def finite(vector: Tensor, matrix: Tensor) -> Tensor:
+    """Whether all entries of (..., n) and (..., r, c) are finite, (...,) bool."""
+    # Their sum is, unless it overflows; and what is not finite does not cancel against itself.
+    total = vector.sum(dim=-1) + matrix.sum(dim=(-2, -1))
+    return total - total == 0
+
+
+def log_diagonal(factor: Tensor) -> Tensor:
+    """Logarithm of the determinant of L L^T, (..., n, n) -> (...,)."""
+    return 2.0 * torch.log(torch.diagonal(factor, dim1=-2, dim2=-1)).sum(dim=-1)
+
+
+def identity(size: int, like: Tensor) -> Tensor:
+    """Identity (n, n) of the other's dtype and device."""
+    if torch.compiler.is_compiling():
+        return torch.eye(size, dtype=like.dtype, device=like.device)
+    return _kept_identity(size, like.dtype, like.device)
+
+
+@lru_cache(maxsize=64)
+def _kept_identity(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    return torch.eye(size, dtype=dtype, device=device)
+
+
+def _broadcast(pieces: Sequence[Tensor], other: torch.Size | None = None) -> list[Tensor]:
+    """Matrices (..., r, c_i) with one batch shape, that of the other included."""
+    batches = {piece.shape[:-2] for piece in pieces} | ({other} if other is not None else set())
+    if len(batches) == 1:
+        return list(pieces)
+    batch = torch.broadcast_shapes(*batches)
+    return [piece.expand(*batch, *piece.shape[-2:]) for piece in pieces]
+
+
+def _without_zero_pivots(factor: Tensor) -> Tensor:
+    """The factor with ones for zero pivots: their columns are zero, so no other unknown changes."""
+    diagonal = torch.diagonal(factor, dim1=-2, dim2=-1)
+    if not torch.compiler.is_compiling() and bool((diagonal != 0).all()):
+        return factor
+    return factor + torch.diag_embed((diagonal == 0).to(factor.dtype))

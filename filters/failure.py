@@ -1,0 +1,74 @@
+"""What happens when an element of a batch cannot be filtered: one policy, one flag, one message that teaches (R8, R14)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from sigmaslam.errors import SigmaSlamError
+from sigmaslam.filters.factors import cholesky
+
+# raise: FilterError. hold: the element keeps the belief it came with. jitter: a covariance that is not positive
+# semidefinite is given the smallest relative jitter that makes it so, and held when none does. hold and jitter flag the
+# element as not healthy; under torch.compile and on a GPU they cost no synchronisation, raise does.
+OnFailure = Literal["raise", "hold", "jitter"]
+POLICIES: tuple[OnFailure, ...] = ("raise", "hold", "jitter")
+
+_JITTERS = tuple(10.0**power for power in range(-12, -2))
+_SHOWN = 5
+
+
+class FilterError(SigmaSlamError):
+    """A filter cannot go on: the message names step, elements and the matrix."""
+
+
+def raise_unless_healthy(healthy: Tensor, stage: str, matrices: Callable[[], dict[str, Tensor]]) -> None:
+    """Raises for the first elements that are not healthy.
+
+    Args:
+        healthy: (...,) bool.
+        stage: what was being done.
+        matrices: makes the symmetric matrices (..., n, n) by name, in the order in which they are to be suspected.
+    Raises:
+        FilterError: an element is not healthy.
+    """
+    if bool(healthy.all()):
+        return
+    bad = (~healthy).nonzero().tolist()
+    shown = ", ".join(str(tuple(index)) for index in bad[:_SHOWN]) + (", ..." if len(bad) > _SHOWN else "")
+    where = f"batch elements {shown} ({len(bad)} of {healthy.numel()})" if healthy.ndim else "the filter"
+    raise FilterError(
+        f"{stage} failed for {where}: {_diagnosis(tuple(bad[0]), matrices())} "
+        "Check units and scales of prior and noise; on_failure='hold' or 'jitter' goes on without these elements."
+    )
+
+
+def jittered(covariance: Tensor, factor: Tensor, healthy: Tensor) -> Tensor:
+    """Factors (..., n, n) in which those that are not healthy are made with the smallest jitter that helps.
+
+    Args:
+        covariance: (..., n, n).
+        factor: (..., n, n) its lower factor where healthy (...,) bool.
+    """
+    largest = torch.diagonal(covariance, dim1=-2, dim2=-1).abs().amax(dim=-1, keepdim=True)
+    scale = torch.diag_embed(largest.expand(covariance.shape[:-1]))
+    usable = healthy
+    for jitter in _JITTERS:
+        tried, mended = cholesky(covariance + jitter * scale)
+        factor = torch.where((mended & ~usable)[..., None, None], tried, factor)
+        usable = usable | mended
+    return factor
+
+
+def _diagnosis(index: tuple[int, ...], matrices: dict[str, Tensor]) -> str:
+    for name, matrix in matrices.items():
+        element = matrix[index].detach()
+        if not bool(torch.isfinite(element).all()):
+            return f"the {name} of the first has entries that are not finite."
+        smallest = float(torch.linalg.eigvalsh(element)[0])
+        if smallest <= 0:
+            return f"the {name} of the first has the smallest eigenvalue {smallest:.3g}."
+    return "the result is not finite."

@@ -1,0 +1,158 @@
+"""A Gaussian belief over states, by its covariance or by a square root of it."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from sigmaslam.filters.factors import cholesky, square, triangularise
+
+
+class Gaussian:
+    """Mean and covariance, for any number of leading batch dimensions.
+
+    On a manifold the mean is a point, and the covariance that of the tangent vector v in mean [+] v.
+
+    Attributes:
+        mean: (..., p) point; p = n in R^n.
+    """
+
+    __slots__ = ("_covariance", "_factor", "_is_lower", "mean")
+
+    def __init__(
+        self,
+        mean: Tensor,
+        covariance: Tensor | None = None,
+        *,
+        factor: Tensor | None = None,
+        factor_is_lower: bool = False,
+    ) -> None:
+        """Takes the covariance, or instead of it a square root.
+
+        Args:
+            mean: (..., p).
+            covariance: (..., n, n) symmetric positive semidefinite; leading dimensions broadcast to the mean's.
+            factor: (..., n, k) any S with S S^T = covariance. A filter goes on with what it is given.
+            factor_is_lower: the factor is known to be lower triangular, which saves making it so.
+        Raises:
+            ValueError: both or neither are given, or a shape or dtype does not fit.
+        """
+        if (covariance is None) == (factor is None):
+            raise ValueError("a Gaussian needs either a covariance or a factor of it")
+        given = covariance if covariance is not None else factor
+        assert given is not None
+        if mean.ndim < 1 or given.ndim < 2 or (covariance is not None and given.shape[-1] != given.shape[-2]):
+            kind = "covariance (..., n, n)" if covariance is not None else "factor (..., n, k)"
+            raise ValueError(f"mean (..., p) and {kind} expected, got {tuple(mean.shape)} and {tuple(given.shape)}")
+        if mean.dtype != given.dtype or not mean.dtype.is_floating_point:
+            raise ValueError(f"mean and covariance need one floating dtype, got {mean.dtype} and {given.dtype}")
+        if given.shape[:-2] != mean.shape[:-1]:
+            try:
+                given = given.expand(*mean.shape[:-1], *given.shape[-2:])
+            except RuntimeError:
+                raise ValueError(
+                    f"batch of the covariance {tuple(given.shape[:-2])} does not broadcast to that of the mean "
+                    f"{tuple(mean.shape[:-1])}"
+                ) from None
+        self.mean = mean
+        self._covariance = given if covariance is not None else None
+        self._factor = given if covariance is None else None
+        self._is_lower = factor_is_lower
+
+    @property
+    def covariance(self) -> Tensor:
+        """(..., n, n)."""
+        if self._covariance is None:
+            assert self._factor is not None
+            return square([self._factor])
+        return self._covariance
+
+    @property
+    def factor(self) -> Tensor:
+        """(..., n, n) lower triangular root; meaningless where the covariance is not positive semidefinite."""
+        return self.checked_factor()[0]
+
+    def checked_factor(self) -> tuple[Tensor, Tensor | None]:
+        """Lower triangular root (..., n, n), and (...,) bool: the covariance is positive semidefinite.
+
+        The second is None for a belief that is held by a root, of which any is as good as another.
+        """
+        if self._covariance is not None:
+            return cholesky(self._covariance)
+        assert self._factor is not None
+        return self._factor if self._is_lower else triangularise([self._factor]), None
+
+    @property
+    def held(self) -> Tensor:
+        """The covariance (..., n, n) or the factor (..., n, k), whichever the belief is held by."""
+        held = self._covariance if self._covariance is not None else self._factor
+        assert held is not None
+        return held
+
+    @property
+    def is_square_root(self) -> bool:
+        """Whether the belief is held by a square root."""
+        return self._covariance is None
+
+    @property
+    def size(self) -> int:
+        """n, the number of tangent dimensions."""
+        return self.held.shape[-2]
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """Leading dimensions."""
+        return self.mean.shape[:-1]
+
+    def __getitem__(self, index: object) -> Gaussian:
+        """Elements of the batch: `belief[3]`, `belief[:, -1]`."""
+        mean = self.mean[_of_batch(index, 1)]
+        if self._covariance is not None:
+            return Gaussian(mean, self._covariance[_of_batch(index, 2)])
+        assert self._factor is not None
+        return self._like(mean, self._factor[_of_batch(index, 2)])
+
+    def where(self, chosen: Tensor, other: Gaussian) -> Gaussian:
+        """This belief where chosen (...,) bool is true, the other elsewhere; held as this one is."""
+        mean = torch.where(chosen.unsqueeze(-1), self.mean, other.mean)
+        mask = chosen[..., None, None]
+        if self._covariance is not None:
+            return Gaussian(mean, torch.where(mask, self._covariance, other.covariance))
+        return Gaussian(mean, factor=torch.where(mask, self.factor, other.factor), factor_is_lower=True)
+
+    def to(self, *arguments: object, **options: object) -> Gaussian:
+        """Another dtype or device, as `Tensor.to`."""
+        mean = self.mean.to(*arguments, **options)  # type: ignore[call-overload]
+        if self._covariance is not None:
+            return Gaussian(mean, self._covariance.to(*arguments, **options))  # type: ignore[call-overload]
+        assert self._factor is not None
+        return self._like(mean, self._factor.to(*arguments, **options))  # type: ignore[call-overload]
+
+    def batch_last(self) -> Gaussian:
+        """The same belief with batch-last memory: `mean[..., i]` is contiguous, and large batches run several times faster."""
+        mean = _with_batch_last_memory(self.mean, 1)
+        if self._covariance is not None:
+            return Gaussian(mean, _with_batch_last_memory(self._covariance, 2))
+        assert self._factor is not None
+        return self._like(mean, _with_batch_last_memory(self._factor, 2))
+
+    def _like(self, mean: Tensor, factor: Tensor) -> Gaussian:
+        return Gaussian(mean, factor=factor, factor_is_lower=self._is_lower)
+
+    def __repr__(self) -> str:
+        kind = "factor" if self.is_square_root else "covariance"
+        return f"Gaussian(mean {tuple(self.mean.shape)}, {kind}, n = {self.size}, {self.mean.dtype})"
+
+
+def _of_batch(index: object, trailing: int) -> tuple[object, ...]:
+    """An index of the batch dimensions made one of the whole array; an ellipsis stands for batch dimensions."""
+    given = index if isinstance(index, tuple) else (index,)
+    if not any(part is Ellipsis for part in given):
+        given = (*given, Ellipsis)
+    return (*given, *[slice(None)] * trailing)
+
+
+def _with_batch_last_memory(array: Tensor, trailing: int) -> Tensor:
+    last = tuple(range(-trailing, 0))
+    first = tuple(range(trailing))
+    return array.movedim(last, first).contiguous().movedim(first, last)

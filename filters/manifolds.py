@@ -1,0 +1,363 @@
+"""Spaces that states and measurements live in: R^n, angles, rotations, rigid motions, and products of them.
+
+A manifold is two functions and two sizes. Points and tangents are flat vectors with any leading dimensions:
+
+| Manifold      | Point (..., p)                                  | Tangent (..., n)                   |
+|---------------|-------------------------------------------------|------------------------------------|
+| Euclidean(n)  | the vector                                      | the difference                     |
+| SO2           | angle in (-pi, pi]                              | angle                              |
+| SE2           | x, y, angle in (-pi, pi]                        | x, y, angle                        |
+| SO3           | unit quaternion x, y, z, w                      | rotation vector                    |
+| SE3           | translation, unit quaternion x, y, z, w         | translation, rotation vector       |
+| Product(...)  | the points of its parts, end to end             | their tangents, end to end         |
+
+Functions are differentiable everywhere, and go through torch.func, vmap and torch.compile. Sizes that do not fit raise
+ValueError; arguments are never changed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
+
+import torch
+from torch import Tensor
+
+from sigmaslam.filters import groups
+from sigmaslam.filters.groups import Quaternion, Vector
+from sigmaslam.filters.layout import concatenate, stack
+
+
+class Manifold(Protocol):
+    """A space with a tangent space at each point: what a filter needs of it."""
+
+    @property
+    def point_size(self) -> int:
+        """Length p of a point."""
+        ...
+
+    @property
+    def tangent_size(self) -> int:
+        """Length n of a tangent."""
+        ...
+
+    @property
+    def flat(self) -> bool:
+        """Whether retract is addition and local is subtraction."""
+        ...
+
+    def retract(self, point: Tensor, tangent: Tensor) -> Tensor:
+        """The point that a tangent leads to, point [+] tangent: (..., p), (..., n) -> (..., p)."""
+        ...
+
+    def local(self, point: Tensor, other: Tensor) -> Tensor:
+        """The shortest tangent that leads to another point, other [-] point: (..., p), (..., p) -> (..., n)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Euclidean:
+    """R^n: retract adds, local subtracts.
+
+    Attributes:
+        size: n.
+    """
+
+    size: int
+    flat: ClassVar[bool] = True
+
+    @property
+    def point_size(self) -> int:
+        """Length of a point."""
+        return self.size
+
+    @property
+    def tangent_size(self) -> int:
+        """Length of a tangent."""
+        return self.size
+
+    def retract(self, point: Tensor, tangent: Tensor) -> Tensor:
+        """point + tangent, (..., n)."""
+        _check(self, point=point, tangent=tangent)
+        return point + tangent
+
+    def local(self, point: Tensor, other: Tensor) -> Tensor:
+        """other - point, (..., n)."""
+        _check(self, point=point, other=other)
+        return other - point
+
+
+@dataclass(frozen=True)
+class SO2:
+    """Angles, radians in (-pi, pi]."""
+
+    point_size: ClassVar[int] = 1
+    tangent_size: ClassVar[int] = 1
+    flat: ClassVar[bool] = False
+
+    def retract(self, point: Tensor, tangent: Tensor) -> Tensor:
+        """The sum as an angle, (..., 1)."""
+        _check(self, point=point, tangent=tangent)
+        return groups.wrap_angle(point + tangent)
+
+    def local(self, point: Tensor, other: Tensor) -> Tensor:
+        """The difference as an angle, (..., 1)."""
+        _check(self, point=point, other=other)
+        return groups.wrap_angle(other - point)
+
+
+@dataclass(frozen=True)
+class _Group:
+    side: str = "right"
+    flat: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        if self.side not in ("left", "right"):
+            raise ValueError(
+                f'{type(self).__name__}: side must be "right" (point * Exp(tangent)) or "left" (Exp(tangent) * point), '
+                f"got {self.side!r}"
+            )
+
+
+@dataclass(frozen=True)
+class SE2(_Group):
+    """Rigid motions of the plane: points (..., 3) are x, y, angle, tangents (..., 3) twists in the same order.
+
+    Attributes:
+        side: "right", point * Exp(v), where v is seen from the moving frame; or "left", Exp(v) * point, from the fixed.
+    """
+
+    point_size: ClassVar[int] = 3
+    tangent_size: ClassVar[int] = 3
+
+    def retract(self, point: Tensor, tangent: Tensor) -> Tensor:
+        """The motion of which the twist is taken, before or after the point: (..., 3), (..., 3) -> (..., 3)."""
+        _check(self, point=point, tangent=tangent)
+        x, y, angle = point.unbind(-1)
+        u, v, added = tangent.unbind(-1)
+        a, b = groups.exp_se2((u, v), added)
+        if self.side == "right":
+            a, b = groups.turn(torch.sin(angle), torch.cos(angle), (a, b))
+        else:
+            x, y = groups.turn(torch.sin(added), torch.cos(added), (x, y))
+        return stack([x + a, y + b, groups.wrap_angle(angle + added)])
+
+    def local(self, point: Tensor, other: Tensor) -> Tensor:
+        """The twist that retract takes from `point` to `other`: (..., 3), (..., 3) -> (..., 3)."""
+        _check(self, point=point, other=other)
+        x, y, angle = point.unbind(-1)
+        a, b, other_angle = other.unbind(-1)
+        between = groups.wrap_angle(other_angle - angle)
+        if self.side == "right":
+            step = groups.turn(-torch.sin(angle), torch.cos(angle), (a - x, b - y))
+        else:
+            x, y = groups.turn(torch.sin(between), torch.cos(between), (x, y))
+            step = (a - x, b - y)
+        return stack([*groups.log_se2(step, between), between])
+
+    def from_matrix(self, matrix: Tensor) -> Tensor:
+        """Points (..., 3) of homogeneous matrices (..., 3, 3)."""
+        _check_matrix(self, matrix, 3)
+        angle = torch.atan2(matrix[..., 1, 0], matrix[..., 0, 0])
+        return stack([matrix[..., 0, 2], matrix[..., 1, 2], groups.wrap_angle(angle)])
+
+    def to_matrix(self, point: Tensor) -> Tensor:
+        """Homogeneous matrices (..., 3, 3) of points (..., 3)."""
+        _check(self, point=point)
+        x, y, angle = point.unbind(-1)
+        sine, cosine = torch.sin(angle), torch.cos(angle)
+        rotation = torch.stack([torch.stack([cosine, -sine], dim=-1), torch.stack([sine, cosine], dim=-1)], dim=-2)
+        return _homogeneous(rotation, torch.stack([x, y], dim=-1))
+
+
+@dataclass(frozen=True)
+class SO3(_Group):
+    """Rotations: points (..., 4) are unit quaternions x, y, z, w of either sign, tangents (..., 3) rotation vectors.
+
+    Attributes:
+        side: "right", point * Exp(v), where v is seen from the moving frame; or "left", Exp(v) * point, from the fixed.
+    """
+
+    point_size: ClassVar[int] = 4
+    tangent_size: ClassVar[int] = 3
+
+    def retract(self, point: Tensor, tangent: Tensor) -> Tensor:
+        """The rotation of which the vector is taken, at unit length: (..., 4), (..., 3) -> (..., 4)."""
+        _check(self, point=point, tangent=tangent)
+        added = groups.exp_so3(_vector(tangent))
+        return stack(groups.normalise(_product(self.side, _quaternion(point), added)))
+
+    def local(self, point: Tensor, other: Tensor) -> Tensor:
+        """The rotation vector that takes `point` to `other`: (..., 4), (..., 4) -> (..., 3)."""
+        _check(self, point=point, other=other)
+        return stack(groups.log_so3(_product(self.side, groups.conjugate(_quaternion(point)), _quaternion(other))))
+
+    def from_matrix(self, matrix: Tensor) -> Tensor:
+        """Points (..., 4), with w >= 0, of rotation matrices (..., 3, 3)."""
+        _check_matrix(self, matrix, 3)
+        return stack(groups.quaternion_from_matrix(matrix))
+
+    def to_matrix(self, point: Tensor) -> Tensor:
+        """Rotation matrices (..., 3, 3) of points (..., 4)."""
+        _check(self, point=point)
+        return groups.matrix_from_quaternion(_quaternion(point))
+
+
+@dataclass(frozen=True)
+class SE3(_Group):
+    """Rigid motions: points (..., 7) are translation and unit quaternion x, y, z, w, tangents (..., 6) twists.
+
+    A twist is (translation, rotation), and what it leads to is the exponential of the group, so its translation bends
+    with its rotation.
+
+    Attributes:
+        side: "right", point * Exp(v), where v is seen from the moving frame; or "left", Exp(v) * point, from the fixed.
+    """
+
+    point_size: ClassVar[int] = 7
+    tangent_size: ClassVar[int] = 6
+
+    def retract(self, point: Tensor, tangent: Tensor) -> Tensor:
+        """The motion of which the twist is taken, its quaternion at unit length: (..., 7), (..., 6) -> (..., 7)."""
+        _check(self, point=point, tangent=tangent)
+        start, turned = _rigid(point)
+        step, added = groups.exp_se3(*_twist(tangent))
+        if self.side == "right":
+            step = groups.rotate(turned, step)
+        else:
+            start = groups.rotate(added, start)
+        translation = [a + b for a, b in zip(start, step, strict=True)]
+        return stack([*translation, *groups.normalise(_product(self.side, turned, added))])
+
+    def local(self, point: Tensor, other: Tensor) -> Tensor:
+        """The twist that retract takes from `point` to `other`: (..., 7), (..., 7) -> (..., 6)."""
+        _check(self, point=point, other=other)
+        (start, turned), (end, other_turned) = _rigid(point), _rigid(other)
+        back = groups.conjugate(turned)
+        between = _product(self.side, back, other_turned)
+        if self.side == "right":
+            step = groups.rotate(back, _difference(end, start))
+        else:
+            step = _difference(end, groups.rotate(between, start))
+        translation, rotation = groups.log_se3(step, between)
+        return stack([*translation, *rotation])
+
+    def from_matrix(self, matrix: Tensor) -> Tensor:
+        """Points (..., 7), with w >= 0, of homogeneous matrices (..., 4, 4)."""
+        _check_matrix(self, matrix, 4)
+        quaternion = groups.quaternion_from_matrix(matrix[..., :3, :3])
+        return stack([*matrix[..., :3, 3].unbind(-1), *quaternion])
+
+    def to_matrix(self, point: Tensor) -> Tensor:
+        """Homogeneous matrices (..., 4, 4) of points (..., 7)."""
+        _check(self, point=point)
+        _, quaternion = _rigid(point)
+        return _homogeneous(groups.matrix_from_quaternion(quaternion), point[..., :3])
+
+
+@dataclass(frozen=True, init=False)
+class Product:
+    """Several manifolds side by side, `Product(SE3(), Euclidean(6))`.
+
+    Attributes:
+        parts: the manifolds, in the order in which their points and tangents lie end to end.
+    """
+
+    parts: tuple[Manifold, ...]
+
+    def __init__(self, *parts: Manifold) -> None:
+        if not parts:
+            raise ValueError("Product: give at least one manifold")
+        object.__setattr__(self, "parts", parts)
+
+    def __repr__(self) -> str:
+        return f"Product({', '.join(map(repr, self.parts))})"
+
+    @property
+    def point_size(self) -> int:
+        """Length of a point, the sum over the parts."""
+        return sum(part.point_size for part in self.parts)
+
+    @property
+    def tangent_size(self) -> int:
+        """Length of a tangent, the sum over the parts."""
+        return sum(part.tangent_size for part in self.parts)
+
+    @property
+    def flat(self) -> bool:
+        """Whether every part is flat."""
+        return all(part.flat for part in self.parts)
+
+    def retract(self, point: Tensor, tangent: Tensor) -> Tensor:
+        """Each part's retract, (..., p), (..., n) -> (..., p)."""
+        _check(self, point=point, tangent=tangent)
+        if self.flat:
+            return point + tangent
+        pieces = zip(self.parts, self._points(point), self._tangents(tangent), strict=True)
+        return concatenate([part.retract(x, v) for part, x, v in pieces])
+
+    def local(self, point: Tensor, other: Tensor) -> Tensor:
+        """Each part's local, (..., p), (..., p) -> (..., n)."""
+        _check(self, point=point, other=other)
+        if self.flat:
+            return other - point
+        pieces = zip(self.parts, self._points(point), self._points(other), strict=True)
+        return concatenate([part.local(x, y) for part, x, y in pieces])
+
+    def _points(self, point: Tensor) -> tuple[Tensor, ...]:
+        return point.split([part.point_size for part in self.parts], dim=-1)
+
+    def _tangents(self, tangent: Tensor) -> tuple[Tensor, ...]:
+        return tangent.split([part.tangent_size for part in self.parts], dim=-1)
+
+
+def _check(manifold: Manifold, *, point: Tensor, tangent: Tensor | None = None, other: Tensor | None = None) -> None:
+    sizes = {"point": manifold.point_size, "tangent": manifold.tangent_size, "other": manifold.point_size}
+    for name, vector in (("point", point), ("tangent", tangent), ("other", other)):
+        if vector is not None and vector.shape[-1:] != (sizes[name],):
+            raise ValueError(
+                f"{manifold}: {name} must have shape (..., {sizes[name]}), got {tuple(vector.shape)}; "
+                f"points have {sizes['point']} numbers and tangents {sizes['tangent']}"
+            )
+
+
+def _check_matrix(manifold: Manifold, matrix: Tensor, size: int) -> None:
+    if matrix.shape[-2:] != (size, size):
+        raise ValueError(f"{manifold}: matrix must have shape (..., {size}, {size}), got {tuple(matrix.shape)}")
+
+
+def _vector(tangent: Tensor) -> Vector:
+    x, y, z = tangent.unbind(-1)
+    return x, y, z
+
+
+def _quaternion(point: Tensor) -> Quaternion:
+    x, y, z, w = point.unbind(-1)
+    return x, y, z, w
+
+
+def _twist(tangent: Tensor) -> tuple[Vector, Vector]:
+    u, v, w, x, y, z = tangent.unbind(-1)
+    return (u, v, w), (x, y, z)
+
+
+def _rigid(point: Tensor) -> tuple[Vector, Quaternion]:
+    a, b, c, x, y, z, w = point.unbind(-1)
+    return (a, b, c), (x, y, z, w)
+
+
+def _difference(end: Vector, start: Vector) -> Vector:
+    return end[0] - start[0], end[1] - start[1], end[2] - start[2]
+
+
+def _product(side: str, point: Quaternion, added: Quaternion) -> Quaternion:
+    """The rotation added on the given side of the point."""
+    return groups.multiply(point, added) if side == "right" else groups.multiply(added, point)
+
+
+def _homogeneous(rotation: Tensor, translation: Tensor) -> Tensor:
+    """Rotations (..., d, d) and translations (..., d) into matrices (..., d + 1, d + 1)."""
+    upper = torch.cat([rotation, translation.unsqueeze(-1)], dim=-1)
+    last = torch.zeros_like(upper[..., :1, :])
+    last = torch.cat([last[..., :-1], torch.ones_like(last[..., -1:])], dim=-1)
+    return torch.cat([upper, last], dim=-2)

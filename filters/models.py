@@ -1,0 +1,120 @@
+"""Motions and measurements as objects: a function, its noise, and how its values are compared."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sigmaslam.filters.factors import apply
+from sigmaslam.filters.noise import Noise
+
+Function = Callable[..., Tensor]
+Residual = Callable[[Tensor, Tensor], Tensor]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionModel:
+    """How a state moves: x' = f(x, *inputs) [+] w, or x' = f(x, w, *inputs) when the noise is not additive.
+
+    The function is called once for all sigma points: with states (k, ..., p) and, if not additive, noise (k, ..., q),
+    while inputs have the batch shape (..., ·) and broadcast. Components are read as `x[..., i]`.
+
+    Attributes:
+        function: f, to states (k, ..., p).
+        noise: covariance Q (..., q, q), or a `Noise`. Additive: in the tangent at f(x), q = n, unless `noise_matrix`.
+        additive: whether w is added to f(x).
+        noise_matrix: B2 (..., n, q) of (9.22): additive noise enters as B2 w.
+        jacobian: derivative of f (and of w, side by side) in tangent coordinates, called like the function at one
+            point, (..., n, n) or (..., n, n + q); None: by automatic differentiation. Only the EKF asks for it.
+    """
+
+    function: Function
+    noise: Noise | Tensor
+    additive: bool = True
+    noise_matrix: Tensor | None = None
+    jacobian: Function | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearMotion:
+    """x' = A x + B1 u + B2 w, (9.22); on R^n. `predict` takes u as its input when there is a B1.
+
+    Attributes:
+        matrix: A (..., n, n).
+        noise: covariance Q (..., q, q) of w, or a `Noise`.
+        control_matrix: B1 (..., n, c).
+        noise_matrix: B2 (..., n, q); None: the identity.
+    """
+
+    matrix: Tensor
+    noise: Noise | Tensor
+    control_matrix: Tensor | None = None
+    noise_matrix: Tensor | None = None
+
+    def function(self, state: Tensor, *inputs: Tensor) -> Tensor:
+        """A x + B1 u for (..., n) and (..., c)."""
+        moved = apply(self.matrix, state)
+        if self.control_matrix is not None:
+            if len(inputs) != 1:
+                raise ValueError("this motion has a control matrix: give predict the control (..., c)")
+            moved = moved + apply(self.control_matrix, inputs[0])
+        elif inputs:
+            raise ValueError("an input was given, but this motion has no control matrix")
+        return moved
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasurementModel:
+    """What a sensor sees: z = h(x, *inputs) + v, or z = h(x, v, *inputs) when the noise is not additive.
+
+    Called as the function of `MotionModel`. A component that is NaN in the measured value, or False in the mask, has
+    weight zero.
+
+    Attributes:
+        function: h, to (k, ..., m).
+        noise: covariance R (..., r, r), or a `Noise`; additive: r = m. `Diagonal` and `BlockDiagonal` keep the cost of
+            an update linear in m.
+        residual: (measured (..., m), predicted (..., m)) -> their difference, where that is not a plain difference
+            (an angle, see `wrap_angle`); None: subtraction.
+        additive: whether v is added to h(x).
+        jacobian: as in `MotionModel`, (..., m, n) or (..., m, n + r).
+        mask: (..., m) bool, True for components that take part; None: all.
+    """
+
+    function: Function
+    noise: Noise | Tensor
+    residual: Residual | None = None
+    additive: bool = True
+    jacobian: Function | None = None
+    mask: Tensor | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearMeasurement:
+    """z = H x + v, (9.22); on R^n.
+
+    Attributes:
+        matrix: H (..., m, n).
+        noise: covariance R (..., m, m) of v, or a `Noise`.
+        mask: (..., m) bool, True for components that take part; None: all.
+    """
+
+    matrix: Tensor
+    noise: Noise | Tensor
+    mask: Tensor | None = None
+
+    def function(self, state: Tensor) -> Tensor:
+        """H x for (..., n)."""
+        return apply(self.matrix, state)
+
+
+AnyMotion = MotionModel | LinearMotion
+AnyMeasurement = MeasurementModel | LinearMeasurement
+
+
+def wrap_angle(angle: Tensor) -> Tensor:
+    """The same angle in [-pi, pi), radians, any shape."""
+    return torch.remainder(angle + torch.pi, 2 * torch.pi) - torch.pi
