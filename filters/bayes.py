@@ -23,6 +23,11 @@ from sigmaslam.filters.transforms import Difference, Exact, Taylor, Transform, T
 from sigmaslam.filters.updates import FORMS, Form, Solution, choose_form, log_likelihood, solve
 
 
+# Squared linearisation error of a whole measurement, in units of its noise's variance, from which on an update is worth
+# a second linearisation.
+TOLERATED_ERROR = 1.0
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class BayesFilter:
     """Predict and correct, for any number of filters at once.
@@ -35,14 +40,15 @@ class BayesFilter:
         form: of the update, see `sigmaslam.filters.updates`; "auto" chooses by shapes and dtype. "qr" goes on with
             square roots, "dense" and "low-rank" with covariances.
         iterations: linearisations of an update, from the second on at the posterior of the one before (posterior
-            linearisation, García-Fernández et al. 2015; with derivatives, the iterated EKF). Take 2 for a start-up.
+            linearisation, García-Fernández et al. 2015; with derivatives, the iterated EKF). "auto": a second one for
+            elements whose sigma points show more linearisation error than `TOLERATED_ERROR`; the EKF sees none.
         on_failure: see `sigmaslam.filters.failure`.
     """
 
     transform: Transform
     space: Manifold | None = None
     form: Form | Literal["auto"] = "auto"
-    iterations: int = 1
+    iterations: int | Literal["auto"] = "auto"
     on_failure: OnFailure = "raise"
 
     def __post_init__(self) -> None:
@@ -50,8 +56,8 @@ class BayesFilter:
             raise ValueError(f"form is {self.form!r}; choose auto, {', '.join(FORMS)}")
         if self.on_failure not in POLICIES:
             raise ValueError(f"on_failure is {self.on_failure!r}; choose {', '.join(POLICIES)}")
-        if self.iterations < 1:
-            raise ValueError(f"iterations is {self.iterations}; it must be at least 1")
+        if self.iterations != "auto" and self.iterations < 1:
+            raise ValueError(f"iterations is {self.iterations}; it must be 'auto' or at least 1")
 
     def predict(self, belief: Gaussian, motion: AnyMotion, *inputs: Tensor) -> Prediction:
         """The belief after a motion: the "action" of (9.21); (9.22), Table 9.1 and steps 2 and 3 of Table 9.2.
@@ -100,21 +106,27 @@ class BayesFilter:
         value, mask, count = _without_missing(value, measurement.mask)
         noise = noise if mask is None else noise.masked(mask)
         added = noise if _is_additive(measurement) else None
-        solution: Solution | None = None
-        for _ in range(1 if isinstance(measurement, LinearMeasurement) else self.iterations):
-            innovation, columns = self._innovate(belief.mean, root, measurement, noise, value, inputs, solution)
+
+        def linearise(previous: Solution | None) -> tuple[Tensor, Columns, Form, Solution]:
+            innovation, columns = self._innovate(belief.mean, root, measurement, noise, value, inputs, previous)
             if mask is not None:
                 innovation, columns = torch.where(mask, innovation, 0.0), _masked(columns, mask, added is None)
             form = self._form(belief, columns, innovation.shape[-1], added is not None)
-            previous, solution = solution, solve(form, innovation, columns, added, root)
-            if previous is None:
-                first = (innovation, columns, solution)
-        assert solution is not None
+            return innovation, columns, form, solve(form, innovation, columns, added, root)
+
+        innovation, columns, form, at_prior = linearise(None)
+        solution = at_prior
+        if self.iterations != "auto":
+            for _ in range(0 if isinstance(measurement, LinearMeasurement) else self.iterations - 1):
+                solution = linearise(solution)[-1]
+        elif added is not None and columns.even is not None:
+            bent = _linearisation_error(columns.even, added) > TOLERATED_ERROR
+            if torch.compiler.is_compiling() or bool(bent.any()):
+                solution = linearise(solution)[-1].where(bent, solution)
         posterior = self._correct(belief, solution)
         healthy = _both(_both(finite(posterior.mean, posterior.held), solution.healthy), healthy)
         suspects = {} if solution.matrix is None else {"innovation covariance": solution.matrix}
         posterior = self._deal_with(healthy, posterior, belief, "update", suspects)
-        innovation, columns, at_prior = first
         evidence = log_likelihood(at_prior, count)
         return Update(posterior, innovation, at_prior.nis, evidence, healthy, form, count, columns, added, root)
 
@@ -279,7 +291,7 @@ def ExtendedKalmanFilter(  # noqa: N802
     space: Manifold | None = None,
     *,
     form: Form | Literal["auto"] = "auto",
-    iterations: int = 1,
+    iterations: int | Literal["auto"] = "auto",
     on_failure: OnFailure = "raise",
 ) -> BayesFilter:
     """First derivatives at the mean, (9.26) and Table 9.1; attributes as `BayesFilter`."""
@@ -291,11 +303,16 @@ def UnscentedKalmanFilter(  # noqa: N802
     points: SigmaPoints | None = None,
     *,
     form: Form | Literal["auto"] = "auto",
-    iterations: int = 1,
+    iterations: int | Literal["auto"] = "auto",
     on_failure: OnFailure = "raise",
 ) -> BayesFilter:
     """Sigma points, Table 9.2; `points` from `sigmaslam.filters.sigma_points`, by default `cubature()`."""
     return BayesFilter(Unscented(points or cubature()), space, form, iterations, on_failure)
+
+
+def _linearisation_error(even: Tensor, noise: Noise) -> Tensor:
+    """Expected square of what sigma points see of the linearisation's error, (...,), over the noise's variance."""
+    return ((even * even).sum(dim=-1) / noise.variance()).sum(dim=-1)
 
 
 def _is_additive(model: AnyMotion | AnyMeasurement) -> bool:

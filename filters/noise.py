@@ -23,6 +23,10 @@ class Noise(Protocol):
         """R, (..., m, m)."""
         ...
 
+    def variance(self) -> Tensor:
+        """Diagonal of R, (..., m)."""
+        ...
+
     def factor(self) -> Tensor:
         """Lower triangular root of R, (..., m, m)."""
         ...
@@ -51,36 +55,40 @@ class Diagonal:
         """Takes the variances (..., m)."""
         if variance.ndim < 1:
             raise ValueError("variances (..., m) expected, got a scalar")
-        self.variance = variance
+        self._variance = variance
 
     @property
     def size(self) -> int:
         """m."""
-        return self.variance.shape[-1]
+        return self._variance.shape[-1]
 
     def covariance(self) -> Tensor:
         """R, (..., m, m)."""
-        return torch.diag_embed(self.variance)
+        return torch.diag_embed(self._variance)
+
+    def variance(self) -> Tensor:
+        """Diagonal of R, (..., m)."""
+        return self._variance
 
     def factor(self) -> Tensor:
         """Root of R, (..., m, m)."""
-        return torch.diag_embed(torch.sqrt(self.variance))
+        return torch.diag_embed(torch.sqrt(self._variance))
 
     def triangularised(self, pieces: Sequence[Tensor]) -> Tensor:
         """Lower root of R and more deviations."""
-        return triangularise(pieces, torch.sqrt(self.variance))
+        return triangularise(pieces, torch.sqrt(self._variance))
 
     def whitened(self, columns: Tensor) -> Tensor:
         """R^-1/2 columns, (..., m, c)."""
-        return columns * torch.rsqrt(self.variance).unsqueeze(-1)
+        return columns * torch.rsqrt(self._variance).unsqueeze(-1)
 
     def log_determinant(self) -> Tensor:
         """log |R|, (...,)."""
-        return torch.log(self.variance).sum(dim=-1)
+        return torch.log(self._variance).sum(dim=-1)
 
     def masked(self, mask: Tensor) -> Diagonal:
         """Unit variance where mask (..., m) is False."""
-        return Diagonal(torch.where(mask, self.variance, 1.0))
+        return Diagonal(torch.where(mask, self._variance, 1.0))
 
 
 class BlockDiagonal:
@@ -100,6 +108,10 @@ class BlockDiagonal:
     def covariance(self) -> Tensor:
         """R, (..., m, m)."""
         return _block_diagonal(self.blocks)
+
+    def variance(self) -> Tensor:
+        """Diagonal of R, (..., m)."""
+        return torch.diagonal(self.blocks, dim1=-2, dim2=-1).flatten(-2)
 
     def factor(self) -> Tensor:
         """Lower triangular root of R, (..., m, m)."""
@@ -145,6 +157,10 @@ class Dense:
         """R, (..., m, m)."""
         return self._covariance
 
+    def variance(self) -> Tensor:
+        """Diagonal of R, (..., m)."""
+        return torch.diagonal(self._covariance, dim1=-2, dim2=-1)
+
     def factor(self) -> Tensor:
         """Lower triangular root of R, (..., m, m)."""
         factor, healthy = cholesky(self._covariance)
@@ -182,6 +198,10 @@ class Rooted:
     def covariance(self) -> Tensor:
         """R, (..., m, m)."""
         return square([self._root])
+
+    def variance(self) -> Tensor:
+        """Diagonal of R, (..., m)."""
+        return (self._root * self._root).sum(dim=-1)
 
     def factor(self) -> Tensor:
         """Root of R, (..., m, m)."""

@@ -13,7 +13,7 @@ covariance is S = odd odd^T + even even^T + R, and odd is its covariance with ze
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -59,6 +59,25 @@ class Solution:
     log_determinant: Tensor
     matrix: Tensor | None
     healthy: Tensor | None
+
+    def where(self, chosen: Tensor, other: Solution) -> Solution:
+        """This solution where chosen (...,) bool is true, the other of the same form elsewhere."""
+
+        def pick(first: Tensor | None, second: Tensor | None, trailing: int) -> Tensor | None:
+            if first is None or second is None:
+                return first
+            return torch.where(chosen[(..., *[None] * trailing)], first, second)
+
+        shift = pick(self.shift, other.shift, 1)
+        assert shift is not None
+        return replace(
+            self,
+            shift=shift,
+            covariance=pick(self.covariance, other.covariance, 2),
+            root=pick(self.root, other.root, 2),
+            matrix=pick(self.matrix, other.matrix, 2),
+            healthy=pick(self.healthy, other.healthy, 0),
+        )
 
     def factor(self) -> Tensor:
         """Lower triangular root of the covariance, (..., n, n)."""

@@ -1,0 +1,286 @@
+"""The three forms of the update against each other, the masks, and the unrolled path against LAPACK."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from builders import (
+    assert_close,
+    assert_same_belief,
+    assert_same_update,
+    beliefs,
+    bent_measurement,
+    bent_motion,
+    covariances,
+    noises,
+    random_numbers,
+)
+from torch import Tensor
+
+from sigmaslam.filters import (
+    BayesFilter,
+    Dense,
+    Diagonal,
+    ExtendedKalmanFilter,
+    Gaussian,
+    KalmanFilter,
+    LinearMeasurement,
+    MeasurementModel,
+    UnscentedKalmanFilter,
+    Update,
+    julier,
+    merwe,
+)
+
+FORMS = ("dense", "low-rank", "qr")
+KINDS = ("diagonal", "blocks", "dense")
+STATES = 4
+# The likelihood has a test of its own for the last digits with missing components.
+OF_LIKELIHOOD = 1e-6
+
+
+def filters(form: str) -> dict[str, BayesFilter]:
+    return {
+        "ukf": UnscentedKalmanFilter(form=form),
+        "ukf julier": UnscentedKalmanFilter(points=julier(1.0), form=form),
+        "ukf iterated": UnscentedKalmanFilter(form=form, iterations=3),
+        "ekf": ExtendedKalmanFilter(form=form),
+    }
+
+
+@pytest.mark.parametrize("name", filters("qr"))
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("measurements", [2, 8, 40])
+def test_low_rank_and_qr_updates_equal_dense(measurements, kind, name):
+    """Fewer measurements than columns, about as many, and more."""
+    prior, z = beliefs(3, STATES), random_numbers(3, measurements, seed=5)
+    measurement = bent_measurement(STATES, measurements, noises(measurements)[kind])
+    dense, low_rank, qr = (filters(form)[name].update(prior, measurement, z) for form in FORMS)
+    assert (dense.form, low_rank.form, qr.form) == FORMS
+    assert_same_update(low_rank, dense, 1e-12)
+    assert_same_update(qr, dense, 1e-12)
+
+
+@pytest.mark.parametrize("measurements", [2, 30])
+def test_forms_agree_over_several_steps(measurements):
+    motion, measurement = bent_motion(STATES), bent_measurement(STATES, measurements, noises(measurements)["blocks"])
+    values = random_numbers(8, 3, measurements, seed=5)
+    tracks = [
+        UnscentedKalmanFilter(form=form).filter(beliefs(3, STATES), motion, measurement, values) for form in FORMS
+    ]
+    for track in tracks[1:]:
+        assert_same_belief(track.filtered, tracks[0].filtered, 1e-11)
+        assert_same_belief(track.predicted, tracks[0].predicted, 1e-11)
+        assert_close(track.log_likelihood, tracks[0].log_likelihood, 1e-11)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_kinds_of_noise_agree_where_they_are_the_same_matrix(kind):
+    noise, prior, z = noises(6)[kind], beliefs(STATES), random_numbers(6, seed=3)
+    for form in FORMS:
+        bayes = UnscentedKalmanFilter(form=form)
+        found = bayes.update(prior, bent_measurement(STATES, 6, noise), z)
+        expected = bayes.update(prior, bent_measurement(STATES, 6, Dense(noise.covariance())), z)
+        assert_same_update(found, expected, 1e-12)
+
+
+@pytest.mark.parametrize(
+    ("bayes", "measurements", "expected"),
+    [
+        (UnscentedKalmanFilter(), 2 * STATES, "dense"),
+        (UnscentedKalmanFilter(), 2 * STATES + 1, "low-rank"),
+        (ExtendedKalmanFilter(), STATES, "dense"),
+        (ExtendedKalmanFilter(), STATES + 1, "low-rank"),
+        (UnscentedKalmanFilter(points=merwe(0.5, 0.0, allow_negative=True)), 40, "dense"),
+    ],
+)
+def test_form_follows_the_larger_of_measurement_and_columns(bayes, measurements, expected):
+    prior, z = beliefs(STATES), random_numbers(measurements)
+    noise = Diagonal(torch.ones(measurements, dtype=torch.float64))
+    assert bayes.update(prior, bent_measurement(STATES, measurements, noise), z).form == expected
+
+
+def test_form_is_qr_in_float32_and_for_square_roots():
+    prior, measurement = beliefs(STATES), bent_measurement(STATES, 2, Diagonal(torch.ones(2)))
+    by_root = Gaussian(prior.mean, factor=random_numbers(STATES, 2 * STATES))
+    double = replace(measurement, noise=Diagonal(torch.ones(2, dtype=torch.float64)))
+    bayes = UnscentedKalmanFilter()
+    assert bayes.update(prior.to(torch.float32), measurement, torch.zeros(2)).form == "qr"
+    update = bayes.update(by_root, double, torch.zeros(2, dtype=torch.float64))
+    assert update.form == "qr"
+    assert update.belief.is_square_root
+    assert bayes.predict(by_root, bent_motion(STATES)).belief.is_square_root
+    assert not bayes.predict(prior, bent_motion(STATES)).belief.is_square_root
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_belief_by_any_root_equals_belief_by_covariance(form):
+    root = random_numbers(3, STATES, 2 * STATES, seed=2)
+    mean, z = random_numbers(3, STATES), random_numbers(3, 6, seed=3)
+    bayes = UnscentedKalmanFilter(form=form)
+    measurement = bent_measurement(STATES, 6)
+    found = bayes.update(Gaussian(mean, factor=root), measurement, z)
+    assert_same_update(found, bayes.update(Gaussian(mean, root @ root.mT), measurement, z), 1e-11)
+
+
+def test_negative_weights_update_as_the_textbook_in_the_dense_form():
+    points, prior, z = merwe(0.4, 0.0, allow_negative=True), beliefs(STATES), random_numbers(2, seed=3)
+    measurement = bent_measurement(STATES, 2)
+    update = UnscentedKalmanFilter(points=points, form="dense").update(prior, measurement, z)
+    spread = 0.4**2 * STATES
+    root = torch.linalg.cholesky(prior.covariance) * spread**0.5
+    x = torch.cat([prior.mean + root.mT, prior.mean - root.mT, prior.mean[None]])
+    weight = torch.full((2 * STATES + 1,), 0.5 / spread, dtype=torch.float64)
+    weight[-1] = 1 - STATES / spread
+    values = measurement.function(x)
+    mean = weight @ values
+    weight[-1] += 1 - 0.4**2
+    dz, dx = values - mean, x - prior.mean
+    S = dz.mT @ (weight[:, None] * dz) + measurement.noise
+    gain = dx.mT @ (weight[:, None] * dz) @ torch.linalg.inv(S)
+    assert weight[-1] < 0
+    assert_close(update.innovation_covariance, S, 1e-12)
+    assert_close(update.belief.mean, prior.mean + gain @ (z - mean), 1e-12)
+    assert_close(update.belief.covariance, prior.covariance - gain @ S @ gain.mT, 1e-12)
+
+
+@pytest.mark.parametrize("form", ["low-rank", "qr"])
+def test_negative_weights_are_refused_by_forms_that_cannot_take_them(form):
+    bayes = UnscentedKalmanFilter(points=merwe(0.5, 0.0, allow_negative=True), form=form)
+    with pytest.raises(ValueError, match="form='dense'"):
+        bayes.update(beliefs(STATES), bent_measurement(STATES, 6), random_numbers(6))
+
+
+def masked_and_without(form: str, noise: Dense, keep: Tensor, augmented: bool) -> tuple[Update, Update, Update]:
+    """NaN in the value; False in the mask; the components taken out of the model."""
+    prior, count = beliefs(3, STATES), noise.size
+    z = random_numbers(3, count, seed=6)
+    full = bent_measurement(STATES, count, noise)
+    without = replace(full, function=lambda x: full.function(x)[..., keep], noise=noise.covariance()[keep][:, keep])
+    if augmented:
+        full = replace(full, function=lambda x, v, h=full.function: h(x) + v, additive=False)
+        root = noise.factor()[keep]
+        function, white = without.function, torch.eye(count, dtype=torch.float64)
+        without = replace(without, function=lambda x, v: function(x) + v @ root.mT, noise=white, additive=False)
+    bayes = UnscentedKalmanFilter(form=form)
+    missing = torch.full_like(z, torch.nan)
+    missing[:, keep] = z[:, keep]
+    mask = torch.zeros(count, dtype=torch.bool)
+    mask[keep] = True
+    return (
+        bayes.update(prior, full, missing),
+        bayes.update(prior, replace(full, mask=mask), z),
+        bayes.update(prior, without, z[:, keep]),
+    )
+
+
+@pytest.mark.parametrize("augmented", [False, True], ids=["additive", "augmented"])
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("form", FORMS)
+def test_missing_components_equal_a_model_without_them(form, kind, augmented):
+    for measurements, keep in ((4, [1, 2]), (4, [3]), (12, [0, 1, 3, 6, 7, 10])):
+        nan, mask, without = masked_and_without(form, noises(measurements)[kind], torch.tensor(keep), augmented)
+        # The cubature set of a smaller noise differs, so the augmented filter agrees to the order of its error.
+        tolerance = 2e-2 if augmented else 1e-11
+        assert_same_belief(nan.belief, without.belief, tolerance)
+        assert_same_belief(mask.belief, nan.belief, 1e-13)
+        for name, precision in (("nis", 1e-11), ("log_likelihood", OF_LIKELIHOOD)):
+            assert_close(getattr(mask, name), getattr(nan, name), 1e-13)
+            if not augmented:
+                assert_close(getattr(nan, name), getattr(without, name), precision)
+        assert_close(nan.innovation[:, keep], without.innovation, tolerance)
+        assert bool((torch.as_tensor(nan.count) == len(keep)).all())
+        assert bool((nan.innovation == 0).sum() == 3 * (measurements - len(keep)))
+
+
+@pytest.mark.xfail(strict=True, reason="the mask of the measurement is laid over the noise's own components")
+def test_missing_components_leave_noise_that_is_not_additive_alone():
+    """v reaches both components: with one of them missing, all of v still disturbs the other."""
+    prior, z = beliefs(STATES), random_numbers(2, seed=3)
+    H, spread, noise = random_numbers(2, STATES), random_numbers(2, 2, seed=4), covariances(2)
+    augmented = MeasurementModel(lambda x, v: x @ H.mT + v @ spread.mT, noise, additive=False)
+    z[0] = torch.nan
+    found = ExtendedKalmanFilter().update(prior, augmented, z)
+    expected = KalmanFilter().update(prior, LinearMeasurement(H, spread @ noise @ spread.mT), z)
+    assert_same_belief(found.belief, expected.belief, 1e-12)
+
+
+@pytest.mark.xfail(strict=True, reason="the mask of the measurement is laid over the noise's own components")
+def test_missing_components_with_more_noise_than_measurements():
+    prior, z = beliefs(STATES), random_numbers(2, seed=3)
+    H, spread, noise = random_numbers(2, STATES), random_numbers(2, 3, seed=4), covariances(3)
+    augmented = MeasurementModel(lambda x, v: x @ H.mT + v @ spread.mT, noise, additive=False)
+    z[0] = torch.nan
+    found = ExtendedKalmanFilter().update(prior, augmented, z)
+    expected = KalmanFilter().update(prior, LinearMeasurement(H, spread @ noise @ spread.mT), z)
+    assert_same_belief(found.belief, expected.belief, 1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("measurements", [4, 12])
+def test_nothing_measured_changes_nothing(form, kind, measurements):
+    prior = beliefs(3, STATES)
+    z = torch.full((3, measurements), torch.nan, dtype=torch.float64)
+    bayes = UnscentedKalmanFilter(form=form, iterations=2)
+    update = bayes.update(prior, bent_measurement(STATES, measurements, noises(measurements)[kind]), z)
+    assert_same_belief(update.belief, prior, 1e-14)
+    for array in (update.innovation, update.nis, update.log_likelihood, update.gain, torch.as_tensor(update.count)):
+        assert_close(array.double(), torch.zeros_like(array).double(), 1e-14)
+    assert bool(update.healthy.all())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("form", FORMS)
+def test_each_element_of_the_batch_has_its_own_mask(form, kind):
+    prior, z = beliefs(6, STATES), random_numbers(6, 8, seed=5)
+    z[random_numbers(6, 8, seed=8) > 0.3] = torch.nan
+    z[0] = random_numbers(8)
+    bayes, measurement = UnscentedKalmanFilter(form=form), bent_measurement(STATES, 8, noises(8)[kind])
+    update = bayes.update(prior, measurement, z)
+    assert update.count.tolist() == (~z.isnan()).sum(dim=-1).tolist()
+    for k in range(6):
+        alone = bayes.update(prior[k], measurement, z[k])
+        assert_same_belief(update.belief[k], alone.belief, 1e-12)
+        assert_close(update.log_likelihood[k], alone.log_likelihood, OF_LIKELIHOOD)
+        assert_close(update.nis[k], alone.nis, 1e-12)
+        assert_close(update.innovation_covariance[k], alone.innovation_covariance, 1e-12)
+
+
+def test_missing_components_of_a_linear_measurement_equal_a_model_without_them():
+    prior, H, noise = beliefs(STATES), random_numbers(4, STATES), covariances(4)
+    z, keep = random_numbers(4, seed=3), torch.tensor([0, 3])
+    nan = z.clone()
+    nan[[1, 2]] = torch.nan
+    for form in FORMS:
+        found = KalmanFilter(form=form).update(prior, LinearMeasurement(H, noise), nan)
+        expected = KalmanFilter(form=form).update(prior, LinearMeasurement(H[keep], noise[keep][:, keep]), z[keep])
+        assert_same_belief(found.belief, expected.belief, 1e-12)
+        assert_close(found.log_likelihood, expected.log_likelihood, OF_LIKELIHOOD)
+
+
+@pytest.mark.xfail(strict=True, reason="count * log(2 pi) of an integer tensor is float32")
+def test_likelihood_with_missing_components_keeps_its_digits():
+    prior, H, noise, z = beliefs(STATES), random_numbers(4, STATES), covariances(4), random_numbers(4, seed=3)
+    found = KalmanFilter().update(prior, LinearMeasurement(H, noise, mask=torch.tensor([True] * 3 + [False])), z)
+    expected = KalmanFilter().update(prior, LinearMeasurement(H[:3], noise[:3, :3]), z[:3])
+    assert_close(found.log_likelihood, expected.log_likelihood, 1e-12)
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("size", [1, 2, 3, 4, 5, 6])
+def test_large_batch_equals_single_filters(size, form):
+    """The unrolled path of many small filters against LAPACK's of each alone."""
+    count, measurements = 130, min(size + 1, 4)
+    bayes = UnscentedKalmanFilter(form=form)
+    motion, measurement = bent_motion(size), bent_measurement(size, measurements)
+    prior, z = beliefs(count, size), random_numbers(count, measurements, seed=6)
+    z[:7, 0] = torch.nan
+    predicted, update = bayes.predict(prior, motion), bayes.update(prior, measurement, z)
+    for k in (0, 5, 6, 7, 64, 129):
+        assert_same_belief(predicted.belief[k], bayes.predict(prior[k], motion).belief, 1e-12)
+        alone = bayes.update(prior[k], measurement, z[k])
+        assert_same_belief(update.belief[k], alone.belief, 1e-11)
+        assert_close(update.log_likelihood[k], alone.log_likelihood, OF_LIKELIHOOD)
+        for name in ("nis", "innovation_covariance", "gain"):
+            assert_close(getattr(update, name)[k], getattr(alone, name), 1e-11)
