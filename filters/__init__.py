@@ -2,6 +2,7 @@
 
 from sigmaslam.filters.bayes import BayesFilter, ExtendedKalmanFilter, KalmanFilter, UnscentedKalmanFilter
 from sigmaslam.filters.belief import degree_of_belief
+from sigmaslam.filters.compiled import compile_step
 from sigmaslam.filters.failure import FilterError
 from sigmaslam.filters.gaussian import Gaussian
 from sigmaslam.filters.layout import stack
@@ -37,6 +38,7 @@ __all__ = [
     "Track",
     "UnscentedKalmanFilter",
     "Update",
+    "compile_step",
     "cubature",
     "degree_of_belief",
     "julier",

@@ -20,7 +20,7 @@ from sigmaslam.filters.sequence import Track, filter_sequence, smooth
 from sigmaslam.filters.sigma_points import Columns, SigmaPoints, cubature
 from sigmaslam.filters.small import join
 from sigmaslam.filters.transforms import Difference, Exact, Taylor, Transform, Transformed, Unscented
-from sigmaslam.filters.updates import FORMS, Form, Solution, choose_form, log_likelihood, solve
+from sigmaslam.filters.updates import FORMS, Form, Solution, choose_form, solve
 
 
 # Squared linearisation error of a whole measurement, in units of its noise's variance, from which on an update is worth
@@ -70,6 +70,8 @@ class BayesFilter:
             FilterError: an element's covariance is not positive semidefinite or not finite, and on_failure is "raise".
             ValueError: shapes do not fit.
         """
+        if isinstance(motion, LinearMotion) and not self._by_root(belief):
+            return self._predict_linear(belief, motion, inputs)
         root, healthy = self._root(belief)
         noise = as_noise(motion.noise)
         moved = self._move(belief.mean, root, motion, noise, inputs)
@@ -86,7 +88,23 @@ class BayesFilter:
             predicted = Gaussian(mean, _predicted_covariance(columns, entering, noise_matrix))
         healthy = _both(finite(mean, predicted.held), healthy)
         predicted = self._deal_with(healthy, predicted, belief, "predict", {})
-        return Prediction(predicted, healthy, root, columns, entering, noise_matrix)
+        return Prediction(predicted, healthy, lambda: (root, columns), entering, noise_matrix)
+
+    def _predict_linear(self, belief: Gaussian, motion: LinearMotion, inputs: tuple[Tensor, ...]) -> Prediction:
+        """A P A^T + B2 Q B2^T, (9.22): no root is needed, so a covariance is not checked for being semidefinite."""
+        self._require_flat("LinearMotion")
+        noise = as_noise(motion.noise)
+        mean = motion.function(belief.mean, *inputs)
+        covariance = multiply(multiply(motion.matrix, belief.covariance), motion.matrix.mT)
+        predicted = Gaussian(mean, covariance + _entering_twice(noise, motion.noise_matrix))
+        healthy = finite(mean, predicted.held)
+        predicted = self._deal_with(healthy, predicted, belief, "predict", {})
+
+        def joint() -> tuple[Tensor, Columns]:
+            root = belief.factor
+            return root, Columns(multiply(motion.matrix, root))
+
+        return Prediction(predicted, healthy, joint, noise, motion.noise_matrix)
 
     def update(self, belief: Gaussian, measurement: AnyMeasurement, value: Tensor, *inputs: Tensor) -> Update:
         """The belief after a measurement: the "perception" of (9.21); Table 9.1 and steps 4 to 7 of Table 9.2.
@@ -127,8 +145,7 @@ class BayesFilter:
         healthy = _both(_both(finite(posterior.mean, posterior.held), solution.healthy), healthy)
         suspects = {} if solution.matrix is None else {"innovation covariance": solution.matrix}
         posterior = self._deal_with(healthy, posterior, belief, "update", suspects)
-        evidence = log_likelihood(at_prior, count)
-        return Update(posterior, innovation, at_prior.nis, evidence, healthy, form, count, columns, added, root)
+        return Update(posterior, innovation, form, count, healthy, at_prior, columns, added, root)
 
     def filter(
         self,
@@ -163,6 +180,10 @@ class BayesFilter:
             root = jittered(belief.covariance, root, healthy)
         return root, healthy
 
+    def _require_flat(self, model: str) -> None:
+        if self.chart is not None:
+            raise TypeError(f"{model} is for states in R^n; on a manifold use a model with a function")
+
     @property
     def chart(self) -> Difference | None:
         """(points, reference) -> tangent at the reference; None in R^n, where it is their difference."""
@@ -193,8 +214,7 @@ class BayesFilter:
         self, mean: Tensor, root: Tensor, motion: AnyMotion, noise: Noise, inputs: tuple[Tensor, ...]
     ) -> Transformed:
         if isinstance(motion, LinearMotion):
-            if self.chart is not None:
-                raise TypeError("LinearMotion is for states in R^n; use MotionModel on a manifold")
+            self._require_flat("LinearMotion")
             return Transformed(None, motion.function(mean, *inputs), Columns(multiply(motion.matrix, root)))
         size = root.shape[-1]
         jacobian = None
@@ -221,8 +241,9 @@ class BayesFilter:
     ) -> tuple[Tensor, Columns]:
         """Innovation and deviations of a linearisation at the prior, or at the posterior of the previous one."""
         if isinstance(measurement, LinearMeasurement):
-            if self.chart is not None or inputs:
-                raise TypeError("LinearMeasurement is for states in R^n and takes no inputs; use MeasurementModel")
+            self._require_flat("LinearMeasurement")
+            if inputs:
+                raise ValueError("an input was given, but a LinearMeasurement takes none")
             innovation = value - measurement.function(mean)
             return innovation, Columns(multiply(measurement.matrix, root))
         size = root.shape[-1]
@@ -272,8 +293,10 @@ class BayesFilter:
         return Gaussian(mean, square(carried))
 
     def _deal_with(
-        self, healthy: Tensor, result: Gaussian, before: Gaussian, stage: str, suspects: dict[str, Tensor]
+        self, healthy: Tensor | None, result: Gaussian, before: Gaussian, stage: str, suspects: dict[str, Tensor]
     ) -> Gaussian:
+        if healthy is None:
+            return result
         if self.on_failure == "raise":
             raise_unless_healthy(healthy, stage, lambda: {"prior covariance": before.covariance, **suspects})
             return result
@@ -319,8 +342,11 @@ def _is_additive(model: AnyMotion | AnyMeasurement) -> bool:
     return isinstance(model, LinearMotion | LinearMeasurement) or model.additive
 
 
-def _both(first: Tensor, second: Tensor | None) -> Tensor:
-    return first if second is None else first & second
+def _both(first: Tensor | None, second: Tensor | None) -> Tensor | None:
+    """Conjunction of flags (...,), of which None is all true."""
+    if first is None or second is None:
+        return second if first is None else first
+    return first & second
 
 
 def _with_noise_columns(columns: Columns, size: int) -> Columns:
@@ -344,11 +370,14 @@ def _predicted_covariance(columns: Columns, noise: Noise | None, noise_matrix: T
     covariance = square(columns.all())
     if columns.negative is not None:
         covariance = covariance - square([columns.negative])
-    if noise is None:
-        return covariance
+    return covariance if noise is None else covariance + _entering_twice(noise, noise_matrix)
+
+
+def _entering_twice(noise: Noise, noise_matrix: Tensor | None) -> Tensor:
+    """B2 Q B2^T, (..., n, n)."""
     if noise_matrix is None:
-        return covariance + noise.covariance()
-    return covariance + multiply(multiply(noise_matrix, noise.covariance()), noise_matrix.mT)
+        return noise.covariance()
+    return multiply(multiply(noise_matrix, noise.covariance()), noise_matrix.mT)
 
 
 def _without_missing(value: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None, Tensor | int]:

@@ -5,6 +5,7 @@ No function here raises for one bad element of a batch or adds anything to a dia
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import lru_cache
 
@@ -17,29 +18,37 @@ from sigmaslam.filters import linalg, small
 _TOLERANCE = 450
 
 
-def cholesky(matrix: Tensor) -> tuple[Tensor, Tensor]:
+def cholesky(matrix: Tensor) -> tuple[Tensor, Tensor | None]:
     """Lower factor L, L L^T = matrix, of positive semidefinite matrices.
 
     Args:
         matrix: (..., n, n) symmetric; the lower triangle is read. Exactly known or copied directions are allowed.
     Returns:
-        (..., n, n) lower triangular factor; (...,) bool, True where the matrix is positive semidefinite and finite.
-        Where it is not, the factor is arbitrary.
+        (..., n, n) lower triangular factor; (...,) bool, True where the matrix is positive semidefinite and finite, or
+        None where that is known to hold for all. Where it does not, the factor is arbitrary.
     """
     tolerance = _TOLERANCE * torch.finfo(matrix.dtype).eps
     if small.is_small(matrix):
         return small.cholesky(matrix, tolerance)
     factor, failure = torch.linalg.cholesky_ex(matrix)
-    healthy = failure == 0
-    if torch.compiler.is_compiling() or bool(healthy.all()):
-        return factor, healthy
+    if may_look(matrix):
+        if not bool(failure.any()):
+            return factor, None
+    elif torch.compiler.is_compiling():
+        return factor, failure == 0
     # LAPACK knows positive definite matrices only.
+    healthy = failure == 0
     semidefinite = linalg.cholesky(matrix)
     error = (semidefinite @ semidefinite.mT - matrix).tril().abs().amax(dim=(-2, -1))
     scale = torch.diagonal(matrix, dim1=-2, dim2=-1).abs().amax(dim=-1)
     restored = error <= 4 * tolerance**0.5 * scale  # False for NaN
     chosen = torch.where(healthy[..., None, None], factor, semidefinite)
     return chosen, healthy | restored
+
+
+def may_look(array: Tensor) -> bool:
+    """Whether control flow may depend on values: on a CPU a look is cheap, elsewhere it waits or breaks a graph."""
+    return array.device.type == "cpu" and not torch.compiler.is_compiling()
 
 
 def triangularise(pieces: Sequence[Tensor], diagonal: Tensor | None = None) -> Tensor:
@@ -71,11 +80,14 @@ def triangularise(pieces: Sequence[Tensor], diagonal: Tensor | None = None) -> T
     return torch.nn.functional.pad(lower, (0, size - columns)) if columns < size else lower
 
 
-def solve_lower(factor: Tensor, right: Tensor) -> Tensor:
-    """L^-1 B for lower triangular L (..., n, n) and B (..., n, c); a zero pivot is a known direction."""
+def solve_lower(factor: Tensor, right: Tensor, regular: bool = False) -> Tensor:
+    """L^-1 B for lower triangular L (..., n, n) and B (..., n, c).
+
+    A zero pivot is a known direction, of which nothing is asked; `regular` says that there is none.
+    """
     if small.is_small(factor, right.shape[-1]):
         return small.solve_lower(factor, right)
-    return torch.linalg.solve_triangular(_without_zero_pivots(factor), right, upper=False)
+    return torch.linalg.solve_triangular(factor if regular else _without_zero_pivots(factor), right, upper=False)
 
 
 def solve_lower_transposed(factor: Tensor, right: Tensor) -> Tensor:
@@ -109,9 +121,11 @@ def apply(matrix: Tensor, vector: Tensor) -> Tensor:
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
 
 
-def finite(vector: Tensor, matrix: Tensor) -> Tensor:
-    """Whether all entries of (..., n) and (..., r, c) are finite, (...,) bool."""
-    # Their sum is, unless it overflows; and what is not finite does not cancel against itself.
+def finite(vector: Tensor, matrix: Tensor) -> Tensor | None:
+    """Whether all entries of (..., n) and (..., r, c) are finite, (...,) bool, or None if all elements' are."""
+    # A sum of finite entries is finite unless it overflows, and what is not finite does not cancel against itself.
+    if may_look(vector) and math.isfinite(float(vector.sum() + matrix.sum())):
+        return None
     total = vector.sum(dim=-1) + matrix.sum(dim=(-2, -1))
     return total - total == 0
 
@@ -145,6 +159,6 @@ def _broadcast(pieces: Sequence[Tensor], other: torch.Size | None = None) -> lis
 def _without_zero_pivots(factor: Tensor) -> Tensor:
     """The factor with ones for zero pivots: their columns are zero, so no other unknown changes."""
     diagonal = torch.diagonal(factor, dim1=-2, dim2=-1)
-    if not torch.compiler.is_compiling() and bool((diagonal != 0).all()):
+    if may_look(factor) and bool(diagonal.all()):
         return factor
     return factor + torch.diag_embed((diagonal == 0).to(factor.dtype))

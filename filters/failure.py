@@ -1,4 +1,4 @@
-"""What happens when an element of a batch cannot be filtered: one policy, one flag, one message that teaches (R8, R14)."""
+"""What happens when an element of a batch cannot be filtered: one policy, one flag, one message (R8, R14)."""
 
 from __future__ import annotations
 
@@ -58,8 +58,9 @@ def jittered(covariance: Tensor, factor: Tensor, healthy: Tensor) -> Tensor:
     usable = healthy
     for jitter in _JITTERS:
         tried, mended = cholesky(covariance + jitter * scale)
-        factor = torch.where((mended & ~usable)[..., None, None], tried, factor)
-        usable = usable | mended
+        chosen = ~usable if mended is None else mended & ~usable
+        factor = torch.where(chosen[..., None, None], tried, factor)
+        usable = usable | chosen
     return factor
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -104,7 +106,7 @@ class Gaussian:
         """Leading dimensions."""
         return self.mean.shape[:-1]
 
-    def __getitem__(self, index: object) -> Gaussian:
+    def __getitem__(self, index: Any) -> Gaussian:
         """Elements of the batch: `belief[3]`, `belief[:, -1]`."""
         mean = self.mean[_of_batch(index, 1)]
         if self._covariance is not None:
@@ -120,16 +122,16 @@ class Gaussian:
             return Gaussian(mean, torch.where(mask, self._covariance, other.covariance))
         return Gaussian(mean, factor=torch.where(mask, self.factor, other.factor), factor_is_lower=True)
 
-    def to(self, *arguments: object, **options: object) -> Gaussian:
+    def to(self, *arguments: Any, **options: Any) -> Gaussian:
         """Another dtype or device, as `Tensor.to`."""
-        mean = self.mean.to(*arguments, **options)  # type: ignore[call-overload]
+        mean = self.mean.to(*arguments, **options)
         if self._covariance is not None:
-            return Gaussian(mean, self._covariance.to(*arguments, **options))  # type: ignore[call-overload]
+            return Gaussian(mean, self._covariance.to(*arguments, **options))
         assert self._factor is not None
-        return self._like(mean, self._factor.to(*arguments, **options))  # type: ignore[call-overload]
+        return self._like(mean, self._factor.to(*arguments, **options))
 
     def batch_last(self) -> Gaussian:
-        """The same belief with batch-last memory: `mean[..., i]` is contiguous, and large batches run several times faster."""
+        """The same belief with batch-last memory: `mean[..., i]` is contiguous, and large batches run much faster."""
         mean = _with_batch_last_memory(self.mean, 1)
         if self._covariance is not None:
             return Gaussian(mean, _with_batch_last_memory(self._covariance, 2))
@@ -144,7 +146,7 @@ class Gaussian:
         return f"Gaussian(mean {tuple(self.mean.shape)}, {kind}, n = {self.size}, {self.mean.dtype})"
 
 
-def _of_batch(index: object, trailing: int) -> tuple[object, ...]:
+def _of_batch(index: Any, trailing: int) -> tuple[Any, ...]:
     """An index of the batch dimensions made one of the whole array; an ellipsis stands for batch dimensions."""
     given = index if isinstance(index, tuple) else (index,)
     if not any(part is Ellipsis for part in given):

@@ -171,7 +171,7 @@ def _apply_v(vector: Vector, rotation: Vector, second: Tensor, third: Tensor) ->
 
 # Series have four terms. They end where the first one left out is half a unit of round-off, and no sooner, because the
 # derivatives of the closed forms lose digits long before the closed forms do. A clamp whose bound lies well inside the
-# other branch keeps the unused side finite. Sums start from a positive number: `1.0 - tensor` is twice as slow.
+# other branch keeps the unused side finite. A number starts sums only: `1.0 - tensor` is twice as slow as `1.0 + tensor`.
 
 
 def _exp_coefficients(squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:

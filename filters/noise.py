@@ -127,7 +127,7 @@ class BlockDiagonal:
         factor, healthy = cholesky(self.blocks)
         white = solve_lower(factor, columns.unflatten(-2, (count, size)))
         # A bad block must not pass for a good one; its element of the batch is flagged by what becomes of it.
-        return torch.where(healthy[..., None, None], white, torch.nan).flatten(-3, -2)
+        return _flagged(white, healthy).flatten(-3, -2)
 
     def log_determinant(self) -> Tensor:
         """log |R|, (...,)."""
@@ -163,8 +163,7 @@ class Dense:
 
     def factor(self) -> Tensor:
         """Lower triangular root of R, (..., m, m)."""
-        factor, healthy = cholesky(self._covariance)
-        return torch.where(healthy[..., None, None], factor, torch.nan)
+        return _flagged(*cholesky(self._covariance))
 
     def triangularised(self, pieces: Sequence[Tensor]) -> Tensor:
         """Lower root of R and more deviations."""
@@ -227,6 +226,11 @@ class Rooted:
 def as_noise(noise: Noise | Tensor) -> Noise:
     """A tensor is taken for a dense covariance (..., m, m)."""
     return Dense(noise) if isinstance(noise, Tensor) else noise
+
+
+def _flagged(matrix: Tensor, healthy: Tensor | None) -> Tensor:
+    """Matrices (..., r, c) with NaN in those that are not healthy, so that no result passes for one."""
+    return matrix if healthy is None else torch.where(healthy[..., None, None], matrix, torch.nan)
 
 
 def _masked(covariance: Tensor, mask: Tensor) -> Tensor:

@@ -109,18 +109,22 @@ class Symmetric:
     def mean(self, values: Tensor, size: int, with_centre: bool) -> Tensor:
         """Centred on the centre where there is one: x0 + sum w_i (x_i - x0), which is exact to round-off (R3)."""
         weight = self.weights(size)[0]
-        if not with_centre:
-            return _total(values) * weight
-        centre = values[-1]
-        return centre + _total(values[: 2 * size] - centre) * weight
+        first = values.movedim(-1, 1)  # components before the batch: what is computed is batch-last in memory
+        if with_centre:
+            centre = first[-1]
+            mean = centre + _total(first[: 2 * size] - centre) * weight
+        else:
+            mean = _total(first) * weight
+        return mean.movedim(0, -1)
 
     def deviations(self, values: Tensor, mean: Tensor, size: int, with_centre: bool) -> Columns:
         """Half differences and half sums of each pair; the centre makes a column of its own."""
         weight, _, centre_covariance = self.weights(size)
         scale = math.sqrt(0.5 * weight)
-        plus, minus = values[:size], values[size : 2 * size]
-        odd = ((plus - minus) * scale).movedim(0, -1)
-        even = ((plus + minus - 2.0 * mean) * scale).movedim(0, -1)
+        first = values.movedim(-1, 1)
+        plus, minus = first[:size], first[size : 2 * size]
+        odd = ((plus - minus) * scale).movedim((0, 1), (-1, -2))
+        even = ((plus + minus - 2.0 * mean.movedim(-1, 0)) * scale).movedim((0, 1), (-1, -2))
         if not with_centre or centre_covariance == 0.0:
             return Columns(odd, even)
         centre = ((values[-1] - mean) * math.sqrt(abs(centre_covariance))).unsqueeze(-1)
@@ -173,7 +177,7 @@ def merwe(alpha: float = 1.0, beta: float = 2.0, kappa: float = 0.0, allow_negat
 
 
 def _total(values: Tensor) -> Tensor:
-    """Sum over the points, (k, ..., m) -> (..., m)."""
+    """Sum over the points, (k, m, ...) -> (m, ...)."""
     if values.ndim < 3 or values.shape[0] > 2 * ROWS:
         return values.sum(dim=0)
     # torch's reduction of an outer dimension is slow on batch-last memory.

@@ -40,18 +40,19 @@ def join(matrices: Sequence[Tensor]) -> Tensor:
 
 def multiply(left: Tensor, right: Tensor) -> Tensor:
     """Product of (..., r, k) and (..., k, c), a sum of outer products."""
-    total = left[..., :, 0, None] * right[..., None, 0, :]
+    # Rows and columns first: what is computed then has the batch last in memory, whatever the arguments have.
+    batch = torch.broadcast_shapes(left.shape[:-2], right.shape[:-2])
+    a = left.expand(*batch, *left.shape[-2:]).movedim((-2, -1), (0, 1))
+    b = right.expand(*batch, *right.shape[-2:]).movedim((-2, -1), (0, 1))
+    total = a[:, 0, None] * b[None, 0]
     for k in range(1, left.shape[-1]):
-        total = total + left[..., :, k, None] * right[..., None, k, :]
-    return total
+        total = total + a[:, k, None] * b[None, k]
+    return total.movedim((0, 1), (-2, -1))
 
 
 def apply(matrix: Tensor, vector: Tensor) -> Tensor:
     """Matrix (..., r, k) times vector (..., k), column by column."""
-    total = matrix[..., :, 0] * vector[..., 0, None]
-    for k in range(1, matrix.shape[-1]):
-        total = total + matrix[..., :, k] * vector[..., k, None]
-    return total
+    return multiply(matrix, vector.unsqueeze(-1))[..., 0]
 
 
 def cholesky(matrix: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
@@ -114,11 +115,14 @@ def stacked_update(white: Tensor, size: int, prior: Tensor) -> tuple[Tensor, Ten
         size: n.
         prior: (..., n, n) lower root of the prior covariance.
     Returns:
-        mean of zeta (..., n), lower root of the posterior covariance (..., n, n), NIS (...,), log |I + W W^T| (...,).
+        mean of zeta (..., n), lower root of the posterior covariance (..., n, n), sqrt(1 + NIS) (...,), and the pivots
+        (..., k), whose squares have the product |I + W W^T|.
     """
     count = white.shape[-1] - 1
     one = torch.ones_like(white[..., 0, :1])
-    rows: list[_Row] = [[*parts, *(one if k == i else None for k in range(count + 1))] for i, parts in enumerate(_parts(white.mT))]
+    rows: list[_Row] = [
+        [*parts, *(one if k == i else None for k in range(count + 1))] for i, parts in enumerate(_parts(white.mT))
+    ]
     triangle = _orthogonalise(rows)
     first = count - size
     root = [row[first:] for row in triangle[first:count]]
@@ -139,11 +143,8 @@ def stacked_update(white: Tensor, size: int, prior: Tensor) -> tuple[Tensor, Ten
         spread: list[_Row] = [[column[..., i : i + 1] for column in columns] for i in range(size)]
     else:
         spread = _parts(assemble(columns).mT)
-    product = triangle[0][0]
-    for j in range(1, count):
-        product = product * triangle[j][j]
-    nis = projected[count] * projected[count] - 1.0
-    return torch.stack(mean, dim=0).movedim(0, -1), _from_lower(_orthogonalise(spread)), nis, 2.0 * torch.log(product)
+    pivots = torch.stack([triangle[j][j] for j in range(count)], dim=0).movedim(0, -1)
+    return torch.stack(mean, dim=0).movedim(0, -1), _from_lower(_orthogonalise(spread)), projected[count], pivots
 
 
 def solve_lower(factor: Tensor, right: Tensor) -> Tensor:

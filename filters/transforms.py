@@ -112,7 +112,8 @@ class Taylor:
             values = evaluate(offsets)
             return values if difference is None else difference(values, reference)
 
-        values, slopes = torch.func.jvp(local, (torch.zeros_like(directions),), (directions,))
+        pushed = torch.func.jvp(local, (torch.zeros_like(directions),), (directions,))
+        values, slopes = pushed[0], pushed[1]
         return Transformed(None if difference is None else reference, values[0], Columns(slopes.movedim(0, -1)))
 
 

@@ -13,6 +13,7 @@ covariance is S = odd odd^T + even even^T + R, and odd is its covariance with ze
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -46,17 +47,17 @@ class Solution:
         shift: (..., n) its mean.
         covariance: (..., n, n); None from the qr form.
         root: (..., n, n) lower triangular root of the covariance; from the qr form only.
-        nis: (...,) e^T S^-1 e.
-        log_determinant: (...,) log |S|.
+        nis: makes e^T S^-1 e, (...,).
+        log_determinant: makes log |S|, (...,).
         matrix: (..., k, k) what was factored: S, or I + W^T W; None from the qr form.
-        healthy: (...,) bool: the factorisation exists; None: it always does.
+        healthy: (...,) bool: the factorisation exists; None: it does for all.
     """
 
     shift: Tensor
     covariance: Tensor | None
     root: Tensor | None
-    nis: Tensor
-    log_determinant: Tensor
+    nis: Callable[[], Tensor]
+    log_determinant: Callable[[], Tensor]
     matrix: Tensor | None
     healthy: Tensor | None
 
@@ -76,7 +77,7 @@ class Solution:
             covariance=pick(self.covariance, other.covariance, 2),
             root=pick(self.root, other.root, 2),
             matrix=pick(self.matrix, other.matrix, 2),
-            healthy=pick(self.healthy, other.healthy, 0),
+            healthy=self.healthy if other.healthy is None else other.healthy,
         )
 
     def factor(self) -> Tensor:
@@ -120,7 +121,7 @@ def solve(form: Form, innovation: Tensor, columns: Columns, noise: Noise | None,
     parts = [odd, innovation.unsqueeze(-1)] if even is None else [even, odd, innovation.unsqueeze(-1)]
     white = noise.whitened(join(parts))
     solver = _qr if form == "qr" else _low_rank
-    return solver(white, prior, noise.log_determinant())
+    return solver(white, prior, noise)
 
 
 def _dense(innovation: Tensor, columns: Columns, noise: Noise | None, prior: Tensor) -> Solution:
@@ -138,56 +139,60 @@ def _dense(innovation: Tensor, columns: Columns, noise: Noise | None, prior: Ten
         shift=apply(prior, apply(gain.mT, residual)),
         covariance=multiply(multiply(prior, covariance), prior.mT),
         root=None,
-        nis=(residual * residual).sum(dim=-1),
-        log_determinant=log_diagonal(factor),
+        nis=lambda: (residual * residual).sum(dim=-1),
+        log_determinant=lambda: log_diagonal(factor),
         matrix=S,
         healthy=healthy,
     )
 
 
-def _low_rank(white: Tensor, prior: Tensor, log_determinant: Tensor) -> Solution:
+def _low_rank(white: Tensor, prior: Tensor, noise: Noise) -> Solution:
     """White deviations (..., m, k), the last n of them odd, with the white innovation as one more column."""
-    deviations, residual = white[..., :-1], white[..., -1:]
-    count = deviations.shape[-1]
+    count = white.shape[-1] - 1
     first = count - prior.shape[-1]
-    projection = deviations.mT @ white
-    information = projection[..., :count] + identity(count, white)
+    deviations = white[..., :count]
+    products = deviations.mT @ white
+    information = products[..., :count] + identity(count, white)
     factor, healthy = cholesky(information)
-    eta = torch.cholesky_solve(projection[..., count:], factor)
-    remaining = residual - deviations @ eta
-    # As sums of squares: the shorter |e|^2 - |c|^2 cancels when the prior is vague.
-    nis = (remaining * remaining).sum(dim=(-2, -1)) + (eta * eta).sum(dim=(-2, -1))
-    spread = solve_lower(factor[..., first:, first:], prior.mT)
+    projected = solve_lower(factor, products[..., count:], regular=True)
+    spread = solve_lower(factor[..., first:, first:], prior.mT, regular=True)
+
+    def nis() -> Tensor:
+        # As sums of squares: the shorter |e|^2 - |projected|^2 cancels when the prior is vague.
+        eta = solve_lower_transposed(factor, projected)
+        remaining = white[..., count:] - deviations @ eta
+        return (remaining * remaining).sum(dim=(-2, -1)) + (eta * eta).sum(dim=(-2, -1))
+
     return Solution(
-        shift=apply(prior, eta[..., first:, 0]),
+        shift=apply(spread.mT, projected[..., first:, 0]),
         covariance=square([spread.mT]),
         root=None,
         nis=nis,
-        log_determinant=log_determinant + log_diagonal(factor),
+        log_determinant=lambda: noise.log_determinant() + log_diagonal(factor),
         matrix=information,
         healthy=healthy,
     )
 
 
-def _qr(white: Tensor, prior: Tensor, log_determinant: Tensor) -> Solution:
+def _qr(white: Tensor, prior: Tensor, noise: Noise) -> Solution:
     """As `_low_rank`, by triangularising the rows [W^T, I, 0] and [e^T, 0, 1]; the 1 keeps the last pivot off zero."""
     if is_small(white.mT):
-        mean, root, nis, evidence = stacked_update(white, prior.shape[-1], prior)
+        mean, root, last, determinant = stacked_update(white, prior.shape[-1], prior)
     else:
         count = white.shape[-1] - 1
         first = count - prior.shape[-1]
         triangle = triangularise([white.mT, identity(count + 1, white)])
         inner, projected = triangle[..., first:count, first:count], triangle[..., count, first:count]
         mean = solve_lower_transposed(inner, projected.unsqueeze(-1)).squeeze(-1)
-        root = triangularise([solve_lower(inner, prior.mT).mT])
-        nis = triangle[..., count, count] ** 2 - 1.0
-        evidence = log_diagonal(triangle[..., :count, :count])
+        root = triangularise([solve_lower(inner, prior.mT, regular=True).mT])
+        last = triangle[..., count, count]
+        determinant = torch.diagonal(triangle, dim1=-2, dim2=-1)[..., :count]
     return Solution(
         shift=apply(prior, mean),
         covariance=None,
         root=root,
-        nis=nis.clamp_min(0.0),
-        log_determinant=log_determinant + evidence,
+        nis=lambda: (last * last - 1.0).clamp_min(0.0),
+        log_determinant=lambda: noise.log_determinant() + 2.0 * torch.log(determinant).sum(dim=-1),
         matrix=None,
         healthy=None,
     )
@@ -195,4 +200,4 @@ def _qr(white: Tensor, prior: Tensor, log_determinant: Tensor) -> Solution:
 
 def log_likelihood(solution: Solution, count: Tensor | int) -> Tensor:
     """Gaussian log-density of the innovation, (...,); count is the number of components that took part."""
-    return -0.5 * (solution.nis + solution.log_determinant + count * math.log(2 * math.pi))
+    return -0.5 * (solution.nis() + solution.log_determinant() + count * math.log(2 * math.pi))

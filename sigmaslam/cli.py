@@ -51,6 +51,8 @@ class Benchmark(StrEnum):
     """Benchmarks by name."""
 
     sequences = "sequences"
+    filters = "filters"
+    claims = "claims"
 
 
 def _show_version(wanted: bool) -> None:
@@ -154,20 +156,38 @@ def export(
 @app.command()
 def benchmark(
     name: Annotated[Benchmark, typer.Argument(help="Which benchmark.")],
-    out: Annotated[Path, typer.Option(help="Markdown page to write.")],
+    out: Annotated[Path, typer.Option(help="Markdown page to write; notes below '<!-- notes -->' in it are kept.")],
     data: Annotated[
-        Path | None, typer.Option(envvar="SIGMASLAM_DATA", help="Folder of the real data sets; none: the demo alone.")
+        Path | None,
+        typer.Option(envvar="SIGMASLAM_DATA", help="sequences: folder of the real data sets; none: the demo alone."),
     ] = None,
     frontend: Annotated[
-        list[Frontend] | None, typer.Option(help="Front-ends to compare; may be given more than once.")
+        list[Frontend] | None,
+        typer.Option(help="sequences: front-ends to compare; may be given more than once."),
     ] = None,
+    rounds: Annotated[int, typer.Option(min=1, help="filters: rounds in which every contender is timed.")] = 7,
+    eager: Annotated[bool, typer.Option("--eager", help="filters: leave out what takes minutes to compile.")] = False,
 ) -> None:
-    """Run a benchmark and write its table."""
-    from sigmaslam.evaluation.benchmarks.sequences import write_results
+    """Run a benchmark and write its page.
 
-    names = [choice.value for choice in frontend or list(Frontend)]
+    sequences: the tracker on every sequence. filters: speed of the filters beside those of other libraries that are
+    installed. claims: EKF against UKF by Monte Carlo. The last two need the extra 'train'.
+    """
     command = f"sigmaslam benchmark {name.value} --out {out}"
-    typer.echo(write_results(out, data, names, command))
+    if name is Benchmark.sequences:
+        from sigmaslam.evaluation.benchmarks.sequences import write_results
+
+        typer.echo(write_results(out, data, [choice.value for choice in frontend or list(Frontend)], command))
+        return
+    _need_train_extra()
+    if name is Benchmark.filters:
+        from sigmaslam.evaluation.benchmarks.filters import write_page
+
+        typer.echo(write_page(out, rounds, not eager, command + (" --eager" if eager else "")))
+    else:
+        from sigmaslam.evaluation.benchmarks.filter_claims import write_claims
+
+        typer.echo(write_claims(out, out.with_suffix(".png")))
 
 
 def main() -> None:

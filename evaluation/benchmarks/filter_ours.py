@@ -31,6 +31,7 @@ from sigmaslam.filters import (
     MeasurementModel,
     MotionModel,
     UnscentedKalmanFilter,
+    compile_step,
     stack,
     wrap_angle,
 )
@@ -79,19 +80,19 @@ def make(work: Work, dtype: str = "float64", compiled: bool = False, device: str
         prior = prior.batch_last()
         inputs = [stack(given.unbind(-1)) for given in inputs]
 
-    def step(mean: Tensor, held: Tensor, *inputs: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def step(mean: Tensor, held: Tensor, *inputs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         by_root = prior.is_square_root
         belief = Gaussian(mean, factor=held, factor_is_lower=True) if by_root else Gaussian(mean, held)
         controls, seen = inputs[: len(motion_inputs)], inputs[len(motion_inputs) :]
         predicted = bayes.predict(belief, motion, *controls).belief
         result = bayes.update(predicted, measurement, *seen)
-        return result.belief.mean, result.belief.held, result.nis, result.healthy
+        return result.belief.mean, result.belief.held, result.healthy
 
-    run = torch.compile(step, dynamic=False, fullgraph=True) if compiled else step
+    run = compile_step(step) if compiled else step
 
     def one() -> Gaussian:
         with torch.inference_mode():
-            mean, held, _, _ = run(prior.mean, prior.held, *inputs)
+            mean, held, _ = run(prior.mean, prior.held, *inputs)
         return Gaussian(mean, factor=held) if prior.is_square_root else Gaussian(mean, held)
 
     return one

@@ -35,29 +35,15 @@ def random_axes(count: int, seed: int = 0) -> Tensor:
     return axes / axes.norm(dim=-1, keepdim=True)
 
 
-def rotations_first_and_last(manifold: Manifold) -> tuple[list[slice], list[slice]]:
-    """Where the turning numbers lie in a tangent: those of planes and those of space."""
-    if isinstance(manifold, Product):
-        planes, spaces, start = [], [], 0
-        for part in manifold.parts:
-            for found, target in zip(rotations_first_and_last(part), (planes, spaces), strict=True):
-                target += [slice(start + s.start, start + s.stop) for s in found]
-            start += part.tangent_size
-        return planes, spaces
-    end = manifold.tangent_size
-    if isinstance(manifold, SO2 | SE2):
-        return [slice(end - 1, end)], []
-    return [], [] if isinstance(manifold, Euclidean) else [slice(end - 3, end)]
-
-
 def tangents(manifold: Manifold, angles: Tensor, seed: int = 0) -> Tensor:
     """Tangents (len(angles), n) of which every rotation turns by the angles, about random axes."""
+    if isinstance(manifold, Product):
+        return torch.cat([tangents(part, angles, seed + i) for i, part in enumerate(manifold.parts)], dim=-1)
     result = random_numbers(len(angles), manifold.tangent_size, seed=seed)
-    planes, spaces = rotations_first_and_last(manifold)
-    for place in planes:
-        result[:, place] = (angles * random_numbers(len(angles), seed=seed + 1).sign()).unsqueeze(-1)
-    for place in spaces:
-        result[:, place] = random_axes(len(angles), seed=seed + 2) * angles.unsqueeze(-1)
+    if isinstance(manifold, SO2 | SE2):
+        result[:, -1] = angles * result[:, -1].sign()
+    elif isinstance(manifold, SO3 | SE3):
+        result[:, -3:] = random_axes(len(angles), seed=seed + 100) * angles.unsqueeze(-1)
     return result
 
 
@@ -136,13 +122,14 @@ def test_tiny_turns_keep_their_digits(group: Group, dtype: torch.dtype):
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_half_a_turn_itself(side: str):
     axes = random_axes(100)
+    half_turn = torch.full((100,), math.pi, dtype=torch.float64)
     for group, found in ((SO3(side), slice(0, 3)), (SE3(side), slice(3, 6))):
         tangent = torch.zeros(100, group.tangent_size, dtype=torch.float64)
         tangent[:, found] = math.pi * axes
         point = random_points(group, 100)
         back = there_and_back(group, point)(tangent)[:, found]
-        torch.testing.assert_close(back.norm(dim=-1), torch.full((100,), math.pi).double(), rtol=0, atol=4e-15)
-        torch.testing.assert_close((back * axes).sum(dim=-1).abs(), torch.full((100,), math.pi).double())
+        torch.testing.assert_close(back.norm(dim=-1), half_turn, rtol=0, atol=4e-15)
+        torch.testing.assert_close((back * axes).sum(dim=-1).abs(), half_turn)
     for quaternion in ([0.6, 0.0, 0.8, 0.0], [-0.6, 0.0, -0.8, 0.0], [-0.6, 0.0, -0.8, -0.0]):
         point = torch.tensor(quaternion, dtype=torch.float64)
         found_angle = SO3(side).local(identity(SO3()), point).norm()
@@ -182,7 +169,7 @@ def test_angles_wrap_to_the_half_open_interval():
     assert SO2().local(torch.tensor([-3.0]), torch.tensor([3.0])).item() == pytest.approx(6.0 - 2 * pi, abs=1e-6)
 
 
-@pytest.mark.parametrize("steps", [1000, pytest.param(100_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("steps", [300, pytest.param(100_000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 def test_a_long_chain_stays_at_unit_length(steps: int, dtype: torch.dtype):
     steps_taken = (0.3 * random_numbers(steps, 3)).to(dtype)
@@ -198,18 +185,14 @@ def test_a_long_chain_stays_at_unit_length(steps: int, dtype: torch.dtype):
 @each_group
 def test_retract_multiplies_by_the_matrix_exponential(group: Group):
     tangent = spread_tangents(group)
-    # matrix_exp spoils numbers that squaring brings to underflow.
-    tangent = tangent[(tangent.abs() > 1e-100).all(dim=-1)]
     point = random_points(group, len(tangent))
     moved, start = group.to_matrix(group.retract(point, tangent)), group.to_matrix(point)
     step = torch.linalg.matrix_exp(hat(group, tangent))
     torch.testing.assert_close(moved, start @ step if group.side == "right" else step @ start, rtol=0, atol=3e-14)
 
 
-@each_group
+@pytest.mark.parametrize("group", GROUPS[::2], ids=str)
 def test_left_and_right_differ_by_the_adjoint(group: Group):
-    if group.side == "left":
-        return
     tangent, point = spread_tangents(group), random_points(group, len(ANGLES))
     if isinstance(group, SE3):
         adjoint = adjoint_se3(group.to_matrix(point))
@@ -246,7 +229,7 @@ def test_motions_equal_the_exported_filters():
 
 
 def test_groups_equal_kornia():
-    # kornia: quaternions are (w, x, y, z). At zero its Se3 needs numbers with a gradient to be a plain tensor.
+    # kornia's quaternions are (w, x, y, z), and its poses are parameters even when made of plain tensors.
     angles = torch.linspace(0.05, 3.1, 200, dtype=torch.float64)
     for group, theirs in ((SO3(), So3), (SE3(), Se3), (SE2(), Se2)):
         tangent = tangents(group, angles)
@@ -300,14 +283,17 @@ def test_there_and_back_has_derivative_identity(manifold: Manifold):
 def test_derivatives_are_finite_at_special_points(manifold: Manifold):
     x = identity(manifold)
     half_turn = tangents(manifold, torch.tensor([math.pi], dtype=torch.float64))[0]
-    for v in (0 * half_turn, half_turn, 1e-200 * half_turn):
-        to_zero = lambda v: manifold.local(x, manifold.retract(x, v)).square().sum()  # noqa: E731
-        assert jacrev(to_zero)(v).isfinite().all()
-        assert jacfwd(jacrev(to_zero))(v).isfinite().all()
-        y = manifold.retract(x, v)
-        for inner, outer in ((x, y), (y, x)):
-            assert all(d.isfinite().all() for d in jacrev(manifold.local, argnums=(0, 1))(inner, outer))
-            assert all(d.isfinite().all() for d in jacfwd(manifold.retract, argnums=(0, 1))(inner, v))
+    v = torch.stack([0.0 * half_turn, half_turn, 1e-200 * half_turn])
+    y = manifold.retract(x, v)
+
+    def squared(v: Tensor) -> Tensor:
+        return manifold.local(x, manifold.retract(x, v)).square().sum()
+
+    assert vmap(jacfwd(jacrev(squared)))(v).isfinite().all()
+    for derivative in (jacfwd, jacrev):
+        local, retract = (derivative(f, argnums=(0, 1)) for f in (manifold.local, manifold.retract))
+        found = (*vmap(local, (None, 0))(x, y), *vmap(local, (0, None))(y, x), *vmap(retract, (None, 0))(x, v))
+        assert all(d.isfinite().all() for d in found)
 
 
 @each_manifold
@@ -317,7 +303,7 @@ def test_second_derivatives_agree_with_differences_across_the_ends_of_the_series
     gradient = vmap(jacrev(lambda v, x: manifold.retract(x, v).pow(3).sum()))
     step = 1e-5 * random_numbers(manifold.tangent_size, seed=7)
     _, found = jvp(lambda v: gradient(v, x), (v,), (step.expand_as(v),))
-    torch.testing.assert_close(found, 0.5 * (gradient(v + step, x) - gradient(v - step, x)), rtol=0, atol=1e-12)
+    torch.testing.assert_close(found, 0.5 * (gradient(v + step, x) - gradient(v - step, x)), rtol=0, atol=1e-11)
 
 
 # Shapes, types and transforms
@@ -378,7 +364,7 @@ def test_wrong_sizes_say_what_was_expected(manifold: Manifold):
 
 
 def test_wrong_settings_are_refused():
-    with pytest.raises(ValueError, match="SE3: side must be \"right\".*'up'"):
+    with pytest.raises(ValueError, match=r'SE3: side must be "right".*got .up.'):
         SE3("up")
     with pytest.raises(ValueError, match="at least one"):
         Product()
@@ -386,15 +372,21 @@ def test_wrong_settings_are_refused():
         SE2().from_matrix(torch.eye(4))
 
 
-@each_manifold
-@pytest.mark.parametrize("backend", ["aot_eager", pytest.param("inductor", marks=pytest.mark.slow)])
-def test_compiled_as_one_graph_equals_eager(manifold: Manifold, backend: str):
+def assert_compiled_equals_eager(manifold: Manifold, backend: str) -> None:
     torch.compiler.reset()
     x, v = random_points(manifold, 30), spread_tangents(manifold)[::13][:30]
-    run = torch.compile(
-        lambda x, v: manifold.local(x, manifold.retract(x, v)), fullgraph=True, dynamic=False, backend=backend
-    )
+    run = torch.compile(lambda x, v: there_and_back(manifold, x)(v), fullgraph=True, dynamic=False, backend=backend)
     torch.testing.assert_close(run(x, v), there_and_back(manifold, x)(v), rtol=0, atol=1e-14)
+
+
+def test_all_is_one_graph():
+    assert_compiled_equals_eager(Product(SE3(), SE2("left"), SO2(), Euclidean(2)), backend="eager")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("manifold", [MANIFOLDS[-1], Product(SE2(), SE2("left"), SE3())], ids=str)
+def test_compiled_equals_eager(manifold: Manifold):
+    assert_compiled_equals_eager(manifold, backend="inductor")
 
 
 # Products and memory

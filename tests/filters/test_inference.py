@@ -1,0 +1,622 @@
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+from scipy.stats import kstest
+from torch import Tensor
+
+from sigmaslam.filters import (
+    SE2,
+    SE3,
+    SO3,
+    BlockDiagonal,
+    Diagonal,
+    ExtendedKalmanFilter,
+    FilterError,
+    Gaussian,
+    KalmanFilter,
+    LinearMeasurement,
+    Manifold,
+    MeasurementModel,
+    wrap_angle,
+)
+from sigmaslam.filters.inference import Estimate, Observation, maximum_a_posteriori, maximum_likelihood
+
+EXACT = {"rtol": 1e-10, "atol": 1e-10}
+BEACONS = torch.tensor([[0.0, 0.0], [4.0, -1.0], [1.0, 5.0]], dtype=torch.float64)
+
+
+def random_numbers(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def covariances(*shape: int, seed: int = 0) -> Tensor:
+    root = random_numbers(*shape, shape[-1], seed=seed)
+    return root @ root.mT + 0.1 * torch.eye(shape[-1], dtype=torch.float64)
+
+
+def numbers(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def linear_problem(*batch: int, size: int = 3, measured: int = 6) -> tuple[LinearMeasurement, Tensor]:
+    matrix, noise = random_numbers(*batch, measured, size, seed=1), covariances(*batch, measured, seed=2)
+    return LinearMeasurement(matrix, noise), random_numbers(*batch, measured, seed=3)
+
+
+def ranges(state: Tensor) -> Tensor:
+    """Distances of points (..., 2) to the beacons."""
+    offset = BEACONS.to(state.dtype) - state[..., None, :2]
+    return torch.sqrt((offset * offset).sum(dim=-1))
+
+
+def bearings(state: Tensor) -> Tensor:
+    """Directions to the beacons from points (..., 2), or as seen from poses (..., 3) of SE2."""
+    offset = BEACONS.to(state.dtype) - state[..., None, :2]
+    seen = torch.atan2(offset[..., 1], offset[..., 0])
+    return wrap_angle(seen - state[..., 2:]) if state.shape[-1] == 3 else seen
+
+
+def ranging(deviation: float = 0.1) -> MeasurementModel:
+    return MeasurementModel(ranges, Diagonal(torch.full((3,), deviation**2, dtype=torch.float64)))
+
+
+def sighting(deviation: float = 0.05) -> MeasurementModel:
+    noise = Diagonal(torch.full((3,), deviation**2, dtype=torch.float64))
+    return MeasurementModel(bearings, noise, residual=lambda measured, seen: wrap_angle(measured - seen))
+
+
+def project(pose: Tensor, points: Tensor) -> Tensor:
+    """Left and right column and row (..., 3 k) of points (..., k, 3) in a stereo camera at the pose (..., 7)."""
+    T = SE3().to_matrix(pose)
+    x, y, z = ((points - T[..., None, :3, 3]) @ T[..., :3, :3]).unbind(-1)
+    return torch.stack([400 * x / z, 400 * (x - 0.2) / z, 400 * y / z], dim=-1).flatten(-2)
+
+
+def assert_same(first: Estimate, second: Estimate, **tolerance: float) -> None:
+    tolerance = tolerance or EXACT
+    torch.testing.assert_close(first.belief.mean, second.belief.mean, **tolerance)
+    torch.testing.assert_close(first.belief.covariance, second.belief.covariance, **tolerance)
+    torch.testing.assert_close(first.cost, second.cost, **tolerance)
+
+
+# Maximum likelihood, (9.1)-(9.7)
+
+
+def test_linear_maximum_likelihood_equals_the_closed_form() -> None:
+    model, value = linear_problem(5)
+    assert isinstance(model.noise, Tensor)
+    estimate = maximum_likelihood([Observation(model, value)], torch.zeros(5, 3, dtype=torch.float64))
+    weighted = torch.linalg.solve(model.noise, model.matrix)
+    covariance = torch.linalg.inv(weighted.mT @ model.matrix)
+    mean = (covariance @ weighted.mT @ value[..., None])[..., 0]
+    left = value - model.function(mean)
+    torch.testing.assert_close(estimate.belief.mean, mean, **EXACT)
+    torch.testing.assert_close(estimate.belief.covariance, covariance, **EXACT)
+    torch.testing.assert_close(estimate.cost, 0.5 * (left * torch.linalg.solve(model.noise, left)).sum(dim=-1), **EXACT)
+
+
+@pytest.mark.parametrize("batch", [1, 200])  # LAPACK, and unrolled
+def test_linear_maximum_likelihood_keeps_the_digits_that_normal_equations_lose(batch: int) -> None:
+    # Läuchli's columns, almost parallel, with rows of noise and columns of units that are many decades apart.
+    near, units = 1e-5, numbers(1e6, 1.0, 1e-6)
+    deviation = numbers(1e-6, 1.0, 1e3, 1e-2)
+    plain = torch.cat([torch.ones(1, 3, dtype=torch.float64), near * torch.eye(3, dtype=torch.float64)])
+    matrix = deviation[:, None] * plain * units
+    truth = numbers(1.0, 2.0, 3.0) / units
+    value = deviation * (plain @ numbers(1.0, 2.0, 3.0))
+    estimate = maximum_likelihood(
+        [Observation(LinearMeasurement(matrix, Diagonal(deviation**2)), value.expand(batch, 4))],
+        torch.zeros(batch, 3, dtype=torch.float64),
+    )
+    torch.testing.assert_close(estimate.belief.mean, truth.expand(batch, 3), rtol=1e-10, atol=0.0)
+    white = matrix / deviation[:, None]
+    normal = torch.linalg.solve(white.T @ white, white.T @ (value / deviation))
+    assert float((normal / truth - 1).abs().max()) > 1e-8
+
+
+def test_linear_problem_takes_one_step_from_anywhere() -> None:
+    model, value = linear_problem(4)
+    near, far = (
+        maximum_likelihood([Observation(model, value)], torch.full((4, 3), start, dtype=torch.float64))
+        for start in (0.0, 1e3)
+    )
+    assert near.iterations.tolist() == far.iterations.tolist() == [1] * 4
+    assert bool(far.converged.all())
+    assert_same(near, far)
+
+
+def test_location_from_ranges_equals_scipy() -> None:
+    value = ranges(numbers(2.0, 1.0)) + 0.1 * random_numbers(3)
+    estimate = maximum_likelihood([Observation(ranging(), value)], numbers(1.0, 1.0))
+    found = least_squares(
+        lambda x: ((value - ranges(torch.from_numpy(x))) / 0.1).numpy(), [1.0, 1.0], xtol=1e-15, ftol=1e-15, gtol=1e-14
+    )
+    assert bool(estimate.converged)
+    np.testing.assert_allclose(estimate.belief.mean, found.x, atol=1e-8)
+    np.testing.assert_allclose(estimate.cost, found.cost, rtol=1e-10)
+    np.testing.assert_allclose(estimate.belief.covariance, np.linalg.inv(found.jac.T @ found.jac), rtol=1e-6)
+
+
+def test_several_sensors_with_models_of_their_own_are_one_sensor_with_all_components() -> None:
+    point = numbers(2.0, 1.0)
+    far, near = ranges(point) + 0.1 * random_numbers(3), bearings(point) + 0.05 * random_numbers(3, seed=1)
+    fix = LinearMeasurement(torch.eye(2, dtype=torch.float64), covariances(2))
+    apart = [Observation(ranging(), far), Observation(sighting(), near), Observation(fix, point)]
+    assert isinstance(fix.noise, Tensor)
+    joined = MeasurementModel(
+        lambda state: torch.cat([ranges(state), bearings(state), state], dim=-1),
+        torch.block_diag(torch.diag(numbers(*3 * [0.1**2], *3 * [0.05**2])), fix.noise),
+    )
+    together = Observation(joined, torch.cat([far, near, point]))
+    initial = numbers(1.5, 1.5)
+    assert_same(maximum_likelihood(apart, initial), maximum_likelihood([together], initial))
+
+
+# Maximum a posteriori, (9.8)-(9.20)
+
+
+def test_one_step_equals_the_kalman_update_and_both_forms_of_its_covariance() -> None:
+    model, value = linear_problem(4)
+    H, R = model.matrix, model.noise
+    assert isinstance(R, Tensor)
+    prior = Gaussian(random_numbers(4, 3, seed=4), covariances(4, 3, seed=5))
+    estimate = maximum_a_posteriori(prior, [Observation(model, value)])
+    update = KalmanFilter().update(prior, model, value)
+    torch.testing.assert_close(estimate.belief.mean, update.belief.mean, **EXACT)
+    torch.testing.assert_close(2 * estimate.cost, update.nis, **EXACT)
+    P = prior.covariance
+    by_information = torch.linalg.inv(torch.linalg.inv(P) + H.mT @ torch.linalg.solve(R, H))  # (9.19)
+    K = torch.linalg.solve(H @ P @ H.mT + R, H @ P).mT
+    torch.testing.assert_close(by_information, P - K @ H @ P, **EXACT)  # (9.20)
+    torch.testing.assert_close(estimate.belief.covariance, by_information, **EXACT)
+    corrected = prior.mean + (K @ (value - model.function(prior.mean))[..., None])[..., 0]
+    torch.testing.assert_close(estimate.belief.mean, corrected, **EXACT)
+
+
+@pytest.mark.parametrize(("space", "size"), [(None, 2), (SE2(), 3)])
+def test_steps_equal_the_iterated_extended_kalman_filter(space: Manifold | None, size: int) -> None:
+    point = numbers(2.0, 1.0, 0.4)[:size]
+    prior = Gaussian(point + 0.2 * random_numbers(6, size), 0.05 * covariances(6, size, seed=1))
+    value = bearings(point) + 0.05 * random_numbers(6, 3, seed=2)
+    for steps in (1, 10):
+        estimate = maximum_a_posteriori(prior, [Observation(sighting(), value)], space, iterations=steps)
+        update = ExtendedKalmanFilter(space, iterations=steps, form="qr").update(prior, sighting(), value)
+        torch.testing.assert_close(estimate.belief.mean, update.belief.mean, **EXACT)
+        torch.testing.assert_close(estimate.belief.covariance, update.belief.covariance, **EXACT)
+
+
+def test_maximum_a_posteriori_equals_scipy() -> None:
+    prior = Gaussian(numbers(2.3, 0.6), covariances(2))
+    value = ranges(numbers(2.0, 1.0)) + 0.3 * random_numbers(3)
+    estimate = maximum_a_posteriori(prior, [Observation(ranging(0.3), value)])
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        state = torch.from_numpy(x)
+        root = torch.linalg.cholesky(prior.covariance)
+        white = torch.linalg.solve_triangular(root, (state - prior.mean)[:, None], upper=False)[:, 0]
+        return torch.cat([(value - ranges(state)) / 0.3, white]).numpy()
+
+    found = least_squares(residuals, prior.mean.numpy(), xtol=1e-15, ftol=1e-15, gtol=1e-14)
+    np.testing.assert_allclose(estimate.belief.mean, found.x, atol=1e-8)
+    np.testing.assert_allclose(estimate.cost, found.cost, rtol=1e-10)
+    assert int(estimate.degrees_of_freedom) == 3
+
+
+def test_prior_by_root_equals_prior_by_covariance() -> None:
+    root = random_numbers(2, 5)
+    value = ranges(numbers(2.0, 1.0))
+    by_root, by_covariance = (
+        maximum_a_posteriori(prior, [Observation(ranging(), value)])
+        for prior in (Gaussian(numbers(2.2, 1.3), factor=root), Gaussian(numbers(2.2, 1.3), root @ root.T))
+    )
+    assert_same(by_root, by_covariance)
+
+
+@pytest.mark.parametrize("batch", [1, 200])
+def test_exactly_known_directions_of_the_prior_stay_known(batch: int) -> None:
+    prior = Gaussian(numbers(2.0, 1.5).expand(batch, 2), torch.diag(numbers(0.0, 1.0)))
+    value = ranges(numbers(2.0, 1.0)) + 0.1 * random_numbers(3)
+    estimate = maximum_a_posteriori(prior, [Observation(ranging(), value)])
+    height = MeasurementModel(
+        lambda y: ranges(torch.cat([torch.full_like(y, 2.0), y], dim=-1)), Diagonal(numbers(0.01, 0.01, 0.01))
+    )
+    alone = maximum_a_posteriori(Gaussian(numbers(1.5), torch.eye(1).double()), [Observation(height, value)])
+    assert bool((estimate.belief.mean[:, 0] == 2.0).all())
+    torch.testing.assert_close(estimate.belief.mean[:, 1:], alone.belief.mean.expand(batch, 1), **EXACT)
+    expected = torch.nn.functional.pad(alone.belief.covariance, (1, 0, 1, 0))
+    torch.testing.assert_close(estimate.belief.covariance, expected.expand(batch, 2, 2), **EXACT)
+
+
+def test_vague_prior_leads_to_maximum_likelihood() -> None:
+    value = ranges(numbers(2.0, 1.0)) + 0.1 * random_numbers(3)
+    prior = Gaussian(numbers(1.5, 1.5), 1e12 * torch.eye(2, dtype=torch.float64))
+    vague = maximum_a_posteriori(prior, [Observation(ranging(), value)])
+    assert_same(vague, maximum_likelihood([Observation(ranging(), value)], prior.mean), rtol=1e-8, atol=1e-8)
+
+
+def test_without_observations_the_prior_stays() -> None:
+    prior = Gaussian(random_numbers(4, 3), covariances(4, 3))
+    estimate = maximum_a_posteriori(prior, [])
+    torch.testing.assert_close(estimate.belief.mean, prior.mean, **EXACT)
+    torch.testing.assert_close(estimate.belief.covariance, prior.covariance, **EXACT)
+
+
+# What the estimate says of itself
+
+
+def test_errors_and_costs_are_distributed_as_the_estimate_says() -> None:
+    runs, truth = 2000, numbers(2.0, 1.0, 0.4)
+    values = [
+        bearings(truth) + 0.02 * random_numbers(runs, 3),
+        ranges(truth) + 0.05 * random_numbers(runs, 3, seed=1),
+    ]
+    observations = [Observation(sighting(0.02), values[0]), Observation(ranging(0.05), values[1])]
+    estimate = maximum_likelihood(observations, truth, SE2())
+    error = SE2().local(estimate.belief.mean, truth.expand(runs, 3))
+    nees = (error * torch.linalg.solve(estimate.belief.covariance, error)).sum(dim=-1)
+    assert estimate.degrees_of_freedom.unique().tolist() == [3]
+    for squares in (nees, 2 * estimate.cost):
+        assert kstest(squares.numpy(), "chi2", args=(3,)).pvalue > 0.01
+
+
+def test_covariance_on_a_curved_space_is_the_inverse_information_in_the_chart_at_the_mean() -> None:
+    points = random_numbers(8, 3, seed=1) + numbers(0.0, 0.0, 6.0)
+    model = MeasurementModel(project, Diagonal(torch.full((24,), 0.25, dtype=torch.float64)))
+    prior = Gaussian(SE3().from_matrix(torch.eye(4, dtype=torch.float64)), 0.02 * covariances(6, seed=3))
+    truth = SE3().retract(prior.mean, 0.2 * random_numbers(6, seed=2))
+    value = project(truth, points) + 0.5 * random_numbers(24)
+    mean = maximum_a_posteriori(prior, [Observation(model, value, (points,))], SE3()).belief.mean
+    root = torch.linalg.inv(prior.factor)
+
+    def residuals(tangent: Tensor) -> Tensor:
+        state = SE3().retract(mean, tangent)
+        return torch.cat([(value - project(state, points)) / 0.5, root @ SE3().local(prior.mean, state)])
+
+    zero = torch.zeros(6, dtype=torch.float64)
+    slope = torch.autograd.functional.jacobian(residuals, zero)
+    torch.testing.assert_close(slope.T @ residuals(zero), zero, rtol=0.0, atol=1e-6)
+    covariance = maximum_a_posteriori(prior, [Observation(model, value, (points,))], SE3()).belief.covariance
+    torch.testing.assert_close(covariance, torch.linalg.inv(slope.T @ slope), rtol=1e-7, atol=1e-12)
+
+
+# Weights and what is missing
+
+
+def blocks() -> MeasurementModel:
+    """Ranges and bearings, in pairs that are correlated."""
+    return MeasurementModel(
+        lambda state: torch.stack([ranges(state), bearings(state)], dim=-1).flatten(-2),
+        BlockDiagonal(0.01 * covariances(3, 2, seed=7)),
+    )
+
+
+def blocks_value() -> Tensor:
+    return blocks().function(numbers(2.0, 1.0)) + 0.05 * random_numbers(6, seed=8)
+
+
+@pytest.mark.parametrize("per_component", [False, True])
+def test_weight_two_is_the_observation_twice(per_component: bool) -> None:
+    once = Observation(blocks(), blocks_value())
+    weight = torch.full((6,), 2.0, dtype=torch.float64) if per_component else 2.0
+    heavy = Observation(blocks(), blocks_value(), weight=weight)
+    initial = numbers(1.5, 1.5)
+    assert_same(maximum_likelihood([once, once], initial), maximum_likelihood([heavy], initial))
+
+
+def test_weight_zero_nan_and_mask_leave_out() -> None:
+    model, value = blocks(), blocks_value()
+    kept = torch.tensor([True, True, False, True, False, True])
+    masked = MeasurementModel(model.function, model.noise, mask=kept)
+    assert isinstance(model.noise, BlockDiagonal)
+    only = MeasurementModel(lambda state: model.function(state)[..., kept], model.noise.covariance()[kept][:, kept])
+    expected = maximum_likelihood([Observation(only, value[kept])], numbers(1.5, 1.5))
+    for observation in (
+        Observation(model, value, weight=kept.double()),
+        Observation(model, torch.where(kept, value, torch.nan)),
+        Observation(masked, value),
+    ):
+        estimate = maximum_likelihood([observation], numbers(1.5, 1.5))
+        assert_same(estimate, expected)
+        assert int(estimate.degrees_of_freedom) == 2
+    nothing = Observation(ranging(0.01), torch.full((3,), torch.nan, dtype=torch.float64))
+    absent = Observation(ranging(0.01), numbers(9.0, 9.0, 9.0), weight=0.0)
+    assert_same(maximum_likelihood([Observation(only, value[kept]), nothing, absent], numbers(1.5, 1.5)), expected)
+
+
+def test_weights_differ_between_elements_of_a_batch() -> None:
+    value, initial = ranges(numbers(2.0, 1.0)) + 0.1 * random_numbers(3), numbers(1.5, 1.5)
+    observations = [Observation(ranging(), value), Observation(sighting(), bearings(numbers(2.2, 1.0)))]
+    of_element = numbers(0.0, 1.0, 7.0)
+    batch = maximum_likelihood(
+        [observations[0], Observation(observations[1].model, observations[1].value, weight=of_element)],
+        initial.expand(3, 2),
+    )
+    of_component = numbers(1.0, 0.5, 3.0).expand(1, 3)
+    weighted = maximum_likelihood([Observation(ranging(), value, weight=of_component)], initial.expand(3, 2))
+    noise = Diagonal(0.01 / of_component[0])
+    for k in range(3):
+        second = Observation(observations[1].model, observations[1].value, weight=of_element[k])
+        alone = maximum_likelihood([observations[0], second], initial)
+        torch.testing.assert_close(batch.belief.mean[k], alone.belief.mean, **EXACT)
+        same = maximum_likelihood([Observation(MeasurementModel(ranges, noise), value)], initial)
+        torch.testing.assert_close(weighted.belief.mean[k], same.belief.mean, **EXACT)
+
+
+# Manifolds
+
+
+def test_rotation_from_vector_pairs_equals_the_closed_form() -> None:
+    truth = SO3().retract(numbers(0.0, 0.0, 0.0, 1.0).expand(5, 4), random_numbers(5, 3))
+    vectors = random_numbers(6, 3, seed=1)
+    weights = numbers(1.0, 2.0, 0.5, 1.0, 3.0, 1.0)
+    seen = vectors @ SO3().to_matrix(truth).mT + 0.05 * random_numbers(5, 6, 3, seed=2)
+    model = MeasurementModel(
+        lambda rotation: (vectors @ SO3().to_matrix(rotation).mT).flatten(-2), 0.05**2 * torch.eye(18).double()
+    )
+    observation = Observation(model, seen.flatten(-2), weight=weights.repeat_interleave(3).expand(1, 18))
+    estimate = maximum_likelihood([observation], numbers(0.0, 0.0, 0.0, 1.0), SO3())
+    assert bool(estimate.converged.all())
+    for k in range(5):
+        rotation, _ = Rotation.align_vectors(seen[k].numpy(), vectors.numpy(), weights=weights.numpy())
+        np.testing.assert_allclose(SO3().to_matrix(estimate.belief.mean[k]), rotation.as_matrix(), atol=1e-8)
+
+
+def test_resection_of_a_stereo_pose_equals_scipy() -> None:
+    points = random_numbers(10, 3, seed=1) + numbers(0.0, 0.0, 6.0)
+    start = SE3().from_matrix(torch.eye(4, dtype=torch.float64))
+    truth = SE3().retract(start, numbers(0.3, -0.2, 0.5, 0.05, 0.2, -0.1))
+    value = project(truth, points) + 0.5 * random_numbers(30)
+    model = MeasurementModel(project, Diagonal(torch.full((30,), 0.25, dtype=torch.float64)))
+    estimate = maximum_likelihood([Observation(model, value, (points,))], start, SE3())
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        pose = np.concatenate([x[:3], Rotation.from_rotvec(x[3:]).as_quat()])
+        return ((value - project(torch.from_numpy(pose), points)) / 0.5).numpy()
+
+    found = least_squares(residuals, np.zeros(6), xtol=1e-15, ftol=1e-15, gtol=1e-14)
+    np.testing.assert_allclose(estimate.cost, found.cost, rtol=1e-9)
+    np.testing.assert_allclose(estimate.belief.mean[:3], found.x[:3], atol=1e-6)
+    rotation = SO3().to_matrix(estimate.belief.mean[3:])
+    np.testing.assert_allclose(rotation, Rotation.from_rotvec(found.x[3:]).as_matrix(), atol=1e-7)
+
+
+@pytest.mark.parametrize("with_prior", [False, True])
+def test_given_jacobian_equals_automatic_differentiation(with_prior: bool) -> None:
+    def slope(state: Tensor, *_: Tensor) -> Tensor:
+        def function(tangent: Tensor) -> Tensor:
+            return ranges(SE2().retract(state, tangent))
+
+        zero = torch.zeros_like(state)
+        columns = [torch.func.jvp(function, (zero,), (axis.expand_as(zero),))[1] for axis in torch.eye(3).double()]
+        return torch.stack(columns, dim=-1)
+
+    given = MeasurementModel(ranges, ranging().noise, jacobian=slope)
+    pose, tilt = numbers(2.0, 1.0, 0.4), Observation(sighting(), bearings(numbers(2.1, 1.0, 0.4)))
+    value = ranges(pose) + 0.1 * random_numbers(4, 3)
+    estimates = []
+    for model in (given, ranging()):
+        observations = [Observation(model, value), tilt]
+        if with_prior:
+            prior = Gaussian((pose + numbers(0.3, 0.3, 0.8)).expand(4, 3), covariances(4, 3))
+            estimates.append(maximum_a_posteriori(prior, observations, SE2()))
+        else:
+            estimates.append(maximum_likelihood(observations, pose + numbers(0.3, 0.3, 0.3), SE2()))
+    assert_same(*estimates)
+
+
+# Batches, precision, gradients
+
+
+def test_batch_equals_loop_and_dimensions_broadcast() -> None:
+    points = numbers(2.0, 1.0) + 0.5 * random_numbers(4, 3, 2)
+    value = ranges(points) + 0.1 * random_numbers(4, 3, 3, seed=1)
+    initial = numbers(1.5, 1.5) + 0.3 * random_numbers(3, 2, seed=2)
+    prior = Gaussian(initial, covariances(3, 2))
+    for solve in (maximum_likelihood, maximum_a_posteriori):
+        start = initial if solve is maximum_likelihood else prior
+        batch = solve([Observation(ranging(), value)], start) if solve is maximum_likelihood else None
+        batch = batch or maximum_a_posteriori(prior, [Observation(ranging(), value)])
+        assert batch.belief.batch_shape == batch.cost.shape == batch.iterations.shape == (4, 3)
+        for i in range(4):
+            for j in range(3):
+                observation = Observation(ranging(), value[i, j])
+                if solve is maximum_likelihood:
+                    alone = maximum_likelihood([observation], initial[j])
+                else:
+                    alone = maximum_a_posteriori(prior[j], [observation])
+                torch.testing.assert_close(batch.belief.mean[i, j], alone.belief.mean, **EXACT)
+                torch.testing.assert_close(batch.belief.covariance[i, j], alone.belief.covariance, **EXACT)
+                assert abs(int(batch.iterations[i, j]) - int(alone.iterations)) <= 1
+
+
+def test_an_element_that_has_converged_does_not_change() -> None:
+    value = ranges(numbers(2.0, 1.0)) + 0.1 * random_numbers(3)
+    observations = [Observation(ranging(), value)]
+    starts = torch.stack([numbers(2.0, 1.0), numbers(40.0, 60.0)])
+    both = maximum_likelihood(observations, starts)
+    steps = int(both.iterations[0])
+    assert bool(both.converged.all())
+    assert steps < int(both.iterations[1])
+    stopped = maximum_likelihood(observations, starts, iterations=steps)
+    assert bool(stopped.converged[0])
+    assert not bool(stopped.converged[1])
+    assert torch.equal(both.belief.mean[0], stopped.belief.mean[0])
+    assert torch.equal(both.belief.factor[0], stopped.belief.factor[0])
+
+
+def test_single_precision_finds_the_same_pose() -> None:
+    points = random_numbers(10, 3, seed=1) + numbers(0.0, 0.0, 6.0)
+    start = SE3().from_matrix(torch.eye(4, dtype=torch.float64))
+    truth = SE3().retract(start.expand(5, 7), 0.1 * random_numbers(5, 6, seed=2))
+    value = project(truth, points) + 0.5 * random_numbers(5, 30)
+    prior_covariance = 0.1 * torch.eye(6, dtype=torch.float64)
+    estimates = []
+    for dtype in (torch.float64, torch.float32):
+        model = MeasurementModel(project, Diagonal(torch.full((30,), 0.25, dtype=dtype)))
+        observations = [Observation(model, value.to(dtype), (points.to(dtype),))]
+        prior = Gaussian(start, prior_covariance).to(dtype)
+        estimates.append(maximum_likelihood(observations, prior.mean, SE3()))
+        estimates.append(maximum_a_posteriori(prior, observations, SE3()))
+    for double, single in zip(estimates[:2], estimates[2:], strict=True):
+        assert single.belief.mean.dtype == single.cost.dtype == torch.float32
+        assert bool(single.converged.all())
+        apart = SE3().local(double.belief.mean, single.belief.mean.double())
+        deviation = torch.sqrt(torch.diagonal(double.belief.covariance, dim1=-2, dim2=-1))
+        assert float((apart / deviation).abs().max()) < 0.02
+        torch.testing.assert_close(single.belief.covariance.double(), double.belief.covariance, rtol=1e-2, atol=1e-8)
+
+
+def test_gradient_flows_through_a_linear_problem() -> None:
+    H = random_numbers(3, 2)
+
+    def solve(mean: Tensor, root: Tensor, noise_root: Tensor, value: Tensor, weight: Tensor) -> tuple[Tensor, ...]:
+        noise = noise_root @ noise_root.mT + torch.eye(3, dtype=torch.float64)
+        prior = Gaussian(mean, root @ root.mT + torch.eye(2, dtype=torch.float64))
+        observation = Observation(LinearMeasurement(H, noise), value, weight=weight)
+        after = maximum_a_posteriori(prior, [observation])
+        likely = maximum_likelihood([observation], mean.detach())
+        return after.belief.mean, after.belief.covariance, after.cost, likely.belief.mean, likely.cost
+
+    arguments = (
+        random_numbers(2),
+        random_numbers(2, 2),
+        random_numbers(3, 3),
+        random_numbers(3),
+        1 + random_numbers(3).abs(),
+    )
+    assert torch.autograd.gradcheck(solve, tuple(argument.requires_grad_() for argument in arguments))
+
+
+def test_gradient_of_a_converged_estimate_is_that_of_its_definition() -> None:
+    prior = Gaussian(numbers(2.3, 0.6), covariances(2))
+    value = ranges(numbers(2.0, 1.0)) + 0.3 * random_numbers(3)
+
+    def solve(value: Tensor) -> Tensor:
+        return maximum_a_posteriori(prior, [Observation(ranging(0.3), value)]).belief.mean
+
+    assert torch.autograd.gradcheck(solve, value.requires_grad_(), atol=1e-6)
+
+
+# Control of steps, and failures
+
+
+def arctangent(slope: float = 1.0) -> MeasurementModel:
+    return MeasurementModel(lambda x: slope * torch.atan(x), torch.eye(1, dtype=torch.float64))
+
+
+def test_halved_steps_recover_a_start_from_which_full_steps_diverge() -> None:
+    x = 3.0
+    for _ in range(4):
+        x = x - math.atan(x) * (1 + x * x)
+    assert abs(x) > 1e6
+    starts = numbers(0.5, 3.0, -10.0, 20.0)[:, None]
+    for estimate in (
+        maximum_likelihood([Observation(arctangent(), numbers(0.0))], starts),
+        maximum_a_posteriori(Gaussian(starts, 1e8 * torch.eye(1).double()), [Observation(arctangent(), numbers(0.0))]),
+    ):
+        assert bool(estimate.converged.all())
+        torch.testing.assert_close(estimate.belief.mean, torch.zeros_like(starts), rtol=0.0, atol=1e-6)
+
+
+def test_cost_never_rises() -> None:
+    value, starts = ranges(numbers(2.0, 1.0)), 20 * random_numbers(50, 2)
+    costs = [
+        maximum_likelihood([Observation(ranging(), value)], starts, iterations=steps).cost for steps in range(1, 8)
+    ]
+    for before, after in zip(costs[:-1], costs[1:], strict=True):
+        assert bool((after <= before + 1e-9).all())
+
+
+def test_step_into_where_the_model_is_not_defined_is_shortened() -> None:
+    model = MeasurementModel(torch.log, torch.eye(1, dtype=torch.float64))
+    estimate = maximum_likelihood([Observation(model, numbers(-2.0))], numbers(5.0))
+    torch.testing.assert_close(estimate.belief.mean, torch.exp(numbers(-2.0)), **EXACT)
+
+
+def test_unobservable_elements_are_named_with_what_nothing_sees() -> None:
+    matrix = random_numbers(5, 4, 3)
+    matrix[[1, 3], :, 2] = matrix[[1, 3], :, 0] - 2 * matrix[[1, 3], :, 1]
+    observations = [Observation(LinearMeasurement(matrix, torch.eye(4).double()), random_numbers(5, 4))]
+    initial = torch.zeros(5, 3, dtype=torch.float64)
+    with pytest.raises(FilterError, match=r"elements \(1,\), \(3,\) \(2 of 5\).*direction \[-0.5, 1, 0.5\]"):
+        maximum_likelihood(observations, initial)
+    held = maximum_likelihood(observations, initial, on_failure="hold")
+    assert held.healthy.tolist() == [True, False, True, False, True]
+    assert held.converged.tolist() == held.healthy.tolist()
+    assert bool((held.belief.mean[[1, 3]] == 0.0).all())
+    assert bool(held.belief.covariance[[1, 3]].isnan().any())
+    well = Observation(LinearMeasurement(matrix[::2], torch.eye(4).double()), random_numbers(5, 4)[::2])
+    torch.testing.assert_close(held.belief.mean[::2], maximum_likelihood([well], initial[::2]).belief.mean, **EXACT)
+    maximum_a_posteriori(Gaussian(initial, torch.eye(3).double()), observations)
+
+
+@pytest.mark.parametrize("batch", [1, 150])
+def test_too_few_observations_are_unobservable(batch: int) -> None:
+    model = LinearMeasurement(random_numbers(1, 3), torch.eye(1, dtype=torch.float64))
+    with pytest.raises(FilterError, match="do not determine the state"):
+        maximum_likelihood([Observation(model, numbers(1.0))], torch.zeros(batch, 3, dtype=torch.float64))
+    pose = torch.zeros(batch, 3, dtype=torch.float64) + numbers(2.0, 1.0, 0.3)
+    with pytest.raises(FilterError, match=r"direction \[0, 0, 1\]"):
+        maximum_likelihood([Observation(ranging(), ranges(numbers(2.1, 1.0)))], pose, SE2())
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda prior, noise, value: prior[1].fill_(-1.0), "prior covariance is not positive semidefinite"),
+        (lambda prior, noise, value: noise[1].mul_(-1.0), "noise covariance of observation 0"),
+        (lambda prior, noise, value: noise[1].zero_(), "noise covariance of observation 0"),
+        (lambda prior, noise, value: value[1].fill_(torch.inf), "not finite"),
+    ],
+)
+def test_one_bad_element_is_named_and_does_not_take_the_batch_down(
+    spoil: Callable[[Tensor, Tensor, Tensor], object], message: str
+) -> None:
+    mean, prior = numbers(1.5, 1.5).expand(3, 2), torch.eye(2, dtype=torch.float64).repeat(3, 1, 1)
+    noise, value = 0.01 * torch.eye(3, dtype=torch.float64).repeat(3, 1, 1), ranges(numbers(2.0, 1.0)).repeat(3, 1)
+
+    def solve(on_failure: str) -> Estimate:
+        observations = [Observation(MeasurementModel(ranges, noise), value)]
+        return maximum_a_posteriori(Gaussian(mean, prior), observations, on_failure=on_failure)  # type: ignore[arg-type]
+
+    good = solve("raise")
+    spoil(prior, noise, value)
+    with pytest.raises(FilterError, match=rf"elements \(1,\) \(1 of 3\), in the first: .*{message}"):
+        solve("raise")
+    held = solve("hold")
+    assert held.healthy.tolist() == [True, False, True]
+    assert torch.equal(held.belief.mean[1], mean[1])
+    torch.testing.assert_close(held.belief.mean[::2], good.belief.mean[::2], **EXACT)
+
+
+def test_what_cannot_be_asked_is_refused_with_the_reason() -> None:
+    start, value = numbers(1.0, 1.0), numbers(1.0, 1.0, 1.0)
+    bent = MeasurementModel(lambda x, v: ranges(x) + v, torch.eye(3).double(), additive=False)
+    flat = LinearMeasurement(torch.eye(3).double(), torch.eye(3).double())
+    with pytest.raises(ValueError, match="observation 1: only additive noise"):
+        maximum_likelihood([Observation(ranging(), value), Observation(bent, value)], start)
+    with pytest.raises(TypeError, match=r"LinearMeasurement is for states in R\^n"):
+        maximum_likelihood([Observation(flat, value)], numbers(1.0, 1.0, 0.0), SE2())
+    with pytest.raises(ValueError, match="at least one observation"):
+        maximum_likelihood([], start)
+    with pytest.raises(ValueError, match="weights must be at least 0"):
+        maximum_likelihood([Observation(ranging(), value, weight=-1.0)], start)
+    with pytest.raises(ValueError, match=r"a weight has shape \(4,\), or \(4, 3\)"):
+        maximum_likelihood([Observation(ranging(), value, weight=value)], start.expand(4, 2))
+    with pytest.raises(ValueError, match="2 components, its noise 3"):
+        maximum_likelihood([Observation(ranging(), value[:2])], start)
+    with pytest.raises(ValueError, match=r"returns 3 components, its value has 2"):
+        maximum_likelihood([Observation(MeasurementModel(ranges, torch.eye(2).double()), value[:2])], start)
+    with pytest.raises(ValueError, match=r"float32, the state torch.float64"):
+        maximum_likelihood([Observation(ranging(), value.float())], start)
+    with pytest.raises(ValueError, match=r"have batch \(4,\), .*expand the state"):
+        maximum_likelihood([Observation(MeasurementModel(ranges, Diagonal(torch.ones(4, 3).double())), value)], start)
+    with pytest.raises(ValueError, match="must be at least 1"):
+        maximum_likelihood([Observation(ranging(), value)], start, iterations=0)
+    with pytest.raises(ValueError, match="choose raise or hold"):
+        maximum_likelihood([Observation(ranging(), value)], start, on_failure="jitter")  # type: ignore[arg-type]
