@@ -5,6 +5,7 @@ from sigmaslam.filters.belief import degree_of_belief
 from sigmaslam.filters.compiled import compile_step
 from sigmaslam.filters.failure import FilterError
 from sigmaslam.filters.gaussian import Gaussian
+from sigmaslam.filters.inference import Estimate, Observation, maximum_a_posteriori, maximum_likelihood
 from sigmaslam.filters.layout import stack
 from sigmaslam.filters.manifolds import SE2, SE3, SO2, SO3, Euclidean, Manifold, Product
 from sigmaslam.filters.models import LinearMeasurement, LinearMotion, MeasurementModel, MotionModel, wrap_angle
@@ -22,6 +23,7 @@ __all__ = [
     "BlockDiagonal",
     "Dense",
     "Diagonal",
+    "Estimate",
     "Euclidean",
     "ExtendedKalmanFilter",
     "FilterError",
@@ -32,6 +34,7 @@ __all__ = [
     "Manifold",
     "MeasurementModel",
     "MotionModel",
+    "Observation",
     "Prediction",
     "Product",
     "Simplex",
@@ -42,6 +45,8 @@ __all__ = [
     "cubature",
     "degree_of_belief",
     "julier",
+    "maximum_a_posteriori",
+    "maximum_likelihood",
     "merwe",
     "stack",
     "wrap_angle",

@@ -83,10 +83,11 @@ def triangularise(pieces: Sequence[Tensor], diagonal: Tensor | None = None) -> T
 def solve_lower(factor: Tensor, right: Tensor, regular: bool = False) -> Tensor:
     """L^-1 B for lower triangular L (..., n, n) and B (..., n, c).
 
-    A zero pivot is a known direction, of which nothing is asked; `regular` says that there is none.
+    A zero pivot is a known direction, of which nothing is asked; with `regular` it is an error, and the result is not
+    finite.
     """
     if small.is_small(factor, right.shape[-1]):
-        return small.solve_lower(factor, right)
+        return small.solve_lower(factor, right, regular)
     return torch.linalg.solve_triangular(factor if regular else _without_zero_pivots(factor), right, upper=False)
 
 

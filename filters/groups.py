@@ -171,7 +171,7 @@ def _apply_v(vector: Vector, rotation: Vector, second: Tensor, third: Tensor) ->
 
 # Series have four terms. They end where the first one left out is half a unit of round-off, and no sooner, because the
 # derivatives of the closed forms lose digits long before the closed forms do. A clamp whose bound lies well inside the
-# other branch keeps the unused side finite. A number starts sums only: `1.0 - tensor` is twice as slow as `1.0 + tensor`.
+# other branch keeps the unused side finite. Numbers start sums only: `1.0 - tensor` takes twice as long.
 
 
 def _exp_coefficients(squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:

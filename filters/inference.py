@@ -35,8 +35,10 @@ from sigmaslam.filters.transforms import Taylor
 
 # A step is halved at most this often while it raises the cost.
 _HALVINGS = 10
-# A pivot below this share of its column, in units of the dtype's epsilon, is round-off of zero (measured: 4).
+# A pivot below this share of its column, in units of the dtype's epsilon, is round-off of zero. Up to 4 were measured,
+# to which derivatives add theirs; with a prior no pivot is zero, but it can be lost in the round-off of precise data.
 _SINGULAR = 64
+_LOST = 4
 _SHOWN = 5
 
 
@@ -106,8 +108,9 @@ def maximum_likelihood(
             estimate; or where round-off keeps steps from getting any shorter.
         on_failure: "raise", or "hold", which flags elements as not healthy.
     Raises:
-        FilterError: for some element the observations do not determine the state, or noise or residuals are not
-            finite, and on_failure is "raise". The message names elements, cause and the direction that nothing sees.
+        FilterError: for some element the observations do not determine the state, noise is not positive definite, or
+            residuals are not finite; and on_failure is "raise". The message names elements, cause, and the direction
+            that nothing sees.
         TypeError: a `LinearMeasurement` on a curved space or with inputs.
         ValueError: noise that is not additive, a negative weight, or shapes or dtypes that do not fit.
     """
@@ -146,8 +149,9 @@ def maximum_a_posteriori(
         tolerance: length of a step, in standard deviations of the posterior, at which an element has converged.
         on_failure: "raise", or "hold", which flags elements as not healthy and gives the prior for them.
     Raises:
-        FilterError: an element's prior covariance is not positive semidefinite, or noise or residuals are not finite,
-            and on_failure is "raise".
+        FilterError: an element's prior covariance is not positive semidefinite, noise is not positive definite,
+            residuals are not finite, or the digits of the dtype do not suffice for both prior and observations; and
+            on_failure is "raise".
         TypeError: a `LinearMeasurement` on a curved space or with inputs.
         ValueError: noise that is not additive, a negative weight, or shapes or dtypes that do not fit.
     """
@@ -328,7 +332,7 @@ def _gauss_newton(problem: _Problem, anchor: Tensor, sound: Tensor, iterations: 
     converged, count = torch.zeros_like(sound), torch.zeros_like(sound, dtype=torch.int64)
     previous = torch.full_like(cost, torch.inf)
     # Round-off of a cost c is about sqrt(2 c) times this: what the values lose, times the residuals.
-    noise = epsilon * torch.sqrt(sum((term.magnitude().detach() for term in problem.terms), torch.zeros_like(cost)))
+    lost = epsilon * torch.sqrt(sum((term.magnitude().detach() for term in problem.terms), torch.zeros_like(cost)))
     linear = problem.is_linear
     for _ in range(1 if linear else iterations):
         if _known_to_hold(~active):
@@ -339,8 +343,8 @@ def _gauss_newton(problem: _Problem, anchor: Tensor, sound: Tensor, iterations: 
             zeta = torch.where(moving, 0.0, zeta)
         triangle = problem.triangle(anchor, zeta)
         finite = torch.where(active, torch.isfinite(triangle).all(dim=-1).all(dim=-1), finite)
-        # A prior is an identity among the rows, which leaves no pivot at zero.
-        determined = determined if problem.has_prior else torch.where(active, _is_regular(triangle), determined)
+        regular = _is_regular(triangle, _LOST if problem.has_prior else _SINGULAR)
+        determined = torch.where(active, regular, determined)
         usable = active & finite & determined
         current = torch.where(usable[..., None, None], triangle[..., :size, :size], unit)
         projected = torch.where(usable.unsqueeze(-1), triangle[..., size, :size], 0.0)
@@ -351,7 +355,7 @@ def _gauss_newton(problem: _Problem, anchor: Tensor, sound: Tensor, iterations: 
         for _ in range(_HALVINGS + 1):
             candidate = zeta + scale.unsqueeze(-1) * step
             reached = problem.cost(anchor, candidate)
-            fine = reached <= cost + noise * torch.sqrt(2 * cost.detach())
+            fine = reached <= cost + lost * torch.sqrt(2 * cost.detach())
             fine = fine | (torch.isfinite(reached) & ((length <= negligible) | linear))
             if _known_to_hold(fine | ~usable):
                 break
@@ -389,7 +393,10 @@ def _estimate(
         sound = sound & holds
     solution = _gauss_newton(problem, start.mean, sound, iterations, tolerance)
     causes.append(("a residual or a derivative is not finite", solution.finite))
-    causes.append(("the observations do not determine the state", solution.determined))
+    text = "the observations do not determine the state"
+    if problem.has_prior:
+        text = f"prior and observations differ in precision by more than the digits of {start.mean.dtype}"
+    causes.append((text, solution.determined))
     healthy = sound & solution.finite & solution.determined
     if on_failure == "raise" and not bool(healthy.all()):
         _raise(stage, healthy, causes, problem, solution)
@@ -472,11 +479,14 @@ def _known_to_hold(condition: Tensor) -> bool:
     return not torch.compiler.is_compiling() and bool(condition.all())
 
 
-def _is_regular(triangle: Tensor) -> Tensor:
-    """Whether the derivative that (..., n + 1, n + 1) was made from has full rank, at any scale of its columns."""
+def _is_regular(triangle: Tensor, tolerance: float) -> Tensor:
+    """Whether the derivative that (..., n + 1, n + 1) was made from has full rank, at any scale of its columns.
+
+    The tolerance is in units of the dtype's epsilon.
+    """
     pivots = torch.diagonal(triangle, dim1=-2, dim2=-1)[..., :-1]
     lengths = torch.linalg.vector_norm(triangle.detach(), dim=-1)[..., :-1]
-    return (pivots > _SINGULAR * torch.finfo(triangle.dtype).eps * lengths).all(dim=-1)
+    return (pivots > tolerance * torch.finfo(triangle.dtype).eps * lengths).all(dim=-1)
 
 
 def _raise(
@@ -489,7 +499,7 @@ def _raise(
     bad = (~healthy).nonzero().tolist()
     first = tuple(bad[0])
     cause = next(text for text, holds in causes if not bool(holds.expand_as(healthy)[first]))
-    if not bool(solution.determined[first]) and bool(solution.finite[first]):
+    if not problem.has_prior and bool(solution.finite[first]) and not bool(solution.determined[first]):
         triangle = problem.triangle(solution.anchor, solution.zeta)[first].detach()
         size = triangle.shape[-1] - 1
         lengths = torch.linalg.vector_norm(triangle[:size, :size], dim=-1)

@@ -125,7 +125,7 @@ class BlockDiagonal:
         """R^-1/2 columns, (..., m, c), block by block."""
         count, size = self.blocks.shape[-3], self.blocks.shape[-1]
         factor, healthy = cholesky(self.blocks)
-        white = solve_lower(factor, columns.unflatten(-2, (count, size)))
+        white = solve_lower(factor, columns.unflatten(-2, (count, size)), regular=True)
         # A bad block must not pass for a good one; its element of the batch is flagged by what becomes of it.
         return _flagged(white, healthy).flatten(-3, -2)
 
@@ -171,7 +171,7 @@ class Dense:
 
     def whitened(self, columns: Tensor) -> Tensor:
         """R^-1/2 columns, (..., m, c)."""
-        return solve_lower(self.factor(), columns)
+        return solve_lower(self.factor(), columns, regular=True)
 
     def log_determinant(self) -> Tensor:
         """log |R|, (...,)."""
@@ -212,7 +212,7 @@ class Rooted:
 
     def whitened(self, columns: Tensor) -> Tensor:
         """R^-1/2 columns, (..., m, c)."""
-        return solve_lower(self._root, columns)
+        return solve_lower(self._root, columns, regular=True)
 
     def log_determinant(self) -> Tensor:
         """log |R|, (...,)."""

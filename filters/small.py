@@ -147,8 +147,8 @@ def stacked_update(white: Tensor, size: int, prior: Tensor) -> tuple[Tensor, Ten
     return torch.stack(mean, dim=0).movedim(0, -1), _from_lower(_orthogonalise(spread)), projected[count], pivots
 
 
-def solve_lower(factor: Tensor, right: Tensor) -> Tensor:
-    """L^-1 B by forward substitution; rows of zero pivots give zero.
+def solve_lower(factor: Tensor, right: Tensor, regular: bool) -> Tensor:
+    """L^-1 B by forward substitution; rows of zero pivots give zero, or if the factor should be regular, no number.
 
     Args:
         factor: (..., n, n) lower triangular.
@@ -159,7 +159,8 @@ def solve_lower(factor: Tensor, right: Tensor) -> Tensor:
         row = right[..., i, :]
         for k in range(i):
             row = row - factor[..., i, k, None] * rows[k]
-        rows.append(row * _reciprocal(factor[..., i, i, None]))
+        pivot = factor[..., i, i, None]
+        rows.append(row / pivot if regular else row * _reciprocal(pivot))
     return assemble(rows)
 
 

@@ -7,13 +7,43 @@ world is R = Rz(phi) Ry(beta) Rx(alpha), singular at beta = 90 degrees.
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import torch
 from torch import Tensor
 
-from sigmaslam.camera import RectifiedStereo
 from sigmaslam.filters.layout import stack
 from sigmaslam.filters.models import LinearMotion, MeasurementModel, MotionModel, wrap_angle
 from sigmaslam.filters.noise import Noise
+
+
+class Rectified(Protocol):
+    """A rectified stereo camera, such as `sigmaslam.RectifiedStereo`: pixels, and the baseline in metres."""
+
+    @property
+    def fx(self) -> float:
+        """Focal length in columns."""
+        ...
+
+    @property
+    def fy(self) -> float:
+        """Focal length in rows."""
+        ...
+
+    @property
+    def cx(self) -> float:
+        """Principal point's column."""
+        ...
+
+    @property
+    def cy(self) -> float:
+        """Principal point's row."""
+        ...
+
+    @property
+    def baseline(self) -> float:
+        """Distance between the cameras."""
+        ...
 
 
 def constant_velocity(densities: Tensor, time_step: float) -> LinearMotion:
@@ -33,7 +63,7 @@ def constant_velocity(densities: Tensor, time_step: float) -> LinearMotion:
     return LinearMotion(torch.kron(identity, step), torch.kron(torch.diag(densities), spread))
 
 
-def project_stereo(state: Tensor, points: Tensor, camera: RectifiedStereo) -> Tensor:
+def project_stereo(state: Tensor, points: Tensor, camera: Rectified) -> Tensor:
     """Pixels of world points in both cameras, (9.39)-(9.42) with the right axis not mirrored.
 
     Args:
@@ -61,7 +91,7 @@ def project_stereo(state: Tensor, points: Tensor, camera: RectifiedStereo) -> Te
     return torch.stack([u, v, right, v], dim=-1).flatten(-2)
 
 
-def stereo_measurement(points: Tensor, camera: RectifiedStereo, noise: Noise | Tensor) -> MeasurementModel:
+def stereo_measurement(points: Tensor, camera: Rectified, noise: Noise | Tensor) -> MeasurementModel:
     """Stereo pixels of known world points, seen from the 12 states, (9.39)-(9.42).
 
     Args:
@@ -131,7 +161,7 @@ def _range_and_bearing_residual(measured: Tensor, predicted: Tensor) -> Tensor:
     return stack([difference[..., 0], wrap_angle(difference[..., 1])])
 
 
-def _projection(state: Tensor, camera: RectifiedStereo) -> list[Tensor]:
+def _projection(state: Tensor, camera: Rectified) -> list[Tensor]:
     """Entries (...,) of K R^T [I, -t] row by row, (3, 4): homogeneous left pixels of homogeneous world points."""
     angles = state[..., 6::2]
     sa, sb, sp = torch.sin(angles).unbind(-1)

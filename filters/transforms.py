@@ -8,7 +8,7 @@ the reference, and columns of deviations. KF, EKF and UKF differ in nothing else
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import torch
@@ -58,7 +58,7 @@ class Transform(Protocol):
 class Unscented:
     """By sigma points (Table 9.2)."""
 
-    points: SigmaPoints = Symmetric()
+    points: SigmaPoints = field(default_factory=Symmetric)
 
     def __call__(
         self,

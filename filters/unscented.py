@@ -1,4 +1,7 @@
-"""Unscented prediction and update with the cubature set, on manifolds, with a low-rank measurement update.
+"""Unscented prediction and update that export to ONNX: the cubature set, and a low-rank measurement update.
+
+What the tracker's graphs are made of (`stereo_pose`). The general library begins with `bayes`; it calls LAPACK, for
+which ONNX has no operators.
 
 The deviations of a symmetric set come in pairs +-sqrt(n) l_i of equal weight 1 / (2n). Rotating each pair by 45 degrees
 splits what a function makes of it into an odd part (n columns, the statistical linearisation) and an even part
