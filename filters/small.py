@@ -72,7 +72,8 @@ def cholesky(matrix: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
         floor = tolerance * matrix[..., j, j].abs()
         kept = pivot > floor
         healthy = healthy & (pivot >= -floor)  # False for NaN as well
-        inverse = _inverse_root(pivot.masked_fill(~kept, 0.0))
+        dropped = ~kept
+        inverse = torch.rsqrt(pivot.masked_fill(dropped, 1.0)).masked_fill(dropped, 0.0)
         rest[j][j] = pivot * inverse
         for i in range(j + 1, size):
             # What a dropped pivot leaves below it must vanish too, else the matrix is indefinite.
@@ -229,11 +230,11 @@ def _minus(part: Tensor | None, length: Tensor, direction: Tensor | None) -> Ten
 
 
 def _inverse_root(square: Tensor) -> Tensor:
-    """1 / sqrt(x), and 0 for an exact 0, whose gradient is 0 as well; NaN stays NaN."""
-    zero = square == 0
+    """1 / sqrt(x) such that x times it is 0 for an exact 0, whose gradient is 0 as well; NaN stays NaN."""
     if square.requires_grad:
-        square = square.masked_fill(zero, 1.0)
-    return torch.rsqrt(square).masked_fill(zero, 0.0)
+        zero = square == 0
+        return torch.rsqrt(square.masked_fill(zero, 1.0)).masked_fill(zero, 0.0)
+    return torch.rsqrt(square.clamp_min(torch.finfo(square.dtype).tiny))
 
 
 def _reciprocal(pivot: Tensor) -> Tensor:

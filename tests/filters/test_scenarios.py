@@ -1,4 +1,5 @@
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,6 @@ from sigmaslam.evaluation.benchmarks import filter_work
 from sigmaslam.evaluation.scenarios import (
     CAMERA,
     Outcome,
-    Scenario,
     bearings,
     coordinated_turn,
     growth,
@@ -168,15 +168,24 @@ def position_nees(outcome: Outcome, rate: int) -> Tensor:
     return 0.5 * outcome.block_nees((0, 1))[20 * rate :].mean(dim=0)
 
 
-def rmse_of_experiments(outcome: Outcome, runs: int = 100) -> Tensor:
-    """Position error of each experiment of as many runs."""
-    return torch.stack([part.square().mean().sqrt() for part in outcome.rmse_by_run.split(runs)])
+def rmse_of_experiments(outcome: Outcome) -> Tensor:
+    """Position RMSE of each experiment of 100 runs, metres; one wild run in a thousand moves that of all."""
+    return torch.stack([part.square().mean().sqrt() for part in outcome.rmse_by_run.split(100)])
 
 
 def test_se2_filter_localises_and_is_consistent() -> None:
     rate = 10
-    outcome = run(localisation(400, seeded(), rate), UnscentedKalmanFilter(SE2(), iterations=3))
+    outcome = run(localisation(400, seeded(), rate), UnscentedKalmanFilter(SE2()))
     assert float(rmse_of_experiments(outcome).median()) <= 0.46
+    assert 0.9 <= float(position_nees(outcome, rate).mean()) <= 1.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("iterations", ["auto", 3])
+def test_se2_filter_localises_in_twenty_experiments(iterations: Any) -> None:
+    rate = 10
+    outcome = run(localisation(2000, seeded(), rate), UnscentedKalmanFilter(SE2(), iterations=iterations))
+    assert outcome.rmse <= 0.46
     assert 0.9 <= float(position_nees(outcome, rate).mean()) <= 1.1
 
 
@@ -184,12 +193,9 @@ def test_se2_filter_localises_and_is_consistent() -> None:
 def test_localisation_at_100_hz_reproduces_the_published_order() -> None:
     rate, scenario = 100, localisation(500, seeded(), 100)
     default = run(scenario, UnscentedKalmanFilter(SE2()))
-    iterated = run(scenario, UnscentedKalmanFilter(SE2(), iterations=3))
     split = run(scenario, UnscentedKalmanFilter(SPLIT))
-    assert_reproduces(default.rmse_by_run.square(), 0.45**2, 0.0)
+    assert default.rmse <= 0.46
     assert 0.9 <= float(position_nees(default, rate).mean()) <= 1.1
-    assert iterated.rmse <= 0.46
-    assert 0.9 <= float(position_nees(iterated, rate).mean()) <= 1.1
     assert split.rmse > 1.3 * default.rmse
     assert float(position_nees(split, rate).mean()) > 5.0
 
@@ -230,20 +236,11 @@ def test_coordinated_turn_of_the_ekf() -> None:
     assert_reproduces(kept_runs(run(coordinated_turn(500, seeded()), bayes)), 28.1, 0.9)
 
 
-def check_bearings(scenario: Scenario, bayes: BayesFilter) -> None:
-    # Known for both filters; the UKF comes out up to 3 % better here, depending on how runs are averaged.
-    outcome = run(scenario, bayes)
-    assert outcome.rmse == pytest.approx(0.1123, abs=0.003)
-
-
-def test_bearings_only_rmse() -> None:
-    check_bearings(bearings(500, seeded()), CUBATURE)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("bayes", [EKF, CUBATURE])
 def test_bearings_only_rmse_of_1000_runs(bayes: BayesFilter) -> None:
-    check_bearings(bearings(1000, seeded()), bayes)
+    # Over all steps and runs; the mean of the runs' own RMSE is 0.111 for the EKF and 0.109 for the UKF.
+    assert run(bearings(1000, seeded()), bayes).rmse == pytest.approx(0.1123, abs=0.003)
 
 
 @pytest.mark.slow
