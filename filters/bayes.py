@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from sigmaslam.filters.factors import apply, finite, multiply, solve_lower_transposed, square, triangularise
-from sigmaslam.filters.failure import POLICIES, OnFailure, jittered, raise_unless_healthy
+from sigmaslam.filters.failure import POLICIES, OnFailure, Suspects, jittered, raise_unless_healthy
 from sigmaslam.filters.gaussian import Gaussian
 from sigmaslam.filters.manifolds import Manifold
 from sigmaslam.filters.models import AnyMeasurement, AnyMotion, LinearMeasurement, LinearMotion
@@ -21,7 +21,6 @@ from sigmaslam.filters.sigma_points import Columns, SigmaPoints, cubature
 from sigmaslam.filters.small import join
 from sigmaslam.filters.transforms import Difference, Exact, Taylor, Transform, Transformed, Unscented
 from sigmaslam.filters.updates import FORMS, Form, Solution, choose_form, solve
-
 
 # Squared linearisation error of a whole measurement, in units of its noise's variance, from which on an update is worth
 # a second linearisation.
@@ -72,7 +71,7 @@ class BayesFilter:
         """
         if isinstance(motion, LinearMotion) and not self._by_root(belief):
             return self._predict_linear(belief, motion, inputs)
-        root, healthy = self._root(belief)
+        root, usable, sound = self._root(belief)
         noise = as_noise(motion.noise)
         moved = self._move(belief.mean, root, motion, noise, inputs)
         mean = moved.mean if moved.reference is None else moved.reference
@@ -86,9 +85,9 @@ class BayesFilter:
             predicted = Gaussian(mean, factor=factor, factor_is_lower=True)
         else:
             predicted = Gaussian(mean, _predicted_covariance(columns, entering, noise_matrix))
-        healthy = _both(finite(mean, predicted.held), healthy)
-        predicted = self._deal_with(healthy, predicted, belief, "predict", {})
-        return Prediction(predicted, healthy, lambda: (root, columns), entering, noise_matrix)
+        usable = _both(finite(mean, predicted.held), usable)
+        predicted = self._deal_with(usable, predicted, belief, "predict", {})
+        return Prediction(predicted, _both(usable, sound), lambda: (root, columns), entering, noise_matrix)
 
     def _predict_linear(self, belief: Gaussian, motion: LinearMotion, inputs: tuple[Tensor, ...]) -> Prediction:
         """A P A^T + B2 Q B2^T, (9.22): no root is needed, so a covariance is not checked for being semidefinite."""
@@ -119,11 +118,14 @@ class BayesFilter:
                 and on_failure is "raise".
             ValueError: shapes do not fit.
         """
-        root, healthy = self._root(belief)
+        if belief.batch_shape != value.shape[:-1]:
+            belief = belief.expand(torch.broadcast_shapes(belief.batch_shape, value.shape[:-1]))
+        root, usable, sound = self._root(belief)
         noise = as_noise(measurement.noise)
         value, mask, count = _without_missing(value, measurement.mask)
-        noise = noise if mask is None else noise.masked(mask)
-        added = noise if _is_additive(measurement) else None
+        added = None
+        if _is_additive(measurement):
+            added = noise = noise if mask is None else noise.masked(mask)
 
         def linearise(previous: Solution | None) -> tuple[Tensor, Columns, Form, Solution]:
             innovation, columns = self._innovate(belief.mean, root, measurement, noise, value, inputs, previous)
@@ -142,10 +144,12 @@ class BayesFilter:
             if torch.compiler.is_compiling() or bool(bent.any()):
                 solution = linearise(solution)[-1].where(bent, solution)
         posterior = self._correct(belief, solution)
-        healthy = _both(_both(finite(posterior.mean, posterior.held), solution.healthy), healthy)
-        suspects = {} if solution.matrix is None else {"innovation covariance": solution.matrix}
-        posterior = self._deal_with(healthy, posterior, belief, "update", suspects)
-        return Update(posterior, innovation, form, count, healthy, at_prior, columns, added, root)
+        usable = _both(_both(finite(posterior.mean, posterior.held), solution.healthy), usable)
+        suspects: dict[str, Callable[[], Tensor]] = {"measurement noise": noise.covariance}
+        if (factored := solution.matrix) is not None:
+            suspects["innovation covariance"] = lambda: factored
+        posterior = self._deal_with(usable, posterior, belief, "update", suspects)
+        return Update(posterior, innovation, form, count, _both(usable, sound), at_prior, columns, added, root)
 
     def filter(
         self,
@@ -173,12 +177,13 @@ class BayesFilter:
             return self.form
         return "qr" if self._by_root(belief) else choose_form(columns, measurements, additive)
 
-    def _root(self, belief: Gaussian) -> tuple[Tensor, Tensor | None]:
-        """Lower root of the covariance (..., n, n), and whether it exists (...,); mended if that is the policy."""
-        root, healthy = belief.checked_factor()
-        if self.on_failure == "jitter" and healthy is not None:
-            root = jittered(belief.covariance, root, healthy)
-        return root, healthy
+    def _root(self, belief: Gaussian) -> tuple[Tensor, Tensor | None, Tensor | None]:
+        """Lower root of the covariance (..., n, n); whether it is usable (...,), and whether it needed no mending."""
+        root, sound = belief.checked_factor()
+        if self.on_failure != "jitter" or sound is None:
+            return root, sound, None
+        root, usable = jittered(belief.covariance, root, sound)
+        return root, usable, sound
 
     def _require_flat(self, model: str) -> None:
         if self.chart is not None:
@@ -248,7 +253,8 @@ class BayesFilter:
             return innovation, Columns(multiply(measurement.matrix, root))
         size = root.shape[-1]
         shift = None if previous is None else previous.shift
-        columns = root if previous is None else previous.factor()
+        spread = None if previous is None else previous.spread()
+        columns = root if spread is None else multiply(root, spread)
         jacobian = None
         # A given derivative is in the chart of the point that it is taken at, which is the prior's only at first.
         in_chart = shift is None or self.chart is None
@@ -273,12 +279,11 @@ class BayesFilter:
         else:
             innovation = measurement.residual(value, seen.reference) - seen.mean
         found = seen.columns if measurement.additive else _with_noise_columns(seen.columns, size)
-        if shift is None:
+        if previous is None or spread is None:
             return innovation, found
-        # The slope was taken along the posterior's root; the update wants it along the prior's.
-        slope = solve_lower_transposed(columns, found.odd.mT).mT
-        odd = multiply(slope, root)
-        return innovation + apply(slope, shift), Columns(odd, found.even, found.negative)
+        # The slope was taken along L M; the update wants it along L, and M is far from singular.
+        odd = solve_lower_transposed(spread, found.odd.mT).mT
+        return innovation + apply(odd, previous.mean), Columns(odd, found.even, found.negative)
 
     def _correct(self, belief: Gaussian, solution: Solution) -> Gaussian:
         """The posterior of the state, with its covariance in the chart at the new mean."""
@@ -293,12 +298,12 @@ class BayesFilter:
         return Gaussian(mean, square(carried))
 
     def _deal_with(
-        self, healthy: Tensor | None, result: Gaussian, before: Gaussian, stage: str, suspects: dict[str, Tensor]
+        self, healthy: Tensor | None, result: Gaussian, before: Gaussian, stage: str, suspects: Suspects
     ) -> Gaussian:
         if healthy is None:
             return result
         if self.on_failure == "raise":
-            raise_unless_healthy(healthy, stage, lambda: {"prior covariance": before.covariance, **suspects})
+            raise_unless_healthy(healthy, stage, {"prior covariance": lambda: before.covariance, **suspects})
             return result
         return result.where(healthy, before)
 

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from sigmaslam.filters import linalg, small
 
-# Round-off of an exact zero, in units of the dtype's epsilon: a clone is a copy of a pose, a first pose is known.
-_TOLERANCE = 450
+# Round-off of an exact zero, as a share of the diagonal: a clone is a copy of a pose, a first pose is known.
+_TOLERANCES = {torch.float64: 1e-13, torch.float32: 2e-6}
 
 
 def cholesky(matrix: Tensor) -> tuple[Tensor, Tensor | None]:
@@ -27,7 +27,7 @@ def cholesky(matrix: Tensor) -> tuple[Tensor, Tensor | None]:
         (..., n, n) lower triangular factor; (...,) bool, True where the matrix is positive semidefinite and finite, or
         None where that is known to hold for all. Where it does not, the factor is arbitrary.
     """
-    tolerance = _TOLERANCE * torch.finfo(matrix.dtype).eps
+    tolerance = _TOLERANCES[matrix.dtype]
     if small.is_small(matrix):
         return small.cholesky(matrix, tolerance)
     factor, failure = torch.linalg.cholesky_ex(matrix)
@@ -41,7 +41,8 @@ def cholesky(matrix: Tensor) -> tuple[Tensor, Tensor | None]:
     semidefinite = linalg.cholesky(matrix)
     error = (semidefinite @ semidefinite.mT - matrix).tril().abs().amax(dim=(-2, -1))
     scale = torch.diagonal(matrix, dim1=-2, dim2=-1).abs().amax(dim=-1)
-    restored = error <= 4 * tolerance**0.5 * scale  # False for NaN
+    # What a dropped pivot may leave beside it is the root of the pivot's own share.
+    restored = error <= tolerance**0.5 * scale  # False for NaN
     chosen = torch.where(healthy[..., None, None], factor, semidefinite)
     return chosen, healthy | restored
 
@@ -125,7 +126,7 @@ def apply(matrix: Tensor, vector: Tensor) -> Tensor:
 def finite(vector: Tensor, matrix: Tensor) -> Tensor | None:
     """Whether all entries of (..., n) and (..., r, c) are finite, (...,) bool, or None if all elements' are."""
     # A sum of finite entries is finite unless it overflows, and what is not finite does not cancel against itself.
-    if may_look(vector) and math.isfinite(float(vector.sum() + matrix.sum())):
+    if may_look(vector) and math.isfinite(float(vector.detach().sum() + matrix.detach().sum())):
         return None
     total = vector.sum(dim=-1) + matrix.sum(dim=(-2, -1))
     return total - total == 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Literal
 
 import torch
@@ -17,6 +17,8 @@ from sigmaslam.filters.factors import cholesky
 OnFailure = Literal["raise", "hold", "jitter"]
 POLICIES: tuple[OnFailure, ...] = ("raise", "hold", "jitter")
 
+Suspects = Mapping[str, Callable[[], Tensor]]
+
 _JITTERS = tuple(10.0**power for power in range(-12, -2))
 _SHOWN = 5
 
@@ -25,13 +27,13 @@ class FilterError(SigmaSlamError):
     """A filter cannot go on: the message names step, elements and the matrix."""
 
 
-def raise_unless_healthy(healthy: Tensor, stage: str, matrices: Callable[[], dict[str, Tensor]]) -> None:
+def raise_unless_healthy(healthy: Tensor, stage: str, suspects: Suspects) -> None:
     """Raises for the first elements that are not healthy.
 
     Args:
         healthy: (...,) bool.
         stage: what was being done.
-        matrices: makes the symmetric matrices (..., n, n) by name, in the order in which they are to be suspected.
+        suspects: makers of symmetric matrices (..., n, n), by name, the first to be suspected first.
     Raises:
         FilterError: an element is not healthy.
     """
@@ -41,13 +43,15 @@ def raise_unless_healthy(healthy: Tensor, stage: str, matrices: Callable[[], dic
     shown = ", ".join(str(tuple(index)) for index in bad[:_SHOWN]) + (", ..." if len(bad) > _SHOWN else "")
     where = f"batch elements {shown} ({len(bad)} of {healthy.numel()})" if healthy.ndim else "the filter"
     raise FilterError(
-        f"{stage} failed for {where}: {_diagnosis(tuple(bad[0]), matrices())} "
+        f"{stage} failed for {where}: {_diagnosis(tuple(bad[0]), healthy.shape, suspects)} "
         "Check units and scales of prior and noise; on_failure='hold' or 'jitter' goes on without these elements."
     )
 
 
-def jittered(covariance: Tensor, factor: Tensor, healthy: Tensor) -> Tensor:
+def jittered(covariance: Tensor, factor: Tensor, healthy: Tensor) -> tuple[Tensor, Tensor]:
     """Factors (..., n, n) in which those that are not healthy are made with the smallest jitter that helps.
+
+    Returns also whether one did, or none was needed, (...,) bool.
 
     Args:
         covariance: (..., n, n).
@@ -61,12 +65,13 @@ def jittered(covariance: Tensor, factor: Tensor, healthy: Tensor) -> Tensor:
         chosen = ~usable if mended is None else mended & ~usable
         factor = torch.where(chosen[..., None, None], tried, factor)
         usable = usable | chosen
-    return factor
+    return factor, usable
 
 
-def _diagnosis(index: tuple[int, ...], matrices: dict[str, Tensor]) -> str:
-    for name, matrix in matrices.items():
-        element = matrix[index].detach()
+def _diagnosis(index: tuple[int, ...], batch: torch.Size, suspects: Suspects) -> str:
+    for name, make in suspects.items():
+        matrix = make()
+        element = matrix.detach().expand(*batch, *matrix.shape[-2:])[index]
         if not bool(torch.isfinite(element).all()):
             return f"the {name} of the first has entries that are not finite."
         smallest = float(torch.linalg.eigvalsh(element)[0])

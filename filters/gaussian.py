@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -113,6 +114,11 @@ class Gaussian:
             return Gaussian(mean, self._covariance[_of_batch(index, 2)])
         assert self._factor is not None
         return self._like(mean, self._factor[_of_batch(index, 2)])
+
+    def expand(self, batch: Sequence[int]) -> Gaussian:
+        """The same belief in every element of a larger batch."""
+        mean, held = self.mean.expand(*batch, -1), self.held.expand(*batch, -1, -1)
+        return Gaussian(mean, held) if self._covariance is not None else self._like(mean, held)
 
     def where(self, chosen: Tensor, other: Gaussian) -> Gaussian:
         """This belief where chosen (...,) bool is true, the other elsewhere; held as this one is."""

@@ -25,7 +25,7 @@ def cholesky(matrix: Tensor) -> Tensor:
     size = matrix.shape[-1]
     rest = matrix
     columns = []
-    share = _PIVOT_TOLERANCE * torch.finfo(matrix.dtype).eps / torch.finfo(torch.float64).eps
+    share = _PIVOT_TOLERANCE if matrix.dtype == torch.float64 else 2e-6
     tolerance = torch.tensor(share, dtype=matrix.dtype, device=matrix.device)
     diagonal = torch.diagonal(matrix, dim1=-2, dim2=-1)
     below = torch.ones(size, size, dtype=matrix.dtype, device=matrix.device).tril()

@@ -115,7 +115,7 @@ class BlockDiagonal:
 
     def factor(self) -> Tensor:
         """Lower triangular root of R, (..., m, m)."""
-        return _block_diagonal(cholesky(self.blocks)[0])
+        return _block_diagonal(_flagged(*cholesky(self.blocks)))
 
     def triangularised(self, pieces: Sequence[Tensor]) -> Tensor:
         """Lower root of R and more deviations."""
@@ -124,14 +124,12 @@ class BlockDiagonal:
     def whitened(self, columns: Tensor) -> Tensor:
         """R^-1/2 columns, (..., m, c), block by block."""
         count, size = self.blocks.shape[-3], self.blocks.shape[-1]
-        factor, healthy = cholesky(self.blocks)
-        white = solve_lower(factor, columns.unflatten(-2, (count, size)), regular=True)
-        # A bad block must not pass for a good one; its element of the batch is flagged by what becomes of it.
-        return _flagged(white, healthy).flatten(-3, -2)
+        factor = _flagged(*cholesky(self.blocks))
+        return solve_lower(factor, columns.unflatten(-2, (count, size)), regular=True).flatten(-3, -2)
 
     def log_determinant(self) -> Tensor:
         """log |R|, (...,)."""
-        return log_diagonal(cholesky(self.blocks)[0]).sum(dim=-1)
+        return log_diagonal(_flagged(*cholesky(self.blocks))).sum(dim=-1)
 
     def masked(self, mask: Tensor) -> BlockDiagonal:
         """Unit variance and no correlation where mask (..., m) is False."""

@@ -157,7 +157,7 @@ class Simplex:
         """n odd columns. About another mean than the average, the difference is an even column."""
         corners = _simplex(size).to(values)
         used = values[: size + 1]
-        odd = (used - mean).movedim(0, -1) @ corners.mT
+        odd = (used - mean).movedim(0, -1) @ corners.mT / math.sqrt(size + 1)
         return Columns(odd, (used.mean(dim=0) - mean).unsqueeze(-1))
 
 

@@ -105,7 +105,7 @@ def triangularise(pieces: Sequence[Tensor], diagonal: Tensor | None) -> Tensor:
     return _from_lower(_orthogonalise(rows))
 
 
-def stacked_update(white: Tensor, size: int, prior: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def stacked_update(white: Tensor, size: int, prior: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Posterior from the triangular factor of the stacked system [W, e; I, 0], see `sigmaslam.filters.updates`.
 
     The same as triangularising [W^T, I] with one more row, but no intermediate matrix is assembled, so that
@@ -116,8 +116,8 @@ def stacked_update(white: Tensor, size: int, prior: Tensor) -> tuple[Tensor, Ten
         size: n.
         prior: (..., n, n) lower root of the prior covariance.
     Returns:
-        mean of zeta (..., n), lower root of the posterior covariance (..., n, n), sqrt(1 + NIS) (...,), and the pivots
-        (..., k), whose squares have the product |I + W W^T|.
+        mean of zeta (..., n), lower root of the posterior covariance (..., n, n), lower root of zeta's information
+        (..., n, n), sqrt(1 + NIS) (...,), and the pivots (..., k), whose squares have the product |I + W W^T|.
     """
     count = white.shape[-1] - 1
     one = torch.ones_like(white[..., 0, :1])
@@ -145,7 +145,8 @@ def stacked_update(white: Tensor, size: int, prior: Tensor) -> tuple[Tensor, Ten
     else:
         spread = _parts(assemble(columns).mT)
     pivots = torch.stack([triangle[j][j] for j in range(count)], dim=0).movedim(0, -1)
-    return torch.stack(mean, dim=0).movedim(0, -1), _from_lower(_orthogonalise(spread)), projected[count], pivots
+    zeta = torch.stack(mean, dim=0).movedim(0, -1)
+    return zeta, _from_lower(_orthogonalise(spread)), _from_lower(root), projected[count], pivots
 
 
 def solve_lower(factor: Tensor, right: Tensor, regular: bool) -> Tensor:

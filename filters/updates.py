@@ -44,18 +44,22 @@ class Solution:
     """Posterior of L zeta, the state's tangent at the prior mean.
 
     Attributes:
-        shift: (..., n) its mean.
+        mean: (..., n) of zeta.
+        shift: (..., n) of L zeta.
         covariance: (..., n, n); None from the qr form.
         root: (..., n, n) lower triangular root of the covariance; from the qr form only.
+        spread: makes a lower triangular M (..., n, n) such that L M is a root of the covariance, but for `_width`.
         nis: makes e^T S^-1 e, (...,).
         log_determinant: makes log |S|, (...,).
         matrix: (..., k, k) what was factored: S, or I + W^T W; None from the qr form.
         healthy: (...,) bool: the factorisation exists; None: it does for all.
     """
 
+    mean: Tensor
     shift: Tensor
     covariance: Tensor | None
     root: Tensor | None
+    spread: Callable[[], Tensor]
     nis: Callable[[], Tensor]
     log_determinant: Callable[[], Tensor]
     matrix: Tensor | None
@@ -69,11 +73,10 @@ class Solution:
                 return first
             return torch.where(chosen[(..., *[None] * trailing)], first, second)
 
-        shift = pick(self.shift, other.shift, 1)
-        assert shift is not None
         return replace(
             self,
-            shift=shift,
+            mean=torch.where(chosen.unsqueeze(-1), self.mean, other.mean),
+            shift=torch.where(chosen.unsqueeze(-1), self.shift, other.shift),
             covariance=pick(self.covariance, other.covariance, 2),
             root=pick(self.root, other.root, 2),
             matrix=pick(self.matrix, other.matrix, 2),
@@ -135,10 +138,13 @@ def _dense(innovation: Tensor, columns: Columns, noise: Noise | None, prior: Ten
     white = solve_lower(factor, join([columns.odd, innovation.unsqueeze(-1)]))
     gain, residual = white[..., :size], white[..., size]
     covariance = identity(size, S) - square([gain.mT])
+    mean = apply(gain.mT, residual)
     return Solution(
-        shift=apply(prior, apply(gain.mT, residual)),
+        mean=mean,
+        shift=apply(prior, mean),
         covariance=multiply(multiply(prior, covariance), prior.mT),
         root=None,
+        spread=lambda: cholesky(covariance + _width(covariance) ** 2 * identity(size, S))[0],
         nis=lambda: (residual * residual).sum(dim=-1),
         log_determinant=lambda: log_diagonal(factor),
         matrix=S,
@@ -155,7 +161,8 @@ def _low_rank(white: Tensor, prior: Tensor, noise: Noise) -> Solution:
     information = products[..., :count] + identity(count, white)
     factor, healthy = cholesky(information)
     projected = solve_lower(factor, products[..., count:], regular=True)
-    spread = solve_lower(factor[..., first:, first:], prior.mT, regular=True)
+    inner = factor[..., first:, first:]
+    spread = solve_lower(inner, prior.mT, regular=True)
 
     def nis() -> Tensor:
         # As sums of squares: the shorter |e|^2 - |projected|^2 cancels when the prior is vague.
@@ -164,9 +171,11 @@ def _low_rank(white: Tensor, prior: Tensor, noise: Noise) -> Solution:
         return (remaining * remaining).sum(dim=(-2, -1)) + (eta * eta).sum(dim=(-2, -1))
 
     return Solution(
+        mean=solve_lower_transposed(inner, projected[..., first:, :]).squeeze(-1),
         shift=apply(spread.mT, projected[..., first:, 0]),
         covariance=square([spread.mT]),
         root=None,
+        spread=lambda: _spread(inner),
         nis=nis,
         log_determinant=lambda: noise.log_determinant() + log_diagonal(factor),
         matrix=information,
@@ -177,7 +186,7 @@ def _low_rank(white: Tensor, prior: Tensor, noise: Noise) -> Solution:
 def _qr(white: Tensor, prior: Tensor, noise: Noise) -> Solution:
     """As `_low_rank`, by triangularising the rows [W^T, I, 0] and [e^T, 0, 1]; the 1 keeps the last pivot off zero."""
     if is_small(white.mT):
-        mean, root, last, determinant = stacked_update(white, prior.shape[-1], prior)
+        mean, root, inner, last, determinant = stacked_update(white, prior.shape[-1], prior)
     else:
         count = white.shape[-1] - 1
         first = count - prior.shape[-1]
@@ -188,9 +197,11 @@ def _qr(white: Tensor, prior: Tensor, noise: Noise) -> Solution:
         last = triangle[..., count, count]
         determinant = torch.diagonal(triangle, dim1=-2, dim2=-1)[..., :count]
     return Solution(
+        mean=mean,
         shift=apply(prior, mean),
         covariance=None,
         root=root,
+        spread=lambda: _spread(inner),
         nis=lambda: (last * last - 1.0).clamp_min(0.0),
         log_determinant=lambda: noise.log_determinant() + 2.0 * torch.log(determinant).sum(dim=-1),
         matrix=None,
@@ -198,6 +209,21 @@ def _qr(white: Tensor, prior: Tensor, noise: Noise) -> Solution:
     )
 
 
+def _width(like: Tensor) -> float:
+    """The least width of a second linearisation, as a share of the prior's: over less, differences are round-off."""
+    return float(torch.finfo(like.dtype).eps ** 0.25)
+
+
+def _spread(information_root: Tensor) -> Tensor:
+    """Lower triangular root (..., n, n) of the inverse of G G^T, widened a little."""
+    size = information_root.shape[-1]
+    unit = identity(size, information_root).expand_as(information_root)
+    return triangularise([solve_lower_transposed(information_root, unit), _width(unit) * unit])
+
+
 def log_likelihood(solution: Solution, count: Tensor | int) -> Tensor:
     """Gaussian log-density of the innovation, (...,); count is the number of components that took part."""
-    return -0.5 * (solution.nis() + solution.log_determinant() + count * math.log(2 * math.pi))
+    nis = solution.nis()
+    if isinstance(count, Tensor):
+        count = count.to(nis.dtype)
+    return -0.5 * (nis + solution.log_determinant() + count * math.log(2 * math.pi))
