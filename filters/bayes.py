@@ -199,10 +199,13 @@ class BayesFilter:
 
     def retract(self, point: Tensor, tangent: Tensor) -> Tensor:
         """point [+] tangent."""
-        return point + tangent if self.space is None else self.space.retract(point, tangent)
+        if self.space is not None:
+            return self.space.retract(point, tangent)
+        # Components before the batch, so that what is computed is batch-last in memory.
+        return (point.mT + tangent.mT).mT if point.ndim > 1 else point + tangent
 
     def carry(self, point: Tensor, shift: Tensor | None, root: Tensor, target: Tensor) -> list[Tensor]:
-        """Deviations (..., n, c) in the chart at `target` of a belief in the chart at `point`, with a mean off by `shift`.
+        """Deviations (..., n, c), in the chart at `target`, of a belief in the chart at `point` with mean `shift`.
 
         In R^n they are the root itself.
         """

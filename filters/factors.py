@@ -39,12 +39,15 @@ def cholesky(matrix: Tensor) -> tuple[Tensor, Tensor | None]:
     # LAPACK knows positive definite matrices only.
     healthy = failure == 0
     semidefinite = linalg.cholesky(matrix)
-    error = (semidefinite @ semidefinite.mT - matrix).tril().abs().amax(dim=(-2, -1))
-    scale = torch.diagonal(matrix, dim1=-2, dim2=-1).abs().amax(dim=-1)
-    # What a dropped pivot may leave beside it is the root of the pivot's own share.
-    restored = error <= tolerance**0.5 * scale  # False for NaN
-    chosen = torch.where(healthy[..., None, None], factor, semidefinite)
-    return chosen, healthy | restored
+    # Where a pivot was dropped, it is still there on the diagonal of what is missing, and must not be negative; beside
+    # it there may be as much as its root.
+    missing = (matrix - semidefinite @ semidefinite.mT).tril()
+    diagonal = torch.diagonal(matrix, dim1=-2, dim2=-1).abs()
+    pivots = torch.diagonal(missing, dim1=-2, dim2=-1)
+    allowed = tolerance * diagonal.unsqueeze(-1) * diagonal.unsqueeze(-2)
+    # Comparisons are False for NaN.
+    restored = (pivots >= -tolerance * diagonal).all(dim=-1) & (missing * missing <= allowed).all(dim=-1).all(dim=-1)
+    return torch.where(healthy[..., None, None], factor, semidefinite), healthy | restored
 
 
 def may_look(array: Tensor) -> bool:

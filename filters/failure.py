@@ -19,7 +19,7 @@ POLICIES: tuple[OnFailure, ...] = ("raise", "hold", "jitter")
 
 Suspects = Mapping[str, Callable[[], Tensor]]
 
-_JITTERS = tuple(10.0**power for power in range(-12, -2))
+_JITTERS = tuple(10.0 ** (half / 2) for half in range(-24, -5))
 _SHOWN = 5
 
 

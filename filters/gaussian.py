@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from sigmaslam.filters.factors import cholesky, square, triangularise
+from sigmaslam.filters.layout import choose
 
 
 class Gaussian:
@@ -122,11 +123,10 @@ class Gaussian:
 
     def where(self, chosen: Tensor, other: Gaussian) -> Gaussian:
         """This belief where chosen (...,) bool is true, the other elsewhere; held as this one is."""
-        mean = torch.where(chosen.unsqueeze(-1), self.mean, other.mean)
-        mask = chosen[..., None, None]
+        mean = choose(chosen, self.mean, other.mean, 1)
         if self._covariance is not None:
-            return Gaussian(mean, torch.where(mask, self._covariance, other.covariance))
-        return Gaussian(mean, factor=torch.where(mask, self.factor, other.factor), factor_is_lower=True)
+            return Gaussian(mean, choose(chosen, self._covariance, other.covariance, 2))
+        return Gaussian(mean, factor=choose(chosen, self.factor, other.factor, 2), factor_is_lower=True)
 
     def to(self, *arguments: Any, **options: Any) -> Gaussian:
         """Another dtype or device, as `Tensor.to`."""

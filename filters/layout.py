@@ -25,6 +25,13 @@ def stack(components: Sequence[Tensor]) -> Tensor:
     return torch.stack(list(components), dim=-2).mT
 
 
+def choose(chosen: Tensor, first: Tensor, second: Tensor, trailing: int) -> Tensor:
+    """The first array (..., *trailing dimensions) where chosen (...,) bool is true, the second elsewhere."""
+    # With the trailing dimensions in front, the result is batch-last in memory.
+    last, front = tuple(range(-trailing, 0)), tuple(range(trailing))
+    return torch.where(chosen, first.movedim(last, front), second.movedim(last, front)).movedim(front, last)
+
+
 def concatenate(vectors: Sequence[Tensor]) -> Tensor:
     """Vectors (..., n_i) of the same leading dimensions end to end, (..., sum n_i), in the memory order of `stack`."""
     if vectors[0].ndim == 1:

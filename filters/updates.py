@@ -31,6 +31,7 @@ from sigmaslam.filters.factors import (
     square,
     triangularise,
 )
+from sigmaslam.filters.layout import choose
 from sigmaslam.filters.noise import Dense, Noise, Rooted
 from sigmaslam.filters.sigma_points import Columns
 from sigmaslam.filters.small import is_small, join, stacked_update
@@ -69,14 +70,12 @@ class Solution:
         """This solution where chosen (...,) bool is true, the other of the same form elsewhere."""
 
         def pick(first: Tensor | None, second: Tensor | None, trailing: int) -> Tensor | None:
-            if first is None or second is None:
-                return first
-            return torch.where(chosen[(..., *[None] * trailing)], first, second)
+            return None if first is None or second is None else choose(chosen, first, second, trailing)
 
         return replace(
             self,
-            mean=torch.where(chosen.unsqueeze(-1), self.mean, other.mean),
-            shift=torch.where(chosen.unsqueeze(-1), self.shift, other.shift),
+            mean=choose(chosen, self.mean, other.mean, 1),
+            shift=choose(chosen, self.shift, other.shift, 1),
             covariance=pick(self.covariance, other.covariance, 2),
             root=pick(self.root, other.root, 2),
             matrix=pick(self.matrix, other.matrix, 2),

@@ -123,12 +123,12 @@ def format_page(rounds: int, compiled: bool, command: str) -> str:
     lines = [
         "# Speed of the filters",
         "",
-        f"Made by `{command}` on {platform.machine()}, {os.cpu_count()} cores, one thread; process CPU time, contenders",
-        f"in turn, {rounds} rounds. {versions}.",
+        f"Made by `{command}` on {platform.machine()}, {os.cpu_count()} cores, one thread; process CPU time,",
+        f"contenders in turn, {rounds} rounds. {versions}.",
         "",
         "Work: one prediction and one update of an unscented filter with the cubature set, one linearisation, sigma",
         "points drawn anew after the process noise; the same models for all (`evaluation/benchmarks/filter_work.py`).",
-        "Tests check that every contender gets the same result.",
+        "Tests check that every contender gets the same result. Compiled: `compile_step`, after its first call.",
         "",
     ]
     tables = len(POINTS) + 1 + len(KINDS) * len(BATCHES)
@@ -153,8 +153,8 @@ def _stereo_section(peers: Sequence[Peer], rounds: int, compiled: bool, advance:
     lines = [
         "## One 12-state stereo pose, m points (4m rows), float64",
         "",
-        "Milliseconds for plain numpy, which has the low-rank form; for the others how many times longer they take, with",
-        "the lowest and highest round. Below 1 is faster.",
+        "Milliseconds for plain numpy, which has the low-rank form; for the others how many times longer they take,",
+        "with the lowest and highest round. Below 1 is faster.",
         "",
         _row("", *(f"m = {points}" for points in POINTS)),
         _row("---", *["---"] * len(POINTS)),

@@ -32,10 +32,7 @@ SETS = {
 }
 
 
-SIMPLEX_SCALE = pytest.mark.xfail(strict=True, reason="Simplex.deviations lacks the factor 1 / sqrt(n + 1)")
-
-
-@pytest.mark.parametrize("name", [pytest.param(n, marks=SIMPLEX_SCALE if n == "simplex" else ()) for n in SETS])
+@pytest.mark.parametrize("name", list(SETS))
 @pytest.mark.parametrize("with_centre", [False, True])
 def test_points_have_mean_and_covariance_of_the_root(name, with_centre):
     points = SETS[name]
