@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import FunctionType
 from typing import TypeVar
 
 import torch
@@ -20,8 +21,15 @@ def compile_step(step: F) -> F:
     in two or always linearises twice.
 
     Args:
-        step: function of tensors, without side effects.
+        step: a plain function of tensors, without side effects.
+    Raises:
+        TypeError: the step is not a plain function.
     """
+    if not isinstance(step, FunctionType):
+        raise TypeError(f"compile_step takes a plain function (def or lambda), got {type(step).__name__}")
+    # torch keeps compiled code by the function's code, which two functions made by one factory share; as what they
+    # refer to is not checked, each needs code of its own.
+    own = FunctionType(step.__code__.replace(), step.__globals__, step.__name__, step.__defaults__, step.__closure__)
     options: dict[str, object] = {
         # Tensors' shapes are checked at each call; the models, which are constants, are not.
         "guard_filter_fn": torch.compiler.keep_tensor_guards_unsafe,
@@ -29,4 +37,4 @@ def compile_step(step: F) -> F:
     }
     if not torch.cuda.is_available():
         options["cpp_wrapper"] = True  # Python's share of a call is most of it for a single filter
-    return torch.compile(step, dynamic=False, fullgraph=True, options=options)  # type: ignore[arg-type,return-value]
+    return torch.compile(own, dynamic=False, fullgraph=True, options=options)  # type: ignore[arg-type,return-value]
