@@ -60,7 +60,7 @@ def make(work: Work, dtype: str = "float64", compiled: bool = False, device: str
     numbers = getattr(torch, dtype)
 
     def tensor(array: Any) -> Tensor:
-        return torch.as_tensor(array, dtype=numbers, device=device)
+        return torch.tensor(array, dtype=numbers, device=device)
 
     # One linearisation, as the peers do; failures are flagged, not raised, where a look at the flag would break a
     # compiled step in two.

@@ -123,8 +123,8 @@ def format_page(rounds: int, compiled: bool, command: str) -> str:
     lines = [
         "# Speed of the filters",
         "",
-        f"Made by `{command}` on {platform.machine()}, {os.cpu_count()} cores, one thread; process CPU time,",
-        f"contenders in turn, {rounds} rounds. {versions}.",
+        f"Made by `{command}` on {platform.machine()}, {os.cpu_count()} cores, one",
+        f"thread; process CPU time, contenders in turn, {rounds} rounds. {versions}.",
         "",
         "Work: one prediction and one update of an unscented filter with the cubature set, one linearisation, sigma",
         "points drawn anew after the process noise; the same models for all (`evaluation/benchmarks/filter_work.py`).",

@@ -1,0 +1,47 @@
+"""The benchmark of the filters times the right work."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from sigmaslam.evaluation.benchmarks import filter_ours, filter_work
+from sigmaslam.evaluation.benchmarks.filters import Contender, Timing, time_interleaved
+
+
+@pytest.mark.parametrize("points", [3, 30])
+@pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-8), ("float32", 1e-2)])
+def test_our_stereo_step_is_the_references(points: int, dtype: str, tolerance: float):
+    work = filter_work.stereo(points, seed=1)
+    check(work, filter_work.step_stereo_dense(work), dtype, tolerance)
+
+
+@pytest.mark.parametrize("kind", ["localisation", "position", "landmark", "linear"])
+@pytest.mark.parametrize("batch", [1, 150])
+@pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-10), ("float32", 1e-3)])
+def test_our_batched_step_is_the_references(kind: str, batch: int, dtype: str, tolerance: float):
+    work = getattr(filter_work, kind)(batch, seed=1)
+    check(work, filter_work.step_loop(work), dtype, tolerance)
+
+
+def check(work: filter_work.Work, expected: filter_work.Belief, dtype: str, tolerance: float) -> None:
+    """Mean and covariance agree, in units of the posterior's standard deviations."""
+    found = filter_ours.make(work, dtype)()
+    mean, covariance = expected
+    sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+    assert np.abs((found.mean.numpy() - mean) / sigma).max() < tolerance
+    scale = sigma[..., :, None] * sigma[..., None, :]
+    assert np.abs((found.covariance.numpy() - covariance) / scale).max() < tolerance
+
+
+def test_contenders_take_turns():
+    calls: list[str] = []
+    contenders = [Contender(name, lambda name=name: calls.append(name)) for name in "ab"]
+    timings = time_interleaved(contenders, rounds=3)
+    assert [len(timing.seconds) for timing in timings.values()] == [3, 3]
+    order = [calls[0]] + [after for before, after in pairwise(calls) if before != after]
+    assert "".join(order) == "ab" * 4  # once to warm up, and three rounds
+
+
+def test_ratio_is_taken_round_by_round():
+    assert Timing([2.0, 4.0, 9.0]).ratio(Timing([1.0, 4.0, 3.0])) == (2.0, 1.0, 3.0)
