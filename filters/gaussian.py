@@ -123,6 +123,8 @@ class Gaussian:
 
     def where(self, chosen: Tensor, other: Gaussian) -> Gaussian:
         """This belief where chosen (...,) bool is true, the other elsewhere; held as this one is."""
+        if other.batch_shape != self.batch_shape:
+            other = other.expand(self.batch_shape)
         mean = choose(chosen, self.mean, other.mean, 1)
         if self._covariance is not None:
             return Gaussian(mean, choose(chosen, self._covariance, other.covariance, 2))
