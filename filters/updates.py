@@ -79,7 +79,7 @@ class Solution:
             covariance=pick(self.covariance, other.covariance, 2),
             root=pick(self.root, other.root, 2),
             matrix=pick(self.matrix, other.matrix, 2),
-            healthy=self.healthy if other.healthy is None else other.healthy,
+            healthy=_choose_flags(chosen, self.healthy, other.healthy),
         )
 
     def factor(self) -> Tensor:
@@ -88,6 +88,14 @@ class Solution:
             return self.root
         assert self.covariance is not None
         return cholesky(self.covariance)[0]
+
+
+def _choose_flags(chosen: Tensor, first: Tensor | None, second: Tensor | None) -> Tensor | None:
+    """The first flags where chosen, the second elsewhere, (...,) bool; None is all true."""
+    if first is None and second is None:
+        return None
+    yes = torch.ones_like(chosen)
+    return torch.where(chosen, yes if first is None else first, yes if second is None else second)
 
 
 def choose_form(columns: Columns, measurements: int, additive: bool) -> Form:
