@@ -187,7 +187,9 @@ def benchmark(
     else:
         from sigmaslam.evaluation.benchmarks.filter_claims import write_claims
 
-        typer.echo(write_claims(out, out.with_suffix(".png")))
+        with Console(stderr=True).status("simulating a dozen scenarios (two to seven minutes)"):
+            page = write_claims(out, out.with_suffix(".png"))
+        typer.echo(page)
 
 
 def main() -> None:
