@@ -277,10 +277,7 @@ class BayesFilter:
             raise ValueError(
                 f"the measurement's function returns {seen.mean.shape[-1]} components, the value has {value.shape[-1]}"
             )
-        if seen.reference is None or measurement.residual is None:
-            innovation = value - seen.mean
-        else:
-            innovation = measurement.residual(value, seen.reference) - seen.mean
+        innovation = seen.from_mean(value, measurement.residual)
         found = seen.columns if measurement.additive else _with_noise_columns(seen.columns, size)
         if previous is None or spread is None:
             return innovation, found
@@ -375,9 +372,7 @@ def _predicted_factor(columns: Columns, noise: Noise | None, noise_matrix: Tenso
 
 
 def _predicted_covariance(columns: Columns, noise: Noise | None, noise_matrix: Tensor | None) -> Tensor:
-    covariance = square(columns.all())
-    if columns.negative is not None:
-        covariance = covariance - square([columns.negative])
+    covariance = columns.covariance()
     return covariance if noise is None else covariance + _entering_twice(noise, noise_matrix)
 
 

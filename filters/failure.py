@@ -39,13 +39,19 @@ def raise_unless_healthy(healthy: Tensor, stage: str, suspects: Suspects) -> Non
     """
     if bool(healthy.all()):
         return
-    bad = (~healthy).nonzero().tolist()
-    shown = ", ".join(str(tuple(index)) for index in bad[:_SHOWN]) + (", ..." if len(bad) > _SHOWN else "")
-    where = f"batch elements {shown} ({len(bad)} of {healthy.numel()})" if healthy.ndim else "the filter"
+    first = tuple((~healthy).nonzero()[0].tolist())
+    where = name_elements(healthy) if healthy.ndim else "the filter"
     raise FilterError(
-        f"{stage} failed for {where}: {_diagnosis(tuple(bad[0]), healthy.shape, suspects)} "
+        f"{stage} failed for {where}: {_diagnosis(first, healthy.shape, suspects)} "
         "Check units and scales of prior and noise; on_failure='hold' or 'jitter' goes on without these elements."
     )
+
+
+def name_elements(healthy: Tensor) -> str:
+    """The first elements of a batch (...,) that are not healthy, and how many there are."""
+    bad = (~healthy).nonzero().tolist()
+    shown = ", ".join(str(tuple(index)) for index in bad[:_SHOWN]) + (", ..." if len(bad) > _SHOWN else "")
+    return f"batch elements {shown} ({len(bad)} of {healthy.numel()})"
 
 
 def jittered(covariance: Tensor, factor: Tensor, healthy: Tensor) -> tuple[Tensor, Tensor]:

@@ -26,7 +26,7 @@ from sigmaslam.filters.factors import (
     solve_lower_transposed,
     triangularise,
 )
-from sigmaslam.filters.failure import FilterError
+from sigmaslam.filters.failure import FilterError, name_elements
 from sigmaslam.filters.gaussian import Gaussian
 from sigmaslam.filters.manifolds import Manifold
 from sigmaslam.filters.models import AnyMeasurement, LinearMeasurement
@@ -39,7 +39,6 @@ _HALVINGS = 10
 # to which derivatives add theirs; with a prior no pivot is zero, but it can be lost in the round-off of precise data.
 _SINGULAR = 64
 _LOST = 4
-_SHOWN = 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -227,10 +226,7 @@ class _Term:
                 jacobian,
             )
             slope = seen.columns.odd
-            if model.residual is None or seen.reference is None:
-                innovation = self.value - seen.mean
-            else:
-                innovation = model.residual(self.value, seen.reference)
+            innovation = seen.from_mean(self.value, model.residual)
         slope = slope.expand(*innovation.shape, slope.shape[-1])
         return self._whiten(torch.cat([slope, innovation.unsqueeze(-1)], dim=-1))
 
@@ -496,8 +492,7 @@ def _raise(
     problem: _Problem,
     solution: _Solution,
 ) -> None:
-    bad = (~healthy).nonzero().tolist()
-    first = tuple(bad[0])
+    first = tuple((~healthy).nonzero()[0].tolist())
     cause = next(text for text, holds in causes if not bool(holds.expand_as(healthy)[first]))
     if not problem.has_prior and bool(solution.finite[first]) and not bool(solution.determined[first]):
         triangle = problem.triangle(solution.anchor, solution.zeta)[first].detach()
@@ -508,6 +503,5 @@ def _raise(
         unseen = unseen / unseen[unseen.abs().argmax()]
         direction = ", ".join(f"{number:.3g}" for number in torch.where(unseen.abs() < 1e-6, 0.0, unseen).tolist())
         cause += f": none of them sees the tangent direction [{direction}]; add observations, or a prior"
-    shown = ", ".join(str(tuple(index)) for index in bad[:_SHOWN]) + (", ..." if len(bad) > _SHOWN else "")
-    where = f" for batch elements {shown} ({len(bad)} of {healthy.numel()}), in the first" if healthy.ndim else ""
+    where = f" for {name_elements(healthy)}, in the first" if healthy.ndim else ""
     raise FilterError(f"{stage} failed{where}: {cause}. on_failure='hold' goes on without them.")

@@ -8,7 +8,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.factors import cholesky, log_diagonal, solve_lower, square, triangularise
+from sigmaslam.filters.factors import cholesky, identity, log_diagonal, solve_lower, square, triangularise
 
 
 class Noise(Protocol):
@@ -233,11 +233,10 @@ def _flagged(matrix: Tensor, healthy: Tensor | None) -> Tensor:
 
 def _masked(covariance: Tensor, mask: Tensor) -> Tensor:
     both = mask.unsqueeze(-1) & mask.unsqueeze(-2)
-    identity = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
-    return torch.where(both, covariance, identity)
+    return torch.where(both, covariance, identity(covariance.shape[-1], covariance))
 
 
 def _block_diagonal(blocks: Tensor) -> Tensor:
-    apart = torch.eye(blocks.shape[-3], dtype=blocks.dtype, device=blocks.device)[:, None, :, None]
+    apart = identity(blocks.shape[-3], blocks)[:, None, :, None]
     spread = apart * blocks.unsqueeze(-2)
     return spread.flatten(-4, -3).flatten(-2, -1)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.factors import multiply, square
+from sigmaslam.filters.factors import multiply
 from sigmaslam.filters.gaussian import Gaussian
 from sigmaslam.filters.noise import Noise
 from sigmaslam.filters.sigma_points import Columns
@@ -91,9 +91,7 @@ class Update:
     @property
     def innovation_covariance(self) -> Tensor:
         """S (..., m, m); unit rows where masked."""
-        S = square(self._columns.all())
-        if self._columns.negative is not None:
-            S = S - square([self._columns.negative])
+        S = self._columns.covariance()
         return S if self._noise is None else S + self._noise.covariance()
 
     @property

@@ -15,6 +15,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from sigmaslam.filters.factors import square
 from sigmaslam.filters.small import ROWS, join
 
 
@@ -35,6 +36,11 @@ class Columns:
     def all(self) -> list[Tensor]:
         """The columns that are added."""
         return [self.odd] if self.even is None else [self.odd, self.even]
+
+    def covariance(self) -> Tensor:
+        """Of the values, (..., m, m)."""
+        covariance = square(self.all())
+        return covariance if self.negative is None else covariance - square([self.negative])
 
 
 class SigmaPoints(Protocol):

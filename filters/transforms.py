@@ -34,6 +34,12 @@ class Transformed:
     mean: Tensor
     columns: Columns
 
+    def from_mean(self, value: Tensor, difference: Difference | None) -> Tensor:
+        """A value (..., m) minus the mean, by the difference that the transform was given."""
+        if difference is None or self.reference is None:
+            return value - self.mean
+        return difference(value, self.reference) - self.mean
+
 
 class Transform(Protocol):
     """Sends a Gaussian with a root (..., n, c) of its covariance through a function."""

@@ -136,9 +136,7 @@ def solve(form: Form, innovation: Tensor, columns: Columns, noise: Noise | None,
 
 def _dense(innovation: Tensor, columns: Columns, noise: Noise | None, prior: Tensor) -> Solution:
     size = columns.odd.shape[-1]
-    S = square(columns.all())
-    if columns.negative is not None:
-        S = S - square([columns.negative])
+    S = columns.covariance()
     if noise is not None:
         S = S + noise.covariance()
     factor, healthy = cholesky(S)

@@ -181,9 +181,9 @@ def benchmark(
         return
     _need_train_extra()
     if name is Benchmark.filters:
-        from sigmaslam.evaluation.benchmarks.filters import write_page
+        from sigmaslam.evaluation.benchmarks.filters import write_in_one_thread
 
-        typer.echo(write_page(out, rounds, not eager, command + (" --eager" if eager else "")))
+        typer.echo(write_in_one_thread(out, rounds, not eager, command + (" --eager" if eager else "")))
     else:
         from sigmaslam.evaluation.benchmarks.filter_claims import write_claims
 

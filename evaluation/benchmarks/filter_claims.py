@@ -18,9 +18,9 @@ from scipy.stats import chi2, t
 from torch import Generator, Tensor
 
 from sigmaslam.evaluation import scenarios
+from sigmaslam.evaluation.benchmarks.page import write_page
 from sigmaslam.evaluation.scenarios import Outcome, Scenario, run
 from sigmaslam.figures import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION, save_png, style_axes
-from sigmaslam.files import atomic_write_text
 from sigmaslam.filters import (
     SE2,
     SO2,
@@ -280,19 +280,14 @@ def plot_claims(comparisons: Sequence[Comparison], samples: int = 400_000) -> Fi
 
 def write_claims(path: Path, figure: Path, command: str | None = None) -> str:
     """Runs everything, writes page and figure and returns the page; what is below `<!-- notes -->` in it is kept."""
-    notes = ""
-    if path.exists():
-        _, mark, after = path.read_text(encoding="utf-8").partition("<!-- notes -->")
-        notes = mark + after
     bananas, comparisons = compare_bananas(), compare_filters()
     try:
         link = figure.resolve().relative_to(path.resolve().parent).as_posix()
     except ValueError:
         link = figure.as_posix()
-    page = format_claims(bananas, comparisons, link, command or f"sigmaslam benchmark claims --out {path}") + notes
+    page = format_claims(bananas, comparisons, link, command or f"sigmaslam benchmark claims --out {path}")
     save_png(plot_claims(comparisons), figure)
-    atomic_write_text(path, page)
-    return page
+    return write_page(path, page)
 
 
 def _plot_banana(axes: Axes, samples: int) -> None:

@@ -21,7 +21,7 @@ from rich.progress import Progress
 from sigmaslam.evaluation.benchmarks import filter_work
 from sigmaslam.evaluation.benchmarks.filter_peers import Peer, available, single_thread_environment
 from sigmaslam.evaluation.benchmarks.filter_work import BatchedWork, StereoWork
-from sigmaslam.files import atomic_write_text
+from sigmaslam.evaluation.benchmarks.page import write_page
 
 POINTS = (10, 50, 100, 200, 500)
 MANY_POINTS = (1000, 2000, 5000)
@@ -243,7 +243,7 @@ def _version(package: str) -> str:
         return "not installed"
 
 
-def write_page(path: Path, rounds: int, compiled: bool, command: str) -> str:
+def write_in_one_thread(path: Path, rounds: int, compiled: bool, command: str) -> str:
     """Runs the benchmark in a process of one thread, writes the page and returns it.
 
     What is below a line `<!-- notes -->` in the page is kept.
@@ -274,21 +274,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--eager", action="store_true", help="leave out the compiled filters (minutes to compile)")
     parser.add_argument("--command", help="what the page says it was made by")
     options = parser.parse_args(arguments)
+    command = options.command or "python -m evaluation.benchmarks.filters"
     if os.environ.get("OMP_NUM_THREADS") != "1":
-        command = options.command or "python -m evaluation.benchmarks.filters"
-        write_page(options.out, options.rounds, not options.eager, command)
+        write_in_one_thread(options.out, options.rounds, not options.eager, command)
         return
     import torch
 
     torch.set_num_threads(1)
     np.seterr(all="ignore")
-    notes = ""
-    if options.out.exists():
-        _, mark, after = options.out.read_text(encoding="utf-8").partition("<!-- notes -->")
-        notes = mark + after
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    page = format_page(options.rounds, not options.eager, options.command or "python -m evaluation.benchmarks.filters")
-    atomic_write_text(options.out, page + notes)
+    write_page(options.out, format_page(options.rounds, not options.eager, command))
 
 
 if __name__ == "__main__":

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from sigmaslam.errors import InputError
+from sigmaslam.evaluation.benchmarks.page import write_page
 from sigmaslam.evaluation.evaluate import Evaluation, evaluate_run
-from sigmaslam.files import atomic_write_text
 from sigmaslam.readers import open_sequence
 from sigmaslam.report import FrameTable, read_frames
 from sigmaslam.run import track_sequence
@@ -93,13 +93,7 @@ def format_results(results: Sequence[SequenceResult], command: str) -> str:
 
 def write_results(path: Path, data: Path | None, frontends: Sequence[str], command: str) -> str:
     """Runs everything, writes the page and returns it; what is below a line `<!-- notes -->` in the page is kept."""
-    notes = ""
-    if path.exists():
-        _, mark, after = path.read_text(encoding="utf-8").partition("<!-- notes -->")
-        notes = mark + after
-    page = format_results(run_sequences(data, frontends), command) + notes
-    atomic_write_text(path, page)
-    return page
+    return write_page(path, format_results(run_sequences(data, frontends), command))
 
 
 _ACCURACY_COLUMNS = ("front-end", "tracked", "ATE m", "t_rel %", "r_rel deg/100 m", "step mm", "step deg", "inliers")
