@@ -15,6 +15,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 from rich.logging import RichHandler
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from sigmaslam.errors import InputError, SigmaSlamError
 
@@ -45,6 +46,52 @@ class InputFormat(StrEnum):
     euroc = "euroc"
     folder = "folder"
     video = "video"
+
+
+class RenderPreset(StrEnum):
+    """Rendered worlds."""
+
+    room = "room"
+    street = "street"
+    drone = "drone"
+    colon = "colon"
+    organ = "organ"
+    tool = "tool"
+
+
+class Motion(StrEnum):
+    """Ways of moving through a rendered world."""
+
+    normal = "normal"
+    stops = "stops"
+    rotation = "rotation"
+    loop = "loop"
+    rest = "rest"
+
+
+class SensorGrade(StrEnum):
+    """How good the rendered camera is."""
+
+    ideal = "ideal"
+    normal = "normal"
+    harsh = "harsh"
+
+
+class Truth(StrEnum):
+    """How much truth is written beside rendered images."""
+
+    dense = "dense"
+    sparse = "sparse"
+
+
+class Data(StrEnum):
+    """What training pairs are made of."""
+
+    leaves = "leaves"
+    noise = "noise"
+    patterns = "patterns"
+    scenes = "scenes"
+    mix = "mix"
 
 
 class Benchmark(StrEnum):
@@ -121,19 +168,87 @@ def evaluate(
 
 
 @app.command()
+def render(
+    preset: Annotated[RenderPreset, typer.Argument(help="What world, and its stereo camera.")],
+    out: Annotated[Path, typer.Option(help="Folder, new or empty, or left from the same command to go on with.")],
+    frames: Annotated[int, typer.Option(min=1, help="Number of stereo pairs.")] = 100,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of world, path, cameras and noise.")] = 0,
+    motion: Annotated[Motion, typer.Option(help="How the camera moves; in 'tool' the tool.")] = Motion.normal,
+    movers: Annotated[
+        float, typer.Option(min=0.0, max=0.5, help="Share of the image that moves on its own, 0 to 0.5.")
+    ] = 0.0,
+    sensor: Annotated[SensorGrade, typer.Option(help="Blur, noise, exposure and compression.")] = SensorGrade.normal,
+    disparity_offset: Annotated[
+        float, typer.Option(help="Pixels by which disparities exceed what the written calibration says.")
+    ] = 0.0,
+    rotation_error: Annotated[
+        float, typer.Option(help="Degrees by which the right camera is turned against its calibration.")
+    ] = 0.0,
+    profile: Annotated[
+        Path | None, typer.Option(help="street: KITTI poses file whose motion the drive follows.")
+    ] = None,
+    width: Annotated[int | None, typer.Option(min=16, help="Pixels.", show_default="the preset's")] = None,
+    height: Annotated[int | None, typer.Option(min=16, help="Pixels.", show_default="the preset's")] = None,
+    truth: Annotated[
+        Truth, typer.Option(help="dense: depth, flow, masks of every pixel; sparse: landmark tracks alone.")
+    ] = Truth.dense,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes.", show_default="one a core")] = None,
+    ray: Annotated[bool, typer.Option("--ray", help="Spread the frames over a Ray cluster (extra 'scale').")] = False,
+    device: Annotated[str, typer.Option(help="Where frames are drawn: cpu, cuda, cuda:1.")] = "cpu",
+) -> None:
+    """Render a stereo sequence with exact truth (needs the extra 'train').
+
+    Writes a KITTI folder (drone and colon: EuRoC, unrectified), poses, truth/NNNNNN.npz, landmarks.npz, scene.json.
+    """
+    _need_train_extra()
+    from sigmaslam.synthetic.sequence import default_workers, write_sequence
+    from sigmaslam.synthetic.simulation import Recipe
+
+    recipe = Recipe(
+        preset.value,
+        frames,
+        seed,
+        motion.value,
+        movers,
+        sensor.value,
+        disparity_offset,
+        rotation_error,
+        width,
+        height,
+        None if profile is None else str(profile),
+    )
+    with Progress(
+        BarColumn(bar_width=16),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.description}"),
+        console=Console(stderr=True),
+    ) as progress:
+        task = progress.add_task("making the world", total=frames)
+
+        def done(count: int) -> None:
+            progress.update(task, completed=count, description="frames")
+
+        before = write_sequence(out, recipe, truth.value, workers or default_workers(), device, ray, done)
+    kept = f" ({before} were there)" if before else ""
+    typer.echo(f"{frames} stereo pairs{kept} in {out}\nTry: sigmaslam track {out} --out run")
+
+
+@app.command()
 def train(
     out: Annotated[Path, typer.Option(help="Folder for the checkpoint, the log, the weights and their card.")],
     steps: Annotated[int, typer.Option(min=1, help="Optimiser steps; about 2 a second on 2 cores.")] = 3400,
+    data: Annotated[Data, typer.Option(help="What the pairs are made of.")] = Data.mix,
     seed: Annotated[int, typer.Option(min=0, help="Seed of data, weights and sampling.")] = 0,
     workers: Annotated[int, typer.Option(min=0, help="Processes that make training pairs.")] = 1,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")] = False,
 ) -> None:
-    """Train the correspondence network on procedural textures (needs the extra 'train')."""
+    """Train the correspondence network on renders alone (needs the extra 'train')."""
     _need_train_extra()
     from sigmaslam.training.loop import TrainingConfig
     from sigmaslam.training.loop import train as run_training
 
-    card = run_training(out, TrainingConfig(steps=steps, seed=seed), workers=workers, resume=resume)
+    card = run_training(out, TrainingConfig(steps=steps, data=data.value, seed=seed), workers=workers, resume=resume)
     typer.echo(json.dumps(card, indent=2))
 
 

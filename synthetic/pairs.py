@@ -5,17 +5,17 @@ A pair is a pure function of (seed, index), so that a run can be resumed anywher
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from sigmaslam.synthetic.textures import dead_leaves, noise_texture
+from sigmaslam.synthetic.bank import TextureBank
+from sigmaslam.synthetic.fills import fixed_point, log_uniform
+from sigmaslam.synthetic.sensor import expose, random_sensor
+from sigmaslam.synthetic.textures import leaf_outline
 
 _TEXTURE_SIZE = 448
-_TEXTURES_A_BLOCK = 16  # a batch of up to 16 pairs sees 16 different textures ...
-_USES_OF_A_TEXTURE = 32  # ... and the next 31 batches see them again under other warps
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,11 +25,23 @@ class HomographyPair:
     Attributes:
         image0, image1: (H, W) float32 in [0, 1].
         H_1_0: (3, 3) homography that takes pixels of image 0 to image 1.
+        hidden1: (H, W) bool, what something else stands before in image 1.
     """
 
     image0: np.ndarray
     image1: np.ndarray
     H_1_0: np.ndarray
+    hidden1: np.ndarray
+
+    def transfer(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where points (N, 2) of image 0 lie in image 1 (N, 2), and whether they are seen there (N,) bool."""
+        homogeneous = np.concatenate([points, np.ones_like(points[:, :1])], axis=1) @ self.H_1_0.T
+        front = homogeneous[:, 2] > 1e-6
+        places = homogeneous[:, :2] / np.where(front, homogeneous[:, 2], 1.0)[:, None]
+        last = np.array(self.hidden1.shape[::-1]) - 1
+        visible = front & ((places >= 0) & (places <= last)).all(axis=1)
+        u, v = np.clip(np.round(places), 0, last).astype(int).T
+        return places, visible & ~self.hidden1[v, u]
 
 
 class HomographyPairs:
@@ -38,38 +50,40 @@ class HomographyPairs:
     Args:
         seed: of the whole stream.
         size: side of the square images in pixels.
+        kinds: of the textures, as `TextureBank` takes them.
     """
 
-    def __init__(self, seed: int, size: int = 224) -> None:
+    def __init__(self, seed: int, size: int = 224, kinds: tuple[str, ...] = ("leaves",)) -> None:
         self.seed = seed
         self.size = size
-        self._textures: OrderedDict[int, np.ndarray] = OrderedDict()
+        self._bank = TextureBank(seed, kinds, _TEXTURE_SIZE)
 
     def pair(self, index: int) -> HomographyPair:
         """The pair of that index, the same whenever it is asked for."""
         rng = np.random.default_rng((self.seed, 1, index))
-        texture = self._texture(index)
-        H_0_texture = _random_view(rng, self.size, strength=0.5)
-        H_1_texture = _random_view(rng, self.size, strength=1.0)
+        texture = self._bank.texture(index)
+        if rng.random() < 0.3:  # seen from afar
+            texture = _shrunk(texture, np.exp(rng.uniform(0.1, 0.9)))
+        H_0_texture = _random_view(rng, texture.shape[0], self.size, strength=0.5)
+        H_1_texture = _random_view(rng, texture.shape[0], self.size, strength=1.0)
         images = [_warp(texture, H, self.size) for H in (H_0_texture, H_1_texture)]
-        if rng.random() < 0.25:
-            images[1] = _occlude(images[1], rng)
+        hidden = np.zeros((self.size, self.size), dtype=bool)
+        if rng.random() < 0.3:
+            foreign = self._bank.texture(index + 1)
+            for _ in range(int(rng.integers(1, 4))):
+                images[1], mask = _occlude(images[1], foreign, rng)
+                hidden |= mask
         images = [_sense(image, rng) for image in images]
         H_1_0 = H_1_texture @ np.linalg.inv(H_0_texture)
-        return HomographyPair(images[0], images[1], H_1_0 / H_1_0[2, 2])
-
-    def _texture(self, index: int) -> np.ndarray:
-        block = index // (_TEXTURES_A_BLOCK * _USES_OF_A_TEXTURE)
-        key = block * _TEXTURES_A_BLOCK + index % _TEXTURES_A_BLOCK
-        if key not in self._textures:
-            rng = np.random.default_rng((self.seed, 0, key))
-            self._textures[key] = dead_leaves((_TEXTURE_SIZE, _TEXTURE_SIZE), rng)
-            while len(self._textures) > _TEXTURES_A_BLOCK:
-                self._textures.popitem(last=False)
-        return self._textures[key]
+        return HomographyPair(images[0], images[1], H_1_0 / H_1_0[2, 2], hidden)
 
 
-def _random_view(rng: np.random.Generator, size: int, strength: float) -> np.ndarray:
+def _shrunk(texture: np.ndarray, factor: float) -> np.ndarray:
+    side = max(2, round(texture.shape[0] / factor))
+    return np.asarray(cv2.resize(texture, (side, side), interpolation=cv2.INTER_AREA))
+
+
+def _random_view(rng: np.random.Generator, texture_size: int, size: int, strength: float) -> np.ndarray:
     """Homography from texture pixels to the pixels of one view, (3, 3).
 
     Rotation to +-40 degrees, scale e^+-0.45, shear, perspective and shift, each scaled by `strength`; one view in
@@ -87,7 +101,7 @@ def _random_view(rng: np.random.Generator, size: int, strength: float) -> np.nda
         @ np.array([[stretch, shear], [0.0, 1.0 / stretch]])
     )
     to_centre, H, to_view = np.eye(3), np.eye(3), np.eye(3)
-    to_centre[:2, 2] = -_TEXTURE_SIZE / 2
+    to_centre[:2, 2] = -texture_size / 2
     H[:2, :2] = linear
     H[2, :2] = 0.6 * strength / size * rng.uniform(-1, 1, 2)
     shift = 0.15 * size * strength * rng.uniform(-1, 1, 2)
@@ -100,41 +114,24 @@ def _warp(texture: np.ndarray, H: np.ndarray, size: int) -> np.ndarray:
     return image.astype(np.float32) / 255.0
 
 
-def _occlude(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A foreign patch over part of the second view: what it hides has no match."""
+def _occlude(image: np.ndarray, foreign: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """The second view with a patch of another texture over part of it, and what that hides (H, W) bool."""
     size = image.shape[0]
-    centre = tuple(int(c) for c in rng.uniform(0, size, 2))
-    axes = tuple(int(a) for a in rng.uniform(0.08, 0.3, 2) * size)
-    mask = np.zeros(image.shape, np.uint8)
-    cv2.ellipse(mask, centre, axes, float(rng.uniform(0, 180)), 0, 360, 1, -1)
-    patch = rng.uniform(0, 1) + 0.15 * noise_texture(image.shape, rng)
-    return np.where(mask > 0, np.clip(patch, 0, 1), image).astype(np.float32)
+    mask: np.ndarray = np.zeros(image.shape, np.uint8)
+    outline = leaf_outline(log_uniform(rng, 0.06, 0.25) * size, rng) + rng.uniform(0, size, 2)
+    cv2.fillPoly(mask, [fixed_point(outline)], 255, cv2.LINE_AA, 4)
+    if rng.random() < 0.3:  # nearer than the focus
+        mask = cv2.blur(mask, (9, 9))
+    patch = _warp(foreign, _random_view(rng, foreign.shape[0], size, strength=1.0), size)
+    return np.asarray(image + mask * np.float32(1 / 255) * (patch - image)), mask > 64
 
 
 def _sense(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Sensor and light: shading, gamma, gain, blur, motion blur, noise, quantisation."""
-    size = image.shape[0]
+    """Uneven light, then a random camera that moved while its shutter was open."""
     if rng.random() < 0.4:
-        shade = cv2.resize(
-            rng.uniform(0.5, 1.3, (3, 3)).astype(np.float32), (size, size), interpolation=cv2.INTER_CUBIC
-        )
-        image = image * shade
-    image = np.clip(image, 0, 1) ** np.exp(rng.uniform(-0.6, 0.6))
-    contrast = np.exp(rng.uniform(-1.2, 0.1))
-    image = contrast * image + rng.uniform(0, 1 - min(contrast, 1.0))
-    if rng.random() < 0.5:
-        image = cv2.GaussianBlur(image, (0, 0), rng.uniform(0.3, 1.4))
-    if rng.random() < 0.15:
-        image = cv2.filter2D(image, -1, _motion_kernel(rng))
-    noise = np.exp(rng.uniform(np.log(0.002), np.log(0.04)))
-    image = image + noise * rng.standard_normal(image.shape, np.float32) * np.sqrt(0.3 + np.clip(image, 0, 1))
-    return (np.round(np.clip(image, 0, 1) * 255) / 255).astype(np.float32)
-
-
-def _motion_kernel(rng: np.random.Generator) -> np.ndarray:
-    length, angle = rng.uniform(2, 7), rng.uniform(0, np.pi)
-    kernel = np.zeros((9, 9), np.float32)
-    reach = 0.5 * length * np.array([np.cos(angle), np.sin(angle)])
-    start, stop = (tuple(int(x) for x in np.round((4 + s * reach) * 16)) for s in (-1, 1))
-    cv2.line(kernel, start, stop, 1.0, 1, cv2.LINE_AA, 4)
-    return kernel / max(float(kernel.sum()), 1e-6)
+        shade = rng.uniform(0.5, 1.3, (3, 3)).astype(np.float32)
+        image = image * cv2.resize(shade, image.shape[::-1], interpolation=cv2.INTER_CUBIC)
+    angle, motion = rng.uniform(0, 2 * np.pi), 12.0 if rng.random() < 0.25 else 0.0
+    flow = (motion * np.array([np.cos(angle), np.sin(angle)])).astype(np.float32)
+    grey = expose(image, random_sensor(rng), rng, flow)
+    return grey.astype(np.float32) / np.float32(255.0)

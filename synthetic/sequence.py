@@ -1,235 +1,248 @@
-"""Writes a rendered stereo sequence as a KITTI-style folder with exact truth."""
+"""Writes rendered stereo sequences with exact truth: in parallel, and again from where it stopped.
 
-import argparse
+A folder holds the images in KITTI's or EuRoC's layout with calibration, times and true poses; `scene.json`, from which
+everything can be made again; `truth/NNNNNN.npz` for each frame; and `landmarks.npz`.
+"""
+
+from __future__ import annotations
+
 import json
-import logging
-import sys
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import asdict
+from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import torch
 
-from sigmaslam.errors import InputError, SigmaSlamError
-from sigmaslam.synthetic.scene import Pinhole, Scene, render
-from sigmaslam.synthetic.sensor import Sensor, expose
-from sigmaslam.synthetic.trajectories import room_flight, street_drive
-from sigmaslam.synthetic.worlds import room_scene, street_scene
+from sigmaslam.errors import InputError
+from sigmaslam.files import atomic_path, atomic_write_text
+from sigmaslam.synthetic.landmarks import Landmarks, choose_landmarks, observe
+from sigmaslam.synthetic.layouts import image_paths, write_layout
+from sigmaslam.synthetic.simulation import Frame, Recipe, Simulation, Studio, simulate
 
-logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class Preset:
-    """A kind of sequence: its stereo camera and its clock.
-
-    Attributes:
-        width, height: pixels.
-        focal: pixels, at this width.
-        baseline: metres.
-        fps: frames per second.
-    """
-
-    width: int
-    height: int
-    focal: float
-    baseline: float
-    fps: float
-
-
-PRESETS = {
-    "room": Preset(400, 304, 300.0, 0.11, 20.0),
-    "street": Preset(640, 240, 360.0, 0.54, 10.0),
-}
-LARGEST_GAIN_DIFFERENCE = 0.06
-TOP_STREET_SPEED = 9.0  # metres per second, of `street_drive`
-# The smallest files of OpenCV's choices: the images are noisy, so that runs of equal bytes are rare.
-PNG_OPTIONS = (
-    cv2.IMWRITE_PNG_COMPRESSION,
-    9,
-    cv2.IMWRITE_PNG_STRATEGY,
-    cv2.IMWRITE_PNG_STRATEGY_FILTERED,
-)
-
-
-@dataclass(frozen=True, slots=True)
-class Simulation:
-    """All that a sequence is made from; the same preset, frames and seed give the same.
-
-    Attributes:
-        scene: the world.
-        T_world_camera: (frames, 4, 4) poses of the left camera.
-        left: the left camera; the right one is the same, `baseline` metres along its x axis.
-        baseline: metres.
-        fps: frames per second.
-    """
-
-    scene: Scene
-    T_world_camera: np.ndarray
-    left: Pinhole
-    baseline: float
-    fps: float
-
-
-def simulate(preset: str, frames: int, seed: int, width: int | None = None, height: int | None = None) -> Simulation:
-    """A seeded scene with a path and a stereo camera.
-
-    Args:
-        preset: a key of `PRESETS`.
-        frames: number of stereo pairs.
-        seed: of all randomness.
-        width, height: pixels, the preset's unless given; the field of view across stays the same.
-    Raises:
-        InputError: the preset is unknown, or a number is out of range.
-    """
-    if preset not in PRESETS:
-        raise InputError(f"preset {preset!r} is unknown; choose one of {', '.join(sorted(PRESETS))}")
-    if frames < 1:
-        raise InputError(f"frames is {frames}; give at least 1")
-    if seed < 0:
-        raise InputError(f"seed is {seed}; give a number from 0 up")
-    chosen = PRESETS[preset]
-    width, height = width or chosen.width, height or chosen.height
-    if width < 16 or height < 16:
-        raise InputError(f"the image size {width}x{height} is too small; give at least 16x16")
-    focal = chosen.focal * width / chosen.width
-    camera = Pinhole(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
-    # Separate streams: the path does not depend on how much the scene draws.
-    scene_rng, path_rng = (np.random.default_rng([seed, stream]) for stream in (0, 1))
-    if preset == "room":
-        scene, poses = room_scene(scene_rng), room_flight(path_rng, frames, chosen.fps)
-    else:
-        driven = frames / chosen.fps * TOP_STREET_SPEED
-        scene = street_scene(scene_rng, max(60.0, driven + 40.0))
-        poses = street_drive(path_rng, frames, chosen.fps)
-    return Simulation(scene, poses, camera, chosen.baseline, chosen.fps)
+TRUTHS = ("dense", "sparse")
+SCENE_NAME, LANDMARKS_NAME = "scene.json", "landmarks.npz"
+_CHUNK = 8  # frames handed to a process at a time, at most
+_TRACK_KEYS = ("landmark", "left", "right", "left_visible", "right_visible", "depth")
 
 
 def write_sequence(
     out: Path,
-    preset: str,
-    frames: int,
-    seed: int,
-    disparity_offset: float = 0.0,
-    width: int | None = None,
-    height: int | None = None,
-    sensor: Sensor | None = None,
-) -> None:
-    """Renders a stereo sequence into a new KITTI-style folder.
-
-    Writes `image_0/%06d.png` (left), `image_1/%06d.png` (right), `calib.txt` (P0, P1), `times.txt` (seconds),
-    `poses.txt` (rows of T_first_camera, the left camera's exact pose in its first frame) and `scene.json`.
+    recipe: Recipe,
+    truth: str = "dense",
+    workers: int = 1,
+    device: str = "cpu",
+    ray: bool = False,
+    done: Callable[[int], None] = lambda frames: None,
+) -> int:
+    """Renders a sequence into a folder; frames that are there already are kept.
 
     Args:
-        out: folder to make; must be absent or empty.
-        preset: a key of `PRESETS`.
-        frames: number of stereo pairs.
-        seed: of all randomness.
-        disparity_offset: pixels by which the images' disparity u_left - u_right exceeds what the written
-            calibration says, as if the right camera were badly calibrated.
-        width, height: pixels, the preset's unless given.
-        sensor: blur and noise of both cameras; the right one's gain differs by a few per cent.
+        out: new, empty, or left from the same recipe.
+        recipe: what to render.
+        truth: 'dense' for depth, instance ids, flow and occlusion of every pixel beside the landmarks; 'sparse' for
+            the landmarks alone.
+        workers: processes.
+        device: where frames are drawn.
+        ray: spread the frames over a Ray cluster instead; `out` must be a folder that all its machines share.
+        done: called with the number of frames that are there.
+    Returns:
+        How many frames were there before.
     Raises:
-        InputError: the folder is not empty, the preset is unknown, or a number is out of range.
+        InputError: the recipe is wrong, or the folder holds something else.
     """
+    if truth not in TRUTHS:
+        raise InputError(f"truth {truth!r} is unknown; choose one of {', '.join(TRUTHS)}")
+    recipe.check()
+    description = prepare(out, recipe, truth)
+    missing = missing_frames(out, recipe.frames)
+    before = recipe.frames - len(missing)
+    done(before)
+    size = int(np.clip(len(missing) // (4 * workers), 1, _CHUNK))
+    chunks = [missing[k : k + size] for k in range(0, len(missing), size)]
+    count = before
+    crew = _ray_crew if ray else _film_crew
+    with crew(out, description, truth, min(workers, len(chunks)), device) as film:
+        for finished in film(chunks):
+            count += finished
+            done(count)
+    join_tracks(out, recipe.frames)
+    return before
+
+
+def prepare(out: Path, recipe: Recipe, truth: str) -> dict[str, Any]:
+    """Makes the folder with all but its frames, or checks the one that is there; returns the simulation as JSON.
+
+    Raises:
+        InputError: the folder holds something else.
+    """
+    asked = {"recipe": asdict(recipe), "truth": truth}
+    scene = out / SCENE_NAME
+    if scene.is_file():
+        try:
+            content: dict[str, Any] = json.loads(scene.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise InputError(f"{scene} cannot be read ({error}); remove it or choose another --out") from error
+        there = {key: content.get(key) for key in asked}
+        if there != asked:
+            raise InputError(f"{scene} was made with {there}, not {asked}; choose another --out")
+        return dict(content["simulation"])
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out} exists and is not an empty folder; remove it or choose another --out")
-    simulation = simulate(preset, frames, seed, width, height)
-    camera = simulation.left
-    right_camera = replace(camera, cx=camera.cx - disparity_offset)
-    T_left_right = np.eye(4)
-    T_left_right[0, 3] = simulation.baseline
-    left_sensor = sensor or Sensor()
-    difference = np.random.default_rng([seed, 2]).uniform(-1, 1) * LARGEST_GAIN_DIFFERENCE
-    right_sensor = replace(left_sensor, gain=left_sensor.gain * (1.0 + difference))
+    simulation = simulate(recipe)
+    description = simulation.to_json()
+    (out / "truth").mkdir(parents=True)
+    write_layout(out, simulation)
+    studio = Studio(simulation)
+    landmarks = choose_landmarks(studio)
+    _save(out / LANDMARKS_NAME, asdict(landmarks))
+    # The last to be written: a folder with scene.json is complete but for its frames.
+    atomic_write_text(scene, json.dumps({**asked, "command": command(recipe, truth), "simulation": description}) + "\n")
+    return description
 
-    for eye in ("image_0", "image_1"):
-        (out / eye).mkdir(parents=True, exist_ok=True)
-    projection = np.concatenate([camera.matrix, np.zeros((3, 1))], axis=1)
-    right_projection = projection.copy()
-    right_projection[0, 3] = -camera.fx * simulation.baseline
-    (out / "calib.txt").write_text(f"P0: {_row(projection)}\nP1: {_row(right_projection)}\n")
-    (out / "times.txt").write_text("".join(f"{k / simulation.fps:.6e}\n" for k in range(frames)))
-    poses = simulation.T_world_camera
-    relative = np.linalg.inv(poses[0]) @ poses
-    relative[0] = np.eye(4)
-    (out / "poses.txt").write_text("".join(f"{_row(pose[:3])}\n" for pose in relative))
-    recipe = {
-        "preset": preset,
-        "frames": frames,
-        "seed": seed,
-        "disparity_offset": disparity_offset,
-        "fps": simulation.fps,
-        "camera": asdict(camera),
-        "baseline": simulation.baseline,
-        "left_sensor": asdict(left_sensor),
-        "right_sensor": asdict(right_sensor),
-    }
-    if sensor is None:
-        recipe["command"] = _command(preset, frames, seed, disparity_offset, width, height)
-    (out / "scene.json").write_text(json.dumps(recipe, indent=2) + "\n")
 
+def missing_frames(out: Path, frames: int) -> list[int]:
+    """Numbers of the frames whose truth, the last of their files, is not there."""
+    return [k for k in range(frames) if not _truth_path(out, k).is_file()]
+
+
+def write_frames(out: Path, studio: Studio, landmarks: Landmarks, truth: str, numbers: list[int]) -> int:
+    """Renders and writes these frames; returns how many."""
+    batch = 1 if studio.renderer.device.type == "cpu" else _CHUNK
+    for start in range(0, len(numbers), batch):
+        part = numbers[start : start + batch]
+        for number, frame in zip(part, studio.frames(np.array(part)), strict=True):
+            for path, image in zip(image_paths(out, studio.simulation, number), (frame.left, frame.right), strict=True):
+                _write_image(path, image)
+            _save(_truth_path(out, number), _truth_of(studio, landmarks, frame, truth, number))
+    return len(numbers)
+
+
+def join_tracks(out: Path, frames: int) -> None:
+    """Adds the observations of all frames to landmarks.npz, one row a landmark and frame."""
+    with np.load(out / LANDMARKS_NAME) as content:
+        landmarks = {key: content[key] for key in ("points", "facet", "body")}
+    rows: dict[str, list[np.ndarray]] = {key: [] for key in ("frame", *_TRACK_KEYS)}
     for k in range(frames):
-        views = (
-            ("image_0", camera, poses[k], left_sensor),
-            ("image_1", right_camera, poses[k] @ T_left_right, right_sensor),
-        )
-        for stream, (eye, view_camera, T_world_view, view_sensor) in enumerate(views):
-            ideal = render(simulation.scene, view_camera, T_world_view).image
-            photograph = expose(ideal, view_sensor, np.random.default_rng([seed, 3, k, stream]))
-            path = out / eye / f"{k:06d}.png"
-            if not cv2.imwrite(str(path), photograph, PNG_OPTIONS):
-                raise InputError(f"{path} cannot be written; is the disk full or read-only?")
-        logger.info("%s: frame %d of %d", out, k + 1, frames)
+        with np.load(_truth_path(out, k)) as content:
+            for key in _TRACK_KEYS:
+                rows[key].append(content[f"track_{key}"])
+        rows["frame"].append(np.full(len(rows["landmark"][-1]), k))
+    _save(out / LANDMARKS_NAME, {**landmarks, **{f"track_{key}": np.concatenate(v) for key, v in rows.items()}})
 
 
-def _row(matrix: np.ndarray) -> str:
-    return " ".join(f"{value:.12e}" for value in matrix.ravel())
-
-
-def _command(
-    preset: str, frames: int, seed: int, disparity_offset: float, width: int | None, height: int | None
-) -> str:
+def command(recipe: Recipe, truth: str) -> str:
     """The command line that writes the same folder again."""
-    words = ["python", "-m", "sigmaslam.synthetic.sequence", preset, "--out", "DIR"]
-    words += ["--frames", str(frames), "--seed", str(seed)]
-    if disparity_offset:
-        words += ["--disparity-offset", repr(disparity_offset)]
-    if width:
-        words += ["--width", str(width)]
-    if height:
-        words += ["--height", str(height)]
-    return " ".join(words)
+    plain = Recipe(recipe.preset, recipe.frames)
+    words = ["sigmaslam", "render", recipe.preset, "--out", "DIR", "--frames", str(recipe.frames)]
+    for name, value in asdict(recipe).items():
+        if name not in ("preset", "frames") and (value != getattr(plain, name) or name == "seed"):
+            words += [f"--{name.replace('_', '-')}", str(value)]
+    return " ".join(words if truth == "dense" else [*words, "--truth", truth])
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line: `python -m sigmaslam.synthetic.sequence PRESET --out DIR --frames N --seed S`."""
-    parser = argparse.ArgumentParser(prog="python -m sigmaslam.synthetic.sequence", description=__doc__)
-    parser.add_argument("preset", choices=sorted(PRESETS))
-    parser.add_argument("--out", type=Path, required=True, help="folder to make; absent or empty")
-    parser.add_argument("--frames", type=int, default=40)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--disparity-offset", type=float, default=0.0, help="pixels, published minus true")
-    parser.add_argument("--width", type=int)
-    parser.add_argument("--height", type=int)
-    options = parser.parse_args(arguments)
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
+@contextmanager
+def _film_crew(
+    out: Path, description: dict[str, Any], truth: str, workers: int, device: str
+) -> Iterator[Callable[[list[list[int]]], Iterable[int]]]:
+    """Something that films chunks of frames, here or in processes, and yields how many are done."""
+    if workers <= 1:
+        crew = _Crew(out, description, truth, device)
+        yield lambda chunks: (crew.film([number]) for chunk in chunks for number in chunk)
+        return
+    context = get_context("spawn")
+    with ProcessPoolExecutor(workers, context, _start_worker, (out, description, truth, device)) as pool:
+        try:
+            yield lambda chunks: pool.map(_work, chunks)
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+@contextmanager
+def _ray_crew(
+    out: Path, description: dict[str, Any], truth: str, workers: int, device: str
+) -> Iterator[Callable[[list[list[int]]], Iterable[int]]]:
+    """The same on a Ray cluster: the one that RAY_ADDRESS names, or this machine."""
     try:
-        write_sequence(
-            options.out,
-            options.preset,
-            options.frames,
-            options.seed,
-            options.disparity_offset,
-            options.width,
-            options.height,
-        )
-    except SigmaSlamError as error:
-        logger.error("error: %s", error)
-        return 2
-    return 0
+        import ray
+        from ray.util import ActorPool
+    except ImportError as error:
+        raise InputError(f"{error.name} is not installed: pip install 'sigmaslam[scale]'") from error
+    if not ray.is_initialized():
+        ray.init(log_to_driver=False)
+    # Ray itself sees to it that an actor of one processor keeps to one thread.
+    actor = ray.remote(num_cpus=1, num_gpus=0 if device == "cpu" else 1)(_Crew)
+    resources: dict[str, float] = ray.cluster_resources()  # type: ignore[no-untyped-call, unused-ignore]
+    size = max(1, int(resources.get("CPU" if device == "cpu" else "GPU", 1)))
+    pool = ActorPool([actor.remote(out.resolve(), description, truth, device) for _ in range(size)])
+    try:
+        yield lambda chunks: pool.map(lambda crew, chunk: crew.film.remote(chunk), chunks)
+    finally:
+        ray.shutdown()
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+class _Crew:
+    """A studio with its landmarks, made once for many frames."""
+
+    def __init__(self, out: Path, description: dict[str, Any], truth: str, device: str) -> None:
+        self._out, self._truth = out, truth
+        self._studio = Studio(Simulation.from_json(description), device)
+        with np.load(out / LANDMARKS_NAME) as content:
+            self._landmarks = Landmarks(content["points"], content["facet"], content["body"])
+
+    def film(self, numbers: list[int]) -> int:
+        """Renders and writes these frames; returns how many."""
+        with torch.inference_mode():
+            return write_frames(self._out, self._studio, self._landmarks, self._truth, numbers)
+
+
+_crew: _Crew | None = None
+
+
+def _start_worker(out: Path, description: dict[str, Any], truth: str, device: str) -> None:
+    global _crew
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    _crew = _Crew(out, description, truth, device)
+
+
+def _work(numbers: list[int]) -> int:
+    assert _crew is not None
+    return _crew.film(numbers)
+
+
+def _truth_of(studio: Studio, landmarks: Landmarks, frame: Frame, truth: str, number: int) -> dict[str, np.ndarray]:
+    tracks = {f"track_{key}": value for key, value in observe(studio, landmarks, number).items()}
+    if truth == "sparse":
+        return tracks
+    images = {key: value for key, value in asdict(frame).items() if key not in ("left", "right")}
+    return {**images, **tracks}
+
+
+def _truth_path(out: Path, frame: int) -> Path:
+    return out / "truth" / f"{frame:06d}.npz"
+
+
+def _save(path: Path, arrays: dict[str, Any]) -> None:
+    with atomic_path(path) as temporary:
+        np.savez_compressed(temporary, **arrays)
+
+
+def _write_image(path: Path, image: np.ndarray) -> None:
+    ok, encoded = cv2.imencode(".png", image)
+    if not ok:
+        raise InputError(f"{path} cannot be encoded as PNG")
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(encoded.tobytes())
+
+
+def default_workers() -> int:
+    """One process a core."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

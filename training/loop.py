@@ -27,7 +27,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path
 from sigmaslam.models.network import FeatureNetwork
 from sigmaslam.training.step import pair_loss
-from sigmaslam.training.stream import pair_loader
+from sigmaslam.training.stream import MIXES, pair_loader
 from sigmaslam.training.validation import matching_accuracy
 
 WEIGHTS_NAME = "features.safetensors"
@@ -42,6 +42,7 @@ class TrainingConfig:
 
     Attributes:
         steps: optimiser steps.
+        data: what the pairs are made of, a key of `stream.MIXES`.
         batch_size: pairs a step.
         size: side of the training images, pixels.
         points: corners per image in the loss.
@@ -53,6 +54,7 @@ class TrainingConfig:
     """
 
     steps: int = 3400
+    data: str = "mix"
     batch_size: int = 16
     size: int = 224
     points: int = 256
@@ -106,6 +108,7 @@ def train(out: Path, config: TrainingConfig, workers: int = 1, resume: bool = Fa
         first, seconds, metrics = int(state["step"]), float(state["seconds"]), dict(state["metrics"])
 
     loader = pair_loader(
+        config.data,
         config.seed,
         config.size,
         first * config.batch_size,
@@ -117,10 +120,10 @@ def train(out: Path, config: TrainingConfig, workers: int = 1, resume: bool = Fa
     began = time.monotonic() - seconds
     with _progress() as progress:
         task = progress.add_task("training", total=config.steps, completed=first, note="")
-        for step, (image0, image1, H_1_0, corners0, corners1) in enumerate(loader, start=first):
+        for step, (image0, image1, corners0, places1, visible, corners1) in enumerate(loader, start=first):
             generator = torch.Generator().manual_seed(config.seed * 1_000_000_007 + step)
             network.train()
-            loss = pair_loss(network, image0, image1, H_1_0, corners0, corners1, generator)
+            loss = pair_loss(network, image0, image1, corners0, places1, visible, corners1, generator)
             optimizer.zero_grad(set_to_none=True)
             (loss.descriptor + config.quality_weight * loss.quality).backward()
             nn.utils.clip_grad_norm_(network.parameters(), 1.0)
@@ -154,7 +157,7 @@ def train(out: Path, config: TrainingConfig, workers: int = 1, resume: bool = Fa
         "duration_s": round(time.monotonic() - began, 1),
         "hardware": f"{os.cpu_count()} CPU cores, torch {torch.__version__}",
         "parameters": sum(p.numel() for p in network.parameters()),
-        "data": "procedural dead-leaves textures under random homographies; no photograph",
+        "data": f"renders alone, no photograph: {', '.join(MIXES[config.data])} in turn",
         "metrics_on_held_out_renders": {k: round(v, 4) for k, v in metrics.items()},
     }
     with atomic_path(out / WEIGHTS_NAME) as path:

@@ -19,23 +19,24 @@ def pair_loss(
     network: FeatureNetwork,
     image0: Tensor,
     image1: Tensor,
-    H_1_0: Tensor,
     corners0: Tensor,
+    places1: Tensor,
+    visible: Tensor,
     corners1: Tensor,
     generator: torch.Generator,
 ) -> MatchLoss:
-    """Loss of a batch of homography pairs.
+    """Loss of a batch of pairs.
 
     Args:
         network: the network in training.
         image0, image1: (B, 1, H, W) float32 in [0, 1].
-        H_1_0: (B, 3, 3) from pixels of image 0 to image 1.
         corners0, corners1: (B, N, 2) corners of either image, pixels.
+        places1: (B, N, 2) where corners0 lie in image 1, pixels.
+        visible: (B, N) bool, whether they are seen there.
         generator: of the small displacements.
     """
     batch, size = image0.shape[0], image0.shape[-1]
-    places1 = transfer(H_1_0, corners0)
-    visible = ((places1 >= _MARGIN) & (places1 <= size - 1 - _MARGIN)).all(dim=-1)
+    visible = visible & ((places1 >= _MARGIN) & (places1 <= size - 1 - _MARGIN)).all(dim=-1)
     distance = torch.cdist(places1, corners1)
     repeated = distance.amin(dim=2) < _REPEAT_DISTANCE
     # A corner of image 1 at a true place would be wrongly pushed away: it moves elsewhere as a distractor.
@@ -51,10 +52,3 @@ def pair_loss(
     quality0 = sample_map(logits[:batch], corners0).squeeze(-1)
     count = corners0.shape[1]
     return match_loss(descriptors0, descriptors1[:, :count], descriptors1[:, count:], quality0, visible, repeated)
-
-
-def transfer(H: Tensor, points: Tensor) -> Tensor:
-    """Points (B, N, 2) under homographies (B, 3, 3)."""
-    homogeneous = torch.cat([points, torch.ones_like(points[..., :1])], dim=-1) @ H.transpose(1, 2)
-    depth = homogeneous[..., 2:]
-    return homogeneous[..., :2] / torch.where(depth.abs() < 1e-6, torch.full_like(depth, 1e-6), depth)

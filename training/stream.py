@@ -2,30 +2,101 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from sigmaslam.errors import InputError
 from sigmaslam.synthetic.pairs import HomographyPairs
+from sigmaslam.synthetic.scene_pairs import ScenePairs
+from sigmaslam.synthetic.textures import KINDS
 
-# image0 (1, H, W), image1 (1, H, W), H_1_0 (3, 3), corners0 (N, 2), corners1 (N, 2); all float32
-TrainingPair = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+# image0 (1, H, W), image1 (1, H, W), corners0 (N, 2), places1 (N, 2), visible (N,), corners1 (N, 2)
+TrainingPair = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+
+# What the pairs of a run are made of: its sources take turns.
+MIXES: dict[str, tuple[str, ...]] = {
+    "leaves": ("leaves",),
+    "noise": ("noise",),
+    "patterns": ("patterns",),
+    "scenes": ("scenes",),
+    "mix": ("leaves", "scenes", "leaves", "scenes", "leaves"),
+}
+
+
+class Pair(Protocol):
+    """Two images and where points of the first lie in the second."""
+
+    @property
+    def image0(self) -> np.ndarray:
+        """(H, W) float32 in [0, 1]."""
+
+    @property
+    def image1(self) -> np.ndarray:
+        """(H, W) float32 in [0, 1]."""
+
+    def transfer(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Places (N, 2) in image 1 of points (N, 2) of image 0, and whether they are seen there (N,) bool."""
+
+
+class PairStream(Protocol):
+    """Random access to pairs."""
+
+    def pair(self, index: int) -> Pair:
+        """The pair of that index, the same whenever it is asked for."""
+
+
+def open_stream(source: str, seed: int, size: int) -> PairStream:
+    """A stream by name: 'scenes', 'patterns' (every texture but leaves) or a texture's kind under homographies."""
+    if source == "scenes":
+        return ScenePairs(seed, size)
+    kinds = tuple(kind for kind in KINDS if kind != "leaves") if source == "patterns" else (source,)
+    return HomographyPairs(seed, size, kinds)
+
+
+class MixedPairs:
+    """Pairs of several sources in turn.
+
+    Args:
+        mix: a key of `MIXES`.
+        seed: of all sources.
+        size: side of the square images, pixels.
+    Raises:
+        InputError: the mix is unknown.
+    """
+
+    def __init__(self, mix: str, seed: int, size: int) -> None:
+        if mix not in MIXES:
+            raise InputError(f"data {mix!r} is unknown; choose one of {', '.join(MIXES)}")
+        self._turns = MIXES[mix]
+        self._streams = {source: open_stream(source, seed, size) for source in set(self._turns)}
+
+    def pair(self, index: int) -> Pair:
+        """The pair of that index, the same whenever it is asked for."""
+        lap, turn = divmod(index, len(self._turns))
+        source = self._turns[turn]
+        # Each source sees neighbouring numbers, so that its textures and scenes are used as often as they should be.
+        own = lap * self._turns.count(source) + self._turns[:turn].count(source)
+        return self._streams[source].pair(own)
 
 
 class PairDataset(Dataset[TrainingPair]):
-    """Pairs `first` to `last` of a stream, each with N random corners of either image.
+    """Pairs `first` to `last` of a mix, each with N random corners of either image.
 
     Args:
+        mix: a key of `MIXES`.
         seed: of the stream.
         size: side of the square images, pixels.
         first, last: range of indices, so that a resumed run goes on where it stopped.
         corners: N, corners per image; random places fill up where an image has fewer.
     """
 
-    def __init__(self, seed: int, size: int, first: int, last: int, corners: int) -> None:
-        self._pairs = HomographyPairs(seed, size)
+    def __init__(self, mix: str, seed: int, size: int, first: int, last: int, corners: int) -> None:
+        self._pairs = MixedPairs(mix, seed, size)
         self._seed, self._size = seed, size
         self._first, self._last = first, last
         self._corners = corners
@@ -39,12 +110,15 @@ class PairDataset(Dataset[TrainingPair]):
         index = self._first + item
         pair = self._pairs.pair(index)
         rng = np.random.default_rng((self._seed, 2, index))
+        corners0, corners1 = (self._some_corners(image, rng) for image in (pair.image0, pair.image1))
+        places1, visible = pair.transfer(corners0)
         return (
             torch.from_numpy(pair.image0)[None],
             torch.from_numpy(pair.image1)[None],
-            torch.from_numpy(pair.H_1_0.astype(np.float32)),
-            torch.from_numpy(self._some_corners(pair.image0, rng)),
-            torch.from_numpy(self._some_corners(pair.image1, rng)),
+            torch.from_numpy(corners0),
+            torch.from_numpy(places1.astype(np.float32)),
+            torch.from_numpy(visible),
+            torch.from_numpy(corners1),
         )
 
     def _some_corners(self, image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -57,11 +131,11 @@ class PairDataset(Dataset[TrainingPair]):
 
 
 def pair_loader(
-    seed: int, size: int, first: int, last: int, corners: int, batch_size: int, workers: int
+    mix: str, seed: int, size: int, first: int, last: int, corners: int, batch_size: int, workers: int
 ) -> DataLoader[TrainingPair]:
     """Batches of pairs in order of their index."""
     return DataLoader(
-        PairDataset(seed, size, first, last, corners),
+        PairDataset(mix, seed, size, first, last, corners),
         batch_size=batch_size,
         num_workers=workers,
         worker_init_fn=_one_thread if workers else None,

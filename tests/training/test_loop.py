@@ -11,12 +11,12 @@ from safetensors.torch import load_file
 from sigmaslam.errors import InputError
 from sigmaslam.models.export import load_network
 from sigmaslam.synthetic import pairs
-from sigmaslam.training import loop
+from sigmaslam.training import loop, stream
 from sigmaslam.training.loop import CARD_NAME, WEIGHTS_NAME, TrainingConfig, train
-from sigmaslam.training.stream import PairDataset, pair_loader
+from sigmaslam.training.stream import MixedPairs, PairDataset, pair_loader
 from sigmaslam.training.validation import matching_accuracy
 
-TINY = TrainingConfig(steps=4, batch_size=2, size=96, points=16, validate_every=100, checkpoint_every=2)
+TINY = TrainingConfig(steps=4, data="leaves", batch_size=2, size=96, points=16, validate_every=100, checkpoint_every=2)
 
 
 @pytest.fixture(autouse=True)
@@ -104,8 +104,8 @@ def test_resuming_a_finished_run_keeps_its_weights_and_metrics(finished, tmp_pat
 
 
 def test_batches_do_not_depend_on_where_the_loader_begins():
-    whole = list(pair_loader(0, 96, 0, 6, 16, 2, workers=0))
-    rest = list(pair_loader(0, 96, 4, 6, 16, 2, workers=0))
+    whole = list(pair_loader("leaves", 0, 96, 0, 6, 16, 2, workers=0))
+    rest = list(pair_loader("leaves", 0, 96, 4, 6, 16, 2, workers=0))
     assert len(whole) == 3
     assert len(rest) == 1
     for a, b in zip(whole[2], rest[0], strict=True):
@@ -113,12 +113,39 @@ def test_batches_do_not_depend_on_where_the_loader_begins():
 
 
 def test_corners_lie_in_the_image_and_have_the_promised_number():
-    image0, image1, H, corners0, corners1 = PairDataset(0, 96, 0, 4, corners=300)[3]
+    image0, image1, corners0, places1, visible, corners1 = PairDataset("leaves", 0, 96, 0, 4, corners=300)[3]
     assert image0.shape == image1.shape == (1, 96, 96)
-    assert H.shape == (3, 3)
+    assert places1.shape == (300, 2)
+    assert visible.shape == (300,)
+    assert (places1[visible] >= 0).all()
+    assert (places1[visible] <= 95).all()
     for corners in (corners0, corners1):
         assert corners.shape == (300, 2)
         assert corners.min() >= 0
         assert corners.max() <= 95
     with pytest.raises(IndexError):
-        PairDataset(0, 96, 0, 4, corners=300)[4]
+        PairDataset("leaves", 0, 96, 0, 4, corners=300)[4]
+
+
+def test_sources_of_a_mix_take_turns_and_see_neighbouring_numbers(monkeypatch):
+    asked = []
+
+    class Recorder:
+        def __init__(self, source):
+            self.source = source
+
+        def pair(self, index):
+            asked.append((self.source, index))
+
+    monkeypatch.setattr(stream, "open_stream", lambda source, seed, size: Recorder(source))
+    mixed = MixedPairs("mix", 0, 96)
+    for index in range(10):
+        mixed.pair(index)
+    assert [source for source, _ in asked] == ["leaves", "scenes", "leaves", "scenes", "leaves"] * 2
+    assert [index for source, index in asked if source == "leaves"] == list(range(6))
+    assert [index for source, index in asked if source == "scenes"] == list(range(4))
+
+
+def test_an_unknown_mix_is_refused():
+    with pytest.raises(InputError, match="choose one of leaves"):
+        MixedPairs("photographs", 0, 96)

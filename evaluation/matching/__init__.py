@@ -1,0 +1,19 @@
+"""How well an extractor matches real images: sets of pairs with truth, scores, and everyone under the same rules."""
+
+from sigmaslam.evaluation.matching.extractors import Extractor, LearnedExtractor, load_extractor
+from sigmaslam.evaluation.matching.pairs import ImagePair
+from sigmaslam.evaluation.matching.run import format_scores, score, score_pairs
+from sigmaslam.evaluation.matching.sets import FINAL, SELECTION, load_set
+
+__all__ = [
+    "FINAL",
+    "SELECTION",
+    "Extractor",
+    "ImagePair",
+    "LearnedExtractor",
+    "format_scores",
+    "load_extractor",
+    "load_set",
+    "score",
+    "score_pairs",
+]

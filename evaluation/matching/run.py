@@ -1,0 +1,78 @@
+"""Scores of an extractor on the sets, and their table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from sigmaslam.evaluation.matching.extractors import MAX_KEYPOINTS, Extractor
+from sigmaslam.evaluation.matching.pairs import ImagePair
+from sigmaslam.evaluation.matching.scores import Features, score_pair, summarize
+from sigmaslam.evaluation.matching.sets import load_set
+
+Scores = dict[str, dict[str, float]]
+"""By set, then by name of the score; shares and areas in [0, 1], numbers of matches a pair."""
+
+_COUNTS = ("correct_3", "matches")
+
+
+def score(extractor: Extractor, sets: Sequence[str], data: Path) -> Scores:
+    """Scores of an extractor.
+
+    Args:
+        extractor: image to keypoints and descriptors.
+        sets: names from SELECTION and FINAL.
+        data: folder of the real data sets.
+    Raises:
+        InputError: a set is unknown or missing.
+    """
+    return {name: score_pairs(extractor, load_set(name, data)) for name in sets}
+
+
+def score_pairs(extractor: Extractor, pairs: Sequence[ImagePair]) -> dict[str, float]:
+    """Scores of an extractor on pairs, each image extracted once.
+
+    Returns:
+        Means over the pairs; names as in `scores.score_pair` and `scores.summarize`, after the name of the part of the
+        set where there is one ("gap1_epipolar_1").
+    Raises:
+        ValueError: the extractor gives more than 1,024 keypoints.
+    """
+    features: dict[int, Features] = {}
+    # `pairs` keeps the arrays alive, so their ids stay apart.
+    for image in (image for pair in pairs for image in (pair.image0, pair.image1)):
+        if id(image) not in features:
+            keypoints, descriptors = extractor(image)
+            features[id(image)] = keypoints, descriptors
+            if len(keypoints) > MAX_KEYPOINTS:
+                raise ValueError(f"the extractor gave {len(keypoints)} keypoints: at most {MAX_KEYPOINTS} are compared")
+    parts: dict[tuple[str, type], list[dict[str, float]]] = {}
+    for pair in pairs:
+        found = score_pair(pair, features[id(pair.image0)], features[id(pair.image1)])
+        parts.setdefault((pair.part, type(pair.truth)), []).append(found)
+    return {
+        f"{part}_{name}" if part else name: value
+        for (part, _), scores in parts.items()
+        for name, value in summarize(scores).items()
+    }
+
+
+def format_scores(results: Mapping[str, Scores]) -> str:
+    """Markdown tables, one a set with a row for each extractor; shares and areas in percent.
+
+    Args:
+        results: by name of the extractor what `score` gave.
+    """
+    lines = []
+    for name in dict.fromkeys(name for scores in results.values() for name in scores):
+        rows = {extractor: scores[name] for extractor, scores in results.items() if name in scores}
+        columns = list(next(iter(rows.values())))
+        lines += [f"## {name}", "", "| extractor | " + " | ".join(columns) + " |", "|---|" + "---:|" * len(columns)]
+        for extractor, row in rows.items():
+            lines.append(f"| {extractor} | " + " | ".join(_number(column, row[column]) for column in columns) + " |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _number(column: str, value: float) -> str:
+    return f"{value:.0f}" if column.endswith(_COUNTS) else f"{100 * value:.1f}"

@@ -1,0 +1,178 @@
+"""Scores of one image pair and of many: matching accuracy, repeatability, homography and pose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from sigmaslam.evaluation.matching.pairs import Disparity, Homography, ImagePair, Motion, SameRows
+from sigmaslam.rotation import rotation_log
+
+CORNER_THRESHOLDS = (1, 3, 5)
+POSE_THRESHOLDS = (1, 5, 10)
+# Keypoints nearer to the border of the other image than this need not be seen again.
+_BORDER = 8
+# The robust estimator of everyone. OpenCV's USAC has its own generator: the same matches give the same answer.
+_INLIER_THRESHOLD = 1.0
+_CONFIDENCE = 0.9999
+_ITERATIONS = 10_000
+_CORNER_ERROR, _POSE_ERROR = "corner_error", "pose_error_deg"
+
+Features = tuple[np.ndarray, np.ndarray]
+
+
+def mutual_nearest(descriptors0: np.ndarray, descriptors1: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mutual nearest neighbours.
+
+    Args:
+        descriptors0, descriptors1: (N, C), (M, C) float of unit length, or uint8 bit strings.
+    Returns:
+        Indices (K,) into both, one to one.
+    """
+    if len(descriptors0) == 0 or len(descriptors1) == 0:
+        none = np.zeros(0, np.int64)
+        return none, none
+    if descriptors0.dtype == np.uint8:
+        # The dot product of bits as +-1 falls with their Hamming distance.
+        descriptors0, descriptors1 = (
+            2.0 * np.unpackbits(bits, axis=1).astype(np.float32) - 1.0 for bits in (descriptors0, descriptors1)
+        )
+    similarity = descriptors0 @ descriptors1.T
+    best1 = similarity.argmax(axis=1)
+    index0 = np.flatnonzero(similarity.argmax(axis=0)[best1] == np.arange(len(best1)))
+    return index0, best1[index0]
+
+
+def score_pair(pair: ImagePair, features0: Features, features1: Features) -> dict[str, float]:
+    """What the features of both images achieve on this pair.
+
+    Args:
+        pair: images and truth.
+        features0, features1: keypoints and descriptors, as an `Extractor` gives them.
+    Returns:
+        By kind of truth:
+        homography and disparity: mma_1, mma_3 (share of the mutual matches within 1 and 3 px of the truth; matches of
+        points without known disparity are left out), correct_3 (their number within 3 px), repeatability_1 (share of
+        the keypoints of image 0 inside image 1 that are seen again within 1 px); homography: corner_error (mean over
+        the corners of image 0, px, infinite without an estimate).
+        same rows: rows_1 (share of the matches with a row error below 1 px), row_matches (their number).
+        motion: epipolar_1 (share of the matches within 1 px of their epipolar line), epipolar_matches (their number),
+        pose_error_deg (larger of the errors of rotation and of direction of translation, infinite without an estimate).
+    """
+    (keypoints0, descriptors0), (keypoints1, descriptors1) = features0, features1
+    index0, index1 = mutual_nearest(descriptors0, descriptors1)
+    points0, points1 = keypoints0[index0].astype(np.float64), keypoints1[index1].astype(np.float64)
+    truth = pair.truth
+    if isinstance(truth, SameRows):
+        level = np.abs(points0[:, 1] - points1[:, 1]) < 1.0
+        return {"rows_1": _share(level), "row_matches": float(level.sum())}
+    if isinstance(truth, Motion):
+        near = truth.epipolar_distance(points0, points1) < 1.0
+        return {
+            "epipolar_1": _share(near),
+            "epipolar_matches": float(near.sum()),
+            _POSE_ERROR: pose_error_deg(points0, points1, truth),
+        }
+    errors = np.linalg.norm(truth.transfer(points0) - points1, axis=1)
+    errors = errors[~np.isnan(errors)]
+    scores = {
+        "mma_1": _share(errors < 1.0),
+        "mma_3": _share(errors < 3.0),
+        "correct_3": float((errors < 3.0).sum()),
+        "repeatability_1": repeatability(keypoints0, keypoints1, truth, pair.image1.shape),
+    }
+    if isinstance(truth, Homography):
+        scores[_CORNER_ERROR] = corner_error(points0, points1, truth, pair.image0.shape)
+    return scores
+
+
+def repeatability(
+    keypoints0: np.ndarray, keypoints1: np.ndarray, truth: Homography | Disparity, shape1: tuple[int, ...]
+) -> float:
+    """Share of keypoints (N, 2) of image 0, of those at least 8 px inside image 1, with one of (M, 2) within 1 px."""
+    places = truth.transfer(keypoints0.astype(np.float64))
+    height, width = shape1
+    seen = ((places >= _BORDER) & (places < (width - _BORDER, height - _BORDER))).all(axis=1)
+    if len(keypoints1) == 0:
+        return 0.0
+    places = places[seen]
+    u = places[:, None, 0] - keypoints1[None, :, 0]
+    v = places[:, None, 1] - keypoints1[None, :, 1]
+    return _share((u * u + v * v).min(axis=1) < 1.0)
+
+
+def corner_error(points0: np.ndarray, points1: np.ndarray, truth: Homography, shape0: tuple[int, ...]) -> float:
+    """Mean distance of the corners of image 0 under the estimated and the true homography, pixels.
+
+    Args:
+        points0, points1: (N, 2) matched pixels.
+        truth: the homography.
+        shape0: (H, W) of image 0.
+    """
+    if len(points0) < 4:
+        return np.inf
+    H, _ = cv2.findHomography(
+        points0, points1, cv2.USAC_MAGSAC, _INLIER_THRESHOLD, maxIters=_ITERATIONS, confidence=_CONFIDENCE
+    )
+    # OpenCV gives None where it finds nothing, against its own type hints.
+    if np.shape(H) != (3, 3):
+        return np.inf
+    bottom, right = shape0[0] - 1.0, shape0[1] - 1.0
+    corners = np.array([[0.0, 0.0], [right, 0.0], [right, bottom], [0.0, bottom]])
+    difference = Homography(H).transfer(corners) - truth.transfer(corners)
+    return float(np.linalg.norm(difference, axis=1).mean())
+
+
+def pose_error_deg(points0: np.ndarray, points1: np.ndarray, truth: Motion) -> float:
+    """Larger of the angles between estimated and true rotation, and direction of translation, degrees.
+
+    Args:
+        points0, points1: (N, 2) matched pixels.
+        truth: intrinsics and motion; the translation must not be zero.
+    """
+    if len(points0) < 5:
+        return np.inf
+    E, inliers = cv2.findEssentialMat(
+        points0,
+        points1,
+        truth.K,
+        method=cv2.USAC_MAGSAC,
+        prob=_CONFIDENCE,
+        threshold=_INLIER_THRESHOLD,
+        maxIters=_ITERATIONS,
+    )
+    if np.shape(E) != (3, 3):
+        return np.inf
+    _, R, direction, _ = cv2.recoverPose(E, points0, points1, truth.K, mask=inliers)
+    translation = truth.T_1_0[:3, 3]
+    cosine = float(direction.ravel() @ translation) / np.linalg.norm(translation)
+    rotation = np.linalg.norm(rotation_log(R.T @ truth.T_1_0[:3, :3]))
+    return float(np.degrees(max(rotation, np.arccos(np.clip(cosine, -1.0, 1.0)))))
+
+
+def area_under_curve(errors: Sequence[float], threshold: float) -> float:
+    """Area under the share of errors below x, for x from 0 to `threshold`, over the area of all right.
+
+    The exact integral of the empirical distribution; the trapezoids of others give more where there are few pairs.
+    """
+    return float(np.clip(1.0 - np.asarray(errors) / threshold, 0.0, 1.0).mean())
+
+
+def summarize(pairs: Sequence[dict[str, float]]) -> dict[str, float]:
+    """Means of what `score_pair` gave; errors become auc_1, auc_3, auc_5 (px) and pose_auc_1, _5, _10 (degrees)."""
+    summary: dict[str, float] = {}
+    for name in pairs[0]:
+        values = [pair[name] for pair in pairs]
+        if name == _CORNER_ERROR:
+            summary |= {f"auc_{limit}": area_under_curve(values, limit) for limit in CORNER_THRESHOLDS}
+        elif name == _POSE_ERROR:
+            summary |= {f"pose_auc_{limit}": area_under_curve(values, limit) for limit in POSE_THRESHOLDS}
+        else:
+            summary[name] = float(np.mean(values))
+    return summary
+
+
+def _share(right: np.ndarray) -> float:
+    return float(right.mean()) if len(right) else 0.0

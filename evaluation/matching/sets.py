@@ -1,0 +1,42 @@
+"""The sets by name: which choose models and data, and which are scored once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from sigmaslam.errors import InputError
+from sigmaslam.evaluation.matching import photographs, sequences
+from sigmaslam.evaluation.matching.pairs import ImagePair
+
+SELECTION = ("set12", "middlebury")
+"""Models and training data are chosen on these."""
+FINAL = ("boat", "churchill", "fountain", "kitti", "euroc")
+"""These are scored once, when everything is chosen."""
+
+_SETS: dict[str, tuple[str, Callable[[Path], list[ImagePair]]]] = {
+    "set12": ("denoising", photographs.set12),
+    "middlebury": ("disparity_middlebury", photographs.middlebury),
+    "boat": ("homography_boat", photographs.boat),
+    "churchill": ("homography_hpatches_churchill", photographs.churchill),
+    "fountain": ("strecha_fountain_P11", photographs.fountain),
+    "kitti": ("kitti_raw_0926_0039_a", sequences.kitti),
+    "euroc": ("euroc_v1_01_keyframes_a", sequences.euroc),
+}
+
+
+def load_set(name: str, data: Path) -> list[ImagePair]:
+    """The image pairs of a set.
+
+    Args:
+        name: one of SELECTION and FINAL.
+        data: folder of the real data sets.
+    Raises:
+        InputError: there is no set of that name, or `data` does not hold it.
+    """
+    if name not in _SETS:
+        raise InputError(f"there is no set '{name}': choose among {', '.join(_SETS)}")
+    folder_name, load = _SETS[name]
+    if not (data / folder_name).is_dir():
+        raise InputError(f"{data} does not hold {folder_name}: set SIGMASLAM_DATA to the folder of the real data sets")
+    return load(data / folder_name)

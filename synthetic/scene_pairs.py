@@ -1,0 +1,153 @@
+"""Image pairs of 3D scenes: true occlusion, depth edges, moving things. A pair is a function of (seed, index)."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from sigmaslam.camera import CameraModel
+from sigmaslam.synthetic.renderer import Renderer, Views
+from sigmaslam.synthetic.sensor import expose, random_sensor
+from sigmaslam.synthetic.truth import at_pixels, transfer
+from sigmaslam.synthetic.visibility import Eye
+from sigmaslam.synthetic.worlds import colon, hall, organ, room, street
+from sigmaslam.synthetic.worlds.episode import Wish
+
+DOMAINS = {
+    "room": room.generate,
+    "street": street.generate,
+    "drone": hall.generate,
+    "colon": colon.generate,
+    "organ": organ.generate,
+}
+_SCENES = 8  # neighbouring pairs come from as many scenes ...
+_USES = 32  # ... each of which serves so many pairs before it is replaced
+_VIEWS = 8  # of a scene
+_SCENES_A_BANK = 64  # share their textures
+_DURATION = 8.0  # seconds of an episode
+_MOST_MOVED = 0.4  # share of the image that may move on its own
+_LEAST_SHARED = 0.15  # of a raster of points, between the views of a pair
+_RASTER = 12
+
+
+@dataclass(frozen=True, slots=True)
+class ScenePair:
+    """Two views of a scene, or of its moving parts a moment later.
+
+    Attributes:
+        image0, image1: (H, W) float32 in [0, 1].
+        views0, views1: what either sees, one view each.
+    """
+
+    image0: np.ndarray
+    image1: np.ndarray
+    views0: Views
+    views1: Views
+
+    def transfer(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where points (N, 2) of image 0 lie in image 1 (N, 2), and whether they are seen there (N,) bool."""
+        return _transfer(self.views0, self.views1, points)
+
+
+class ScenePairs:
+    """Random-access stream of pairs of rendered 3D scenes.
+
+    Args:
+        seed: of the whole stream.
+        size: side of the square images in pixels.
+        domains: keys of `DOMAINS`, drawn alike.
+    """
+
+    def __init__(self, seed: int, size: int = 224, domains: tuple[str, ...] = tuple(DOMAINS)) -> None:
+        unknown = set(domains) - set(DOMAINS)
+        if unknown or not domains:
+            raise ValueError(f"unknown domains {sorted(unknown)}; give one or more of {', '.join(DOMAINS)}")
+        self.seed, self.size, self.domains = seed, size, domains
+        self._kept: OrderedDict[int, list[Views]] = OrderedDict()
+
+    def pair(self, index: int) -> ScenePair:
+        """The pair of that index, the same whenever it is asked for."""
+        rng = np.random.default_rng((self.seed, 1, index))
+        views = self._views(self._scene_of(index))
+        order = rng.permutation([(i, j) for i in range(_VIEWS) for j in range(_VIEWS) if i != j])
+        # Of views that hardly overlap there is little to learn; if all are so, the last ones will do.
+        i, j = next(((i, j) for i, j in order if self._shared(views[i], views[j]) >= _LEAST_SHARED), order[-1])
+        return ScenePair(self._photograph(views[i], rng), self._photograph(views[j], rng), views[i], views[j])
+
+    def _scene_of(self, index: int) -> int:
+        """Scenes are replaced one after another, so that rendering takes its time evenly."""
+        turn, place = divmod(index, _SCENES)
+        return (turn + place * _USES // _SCENES) // _USES * _SCENES + place
+
+    def _views(self, scene: int) -> list[Views]:
+        if scene not in self._kept:
+            with torch.inference_mode():
+                self._kept[scene] = self._render(scene)
+            if len(self._kept) > 2 * _SCENES:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(scene)
+        return self._kept[scene]
+
+    def _render(self, scene: int) -> list[Views]:
+        rng = np.random.default_rng((self.seed, 0, scene))
+        domain = self.domains[int(rng.integers(len(self.domains)))]
+        wish = Wish(
+            _DURATION,
+            movers=float(rng.uniform(0.0, _MOST_MOVED)) if rng.random() < 0.5 else 0.0,
+            first_texture=4 * (self.seed + scene // _SCENES_A_BANK),
+            textures=4,
+        )
+        episode = DOMAINS[domain](rng, wish)
+        renderer = Renderer(episode.scene)
+        middle = rng.uniform(1.0, _DURATION - 1.0)
+        span = np.exp(rng.uniform(np.log(0.1), np.log(2.0)))
+        result: list[Views] = []
+        for k in range(_VIEWS):
+            time = np.clip(middle + span * rng.uniform(-0.5, 0.5), 0.0, _DURATION)[None]
+            T = episode.path.poses(time)
+            if k:
+                # From the first view's depth it is known how far aside one can step.
+                T = T @ _step_aside(rng, float(result[0].depth[torch.isfinite(result[0].depth)].median()))
+            focal = self.size * np.exp(rng.uniform(np.log(0.6), np.log(1.3)))
+            centre = (self.size - 1) / 2
+            eye = Eye(CameraModel(self.size, self.size, focal, focal, centre, centre))
+            result.append(renderer.render(eye, T, time))
+        return result
+
+    def _photograph(self, views: Views, rng: np.random.Generator) -> np.ndarray:
+        light = views.image[0].numpy()
+        light = light * (rng.uniform(0.3, 0.6) / max(float(light.mean()), 1e-6))
+        flow = rng.normal(0.0, 4.0, 2) if rng.random() < 0.15 else None
+        # White is where the light of few pixels ends, so that the sensor's contrast means the same everywhere.
+        return expose(np.minimum(light, 1.0), random_sensor(rng), rng, flow).astype(np.float32) / 255.0
+
+    def _shared(self, views0: Views, views1: Views) -> float:
+        ticks = (np.arange(_RASTER) + 0.5) * self.size / _RASTER
+        raster = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
+        return float(_transfer(views0, views1, raster)[1].mean())
+
+
+def _transfer(views0: Views, views1: Views, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    view = torch.zeros(len(points), dtype=torch.int64)
+    facet, places = at_pixels(views0, view, torch.from_numpy(points.astype(np.float64)))
+    hit = facet >= 0
+    moved = transfer(views0.sight, view[hit], facet[hit], places[hit], views1.sight, view[hit])
+    places1, visible = np.full((len(points), 2), -1.0), np.zeros(len(points), dtype=bool)
+    index = hit.numpy()
+    places1[index] = np.nan_to_num(moved.pixels.numpy(), nan=-1.0)
+    visible[index] = moved.visible.numpy()
+    return places1, visible
+
+
+def _step_aside(rng: np.random.Generator, depth: float) -> np.ndarray:
+    """A small random motion of the camera, (4, 4): mostly a turn, a roll now and then."""
+    T = np.eye(4)
+    turn = np.deg2rad(6.0) * rng.standard_normal(3)
+    turn[2] += np.deg2rad(rng.uniform(-40.0, 40.0)) if rng.random() < 0.4 else 0.0
+    T[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
+    T[:3, 3] = depth * rng.uniform(0.0, 0.08) * rng.standard_normal(3) * np.array([1.0, 0.5, 0.5])
+    return T

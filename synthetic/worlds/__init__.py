@@ -1,0 +1,1 @@
+"""Random worlds by domain: a scene with a camera path through it."""

@@ -1,0 +1,51 @@
+"""A world with a way through it: what every generator makes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+
+import numpy as np
+
+from sigmaslam.synthetic.paths import Path
+from sigmaslam.synthetic.scene import Scene, Texture
+
+MOTIONS = ("normal", "stops", "rotation", "loop", "rest")
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """A scene and the camera's path through it.
+
+    Attributes:
+        scene: all there is to see.
+        path: of the left camera, axes x right, y down, z forward; it lasts from 0 to the duration asked for, or longer.
+    """
+
+    scene: Scene
+    path: Path
+
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """What a generator is asked for.
+
+    Attributes:
+        duration: seconds.
+        motion: one of `MOTIONS`: the domain's own way of moving, with stops, turning on the spot, coming back to the
+            start (for loop closure), or at rest.
+        movers: share of the image that independently moving bodies cover about, 0 to 0.5.
+        profile: KITTI poses file whose motion a drive follows; none: random.
+        first_texture, textures: range of the textures' seeds, so that many worlds can share a bank of them.
+    """
+
+    duration: float
+    motion: str = "normal"
+    movers: float = 0.0
+    profile: FilePath | None = None
+    first_texture: int = 0
+    textures: int = 4
+
+    def texture(self, rng: np.random.Generator, kind: str, tile: float, contrast: float = 1.0) -> Texture:
+        """A texture of that kind out of the bank."""
+        return Texture(kind, self.first_texture + int(rng.integers(self.textures)), tile, contrast)

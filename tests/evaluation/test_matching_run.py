@@ -1,0 +1,112 @@
+"""Scores of whole sets, their table, and the command."""
+
+import json
+from collections.abc import Iterator
+from importlib.resources import as_file, files
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sigmaslam.errors import InputError
+from sigmaslam.evaluation.matching import format_scores, load_extractor, score_pairs
+from sigmaslam.evaluation.matching.__main__ import main
+from sigmaslam.evaluation.matching.pairs import Homography, ImagePair, SameRows
+from sigmaslam.synthetic.textures import dead_leaves
+
+
+@pytest.fixture(scope="module")
+def image() -> np.ndarray:
+    return dead_leaves((200, 330), np.random.default_rng(3))
+
+
+@pytest.fixture(scope="module")
+def weights() -> Iterator[Path]:
+    with as_file(files("sigmaslam.models.weights")) as folder:
+        yield folder
+
+
+def test_each_image_is_extracted_once_and_parts_are_averaged_apart(image: np.ndarray):
+    calls = []
+    orb = load_extractor("orb")
+
+    def counting(given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        calls.append(given)
+        return orb(given)
+
+    same, moved = Homography(np.eye(3)), np.roll(image, 2, axis=1)
+    pairs = [
+        ImagePair("0", image, image, same),
+        ImagePair("1", image, moved, same),
+        ImagePair("2", image, moved, SameRows(), "stereo"),
+    ]
+    found = score_pairs(counting, pairs)
+    assert len(calls) == 2
+    # Half of the pairs is perfect, the other is two pixels off.
+    assert found["mma_1"] == pytest.approx(0.5, abs=0.05)
+    assert found["mma_3"] > 0.95
+    assert found["stereo_rows_1"] > 0.9
+    assert "stereo_mma_1" not in found
+
+
+@pytest.mark.parametrize("name", ["sift", "orb", "features.onnx", "features.safetensors"])
+def test_every_extractor_finds_an_image_again(name: str, weights: Path, image: np.ndarray):
+    extractor = load_extractor(name if "." not in name else str(weights / name))
+    keypoints, descriptors = extractor(image)
+    assert 100 < len(keypoints) == len(descriptors) <= 1024
+    assert (keypoints < (330, 200)).all()
+    np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1.0, atol=1e-5)
+    assert score_pairs(extractor, [ImagePair("", image, image, Homography(np.eye(3)))])["mma_1"] > 0.99
+
+
+def test_the_graph_and_the_weights_give_the_same_features(weights: Path, image: np.ndarray):
+    (points0, descriptors0), (points1, descriptors1) = (
+        load_extractor(str(weights / name))(image) for name in ("features.onnx", "features.safetensors")
+    )
+    np.testing.assert_allclose(points0[:200], points1[:200], atol=1e-2)
+    np.testing.assert_allclose(descriptors0[:200], descriptors1[:200], atol=1e-3)
+
+
+def test_more_keypoints_than_the_others_have_are_refused(image: np.ndarray):
+    def greedy(_: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros((1025, 2), np.float32), np.zeros((1025, 8), np.float32)
+
+    with pytest.raises(ValueError, match="1025 keypoints"):
+        score_pairs(greedy, [ImagePair("", image, image, Homography(np.eye(3)))])
+
+
+def test_an_unknown_extractor_is_refused(tmp_path: Path):
+    with pytest.raises(InputError, match="surf"):
+        load_extractor("surf")
+    with pytest.raises(InputError, match=r"none\.onnx"):
+        load_extractor(str(tmp_path / "none.onnx"))
+
+
+def test_the_table_has_a_row_for_each_extractor():
+    page = format_scores(
+        {"a": {"boat": {"mma_1": 0.25, "correct_3": 99.6}}, "b": {"boat": {"mma_1": 1, "correct_3": 7}}}
+    )
+    assert "| extractor | mma_1 | correct_3 |" in page
+    assert "| a | 25.0 | 100 |" in page
+    assert "| b | 100.0 | 7 |" in page
+
+
+def test_the_command_prints_json_of_all_extractors(
+    real_data: Path, weights: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    graph = str(weights / "features.onnx")
+    monkeypatch.setenv("SIGMASLAM_DATA", str(real_data))
+    monkeypatch.setattr("sys.argv", ["matching", "--weights", graph, "--sets", "middlebury", "--json"])
+    main()
+    printed = capsys.readouterr()
+    found = json.loads(printed.out)
+    assert list(found) == ["sift", "orb", graph]
+    assert found[graph]["middlebury"]["mma_3"] > 0.5
+    assert f"middlebury: {graph}, 2 pairs" in printed.err
+
+
+def test_the_command_says_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("SIGMASLAM_DATA", str(tmp_path))
+    monkeypatch.setattr("sys.argv", ["matching"])
+    with pytest.raises(SystemExit, match="denoising"):
+        main()
