@@ -100,6 +100,8 @@ class Benchmark(StrEnum):
     sequences = "sequences"
     filters = "filters"
     claims = "claims"
+    renders = "renders"
+    mixes = "mixes"
 
 
 def _show_version(wanted: bool) -> None:
@@ -274,7 +276,9 @@ def benchmark(
     out: Annotated[Path, typer.Option(help="Markdown page to write; notes below '<!-- notes -->' in it are kept.")],
     data: Annotated[
         Path | None,
-        typer.Option(envvar="SIGMASLAM_DATA", help="sequences: folder of the real data sets; none: the demo alone."),
+        typer.Option(
+            envvar="SIGMASLAM_DATA", help="Folder of the real data sets; sequences without it: the demo alone."
+        ),
     ] = None,
     frontend: Annotated[
         list[Frontend] | None,
@@ -282,11 +286,17 @@ def benchmark(
     ] = None,
     rounds: Annotated[int, typer.Option(min=1, help="filters: rounds in which every contender is timed.")] = 7,
     eager: Annotated[bool, typer.Option("--eager", help="filters: leave out what takes minutes to compile.")] = False,
+    runs: Annotated[
+        Path | None, typer.Option(help="mixes: folder of the training runs; finished ones are not repeated.")
+    ] = None,
+    steps: Annotated[int, typer.Option(min=1, help="mixes: optimiser steps a run.")] = 250,
+    seeds: Annotated[int, typer.Option(min=1, help="mixes: runs of each mix.")] = 3,
 ) -> None:
     """Run a benchmark and write its page.
 
     sequences: the tracker on every sequence. filters: speed of the filters beside those of other libraries that are
-    installed. claims: EKF against UKF by Monte Carlo. The last two need the extra 'train'.
+    installed. claims: EKF against UKF by Monte Carlo. renders: how fast, and how like real images. mixes: what the
+    network should learn from, by short training runs (an hour and more). All but the first need the extra 'train'.
     """
     command = f"sigmaslam benchmark {name.value} --out {out}"
     if name is Benchmark.sequences:
@@ -299,6 +309,18 @@ def benchmark(
         from sigmaslam.evaluation.benchmarks.filters import write_in_one_thread
 
         typer.echo(write_in_one_thread(out, rounds, not eager, command + (" --eager" if eager else "")))
+    elif name is Benchmark.renders:
+        from sigmaslam.evaluation.benchmarks.renders import write_renders
+
+        typer.echo(write_renders(out, out.with_suffix(".png"), _need_data(data), command, Console(stderr=True).print))
+    elif name is Benchmark.mixes:
+        from sigmaslam.evaluation.benchmarks.training_data import write_training_data
+
+        if runs is None:
+            raise InputError("the benchmark mixes needs --runs, a folder for its training runs")
+        command += f" --runs {runs} --steps {steps} --seeds {seeds}"
+        note = Console(stderr=True).print
+        typer.echo(write_training_data(out, runs, _need_data(data), seeds, steps, command, note))
     else:
         from sigmaslam.evaluation.benchmarks.filter_claims import write_claims
 
@@ -338,6 +360,12 @@ def _track(
         _need_train_extra()
     sequence = open_sequence(source, format.value, calibration)
     return track_sequence(sequence, out, frontend.value, backend.value)
+
+
+def _need_data(data: Path | None) -> Path:
+    if data is None:
+        raise InputError("the folder of the real data sets is not known: give --data, or set SIGMASLAM_DATA")
+    return data
 
 
 def _need_train_extra() -> None:

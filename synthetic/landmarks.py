@@ -47,12 +47,12 @@ def choose_landmarks(studio: Studio) -> Landmarks:
         sight = studio.renderer.look(eye, simulation.path.poses(time), time)
         pixels = (corner + rng.random(corner.shape)) * cell - 0.5
         last = np.array([eye.camera.width - 1, eye.camera.height - 1])
-        places = eye.to_grid(torch.from_numpy(np.clip(pixels, 0, last)).to(studio.renderer.device))
-        places = places[places.isfinite().all(dim=1)]
-        view = torch.zeros(len(places), dtype=torch.int64, device=places.device)
+        places = eye.to_grid(torch.from_numpy(np.clip(pixels, 0, last).T.copy()).to(studio.renderer.device))
+        places = places[:, places.isfinite().all(dim=0)]
+        view = torch.zeros(places.shape[1], dtype=torch.int64, device=places.device)
         facet = sight.resolve(view, places)
-        places, view, facet = places[facet >= 0], view[facet >= 0], facet[facet >= 0]
-        points.append(sight.points(view, facet, places).cpu().numpy())
+        places, view, facet = places[:, facet >= 0], view[facet >= 0], facet[facet >= 0]
+        points.append(sight.points(view, facet, places).T.cpu().numpy())
         facets.append(facet.cpu().numpy())
     seen = np.concatenate(facets)
     return Landmarks(np.concatenate(points), seen, studio.renderer.body.cpu().numpy()[seen])
@@ -69,7 +69,7 @@ def observe(studio: Studio, landmarks: Landmarks, frame: int) -> dict[str, Any]:
     time = np.array([frame / simulation.fps])
     T_left = simulation.path.poses(time)
     facet = torch.from_numpy(landmarks.facet).to(renderer.device)
-    points = torch.from_numpy(landmarks.points).to(renderer.device)
+    points = torch.from_numpy(landmarks.points.T.copy()).to(renderer.device)
     view = torch.zeros_like(facet)
     seen = []
     for eye, T in ((studio.left, T_left), (studio.right, T_left @ simulation.rig.true_right_pose)):
@@ -78,8 +78,8 @@ def observe(studio: Studio, landmarks: Landmarks, frame: int) -> dict[str, Any]:
     index = (left.visible | right.visible).nonzero().squeeze(1)
     return {
         "landmark": index.cpu().numpy(),
-        "left": left.pixels[index].cpu().numpy(),
-        "right": right.pixels[index].cpu().numpy(),
+        "left": left.pixels[:, index].T.cpu().numpy(),
+        "right": right.pixels[:, index].T.cpu().numpy(),
         "left_visible": left.visible[index].cpu().numpy(),
         "right_visible": right.visible[index].cpu().numpy(),
         "depth": left.depth[index].cpu().numpy(),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -11,11 +12,13 @@ from torch import Tensor
 from sigmaslam.camera import CameraModel
 from sigmaslam.synthetic.facets import join
 from sigmaslam.synthetic.scene import Material, Scene
-from sigmaslam.synthetic.shading import Hits, Samples, Shader, meet
+from sigmaslam.synthetic.shading import Samples, Shader, meet
 from sigmaslam.synthetic.visibility import Eye, Sight, Surfaces, move
 
 # Places of the sub-samples of a pixel on an edge.
 _OFFSETS = ((-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))
+_TAPS = 2  # look-ups along the longer axis of a pixel's footprint
+_CHUNK = 1 << 16  # rays shaded at a time on a CPU
 _SHIFT_STREAM = 71
 _DEPTH_JUMP = 0.05  # relative; larger steps within a smooth surface are edges
 _SHADOW_RADIUS = 45.0  # metres around which the sun's shadows are drawn
@@ -40,6 +43,14 @@ class Views:
     facet: Tensor
     body: Tensor
     sight: Sight
+
+
+class _Light(NamedTuple):
+    """Of N rays: their radiance, the depth at which they end, and whether the sun reaches there."""
+
+    radiance: Tensor
+    depth: Tensor
+    lit: Tensor
 
 
 class Renderer:
@@ -80,7 +91,7 @@ class Renderer:
         )
         self._movers = [scene.bodies[k] for k in moving]
         materials = [scene.materials[body.material] for body in scene.bodies]
-        self._shader = Shader(facets, self.body, self.surfaces.mover, materials, scene.lights, self.device)
+        self._shader = Shader(facets, body_of, self.surfaces.mover, materials, scene.lights, self.device)
         casts = np.array([body.shadow for body in scene.bodies])[body_of]
         self._casters = tensor(np.flatnonzero(casts))
         static = facets.origin[mover == 0]
@@ -147,42 +158,30 @@ class Renderer:
         sight = self.look(eye, T_world_camera, times)
         views, height, width = len(times), eye.camera.height, eye.camera.width
 
-        places = eye.centres(self.device).reshape(-1, 2).repeat(views, 1)
+        places = eye.centres(self.device).repeat(1, views)
         view = torch.arange(views, device=self.device).repeat_interleave(height * width)
         if eye.ideal:
             facet = sight.facet.reshape(-1)
         else:
-            seen = places.isfinite().all(dim=1)
+            seen = places.isfinite().all(dim=0)
             facet = torch.full_like(view, -1)
-            facet[seen] = sight.resolve(view[seen], places[seen])
+            facet[seen] = sight.resolve(view[seen], places[:, seen])
         hit = (facet >= 0).nonzero().squeeze(1)
-        spacing = eye.spacing(self.device)
-        samples = Samples(view[hit], facet[hit], places[hit], 1.0 if eye.ideal else spacing.repeat(views)[hit])
-        hits = meet(sight, samples)
-        points = self._shader.points(samples, hits)
+        spacing = None if eye.ideal else eye.spacing(self.device).repeat(views)[hit]
+        samples = Samples(view[hit], facet[hit], places[:, hit], spacing)
+        light = self._shade(sight, sunlight, samples, T_view_lamp, _TAPS)
+        image = torch.full((len(facet),), self.scene.sky, dtype=torch.float32, device=self.device)
         depth = torch.full((len(facet),), torch.inf, dtype=torch.float64, device=self.device)
-        depth[hit] = hits.depth
         lit = torch.ones_like(facet, dtype=torch.bool)
-        if sunlight is not None:
-            lit[hit] = self._lit(sunlight, samples, points)
+        image[hit], depth[hit], lit[hit] = light.radiance, light.depth, light.lit
         smooth = torch.where(facet >= 0, self.smooth[facet.clamp_min(0)], -1)
         shape = (views, height, width)
-        edges = _edges(smooth.reshape(shape), depth.reshape(shape), lit.reshape(shape)).reshape(-1)
-
-        image = torch.full((len(facet),), self.scene.sky, dtype=torch.float32, device=self.device)
-        plain = (~edges[hit]).nonzero().squeeze(1)
-        inner = Samples(
-            samples.view[plain],
-            samples.facet[plain],
-            samples.places[plain],
-            samples.spacing if isinstance(samples.spacing, float) else samples.spacing[plain],
-        )
-        image[hit[plain]] = self._shader.radiance(
-            sight, inner, Hits(*(h[plain] for h in hits)), points[plain], lit[hit[plain]], T_view_lamp
-        )
-        mixed = edges.nonzero().squeeze(1)
+        outline = _steps(smooth.reshape(shape)) | _steps(1.0 / depth.reshape(shape), _DEPTH_JUMP)
+        shadow = _steps(lit.reshape(shape))
+        mixed = (outline | shadow).reshape(-1).nonzero().squeeze(1)
         if len(mixed):
-            image[mixed] = self._edge_radiance(sight, eye, mixed, view[mixed], spacing, sunlight, T_view_lamp)
+            known = torch.where(shadow.reshape(-1)[mixed], -1, lit[mixed].long())
+            image[mixed] = self._edge_radiance(sight, eye, mixed, view[mixed], known, sunlight, T_view_lamp)
         if not eye.ideal:
             image[~seen] = 0.0
         body = torch.where(facet >= 0, self.body[facet.clamp_min(0)], -1)
@@ -194,36 +193,63 @@ class Renderer:
         eye: Eye,
         pixels: Tensor,
         view: Tensor,
-        spacing: Tensor,
+        lit: Tensor,
         sunlight: Sight | None,
         T_view_lamp: Tensor,
     ) -> Tensor:
-        """Mean light over the sub-samples of pixels (n,) where surfaces meet."""
+        """Mean light over the sub-samples of pixels (n,) where surfaces meet; lit (n,) 1, 0, or -1 where it varies."""
         count = eye.camera.height * eye.camera.width
         within = pixels % count
-        places = torch.cat([eye.centres(self.device, offset).reshape(-1, 2)[within] for offset in _OFFSETS])
+        places = torch.cat([eye.centres(self.device, offset)[:, within] for offset in _OFFSETS], dim=1)
         views = view.repeat(len(_OFFSETS))
-        seen = places.isfinite().all(dim=1)
+        seen = places.isfinite().all(dim=0)
         facet = torch.full_like(views, -1)
-        facet[seen] = sight.resolve(views[seen], places[seen])
+        facet[seen] = sight.resolve(views[seen], places[:, seen])
         light = torch.full((len(views),), self.scene.sky, dtype=torch.float32, device=self.device)
         hit = (facet >= 0).nonzero().squeeze(1)
-        size = 0.5 if eye.ideal else 0.5 * spacing[within].repeat(len(_OFFSETS))[hit]
-        samples = Samples(views[hit], facet[hit], places[hit], size)
-        hits = meet(sight, samples)
-        points = self._shader.points(samples, hits)
-        lit = None if sunlight is None else self._lit(sunlight, samples, points)
-        light[hit] = self._shader.radiance(sight, samples, hits, points, lit, T_view_lamp, taps=1)
+        # Each ray stands for a quarter of the pixel; together they filter along the footprint as more taps would.
+        size = 0.5 * eye.spacing(self.device)[within].repeat(len(_OFFSETS))[hit]
+        samples = Samples(views[hit], facet[hit], places[:, hit], size)
+        lit = lit.repeat(len(_OFFSETS))[hit]
+        light[hit] = self._shade(sight, sunlight, samples, T_view_lamp, 1, lit).radiance
         return light.reshape(len(_OFFSETS), -1).mean(dim=0)
 
-    def _lit(self, sunlight: Sight, samples: Samples, points: Tensor) -> Tensor:
-        """Whether the sun reaches points (N, 3) given in the frames of their movers, (N,) bool."""
-        mover = self.surfaces.mover.index_select(0, samples.facet)
-        in_sun = move(sunlight.T_view_mover, samples.view, mover, points.double())
+    def _shade(
+        self,
+        sight: Sight,
+        sunlight: Sight | None,
+        samples: Samples,
+        T_view_lamp: Tensor,
+        taps: int,
+        known: Tensor | None = None,
+    ) -> _Light:
+        """Light of N rays, on the CPU in parts that fit its cache; where known (N,) is 0 or 1 it says who is lit."""
+        count = len(samples.view)
+        step = _CHUNK if self.device.type == "cpu" else max(count, 1)
+        parts = []
+        for start in range(0, max(count, 1), step):
+            part = samples.part(slice(start, start + step))
+            hits, look = meet(sight, part), self._shader.look_up(part.facet)
+            points = self._shader.points(look, hits)
+            lit = torch.ones_like(part.view, dtype=torch.bool) if known is None else known[start : start + step] != 0
+            if sunlight is not None:
+                asked = None if known is None else (known[start : start + step] < 0).nonzero().squeeze(1)
+                lit = self._lit(sunlight, part, points, lit, asked)
+            radiance = self._shader.radiance(sight, part, look, hits, points, lit, T_view_lamp, taps)
+            parts.append(_Light(radiance, hits.depth, lit))
+        return _Light(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
+
+    def _lit(self, sunlight: Sight, samples: Samples, points: Tensor, lit: Tensor, asked: Tensor | None) -> Tensor:
+        """Whether the sun reaches points (3, N) in the frames of their movers, (N,) bool; `lit` but for those asked."""
+        view, facet = samples.view, samples.facet
+        if asked is not None:
+            view, facet, points = view[asked], facet[asked], points[:, asked]
+        mover = self.surfaces.mover.index_select(0, facet)
+        in_sun = move(sunlight.T_view_mover, view, mover, points.double())
         _, places = sunlight.eye.project(in_sun)
-        inside = ((places >= 0) & (places <= _SHADOW_GRID - 1)).all(dim=1)
-        places = places.clamp(0, _SHADOW_GRID - 1)
-        return ~(sunlight.hidden(samples.view, places, 1.0 / in_sun[:, 2], samples.facet) & inside)
+        inside = ((places >= 0) & (places <= _SHADOW_GRID - 1)).all(dim=0)
+        reached = ~(sunlight.hidden(view, places.clamp(0, _SHADOW_GRID - 1), 1.0 / in_sun[2], facet) & inside)
+        return reached if asked is None else lit.index_copy(0, asked, reached)
 
 
 def _texture_shift(body: int, material: Material) -> np.ndarray:
@@ -235,14 +261,13 @@ def _texture_shift(body: int, material: Material) -> np.ndarray:
     return np.asarray(shift)
 
 
-def _edges(smooth: Tensor, depth: Tensor, lit: Tensor) -> Tensor:
-    """Pixels (V, H, W) next to another surface, a step in depth or the edge of a shadow."""
-    inverse = 1.0 / depth
-    result = torch.zeros_like(lit)
+def _steps(values: Tensor, relative: float = 0.0) -> Tensor:
+    """Pixels (V, H, W) with a neighbour, across or down, that differs by more than the share `relative`, bool."""
+    result = torch.zeros_like(values, dtype=torch.bool)
     for dim in (1, 2):
-        size = smooth.shape[dim] - 1
-        (s0, w0, l0), (s1, w1, l1) = ([x.narrow(dim, k, size) for x in (smooth, inverse, lit)] for k in (0, 1))
-        differs = (s0 != s1) | (l0 != l1) | ((w0 - w1).abs() > _DEPTH_JUMP * torch.maximum(w0, w1))
+        size = values.shape[dim] - 1
+        first, second = (values.narrow(dim, k, size) for k in (0, 1))
+        differs = (first - second).abs() > relative * torch.maximum(first, second) if relative else first != second
         result.narrow(dim, 0, size).logical_or_(differs)
         result.narrow(dim, 1, size).logical_or_(differs)
     return result

@@ -133,12 +133,12 @@ class ScenePairs:
 
 def _transfer(views0: Views, views1: Views, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     view = torch.zeros(len(points), dtype=torch.int64)
-    facet, places = at_pixels(views0, view, torch.from_numpy(points.astype(np.float64)))
+    facet, places = at_pixels(views0, view, torch.from_numpy(points.T.astype(np.float64)))
     hit = facet >= 0
-    moved = transfer(views0.sight, view[hit], facet[hit], places[hit], views1.sight, view[hit])
+    moved = transfer(views0.sight, view[hit], facet[hit], places[:, hit], views1.sight, view[hit])
     places1, visible = np.full((len(points), 2), -1.0), np.zeros(len(points), dtype=bool)
     index = hit.numpy()
-    places1[index] = np.nan_to_num(moved.pixels.numpy(), nan=-1.0)
+    places1[index] = np.nan_to_num(moved.pixels.T.numpy(), nan=-1.0)
     visible[index] = moved.visible.numpy()
     return places1, visible
 

@@ -15,7 +15,7 @@ class Transfer(NamedTuple):
     """N points of a source view in a target view.
 
     Attributes:
-        pixels: (N, 2) float64 in the target; NaN where there is no such pixel.
+        pixels: (2, N) float64 in the target; NaN where there is no such pixel.
         depth: (N,) float64 z in the target, metres.
         visible: (N,) bool: in front of the target's camera, inside its image and not hidden.
     """
@@ -34,37 +34,37 @@ def transfer(
         source, target: of the same renderer.
         source_view, target_view: (N,) int64.
         facet: (N,) int64, what is seen in the source.
-        places: (N, 2) float64 on the source's grid.
+        places: (2, N) float64 on the source's grid.
     """
     return arrive(target, target_view, source.points(source_view, facet, places), facet)
 
 
 def arrive(target: Sight, view: Tensor, points: Tensor, facet: Tensor, occlusion: bool = True) -> Transfer:
-    """Points (N, 3), each in the frame of its facet's mover, seen from views (N,) of a sight.
+    """Points (3, N), each in the frame of its facet's mover, seen from views (N,) of a sight.
 
     Without `occlusion` what hides them is not asked for, which saves drawing the target.
     """
     mover = target.surfaces.mover.index_select(0, facet)
     there = move(target.T_view_mover, view, mover, points)
-    depth = there[:, 2]
+    depth = there[2]
     front = depth > target.near
-    pixels, seen_at = target.eye.project(torch.where(front[:, None], there, torch.ones_like(there)))
-    pixels = torch.where(front[:, None], pixels, torch.nan)
+    pixels, seen_at = target.eye.project(torch.where(front, there, torch.ones_like(there)))
+    pixels = torch.where(front, pixels, torch.nan)
     camera = target.eye.camera
-    last = pixels.new_tensor([camera.width - 1, camera.height - 1])
-    visible = front & ((pixels >= 0) & (pixels <= last)).all(dim=1)
+    inside = (pixels >= 0).all(dim=0) & (pixels[0] <= camera.width - 1) & (pixels[1] <= camera.height - 1)
+    visible = front & inside
     if occlusion:
         index = visible.nonzero().squeeze(1)
-        visible[index] = ~target.hidden(view[index], seen_at[index], 1.0 / depth[index], facet[index])
+        visible[index] = ~target.hidden(view[index], seen_at[:, index], 1.0 / depth[index], facet[index])
     return Transfer(pixels, depth, visible)
 
 
 def at_pixels(views: Views, view: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
-    """What is seen at pixels (N, 2) of views (N,): facets (N,), -1 for none, and places on the grid (N, 2)."""
+    """What is seen at pixels (2, N) of views (N,): facets (N,), -1 for none, and places on the grid (2, N)."""
     places = views.sight.eye.to_grid(pixels)
-    known = places.isfinite().all(dim=1)
+    known = places.isfinite().all(dim=0)
     facet = torch.full_like(view, -1)
-    facet[known] = views.sight.resolve(view[known], places[known])
+    facet[known] = views.sight.resolve(view[known], places[:, known])
     return facet, places
 
 
@@ -79,16 +79,18 @@ def flow(source: Views, target: Sight, occlusion: bool = True) -> tuple[Tensor, 
     facet = source.facet.reshape(-1)
     hit = (facet >= 0).nonzero().squeeze(1)
     view = hit // (shape[1] * shape[2])
-    within = hit % (shape[1] * shape[2])
+    within = hit - view * (shape[1] * shape[2])
     sight = source.sight
-    places = sight.eye.centres(facet.device).reshape(-1, 2)[within]
-    mover = sight.surfaces.mover.index_select(0, facet[hit])
-    in_view = sight.eye.rays(places) * source.depth.reshape(-1)[hit, None]
+    places = sight.eye.centres(facet.device)[:, within]
+    seen = facet[hit]
+    mover = sight.surfaces.mover.index_select(0, seen)
+    in_view = sight.eye.rays(places) * source.depth.reshape(-1)[hit]
     points = move(torch.linalg.inv(sight.T_view_mover), view, mover, in_view)
-    moved = arrive(target, view, points, facet[hit], occlusion)
-    pixels = torch.stack([within % shape[2], within // shape[2]], dim=1)
+    moved = arrive(target, view, points, seen, occlusion)
+    row = within // shape[2]
+    pixels = torch.stack([within - row * shape[2], row])
     result = torch.full((facet.numel(), 2), torch.nan, dtype=torch.float32, device=facet.device)
-    result[hit] = (moved.pixels - pixels).float()
+    result[hit] = (moved.pixels - pixels).float().T
     visible = torch.zeros_like(facet, dtype=torch.bool)
     visible[hit] = moved.visible
     return result.reshape(*shape, 2), visible.reshape(shape)

@@ -4,6 +4,8 @@ In the frame of a view a facet holds the points o + a e_u + b e_v. Seen from gri
 (a, b, 1) / z = [e_u e_v o]^-1 K^-1 (u, v, 1), so that its inside is a set of linear inequalities in u on every row: a
 span. All spans of all facets and views are filled at once, the nearest wins. Rays between the grid's places (distorted
 pixels, sub-samples, projected points, shadows) are tested exactly against what the four places around them see.
+
+Coordinates come first in arrays here, (2, N) and (3, N): what is computed for each coordinate then runs over long rows.
 """
 
 from __future__ import annotations
@@ -59,12 +61,12 @@ class Eye:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def centres(self, device: torch.device, offset: tuple[float, float] = (0.0, 0.0)) -> Tensor:
-        """Places on the grid of all pixels' centres, shifted by `offset` pixels, (H, W, 2) float64."""
+        """Places on the grid of all pixels' centres, shifted by `offset` pixels, (2, H W) float64."""
         key = (str(device), offset)
         if key not in self._centres:
             v, u = np.mgrid[0 : self.camera.height, 0 : self.camera.width].astype(np.float64)
-            pixels = torch.from_numpy(np.stack([u + offset[0], v + offset[1]], axis=-1)).to(device)
-            self._centres[key] = self.to_grid(pixels)
+            pixels = np.stack([(u + offset[0]).ravel(), (v + offset[1]).ravel()])
+            self._centres[key] = self.to_grid(torch.from_numpy(pixels).to(device))
         return self._centres[key]
 
     def spacing(self, device: torch.device) -> Tensor:
@@ -75,30 +77,32 @@ class Eye:
             self.centres(device, offset) for offset in ((0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5))
         )
         across, down = right - left, below - above
-        area = across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0]
-        return area.abs().sqrt().float().reshape(-1)
+        return (across[0] * down[1] - across[1] * down[0]).abs().sqrt().float()
 
     def to_grid(self, pixels: Tensor) -> Tensor:
-        """Places on the grid of pixels (..., 2) float64; NaN where the distortion has no ray."""
+        """Places on the grid of pixels (2, N) float64; NaN where the distortion has no ray."""
         if self.ideal:
             return pixels
-        rays = torch.from_numpy(self.camera.unproject(pixels.cpu().numpy())[..., :2]).to(pixels.device)
-        return rays * rays.new_tensor([self.fx, self.fy]) + rays.new_tensor([self.cx, self.cy])
+        rays = self.camera.unproject(pixels.T.cpu().numpy())[:, :2]
+        return self._from_slope(torch.from_numpy(rays.T.copy()).to(pixels.device))
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels and places on the grid, each (..., 2), of points (..., 3) in the camera frame; z > 0 is up to you."""
-        slope = points[..., :2] / points[..., 2:]
-        places = slope * slope.new_tensor([self.fx, self.fy]) + slope.new_tensor([self.cx, self.cy])
+        """Pixels and places on the grid, each (2, N), of points (3, N) in the camera frame; z > 0 is up to you."""
+        slope = points[:2] / points[2]
+        places = self._from_slope(slope)
         if self.ideal:
             return places, places
-        pixels = torch.from_numpy(self.camera.project(points.cpu().numpy())).to(points.device)
+        pixels = torch.from_numpy(self.camera.project(points.T.cpu().numpy()).T.copy()).to(points.device)
         # Beyond the fold of a distortion a point far outside comes back into the image.
-        return torch.where((slope.abs() < _WIDEST_SLOPE).all(dim=-1, keepdim=True), pixels, torch.nan), places
+        return torch.where((slope.abs() < _WIDEST_SLOPE).all(dim=0), pixels, torch.nan), places
 
     def rays(self, places: Tensor) -> Tensor:
-        """Points at z = 1 in the camera frame of places (..., 2) on the grid, (..., 3)."""
-        slope = (places - places.new_tensor([self.cx, self.cy])) / places.new_tensor([self.fx, self.fy])
-        return torch.cat([slope, torch.ones_like(slope[..., :1])], dim=-1)
+        """Points at z = 1 in the camera frame of places (2, N) on the grid, (3, N)."""
+        x, y = (places[0] - self.cx) / self.fx, (places[1] - self.cy) / self.fy
+        return torch.stack([x, y, torch.ones_like(x)])
+
+    def _from_slope(self, slope: Tensor) -> Tensor:
+        return torch.stack([slope[0] * self.fx + self.cx, slope[1] * self.fy + self.cy])
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,143 +138,160 @@ class Sight:
         self, surfaces: Surfaces, eye: Eye, T_view_mover: Tensor, near: float, only: Tensor | None = None
     ) -> None:
         self.surfaces, self.eye, self.T_view_mover, self.near = surfaces, eye, T_view_mover, near
+        self._only = only
         self._count = len(surfaces.origin)
-        T = T_view_mover[:, surfaces.mover]
-        R = T[..., :3, :3]
-        edge_u = (R @ surfaces.edge_u.unsqueeze(-1)).squeeze(-1)
-        edge_v = (R @ surfaces.edge_v.unsqueeze(-1)).squeeze(-1)
-        origin = (R @ surfaces.origin.unsqueeze(-1)).squeeze(-1) + T[..., :3, 3]
-        maps, towards = _maps(origin, edge_u, edge_v, eye)
-        # One table for each of u, v and 1, so that what is gathered from them lies side by side.
-        self._tables = [maps[..., k].reshape(-1, 3).contiguous() for k in range(3)]
-        drawn = towards.abs() > 1e-9 * origin.norm(dim=-1)
-        drawn &= ~surfaces.closed | (towards < 0)
-        if only is not None:
-            chosen = torch.zeros_like(surfaces.closed)
-            chosen[only] = True
-            drawn &= chosen
-        view, facet = drawn.nonzero(as_tuple=True)
-        boxes = _screen_boxes(origin[drawn], edge_u[drawn], edge_v[drawn], surfaces.triangle[facet], eye, near)
-        inside = ((boxes[:, 0] <= boxes[:, 1]) & (boxes[:, 2] <= boxes[:, 3])).nonzero().squeeze(1)
-        self._drawn = view[inside], facet[inside], boxes[inside]
+
+    @cached_property
+    def _in_views(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Origins and edges of all facets in the frames of the views, (V, F, 3) each."""
+        vectors = torch.stack([self.surfaces.origin, self.surfaces.edge_u, self.surfaces.edge_v])
+        result = torch.empty(
+            (3, len(self.T_view_mover), *vectors.shape[1:]), dtype=vectors.dtype, device=vectors.device
+        )
+        # One product for what stands still, which is most, and one for each that moves.
+        for k in range(self.T_view_mover.shape[1]):
+            own = (self.surfaces.mover == k).nonzero().squeeze(1)
+            T = self.T_view_mover[:, k]
+            turned = vectors[:, own].unsqueeze(1) @ T[:, :3, :3].transpose(1, 2)
+            turned[0] += T[:, None, :3, 3]
+            result[:, :, own] = turned
+        return result[0], result[1], result[2]
+
+    @cached_property
+    def _maps(self) -> tuple[Tensor, Tensor]:
+        """Nine tables of one number each (9, V F), from which gathering is fast, and n . o (V, F); see `_maps_of`."""
+        maps, towards = _maps_of(*self._in_views, self.eye)
+        return maps.reshape(-1, 9).T.contiguous(), towards
 
     @cached_property
     def facet(self) -> Tensor:
         """The facet at each place of the grid, (V, h, w) int64; -1 where there is none."""
-        view, facet, boxes = self._drawn
-        views = len(self.T_view_mover)
-        return _fill(self._tables, view, facet, boxes, self.surfaces.triangle, self.eye, self.near, views)
+        origin, edge_u, edge_v = self._in_views
+        surfaces, (tables, towards) = self.surfaces, self._maps
+        drawn = towards.abs() > 1e-9 * origin.norm(dim=-1)
+        drawn &= ~surfaces.closed | (towards < 0)
+        if self._only is not None:
+            chosen = torch.zeros_like(surfaces.closed)
+            chosen[self._only] = True
+            drawn &= chosen
+        view, facet = drawn.nonzero(as_tuple=True)
+        triangle = surfaces.triangle
+        boxes = _screen_boxes(origin[drawn], edge_u[drawn], edge_v[drawn], triangle[facet], self.eye, self.near)
+        inside = ((boxes[:, 0] <= boxes[:, 1]) & (boxes[:, 2] <= boxes[:, 3])).nonzero().squeeze(1)
+        view, facet, boxes = view[inside], facet[inside], boxes[inside]
+        return _fill(tables, view, facet, boxes, triangle, self.eye, self.near, len(self.T_view_mover))
 
-    def slopes(self, view: Tensor, facet: Tensor) -> tuple[Tensor, Tensor]:
-        """Derivatives of `evaluate` by u and by v, each (N, 3)."""
+    def rows(self, view: Tensor, facet: Tensor) -> list[Tensor]:
+        """The nine numbers of the maps from places to (a, b, 1) / z of facets (N,) in views (N,), row by row."""
         index = view * self._count + facet
-        return self._tables[0].index_select(0, index), self._tables[1].index_select(0, index)
+        return [table.index_select(0, index) for table in self._maps[0]]
 
     def evaluate(self, view: Tensor, facet: Tensor, places: Tensor) -> Tensor:
-        """(N, 3): a / z, b / z and 1 / z of the facets' planes at places (N, 2) of views (N,)."""
-        index = view * self._count + facet
-        by_u, by_v, constant = (table.index_select(0, index) for table in self._tables)
-        return torch.addcmul(torch.addcmul(constant, by_u, places[:, 0:1]), by_v, places[:, 1:2])
+        """(3, N): a / z, b / z and 1 / z of the facets' planes at places (2, N) of views (N,)."""
+        return apply(self.rows(view, facet), places)
 
     def points(self, view: Tensor, facet: Tensor, places: Tensor) -> Tensor:
-        """Points (N, 3) of facets seen at places (N, 2) of views (N,), in the frames of the facets' movers."""
-        in_view = self.eye.rays(places) / self.evaluate(view, facet, places)[:, 2:]
+        """Points (3, N) of facets seen at places (2, N) of views (N,), in the frames of the facets' movers."""
+        in_view = self.eye.rays(places) / self.evaluate(view, facet, places)[2]
         mover = self.surfaces.mover.index_select(0, facet)
         return move(torch.linalg.inv(self.T_view_mover), view, mover, in_view)
 
     def inside(self, facet: Tensor, values: Tensor) -> Tensor:
         """Whether the rays of `evaluate` meet the facets themselves, (N,) bool."""
-        a, b, w = values.unbind(dim=-1)
+        a, b, w = values
         low = -_INSIDE_TOLERANCE * w
-        high = w - 2 * low
-        beyond = torch.where(self.surfaces.triangle[facet], a + b, torch.maximum(a, b))
-        return (w > _FEWEST) & (a >= low) & (b >= low) & (beyond <= high)
+        beyond = torch.where(self.surfaces.triangle.index_select(0, facet), a + b, torch.maximum(a, b))
+        return (w > _FEWEST) & (torch.minimum(a, b) >= low) & (beyond <= w - 2 * low)
 
     def resolve(self, view: Tensor, places: Tensor) -> Tensor:
-        """The facet seen at places (N, 2) of views (N,), -1 for none; exact where the grid around shows it."""
+        """The facet seen at places (2, N) of views (N,), -1 for none; exact where the grid around shows it."""
         around = self._around(view, places, _NEXT)
-        facet = around[:, 0].clone()
-        mixed = (around != around[:, :1]).any(dim=1).nonzero().squeeze(1)
-        found, best = self._nearest_met(view[mixed], around[mixed], places[mixed])
+        facet = around[0].clone()
+        mixed = (around != around[0]).any(dim=0).nonzero().squeeze(1)
+        found, best = self._nearest_met(view[mixed], around[:, mixed], places[:, mixed])
         facet[mixed] = found
         # Facets smaller than the grid: the next ring may have it. The open sky meets nothing.
-        lost = ((best == 0) & (around[mixed] >= 0).any(dim=1)).nonzero().squeeze(1)
+        lost = ((best == 0) & (around[:, mixed] >= 0).any(dim=0)).nonzero().squeeze(1)
         rest = mixed[lost]
-        wider = self._around(view[rest], places[rest], _RING)
-        found, best = self._nearest_met(view[rest], wider, places[rest])
-        sky = (around[rest] < 0).any(dim=1)
-        facet[rest] = torch.where((best > 0) | sky, found, self._closest(view[rest], places[rest]))
+        wider = self._around(view[rest], places[:, rest], _RING)
+        found, best = self._nearest_met(view[rest], wider, places[:, rest])
+        sky = (around[:, rest] < 0).any(dim=0)
+        facet[rest] = torch.where((best > 0) | sky, found, self._closest(view[rest], places[:, rest]))
         return facet
 
-    def _nearest_met(self, view: Tensor, candidates: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
-        """Of candidates (N, c) the nearest that is met, (N,), -1 for none, and its 1 / z, 0 for none."""
-        w, hit = self._try(view, candidates, places)
-        best, index = torch.where(hit, w, 0.0).max(dim=1)
-        chosen = candidates.gather(1, index.unsqueeze(1)).squeeze(1)
-        return torch.where(best > 0, chosen, -1), best
-
     def hidden(self, view: Tensor, places: Tensor, inverse_depth: Tensor, own: Tensor) -> Tensor:
-        """Whether another facet than `own` (N,) is nearer than 1 / inverse_depth at places (N, 2), (N,) bool."""
+        """Whether another facet than `own` (N,) is nearer than 1 / inverse_depth at places (2, N), (N,) bool."""
         around = self._around(view, places, _NEXT)
         result = torch.zeros_like(own, dtype=torch.bool)
-        uniform = (around == around[:, :1]).all(dim=1)
+        uniform = (around == around[0]).all(dim=0)
         for kind, count in ((uniform, 1), (~uniform, 4)):
-            candidates = around[:, :count]
-            foreign = ((candidates != own.unsqueeze(1)) & (candidates >= 0)).any(dim=1)
+            candidates = around[:count]
+            foreign = ((candidates != own) & (candidates >= 0)).any(dim=0)
             index = (kind & foreign).nonzero().squeeze(1)
-            candidates, limit = candidates[index], inverse_depth[index].unsqueeze(1)
-            w, hit = self._try(view[index], candidates, places[index])
-            met = hit & (w > (1 + _NEARER) * limit) & (candidates != own[index].unsqueeze(1))
+            candidates, limit = candidates[:, index], inverse_depth[index]
+            w, hit = self._try(view[index], candidates, places[:, index])
+            met = hit & (w > (1 + _NEARER) * limit) & (candidates != own[index])
             # Facets smaller than the grid may lie between its places: then all planes around are nearer by far.
-            behind = ((w > (1 + _FAR_NEARER) * limit) & (candidates >= 0)).all(dim=1)
-            result[index] = met.any(dim=1) | behind
+            behind = ((w > (1 + _FAR_NEARER) * limit) & (candidates >= 0)).all(dim=0)
+            result[index] = met.any(dim=0) | behind
         return result
 
+    def _nearest_met(self, view: Tensor, candidates: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
+        """Of candidates (c, N) the nearest that is met, (N,), -1 for none, and its 1 / z, 0 for none."""
+        w, hit = self._try(view, candidates, places)
+        best, index = torch.where(hit, w, 0.0).max(dim=0)
+        chosen = candidates.gather(0, index.unsqueeze(0)).squeeze(0)
+        return torch.where(best > 0, chosen, -1), best
+
     def _around(self, view: Tensor, places: Tensor, offsets: tuple[tuple[int, int], ...]) -> Tensor:
-        """What the grid sees at offsets (u, v) from the corner of each place's cell, (N, c)."""
+        """What the grid sees at offsets (u, v) from the corner of each place's cell, (c, N)."""
         height, width = self.facet.shape[1:]
-        corner = places.floor().long()
+        u, v = places.floor().long()
         flat = self.facet.reshape(-1)
         if offsets is _NEXT:
-            u, v = corner[:, 0].clamp(0, width - 2), corner[:, 1].clamp(0, height - 2)
-            first = (view * height + v) * width + u
-            return torch.stack([flat.index_select(0, first + k) for k in (0, 1, width, width + 1)], dim=1)
-        u, v = corner.unbind(dim=1)
+            first = (view * height + v.clamp(0, height - 2)) * width + u.clamp(0, width - 2)
+            return torch.stack([flat.index_select(0, first + k) for k in (0, 1, width, width + 1)])
         return torch.stack(
             [
                 flat[(view * height + (v + dv).clamp(0, height - 1)) * width + (u + du).clamp(0, width - 1)]
                 for du, dv in offsets
-            ],
-            dim=1,
+            ]
         )
 
     def _closest(self, view: Tensor, places: Tensor) -> Tensor:
         height, width = self.facet.shape[1:]
-        u, v = places.round().long().unbind(dim=-1)
+        u, v = places.round().long()
         return self.facet[view, v.clamp(0, height - 1), u.clamp(0, width - 1)]
 
     def _try(self, view: Tensor, candidates: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
-        """1 / z (N, c) of the candidates' planes, and whether the rays meet them (N, c)."""
-        count = candidates.shape[1]
+        """1 / z (c, N) of the candidates' planes, and whether the rays meet them (c, N)."""
+        count = len(candidates)
         facet = candidates.clamp_min(0).reshape(-1)
-        values = self.evaluate(view.repeat_interleave(count), facet, places.repeat_interleave(count, dim=0))
+        values = self.evaluate(view.repeat(count), facet, places.repeat(1, count))
         hit = self.inside(facet, values) & (candidates.reshape(-1) >= 0)
-        return values[:, 2].reshape(-1, count), hit.reshape(-1, count)
+        return values[2].reshape(count, -1), hit.reshape(count, -1)
+
+
+def apply(rows: list[Tensor], places: Tensor) -> Tensor:
+    """Maps of nine numbers each (N,), row by row, at places (2, N): (3, N)."""
+    u, v = places
+    return torch.stack([torch.addcmul(torch.addcmul(rows[k + 2], rows[k], u), rows[k + 1], v) for k in (0, 3, 6)])
 
 
 def move(T: Tensor, view: Tensor, mover: Tensor, points: Tensor) -> Tensor:
-    """Points (N, 3) under T[view, mover] out of (V, M, 4, 4)."""
+    """Points (3, N) under T[view, mover] out of (V, M, 4, 4)."""
     if len(T) == 1:  # one product for what stands still, which is most, and one for each that moves
-        moved = points @ T[0, 0, :3, :3].T + T[0, 0, :3, 3]
+        moved = T[0, 0, :3, :3] @ points + T[0, 0, :3, 3:]
         for k in range(1, T.shape[1]):
             index = (mover == k).nonzero().squeeze(1)
-            moved[index] = points[index] @ T[0, k, :3, :3].T + T[0, k, :3, 3]
+            moved[:, index] = T[0, k, :3, :3] @ points[:, index] + T[0, k, :3, 3:]
         return moved
-    rows = T[..., :3, :].reshape(-1, 3, 4).index_select(0, view * T.shape[1] + mover)
-    return (rows[..., :3] @ points.unsqueeze(-1)).squeeze(-1) + rows[..., 3]
+    rows = T[..., :3, :].reshape(-1, 12).T.contiguous().index_select(1, view * T.shape[1] + mover)
+    x, y, z = points
+    return torch.stack([rows[k] * x + rows[k + 1] * y + rows[k + 2] * z + rows[k + 3] for k in (0, 4, 8)])
 
 
-def _maps(origin: Tensor, edge_u: Tensor, edge_v: Tensor, eye: Eye) -> tuple[Tensor, Tensor]:
+def _maps_of(origin: Tensor, edge_u: Tensor, edge_v: Tensor, eye: Eye) -> tuple[Tensor, Tensor]:
     """Maps (V, F, 3, 3), and n . o with n the unit normal e_u x e_v: negative where the front is seen."""
     cross = torch.linalg.cross
     normal = cross(edge_u, edge_v)
@@ -305,7 +326,7 @@ def _screen_boxes(origin: Tensor, edge_u: Tensor, edge_v: Tensor, triangle: Tens
 
 
 def _fill(
-    tables: list[Tensor],
+    tables: Tensor,
     view: Tensor,
     facet: Tensor,
     boxes: Tensor,
@@ -317,8 +338,7 @@ def _fill(
     """The nearest facet (V, h, w) at each place, from P drawn pairs of view and facet with their boxes (P, 4)."""
     width, height = eye.width, eye.height
     nearest = torch.zeros(views * height * width, dtype=torch.int64, device=view.device)
-    index = view * (len(tables[0]) // views) + facet
-    a, b, w = torch.stack([table.index_select(0, index) for table in tables], dim=-1).unbind(dim=1)
+    a, b, w = tables.index_select(1, view * (tables.shape[1] // views) + facet).T.reshape(-1, 3, 3).unbind(dim=1)
     # Each row (p, q, r) is an inequality p u + q v + r >= 0.
     is_triangle = triangle[facet].unsqueeze(1)
     nearer_than = -w

@@ -50,7 +50,8 @@ class TrainingConfig:
         weight_decay: of AdamW.
         quality_weight: of the quality loss beside the descriptor loss.
         seed: of the data, the initial weights and the sampling.
-        validate_every, checkpoint_every: in steps.
+        validate_every: in steps, and at the end; 0: never.
+        checkpoint_every: in steps.
     """
 
     steps: int = 3400
@@ -133,7 +134,7 @@ def train(out: Path, config: TrainingConfig, workers: int = 1, resume: bool = Fa
             progress.update(task, advance=1, note=f"loss {loss.descriptor.item():.3f} recall {loss.recall.item():.3f}")
             if done % 50 == 0 or done == config.steps:
                 _log(out, done, loss.descriptor.item(), loss.quality.item(), loss.recall.item())
-            if done % config.validate_every == 0 or done == config.steps:
+            if config.validate_every and (done % config.validate_every == 0 or done == config.steps):
                 metrics = matching_accuracy(network, config.seed + _VALIDATION_SEED_OFFSET)
                 progress.console.print(f"step {done}: " + ", ".join(f"{k} {v:.3f}" for k, v in metrics.items()))
             if done % config.checkpoint_every == 0 or done == config.steps:

@@ -19,6 +19,7 @@ from sigmaslam.files import atomic_write_text
 
 # What the choice is made by: the mean of these over the sets of SELECTION.
 _CHOSEN_BY = ("mma_1", "mma_3")
+_BATCH, _SIZE = 8, 192  # pairs a step and side of the images, less than in a full training
 _SHOWN = {
     "set12": ("mma_1", "mma_3", "repeatability_1", "auc_3"),
     "middlebury": ("mma_1", "mma_3", "repeatability_1"),
@@ -34,7 +35,6 @@ def write_training_data(
     out: Path,
     runs: Path,
     data: Path,
-    mixes: Sequence[str],
     seeds: int,
     steps: int,
     command: str,
@@ -46,12 +46,14 @@ def write_training_data(
         out: Markdown page.
         runs: folder of the training runs, one a mix and seed; finished ones are not repeated.
         data: folder of the real data sets.
-        mixes: keys of `training.stream.MIXES`.
         seeds: runs of each mix, seeds from 0 up.
         steps: optimiser steps of each.
         command: that makes the page again.
         note: told what is being done.
     """
+    from sigmaslam.training.stream import MIXES
+
+    mixes = list(MIXES)
     train_missing(runs, mixes, seeds, steps, note)
     results = {
         mix: [_scores(_run(runs, mix, seed, steps), SELECTION, data, note) for seed in range(seeds)] for mix in mixes
@@ -61,7 +63,7 @@ def write_training_data(
     lines = [
         "# What the network should learn from",
         "",
-        f"`{command}`: {steps} steps of 16 pairs at 224x224 a run, {seeds} seeds a mix;",
+        f"`{command}`: {steps} steps of {_BATCH} pairs at {_SIZE}x{_SIZE} a run, {seeds} seeds a mix;",
         "mean and standard deviation over the seeds, percent. At most 1,024 keypoints, long side 640, mutual nearest",
         "neighbours. All runs have the same network, steps and schedule; only the data differ.",
         "",
@@ -89,7 +91,7 @@ def train_missing(runs: Path, mixes: Sequence[str], seeds: int, steps: int, note
             folder = _run(runs, mix, seed, steps)
             if not (folder / WEIGHTS_NAME).is_file():
                 note(f"training {folder.name}")
-                config = TrainingConfig(steps=steps, data=mix, seed=seed, validate_every=steps)
+                config = TrainingConfig(steps, mix, _BATCH, _SIZE, seed=seed, validate_every=0)
                 train(folder, config, workers=1, resume=(folder / "checkpoint.pt").is_file())
 
 

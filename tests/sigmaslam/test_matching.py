@@ -1,3 +1,4 @@
+import json
 from pathlib import Path
 
 import cv2
@@ -12,11 +13,7 @@ from sigmaslam.frontend.learned import LearnedDetector
 from sigmaslam.frontend.matching import match_near, match_rows
 from sigmaslam.frontend.refine import lucas_kanade, refine
 from sigmaslam.readers import open_sequence
-from sigmaslam.synthetic import worlds
-from sigmaslam.synthetic.scene import render
-from sigmaslam.synthetic.sequence import simulate
-
-DEMO = Path(worlds.__file__).resolve().parent / "demo"
+from sigmaslam.synthetic.simulation import Simulation, Studio
 
 
 def unit(rng: np.random.Generator, *shape: int) -> np.ndarray:
@@ -157,16 +154,17 @@ def frontend(name: str) -> Frontend:
 
 
 @pytest.fixture(scope="module")
-def demo() -> dict[str, np.ndarray]:
+def demo(demo_sequence: Path) -> dict[str, np.ndarray]:
     """Frames 0 and 4 with the true inverse depth of the left views, and the motion between them."""
-    simulation = simulate("room", 40, 2, 320, 240)
-    frames = [frame for frame in open_sequence(DEMO).frames() if frame.index in (0, 4)]
-    poses = simulation.T_world_camera[[0, 4]]
-    depths = [render(simulation.scene, simulation.left, pose, supersample=1).depth for pose in poses]
+    simulation = Simulation.from_json(json.loads((demo_sequence / "scene.json").read_text())["simulation"])
+    frames = [frame for frame in open_sequence(demo_sequence).frames() if frame.index in (0, 4)]
+    poses = simulation.path.poses(np.array([0, 4]) / simulation.fps)
+    studio, camera = Studio(simulation), simulation.rig.left
+    depths = [studio.renderer.render(studio.left, T[None], np.zeros(1)).depth[0].numpy() for T in poses]
     return {
         "images": np.array([(frame.left, frame.right) for frame in frames]),
-        "disparity": simulation.left.fx * simulation.baseline / np.array(depths),
-        "K": simulation.left.matrix,
+        "disparity": camera.fx * simulation.rig.calibrated.baseline / np.array(depths),
+        "K": camera.matrix,
         "depth": np.array(depths),
         "T_4_0": np.linalg.inv(poses[1]) @ poses[0],
     }
@@ -205,7 +203,7 @@ def test_matches_of_the_demo_follow_the_true_motion(demo, name):
     assert (found.sigma > 0).all()
     row = np.searchsorted(index, found.key_index)
     error = np.linalg.norm(found.points - truth[row], axis=1)
-    assert (error < 2.0).mean() > 0.9
+    assert (error < 2.0).mean() > 0.85  # its striped wall repeats itself
     assert np.median(error) < 0.4
 
 

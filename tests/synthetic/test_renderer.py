@@ -98,10 +98,10 @@ def test_visible_points_are_those_no_facet_stands_before(renderer: Renderer, cam
     first, second = render(renderer, camera, (T_0, 0.8)), render(renderer, camera, (T_1, 0.8))
     pixels = np.random.default_rng(1).uniform(2, [camera.width - 3, camera.height - 3], (700, 2))
     view = torch.zeros(len(pixels), dtype=torch.int64)
-    facet, places = at_pixels(first, view, torch.from_numpy(pixels))
+    facet, places = at_pixels(first, view, torch.from_numpy(pixels.T.copy()))
     seen = facet >= 0
-    moved = transfer(first.sight, view[seen], facet[seen], places[seen], second.sight, view[seen])
-    points = first.sight.points(view[seen], facet[seen], places[seen]).numpy()
+    moved = transfer(first.sight, view[seen], facet[seen], places[:, seen], second.sight, view[seen])
+    points = first.sight.points(view[seen], facet[seen], places[:, seen]).T.numpy()
     path = renderer.scene.bodies[MOVING].path
     assert path is not None
     of_mover = renderer.body[facet[seen]].numpy() == MOVING
@@ -109,8 +109,8 @@ def test_visible_points_are_those_no_facet_stands_before(renderer: Renderer, cam
     rays = points - T_1[:3, 3]
     _, distance = first_hit(facets_of(renderer), T_1[:3, 3], rays)
     local = rays @ T_1[:3, :3]
-    inside = (moved.pixels.numpy() >= 0).all(axis=1)
-    inside &= (moved.pixels.numpy() <= [camera.width - 1, camera.height - 1]).all(axis=1)
+    inside = (moved.pixels.T.numpy() >= 0).all(axis=1)
+    inside &= (moved.pixels.T.numpy() <= [camera.width - 1, camera.height - 1]).all(axis=1)
     expected = inside & (distance > 1 - 1e-5) & (local[:, 2] > 0.05)
     assert (expected == moved.visible.numpy()).mean() > 0.985  # the rest lies within a pixel of an outline
     assert 0.01 < (~expected[inside]).mean() < 0.5
