@@ -64,7 +64,7 @@ PRESETS = {
 # Sensors by name: what comes after the light has reached the lens.
 SENSORS = {
     "ideal": Sensor(blur=0.0, read_noise=0.0, photons_at_white=1e9),
-    "normal": Sensor(blur=0.5, vignetting=0.15, shutter=0.1, photons_at_white=15000.0, read_noise=0.8, gamma=0.8),
+    "normal": Sensor(blur=0.5, vignetting=0.15, shutter=0.1, photons_at_white=10500.0, read_noise=0.4),
     "harsh": Sensor(
         blur=0.9,
         vignetting=0.4,

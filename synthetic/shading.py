@@ -15,7 +15,7 @@ from sigmaslam.synthetic.scene import Lights, Material
 from sigmaslam.synthetic.visibility import Sight, apply
 
 _LONGEST = 2  # of a footprint's axes, longer by more than this the mip level rises instead
-_KNEE = 0.49  # albedo stays within 0.5 +- this
+_KNEE = 0.2  # albedo is what was asked for from here to 1 - this; beyond it nears 0 and 1 without reaching them
 _TINY = 1e-18
 
 
@@ -245,8 +245,7 @@ class Shader:
             level = torch.log2((size[second] * scale).clamp_min(1.0))
             other = self._atlas.sample(corner, uv[:, second] * scale + 137.0, level)
             deviation = deviation.index_add(0, second, contrast * (other - 0.5))
-        # A soft knee in place of clipping keeps texture in the dark and the bright parts.
-        return 0.5 + _KNEE * torch.tanh((look.brightness + deviation - 0.5) / _KNEE), texels
+        return _albedo_of(look.brightness + deviation), texels
 
     def _tilted(self, look: _Look, uv: Tensor, texels: Tensor, normal: Tensor) -> Tensor:
         """Normals (3, N) tilted by the slope of the first texture, as a wet, uneven surface has them."""
@@ -267,6 +266,13 @@ def _between(columns: Tensor, fraction: Tensor) -> Tensor:
     size = len(columns) // 3
     start, along_u, along_v = columns.split(size)
     return torch.addcmul(torch.addcmul(start, along_u, fraction[0]), along_v, fraction[1])
+
+
+def _albedo_of(value: Tensor) -> Tensor:
+    """Soft knees in place of clipping, which would lose the texture of the dark and the bright parts."""
+    dark = _KNEE * torch.exp(((value - _KNEE) / _KNEE).clamp_max(0))
+    bright = _KNEE * torch.exp(((1 - _KNEE - value) / _KNEE).clamp_max(0))
+    return value.clamp(_KNEE, 1 - _KNEE) + (dark - _KNEE) - (bright - _KNEE)
 
 
 def _dot(first: Tensor, second: Tensor) -> Tensor:

@@ -20,7 +20,7 @@ from sigmaslam.synthetic.truth import flow
 from sigmaslam.synthetic.visibility import Eye
 from sigmaslam.synthetic.worlds.episode import MOTIONS, Wish
 
-_BRIGHTNESS = 0.38  # mean of the linear image that the exposure aims at
+_BRIGHTNESS = 0.48  # mean of the linear image that the exposure aims at
 _METERED = 5  # frames that are looked at for it
 # Streams of random numbers of one seed: what one draws does not depend on the others.
 _WORLD, _RIG, _ERRORS, _GAINS, _NOISE = range(5)

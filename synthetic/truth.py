@@ -10,6 +10,8 @@ from torch import Tensor
 from sigmaslam.synthetic.renderer import Views
 from sigmaslam.synthetic.visibility import Sight, move
 
+_BORDER = 1e-6  # pixels; what stands still at the image's edge stays in it whatever the rounding
+
 
 class Transfer(NamedTuple):
     """N points of a source view in a target view.
@@ -51,7 +53,8 @@ def arrive(target: Sight, view: Tensor, points: Tensor, facet: Tensor, occlusion
     pixels, seen_at = target.eye.project(torch.where(front, there, torch.ones_like(there)))
     pixels = torch.where(front, pixels, torch.nan)
     camera = target.eye.camera
-    inside = (pixels >= 0).all(dim=0) & (pixels[0] <= camera.width - 1) & (pixels[1] <= camera.height - 1)
+    within = (pixels + _BORDER >= 0).all(dim=0)
+    inside = within & (pixels[0] <= camera.width - 1 + _BORDER) & (pixels[1] <= camera.height - 1 + _BORDER)
     visible = front & inside
     if occlusion:
         index = visible.nonzero().squeeze(1)

@@ -204,6 +204,7 @@ def draw(sets: dict[str, ImageSet]) -> Figure:
             axes.set_xlabel(label)
             axes.set_title(f"{title}: {heading}", fontsize=10)
             style_axes(axes)
+        row[4].set_ylim(0, None)  # last, or what is drawn later would be cut off
         row[0].legend(fontsize=9)
     return figure
 
@@ -229,7 +230,6 @@ def _draw_set(row: Sequence[Axes], images: ImageSet, style: dict[str, Any]) -> N
     corner.set_ylim(0.03, 300.0)
     brightness.plot(_centres(statistics.BRIGHTNESS_EDGES), images.brightness, **style)
     noise.plot(_centres(statistics.BRIGHTNESS_EDGES), images.noise, marker=".", **style)
-    noise.set_ylim(0, None)
 
 
 def _centres(edges: np.ndarray, log: bool = False) -> np.ndarray:
@@ -253,12 +253,12 @@ def _statistics_section(sets: dict[str, ImageSet], figure: Path) -> list[str]:
         f"All but spectrum and noise after a blur of {statistics.BLUR:g} px. *gradient*: median magnitude, grey levels",
         f"per pixel; *flat*: share of the pixels below {statistics.FLAT:g}. *slope*: of log power against log",
         f"frequency, {low:g} to {high:g} cycles per pixel. *corners*: Shi-Tomasi's of {levels} grey levels per",
-        "pixel or more, per 10^4 pixels. *repeated*: share of the",
-        f"{statistics.CORNERS_PER_10000:g} strongest per 10^4 pixels that are found again within 1 px when the image",
-        "is warped by a random homography. *brightness*: a tenth, half and nine tenths of the pixels are darker;",
-        f"*white*: share of {statistics.BRIGHTNESS_EDGES[-2]:g} and more. *noise*: as if white, grey levels, in the",
-        "flattest tenth of the patches of each brightness: median over brightness, lowest and highest. Compression",
-        f"(EuRoC) and resampling (KITTI, but not {_RAW}) hide noise.",
+        f"pixel or more, per 10^4 pixels. *repeated*: share of the {statistics.CORNERS_PER_10000:g} strongest per 10^4",
+        "pixels that are found again within 1 px when the image is warped by a random homography. *brightness*: a",
+        "tenth, half and nine tenths of the pixels are darker; *white*: share of",
+        f"{statistics.BRIGHTNESS_EDGES[-2]:g} and more. *noise*: as if white, grey levels, in the flattest tenth of",
+        "the patches of each brightness: median over brightness, lowest and highest. Compression (EuRoC) and",
+        f"resampling (KITTI, but not {_RAW}) hide noise.",
         "",
         f"| set | images | gradient | flat % | slope | corners {levels} | repeated % | brightness | white % | noise |",
         "|---|" + "---:|" * 9,

@@ -44,11 +44,11 @@ def generate(rng: np.random.Generator, wish: Wish) -> Episode:
     elevation, azimuth = np.deg2rad(rng.uniform(25, 70)), rng.uniform(0, 2 * np.pi)
     sun = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
     lights = Lights(
-        ambient=float(rng.uniform(0.3, 0.5)),
-        sun=float(rng.uniform(0.5, 1.0)),
+        ambient=float(rng.uniform(0.2, 0.4)),
+        sun=float(rng.uniform(0.6, 1.2)),
         sun_direction=(float(sun[0]), float(sun[1]), float(sun[2])),
     )
-    return Episode(Scene(tuple(bodies), tuple(hall.palette.materials), lights, sky=float(rng.uniform(0.6, 0.9))), path)
+    return Episode(Scene(tuple(bodies), tuple(hall.palette.materials), lights, sky=float(rng.uniform(0.8, 2.2))), path)
 
 
 class Hall:

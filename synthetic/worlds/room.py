@@ -53,7 +53,7 @@ def generate(rng: np.random.Generator, wish: Wish) -> Episode:
     _lay_floor(furniture, size)
     _fill_middle(furniture, size, free)
     direction = _triple(rng.uniform((-0.8, -0.8, 0.7), (0.8, 0.8, 1.2)))
-    lights = Lights(rng.uniform(0.3, 0.55), rng.uniform(0.25, 0.7), direction, shadows=bool(rng.random() < 0.85))
+    lights = Lights(rng.uniform(0.2, 0.45), rng.uniform(0.3, 0.9), direction, shadows=bool(rng.random() < 0.85))
     path = _carry(rng, wish, free)
     if wish.movers > 0:
         models = [_passer_by(furniture) for _ in range(1 if wish.movers < 0.15 else int(rng.integers(1, 4)))]

@@ -41,9 +41,9 @@ def generate(rng: np.random.Generator, wish: Wish) -> Episode:
     elevation, azimuth = np.deg2rad(rng.uniform(20, 70)), rng.uniform(0, 2 * np.pi)
     sun = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
     lights = Lights(
-        ambient=float(rng.uniform(0.3, 0.5)), sun=float(rng.uniform(0.6, 1.1)), sun_direction=tuple(sun.tolist())
+        ambient=float(rng.uniform(0.2, 0.4)), sun=float(rng.uniform(0.7, 1.3)), sun_direction=tuple(sun.tolist())
     )
-    scene = Scene(tuple(bodies), tuple(palette.materials), lights, sky=float(rng.uniform(0.6, 0.9)))
+    scene = Scene(tuple(bodies), tuple(palette.materials), lights, sky=float(rng.uniform(0.8, 2.2)))
     return Episode(scene, path)
 
 
