@@ -10,8 +10,9 @@ DATA := $(or $(SIGMASLAM_DATA),$(wildcard ../shared/data))
 demo: $(VENV)/.runtime
 	$(VENV)/bin/sigmaslam demo
 
+# One process a core, one thread each.
 test: $(VENV)/.dev
-	SIGMASLAM_DATA="$(DATA)" $(VENV)/bin/python -m pytest
+	OMP_NUM_THREADS=1 SIGMASLAM_DATA="$(DATA)" $(VENV)/bin/python -m pytest --numprocesses auto --dist loadscope
 
 test-slow: $(VENV)/.dev
 	SIGMASLAM_DATA="$(DATA)" $(VENV)/bin/python -m pytest -m slow

@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from sigmaslam.camera import CameraModel
 from sigmaslam.synthetic.renderer import Renderer
 from sigmaslam.synthetic.scene import Scene, Texture
-from sigmaslam.synthetic.shading import Samples, meet
 from sigmaslam.synthetic.visibility import Eye
 from sigmaslam.synthetic.worlds import colon, organ, room, tool
 from sigmaslam.synthetic.worlds.episode import MOTIONS, Episode, Wish
@@ -47,9 +46,9 @@ def look(renderer: Renderer, poses: np.ndarray, times: np.ndarray, focal: float)
     view, v, u = np.mgrid[: len(times), :30, :40].reshape(3, -1)
     facet = sight.facet.reshape(-1)
     hit = facet >= 0
-    places = torch.from_numpy(np.stack([u, v], axis=-1).astype(np.float64))
+    places = torch.from_numpy(np.stack([u, v]).astype(np.float64))
     depth = torch.full(facet.shape, torch.inf, dtype=torch.float64)
-    depth[hit] = meet(sight, Samples(torch.from_numpy(view)[hit], facet[hit], places[hit], 1.0)).depth
+    depth[hit] = 1.0 / sight.evaluate(torch.from_numpy(view)[hit], facet[hit], places[:, hit])[2]
     body = torch.where(hit, renderer.body[facet.clamp_min(0)], -1)
     return depth.reshape(-1, 30, 40).numpy(), body.reshape(-1, 30, 40).numpy()
 

@@ -63,9 +63,9 @@ def test_nothing_is_nearer_than_0_3_m(shown: tuple[str, Episode, Renderer]):
         T[k, :3, :3] = T[k, :3, :3] @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
     sight = renderer.look(eye, T, times)
     view, v, u = (sight.facet >= 0).nonzero(as_tuple=True)
-    places = torch.stack([u, v], dim=-1).double()
-    depth = 1.0 / sight.evaluate(view, sight.facet[view, v, u], places)[:, 2]
-    assert float((depth * eye.rays(places).norm(dim=-1)).min()) > 0.3
+    places = torch.stack([u, v]).double()
+    depth = 1.0 / sight.evaluate(view, sight.facet[view, v, u], places)[2]
+    assert float((depth * eye.rays(places).norm(dim=0)).min()) > 0.3
 
 
 def test_movers_cover_about_the_wished_share(shown: tuple[str, Episode, Renderer]):
@@ -98,9 +98,9 @@ def test_the_lane_is_free_and_the_camera_is_1_65_m_above_it(shown: tuple[str, Ep
     down = episode.path.poses(times[::80])
     down[:, :3, :3] = np.diag([1.0, -1.0, -1.0])
     sight = renderer.look(Eye(CameraModel(3, 3, 300.0, 300.0, 1.0, 1.0)), down, times[::80])
-    places = torch.ones(len(down), 2, dtype=torch.float64)
+    places = torch.ones(2, len(down), dtype=torch.float64)
     view = torch.arange(len(down))
-    height = 1.0 / sight.evaluate(view, sight.resolve(view, places), places)[:, 2]
+    height = 1.0 / sight.evaluate(view, sight.resolve(view, places), places)[2]
     assert height.numpy() == pytest.approx(1.65, abs=0.1)
 
 
