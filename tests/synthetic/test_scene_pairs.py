@@ -1,0 +1,91 @@
+"""Pairs of 3D scenes as a stream; the worlds themselves are tested elsewhere, here a small one stands for all."""
+
+import cv2
+import numpy as np
+import pytest
+from small_worlds import camera_pose, small_scene
+
+from sigmaslam.synthetic import scene_pairs
+from sigmaslam.synthetic.paths import Path
+from sigmaslam.synthetic.scene_pairs import ScenePair, ScenePairs
+from sigmaslam.synthetic.sensor import Sensor
+from sigmaslam.synthetic.worlds.episode import Episode, Wish
+
+
+def small_world(rng: np.random.Generator, wish: Wish) -> Episode:
+    poses = np.stack([camera_pose((0.1 * k, 0.3 * np.sin(k), 1.2 + 0.05 * rng.random())) for k in range(9)])
+    return Episode(small_scene(), Path.from_poses(np.linspace(0, wish.duration, 9), poses))
+
+
+@pytest.fixture(autouse=True)
+def one_small_world(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scene_pairs, "DOMAINS", {"small": small_world})
+    monkeypatch.setattr(scene_pairs, "_VIEWS", 4)
+
+
+def stream(seed: int = 3) -> ScenePairs:
+    return ScenePairs(seed, 96, ("small",))
+
+
+def assert_equal(a: ScenePair, b: ScenePair) -> None:
+    np.testing.assert_array_equal(a.image0, b.image0)
+    np.testing.assert_array_equal(a.image1, b.image1)
+
+
+def test_a_pair_does_not_depend_on_what_was_asked_before() -> None:
+    forward, backward = stream(), stream()
+    indices = [0, 1, 8, 600, 1]
+    found = [forward.pair(i) for i in indices]
+    for i, pair in zip(reversed(indices), reversed(found), strict=True):
+        assert_equal(backward.pair(i), pair)
+    assert np.abs(stream(4).pair(0).image0 - found[0].image0).mean() > 1e-3
+
+
+def test_no_two_pairs_and_no_two_scenes_share_their_random_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    named, default_rng = [], np.random.default_rng
+    monkeypatch.setattr(np.random, "default_rng", lambda name=None: named.append(name) or default_rng(name))
+    monkeypatch.setattr(ScenePairs, "_views", lambda self, scene: [None] * 4)
+    monkeypatch.setattr(ScenePairs, "_shared", lambda self, a, b: 1.0)
+    monkeypatch.setattr(ScenePairs, "_photograph", lambda self, views, rng: None)
+    for seed in range(3):
+        for index in range(40):
+            stream(seed).pair(index)
+    assert len(named) == len(set(named)) == 120
+
+
+def test_neighbours_see_other_scenes_and_every_scene_is_replaced() -> None:
+    pairs = stream()
+    scenes = [pairs._scene_of(index) for index in range(4096)]
+    assert len(set(scenes[:8])) == 8
+    uses = np.bincount(scenes)
+    assert uses.max() <= scene_pairs._USES
+    # After the beginning one scene is replaced at a time, so that rendering takes its time evenly.
+    first_seen = sorted({scene: index for index, scene in reversed(list(enumerate(scenes)))}.values())
+    assert np.diff(first_seen[8:]).min() > 20
+
+
+def test_points_move_to_where_the_same_thing_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    clean = Sensor(blur=0.0, read_noise=0.0, photons_at_white=1e9)
+    monkeypatch.setattr(scene_pairs, "random_sensor", lambda rng: clean)
+    correlations, hidden = [], 0
+    pairs = stream()
+    for index in range(6):
+        pair = pairs.pair(index)
+        v, u = np.mgrid[8:88:2, 8:88:2]
+        points = np.stack([u.ravel(), v.ravel()], axis=-1).astype(float)
+        places, visible = pair.transfer(points)
+        hidden += int((~visible).sum())
+        if visible.sum() < 100:
+            continue
+        where = places[visible].astype(np.float32)
+        there = cv2.remap(pair.image1, where[:, 0], where[:, 1], cv2.INTER_LINEAR).ravel()
+        here = pair.image0[points[visible, 1].astype(int), points[visible, 0].astype(int)]
+        correlations.append(np.corrcoef(here, there)[0, 1])
+    assert len(correlations) >= 3
+    assert np.median(correlations) > 0.9
+    assert hidden > 50
+
+
+def test_an_unknown_domain_is_refused() -> None:
+    with pytest.raises(ValueError, match="unknown domains"):
+        ScenePairs(0, 96, ("moon",))
