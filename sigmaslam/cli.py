@@ -240,7 +240,7 @@ def render(
 def train(
     out: Annotated[Path, typer.Option(help="Folder for the checkpoint, the log, the weights and their card.")],
     steps: Annotated[int, typer.Option(min=1, help="Optimiser steps; about 2 a second on 2 cores.")] = 3400,
-    data: Annotated[Data, typer.Option(help="What the pairs are made of.")] = Data.mix,
+    data: Annotated[Data, typer.Option(help="What the pairs are made of.")] = Data.leaves,
     seed: Annotated[int, typer.Option(min=0, help="Seed of data, weights and sampling.")] = 0,
     workers: Annotated[int, typer.Option(min=0, help="Processes that make training pairs.")] = 1,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")] = False,

@@ -55,7 +55,7 @@ class TrainingConfig:
     """
 
     steps: int = 3400
-    data: str = "mix"
+    data: str = "leaves"
     batch_size: int = 16
     size: int = 224
     points: int = 256

@@ -63,7 +63,8 @@ def write_training_data(
     lines = [
         "# What the network should learn from",
         "",
-        f"`{command}`: {steps} steps of {_BATCH} pairs at {_SIZE}x{_SIZE} a run, {seeds} seeds a mix;",
+        f"`{command}`:",
+        f"{steps} steps of {_BATCH} pairs at {_SIZE}x{_SIZE} a run, {seeds} seeds a mix;",
         "mean and standard deviation over the seeds, percent. At most 1,024 keypoints, long side 640, mutual nearest",
         "neighbours. All runs have the same network, steps and schedule; only the data differ.",
         "",
