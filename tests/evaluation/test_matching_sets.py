@@ -83,7 +83,7 @@ def test_pairs_of_the_rendered_sequence_agree_with_its_exact_truth(demo_sequence
     assert [pair.part for pair in pairs] == ["", "", "gap1", "gap1", "gap3", "gap3"]
     found = score_pairs(load_extractor("sift"), pairs)
     assert found["rows_1"] > 0.8
-    assert found["gap1_epipolar_1"] > 0.9
+    assert found["gap1_epipolar_1"] > 0.85
     assert found["gap3_epipolar_1"] > 0.8
 
 
