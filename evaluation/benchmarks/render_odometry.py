@@ -25,7 +25,7 @@ REAL_DRIVE = "kitti_raw_0926_0039_a"
 PROFILE = "kitti_gt_trajectories/07.txt"
 """The drive whose motion the renders have, at about the speed of the real one."""
 SEEDS = (0, 1, 2)
-FRAMES = 100
+FRAMES = 70
 WIDTH, HEIGHT = 1242, 376
 LIMIT = 2.0
 """Ratio of render to real, either way, up to which the two behave alike."""
