@@ -10,6 +10,7 @@ import torch
 
 from sigmaslam.synthetic.simulation import Studio
 from sigmaslam.synthetic.truth import arrive
+from sigmaslam.synthetic.visibility import Sight
 
 _MOST_VIEWS = 200
 _FRAMES_A_VIEW = 5  # new landmarks are taken in every so many frames ...
@@ -58,23 +59,18 @@ def choose_landmarks(studio: Studio) -> Landmarks:
     return Landmarks(np.concatenate(points), seen, studio.renderer.body.cpu().numpy()[seen])
 
 
-def observe(studio: Studio, landmarks: Landmarks, frame: int) -> dict[str, Any]:
-    """Where the landmarks are seen in a frame.
+def observe(landmarks: Landmarks, left_sight: Sight, right_sight: Sight, number: int) -> dict[str, Any]:
+    """Where the landmarks are seen by view `number` of the left and of the right camera.
 
     Returns:
         landmark (n,) int64 indices of those that at least one eye sees; left, right (n, 2) float64 exact pixels;
         left_visible, right_visible (n,) bool; depth (n,) float64 z in the left camera, metres.
     """
-    simulation, renderer = studio.simulation, studio.renderer
-    time = np.array([frame / simulation.fps])
-    T_left = simulation.path.poses(time)
-    facet = torch.from_numpy(landmarks.facet).to(renderer.device)
-    points = torch.from_numpy(landmarks.points.T.copy()).to(renderer.device)
-    view = torch.zeros_like(facet)
-    seen = []
-    for eye, T in ((studio.left, T_left), (studio.right, T_left @ simulation.rig.true_right_pose)):
-        seen.append(arrive(renderer.look(eye, T, time), view, points, facet))
-    left, right = seen
+    device = left_sight.T_view_mover.device
+    facet = torch.from_numpy(landmarks.facet).to(device)
+    points = torch.from_numpy(landmarks.points.T.copy()).to(device)
+    view = torch.full_like(facet, number)
+    left, right = (arrive(sight, view, points, facet) for sight in (left_sight, right_sight))
     index = (left.visible | right.visible).nonzero().squeeze(1)
     return {
         "landmark": index.cpu().numpy(),

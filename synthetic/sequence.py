@@ -118,10 +118,13 @@ def write_frames(out: Path, studio: Studio, landmarks: Landmarks, truth: str, nu
     batch = 1 if studio.renderer.device.type == "cpu" else _CHUNK
     for start in range(0, len(numbers), batch):
         part = numbers[start : start + batch]
-        for number, frame in zip(part, studio.frames(np.array(part)), strict=True):
+        left, right = studio.views(np.array(part))
+        frames = studio.frames(np.array(part), (left, right))
+        for view, (number, frame) in enumerate(zip(part, frames, strict=True)):
             for path, image in zip(image_paths(out, studio.simulation, number), (frame.left, frame.right), strict=True):
                 _write_image(path, image)
-            _save(_truth_path(out, number), _truth_of(studio, landmarks, frame, truth, number))
+            tracks = observe(landmarks, left.sight, right.sight, view)
+            _save(_truth_path(out, number), _truth_of(tracks, frame, truth))
     return len(numbers)
 
 
@@ -219,8 +222,8 @@ def _work(numbers: list[int]) -> int:
     return _crew.film(numbers)
 
 
-def _truth_of(studio: Studio, landmarks: Landmarks, frame: Frame, truth: str, number: int) -> dict[str, np.ndarray]:
-    tracks = {f"track_{key}": value for key, value in observe(studio, landmarks, number).items()}
+def _truth_of(observed: dict[str, np.ndarray], frame: Frame, truth: str) -> dict[str, np.ndarray]:
+    tracks = {f"track_{key}": value for key, value in observed.items()}
     if truth == "sparse":
         return tracks
     images = {key: value for key, value in asdict(frame).items() if key not in ("left", "right")}

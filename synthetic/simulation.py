@@ -206,16 +206,28 @@ class Studio:
         self.renderer = Renderer(simulation.scene, device)
         self.left, self.right = Eye(simulation.rig.left), Eye(simulation.rig.true_right)
 
-    def frames(self, numbers: np.ndarray) -> list[Frame]:
-        """The frames of these numbers; on a GPU it pays to ask for many at once."""
+    def views(self, numbers: np.ndarray) -> tuple[Views, Views]:
+        """What the left and the right camera see in the frames of these numbers, before the sensor."""
         simulation, renderer = self.simulation, self.renderer
         times = numbers / simulation.fps
-        T_left, T_left_next = (simulation.path.poses(t) for t in (times, times + 1.0 / simulation.fps))
-        T_left_right = simulation.rig.true_right_pose
+        T_left = simulation.path.poses(times)
         sunlight = renderer.sunlight(T_left, times)
         left = renderer.render(self.left, T_left, times, sunlight=sunlight)
-        right = renderer.render(self.right, T_left @ T_left_right, times, T_left, sunlight)
-        later = times + 1.0 / simulation.fps
+        T_right = T_left @ simulation.rig.true_right_pose
+        return left, renderer.render(self.right, T_right, times, T_left, sunlight)
+
+    def frames(self, numbers: np.ndarray, views: tuple[Views, Views] | None = None) -> list[Frame]:
+        """The frames of these numbers; on a GPU it pays to ask for many at once.
+
+        Args:
+            numbers: (V,) of the frames.
+            views: theirs from `views`, made here unless given.
+        """
+        simulation, renderer = self.simulation, self.renderer
+        left, right = views or self.views(numbers)
+        later = numbers / simulation.fps + 1.0 / simulation.fps
+        T_left_next = simulation.path.poses(later)
+        T_left_right = simulation.rig.true_right_pose
         motion, seen_next = flow(left, renderer.look(self.left, T_left_next, later))
         stereo, seen_right = flow(left, right.sight)
         blurred = simulation.sensor.shutter > 0
@@ -226,8 +238,8 @@ class Studio:
             depth = left.depth[k].cpu().numpy()
             motions = (motion[k].cpu().numpy(), right_motion[k].cpu().numpy() if blurred else None)
             eyes = []
-            for eye, (views, field) in enumerate(zip((left, right), motions, strict=True)):
-                eyes.append(self._expose(views, k, int(number), eye, field))
+            for eye, (seen, field) in enumerate(zip((left, right), motions, strict=True)):
+                eyes.append(self._expose(seen, k, int(number), eye, field))
             result.append(
                 Frame(
                     eyes[0],
