@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from sigmaslam.camera import CameraModel
 from sigmaslam.files import atomic_write_text
 from sigmaslam.synthetic.simulation import Simulation
+from sigmaslam.trajectory import Trajectory, write_kitti
 
 _FIRST_STAMP = 1_600_000_000_000_000_000  # nanoseconds; EuRoC's stamps count from 1970
 _DISTORTION_NAMES = {"none": "radial-tangential", "radtan": "radial-tangential", "equidistant": "equidistant"}
@@ -47,7 +48,7 @@ def _write_kitti(out: Path, simulation: Simulation, poses: np.ndarray) -> None:
     atomic_write_text(out / "times.txt", "".join(f"{t:.6e}\n" for t in simulation.times))
     relative = np.linalg.inv(poses[0]) @ poses
     relative[0] = np.eye(4)
-    atomic_write_text(out / "poses.txt", "".join(f"{_row(pose[:3])}\n" for pose in relative))
+    write_kitti(out / "poses.txt", Trajectory(simulation.times, relative))
 
 
 def _write_euroc(root: Path, simulation: Simulation, poses: np.ndarray) -> None:

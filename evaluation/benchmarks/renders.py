@@ -22,9 +22,9 @@ from sigmaslam.evaluation.benchmarks import render_odometry as odometry
 from sigmaslam.evaluation.benchmarks import render_speed as speed
 from sigmaslam.evaluation.benchmarks.image_statistics import ImageSet
 from sigmaslam.evaluation.benchmarks.page import write_page
+from sigmaslam.evaluation.matching.photographs import read_grey
 from sigmaslam.figures import BLACK, GREY, SERIES, save_png, style_axes
 from sigmaslam.readers import open_sequence
-from sigmaslam.readers.images import read_image
 
 _RAW = "KITTI raw"  # before it was rectified: what the sensor itself does
 _SET12, _KITTI, _EUROC = "denoising/Set12", odometry.REAL_DRIVE, "euroc_v1_01_keyframes_a"
@@ -126,8 +126,8 @@ def summarize_all(data: Path, drives: Sequence[Path]) -> dict[str, ImageSet]:
     images = {
         "KITTI": _lefts(data / _KITTI, _KITTI_STEP),
         "EuRoC": _lefts(data / _EUROC, _EUROC_STEP),
-        "Set12": [_grey(path) for path in sorted((data / _SET12).glob("*.png"))],
-        _RAW: [_grey(path) for path in sorted((data / _KITTI / "raw_unrectified").rglob("*.png"))],
+        "Set12": [read_grey(path) for path in sorted((data / _SET12).glob("*.png"))],
+        _RAW: [read_grey(path) for path in sorted((data / _KITTI / "raw_unrectified").rglob("*.png"))],
         "street": [image for drive in drives for image in _lefts(drive, _DRIVE_STEP)],
         **_render_presets([*(name for name, _ in PAIRS if name not in ("street", "leaves")), *ALONE]),
         "leaves": _leaves(),
@@ -321,11 +321,6 @@ def _odometry_section(real: odometry.Drive, renders: Sequence[odometry.Drive]) -
 
 def _lefts(folder: Path, step: int) -> list[np.ndarray]:
     return [frame.left for frame in open_sequence(folder).frames() if frame.index % step == 0]
-
-
-def _grey(path: Path) -> np.ndarray:
-    image = read_image(path)
-    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
 
 
 def _leaves() -> list[np.ndarray]:

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
-import cv2
 import numpy as np
 
 from sigmaslam.errors import InputError
 from sigmaslam.frontend.classical import OrbDetector, SiftDetector
+from sigmaslam.frontend.learned import Graph, extract
 from sigmaslam.frontend.types import Features
 from sigmaslam.session import OnnxGraph
 
 MAX_KEYPOINTS = 1024
 CLASSICAL = ("sift", "orb")
-_SIZE_MULTIPLE = 16
-_BORDER = 8
-
-Graph = Callable[[Mapping[str, np.ndarray]], list[np.ndarray]]
 
 
 class Extractor(Protocol):
@@ -48,14 +44,8 @@ class LearnedExtractor:
 
     def __call__(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Keypoints and descriptors of an (H, W) uint8 image."""
-        height, width = image.shape
-        bottom, right = -height % _SIZE_MULTIPLE, -width % _SIZE_MULTIPLE
-        padded = cv2.copyMakeBorder(image, 0, bottom, 0, right, cv2.BORDER_REPLICATE)
-        keypoints, scores, descriptors = self._graph({"image": padded[None, None].astype(np.float32) / 255.0})
-        # As at run time: the seam of the padding may look like corners.
-        inside = (keypoints[:, 0] < width - _BORDER) & (keypoints[:, 1] < height - _BORDER)
-        kept = np.flatnonzero((scores > 0) & inside)[:MAX_KEYPOINTS]
-        return keypoints[kept], descriptors[kept]
+        found = extract(self._graph, image, MAX_KEYPOINTS)
+        return found.keypoints, found.descriptors
 
 
 def load_extractor(name: str) -> Extractor:

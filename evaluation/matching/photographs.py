@@ -21,7 +21,7 @@ def set12(folder: Path) -> list[ImagePair]:
     """The 12 photographs, each under 3 random warps that are the same in every run."""
     pairs = []
     for number in range(1, 13):
-        photograph = _read_grey(folder / "Set12" / f"{number:02d}.png")
+        photograph = read_grey(folder / "Set12" / f"{number:02d}.png")
         for warp in range(_WARPS):
             pairs.append(warped_pair(photograph, np.random.default_rng((_SEED, number, warp)), f"{number:02d} {warp}"))
     return pairs
@@ -92,7 +92,7 @@ def fountain(folder: Path) -> list[ImagePair]:
     numbers = ("0002", "0003", "0004", "0005")
     images, cameras = {}, {}
     for number in numbers:
-        images[number], S = resize(_read_grey(folder / "images" / f"{number}.jpg"))
+        images[number], S = resize(read_grey(folder / "images" / f"{number}.jpg"))
         rows = _read_numbers(folder / "gt_dense_cameras" / f"{number}.jpg.camera", 26)
         # K, distortion, R (camera to world), centre, size: x_camera = R^T (X - C).
         T_world_camera = np.eye(4)
@@ -107,17 +107,17 @@ def fountain(folder: Path) -> list[ImagePair]:
 
 
 def _homographies(folder: Path, image_name: str, homography_name: str) -> list[ImagePair]:
-    first, S0 = resize(_read_grey(folder / image_name.format(1)))
+    first, S0 = resize(read_grey(folder / image_name.format(1)))
     pairs = []
     for number in range(2, 7):
-        other, S1 = resize(_read_grey(folder / image_name.format(number)))
+        other, S1 = resize(read_grey(folder / image_name.format(number)))
         H = _read_numbers(folder / homography_name.format(number), 9).reshape(3, 3)
         pairs.append(ImagePair(f"1 {number}", first, other, Homography(S1 @ H @ np.linalg.inv(S0))))
     return pairs
 
 
 def _disparity_pair(name: str, left: Path, right: Path, disparity: np.ndarray) -> ImagePair:
-    (image0, S0), (image1, S1) = (resize(_read_grey(path)) for path in (left, right))
+    (image0, S0), (image1, S1) = (resize(read_grey(path)) for path in (left, right))
     return ImagePair(name, image0, image1, Disparity(disparity, S0, S1))
 
 
@@ -153,7 +153,8 @@ def _view(photograph: np.ndarray, H: np.ndarray, rng: np.random.Generator) -> np
     return np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
-def _read_grey(path: Path) -> np.ndarray:
+def read_grey(path: Path) -> np.ndarray:
+    """An image file as (H, W) grey."""
     image = read_image(path)
     return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
 

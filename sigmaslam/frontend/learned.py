@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+
 import cv2
 import numpy as np
 
 from sigmaslam.frontend.types import Features
 from sigmaslam.session import OnnxGraph, shipped_weights
+
+Graph = Callable[[Mapping[str, np.ndarray]], list[np.ndarray]]
+"""What runs the network: an `OnnxGraph`, or the same network in torch."""
 
 _SIZE_MULTIPLE = 16
 _BORDER = 8
@@ -26,17 +31,29 @@ class LearnedDetector:
         if backend == "torch":
             from sigmaslam.models.torch_runtime import TorchFeatures
 
-            self._graph: OnnxGraph | TorchFeatures = TorchFeatures(shipped_weights("features.safetensors"))
+            self._graph: Graph = TorchFeatures(shipped_weights("features.safetensors"))
         else:
             self._graph = OnnxGraph(shipped_weights("features.onnx"), threads)
 
     def __call__(self, image: np.ndarray) -> Features:
         """Features of an (H, W) uint8 image of any size from 96 pixels."""
-        height, width = image.shape
-        bottom, right = -height % _SIZE_MULTIPLE, -width % _SIZE_MULTIPLE
-        padded = cv2.copyMakeBorder(image, 0, bottom, 0, right, cv2.BORDER_REPLICATE)
-        keypoints, scores, descriptors = self._graph({"image": padded[None, None].astype(np.float32) / 255.0})
-        # The padding has no corners of its own, but its seam may.
-        inside = (keypoints[:, 0] < width - _BORDER) & (keypoints[:, 1] < height - _BORDER)
-        kept = np.flatnonzero((scores > 0) & inside)[: self._max_keypoints]
-        return Features(keypoints[kept], descriptors[kept], scores[kept])
+        return extract(self._graph, image, self._max_keypoints)
+
+
+def extract(graph: Graph, image: np.ndarray, max_keypoints: int) -> Features:
+    """Features of an (H, W) uint8 image by a graph that is called as the exported one is.
+
+    Args:
+        graph: takes {"image": (1, 1, H, W) float32 in [0, 1]} and returns keypoints (N, 2), scores (N,), best first,
+            and descriptors (N, C).
+        image: of any size from 96 pixels.
+        max_keypoints: how many of the best are kept.
+    """
+    height, width = image.shape
+    bottom, right = -height % _SIZE_MULTIPLE, -width % _SIZE_MULTIPLE
+    padded = cv2.copyMakeBorder(image, 0, bottom, 0, right, cv2.BORDER_REPLICATE)
+    keypoints, scores, descriptors = graph({"image": padded[None, None].astype(np.float32) / 255.0})
+    # The padding has no corners of its own, but its seam may.
+    inside = (keypoints[:, 0] < width - _BORDER) & (keypoints[:, 1] < height - _BORDER)
+    kept = np.flatnonzero((scores > 0) & inside)[:max_keypoints]
+    return Features(keypoints[kept], descriptors[kept], scores[kept])
