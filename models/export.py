@@ -20,12 +20,11 @@ from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.files import atomic_path, atomic_write_text
 from sigmaslam.filters.lie import exp_se3
 from sigmaslam.filters.stereo_pose import STATE_SIZE, Innovate, Predict, Update
-from sigmaslam.models.extractor import FeatureExtractor
+from sigmaslam.models.extractor import EXTRACTOR_SIZE_MULTIPLE, FeatureExtractor
 from sigmaslam.models.network import FeatureNetwork
 from sigmaslam.session import OnnxGraph
 from sigmaslam.synthetic.textures import dead_leaves
 
-MAX_KEYPOINTS = 2048
 _OPSET = 20
 # ONNX Runtime and torch may order sums differently; more than this is a wrong graph.
 _FEATURE_TOLERANCE = 1e-4
@@ -41,7 +40,7 @@ class _Graph:
     checked: tuple[Tensor, ...]
     inputs: list[str]
     outputs: list[str]
-    dynamic: tuple[dict[int, Any], ...]
+    dynamic: tuple[dict[int, Any] | None, ...]
 
 
 def load_network(weights: Path) -> FeatureNetwork:
@@ -62,18 +61,19 @@ def load_network(weights: Path) -> FeatureNetwork:
 
 def export_features(weights: Path, out: Path) -> float:
     """Writes the feature graph and returns the largest difference of descriptors or keypoints from torch."""
-    extractor = FeatureExtractor(load_network(weights), MAX_KEYPOINTS).eval()
-    height = torch.export.Dim("height_sixteenths", min=5, max=512)
-    width = torch.export.Dim("width_sixteenths", min=5, max=512)
+    extractor = FeatureExtractor(load_network(weights)).eval()
+    height = torch.export.Dim("height_blocks", min=3, max=256)
+    width = torch.export.Dim("width_blocks", min=3, max=256)
     rng = np.random.default_rng(0)
-    image, other = (_noisy_texture(rng, shape) for shape in ((240, 320), (176, 400)))
+    image, other = (_noisy_texture(rng, shape) for shape in ((256, 320), (192, 416)))
+    multiple = EXTRACTOR_SIZE_MULTIPLE
     graph = _Graph(
         extractor,
-        (image,),
-        (other,),
-        ["image"],
-        ["keypoints", "scores", "descriptors"],
-        ({2: 16 * height, 3: 16 * width},),
+        (image, torch.tensor(512)),
+        (other, torch.tensor(700)),
+        ["image", "count"],
+        ["keypoints", "scores", "descriptors", "sigma"],
+        ({2: multiple * height, 3: multiple * width}, None),
     )
     return _export(graph, out, _FEATURE_TOLERANCE, _feature_difference)
 
@@ -255,7 +255,7 @@ def _export(
         )
         assert program is not None
         program.save(path, external_data=False)
-        feed = {name: value.numpy() for name, value in zip(graph.inputs, graph.checked, strict=True)}
+        feed = {name: np.asarray(value) for name, value in zip(graph.inputs, graph.checked, strict=True)}
         found = OnnxGraph(path)(feed)
         with torch.no_grad():
             expected = [value.numpy() for value in graph.module(*graph.checked)]

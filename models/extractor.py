@@ -1,45 +1,65 @@
-"""From an image to keypoints, scores and descriptors: the graph that is exported and shipped."""
+"""From an image to keypoints, scores, descriptors and sigmas: the graph that is exported and shipped."""
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from sigmaslam.models.corners import corner_response, corner_scores, select_peaks
+from sigmaslam.models.detector import BORDER, detect, to_cells, to_half_cells
 from sigmaslam.models.network import FeatureNetwork, sample_map
 
-# Twice as many corners are described as are kept; the learned quality decides which.
-CANDIDATES_PER_KEYPOINT = 2
+EXTRACTOR_SIZE_MULTIPLE = 32
+"""Sides of the image: the network's multiple, at half size too."""
+# Twice as many peaks are described as are kept; the learned quality decides which.
+_CANDIDATES_PER_KEYPOINT = 2
+# Share of the keypoints that comes from the image at half size: they match where the scale differs by 2 and more, but
+# lie less exactly.
+_HALF_SHARE = 4
 
 
 class FeatureExtractor(nn.Module):
-    """Keypoints with descriptors, best first.
+    """Keypoints of two scales with descriptors, best first.
+
+    The same detector and network run on the image and on the image at half its size: three keypoints in four come
+    from the first, one from the second.
 
     Args:
-        network: trained descriptors and quality.
-        max_keypoints: number of keypoints returned for every image.
+        network: trained descriptors, quality and log-sigma.
 
     Shapes:
-        image (1, 1, H, W) float32 in [0, 1], H and W multiples of 16 and H W >= 2 max_keypoints -> keypoints (N, 2)
-        pixel coordinates (u, v); scores (N,), zero where the image has fewer corners; unit descriptors (N, 64).
+        image (1, 1, H, W) float32 in [0, 1], H and W multiples of 32; count, the number N of keypoints, scalar int64,
+        at most H W / 4 -> keypoints (N, 2) pixel coordinates (u, v); scores (N,), zero where the image has fewer;
+        unit descriptors (N, C); sigma (N,), standard deviation of a keypoint's place per axis, pixels.
     """
 
-    def __init__(self, network: FeatureNetwork, max_keypoints: int) -> None:
+    def __init__(self, network: FeatureNetwork) -> None:
         super().__init__()
         self.network = network
-        self.max_keypoints = max_keypoints
 
-    def forward(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, image: Tensor, count: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """One image at a time: batches gain nothing on a CPU."""
-        response = corner_response(image)
-        candidates, strength = select_peaks(
-            corner_scores(response), response, CANDIDATES_PER_KEYPOINT * self.max_keypoints
-        )
-        dense, logits = self.network(image)
-        quality = sample_map(logits, candidates).squeeze(-1).sigmoid()
-        # Relative strength of the corner and learned quality count alike; a corner of strength zero is no corner.
+        total = count.item()
+        torch._check(total >= 4)
+        torch._check(total <= image.shape[2] * image.shape[3] // 8)
+        half = total // _HALF_SHARE
+        full_scale = self._level(to_cells(image), total - half)
+        half_scale = self._level(to_half_cells(image), half)
+        keypoints = torch.cat([full_scale[0], 2.0 * half_scale[0] + 0.5])
+        sigma = torch.cat([full_scale[3], 2.0 * half_scale[3]])
+        scores, order = torch.cat([full_scale[1], half_scale[1]]).sort(descending=True)
+        descriptors = torch.cat([full_scale[2], half_scale[2]])[order]
+        return keypoints[order], scores, descriptors, sigma[order]
+
+    def _level(self, cells: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        candidates, strength = detect(cells, _CANDIDATES_PER_KEYPOINT * count)
+        maps = self.network(cells)
+        stride = self.network.stride
+        quality = sample_map(maps.quality, candidates, stride).squeeze(-1).sigmoid()
+        # Relative strength of the blob and learned quality count alike; a blob of strength zero is none.
         strength = strength / strength.amax(dim=1, keepdim=True).clamp_min(1e-12)
-        scores, order = (strength.sqrt() * quality).topk(self.max_keypoints, dim=1)
+        scores, order = (strength.sqrt() * quality).topk(count, dim=1)
         keypoints = candidates.gather(1, order.unsqueeze(-1).expand(-1, -1, 2))
-        descriptors = functional.normalize(sample_map(dense, keypoints), dim=-1)
-        return keypoints[0], scores[0], descriptors[0]
+        descriptors = functional.normalize(sample_map(maps.descriptors, keypoints, stride), dim=-1)
+        sigma = sample_map(maps.log_sigma, keypoints, stride).squeeze(-1).exp()
+        return keypoints[0], scores[0], descriptors[0], sigma[0]

@@ -1,54 +1,84 @@
-"""The correspondence network: one descriptor and one quality per 8x8 cell, interpolated in between."""
+"""The correspondence network: a descriptor, a quality and a log-sigma per 8x8 pixels, interpolated in between."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from sigmaslam.models.detector import CELL
+
 DESCRIPTOR_SIZE = 64
 STRIDE = 8
-# The network halves four times; images are padded to a multiple of this before it.
 SIZE_MULTIPLE = 16
+"""The network halves four times; images are padded to a multiple of this before it."""
+
+
+class FeatureMaps(NamedTuple):
+    """What the network says of an image.
+
+    Attributes:
+        descriptors: (B, C, H/stride, W/stride), not of unit length.
+        quality: (B, 1, H/stride, W/stride) logits that a keypoint there will be matched rightly.
+        log_sigma: (B, 1, H/stride, W/stride) logarithm of the standard deviation of a keypoint's place per axis, pixels.
+    """
+
+    descriptors: Tensor
+    quality: Tensor
+    log_sigma: Tensor
 
 
 class FeatureNetwork(nn.Module):
-    """Dense descriptors and match quality from a grey image.
+    """Dense descriptors, quality and log-sigma from a grey image.
 
-    A PixelUnshuffle(4) stem keeps every convolution at quarter resolution or below, where the time goes; a 1/16
-    branch widens the receptive field. Channel counts are multiples of 16 so that int8 can win later.
+    Nothing is computed above quarter resolution, where the time would go; a 1/16 branch widens the receptive field.
+    Channel counts are multiples of 16, which ONNX Runtime's kernels want.
+
+    Args:
+        descriptor_size: channels of the descriptors.
+        stride: of the maps: 4, 8 or 16.
 
     Shapes:
-        image (B, 1, H, W) float32, H and W multiples of 16 -> descriptors (B, 64, H/8, W/8), quality logits
-        (B, 1, H/8, W/8). Cell (i, j) is centred on pixel (8 i + 3.5, 8 j + 3.5).
+        cells (B, 16, H/4, W/4) of an image in [0, 1], H and W multiples of 16 -> FeatureMaps. With stride 8 cell
+        (i, j) of a map is centred on pixel (8 i + 3.5, 8 j + 3.5).
     """
 
-    def __init__(self) -> None:
+    def __init__(self, descriptor_size: int = DESCRIPTOR_SIZE, stride: int = STRIDE) -> None:
         super().__init__()
-        self.stem = nn.Sequential(nn.PixelUnshuffle(4), _block(16, 32), _block(32, 32))
-        self.eighth = nn.Sequential(_block(32, 48, stride=2), _block(48, 48), _block(48, 48))
-        self.sixteenth = nn.Sequential(_block(48, 64, stride=2), _block(64, 64), _block(64, 48))
+        self.descriptor_size, self.stride = descriptor_size, stride
+        self.stem = _block(CELL * CELL, 32)
+        self.eighth = nn.Sequential(_block(32, 48, stride=2), _block(48, 48))
+        self.sixteenth = nn.Sequential(_block(48, 64, stride=2), _block(64, 64), _block(64, 64), _block(64, 48))
+        self.lateral = nn.Conv2d(32, 48, 1) if stride == 4 else None
         self.merge = _block(48, 64)
-        self.descriptor = nn.Conv2d(64, DESCRIPTOR_SIZE, 1)
-        self.quality = nn.Conv2d(64, 1, 1)
+        self.head = nn.Conv2d(64, descriptor_size + 2, 1)
 
-    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Descriptors (not yet of unit length) and quality logits."""
-        fine = self.eighth(self.stem(normalize_image(image)))
-        coarse = functional.interpolate(self.sixteenth(fine), scale_factor=2.0, mode="bilinear", align_corners=False)
-        merged = self.merge(fine + coarse)
-        return self.descriptor(merged), self.quality(merged)
+    def forward(self, cells: Tensor) -> FeatureMaps:
+        """Maps of a batch of images."""
+        quarter = self.stem(normalize_image(cells))
+        fine = self.eighth(quarter)
+        merged = self.sixteenth(fine)
+        if self.stride < 16:
+            merged = fine + _doubled(merged)
+        if self.lateral is not None:
+            merged = self.lateral(quarter) + _doubled(merged)
+        maps = self.head(self.merge(merged))
+        return FeatureMaps(*maps.split([self.descriptor_size, 1, 1], dim=1))
 
 
 def normalize_image(image: Tensor) -> Tensor:
     """Zero mean and unit standard deviation per image, so that gain and offset of the exposure drop out."""
-    centred = image - image.mean(dim=(2, 3), keepdim=True)
-    variance = (centred * centred).mean(dim=(2, 3), keepdim=True)
+    centred = image - image.mean(dim=(1, 2, 3), keepdim=True)
+    variance = (centred * centred).mean(dim=(1, 2, 3), keepdim=True)
     return centred * torch.rsqrt(variance.clamp_min(1e-6))
 
 
 def sample_map(features: Tensor, keypoints: Tensor, stride: int = STRIDE) -> Tensor:
-    """Bilinear samples of a strided map at pixel positions.
+    """Bilinear samples of a strided map at pixel positions; outside the map its border is repeated.
+
+    Written with gathers, which ONNX Runtime runs several times faster than its GridSample.
 
     Args:
         features: (B, C, H/stride, W/stride).
@@ -56,12 +86,26 @@ def sample_map(features: Tensor, keypoints: Tensor, stride: int = STRIDE) -> Ten
     Returns:
         (B, N, C).
     """
-    height, width = features.shape[-2] * stride, features.shape[-1] * stride
-    u = (2.0 * keypoints[..., 0] + 1.0) / width - 1.0
-    v = (2.0 * keypoints[..., 1] + 1.0) / height - 1.0
-    grid = torch.stack([u, v], dim=-1).unsqueeze(2)
-    sampled = functional.grid_sample(features, grid, mode="bilinear", padding_mode="border", align_corners=False)
-    return sampled.squeeze(-1).transpose(1, 2)
+    height, width = features.shape[-2:]
+    rows = features.flatten(2).transpose(1, 2)
+    u = ((keypoints[..., 0] + 0.5) / stride - 0.5).clamp(0, width - 1)
+    v = ((keypoints[..., 1] + 0.5) / stride - 0.5).clamp(0, height - 1)
+    left, top = u.floor(), v.floor()
+    du, dv = (u - left).unsqueeze(-1), (v - top).unsqueeze(-1)
+    left, top = left.long(), top.long()
+    right, bottom = (left + 1).clamp_max(width - 1), (top + 1).clamp_max(height - 1)
+
+    def at(column: Tensor, row: Tensor) -> Tensor:
+        index = (row * width + column).unsqueeze(-1).expand(-1, -1, rows.shape[2])
+        return rows.gather(1, index)
+
+    above = (1 - du) * at(left, top) + du * at(right, top)
+    below = (1 - du) * at(left, bottom) + du * at(right, bottom)
+    return (1 - dv) * above + dv * below
+
+
+def _doubled(features: Tensor) -> Tensor:
+    return functional.interpolate(features, scale_factor=2.0, mode="bilinear", align_corners=False)
 
 
 def _block(channels_in: int, channels_out: int, stride: int = 1) -> nn.Sequential:

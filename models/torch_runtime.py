@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from sigmaslam.filters.stereo_pose import Innovate, Predict, Update
-from sigmaslam.models.export import MAX_KEYPOINTS, load_network
+from sigmaslam.models.export import load_network
 from sigmaslam.models.extractor import FeatureExtractor
 
 
@@ -31,7 +31,7 @@ class TorchFeatures(TorchModule):
     """The feature extractor from its weights."""
 
     def __init__(self, weights: Path) -> None:
-        super().__init__(FeatureExtractor(load_network(weights), MAX_KEYPOINTS))
+        super().__init__(FeatureExtractor(load_network(weights)))
 
 
 def filter_module(name: str) -> TorchModule:

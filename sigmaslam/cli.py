@@ -92,6 +92,7 @@ class Data(StrEnum):
     patterns = "patterns"
     scenes = "scenes"
     mix = "mix"
+    blend = "blend"
 
 
 class Benchmark(StrEnum):

@@ -48,7 +48,7 @@ class TrainingConfig:
         points: corners per image in the loss.
         learning_rate: peak of the one-cycle schedule.
         weight_decay: of AdamW.
-        quality_weight: of the quality loss beside the descriptor loss.
+        quality_weight, place_weight: of the losses of quality and log-sigma beside the descriptor loss.
         seed: of the data, the initial weights and the sampling.
         validate_every: in steps, and at the end; 0: never.
         checkpoint_every: in steps.
@@ -62,6 +62,7 @@ class TrainingConfig:
     learning_rate: float = 2e-3
     weight_decay: float = 1e-4
     quality_weight: float = 0.5
+    place_weight: float = 0.1
     seed: int = 0
     validate_every: int = 1700
     checkpoint_every: int = 250
@@ -121,12 +122,12 @@ def train(out: Path, config: TrainingConfig, workers: int = 1, resume: bool = Fa
     began = time.monotonic() - seconds
     with _progress() as progress:
         task = progress.add_task("training", total=config.steps, completed=first, note="")
-        for step, (image0, image1, corners0, places1, visible, corners1) in enumerate(loader, start=first):
+        for step, (image0, image1, keypoints0, places1, visible, keypoints1) in enumerate(loader, start=first):
             generator = torch.Generator().manual_seed(config.seed * 1_000_000_007 + step)
             network.train()
-            loss = pair_loss(network, image0, image1, corners0, places1, visible, corners1, generator)
+            loss = pair_loss(network, image0, image1, keypoints0, places1, visible, keypoints1, generator)
             optimizer.zero_grad(set_to_none=True)
-            (loss.descriptor + config.quality_weight * loss.quality).backward()
+            (loss.descriptor + config.quality_weight * loss.quality + config.place_weight * loss.place).backward()
             nn.utils.clip_grad_norm_(network.parameters(), 1.0)
             optimizer.step()
             schedule.step()

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
+_FREEDOM = 3.0
 
-@dataclass(frozen=True, slots=True)
-class MatchLoss:
-    """Loss of one batch and what there is to watch.
+
+class MatchLoss(NamedTuple):
+    """How well the descriptors of a batch match.
 
     Attributes:
         descriptor: negative log-likelihood of the true matches under the dual softmax.
@@ -22,6 +23,20 @@ class MatchLoss:
     descriptor: Tensor
     quality: Tensor
     recall: Tensor
+
+
+class PairLoss(NamedTuple):
+    """Losses of one batch and what there is to watch.
+
+    Attributes:
+        descriptor, quality, recall: as in `MatchLoss`.
+        place: negative log-likelihood of the distances between keypoints that show the same point.
+    """
+
+    descriptor: Tensor
+    quality: Tensor
+    recall: Tensor
+    place: Tensor
 
 
 def match_loss(
@@ -37,10 +52,10 @@ def match_loss(
 
     Args:
         descriptors0, descriptors1: (B, N, C) unit descriptors; row i of both shows the same point where visible.
-        distractors1: (B, D, C) unit descriptors of other corners of image 1.
+        distractors1: (B, D, C) unit descriptors of other keypoints of image 1.
         quality0: (B, N) quality logits in image 0.
         visible: (B, N) bool, the point lies inside image 1.
-        repeated: (B, N) bool, a corner was also found near the true place in image 1.
+        repeated: (B, N) bool, a keypoint was also found near the true place in image 1.
         inverse_temperature: factor on cosine similarity before the softmax.
     """
     candidates1 = torch.cat([descriptors1, distractors1], dim=1)
@@ -63,3 +78,21 @@ def match_loss(
     # A point that left the image tells nothing about how good it is.
     quality = (functional.binary_cross_entropy_with_logits(quality0, target, reduction="none") * weight).sum() / total
     return MatchLoss(descriptor, quality, right.to(similarity.dtype).sum() / total)
+
+
+def place_loss(distance: Tensor, log_sigma0: Tensor, log_sigma1: Tensor, zoom: Tensor, partnered: Tensor) -> Tensor:
+    """Negative log-likelihood of the distances under a bivariate Student t law of 3 degrees of freedom, its mean.
+
+    Its heavy tails bear the wrong partners that chance brings near.
+
+    Args:
+        distance: (B, N) between the true place in image 1 of a keypoint of image 0 and the keypoint found there, pixels.
+        log_sigma0, log_sigma1: (B, N) predicted for the one and the other, of pixels of their images.
+        zoom: (B, 1) pixels of image 1 a pixel of image 0.
+        partnered: (B, N) bool, the rows that count.
+    """
+    variance = zoom.square() * (2.0 * log_sigma0).exp() + (2.0 * log_sigma1).exp()
+    tail = torch.log1p(distance.square() / (_FREEDOM * variance))
+    likelihood = variance.log() + 0.5 * (_FREEDOM + 2.0) * tail
+    weight = partnered.to(distance.dtype)
+    return (likelihood * weight).sum() / weight.sum().clamp_min(1.0)

@@ -1,4 +1,4 @@
-"""One training step of the correspondence network: from a batch of pairs to a loss."""
+"""One training step of the correspondence network: from a batch of pairs to its losses."""
 
 from __future__ import annotations
 
@@ -6,11 +6,17 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from sigmaslam.models.detector import to_cells
 from sigmaslam.models.network import FeatureNetwork, sample_map
-from sigmaslam.training.losses import MatchLoss, match_loss
+from sigmaslam.training.losses import PairLoss, match_loss, place_loss
 
-_REPEAT_DISTANCE = 2.0
-# True places in image 1 are shaken by this much, because at run time a descriptor is taken at a detected corner.
+# A keypoint has a partner if one was found this near to its true place in image 1, pixels.
+_PARTNER_DISTANCE = 3.0
+# It is repeated if the partner is this near.
+_REPEAT_DISTANCE = 1.5
+# No keypoint of image 1 within this distance of a true place serves as a distractor.
+_CLASH_DISTANCE = 4.0
+# True places in image 1 are shaken by this much, because at run time a descriptor is taken at a detected keypoint.
 _PLACE_JITTER = 0.7
 _MARGIN = 4.0
 
@@ -19,36 +25,64 @@ def pair_loss(
     network: FeatureNetwork,
     image0: Tensor,
     image1: Tensor,
-    corners0: Tensor,
+    keypoints0: Tensor,
     places1: Tensor,
     visible: Tensor,
-    corners1: Tensor,
+    keypoints1: Tensor,
     generator: torch.Generator,
-) -> MatchLoss:
-    """Loss of a batch of pairs.
+) -> PairLoss:
+    """Losses of a batch of pairs.
 
     Args:
         network: the network in training.
         image0, image1: (B, 1, H, W) float32 in [0, 1].
-        corners0, corners1: (B, N, 2) corners of either image, pixels.
-        places1: (B, N, 2) where corners0 lie in image 1, pixels.
+        keypoints0, keypoints1: (B, N, 2) keypoints of either image, pixels.
+        places1: (B, N, 2) where keypoints0 lie in image 1, pixels.
         visible: (B, N) bool, whether they are seen there.
-        generator: of the small displacements.
+        generator: of the small displacements, on the CPU.
     """
-    batch, size = image0.shape[0], image0.shape[-1]
+    batch, count = keypoints0.shape[:2]
+    size = image0.shape[-1]
     visible = visible & ((places1 >= _MARGIN) & (places1 <= size - 1 - _MARGIN)).all(dim=-1)
-    distance = torch.cdist(places1, corners1)
-    repeated = distance.amin(dim=2) < _REPEAT_DISTANCE
-    # A corner of image 1 at a true place would be wrongly pushed away: it moves elsewhere as a distractor.
-    elsewhere = size * torch.rand(corners1.shape, generator=generator)
-    clash = distance.amin(dim=1) < 2 * _REPEAT_DISTANCE
-    distractors = torch.where(clash.unsqueeze(-1), elsewhere, corners1)
-    jittered = places1 + _PLACE_JITTER * torch.randn(places1.shape, generator=generator)
+    distance = torch.cdist(places1, keypoints1)
+    nearest, partner = distance.min(dim=2)
+    # A keypoint of image 1 at a true place would be wrongly pushed away: it moves elsewhere as a distractor.
+    elsewhere = size * torch.rand(keypoints1.shape, generator=generator).to(keypoints1)
+    clash = distance.amin(dim=1) < _CLASH_DISTANCE
+    distractors = torch.where(clash.unsqueeze(-1), elsewhere, keypoints1)
+    jittered = places1 + _PLACE_JITTER * torch.randn(places1.shape, generator=generator).to(places1)
 
-    images = torch.cat([image0, image1]).contiguous(memory_format=torch.channels_last)
-    dense, logits = network(images)
-    descriptors0 = functional.normalize(sample_map(dense[:batch], corners0), dim=-1)
-    descriptors1 = functional.normalize(sample_map(dense[batch:], torch.cat([jittered, distractors], dim=1)), dim=-1)
-    quality0 = sample_map(logits[:batch], corners0).squeeze(-1)
-    count = corners0.shape[1]
-    return match_loss(descriptors0, descriptors1[:, :count], descriptors1[:, count:], quality0, visible, repeated)
+    cells = to_cells(torch.cat([image0, image1])).contiguous(memory_format=torch.channels_last)
+    maps = network(cells)
+
+    def sample(features: Tensor, first: bool, places: Tensor) -> Tensor:
+        return sample_map(features[:batch] if first else features[batch:], places, network.stride)
+
+    descriptors0 = functional.normalize(sample(maps.descriptors, True, keypoints0), dim=-1)
+    at1 = sample(maps.descriptors, False, torch.cat([jittered, distractors], dim=1))
+    descriptors1 = functional.normalize(at1, dim=-1)
+    matching = match_loss(
+        descriptors0,
+        descriptors1[:, :count],
+        descriptors1[:, count:],
+        sample(maps.quality, True, keypoints0).squeeze(-1),
+        visible,
+        nearest < _REPEAT_DISTANCE,
+    )
+    log_sigma0 = sample(maps.log_sigma, True, keypoints0).squeeze(-1)
+    log_sigma1 = sample(maps.log_sigma, False, keypoints1).squeeze(-1).gather(1, partner)
+    zoom = _zoom(keypoints0, places1, visible)
+    place = place_loss(nearest, log_sigma0, log_sigma1, zoom, visible & (nearest < _PARTNER_DISTANCE))
+    return PairLoss(*matching, place)
+
+
+def _zoom(keypoints0: Tensor, places1: Tensor, visible: Tensor) -> Tensor:
+    """(B, 1) by how much lengths grow from image 0 to image 1, from the spread of the visible points."""
+    weight = visible.to(places1.dtype).unsqueeze(-1)
+    total = weight.sum(dim=1, keepdim=True).clamp_min(1.0)
+
+    def spread(points: Tensor) -> Tensor:
+        centred = (points - (points * weight).sum(dim=1, keepdim=True) / total) * weight
+        return centred.square().sum(dim=(1, 2)).clamp_min(1.0)
+
+    return (spread(places1) / spread(keypoints0)).sqrt().clamp(0.2, 5.0).unsqueeze(1)

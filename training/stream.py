@@ -11,11 +11,12 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from sigmaslam.errors import InputError
+from sigmaslam.models.detector import detect, to_cells
 from sigmaslam.synthetic.pairs import HomographyPairs
 from sigmaslam.synthetic.scene_pairs import ScenePairs
 from sigmaslam.synthetic.textures import KINDS
 
-# image0 (1, H, W), image1 (1, H, W), corners0 (N, 2), places1 (N, 2), visible (N,), corners1 (N, 2)
+# image0 (1, H, W), image1 (1, H, W), keypoints0 (N, 2), places1 (N, 2), visible (N,), keypoints1 (N, 2)
 TrainingPair = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
 # What the pairs of a run are made of: its sources take turns.
@@ -25,6 +26,7 @@ MIXES: dict[str, tuple[str, ...]] = {
     "patterns": ("patterns",),
     "scenes": ("scenes",),
     "mix": ("leaves", "scenes", "leaves", "scenes", "leaves"),
+    "blend": ("leaves", "leaves", "leaves", "scenes"),
 }
 
 
@@ -85,21 +87,21 @@ class MixedPairs:
 
 
 class PairDataset(Dataset[TrainingPair]):
-    """Pairs `first` to `last` of a mix, each with N random corners of either image.
+    """Pairs `first` to `last` of a mix, each with N random keypoints of either image.
 
     Args:
         mix: a key of `MIXES`.
         seed: of the stream.
         size: side of the square images, pixels.
         first, last: range of indices, so that a resumed run goes on where it stopped.
-        corners: N, corners per image; random places fill up where an image has fewer.
+        keypoints: N, per image; random places fill up where an image has fewer.
     """
 
-    def __init__(self, mix: str, seed: int, size: int, first: int, last: int, corners: int) -> None:
+    def __init__(self, mix: str, seed: int, size: int, first: int, last: int, keypoints: int) -> None:
         self._pairs = MixedPairs(mix, seed, size)
         self._seed, self._size = seed, size
         self._first, self._last = first, last
-        self._corners = corners
+        self._keypoints = keypoints
 
     def __len__(self) -> int:
         return self._last - self._first
@@ -110,32 +112,32 @@ class PairDataset(Dataset[TrainingPair]):
         index = self._first + item
         pair = self._pairs.pair(index)
         rng = np.random.default_rng((self._seed, 2, index))
-        corners0, corners1 = (self._some_corners(image, rng) for image in (pair.image0, pair.image1))
-        places1, visible = pair.transfer(corners0)
+        keypoints0, keypoints1 = (self._some_keypoints(image, rng) for image in (pair.image0, pair.image1))
+        places1, visible = pair.transfer(keypoints0)
         return (
             torch.from_numpy(pair.image0)[None],
             torch.from_numpy(pair.image1)[None],
-            torch.from_numpy(corners0),
+            torch.from_numpy(keypoints0),
             torch.from_numpy(places1.astype(np.float32)),
             torch.from_numpy(visible),
-            torch.from_numpy(corners1),
+            torch.from_numpy(keypoints1),
         )
 
-    def _some_corners(self, image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """A random choice among twice as many corners, so that weak ones are learned too: (N, 2) float32."""
-        found = cv2.goodFeaturesToTrack(image, 2 * self._corners, 1e-3, 3.0, blockSize=5)
-        places = np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
-        chosen = rng.permutation(places)[: self._corners]
-        filling = rng.uniform(0, self._size - 1, (self._corners - len(chosen), 2))
+    def _some_keypoints(self, image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """A random choice among twice as many, so that weak ones are learned too: (N, 2) float32."""
+        keypoints, strength = detect(to_cells(torch.from_numpy(image)[None, None]), 2 * self._keypoints)
+        places = keypoints[strength > 0].numpy()
+        chosen = rng.permutation(places)[: self._keypoints]
+        filling = rng.uniform(0, self._size - 1, (self._keypoints - len(chosen), 2))
         return np.concatenate([chosen, filling]).astype(np.float32)
 
 
 def pair_loader(
-    mix: str, seed: int, size: int, first: int, last: int, corners: int, batch_size: int, workers: int
+    mix: str, seed: int, size: int, first: int, last: int, keypoints: int, batch_size: int, workers: int
 ) -> DataLoader[TrainingPair]:
     """Batches of pairs in order of their index."""
     return DataLoader(
-        PairDataset(mix, seed, size, first, last, corners),
+        PairDataset(mix, seed, size, first, last, keypoints),
         batch_size=batch_size,
         num_workers=workers,
         worker_init_fn=_one_thread if workers else None,

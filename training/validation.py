@@ -23,13 +23,14 @@ def matching_accuracy(network: FeatureNetwork, seed: int, pairs: int = _PAIRS, s
     """
     was_training = network.training
     network.eval()
-    extractor = FeatureExtractor(network, _KEYPOINTS)
+    extractor = FeatureExtractor(network)
+    count = torch.tensor(_KEYPOINTS)
     streams = [open_stream(source, seed, size) for source in _SOURCES]
     sums = {"mma_1": 0.0, "mma_3": 0.0, "correct_3": 0.0, "repeatability_1": 0.0}
     for index in range(pairs):
         pair = streams[index % len(streams)].pair(index // len(streams))
-        keypoints0, _, descriptors0 = extractor(torch.from_numpy(pair.image0)[None, None])
-        keypoints1, _, descriptors1 = extractor(torch.from_numpy(pair.image1)[None, None])
+        keypoints0, _, descriptors0, _ = extractor(torch.from_numpy(pair.image0)[None, None], count)
+        keypoints1, _, descriptors1, _ = extractor(torch.from_numpy(pair.image1)[None, None], count)
         similarity = descriptors0 @ descriptors1.T
         best1 = similarity.argmax(dim=1)
         mutual = similarity.argmax(dim=0)[best1] == torch.arange(len(best1))

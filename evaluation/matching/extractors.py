@@ -35,8 +35,8 @@ class LearnedExtractor:
     """Our network, from a graph that is called as the exported one is.
 
     Args:
-        graph: takes {"image": (1, 1, H, W) float32 in [0, 1]} and returns keypoints (N, 2), scores (N,), best first,
-            and descriptors (N, C): an `OnnxGraph`, or a `FeatureExtractor` in a `TorchModule`.
+        graph: called as `sigmaslam.frontend.learned.extract` does: an `OnnxGraph`, or a `FeatureExtractor` in a
+            `TorchModule`.
     """
 
     def __init__(self, graph: Graph) -> None:

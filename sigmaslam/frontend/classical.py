@@ -9,6 +9,11 @@ import numpy as np
 
 from sigmaslam.frontend.types import Features
 
+# Standard deviation of a keypoint's place over the diameter that OpenCV gives it: half a pixel of its octave for ORB's
+# patches of 31 pixels, less for SIFT, which interpolates.
+_SIFT_SIGMA = 0.1
+_ORB_SIGMA = 0.5 / 31
+
 
 class SiftDetector:
     """OpenCV's SIFT with RootSIFT descriptors (Arandjelovic & Zisserman 2012)."""
@@ -22,7 +27,7 @@ class SiftDetector:
         if not keypoints:
             return _no_features(128)
         root = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-12))
-        return _features(keypoints, root.astype(np.float32))
+        return _features(keypoints, root.astype(np.float32), _SIFT_SIGMA)
 
 
 class OrbDetector:
@@ -37,17 +42,19 @@ class OrbDetector:
         if not keypoints:
             return _no_features(256)
         bits = np.unpackbits(descriptors.astype(np.uint8, copy=False), axis=1).astype(np.float32)
-        return _features(keypoints, (2.0 * bits - 1.0) / 16.0)
+        return _features(keypoints, (2.0 * bits - 1.0) / 16.0, _ORB_SIGMA)
 
 
-def _features(keypoints: Sequence[cv2.KeyPoint], descriptors: np.ndarray) -> Features:
+def _features(keypoints: Sequence[cv2.KeyPoint], descriptors: np.ndarray, sigma_per_size: float) -> Features:
     places = np.array([keypoint.pt for keypoint in keypoints], np.float32)
     scores = np.array([keypoint.response for keypoint in keypoints], np.float32)
+    sigma = sigma_per_size * np.array([keypoint.size for keypoint in keypoints], np.float32)
     # OpenCV may return the same place twice with two orientations: the first stays, matches must be one to one.
     _, first = np.unique(places, axis=0, return_index=True)
     order = first[np.argsort(-scores[first], kind="stable")]
-    return Features(places[order], descriptors[order], scores[order])
+    return Features(places[order], descriptors[order], scores[order], sigma[order])
 
 
 def _no_features(size: int) -> Features:
-    return Features(np.zeros((0, 2), np.float32), np.zeros((0, size), np.float32), np.zeros(0, np.float32))
+    none = np.zeros(0, np.float32)
+    return Features(np.zeros((0, 2), np.float32), np.zeros((0, size), np.float32), none, none)

@@ -36,6 +36,7 @@ class KltFrontend:
             keypoints,
             np.zeros((len(keypoints), 0), np.float32),
             np.linspace(1, 0, len(keypoints), dtype=np.float32),
+            np.full(len(keypoints), _SIGMA, np.float32),
         )
         return StereoView(left, right, features, _disparity(left, right, keypoints))
 

@@ -13,15 +13,17 @@ from sigmaslam.session import OnnxGraph, shipped_weights
 Graph = Callable[[Mapping[str, np.ndarray]], list[np.ndarray]]
 """What runs the network: an `OnnxGraph`, or the same network in torch."""
 
-_SIZE_MULTIPLE = 16
+_SIZE_MULTIPLE = 32
 _BORDER = 8
+# The graph describes twice as many candidates, and one in four comes from an image of a quarter of the pixels.
+_PIXELS_PER_KEYPOINT = 8
 
 
 class LearnedDetector:
     """Keypoints, scores and descriptors from the network, best first.
 
     Args:
-        max_keypoints: at most as many as the graph was exported for (2,048).
+        max_keypoints: per image.
         backend: "onnx", or "torch" (needs the extra `train`).
         threads: of ONNX Runtime.
     """
@@ -44,16 +46,18 @@ def extract(graph: Graph, image: np.ndarray, max_keypoints: int) -> Features:
     """Features of an (H, W) uint8 image by a graph that is called as the exported one is.
 
     Args:
-        graph: takes {"image": (1, 1, H, W) float32 in [0, 1]} and returns keypoints (N, 2), scores (N,), best first,
-            and descriptors (N, C).
+        graph: takes {"image": (1, 1, H, W) float32 in [0, 1], "count": N} and returns keypoints (N, 2), scores (N,),
+            best first, descriptors (N, C) and sigma (N,).
         image: of any size from 96 pixels.
-        max_keypoints: how many of the best are kept.
+        max_keypoints: how many are wanted; small images give fewer.
     """
     height, width = image.shape
     bottom, right = -height % _SIZE_MULTIPLE, -width % _SIZE_MULTIPLE
     padded = cv2.copyMakeBorder(image, 0, bottom, 0, right, cv2.BORDER_REPLICATE)
-    keypoints, scores, descriptors = graph({"image": padded[None, None].astype(np.float32) / 255.0})
+    count = np.array(min(max_keypoints, padded.size // _PIXELS_PER_KEYPOINT), np.int64)
+    feed = {"image": padded[None, None].astype(np.float32) / 255.0, "count": count}
+    keypoints, scores, descriptors, sigma = graph(feed)
     # The padding has no corners of its own, but its seam may.
     inside = (keypoints[:, 0] < width - _BORDER) & (keypoints[:, 1] < height - _BORDER)
-    kept = np.flatnonzero((scores > 0) & inside)[:max_keypoints]
-    return Features(keypoints[kept], descriptors[kept], scores[kept])
+    kept = np.flatnonzero((scores > 0) & inside)
+    return Features(keypoints[kept], descriptors[kept], scores[kept], sigma[kept])

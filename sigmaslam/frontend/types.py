@@ -16,15 +16,17 @@ class Features:
         keypoints: (N, 2) float32 pixel coordinates (u, v).
         descriptors: (N, D) float32 of unit length; their dot product is the similarity. D = 0 for trackers without.
         scores: (N,) float32, larger is better.
+        sigma: (N,) float32 standard deviation of a keypoint's place per axis, pixels.
     """
 
     keypoints: np.ndarray
     descriptors: np.ndarray
     scores: np.ndarray
+    sigma: np.ndarray
 
     def select(self, index: np.ndarray) -> Features:
         """The features of that index or mask."""
-        return Features(self.keypoints[index], self.descriptors[index], self.scores[index])
+        return Features(self.keypoints[index], self.descriptors[index], self.scores[index], self.sigma[index])
 
 
 @dataclass(frozen=True, slots=True)
