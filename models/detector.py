@@ -1,7 +1,7 @@
 """Blob detection as a graph: Hessian response, maxima, sub-pixel peaks, all exportable to ONNX.
 
 Published learned detectors localise worse than classical ones (repeatability within 1 px), so the network only says
-which keypoints are worth keeping. Among the classical ones the determinant of the Hessian repeats best (docs/network.md).
+which keypoints are worth keeping. Of the classical ones the determinant of the Hessian repeats best (docs/network.md).
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ _SIGMA = 1.4
 # Reach of the filters, pixels: a cell and its neighbours hold it.
 _REACH = 4
 _NMS_WINDOW = 3
+# Less is round-off: one grey level of 255 gives 1e-6.
+_LEAST_RESPONSE = 1e-9
 # Response is compared with its surroundings to this power: 0 keeps the strongest peaks wherever they crowd, 1 spreads
 # them as evenly as texture allows.
 _EVENING_POWER = 0.75
@@ -29,16 +31,19 @@ def to_cells(image: Tensor) -> Tensor:
 
     `functional.pixel_unshuffle` as a convolution, which ONNX Runtime computes eight times faster.
     """
-    size = CELL * CELL
-    return functional.conv2d(image, torch.eye(size, dtype=image.dtype).view(size, 1, CELL, CELL), stride=CELL)
+    return functional.conv2d(image, _pixels_of_a_cell(image), stride=CELL)
 
 
 def to_half_cells(image: Tensor) -> Tensor:
     """Cells of the image at half its size (means of 2x2 pixels): (B, 1, H, W) -> (B, 16, H/8, W/8)."""
-    size = CELL * CELL
-    pick = torch.eye(size, dtype=image.dtype).view(size, 1, CELL, CELL)
-    mean = pick.repeat_interleave(2, dim=2).repeat_interleave(2, dim=3) / 4.0
+    mean = _pixels_of_a_cell(image).repeat_interleave(2, dim=2).repeat_interleave(2, dim=3) / 4.0
     return functional.conv2d(image, mean, stride=2 * CELL)
+
+
+def _pixels_of_a_cell(image: Tensor) -> Tensor:
+    """(16, 1, 4, 4): filter k picks pixel k of a cell; of the image's type and device."""
+    size = CELL * CELL
+    return torch.eye(size, dtype=image.dtype, device=image.device).view(size, 1, CELL, CELL)
 
 
 def hessian_response(cells: Tensor) -> Tensor:
@@ -81,12 +86,16 @@ def detect(cells: Tensor, count: int) -> tuple[Tensor, Tensor]:
     Returns:
         keypoints (B, count, 2) pixels (u, v) and their strengths (B, count), zero where the image has fewer.
     """
-    response = hessian_response(cells)
+    return find_peaks(hessian_response(cells), count)
+
+
+def find_peaks(response: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """As `detect`, for any response (B, 16, h, w) in cells."""
     evened = response / _surroundings(response)
     flat = functional.pixel_shuffle(response, CELL)
     scores = functional.pixel_shuffle(evened, CELL)
     peak = functional.max_pool2d(scores, _NMS_WINDOW, stride=1, padding=_NMS_WINDOW // 2)
-    kept = torch.where((scores >= peak) & (scores > 0), scores, torch.zeros_like(scores))
+    kept = torch.where((scores >= peak) & (flat > _LEAST_RESPONSE), scores, torch.zeros_like(scores))
     inner = kept[:, :, BORDER:-BORDER, BORDER:-BORDER]
     kept = functional.pad(inner, (BORDER, BORDER, BORDER, BORDER))
     strength, index = torch.topk(kept.flatten(1), count, dim=1)
@@ -95,7 +104,10 @@ def detect(cells: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 def _surroundings(response: Tensor) -> Tensor:
     """What the response is measured against, (B, 1, h, w): its mean around a cell to a power."""
-    block = functional.avg_pool2d(response.clamp_min(0.0).mean(dim=1, keepdim=True), _EVENING_CELLS)
+    cells = response.clamp_min(0.0).mean(dim=1, keepdim=True)
+    # The outermost cells respond to the border of the image.
+    cells = functional.pad(cells[:, :, 1:-1, 1:-1], (1, 1, 1, 1), mode="replicate")
+    block = functional.avg_pool2d(cells, _EVENING_CELLS)
     local = functional.avg_pool2d(block, _EVENING_WINDOW, 1, _EVENING_WINDOW // 2, count_include_pad=False)
     overall = block.mean(dim=(2, 3), keepdim=True)
     level = (local + 0.05 * overall).clamp_min(1e-14) ** _EVENING_POWER

@@ -21,7 +21,7 @@ from sigmaslam.files import atomic_path, atomic_write_text
 from sigmaslam.filters.lie import exp_se3
 from sigmaslam.filters.stereo_pose import STATE_SIZE, Innovate, Predict, Update
 from sigmaslam.models.extractor import EXTRACTOR_SIZE_MULTIPLE, FeatureExtractor
-from sigmaslam.models.network import FeatureNetwork
+from sigmaslam.models.network import DESCRIPTOR_SIZE, STRIDE, FeatureNetwork
 from sigmaslam.session import OnnxGraph
 from sigmaslam.synthetic.textures import dead_leaves
 
@@ -43,15 +43,18 @@ class _Graph:
     dynamic: tuple[dict[int, Any] | None, ...]
 
 
-def load_network(weights: Path) -> FeatureNetwork:
+def load_network(weights: Path, descriptor_size: int = DESCRIPTOR_SIZE, stride: int = STRIDE) -> FeatureNetwork:
     """The network with trained weights, in evaluation mode.
 
+    Args:
+        weights: safetensors file.
+        descriptor_size, stride: of the network that was trained.
     Raises:
         InputError: the file is missing or holds another network.
     """
     if not weights.is_file():
         raise InputError(f"{weights} does not exist: train first, or give the path of a .safetensors file")
-    network = FeatureNetwork()
+    network = FeatureNetwork(descriptor_size, stride)
     try:
         network.load_state_dict(load_file(weights))
     except (RuntimeError, ValueError, SafetensorError) as error:
@@ -109,29 +112,36 @@ def export_all(weights: Path, card: Path, out: Path) -> dict[str, float]:
 
 def _card_page(card: dict[str, Any]) -> str:
     """The model card for people."""
-    metrics = "".join(f"| {name} | {value} |\n" for name, value in card["metrics_on_held_out_renders"].items())
-    differences = "".join(f"| {name}.onnx | {value:.1e} |\n" for name, value in card["onnx_minus_torch"].items())
-    settings = "".join(f"| {name} | {value} |\n" for name, value in card["config"].items())
+    started = card.get("started_from")
+    origin = "random weights" if started is None else f"{started['name']} (sha256 {started['sha256']})"
+    sections = [
+        _table("setting", "", card["config"]),
+        _table("held-out renders (48 pairs, 256 keypoints)", "", card["metrics_on_held_out_renders"]),
+    ]
+    real = card.get("metrics_on_real_sets", {})
+    if real:
+        rows = {f"{name} {metric}": value for name, values in real.items() for metric, value in values.items()}
+        sections.append("## Real sets\n\nNone of them was used in training.\n\n" + _table("set, metric", "", rows))
+    if card.get("limits"):
+        sections.append("## Limits\n\n" + "".join(f"- {limit}\n" for limit in card["limits"]))
+    differences = {f"{name}.onnx": f"{value:.1e}" for name, value in card["onnx_minus_torch"].items()}
+    sections.append("## Graphs\n\n" + _table("ONNX minus torch", "largest difference", differences))
     return f"""# Model card: features
 
-Keypoints (Shi-Tomasi corners, ranked by a learned quality), 64-D descriptors; {card["parameters"]} parameters.
+Keypoints (blobs of two scales, ranked by a learned quality), {DESCRIPTOR_SIZE}-D descriptors, a sigma of each place;
+{card["parameters"]} parameters.
 
+- Recipe: {card.get("recipe") or "none"}, started from {origin}.
 - Data: {card["data"]}.
 - Command: `{card["command"]}`, commit {card["commit"]}, seed {card["seed"]}.
 - Duration: {card["duration_s"] / 60:.0f} minutes on {card["hardware"]}.
 - Figures on real sequences: docs/results.md; none of them was used in training.
-- Limits: grey images; rotation and scale as far as the training homographies go (40 degrees and a factor of 1.6 a
-  view); no covariance of its own yet.
 
-| setting | |
-|---|---|
-{settings}
-| held-out renders (48 pairs, 256 keypoints) | |
-|---|---|
-{metrics}
-| ONNX minus torch | largest difference |
-|---|---|
-{differences}"""
+""" + "\n".join(sections)
+
+
+def _table(left: str, right: str, rows: dict[str, Any]) -> str:
+    return f"| {left} | {right} |\n|---|---|\n" + "".join(f"| {name} | {value} |\n" for name, value in rows.items())
 
 
 def _noisy_texture(rng: np.random.Generator, shape: tuple[int, int]) -> Tensor:

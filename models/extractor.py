@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from sigmaslam.models.detector import BORDER, detect, to_cells, to_half_cells
+from sigmaslam.models.detector import detect, to_cells, to_half_cells
 from sigmaslam.models.network import FeatureNetwork, sample_map
 
 EXTRACTOR_SIZE_MULTIPLE = 32
@@ -29,7 +29,7 @@ class FeatureExtractor(nn.Module):
 
     Shapes:
         image (1, 1, H, W) float32 in [0, 1], H and W multiples of 32; count, the number N of keypoints, scalar int64,
-        at most H W / 4 -> keypoints (N, 2) pixel coordinates (u, v); scores (N,), zero where the image has fewer;
+        from 4 to H W / 8 -> keypoints (N, 2) pixel coordinates (u, v); scores (N,), zero where the image has fewer;
         unit descriptors (N, C); sigma (N,), standard deviation of a keypoint's place per axis, pixels.
     """
 
@@ -39,7 +39,7 @@ class FeatureExtractor(nn.Module):
 
     def forward(self, image: Tensor, count: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """One image at a time: batches gain nothing on a CPU."""
-        total = count.item()
+        total: int = count.item()  # type: ignore[assignment]  # int() would freeze it in the graph
         torch._check(total >= 4)
         torch._check(total <= image.shape[2] * image.shape[3] // 8)
         half = total // _HALF_SHARE
@@ -52,14 +52,20 @@ class FeatureExtractor(nn.Module):
         return keypoints[order], scores, descriptors, sigma[order]
 
     def _level(self, cells: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        candidates, strength = detect(cells, _CANDIDATES_PER_KEYPOINT * count)
+        candidates, strength = self._detect(cells, _CANDIDATES_PER_KEYPOINT * count)
         maps = self.network(cells)
         stride = self.network.stride
         quality = sample_map(maps.quality, candidates, stride).squeeze(-1).sigmoid()
-        # Relative strength of the blob and learned quality count alike; a blob of strength zero is none.
         strength = strength / strength.amax(dim=1, keepdim=True).clamp_min(1e-12)
-        scores, order = (strength.sqrt() * quality).topk(count, dim=1)
+        sigma = sample_map(maps.log_sigma, candidates, stride).squeeze(-1).exp()
+        scores, order = self._rank(strength, quality, sigma).topk(count, dim=1)
         keypoints = candidates.gather(1, order.unsqueeze(-1).expand(-1, -1, 2))
         descriptors = functional.normalize(sample_map(maps.descriptors, keypoints, stride), dim=-1)
-        sigma = sample_map(maps.log_sigma, keypoints, stride).squeeze(-1).exp()
-        return keypoints[0], scores[0], descriptors[0], sigma[0]
+        return keypoints[0], scores[0], descriptors[0], sigma.gather(1, order)[0]
+
+    def _detect(self, cells: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        return detect(cells, count)
+
+    def _rank(self, strength: Tensor, quality: Tensor, sigma: Tensor) -> Tensor:
+        """Scores (B, N). Relative strength of the blob and learned quality count alike; of strength zero is no blob."""
+        return strength.sqrt() * quality

@@ -2,7 +2,17 @@
 
 from sigmaslam.camera import StereoCamera
 from sigmaslam.errors import SigmaSlamError
+from sigmaslam.match import Matches, match_images
 from sigmaslam.readers import open_sequence
 from sigmaslam.tracker import Estimate, StereoTracker, TrackerConfig
 
-__all__ = ["Estimate", "SigmaSlamError", "StereoCamera", "StereoTracker", "TrackerConfig", "open_sequence"]
+__all__ = [
+    "Estimate",
+    "Matches",
+    "SigmaSlamError",
+    "StereoCamera",
+    "StereoTracker",
+    "TrackerConfig",
+    "match_images",
+    "open_sequence",
+]

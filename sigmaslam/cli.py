@@ -31,6 +31,14 @@ class Frontend(StrEnum):
     klt = "klt"
 
 
+class Detector(StrEnum):
+    """What finds and describes keypoints in a single image."""
+
+    learned = "learned"
+    sift = "sift"
+    orb = "orb"
+
+
 class Backend(StrEnum):
     """What runs the network and the filter."""
 
@@ -93,6 +101,15 @@ class Data(StrEnum):
     scenes = "scenes"
     mix = "mix"
     blend = "blend"
+    endoscope = "endoscope"
+
+
+class TrainingRecipe(StrEnum):
+    """Training runs by name."""
+
+    full = "full"
+    quick = "quick"
+    endoscope = "endoscope"
 
 
 class Benchmark(StrEnum):
@@ -102,7 +119,8 @@ class Benchmark(StrEnum):
     filters = "filters"
     claims = "claims"
     renders = "renders"
-    mixes = "mixes"
+    features = "features"
+    ablations = "ablations"
 
 
 def _show_version(wanted: bool) -> None:
@@ -155,6 +173,27 @@ def track(
         f"{summary['skipped']} skipped; {summary['median_inliers']:.0f} inliers in the median frame, "
         f"{summary['map_points']} map points.\n{summary['calibration_verdict']}\nReport: {out / 'report.html'}"
     )
+
+
+@app.command()
+def match(
+    image0: Annotated[Path, typer.Argument(metavar="IMAGE0", help="Image file, grey or colour, 8 or 16 bits.")],
+    image1: Annotated[Path, typer.Argument(metavar="IMAGE1", help="Another view of the scene, of any size.")],
+    out: Annotated[Path, typer.Option(help="File to write, ends in .npz.")],
+    frontend: Annotated[Detector, typer.Option(help="What finds and describes keypoints.")] = Detector.learned,
+    max_keypoints: Annotated[int, typer.Option(help="Most keypoints an image, at least 4.")] = 1024,
+    picture: Annotated[
+        Path | None, typer.Option(help="PNG to draw: both images, lines from purple (unlikely) to yellow (certain).")
+    ] = None,
+) -> None:
+    """Match two images: which points show the same, how probably and how exactly; prints one line.
+
+    Writes an .npz, best match first: keypoints0, keypoints1 (M, 2) pixels (u, v); probability (M,), which ranks but is
+    not yet calibrated; covariance (M, 2, 2) of keypoints1 given keypoints0. numpy.load reads it.
+    """
+    from sigmaslam.match import match_files
+
+    typer.echo(match_files(image0, image1, out, frontend.value, max_keypoints, picture))
 
 
 @app.command()
@@ -239,20 +278,38 @@ def render(
 
 @app.command()
 def train(
-    out: Annotated[Path, typer.Option(help="Folder for the checkpoint, the log, the weights and their card.")],
-    steps: Annotated[int, typer.Option(min=1, help="Optimiser steps; about 2 a second on 2 cores.")] = 3400,
-    data: Annotated[Data, typer.Option(help="What the pairs are made of.")] = Data.leaves,
+    out: Annotated[Path, typer.Option(help="Folder for checkpoint, log, TensorBoard, samples, weights and card.")],
+    recipe: Annotated[
+        TrainingRecipe,
+        typer.Option(help="full: what ships, 1 to 2 hours on 2 cores; quick: 5 minutes; endoscope: from what ships."),
+    ] = TrainingRecipe.full,
+    start: Annotated[
+        Path | None,
+        typer.Option("--from", help="Weights (.safetensors) to go on from.", show_default="the recipe's"),
+    ] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Optimiser steps.", show_default="the recipe's")] = None,
+    data: Annotated[Data | None, typer.Option(help="What pairs are made of.", show_default="the recipe's")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of data, weights and sampling.")] = 0,
     workers: Annotated[int, typer.Option(min=0, help="Processes that make training pairs.")] = 1,
+    device: Annotated[str, typer.Option(help="auto (a GPU if there is one), cpu, cuda, cuda:1.")] = "auto",
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")] = False,
 ) -> None:
-    """Train the correspondence network on renders alone (needs the extra 'train')."""
-    _need_train_extra()
-    from sigmaslam.training.loop import TrainingConfig
-    from sigmaslam.training.loop import train as run_training
+    """Train the correspondence network on renders alone (needs the extra 'train').
 
-    card = run_training(out, TrainingConfig(steps=steps, data=data.value, seed=seed), workers=workers, resume=resume)
-    typer.echo(json.dumps(card, indent=2))
+    Ctrl-C saves the last step; the same command with --resume goes on. On several GPUs: torchrun --nproc-per-node N
+    -m sigmaslam train ...
+    """
+    _need_train_extra()
+    from sigmaslam.training.devices import leads
+    from sigmaslam.training.loop import train as run_training
+    from sigmaslam.training.recipes import choose_config, starting_weights
+
+    config = choose_config(recipe.value, steps, None if data is None else data.value, seed)
+    # What a resumed run began with is written in its checkpoint.
+    weights = start if resume else starting_weights(recipe.value, start)
+    card = run_training(out, config, workers, resume, recipe.value, weights, device)
+    if leads():
+        typer.echo(json.dumps(card, indent=2))
 
 
 @app.command()
@@ -263,7 +320,8 @@ def export(
     """Export network and filter to ONNX and check the graphs against torch (needs the extra 'train')."""
     _need_train_extra()
     from sigmaslam.models.export import export_all
-    from sigmaslam.training.loop import CARD_NAME, WEIGHTS_NAME
+    from sigmaslam.training.card import CARD_NAME
+    from sigmaslam.training.loop import WEIGHTS_NAME
 
     with Console(stderr=True).status("exporting four graphs (about a minute)"):
         differences = export_all(run / WEIGHTS_NAME, run / CARD_NAME, out)
@@ -285,19 +343,41 @@ def benchmark(
         list[Frontend] | None,
         typer.Option(help="sequences: front-ends to compare; may be given more than once."),
     ] = None,
-    rounds: Annotated[int, typer.Option(min=1, help="filters: rounds in which every contender is timed.")] = 7,
+    rounds: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="filters, features: rounds in which every contender is timed.",
+            show_default="7, features 15",
+        ),
+    ] = None,
     eager: Annotated[bool, typer.Option("--eager", help="filters: leave out what takes minutes to compile.")] = False,
     runs: Annotated[
-        Path | None, typer.Option(help="mixes: folder of the training runs; finished ones are not repeated.")
+        Path | None, typer.Option(help="ablations: folder of the training runs; finished ones are not repeated.")
     ] = None,
-    steps: Annotated[int, typer.Option(min=1, help="mixes: optimiser steps a run.")] = 250,
-    seeds: Annotated[int, typer.Option(min=1, help="mixes: runs of each mix.")] = 3,
+    steps: Annotated[int, typer.Option(min=1, help="ablations: optimiser steps a run.")] = 250,
+    seeds: Annotated[int, typer.Option(min=1, help="ablations: runs of each variant.")] = 3,
+    weights: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="features: .onnx or .safetensors of ours; may be given more than once.",
+            show_default="the shipped graph",
+        ),
+    ] = None,
+    peer: Annotated[
+        list[Path] | None,
+        typer.Option(help="features: .onnx of another extractor to compare with; may be given more than once."),
+    ] = None,
+    sets: Annotated[
+        str | None, typer.Option(help="features: comma-separated sets to score.", show_default="all")
+    ] = None,
 ) -> None:
     """Run a benchmark and write its page.
 
     sequences: the tracker on every sequence. filters: speed of the filters beside those of other libraries that are
-    installed. claims: EKF against UKF by Monte Carlo. renders: how fast, and how like real images. mixes: what the
-    network should learn from, by short training runs (an hour and more). All but the first need the extra 'train'.
+    installed. claims: EKF against UKF by Monte Carlo. renders: how fast, and how like real images. features: time
+    and scores of the features beside SIFT, ORB and other people's. ablations: what each part of the features gains, by
+    short training runs (an hour). All but the first need the extra 'train'.
     """
     command = f"sigmaslam benchmark {name.value} --out {out}"
     if name is Benchmark.sequences:
@@ -309,19 +389,31 @@ def benchmark(
     if name is Benchmark.filters:
         from sigmaslam.evaluation.benchmarks.filters import write_in_one_thread
 
-        typer.echo(write_in_one_thread(out, rounds, not eager, command + (" --eager" if eager else "")))
+        typer.echo(write_in_one_thread(out, rounds or 7, not eager, command + (" --eager" if eager else "")))
     elif name is Benchmark.renders:
         from sigmaslam.evaluation.benchmarks.renders import write_renders
 
         typer.echo(write_renders(out, out.with_suffix(".png"), _need_data(data), command, Console(stderr=True).print))
-    elif name is Benchmark.mixes:
-        from sigmaslam.evaluation.benchmarks.training_data import write_training_data
+    elif name is Benchmark.features:
+        from sigmaslam.evaluation.benchmarks.features import ROUNDS, write_features
+        from sigmaslam.evaluation.matching.sets import ALL
+
+        options = [f" --weights {path}" for path in weights or []] + [f" --peer {path}" for path in peer or []]
+        options += [f" --sets {sets}"] if sets else []
+        command += "".join(options) + (f" --rounds {rounds}" if rounds else "")
+        note = Console(stderr=True).print
+        chosen = sets.split(",") if sets else list(ALL)
+        typer.echo(
+            write_features(out, _need_data(data), weights or [], peer or [], command, chosen, rounds or ROUNDS, note)
+        )
+    elif name is Benchmark.ablations:
+        from sigmaslam.evaluation.benchmarks.ablations import write_ablations
 
         if runs is None:
-            raise InputError("the benchmark mixes needs --runs, a folder for its training runs")
+            raise InputError("the benchmark ablations needs --runs, a folder for its training runs")
         command += f" --runs {runs} --steps {steps} --seeds {seeds}"
         note = Console(stderr=True).print
-        typer.echo(write_training_data(out, runs, _need_data(data), seeds, steps, command, note))
+        typer.echo(write_ablations(out, runs, _need_data(data), seeds, steps, command, note))
     else:
         from sigmaslam.evaluation.benchmarks.filter_claims import write_claims
 

@@ -1,13 +1,10 @@
-"""The training loop: resumable at any checkpoint, the same result whether it was interrupted or not."""
+"""The training loop: resumable at any step, the same result whether it was interrupted or not."""
 
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 import time
-from dataclasses import asdict, dataclass
+from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -22,159 +19,203 @@ from rich.progress import (
 )
 from safetensors.torch import save_file
 from torch import nn
+from torch.utils.data import DataLoader
 
-from sigmaslam.errors import InputError
-from sigmaslam.files import atomic_path
-from sigmaslam.models.network import FeatureNetwork
-from sigmaslam.training.step import pair_loss
-from sigmaslam.training.stream import MIXES, pair_loader
-from sigmaslam.training.validation import matching_accuracy
+from sigmaslam.files import atomic_path, atomic_write_text
+from sigmaslam.training.card import CARD_NAME, current_commit, make_card
+from sigmaslam.training.checkpoint import (
+    CHECKPOINT_NAME,
+    TrainingState,
+    begin,
+    check_run_folder,
+    resume_checkpoint,
+    save_checkpoint,
+)
+from sigmaslam.training.devices import Workplace, loss_module, open_workplace, to_device
+from sigmaslam.training.interruption import Interruption
+from sigmaslam.training.journal import Journal
+from sigmaslam.training.losses import PairLoss
+from sigmaslam.training.pictures import draw_sample
+from sigmaslam.training.recipes import TrainingConfig, check_config
+from sigmaslam.training.stream import MIXES, TrainingPair, open_stream, pair_loader
+from sigmaslam.training.validation import held_out_seed, held_out_sources, matching_accuracy
 
 WEIGHTS_NAME = "features.safetensors"
-CARD_NAME = "features.json"
-_CHECKPOINT_NAME = "checkpoint.pt"
-_VALIDATION_SEED_OFFSET = 1_000_003
+_LOG_EVERY = 50
+_SHOW_EVERY = 10
 
 
-@dataclass(frozen=True, slots=True)
-class TrainingConfig:
-    """What one run is made of.
+def train(
+    out: Path,
+    config: TrainingConfig,
+    workers: int = 1,
+    resume: bool = False,
+    recipe: str | None = None,
+    start: Path | None = None,
+    device: str = "auto",
+) -> dict[str, Any]:
+    """Trains the correspondence network on renders and writes weights and card into `out`.
 
-    Attributes:
-        steps: optimiser steps.
-        data: what the pairs are made of, a key of `stream.MIXES`.
-        batch_size: pairs a step.
-        size: side of the training images, pixels.
-        points: corners per image in the loss.
-        learning_rate: peak of the one-cycle schedule.
-        weight_decay: of AdamW.
-        quality_weight, place_weight: of the losses of quality and log-sigma beside the descriptor loss.
-        seed: of the data, the initial weights and the sampling.
-        validate_every: in steps, and at the end; 0: never.
-        checkpoint_every: in steps.
-    """
-
-    steps: int = 3400
-    data: str = "leaves"
-    batch_size: int = 16
-    size: int = 224
-    points: int = 256
-    learning_rate: float = 2e-3
-    weight_decay: float = 1e-4
-    quality_weight: float = 0.5
-    place_weight: float = 0.1
-    seed: int = 0
-    validate_every: int = 1700
-    checkpoint_every: int = 250
-
-
-def train(out: Path, config: TrainingConfig, workers: int = 1, resume: bool = False) -> dict[str, Any]:
-    """Trains the correspondence network on procedural textures and writes weights and card into `out`.
+    Under torchrun each process takes its share of every batch. Ctrl-C or SIGTERM: the step under way is finished and
+    saved, then KeyboardInterrupt is raised.
 
     Args:
-        out: run folder; gets checkpoint.pt, log.jsonl, features.safetensors and features.json.
-        config: the recipe.
-        workers: processes that make pairs.
+        out: run folder; gets checkpoint.safetensors, log.jsonl, tensorboard/, samples/, features.safetensors and
+            features.json.
+        config: what the run is made of.
+        workers: processes that make pairs, for each process that trains.
         resume: go on from the checkpoint in `out`.
+        recipe: name of the configuration, for the card.
+        start: weights to go on from; None: random ones, or what the resumed run began with.
+        device: auto (a GPU if there is one), cpu, cuda or cuda:1.
     Returns:
-        The card: config, seed, commit, command, duration, metrics on held-out renders.
+        The card: recipe, config, seed, commit, command, duration, metrics on held-out renders.
     Raises:
-        InputError: `out` holds a checkpoint and `resume` is off, or the other way round, or another recipe made it.
+        InputError: the folder, the configuration, the device or the weights do not go together.
+        KeyboardInterrupt: the run was stopped; it can be resumed.
     """
-    checkpoint_path = out / _CHECKPOINT_NAME
-    if checkpoint_path.exists() and not resume:
-        raise InputError(f"{checkpoint_path} exists: give --resume to go on with it, or another --out")
-    if resume and not checkpoint_path.exists():
-        raise InputError(f"{checkpoint_path} does not exist: there is nothing to resume; leave --resume out")
-    out.mkdir(parents=True, exist_ok=True)
-
-    commit = _commit()  # before the run: the tree may move on while it lasts
-    torch.manual_seed(config.seed)
-    network = FeatureNetwork()
-    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    optimizer = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimizer, max_lr=config.learning_rate, total_steps=config.steps, pct_start=0.1
-    )
-    first, seconds = 0, 0.0
-    metrics: dict[str, float] = {}
-    if resume:
-        state = torch.load(checkpoint_path, weights_only=True)
-        if state["config"] != asdict(config):
-            raise InputError(
-                f"{checkpoint_path} was made with {state['config']}, not {asdict(config)}: resume with the same options"
-            )
-        network.load_state_dict(state["network"])
-        optimizer.load_state_dict(state["optimizer"])
-        schedule.load_state_dict(state["schedule"])
-        first, seconds, metrics = int(state["step"]), float(state["seconds"]), dict(state["metrics"])
-
-    loader = pair_loader(
-        config.data,
-        config.seed,
-        config.size,
-        first * config.batch_size,
-        config.steps * config.batch_size,
-        config.points,
-        config.batch_size,
-        workers,
-    )
-    began = time.monotonic() - seconds
-    with _progress() as progress:
-        task = progress.add_task("training", total=config.steps, completed=first, note="")
-        for step, (image0, image1, keypoints0, places1, visible, keypoints1) in enumerate(loader, start=first):
-            generator = torch.Generator().manual_seed(config.seed * 1_000_000_007 + step)
-            network.train()
-            loss = pair_loss(network, image0, image1, keypoints0, places1, visible, keypoints1, generator)
-            optimizer.zero_grad(set_to_none=True)
-            (loss.descriptor + config.quality_weight * loss.quality + config.place_weight * loss.place).backward()
-            nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-            optimizer.step()
-            schedule.step()
-            done = step + 1
-            progress.update(task, advance=1, note=f"loss {loss.descriptor.item():.3f} recall {loss.recall.item():.3f}")
-            if done % 50 == 0 or done == config.steps:
-                _log(out, done, loss.descriptor.item(), loss.quality.item(), loss.recall.item())
-            if config.validate_every and (done % config.validate_every == 0 or done == config.steps):
-                metrics = matching_accuracy(network, config.seed + _VALIDATION_SEED_OFFSET)
-                progress.console.print(f"step {done}: " + ", ".join(f"{k} {v:.3f}" for k, v in metrics.items()))
-            if done % config.checkpoint_every == 0 or done == config.steps:
-                state = {
-                    "network": network.state_dict(),
-                    "optimizer": optimizer.state_dict(),
-                    "schedule": schedule.state_dict(),
-                    "config": asdict(config),
-                    "step": done,
-                    "seconds": time.monotonic() - began,
-                    "metrics": metrics,
-                }
-                with atomic_path(checkpoint_path) as path:
-                    torch.save(state, path)
-    card = {
-        "config": asdict(config),
-        "seed": config.seed,
-        "commit": commit,
-        # The folder's name alone: where it lay on this machine is nobody's business.
-        "command": " ".join(["sigmaslam", *sys.argv[1:]]).replace(str(out), out.name),
-        "duration_s": round(time.monotonic() - began, 1),
-        "hardware": f"{os.cpu_count()} CPU cores, torch {torch.__version__}",
-        "parameters": sum(p.numel() for p in network.parameters()),
-        "data": f"renders alone, no photograph: {', '.join(MIXES[config.data])} in turn",
-        "metrics_on_held_out_renders": {k: round(v, 4) for k, v in metrics.items()},
-    }
-    with atomic_path(out / WEIGHTS_NAME) as path:
-        save_file({k: v.contiguous() for k, v in network.state_dict().items()}, path)
-    with atomic_path(out / CARD_NAME) as path:
-        path.write_text(json.dumps(card, indent=2) + "\n")
+    check_config(config)
+    check_run_folder(out, resume)
+    commit = current_commit()  # before the run: the tree may move on while it lasts
+    with open_workplace(device, config.batch_size) as place:
+        path = out / CHECKPOINT_NAME
+        state = resume_checkpoint(path, config, recipe, start, place) if resume else begin(config, recipe, start, place)
+        out.mkdir(parents=True, exist_ok=True)
+        with closing(Journal(out, state.step)) if place.leads else nullcontext() as journal:
+            _Run(state, place, out, journal).finish(workers)
+        card = make_card(state, place, commit, [out] if start is None else [out, start])
+        if place.leads:
+            _write_result(out, state, card)
     return card
 
 
-def _log(out: Path, step: int, descriptor: float, quality: float, recall: float) -> None:
-    with (out / "log.jsonl").open("a") as log:
-        log.write(json.dumps({"step": step, "descriptor": descriptor, "quality": quality, "recall": recall}) + "\n")
+class _Run:
+    """The steps that a state lacks, and what is written meanwhile.
+
+    Args:
+        state: goes on changing.
+        place: of this process.
+        out: run folder.
+        journal: of the process that leads.
+    """
+
+    def __init__(self, state: TrainingState, place: Workplace, out: Path, journal: Journal | None) -> None:
+        self._state, self._place, self._journal = state, place, journal
+        self._checkpoint = out / CHECKPOINT_NAME
+        self._saved = state.step
+        self._loss = loss_module(state.network, place)
+        self._began = time.monotonic() - state.seconds
+        self._logged = (state.step, time.monotonic())
+        self._progress = _progress(hidden=not place.leads)
+
+    def finish(self, workers: int) -> None:
+        """Trains to the end; stopped, it saves the last whole step and raises KeyboardInterrupt."""
+        interruption = Interruption(self._place)
+        with interruption.listening():
+            try:
+                with self._progress:
+                    self._steps(workers, interruption)
+            except KeyboardInterrupt:
+                if not interruption.torn and self._state.step > self._saved:
+                    self._save()
+                raise
+
+    def _steps(self, workers: int, interruption: Interruption) -> None:
+        state, config = self._state, self._state.config
+        task = self._progress.add_task("training", total=config.steps, completed=state.step, note="")
+        # The workers begin while this process validates.
+        batches = iter(self._loader(workers))
+        self._validate_if_due()
+        for batch in batches:
+            with interruption.whole_step():
+                loss = self._step(to_device(batch, self._place))
+            self._progress.update(task, completed=state.step)
+            last = state.step == config.steps
+            if state.step % _SHOW_EVERY == 0 or last:
+                self._progress.update(task, note=_note(loss))
+            if state.step % _LOG_EVERY == 0 or last:
+                self._log(loss)
+            self._validate_if_due()
+            if state.step % config.checkpoint_every == 0 or last:
+                self._save()
+
+    def _loader(self, workers: int) -> DataLoader[TrainingPair]:
+        config, place = self._state.config, self._place
+        return pair_loader(
+            config.data,
+            config.seed,
+            config.size,
+            self._state.step * config.batch_size,
+            config.steps * config.batch_size,
+            config.points,
+            config.batch_size,
+            workers,
+            place.rank,
+            place.ranks,
+            pinned=place.on_gpu,
+        )
+
+    def _step(self, batch: TrainingPair) -> PairLoss:
+        """One step of the optimiser."""
+        state, config = self._state, self._state.config
+        seed = config.seed * 1_000_000_007 + state.step + self._place.rank * 500_000_003
+        state.network.train()
+        loss: PairLoss = self._loss(batch, torch.Generator().manual_seed(seed))
+        state.optimizer.zero_grad(set_to_none=True)
+        (loss.descriptor + config.quality_weight * loss.quality + config.place_weight * loss.place).backward()
+        nn.utils.clip_grad_norm_(state.network.parameters(), 1.0)
+        state.optimizer.step()
+        state.schedule.step()
+        state.step += 1
+        return loss
+
+    def _log(self, loss: PairLoss) -> None:
+        if self._journal is None:
+            return
+        step, now = self._state.step, time.monotonic()
+        before, then = self._logged
+        self._logged = (step, now)
+        values = {name: float(value.detach()) for name, value in loss._asdict().items()}
+        rate = float(self._state.schedule.get_last_lr()[0])
+        speed = (step - before) / max(now - then, 1e-9)
+        self._journal.write_losses(step, {**values, "learning_rate": rate, "steps_per_second": round(speed, 3)})
+
+    def _validate_if_due(self) -> None:
+        """Validates and draws a sample; before the first step it draws alone."""
+        state, config = self._state, self._state.config
+        if self._journal is None or config.validate_every == 0:
+            return
+        due = state.step % config.validate_every == 0 or state.step == config.steps
+        if not due or state.validated == state.step:
+            return
+        seed, sources = held_out_seed(config.seed), held_out_sources(config.data)
+        if state.step:
+            state.metrics = matching_accuracy(state.network, seed, sources)
+            self._journal.write_metrics(state.step, state.metrics)
+            metrics = ", ".join(f"{name} {value:.3f}" for name, value in state.metrics.items())
+            self._progress.console.print(f"step {state.step}: {metrics}")
+        pair = open_stream(MIXES[config.data][0], seed, config.size).pair(0)
+        self._journal.write_sample(state.step, draw_sample(state.network, pair))
+        state.validated = state.step
+
+    def _save(self) -> None:
+        if self._place.leads:
+            self._state.seconds = time.monotonic() - self._began
+            save_checkpoint(self._checkpoint, self._state)
+            self._saved = self._state.step
 
 
-def _progress() -> Progress:
+def _write_result(out: Path, state: TrainingState, card: dict[str, Any]) -> None:
+    with atomic_path(out / WEIGHTS_NAME) as path:
+        save_file({name: value.cpu().contiguous() for name, value in state.network.state_dict().items()}, path)
+    atomic_write_text(out / CARD_NAME, json.dumps(card, indent=2) + "\n")
+
+
+def _note(loss: PairLoss) -> str:
+    return " ".join(f"{name} {float(value.detach()):.3f}" for name, value in loss._asdict().items())
+
+
+def _progress(hidden: bool) -> Progress:
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -182,19 +223,5 @@ def _progress() -> Progress:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
         TextColumn("{task.fields[note]}"),
+        disable=hidden,
     )
-
-
-def _commit() -> str:
-    """The commit of the source tree, or 'unknown' when installed from a wheel."""
-    try:
-        result = subprocess.run(
-            ["git", "rev-parse", "HEAD"],
-            cwd=Path(__file__).resolve().parent,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-    return result.stdout.strip()

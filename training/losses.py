@@ -86,7 +86,7 @@ def place_loss(distance: Tensor, log_sigma0: Tensor, log_sigma1: Tensor, zoom: T
     Its heavy tails bear the wrong partners that chance brings near.
 
     Args:
-        distance: (B, N) between the true place in image 1 of a keypoint of image 0 and the keypoint found there, pixels.
+        distance: (B, N) from the true place in image 1 of a keypoint of image 0 to the keypoint found there, pixels.
         log_sigma0, log_sigma1: (B, N) predicted for the one and the other, of pixels of their images.
         zoom: (B, 1) pixels of image 1 a pixel of image 0.
         partnered: (B, N) bool, the rows that count.

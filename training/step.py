@@ -44,7 +44,8 @@ def pair_loss(
     batch, count = keypoints0.shape[:2]
     size = image0.shape[-1]
     visible = visible & ((places1 >= _MARGIN) & (places1 <= size - 1 - _MARGIN)).all(dim=-1)
-    distance = torch.cdist(places1, keypoints1)
+    # By matrix products it would be off by a tenth of a pixel.
+    distance = torch.cdist(places1, keypoints1, compute_mode="donot_use_mm_for_euclid_dist")
     nearest, partner = distance.min(dim=2)
     # A keypoint of image 1 at a true place would be wrongly pushed away: it moves elsewhere as a distractor.
     elsewhere = size * torch.rand(keypoints1.shape, generator=generator).to(keypoints1)

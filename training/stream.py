@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import signal
 from typing import Protocol
 
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader, Dataset, Subset
 
 from sigmaslam.errors import InputError
 from sigmaslam.models.detector import detect, to_cells
@@ -27,6 +28,7 @@ MIXES: dict[str, tuple[str, ...]] = {
     "scenes": ("scenes",),
     "mix": ("leaves", "scenes", "leaves", "scenes", "leaves"),
     "blend": ("leaves", "leaves", "leaves", "scenes"),
+    "endoscope": ("endoscopy", "leaves", "endoscopy", "leaves"),
 }
 
 
@@ -53,9 +55,15 @@ class PairStream(Protocol):
 
 
 def open_stream(source: str, seed: int, size: int) -> PairStream:
-    """A stream by name: 'scenes', 'patterns' (every texture but leaves) or a texture's kind under homographies."""
+    """A stream by name.
+
+    'scenes', 'endoscopy' (scenes inside a body), 'patterns' (every texture but leaves) or a texture's kind under
+    homographies.
+    """
     if source == "scenes":
         return ScenePairs(seed, size)
+    if source == "endoscopy":
+        return ScenePairs(seed, size, ("colon", "organ"))
     kinds = tuple(kind for kind in KINDS if kind != "leaves") if source == "patterns" else (source,)
     return HomographyPairs(seed, size, kinds)
 
@@ -133,18 +141,42 @@ class PairDataset(Dataset[TrainingPair]):
 
 
 def pair_loader(
-    mix: str, seed: int, size: int, first: int, last: int, keypoints: int, batch_size: int, workers: int
+    mix: str,
+    seed: int,
+    size: int,
+    first: int,
+    last: int,
+    keypoints: int,
+    batch_size: int,
+    workers: int,
+    rank: int = 0,
+    ranks: int = 1,
+    pinned: bool = False,
 ) -> DataLoader[TrainingPair]:
-    """Batches of pairs in order of their index."""
+    """Batches of pairs in order of their index.
+
+    Args:
+        mix, seed, size, first, last, keypoints: as `PairDataset` takes them; a batch begins at `first`.
+        batch_size: pairs of a batch, a multiple of `ranks`.
+        workers: processes that make pairs.
+        rank, ranks: this process takes pairs rank, rank + ranks, ... of every batch.
+        pinned: batches lie where a GPU can fetch them.
+    """
+    dataset = PairDataset(mix, seed, size, first, last, keypoints)
     return DataLoader(
-        PairDataset(mix, seed, size, first, last, keypoints),
-        batch_size=batch_size,
+        Subset(dataset, range(rank, len(dataset), ranks)),
+        batch_size=batch_size // ranks,
         num_workers=workers,
-        worker_init_fn=_one_thread if workers else None,
+        worker_init_fn=_prepare_worker if workers else None,
+        # A fork of a process that has used OpenCV or torch may wait for ever for threads that it lacks.
+        multiprocessing_context="spawn" if workers else None,
         prefetch_factor=4 if workers else None,
+        pin_memory=pinned,
     )
 
 
-def _one_thread(worker: int) -> None:
+def _prepare_worker(worker: int) -> None:
+    # Ctrl-C reaches every process of the terminal: the one that trains ends its workers itself.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)
     torch.set_num_threads(1)

@@ -1,7 +1,9 @@
 """How well an extractor matches real images: sets of pairs with truth, scores, and everyone under the same rules."""
 
+from sigmaslam.evaluation.matching.comparison import compare
 from sigmaslam.evaluation.matching.extractors import Extractor, LearnedExtractor, load_extractor
 from sigmaslam.evaluation.matching.pairs import ImagePair
+from sigmaslam.evaluation.matching.peers import PeerExtractor
 from sigmaslam.evaluation.matching.run import format_scores, score, score_pairs
 from sigmaslam.evaluation.matching.sets import FINAL, SELECTION, load_set
 
@@ -11,6 +13,8 @@ __all__ = [
     "Extractor",
     "ImagePair",
     "LearnedExtractor",
+    "PeerExtractor",
+    "compare",
     "format_scores",
     "load_extractor",
     "load_set",

@@ -1,4 +1,4 @@
-"""`python -m sigmaslam.evaluation.matching`: SIFT, ORB and weights files side by side."""
+"""`python -m sigmaslam.evaluation.matching`: SIFT, ORB, weights files and other people's graphs side by side."""
 
 from __future__ import annotations
 
@@ -6,48 +6,38 @@ import argparse
 import json
 import os
 import sys
-import time
 from pathlib import Path
 
 from sigmaslam.errors import SigmaSlamError
-from sigmaslam.evaluation.matching.extractors import CLASSICAL, load_extractor
-from sigmaslam.evaluation.matching.run import Scores, format_scores, score_pairs
-from sigmaslam.evaluation.matching.sets import FINAL, SELECTION, load_set
+from sigmaslam.evaluation.matching.comparison import compare
+from sigmaslam.evaluation.matching.extractors import CLASSICAL
+from sigmaslam.evaluation.matching.run import format_scores
+from sigmaslam.evaluation.matching.sets import ALL, SELECTION
 
 
 def main() -> None:
     """Parses, scores, prints; progress goes to the standard error."""
     parser = argparse.ArgumentParser(
         prog="python -m sigmaslam.evaluation.matching",
-        description="How well SIFT, ORB and our networks match real images: at most 1,024 keypoints, long side 640, "
-        "mutual nearest neighbours. The folder of the data sets is taken from SIGMASLAM_DATA.",
+        description="How well SIFT, ORB, our networks and other people's match real images: at most 1,024 keypoints "
+        "(kitti_tracks: 2,048), long side 640, mutual nearest neighbours. The folder of the data sets is taken from "
+        "SIGMASLAM_DATA.",
     )
-    parser.add_argument("--weights", nargs="*", type=Path, default=[], metavar="FILE", help=".safetensors or .onnx")
     parser.add_argument(
-        "--sets", default=",".join(SELECTION), help=f"comma-separated, of {', '.join(SELECTION + FINAL)} (%(default)s)"
+        "--weights", nargs="*", type=Path, default=[], metavar="FILE", help=".safetensors or .onnx, ours or a peer's"
+    )
+    parser.add_argument(
+        "--sets", default=",".join(SELECTION), help=f"comma-separated, of {', '.join(ALL)} (%(default)s)"
     )
     parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
     arguments = parser.parse_args()
     try:
-        results = _score_all(arguments.weights, arguments.sets.split(","))
+        data = Path(os.environ.get("SIGMASLAM_DATA", ""))
+        names = [*CLASSICAL, *map(str, arguments.weights)]
+        results = compare(names, arguments.sets.split(","), data, lambda text: print(text, file=sys.stderr))
     except SigmaSlamError as error:
         sys.exit(f"error: {error}")
     print(json.dumps(results, indent=2) if arguments.json else format_scores(results))
-
-
-def _score_all(weights: list[Path], sets: list[str]) -> dict[str, Scores]:
-    data = Path(os.environ.get("SIGMASLAM_DATA", ""))
-    names = [*CLASSICAL, *map(str, weights)]
-    extractors = {name: load_extractor(name) for name in names}
-    results: dict[str, Scores] = {name: {} for name in extractors}
-    for name in sets:
-        pairs = load_set(name, data)
-        for label, extractor in extractors.items():
-            start = time.perf_counter()
-            results[label][name] = score_pairs(extractor, pairs)
-            seconds = time.perf_counter() - start
-            print(f"{name}: {label}, {len(pairs)} pairs in {seconds:.1f} s", file=sys.stderr)
-    return results
 
 
 if __name__ == "__main__":

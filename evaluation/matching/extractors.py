@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from sigmaslam.errors import InputError
+from sigmaslam.evaluation.matching.peers import PeerExtractor, read_signature
 from sigmaslam.frontend.classical import OrbDetector, SiftDetector
 from sigmaslam.frontend.learned import Graph, extract
 from sigmaslam.frontend.types import Features
@@ -16,13 +17,14 @@ from sigmaslam.session import OnnxGraph
 
 MAX_KEYPOINTS = 1024
 CLASSICAL = ("sift", "orb")
+_OUR_INPUTS = {"image", "count"}
 
 
 class Extractor(Protocol):
     """Keypoints and descriptors of one image."""
 
     def __call__(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Features of an (H, W) uint8 grey image, at most 1,024 of them.
+        """Features of an (H, W) uint8 grey image, at most 1,024 of them unless another number was asked for.
 
         Returns:
             (N, 2) pixel coordinates (u, v), and (N, C) descriptors: float32 of unit length, compared by dot product,
@@ -37,40 +39,45 @@ class LearnedExtractor:
     Args:
         graph: called as `sigmaslam.frontend.learned.extract` does: an `OnnxGraph`, or a `FeatureExtractor` in a
             `TorchModule`.
+        max_keypoints: of an image.
     """
 
-    def __init__(self, graph: Graph) -> None:
-        self._graph = graph
+    def __init__(self, graph: Graph, max_keypoints: int = MAX_KEYPOINTS) -> None:
+        self._graph, self._max_keypoints = graph, max_keypoints
 
     def __call__(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Keypoints and descriptors of an (H, W) uint8 image."""
-        found = extract(self._graph, image, MAX_KEYPOINTS)
+        found = extract(self._graph, image, self._max_keypoints)
         return found.keypoints, found.descriptors
 
 
-def load_extractor(name: str) -> Extractor:
-    """ "sift", "orb", or the path of a .safetensors (needs the extra `train`) or .onnx file of ours.
+def load_extractor(name: str, max_keypoints: int = MAX_KEYPOINTS) -> Extractor:
+    """ "sift", "orb", or the path of a file: ours (.safetensors, which needs the extra `train`, or .onnx), or a peer's
+    .onnx (see `PeerExtractor`).
 
     Raises:
         InputError: it is none of these, or the file cannot be used.
     """
     if name == "sift":
-        return _classical(SiftDetector(MAX_KEYPOINTS))
+        return _classical(SiftDetector(max_keypoints), max_keypoints)
     if name == "orb":
-        return _classical(OrbDetector(MAX_KEYPOINTS))
+        return _classical(OrbDetector(max_keypoints), max_keypoints)
     path = Path(name)
     if path.suffix == ".onnx":
-        return LearnedExtractor(OnnxGraph(path))
+        graph = OnnxGraph(path)
+        if set(read_signature(path).inputs) == _OUR_INPUTS:
+            return LearnedExtractor(graph, max_keypoints)
+        return PeerExtractor(path, max_keypoints)
     if path.suffix == ".safetensors":
         from sigmaslam.models.torch_runtime import TorchFeatures
 
-        return LearnedExtractor(TorchFeatures(path))
-    raise InputError(f"{name} is no extractor: give {', '.join(CLASSICAL)}, or a .safetensors or .onnx file of ours")
+        return LearnedExtractor(TorchFeatures(path), max_keypoints)
+    raise InputError(f"{name} is no extractor: give {', '.join(CLASSICAL)}, or a .safetensors or .onnx file")
 
 
-def _classical(detect: Callable[[np.ndarray], Features]) -> Extractor:
+def _classical(detect: Callable[[np.ndarray], Features], max_keypoints: int) -> Extractor:
     def extract(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         features = detect(image)
-        return features.keypoints[:MAX_KEYPOINTS], features.descriptors[:MAX_KEYPOINTS]
+        return features.keypoints[:max_keypoints], features.descriptors[:max_keypoints]
 
     return extract

@@ -10,6 +10,7 @@ import numpy as np
 
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.matching.pairs import Disparity, Homography, ImagePair, Motion, resize
+from sigmaslam.readers.images import read_grey as read_grey  # also imported from here
 from sigmaslam.readers.images import read_image
 from sigmaslam.rotation import se3_inverse
 
@@ -151,12 +152,6 @@ def _view(photograph: np.ndarray, H: np.ndarray, rng: np.random.Generator) -> np
         image = cv2.GaussianBlur(image, (0, 0), blur)
     image = image + rng.uniform(0.003, 0.03) * rng.standard_normal(image.shape, np.float32)
     return np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
-
-
-def read_grey(path: Path) -> np.ndarray:
-    """An image file as (H, W) grey."""
-    image = read_image(path)
-    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
 
 
 def _read_pfm(path: Path) -> np.ndarray:

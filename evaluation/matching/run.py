@@ -13,7 +13,7 @@ from sigmaslam.evaluation.matching.sets import load_set
 Scores = dict[str, dict[str, float]]
 """By set, then by name of the score; shares and areas in [0, 1], numbers of matches a pair."""
 
-_COUNTS = ("correct_3", "matches")
+_COUNTS = ("correct_3", "matches", "steps_good", "steps", "inliers")
 
 
 def score(extractor: Extractor, sets: Sequence[str], data: Path) -> Scores:
@@ -29,14 +29,20 @@ def score(extractor: Extractor, sets: Sequence[str], data: Path) -> Scores:
     return {name: score_pairs(extractor, load_set(name, data)) for name in sets}
 
 
-def score_pairs(extractor: Extractor, pairs: Sequence[ImagePair]) -> dict[str, float]:
+def score_pairs(
+    extractor: Extractor, pairs: Sequence[ImagePair], max_keypoints: int = MAX_KEYPOINTS
+) -> dict[str, float]:
     """Scores of an extractor on pairs, each image extracted once.
 
+    Args:
+        extractor: image to keypoints and descriptors.
+        pairs: images with the truth between them.
+        max_keypoints: what everyone in the comparison may give.
     Returns:
         Means over the pairs; names as in `scores.score_pair` and `scores.summarize`, after the name of the part of the
         set where there is one ("gap1_epipolar_1").
     Raises:
-        ValueError: the extractor gives more than 1,024 keypoints.
+        ValueError: the extractor gives more keypoints.
     """
     features: dict[int, Features] = {}
     # `pairs` keeps the arrays alive, so their ids stay apart.
@@ -44,8 +50,8 @@ def score_pairs(extractor: Extractor, pairs: Sequence[ImagePair]) -> dict[str, f
         if id(image) not in features:
             keypoints, descriptors = extractor(image)
             features[id(image)] = keypoints, descriptors
-            if len(keypoints) > MAX_KEYPOINTS:
-                raise ValueError(f"the extractor gave {len(keypoints)} keypoints: at most {MAX_KEYPOINTS} are compared")
+            if len(keypoints) > max_keypoints:
+                raise ValueError(f"the extractor gave {len(keypoints)} keypoints: at most {max_keypoints} are compared")
     parts: dict[tuple[str, type], list[dict[str, float]]] = {}
     for pair in pairs:
         found = score_pair(pair, features[id(pair.image0)], features[id(pair.image1)])
@@ -66,13 +72,15 @@ def format_scores(results: Mapping[str, Scores]) -> str:
     lines = []
     for name in dict.fromkeys(name for scores in results.values() for name in scores):
         rows = {extractor: scores[name] for extractor, scores in results.items() if name in scores}
-        columns = list(next(iter(rows.values())))
+        columns = list(dict.fromkeys(column for row in rows.values() for column in row))
         lines += [f"## {name}", "", "| extractor | " + " | ".join(columns) + " |", "|---|" + "---:|" * len(columns)]
         for extractor, row in rows.items():
-            lines.append(f"| {extractor} | " + " | ".join(_number(column, row[column]) for column in columns) + " |")
+            lines.append(f"| {extractor} | " + " | ".join(_number(column, row) for column in columns) + " |")
         lines.append("")
     return "\n".join(lines)
 
 
-def _number(column: str, value: float) -> str:
-    return f"{value:.0f}" if column.endswith(_COUNTS) else f"{100 * value:.1f}"
+def _number(column: str, row: Mapping[str, float]) -> str:
+    if column not in row:
+        return "-"
+    return f"{row[column]:.0f}" if column.endswith(_COUNTS) else f"{100 * row[column]:.1f}"

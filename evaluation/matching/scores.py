@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 
 from sigmaslam.evaluation.matching.pairs import Disparity, Homography, ImagePair, Motion, SameRows
+from sigmaslam.frontend.matching import match_rows
+from sigmaslam.frontend.refine import refine
 from sigmaslam.rotation import rotation_log
 
 CORNER_THRESHOLDS = (1, 3, 5)
@@ -18,6 +20,10 @@ _BORDER = 8
 _INLIER_THRESHOLD = 1.0
 _CONFIDENCE = 0.9999
 _ITERATIONS = 10_000
+# Rows as the tracker matches them (sigmaslam/frontend/descriptor.py), with the ratio of our features for everyone.
+_ROW_TOLERANCE = 2.0
+_DISPARITY_SHARE = 0.25
+_RATIO = 0.95
 _CORNER_ERROR, _POSE_ERROR = "corner_error", "pose_error_deg"
 
 Features = tuple[np.ndarray, np.ndarray]
@@ -34,15 +40,31 @@ def mutual_nearest(descriptors0: np.ndarray, descriptors1: np.ndarray) -> tuple[
     if len(descriptors0) == 0 or len(descriptors1) == 0:
         none = np.zeros(0, np.int64)
         return none, none
-    if descriptors0.dtype == np.uint8:
-        # The dot product of bits as +-1 falls with their Hamming distance.
-        descriptors0, descriptors1 = (
-            2.0 * np.unpackbits(bits, axis=1).astype(np.float32) - 1.0 for bits in (descriptors0, descriptors1)
-        )
-    similarity = descriptors0 @ descriptors1.T
+    similarity = _unit(descriptors0) @ _unit(descriptors1).T
     best1 = similarity.argmax(axis=1)
     index0 = np.flatnonzero(similarity.argmax(axis=0)[best1] == np.arange(len(best1)))
     return index0, best1[index0]
+
+
+def match_rows_refined(
+    left: np.ndarray, right: np.ndarray, features_left: Features, features_right: Features
+) -> tuple[np.ndarray, np.ndarray]:
+    """Stereo matches of a rectified pair as the tracker makes them: descriptors within a band, then Lucas-Kanade.
+
+    Args:
+        left, right: (H, W) uint8.
+        features_left, features_right: their keypoints and descriptors.
+    Returns:
+        Indices (K,) into the left keypoints and their places (K, 2) in the right image; what could not be refined is
+        left out.
+    """
+    (keypoints, descriptors), (others, other_descriptors) = features_left, features_right
+    disparities = (-_ROW_TOLERANCE, _DISPARITY_SHARE * left.shape[1])
+    index_left, index_right = match_rows(
+        keypoints, others, _unit(descriptors), _unit(other_descriptors), _ROW_TOLERANCE, disparities, _RATIO
+    )
+    places, moved = refine(left, right, keypoints[index_left], others[index_right])
+    return index_left[moved], places[moved]
 
 
 def score_pair(pair: ImagePair, features0: Features, features1: Features) -> dict[str, float]:
@@ -57,7 +79,8 @@ def score_pair(pair: ImagePair, features0: Features, features1: Features) -> dic
         points without known disparity are left out), correct_3 (their number within 3 px), repeatability_1 (share of
         the keypoints of image 0 inside image 1 that are seen again within 1 px); homography: corner_error (mean over
         the corners of image 0, px, infinite without an estimate).
-        same rows: rows_1 (share of the matches with a row error below 1 px), row_matches (their number).
+        same rows: rows_1 (share of the matches with a row error below 1 px), row_matches (their number);
+        rows_refined_1, rows_refined_matches: the same after matching within 2 rows and refinement.
         motion: epipolar_1 (share of the matches within 1 px of their epipolar line), epipolar_matches (their number),
         pose_error_deg (larger of the errors of rotation and of direction of translation, infinite without an estimate).
     """
@@ -67,7 +90,14 @@ def score_pair(pair: ImagePair, features0: Features, features1: Features) -> dic
     truth = pair.truth
     if isinstance(truth, SameRows):
         level = np.abs(points0[:, 1] - points1[:, 1]) < 1.0
-        return {"rows_1": _share(level), "row_matches": float(level.sum())}
+        index, places = match_rows_refined(pair.image0, pair.image1, features0, features1)
+        refined = np.abs(keypoints0[index, 1] - places[:, 1]) < 1.0
+        return {
+            "rows_1": _share(level),
+            "row_matches": float(level.sum()),
+            "rows_refined_1": _share(refined),
+            "rows_refined_matches": float(refined.sum()),
+        }
     if isinstance(truth, Motion):
         near = truth.epipolar_distance(points0, points1) < 1.0
         return {
@@ -172,6 +202,14 @@ def summarize(pairs: Sequence[dict[str, float]]) -> dict[str, float]:
         else:
             summary[name] = float(np.mean(values))
     return summary
+
+
+def _unit(descriptors: np.ndarray) -> np.ndarray:
+    """Bit strings as +-1, whose dot product falls with their Hamming distance, of unit length; others as they are."""
+    if descriptors.dtype != np.uint8:
+        return descriptors
+    bits = np.unpackbits(descriptors, axis=1).astype(np.float32)
+    return np.asarray((2.0 * bits - 1.0) / np.sqrt(max(bits.shape[1], 1)), np.float32)
 
 
 def _share(right: np.ndarray) -> float:

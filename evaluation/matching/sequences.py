@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
+from sigmaslam.camera import RectifiedStereo
 from sigmaslam.evaluation.matching.pairs import ImagePair, Motion, SameRows, resize
+from sigmaslam.evaluation.matching.stereo import StereoStep
 from sigmaslam.readers import StereoSequence, open_sequence
 from sigmaslam.rectify import StereoRectifier
 from sigmaslam.rotation import se3_inverse
@@ -26,6 +30,11 @@ def euroc(folder: Path) -> list[ImagePair]:
     return sequence_pairs(open_sequence(folder), folder / "groundtruth.csv", 1, {1: "next"})
 
 
+def euroc_steps(folder: Path) -> list[StereoStep]:
+    """From every keyframe to the next."""
+    return sequence_steps(open_sequence(folder), folder / "groundtruth.csv")
+
+
 def sequence_pairs(sequence: StereoSequence, truth: Path, step: int, gaps: Mapping[int, str]) -> list[ImagePair]:
     """Stereo and temporal pairs of a sequence.
 
@@ -35,27 +44,65 @@ def sequence_pairs(sequence: StereoSequence, truth: Path, step: int, gaps: Mappi
         step: every so many frames pairs begin.
         gaps: by frames between the two images of a temporal pair, the name of its part.
     """
+    views = {
+        view.index: view
+        for view in _views(sequence, truth)
+        if any((view.index - gap) % step == 0 for gap in (0, *gaps))
+    }
+    begins = [index for index in views if index % step == 0]
+    pairs = [ImagePair(f"{index} stereo", views[index].left, views[index].right, SameRows()) for index in begins]
+    for gap, part in gaps.items():
+        for first, second in ((views[index], views[index + gap]) for index in begins if index + gap in views):
+            motion = Motion(first.camera.matrix, se3_inverse(second.T_world_camera) @ first.T_world_camera)
+            pairs.append(ImagePair(f"{first.index} {second.index}", first.left, second.left, motion, part))
+    return pairs
+
+
+def sequence_steps(sequence: StereoSequence, truth: Path) -> list[StereoStep]:
+    """Steps from each frame to the next.
+
+    Args:
+        sequence: images as stored; they are rectified here.
+        truth: trajectory of the left camera, any format.
+    """
+    return [
+        StereoStep(
+            f"{first.index} {second.index}",
+            first.left,
+            first.right,
+            second.left,
+            first.camera,
+            se3_inverse(second.T_world_camera) @ first.T_world_camera,
+        )
+        for first, second in pairwise(_views(sequence, truth))
+        if second.index == first.index + 1
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class _View:
+    """A stereo pair, rectified and resized, with its camera and the true pose of the left eye."""
+
+    index: int
+    left: np.ndarray
+    right: np.ndarray
+    camera: RectifiedStereo
+    T_world_camera: np.ndarray
+
+
+def _views(sequence: StereoSequence, truth: Path) -> Iterator[_View]:
     rectifier = StereoRectifier(sequence.camera)
-    view = rectifier.rectified
     T_camera_rectified = np.eye(4)
     T_camera_rectified[:3, :3] = rectifier.R_rectified_left.T
     trajectory = read_trajectory(truth)
-    lefts, poses, pairs = {}, {}, []
-    K = np.eye(3)
     for frame in sequence.frames():
-        if not any((frame.index - gap) % step == 0 for gap in (0, *gaps)):
-            continue
         left, right = rectifier.rectify(frame.left, frame.right)
-        lefts[frame.index], S = resize(left)
-        K = S @ view.matrix
+        (small_left, S), (small_right, _) = resize(left), resize(right)
+        K = S @ rectifier.rectified.matrix
+        height, width = small_left.shape
+        camera = RectifiedStereo(
+            K[0, 0], K[1, 1], K[0, 2], K[1, 2], rectifier.rectified.baseline, width=width, height=height
+        )
         nearest = np.abs(trajectory.timestamps - frame.timestamp).argmin()
-        poses[frame.index] = trajectory.poses[nearest] @ T_camera_rectified
-        if frame.index % step == 0:
-            pairs.append(ImagePair(f"{frame.index} stereo", lefts[frame.index], resize(right)[0], SameRows()))
-    for gap, part in gaps.items():
-        for first in lefts:
-            second = first + gap
-            if first % step == 0 and second in lefts:
-                motion = Motion(K, se3_inverse(poses[second]) @ poses[first])
-                pairs.append(ImagePair(f"{first} {second}", lefts[first], lefts[second], motion, part))
-    return pairs
+        pose = trajectory.poses[nearest] @ T_camera_rectified
+        yield _View(frame.index, small_left, small_right, camera, pose)

@@ -7,12 +7,16 @@ from pathlib import Path
 
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.matching import photographs, sequences
-from sigmaslam.evaluation.matching.pairs import ImagePair
+from sigmaslam.evaluation.matching.pairs import ImagePair, Motion
+from sigmaslam.evaluation.matching.stereo import StereoStep
 
 SELECTION = ("set12", "middlebury")
 """Models and training data are chosen on these."""
 FINAL = ("boat", "churchill", "fountain", "kitti", "euroc")
 """These are scored once, when everything is chosen."""
+TRACKS, STEPS = "kitti_tracks", "euroc_steps"
+"""The last two again: matches from frame to frame of up to 2,048 keypoints, and poses of steps between keyframes."""
+ALL = (*SELECTION, *FINAL, TRACKS, STEPS)
 
 _SETS: dict[str, tuple[str, Callable[[Path], list[ImagePair]]]] = {
     "set12": ("denoising", photographs.set12),
@@ -37,6 +41,20 @@ def load_set(name: str, data: Path) -> list[ImagePair]:
     if name not in _SETS:
         raise InputError(f"there is no set '{name}': choose among {', '.join(_SETS)}")
     folder_name, load = _SETS[name]
-    if not (data / folder_name).is_dir():
-        raise InputError(f"{data} does not hold {folder_name}: set SIGMASLAM_DATA to the folder of the real data sets")
-    return load(data / folder_name)
+    return load(_folder(data, folder_name))
+
+
+def load_tracks(data: Path) -> list[ImagePair]:
+    """The temporal pairs of the set kitti."""
+    return [pair for pair in load_set("kitti", data) if isinstance(pair.truth, Motion)]
+
+
+def load_steps(data: Path) -> list[StereoStep]:
+    """The steps between keyframes of the set euroc."""
+    return sequences.euroc_steps(_folder(data, _SETS["euroc"][0]))
+
+
+def _folder(data: Path, name: str) -> Path:
+    if not (data / name).is_dir():
+        raise InputError(f"{data} does not hold {name}: set SIGMASLAM_DATA to the folder of the real data sets")
+    return data / name

@@ -76,6 +76,16 @@ def read_image(path: Path) -> np.ndarray:
     return image
 
 
+def read_grey(path: Path) -> np.ndarray:
+    """Read one image of any kind as (H, W) uint8; 16 bits are scaled by those that are significant in it.
+
+    Raises:
+        FrameError: the file is missing or no image, or has another pixel type or number of channels.
+    """
+    image = _single_channel(read_image(path), str(path))
+    return image if image.dtype == np.uint8 else _to_8_bits(image, _significant_bits(image))
+
+
 class GreyConverter:
     """Makes every image of one sequence grey and 8-bit by the same rule, and says once that it does.
 
@@ -93,32 +103,42 @@ class GreyConverter:
         Raises:
             FrameError: another pixel type or number of channels.
         """
-        if image.dtype not in (np.uint8, np.uint16):
-            raise FrameError(f"{name}: pixel type {image.dtype} is neither 8- nor 16-bit unsigned")
-        if image.ndim == 3 and image.shape[2] > 4:
-            raise FrameError(f"{name}: {image.shape[2]} channels; expected grey, BGR or BGR with alpha")
-        if image.ndim == 3:
-            image = self._to_grey(image, name)
-        if image.dtype == np.uint16:
+        grey = _single_channel(image, name)
+        if image.ndim == 3 and image.shape[2] > 2 and not self._colour_warned:
+            self._colour_warned = True
+            logger.warning("%s: colour image; the whole sequence is converted to grey", name)
+        if grey.dtype == np.uint16:
             if self.significant_bits is None:
-                self.significant_bits = max(8, int(image.max()).bit_length())
+                self.significant_bits = _significant_bits(grey)
                 logger.warning(
                     "%s: 16-bit image, %d significant bits; the whole sequence is scaled to 8 bits by 255/%d",
                     name,
                     self.significant_bits,
                     2**self.significant_bits - 1,
                 )
-            image = cv2.convertScaleAbs(image, alpha=255.0 / (2**self.significant_bits - 1))
-        return image
+            grey = _to_8_bits(grey, self.significant_bits)
+        return grey
 
-    def _to_grey(self, image: np.ndarray, name: str) -> np.ndarray:
-        channels = image.shape[2]
-        if channels <= 2:
-            return np.ascontiguousarray(image[..., 0])
-        if not self._colour_warned:
-            self._colour_warned = True
-            logger.warning("%s: colour image; the whole sequence is converted to grey", name)
-        return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY if channels == 3 else cv2.COLOR_BGRA2GRAY)
+
+def _single_channel(image: np.ndarray, name: str) -> np.ndarray:
+    if image.dtype not in (np.uint8, np.uint16):
+        raise FrameError(f"{name}: pixel type {image.dtype} is neither 8- nor 16-bit unsigned")
+    if image.ndim == 2:
+        return image
+    channels = image.shape[2]
+    if channels > 4:
+        raise FrameError(f"{name}: {channels} channels; expected grey, BGR or BGR with alpha")
+    if channels <= 2:
+        return np.ascontiguousarray(image[..., 0])
+    return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY if channels == 3 else cv2.COLOR_BGRA2GRAY)
+
+
+def _significant_bits(image: np.ndarray) -> int:
+    return max(8, int(image.max()).bit_length())
+
+
+def _to_8_bits(image: np.ndarray, significant_bits: int) -> np.ndarray:
+    return cv2.convertScaleAbs(image, alpha=255.0 / (2**significant_bits - 1))
 
 
 class ImagePairs:

@@ -1,0 +1,88 @@
+"""Training pairs: their order, and what they are made of."""
+
+import pytest
+import torch
+
+from sigmaslam.errors import InputError
+from sigmaslam.synthetic import pairs
+from sigmaslam.training import stream
+from sigmaslam.training.stream import MIXES, MixedPairs, PairDataset, open_stream, pair_loader
+
+
+@pytest.fixture(autouse=True)
+def small_textures(monkeypatch):
+    monkeypatch.setattr(pairs, "_TEXTURE_SIZE", 128)
+
+
+def test_batches_do_not_depend_on_where_the_loader_begins():
+    whole = list(pair_loader("leaves", 0, 96, 0, 6, 16, 2, workers=0))
+    rest = list(pair_loader("leaves", 0, 96, 4, 6, 16, 2, workers=0))
+    assert len(whole) == 3
+    assert len(rest) == 1
+    for a, b in zip(whole[2], rest[0], strict=True):
+        assert torch.equal(a, b)
+
+
+def test_keypoints_lie_in_the_image_and_have_the_promised_number():
+    image0, image1, keypoints0, places1, visible, keypoints1 = PairDataset("leaves", 0, 96, 0, 4, keypoints=300)[3]
+    assert image0.shape == image1.shape == (1, 96, 96)
+    assert places1.shape == (300, 2)
+    assert visible.shape == (300,)
+    assert (places1[visible] >= 0).all()
+    assert (places1[visible] <= 95).all()
+    for keypoints in (keypoints0, keypoints1):
+        assert keypoints.shape == (300, 2)
+        assert keypoints.min() >= 0
+        assert keypoints.max() <= 95
+    with pytest.raises(IndexError):
+        PairDataset("leaves", 0, 96, 0, 4, keypoints=300)[4]
+
+
+def test_sources_of_a_mix_take_turns_and_see_neighbouring_numbers(monkeypatch):
+    asked = []
+
+    class Recorder:
+        def __init__(self, source):
+            self.source = source
+
+        def pair(self, index):
+            asked.append((self.source, index))
+
+    monkeypatch.setattr(stream, "open_stream", lambda source, seed, size: Recorder(source))
+    mixed = MixedPairs("mix", 0, 96)
+    for index in range(10):
+        mixed.pair(index)
+    assert [source for source, _ in asked] == ["leaves", "scenes", "leaves", "scenes", "leaves"] * 2
+    assert [index for source, index in asked if source == "leaves"] == list(range(6))
+    assert [index for source, index in asked if source == "scenes"] == list(range(4))
+
+
+def test_an_unknown_mix_is_refused():
+    with pytest.raises(InputError, match="choose one of leaves"):
+        MixedPairs("photographs", 0, 96)
+
+
+@pytest.mark.parametrize("ranks", [2, 4])
+def test_shares_of_the_processes_make_up_the_batches_of_one(ranks):
+    whole = list(pair_loader("leaves", 0, 96, 4, 12, 16, 4, workers=0))
+    shares = [list(pair_loader("leaves", 0, 96, 4, 12, 16, 4, 0, rank, ranks)) for rank in range(ranks)]
+    for index, batch in enumerate(whole):
+        for part, expected in enumerate(batch):
+            found = torch.stack([share[index][part] for share in shares], dim=1).flatten(0, 1)
+            assert torch.equal(found, expected)
+
+
+def test_endoscopy_shows_the_inside_of_bodies_alone():
+    assert open_stream("endoscopy", 0, 96).domains == ("colon", "organ")
+    assert MIXES["endoscope"].count("endoscopy") == 2
+
+
+@pytest.mark.slow
+def test_workers_make_the_same_batches_after_this_process_has_computed(monkeypatch):
+    """Forked workers would wait for ever: drawing a sample before the first step did that."""
+    monkeypatch.undo()  # workers know nothing of the small textures
+    alone = list(pair_loader("leaves", 0, 96, 0, 4, 16, 2, workers=0))
+    helped = list(pair_loader("leaves", 0, 96, 0, 4, 16, 2, workers=1))
+    for batch, other in zip(alone, helped, strict=True):
+        for a, b in zip(batch, other, strict=True):
+            assert torch.equal(a, b)

@@ -1,0 +1,15 @@
+"""Runs so small that the loop is tested, not the network."""
+
+import functools
+
+import pytest
+
+from sigmaslam.synthetic import pairs
+from sigmaslam.training import loop
+from sigmaslam.training.validation import matching_accuracy
+
+
+def make_small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Small textures, and one held-out pair of leaves."""
+    monkeypatch.setattr(pairs, "_TEXTURE_SIZE", 128)
+    monkeypatch.setattr(loop, "matching_accuracy", functools.partial(matching_accuracy, pairs=1, size=96))
