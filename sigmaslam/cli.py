@@ -182,6 +182,9 @@ def match(
     out: Annotated[Path, typer.Option(help="File to write, ends in .npz.")],
     frontend: Annotated[Detector, typer.Option(help="What finds and describes keypoints.")] = Detector.learned,
     max_keypoints: Annotated[int, typer.Option(help="Most keypoints an image, at least 4.")] = 1024,
+    refine: Annotated[
+        bool, typer.Option(help="Drop matches that their neighbours contradict, align the patches of the others.")
+    ] = True,
     picture: Annotated[
         Path | None, typer.Option(help="PNG to draw: both images, lines from purple (unlikely) to yellow (certain).")
     ] = None,
@@ -193,7 +196,7 @@ def match(
     """
     from sigmaslam.match import match_files
 
-    typer.echo(match_files(image0, image1, out, frontend.value, max_keypoints, picture))
+    typer.echo(match_files(image0, image1, out, frontend.value, max_keypoints, refine, picture))
 
 
 @app.command()

@@ -12,6 +12,7 @@ import numpy as np
 
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path, atomic_write_bytes
+from sigmaslam.frontend.affine import align_patches, local_maps
 from sigmaslam.frontend.classical import OrbDetector, SiftDetector
 from sigmaslam.frontend.learned import LearnedDetector
 from sigmaslam.frontend.matching import match_near
@@ -21,7 +22,11 @@ from sigmaslam.readers.images import read_grey
 _DETECTORS = {"learned": LearnedDetector, "sift": SiftDetector, "orb": OrbDetector}
 # Learned: that of the network's training (`match_loss`). RootSIFT has no negative numbers, its similarities lie closer
 # together: 60 has the least Brier score on rendered pairs (20: 0.58, 40: 0.16, 60: 0.10, 80: 0.12).
-_INVERSE_TEMPERATURES = {"learned": 20.0, "sift": 60.0, "orb": 20.0}
+_INVERSE_TEMPERATURES = {"sift": 60.0}
+_INVERSE_TEMPERATURE = 20.0
+# Chosen on warped photographs and rectified pairs of the sets for selection (docs/network.md).
+_AGREEMENT = 4.0
+_SIGMA_ALIGNED = 0.3
 _LEAST_SIDE = 96
 _LEAST_KEYPOINTS = 4
 _MOST_LINES = 200
@@ -29,14 +34,15 @@ _MOST_LINES = 200
 
 @dataclass(frozen=True, slots=True)
 class Matches:
-    """Putative correspondences between two images, one to one, the most probable first.
+    """Correspondences between two images, one to one, the most probable first.
 
     Attributes:
         keypoints0, keypoints1: (M, 2) float32 pixel coordinates (u, v) in image 0 and 1, as the images are stored.
         probability: (M,) float32 in (0, 1], the dual softmax over all keypoints. It ranks matches but is not yet
             calibrated: of those near 0.8, not 80 per cent need be right.
         covariance: (M, 2, 2) float32, pixels squared, of keypoints1 minus the true place of keypoints0 in image 1, if
-            the match is right: (sigma0^2 + sigma1^2) I, which takes both images to have about the same scale.
+            the match is right: (0.3 px)^2 I where the patches were aligned, else (sigma0^2 + sigma1^2) I, which takes
+            both images to have about the same scale.
     """
 
     keypoints0: np.ndarray
@@ -46,7 +52,7 @@ class Matches:
 
 
 def match_images(
-    image0: np.ndarray, image1: np.ndarray, frontend: str = "learned", max_keypoints: int = 1024
+    image0: np.ndarray, image1: np.ndarray, frontend: str = "learned", max_keypoints: int = 1024, refine: bool = True
 ) -> Matches:
     """Matches between two images of one scene.
 
@@ -54,12 +60,19 @@ def match_images(
         image0, image1: (H, W) uint8 grey, of any two sizes from 96 pixels.
         frontend: "learned", "sift" or "orb".
         max_keypoints: most an image, from 4; the time and memory of matching grow with its square.
+        refine: as `refine_matches` does; without it every mutual nearest neighbour is a match.
     Raises:
         InputError: an image has another shape or type or is too small, or an option is out of range.
     """
     detect = _detector(frontend, max_keypoints)
     features0, features1 = detect(_checked(image0, "image0")), detect(_checked(image1, "image1"))
-    return match_features(features0, features1, _INVERSE_TEMPERATURES[frontend])
+    matches = match_features(features0, features1, temperature_of(frontend))
+    return refine_matches(image0, image1, matches) if refine else matches
+
+
+def temperature_of(frontend: str) -> float:
+    """Factor on the similarity of descriptors before the softmax, by name of what made them."""
+    return _INVERSE_TEMPERATURES.get(frontend, _INVERSE_TEMPERATURE)
 
 
 def match_features(features0: Features, features1: Features, inverse_temperature: float) -> Matches:
@@ -78,8 +91,30 @@ def match_features(features0: Features, features1: Features, inverse_temperature
     return Matches(features0.keypoints[index0], features1.keypoints[index1], probability[order], covariance)
 
 
+def refine_matches(image0: np.ndarray, image1: np.ndarray, matches: Matches) -> Matches:
+    """The matches that agree with their neighbours to 4 px, moved to where the patches, warped as these say, fit best.
+
+    Args:
+        image0, image1: (H, W) uint8.
+        matches: mutual nearest neighbours.
+    """
+    points0, points1 = (points.astype(np.float64) for points in (matches.keypoints0, matches.keypoints1))
+    A, distance = local_maps(points0, points1, matches.probability.astype(np.float64))
+    kept = np.flatnonzero(distance < _AGREEMENT)
+    places, moved = align_patches(image0, image1, points0[kept], points1[kept], A[kept])
+    covariance = matches.covariance[kept]
+    covariance[moved] = _SIGMA_ALIGNED**2 * np.eye(2, dtype=np.float32)
+    return Matches(matches.keypoints0[kept], places.astype(np.float32), matches.probability[kept], covariance)
+
+
 def match_files(
-    path0: Path, path1: Path, out: Path, frontend: str, max_keypoints: int, picture: Path | None = None
+    path0: Path,
+    path1: Path,
+    out: Path,
+    frontend: str,
+    max_keypoints: int,
+    refine: bool = True,
+    picture: Path | None = None,
 ) -> str:
     """Matches two image files, writes the fields of `Matches` as .npz and perhaps a picture; returns a summary.
 
@@ -96,7 +131,9 @@ def match_files(
     start = time.perf_counter()
     features0, features1 = detect(image0), detect(image1)
     detected = time.perf_counter()
-    matches = match_features(features0, features1, _INVERSE_TEMPERATURES[frontend])
+    matches = match_features(features0, features1, temperature_of(frontend))
+    if refine:
+        matches = refine_matches(image0, image1, matches)
     end = time.perf_counter()
     with atomic_path(out) as temporary:
         np.savez_compressed(temporary, **asdict(matches))

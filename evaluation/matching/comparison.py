@@ -9,16 +9,18 @@ from pathlib import Path
 from sigmaslam.errors import FrameError, InputError
 from sigmaslam.evaluation.matching.extractors import load_extractor
 from sigmaslam.evaluation.matching.pairs import ImagePair
-from sigmaslam.evaluation.matching.run import Scores, score_pairs
-from sigmaslam.evaluation.matching.sets import ALL, STEPS, TRACKS, load_set, load_steps, load_tracks
+from sigmaslam.evaluation.matching.run import Scores, score_pairs, score_refined
+from sigmaslam.evaluation.matching.sets import ALL, REFINED, STEPS, TRACKS, load_set, load_steps, load_tracks
 from sigmaslam.evaluation.matching.stereo import score_steps
 from sigmaslam.evaluation.matching.tracks import KLT, TRACKED_KEYPOINTS, score_klt
+from sigmaslam.match import temperature_of
 
 
 def compare(
     names: Sequence[str], sets: Sequence[str], data: Path, note: Callable[[str], None] = lambda text: None
 ) -> dict[str, Scores]:
-    """Scores by name of the extractor, then by set; the set kitti_tracks adds a row for KLT.
+    """Scores by name of the extractor, then by set; the set kitti_tracks adds a row for KLT, and the sets of
+    `sets.REFINED` a second one for everyone with what `sigmaslam match` makes of the same features.
 
     A graph of fixed size that is too small for the images of a set is left out there, and `note` is told.
 
@@ -46,6 +48,11 @@ def compare(
                 note(f"{name}: left out {label}: {error}")
                 continue
             results.setdefault(label, {})[name] = found
+            if name in REFINED:
+                row = f"{label} + sigmaslam match"
+                results.setdefault(row, {})[name] = score_refined(
+                    load_extractor(label), load_set(name, data), temperature_of(label)
+                )
             note(f"{name}: {label}, {count} pairs in {time.perf_counter() - start:.1f} s")
     return results
 

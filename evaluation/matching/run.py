@@ -5,10 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
+from sigmaslam import frontend
 from sigmaslam.evaluation.matching.extractors import MAX_KEYPOINTS, Extractor
 from sigmaslam.evaluation.matching.pairs import ImagePair
-from sigmaslam.evaluation.matching.scores import Features, score_pair, summarize
+from sigmaslam.evaluation.matching.scores import Features, score_pair, score_points, summarize
 from sigmaslam.evaluation.matching.sets import load_set
+from sigmaslam.match import match_features, refine_matches
 
 Scores = dict[str, dict[str, float]]
 """By set, then by name of the score; shares and areas in [0, 1], numbers of matches a pair."""
@@ -44,6 +48,25 @@ def score_pairs(
     Raises:
         ValueError: the extractor gives more keypoints.
     """
+    features = _extract_all(extractor, pairs, max_keypoints)
+    return _summarize_parts(
+        pairs, [score_pair(pair, features[id(pair.image0)], features[id(pair.image1)]) for pair in pairs]
+    )
+
+
+def score_refined(extractor: Extractor, pairs: Sequence[ImagePair], inverse_temperature: float) -> dict[str, float]:
+    """As `score_pairs`, for the matches that `sigmaslam match` returns: consistent ones, with aligned patches."""
+    features = _extract_all(extractor, pairs, MAX_KEYPOINTS)
+    scores = []
+    for pair in pairs:
+        both = [_with_sigma(features[id(image)]) for image in (pair.image0, pair.image1)]
+        matches = refine_matches(pair.image0, pair.image1, match_features(both[0], both[1], inverse_temperature))
+        points0, points1 = (points.astype(np.float64) for points in (matches.keypoints0, matches.keypoints1))
+        scores.append(score_points(pair, points0, points1))
+    return _summarize_parts(pairs, scores)
+
+
+def _extract_all(extractor: Extractor, pairs: Sequence[ImagePair], max_keypoints: int) -> dict[int, Features]:
     features: dict[int, Features] = {}
     # `pairs` keeps the arrays alive, so their ids stay apart.
     for image in (image for pair in pairs for image in (pair.image0, pair.image1)):
@@ -52,10 +75,20 @@ def score_pairs(
             features[id(image)] = keypoints, descriptors
             if len(keypoints) > max_keypoints:
                 raise ValueError(f"the extractor gave {len(keypoints)} keypoints: at most {max_keypoints} are compared")
+    return features
+
+
+def _with_sigma(features: Features) -> frontend.Features:
+    """What `match_features` takes; the sigmas are of no use to it."""
+    keypoints, descriptors = features
+    none = np.zeros(len(keypoints), np.float32)
+    return frontend.Features(keypoints, descriptors, none, none)
+
+
+def _summarize_parts(pairs: Sequence[ImagePair], found: Sequence[dict[str, float]]) -> dict[str, float]:
     parts: dict[tuple[str, type], list[dict[str, float]]] = {}
-    for pair in pairs:
-        found = score_pair(pair, features[id(pair.image0)], features[id(pair.image1)])
-        parts.setdefault((pair.part, type(pair.truth)), []).append(found)
+    for pair, scores in zip(pairs, found, strict=True):
+        parts.setdefault((pair.part, type(pair.truth)), []).append(scores)
     return {
         f"{part}_{name}" if part else name: value
         for (part, _), scores in parts.items()

@@ -1,0 +1,142 @@
+"""Wide-baseline matches made consistent and exact: the map around each match from its neighbours, then patch alignment.
+
+The classical Lucas-Kanade step (`refine`) takes both patches to differ by a shift. Between views that are turned and
+scaled they do not; here each patch is first warped by the affine map that the neighbouring matches agree on.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+_NEIGHBOURS = 24
+# Scale of the robust weight, pixels: from the first fit to the last.
+_FIRST_SCALE, _LAST_SCALE = 12.0, 2.0
+_FITS = 8
+# What holds a map back that its neighbours leave undetermined.
+_PRIOR = 1.0
+_RADIUS = 7
+_ITERATIONS = 6
+_LEAST_CORRELATION = 0.5
+_LONGEST_STEP = 1.0
+_BLUR = 0.8
+# Distances from so many points are held at once.
+_ROWS_AT_ONCE = 512
+
+
+def local_maps(points0: np.ndarray, points1: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The affine map around each match that its nearest matches agree on, by iterated weighted least squares.
+
+    Args:
+        points0, points1: (M, 2) matched pixels.
+        weight: (M,) trust in each match, as its probability.
+    Returns:
+        A (M, 2, 2), points1 - points1[i] = A[i] (points0 - points0[i]) near match i, and the distance (M,) in pixels
+        of points1[i] from where the map of its neighbours would have it. Both are infinite for fewer than 4 matches.
+    """
+    count = len(points0)
+    if count < 4:
+        return np.full((count, 2, 2), np.inf), np.full(count, np.inf)
+    near = _nearest(points0, min(_NEIGHBOURS, count))
+    from0, from1 = points0[near] - points0[:, None], points1[near] - points1[:, None]
+    design = np.concatenate([from0, np.ones((*near.shape, 1))], axis=2)
+    trust = weight[near]
+    fitted = trust
+    scale = _FIRST_SCALE
+    for _ in range(_FITS):
+        weighted = design * fitted[..., None]
+        normal = weighted.transpose(0, 2, 1) @ design + np.diag([_PRIOR, _PRIOR, 1e-3])
+        solution = np.linalg.solve(normal, weighted.transpose(0, 2, 1) @ from1)
+        distance = np.linalg.norm(from1 - design @ solution, axis=2)
+        # Geman-McClure: a match far from the others' map does not pull it.
+        fitted = trust / (1.0 + (distance / scale) ** 2) ** 2
+        scale = max(0.7 * scale, _LAST_SCALE)
+    return solution[:, :2].transpose(0, 2, 1), np.linalg.norm(solution[:, 2], axis=1)
+
+
+def _nearest(points: np.ndarray, count: int) -> np.ndarray:
+    """Indices (M, count) of the nearest of (M, 2) points to each, itself among them, in any order."""
+    found = [
+        np.argpartition(((some[:, None] - points) ** 2).sum(axis=2), count - 1, axis=1)[:, :count]
+        for some in np.array_split(points, -(-len(points) // _ROWS_AT_ONCE))
+    ]
+    return np.concatenate(found)
+
+
+def align_patches(
+    image0: np.ndarray, image1: np.ndarray, points0: np.ndarray, points1: np.ndarray, A: np.ndarray, reach: float = 3.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Places in image 1 where the patches around points of image 0, warped by their maps, fit best.
+
+    Inverse compositional Lucas-Kanade (Baker & Matthews 2004) over a shift, with gain and offset of the grey values
+    free, on patches of 15 x 15 pixels of the coarser image.
+
+    Args:
+        image0, image1: (H, W) uint8.
+        points0, points1: (M, 2) matched pixels.
+        A: (M, 2, 2) as `local_maps` gives it.
+        reach: longest move, pixels of image 1.
+    Returns:
+        (M, 2) float64 places, unchanged where the patches do not fit or the way is too far, and (M,) bool moved.
+    """
+    places, moved = points1.astype(np.float64), np.zeros(len(points1), bool)
+    determinant = np.where(np.isfinite(A).all(axis=(1, 2)), np.abs(np.linalg.det(np.nan_to_num(A))), 0.0)
+    zoom = np.sqrt(determinant)
+    # The finer image is smoothed as much as the coarser one's pixels do, in steps of half an octave.
+    half_octaves = np.round(2.0 * np.log2(np.clip(zoom, 0.2, 5.0))).astype(int)
+    for step in np.unique(half_octaves[zoom > 0.2]):
+        rows = np.flatnonzero((half_octaves == step) & (zoom > 0.2) & (zoom < 5.0))
+        ratio = 2.0 ** (0.5 * step)
+        smooth0, smooth1 = _smoothed(image0, max(1.0, 1.0 / ratio)), _smoothed(image1, max(1.0, ratio))
+        places[rows], moved[rows] = _align(
+            smooth0, smooth1, points0[rows], places[rows], A[rows], max(1.0, ratio), reach * max(1.0, ratio)
+        )
+    return places, moved
+
+
+def _smoothed(image: np.ndarray, factor: float) -> np.ndarray:
+    return cv2.GaussianBlur(image.astype(np.float32), (0, 0), _BLUR * factor)
+
+
+def _align(
+    image0: np.ndarray,
+    image1: np.ndarray,
+    points0: np.ndarray,
+    points1: np.ndarray,
+    A: np.ndarray,
+    spacing: float,
+    reach: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """As `align_patches`, for matches of one zoom; `spacing` of the samples is in pixels of image 1."""
+    side = np.arange(-_RADIUS, _RADIUS + 1, dtype=np.float64)
+    grid = spacing * np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    window = np.exp(-0.5 * (grid**2).sum(axis=1) / (0.6 * spacing * _RADIUS) ** 2)
+    window /= window.sum()
+    template = _normalised(_sample(image0, points0[:, None] + grid @ np.linalg.inv(A).transpose(0, 2, 1)), window)
+    square = template.reshape(-1, len(side), len(side))
+    along_v, along_u = np.gradient(square, spacing, axis=(1, 2))
+    gradient = np.stack([along_u, along_v], axis=-1).reshape(len(template), -1, 2)
+    weighted = gradient * window[:, None]
+    normal = weighted.transpose(0, 2, 1) @ gradient + 1e-6 * np.eye(2)
+    inverse = np.linalg.inv(normal)
+    shift = np.zeros_like(points1)
+    for _ in range(_ITERATIONS):
+        error = _normalised(_sample(image1, (points1 + shift)[:, None] + grid), window) - template
+        step = np.einsum("nij,nkj,nk->ni", inverse, weighted, error)
+        length = np.linalg.norm(step, axis=1, keepdims=True)
+        shift -= step * np.minimum(1.0, _LONGEST_STEP * spacing / np.maximum(length, 1e-9))
+    final = _normalised(_sample(image1, (points1 + shift)[:, None] + grid), window)
+    moved = ((final * template) @ window > _LEAST_CORRELATION) & (np.linalg.norm(shift, axis=1) <= reach)
+    return np.where(moved[:, None], points1 + shift, points1), moved
+
+
+def _sample(image: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Bilinear samples (M, K) at places (M, K, 2)."""
+    u, v = (np.ascontiguousarray(places[..., axis], np.float32) for axis in (0, 1))
+    return np.asarray(cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+
+
+def _normalised(patches: np.ndarray, window: np.ndarray) -> np.ndarray:
+    """Patches (M, K) of weighted mean 0 and variance 1."""
+    centred = patches - (patches @ window)[:, None]
+    return np.asarray(centred / np.sqrt((centred * centred) @ window + 1e-2)[:, None])
