@@ -41,8 +41,8 @@ class Matches:
         probability: (M,) float32 in (0, 1], the dual softmax over all keypoints. It ranks matches but is not yet
             calibrated: of those near 0.8, not 80 per cent need be right.
         covariance: (M, 2, 2) float32, pixels squared, of keypoints1 minus the true place of keypoints0 in image 1, if
-            the match is right: (0.3 px)^2 I where the patches were aligned, else (sigma0^2 + sigma1^2) I, which takes
-            both images to have about the same scale.
+            the match is right: (0.3 px)^2 I after refinement, else (sigma0^2 + sigma1^2) I, which takes both images to
+            have about the same scale.
     """
 
     keypoints0: np.ndarray
@@ -94,17 +94,19 @@ def match_features(features0: Features, features1: Features, inverse_temperature
 def refine_matches(image0: np.ndarray, image1: np.ndarray, matches: Matches) -> Matches:
     """The matches that agree with their neighbours to 4 px, moved to where the patches, warped as these say, fit best.
 
+    Where the patches do not fit, the match is dropped: nine in ten of them are wrong.
+
     Args:
         image0, image1: (H, W) uint8.
         matches: mutual nearest neighbours.
     """
     points0, points1 = (points.astype(np.float64) for points in (matches.keypoints0, matches.keypoints1))
     A, distance = local_maps(points0, points1, matches.probability.astype(np.float64))
-    kept = np.flatnonzero(distance < _AGREEMENT)
-    places, moved = align_patches(image0, image1, points0[kept], points1[kept], A[kept])
-    covariance = matches.covariance[kept]
-    covariance[moved] = _SIGMA_ALIGNED**2 * np.eye(2, dtype=np.float32)
-    return Matches(matches.keypoints0[kept], places.astype(np.float32), matches.probability[kept], covariance)
+    agree = np.flatnonzero(distance < _AGREEMENT)
+    places, fitting = align_patches(image0, image1, points0[agree], points1[agree], A[agree])
+    kept = agree[fitting]
+    covariance = np.tile(_SIGMA_ALIGNED**2 * np.eye(2, dtype=np.float32), (len(kept), 1, 1))
+    return Matches(matches.keypoints0[kept], places[fitting].astype(np.float32), matches.probability[kept], covariance)
 
 
 def match_files(

@@ -63,7 +63,6 @@ VARIANTS = (
     Variant("descriptor", "128 numbers", {"descriptor_size": 128}),
     Variant("stride", "4", {"stride": 4}),
     Variant("stride", "16", {"stride": 16}),
-    Variant("data", "scenes", {"data": "scenes"}),
     Variant("data", "blend (3 leaves, 1 scene)", {"data": "blend"}),
 )
 

@@ -17,8 +17,8 @@ POSE_THRESHOLDS = (1, 5, 10)
 # Keypoints nearer to the border of the other image than this need not be seen again.
 _BORDER = 8
 # The robust estimators of everyone. OpenCV's USAC has its own generator: the same matches give the same answer. Its
-# MAGSAC leaves homographies unpolished, pixels off where least squares on the same inliers is right to a tenth: beside
-# it, graph-cut RANSAC with local optimisation.
+# MAGSAC leaves some homographies of our photographs pixels off where least squares on the same inliers is right to a
+# few tenths: beside it, graph-cut RANSAC with local optimisation.
 _INLIER_THRESHOLD = 1.0
 _POLISHED_THRESHOLD = 1.5
 _CONFIDENCE = 0.9999

@@ -80,18 +80,25 @@ def align_patches(
         (M, 2) float64 places, unchanged where the patches do not fit or the way is too far, and (M,) bool moved.
     """
     places, moved = points1.astype(np.float64), np.zeros(len(points1), bool)
-    determinant = np.where(np.isfinite(A).all(axis=(1, 2)), np.abs(np.linalg.det(np.nan_to_num(A))), 0.0)
+    determinant = np.where(
+        np.isfinite(A).all(axis=(1, 2)), np.abs(np.linalg.det(np.nan_to_num(A, posinf=0.0, neginf=0.0))), 0.0
+    )
     zoom = np.sqrt(determinant)
+    usable = (zoom > 0.2) & (zoom < 5.0) & _inside(image0, points0) & _inside(image1, points1)
     # The finer image is smoothed as much as the coarser one's pixels do, in steps of half an octave.
     half_octaves = np.round(2.0 * np.log2(np.clip(zoom, 0.2, 5.0))).astype(int)
-    for step in np.unique(half_octaves[zoom > 0.2]):
-        rows = np.flatnonzero((half_octaves == step) & (zoom > 0.2) & (zoom < 5.0))
+    for step in np.unique(half_octaves[usable]):
+        rows = np.flatnonzero((half_octaves == step) & usable)
         ratio = 2.0 ** (0.5 * step)
         smooth0, smooth1 = _smoothed(image0, max(1.0, 1.0 / ratio)), _smoothed(image1, max(1.0, ratio))
         places[rows], moved[rows] = _align(
             smooth0, smooth1, points0[rows], places[rows], A[rows], max(1.0, ratio), reach * max(1.0, ratio)
         )
     return places, moved
+
+
+def _inside(image: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return np.asarray(((points >= 0) & (points <= (image.shape[1] - 1, image.shape[0] - 1))).all(axis=1))
 
 
 def _smoothed(image: np.ndarray, factor: float) -> np.ndarray:

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from importlib.resources import as_file, files
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -13,7 +14,11 @@ from sigmaslam.evaluation.matching import compare, comparison, format_scores, lo
 from sigmaslam.evaluation.matching.__main__ import main
 from sigmaslam.evaluation.matching.pairs import Homography, ImagePair, SameRows
 from sigmaslam.evaluation.matching.peers import read_signature
+from sigmaslam.evaluation.matching.run import score_refined
+from sigmaslam.evaluation.matching.scores import score_points, summarize
 from sigmaslam.evaluation.matching.sequences import sequence_pairs, sequence_steps
+from sigmaslam.evaluation.matching.sets import ALL, REFINED, SELECTION, STEPS, TRACKS
+from sigmaslam.match import match_images, temperature_of
 from sigmaslam.readers import open_sequence
 from sigmaslam.synthetic.textures import dead_leaves
 
@@ -90,6 +95,41 @@ def test_more_keypoints_than_the_others_have_are_refused(image: np.ndarray):
         score_pairs(greedy, [ImagePair("", image, image, Homography(np.eye(3)))])
 
 
+def _warped(image: np.ndarray, degrees: float) -> ImagePair:
+    centre = (image.shape[1] / 2.0, image.shape[0] / 2.0)
+    H = np.vstack([cv2.getRotationMatrix2D(centre, degrees, 1.1), [0.0, 0.0, 1.0]])
+    size = (image.shape[1], image.shape[0])
+    return ImagePair("", image, cv2.warpPerspective(image, H, size, flags=cv2.INTER_CUBIC), Homography(H))
+
+
+@pytest.mark.parametrize("name", ["sift", "orb"])
+def test_refined_matches_score_higher_than_mutual_neighbours(name: str, image: np.ndarray):
+    pairs = [_warped(image, degrees) for degrees in (10.0, 25.0)]
+    extractor = load_extractor(name)
+    plain, refined = score_pairs(extractor, pairs), score_refined(extractor, pairs, temperature_of(name))
+    assert set(plain) - set(refined) == {"repeatability_1"}
+    for column in ("mma_1", "mma_3", "polished_auc_1"):
+        assert refined[column] > plain[column], column
+    assert refined["mma_1"] > 0.9
+    # Most of what is dropped is wrong.
+    assert refined["correct_3"] > 0.95 * plain["correct_3"]
+
+
+def test_refined_matches_are_those_of_the_command(image: np.ndarray):
+    pair = _warped(image, 15.0)
+    found = match_images(pair.image0, pair.image1, "sift", 1024)
+    places = (points.astype(np.float64) for points in (found.keypoints0, found.keypoints1))
+    expected = summarize([score_points(pair, *places)])
+    assert score_refined(load_extractor("sift"), [pair], temperature_of("sift")) == pytest.approx(expected)
+
+
+def test_refined_matches_of_an_image_without_keypoints_score_zero(image: np.ndarray):
+    black = np.zeros_like(image)
+    pairs = [ImagePair("", image, black, Homography(np.eye(3)))]
+    found = score_refined(load_extractor("orb"), pairs, temperature_of("orb"))
+    assert set(found.values()) == {0.0}
+
+
 def test_an_unknown_extractor_is_refused(tmp_path: Path):
     with pytest.raises(InputError, match="surf"):
         load_extractor("surf")
@@ -121,7 +161,8 @@ def test_the_command_prints_json_of_all_extractors(
     main()
     printed = capsys.readouterr()
     found = json.loads(printed.out)
-    assert list(found) == ["sift", "orb", graph]
+    names = ["sift", "orb", graph]
+    assert sorted(found) == sorted([*names, *(f"{name} + sigmaslam match" for name in names)])
     assert found[graph]["middlebury"]["mma_3"] > 0.5
     assert f"middlebury: {graph}, 2 pairs" in printed.err
 
@@ -136,6 +177,31 @@ def test_klt_has_a_row_among_the_tracks_alone(monkeypatch: pytest.MonkeyPatch, d
     assert list(found["klt"]) == ["kitti_tracks"]
     assert found["orb"]["euroc_steps"]["steps"] == 1.0
     assert found["orb"]["kitti_tracks"]["gap1_epipolar_matches"] > 100
+
+
+def test_sets_of_views_have_a_second_row_with_refined_matches(monkeypatch: pytest.MonkeyPatch, image: np.ndarray):
+    pairs = [_warped(image, 10.0)]
+    monkeypatch.setattr(comparison, "load_set", lambda name, data: pairs)
+    notes: list[str] = []
+    found = compare(["sift", "orb"], ["boat", "euroc"], Path(), notes.append)
+    # No second row of a set that is none of REFINED.
+    assert {name: list(scores) for name, scores in found.items()} == {
+        "sift": ["boat", "euroc"],
+        "orb": ["boat", "euroc"],
+        "sift + sigmaslam match": ["boat"],
+        "orb + sigmaslam match": ["boat"],
+    }
+    assert found["orb + sigmaslam match"]["boat"] == score_refined(load_extractor("orb"), pairs, temperature_of("orb"))
+    assert found["orb"]["boat"] == score_pairs(load_extractor("orb"), pairs)
+    assert len(notes) == 4
+    page = format_scores(found)
+    assert page.count("| orb + sigmaslam match |") == 1
+
+
+def test_the_sets_with_refined_matches_have_views_from_afar():
+    assert set(REFINED) < set(ALL)
+    assert set(SELECTION) <= set(REFINED)
+    assert not {TRACKS, STEPS} & set(REFINED)
 
 
 def test_an_unknown_set_is_refused_before_anything_is_scored(real_data: Path):

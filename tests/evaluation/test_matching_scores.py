@@ -1,14 +1,17 @@
 """Scores of matching against known answers."""
 
+import cv2
 import numpy as np
 import pytest
 
 from sigmaslam.evaluation.matching.pairs import Disparity, Homography, ImagePair, Motion, SameRows, Truth
 from sigmaslam.evaluation.matching.scores import (
     area_under_curve,
+    corner_error,
     mutual_nearest,
     pose_error_deg,
     score_pair,
+    score_points,
     summarize,
 )
 from sigmaslam.rotation import rotation_exp
@@ -37,6 +40,7 @@ def test_the_same_keypoints_under_the_identity_are_perfect():
     found = _score(Homography(np.eye(3)), _grid(), _grid())
     assert found.pop("correct_3") == len(_grid())
     assert found.pop("corner_error") < 1e-6
+    assert found.pop("polished_corner_error") < 1e-6
     assert found == {"mma_1": 1.0, "mma_3": 1.0, "repeatability_1": 1.0}
 
 
@@ -46,6 +50,73 @@ def test_two_pixels_off_is_right_at_three_and_wrong_at_one():
     assert found["mma_3"] == 1.0
     assert found["repeatability_1"] == 0.0
     assert found["corner_error"] == pytest.approx(2.0, abs=1e-4)
+    assert found["polished_corner_error"] == pytest.approx(2.0, abs=1e-4)
+
+
+TRUTHS = {
+    "homography": Homography(np.eye(3)),
+    "disparity": Disparity(np.full(IMAGE.shape, 10.0), np.eye(3), np.eye(3)),
+    "rows": SameRows(),
+    "motion": Motion(K, np.block([[np.eye(3), np.array([[0.5], [0.1], [0.2]])], [np.zeros((1, 3)), np.ones((1, 1))]])),
+}
+
+
+@pytest.mark.parametrize("truth", TRUTHS.values(), ids=TRUTHS)
+def test_points_score_as_the_features_that_match_so(truth: Truth):
+    """All but what is asked of keypoints alone, or of other matches."""
+    points1 = _grid() - (10.0, 0.0) + np.random.default_rng(5).normal(0.0, 1.0, _grid().shape)
+    of_features = _score(truth, _grid(), points1)
+    of_points = score_points(ImagePair("", IMAGE, IMAGE, truth), _grid(), points1)
+    assert of_points == {name: of_features[name] for name in of_points}
+    assert set(of_features) - set(of_points) <= {"repeatability_1", "rows_refined_1", "rows_refined_matches"}
+
+
+def _plane(seed: int, noise: float = 0.5, outliers: float = 0.3) -> tuple[np.ndarray, np.ndarray, Homography]:
+    """The grid under a homography, with noise in pixels and a share of wrong places."""
+    rng = np.random.default_rng(seed)
+    truth = Homography(np.array([[0.9, -0.2, 80.0], [0.15, 1.0, -20.0], [2e-4, -1e-4, 1.0]]))
+    points1 = truth.transfer(_grid()) + rng.normal(0.0, noise, _grid().shape)
+    wrong = rng.random(len(points1)) < outliers
+    points1[wrong] = rng.uniform((0, 0), (640, 480), (int(wrong.sum()), 2))
+    return _grid(), points1, truth
+
+
+def test_of_exact_points_the_polished_homography_errs_less_than_that_of_magsac():
+    pairs = [_plane(seed, noise=0.03, outliers=0.6) for seed in range(10)]
+    scores = [score_points(ImagePair("", IMAGE, IMAGE, truth), *points) for *points, truth in pairs]
+    plain, polished = (np.array([found[key] for found in scores]) for key in ("corner_error", "polished_corner_error"))
+    assert np.median(polished) < 0.8 * np.median(plain)
+    assert polished.max() < 0.05
+
+
+@pytest.mark.parametrize(("method", "threshold"), [(cv2.USAC_MAGSAC, 1.0), (cv2.USAC_ACCURATE, 1.5), (cv2.RANSAC, 1.5)])
+def test_corner_errors_are_those_of_the_method_and_the_same_every_time(method: int, threshold: float):
+    points0, points1, truth = _plane(0)
+    found = corner_error(points0, points1, truth, IMAGE.shape, method, threshold)
+    assert found < 3.0
+    assert corner_error(points0, points1, truth, IMAGE.shape, method, threshold) == found
+    # The method's estimate by hand.
+    H, _ = cv2.findHomography(points0, points1, method, threshold, maxIters=10_000, confidence=0.9999)
+    corners = np.array([[0.0, 0.0], [639.0, 0.0], [639.0, 479.0], [0.0, 479.0]])
+    expected = np.linalg.norm(Homography(H).transfer(corners) - truth.transfer(corners), axis=1).mean()
+    assert found == pytest.approx(expected)
+    assert corner_error(points0[:3], points1[:3], truth, IMAGE.shape, method, threshold) == np.inf
+
+
+def test_errors_become_areas_under_their_own_names():
+    pairs = [{"mma_1": share, "corner_error": 1.5, "polished_corner_error": 0.5} for share in (0.2, 0.4)]
+    found = summarize(pairs)
+    assert found == pytest.approx(
+        {
+            "mma_1": 0.3,
+            "auc_1": 0.0,
+            "auc_3": 0.5,
+            "auc_5": 0.7,
+            "polished_auc_1": 0.5,
+            "polished_auc_3": 1.0 - 0.5 / 3.0,
+            "polished_auc_5": 0.9,
+        }
+    )
 
 
 def test_keypoints_that_leave_the_image_do_not_count_against_repeatability():

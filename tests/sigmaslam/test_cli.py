@@ -198,7 +198,7 @@ def test_training_without_its_extra_says_how_to_install_it(tmp_path: Path):
     refused(result, "sigmaslam[train]")
 
 
-@pytest.mark.parametrize("command", ["demo", "track", "evaluate", "train", "export"])
+@pytest.mark.parametrize("command", ["demo", "track", "evaluate", "match", "render", "train", "export", "benchmark"])
 def test_every_command_has_help(command: str):
     result = sigmaslam(command, "--help")
     assert result.returncode == 0
