@@ -101,6 +101,7 @@ class Data(StrEnum):
     scenes = "scenes"
     mix = "mix"
     blend = "blend"
+    turned = "turned"
     endoscope = "endoscope"
 
 
@@ -108,6 +109,7 @@ class TrainingRecipe(StrEnum):
     """Training runs by name."""
 
     full = "full"
+    turned = "turned"
     quick = "quick"
     endoscope = "endoscope"
 
@@ -284,7 +286,9 @@ def train(
     out: Annotated[Path, typer.Option(help="Folder for checkpoint, log, TensorBoard, samples, weights and card.")],
     recipe: Annotated[
         TrainingRecipe,
-        typer.Option(help="full: what ships, 1 to 2 hours on 2 cores; quick: 5 minutes; endoscope: from what ships."),
+        typer.Option(
+            help="full: 1 to 2 hours on 2 cores; turned: after it, for large turns; quick: 5 minutes; endoscope: a domain."
+        ),
     ] = TrainingRecipe.full,
     start: Annotated[
         Path | None,

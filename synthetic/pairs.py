@@ -51,11 +51,19 @@ class HomographyPairs:
         seed: of the whole stream.
         size: side of the square images in pixels.
         kinds: of the textures, as `TextureBank` takes them.
+        strengths: of the warps of the two views; at 1 a view is turned by up to 40 degrees and scaled by up to e^0.45.
     """
 
-    def __init__(self, seed: int, size: int = 224, kinds: tuple[str, ...] = ("leaves",)) -> None:
+    def __init__(
+        self,
+        seed: int,
+        size: int = 224,
+        kinds: tuple[str, ...] = ("leaves",),
+        strengths: tuple[float, float] = (0.5, 1.0),
+    ) -> None:
         self.seed = seed
         self.size = size
+        self._strengths = strengths
         self._bank = TextureBank(seed, kinds, _TEXTURE_SIZE)
 
     def pair(self, index: int) -> HomographyPair:
@@ -64,8 +72,9 @@ class HomographyPairs:
         texture = self._bank.texture(index)
         if rng.random() < 0.3:  # seen from afar
             texture = _shrunk(texture, np.exp(rng.uniform(0.1, 0.9)))
-        H_0_texture = _random_view(rng, texture.shape[0], self.size, strength=0.5)
-        H_1_texture = _random_view(rng, texture.shape[0], self.size, strength=1.0)
+        H_0_texture, H_1_texture = (
+            _random_view(rng, texture.shape[0], self.size, strength) for strength in self._strengths
+        )
         images = [_warp(texture, H, self.size) for H in (H_0_texture, H_1_texture)]
         hidden = np.zeros((self.size, self.size), dtype=bool)
         if rng.random() < 0.3:

@@ -28,6 +28,7 @@ MIXES: dict[str, tuple[str, ...]] = {
     "scenes": ("scenes",),
     "mix": ("leaves", "scenes", "leaves", "scenes", "leaves"),
     "blend": ("leaves", "leaves", "leaves", "scenes"),
+    "turned": ("turned leaves", "leaves", "turned leaves", "scenes"),
     "endoscope": ("endoscopy", "leaves", "endoscopy", "leaves"),
 }
 
@@ -57,13 +58,15 @@ class PairStream(Protocol):
 def open_stream(source: str, seed: int, size: int) -> PairStream:
     """A stream by name.
 
-    'scenes', 'endoscopy' (scenes inside a body), 'patterns' (every texture but leaves) or a texture's kind under
-    homographies.
+    'scenes', 'endoscopy' (scenes inside a body), 'patterns' (every texture but leaves), a texture's kind under
+    homographies, or 'turned leaves', which are warped further: by up to 90 degrees and e^1 between the views.
     """
     if source == "scenes":
         return ScenePairs(seed, size)
     if source == "endoscopy":
         return ScenePairs(seed, size, ("colon", "organ"))
+    if source == "turned leaves":
+        return HomographyPairs(seed, size, ("leaves",), (1.0, 1.25))
     kinds = tuple(kind for kind in KINDS if kind != "leaves") if source == "patterns" else (source,)
     return HomographyPairs(seed, size, kinds)
 
