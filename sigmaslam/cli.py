@@ -287,7 +287,7 @@ def train(
     recipe: Annotated[
         TrainingRecipe,
         typer.Option(
-            help="full: 1 to 2 hours on 2 cores; turned: after it, for large turns; quick: 5 minutes; endoscope: a domain."
+            help="full: 1 to 2 hours on 2 cores; turned: after it, for large turns; quick: 5 minutes; endoscope."
         ),
     ] = TrainingRecipe.full,
     start: Annotated[

@@ -1,5 +1,6 @@
 """Training pairs: their order, and what they are made of."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -70,6 +71,22 @@ def test_shares_of_the_processes_make_up_the_batches_of_one(ranks):
         for part, expected in enumerate(batch):
             found = torch.stack([share[index][part] for share in shares], dim=1).flatten(0, 1)
             assert torch.equal(found, expected)
+
+
+def test_turned_leaves_are_turned_further():
+    def turns(source: str) -> np.ndarray:
+        """Degrees by which the middle of the second view is turned against the first."""
+        stream = open_stream(source, 0, 96)
+        middle = np.array([[47.5, 47.5], [48.5, 47.5], [47.5, 48.5]])
+        moved = np.stack([stream.pair(index).transfer(middle)[0] for index in range(24)])
+        along_u, along_v = moved[:, 1] - moved[:, 0], moved[:, 2] - moved[:, 0]
+        turn = np.arctan2(along_u[:, 1] - along_v[:, 0], along_u[:, 0] + along_v[:, 1])
+        return np.abs(np.degrees(turn))
+
+    usual, further = turns("leaves"), turns("turned leaves")
+    assert np.median(further) > 1.5 * np.median(usual)
+    assert usual.max() < 60
+    assert 60 < further.max() < 95
 
 
 def test_endoscopy_shows_the_inside_of_bodies_alone():
