@@ -49,10 +49,7 @@ def compare(
                 continue
             results.setdefault(label, {})[name] = found
             if name in REFINED:
-                row = f"{label} + sigmaslam match"
-                results.setdefault(row, {})[name] = score_refined(
-                    load_extractor(label), load_set(name, data), temperature_of(label)
-                )
+                results.setdefault(f"{label} + sigmaslam match", {})[name] = _score_refined(label, name, data)
             note(f"{name}: {label}, {count} pairs in {time.perf_counter() - start:.1f} s")
     return results
 
@@ -67,6 +64,13 @@ def _scorer(name: str, data: Path) -> tuple[Callable[[str], dict[str, float]], i
         return lambda label: _score_tracks(label, tracks), len(tracks)
     pairs = load_set(name, data)
     return lambda label: score_pairs(load_extractor(label), pairs), len(pairs)
+
+
+def _score_refined(label: str, name: str, data: Path) -> dict[str, float]:
+    extractor, temperature = load_extractor(label), temperature_of(label)
+    if name == STEPS:
+        return score_steps(extractor, load_steps(data), temperature)
+    return score_refined(extractor, load_set(name, data), temperature)
 
 
 def _score_tracks(label: str, tracks: Sequence[ImagePair]) -> dict[str, float]:

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmaslam import frontend
 from sigmaslam.evaluation.matching.extractors import MAX_KEYPOINTS, Extractor
 from sigmaslam.evaluation.matching.pairs import ImagePair
-from sigmaslam.evaluation.matching.scores import Features, score_pair, score_points, summarize
+from sigmaslam.evaluation.matching.scores import Features, score_pair, score_points, summarize, without_sigma
 from sigmaslam.evaluation.matching.sets import load_set
 from sigmaslam.match import match_features, refine_matches
 
@@ -59,7 +58,7 @@ def score_refined(extractor: Extractor, pairs: Sequence[ImagePair], inverse_temp
     features = _extract_all(extractor, pairs, MAX_KEYPOINTS)
     scores = []
     for pair in pairs:
-        both = [_with_sigma(features[id(image)]) for image in (pair.image0, pair.image1)]
+        both = [without_sigma(features[id(image)]) for image in (pair.image0, pair.image1)]
         matches = refine_matches(pair.image0, pair.image1, match_features(both[0], both[1], inverse_temperature))
         points0, points1 = (points.astype(np.float64) for points in (matches.keypoints0, matches.keypoints1))
         scores.append(score_points(pair, points0, points1))
@@ -76,13 +75,6 @@ def _extract_all(extractor: Extractor, pairs: Sequence[ImagePair], max_keypoints
             if len(keypoints) > max_keypoints:
                 raise ValueError(f"the extractor gave {len(keypoints)} keypoints: at most {max_keypoints} are compared")
     return features
-
-
-def _with_sigma(features: Features) -> frontend.Features:
-    """What `match_features` takes; the sigmas are of no use to it."""
-    keypoints, descriptors = features
-    none = np.zeros(len(keypoints), np.float32)
-    return frontend.Features(keypoints, descriptors, none, none)
 
 
 def _summarize_parts(pairs: Sequence[ImagePair], found: Sequence[dict[str, float]]) -> dict[str, float]:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from sigmaslam import frontend
 from sigmaslam.evaluation.matching.pairs import Disparity, Homography, ImagePair, Motion, SameRows
 from sigmaslam.frontend.matching import match_rows
 from sigmaslam.frontend.refine import refine
@@ -229,6 +230,13 @@ def summarize(pairs: Sequence[dict[str, float]]) -> dict[str, float]:
         else:
             summary[name] = float(np.mean(values))
     return summary
+
+
+def without_sigma(features: Features) -> frontend.Features:
+    """What `sigmaslam.match.match_features` takes; scores and sigmas, which are not known here, are of no use to it."""
+    keypoints, descriptors = features
+    none = np.zeros(len(keypoints), np.float32)
+    return frontend.Features(keypoints, descriptors, none, none)
 
 
 def _unit(descriptors: np.ndarray) -> np.ndarray:

@@ -16,9 +16,9 @@ FINAL = ("boat", "churchill", "fountain", "kitti", "euroc")
 """These are scored once, when everything is chosen."""
 TRACKS, STEPS = "kitti_tracks", "euroc_steps"
 """The last two again: matches from frame to frame of up to 2,048 keypoints, and poses of steps between keyframes."""
-REFINED = (*SELECTION, "boat", "churchill", "fountain")
-"""On these the matches of `sigmaslam match` are scored too."""
 ALL = (*SELECTION, *FINAL, TRACKS, STEPS)
+REFINED = (*SELECTION, "boat", "churchill", "fountain", STEPS)
+"""On these the matches of `sigmaslam match` are scored too."""
 
 _SETS: dict[str, tuple[str, Callable[[Path], list[ImagePair]]]] = {
     "set12": ("denoising", photographs.set12),
