@@ -53,7 +53,7 @@ def hessian_response(cells: Tensor) -> Tensor:
     it is meaningless.
     """
     size = CELL * CELL
-    uu, vv, uv = functional.conv2d(cells, _hessian_kernels().to(cells), padding=1).split(size, dim=1)
+    uu, vv, uv = functional.conv2d(cells, _HESSIAN_KERNELS.to(cells), padding=1).split(size, dim=1)
     return uu * vv - uv * uv
 
 
@@ -75,6 +75,10 @@ def _hessian_kernels() -> Tensor:
             kernels[kind, pixel, v : v + taps, u : u + taps] = _SIGMA**2 * taps_2d
     cells = kernels.view(3 * size, 3, CELL, 3, CELL).permute(0, 2, 4, 1, 3)
     return cells.reshape(3 * size, size, 3, 3).float()
+
+
+# Made once: training detects in every image.
+_HESSIAN_KERNELS = _hessian_kernels()
 
 
 def detect(cells: Tensor, count: int) -> tuple[Tensor, Tensor]:

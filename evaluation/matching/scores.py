@@ -9,8 +9,7 @@ import numpy as np
 
 from sigmaslam import frontend
 from sigmaslam.evaluation.matching.pairs import Disparity, Homography, ImagePair, Motion, SameRows
-from sigmaslam.frontend.matching import match_rows
-from sigmaslam.frontend.refine import refine
+from sigmaslam.frontend.descriptor import match_stereo
 from sigmaslam.rotation import rotation_log
 
 CORNER_THRESHOLDS = (1, 3, 5)
@@ -24,9 +23,7 @@ _INLIER_THRESHOLD = 1.0
 _POLISHED_THRESHOLD = 1.5
 _CONFIDENCE = 0.9999
 _ITERATIONS = 10_000
-# Rows as the tracker matches them (sigmaslam/frontend/descriptor.py), with the ratio of our features for everyone.
-_ROW_TOLERANCE = 2.0
-_DISPARITY_SHARE = 0.25
+# For matches along rows: that of our features in the tracker, for everyone.
 _RATIO = 0.95
 _CORNER_ERROR, _POLISHED_ERROR, _POSE_ERROR = "corner_error", "polished_corner_error", "pose_error_deg"
 
@@ -53,7 +50,7 @@ def mutual_nearest(descriptors0: np.ndarray, descriptors1: np.ndarray) -> tuple[
 def match_rows_refined(
     left: np.ndarray, right: np.ndarray, features_left: Features, features_right: Features
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Stereo matches of a rectified pair as the tracker makes them: descriptors within a band, then Lucas-Kanade.
+    """Stereo matches of a rectified pair as the tracker makes them (`match_stereo`).
 
     Args:
         left, right: (H, W) uint8.
@@ -62,13 +59,10 @@ def match_rows_refined(
         Indices (K,) into the left keypoints and their places (K, 2) in the right image; what could not be refined is
         left out.
     """
-    (keypoints, descriptors), (others, other_descriptors) = features_left, features_right
-    disparities = (-_ROW_TOLERANCE, _DISPARITY_SHARE * left.shape[1])
-    index_left, index_right = match_rows(
-        keypoints, others, _unit(descriptors), _unit(other_descriptors), _ROW_TOLERANCE, disparities, _RATIO
-    )
-    places, moved = refine(left, right, keypoints[index_left], others[index_right])
-    return index_left[moved], places[moved]
+    both = [
+        without_sigma((keypoints, _unit(descriptors))) for keypoints, descriptors in (features_left, features_right)
+    ]
+    return match_stereo(left, right, both[0], both[1], _RATIO)
 
 
 def score_pair(pair: ImagePair, features0: Features, features1: Features) -> dict[str, float]:

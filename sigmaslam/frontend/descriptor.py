@@ -21,6 +21,32 @@ _SIGMA_DETECTED = 1.0
 Detector = Callable[[np.ndarray], Features]
 
 
+def match_stereo(
+    left: np.ndarray, right: np.ndarray, features_left: Features, features_right: Features, ratio: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Stereo matches of a rectified pair: descriptors within a band of rows, then Lucas-Kanade.
+
+    Args:
+        left, right: (H, W) uint8.
+        features_left, features_right: of these images.
+        ratio: as in `match_rows`.
+    Returns:
+        Indices (K,) into the left features and their places (K, 2) in the right image; what could not be refined is
+        left out.
+    """
+    index_left, index_right = match_rows(
+        features_left.keypoints,
+        features_right.keypoints,
+        features_left.descriptors,
+        features_right.descriptors,
+        _ROW_TOLERANCE,
+        (_LEAST_DISPARITY, _MOST_DISPARITY * left.shape[1]),
+        ratio,
+    )
+    places, moved = refine(left, right, features_left.keypoints[index_left], features_right.keypoints[index_right])
+    return index_left[moved], places[moved]
+
+
 class DescriptorFrontend:
     """Matches by mutual nearest descriptor, refined by one Lucas-Kanade level.
 
@@ -39,19 +65,10 @@ class DescriptorFrontend:
         """Features of both images, matched along the rows."""
         features, other = self._detect(left), self._detect(right)
         disparity = np.full(len(features.keypoints), np.nan)
-        index_left, index_right = match_rows(
-            features.keypoints,
-            other.keypoints,
-            features.descriptors,
-            other.descriptors,
-            _ROW_TOLERANCE,
-            (_LEAST_DISPARITY, _MOST_DISPARITY * left.shape[1]),
-            self._ratio,
-        )
-        points_left = features.keypoints[index_left]
-        places, moved = refine(left, right, points_left, other.keypoints[index_right])
-        level = moved & (np.abs(places[:, 1] - points_left[:, 1]) <= _ROW_TOLERANCE)
-        disparity[index_left[level]] = points_left[level, 0] - places[level, 0]
+        index, places = match_stereo(left, right, features, other, self._ratio)
+        points = features.keypoints[index]
+        level = np.abs(places[:, 1] - points[:, 1]) <= _ROW_TOLERANCE
+        disparity[index[level]] = points[level, 0] - places[level, 0]
         return StereoView(left, right, features, disparity)
 
     def match(
