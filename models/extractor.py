@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from sigmaslam.models.detector import detect, to_cells, to_half_cells
 from sigmaslam.models.network import FeatureNetwork, sample_map
@@ -54,13 +53,12 @@ class FeatureExtractor(nn.Module):
     def _level(self, cells: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         candidates, strength = self._detect(cells, _CANDIDATES_PER_KEYPOINT * count)
         maps = self.network(cells)
-        stride = self.network.stride
-        quality = sample_map(maps.quality, candidates, stride).squeeze(-1).sigmoid()
+        quality = sample_map(maps.quality, candidates).squeeze(-1).sigmoid()
         strength = strength / strength.amax(dim=1, keepdim=True).clamp_min(1e-12)
-        sigma = sample_map(maps.log_sigma, candidates, stride).squeeze(-1).exp()
+        sigma = sample_map(maps.log_sigma, candidates).squeeze(-1).exp()
         scores, order = self._rank(strength, quality, sigma).topk(count, dim=1)
         keypoints = candidates.gather(1, order.unsqueeze(-1).expand(-1, -1, 2))
-        descriptors = functional.normalize(sample_map(maps.descriptors, keypoints, stride), dim=-1)
+        descriptors = self.network.describe(maps, keypoints)
         return keypoints[0], scores[0], descriptors[0], sigma.gather(1, order)[0]
 
     def _detect(self, cells: Tensor, count: int) -> tuple[Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""The correspondence network: a descriptor, a quality and a log-sigma per 8x8 pixels, interpolated in between."""
+"""The correspondence network: a descriptor, a quality and a log-sigma for every place of an image."""
 
 from __future__ import annotations
 
@@ -11,62 +11,75 @@ from torch.nn import functional
 from sigmaslam.models.detector import CELL
 
 DESCRIPTOR_SIZE = 64
-STRIDE = 8
+STRIDE = 4
 SIZE_MULTIPLE = 16
 """The network halves four times; images are padded to a multiple of this before it."""
+_FINE, _COARSE = 32, 64
+_HIDDEN = 96
+_COARSE_STRIDE = 8
+_WINDOW = 3
 
 
 class FeatureMaps(NamedTuple):
     """What the network says of an image.
 
     Attributes:
-        descriptors: (B, C, H/stride, W/stride), not of unit length.
-        quality: (B, 1, H/stride, W/stride) logits that a keypoint there will be matched rightly.
-        log_sigma: (B, 1, H/stride, W/stride) logarithm of the standard deviation of a keypoint's place per axis, in
-            pixels.
+        fine: (B, 32, H/4, W/4) features.
+        coarse: (B, 64, H/8, W/8) features.
+        quality: (B, 1, H/8, W/8) logits that a keypoint there will be matched rightly.
+        log_sigma: (B, 1, H/8, W/8) logarithm of the standard deviation of a keypoint's place per axis, in pixels.
     """
 
-    descriptors: Tensor
+    fine: Tensor
+    coarse: Tensor
     quality: Tensor
     log_sigma: Tensor
 
 
 class FeatureNetwork(nn.Module):
-    """Dense descriptors, quality and log-sigma from a grey image.
+    """Descriptors, quality and log-sigma from a grey image.
 
-    Nothing is computed above quarter resolution, where the time would go; a 1/16 branch widens the receptive field.
-    Channel counts are multiples of 16, which ONNX Runtime's kernels want.
+    Nothing is computed above quarter resolution, where the time would go, and nothing after it but the keypoints' own
+    descriptors: two layers on a window of the fine map, centred on the keypoint, and on the coarse map there. Channel
+    counts are multiples of 16, which ONNX Runtime's kernels want.
 
     Args:
-        descriptor_size: channels of the descriptors.
-        stride: of the maps: 4, 8 or 16.
+        descriptor_size: of the descriptors.
+        stride: of the finest map that descriptors see: 4; 8 and 16 see the coarse one alone, 16 without its 1/8 branch.
 
     Shapes:
-        cells (B, 16, H/4, W/4) of an image in [0, 1], H and W multiples of 16 -> FeatureMaps. With stride 8 cell
-        (i, j) of a map is centred on pixel (8 i + 3.5, 8 j + 3.5).
+        cells (B, 16, H/4, W/4) of an image in [0, 1], H and W multiples of 16 -> FeatureMaps. Cell (i, j) of a map of
+        stride s is centred on pixel (s i + (s - 1) / 2, s j + (s - 1) / 2).
     """
 
     def __init__(self, descriptor_size: int = DESCRIPTOR_SIZE, stride: int = STRIDE) -> None:
         super().__init__()
         self.descriptor_size, self.stride = descriptor_size, stride
-        self.stem = _block(CELL * CELL, 32)
-        self.eighth = nn.Sequential(_block(32, 48, stride=2), _block(48, 48))
+        self.stem = nn.Sequential(_block(CELL * CELL, _FINE), _block(_FINE, _FINE))
+        self.eighth = nn.Sequential(_block(_FINE, 48, stride=2), _block(48, 48))
         self.sixteenth = nn.Sequential(_block(48, 64, stride=2), _block(64, 64), _block(64, 64), _block(64, 48))
-        self.lateral = nn.Conv2d(32, 48, 1) if stride == 4 else None
-        self.merge = _block(48, 64)
-        self.head = nn.Conv2d(64, descriptor_size + 2, 1)
+        self.merge = _block(48, _COARSE)
+        self.judge = nn.Conv2d(_COARSE, 2, 1)
+        seen = _COARSE + (_WINDOW * _WINDOW * _FINE if stride == 4 else 0)
+        self.describer = nn.Sequential(
+            nn.Linear(seen, _HIDDEN), nn.ReLU(inplace=True), nn.Linear(_HIDDEN, descriptor_size)
+        )
 
     def forward(self, cells: Tensor) -> FeatureMaps:
         """Maps of a batch of images."""
-        quarter = self.stem(normalize_image(cells))
-        fine = self.eighth(quarter)
-        merged = self.sixteenth(fine)
-        if self.stride < 16:
-            merged = fine + _doubled(merged)
-        if self.lateral is not None:
-            merged = self.lateral(quarter) + _doubled(merged)
-        maps = self.head(self.merge(merged))
-        return FeatureMaps(*maps.split([self.descriptor_size, 1, 1], dim=1))
+        fine = self.stem(normalize_image(cells))
+        eighth = self.eighth(fine)
+        merged = _doubled(self.sixteenth(eighth))
+        coarse = self.merge(merged + eighth if self.stride < 16 else merged)
+        quality, log_sigma = self.judge(coarse).split(1, dim=1)
+        return FeatureMaps(fine, coarse, quality, log_sigma)
+
+    def describe(self, maps: FeatureMaps, keypoints: Tensor) -> Tensor:
+        """Unit descriptors (B, N, C) of keypoints (B, N, 2), pixel coordinates (u, v)."""
+        seen = sample_map(maps.coarse, keypoints)
+        if self.stride == 4:
+            seen = torch.cat([seen, sample_window(maps.fine, keypoints)], dim=-1)
+        return functional.normalize(self.describer(seen), dim=-1)
 
 
 def normalize_image(image: Tensor) -> Tensor:
@@ -76,33 +89,50 @@ def normalize_image(image: Tensor) -> Tensor:
     return centred * torch.rsqrt(variance.clamp_min(1e-6))
 
 
-def sample_map(features: Tensor, keypoints: Tensor, stride: int = STRIDE) -> Tensor:
+def sample_map(features: Tensor, keypoints: Tensor, stride: int = _COARSE_STRIDE) -> Tensor:
     """Bilinear samples of a strided map at pixel positions; outside the map its border is repeated.
-
-    Written with look-ups of rows, which ONNX Runtime runs several times faster than its GridSample.
 
     Args:
         features: (B, C, H/stride, W/stride).
         keypoints: (B, N, 2) pixel coordinates (u, v).
+        stride: pixels a cell of the map.
     Returns:
         (B, N, C).
     """
+    return _samples(features, keypoints, stride, 1).flatten(2)
+
+
+def sample_window(features: Tensor, keypoints: Tensor, stride: int = CELL) -> Tensor:
+    """As `sample_map`, at each keypoint and its 8 neighbours one cell away: (B, N, 9 C), row by row."""
+    return _samples(features, keypoints, stride, _WINDOW).flatten(2)
+
+
+def _samples(features: Tensor, keypoints: Tensor, stride: int, window: int) -> Tensor:
+    """Samples (B, N, window, window, C) of a map, one cell apart.
+
+    They share their fractions of a cell, so each takes one look-up, and not four. Written with look-ups of rows, which
+    ONNX Runtime runs several times faster than its GridSample.
+    """
     batch, channels, height, width = features.shape
     table = features.permute(0, 2, 3, 1).reshape(-1, channels)
-    first = height * width * torch.arange(batch, device=features.device).unsqueeze(1)
-    u = ((keypoints[..., 0] + 0.5) / stride - 0.5).clamp(0, width - 1)
-    v = ((keypoints[..., 1] + 0.5) / stride - 0.5).clamp(0, height - 1)
-    left, top = u.floor(), v.floor()
-    du, dv = (u - left).unsqueeze(-1), (v - top).unsqueeze(-1)
-    left, top = left.long(), top.long()
-    right, bottom = (left + 1).clamp_max(width - 1), (top + 1).clamp_max(height - 1)
+    first = height * width * torch.arange(batch, device=features.device).view(-1, 1, 1, 1)
+    reach = window // 2
+    steps = torch.arange(-reach, reach + 2, device=features.device)
 
-    def at(column: Tensor, row: Tensor) -> Tensor:
-        return functional.embedding(first + row * width + column, table)
+    def axis(places: Tensor, cells: int) -> tuple[Tensor, Tensor]:
+        # Beyond its border the map goes on as it ends there.
+        place = ((places + 0.5) / stride - 0.5).clamp(-reach - 1, cells + reach)
+        lower = place.floor()
+        return (lower.long().unsqueeze(-1) + steps).clamp(0, cells - 1), (place - lower)[..., None, None, None]
 
-    above = (1 - du) * at(left, top) + du * at(right, top)
-    below = (1 - du) * at(left, bottom) + du * at(right, bottom)
-    return (1 - dv) * above + dv * below
+    columns, du = axis(keypoints[..., 0], width)
+    rows, dv = axis(keypoints[..., 1], height)
+    cells = functional.embedding(first + rows.unsqueeze(-1) * width + columns.unsqueeze(-2), table)
+    # Not torch.lerp, which becomes twice the work in ONNX.
+    left, right = cells[..., :-1, :], cells[..., 1:, :]
+    cells = left + du * (right - left)
+    above, below = cells[..., :-1, :, :], cells[..., 1:, :, :]
+    return above + dv * (below - above)
 
 
 def _doubled(features: Tensor) -> Tensor:

@@ -113,13 +113,17 @@ class Bfloat16Network(nn.Module):
 
     def __init__(self, network: FeatureNetwork) -> None:
         super().__init__()
-        self.network, self.stride = network, network.stride
+        self.network = network
 
     def forward(self, cells: Tensor) -> FeatureMaps:
         """Maps of a batch of images, as `FeatureNetwork` gives them."""
         with torch.autocast(cells.device.type, dtype=torch.bfloat16):
             maps = self.network(cells)
         return FeatureMaps(*(each.float() for each in maps))
+
+    def describe(self, maps: FeatureMaps, keypoints: Tensor) -> Tensor:
+        """Descriptors, as `FeatureNetwork` gives them; in float32, as the losses."""
+        return self.network.describe(maps, keypoints)
 
 
 def place_network(network: FeatureNetwork, place: Workplace) -> FeatureNetwork:

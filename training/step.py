@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from sigmaslam.models.detector import to_cells
-from sigmaslam.models.network import FeatureNetwork, sample_map
+from sigmaslam.models.network import FeatureMaps, FeatureNetwork, sample_map
 from sigmaslam.training.losses import PairLoss, match_loss, place_loss
 
 # A keypoint has a partner if one was found this near to its true place in image 1, pixels.
@@ -56,22 +55,19 @@ def pair_loss(
     cells = to_cells(torch.cat([image0, image1])).contiguous(memory_format=torch.channels_last)
     maps = network(cells)
 
-    def sample(features: Tensor, first: bool, places: Tensor) -> Tensor:
-        return sample_map(features[:batch] if first else features[batch:], places, network.stride)
-
-    descriptors0 = functional.normalize(sample(maps.descriptors, True, keypoints0), dim=-1)
-    at1 = sample(maps.descriptors, False, torch.cat([jittered, distractors], dim=1))
-    descriptors1 = functional.normalize(at1, dim=-1)
+    maps0, maps1 = (FeatureMaps(*maps_of) for maps_of in zip(*(each.split(batch) for each in maps), strict=True))
+    descriptors0 = network.describe(maps0, keypoints0)
+    descriptors1 = network.describe(maps1, torch.cat([jittered, distractors], dim=1))
     matching = match_loss(
         descriptors0,
         descriptors1[:, :count],
         descriptors1[:, count:],
-        sample(maps.quality, True, keypoints0).squeeze(-1),
+        sample_map(maps0.quality, keypoints0).squeeze(-1),
         visible,
         nearest < _REPEAT_DISTANCE,
     )
-    log_sigma0 = sample(maps.log_sigma, True, keypoints0).squeeze(-1)
-    log_sigma1 = sample(maps.log_sigma, False, keypoints1).squeeze(-1).gather(1, partner)
+    log_sigma0 = sample_map(maps0.log_sigma, keypoints0).squeeze(-1)
+    log_sigma1 = sample_map(maps1.log_sigma, keypoints1).squeeze(-1).gather(1, partner)
     zoom = _zoom(keypoints0, places1, visible)
     place = place_loss(nearest, log_sigma0, log_sigma1, zoom, visible & (nearest < _PARTNER_DISTANCE))
     return PairLoss(*matching, place)
