@@ -135,17 +135,9 @@ Keypoints (blobs of two scales, ranked by a learned quality), {DESCRIPTOR_SIZE}-
 - Data: {card["data"]}.
 - Command: `{card["command"]}`, commit {card["commit"]}, seed {card["seed"]}.
 - Duration: {card["duration_s"] / 60:.0f} minutes on {card["hardware"]}.
-{_first_stage(card)}- Figures on real sequences: docs/results.md; none of them was used in training.
+- Figures on real sequences: docs/results.md; none of them was used in training.
 
 """ + "\n".join(sections)
-
-
-def _first_stage(card: dict[str, Any]) -> str:
-    """A line on the run whose weights this one started from, if the card tells of it."""
-    first = card.get("first_stage")
-    if first is None:
-        return ""
-    return f"- Before it: `{first['command']}`, commit {first['commit']}, {first['duration_s'] / 60:.0f} minutes.\n"
 
 
 def _table(left: str, right: str, rows: dict[str, Any]) -> str:

@@ -109,7 +109,6 @@ class TrainingRecipe(StrEnum):
     """Training runs by name."""
 
     full = "full"
-    turned = "turned"
     quick = "quick"
     endoscope = "endoscope"
 
@@ -286,9 +285,7 @@ def train(
     out: Annotated[Path, typer.Option(help="Folder for checkpoint, log, TensorBoard, samples, weights and card.")],
     recipe: Annotated[
         TrainingRecipe,
-        typer.Option(
-            help="full: 1 to 2 hours on 2 cores; turned: after it, for large turns; quick: 5 minutes; endoscope."
-        ),
+        typer.Option(help="full: an hour on 2 cores; quick: 5 minutes; endoscope: goes on from the shipped weights."),
     ] = TrainingRecipe.full,
     start: Annotated[
         Path | None,

@@ -61,9 +61,10 @@ VARIANTS = (
     Variant("sub-pixel", "whole pixels", extraction="whole_pixels"),
     Variant("descriptor", "32 numbers", {"descriptor_size": 32}),
     Variant("descriptor", "128 numbers", {"descriptor_size": 128}),
-    Variant("stride", "4", {"stride": 4}),
+    Variant("stride", "8", {"stride": 8}),
     Variant("stride", "16", {"stride": 16}),
     Variant("data", "blend (3 leaves, 1 scene)", {"data": "blend"}),
+    Variant("data", "turned (2 turned leaves, 1 leaves, 1 scene)", {"data": "turned"}),
 )
 
 

@@ -138,7 +138,7 @@ def test_scores_are_kept_beside_the_weights_by_extraction_and_not_computed_again
 def test_a_run_that_was_stopped_goes_on(tmp_path: Path, calls: Calls):
     from sigmaslam.training.checkpoint import CHECKPOINT_NAME
 
-    stopped = tmp_path / "runs" / f"stride_4-{STEPS}-0"
+    stopped = tmp_path / "runs" / f"stride_8-{STEPS}-0"
     stopped.mkdir(parents=True)
     (stopped / CHECKPOINT_NAME).touch()
     write(tmp_path, seeds=1)

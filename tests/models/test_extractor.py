@@ -71,9 +71,8 @@ def test_three_in_four_come_from_the_image_and_one_from_half_of_it():
     """With a sigma of one pixel everywhere the level shows: two pixels mean half scale."""
     network = FeatureNetwork().eval()
     with torch.no_grad():
-        network.head.weight.zero_()
-        network.head.bias.zero_()
-        network.head.bias[:-2] = 1.0
+        network.judge.weight.zero_()
+        network.judge.bias.zero_()
     rng = np.random.default_rng(4)
     image = as_image(cv2.GaussianBlur(dead_leaves((192, 256), rng) / 255.0, (0, 0), 0.8))
     _, _, _, sigma = run(FeatureExtractor(network), image, 101)
@@ -160,8 +159,8 @@ def test_a_keypoint_of_low_quality_scores_less(image):
     scores = []
     for logit in (0.0, -3.0):
         with torch.no_grad():
-            network.head.weight[-2].zero_()
-            network.head.bias[-2] = logit
+            network.judge.weight[0].zero_()
+            network.judge.bias[0] = logit
         scores.append(run(FeatureExtractor(network), image, 100)[1])
     ratio = 1 / (1 + np.exp(3.0)) / 0.5
     torch.testing.assert_close(scores[1], ratio * scores[0], rtol=1e-4, atol=1e-6)

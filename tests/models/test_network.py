@@ -10,11 +10,11 @@ from sigmaslam.models.detector import to_cells
 from sigmaslam.models.network import (
     DESCRIPTOR_SIZE,
     SIZE_MULTIPLE,
-    STRIDE,
     FeatureMaps,
     FeatureNetwork,
     normalize_image,
     sample_map,
+    sample_window,
 )
 from sigmaslam.synthetic.textures import dead_leaves
 
@@ -38,19 +38,31 @@ def maps_of(network: FeatureNetwork, image: Tensor) -> FeatureMaps:
         return network(to_cells(image))
 
 
-@pytest.mark.parametrize("stride", [4, 8, 16])
 @pytest.mark.parametrize(("batch", "height", "width"), [(1, 96, 96), (2, 112, 176)])
-def test_maps_have_the_size_over_the_stride(stride, batch, height, width):
+def test_maps_have_the_size_over_their_stride(network, batch, height, width):
     assert height % SIZE_MULTIPLE == width % SIZE_MULTIPLE == 0
-    maps = maps_of(FeatureNetwork(stride=stride).eval(), torch.rand(batch, 1, height, width))
-    size = (height // stride, width // stride)
-    assert maps.descriptors.shape == (batch, DESCRIPTOR_SIZE, *size)
-    assert maps.quality.shape == maps.log_sigma.shape == (batch, 1, *size)
+    maps = maps_of(network, torch.rand(batch, 1, height, width))
+    assert maps.fine.shape == (batch, 32, height // 4, width // 4)
+    assert maps.coarse.shape == (batch, 64, height // 8, width // 8)
+    assert maps.quality.shape == maps.log_sigma.shape == (batch, 1, height // 8, width // 8)
 
 
-def test_the_length_of_descriptors_can_be_chosen():
-    maps = maps_of(FeatureNetwork(descriptor_size=30).eval(), torch.rand(1, 1, 96, 96))
-    assert maps.descriptors.shape[1] == 30
+@pytest.mark.parametrize("stride", [4, 8, 16])
+@pytest.mark.parametrize("size", [30, DESCRIPTOR_SIZE])
+def test_descriptors_have_the_length_that_was_chosen_and_unit_norm(stride, size, image):
+    network = FeatureNetwork(size, stride).eval()
+    with torch.no_grad():
+        descriptors = network.describe(network(to_cells(image)), 90 * torch.rand(1, 7, 2))
+    assert descriptors.shape == (1, 7, size)
+    torch.testing.assert_close(descriptors.norm(dim=-1), torch.ones(1, 7))
+
+
+def test_a_descriptor_sees_both_maps(network, image):
+    maps, keypoint = maps_of(network, image), torch.tensor([[[70.3, 60.8]]])
+    with torch.no_grad():
+        descriptor = network.describe(maps, keypoint)
+        for other in (maps._replace(fine=maps.fine.roll(1, 2)), maps._replace(coarse=maps.coarse.roll(1, 2))):
+            assert (network.describe(other, keypoint) - descriptor).abs().max() > 1e-3
 
 
 @pytest.mark.parametrize(("gain", "offset"), [(0.3, 0.4), (1.0, -0.1), (0.05, 0.0)])
@@ -67,19 +79,23 @@ def test_images_of_a_batch_do_not_mix(network, image):
 
 @pytest.mark.parametrize("stride", [4, 8, 16])
 def test_every_parameter_learns(stride):
-    """No layer is left out of the graph: each gets a gradient from the maps."""
+    """No layer is left out of the graph: each gets a gradient from descriptors, quality or log-sigma."""
     network = FeatureNetwork(stride=stride)
-    sum(value.square().sum() for value in network(to_cells(torch.rand(2, 1, 96, 96)))).backward()
+    maps = network(to_cells(torch.rand(2, 1, 96, 96)))
+    descriptors = network.describe(maps, 90 * torch.rand(2, 40, 2))
+    # The length of a descriptor is one: its square would teach nothing.
+    (descriptors.sum() + maps.quality.square().sum() + maps.log_sigma.square().sum()).backward()
     assert all(p.grad is not None and p.grad.abs().max() > 0 for p in network.parameters())
 
 
 def test_maps_move_with_the_image(network, image):
-    """A shift by 16 pixels, the network's coarsest cell, shifts the maps by 16 / stride cells, away from borders."""
+    """A shift by the network's coarsest cell, 16 pixels, or two shifts the maps by as much, away from borders."""
     tiled = image.repeat(1, 1, 3, 3)
     shifted = torch.roll(tiled, (16, 32), dims=(2, 3))
     for a, b in zip(maps_of(network, tiled), maps_of(network, shifted), strict=True):
-        moved = torch.roll(a, (16 // STRIDE, 32 // STRIDE), dims=(2, 3))
-        inner = (..., slice(18, -18), slice(18, -18))
+        cells = a.shape[2] * 16 // tiled.shape[2]
+        moved = torch.roll(a, (cells, 2 * cells), dims=(2, 3))
+        inner = (..., slice(9 * cells, -9 * cells), slice(9 * cells, -9 * cells))
         torch.testing.assert_close(b[inner], moved[inner], rtol=0, atol=1e-4)
 
 
@@ -108,16 +124,35 @@ def test_samples_are_torchs_grid_samples(stride):
     torch.testing.assert_close(sample_map(features, places, stride), expected[..., 0].mT, rtol=0, atol=1e-4)
 
 
-def test_sample_at_cell_centres_is_the_cell():
+@pytest.mark.parametrize("stride", [4, 8])
+def test_a_window_is_nine_samples_a_cell_apart(stride):
+    """Row by row, also where it reaches out of the map."""
+    torch.manual_seed(2)
     features = torch.rand(2, 5, 6, 9)
-    v, u = torch.meshgrid(torch.arange(6.0), torch.arange(9.0), indexing="ij")
-    centres = torch.stack([STRIDE * u + 3.5, STRIDE * v + 3.5], dim=-1).reshape(1, -1, 2).expand(2, -1, -1)
-    torch.testing.assert_close(sample_map(features, centres), features.flatten(2).mT, rtol=0, atol=1e-5)
+    places = torch.rand(2, 200, 2) * torch.tensor([9.0 * stride + 40, 6.0 * stride + 40]) - 20
+    steps = [(stride * u, stride * v) for v in (-1, 0, 1) for u in (-1, 0, 1)]
+    expected = [sample_map(features, places + torch.tensor(step), stride) for step in steps]
+    window = sample_window(features, places, stride)
+    torch.testing.assert_close(window, torch.cat(expected, dim=-1), rtol=0, atol=1e-4)
 
 
+@pytest.mark.parametrize("stride", [4, 8])
+def test_sample_at_cell_centres_is_the_cell(stride):
+    features = torch.rand(2, 5, 6, 9)
+    u, v = cell_centres(stride)
+    centres = torch.stack([u, v], dim=-1).reshape(1, -1, 2).expand(2, -1, -1)
+    torch.testing.assert_close(sample_map(features, centres, stride), features.flatten(2).mT, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("stride", [4, 8])
 @pytest.mark.parametrize("axis", [0, 1])
-def test_samples_of_a_ramp_are_the_ramp_between_cell_centres(axis):
-    v, u = torch.meshgrid(STRIDE * torch.arange(6.0) + 3.5, STRIDE * torch.arange(9.0) + 3.5, indexing="ij")
-    ramp = (u, v)[axis][None, None]
-    places = torch.tensor([[[10.0, 20.0], [33.3, 7.0], [66.9, 40.0]]])
-    torch.testing.assert_close(sample_map(ramp, places)[..., 0], places[..., axis], rtol=0, atol=1e-4)
+def test_samples_of_a_ramp_are_the_ramp_between_cell_centres(stride, axis):
+    ramp = cell_centres(stride)[axis][None, None]
+    places = torch.tensor([[[10.0, 10.0], [18.3, 7.0], [32.9, 19.0]]])
+    torch.testing.assert_close(sample_map(ramp, places, stride)[..., 0], places[..., axis], rtol=0, atol=1e-4)
+
+
+def cell_centres(stride: int) -> tuple[Tensor, Tensor]:
+    """Columns and rows (6, 9) of the pixels on which the cells of a map are centred."""
+    v, u = torch.meshgrid(torch.arange(6.0), torch.arange(9.0), indexing="ij")
+    return stride * u + 0.5 * (stride - 1), stride * v + 0.5 * (stride - 1)

@@ -33,7 +33,7 @@ def test_what_is_asked_for_replaces_what_the_recipe_says():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"recipe": "huge"}, "recipe 'huge' is unknown; choose one of full, turned, quick, endoscope"),
+        ({"recipe": "huge"}, "recipe 'huge' is unknown; choose one of full, quick, endoscope"),
         ({"recipe": "full", "data": "photographs"}, "data 'photographs' is unknown; choose one of leaves"),
         ({"recipe": "full", "steps": 0}, "steps 0 is too small"),
     ],
