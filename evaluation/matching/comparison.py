@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from sigmaslam.errors import FrameError, InputError
-from sigmaslam.evaluation.matching.extractors import load_extractor
+from sigmaslam.evaluation.matching.extractors import Extractor, load_extractor, remembering
 from sigmaslam.evaluation.matching.pairs import ImagePair
 from sigmaslam.evaluation.matching.run import Scores, score_pairs, score_refined
 from sigmaslam.evaluation.matching.sets import ALL, REFINED, STEPS, TRACKS, load_set, load_steps, load_tracks
@@ -35,42 +35,53 @@ def compare(
     unknown = [name for name in sets if name not in ALL]
     if unknown:
         raise InputError(f"there is no set '{unknown[0]}': choose among {', '.join(ALL)}")
-    for name in names:
-        load_extractor(name)
+    extractors = {name: load_extractor(name) for name in names}
     results: dict[str, Scores] = {name: {} for name in names}
     for name in sets:
+        if name == TRACKS:
+            _compare_tracks(results, load_tracks(data), names, note)
+            continue
         score, count = _scorer(name, data)
-        for label in (*names, KLT) if name == TRACKS else names:
+        for label, extractor in extractors.items():
             start = time.perf_counter()
+            features = remembering(extractor)
             try:
-                found = score(label)
+                results[label][name] = score(features, None)
+                if name in REFINED:
+                    refined = results.setdefault(f"{label} + sigmaslam match", {})
+                    refined[name] = score(features, temperature_of(label))
             except FrameError as error:
                 note(f"{name}: left out {label}: {error}")
                 continue
-            results.setdefault(label, {})[name] = found
-            if name in REFINED:
-                results.setdefault(f"{label} + sigmaslam match", {})[name] = _score_refined(label, name, data)
             note(f"{name}: {label}, {count} pairs in {time.perf_counter() - start:.1f} s")
     return results
 
 
-def _scorer(name: str, data: Path) -> tuple[Callable[[str], dict[str, float]], int]:
-    """What scores an extractor by name on a set, and the number of its pairs."""
+def _scorer(name: str, data: Path) -> tuple[Callable[[Extractor, float | None], dict[str, float]], int]:
+    """What scores an extractor on a set, by the matches of `sigmaslam match` if it gets a temperature; its pairs."""
     if name == STEPS:
         steps = load_steps(data)
-        return lambda label: score_steps(load_extractor(label), steps), len(steps)
-    if name == TRACKS:
-        tracks = load_tracks(data)
-        return lambda label: _score_tracks(label, tracks), len(tracks)
+        return lambda extractor, temperature: score_steps(extractor, steps, temperature), len(steps)
     pairs = load_set(name, data)
-    return lambda label: score_pairs(load_extractor(label), pairs), len(pairs)
+
+    def score(extractor: Extractor, temperature: float | None) -> dict[str, float]:
+        return score_pairs(extractor, pairs) if temperature is None else score_refined(extractor, pairs, temperature)
+
+    return score, len(pairs)
 
 
-def _score_refined(label: str, name: str, data: Path) -> dict[str, float]:
-    extractor, temperature = load_extractor(label), temperature_of(label)
-    if name == STEPS:
-        return score_steps(extractor, load_steps(data), temperature)
-    return score_refined(extractor, load_set(name, data), temperature)
+def _compare_tracks(
+    results: dict[str, Scores], tracks: Sequence[ImagePair], names: Sequence[str], note: Callable[[str], None]
+) -> None:
+    for label in (*names, KLT):
+        start = time.perf_counter()
+        try:
+            found = _score_tracks(label, tracks)
+        except FrameError as error:
+            note(f"{TRACKS}: left out {label}: {error}")
+            continue
+        results.setdefault(label, {})[TRACKS] = found
+        note(f"{TRACKS}: {label}, {len(tracks)} pairs in {time.perf_counter() - start:.1f} s")
 
 
 def _score_tracks(label: str, tracks: Sequence[ImagePair]) -> dict[str, float]:

@@ -75,6 +75,19 @@ def load_extractor(name: str, max_keypoints: int = MAX_KEYPOINTS) -> Extractor:
     raise InputError(f"{name} is no extractor: give {', '.join(CLASSICAL)}, or a .safetensors or .onnx file")
 
 
+def remembering(extractor: Extractor) -> Extractor:
+    """The same extractor, which is asked only once for the features of an array."""
+    # With the arrays themselves, so that their ids stay apart.
+    found: dict[int, tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]] = {}
+
+    def extract(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if id(image) not in found:
+            found[id(image)] = image, extractor(image)
+        return found[id(image)][1]
+
+    return extract
+
+
 def _classical(detect: Callable[[np.ndarray], Features], max_keypoints: int) -> Extractor:
     def extract(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         features = detect(image)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmaslam.evaluation.matching.extractors import MAX_KEYPOINTS, Extractor
+from sigmaslam.evaluation.matching.extractors import MAX_KEYPOINTS, Extractor, remembering
 from sigmaslam.evaluation.matching.pairs import ImagePair
 from sigmaslam.evaluation.matching.scores import Features, score_pair, score_points, summarize, without_sigma
 from sigmaslam.evaluation.matching.sets import load_set
@@ -47,34 +47,32 @@ def score_pairs(
     Raises:
         ValueError: the extractor gives more keypoints.
     """
-    features = _extract_all(extractor, pairs, max_keypoints)
-    return _summarize_parts(
-        pairs, [score_pair(pair, features[id(pair.image0)], features[id(pair.image1)]) for pair in pairs]
-    )
+    features = _limited(extractor, max_keypoints)
+    return _summarize_parts(pairs, [score_pair(pair, features(pair.image0), features(pair.image1)) for pair in pairs])
 
 
 def score_refined(extractor: Extractor, pairs: Sequence[ImagePair], inverse_temperature: float) -> dict[str, float]:
     """As `score_pairs`, for the matches that `sigmaslam match` returns: consistent ones, with aligned patches."""
-    features = _extract_all(extractor, pairs, MAX_KEYPOINTS)
+    features = _limited(extractor, MAX_KEYPOINTS)
     scores = []
     for pair in pairs:
-        both = [without_sigma(features[id(image)]) for image in (pair.image0, pair.image1)]
+        both = [without_sigma(features(image)) for image in (pair.image0, pair.image1)]
         matches = refine_matches(pair.image0, pair.image1, match_features(both[0], both[1], inverse_temperature))
         points0, points1 = (points.astype(np.float64) for points in (matches.keypoints0, matches.keypoints1))
         scores.append(score_points(pair, points0, points1))
     return _summarize_parts(pairs, scores)
 
 
-def _extract_all(extractor: Extractor, pairs: Sequence[ImagePair], max_keypoints: int) -> dict[int, Features]:
-    features: dict[int, Features] = {}
-    # `pairs` keeps the arrays alive, so their ids stay apart.
-    for image in (image for pair in pairs for image in (pair.image0, pair.image1)):
-        if id(image) not in features:
-            keypoints, descriptors = extractor(image)
-            features[id(image)] = keypoints, descriptors
-            if len(keypoints) > max_keypoints:
-                raise ValueError(f"the extractor gave {len(keypoints)} keypoints: at most {max_keypoints} are compared")
-    return features
+def _limited(extractor: Extractor, max_keypoints: int) -> Extractor:
+    """The extractor, asked once for an image, which must not give more keypoints than everyone may."""
+
+    def extract(image: np.ndarray) -> Features:
+        features = extractor(image)
+        if len(features[0]) > max_keypoints:
+            raise ValueError(f"the extractor gave {len(features[0])} keypoints: at most {max_keypoints} are compared")
+        return features
+
+    return remembering(extract)
 
 
 def _summarize_parts(pairs: Sequence[ImagePair], found: Sequence[dict[str, float]]) -> dict[str, float]:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from sigmaslam.camera import RectifiedStereo
-from sigmaslam.evaluation.matching.extractors import Extractor
+from sigmaslam.evaluation.matching.extractors import Extractor, remembering
 from sigmaslam.evaluation.matching.scores import Features, match_rows_refined, mutual_nearest, without_sigma
 from sigmaslam.match import match_features, refine_matches
 from sigmaslam.rotation import rotation_log
@@ -58,13 +58,10 @@ def score_steps(
         steps_good: number of steps with a pose within 5 cm and 1 degree of the truth; steps: of all; pnp_inliers: mean
         number of points that agree with the pose, 0 where there is none.
     """
-    features: dict[int, Features] = {}
-    for image in (image for step in steps for image in (step.left0, step.right0, step.left1)):
-        if id(image) not in features:
-            features[id(image)] = extractor(image)
+    features = remembering(extractor)
     good, inliers = 0, 0
     for step in steps:
-        left0, right0, left1 = (features[id(image)] for image in (step.left0, step.right0, step.left1))
+        left0, right0, left1 = (features(image) for image in (step.left0, step.right0, step.left1))
         found = estimate_step(step, left0, right0, left1, inverse_temperature)
         if found is not None:
             good += is_good(found[0], step.T_1_0)
