@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -153,18 +153,25 @@ def draw_matches(image0: np.ndarray, image1: np.ndarray, matches: Matches) -> np
 
     Of many matches 200 are drawn, evenly chosen from the first to the last.
     """
+    palette = cv2.applyColorMap(np.arange(256, dtype=np.uint8), cv2.COLORMAP_VIRIDIS).reshape(256, 3).tolist()
+    count = len(matches.probability)
+    # The most probable last: their lines lie on top.
+    rows = np.linspace(count - 1, 0, min(count, _MOST_LINES)).round().astype(int)
+    colours = [palette[round(255.0 * float(probability))] for probability in matches.probability[rows]]
+    return draw_lines(image0, image1, matches.keypoints0[rows], matches.keypoints1[rows], colours)
+
+
+def draw_lines(
+    image0: np.ndarray, image1: np.ndarray, points0: np.ndarray, points1: np.ndarray, colours: Sequence[Sequence[int]]
+) -> np.ndarray:
+    """Both images (H, W) uint8 side by side with lines between points (M, 2) in BGR colours, the last on top."""
     (height0, width0), (height1, width1) = image0.shape, image1.shape
     grey = np.zeros((max(height0, height1), width0 + width1), np.uint8)
     grey[:height0, :width0], grey[:height1, width0:] = image0, image1
     canvas = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
     thickness = 1 + canvas.shape[1] // 2000
-    count = len(matches.probability)
-    palette = cv2.applyColorMap(np.arange(256, dtype=np.uint8), cv2.COLORMAP_VIRIDIS).reshape(256, 3).tolist()
-    # The most probable last: their lines lie on top.
-    for row in np.linspace(count - 1, 0, min(count, _MOST_LINES)).round().astype(int):
-        colour = palette[round(255.0 * float(matches.probability[row]))]
-        start = matches.keypoints0[row].round().astype(int).tolist()
-        end = (matches.keypoints1[row] + (width0, 0)).round().astype(int).tolist()
+    for point0, point1, colour in zip(points0, points1 + (width0, 0), colours, strict=True):
+        start, end = point0.round().astype(int).tolist(), point1.round().astype(int).tolist()
         cv2.line(canvas, start, end, colour, thickness, cv2.LINE_AA)
         for place in (start, end):
             cv2.circle(canvas, place, 3 * thickness, colour, thickness, cv2.LINE_AA)

@@ -3,8 +3,10 @@ import pytest
 import torch
 
 from sigmaslam.models.network import FeatureNetwork
-from sigmaslam.training.pictures import draw_matches, draw_sample
+from sigmaslam.training import pictures
+from sigmaslam.training.pictures import draw_sample
 from sigmaslam.training.stream import open_stream
+from sigmaslam.training.validation import PairMatches
 
 
 def coloured(picture: np.ndarray, channel: int) -> np.ndarray:
@@ -13,18 +15,21 @@ def coloured(picture: np.ndarray, channel: int) -> np.ndarray:
     return picture[..., channel].astype(int) - others.max(axis=2) > 80
 
 
-def test_right_matches_are_green_and_wrong_ones_red():
-    points = np.array([[4.0, 8.0], [4.0, 24.0]])
-    picture = draw_matches(np.zeros((32, 32)), np.ones((32, 32)), points, points, np.array([True, False]))
-    assert picture.shape == (64, 128, 3)
-    assert picture.dtype == np.uint8
-    green, red = coloured(picture, 1), coloured(picture, 2)
-    assert set(np.flatnonzero(green.any(axis=1))) <= {16, 17}
-    assert set(np.flatnonzero(red.any(axis=1))) <= {48, 49}
-    # From the point in image 0 to the point in image 1, twice as large and side by side.
-    columns = np.flatnonzero(green.any(axis=0))
-    assert columns.min() == pytest.approx(8, abs=1)
-    assert columns.max() == pytest.approx(64 + 8, abs=1)
+@pytest.mark.usefixtures("small")
+@pytest.mark.parametrize(("error", "shown", "not_shown"), [(2.9, 1, 2), (3.1, 2, 1)], ids=["right", "wrong"])
+def test_right_matches_are_green_and_wrong_ones_red(
+    monkeypatch: pytest.MonkeyPatch, error: float, shown: int, not_shown: int
+):
+    """From the point in image 0 to the point in image 1, twice as large and side by side."""
+    point = torch.tensor([[30.0, 8.0]])
+    found = PairMatches(point, point, torch.tensor([error]), torch.zeros(1))
+    monkeypatch.setattr(pictures, "match_pair", lambda network, pair: found)
+    picture = draw_sample(FeatureNetwork(), open_stream("leaves", 5, 96).pair(0))
+    assert not coloured(picture, not_shown).any()
+    rows, columns = np.nonzero(coloured(picture, shown))
+    assert abs(rows - 16.5).max() <= 4
+    assert columns.min() == pytest.approx(60.5, abs=4)
+    assert columns.max() == pytest.approx(192 + 60.5, abs=4)
 
 
 @pytest.mark.usefixtures("small")
