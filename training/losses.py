@@ -81,18 +81,20 @@ def match_loss(
 
 
 def place_loss(distance: Tensor, log_sigma0: Tensor, log_sigma1: Tensor, zoom: Tensor, partnered: Tensor) -> Tensor:
-    """Negative log-likelihood of the distances under a bivariate Student t law of 3 degrees of freedom, its mean.
+    """Mean negative log-likelihood of distances under a bivariate Student t law of 3 degrees of freedom.
 
-    Its heavy tails bear the wrong partners that chance brings near.
+    Up to a constant. Its heavy tails bear the wrong partners that chance brings near.
 
     Args:
         distance: (B, N) from the true place in image 1 of a keypoint of image 0 to the keypoint found there, pixels.
-        log_sigma0, log_sigma1: (B, N) predicted for the one and the other, of pixels of their images.
+        log_sigma0, log_sigma1: (B, N) predicted for the one and the other: logarithms of the law's standard deviation
+            per axis, of pixels of their images.
         zoom: (B, 1) pixels of image 1 a pixel of image 0.
         partnered: (B, N) bool, the rows that count.
     """
     variance = zoom.square() * (2.0 * log_sigma0).exp() + (2.0 * log_sigma1).exp()
-    tail = torch.log1p(distance.square() / (_FREEDOM * variance))
+    # The law's own scale is that variance over freedom / (freedom - 2).
+    tail = torch.log1p(distance.square() / ((_FREEDOM - 2.0) * variance))
     likelihood = variance.log() + 0.5 * (_FREEDOM + 2.0) * tail
     weight = partnered.to(distance.dtype)
     return (likelihood * weight).sum() / weight.sum().clamp_min(1.0)

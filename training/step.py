@@ -35,7 +35,8 @@ def pair_loss(
     Args:
         network: the network in training.
         image0, image1: (B, 1, H, W) float32 in [0, 1].
-        keypoints0, keypoints1: (B, N, 2) keypoints of either image, pixels.
+        keypoints0: (B, N, 2) some keypoints of image 0, pixels.
+        keypoints1: (B, K, 2) all keypoints of image 1, pixels, the strongest first; every second one is a distractor.
         places1: (B, N, 2) where keypoints0 lie in image 1, pixels.
         visible: (B, N) bool, whether they are seen there.
         generator: of the small displacements, on the CPU.
@@ -46,10 +47,11 @@ def pair_loss(
     # By matrix products it would be off by a tenth of a pixel.
     distance = torch.cdist(places1, keypoints1, compute_mode="donot_use_mm_for_euclid_dist")
     nearest, partner = distance.min(dim=2)
+    distractors = keypoints1[:, ::2]
     # A keypoint of image 1 at a true place would be wrongly pushed away: it moves elsewhere as a distractor.
-    elsewhere = size * torch.rand(keypoints1.shape, generator=generator).to(keypoints1)
-    clash = distance.amin(dim=1) < _CLASH_DISTANCE
-    distractors = torch.where(clash.unsqueeze(-1), elsewhere, keypoints1)
+    elsewhere = size * torch.rand(distractors.shape, generator=generator).to(distractors)
+    useless = (distance[:, :, ::2].amin(dim=1) < _CLASH_DISTANCE) | (distractors < 0).any(dim=-1)
+    distractors = torch.where(useless.unsqueeze(-1), elsewhere, distractors)
     jittered = places1 + _PLACE_JITTER * torch.randn(places1.shape, generator=generator).to(places1)
 
     cells = to_cells(torch.cat([image0, image1])).contiguous(memory_format=torch.channels_last)

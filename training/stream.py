@@ -17,9 +17,11 @@ from sigmaslam.synthetic.pairs import HomographyPairs
 from sigmaslam.synthetic.scene_pairs import ScenePairs
 from sigmaslam.synthetic.textures import KINDS
 
-# image0 (1, H, W), image1 (1, H, W), keypoints0 (N, 2), places1 (N, 2), visible (N,), keypoints1 (N, 2)
+# image0 (1, H, W), image1 (1, H, W), keypoints0 (N, 2), places1 (N, 2), visible (N,), keypoints1 (2 N, 2)
 TrainingPair = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
+NOWHERE = -1000.0
+"""Both coordinates of a keypoint that fills up."""
 # What the pairs of a run are made of: its sources take turns.
 MIXES: dict[str, tuple[str, ...]] = {
     "leaves": ("leaves",),
@@ -61,6 +63,8 @@ def open_stream(source: str, seed: int, size: int) -> PairStream:
     'scenes', 'endoscopy' (scenes inside a body), 'patterns' (every texture but leaves), a texture's kind under
     homographies, or 'turned leaves', which are warped further: by up to 90 degrees and e^1 between the views.
     """
+    # Of its own, or two sources with textures of one kind would show the same ones.
+    seed = int(np.random.SeedSequence((seed, *source.encode())).generate_state(1)[0])
     if source == "scenes":
         return ScenePairs(seed, size)
     if source == "endoscopy":
@@ -98,14 +102,14 @@ class MixedPairs:
 
 
 class PairDataset(Dataset[TrainingPair]):
-    """Pairs `first` to `last` of a mix, each with N random keypoints of either image.
+    """Pairs `first` to `last` of a mix, each with N random keypoints of image 0 and the 2 N strongest of image 1.
 
     Args:
         mix: a key of `MIXES`.
         seed: of the stream.
         size: side of the square images, pixels.
         first, last: range of indices, so that a resumed run goes on where it stopped.
-        keypoints: N, per image; random places fill up where an image has fewer.
+        keypoints: N; random places fill up where an image has fewer, places far outside in image 1.
     """
 
     def __init__(self, mix: str, seed: int, size: int, first: int, last: int, keypoints: int) -> None:
@@ -123,7 +127,12 @@ class PairDataset(Dataset[TrainingPair]):
         index = self._first + item
         pair = self._pairs.pair(index)
         rng = np.random.default_rng((self._seed, 2, index))
-        keypoints0, keypoints1 = (self._some_keypoints(image, rng) for image in (pair.image0, pair.image1))
+        # A random choice, so that weak ones are learned too; of image 1 all, or partners would be missing.
+        keypoints0 = rng.permutation(self._strongest(pair.image0))[: self._keypoints]
+        filling = rng.uniform(0, self._size - 1, (self._keypoints - len(keypoints0), 2))
+        keypoints0 = np.concatenate([keypoints0, filling]).astype(np.float32)
+        keypoints1 = self._strongest(pair.image1)
+        keypoints1 = np.pad(keypoints1, ((0, 2 * self._keypoints - len(keypoints1)), (0, 0)), constant_values=NOWHERE)
         places1, visible = pair.transfer(keypoints0)
         return (
             torch.from_numpy(pair.image0)[None],
@@ -134,13 +143,10 @@ class PairDataset(Dataset[TrainingPair]):
             torch.from_numpy(keypoints1),
         )
 
-    def _some_keypoints(self, image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """A random choice among twice as many, so that weak ones are learned too: (N, 2) float32."""
+    def _strongest(self, image: np.ndarray) -> np.ndarray:
+        """At most 2 N keypoints, (K, 2) float32, the strongest first."""
         keypoints, strength = detect(to_cells(torch.from_numpy(image)[None, None]), 2 * self._keypoints)
-        places = keypoints[strength > 0].numpy()
-        chosen = rng.permutation(places)[: self._keypoints]
-        filling = rng.uniform(0, self._size - 1, (self._keypoints - len(chosen), 2))
-        return np.concatenate([chosen, filling]).astype(np.float32)
+        return np.asarray(keypoints[strength > 0].numpy())
 
 
 def pair_loader(
