@@ -17,9 +17,10 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from sigmaslam.errors import InputError, SigmaSlamError
-from sigmaslam.files import atomic_path, atomic_write_text
+from sigmaslam.files import atomic_path, atomic_write_text, make_folder
 from sigmaslam.filters.lie import exp_se3
 from sigmaslam.filters.stereo_pose import STATE_SIZE, Innovate, Predict, Update
+from sigmaslam.models.card import card_page, read_card, read_scores
 from sigmaslam.models.extractor import EXTRACTOR_SIZE_MULTIPLE, FeatureExtractor
 from sigmaslam.models.network import DESCRIPTOR_SIZE, STRIDE, FeatureNetwork
 from sigmaslam.session import OnnxGraph
@@ -63,7 +64,7 @@ def load_network(weights: Path, descriptor_size: int = DESCRIPTOR_SIZE, stride: 
 
 
 def export_features(weights: Path, out: Path) -> float:
-    """Writes the feature graph and returns the largest difference of descriptors or keypoints from torch."""
+    """Writes the feature graph and returns the largest difference from torch, in pixels where there are any."""
     extractor = FeatureExtractor(load_network(weights)).eval()
     height = torch.export.Dim("height_blocks", min=3, max=256)
     width = torch.export.Dim("width_blocks", min=3, max=256)
@@ -88,60 +89,27 @@ def export_filter(folder: Path) -> dict[str, float]:
     }
 
 
-def export_all(weights: Path, card: Path, out: Path) -> dict[str, float]:
+def export_all(weights: Path, card: Path, out: Path, scores: Path | None = None) -> dict[str, float]:
     """Everything the runtime needs, into one folder: graphs, weights and card.
 
     Args:
         weights: safetensors file of a training run.
         card: its JSON card; the differences found here are added to the copy in `out`.
-        out: folder that gets features.onnx, pose_*.onnx, features.safetensors and features.json.
+        scores: of these weights on real sets, for the card; see `read_scores`.
+        out: folder that gets features.onnx, pose_*.onnx, features.safetensors and features.json and .md.
     """
-    if not card.is_file():
-        raise InputError(f"{card} does not exist: weights ship only with the card of the run that made them")
-    content = json.loads(card.read_text())
-    out.mkdir(parents=True, exist_ok=True)
+    content = read_card(card)
+    if scores is not None:
+        content["metrics_on_real_sets"] = read_scores(scores)
+    make_folder(out)
     differences = {"features": export_features(weights, out / "features.onnx"), **export_filter(out)}
     content["onnx_minus_torch"] = differences
     copied = weights.read_bytes()
     with atomic_path(out / "features.safetensors") as path:
         path.write_bytes(copied)
     atomic_write_text(out / "features.json", json.dumps(content, indent=2) + "\n")
-    atomic_write_text(out / "features.md", _card_page(content))
+    atomic_write_text(out / "features.md", card_page(content))
     return differences
-
-
-def _card_page(card: dict[str, Any]) -> str:
-    """The model card for people."""
-    started = card.get("started_from")
-    origin = "random weights" if started is None else f"{started['name']} (sha256 {started['sha256']})"
-    sections = [
-        _table("setting", "", card["config"]),
-        _table("held-out renders (48 pairs, 256 keypoints)", "", card["metrics_on_held_out_renders"]),
-    ]
-    real = card.get("metrics_on_real_sets", {})
-    if real:
-        rows = {f"{name} {metric}": value for name, values in real.items() for metric, value in values.items()}
-        sections.append("## Real sets\n\nNone of them was used in training.\n\n" + _table("set, metric", "", rows))
-    if card.get("limits"):
-        sections.append("## Limits\n\n" + "".join(f"- {limit}\n" for limit in card["limits"]))
-    differences = {f"{name}.onnx": f"{value:.1e}" for name, value in card["onnx_minus_torch"].items()}
-    sections.append("## Graphs\n\n" + _table("ONNX minus torch", "largest difference", differences))
-    return f"""# Model card: features
-
-Keypoints (blobs of two scales, ranked by a learned quality), {DESCRIPTOR_SIZE}-D descriptors, a sigma of each place;
-{card["parameters"]} parameters.
-
-- Recipe: {card.get("recipe") or "none"}, started from {origin}.
-- Data: {card["data"]}.
-- Command: `{card["command"]}`, commit {card["commit"]}, seed {card["seed"]}.
-- Duration: {card["duration_s"] / 60:.0f} minutes on {card["hardware"]}.
-- Figures on real sequences: docs/results.md; none of them was used in training.
-
-""" + "\n".join(sections)
-
-
-def _table(left: str, right: str, rows: dict[str, Any]) -> str:
-    return f"| {left} | {right} |\n|---|---|\n" + "".join(f"| {name} | {value} |\n" for name, value in rows.items())
 
 
 def _noisy_texture(rng: np.random.Generator, shape: tuple[int, int]) -> Tensor:
@@ -285,14 +253,16 @@ def _relative_difference(found: list[np.ndarray], expected: list[np.ndarray]) ->
 
 
 def _feature_difference(found: list[np.ndarray], expected: list[np.ndarray]) -> float:
-    """Largest difference of descriptors at common keypoints; infinite if fewer than 98 % are common.
+    """Largest difference of common keypoints, their scores, descriptors and sigmas; infinite if over 2 % are missing.
 
     Round-off may swap two keypoints of nearly equal score, so they are paired by place.
     """
     count = int((expected[1] > 0).sum())
     distance = np.linalg.norm(expected[0][:count, None] - found[0][None, :count], axis=2)
     nearest = distance.argmin(axis=1)
-    common = distance[np.arange(count), nearest] < 1e-2
+    common = distance[np.arange(count), nearest] < 1.0
     if common.mean() < 0.98:
         return float("inf")
-    return float(np.abs(found[2][nearest[common]] - expected[2][:count][common]).max())
+    return max(
+        float(np.abs(a[nearest[common]] - b[:count][common]).max()) for a, b in zip(found, expected, strict=True)
+    )

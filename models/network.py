@@ -12,6 +12,7 @@ from sigmaslam.models.detector import CELL
 
 DESCRIPTOR_SIZE = 64
 STRIDE = 4
+STRIDES = (4, 8, 16)
 SIZE_MULTIPLE = 16
 """The network halves four times; images are padded to a multiple of this before it."""
 _FINE, _COARSE = 32, 64
@@ -47,6 +48,9 @@ class FeatureNetwork(nn.Module):
         descriptor_size: of the descriptors.
         stride: of the finest map that descriptors see: 4; 8 and 16 see the coarse one alone, 16 without its 1/8 branch.
 
+    Raises:
+        ValueError: the stride is none of these.
+
     Shapes:
         cells (B, 16, H/4, W/4) of an image in [0, 1], H and W multiples of 16 -> FeatureMaps. Cell (i, j) of a map of
         stride s is centred on pixel (s i + (s - 1) / 2, s j + (s - 1) / 2).
@@ -54,6 +58,8 @@ class FeatureNetwork(nn.Module):
 
     def __init__(self, descriptor_size: int = DESCRIPTOR_SIZE, stride: int = STRIDE) -> None:
         super().__init__()
+        if stride not in STRIDES:
+            raise ValueError(f"stride {stride} is none of {STRIDES}")
         self.descriptor_size, self.stride = descriptor_size, stride
         self.stem = nn.Sequential(_block(CELL * CELL, _FINE), _block(_FINE, _FINE))
         self.eighth = nn.Sequential(_block(_FINE, 48, stride=2), _block(48, 48))

@@ -320,6 +320,9 @@ def train(
 def export(
     run: Annotated[Path, typer.Argument(help="Folder of a finished training run.")],
     out: Annotated[Path, typer.Option(help="Folder for the graphs, the weights and their card.")],
+    scores: Annotated[
+        Path | None, typer.Option(help="The .json of 'benchmark features' for these weights: into the card.")
+    ] = None,
 ) -> None:
     """Export network and filter to ONNX and check the graphs against torch (needs the extra 'train')."""
     _need_train_extra()
@@ -328,7 +331,7 @@ def export(
     from sigmaslam.training.loop import WEIGHTS_NAME
 
     with Console(stderr=True).status("exporting four graphs (about a minute)"):
-        differences = export_all(run / WEIGHTS_NAME, run / CARD_NAME, out)
+        differences = export_all(run / WEIGHTS_NAME, run / CARD_NAME, out, scores)
     for name, difference in differences.items():
         typer.echo(f"{name}.onnx differs from torch by {difference:.1e}")
 

@@ -1,5 +1,6 @@
 """Files that appear whole or not at all."""
 
+import os
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -33,10 +34,25 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         ) from error
     try:
         yield temporary
+        # On the disk before the name is: a power cut would else leave an empty file.
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
         temporary.replace(path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def make_folder(path: Path) -> None:
+    """Makes a folder, and those above it, where there is none.
+
+    Raises:
+        InputError: a file is in the way, or it may not be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{path} cannot be made a folder ({error.strerror or error}): choose another") from error
 
 
 def atomic_write_text(path: str | Path, text: str) -> None:

@@ -162,7 +162,7 @@ def draw_matches(image0: np.ndarray, image1: np.ndarray, matches: Matches) -> np
 
 
 def draw_lines(
-    image0: np.ndarray, image1: np.ndarray, points0: np.ndarray, points1: np.ndarray, colours: Sequence[Sequence[int]]
+    image0: np.ndarray, image1: np.ndarray, points0: np.ndarray, points1: np.ndarray, colours: Sequence[Sequence[float]]
 ) -> np.ndarray:
     """Both images (H, W) uint8 side by side with lines between points (M, 2) in BGR colours, the last on top."""
     (height0, width0), (height1, width1) = image0.shape, image1.shape

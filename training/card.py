@@ -14,31 +14,36 @@ from sigmaslam.training.stream import MIXES
 
 CARD_NAME = "features.json"
 _LIMITS = [
-    "grey images",
-    "rotation and scale as far as the views of the training pairs go",
-    "learned from renders alone",
+    "grey images from 96 pixels a side; turned and scaled against each other as far as the training pairs are",
+    "textures of renders: very dark, very noisy and textureless images give few keypoints",
+    "sigma is learned from renders and not calibrated on real images; it is too large after refinement",
 ]
 
 
-def make_card(state: TrainingState, place: Workplace, commit: str, hidden: list[Path]) -> dict[str, Any]:
+def describe_origin(hidden: list[Path]) -> dict[str, str]:
+    """Commit and command of this process.
+
+    Args:
+        hidden: paths of the command of which the name alone is told: where they lay is nobody's business.
+    """
+    names = {str(path): path.resolve().name for path in hidden}
+    command = ["sigmaslam", *(names.get(argument, argument) for argument in sys.argv[1:])]
+    return {"commit": current_commit(), "command": " ".join(command)}
+
+
+def make_card(state: TrainingState, place: Workplace) -> dict[str, Any]:
     """The card of a finished run.
 
     Args:
         state: at its end.
-        place: where it ran.
-        commit: of the source tree when it began.
-        hidden: paths of the command of which the name alone is told: where they lay is nobody's business.
+        place: where it ended.
     """
-    command = " ".join(["sigmaslam", *sys.argv[1:]])
-    for path in hidden:
-        command = command.replace(str(path), path.name)
     return {
         "recipe": state.recipe,
         "started_from": state.started_from,
         "config": asdict(state.config),
         "seed": state.config.seed,
-        "commit": commit,
-        "command": command,
+        **state.origin,
         "duration_s": round(state.seconds, 1),
         "hardware": describe_hardware(place),
         "parameters": sum(p.numel() for p in state.network.parameters()),
@@ -50,14 +55,15 @@ def make_card(state: TrainingState, place: Workplace, commit: str, hidden: list[
 
 def current_commit() -> str:
     """The commit of the source tree, or 'unknown' when installed from a wheel."""
+    here = Path(__file__).resolve()
     try:
-        result = subprocess.run(
-            ["git", "rev-parse", "HEAD"],
-            cwd=Path(__file__).resolve().parent,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
+        # An installed package may lie inside of another repository.
+        _git(here.parent, "ls-files", "--error-unmatch", here.name)
+        return _git(here.parent, "rev-parse", "HEAD")
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    result = subprocess.run(["git", *arguments], cwd=folder, capture_output=True, text=True, check=True)
     return result.stdout.strip()

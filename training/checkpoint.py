@@ -22,7 +22,7 @@ from sigmaslam.training.recipes import TrainingConfig
 
 CHECKPOINT_NAME = "checkpoint.safetensors"
 _OLD_NAME = "checkpoint.pt"
-_FORMAT = "sigmaslam training 1"
+_FORMAT = "sigmaslam training 2"
 
 
 @dataclass(slots=True)
@@ -35,6 +35,7 @@ class TrainingState:
         config: what the run is made of.
         recipe: its name, if it has one.
         started_from: name and sha256 of the weights that it began with; None: random ones.
+        origin: commit and command that began it.
         network, optimizer, schedule: in training.
         step: steps that are done.
         seconds: that they took.
@@ -52,6 +53,7 @@ class TrainingState:
     seconds: float = 0.0
     metrics: dict[str, float] = field(default_factory=dict)
     validated: int = -1
+    origin: dict[str, str] = field(default_factory=dict)
 
 
 def check_run_folder(out: Path, resume: bool) -> None:
@@ -82,8 +84,10 @@ def begin(config: TrainingConfig, recipe: str | None, start: Path | None, place:
     network = FeatureNetwork(size, stride) if start is None else _load_start(start, size, stride)
     network = place_network(network, place)
     optimizer = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
+    # The rate rises for a tenth of the steps; a rise of one step, that of ten steps, is a division by zero in torch.
+    rising = 0.1 if config.steps < 3 else max(0.1, 2 / config.steps)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimizer, max_lr=config.learning_rate, total_steps=config.steps, pct_start=0.1
+        optimizer, max_lr=config.learning_rate, total_steps=config.steps, pct_start=rising
     )
     return TrainingState(config, recipe, _identify(start), network, optimizer, schedule)
 
@@ -99,6 +103,7 @@ def save_checkpoint(path: Path, state: TrainingState) -> None:
         "config": asdict(state.config),
         "recipe": state.recipe,
         "started_from": state.started_from,
+        "origin": state.origin,
         "step": state.step,
         "seconds": state.seconds,
         "metrics": state.metrics,
@@ -129,7 +134,7 @@ def resume_checkpoint(
     if start is not None:
         _check_same(path, "weights with ", _identify(start) or {}, metadata["started_from"] or {})
     state = begin(config, recipe, None, place)
-    state.started_from = metadata["started_from"]
+    state.started_from, state.origin = metadata["started_from"], metadata["origin"]
     state.network.load_state_dict(_below("network", tensors))
     state.optimizer.load_state_dict({"state": _optimizer_state(state, tensors), "param_groups": metadata["optimizer"]})
     state.schedule.load_state_dict(metadata["schedule"])

@@ -58,7 +58,8 @@ class Journal:
 
 
 def _keep_until(log: Path, step: int) -> None:
-    """Takes back the lines after a step."""
+    """Takes back the lines after a step, and one that a power cut left unfinished."""
     if log.is_file():
         lines = log.read_text().splitlines(keepends=True)
-        atomic_write_text(log, "".join(line for line in lines if json.loads(line)["step"] <= step))
+        whole = [line for line in lines if line.endswith("}\n")]
+        atomic_write_text(log, "".join(line for line in whole if json.loads(line)["step"] <= step))

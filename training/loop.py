@@ -1,4 +1,4 @@
-"""The training loop: resumable at any step, the same result whether it was interrupted or not."""
+"""The training loop: resumable at any step, the same result on as many processes whether it was interrupted or not."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from safetensors.torch import save_file
 from torch import nn
 from torch.utils.data import DataLoader
 
-from sigmaslam.files import atomic_path, atomic_write_text
-from sigmaslam.training.card import CARD_NAME, current_commit, make_card
+from sigmaslam.files import atomic_path, atomic_write_text, make_folder
+from sigmaslam.training.card import CARD_NAME, describe_origin, make_card
 from sigmaslam.training.checkpoint import (
     CHECKPOINT_NAME,
     TrainingState,
@@ -76,14 +76,18 @@ def train(
     """
     check_config(config)
     check_run_folder(out, resume)
-    commit = current_commit()  # before the run: the tree may move on while it lasts
     with open_workplace(device, config.batch_size) as place:
         path = out / CHECKPOINT_NAME
-        state = resume_checkpoint(path, config, recipe, start, place) if resume else begin(config, recipe, start, place)
-        out.mkdir(parents=True, exist_ok=True)
+        if resume:
+            state = resume_checkpoint(path, config, recipe, start, place)
+        else:
+            state = begin(config, recipe, start, place)
+            # Before the run: the tree may move on while it lasts.
+            state.origin = describe_origin([out] if start is None else [out, start])
+        make_folder(out)
         with closing(Journal(out, state.step)) if place.leads else nullcontext() as journal:
             _Run(state, place, out, journal).finish(workers)
-        card = make_card(state, place, commit, [out] if start is None else [out, start])
+        card = make_card(state, place)
         if place.leads:
             _write_result(out, state, card)
     return card
@@ -158,7 +162,7 @@ class _Run:
     def _step(self, batch: TrainingPair) -> PairLoss:
         """One step of the optimiser."""
         state, config = self._state, self._state.config
-        seed = config.seed * 1_000_000_007 + state.step + self._place.rank * 500_000_003
+        seed = (config.seed * 1_000_000_007 + state.step + self._place.rank * 500_000_003) % 2**63
         state.network.train()
         loss: PairLoss = self._loss(batch, torch.Generator().manual_seed(seed))
         state.optimizer.zero_grad(set_to_none=True)

@@ -22,9 +22,10 @@ def draw_sample(network: FeatureNetwork, pair: Pair) -> np.ndarray:
     right = (matches.error < RIGHT_WITHIN).numpy()
     # Right ones last: they lie above.
     order = np.argsort(right, kind="stable")
-    large = (
+    image0, image1 = (
         cv2.resize(np.round(255 * image.clip(0, 1)).astype(np.uint8), None, fx=_ENLARGED, fy=_ENLARGED)
         for image in (pair.image0, pair.image1)
     )
-    points = (_ENLARGED * (points[order].numpy() + 0.5) - 0.5 for points in (matches.points0, matches.points1))
-    return draw_lines(*large, *points, [_RIGHT_COLOUR if each else _WRONG_COLOUR for each in right[order]])
+    points0, points1 = (_ENLARGED * (each[order].numpy() + 0.5) - 0.5 for each in (matches.points0, matches.points1))
+    colours = [_RIGHT_COLOUR if each else _WRONG_COLOUR for each in right[order]]
+    return draw_lines(image0, image1, points0, points1, colours)

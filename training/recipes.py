@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sigmaslam.errors import InputError
-from sigmaslam.models.network import DESCRIPTOR_SIZE, STRIDE
+from sigmaslam.models.network import DESCRIPTOR_SIZE, STRIDE, STRIDES
 from sigmaslam.session import shipped_weights
 from sigmaslam.training.stream import MIXES
 
@@ -85,11 +85,15 @@ def check_config(config: TrainingConfig) -> None:
     """
     if config.data not in MIXES:
         raise InputError(f"data {config.data!r} is unknown; choose one of {', '.join(MIXES)}")
-    for name in ("steps", "batch_size", "points", "checkpoint_every"):
+    for name in ("steps", "batch_size", "points", "checkpoint_every", "descriptor_size"):
         if getattr(config, name) < 1:
             raise InputError(f"{name} {getattr(config, name)} is too small: give 1 or more")
     if config.validate_every < 0:
         raise InputError(f"validate_every {config.validate_every} is negative: give steps, or 0 for never")
+    if config.stride not in STRIDES:
+        raise InputError(f"stride {config.stride} is unknown; choose one of {', '.join(map(str, STRIDES))}")
+    if 8 * config.points > config.size**2:
+        raise InputError(f"points {config.points} are too many for {config.size}x{config.size} pixels: give less")
     if config.size < 64 or config.size % 32:
         raise InputError(f"size {config.size} does not fit the network: give a multiple of 32 from 64 up")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -85,13 +86,13 @@ def match_pair(network: FeatureNetwork, pair: Pair) -> PairMatches:
     network.eval()
     extractor = FeatureExtractor(network)
     device = next(network.parameters()).device
-    count = torch.tensor(_KEYPOINTS)
-    (keypoints0, descriptors0), (keypoints1, descriptors1) = (
-        (found[0].cpu(), found[2].cpu())
-        for found in (
-            extractor(torch.from_numpy(image)[None, None].to(device), count) for image in (pair.image0, pair.image1)
-        )
-    )
+
+    def extract(image: np.ndarray) -> tuple[Tensor, Tensor]:
+        found = extractor(torch.from_numpy(image)[None, None].to(device), torch.tensor(_KEYPOINTS))
+        keypoints, scores, descriptors, _ = (values.cpu() for values in found)
+        return keypoints[scores > 0], descriptors[scores > 0]
+
+    (keypoints0, descriptors0), (keypoints1, descriptors1) = extract(pair.image0), extract(pair.image1)
     network.train(was_training)
     similarity = descriptors0 @ descriptors1.T
     best1 = similarity.argmax(dim=1)

@@ -7,23 +7,25 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sigmaslam.errors import InputError
 from sigmaslam.evaluation.benchmarks.page import write_page
 from sigmaslam.evaluation.matching.extractors import LearnedExtractor
 from sigmaslam.evaluation.matching.run import Scores, score
 from sigmaslam.evaluation.matching.sets import SELECTION
-from sigmaslam.files import atomic_write_text
+from sigmaslam.files import atomic_write_text, make_folder
 
 if TYPE_CHECKING:
     from sigmaslam.training.recipes import TrainingConfig
 
 # What a choice is made by: the mean of these over the sets of SELECTION.
 _CHOSEN_BY = ("mma_1", "mma_3")
+_MADE_WITH = "made_with.json"
 _BATCH, _SIZE = 8, 192  # pairs a step and side of the images, less than in a full training
 _SHOWN = {
     "set12": ("mma_1", "mma_3", "repeatability_1", "auc_3"),
@@ -88,6 +90,7 @@ def write_ablations(
         command: that makes the page again.
         note: told what is being done.
     """
+    _check_runs(runs, steps)
     # One seed of every variant first: what is there when it is stopped can be compared.
     for seed in range(seeds):
         for variant in VARIANTS:
@@ -121,6 +124,20 @@ def configuration(variant: Variant, seed: int, steps: int) -> TrainingConfig:
     from sigmaslam.training.recipes import TrainingConfig
 
     return TrainingConfig(steps=steps, batch_size=_BATCH, size=_SIZE, seed=seed, validate_every=0, **variant.training)
+
+
+def _check_runs(runs: Path, steps: int) -> None:
+    """Refuses runs that were made with another network or another training."""
+    from sigmaslam.models.network import FeatureNetwork
+
+    network = {name: list(value.shape) for name, value in FeatureNetwork().state_dict().items()}
+    made_with = {"network": network, "training": asdict(configuration(VARIANTS[0], 0, steps))}
+    path = runs / _MADE_WITH
+    if not path.is_file() and (not runs.exists() or not any(runs.iterdir())):
+        make_folder(runs)
+        atomic_write_text(path, json.dumps(made_with) + "\n")
+    if not path.is_file() or json.loads(path.read_text(encoding="utf-8")) != made_with:
+        raise InputError(f"the runs in {runs} were made with another network or training: give another --runs")
 
 
 def _train_missing(runs: Path, variant: Variant, seed: int, steps: int, note: Callable[[str], None]) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import platform
+import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,9 +19,10 @@ import numpy as np
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.benchmarks.filters import Contender, Timing, time_interleaved
 from sigmaslam.evaluation.benchmarks.page import write_page
-from sigmaslam.evaluation.matching import compare, format_scores, load_extractor
+from sigmaslam.evaluation.matching import check_sets, compare, format_scores, load_extractor
 from sigmaslam.evaluation.matching.extractors import CLASSICAL, MAX_KEYPOINTS
 from sigmaslam.evaluation.matching.sets import ALL
+from sigmaslam.files import atomic_write_text
 from sigmaslam.session import OnnxGraph, shipped_weights
 
 ROUNDS = 15
@@ -58,7 +61,9 @@ def write_features(
     rounds: int = ROUNDS,
     note: Callable[[str], None] = lambda text: None,
 ) -> str:
-    """Times and scores everyone, writes the page and returns it; notes in the page are kept.
+    """Times and scores everyone, writes the page, and the scores beside it as .json; returns the page.
+
+    Notes in the page are kept.
 
     Args:
         path: Markdown page.
@@ -75,13 +80,19 @@ def write_features(
     names = [*map(str, weights or [shipped_weights("features.onnx")]), *CLASSICAL, *map(str, peers)]
     if len(set(names)) < len(names):
         raise InputError(f"an extractor is given twice among {', '.join(names)}: leave one out")
+    check_sets(sets, data)
     note("timing")
     costs = measure_costs(names, rounds)
     reference = str(peers[0]) if peers else "orb"
     scores = compare(names, sets, data, note)
+    atomic_write_text(path.with_suffix(".json"), _public(json.dumps(scores, indent=1)) + "\n")
     page = "\n".join([*_introduction(command, rounds), *format_costs(costs, reference), "", format_scores(scores)])
-    # Where the package lies is nobody's business.
-    return write_page(path, page.replace(str(shipped_weights("features.onnx")), "ours (shipped)"))
+    return write_page(path, _public(page))
+
+
+def _public(text: str) -> str:
+    """Where the package lies is nobody's business."""
+    return text.replace(str(shipped_weights("features.onnx")), "ours (shipped)")
 
 
 def measure_costs(names: Sequence[str], rounds: int) -> list[Cost]:
@@ -91,12 +102,19 @@ def measure_costs(names: Sequence[str], rounds: int) -> list[Cost]:
     try:
         image = photograph_like((_HEIGHT, _WIDTH))
         extractors = {name: load_extractor(name) for name in names}
+        _use_one_torch_thread()
         found = {name: extractor(image)[0] for name, extractor in extractors.items()}
         contenders = [Contender(name, partial(extractor, image)) for name, extractor in extractors.items()]
         timings = time_interleaved(contenders, rounds)
     finally:
         cv2.setNumThreads(threads)
     return [Cost(name, timings[name], _loading_time(name), count_parameters(name), len(found[name])) for name in names]
+
+
+def _use_one_torch_thread() -> None:
+    """Of weights that run in torch; who has not imported it does not now."""
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
 
 
 def format_costs(costs: Sequence[Cost], reference: str) -> list[str]:

@@ -5,7 +5,7 @@ from sigmaslam.evaluation.matching.extractors import Extractor, LearnedExtractor
 from sigmaslam.evaluation.matching.pairs import ImagePair
 from sigmaslam.evaluation.matching.peers import PeerExtractor
 from sigmaslam.evaluation.matching.run import format_scores, score, score_pairs
-from sigmaslam.evaluation.matching.sets import FINAL, SELECTION, load_set
+from sigmaslam.evaluation.matching.sets import FINAL, SELECTION, check_sets, load_set
 
 __all__ = [
     "FINAL",
@@ -14,6 +14,7 @@ __all__ = [
     "ImagePair",
     "LearnedExtractor",
     "PeerExtractor",
+    "check_sets",
     "compare",
     "format_scores",
     "load_extractor",

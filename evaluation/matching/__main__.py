@@ -36,7 +36,8 @@ def main() -> None:
         names = [*CLASSICAL, *map(str, arguments.weights)]
         results = compare(names, arguments.sets.split(","), data, lambda text: print(text, file=sys.stderr))
     except SigmaSlamError as error:
-        sys.exit(f"error: {error}")
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
     print(json.dumps(results, indent=2) if arguments.json else format_scores(results))
 
 

@@ -6,11 +6,11 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from sigmaslam.errors import FrameError, InputError
+from sigmaslam.errors import FrameError
 from sigmaslam.evaluation.matching.extractors import Extractor, load_extractor, remembering
 from sigmaslam.evaluation.matching.pairs import ImagePair
 from sigmaslam.evaluation.matching.run import Scores, score_pairs, score_refined
-from sigmaslam.evaluation.matching.sets import ALL, REFINED, STEPS, TRACKS, load_set, load_steps, load_tracks
+from sigmaslam.evaluation.matching.sets import REFINED, STEPS, TRACKS, check_sets, load_set, load_steps, load_tracks
 from sigmaslam.evaluation.matching.stereo import score_steps
 from sigmaslam.evaluation.matching.tracks import KLT, TRACKED_KEYPOINTS, score_klt
 from sigmaslam.match import temperature_of
@@ -30,11 +30,9 @@ def compare(
         data: folder of the real data sets.
         note: is told of progress.
     Raises:
-        InputError: a name, a set or a file cannot be used; names of sets are checked before anything is scored.
+        InputError: a name, a set or a file cannot be used; that sets are there is checked before anything is scored.
     """
-    unknown = [name for name in sets if name not in ALL]
-    if unknown:
-        raise InputError(f"there is no set '{unknown[0]}': choose among {', '.join(ALL)}")
+    check_sets(sets, data)
     extractors = {name: load_extractor(name) for name in names}
     results: dict[str, Scores] = {name: {} for name in names}
     for name in sets:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from sigmaslam.errors import InputError
@@ -29,6 +29,21 @@ _SETS: dict[str, tuple[str, Callable[[Path], list[ImagePair]]]] = {
     "kitti": ("kitti_raw_0926_0039_a", sequences.kitti),
     "euroc": ("euroc_v1_01_keyframes_a", sequences.euroc),
 }
+
+
+def check_sets(names: Sequence[str], data: Path) -> None:
+    """Refuses sets that are unknown or not there, before long work starts.
+
+    Args:
+        names: of ALL.
+        data: folder of the real data sets.
+    Raises:
+        InputError: names the first of them.
+    """
+    for name in names:
+        if name not in ALL:
+            raise InputError(f"there is no set '{name}': choose among {', '.join(ALL)}")
+        _folder(data, _SETS[name.split("_")[0]][0])
 
 
 def load_set(name: str, data: Path) -> list[ImagePair]:

@@ -32,7 +32,8 @@ def local_maps(points0: np.ndarray, points1: np.ndarray, weight: np.ndarray) -> 
         weight: (M,) trust in each match, as its probability.
     Returns:
         A (M, 2, 2), points1 - points1[i] = A[i] (points0 - points0[i]) near match i, and the distance (M,) in pixels
-        of points1[i] from where the map of its neighbours would have it. Both are infinite for fewer than 4 matches.
+        of points1[i] from where the map of its neighbours, itself among them, would have it. Both are infinite for
+        fewer than 4 matches.
     """
     count = len(points0)
     if count < 4:
@@ -80,10 +81,11 @@ def align_patches(
         (M, 2) float64 places, unchanged where the patches do not fit or the way is too far, and (M,) bool moved.
     """
     places, moved = points1.astype(np.float64), np.zeros(len(points1), bool)
+    # No opaque surface shows its mirror image: a negative determinant is as bad as none.
     determinant = np.where(
-        np.isfinite(A).all(axis=(1, 2)), np.abs(np.linalg.det(np.nan_to_num(A, posinf=0.0, neginf=0.0))), 0.0
+        np.isfinite(A).all(axis=(1, 2)), np.linalg.det(np.nan_to_num(A, posinf=0.0, neginf=0.0)), 0.0
     )
-    zoom = np.sqrt(determinant)
+    zoom = np.sqrt(np.maximum(determinant, 0.0))
     usable = (zoom > 0.2) & (zoom < 5.0) & _inside(image0, points0) & _inside(image1, points1)
     # The finer image is smoothed as much as the coarser one's pixels do, in steps of half an octave.
     half_octaves = np.round(2.0 * np.log2(np.clip(zoom, 0.2, 5.0))).astype(int)

@@ -12,6 +12,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 from torch.nn import functional
 
+from sigmaslam.errors import InputError
 from sigmaslam.evaluation.benchmarks import ablations, extraction
 from sigmaslam.evaluation.benchmarks.ablations import VARIANTS, Variant, configuration, selection_score, write_ablations
 from sigmaslam.evaluation.benchmarks.extraction import EXTRACTIONS
@@ -139,10 +140,25 @@ def test_a_run_that_was_stopped_goes_on(tmp_path: Path, calls: Calls):
     from sigmaslam.training.checkpoint import CHECKPOINT_NAME
 
     stopped = tmp_path / "runs" / f"stride_8-{STEPS}-0"
-    stopped.mkdir(parents=True)
+    write(tmp_path, seeds=1)
+    (stopped / WEIGHTS_NAME).unlink()
     (stopped / CHECKPOINT_NAME).touch()
+    calls.trained.clear()
     write(tmp_path, seeds=1)
     assert calls.resumed == [stopped.name]
+
+
+def test_runs_of_another_network_are_refused(tmp_path: Path, calls: Calls):
+    write(tmp_path, seeds=1)
+    made_with = tmp_path / "runs" / "made_with.json"
+    content = json.loads(made_with.read_text())
+    content["network"]["judge.weight"] = [3, 64, 1, 1]
+    for bad in (json.dumps(content), None):
+        made_with.unlink()
+        if bad is not None:
+            made_with.write_text(bad)
+        with pytest.raises(InputError, match="another --runs"):
+            write(tmp_path, seeds=1)
 
 
 def test_notes_below_the_mark_are_kept(tmp_path: Path, calls: Calls):

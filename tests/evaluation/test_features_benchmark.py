@@ -1,5 +1,6 @@
 """The benchmark of features: what it times and writes, with a stub in place of the real sets."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -66,6 +67,7 @@ def test_the_command_writes_costs_and_scores_and_keeps_notes(tmp_path: Path, mon
         return {name: {"boat": {"mma_1": 0.5}} for name in names}
 
     monkeypatch.setattr(features, "compare", stub)
+    (tmp_path / "homography_boat").mkdir()
     arguments = ["benchmark", "features", "--out", str(page), "--data", str(tmp_path), "--weights", str(weights)]
     result = CliRunner().invoke(app, [*arguments, "--sets", "boat", "--rounds", "2"], catch_exceptions=False)
     assert result.exit_code == 0
@@ -73,6 +75,7 @@ def test_the_command_writes_costs_and_scores_and_keeps_notes(tmp_path: Path, mon
     text = page.read_text()
     assert f"| {weights} | 50.0 |" in text
     assert "time / orb" in text
+    assert json.loads(page.with_suffix(".json").read_text())["sift"] == {"boat": {"mma_1": 0.5}}
     assert "2 rounds" in text
     assert f"--weights {weights} --sets boat --rounds 2" in text
     assert text.endswith("<!-- notes -->\nMine.\n")

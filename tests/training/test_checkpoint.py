@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from safetensors import safe_open
@@ -61,7 +63,7 @@ def test_the_file_names_its_tensors_and_tells_what_it_is(walked):
     _, path = walked
     with safe_open(path, framework="pt") as file:
         assert file.metadata()["step"] == "2"
-        assert {"network.head.weight", "optimizer.0.exp_avg", "optimizer.0.step", "random.torch"} <= set(file.keys())
+        assert {"network.judge.weight", "optimizer.0.exp_avg", "optimizer.0.step", "random.torch"} <= set(file.keys())
 
 
 def test_files_that_are_no_checkpoints_are_refused(tmp_path, tiny):
@@ -76,7 +78,19 @@ def test_files_that_are_no_checkpoints_are_refused(tmp_path, tiny):
 
 def test_weights_of_another_network_are_refused_with_what_to_do(tmp_path, tiny, weights):
     others = load_file(weights)
-    others["head.weight"] = others["head.weight"][:5].clone()
+    others["judge.weight"] = others["judge.weight"][:1].clone()
     save_file(others, tmp_path / "others.safetensors")
-    with pytest.raises(InputError, match=r"(?s)others\.safetensors.*head\.weight.*--from.*--recipe full"):
+    with pytest.raises(InputError, match=r"(?s)others\.safetensors.*judge\.weight.*--from.*--recipe full"):
         begin(tiny, "endoscope", tmp_path / "others.safetensors", PLACE)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3, 9, 10, 11, 20])
+def test_runs_of_any_length_have_a_schedule(tiny, steps):
+    state = begin(replace(tiny, steps=steps), None, None, PLACE)
+    rates = []
+    for _ in range(steps):
+        rates.append(state.schedule.get_last_lr()[0])
+        state.optimizer.step()
+        state.schedule.step()
+    assert all(0 < rate <= tiny.learning_rate * 1.001 for rate in rates)
+    assert steps < 3 or max(rates) == pytest.approx(tiny.learning_rate, rel=1e-2)

@@ -60,7 +60,7 @@ def test_two_processes_end_with_the_same_weights_and_share_their_gradients(tiny,
     for name, value in one.items():
         assert torch.equal(other[name], value), name
     shipped = load_file(tmp_path / "run" / WEIGHTS_NAME)
-    assert torch.equal(shipped["head.bias"], one[f"weight.{len(one) // 2 - 1}"])
+    assert torch.equal(shipped["describer.2.bias"], one[f"weight.{len(one) // 2 - 1}"])
 
     monkeypatch.setattr("sigmaslam.synthetic.pairs._TEXTURE_SIZE", 128)
     shares = [first_gradient(config, rank, 2) for rank in range(2)]

@@ -18,6 +18,7 @@ from sigmaslam.models.export import load_network
 from sigmaslam.training import devices
 from sigmaslam.training.card import CARD_NAME
 from sigmaslam.training.checkpoint import CHECKPOINT_NAME
+from sigmaslam.training.journal import Journal
 from sigmaslam.training.loop import WEIGHTS_NAME, train
 from sigmaslam.training.recipes import TrainingConfig
 
@@ -102,6 +103,33 @@ def test_run_folder_holds_weights_card_log_curves_and_samples(finished, tiny):
     assert [image.step for image in events.Images("matches")] == [0, 4]
 
 
+def test_a_log_that_a_power_cut_tore_is_gone_on_with(finished, tmp_path):
+    log = tmp_path / "log.jsonl"
+    log.write_text('{"step": 2}\n{"step": 4}\n{"step": 6, "des')
+    Journal(tmp_path, 2).close()
+    assert log.read_text() == '{"step": 2}\n'
+
+
+def test_a_resumed_run_tells_of_the_command_that_began_it(finished, tiny, tmp_path, monkeypatch):
+    finished = Path(shutil.copytree(finished, tmp_path / "copy"))
+    card = json.loads((finished / CARD_NAME).read_text())
+    monkeypatch.setattr("sys.argv", ["sigmaslam", "train", "--resume"])
+    again = train(finished, tiny, workers=0, resume=True, recipe="quick")
+    assert again["command"] == card["command"]
+    assert "--resume" not in again["command"]
+
+
+def test_a_file_in_the_way_of_the_run_folder_is_refused(tiny, tmp_path):
+    (tmp_path / "run").touch()
+    with pytest.raises(InputError, match=r"run cannot be made a folder"):
+        train(tmp_path / "run", tiny, workers=0)
+
+
+@pytest.mark.parametrize("seed", [2**40])
+def test_a_time_stamp_will_do_for_a_seed(tiny, tmp_path, seed):
+    train(tmp_path, replace(tiny, steps=1, seed=seed, validate_every=0), workers=0)
+
+
 def test_an_existing_checkpoint_is_not_overwritten(finished, tiny):
     before = (finished / WEIGHTS_NAME).read_bytes()
     with pytest.raises(InputError, match=r"checkpoint\.safetensors exists.*--resume"):
@@ -145,7 +173,7 @@ def test_resuming_a_finished_run_keeps_its_weights_and_metrics(finished, tiny, t
 def test_a_run_starts_from_given_weights_and_remembers_them(tmp_path, tiny, weights):
     card = train(tmp_path, replace(tiny, steps=1, validate_every=0, learning_rate=1e-9), workers=0, start=weights)
     begun, ended = load_file(weights), load_file(tmp_path / WEIGHTS_NAME)
-    torch.testing.assert_close(ended["head.weight"], begun["head.weight"], rtol=0, atol=1e-6)
+    torch.testing.assert_close(ended["judge.weight"], begun["judge.weight"], rtol=0, atol=1e-6)
     assert card["started_from"]["name"] == "others.safetensors"
     assert len(card["started_from"]["sha256"]) == 64
     # What it began with need not be there any more, and is still told.

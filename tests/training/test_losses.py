@@ -1,12 +1,17 @@
+import math
+
 import numpy as np
 import pytest
 import torch
+from scipy import stats
 from torch import Tensor
 from torch.nn import functional
 
 from sigmaslam.models.network import FeatureNetwork
-from sigmaslam.training.losses import MatchLoss, match_loss
-from sigmaslam.training.step import pair_loss
+from sigmaslam.training import step
+from sigmaslam.training.losses import MatchLoss, match_loss, place_loss
+from sigmaslam.training.step import _zoom, pair_loss
+from sigmaslam.training.stream import NOWHERE
 
 
 def unit(*shape: int, seed: int = 0) -> Tensor:
@@ -87,6 +92,63 @@ def test_quality_is_asked_for_where_the_corner_repeats():
     assert losses[1] > 5
 
 
+def test_place_loss_is_the_density_of_a_t_law_with_that_standard_deviation():
+    """Of a bivariate Student t vector: a normal one over the root of a chi-square of 3 degrees, independently."""
+    distance, sigma = torch.tensor([[0.3, 2.0]]), 0.7
+    log_sigma = torch.full((1, 2), math.log(sigma))
+    everything = torch.ones(1, 2, dtype=torch.bool)
+    zoom = torch.tensor([[2.0]])
+    loss = place_loss(distance, log_sigma, log_sigma, zoom, everything)
+    # Sigma of image 0 grows with the zoom; the law's shape matrix is its covariance over three.
+    variance = (2.0**2 + 1.0) * sigma**2
+    law = stats.multivariate_t(shape=variance / 3.0 * np.eye(2), df=3)
+    expected = [-law.logpdf([float(d), 0.0]) for d in distance[0]]
+    constant = -law.logpdf([0.0, 0.0]) - math.log(variance)
+    assert float(loss) == pytest.approx(np.mean(expected) - constant, rel=1e-5)
+
+
+def test_place_loss_is_least_at_the_standard_deviation_and_counts_partners_alone():
+    draws = stats.multivariate_t(shape=np.eye(2) / 3.0, df=3, seed=0).rvs(20_000)
+    distance = torch.from_numpy(np.linalg.norm(draws, axis=1)[None]).float()
+    partnered = torch.ones_like(distance, dtype=torch.bool)
+    distance[:, ::2], partnered[:, ::2] = 100.0, False
+
+    def loss(sigma: float) -> float:
+        log_sigma = torch.full_like(distance, math.log(sigma / math.sqrt(2.0)))
+        return float(place_loss(distance, log_sigma, log_sigma, torch.ones(1, 1), partnered))
+
+    assert loss(1.0) < min(loss(0.9), loss(1.1))
+
+
+def test_zoom_is_the_scale_of_a_similarity():
+    points = 100 * torch.rand(2, 30, 2, generator=torch.Generator().manual_seed(0))
+    turn = torch.tensor([[0.8, 0.6], [-0.6, 0.8]])
+    visible = torch.rand(2, 30, generator=torch.Generator().manual_seed(1)) < 0.7
+    moved = points @ turn * torch.tensor([1.7, 0.6]).view(2, 1, 1) + 20.0
+    moved[~visible] = 1e4
+    torch.testing.assert_close(_zoom(points, moved, visible), torch.tensor([[1.7], [0.6]]), rtol=1e-4, atol=0)
+
+
+def test_every_partner_teaches_quality_whether_it_is_a_distractor_or_not():
+    """Keypoints of image 1 at the true places, in odd rows alone: the even ones, distractors, are nowhere."""
+    torch.manual_seed(0)
+    network = FeatureNetwork()
+    image = torch.rand(1, 1, 96, 96)
+    corners = 10 + 70 * torch.rand(1, 12, 2)
+    found = torch.stack([torch.full_like(corners, NOWHERE), corners], dim=2).reshape(1, 24, 2)
+    visible = torch.ones(1, 12, dtype=torch.bool)
+    asked: dict[str, Tensor] = {}
+
+    def spy(*arguments: Tensor) -> MatchLoss:
+        asked["repeated"] = arguments[-1]
+        return match_loss(*arguments)
+
+    with pytest.MonkeyPatch.context() as context:
+        context.setattr(step, "match_loss", spy)
+        pair_loss(network, image, image, corners, corners, visible, found, torch.Generator().manual_seed(5))
+    assert asked["repeated"].all()
+
+
 def test_step_of_the_same_generator_is_the_same_and_reaches_every_weight():
     torch.manual_seed(0)
     network = FeatureNetwork()
@@ -95,7 +157,8 @@ def test_step_of_the_same_generator_is_the_same_and_reaches_every_weight():
     batch = (images, images, corners, corners, torch.ones(2, 12, dtype=torch.bool), corners)
     losses = [pair_loss(network, *batch, torch.Generator().manual_seed(5)) for _ in range(2)]
     assert losses[0].descriptor == losses[1].descriptor
-    (losses[0].descriptor + losses[0].quality).backward()
+    (losses[0].descriptor + losses[0].quality + losses[0].place).backward()
     for name, parameter in network.named_parameters():
         assert parameter.grad is not None, name
         assert torch.isfinite(parameter.grad).all(), name
+        assert parameter.grad.abs().max() > 0, name

@@ -1,4 +1,4 @@
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import pytest
 
@@ -20,7 +20,7 @@ def test_every_recipe_can_be_trained(name):
 
 
 def test_the_full_recipe_is_what_the_shipped_weights_are_made_with():
-    other = {"steps": 5000, "data": "blend"}
+    other = {"steps": 5000, "data": "turned"}
     assert asdict(choose_config("full")) == {**asdict(TrainingConfig()), **other}
 
 
@@ -46,6 +46,12 @@ def test_what_cannot_be_trained_is_refused_with_what_can(options, message):
 def test_sizes_that_the_network_cannot_take_are_refused():
     with pytest.raises(InputError, match=r"size 100 .* multiple of 32"):
         check_config(TrainingConfig(size=100))
+
+
+@pytest.mark.parametrize(("name", "value"), [("stride", 5), ("points", 7000), ("descriptor_size", 0)])
+def test_networks_and_losses_that_there_are_not_are_refused(name, value):
+    with pytest.raises(InputError, match=f"{name} {value} "):
+        check_config(replace(TrainingConfig(), **{name: value}))
 
 
 def test_only_fine_tuning_starts_from_the_shipped_weights(tmp_path):

@@ -1,5 +1,7 @@
 """Training pairs: their order, and what they are made of."""
 
+import itertools
+
 import numpy as np
 import pytest
 import torch
@@ -31,8 +33,11 @@ def test_keypoints_lie_in_the_image_and_have_the_promised_number():
     assert visible.shape == (300,)
     assert (places1[visible] >= 0).all()
     assert (places1[visible] <= 95).all()
-    for keypoints in (keypoints0, keypoints1):
-        assert keypoints.shape == (300, 2)
+    assert keypoints0.shape == (300, 2)
+    assert keypoints1.shape == (600, 2)
+    found1 = keypoints1[(keypoints1 != stream.NOWHERE).all(dim=1)]
+    assert 0 < len(found1) < 600
+    for keypoints in (keypoints0, found1):
         assert keypoints.min() >= 0
         assert keypoints.max() <= 95
     with pytest.raises(IndexError):
@@ -78,15 +83,24 @@ def test_turned_leaves_are_turned_further():
         """Degrees by which the middle of the second view is turned against the first."""
         stream = open_stream(source, 0, 96)
         middle = np.array([[47.5, 47.5], [48.5, 47.5], [47.5, 48.5]])
-        moved = np.stack([stream.pair(index).transfer(middle)[0] for index in range(24)])
+        moved = np.stack([stream.pair(index).transfer(middle)[0] for index in range(150)])
         along_u, along_v = moved[:, 1] - moved[:, 0], moved[:, 2] - moved[:, 0]
         turn = np.arctan2(along_u[:, 1] - along_v[:, 0], along_u[:, 0] + along_v[:, 1])
         return np.abs(np.degrees(turn))
 
     usual, further = turns("leaves"), turns("turned leaves")
-    assert np.median(further) > 1.5 * np.median(usual)
+    # By root mean square, sqrt((1 + 1.25^2) / (0.5^2 + 1)) = 1.43 times as far.
+    assert 1.2 < np.sqrt(np.mean(further**2) / np.mean(usual**2)) < 1.7
     assert usual.max() < 60
-    assert 60 < further.max() < 95
+    assert 65 < further.max() < 95
+
+
+@pytest.mark.parametrize("mix", ["turned", "endoscope", "mix"])
+def test_sources_of_a_mix_share_no_textures(mix):
+    banks = [source._bank for source in MixedPairs(mix, 3, 96)._streams.values() if hasattr(source, "_bank")]
+    textures = [bank.texture(index) for bank in banks for index in (0, 1, 40)]
+    for one, other in itertools.combinations(textures, 2):
+        assert one.shape != other.shape or np.abs(one.astype(float) - other).mean() > 1
 
 
 def test_endoscopy_shows_the_inside_of_bodies_alone():

@@ -41,6 +41,14 @@ def test_an_image_matches_itself(network):
     assert metrics["correct_3"] > 50
 
 
+def test_what_fills_up_where_an_image_has_few_keypoints_does_not_count(network):
+    image = np.full((96, 96), 0.5, np.float32)
+    image[40:56, 40:56] = noise(1)[:16, :16]
+    found = match_pair(network, Same(image))
+    assert 5 < len(found.error) < 60
+    assert ((found.points0 > 30) & (found.points0 < 66)).all()
+
+
 def test_metrics_of_a_pair_count_what_their_names_say():
     error, nearest = torch.tensor([0.5, 2.0, 9.0, torch.inf]), torch.tensor([0.2, 1.5])
     found = PairMatches(torch.zeros(4, 2), torch.zeros(4, 2), error, nearest).metrics()
