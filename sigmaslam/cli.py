@@ -285,7 +285,7 @@ def train(
     out: Annotated[Path, typer.Option(help="Folder for checkpoint, log, TensorBoard, samples, weights and card.")],
     recipe: Annotated[
         TrainingRecipe,
-        typer.Option(help="full: an hour on 2 cores; quick: 5 minutes; endoscope: goes on from the shipped weights."),
+        typer.Option(help="full: an hour on 2 cores; quick: 7 minutes; endoscope: goes on from the shipped weights."),
     ] = TrainingRecipe.full,
     start: Annotated[
         Path | None,

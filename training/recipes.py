@@ -49,7 +49,7 @@ class TrainingConfig:
 RECIPES = {
     # What the shipped weights are made with.
     "full": TrainingConfig(steps=5000, data="turned"),
-    # To see that everything works: about five minutes on two cores.
+    # To see that everything works: five to seven minutes on two cores.
     "quick": TrainingConfig(steps=600, data="leaves", validate_every=600),
     # Goes on from trained weights, and keeps seeing leaves so that it forgets nothing.
     "endoscope": TrainingConfig(steps=800, data="endoscope", learning_rate=5e-4, validate_every=400),
