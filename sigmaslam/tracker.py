@@ -24,6 +24,9 @@ _CHI_SQUARE_999 = np.array([0.0, 10.827566170662733, 13.815510557964274, 16.2662
 _CHI_SQUARE_99_2D = 9.21034037197618
 # A pose that fewer of the matches near the prediction agree with is not believed.
 _LEAST_SHARE = 0.3
+# A pose from matches alone has no prediction to agree with: so many times more inliers are asked for. A patch of
+# symmetric texture in a mirrored image once gave 20 that agreed on a wrong pose.
+_UNGUIDED = 2
 # A fit near the prediction with a larger NIS per degree of freedom may sit in a wrong place: it is checked against one
 # that does without the prediction.
 _DOUBTFUL_NIS = 2.0
@@ -45,7 +48,7 @@ class TrackerConfig:
         start_turn: of the angular velocity, rad/s.
         offset_sigma: prior of the disparity offset, pixels.
         offset_walk: its random walk, pixels per root second.
-        least_inliers: fewer is no pose.
+        least_inliers: fewer is no pose; without a prediction, fewer than twice as many.
         keyframe_ratio: a new keyframe is taken when the inliers fall below this share of what the keyframe began with.
         search_limit: with a predicted place less certain than this (pixels, one sigma) the search is not guided.
         lost_seconds: after this long without a pose, tracking starts anew from the current view.
@@ -294,7 +297,8 @@ class StereoTracker:
         """Start-up and recovery: relative pose from the matches alone, then the update from a vague prior about it."""
         points, _ = self._stereo_points(found)
         relative = estimate_relative_pose(self._camera, points.landmarks, points.measurement)
-        if relative is None or relative.inliers.sum() < self.config.least_inliers:
+        least = _UNGUIDED * self.config.least_inliers
+        if relative is None or relative.inliers.sum() < least:
             return None
         before = self._filter.state
         self._filter.set_pose_from_clone(relative.T_key_camera, np.repeat([0.01 * self._depth, 0.01], 3))
@@ -303,8 +307,9 @@ class StereoTracker:
         sigma = np.sqrt(np.repeat(self._densities[:2], 3) * elapsed)
         self._filter.set_twist(se3_log(se3_inverse(self._tracked_pose) @ self._filter.state.pose) / elapsed, sigma)
         fit = self._fit(found.select(relative.inliers))
-        if fit is None:
+        if fit is None or len(fit.rows) < least:
             self._filter.state = before
+            return None
         return fit
 
     def _forget_twist(self) -> None:
