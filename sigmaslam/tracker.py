@@ -24,9 +24,9 @@ _CHI_SQUARE_999 = np.array([0.0, 10.827566170662733, 13.815510557964274, 16.2662
 _CHI_SQUARE_99_2D = 9.21034037197618
 # A pose that fewer of the matches near the prediction agree with is not believed.
 _LEAST_SHARE = 0.3
-# A pose from matches alone has no prediction to agree with: so many times more inliers are asked for. A patch of
-# symmetric texture in a mirrored image once gave 20 that agreed on a wrong pose.
-_UNGUIDED = 2
+# A pose from matches alone has no prediction to agree with. Where less than this share of the matches, anywhere in the
+# image, agree with it, twice as many inliers are asked for: symmetric texture in a mirrored image once gave 20 of 255.
+_LEAST_SHARE_UNGUIDED = 0.15
 # A fit near the prediction with a larger NIS per degree of freedom may sit in a wrong place: it is checked against one
 # that does without the prediction.
 _DOUBTFUL_NIS = 2.0
@@ -48,7 +48,7 @@ class TrackerConfig:
         start_turn: of the angular velocity, rad/s.
         offset_sigma: prior of the disparity offset, pixels.
         offset_walk: its random walk, pixels per root second.
-        least_inliers: fewer is no pose; without a prediction, fewer than twice as many.
+        least_inliers: fewer is no pose; without a prediction and a fair share of the matches, fewer than twice as many.
         keyframe_ratio: a new keyframe is taken when the inliers fall below this share of what the keyframe began with.
         search_limit: with a predicted place less certain than this (pixels, one sigma) the search is not guided.
         lost_seconds: after this long without a pose, tracking starts anew from the current view.
@@ -297,9 +297,11 @@ class StereoTracker:
         """Start-up and recovery: relative pose from the matches alone, then the update from a vague prior about it."""
         points, _ = self._stereo_points(found)
         relative = estimate_relative_pose(self._camera, points.landmarks, points.measurement)
-        least = _UNGUIDED * self.config.least_inliers
+        least = self.config.least_inliers
         if relative is None or relative.inliers.sum() < least:
             return None
+        if relative.inliers.mean() < _LEAST_SHARE_UNGUIDED:
+            least *= 2
         before = self._filter.state
         self._filter.set_pose_from_clone(relative.T_key_camera, np.repeat([0.01 * self._depth, 0.01], 3))
         # The mean velocity since the last pose, as uncertain as an acceleration over that time makes it.
