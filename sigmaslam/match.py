@@ -24,7 +24,7 @@ _DETECTORS = {"learned": LearnedDetector, "sift": SiftDetector, "orb": OrbDetect
 # together: 60 has the least Brier score on rendered pairs (20: 0.58, 40: 0.16, 60: 0.10, 80: 0.12).
 _INVERSE_TEMPERATURES = {"sift": 60.0}
 _INVERSE_TEMPERATURE = 20.0
-# Chosen on warped photographs and rectified pairs of the sets for selection (docs/network.md).
+# Chosen by hand on warped photographs and rectified pairs, the sets for selection.
 _AGREEMENT = 4.0
 _SIGMA_ALIGNED = 0.3
 _LEAST_SIDE = 96
