@@ -297,11 +297,11 @@ class StereoTracker:
         """Start-up and recovery: relative pose from the matches alone, then the update from a vague prior about it."""
         points, _ = self._stereo_points(found)
         relative = estimate_relative_pose(self._camera, points.landmarks, points.measurement)
-        least = self.config.least_inliers
-        if relative is None or relative.inliers.sum() < least:
+        if relative is None:
             return None
-        if relative.inliers.mean() < _LEAST_SHARE_UNGUIDED:
-            least *= 2
+        least = self.config.least_inliers * (1 if relative.inliers.mean() >= _LEAST_SHARE_UNGUIDED else 2)
+        if relative.inliers.sum() < least:
+            return None
         before = self._filter.state
         self._filter.set_pose_from_clone(relative.T_key_camera, np.repeat([0.01 * self._depth, 0.01], 3))
         # The mean velocity since the last pose, as uncertain as an acceleration over that time makes it.
