@@ -1,4 +1,4 @@
-"""The model card that ships with weights: read, completed with scores on real sets, and as a page for people."""
+"""The model card that ships with weights: read, and as a page for people."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ _CARD_FIELDS = (
     *("config", "metrics_on_held_out_renders", "parameters", "data", "command", "commit", "seed"),
     *("duration_s", "hardware"),
 )
-_OF_OTHERS = ("sift", "orb", "klt")
-_REFINED = " + sigmaslam match"
 
 
 def read_card(card: Path) -> dict[str, Any]:
@@ -33,32 +31,6 @@ def read_card(card: Path) -> dict[str, Any]:
     if missing:
         raise InputError(f"{card} is no card of a training run: it says nothing of {', '.join(missing)}")
     return content
-
-
-def read_scores(path: Path) -> dict[str, dict[str, float]]:
-    """Scores of one extractor by set, as `sigmaslam benchmark features` writes them beside its page.
-
-    Those of SIFT, ORB and KLT are left out; those with what `sigmaslam match` makes of the features get its name.
-
-    Raises:
-        InputError: the file cannot be read, or holds the scores of no or several extractors.
-    """
-    try:
-        everyone: dict[str, dict[str, dict[str, float]]] = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path} cannot be read ({error}): give the .json of `sigmaslam benchmark features`"
-        ) from error
-    names = [name for name in everyone if name not in _OF_OTHERS and not name.endswith(_REFINED)]
-    if len(names) != 1:
-        raise InputError(f"{path} holds the scores of {', '.join(names) or 'nobody'}: one extractor is needed")
-    refined = everyone.get(names[0] + _REFINED, {})
-    return {
-        label: {name: round(value, 4) for name, value in scores.items()}
-        for of_set in everyone[names[0]]
-        for label, scores in ((of_set, everyone[names[0]][of_set]), (of_set + _REFINED, refined.get(of_set, {})))
-        if scores
-    }
 
 
 def card_page(card: dict[str, Any]) -> str:

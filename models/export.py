@@ -20,7 +20,7 @@ from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.files import atomic_path, atomic_write_text, make_folder
 from sigmaslam.filters.lie import exp_se3
 from sigmaslam.filters.stereo_pose import STATE_SIZE, Innovate, Predict, Update
-from sigmaslam.models.card import card_page, read_card, read_scores
+from sigmaslam.models.card import card_page, read_card
 from sigmaslam.models.extractor import EXTRACTOR_SIZE_MULTIPLE, FeatureExtractor
 from sigmaslam.models.network import DESCRIPTOR_SIZE, STRIDE, FeatureNetwork
 from sigmaslam.session import OnnxGraph
@@ -89,18 +89,20 @@ def export_filter(folder: Path) -> dict[str, float]:
     }
 
 
-def export_all(weights: Path, card: Path, out: Path, scores: Path | None = None) -> dict[str, float]:
+def export_all(
+    weights: Path, card: Path, out: Path, scores: dict[str, dict[str, float]] | None = None
+) -> dict[str, float]:
     """Everything the runtime needs, into one folder: graphs, weights and card.
 
     Args:
         weights: safetensors file of a training run.
         card: its JSON card; the differences found here are added to the copy in `out`.
-        scores: of these weights on real sets, for the card; see `read_scores`.
+        scores: of these weights on real sets, by set, for the card.
         out: folder that gets features.onnx, pose_*.onnx, features.safetensors and features.json and .md.
     """
     content = read_card(card)
     if scores is not None:
-        content["metrics_on_real_sets"] = read_scores(scores)
+        content["metrics_on_real_sets"] = scores
     make_folder(out)
     differences = {"features": export_features(weights, out / "features.onnx"), **export_filter(out)}
     content["onnx_minus_torch"] = differences

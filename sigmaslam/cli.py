@@ -326,12 +326,14 @@ def export(
 ) -> None:
     """Export network and filter to ONNX and check the graphs against torch (needs the extra 'train')."""
     _need_train_extra()
+    from sigmaslam.evaluation.matching import read_scores
     from sigmaslam.models.export import export_all
     from sigmaslam.training.card import CARD_NAME
     from sigmaslam.training.loop import WEIGHTS_NAME
 
+    on_real_sets = None if scores is None else read_scores(scores)
     with Console(stderr=True).status("exporting four graphs (about a minute)"):
-        differences = export_all(run / WEIGHTS_NAME, run / CARD_NAME, out, scores)
+        differences = export_all(run / WEIGHTS_NAME, run / CARD_NAME, out, on_real_sets)
     for name, difference in differences.items():
         typer.echo(f"{name}.onnx differs from torch by {difference:.1e}")
 

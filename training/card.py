@@ -27,8 +27,12 @@ def describe_origin(hidden: list[Path]) -> dict[str, str]:
         hidden: paths of the command of which the name alone is told: where they lay is nobody's business.
     """
     names = {str(path): path.resolve().name for path in hidden}
-    command = ["sigmaslam", *(names.get(argument, argument) for argument in sys.argv[1:])]
-    return {"commit": current_commit(), "command": " ".join(command)}
+
+    def shortened(argument: str) -> str:
+        option, equals, value = argument.rpartition("=")  # --out=PATH, or PATH alone
+        return option + equals + names.get(value, value)
+
+    return {"commit": current_commit(), "command": " ".join(["sigmaslam", *map(shortened, sys.argv[1:])])}
 
 
 def make_card(state: TrainingState, place: Workplace) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """How well an extractor matches real images: sets of pairs with truth, scores, and everyone under the same rules."""
 
-from sigmaslam.evaluation.matching.comparison import compare
+from sigmaslam.evaluation.matching.comparison import compare, read_scores
 from sigmaslam.evaluation.matching.extractors import Extractor, LearnedExtractor, load_extractor
 from sigmaslam.evaluation.matching.pairs import ImagePair
 from sigmaslam.evaluation.matching.peers import PeerExtractor
@@ -19,6 +19,7 @@ __all__ = [
     "format_scores",
     "load_extractor",
     "load_set",
+    "read_scores",
     "score",
     "score_pairs",
 ]

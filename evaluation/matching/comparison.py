@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from sigmaslam.errors import FrameError
-from sigmaslam.evaluation.matching.extractors import Extractor, load_extractor, remembering
+from sigmaslam.errors import FrameError, InputError
+from sigmaslam.evaluation.matching.extractors import CLASSICAL, Extractor, load_extractor, remembering
 from sigmaslam.evaluation.matching.pairs import ImagePair
 from sigmaslam.evaluation.matching.run import Scores, score_pairs, score_refined
 from sigmaslam.evaluation.matching.sets import REFINED, STEPS, TRACKS, check_sets, load_set, load_steps, load_tracks
 from sigmaslam.evaluation.matching.stereo import score_steps
 from sigmaslam.evaluation.matching.tracks import KLT, TRACKED_KEYPOINTS, score_klt
 from sigmaslam.match import temperature_of
+
+# Follows the name of an extractor in the row of what `sigmaslam match` makes of its features.
+_REFINED = " + sigmaslam match"
 
 
 def compare(
@@ -46,7 +50,7 @@ def compare(
             try:
                 results[label][name] = score(features, None)
                 if name in REFINED:
-                    refined = results.setdefault(f"{label} + sigmaslam match", {})
+                    refined = results.setdefault(label + _REFINED, {})
                     refined[name] = score(features, temperature_of(label))
             except FrameError as error:
                 note(f"{name}: left out {label}: {error}")
@@ -86,3 +90,29 @@ def _score_tracks(label: str, tracks: Sequence[ImagePair]) -> dict[str, float]:
     if label == KLT:
         return score_klt(tracks)
     return score_pairs(load_extractor(label, TRACKED_KEYPOINTS), tracks, TRACKED_KEYPOINTS)
+
+
+def read_scores(path: Path) -> dict[str, dict[str, float]]:
+    """Scores of one extractor by set, as `sigmaslam benchmark features` writes them beside its page.
+
+    Those of SIFT, ORB and KLT are left out; those with what `sigmaslam match` makes of the features get its name.
+
+    Raises:
+        InputError: the file cannot be read, or holds the scores of no or several extractors.
+    """
+    try:
+        everyone: dict[str, dict[str, dict[str, float]]] = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path} cannot be read ({error}): give the .json of `sigmaslam benchmark features`"
+        ) from error
+    names = [name for name in everyone if name not in (*CLASSICAL, KLT) and not name.endswith(_REFINED)]
+    if len(names) != 1:
+        raise InputError(f"{path} holds the scores of {', '.join(names) or 'nobody'}: one extractor is needed")
+    refined = everyone.get(names[0] + _REFINED, {})
+    return {
+        label: {name: round(value, 4) for name, value in scores.items()}
+        for of_set in everyone[names[0]]
+        for label, scores in ((of_set, everyone[names[0]][of_set]), (of_set + _REFINED, refined.get(of_set, {})))
+        if scores
+    }

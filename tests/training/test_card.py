@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from sigmaslam.errors import InputError
-from sigmaslam.models.card import card_page, read_card, read_scores
+from sigmaslam.evaluation.matching import read_scores
+from sigmaslam.models.card import card_page, read_card
 from sigmaslam.training.card import current_commit, describe_origin, make_card
 from sigmaslam.training.checkpoint import TrainingState, begin
 from sigmaslam.training.devices import Workplace
@@ -18,6 +19,12 @@ PLACE = Workplace(torch.device("cpu"))
 def made(state: TrainingState) -> dict[str, Any]:
     state.origin = {"commit": "abc", "command": "sigmaslam train"}
     return make_card(state, PLACE)
+
+
+def test_paths_behind_an_equals_sign_are_hidden_too(monkeypatch):
+    out = Path("/home/somebody/runs/third")
+    monkeypatch.setattr(sys, "argv", ["sigmaslam", "train", f"--out={out}", "--seed=3"])
+    assert describe_origin([out])["command"] == "sigmaslam train --out=third --seed=3"
 
 
 def test_the_card_tells_names_of_paths_alone(tiny, weights, monkeypatch):
