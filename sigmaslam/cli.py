@@ -316,6 +316,29 @@ def train(
         typer.echo(json.dumps(card, indent=2))
 
 
+@app.command("train-scorer")
+def train_scorer(
+    out: Annotated[Path, typer.Option(help="Folder for pairs, checkpoint, weights and card; new, or left to go on.")],
+    pairs: Annotated[int, typer.Option(min=16, help="Rendered pairs to learn from; a tenth more to calibrate on.")] = (
+        2400
+    ),
+    steps: Annotated[int, typer.Option(min=1, help="Optimiser steps of the scorer, 8 sets of matches each.")] = 4000,
+    verifier_steps: Annotated[int, typer.Option(min=1, help="Of the verifier, 4,096 matches each.")] = 6000,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of pairs, weights and order.")] = 0,
+    workers: Annotated[int, typer.Option(min=1, help="Processes that render pairs.")] = 2,
+) -> None:
+    """Train what gives matches their probability and covariance, on renders alone (needs the extra 'train').
+
+    On matches of the shipped features, SIFT and ORB: after training features of your own, export them first. Half an
+    hour on 2 cores; stopped by Ctrl-C, the same command goes on.
+    """
+    _need_train_extra()
+    from sigmaslam.training.scoring import ScoringConfig, train_scoring
+
+    card = train_scoring(out, ScoringConfig(pairs, steps, verifier_steps, seed), workers)
+    typer.echo(json.dumps(card, indent=2))
+
+
 @app.command()
 def export(
     run: Annotated[Path, typer.Argument(help="Folder of a finished training run.")],

@@ -15,7 +15,7 @@ from sigmaslam.files import atomic_path, atomic_write_bytes
 from sigmaslam.frontend.affine import align_patches, local_maps
 from sigmaslam.frontend.classical import OrbDetector, SiftDetector
 from sigmaslam.frontend.learned import LearnedDetector
-from sigmaslam.frontend.matching import match_near
+from sigmaslam.frontend.matching import nearest_anywhere
 from sigmaslam.frontend.types import Features
 from sigmaslam.readers.images import read_grey
 
@@ -77,9 +77,9 @@ def temperature_of(frontend: str) -> float:
 
 def match_features(features0: Features, features1: Features, inverse_temperature: float) -> Matches:
     """Mutual nearest neighbours among all keypoints of two images; exact ties are no match."""
-    anywhere = np.full(len(features0.keypoints), np.inf)
     descriptors0, descriptors1 = features0.descriptors, features1.descriptors
-    index0, index1 = match_near(features0.keypoints, anywhere, features1.keypoints, descriptors0, descriptors1, 1.0)
+    putative = nearest_anywhere(descriptors0, descriptors1)
+    index0, index1 = putative.index0[putative.mutual], putative.index1[putative.mutual]
     # No similarity of unit vectors exceeds 1: no overflow. A mutual neighbour is the largest of its row and column.
     weight = np.exp(inverse_temperature * (descriptors0 @ descriptors1.T - 1.0))
     chosen = weight[index0, index1]

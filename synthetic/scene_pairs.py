@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from sigmaslam.camera import CameraModel
 from sigmaslam.synthetic.renderer import Renderer, Views
-from sigmaslam.synthetic.sensor import expose, random_sensor
+from sigmaslam.synthetic.sensor import Sensor, expose, random_sensor
 from sigmaslam.synthetic.truth import at_pixels, transfer
 from sigmaslam.synthetic.visibility import Eye
 from sigmaslam.synthetic.worlds import colon, hall, organ, room, street
@@ -60,23 +60,31 @@ class ScenePairs:
         seed: of the whole stream.
         size: side of the square images in pixels.
         domains: keys of `DOMAINS`, drawn alike.
+        stereo: the two views are the eyes of a rectified stereo pair, through sensors of one kind.
     """
 
-    def __init__(self, seed: int, size: int = 224, domains: tuple[str, ...] = tuple(DOMAINS)) -> None:
+    def __init__(
+        self, seed: int, size: int = 224, domains: tuple[str, ...] = tuple(DOMAINS), stereo: bool = False
+    ) -> None:
         unknown = set(domains) - set(DOMAINS)
         if unknown or not domains:
             raise ValueError(f"unknown domains {sorted(unknown)}; give one or more of {', '.join(DOMAINS)}")
-        self.seed, self.size, self.domains = seed, size, domains
+        self.seed, self.size, self.domains, self.stereo = seed, size, domains, stereo
         self._kept: OrderedDict[int, list[Views]] = OrderedDict()
 
     def pair(self, index: int) -> ScenePair:
         """The pair of that index, the same whenever it is asked for."""
         rng = np.random.default_rng((self.seed, 1, index))
         views = self._views(self._scene_of(index))
-        order = rng.permutation([(i, j) for i in range(_VIEWS) for j in range(_VIEWS) if i != j])
+        order = rng.permutation([(i, j) for i in range(_VIEWS) for j in range(_VIEWS) if self._go_together(i, j)])
         # Of views that hardly overlap there is little to learn; if all are so, the last ones will do.
         i, j = next(((i, j) for i, j in order if self._shared(views[i], views[j]) >= _LEAST_SHARED), order[-1])
-        return ScenePair(self._photograph(views[i], rng), self._photograph(views[j], rng), views[i], views[j])
+        sensor = random_sensor(rng) if self.stereo else None
+        images = [self._photograph(views[k], rng, sensor) for k in (i, j)]
+        return ScenePair(images[0], images[1], views[i], views[j])
+
+    def _go_together(self, i: int, j: int) -> bool:
+        return j == i + 1 and i % 2 == 0 if self.stereo else i != j
 
     def _scene_of(self, index: int) -> int:
         """Scenes are replaced one after another, so that rendering takes its time evenly."""
@@ -107,6 +115,12 @@ class ScenePairs:
         span = np.exp(rng.uniform(np.log(0.1), np.log(2.0)))
         result: list[Views] = []
         for k in range(_VIEWS):
+            if self.stereo and k % 2:
+                baseline = np.exp(rng.uniform(np.log(0.01), np.log(0.12)))  # of the depth of what is seen
+                to_right = np.eye(4)
+                to_right[0, 3] = baseline * float(result[0].depth[torch.isfinite(result[0].depth)].median())
+                result.append(renderer.render(eye, T @ to_right, time))
+                continue
             time = np.clip(middle + span * rng.uniform(-0.5, 0.5), 0.0, _DURATION)[None]
             T = episode.path.poses(time)
             if k:
@@ -118,12 +132,12 @@ class ScenePairs:
             result.append(renderer.render(eye, T, time))
         return result
 
-    def _photograph(self, views: Views, rng: np.random.Generator) -> np.ndarray:
+    def _photograph(self, views: Views, rng: np.random.Generator, sensor: Sensor | None) -> np.ndarray:
         light = views.image[0].numpy()
         light = light * (rng.uniform(0.3, 0.6) / max(float(light.mean()), 1e-6))
         flow = rng.normal(0.0, 4.0, 2) if rng.random() < 0.15 else None
         # White is where the light of few pixels ends, so that the sensor's contrast means the same everywhere.
-        return expose(np.minimum(light, 1.0), random_sensor(rng), rng, flow).astype(np.float32) / 255.0
+        return expose(np.minimum(light, 1.0), sensor or random_sensor(rng), rng, flow).astype(np.float32) / 255.0
 
     def _shared(self, views0: Views, views1: Views) -> float:
         ticks = (np.arange(_RASTER) + 0.5) * self.size / _RASTER

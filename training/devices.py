@@ -88,7 +88,12 @@ def describe_hardware(place: Workplace) -> str:
     """For the card."""
     processes = f"{place.ranks} processes, " if place.ranks > 1 else ""
     gpu = f"{torch.cuda.get_device_name(place.device)}, " if place.on_gpu else ""
-    return f"{processes}{gpu}{os.cpu_count()} CPU cores, torch {torch.__version__}"
+    return f"{processes}{gpu}{describe_processor()}"
+
+
+def describe_processor() -> str:
+    """For the card of a run without a GPU."""
+    return f"{os.cpu_count()} CPU cores, torch {torch.__version__}"
 
 
 class NetworkLoss(nn.Module):

@@ -176,7 +176,7 @@ def pair_loader(
         Subset(dataset, range(rank, len(dataset), ranks)),
         batch_size=batch_size // ranks,
         num_workers=workers,
-        worker_init_fn=_prepare_worker if workers else None,
+        worker_init_fn=prepare_worker if workers else None,
         # A fork of a process that has used OpenCV or torch may wait for ever for threads that it lacks.
         multiprocessing_context="spawn" if workers else None,
         prefetch_factor=4 if workers else None,
@@ -184,7 +184,8 @@ def pair_loader(
     )
 
 
-def _prepare_worker(worker: int) -> None:
+def prepare_worker(worker: int) -> None:
+    """What a process that makes pairs does first."""
     # Ctrl-C reaches every process of the terminal: the one that trains ends its workers itself.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)

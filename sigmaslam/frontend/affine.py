@@ -9,6 +9,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from sigmaslam.frontend.neighbours import nearest_points
+from sigmaslam.frontend.types import Refinement
+
 _NEIGHBOURS = 24
 # Scale of the robust weight, pixels: from the first fit to the last.
 _FIRST_SCALE, _LAST_SCALE = 12.0, 2.0
@@ -20,8 +23,6 @@ _ITERATIONS = 6
 _LEAST_CORRELATION = 0.5
 _LONGEST_STEP = 1.0
 _BLUR = 0.8
-# Distances from so many points are held at once.
-_ROWS_AT_ONCE = 512
 
 
 def local_maps(points0: np.ndarray, points1: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -38,7 +39,7 @@ def local_maps(points0: np.ndarray, points1: np.ndarray, weight: np.ndarray) -> 
     count = len(points0)
     if count < 4:
         return np.full((count, 2, 2), np.inf), np.full(count, np.inf)
-    near = _nearest(points0, min(_NEIGHBOURS, count))
+    near = nearest_points(points0, points0, min(_NEIGHBOURS, count))
     from0, from1 = points0[near] - points0[:, None], points1[near] - points1[:, None]
     design = np.concatenate([from0, np.ones((*near.shape, 1))], axis=2)
     trust = weight[near]
@@ -53,15 +54,6 @@ def local_maps(points0: np.ndarray, points1: np.ndarray, weight: np.ndarray) -> 
         fitted = trust / (1.0 + (distance / scale) ** 2) ** 2
         scale = max(0.7 * scale, _LAST_SCALE)
     return solution[:, :2].transpose(0, 2, 1), np.linalg.norm(solution[:, 2], axis=1)
-
-
-def _nearest(points: np.ndarray, count: int) -> np.ndarray:
-    """Indices (M, count) of the nearest of (M, 2) points to each, itself among them, in any order."""
-    found = [
-        np.argpartition(((some[:, None] - points) ** 2).sum(axis=2), count - 1, axis=1)[:, :count]
-        for some in np.array_split(points, -(-len(points) // _ROWS_AT_ONCE))
-    ]
-    return np.concatenate(found)
 
 
 def align_patches(
@@ -97,6 +89,21 @@ def align_patches(
             smooth0, smooth1, points0[rows], places[rows], A[rows], max(1.0, ratio), reach * max(1.0, ratio)
         )
     return places, moved
+
+
+def refine_by_neighbours(
+    image0: np.ndarray, image1: np.ndarray, points0: np.ndarray, points1: np.ndarray, weight: np.ndarray
+) -> Refinement:
+    """Aligns the patches of every match, warped as its neighbours say.
+
+    Args:
+        image0, image1: (H, W) uint8.
+        points0, points1: (M, 2) matched pixels.
+        weight: (M,) trust in each match.
+    """
+    A, distance = local_maps(points0, points1, weight)
+    places, moved = align_patches(image0, image1, points0, points1, A)
+    return Refinement(points1.astype(np.float64), places, moved, A, distance)
 
 
 def _inside(image: np.ndarray, points: np.ndarray) -> np.ndarray:

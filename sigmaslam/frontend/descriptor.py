@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sigmaslam.frontend.matching import match_near, match_rows
+from sigmaslam.frontend.matching import nearest_in_ellipses, nearest_in_rows, nearest_anywhere
 from sigmaslam.frontend.refine import refine
 from sigmaslam.frontend.types import Features, StereoView, TemporalMatches
 
@@ -34,15 +34,16 @@ def match_stereo(
         Indices (K,) into the left features and their places (K, 2) in the right image; what could not be refined is
         left out.
     """
-    index_left, index_right = match_rows(
+    putative = nearest_in_rows(
         features_left.keypoints,
         features_right.keypoints,
         features_left.descriptors,
         features_right.descriptors,
         _ROW_TOLERANCE,
         (_LEAST_DISPARITY, _MOST_DISPARITY * left.shape[1]),
-        ratio,
     )
+    kept = putative.mutual & putative.distinct(ratio)
+    index_left, index_right = putative.index0[kept], putative.index1[kept]
     places, moved = refine(left, right, features_left.keypoints[index_left], features_right.keypoints[index_right])
     return index_left[moved], places[moved]
 
@@ -76,9 +77,14 @@ class DescriptorFrontend:
     ) -> TemporalMatches:
         """Mutual nearest neighbours within the search radius."""
         wanted = key.features.select(index)
-        first, second = match_near(
-            predicted, radius, view.features.keypoints, wanted.descriptors, view.features.descriptors, self._ratio
-        )
+        descriptors = wanted.descriptors, view.features.descriptors
+        if np.isfinite(radius).all():
+            covariance = (radius**2 / 9.21034037197618)[:, None, None] * np.eye(2)
+            putative = nearest_in_ellipses(predicted, covariance, view.features.keypoints, *descriptors)
+        else:
+            putative = nearest_anywhere(*descriptors)
+        kept = putative.mutual & putative.distinct(self._ratio)
+        first, second = putative.index0[kept], putative.index1[kept]
         points = view.features.keypoints[second]
         places, moved = refine(key.left, view.left, wanted.keypoints[first], points)
         return TemporalMatches(

@@ -5,6 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from sigmaslam.frontend.types import Refinement
+
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
 
 
@@ -46,12 +48,12 @@ def refine(
     points1: np.ndarray,
     window: int = 11,
     reach: float = 2.0,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> Refinement:
     """Matched points moved to where the patches agree, if that is near.
 
-    Returns:
-        (N, 2) places, unchanged where the solver went further than `reach` pixels or failed, and (N,) bool moved.
+    Where the solver went further than `reach` pixels or failed they stay.
     """
+    start = points1.astype(np.float64)
     places, found = lucas_kanade(image0, image1, points0, points1, window, 0)
-    moved = found & (np.linalg.norm(places - points1, axis=1) <= reach)
-    return np.where(moved[:, None], places, points1.astype(np.float64)), moved
+    moved = found & (np.linalg.norm(places - start, axis=1) <= reach)
+    return Refinement(start, np.where(moved[:, None], places, start), moved)

@@ -66,6 +66,25 @@ class TemporalMatches:
         return TemporalMatches(self.key_index[index], self.points[index], self.disparity[index], self.sigma[index])
 
 
+@dataclass(frozen=True, slots=True)
+class Refinement:
+    """Matches moved to where their patches agree.
+
+    Attributes:
+        start, places: (M, 2) float64 in image 1, as detected and refined, pixels; the same where it failed.
+        moved: (M,) bool, whether it succeeded.
+        A: (M, 2, 2), affine map of image 0 to image 1 around each match by which its patch was warped, infinite where
+            there is none; None: patches were only shifted.
+        distance: (M,) pixels from where the neighbours' map would have the detected match; None likewise.
+    """
+
+    start: np.ndarray
+    places: np.ndarray
+    moved: np.ndarray
+    A: np.ndarray | None = None
+    distance: np.ndarray | None = None
+
+
 class Frontend(Protocol):
     """Turns images into correspondences; the tracker knows nothing else of them."""
 

@@ -1,0 +1,57 @@
+"""The match verifier: probability and covariance of a match from what its refined patches look like."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+VERIFIER_COLUMNS = 14
+"""Of `sigmaslam.frontend.verifier.describe_matches`."""
+_WIDTH = 48
+# Of log sigma, pixels.
+_LEAST_LOG_SIGMA, _MOST_LOG_SIGMA = -4.0, 2.5
+
+
+class MatchVerifier(nn.Module):
+    """A small network on each match alone.
+
+    It learns by how much the error exceeds what theory says of an alignment: variance of the difference of the patches
+    over their squared gradient, along each of the patch's axes.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(VERIFIER_COLUMNS))
+        self.register_buffer("spread", torch.ones(VERIFIER_COLUMNS))
+        # Fitted after training, on held-out renders.
+        self.register_buffer("logit_scale", torch.ones(()))
+        self.register_buffer("logit_shift", torch.zeros(()))
+        self.register_buffer("sigma_scale", torch.ones(()))
+        self.layers = nn.Sequential(
+            nn.Linear(VERIFIER_COLUMNS, _WIDTH), nn.ReLU(), nn.Linear(_WIDTH, _WIDTH), nn.ReLU(), nn.Linear(_WIDTH, 3)
+        )
+
+    def forward(self, columns: Tensor) -> tuple[Tensor, Tensor]:
+        """Logit that the match is right, (M,), and log sigma along the patch's axes, (M, 2), pixels of image 1.
+
+        Args:
+            columns: (M, 14) of `sigmaslam.frontend.verifier.describe_matches`.
+        """
+        found = self.layers((columns - self.mean) / self.spread)
+        theory = 0.5 * (columns[:, 1:2] - columns[:, 4:6])
+        log_sigma = (found[:, 1:] + theory).clamp(_LEAST_LOG_SIGMA, _MOST_LOG_SIGMA)
+        return self.logit_scale * found[:, 0] + self.logit_shift, log_sigma + torch.log(self.sigma_scale)
+
+
+class MatchCovariance(nn.Module):
+    """The verifier as its graph is called."""
+
+    def __init__(self, verifier: MatchVerifier) -> None:
+        super().__init__()
+        self.verifier = verifier
+
+    def forward(self, columns: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
+        """Probability (M,) and covariance (M, 2, 2) in pixels squared, from (M, 14) columns and (M, 2, 2) axes."""
+        logit, log_sigma = self.verifier(columns)
+        variance = torch.exp(2.0 * log_sigma)
+        return torch.sigmoid(logit), (axes * variance.unsqueeze(1)) @ axes.transpose(1, 2)

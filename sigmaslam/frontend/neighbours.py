@@ -1,0 +1,23 @@
+"""Nearest points in the plane."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+# FLANN_INDEX_KDTREE_SINGLE and unlimited checks: exact.
+_TREE = {"algorithm": 4, "leaf_max_size": 10}
+_SEARCH = {"checks": -1}
+
+
+def nearest_points(points: np.ndarray, queries: np.ndarray, count: int) -> np.ndarray:
+    """Indices (M, count) of the nearest of (N, 2) points to each of (M, 2) queries, the nearest first.
+
+    Args:
+        count: at most N.
+    """
+    if len(queries) == 0:
+        return np.zeros((0, count), np.int64)
+    index = cv2.flann.Index(np.ascontiguousarray(points, np.float32), _TREE)
+    found, _ = index.knnSearch(np.ascontiguousarray(queries, np.float32), count, params=_SEARCH)
+    return np.asarray(found, np.int64)
