@@ -47,8 +47,7 @@ def card_page(card: dict[str, Any]) -> str:
         sections.append("## Real sets\n\nNone of them was used in training.\n\n" + _table("set, metric", "", rows))
     if card.get("limits"):
         sections.append("## Limits\n\n" + "".join(f"- {limit}\n" for limit in card["limits"]))
-    differences = {f"{name}.onnx": f"{value:.1e}" for name, value in card["onnx_minus_torch"].items()}
-    sections.append("## Graphs\n\n" + _table("ONNX minus torch", "largest difference", differences))
+    sections.append(_graphs_section(card))
     return f"""# Model card: features
 
 Keypoints (blobs of two scales, ranked by a learned quality), {DESCRIPTOR_SIZE}-D descriptors, a sigma of each place;
@@ -61,6 +60,32 @@ Keypoints (blobs of two scales, ranked by a learned quality), {DESCRIPTOR_SIZE}-
 - Figures on real sequences: docs/results.md; none of them was used in training.
 
 """ + "\n".join(sections)
+
+
+def scoring_page(card: dict[str, Any]) -> str:
+    """The card of scorer and verifier for people, in Markdown."""
+    sections = [
+        _table("setting", "", card["config"]),
+        _table("held-out renders", "", card["metrics_on_held_out_renders"]),
+        "## Limits\n\n" + "".join(f"- {limit}\n" for limit in card.get("limits", [])),
+        _graphs_section(card),
+    ]
+    counts = card["parameters"]
+    return f"""# Model card: match scorer and verifier
+
+Probability that a match is right, and covariance of its place; {counts["scorer"]} and {counts["verifier"]} parameters.
+
+- Data: {card["data"]}.
+- Command: `{card["command"]}`, commit {card["commit"]}, seed {card["seed"]}.
+- Duration: {card["duration_s"] / 60:.0f} minutes on {card["hardware"]}.
+- Figures on real images: docs/matching.md; none of them was used in training.
+
+""" + "\n".join(sections)
+
+
+def _graphs_section(card: dict[str, Any]) -> str:
+    differences = {f"{name}.onnx": f"{value:.1e}" for name, value in card["onnx_minus_torch"].items()}
+    return "## Graphs\n\n" + _table("ONNX minus torch", "largest difference", differences)
 
 
 def _table(left: str, right: str, rows: dict[str, Any]) -> str:

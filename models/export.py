@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -20,9 +20,12 @@ from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.files import atomic_path, atomic_write_text, make_folder
 from sigmaslam.filters.lie import exp_se3
 from sigmaslam.filters.stereo_pose import STATE_SIZE, Innovate, Predict, Update
-from sigmaslam.models.card import card_page, read_card
+from sigmaslam.frontend.scorer import NEIGHBOURS
+from sigmaslam.models.card import card_page, read_card, scoring_page
 from sigmaslam.models.extractor import EXTRACTOR_SIZE_MULTIPLE, FeatureExtractor
 from sigmaslam.models.network import DESCRIPTOR_SIZE, STRIDE, FeatureNetwork
+from sigmaslam.models.scorer import SIDE_CHANNELS, MatchScorer, ScoredMatches
+from sigmaslam.models.verifier import VERIFIER_COLUMNS, MatchCovariance, MatchVerifier
 from sigmaslam.session import OnnxGraph
 from sigmaslam.synthetic.textures import dead_leaves
 
@@ -30,6 +33,8 @@ _OPSET = 20
 # ONNX Runtime and torch may order sums differently; more than this is a wrong graph.
 _FEATURE_TOLERANCE = 1e-4
 _FILTER_TOLERANCE = 1e-9
+
+_Module = TypeVar("_Module", bound=nn.Module)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,14 +58,40 @@ def load_network(weights: Path, descriptor_size: int = DESCRIPTOR_SIZE, stride: 
     Raises:
         InputError: the file is missing or holds another network.
     """
-    if not weights.is_file():
-        raise InputError(f"{weights} does not exist: train first, or give the path of a .safetensors file")
-    network = FeatureNetwork(descriptor_size, stride)
-    try:
-        network.load_state_dict(load_file(weights))
-    except (RuntimeError, ValueError, SafetensorError) as error:
-        raise InputError(f"{weights} does not hold the weights of this network: {error}") from error
-    return network.eval()
+    return _load(FeatureNetwork(descriptor_size, stride), weights)
+
+
+def load_scorer(weights: Path) -> MatchScorer:
+    """The match scorer with trained weights; raises as `load_network` does."""
+    return _load(MatchScorer(), weights)
+
+
+def load_verifier(weights: Path) -> MatchVerifier:
+    """The match verifier with trained weights; raises as `load_network` does."""
+    return _load(MatchVerifier(), weights)
+
+
+def export_scoring(run: Path, out: Path) -> dict[str, float]:
+    """Graphs, weights and card of a run of `sigmaslam train-scorer`, into one folder.
+
+    Args:
+        run: folder with scorer.safetensors, verifier.safetensors and matching.json.
+        out: folder.
+    Returns:
+        Largest differences of the graphs from torch.
+    """
+    content = read_card(run / "matching.json")
+    make_folder(out)
+    graphs = _scoring_graphs(load_scorer(run / "scorer.safetensors"), load_verifier(run / "verifier.safetensors"))
+    differences = {name: _export(graph, out / f"{name}.onnx", _FEATURE_TOLERANCE) for name, graph in graphs.items()}
+    content["onnx_minus_torch"] = differences
+    for name in graphs:
+        copied = (run / f"{name}.safetensors").read_bytes()
+        with atomic_path(out / f"{name}.safetensors") as path:
+            path.write_bytes(copied)
+    atomic_write_text(out / "matching.json", json.dumps(content, indent=2) + "\n")
+    atomic_write_text(out / "matching.md", scoring_page(content))
+    return differences
 
 
 def export_features(weights: Path, out: Path) -> float:
@@ -112,6 +143,53 @@ def export_all(
     atomic_write_text(out / "features.json", json.dumps(content, indent=2) + "\n")
     atomic_write_text(out / "features.md", card_page(content))
     return differences
+
+
+def _load(module: _Module, weights: Path) -> _Module:
+    if not weights.is_file():
+        raise InputError(f"{weights} does not exist: train first, or give the path of a .safetensors file")
+    try:
+        module.load_state_dict(load_file(weights))
+    except (RuntimeError, ValueError, SafetensorError) as error:
+        raise InputError(f"{weights} does not hold the weights of this network: {error}") from error
+    return module.eval()
+
+
+def _scoring_graphs(scorer: MatchScorer, verifier: MatchVerifier) -> dict[str, _Graph]:
+    free = {0: torch.export.Dim("matches", min=1, max=100_000)}
+    return {
+        "scorer": _Graph(
+            ScoredMatches(scorer),
+            _matches_example(0, 300),
+            _matches_example(1, 77),
+            ["points0", "points1", "side", "near"],
+            ["logit"],
+            (free,) * 4,
+        ),
+        "verifier": _Graph(
+            MatchCovariance(verifier),
+            _columns_example(0, 300),
+            _columns_example(1, 77),
+            ["columns", "axes"],
+            ["probability", "covariance"],
+            (free,) * 2,
+        ),
+    }
+
+
+def _matches_example(seed: int, count: int) -> tuple[Tensor, ...]:
+    generator = torch.Generator().manual_seed(seed)
+    points0 = 400.0 * torch.rand(count, 2, generator=generator)
+    points1 = points0 + 4.0 * torch.rand(count, 2, generator=generator)
+    near = torch.randint(0, count, (count, NEIGHBOURS), generator=generator)
+    return points0, points1, torch.rand(count, SIDE_CHANNELS, generator=generator), near
+
+
+def _columns_example(seed: int, count: int) -> tuple[Tensor, ...]:
+    generator = torch.Generator().manual_seed(seed)
+    angle = torch.pi * torch.rand(count, generator=generator)
+    axes = torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()], dim=1).reshape(count, 2, 2)
+    return torch.randn(count, VERIFIER_COLUMNS, generator=generator), axes
 
 
 def _noisy_texture(rng: np.random.Generator, shape: tuple[int, int]) -> Tensor:

@@ -100,6 +100,19 @@ class MatchScorer(nn.Module):
         return torch.stack(logits)
 
 
+class ScoredMatches(nn.Module):
+    """The scorer as its graph is called: one set, the logits of the last round."""
+
+    def __init__(self, scorer: MatchScorer) -> None:
+        super().__init__()
+        self.scorer = scorer
+
+    def forward(self, points0: Tensor, points1: Tensor, side: Tensor, near: Tensor) -> tuple[Tensor]:
+        """(M,) logits alone; arguments as of `MatchScorer.forward`, without the axis of the batch."""
+        inputs = (each.unsqueeze(0) for each in (points0, points1, side, near))
+        return (self.scorer(*inputs, torch.ones_like(points0[:, 0]).unsqueeze(0))[-1, 0],)
+
+
 def _layers(*sizes: int) -> nn.Sequential:
     """Linear layers with ReLU between them."""
     layers: list[nn.Module] = []

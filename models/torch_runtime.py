@@ -10,8 +10,11 @@ import torch
 from torch import nn
 
 from sigmaslam.filters.stereo_pose import Innovate, Predict, Update
-from sigmaslam.models.export import load_network
+from sigmaslam.models.export import load_network, load_scorer, load_verifier
 from sigmaslam.models.extractor import FeatureExtractor
+from sigmaslam.models.scorer import ScoredMatches
+from sigmaslam.models.verifier import MatchCovariance
+from sigmaslam.session import shipped_weights
 
 
 class TorchModule:
@@ -32,6 +35,14 @@ class TorchFeatures(TorchModule):
 
     def __init__(self, weights: Path) -> None:
         super().__init__(FeatureExtractor(load_network(weights)))
+
+
+def scoring_module(name: str) -> TorchModule:
+    """scorer or verifier."""
+    weights = shipped_weights(f"{name}.safetensors")
+    return TorchModule(
+        ScoredMatches(load_scorer(weights)) if name == "scorer" else MatchCovariance(load_verifier(weights))
+    )
 
 
 def filter_module(name: str) -> TorchModule:

@@ -19,6 +19,12 @@ class MatchVerifier(nn.Module):
     over their squared gradient, along each of the patch's axes.
     """
 
+    mean: Tensor
+    spread: Tensor
+    logit_scale: Tensor
+    logit_shift: Tensor
+    sigma_scale: Tensor
+
     def __init__(self) -> None:
         super().__init__()
         self.register_buffer("mean", torch.zeros(VERIFIER_COLUMNS))

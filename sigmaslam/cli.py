@@ -183,21 +183,21 @@ def match(
     out: Annotated[Path, typer.Option(help="File to write, ends in .npz.")],
     frontend: Annotated[Detector, typer.Option(help="What finds and describes keypoints.")] = Detector.learned,
     max_keypoints: Annotated[int, typer.Option(help="Most keypoints an image, at least 4.")] = 1024,
-    refine: Annotated[
-        bool, typer.Option(help="Drop matches that their neighbours contradict, align the patches of the others.")
-    ] = True,
+    min_probability: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="Matches less probable than this are left out; 0 keeps all mutual.")
+    ] = 0.5,
     picture: Annotated[
         Path | None, typer.Option(help="PNG to draw: both images, lines from purple (unlikely) to yellow (certain).")
     ] = None,
 ) -> None:
     """Match two images: which points show the same, how probably and how exactly; prints one line.
 
-    Writes an .npz, best match first: keypoints0, keypoints1 (M, 2) pixels (u, v); probability (M,), which ranks but is
-    not yet calibrated; covariance (M, 2, 2) of keypoints1 given keypoints0. numpy.load reads it.
+    Writes an .npz, best match first: keypoints0, keypoints1 (M, 2) pixels (u, v); probability (M,) that a match is
+    right to 3 px; covariance (M, 2, 2) of keypoints1 given keypoints0; index0, index1 (M,). numpy.load reads it.
     """
     from sigmaslam.match import match_files
 
-    typer.echo(match_files(image0, image1, out, frontend.value, max_keypoints, refine, picture))
+    typer.echo(match_files(image0, image1, out, frontend.value, max_keypoints, min_probability, picture))
 
 
 @app.command()
@@ -347,18 +347,29 @@ def export(
         Path | None, typer.Option(help="The .json of 'benchmark features' for these weights: into the card.")
     ] = None,
 ) -> None:
-    """Export network and filter to ONNX and check the graphs against torch (needs the extra 'train')."""
+    """Export what a run made to ONNX and check the graphs against torch (needs the extra 'train').
+
+    A run of 'train' gives the features' graph and those of the filter, a run of 'train-scorer' scorer and verifier.
+    """
     _need_train_extra()
     from sigmaslam.evaluation.matching import read_scores
-    from sigmaslam.models.export import export_all
+    from sigmaslam.models.export import export_all, export_scoring
     from sigmaslam.training.card import CARD_NAME
     from sigmaslam.training.loop import WEIGHTS_NAME
+    from sigmaslam.training.scoring import SCORER_NAME
+
+    if (run / SCORER_NAME).is_file():
+        if scores is not None:
+            raise InputError(f"--scores is of features, {run} is a run of train-scorer: leave it out")
+        with Console(stderr=True).status("exporting two graphs"):
+            differences = export_scoring(run, out)
+        _tell_differences(differences)
+        return
 
     on_real_sets = None if scores is None else read_scores(scores)
     with Console(stderr=True).status("exporting four graphs (about a minute)"):
         differences = export_all(run / WEIGHTS_NAME, run / CARD_NAME, out, on_real_sets)
-    for name, difference in differences.items():
-        typer.echo(f"{name}.onnx differs from torch by {difference:.1e}")
+    _tell_differences(differences)
 
 
 @app.command()
@@ -485,6 +496,11 @@ def _track(
         _need_train_extra()
     sequence = open_sequence(source, format.value, calibration)
     return track_sequence(sequence, out, frontend.value, backend.value)
+
+
+def _tell_differences(differences: dict[str, float]) -> None:
+    for name, difference in differences.items():
+        typer.echo(f"{name}.onnx differs from torch by {difference:.1e}")
 
 
 def _need_data(data: Path | None) -> Path:

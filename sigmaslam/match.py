@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import cv2
@@ -12,21 +12,17 @@ import numpy as np
 
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path, atomic_write_bytes
-from sigmaslam.frontend.affine import align_patches, local_maps
+from sigmaslam.frontend.affine import refine_by_neighbours
 from sigmaslam.frontend.classical import OrbDetector, SiftDetector
+from sigmaslam.frontend.judge import LEAST_LOGIT, MatchJudge
 from sigmaslam.frontend.learned import LearnedDetector
 from sigmaslam.frontend.matching import nearest_anywhere
 from sigmaslam.frontend.types import Features
 from sigmaslam.readers.images import read_grey
 
 _DETECTORS = {"learned": LearnedDetector, "sift": SiftDetector, "orb": OrbDetector}
-# Learned: that of the network's training (`match_loss`). RootSIFT has no negative numbers, its similarities lie closer
-# together: 60 has the least Brier score on rendered pairs (20: 0.58, 40: 0.16, 60: 0.10, 80: 0.12).
-_INVERSE_TEMPERATURES = {"sift": 60.0}
-_INVERSE_TEMPERATURE = 20.0
-# Chosen by hand on warped photographs and rectified pairs, the sets for selection.
-_AGREEMENT = 4.0
-_SIGMA_ALIGNED = 0.3
+# What is less probable is left out by default.
+LEAST_PROBABILITY = 0.5
 _LEAST_SIDE = 96
 _LEAST_KEYPOINTS = 4
 _MOST_LINES = 200
@@ -37,22 +33,32 @@ class Matches:
     """Correspondences between two images, one to one, the most probable first.
 
     Attributes:
-        keypoints0, keypoints1: (M, 2) float32 pixel coordinates (u, v) in image 0 and 1, as the images are stored.
-        probability: (M,) float32 in (0, 1], the dual softmax over all keypoints. It ranks matches but is not yet
-            calibrated: of those near 0.8, not 80 per cent need be right.
-        covariance: (M, 2, 2) float32, pixels squared, of keypoints1 minus the true place of keypoints0 in image 1, if
-            the match is right: (0.3 px)^2 I after refinement, else (sigma0^2 + sigma1^2) I, which takes both images to
-            have about the same scale.
+        keypoints0, keypoints1: (M, 2) float32 pixel coordinates (u, v) in image 0 and 1, as the images are stored;
+            keypoints1 refined to a fraction of a pixel.
+        probability: (M,) float32, that keypoints1 is within 3 px of the true place of keypoints0 in image 1; calibrated
+            on renders: of matches near 0.8 about 80 per cent are right.
+        covariance: (M, 2, 2) float32, pixels squared, of keypoints1 minus that true place, if the match is right.
+        index0, index1: (M,) which keypoints of either image they are, from the best score down.
     """
 
     keypoints0: np.ndarray
     keypoints1: np.ndarray
     probability: np.ndarray
     covariance: np.ndarray
+    index0: np.ndarray
+    index1: np.ndarray
+
+    def select(self, index: np.ndarray) -> Matches:
+        """The matches of that index or mask."""
+        return Matches(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
 def match_images(
-    image0: np.ndarray, image1: np.ndarray, frontend: str = "learned", max_keypoints: int = 1024, refine: bool = True
+    image0: np.ndarray,
+    image1: np.ndarray,
+    frontend: str = "learned",
+    max_keypoints: int = 1024,
+    min_probability: float = LEAST_PROBABILITY,
 ) -> Matches:
     """Matches between two images of one scene.
 
@@ -60,53 +66,45 @@ def match_images(
         image0, image1: (H, W) uint8 grey, of any two sizes from 96 pixels.
         frontend: "learned", "sift" or "orb".
         max_keypoints: most an image, from 4; the time and memory of matching grow with its square.
-        refine: as `refine_matches` does; without it every mutual nearest neighbour is a match.
+        min_probability: matches with less are left out; 0 keeps every mutual nearest neighbour that is not hopeless.
     Raises:
         InputError: an image has another shape or type or is too small, or an option is out of range.
     """
     detect = _detector(frontend, max_keypoints)
+    _check_probability(min_probability)
     features0, features1 = detect(_checked(image0, "image0")), detect(_checked(image1, "image1"))
-    matches = match_features(features0, features1, temperature_of(frontend))
-    return refine_matches(image0, image1, matches) if refine else matches
+    return match_features(MatchJudge(), image0, image1, features0, features1, min_probability)
 
 
-def temperature_of(frontend: str) -> float:
-    """Factor on the similarity of descriptors before the softmax, by name of what made them."""
-    return _INVERSE_TEMPERATURES.get(frontend, _INVERSE_TEMPERATURE)
-
-
-def match_features(features0: Features, features1: Features, inverse_temperature: float) -> Matches:
-    """Mutual nearest neighbours among all keypoints of two images; exact ties are no match."""
-    descriptors0, descriptors1 = features0.descriptors, features1.descriptors
-    putative = nearest_anywhere(descriptors0, descriptors1)
-    index0, index1 = putative.index0[putative.mutual], putative.index1[putative.mutual]
-    # No similarity of unit vectors exceeds 1: no overflow. A mutual neighbour is the largest of its row and column.
-    weight = np.exp(inverse_temperature * (descriptors0 @ descriptors1.T - 1.0))
-    chosen = weight[index0, index1]
-    probability = (chosen / weight.sum(axis=1)[index0]) * (chosen / weight.sum(axis=0)[index1])
-    order = np.argsort(-probability, kind="stable")
-    index0, index1 = index0[order], index1[order]
-    variance = features0.sigma[index0] ** 2 + features1.sigma[index1] ** 2
-    covariance = variance[:, None, None] * np.eye(2, dtype=np.float32)
-    return Matches(features0.keypoints[index0], features1.keypoints[index1], probability[order], covariance)
-
-
-def refine_matches(image0: np.ndarray, image1: np.ndarray, matches: Matches) -> Matches:
-    """The matches that agree with their neighbours to 4 px, moved to where the patches, warped as these say, fit best.
-
-    Where the patches do not fit, the match is dropped: nine in ten of them are wrong.
+def match_features(
+    judge: MatchJudge,
+    image0: np.ndarray,
+    image1: np.ndarray,
+    features0: Features,
+    features1: Features,
+    min_probability: float = LEAST_PROBABILITY,
+) -> Matches:
+    """Mutual nearest neighbours among all keypoints, moved to where the patches, warped as the neighbours say, agree.
 
     Args:
+        judge: of the matches.
         image0, image1: (H, W) uint8.
-        matches: mutual nearest neighbours.
+        features0, features1: of these.
+        min_probability: as `match_images` takes it.
     """
-    points0, points1 = (points.astype(np.float64) for points in (matches.keypoints0, matches.keypoints1))
-    A, distance = local_maps(points0, points1, matches.probability.astype(np.float64))
-    agree = np.flatnonzero(distance < _AGREEMENT)
-    places, fitting = align_patches(image0, image1, points0[agree], points1[agree], A[agree])
-    kept = agree[fitting]
-    covariance = np.tile(_SIGMA_ALIGNED**2 * np.eye(2, dtype=np.float32), (len(kept), 1, 1))
-    return Matches(matches.keypoints0[kept], places[fitting].astype(np.float32), matches.probability[kept], covariance)
+    putative = nearest_anywhere(features0.descriptors, features1.descriptors)
+    logit = judge.score(putative, features0, features1)
+    kept = putative.mutual & (logit > LEAST_LOGIT)
+    index0, index1, logit = putative.index0[kept], putative.index1[kept], logit[kept]
+    points0, points1 = features0.keypoints[index0], features1.keypoints[index1]
+    weight = 1.0 / (1.0 + np.exp(-logit.astype(np.float64)))
+    refinement = refine_by_neighbours(image0, image1, points0.astype(np.float64), points1.astype(np.float64), weight)
+    sigma = features0.sigma[index0], features1.sigma[index1]
+    probability, covariance = judge.verify(image0, image1, points0, logit, refinement, sigma)
+    places = refinement.places.astype(np.float32)
+    order = np.argsort(-probability, kind="stable")
+    order = order[probability[order] >= min_probability]
+    return Matches(points0, places, probability, covariance, index0, index1).select(order)
 
 
 def match_files(
@@ -115,7 +113,7 @@ def match_files(
     out: Path,
     frontend: str,
     max_keypoints: int,
-    refine: bool = True,
+    min_probability: float = LEAST_PROBABILITY,
     picture: Path | None = None,
 ) -> str:
     """Matches two image files, writes the fields of `Matches` as .npz and perhaps a picture; returns a summary.
@@ -129,13 +127,13 @@ def match_files(
     if picture is not None and picture.resolve() in (path0.resolve(), path1.resolve()):
         raise InputError(f"--picture {picture} would overwrite an image that is to be matched: choose another name")
     detect = _detector(frontend, max_keypoints)
+    _check_probability(min_probability)
+    judge = MatchJudge()
     image0, image1 = (_checked(read_grey(path), str(path)) for path in (path0, path1))
     start = time.perf_counter()
     features0, features1 = detect(image0), detect(image1)
     detected = time.perf_counter()
-    matches = match_features(features0, features1, temperature_of(frontend))
-    if refine:
-        matches = refine_matches(image0, image1, matches)
+    matches = match_features(judge, image0, image1, features0, features1, min_probability)
     end = time.perf_counter()
     with atomic_path(out) as temporary:
         np.savez_compressed(temporary, **asdict(matches))
@@ -143,7 +141,12 @@ def match_files(
             atomic_write_bytes(picture, cv2.imencode(".png", draw_matches(image0, image1, matches))[1].tobytes())
     counts = f"{len(features0.keypoints)} and {len(features1.keypoints)} keypoints"
     count = len(matches.probability)
-    found = f"{count} matches, median sigma {np.sqrt(np.median(matches.covariance[:, 0, 0])):.2f} px" if count else ""
+    sigma = np.sqrt(0.5 * np.trace(matches.covariance, axis1=1, axis2=2))
+    found = (
+        f"{count} matches, {matches.probability.sum():.0f} expected to be right, median sigma {np.median(sigma):.2f} px"
+        if count
+        else ""
+    )
     milliseconds = f"features {1e3 * (detected - start):.0f} ms, matching {1e3 * (end - detected):.0f} ms"
     return f"{counts}, {found or 'no matches'}; {milliseconds}"
 
@@ -184,6 +187,11 @@ def _detector(frontend: str, max_keypoints: int) -> Callable[[np.ndarray], Featu
     if max_keypoints < _LEAST_KEYPOINTS:
         raise InputError(f"--max-keypoints is {max_keypoints}: give at least {_LEAST_KEYPOINTS}")
     return _DETECTORS[frontend](max_keypoints)
+
+
+def _check_probability(min_probability: float) -> None:
+    if not 0.0 <= min_probability <= 1.0:
+        raise InputError(f"--min-probability is {min_probability}: give a number from 0 to 1")
 
 
 def _checked(image: np.ndarray, name: str) -> np.ndarray:

@@ -21,7 +21,6 @@ _LOGGER = logging.getLogger(__name__)
 
 # 99.9 % quantiles of chi-square with 0, 1, 2 and 3 degrees of freedom.
 _CHI_SQUARE_999 = np.array([0.0, 10.827566170662733, 13.815510557964274, 16.26623619623813])
-_CHI_SQUARE_99_2D = 9.21034037197618
 # A pose that fewer of the matches near the prediction agree with is not believed.
 _LEAST_SHARE = 0.3
 # A pose from matches alone has no prediction to agree with. Where less than this share of the matches, anywhere in the
@@ -38,7 +37,6 @@ class TrackerConfig:
 
     Attributes:
         max_keypoints: per image.
-        disparity_sigma: standard deviation of a measured disparity, pixels.
         keyframe_sigma: of a keypoint of the keyframe itself, pixels; small, because the current place is measured
             relative to its patch.
         acceleration: square root of the power spectral density of the linear acceleration, in median scene depths
@@ -55,7 +53,6 @@ class TrackerConfig:
     """
 
     max_keypoints: int = 1500
-    disparity_sigma: float = 0.4
     keyframe_sigma: float = 0.1
     acceleration: float = 0.1
     angular_acceleration: float = 0.5
@@ -236,14 +233,15 @@ class StereoTracker:
         rows = np.flatnonzero(in_front & self._in_image(predicted))
         enough = len(rows) >= self.config.least_inliers
         if enough and self._velocity_known and np.median(spread[rows]) < self.config.search_limit**2:
-            radius = np.sqrt(_CHI_SQUARE_99_2D * spread[rows]) + 1.0
-            found = self._frontend.match(self._keyframe.view, landmarks.index[rows], view, predicted[rows, :2], radius)
+            ellipses = S[rows, :2, :2]
+            found = self._frontend.match(
+                self._keyframe.view, landmarks.index[rows], view, predicted[rows, :2], ellipses
+            )
             clock.lap("match")
             matches, fit = len(found.key_index), self._fit(found)
             clock.lap("filter")
         if fit is None or fit.nis_per_dof > _DOUBTFUL_NIS:
-            anywhere = np.full(len(landmarks.index), np.inf)
-            found = self._frontend.match(self._keyframe.view, landmarks.index, view, predicted[:, :2], anywhere)
+            found = self._frontend.match(self._keyframe.view, landmarks.index, view, predicted[:, :2], None)
             clock.lap("match")
             other = self._fit_without_prediction(found, timestamp)
             clock.lap("filter")
@@ -261,8 +259,8 @@ class StereoTracker:
         landmarks = self._keyframe.landmarks
         rows = np.searchsorted(landmarks.index, found.key_index)
         noise = np.zeros((len(rows), 3, 3))
-        noise[:, 0, 0] = noise[:, 1, 1] = found.sigma**2
-        noise[:, 2, 2] = self.config.disparity_sigma**2
+        noise[:, :2, :2] = found.covariance
+        noise[:, 2, 2] = np.where(np.isfinite(found.disparity), found.disparity_sigma, 1.0) ** 2
         measurement = np.column_stack([found.points, found.disparity])
         return StereoPoints(landmarks.measured[rows], landmarks.sigma[rows], measurement, noise), rows
 
@@ -367,8 +365,8 @@ class StereoTracker:
         if self._keyframe is not None:
             self._retired.append(self._keyframe_map())
         measured = np.column_stack([view.features.keypoints[index].astype(np.float64), view.disparity[index]])
-        keypoint, disparity = self.config.keyframe_sigma, self.config.disparity_sigma
-        sigma = np.tile([keypoint, keypoint, disparity], (len(index), 1))
+        keypoint = np.full(len(index), self.config.keyframe_sigma)
+        sigma = np.column_stack([keypoint, keypoint, view.disparity_sigma[index]])
         starting = self._keyframe is None
         self._filter.clone_pose()
         state = self._filter.state

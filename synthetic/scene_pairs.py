@@ -32,6 +32,7 @@ _DURATION = 8.0  # seconds of an episode
 _MOST_MOVED = 0.4  # share of the image that may move on its own
 _LEAST_SHARED = 0.15  # of a raster of points, between the views of a pair
 _RASTER = 12
+_BASELINES = (0.01, 0.12)  # of stereo pairs, in median depths, drawn evenly in the logarithm
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,22 +115,18 @@ class ScenePairs:
         middle = rng.uniform(1.0, _DURATION - 1.0)
         span = np.exp(rng.uniform(np.log(0.1), np.log(2.0)))
         result: list[Views] = []
-        for k in range(_VIEWS):
-            if self.stereo and k % 2:
-                baseline = np.exp(rng.uniform(np.log(0.01), np.log(0.12)))  # of the depth of what is seen
-                to_right = np.eye(4)
-                to_right[0, 3] = baseline * float(result[0].depth[torch.isfinite(result[0].depth)].median())
-                result.append(renderer.render(eye, T @ to_right, time))
-                continue
+        for k in range(0, _VIEWS, 2 if self.stereo else 1):
             time = np.clip(middle + span * rng.uniform(-0.5, 0.5), 0.0, _DURATION)[None]
             T = episode.path.poses(time)
             if k:
                 # From the first view's depth it is known how far aside one can step.
-                T = T @ _step_aside(rng, float(result[0].depth[torch.isfinite(result[0].depth)].median()))
+                T = T @ _step_aside(rng, _median_depth(result[0]))
             focal = self.size * np.exp(rng.uniform(np.log(0.6), np.log(1.3)))
             centre = (self.size - 1) / 2
             eye = Eye(CameraModel(self.size, self.size, focal, focal, centre, centre))
             result.append(renderer.render(eye, T, time))
+            if self.stereo:
+                result.append(renderer.render(eye, T @ _to_right_eye(rng, _median_depth(result[0])), time))
         return result
 
     def _photograph(self, views: Views, rng: np.random.Generator, sensor: Sensor | None) -> np.ndarray:
@@ -155,6 +152,17 @@ def _transfer(views0: Views, views1: Views, points: np.ndarray) -> tuple[np.ndar
     places1[index] = np.nan_to_num(moved.pixels.T.numpy(), nan=-1.0)
     visible[index] = moved.visible.numpy()
     return places1, visible
+
+
+def _median_depth(views: Views) -> float:
+    return float(views.depth[torch.isfinite(views.depth)].median())
+
+
+def _to_right_eye(rng: np.random.Generator, depth: float) -> np.ndarray:
+    """Pose of the right eye in the left one, (4, 4)."""
+    T = np.eye(4)
+    T[0, 3] = depth * np.exp(rng.uniform(*np.log(_BASELINES)))
+    return T
 
 
 def _step_aside(rng: np.random.Generator, depth: float) -> np.ndarray:

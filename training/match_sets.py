@@ -19,7 +19,7 @@ from sigmaslam.frontend.types import Features
 from sigmaslam.synthetic.pairs import HomographyPairs
 from sigmaslam.synthetic.scene_pairs import ScenePairs
 from sigmaslam.synthetic.textures import KINDS
-from sigmaslam.training.stream import prepare_worker
+from sigmaslam.training.stream import PairStream, prepare_worker
 
 DETECTORS: dict[str, Callable[[int], Callable[[np.ndarray], Features]]] = {
     "learned": lambda count: LearnedDetector(count, threads=1),
@@ -78,7 +78,7 @@ class MatchSets:
 
     def __init__(self, seed: int) -> None:
         self._seed = seed
-        self._streams = {
+        self._streams: dict[str, PairStream] = {
             "planes": HomographyPairs(seed, SIZE, KINDS, (0.5, 1.0)),
             "turned planes": HomographyPairs(seed + 1, SIZE, ("leaves",), (1.0, 1.25)),
             "scenes": ScenePairs(seed, SIZE),
@@ -145,7 +145,7 @@ def save_record(path: Path, record: PairRecord) -> None:
         for name in _PUTATIVE:
             arrays[f"{kind}.{name}"] = getattr(found.putative, name)
     with atomic_path(path) as temporary:
-        np.savez(temporary, **arrays)
+        np.savez(temporary, allow_pickle=False, **arrays)
 
 
 def load_record(path: Path) -> PairRecord:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
+from torch.nn.functional import binary_cross_entropy_with_logits
 
 from sigmaslam.files import atomic_path
 from sigmaslam.frontend.scorer import NEIGHBOURS, nearest_matches, side_information
@@ -77,11 +78,12 @@ def collate(samples: Sequence[Sample]) -> tuple[Tensor, Tensor, Tensor, Tensor, 
     weight, error = np.zeros((batch, most), np.float32), np.full((batch, most), np.inf, np.float32)
     for row, sample in enumerate(samples):
         count = len(sample[0])
-        for array, values in zip((points0, points1, side, near, error), sample, strict=True):
+        arrays: tuple[np.ndarray, ...] = points0, points1, side, near, error
+        for array, values in zip(arrays, sample, strict=True):
             array[row, :count] = values
         weight[row, :count] = 1.0
-    arrays = (points0, points1, side, near, weight, error)
-    return tuple(torch.from_numpy(array) for array in arrays)  # type: ignore[return-value]
+    first, second, known, close, counted, off = map(torch.from_numpy, (points0, points1, side, near, weight, error))
+    return first, second, known, close, counted, off
 
 
 def scorer_loss(logits: Tensor, weight: Tensor, error: Tensor) -> Tensor:
@@ -92,7 +94,7 @@ def scorer_loss(logits: Tensor, weight: Tensor, error: Tensor) -> Tensor:
         weight, error: (B, M) as `collate` gives them.
     """
     right = (error < RIGHT).to(logits.dtype)
-    each = F.binary_cross_entropy_with_logits(logits, right.expand_as(logits), reduction="none") * weight
+    each = binary_cross_entropy_with_logits(logits, right.expand_as(logits), reduction="none") * weight
     by_round = (each.sum(dim=2) / weight.sum(dim=1)).mean(dim=1)
     first, between, last = _ROUND_WEIGHTS
     factors = torch.tensor([first, *[between] * (len(logits) - 2), last], dtype=logits.dtype, device=logits.device)
@@ -125,19 +127,21 @@ def train_scorer(
     optimizer = torch.optim.AdamW(scorer.parameters(), LEARNING_RATE, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, LEARNING_RATE, total_steps=steps, pct_start=0.05)
     done = 0
+    state: dict[str, Any]
     if checkpoint.is_file():
         state = torch.load(checkpoint, weights_only=True)
         done = state["step"]
-        for part, name in ((scorer, "scorer"), (optimizer, "optimizer"), (schedule, "schedule")):
-            part.load_state_dict(state[name])
+        scorer.load_state_dict(state["scorer"])
+        optimizer.load_state_dict(state["optimizer"])
+        schedule.load_state_dict(state["schedule"])
     order = _endless_order(len(sets), seed)
     for _ in range(done * SETS_A_STEP):
         next(order)
     for step in range(done, steps):
         rng = np.random.default_rng((seed, 4, step))
-        batch = collate([vary_sample(sets[next(order)], rng) for _ in range(SETS_A_STEP)])
+        *inputs, weight, error = collate([vary_sample(sets[next(order)], rng) for _ in range(SETS_A_STEP)])
         scorer.train()
-        loss = scorer_loss(scorer(*batch[:5]), *batch[4:])
+        loss = scorer_loss(scorer(*inputs, weight), weight, error)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         nn.utils.clip_grad_norm_(scorer.parameters(), 1.0)
@@ -145,9 +149,14 @@ def train_scorer(
         schedule.step()
         note(step + 1, f"loss {float(loss.detach()):.3f}")
         if (step + 1) % _SAVE_EVERY == 0 or step + 1 == steps:
-            parts = {"scorer": scorer, "optimizer": optimizer, "schedule": schedule}
+            state = {
+                "step": step + 1,
+                "scorer": scorer.state_dict(),
+                "optimizer": optimizer.state_dict(),
+                "schedule": schedule.state_dict(),
+            }
             with atomic_path(checkpoint) as path:
-                torch.save({"step": step + 1} | {name: part.state_dict() for name, part in parts.items()}, path)
+                torch.save(state, path)
     return scorer.eval()
 
 

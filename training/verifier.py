@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional as F
+from torch.nn.functional import binary_cross_entropy_with_logits
 
 from sigmaslam.frontend.affine import refine_by_neighbours
 from sigmaslam.frontend.evidence import examine_patches
+from sigmaslam.frontend.judge import LEAST_LOGIT
 from sigmaslam.frontend.refine import refine
 from sigmaslam.frontend.types import Refinement
 from sigmaslam.frontend.verifier import describe_matches
@@ -20,8 +21,6 @@ from sigmaslam.models.verifier import MatchVerifier
 from sigmaslam.training.match_sets import MatchSet, PairRecord
 from sigmaslam.training.scorer import RIGHT, score_set
 
-# Only mutual matches that are not hopeless are verified.
-LEAST_LOGIT = -4.0
 _LEARNING_RATE = 3e-3
 _BATCH = 4096
 # Degrees of freedom of Student's t: few near-misses among the right matches must not widen the sigma of all.
@@ -109,7 +108,7 @@ def verifier_loss(logit: Tensor, log_sigma: Tensor, error: Tensor) -> Tensor:
     right = (error.norm(dim=1) < RIGHT).to(logit.dtype)
     square = (error.square() * torch.exp(-2.0 * log_sigma)).sum(dim=1)
     likelihood = log_sigma.sum(dim=1) + 0.5 * (_FREEDOM + 2.0) * torch.log1p(square / _FREEDOM)
-    return F.binary_cross_entropy_with_logits(logit, right) + (likelihood * right).sum() / right.sum().clamp_min(1.0)
+    return binary_cross_entropy_with_logits(logit, right) + (likelihood * right).sum() / right.sum().clamp_min(1.0)
 
 
 def train_verifier(rows: VerifierRows, steps: int, seed: int, note: Callable[[int, str], None]) -> MatchVerifier:
@@ -131,7 +130,8 @@ def train_verifier(rows: VerifierRows, steps: int, seed: int, note: Callable[[in
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, _LEARNING_RATE, total_steps=steps)
     for step in range(steps):
         batch = torch.randint(len(columns), (_BATCH,), generator=generator)
-        loss = verifier_loss(*verifier(columns[batch]), error[batch])
+        logit, log_sigma = verifier(columns[batch])
+        loss = verifier_loss(logit, log_sigma, error[batch])
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()
@@ -154,11 +154,11 @@ def calibrate(verifier: MatchVerifier, rows: VerifierRows) -> None:
 
     def likelihood() -> Tensor:
         optimizer.zero_grad()
-        loss = F.binary_cross_entropy_with_logits(scale * logit + shift, right.to(logit.dtype))
+        loss = binary_cross_entropy_with_logits(scale * logit + shift, right.to(logit.dtype))
         loss.backward()
         return loss
 
-    optimizer.step(likelihood)  # type: ignore[no-untyped-call]
+    optimizer.step(likelihood)
     square = (torch.from_numpy(rows.error)[right] * torch.exp(-log_sigma[right])).square().sum(dim=1)
     with torch.no_grad():
         verifier.logit_shift.copy_(scale * verifier.logit_shift + shift)

@@ -14,7 +14,6 @@ from sigmaslam.evaluation.matching.run import Scores, score_pairs, score_refined
 from sigmaslam.evaluation.matching.sets import REFINED, STEPS, TRACKS, check_sets, load_set, load_steps, load_tracks
 from sigmaslam.evaluation.matching.stereo import score_steps
 from sigmaslam.evaluation.matching.tracks import KLT, TRACKED_KEYPOINTS, score_klt
-from sigmaslam.match import temperature_of
 
 # Follows the name of an extractor in the row of what `sigmaslam match` makes of its features.
 _REFINED = " + sigmaslam match"
@@ -48,10 +47,10 @@ def compare(
             start = time.perf_counter()
             features = remembering(extractor)
             try:
-                results[label][name] = score(features, None)
+                results[label][name] = score(features, False)
                 if name in REFINED:
                     refined = results.setdefault(label + _REFINED, {})
-                    refined[name] = score(features, temperature_of(label))
+                    refined[name] = score(features, True)
             except FrameError as error:
                 note(f"{name}: left out {label}: {error}")
                 continue
@@ -59,15 +58,15 @@ def compare(
     return results
 
 
-def _scorer(name: str, data: Path) -> tuple[Callable[[Extractor, float | None], dict[str, float]], int]:
-    """What scores an extractor on a set, by the matches of `sigmaslam match` if it gets a temperature; its pairs."""
+def _scorer(name: str, data: Path) -> tuple[Callable[[Extractor, bool], dict[str, float]], int]:
+    """What scores an extractor on a set, perhaps by the matches of `sigmaslam match`; the number of its pairs."""
     if name == STEPS:
         steps = load_steps(data)
-        return lambda extractor, temperature: score_steps(extractor, steps, temperature), len(steps)
+        return lambda extractor, judged: score_steps(extractor, steps, judged), len(steps)
     pairs = load_set(name, data)
 
-    def score(extractor: Extractor, temperature: float | None) -> dict[str, float]:
-        return score_pairs(extractor, pairs) if temperature is None else score_refined(extractor, pairs, temperature)
+    def score(extractor: Extractor, judged: bool) -> dict[str, float]:
+        return score_refined(extractor, pairs) if judged else score_pairs(extractor, pairs)
 
     return score, len(pairs)
 

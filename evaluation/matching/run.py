@@ -9,9 +9,8 @@ import numpy as np
 
 from sigmaslam.evaluation.matching.extractors import MAX_KEYPOINTS, Extractor, remembering
 from sigmaslam.evaluation.matching.pairs import ImagePair
-from sigmaslam.evaluation.matching.scores import Features, score_pair, score_points, summarize, without_sigma
+from sigmaslam.evaluation.matching.scores import Features, match_judged, score_pair, score_points, summarize
 from sigmaslam.evaluation.matching.sets import load_set
-from sigmaslam.match import match_features, refine_matches
 
 Scores = dict[str, dict[str, float]]
 """By set, then by name of the score; shares and areas in [0, 1], numbers of matches a pair."""
@@ -51,13 +50,12 @@ def score_pairs(
     return _summarize_parts(pairs, [score_pair(pair, features(pair.image0), features(pair.image1)) for pair in pairs])
 
 
-def score_refined(extractor: Extractor, pairs: Sequence[ImagePair], inverse_temperature: float) -> dict[str, float]:
-    """As `score_pairs`, for the matches that `sigmaslam match` returns: consistent ones, with aligned patches."""
+def score_refined(extractor: Extractor, pairs: Sequence[ImagePair]) -> dict[str, float]:
+    """As `score_pairs`, for the matches that `sigmaslam match` returns: probable ones, with aligned patches."""
     features = _limited(extractor, MAX_KEYPOINTS)
     scores = []
     for pair in pairs:
-        both = [without_sigma(features(image)) for image in (pair.image0, pair.image1)]
-        matches = refine_matches(pair.image0, pair.image1, match_features(both[0], both[1], inverse_temperature))
+        matches = match_judged(pair.image0, pair.image1, features(pair.image0), features(pair.image1))
         points0, points1 = (points.astype(np.float64) for points in (matches.keypoints0, matches.keypoints1))
         scores.append(score_points(pair, points0, points1))
     return _summarize_parts(pairs, scores)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 
 import cv2
 import numpy as np
@@ -10,6 +11,8 @@ import numpy as np
 from sigmaslam import frontend
 from sigmaslam.evaluation.matching.pairs import Disparity, Homography, ImagePair, Motion, SameRows
 from sigmaslam.frontend.descriptor import match_stereo
+from sigmaslam.frontend.judge import MatchJudge
+from sigmaslam.match import Matches, match_features
 from sigmaslam.rotation import rotation_log
 
 CORNER_THRESHOLDS = (1, 3, 5)
@@ -23,8 +26,6 @@ _INLIER_THRESHOLD = 1.0
 _POLISHED_THRESHOLD = 1.5
 _CONFIDENCE = 0.9999
 _ITERATIONS = 10_000
-# For matches along rows: that of our features in the tracker, for everyone.
-_RATIO = 0.95
 _CORNER_ERROR, _POLISHED_ERROR, _POSE_ERROR = "corner_error", "polished_corner_error", "pose_error_deg"
 
 Features = tuple[np.ndarray, np.ndarray]
@@ -56,13 +57,11 @@ def match_rows_refined(
         left, right: (H, W) uint8.
         features_left, features_right: their keypoints and descriptors.
     Returns:
-        Indices (K,) into the left keypoints and their places (K, 2) in the right image; what could not be refined is
-        left out.
+        Indices (K,) into the left keypoints and their places (K, 2) in the right image; what is more likely wrong
+        than right is left out.
     """
-    both = [
-        without_sigma((keypoints, _unit(descriptors))) for keypoints, descriptors in (features_left, features_right)
-    ]
-    return match_stereo(left, right, both[0], both[1], _RATIO)
+    found = match_stereo(_judge(), left, right, without_sigma(features_left), without_sigma(features_right))
+    return found.index0, found.places
 
 
 def score_pair(pair: ImagePair, features0: Features, features1: Features) -> dict[str, float]:
@@ -227,10 +226,20 @@ def summarize(pairs: Sequence[dict[str, float]]) -> dict[str, float]:
 
 
 def without_sigma(features: Features) -> frontend.Features:
-    """What `sigmaslam.match.match_features` takes; scores and sigmas, which are not known here, are of no use to it."""
+    """What the judge takes; everyone's scores and sigmas are taken to be the same, as not all extractors give them."""
     keypoints, descriptors = features
-    none = np.zeros(len(keypoints), np.float32)
-    return frontend.Features(keypoints, descriptors, none, none)
+    alike = np.ones(len(keypoints), np.float32)
+    return frontend.Features(keypoints, _unit(descriptors), alike, alike)
+
+
+@cache
+def _judge() -> MatchJudge:
+    return MatchJudge()
+
+
+def match_judged(image0: np.ndarray, image1: np.ndarray, features0: Features, features1: Features) -> Matches:
+    """What `sigmaslam match` makes of anyone's keypoints and descriptors of two images."""
+    return match_features(_judge(), image0, image1, without_sigma(features0), without_sigma(features1))
 
 
 def _unit(descriptors: np.ndarray) -> np.ndarray:

@@ -10,8 +10,7 @@ import numpy as np
 
 from sigmaslam.camera import RectifiedStereo
 from sigmaslam.evaluation.matching.extractors import Extractor, remembering
-from sigmaslam.evaluation.matching.scores import Features, match_rows_refined, mutual_nearest, without_sigma
-from sigmaslam.match import match_features, refine_matches
+from sigmaslam.evaluation.matching.scores import Features, match_judged, match_rows_refined, mutual_nearest
 from sigmaslam.rotation import rotation_log
 
 GOOD_POSITION = 0.05
@@ -44,16 +43,13 @@ class StereoStep:
     T_1_0: np.ndarray
 
 
-def score_steps(
-    extractor: Extractor, steps: Sequence[StereoStep], inverse_temperature: float | None = None
-) -> dict[str, float]:
+def score_steps(extractor: Extractor, steps: Sequence[StereoStep], judged: bool = False) -> dict[str, float]:
     """How often the pose of the next keyframe is found by PnP.
 
     Args:
         extractor: image to keypoints and descriptors.
         steps: from a pair to the next left image.
-        inverse_temperature: of `match_features`: the matches are those of `sigmaslam match`; None: mutual nearest
-            neighbours.
+        judged: the matches are those of `sigmaslam match`, else mutual nearest neighbours.
     Returns:
         steps_good: number of steps with a pose within 5 cm and 1 degree of the truth; steps: of all; pnp_inliers: mean
         number of points that agree with the pose, 0 where there is none.
@@ -62,7 +58,7 @@ def score_steps(
     good, inliers = 0, 0
     for step in steps:
         left0, right0, left1 = (features(image) for image in (step.left0, step.right0, step.left1))
-        found = estimate_step(step, left0, right0, left1, inverse_temperature)
+        found = estimate_step(step, left0, right0, left1, judged)
         if found is not None:
             good += is_good(found[0], step.T_1_0)
             inliers += found[1]
@@ -78,14 +74,14 @@ def is_good(T_1_0: np.ndarray, truth: np.ndarray) -> bool:
 
 
 def estimate_step(
-    step: StereoStep, left0: Features, right0: Features, left1: Features, inverse_temperature: float | None = None
+    step: StereoStep, left0: Features, right0: Features, left1: Features, judged: bool = False
 ) -> tuple[np.ndarray, int] | None:
     """Pose by stereo triangulation, mutual nearest neighbours in the next left image, P3P and refinement.
 
     Args:
         step: the images.
         left0, right0, left1: keypoints and descriptors of its three images.
-        inverse_temperature: as in `score_steps`.
+        judged: as in `score_steps`.
     Returns:
         T_1_0 (4, 4) and the number of inliers, or None.
     """
@@ -95,14 +91,11 @@ def estimate_step(
     near = (disparity >= _LEAST_DISPARITY) & (np.abs(keypoints[:, 1] - places[:, 1]) < 1.0)
     points = step.camera.triangulate(np.column_stack([keypoints, disparity])[near])
     kept = index[near]
-    if inverse_temperature is None:
+    if not judged:
         first, second = mutual_nearest(left0[1][kept], left1[1])
         return _solve_pnp(points[first], left1[0][second].astype(np.float64), step.camera.matrix)
-    matches = match_features(without_sigma((left0[0][kept], left0[1][kept])), without_sigma(left1), inverse_temperature)
-    matches = refine_matches(step.left0, step.left1, matches)
-    row_of = {tuple(place): row for row, place in enumerate(left0[0][kept])}
-    first = np.array([row_of[tuple(place)] for place in matches.keypoints0], np.int64)
-    return _solve_pnp(points[first], matches.keypoints1.astype(np.float64), step.camera.matrix)
+    matches = match_judged(step.left0, step.left1, (left0[0][kept], left0[1][kept]), left1)
+    return _solve_pnp(points[matches.index0], matches.keypoints1.astype(np.float64), step.camera.matrix)
 
 
 def _solve_pnp(points: np.ndarray, pixels: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, int] | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from sigmaslam.errors import InputError
 from sigmaslam.frontend.classical import OrbDetector, SiftDetector
 from sigmaslam.frontend.descriptor import DescriptorFrontend
+from sigmaslam.frontend.judge import MatchJudge
 from sigmaslam.frontend.klt import KltFrontend
 from sigmaslam.frontend.learned import LearnedDetector
 from sigmaslam.frontend.types import Frontend
@@ -18,16 +19,16 @@ def build_frontend(name: str, max_keypoints: int, backend: str = "onnx") -> Fron
     Args:
         name: one of FRONTENDS.
         max_keypoints: per image.
-        backend: "onnx" or "torch", for the learned one.
+        backend: "onnx" or "torch", of the networks.
     Raises:
         InputError: there is no front-end of that name.
     """
     if name == "learned":
-        return DescriptorFrontend(name, LearnedDetector(max_keypoints, backend), ratio=0.95)
+        return DescriptorFrontend(name, LearnedDetector(max_keypoints, backend), MatchJudge(backend))
     if name == "sift":
-        return DescriptorFrontend(name, SiftDetector(max_keypoints), ratio=0.9)
+        return DescriptorFrontend(name, SiftDetector(max_keypoints), MatchJudge(backend))
     if name == "orb":
-        return DescriptorFrontend(name, OrbDetector(max_keypoints), ratio=0.95)
+        return DescriptorFrontend(name, OrbDetector(max_keypoints), MatchJudge(backend))
     if name == "klt":
         return KltFrontend(max_keypoints)
     raise InputError(f"there is no front-end '{name}': choose one of {', '.join(FRONTENDS)}")

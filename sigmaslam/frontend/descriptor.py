@@ -1,12 +1,14 @@
-"""Front-end for keypoints with descriptors, learned or classical: detect, match, refine."""
+"""Front-end for keypoints with descriptors, learned or classical: detect, match, refine, judge."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
-from sigmaslam.frontend.matching import nearest_in_ellipses, nearest_in_rows, nearest_anywhere
+from sigmaslam.frontend.judge import LEAST_LOGIT, MatchJudge
+from sigmaslam.frontend.matching import Putative, nearest_anywhere, nearest_in_ellipses, nearest_in_rows
 from sigmaslam.frontend.refine import refine
 from sigmaslam.frontend.types import Features, StereoView, TemporalMatches
 
@@ -15,24 +17,71 @@ _ROW_TOLERANCE = 2.0
 _LEAST_DISPARITY = -2.0
 # Share of the image width that disparity may reach.
 _MOST_DISPARITY = 0.25
-_SIGMA_REFINED = 0.3
-_SIGMA_DETECTED = 1.0
+# What is more likely wrong than right is left out.
+_LEAST_PROBABILITY = 0.5
 
 Detector = Callable[[np.ndarray], Features]
 
 
+@dataclass(frozen=True, slots=True)
+class JudgedMatches:
+    """One-to-one matches of two images, refined.
+
+    Attributes:
+        index0, index1: (M,) keypoints of either image.
+        places: (M, 2) float64 in image 1, refined, pixels.
+        probability: (M,) that the match is right.
+        covariance: (M, 2, 2) of the places given the keypoints of image 0, pixels squared.
+    """
+
+    index0: np.ndarray
+    index1: np.ndarray
+    places: np.ndarray
+    probability: np.ndarray
+    covariance: np.ndarray
+
+    def select(self, index: np.ndarray) -> JudgedMatches:
+        """The matches of that index or mask."""
+        return JudgedMatches(
+            self.index0[index], self.index1[index], self.places[index], self.probability[index], self.covariance[index]
+        )
+
+
+def judge_shifted(
+    judge: MatchJudge,
+    image0: np.ndarray,
+    image1: np.ndarray,
+    features0: Features,
+    features1: Features,
+    putative: Putative,
+) -> JudgedMatches:
+    """The mutual matches of images that differ by little more than a shift around each: eyes of a pair, frames.
+
+    Args:
+        judge: of the matches.
+        image0, image1: (H, W) uint8.
+        features0, features1: of these.
+        putative: nearest neighbours among them.
+    """
+    logit = judge.score(putative, features0, features1)
+    kept = putative.mutual & (logit > LEAST_LOGIT)
+    index0, index1, logit = putative.index0[kept], putative.index1[kept], logit[kept]
+    points0 = features0.keypoints[index0]
+    refinement = refine(image0, image1, points0, features1.keypoints[index1])
+    sigma = features0.sigma[index0], features1.sigma[index1]
+    probability, covariance = judge.verify(image0, image1, points0, logit, refinement, sigma)
+    return JudgedMatches(index0, index1, refinement.places, probability, covariance)
+
+
 def match_stereo(
-    left: np.ndarray, right: np.ndarray, features_left: Features, features_right: Features, ratio: float
-) -> tuple[np.ndarray, np.ndarray]:
+    judge: MatchJudge, left: np.ndarray, right: np.ndarray, features_left: Features, features_right: Features
+) -> JudgedMatches:
     """Stereo matches of a rectified pair: descriptors within a band of rows, then Lucas-Kanade.
 
     Args:
+        judge: of the matches.
         left, right: (H, W) uint8.
         features_left, features_right: of these images.
-        ratio: as in `match_rows`.
-    Returns:
-        Indices (K,) into the left features and their places (K, 2) in the right image; what could not be refined is
-        left out.
     """
     putative = nearest_in_rows(
         features_left.keypoints,
@@ -42,51 +91,57 @@ def match_stereo(
         _ROW_TOLERANCE,
         (_LEAST_DISPARITY, _MOST_DISPARITY * left.shape[1]),
     )
-    kept = putative.mutual & putative.distinct(ratio)
-    index_left, index_right = putative.index0[kept], putative.index1[kept]
-    places, moved = refine(left, right, features_left.keypoints[index_left], features_right.keypoints[index_right])
-    return index_left[moved], places[moved]
+    found = judge_shifted(judge, left, right, features_left, features_right, putative)
+    level = np.abs(found.places[:, 1] - features_left.keypoints[found.index0, 1]) <= _ROW_TOLERANCE
+    return found.select(level & (found.probability >= _LEAST_PROBABILITY))
 
 
 class DescriptorFrontend:
-    """Matches by mutual nearest descriptor, refined by one Lucas-Kanade level.
+    """Matches by mutual nearest descriptor, refined by one Lucas-Kanade level, each with its own covariance.
 
     Args:
         name: for reports.
         detect: image (H, W) uint8 to features.
-        ratio: nearest over second nearest descriptor distance that is still accepted.
+        judge: of the matches.
     """
 
-    def __init__(self, name: str, detect: Detector, ratio: float) -> None:
+    def __init__(self, name: str, detect: Detector, judge: MatchJudge) -> None:
         self.name = name
         self._detect = detect
-        self._ratio = ratio
+        self._judge = judge
 
     def observe(self, left: np.ndarray, right: np.ndarray) -> StereoView:
         """Features of both images, matched along the rows."""
-        features, other = self._detect(left), self._detect(right)
-        disparity = np.full(len(features.keypoints), np.nan)
-        index, places = match_stereo(left, right, features, other, self._ratio)
-        points = features.keypoints[index]
-        level = np.abs(places[:, 1] - points[:, 1]) <= _ROW_TOLERANCE
-        disparity[index[level]] = points[level, 0] - places[level, 0]
-        return StereoView(left, right, features, disparity)
+        features = self._detect(left)
+        found = match_stereo(self._judge, left, right, features, self._detect(right))
+        disparity, sigma = np.full((2, len(features.keypoints)), np.nan)
+        disparity[found.index0] = features.keypoints[found.index0, 0] - found.places[:, 0]
+        sigma[found.index0] = np.sqrt(found.covariance[:, 0, 0])
+        return StereoView(left, right, features, disparity, sigma)
 
     def match(
-        self, key: StereoView, index: np.ndarray, view: StereoView, predicted: np.ndarray, radius: np.ndarray
+        self,
+        key: StereoView,
+        index: np.ndarray,
+        view: StereoView,
+        predicted: np.ndarray,
+        covariance: np.ndarray | None,
     ) -> TemporalMatches:
-        """Mutual nearest neighbours within the search radius."""
+        """Mutual nearest neighbours within the ellipses of the prediction, or anywhere."""
         wanted = key.features.select(index)
         descriptors = wanted.descriptors, view.features.descriptors
-        if np.isfinite(radius).all():
-            covariance = (radius**2 / 9.21034037197618)[:, None, None] * np.eye(2)
-            putative = nearest_in_ellipses(predicted, covariance, view.features.keypoints, *descriptors)
-        else:
-            putative = nearest_anywhere(*descriptors)
-        kept = putative.mutual & putative.distinct(self._ratio)
-        first, second = putative.index0[kept], putative.index1[kept]
-        points = view.features.keypoints[second]
-        places, moved = refine(key.left, view.left, wanted.keypoints[first], points)
+        putative = (
+            nearest_anywhere(*descriptors)
+            if covariance is None
+            else nearest_in_ellipses(predicted, covariance, view.features.keypoints, *descriptors)
+        )
+        found = judge_shifted(self._judge, key.left, view.left, wanted, view.features, putative)
+        found = found.select(found.probability >= _LEAST_PROBABILITY)
         return TemporalMatches(
-            index[first], places, view.disparity[second], np.where(moved, _SIGMA_REFINED, _SIGMA_DETECTED)
+            index[found.index0],
+            found.places,
+            view.disparity[found.index1],
+            found.covariance.astype(np.float64),
+            view.disparity_sigma[found.index1],
+            found.probability,
         )

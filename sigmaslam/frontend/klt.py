@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from sigmaslam.frontend.matching import within_ellipses
 from sigmaslam.frontend.refine import lucas_kanade
 from sigmaslam.frontend.types import Features, StereoView, TemporalMatches
 
@@ -13,6 +14,7 @@ _LEVELS = 4
 _ROW_TOLERANCE = 2.0
 _FORWARD_BACKWARD = 0.7
 _SIGMA = 0.3
+_DISPARITY_SIGMA = 0.4
 
 
 class KltFrontend:
@@ -38,18 +40,31 @@ class KltFrontend:
             np.linspace(1, 0, len(keypoints), dtype=np.float32),
             np.full(len(keypoints), _SIGMA, np.float32),
         )
-        return StereoView(left, right, features, _disparity(left, right, keypoints))
+        disparity = _disparity(left, right, keypoints)
+        return StereoView(left, right, features, disparity, np.where(np.isfinite(disparity), _DISPARITY_SIGMA, np.nan))
 
     def match(
-        self, key: StereoView, index: np.ndarray, view: StereoView, predicted: np.ndarray, radius: np.ndarray
+        self,
+        key: StereoView,
+        index: np.ndarray,
+        view: StereoView,
+        predicted: np.ndarray,
+        covariance: np.ndarray | None,
     ) -> TemporalMatches:
         """Corners of the keyframe followed into the current left image, then into the right one."""
         points = key.features.keypoints[index]
         places, found = _follow(key.left, view.left, points, predicted)
-        found &= np.linalg.norm(places - predicted, axis=1) <= radius
+        if covariance is not None:
+            found &= within_ellipses(places - predicted, covariance)
         places = places[found]
+        disparity = _disparity(view.left, view.right, places)
         return TemporalMatches(
-            index[found], places, _disparity(view.left, view.right, places), np.full(len(places), _SIGMA)
+            index[found],
+            places,
+            disparity,
+            np.tile(_SIGMA**2 * np.eye(2), (len(places), 1, 1)),
+            np.where(np.isfinite(disparity), _DISPARITY_SIGMA, np.nan),
+            np.ones(len(places)),
         )
 
 

@@ -108,9 +108,15 @@ def nearest_in_ellipses(
     # Rows and columns of the ellipse's box first: most pairs of a band are far away.
     close = np.abs(offset[:, 0]) <= np.sqrt(_CHI_SQUARE_99 * covariance[:, 0, 0])[first]
     first, second, offset = first[close], second[close], offset[close]
-    information = np.linalg.inv(covariance)[first]
-    inside = np.einsum("ki,kij,kj->k", offset, information, offset) <= _CHI_SQUARE_99
+    inside = within_ellipses(offset, covariance[first])
     return _nearest(descriptors0, descriptors1, first[inside], second[inside])
+
+
+def within_ellipses(offset: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """(K,) bool, whether offsets (K, 2) lie in the 99 % ellipses of covariances (K, 2, 2)."""
+    u, v = offset.T
+    uu, uv, vv = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    return np.asarray(vv * u * u - 2.0 * uv * u * v + uu * v * v <= _CHI_SQUARE_99 * (uu * vv - uv * uv))
 
 
 def _pairs_in_band(row0: np.ndarray, reach: np.ndarray, row1: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -132,7 +138,7 @@ def _nearest(descriptors0: np.ndarray, descriptors1: np.ndarray, first: np.ndarr
         similarity = (descriptors0 @ descriptors1.T)[first, second]
     else:
         similarity = np.einsum("kd,kd->k", descriptors0[first], descriptors1[second])
-    best0, place0, runner_up0 = _two_best(similarity, first, len(descriptors0))
+    _, place0, runner_up0 = _two_best(similarity, first, len(descriptors0))
     best1, place1, runner_up1 = _two_best(similarity, second, len(descriptors1))
     index0 = np.flatnonzero(place0 >= 0)
     place = place0[index0]

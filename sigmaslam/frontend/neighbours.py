@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 
 # FLANN_INDEX_KDTREE_SINGLE and unlimited checks: exact.
-_TREE = {"algorithm": 4, "leaf_max_size": 10}
-_SEARCH = {"checks": -1}
+_TREE: dict[str, bool | int | float | str] = {"algorithm": 4, "leaf_max_size": 10}
+_SEARCH: dict[str, bool | int | float | str] = {"checks": -1}
 
 
 def nearest_points(points: np.ndarray, queries: np.ndarray, count: int) -> np.ndarray:

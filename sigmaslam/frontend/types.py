@@ -37,12 +37,14 @@ class StereoView:
         left, right: (H, W) uint8.
         features: of the left image.
         disparity: (N,) float64 in pixels, NaN where the keypoint was not found in the right image.
+        disparity_sigma: (N,) its standard deviation, NaN likewise.
     """
 
     left: np.ndarray
     right: np.ndarray
     features: Features
     disparity: np.ndarray
+    disparity_sigma: np.ndarray
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,17 +55,28 @@ class TemporalMatches:
         key_index: (M,) index into the keyframe's features, each at most once.
         points: (M, 2) float64 pixel coordinates in the current left image.
         disparity: (M,) float64 there, NaN where unknown.
-        sigma: (M,) standard deviation of the points per axis, pixels.
+        covariance: (M, 2, 2) of the points given the keypoints, pixels squared.
+        disparity_sigma: (M,) standard deviation of the disparity, NaN where it is unknown.
+        probability: (M,) that the match is right.
     """
 
     key_index: np.ndarray
     points: np.ndarray
     disparity: np.ndarray
-    sigma: np.ndarray
+    covariance: np.ndarray
+    disparity_sigma: np.ndarray
+    probability: np.ndarray
 
     def select(self, index: np.ndarray) -> TemporalMatches:
         """The matches of that index or mask."""
-        return TemporalMatches(self.key_index[index], self.points[index], self.disparity[index], self.sigma[index])
+        return TemporalMatches(
+            self.key_index[index],
+            self.points[index],
+            self.disparity[index],
+            self.covariance[index],
+            self.disparity_sigma[index],
+            self.probability[index],
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +108,12 @@ class Frontend(Protocol):
         ...
 
     def match(
-        self, key: StereoView, index: np.ndarray, view: StereoView, predicted: np.ndarray, radius: np.ndarray
+        self,
+        key: StereoView,
+        index: np.ndarray,
+        view: StereoView,
+        predicted: np.ndarray,
+        covariance: np.ndarray | None,
     ) -> TemporalMatches:
         """Finds keypoints of a keyframe in the current view.
 
@@ -104,6 +122,7 @@ class Frontend(Protocol):
             index: (K,) which of its keypoints are wanted.
             view: the current view.
             predicted: (K, 2) where the filter expects them, pixels.
-            radius: (K,) search radius about the prediction, pixels; infinite when the prediction is worth little.
+            covariance: (K, 2, 2) of that, pixels squared: only the 99 % ellipse is searched; None: the prediction is
+                worth little.
         """
         ...
