@@ -122,6 +122,7 @@ class Benchmark(StrEnum):
     renders = "renders"
     features = "features"
     ablations = "ablations"
+    matches = "matches"
 
 
 def _show_version(wanted: bool) -> None:
@@ -419,7 +420,8 @@ def benchmark(
 
     sequences: the tracker on every sequence. filters: speed of the filters beside those of other libraries that are
     installed. claims: EKF against UKF by Monte Carlo. renders: how fast, and how like real images. features: time
-    and scores of the features beside SIFT, ORB and other people's. ablations: what each part of the features gains, by
+    and scores of the features beside SIFT, ORB and other people's. matches: whether their probability and covariance
+    hold, beside AdaLAM and MAGSAC. ablations: what each part of the features gains, by
     short training runs (an hour). All but the first need the extra 'train'.
     """
     command = f"sigmaslam benchmark {name.value} --out {out}"
@@ -449,6 +451,10 @@ def benchmark(
         typer.echo(
             write_features(out, _need_data(data), weights or [], peer or [], command, chosen, rounds or ROUNDS, note)
         )
+    elif name is Benchmark.matches:
+        from sigmaslam.evaluation.benchmarks.matches import write_matches
+
+        typer.echo(write_matches(out, _need_data(data), command, Console(stderr=True).print))
     elif name is Benchmark.ablations:
         from sigmaslam.evaluation.benchmarks.ablations import write_ablations
 

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from sigmaslam.camera import RectifiedStereo
+from sigmaslam.epipolar import estimate_epipolar_pose
 from sigmaslam.rotation import se3_inverse
 
 _THRESHOLD = 2.0  # pixels
@@ -30,7 +31,11 @@ class RelativePose:
 
 
 def estimate_relative_pose(
-    camera: RectifiedStereo, landmarks: np.ndarray, measurement: np.ndarray
+    camera: RectifiedStereo,
+    landmarks: np.ndarray,
+    measurement: np.ndarray,
+    probability: np.ndarray,
+    covariance: np.ndarray,
 ) -> RelativePose | None:
     """Pose of the current view in the keyframe, from stereo points and where they are seen now.
 
@@ -41,6 +46,8 @@ def estimate_relative_pose(
         camera: the rectified pair.
         landmarks: (M, 3) (u, v, disparity) in the keyframe.
         measurement: (M, 3) now; disparity may be NaN.
+        probability: (M,) that a match is right.
+        covariance: (M, 2, 2) of its place now, pixels squared.
     Returns:
         None when fewer than eight points agree with either.
     """
@@ -50,7 +57,7 @@ def estimate_relative_pose(
     points = camera.triangulate(np.where(near[:, None], landmarks, [0.0, 0.0, 1.0]))
     best: RelativePose | None = None
     for guess in (
-        _from_essential(camera, points, near, landmarks[:, :2], measurement[:, :2]),
+        _from_essential(camera, points, near, landmarks[:, :2], measurement[:, :2], probability, covariance),
         _from_points(camera, points[near], measurement[near, :2]),
     ):
         if guess is None:
@@ -62,28 +69,31 @@ def estimate_relative_pose(
 
 
 def _from_essential(
-    camera: RectifiedStereo, points: np.ndarray, near: np.ndarray, pixels_key: np.ndarray, pixels: np.ndarray
+    camera: RectifiedStereo,
+    points: np.ndarray,
+    near: np.ndarray,
+    pixels_key: np.ndarray,
+    pixels: np.ndarray,
+    probability: np.ndarray,
+    covariance: np.ndarray,
 ) -> np.ndarray | None:
-    """T_camera_key from the 5-point method; the length of the translation from stereo depth."""
-    cv2.setRNGSeed(0)
-    essential, mask = cv2.findEssentialMat(
-        pixels_key, pixels, camera.matrix, method=cv2.USAC_DEFAULT, prob=0.9999, threshold=_THRESHOLD / 2
-    )
-    if essential is None or essential.shape != (3, 3):
+    """T_camera_key from the matches alone; the length of the translation from stereo depth."""
+    pose = estimate_epipolar_pose(camera.matrix, pixels_key, pixels, probability, covariance)
+    if pose is None:
         return None
-    _, R, direction, mask = cv2.recoverPose(essential, pixels_key, pixels, camera.matrix, mask=mask)
-    used = near & (mask.ravel() > 0)
+    R, direction = pose.R, pose.direction
+    used = near & pose.inliers
     if used.sum() < _LEAST_POINTS:
         return None
     # x ~ R X + s t: cross product with the ray leaves one unknown, s, per point; the median is robust.
     rays = np.linalg.solve(camera.matrix, np.c_[pixels[used], np.ones(used.sum())].T).T
     constant = np.cross(rays, points[used] @ R.T)
-    slope = np.cross(rays, direction.ravel())
+    slope = np.cross(rays, direction)
     strength = np.einsum("ij,ij->i", slope, slope)
     scales = -np.einsum("ij,ij->i", slope, constant) / np.maximum(strength, 1e-12)
     T = np.eye(4)
     T[:3, :3] = R
-    T[:3, 3] = max(float(np.median(scales)), 0.0) * direction.ravel()
+    T[:3, 3] = max(float(np.median(scales)), 0.0) * direction
     return T
 
 

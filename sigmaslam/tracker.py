@@ -37,6 +37,8 @@ class TrackerConfig:
 
     Attributes:
         max_keypoints: per image.
+        constant_sigma: standard deviations of every matched place per axis and of every disparity, pixels, in place of
+            the matches' own; for comparison.
         keyframe_sigma: of a keypoint of the keyframe itself, pixels; small, because the current place is measured
             relative to its patch.
         acceleration: square root of the power spectral density of the linear acceleration, in median scene depths
@@ -53,6 +55,7 @@ class TrackerConfig:
     """
 
     max_keypoints: int = 1500
+    constant_sigma: tuple[float, float] | None = None
     keyframe_sigma: float = 0.1
     acceleration: float = 0.1
     angular_acceleration: float = 0.5
@@ -259,8 +262,12 @@ class StereoTracker:
         landmarks = self._keyframe.landmarks
         rows = np.searchsorted(landmarks.index, found.key_index)
         noise = np.zeros((len(rows), 3, 3))
-        noise[:, :2, :2] = found.covariance
-        noise[:, 2, 2] = np.where(np.isfinite(found.disparity), found.disparity_sigma, 1.0) ** 2
+        if self.config.constant_sigma is None:
+            noise[:, :2, :2] = found.covariance
+            noise[:, 2, 2] = np.where(np.isfinite(found.disparity), found.disparity_sigma, 1.0) ** 2
+        else:
+            place, disparity = self.config.constant_sigma
+            noise[:] = np.diag([place, place, disparity]) ** 2
         measurement = np.column_stack([found.points, found.disparity])
         return StereoPoints(landmarks.measured[rows], landmarks.sigma[rows], measurement, noise), rows
 
@@ -294,7 +301,9 @@ class StereoTracker:
     def _fit_without_prediction(self, found: TemporalMatches, timestamp: float) -> _Fit | None:
         """Start-up and recovery: relative pose from the matches alone, then the update from a vague prior about it."""
         points, _ = self._stereo_points(found)
-        relative = estimate_relative_pose(self._camera, points.landmarks, points.measurement)
+        relative = estimate_relative_pose(
+            self._camera, points.landmarks, points.measurement, found.probability, points.noise[:, :2, :2]
+        )
         if relative is None:
             return None
         least = self.config.least_inliers * (1 if relative.inliers.mean() >= _LEAST_SHARE_UNGUIDED else 2)
@@ -366,7 +375,9 @@ class StereoTracker:
             self._retired.append(self._keyframe_map())
         measured = np.column_stack([view.features.keypoints[index].astype(np.float64), view.disparity[index]])
         keypoint = np.full(len(index), self.config.keyframe_sigma)
-        sigma = np.column_stack([keypoint, keypoint, view.disparity_sigma[index]])
+        known = self.config.constant_sigma
+        disparity = view.disparity_sigma[index] if known is None else np.full(len(index), known[1])
+        sigma = np.column_stack([keypoint, keypoint, disparity])
         starting = self._keyframe is None
         self._filter.clone_pose()
         state = self._filter.state

@@ -29,7 +29,7 @@ _USES = 32  # ... each of which serves so many pairs before it is replaced
 _VIEWS = 8  # of a scene
 _SCENES_A_BANK = 64  # share their textures
 _DURATION = 8.0  # seconds of an episode
-_MOST_MOVED = 0.4  # share of the image that may move on its own
+_MOST_MOVED = 0.4
 _LEAST_SHARED = 0.15  # of a raster of points, between the views of a pair
 _RASTER = 12
 _BASELINES = (0.01, 0.12)  # of stereo pairs, in median depths, drawn evenly in the logarithm
@@ -62,15 +62,22 @@ class ScenePairs:
         size: side of the square images in pixels.
         domains: keys of `DOMAINS`, drawn alike.
         stereo: the two views are the eyes of a rectified stereo pair, through sensors of one kind.
+        most_moved: share of the image that may move on its own in a scene.
     """
 
     def __init__(
-        self, seed: int, size: int = 224, domains: tuple[str, ...] = tuple(DOMAINS), stereo: bool = False
+        self,
+        seed: int,
+        size: int = 224,
+        domains: tuple[str, ...] = tuple(DOMAINS),
+        stereo: bool = False,
+        most_moved: float = _MOST_MOVED,
     ) -> None:
         unknown = set(domains) - set(DOMAINS)
         if unknown or not domains:
             raise ValueError(f"unknown domains {sorted(unknown)}; give one or more of {', '.join(DOMAINS)}")
         self.seed, self.size, self.domains, self.stereo = seed, size, domains, stereo
+        self._most_moved = most_moved
         self._kept: OrderedDict[int, list[Views]] = OrderedDict()
 
     def pair(self, index: int) -> ScenePair:
@@ -106,7 +113,7 @@ class ScenePairs:
         domain = self.domains[int(rng.integers(len(self.domains)))]
         wish = Wish(
             _DURATION,
-            movers=float(rng.uniform(0.0, _MOST_MOVED)) if rng.random() < 0.5 else 0.0,
+            movers=float(rng.uniform(0.0, self._most_moved)) if rng.random() < 0.5 else 0.0,
             first_texture=4 * (self.seed + scene // _SCENES_A_BANK),
             textures=4,
         )

@@ -1,0 +1,137 @@
+"""Rendered pairs of views in which half of the right matches are on things that move: who accepts what."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from sigmaslam.camera import RectifiedStereo
+from sigmaslam.epipolar import estimate_epipolar_pose
+from sigmaslam.frontend.judge import MatchJudge
+from sigmaslam.frontend.types import Features
+from sigmaslam.match import match_features
+from sigmaslam.rotation import rotation_log
+from sigmaslam.startup import estimate_relative_pose
+from sigmaslam.synthetic.scene_pairs import ScenePair, ScenePairs
+from sigmaslam.synthetic.truth import at_pixels
+from sigmaslam.synthetic.visibility import move
+
+SHARES = (0.35, 0.65)
+"""Between these a pair's right matches are on moving things."""
+_SIZE = 384
+_DOMAINS = ("street", "room", "drone")
+_RIGHT = 3.0
+# A thing that moves by less in the image cannot be told from the scene.
+_MOVED = 3.0
+_LEAST_MATCHES = 60
+# Of the virtual stereo pair, in depths of the median point, and the noise of its disparities, pixels.
+_BASELINE, _DISPARITY_NOISE = 0.05, 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class MoverJudgement:
+    """Over all pairs found.
+
+    Attributes:
+        pairs: how many.
+        moving: share of the right matches on moving things.
+        static_matched: share on the static scene of the matches more probable than not, wrong ones counted as not.
+        static_epipolar: of those that agree with the pose from two images.
+        static_stereo: of those that agree with the pose from stereo points, as the tracker starts.
+        poses_right: share of the pairs whose pose from stereo points turns by less than 1 degree wrongly.
+    """
+
+    pairs: int
+    moving: float
+    static_matched: float
+    static_epipolar: float
+    static_stereo: float
+    poses_right: float
+
+
+def judge_movers(detect: Callable[[np.ndarray], Features], judge: MatchJudge, seed: int, tried: int) -> MoverJudgement:
+    """Looks for such pairs among `tried` rendered ones and matches them.
+
+    Args:
+        detect: image to features.
+        judge: of the matches.
+        seed: of the pairs.
+        tried: how many are rendered.
+    """
+    stream = ScenePairs(seed, _SIZE, _DOMAINS, most_moved=0.5)
+    counts = np.zeros((4, 2))
+    found, right_poses = 0, 0
+    for index in range(tried):
+        pair = stream.pair(index)
+        image0, image1 = (np.round(255.0 * image).astype(np.uint8) for image in (pair.image0, pair.image1))
+        features0, features1 = detect(image0), detect(image1)
+        matches = match_features(judge, image0, image1, features0, features1)
+        truth = _look_up(pair, matches.keypoints0.astype(np.float64))
+        right = np.linalg.norm(matches.keypoints1 - truth.places, axis=1) < _RIGHT
+        static = right & ~truth.moved
+        share = 1.0 - static.sum() / max(right.sum(), 1)
+        if right.sum() < _LEAST_MATCHES or not SHARES[0] <= share <= SHARES[1]:
+            continue
+        found += 1
+        camera0, camera1 = pair.views0.sight.eye.camera, pair.views1.sight.eye.camera
+        # As if both had been taken by the first camera: the centres are the same.
+        centre, zoom = np.array([camera0.cx, camera0.cy]), camera0.fx / camera1.fx
+        points1 = (matches.keypoints1 - centre) * zoom + centre
+        covariance = zoom**2 * matches.covariance
+        camera = RectifiedStereo(
+            camera0.fx, camera0.fy, camera0.cx, camera0.cy, _BASELINE * float(np.median(truth.depth0)), _SIZE, _SIZE
+        )
+        epipolar = estimate_epipolar_pose(camera.matrix, matches.keypoints0, points1, matches.probability, covariance)
+        noise = np.random.default_rng((seed, index)).normal(0.0, _DISPARITY_NOISE, (2, len(truth.depth0)))
+        landmarks = np.column_stack([matches.keypoints0, camera.fx * camera.baseline / truth.depth0 + noise[0]])
+        depth1 = np.where(truth.depth1 > 0, truth.depth1, np.nan)
+        measurement = np.column_stack([points1, camera.fx * camera.baseline / depth1 + noise[1]])
+        stereo = estimate_relative_pose(camera, landmarks, measurement, matches.probability, covariance)
+        accepted = [
+            right,
+            np.ones(len(right), bool),
+            np.zeros(len(right), bool) if epipolar is None else epipolar.inliers,
+            np.zeros(len(right), bool) if stereo is None else stereo.inliers,
+        ]
+        counts += [[float((each & static).sum()), float(each.sum())] for each in accepted]
+        if stereo is not None:
+            turn = rotation_log(stereo.T_key_camera[:3, :3] @ truth.T_1_0[:3, :3])
+            right_poses += bool(np.degrees(np.linalg.norm(turn)) < 1.0)
+    still, matched, epipolar_share, stereo_share = (
+        float(share) for share in counts[:, 0] / np.maximum(counts[:, 1], 1.0)
+    )
+    return MoverJudgement(found, 1.0 - still, matched, epipolar_share, stereo_share, right_poses / max(found, 1))
+
+
+@dataclass(frozen=True, slots=True)
+class _Truth:
+    """Of M pixels of the first view: where they are in the second, whether they moved on their own, depths, motion."""
+
+    places: np.ndarray
+    moved: np.ndarray
+    depth0: np.ndarray
+    depth1: np.ndarray
+    T_1_0: np.ndarray
+
+
+def _look_up(pair: ScenePair, points0: np.ndarray) -> _Truth:
+    sight0, sight1 = pair.views0.sight, pair.views1.sight
+    T_1_0 = sight1.T_view_mover[0, 0] @ torch.linalg.inv(sight0.T_view_mover[0, 0])
+    places, visible = pair.transfer(points0)
+    view = torch.zeros(len(points0), dtype=torch.int64)
+    facet, grid = at_pixels(pair.views0, view, torch.from_numpy(points0.T.copy()))
+    hit = facet >= 0
+    mover = sight0.surfaces.mover.index_select(0, facet[hit])
+    points = sight0.points(view[hit], facet[hit], grid[:, hit])
+    in_view0 = move(sight0.T_view_mover, view[hit], mover, points)
+    in_view1 = move(sight1.T_view_mover, view[hit], mover, points)
+    still = T_1_0[:3, :3] @ in_view0 + T_1_0[:3, 3:]
+    static_places = sight1.eye.project(torch.where(still[2] > 0, still, torch.ones_like(still)))[0].T.numpy()
+    rows = hit.numpy()
+    moved, depth0, depth1 = np.zeros(len(points0), bool), np.ones(len(points0)), np.ones(len(points0))
+    moved[rows] = np.linalg.norm(static_places - places[rows], axis=1) > _MOVED
+    depth0[rows], depth1[rows] = in_view0[2].numpy(), in_view1[2].numpy()
+    return _Truth(np.where(visible[:, None], places, np.inf), moved, depth0, depth1, T_1_0.numpy())

@@ -1,0 +1,124 @@
+"""Relative pose of two views without a prediction: ours from judged matches beside MAGSAC."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from sigmaslam.epipolar import estimate_epipolar_pose
+from sigmaslam.evaluation.matching.pairs import ImagePair, Motion
+from sigmaslam.frontend.judge import MatchJudge
+from sigmaslam.frontend.matching import nearest_anywhere
+from sigmaslam.frontend.types import Features
+from sigmaslam.match import Matches, match_features
+from sigmaslam.rotation import rotation_log
+
+# With less translation its direction means nothing, metres.
+_LEAST_TRANSLATION = 0.02
+# Ours sees less probable matches too: its weights leave them out.
+_LEAST_PROBABILITY = 0.05
+_MAGSAC_THRESHOLD = 1.0
+_ROUNDS = 5
+
+_Pose = tuple[np.ndarray, np.ndarray] | None
+
+
+@dataclass(frozen=True, slots=True)
+class StartScore:
+    """Of one estimator on one set; errors in degrees, 180 where there is no pose.
+
+    Attributes:
+        rotation, direction: median errors of rotation and of the direction of translation.
+        mean: mean of the larger of the two.
+        milliseconds: median over the pairs of the least of five rounds, without matching.
+    """
+
+    rotation: float
+    direction: float
+    mean: float
+    milliseconds: float
+
+
+def compare_starts(
+    pairs: Sequence[ImagePair], detect: Callable[[np.ndarray], Features], judge: MatchJudge
+) -> dict[str, StartScore]:
+    """Everyone on the pairs with a known motion that is more than a turn.
+
+    Args:
+        pairs: others are left out.
+        detect: image to features.
+        judge: of the matches.
+    """
+    found: dict[str, list[tuple[float, float, float]]] = {}
+    for pair in pairs:
+        truth = pair.truth
+        if not isinstance(truth, Motion) or np.linalg.norm(truth.T_1_0[:3, 3]) < _LEAST_TRANSLATION:
+            continue
+        features0, features1 = detect(pair.image0), detect(pair.image1)
+        putative = nearest_anywhere(features0.descriptors, features1.descriptors)
+        mutual = putative.select(putative.mutual)
+        points0, points1 = features0.keypoints[mutual.index0], features1.keypoints[mutual.index1]
+        matches = match_features(judge, pair.image0, pair.image1, features0, features1, _LEAST_PROBABILITY)
+        contenders = _contenders(points0, points1, matches, truth.K)
+        # In turn, so that a busy moment of the machine hits everyone.
+        times = np.full((_ROUNDS, len(contenders)), np.inf)
+        for turn in range(_ROUNDS):
+            for column, (name, estimate) in enumerate(contenders.items()):
+                begin = time.perf_counter()
+                pose = estimate()
+                times[turn, column] = 1e3 * (time.perf_counter() - begin)
+                if turn == 0:
+                    found.setdefault(name, []).append((*_errors(pose, truth.T_1_0), 0.0))
+        for column, name in enumerate(contenders):
+            found[name][-1] = (*found[name][-1][:2], float(times[:, column].min()))
+    return {name: _summary(np.array(values)) for name, values in found.items()}
+
+
+def _contenders(
+    points0: np.ndarray, points1: np.ndarray, matches: Matches, K: np.ndarray
+) -> dict[str, Callable[[], _Pose]]:
+    probable = matches.select(matches.probability >= 0.5)
+
+    def ours() -> _Pose:
+        pose = estimate_epipolar_pose(
+            K, matches.keypoints0, matches.keypoints1, matches.probability, matches.covariance
+        )
+        return None if pose is None else (pose.R, pose.direction)
+
+    return {
+        "MAGSAC, mutual nearest neighbours": lambda: _magsac(points0, points1, K),
+        "MAGSAC, our refined matches": lambda: _magsac(probable.keypoints0, probable.keypoints1, K),
+        "ours": ours,
+    }
+
+
+def _magsac(points0: np.ndarray, points1: np.ndarray, K: np.ndarray) -> _Pose:
+    if len(points0) < 5:
+        return None
+    points0, points1 = points0.astype(np.float64), points1.astype(np.float64)
+    cv2.setRNGSeed(0)
+    E, mask = cv2.findEssentialMat(
+        points0, points1, K, method=cv2.USAC_MAGSAC, prob=0.9999, threshold=_MAGSAC_THRESHOLD, maxIters=10_000
+    )
+    if np.shape(E) != (3, 3):
+        return None
+    _, R, direction, _ = cv2.recoverPose(E, points0, points1, K, mask=mask)
+    return R, direction.ravel()
+
+
+def _errors(pose: _Pose, T_1_0: np.ndarray) -> tuple[float, float]:
+    if pose is None:
+        return 180.0, 180.0
+    R, direction = pose
+    rotation = np.linalg.norm(rotation_log(R.T @ T_1_0[:3, :3]))
+    cosine = float(direction @ T_1_0[:3, 3]) / np.linalg.norm(T_1_0[:3, 3])
+    return float(np.degrees(rotation)), float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+
+
+def _summary(values: np.ndarray) -> StartScore:
+    rotation, direction, milliseconds = np.median(values, axis=0)
+    return StartScore(float(rotation), float(direction), float(values[:, :2].max(axis=1).mean()), float(milliseconds))
