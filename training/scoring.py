@@ -27,7 +27,7 @@ from sigmaslam.training.validation import held_out_seed
 from sigmaslam.training.verifier import VerifierRows, calibrate, collect_rows, train_verifier
 
 SCORER_NAME, VERIFIER_NAME, CARD_NAME = "scorer.safetensors", "verifier.safetensors", "matching.json"
-_CONFIG_NAME, _CHECKPOINT_NAME = "config.json", "scorer.pt"
+_CONFIG_NAME, _CHECKPOINT_NAME, _SECONDS_NAME = "config.json", "scorer.pt", "seconds.txt"
 _HELD_OUT_SHARE = 0.1
 _SHOW_EVERY = 20
 _CHI_SQUARE_95, _CHI_SQUARE_68 = 5.991464547107979, 2.278868566
@@ -68,7 +68,7 @@ def train_scoring(out: Path, config: ScoringConfig, workers: int) -> dict[str, A
         InputError: the folder holds a run of another configuration, or something else.
     """
     _claim(out, config)
-    began = time.monotonic()
+    clock = _Clock(out / _SECONDS_NAME)
     torch.set_num_threads(1)
     with _progress() as progress:
         folders = [
@@ -78,6 +78,7 @@ def train_scoring(out: Path, config: ScoringConfig, workers: int) -> dict[str, A
                 ("held_out", held_out_seed(config.seed), max(8, round(_HELD_OUT_SHARE * config.pairs))),
             )
         ]
+        clock.seconds()
         sets = [found for record in _records(folders[0]) for found in record.sets.values()]
         task = progress.add_task("training the scorer", total=config.steps, note="")
         scorer = train_scorer(
@@ -87,6 +88,7 @@ def train_scoring(out: Path, config: ScoringConfig, workers: int) -> dict[str, A
             out / _CHECKPOINT_NAME,
             lambda step, note: _show(progress, task, step, note),
         )
+        clock.seconds()
         rows, held_out = (_collect(progress, folder, scorer) for folder in folders)
         task = progress.add_task("training the verifier", total=config.verifier_steps, note="")
         verifier = train_verifier(
@@ -95,11 +97,26 @@ def train_scoring(out: Path, config: ScoringConfig, workers: int) -> dict[str, A
     # Pairs in turn calibrate and measure.
     calibrate(verifier, held_out.select(held_out.pair % 2 == 0))
     metrics = _scorer_metrics(scorer, folders[1]) | _verifier_metrics(verifier, held_out.select(held_out.pair % 2 == 1))
-    card = _make_card(out, config, scorer, verifier, metrics, time.monotonic() - began)
+    card = _make_card(out, config, scorer, verifier, metrics, clock.seconds())
     _save(out / SCORER_NAME, scorer)
     _save(out / VERIFIER_NAME, verifier)
     atomic_write_text(out / CARD_NAME, json.dumps(card, indent=2) + "\n")
     return card
+
+
+class _Clock:
+    """Seconds that a run has taken, over all its parts."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        before = float(path.read_text()) if path.is_file() else 0.0
+        self._began = time.monotonic() - before
+
+    def seconds(self) -> float:
+        """So far; remembered for the next part."""
+        seconds = time.monotonic() - self._began
+        atomic_write_text(self._path, f"{seconds:.1f}\n")
+        return seconds
 
 
 def _claim(out: Path, config: ScoringConfig) -> None:

@@ -25,8 +25,8 @@ _LEARNING_RATE = 3e-3
 _BATCH = 4096
 # Degrees of freedom of Student's t: few near-misses among the right matches must not widen the sigma of all.
 _FREEDOM = 20.0
-# 95 % quantile of chi-square with 2 degrees of freedom.
-_CHI_SQUARE_95 = 5.991464547107979
+# Share of a normal distribution within two standard deviations.
+_WITHIN_2 = 0.9544997361036416
 # Pairs whose images differ by more than a shift are refined by the neighbours' maps alone.
 _SHIFTED = ("stereo", "scenes", "video")
 _MAPPED = ("planes", "turned planes", "scenes", "video")
@@ -143,8 +143,8 @@ def train_verifier(rows: VerifierRows, steps: int, seed: int, note: Callable[[in
 def calibrate(verifier: MatchVerifier, rows: VerifierRows) -> None:
     """Fits the three numbers that turn what it learned into probabilities and sigmas that hold, on held-out pairs.
 
-    Scale and shift of the logit by likelihood (Platt 1999); the scale of sigma such that 95 % of the right matches lie
-    in their 95 % ellipse.
+    Scale and shift of the logit by likelihood (Platt 1999); the scale of sigma such that as many errors of right matches
+    lie within two sigma, along either axis, as of a normal error.
     """
     with torch.no_grad():
         logit, log_sigma = verifier(torch.from_numpy(rows.columns))
@@ -159,8 +159,8 @@ def calibrate(verifier: MatchVerifier, rows: VerifierRows) -> None:
         return loss
 
     optimizer.step(likelihood)
-    square = (torch.from_numpy(rows.error)[right] * torch.exp(-log_sigma[right])).square().sum(dim=1)
+    deviation = (torch.from_numpy(rows.error)[right] * torch.exp(-log_sigma[right])).abs().flatten()
     with torch.no_grad():
         verifier.logit_shift.copy_(scale * verifier.logit_shift + shift)
         verifier.logit_scale.copy_(scale * verifier.logit_scale)
-        verifier.sigma_scale.mul_((torch.quantile(square, 0.95) / _CHI_SQUARE_95).sqrt())
+        verifier.sigma_scale.mul_(torch.quantile(deviation, _WITHIN_2) / 2.0)

@@ -18,7 +18,9 @@ from sigmaslam.evaluation.matching.run import score_refined
 from sigmaslam.evaluation.matching.scores import score_points, summarize
 from sigmaslam.evaluation.matching.sequences import sequence_pairs, sequence_steps
 from sigmaslam.evaluation.matching.sets import ALL, REFINED, SELECTION, STEPS, TRACKS
-from sigmaslam.match import match_images, temperature_of
+from sigmaslam.frontend.judge import MatchJudge
+from sigmaslam.frontend.types import Features
+from sigmaslam.match import match_features
 from sigmaslam.readers import open_sequence
 from sigmaslam.synthetic.textures import dead_leaves
 
@@ -106,7 +108,7 @@ def _warped(image: np.ndarray, degrees: float) -> ImagePair:
 def test_refined_matches_score_higher_than_mutual_neighbours(name: str, image: np.ndarray):
     pairs = [_warped(image, degrees) for degrees in (10.0, 25.0)]
     extractor = load_extractor(name)
-    plain, refined = score_pairs(extractor, pairs), score_refined(extractor, pairs, temperature_of(name))
+    plain, refined = score_pairs(extractor, pairs), score_refined(extractor, pairs)
     assert set(plain) - set(refined) == {"repeatability_1"}
     for column in ("mma_1", "mma_3", "polished_auc_1"):
         assert refined[column] > plain[column], column
@@ -115,18 +117,22 @@ def test_refined_matches_score_higher_than_mutual_neighbours(name: str, image: n
     assert refined["correct_3"] > 0.95 * plain["correct_3"]
 
 
-def test_refined_matches_are_those_of_the_command(image: np.ndarray):
+def test_refined_matches_are_those_of_the_command_for_features_without_scores_and_sigmas(image: np.ndarray):
     pair = _warped(image, 15.0)
-    found = match_images(pair.image0, pair.image1, "sift", 1024)
+    features = []
+    for keypoints, descriptors in map(load_extractor("sift"), (pair.image0, pair.image1)):
+        ones = np.ones(len(keypoints), np.float32)
+        features.append(Features(keypoints, descriptors, ones, ones))
+    found = match_features(MatchJudge(), pair.image0, pair.image1, *features)
     places = (points.astype(np.float64) for points in (found.keypoints0, found.keypoints1))
     expected = summarize([score_points(pair, *places)])
-    assert score_refined(load_extractor("sift"), [pair], temperature_of("sift")) == pytest.approx(expected)
+    assert score_refined(load_extractor("sift"), [pair]) == pytest.approx(expected)
 
 
 def test_refined_matches_of_an_image_without_keypoints_score_zero(image: np.ndarray):
     black = np.zeros_like(image)
     pairs = [ImagePair("", image, black, Homography(np.eye(3)))]
-    found = score_refined(load_extractor("orb"), pairs, temperature_of("orb"))
+    found = score_refined(load_extractor("orb"), pairs)
     assert set(found.values()) == {0.0}
 
 
@@ -193,7 +199,7 @@ def test_sets_of_views_have_a_second_row_with_refined_matches(monkeypatch: pytes
         "sift + sigmaslam match": ["boat"],
         "orb + sigmaslam match": ["boat"],
     }
-    assert found["orb + sigmaslam match"]["boat"] == score_refined(load_extractor("orb"), pairs, temperature_of("orb"))
+    assert found["orb + sigmaslam match"]["boat"] == score_refined(load_extractor("orb"), pairs)
     assert found["orb"]["boat"] == score_pairs(load_extractor("orb"), pairs)
     assert len(notes) == 4
     page = format_scores(found)

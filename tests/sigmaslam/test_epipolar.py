@@ -74,19 +74,22 @@ def errors(found: EpipolarPose, truth: Scene) -> tuple[float, float]:
     return float(np.degrees(between)), float(np.degrees(np.linalg.norm(cv2.Rodrigues(found.R @ truth.R.T)[0])))
 
 
+def standardised(found: EpipolarPose, matches: Scene) -> np.ndarray:
+    """Distances (M,) of points1 from their epipolar lines over the standard deviation of that."""
+    K_inverse = np.linalg.inv(K)
+    F = K_inverse.T @ np.cross(np.eye(3), found.direction) @ found.R @ K_inverse
+    line = np.c_[matches.points0, np.ones(len(matches.points0))] @ F.T
+    sigma = np.sqrt(np.einsum("mi,mij,mj->m", line[:, :2], matches.covariance, line[:, :2]))
+    return np.einsum("mi,mi->m", np.c_[matches.points1, np.ones(len(line))], line) / sigma
+
+
 def standard_deviations(truth: Scene) -> np.ndarray:
     """Of the five degrees of freedom, radians: inverse root of the information of the matches, by differences."""
-    K_inverse = np.linalg.inv(K)
-    rays0, rays1 = (np.c_[points, np.ones(len(points))] @ K_inverse.T for points in (truth.points0, truth.points1))
     tangent = np.linalg.svd(truth.direction[None])[2][1:].T
 
     def distances(step: np.ndarray) -> np.ndarray:
-        R = cv2.Rodrigues(step[:3])[0] @ truth.R
-        t = truth.direction + tangent @ step[3:]
-        F = K_inverse.T @ np.cross(np.eye(3), t) @ R @ K_inverse
-        line = np.c_[truth.points0, np.ones(len(rays0))] @ F.T
-        variance = np.einsum("mi,mij,mj->m", line[:, :2], truth.covariance, line[:, :2])
-        return np.einsum("mi,mi->m", np.c_[truth.points1, np.ones(len(rays1))], line) / np.sqrt(variance)
+        R, direction = cv2.Rodrigues(step[:3])[0] @ truth.R, truth.direction + tangent @ step[3:]
+        return standardised(EpipolarPose(R, direction, np.zeros(0, bool)), truth)
 
     J = np.stack([(distances(1e-5 * e) - distances(-1e-5 * e)) / 2e-5 for e in np.eye(5)], axis=1)
     return np.sqrt(np.diag(np.linalg.inv(J.T @ J)))
@@ -128,25 +131,18 @@ def test_the_pose_is_a_rotation_and_a_unit_vector():
     assert np.linalg.norm(found.direction) == pytest.approx(1.0)
 
 
-def poses_of_plane(exact: Scene) -> list[EpipolarPose]:
-    """The poses that the homography of a plane allows: two of the four have the plane before both cameras."""
-    H = cv2.findHomography(exact.points0, exact.points1, 0)[0]
-    _, rotations, translations, normals = cv2.decomposeHomographyMat(H, K)
-    rays0 = np.c_[exact.points0, np.ones(len(exact.points0))] @ np.linalg.inv(K).T
-    return [
-        EpipolarPose(R, t.ravel() / np.linalg.norm(t), np.ones(len(rays0), bool))
-        for R, t, normal in zip(rotations, translations, normals, strict=True)
-        if (rays0 @ normal > 0).all()
-    ]
-
-
 @pytest.mark.parametrize("translation", [SIDEWAYS, FORWARD], ids=["sideways", "forward"])
-def test_points_of_a_plane_have_one_of_the_poses_that_the_plane_allows(translation: np.ndarray):
-    exact = scene(translation=translation, plane=True)
-    allowed = [replace(exact, R=pose.R, direction=pose.direction) for pose in poses_of_plane(exact)]
-    assert min(errors(exact.estimate(), each)[0] for each in allowed) < 0.01
-    off = [min(errors(noisy(exact, seed).estimate(), each)[0] for each in allowed) for seed in range(10)]
-    assert max(off) < 2.0
+def test_points_of_a_plane_have_a_pose_that_explains_them(translation: np.ndarray):
+    for seed in range(10):
+        disturbed = noisy(scene(translation=translation, plane=True), seed)
+        assert np.sqrt(np.mean(standardised(disturbed.estimate(), disturbed) ** 2)) < 1.1
+
+
+def test_of_the_poses_that_explain_a_plane_the_one_that_has_it_before_both_cameras_is_found():
+    """The other one of this plane, 82 degrees off, has a fifth of it behind them."""
+    exact = scene(plane=True)
+    assert max(errors(exact.estimate(), exact)) < 0.01
+    assert max(errors(noisy(exact, seed).estimate(), exact)[0] for seed in range(10)) < 2.0
 
 
 # Noise
@@ -160,25 +156,25 @@ def test_errors_are_as_large_as_the_information_of_the_matches_allows(translatio
     expected = np.array([np.linalg.norm(sigma[3:]), np.linalg.norm(sigma[:3])])
     assert (off.max(axis=0) < 4.0 * expected).all()
     rms = np.sqrt(np.mean(off**2, axis=0))
-    assert (rms < 1.4 * expected).all()
+    assert (rms < 1.5 * expected).all()
     assert (rms > 0.6 * expected).all()
 
 
 def test_covariances_told_as_they_are_beat_equal_ones():
-    """Half the matches ten times as uncertain, along one direction only."""
+    """Matches as on edges: ten times as uncertain along a direction of their own as across."""
     exact = scene()
-    rng = np.random.default_rng(7)
-    angle = rng.uniform(0.0, np.pi, 300)
-    long = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    spread = np.where(rng.random(300) < 0.5, 3.0, 0.3)
-    covariance = 0.3**2 * np.eye(2) + (spread**2 - 0.3**2)[:, None, None] * long[:, :, None] * long[:, None, :]
+    angle = np.random.default_rng(7).uniform(0.0, np.pi, 300)
+    along = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    covariance = 0.3**2 * np.eye(2) + (3.0**2 - 0.3**2) * along[:, :, None] * along[:, None, :]
+    equal_ones = np.tile(covariance.mean(axis=0), (300, 1, 1))
     told, equal = [], []
     for seed in range(20):
         disturbed = noisy(exact, seed, covariance)
         told.append(errors(disturbed.estimate(), exact)[0])
-        mean = np.tile(0.5 * np.trace(covariance, axis1=1, axis2=2).mean() * np.eye(2), (300, 1, 1))
-        equal.append(errors(replace(disturbed, covariance=mean).estimate(), exact)[0])
-    assert np.median(told) < 0.7 * np.median(equal)
+        equal.append(errors(replace(disturbed, covariance=equal_ones).estimate(), exact)[0])
+    assert np.median(told) < 0.5 * np.median(equal)
+    sigma = standard_deviations(replace(exact, covariance=covariance))
+    assert np.sqrt(np.mean(np.radians(told) ** 2)) < 1.5 * np.linalg.norm(sigma[3:])
 
 
 def test_inliers_are_what_three_standard_deviations_hold():

@@ -1,4 +1,4 @@
-"""Matching of two images: on a known warp, plain and refined, by the command, and what it says to bad input."""
+"""Matching of two images: on a known warp, of any probability, by the command, and what it says to bad input."""
 
 import subprocess
 import sys
@@ -12,19 +12,24 @@ import pytest
 import sigmaslam
 from sigmaslam import Matches, session
 from sigmaslam.errors import InputError
-from sigmaslam.frontend.classical import SiftDetector
+from sigmaslam.frontend.classical import OrbDetector, SiftDetector
+from sigmaslam.frontend.judge import LEAST_LOGIT, MatchJudge
+from sigmaslam.frontend.learned import LearnedDetector
+from sigmaslam.frontend.matching import nearest_anywhere
 from sigmaslam.frontend.types import Features
-from sigmaslam.match import draw_matches, match_features, refine_matches
+from sigmaslam.match import draw_matches, match_features
 from sigmaslam.synthetic.textures import dead_leaves
 
-FIELDS = ("keypoints0", "keypoints1", "probability", "covariance")
-SHAPES_OF_NONE = [(0, 2), (0, 2), (0,), (0, 2, 2)]
+FIELDS = ("keypoints0", "keypoints1", "probability", "covariance", "index0", "index1")
+SHAPES_OF_NONE = [(0, 2), (0, 2), (0,), (0, 2, 2), (0,), (0,)]
+DETECTORS = {"learned": LearnedDetector, "sift": SiftDetector, "orb": OrbDetector}
+Pair = tuple[np.ndarray, np.ndarray]
 # Turns by 12 degrees, enlarges by a tenth and shifts.
 WARP = np.array([[1.076, -0.2287, 40.0], [0.2287, 1.076, -60.0]])
 
 
 @pytest.fixture(scope="module")
-def pair() -> tuple[np.ndarray, np.ndarray]:
+def pair() -> Pair:
     """A textured image and the same through `WARP`, of another size, darker and noisier."""
     image0 = dead_leaves((360, 480), np.random.default_rng(3))
     warped = cv2.warpAffine(image0, WARP, (500, 380), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101)
@@ -44,25 +49,53 @@ def frontend(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture(scope="module")
-def nearest(frontend: str, pair: tuple[np.ndarray, np.ndarray]) -> Matches:
-    """The mutual nearest neighbours."""
-    return sigmaslam.match_images(*pair, frontend=frontend, max_keypoints=600, refine=False)
+def features(frontend: str, pair: Pair) -> tuple[Features, Features]:
+    detect = DETECTORS[frontend](600)
+    return detect(pair[0]), detect(pair[1])
 
 
 @pytest.fixture(scope="module")
-def matches(frontend: str, pair: tuple[np.ndarray, np.ndarray]) -> Matches:
-    """As the command gives them: consistent and aligned."""
+def judge() -> MatchJudge:
+    return MatchJudge()
+
+
+@pytest.fixture(scope="module")
+def everything(frontend: str, pair: Pair) -> Matches:
+    """Matches of any probability."""
+    return sigmaslam.match_images(*pair, frontend=frontend, max_keypoints=600, min_probability=0.0)
+
+
+@pytest.fixture(scope="module")
+def matches(frontend: str, pair: Pair) -> Matches:
+    """As the command gives them: more likely right than wrong."""
     return sigmaslam.match_images(*pair, frontend=frontend, max_keypoints=600)
 
 
-@pytest.fixture(params=[False, True], ids=["nearest", "refined"])
-def either(request: pytest.FixtureRequest, nearest: Matches, matches: Matches) -> Matches:
-    return matches if request.param else nearest
+@pytest.fixture(params=[False, True], ids=["everything", "probable"])
+def either(request: pytest.FixtureRequest, everything: Matches, matches: Matches) -> Matches:
+    return matches if request.param else everything
+
+
+def warped(points: np.ndarray) -> np.ndarray:
+    return np.asarray(points @ WARP[:, :2].T + WARP[:, 2])
 
 
 def errors(matches: Matches) -> np.ndarray:
     """(M, 2) of keypoints1 against the true place of keypoints0."""
-    return np.asarray(matches.keypoints1 - (matches.keypoints0 @ WARP[:, :2].T + WARP[:, 2]))
+    return np.asarray(matches.keypoints1 - warped(matches.keypoints0))
+
+
+def mutual(features: tuple[Features, Features]) -> list[tuple[int, int]]:
+    """Mutual nearest neighbours without equals, in order of image 0."""
+    similarity = features[0].descriptors @ features[1].descriptors.T
+    best = [similarity == similarity.max(axis=axis, keepdims=True, initial=-1.0) for axis in (0, 1)]
+    alone = [each & (each.sum(axis=axis, keepdims=True) == 1) for axis, each in enumerate(best)]
+    rows, columns = np.nonzero(alone[0] & alone[1])
+    return list(zip(rows.tolist(), columns.tolist(), strict=True))
+
+
+def pairs(matches: Matches) -> list[tuple[int, int]]:
+    return list(zip(matches.index0.tolist(), matches.index1.tolist(), strict=True))
 
 
 def empty() -> Matches:
@@ -82,16 +115,14 @@ def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
 # What is found
 
 
-def test_the_most_probable_neighbours_are_right(nearest: Matches):
-    distance = np.linalg.norm(errors(nearest), axis=1)
+def test_the_most_probable_matches_are_right(everything: Matches):
+    distance = np.linalg.norm(errors(everything), axis=1)
     assert len(distance) > 100
-    # ORB's coarse octaves have pixels of up to 3.6, which its covariance says.
-    limit = np.maximum(2.0, 3.0 * np.sqrt(nearest.covariance[:, 0, 0]))
-    assert (distance < limit)[: len(distance) // 4].mean() > 0.9
+    assert (distance < 2.0)[: len(distance) // 4].mean() > 0.9
 
 
-def test_the_more_probable_half_of_the_neighbours_is_more_precise(nearest: Matches):
-    right = np.linalg.norm(errors(nearest), axis=1) < 3.0
+def test_the_more_probable_half_of_the_matches_is_more_often_right(everything: Matches):
+    right = np.linalg.norm(errors(everything), axis=1) < 3.0
     half = len(right) // 2
     assert right[:half].mean() >= right[half:].mean()
 
@@ -99,56 +130,65 @@ def test_the_more_probable_half_of_the_neighbours_is_more_precise(nearest: Match
 def test_probabilities_are_sorted_and_matches_one_to_one(either: Matches):
     assert ((either.probability > 0) & (either.probability <= 1)).all()
     assert (np.diff(either.probability) <= 0).all()
+    for index in (either.index0, either.index1):
+        assert len(np.unique(index)) == len(index)
     for keypoints in (either.keypoints0, either.keypoints1):
         assert len(np.unique(keypoints, axis=0)) == len(keypoints)
 
 
-def test_every_field_is_float32_of_its_shape(either: Matches):
+def test_every_field_is_of_its_type_and_shape(either: Matches):
     count = len(either.probability)
-    shapes = [(count, 2), (count, 2), (count,), (count, 2, 2)]
-    for name, shape in zip(FIELDS, shapes, strict=True):
-        assert getattr(either, name).dtype == np.float32
+    shapes = [(count, 2), (count, 2), (count,), (count, 2, 2), (count,), (count,)]
+    types = [np.float32] * 4 + [np.int64] * 2
+    for name, shape, kind in zip(FIELDS, shapes, types, strict=True):
+        assert getattr(either, name).dtype == kind
         assert getattr(either, name).shape == shape
 
 
 def test_covariances_are_positive_and_not_too_sure_of_right_matches(either: Matches):
-    np.testing.assert_array_equal(either.covariance, either.covariance.transpose(0, 2, 1))
+    # Symmetric but for the rounding of float32.
+    asymmetry = np.abs(either.covariance[:, 0, 1] - either.covariance[:, 1, 0])
+    assert (asymmetry <= 1e-6 * np.trace(either.covariance, axis1=1, axis2=2)).all()
     assert (np.linalg.eigvalsh(either.covariance) > 0).all()
     error = errors(either)
     right = np.linalg.norm(error, axis=1) < 3.0
     squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(either.covariance), error)
-    # 1.39 for a normal law. So clean a warp stays below: sigma of SIFT and ORB is a rule of thumb for photographs.
+    # 1.39 for a normal law.
     assert np.median(squared[right]) < 2.5
 
 
-def test_probability_is_the_product_of_the_two_softmaxes():
-    rng = np.random.default_rng(0)
-    features = []
-    for count in (30, 40):
-        descriptors = rng.standard_normal((count, 8)).astype(np.float32)
-        descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
-        places = rng.uniform(0, 99, (count, 2)).astype(np.float32)
-        features.append(Features(places, descriptors, np.ones(count, np.float32), np.full(count, 0.5, np.float32)))
-    found = match_features(*features, inverse_temperature=7.0)
-    similarity = features[0].descriptors @ features[1].descriptors.T
-    expected = {}
-    for i, row in enumerate(similarity):
-        j = int(row.argmax())
-        if similarity[:, j].argmax() == i:
-            forward = np.exp(7.0 * row[j]) / np.exp(7.0 * row).sum()
-            backward = np.exp(7.0 * row[j]) / np.exp(7.0 * similarity[:, j]).sum()
-            expected[tuple(features[0].keypoints[i])] = forward * backward
-    assert len(expected) == len(found.probability) > 5
-    wanted = [expected[tuple(place)] for place in found.keypoints0]
-    np.testing.assert_allclose(found.probability, wanted, rtol=1e-5)
-    np.testing.assert_allclose(found.covariance, np.tile(0.5 * np.eye(2), (len(wanted), 1, 1)))
+def test_of_any_probability_all_mutual_neighbours_are_matches_but_hopeless_ones(
+    judge: MatchJudge, features: tuple[Features, Features], everything: Matches
+):
+    found, expected = set(pairs(everything)), set(mutual(features))
+    assert found <= expected
+    putative = nearest_anywhere(features[0].descriptors, features[1].descriptors)
+    hopeless = judge.score(putative, *features) <= LEAST_LOGIT
+    index = zip(putative.index0[hopeless].tolist(), putative.index1[hopeless].tolist(), strict=True)
+    assert expected - found == expected & set(index)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+def test_of_a_least_probability_the_matches_are_the_first_of_all(
+    judge: MatchJudge, pair: Pair, features: tuple[Features, Features], everything: Matches, share: float
+):
+    least = float(np.quantile(everything.probability, share))
+    found = match_features(judge, *pair, *features, min_probability=least)
+    expected = everything.select(everything.probability >= least)
+    assert 0 < len(found.probability) < len(everything.probability)
+    for name in FIELDS:
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
 
 
 # What refinement makes of it
 
 
-def test_refined_matches_are_more_exact_and_more_often_right(nearest: Matches, matches: Matches):
-    before, after = (np.linalg.norm(errors(found), axis=1) for found in (nearest, matches))
+def test_matches_are_more_exact_and_more_often_right_than_mutual_neighbours(
+    features: tuple[Features, Features], matches: Matches
+):
+    index0, index1 = np.array(mutual(features)).T
+    before = np.linalg.norm(features[1].keypoints[index1] - warped(features[0].keypoints[index0]), axis=1)
+    after = np.linalg.norm(errors(matches), axis=1)
     assert np.median(after) < np.median(before)
     assert np.median(after) < 0.1
     assert (after < 1.0).mean() > (before < 1.0).mean()
@@ -156,93 +196,103 @@ def test_refined_matches_are_more_exact_and_more_often_right(nearest: Matches, m
     assert (after < 1.0).sum() > 0.98 * (before < 1.0).sum()
 
 
-def test_refinement_drops_and_moves_and_changes_nothing_else(nearest: Matches, matches: Matches):
-    row_of = {tuple(place): row for row, place in enumerate(nearest.keypoints0)}
-    rows = np.array([row_of[tuple(place)] for place in matches.keypoints0])
-    # In their order.
-    assert (np.diff(rows) > 0).all()
-    np.testing.assert_array_equal(matches.probability, nearest.probability[rows])
-    shift = np.linalg.norm(matches.keypoints1 - nearest.keypoints1[rows], axis=1)
+def test_refinement_moves_places_a_little_and_changes_nothing_else(
+    features: tuple[Features, Features], either: Matches
+):
+    np.testing.assert_array_equal(either.keypoints0, features[0].keypoints[either.index0])
+    shift = np.linalg.norm(either.keypoints1 - features[1].keypoints[either.index1], axis=1)
     # Three pixels of the coarser image, of which two are 2 half octaves apart at most here.
     assert shift.max() < 6.0
-    expected = np.tile(0.09 * np.eye(2, dtype=np.float32), (len(rows), 1, 1))
-    np.testing.assert_allclose(matches.covariance, expected, rtol=1e-6)
 
 
-def test_matches_whose_patches_do_not_fit_are_dropped(pair: tuple[np.ndarray, np.ndarray], matches: Matches):
-    """Half of the second image is repainted: hardly a match is left there."""
+def test_matches_whose_patches_do_not_fit_are_less_probable_and_less_exact(
+    judge: MatchJudge, pair: Pair, features: tuple[Features, Features], everything: Matches
+):
+    """Half of the second image is repainted, the features stay where they are, which is right to a few pixels."""
     image0, image1 = pair
+    middle = image1.shape[1] // 2
     repainted = image1.copy()
-    repainted[:, : image1.shape[1] // 2] = np.random.default_rng(0).integers(0, 255, repainted.shape, np.uint8)[
-        :, : image1.shape[1] // 2
-    ]
-    left = matches.keypoints1[:, 0] < image1.shape[1] / 2 - 16
-    right = matches.keypoints1[:, 0] > image1.shape[1] / 2 + 16
-    again = refine_matches(image0, repainted, matches)
-    kept = {tuple(place) for place in again.keypoints0}
-    survived = np.array([tuple(place) in kept for place in matches.keypoints0])
-    assert survived[left].mean() < 0.1
-    assert survived[right].mean() > 0.95
+    repainted[:, :middle] = np.random.default_rng(0).integers(0, 255, repainted.shape, np.uint8)[:, :middle]
+    found = match_features(judge, image0, repainted, *features, min_probability=0.0)
+    row_of = {each: row for row, each in enumerate(pairs(found))}
+    again = found.select(np.array([row_of[each] for each in pairs(everything)]))
+    u = features[1].keypoints[everything.index1, 0]
+    probable = everything.probability > 0.5
+    left, right = probable & (u < middle - 16), probable & (u > middle + 16)
+    area, area_again = (np.linalg.det(each.covariance[left]) for each in (everything, again))
+    assert (again.probability < everything.probability)[left].mean() > 0.95
+    assert (area_again > area).mean() > 0.95
+    assert np.median(area_again / area) > 100.0
+    np.testing.assert_array_equal(again.probability[right], everything.probability[right])
+    np.testing.assert_array_equal(again.covariance[right], everything.covariance[right])
 
 
-def test_without_refinement_every_mutual_nearest_neighbour_is_a_match(pair: tuple[np.ndarray, np.ndarray]):
-    features0, features1 = (SiftDetector(600)(image) for image in pair)
-    found = sigmaslam.match_images(*pair, "sift", 600, refine=False)
-    similarity = features0.descriptors @ features1.descriptors.T
-    best = similarity.argmax(axis=1)
-    mutual = np.flatnonzero(similarity.argmax(axis=0)[best] == np.arange(len(best)))
-    expected = {(*features0.keypoints[i], *features1.keypoints[best[i]]) for i in mutual}
-    assert {(*a, *b) for a, b in zip(found.keypoints0, found.keypoints1, strict=True)} == expected
+def alike(keypoints0: np.ndarray, keypoints1: np.ndarray) -> tuple[Features, Features]:
+    """Features (N, 2) and (N, 2) of which number i is like number i alone, noise apart."""
+    rng = np.random.default_rng(7)
+    count = len(keypoints0)
+    descriptors = rng.standard_normal((count, 64)) + 0.2 * rng.standard_normal((2, count, 64))
+    descriptors /= np.linalg.norm(descriptors, axis=2, keepdims=True)
+    first, second = (
+        Features(
+            points.astype(np.float32),
+            values.astype(np.float32),
+            np.linspace(1.0, 0.5, count, dtype=np.float32),
+            np.full(count, 0.5, np.float32),
+        )
+        for points, values in zip((keypoints0, keypoints1), descriptors, strict=True)
+    )
+    return first, second
 
 
-def test_wrong_matches_among_right_ones_are_dropped(pair: tuple[np.ndarray, np.ndarray]):
+def test_wrong_matches_among_right_ones_are_dropped(judge: MatchJudge, pair: Pair):
     rng = np.random.default_rng(6)
-    keypoints0 = rng.uniform((120, 80), (400, 300), (400, 2)).astype(np.float32)
-    keypoints1 = (keypoints0 @ WARP[:, :2].T + WARP[:, 2]).astype(np.float32)
+    keypoints0 = rng.uniform((120, 80), (400, 300), (400, 2))
+    keypoints1 = warped(keypoints0)
     wrong = rng.random(400) < 0.3
     keypoints1[wrong] = rng.uniform((20, 20), (480, 360), (int(wrong.sum()), 2))
-    probability = np.where(wrong, 0.3, 0.7).astype(np.float32)
-    given = Matches(keypoints0, keypoints1, probability, np.tile(np.eye(2, dtype=np.float32), (400, 1, 1)))
-    kept = {tuple(place) for place in refine_matches(*pair, given).keypoints0}
-    found = np.array([tuple(place) in kept for place in keypoints0])
+    found = np.isin(np.arange(400), match_features(judge, *pair, *alike(keypoints0, keypoints1)).index0)
     assert found[~wrong].mean() > 0.97
     assert found[wrong].mean() < 0.1
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])
-def test_fewer_than_four_matches_cannot_be_refined(pair: tuple[np.ndarray, np.ndarray], count: int):
-    """No neighbours say that they are right: none is left."""
-    places = np.random.default_rng(0).uniform(100, 300, (count, 2)).astype(np.float32)
-    given = Matches(places, places, np.ones(count, np.float32), np.tile(np.eye(2, dtype=np.float32), (count, 1, 1)))
-    found = refine_matches(*pair, given)
-    assert [getattr(found, name).shape for name in FIELDS] == SHAPES_OF_NONE
+def test_fewer_than_four_matches_stay_where_they_are(judge: MatchJudge, pair: Pair, count: int):
+    """No neighbours say how their patches are turned."""
+    places = np.random.default_rng(0).uniform(150, 300, (count, 2))
+    features = alike(places, warped(places) + 0.5)
+    found = match_features(judge, *pair, *features, min_probability=0.0)
+    assert [getattr(found, name).shape[1:] for name in FIELDS] == [shape[1:] for shape in SHAPES_OF_NONE]
+    assert set(pairs(found)) <= set(mutual(features))
+    np.testing.assert_array_equal(found.keypoints1, features[1].keypoints[found.index1])
 
 
-def test_refinement_leaves_its_input(nearest: Matches, pair: tuple[np.ndarray, np.ndarray]):
-    before = [getattr(nearest, name).copy() for name in FIELDS]
-    refine_matches(*pair, nearest)
-    for name, copy in zip(FIELDS, before, strict=True):
-        np.testing.assert_array_equal(getattr(nearest, name), copy)
+def test_matching_leaves_its_input(judge: MatchJudge, pair: Pair, features: tuple[Features, Features]):
+    given = [*pair, *(getattr(each, name) for each in features for name in ("keypoints", "descriptors", "sigma"))]
+    before = [array.copy() for array in given]
+    match_features(judge, *pair, *features)
+    for array, copy in zip(given, before, strict=True):
+        np.testing.assert_array_equal(array, copy)
 
 
 # Odd input
 
 
-@pytest.mark.parametrize("refine", [True, False])
+@pytest.mark.parametrize("least", [0.0, 0.5])
 @pytest.mark.parametrize("name", ["sift", "orb"])
-def test_a_black_image_has_no_matches(pair: tuple[np.ndarray, np.ndarray], name: str, refine: bool):
-    found = sigmaslam.match_images(pair[0], np.zeros((100, 120), np.uint8), name, refine=refine)
+def test_a_black_image_has_no_matches(pair: Pair, name: str, least: float):
+    found = sigmaslam.match_images(pair[0], np.zeros((100, 120), np.uint8), name, min_probability=least)
     assert [getattr(found, name).shape for name in FIELDS] == SHAPES_OF_NONE
 
 
-def test_the_picture_shows_both_images_whatever_their_sizes(pair: tuple[np.ndarray, np.ndarray]):
+def test_the_picture_shows_both_images_whatever_their_sizes(pair: Pair):
     image0, image1 = pair
     plain = draw_matches(image0, image1, empty())
     np.testing.assert_array_equal(plain[:360, :480], np.repeat(image0[..., None], 3, axis=2))
     np.testing.assert_array_equal(plain[:380, 480:], np.repeat(image1[..., None], 3, axis=2))
-    one = Matches(
-        np.full((1, 2), 50, np.float32), np.full((1, 2), 60, np.float32), np.ones(1), np.eye(2, dtype=np.float32)[None]
-    )
+    places = np.full((1, 2), 50, np.float32), np.full((1, 2), 60, np.float32)
+    index = np.zeros(1, np.int64)
+    one = Matches(*places, np.ones(1), np.eye(2, dtype=np.float32)[None], index, index)
     blue, green, red = draw_matches(image0, image1, one)[52, 150].astype(int)
     assert min(green, red) > blue + 50  # yellow: certain
 
@@ -250,16 +300,14 @@ def test_the_picture_shows_both_images_whatever_their_sizes(pair: tuple[np.ndarr
 # The command
 
 
-@pytest.mark.parametrize("option", [[], ["--refine"], ["--no-refine"]], ids=lambda option: "".join(option) or "default")
-def test_the_command_writes_what_the_library_finds(
-    pair: tuple[np.ndarray, np.ndarray], tmp_path: Path, option: list[str]
-):
+@pytest.mark.parametrize(("option", "least"), [([], 0.5), (["--min-probability", "0"], 0.0)], ids=["default", "any"])
+def test_the_command_writes_what_the_library_finds(pair: Pair, tmp_path: Path, option: list[str], least: float):
     files = [write(tmp_path / name, image) for name, image in zip(("a.png", "b.pgm"), pair, strict=True)]
     out, picture = tmp_path / "matches.npz", tmp_path / "matches.png"
     options = ("--frontend", "sift", "--max-keypoints", "300", "--picture", picture)
     result = run(*files, "--out", out, *options, *option)
     assert result.returncode == 0, result.stderr
-    expected = sigmaslam.match_images(*pair, "sift", 300, refine=option != ["--no-refine"])
+    expected = sigmaslam.match_images(*pair, "sift", 300, least)
     with np.load(out) as archive:
         assert sorted(archive.files) == sorted(FIELDS)
         for name in FIELDS:
@@ -282,7 +330,7 @@ def test_no_matches_are_no_error(tmp_path: Path):
 
 
 @pytest.mark.parametrize("kind", ["colour", "alpha", "16-bit"])
-def test_colours_and_depths_match_as_their_grey_image(pair: tuple[np.ndarray, np.ndarray], tmp_path: Path, kind: str):
+def test_colours_and_depths_match_as_their_grey_image(pair: Pair, tmp_path: Path, kind: str):
     grey = pair[0]
     stored = {
         "colour": cv2.merge([grey] * 3),
@@ -290,12 +338,15 @@ def test_colours_and_depths_match_as_their_grey_image(pair: tuple[np.ndarray, np
         "16-bit": grey.astype(np.uint16) * 257,
     }[kind]
     files = write(tmp_path / "a.png", grey), write(tmp_path / "b.png", stored)
-    result = run(*files, "--out", tmp_path / "m.npz", "--frontend", "sift", "--no-refine")
+    result = run(*files, "--out", tmp_path / "m.npz", "--frontend", "sift", "--min-probability", "0")
     assert result.returncode == 0, result.stderr
     assert result.stderr == ""
+    expected = sigmaslam.match_images(grey, grey, "sift", min_probability=0.0)
     with np.load(tmp_path / "m.npz") as archive:
         assert len(archive["probability"]) > 100
-        np.testing.assert_array_equal(archive["keypoints0"], archive["keypoints1"])
+        np.testing.assert_array_equal(archive["index0"], archive["index1"])
+        for name in FIELDS:
+            np.testing.assert_array_equal(archive[name], getattr(expected, name))
 
 
 @pytest.mark.parametrize(
@@ -312,6 +363,7 @@ def test_colours_and_depths_match_as_their_grey_image(pair: tuple[np.ndarray, np
         (["a.png", "b.png", "--out", "m.npz", "--picture", "m.jpg"], ["--picture", "m.jpg", ".png"]),
         (["a.png", "b.png", "--out", "m.npz", "--picture", "b.png"], ["--picture", "b.png", "overwrite"]),
         (["a.png", "b.png", "--out", "m.npz", "--max-keypoints", "3"], ["--max-keypoints", "3", "at least 4"]),
+        (["a.png", "b.png", "--out", "m.npz", "--min-probability", "1.1"], ["--min-probability", "less"]),
         (["a.png", "b.png", "--out", "m.npz", "--frontend", "klt"], ["klt", "learned", "sift", "orb"]),
     ],
     ids=lambda value: " ".join(value[-2:]),
@@ -333,13 +385,16 @@ def test_bad_input_is_refused_with_its_name(
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def test_the_library_refuses_what_it_cannot_match(pair: tuple[np.ndarray, np.ndarray]):
+def test_the_library_refuses_what_it_cannot_match(pair: Pair):
     with pytest.raises(InputError, match=r"image1 is float64 of shape \(380, 500\)"):
         sigmaslam.match_images(pair[0], pair[1].astype(float), "sift")
     with pytest.raises(InputError, match=r"image0 is uint8 of shape \(9, 9, 3\)"):
         sigmaslam.match_images(np.zeros((9, 9, 3), np.uint8), pair[1], "sift")
     with pytest.raises(InputError, match=r"surf.*learned, sift, orb"):
         sigmaslam.match_images(*pair, "surf")
+    for least in (-0.1, 1.1, np.nan):
+        with pytest.raises(InputError, match=rf"--min-probability is {least}"):
+            sigmaslam.match_images(*pair, "sift", min_probability=least)
 
 
 def test_the_help_names_files_and_options():
@@ -351,7 +406,7 @@ def test_the_help_names_files_and_options():
         "--out",
         "--frontend",
         "--max-keypoints",
-        "--no-refine",
+        "--min-probability",
         "--picture",
         "keypoints0",
     ):

@@ -46,7 +46,7 @@ def test_no_two_pairs_and_no_two_scenes_share_their_random_numbers(monkeypatch: 
     monkeypatch.setattr(np.random, "default_rng", lambda name=None: named.append(name) or default_rng(name))
     monkeypatch.setattr(ScenePairs, "_views", lambda self, scene: [None] * 4)
     monkeypatch.setattr(ScenePairs, "_shared", lambda self, a, b: 1.0)
-    monkeypatch.setattr(ScenePairs, "_photograph", lambda self, views, rng: None)
+    monkeypatch.setattr(ScenePairs, "_photograph", lambda self, views, rng, sensor: None)
     for seed in range(3):
         for index in range(40):
             stream(seed).pair(index)
@@ -84,6 +84,18 @@ def test_points_move_to_where_the_same_thing_is_seen(monkeypatch: pytest.MonkeyP
     assert len(correlations) >= 3
     assert np.median(correlations) > 0.9
     assert hidden > 50
+
+
+def test_eyes_of_a_stereo_pair_see_the_same_on_one_row_the_right_one_further_left() -> None:
+    pairs = ScenePairs(3, 96, ("small",), stereo=True)
+    for index in range(4):
+        v, u = np.mgrid[8:88:4, 8:88:4]
+        points = np.stack([u.ravel(), v.ravel()], axis=-1).astype(float)
+        places, visible = pairs.pair(index).transfer(points)
+        assert visible.sum() > 100
+        shift = (places - points)[visible]
+        np.testing.assert_allclose(shift[:, 1], 0.0, atol=1e-3)
+        assert shift[:, 0].max() < 0.0
 
 
 def test_an_unknown_domain_is_refused() -> None:
