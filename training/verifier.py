@@ -141,7 +141,7 @@ def train_verifier(rows: VerifierRows, steps: int, seed: int, note: Callable[[in
 
 
 def calibrate(verifier: MatchVerifier, rows: VerifierRows) -> None:
-    """Fits the three numbers that turn what it learned into probabilities and sigmas that hold, on held-out pairs.
+    """Fits the numbers that turn what it learned into probabilities and sigmas that hold, on held-out pairs.
 
     Scale and shift of the logit by likelihood (Platt 1999); the scale of sigma such that as many errors of right matches
     lie within two sigma, along either axis, as of a normal error.
