@@ -12,13 +12,18 @@ def auroc(score: np.ndarray, right: np.ndarray) -> float:
 
     NaN unless there are both.
     """
-    _, group, counts = np.unique(score, return_inverse=True, return_counts=True)
-    rank = (np.cumsum(counts) - 0.5 * (counts - 1))[group]
+    rank = _mean_ranks(score)
     count = int(right.sum())
     others = len(right) - count
     if count == 0 or others == 0:
         return float("nan")
     return float((rank[right].sum() - 0.5 * count * (count + 1)) / (count * others))
+
+
+def _mean_ranks(values: np.ndarray) -> np.ndarray:
+    """Ranks from 1, ties sharing their mean."""
+    _, group, counts = np.unique(values, return_inverse=True, return_counts=True)
+    return np.asarray((np.cumsum(counts) - 0.5 * (counts - 1))[group])
 
 
 def average_precision(score: np.ndarray, right: np.ndarray) -> float:
@@ -29,9 +34,11 @@ def average_precision(score: np.ndarray, right: np.ndarray) -> float:
 
 
 def spearman(a: np.ndarray, b: np.ndarray) -> float:
-    """Rank correlation of two (M,)."""
-    ranks = [np.argsort(np.argsort(values, kind="stable"), kind="stable") for values in (a, b)]
-    return float(np.corrcoef(ranks[0], ranks[1])[0, 1]) if len(a) > 1 else float("nan")
+    """Rank correlation of two (M,); NaN where one of them is the same throughout."""
+    ranks0, ranks1 = _mean_ranks(a), _mean_ranks(b)
+    if len(a) < 2 or np.ptp(ranks0) == 0 or np.ptp(ranks1) == 0:
+        return float("nan")
+    return float(np.corrcoef(ranks0, ranks1)[0, 1])
 
 
 def best_half(sigma: np.ndarray, error: np.ndarray) -> float:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import wait
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import numpy as np
@@ -188,13 +189,18 @@ def write_records(folder: Path, seed: int, pairs: int, workers: int) -> Iterator
             process.start()
         while alive := [process.sentinel for process in processes if process.is_alive()]:
             wait(alive, _POLL)
+            _check_alive(processes, folder)
             yield sum(record_path(folder, index).is_file() for index in range(pairs))
-            if any(process.exitcode for process in processes):
-                raise SigmaSlamError(f"a process that makes pairs in {folder} died: run the same command again")
+        _check_alive(processes, folder)
     finally:
         for process in processes:
             process.terminate()
     yield pairs
+
+
+def _check_alive(processes: Sequence[BaseProcess], folder: Path) -> None:
+    if any(process.exitcode for process in processes):
+        raise SigmaSlamError(f"a process that makes pairs in {folder} died: run the same command again")
 
 
 def record_path(folder: Path, index: int) -> Path:

@@ -14,6 +14,8 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 from sigmaslam.files import atomic_path
 from sigmaslam.frontend.scorer import NEIGHBOURS, nearest_matches, side_information
 from sigmaslam.models.scorer import SIDE_CHANNELS, MatchScorer
+from sigmaslam.training.devices import Workplace
+from sigmaslam.training.interruption import Interruption
 from sigmaslam.training.match_sets import MatchSet
 
 RIGHT = 3.0
@@ -111,7 +113,7 @@ def score_set(scorer: MatchScorer, found: MatchSet) -> np.ndarray:
 def train_scorer(
     sets: Sequence[MatchSet], steps: int, seed: int, checkpoint: Path, note: Callable[[int, str], None]
 ) -> MatchScorer:
-    """Trains from random weights, or goes on from the checkpoint, which is removed by whoever has what came of it.
+    """Trains from random weights, or goes on from the checkpoint.
 
     Args:
         sets: to learn from.
@@ -127,9 +129,8 @@ def train_scorer(
     optimizer = torch.optim.AdamW(scorer.parameters(), LEARNING_RATE, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, LEARNING_RATE, total_steps=steps, pct_start=0.05)
     done = 0
-    state: dict[str, Any]
     if checkpoint.is_file():
-        state = torch.load(checkpoint, weights_only=True)
+        state: dict[str, Any] = torch.load(checkpoint, weights_only=True)
         done = state["step"]
         scorer.load_state_dict(state["scorer"])
         optimizer.load_state_dict(state["optimizer"])
@@ -137,26 +138,35 @@ def train_scorer(
     order = _endless_order(len(sets), seed)
     for _ in range(done * SETS_A_STEP):
         next(order)
-    for step in range(done, steps):
-        rng = np.random.default_rng((seed, 4, step))
-        *inputs, weight, error = collate([vary_sample(sets[next(order)], rng) for _ in range(SETS_A_STEP)])
-        scorer.train()
-        loss = scorer_loss(scorer(*inputs, weight), weight, error)
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        nn.utils.clip_grad_norm_(scorer.parameters(), 1.0)
-        optimizer.step()
-        schedule.step()
-        note(step + 1, f"loss {float(loss.detach()):.3f}")
-        if (step + 1) % _SAVE_EVERY == 0 or step + 1 == steps:
-            state = {
-                "step": step + 1,
-                "scorer": scorer.state_dict(),
-                "optimizer": optimizer.state_dict(),
-                "schedule": schedule.state_dict(),
-            }
-            with atomic_path(checkpoint) as path:
-                torch.save(state, path)
+
+    def save(step: int) -> None:
+        parts = {"scorer": scorer.state_dict(), "optimizer": optimizer.state_dict(), "schedule": schedule.state_dict()}
+        with atomic_path(checkpoint) as path:
+            torch.save({"step": step, **parts}, path)
+
+    interruption = Interruption(Workplace(torch.device("cpu")))
+    step = done
+    with interruption.listening():
+        try:
+            while step < steps:
+                with interruption.whole_step():
+                    rng = np.random.default_rng((seed, 4, step))
+                    *inputs, weight, error = collate([vary_sample(sets[next(order)], rng) for _ in range(SETS_A_STEP)])
+                    scorer.train()
+                    loss = scorer_loss(scorer(*inputs, weight), weight, error)
+                    optimizer.zero_grad(set_to_none=True)
+                    loss.backward()
+                    nn.utils.clip_grad_norm_(scorer.parameters(), 1.0)
+                    optimizer.step()
+                    schedule.step()
+                    step += 1
+                note(step, f"loss {float(loss.detach()):.3f}")
+                if step % _SAVE_EVERY == 0 or step == steps:
+                    save(step)
+        except KeyboardInterrupt:
+            if not interruption.torn and step > done:
+                save(step)
+            raise
     return scorer.eval()
 
 

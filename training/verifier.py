@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
+from sigmaslam.errors import SigmaSlamError
 from sigmaslam.frontend.affine import refine_by_neighbours
 from sigmaslam.frontend.evidence import examine_patches
 from sigmaslam.frontend.judge import LEAST_LOGIT
@@ -74,6 +75,8 @@ def collect_rows(records: Iterable[PairRecord], scorer: MatchScorer, note: Calla
                 if found.source in sources and kept.any():
                     parts.append(_rows_of(record, found, logit, kept, mapped, number))
         note(number + 1)
+    if not parts:
+        raise SigmaSlamError("the scorer finds no match likely in any pair: train it longer, or on more pairs")
     columns, error, pair = (np.concatenate([part[k] for part in parts]) for k in range(3))
     return VerifierRows(columns, error, pair)
 
@@ -143,14 +146,14 @@ def train_verifier(rows: VerifierRows, steps: int, seed: int, note: Callable[[in
 def calibrate(verifier: MatchVerifier, rows: VerifierRows) -> None:
     """Fits the numbers that turn what it learned into probabilities and sigmas that hold, on held-out pairs.
 
-    Scale and shift of the logit by likelihood (Platt 1999); the scale of sigma such that as many errors of right matches
+    """Fits the numbers that turn what was learned into probabilities and sigmas that hold, on held-out pairs.
     lie within two sigma, along either axis, as of a normal error.
     """
     with torch.no_grad():
         logit, log_sigma = verifier(torch.from_numpy(rows.columns))
     right = torch.from_numpy(rows.right)
     scale, shift = torch.ones((), requires_grad=True), torch.zeros((), requires_grad=True)
-    optimizer = torch.optim.LBFGS([scale, shift], max_iter=50)
+    optimizer = torch.optim.LBFGS([scale, shift], max_iter=100, line_search_fn="strong_wolfe")
 
     def likelihood() -> Tensor:
         optimizer.zero_grad()

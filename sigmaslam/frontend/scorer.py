@@ -73,9 +73,6 @@ def nearest_matches(points0: np.ndarray, mutual: np.ndarray) -> np.ndarray:
 
 
 def _rank(values: np.ndarray) -> np.ndarray:
-    """Share of the others below each; 0.5 for all where all are the same."""
-    if len(values) == 0 or values.min() == values.max():
-        return np.full(len(values), 0.5)
-    rank = np.empty(len(values))
-    rank[np.argsort(values, kind="stable")] = (np.arange(len(values)) + 0.5) / len(values)
-    return rank
+    """Share of the others below each, equal ones counting half."""
+    _, group, counts = np.unique(values, return_inverse=True, return_counts=True)
+    return np.asarray((np.cumsum(counts) - 0.5 * counts)[group] / max(len(values), 1))

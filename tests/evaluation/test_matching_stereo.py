@@ -96,11 +96,13 @@ def test_steps_without_features_are_not_good(texture: np.ndarray):
     def blind(_: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros((0, 2), np.float32), np.zeros((0, 16), np.float32)
 
-    assert score_steps(blind, [step]) == {"steps_good": 0.0, "steps": 1.0, "pnp_inliers": 0.0}
+    for judged in (False, True):
+        assert score_steps(blind, [step], judged) == {"steps_good": 0.0, "steps": 1.0, "pnp_inliers": 0.0}
 
 
+@pytest.mark.parametrize("judged", [False, True], ids=["mutual", "judged"])
 @pytest.mark.parametrize("name", ["sift", "orb"])
-def test_steps_of_the_rendered_sequence_are_found(demo_sequence: Path, name: str):
+def test_steps_of_the_rendered_sequence_are_found(demo_sequence: Path, name: str, judged: bool):
     steps = sequence_steps(open_sequence(demo_sequence), demo_sequence / "poses.txt")[:6]
     calls = []
     extract = load_extractor(name)
@@ -109,7 +111,7 @@ def test_steps_of_the_rendered_sequence_are_found(demo_sequence: Path, name: str
         calls.append(image)
         return extract(image)
 
-    found = score_steps(counting, steps)
+    found = score_steps(counting, steps, judged)
     assert found["steps_good"] == found["steps"] == 6.0
     assert found["pnp_inliers"] > 50
     # Seven left and six right images, each once.

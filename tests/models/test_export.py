@@ -1,3 +1,5 @@
+import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -7,10 +9,19 @@ from safetensors.torch import save_file
 
 from sigmaslam.errors import InputError
 from sigmaslam.models import export
-from sigmaslam.models.export import export_features, export_filter, load_network
+from sigmaslam.models.export import (
+    export_features,
+    export_filter,
+    export_scoring,
+    load_network,
+    load_scorer,
+    load_verifier,
+)
 from sigmaslam.models.extractor import FeatureExtractor
 from sigmaslam.models.network import FeatureNetwork
-from sigmaslam.models.torch_runtime import TorchFeatures, filter_module
+from sigmaslam.models.scorer import MatchScorer
+from sigmaslam.models.torch_runtime import TorchFeatures, filter_module, scoring_module
+from sigmaslam.models.verifier import MatchVerifier
 from sigmaslam.session import OnnxGraph, shipped_weights
 from sigmaslam.synthetic.textures import dead_leaves
 
@@ -100,6 +111,41 @@ def assert_filter_graphs_equal_torch(folder: Path, names: tuple[str, ...] = FILT
                 np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9, err_msg=name)
 
 
+@pytest.mark.parametrize("name", ["scorer", "verifier"])
+def test_shipped_scorer_and_verifier_equal_torch(name):
+    """On numbers of matches that the export neither traced (300) nor checked (77)."""
+    graph, twin = OnnxGraph(shipped(f"{name}.onnx")), scoring_module(name)
+    shipped(f"{name}.safetensors")
+    inputs = export._scoring_graphs(MatchScorer(), MatchVerifier())[name].inputs
+    example = {"scorer": export._matches_example, "verifier": export._columns_example}[name]
+    for seed, count in ((5, 1), (6, 13), (7, 1500)):
+        given = {key: value.numpy() for key, value in zip(inputs, example(seed, count), strict=True)}
+        for a, b in zip(graph(given), twin(given), strict=True):
+            assert len(a) == count
+            np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_scorer_and_verifier_of_a_run_are_exported_with_their_card(tmp_path):
+    run, out = tmp_path / "run", tmp_path / "out"
+    run.mkdir()
+    torch.manual_seed(0)
+    networks = {"scorer": MatchScorer(), "verifier": MatchVerifier()}
+    for name, network in networks.items():
+        save_file({k: v.contiguous() for k, v in network.state_dict().items()}, run / f"{name}.safetensors")
+    shutil.copy(shipped("matching.json"), run)
+    differences = export_scoring(run, out)
+    assert set(differences) == set(networks)
+    assert max(differences.values()) <= 1e-4
+    files = [f"{name}.{kind}" for name in networks for kind in ("onnx", "safetensors")]
+    assert {path.name for path in out.iterdir()} == {*files, "matching.json", "matching.md"}
+    for name in networks:
+        assert (out / f"{name}.safetensors").read_bytes() == (run / f"{name}.safetensors").read_bytes()
+    card = json.loads((out / "matching.json").read_text())
+    assert card["onnx_minus_torch"] == differences
+    assert f"| scorer.onnx | {differences['scorer']:.1e} |" in (out / "matching.md").read_text()
+
+
 def test_shipped_features_equal_the_shipped_weights_in_torch():
     path = shipped("features.onnx")
     weights = shipped("features.safetensors")
@@ -157,9 +203,16 @@ def test_a_file_that_holds_no_weights_is_refused(tmp_path, content):
         load_network(path)
 
 
-def test_missing_weights_are_named():
+@pytest.mark.parametrize("load", [load_network, load_scorer, load_verifier])
+def test_missing_weights_are_named(load):
     with pytest.raises(InputError, match=r"nowhere\.safetensors does not exist"):
-        load_network(Path("nowhere.safetensors"))
+        load(Path("nowhere.safetensors"))
+
+
+@pytest.mark.parametrize("load", [load_scorer, load_verifier])
+def test_weights_of_the_features_are_refused_by_scorer_and_verifier(weights, load):
+    with pytest.raises(InputError, match=r"random\.safetensors does not hold the weights of this network"):
+        load(weights)
 
 
 @pytest.mark.parametrize("output", range(4))

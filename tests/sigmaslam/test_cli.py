@@ -198,7 +198,9 @@ def test_training_without_its_extra_says_how_to_install_it(tmp_path: Path):
     refused(result, "sigmaslam[train]")
 
 
-@pytest.mark.parametrize("command", ["demo", "track", "evaluate", "match", "render", "train", "export", "benchmark"])
+@pytest.mark.parametrize(
+    "command", ["demo", "track", "evaluate", "match", "render", "train", "train-scorer", "export", "benchmark"]
+)
 def test_every_command_has_help(command: str):
     result = sigmaslam(command, "--help")
     assert result.returncode == 0

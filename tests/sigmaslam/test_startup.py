@@ -3,7 +3,7 @@ import pytest
 
 from sigmaslam.camera import RectifiedStereo
 from sigmaslam.rotation import se3_exp, se3_inverse, se3_log
-from sigmaslam.startup import estimate_relative_pose
+from sigmaslam.startup import RelativePose, estimate_relative_pose
 
 CAMERA = RectifiedStereo(fx=400.0, fy=400.0, cx=319.5, cy=239.5, baseline=0.2, width=640, height=480)
 
@@ -36,11 +36,18 @@ def error(found: np.ndarray, T_key_camera: np.ndarray) -> np.ndarray:
     return np.array([np.linalg.norm(tangent[:3]), np.linalg.norm(tangent[3:])])
 
 
+def estimate(landmarks: np.ndarray, measurement: np.ndarray, sigma: float = 0.3) -> RelativePose | None:
+    """From matches that are all said to be right, and known to `sigma` pixels."""
+    count = len(landmarks)
+    covariance = np.tile(sigma**2 * np.eye(2), (count, 1, 1))
+    return estimate_relative_pose(CAMERA, landmarks, measurement, np.ones(count), covariance)
+
+
 @pytest.mark.parametrize("planar", [False, True], ids=["scattered", "planar"])
 @pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS.keys())
 def test_pose_is_exact_without_noise(motion, planar):
     landmarks, truth = points_in_view(80, planar=planar), se3_exp(motion)
-    found = estimate_relative_pose(CAMERA, landmarks, observe(landmarks, truth))
+    found = estimate(landmarks, observe(landmarks, truth))
     assert found is not None
     assert error(found.T_key_camera, truth).max() < 1e-6
     assert found.inliers.all()
@@ -54,7 +61,7 @@ def test_forty_per_cent_outliers_do_no_harm(motion, seed):
     measurement = observe(landmarks, truth) + rng.normal(0, 0.3, (150, 3))
     wrong = np.arange(150) < 60
     measurement[wrong, :2] = np.c_[rng.uniform(0, 640, 60), rng.uniform(0, 480, 60)]
-    found = estimate_relative_pose(CAMERA, landmarks, measurement)
+    found = estimate(landmarks, measurement)
     assert found is not None
     assert (error(found.T_key_camera, truth) < (0.03, 0.005)).all()
     assert found.inliers[~wrong].mean() > 0.95
@@ -67,7 +74,7 @@ def test_consistent_outliers_do_no_harm():
     landmarks, truth = points_in_view(150), se3_exp(MOTIONS["general"])
     measurement = observe(landmarks, truth) + rng.normal(0, 0.3, (150, 3))
     measurement[:50] = observe(landmarks[:50], truth @ se3_exp([0.6, 0, 0.5, 0, 0, 0]))
-    found = estimate_relative_pose(CAMERA, landmarks, measurement)
+    found = estimate(landmarks, measurement)
     assert found is not None
     assert (error(found.T_key_camera, truth) < (0.03, 0.005)).all()
     assert found.inliers[:50].mean() < 0.1
@@ -77,7 +84,7 @@ def test_missing_disparities_are_no_obstacle():
     landmarks, truth = points_in_view(60), se3_exp(MOTIONS["general"])
     measurement = observe(landmarks, truth)
     measurement[:, 2] = np.nan
-    found = estimate_relative_pose(CAMERA, landmarks, measurement)
+    found = estimate(landmarks, measurement)
     assert found is not None
     assert error(found.T_key_camera, truth).max() < 1e-6
     assert found.inliers.all()
@@ -87,7 +94,7 @@ def test_a_wrong_disparity_makes_an_outlier():
     landmarks, truth = points_in_view(60), se3_exp(MOTIONS["general"])
     measurement = observe(landmarks, truth)
     measurement[:5, 2] += 10.0
-    found = estimate_relative_pose(CAMERA, landmarks, measurement)
+    found = estimate(landmarks, measurement)
     assert found is not None
     np.testing.assert_array_equal(found.inliers, np.arange(60) >= 5)
 
@@ -96,7 +103,7 @@ def test_points_at_infinity_take_no_part():
     landmarks, truth = points_in_view(60), se3_exp(MOTIONS["general"])
     measurement = observe(landmarks, truth)
     landmarks[:20, 2], measurement[:20, 2] = [0.3, -0.5] * 10, np.nan
-    found = estimate_relative_pose(CAMERA, landmarks, measurement)
+    found = estimate(landmarks, measurement)
     assert found is not None
     assert (error(found.T_key_camera, truth) < (1e-3, 1e-3)).all()
     assert not found.inliers[:20].any()
@@ -105,12 +112,12 @@ def test_points_at_infinity_take_no_part():
 @pytest.mark.parametrize("count", [0, 1, 7])
 def test_too_few_points_give_no_pose(count):
     landmarks = points_in_view(count)
-    assert estimate_relative_pose(CAMERA, landmarks, observe(landmarks, np.eye(4))) is None
+    assert estimate(landmarks, observe(landmarks, np.eye(4))) is None
 
 
 def test_eight_points_are_enough():
     landmarks, truth = points_in_view(8), se3_exp(MOTIONS["general"])
-    found = estimate_relative_pose(CAMERA, landmarks, observe(landmarks, truth))
+    found = estimate(landmarks, observe(landmarks, truth))
     assert found is not None
     assert error(found.T_key_camera, truth).max() < 1e-6
 
@@ -119,20 +126,20 @@ def test_unrelated_points_give_no_pose():
     rng = np.random.default_rng(0)
     landmarks = points_in_view(40)
     measurement = np.c_[rng.uniform(0, 640, 40), rng.uniform(0, 480, 40), rng.uniform(1, 60, 40)]
-    assert estimate_relative_pose(CAMERA, landmarks, measurement) is None
+    assert estimate(landmarks, measurement) is None
 
 
 def test_only_far_points_give_no_pose():
     landmarks = points_in_view(40)
     landmarks[:, 2] = 0.5
-    assert estimate_relative_pose(CAMERA, landmarks, observe(landmarks, np.eye(4))) is None
+    assert estimate(landmarks, observe(landmarks, np.eye(4))) is None
 
 
 def test_the_same_points_give_the_same_pose():
     rng = np.random.default_rng(1)
     landmarks, truth = points_in_view(100), se3_exp(MOTIONS["general"])
     measurement = observe(landmarks, truth) + rng.normal(0, 0.5, (100, 3))
-    first, second = (estimate_relative_pose(CAMERA, landmarks, measurement) for _ in range(2))
+    first, second = (estimate(landmarks, measurement) for _ in range(2))
     assert first is not None
     assert second is not None
     np.testing.assert_array_equal(first.T_key_camera, second.T_key_camera)

@@ -264,7 +264,7 @@ def test_a_run_that_was_stopped_ends_bit_for_bit_as_one_that_was_not(
     stopped = tmp_path / "stopped.pt"
     with pytest.raises(KeyboardInterrupt):
         train(sets, stopped, stop_in=3)
-    assert torch.load(stopped, weights_only=True)["step"] == 2
+    assert torch.load(stopped, weights_only=True)["step"] == 3
     torch.rand(7)
     steps: list[int] = []
     again = train_scorer(sets, 4, 0, stopped, lambda step, _: steps.append(step))

@@ -140,14 +140,24 @@ def test_calibrated_probabilities_are_the_shares_of_right_matches(scale: float, 
     assert before > 0.05 or (scale, shift) == (1.0, 0.0)
 
 
-def test_calibrating_again_changes_nothing():
+def test_logits_ten_times_too_certain_are_calibrated():
     verifier = larger_logits()
-    rows = known_rows(verifier, 10_000, 2.0, 0.5, -1.0)
-    calibrate(verifier, rows)
-    first = [float(each) for each in (verifier.logit_scale, verifier.logit_shift, verifier.sigma_scale)]
-    calibrate(verifier, rows)
-    again = [float(each) for each in (verifier.logit_scale, verifier.logit_shift, verifier.sigma_scale)]
-    np.testing.assert_allclose(again, first, rtol=1e-3, atol=1e-3)
+    verifier.logit_scale.fill_(10.0)
+    calibrate(verifier, known_rows(larger_logits(), 10_000, 1.0, 1.0, 0.0))
+    assert float(verifier.logit_scale) == pytest.approx(1.0, rel=0.1)
+
+
+def test_what_was_fitted_before_does_not_matter():
+    fresh, fitted = larger_logits(), larger_logits()
+    rows = known_rows(fresh, 10_000, 2.0, 0.5, -1.0)
+    fitted.logit_scale.fill_(0.7)
+    fitted.logit_shift.fill_(2.0)
+    fitted.sigma_scale.fill_(0.3)
+    results = []
+    for verifier in (fresh, fitted):
+        calibrate(verifier, rows)
+        results.append([float(each) for each in (verifier.logit_scale, verifier.logit_shift, verifier.sigma_scale)])
+    np.testing.assert_allclose(results[1], results[0], rtol=1e-3, atol=1e-3)
 
 
 def test_calibration_leaves_the_weights():
