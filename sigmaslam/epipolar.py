@@ -18,6 +18,9 @@ _ITERATIONS = 12
 _CONVERGED = 1e-5  # radians
 # So many matches say which side of the cameras the scene is on.
 _ASKED = 100
+# A homography that so many matches follow within this distance, pixels, may be that of a plane; with less translation,
+# in distances of the plane, it is that of a turn.
+_PLANE_SHARE, _PLANE_THRESHOLD, _LEAST_PARALLAX = 0.8, 2.0, 1e-3
 # Scale of the robust loss and bound of an inlier, in standard deviations of the epipolar distance.
 _ROBUST = 2.0
 _INLIER = 3.0
@@ -32,7 +35,8 @@ class EpipolarPose:
     Attributes:
         R: (3, 3) rotation, takes directions of camera 0 to camera 1.
         direction: (3,) unit vector, translation of the points of camera 0 in camera 1.
-        inliers: (M,) bool, matches within three standard deviations of their epipolar lines and in front of both.
+        inliers: (M,) bool, probable matches within three standard deviations of their epipolar lines whose rays meet
+            before both cameras, or are parallel within their errors.
     """
 
     R: np.ndarray
@@ -75,15 +79,20 @@ def estimate_epipolar_pose(
         return None
     K_inverse = np.linalg.inv(K)
     rays0, rays1 = (np.c_[points, np.ones(len(points))] @ K_inverse.T for points in (points0, points1))
-    some = probable[mask.ravel() > 0][:_ASKED]
-    R, direction = _most_in_front(essential, rays0[some], rays1[some])
+    agreeing = probable[mask.ravel() > 0]
     # Covariances in the units of the rays.
     J = K_inverse[:2, :2]
     views = _Views(rays0, rays1, _SIGMA0**2 * J @ J.T, J @ covariance.astype(np.float64) @ J.T)
-    R, direction = _polish(views, probability, R, direction)
-    residual = views.whitened(R, direction)[0]
-    inliers = (np.abs(residual) < _INLIER) & (probability >= _LEAST_PROBABILITY) & _in_front(rays0, rays1, R, direction)
-    return EpipolarPose(R, direction, inliers)
+    begins = [_most_in_front(essential, rays0[agreeing[:_ASKED]], rays1[agreeing[:_ASKED]])]
+    begins += _poses_of_plane(K, points0[agreeing], points1[agreeing])
+    best: EpipolarPose | None = None
+    for begin in begins:
+        R, direction = _polish(views, probability, *begin)
+        near = (np.abs(views.whitened(R, direction)[0]) < _INLIER) & (probability >= _LEAST_PROBABILITY)
+        pose = EpipolarPose(R, direction, near & views.in_front(R, direction))
+        if best is None or pose.inliers.sum() > best.inliers.sum():
+            best = pose
+    return best
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,12 +115,37 @@ class _Views:
         sigma = np.sqrt(np.maximum(variance, 1e-24))
         return (self.rays1 * by1).sum(axis=1) / sigma, sigma
 
+    def in_front(self, R: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """(M,) bool, whether the rays meet before both cameras, or are parallel within their errors."""
+        before, parallax = _depths_positive(self.rays0, self.rays1, R, direction)
+        variance = np.trace(self.spread1, axis1=1, axis2=2) + np.trace(self.spread0)
+        return np.asarray(before | (parallax < _INLIER**2 * variance))
+
 
 def _most_in_front(essential: np.ndarray, rays0: np.ndarray, rays1: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Of the four poses of an essential matrix the one that puts most points in front of both cameras."""
     Ra, Rb, direction = cv2.decomposeEssentialMat(essential)
     poses = [(R, sign * direction.ravel()) for R in (Ra, Rb) for sign in (1.0, -1.0)]
-    return max(poses, key=lambda pose: int(_in_front(rays0, rays1, *pose).sum()))
+    return max(poses, key=lambda pose: int(_depths_positive(rays0, rays1, *pose)[0].sum()))
+
+
+def _poses_of_plane(K: np.ndarray, points0: np.ndarray, points1: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Where one homography explains the matches (M, 2), (M, 2), the poses that a plane leaves, else none.
+
+    Of a plane two poses explain the matches, and the 5-point method gives either.
+    """
+    if len(points0) < _LEAST_MATCHES:
+        return []
+    H, mask = cv2.findHomography(points0, points1, cv2.USAC_FAST, _PLANE_THRESHOLD, maxIters=_SAMPLES)
+    if np.shape(H) != (3, 3) or mask.mean() < _PLANE_SHARE:
+        return []
+    _, rotations, translations, _ = cv2.decomposeHomographyMat(H, K)
+    lengths = [float(np.linalg.norm(translation)) for translation in translations]
+    return [
+        (np.asarray(R), translation.ravel() / length)
+        for R, translation, length in zip(rotations, translations, lengths, strict=True)
+        if length > _LEAST_PARALLAX
+    ]
 
 
 def _polish(
@@ -137,15 +171,16 @@ def _polish(
     return R, direction
 
 
-def _in_front(rays0: np.ndarray, rays1: np.ndarray, R: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Whether the rays meet before both cameras, or nearly in parallel."""
+def _depths_positive(
+    rays0: np.ndarray, rays1: np.ndarray, R: np.ndarray, direction: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Whether the rays meet before both cameras, and the squared sine of their angle times their lengths, both (M,)."""
     turned = rays0 @ R.T
     # Depth z0 from rays1 x (z0 R rays0 + t) = 0, and likewise z1.
     normal = _cross(rays1, turned)
-    square = np.maximum((normal * normal).sum(axis=1), 1e-12)
-    depth0 = -(_cross(rays1, direction) * normal).sum(axis=1) / square
-    depth1 = -(_cross(turned, direction) * normal).sum(axis=1) / square
-    return np.asarray((depth0 > 0) & (depth1 > 0))
+    before = (_cross(rays1, direction) * normal).sum(axis=1) < 0
+    before &= (_cross(turned, direction) * normal).sum(axis=1) < 0
+    return before, (normal * normal).sum(axis=1)
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -146,8 +146,8 @@ def train_verifier(rows: VerifierRows, steps: int, seed: int, note: Callable[[in
 def calibrate(verifier: MatchVerifier, rows: VerifierRows) -> None:
     """Fits the numbers that turn what it learned into probabilities and sigmas that hold, on held-out pairs.
 
-    """Fits the numbers that turn what was learned into probabilities and sigmas that hold, on held-out pairs.
-    lie within two sigma, along either axis, as of a normal error.
+    Scale and shift of the logit by likelihood (Platt 1999); the scale of sigma such that as many errors of right
+    matches lie within two sigma, along either axis, as of a normal error.
     """
     with torch.no_grad():
         logit, log_sigma = verifier(torch.from_numpy(rows.columns))

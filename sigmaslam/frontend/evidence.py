@@ -10,6 +10,8 @@ import numpy as np
 _RADIUS = 5
 _BLUR = 0.7
 _MOST_ZOOM = 5.0
+# OpenCV samples at fewer than 2^15 rows at once.
+_MOST_ROWS = 30_000
 # Variance of grey values that a flat patch is taken to have.
 _LEAST_VARIANCE = 1.0
 
@@ -77,7 +79,7 @@ def examine_patches(
     # Gradients of the mean of both normalised patches: their noise is the smaller for it.
     mean = 0.5 * (centred0 / np.sqrt(variance0)[:, None] + centred1 / np.sqrt(variance1)[:, None])
     square = mean.reshape(count, 2 * _RADIUS + 1, 2 * _RADIUS + 1)
-    along_v, along_u = (each.reshape(count, -1) for each in np.gradient(square, axis=(1, 2)))
+    along_v, along_u = (each.reshape(patches0.shape) for each in np.gradient(square, axis=(1, 2)))
     uu, uv, vv = (
         (a * b) @ _WINDOW / spacing**2 for a, b in ((along_u, along_u), (along_u, along_v), (along_v, along_v))
     )
@@ -105,8 +107,12 @@ def _smoothed(image: np.ndarray, factor: float) -> np.ndarray:
 
 def _sample(image: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Bilinear samples (M, K) at places (M, K, 2)."""
-    u, v = (np.ascontiguousarray(places[..., axis], np.float32) for axis in (0, 1))
-    return np.asarray(cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+    samples = np.empty(places.shape[:2], np.float32)
+    for begin in range(0, len(places), _MOST_ROWS):
+        some = slice(begin, begin + _MOST_ROWS)
+        u, v = (np.ascontiguousarray(places[some, :, axis], np.float32) for axis in (0, 1))
+        samples[some] = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return samples
 
 
 def _centred(patches: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
