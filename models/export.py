@@ -20,11 +20,10 @@ from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.files import atomic_path, atomic_write_text, make_folder
 from sigmaslam.filters.lie import exp_se3
 from sigmaslam.filters.stereo_pose import STATE_SIZE, Innovate, Predict, Update
-from sigmaslam.frontend.scorer import NEIGHBOURS
 from sigmaslam.models.card import card_page, read_card, scoring_page
 from sigmaslam.models.extractor import EXTRACTOR_SIZE_MULTIPLE, FeatureExtractor
 from sigmaslam.models.network import DESCRIPTOR_SIZE, STRIDE, FeatureNetwork
-from sigmaslam.models.scorer import SIDE_CHANNELS, MatchScorer, ScoredMatches
+from sigmaslam.models.scorer import NEIGHBOURS, SIDE_CHANNELS, MatchScorer, ScoredMatches
 from sigmaslam.models.verifier import VERIFIER_COLUMNS, MatchCovariance, MatchVerifier
 from sigmaslam.session import OnnxGraph
 from sigmaslam.synthetic.textures import dead_leaves

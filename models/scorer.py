@@ -9,6 +9,8 @@ from torch import Tensor, nn
 
 SIDE_CHANNELS = 9
 """Of `sigmaslam.frontend.scorer.side_information`."""
+NEIGHBOURS = 12
+"""Of `sigmaslam.frontend.scorer.nearest_matches`."""
 _WIDTH = 32
 _ROUNDS = 2
 # A neighbour supports a hypothesis as far as it lies near where that has it: scales in pixels, for a neighbour next to

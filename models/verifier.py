@@ -60,4 +60,6 @@ class MatchCovariance(nn.Module):
         """Probability (M,) and covariance (M, 2, 2) in pixels squared, from (M, 14) columns and (M, 2, 2) axes."""
         logit, log_sigma = self.verifier(columns)
         variance = torch.exp(2.0 * log_sigma)
-        return torch.sigmoid(logit), (axes * variance.unsqueeze(1)) @ axes.transpose(1, 2)
+        covariance = (axes * variance.unsqueeze(1)) @ axes.transpose(1, 2)
+        # The product rounds both off-diagonals on its own.
+        return torch.sigmoid(logit), 0.5 * (covariance + covariance.transpose(1, 2))

@@ -123,6 +123,7 @@ class Benchmark(StrEnum):
     features = "features"
     ablations = "ablations"
     matches = "matches"
+    noise = "noise"
 
 
 def _show_version(wanted: bool) -> None:
@@ -397,7 +398,8 @@ def benchmark(
     ] = None,
     eager: Annotated[bool, typer.Option("--eager", help="filters: leave out what takes minutes to compile.")] = False,
     runs: Annotated[
-        Path | None, typer.Option(help="ablations: folder of the training runs; finished ones are not repeated.")
+        Path | None,
+        typer.Option(help="ablations, noise: folder of the training runs or renders; what is there is used again."),
     ] = None,
     steps: Annotated[int, typer.Option(min=1, help="ablations: optimiser steps a run.")] = 250,
     seeds: Annotated[int, typer.Option(min=1, help="ablations: runs of each variant.")] = 3,
@@ -420,9 +422,10 @@ def benchmark(
 
     sequences: the tracker on every sequence. filters: speed of the filters beside those of other libraries that are
     installed. claims: EKF against UKF by Monte Carlo. renders: how fast, and how like real images. features: time
-    and scores of the features beside SIFT, ORB and other people's. matches: whether their probability and covariance
-    hold, beside AdaLAM and MAGSAC. ablations: what each part of the features gains, by
-    short training runs (an hour). All but the first need the extra 'train'.
+    and scores of the features beside SIFT, ORB and other people's. matches: whether their probability and
+    covariance hold, beside AdaLAM and MAGSAC. noise: the tracker with these covariances beside one constant.
+    ablations: what each part of the features gains, by short training runs (an hour). All but the first need the
+    extra 'train'.
     """
     command = f"sigmaslam benchmark {name.value} --out {out}"
     if name is Benchmark.sequences:
@@ -455,6 +458,15 @@ def benchmark(
         from sigmaslam.evaluation.benchmarks.matches import write_matches
 
         typer.echo(write_matches(out, _need_data(data), command, Console(stderr=True).print))
+    elif name is Benchmark.noise:
+        from sigmaslam.evaluation.benchmarks.noise import write_noise
+        from sigmaslam.synthetic.sequence import default_workers
+
+        if runs is None:
+            raise InputError("the benchmark noise needs --runs, a folder for its renders")
+        command += f" --runs {runs}"
+        note = Console(stderr=True).print
+        typer.echo(write_noise(out, _need_data(data), runs, default_workers(), command, note))
     elif name is Benchmark.ablations:
         from sigmaslam.evaluation.benchmarks.ablations import write_ablations
 

@@ -23,9 +23,10 @@ _LOGGER = logging.getLogger(__name__)
 _CHI_SQUARE_999 = np.array([0.0, 10.827566170662733, 13.815510557964274, 16.26623619623813])
 # A pose that fewer of the matches near the prediction agree with is not believed.
 _LEAST_SHARE = 0.3
-# A pose from matches alone has no prediction to agree with. Where less than this share of the matches, anywhere in the
-# image, agree with it, twice as many inliers are asked for: symmetric texture in a mirrored image once gave 20 of 255.
-_LEAST_SHARE_UNGUIDED = 0.15
+# A pose from matches alone has no prediction to agree with. Where fewer than this share of the matches that should be
+# right by their probabilities agree with it, twice as many inliers are asked for: symmetric texture in a mirrored image
+# once gave 26 where 60 should be right. Up to half of the right ones may be on moving things.
+_LEAST_SHARE_UNGUIDED = 0.5
 # A fit near the prediction with a larger NIS per degree of freedom may sit in a wrong place: it is checked against one
 # that does without the prediction.
 _DOUBTFUL_NIS = 2.0
@@ -306,8 +307,10 @@ class StereoTracker:
         )
         if relative is None:
             return None
-        least = self.config.least_inliers * (1 if relative.inliers.mean() >= _LEAST_SHARE_UNGUIDED else 2)
-        if relative.inliers.sum() < least:
+        agreeing = int(relative.inliers.sum())
+        fair = agreeing >= _LEAST_SHARE_UNGUIDED * found.probability.sum()
+        least = self.config.least_inliers * (1 if fair else 2)
+        if agreeing < least:
             return None
         before = self._filter.state
         self._filter.set_pose_from_clone(relative.T_key_camera, np.repeat([0.01 * self._depth, 0.01], 3))

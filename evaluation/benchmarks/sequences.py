@@ -19,13 +19,13 @@ from sigmaslam.readers import open_sequence
 from sigmaslam.report import FrameTable, read_frames
 from sigmaslam.run import track_sequence
 
-# Folder and its truth; the demo comes first and needs no data.
-_REAL = (
+REAL = (
     ("kitti_raw_0926_0039_a", "poses.txt"),
     ("kitti_odometry_01_f000_050", "poses.txt"),
     ("euroc_v1_01_keyframes_a", "groundtruth.csv"),
     ("euroc_v1_01_static", "groundtruth.csv"),
 )
+"""Folder and its truth; the demo comes first and needs no data."""
 _STAGES = ("features", "match", "filter", "map")
 
 
@@ -49,14 +49,14 @@ def run_sequences(data: Path | None, frontends: Sequence[str]) -> list[SequenceR
         InputError: `data` does not hold the sequences.
     """
     if data is not None:
-        missing = [name for name, _ in _REAL if not (data / name).is_dir()]
+        missing = [name for name, _ in REAL if not (data / name).is_dir()]
         if missing:
             raise InputError(f"{data} does not hold {', '.join(missing)}: give the folder of the data sets with --data")
     results = []
     with as_file(files("sigmaslam.synthetic") / "demo") as demo, tempfile.TemporaryDirectory() as scratch:
         inputs = [("demo (rendered)", demo, demo / "poses.txt")]
         if data is not None:
-            inputs += [(name, data / name, data / name / truth) for name, truth in _REAL]
+            inputs += [(name, data / name, data / name / truth) for name, truth in REAL]
         for name, source, truth in inputs:
             for frontend in frontends:
                 run = Path(scratch) / f"{name}-{frontend}"

@@ -238,7 +238,7 @@ def _judge() -> MatchJudge:
 
 
 def match_judged(image0: np.ndarray, image1: np.ndarray, features0: Features, features1: Features) -> Matches:
-    """What `sigmaslam match` makes of anyone's keypoints and descriptors of two images."""
+    """What `sigmaslam match` makes of anyone's keypoints and descriptors if all have the same score and sigma."""
     return match_features(_judge(), image0, image1, without_sigma(features0), without_sigma(features1))
 
 

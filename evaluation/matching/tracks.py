@@ -41,6 +41,5 @@ def follow_corners(image0: np.ndarray, image1: np.ndarray) -> tuple[np.ndarray, 
     klt = KltFrontend(TRACKED_KEYPOINTS)
     key, view = klt.observe(image0, image0), klt.observe(image1, image1)
     points = key.features.keypoints
-    everywhere = np.full(len(points), np.inf)
-    tracks = klt.match(key, np.arange(len(points)), view, points.astype(np.float64), everywhere)
+    tracks = klt.match(key, np.arange(len(points)), view, points.astype(np.float64), None)
     return points[tracks.key_index].astype(np.float64), tracks.points

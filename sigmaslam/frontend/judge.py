@@ -45,7 +45,10 @@ class MatchJudge:
         """
         if len(putative.index0) == 0:
             return np.zeros(0, np.float32)
-        points0, points1 = features0.keypoints[putative.index0], features1.keypoints[putative.index1]
+        points0, points1 = (
+            np.asarray(features.keypoints[index], np.float32)
+            for features, index in ((features0, putative.index0), (features1, putative.index1))
+        )
         feed = {
             "points0": points0,
             "points1": points1,
