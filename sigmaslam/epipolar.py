@@ -16,7 +16,7 @@ _THRESHOLD = 1.0
 _SAMPLES = 500
 _ITERATIONS = 12
 _CONVERGED = 1e-5  # radians
-# So many matches say which side of the cameras the scene is on.
+# About so many matches say which side of the cameras the scene is on, and whether it is a plane.
 _ASKED = 100
 # A homography that so many matches follow within this distance, pixels, may be that of a plane; with less translation,
 # in distances of the plane, it is that of a turn.
@@ -83,8 +83,9 @@ def estimate_epipolar_pose(
     # Covariances in the units of the rays.
     J = K_inverse[:2, :2]
     views = _Views(rays0, rays1, _SIGMA0**2 * J @ J.T, J @ covariance.astype(np.float64) @ J.T)
-    begins = [_most_in_front(essential, rays0[agreeing[:_ASKED]], rays1[agreeing[:_ASKED]])]
-    begins += _poses_of_plane(K, points0[agreeing], points1[agreeing])
+    some = agreeing[:: max(1, len(agreeing) // _ASKED)]
+    begins = [_most_in_front(essential, rays0[some], rays1[some])]
+    begins += _poses_of_plane(K, points0[some], points1[some])
     best: EpipolarPose | None = None
     for begin in begins:
         R, direction = _polish(views, probability, *begin)
