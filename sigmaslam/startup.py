@@ -9,10 +9,15 @@ import numpy as np
 
 from sigmaslam.camera import RectifiedStereo
 from sigmaslam.epipolar import estimate_epipolar_pose
-from sigmaslam.rotation import se3_inverse
+from sigmaslam.rotation import se3_exp, se3_inverse, skew
 
 _THRESHOLD = 2.0  # pixels
 _LEAST_POINTS = 8
+# Of the refinement: steps, and scale of the robust loss in standard deviations, from the first to the last.
+_STEPS, _FIRST_SCALE, _NARROWING, _LAST_SCALE = 10, 8.0, 0.75, 2.0
+_WORST_CONDITION = 1e14
+# 99.9 % quantile of chi-square with 3 degrees of freedom.
+_GATE = 16.26623619623813
 # Depth from less disparity than this says nothing about scale.
 _LEAST_DISPARITY = 1.0
 
@@ -33,9 +38,10 @@ class RelativePose:
 def estimate_relative_pose(
     camera: RectifiedStereo,
     landmarks: np.ndarray,
+    landmark_sigma: np.ndarray,
     measurement: np.ndarray,
+    noise: np.ndarray,
     probability: np.ndarray,
-    covariance: np.ndarray,
 ) -> RelativePose | None:
     """Pose of the current view in the keyframe, from stereo points and where they are seen now.
 
@@ -45,9 +51,10 @@ def estimate_relative_pose(
     Args:
         camera: the rectified pair.
         landmarks: (M, 3) (u, v, disparity) in the keyframe.
+        landmark_sigma: (M, 3) their standard deviations, pixels.
         measurement: (M, 3) now; disparity may be NaN.
+        noise: (M, 3, 3) covariance of the measurement, pixels squared.
         probability: (M,) that a match is right.
-        covariance: (M, 2, 2) of its place now, pixels squared.
     Returns:
         None when fewer than eight points agree with either.
     """
@@ -55,14 +62,15 @@ def estimate_relative_pose(
     if near.sum() < _LEAST_POINTS:
         return None
     points = camera.triangulate(np.where(near[:, None], landmarks, [0.0, 0.0, 1.0]))
+    views = _Views(camera, landmarks, landmark_sigma, measurement, noise, near * probability)
     best: RelativePose | None = None
     for guess in (
-        _from_essential(camera, points, near, landmarks[:, :2], measurement[:, :2], probability, covariance),
+        _from_essential(camera, points, near, landmarks[:, :2], measurement[:, :2], probability, noise[:, :2, :2]),
         _from_points(camera, points[near], measurement[near, :2]),
     ):
         if guess is None:
             continue
-        refined = _refine(camera, points, near, measurement, guess)
+        refined = _refine(views, guess)
         if refined is not None and (best is None or refined.inliers.sum() > best.inliers.sum()):
             best = refined
     return best
@@ -113,41 +121,82 @@ def _from_points(camera: RectifiedStereo, points: np.ndarray, pixels: np.ndarray
     return _pose(rotation, translation) if found else None
 
 
-def _refine(
-    camera: RectifiedStereo, points: np.ndarray, near: np.ndarray, measurement: np.ndarray, T_camera_key: np.ndarray
-) -> RelativePose | None:
-    """Levenberg-Marquardt on the points that agree, twice, because the first set is chosen by a rough pose."""
-    for _ in range(2):
-        inliers = near & _agree(camera, points, measurement, T_camera_key)
-        if inliers.sum() < _LEAST_POINTS:
-            return None
-        rotation, _ = cv2.Rodrigues(T_camera_key[:3, :3])
-        rotation, translation = cv2.solvePnPRefineLM(
-            points[inliers],
-            np.ascontiguousarray(measurement[inliers, :2]),
-            camera.matrix,
-            None,
-            rotation,
-            T_camera_key[:3, 3:].copy(),
+@dataclass(frozen=True, slots=True)
+class _Views:
+    """Stereo points and where they are seen now; arguments as of `estimate_relative_pose`, weight 0 for far points."""
+
+    camera: RectifiedStereo
+    landmarks: np.ndarray
+    landmark_sigma: np.ndarray
+    measurement: np.ndarray
+    noise: np.ndarray
+    weight: np.ndarray
+
+    def linearise(self, T_camera_key: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Residual (M, 3), its derivative by a perturbation of T from the left (M, 3, 6), and information (M, 3, 3).
+
+        What is not known, and all of a point behind the camera, has no information.
+        """
+        camera = self.camera
+        focal = camera.fx * camera.baseline
+        # Scaled by inverse depth, points at infinity do no harm.
+        ray = np.column_stack(
+            [
+                (self.landmarks[:, 0] - camera.cx) / camera.fx,
+                (self.landmarks[:, 1] - camera.cy) / camera.fy,
+                np.ones(len(self.landmarks)),
+            ]
         )
-        T_camera_key = _pose(rotation, translation)
-    inliers = near & _agree(camera, points, measurement, T_camera_key)
+        inverse_depth = self.landmarks[:, 2] / focal
+        R, t = T_camera_key[:3, :3], T_camera_key[:3, 3]
+        seen = ray @ R.T + inverse_depth[:, None] * t
+        front = seen[:, 2] > 1e-6
+        x, y, z = np.where(front[:, None], seen, [0.0, 0.0, 1.0]).T
+        predicted = np.column_stack(
+            [camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy, focal * inverse_depth / z]
+        )
+        by_seen = np.zeros((len(z), 3, 3))
+        by_seen[:, 0, 0], by_seen[:, 0, 2] = camera.fx / z, -camera.fx * x / z**2
+        by_seen[:, 1, 1], by_seen[:, 1, 2] = camera.fy / z, -camera.fy * y / z**2
+        by_seen[:, 2, 2] = -focal * inverse_depth / z**2
+        by_pose = np.concatenate([by_seen * inverse_depth[:, None, None], -by_seen @ skew(seen)], axis=2)
+        by_landmark = by_seen @ np.stack(
+            [
+                np.tile(R[:, 0] / camera.fx, (len(z), 1)),
+                np.tile(R[:, 1] / camera.fy, (len(z), 1)),
+                np.tile(t / focal, (len(z), 1)),
+            ],
+            axis=2,
+        )
+        by_landmark[:, 2, 2] += 1.0 / z
+        spread = self.noise + (by_landmark * (self.landmark_sigma**2)[:, None, :]) @ by_landmark.transpose(0, 2, 1)
+        residual = self.measurement - predicted
+        known = np.isfinite(residual) & front[:, None]
+        present = known[:, :, None] & known[:, None, :]
+        information = np.where(present, np.linalg.inv(np.where(present, spread, np.eye(3))), 0.0)
+        return np.where(known, residual, 0.0), by_pose, information
+
+
+def _refine(views: _Views, T_camera_key: np.ndarray) -> RelativePose | None:
+    """Gauss-Newton on the stereo points by their covariances, with a robust loss that narrows from step to step."""
+    scale = _FIRST_SCALE
+    for _ in range(_STEPS):
+        residual, by_pose, information = views.linearise(T_camera_key)
+        squared = np.einsum("mi,mij,mj->m", residual, information, residual)
+        weight = views.weight / (1.0 + squared / scale**2) ** 2
+        weighted = by_pose.transpose(0, 2, 1) @ (information * weight[:, None, None])
+        normal = (weighted @ by_pose).sum(axis=0)
+        gradient = np.einsum("mij,mj->i", weighted, residual)
+        if not np.linalg.cond(normal) < _WORST_CONDITION:
+            return None
+        T_camera_key = se3_exp(np.linalg.solve(normal, gradient)) @ T_camera_key
+        scale = max(_NARROWING * scale, _LAST_SCALE)
+    residual, _, information = views.linearise(T_camera_key)
+    squared = np.einsum("mi,mij,mj->m", residual, information, residual)
+    inliers = (views.weight > 0) & (np.trace(information, axis1=1, axis2=2) > 0) & (squared < _GATE)
     if inliers.sum() < _LEAST_POINTS:
         return None
     return RelativePose(se3_inverse(T_camera_key), inliers)
-
-
-def _agree(
-    camera: RectifiedStereo, points: np.ndarray, measurement: np.ndarray, T_camera_key: np.ndarray
-) -> np.ndarray:
-    """Which points are seen where the pose says, in image and disparity, and in front."""
-    seen = points @ T_camera_key[:3, :3].T + T_camera_key[:3, 3]
-    front = seen[:, 2] > 1e-6
-    expected = camera.project(np.where(front[:, None], seen, [0.0, 0.0, 1.0]))
-    error = np.abs(expected - measurement)
-    close = np.hypot(error[:, 0], error[:, 1]) <= _THRESHOLD
-    # A disparity that is not known cannot disagree.
-    return front & close & ~(error[:, 2] > 2.0 * _THRESHOLD)
 
 
 def _pose(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:

@@ -303,7 +303,12 @@ class StereoTracker:
         """Start-up and recovery: relative pose from the matches alone, then the update from a vague prior about it."""
         points, _ = self._stereo_points(found)
         relative = estimate_relative_pose(
-            self._camera, points.landmarks, points.measurement, found.probability, points.noise[:, :2, :2]
+            self._camera,
+            points.landmarks,
+            points.landmark_sigma,
+            points.measurement,
+            points.noise,
+            found.probability,
         )
         if relative is None:
             return None

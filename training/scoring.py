@@ -68,6 +68,8 @@ def train_scoring(out: Path, config: ScoringConfig, workers: int) -> dict[str, A
         InputError: the folder holds a run of another configuration, or something else.
     """
     _claim(out, config)
+    # Before the run: the tree may move on while it lasts.
+    origin = describe_origin([out])
     clock = _Clock(out / _SECONDS_NAME)
     torch.set_num_threads(1)
     with _progress() as progress:
@@ -97,7 +99,7 @@ def train_scoring(out: Path, config: ScoringConfig, workers: int) -> dict[str, A
     # Pairs in turn calibrate and measure.
     calibrate(verifier, held_out.select(held_out.pair % 2 == 0))
     metrics = _scorer_metrics(scorer, folders[1]) | _verifier_metrics(verifier, held_out.select(held_out.pair % 2 == 1))
-    card = _make_card(out, config, scorer, verifier, metrics, clock.seconds())
+    card = _make_card(origin, config, scorer, verifier, metrics, clock.seconds())
     _save(out / SCORER_NAME, scorer)
     _save(out / VERIFIER_NAME, verifier)
     atomic_write_text(out / CARD_NAME, json.dumps(card, indent=2) + "\n")
@@ -192,7 +194,7 @@ def _verifier_metrics(verifier: MatchVerifier, rows: VerifierRows) -> dict[str, 
 
 
 def _make_card(
-    out: Path,
+    origin: dict[str, str],
     config: ScoringConfig,
     scorer: MatchScorer,
     verifier: MatchVerifier,
@@ -202,7 +204,7 @@ def _make_card(
     return {
         "config": asdict(config),
         "seed": config.seed,
-        **describe_origin([out]),
+        **origin,
         "duration_s": round(seconds, 1),
         "hardware": describe_processor(),
         "parameters": {

@@ -19,8 +19,8 @@ from sigmaslam.synthetic.scene_pairs import ScenePair, ScenePairs
 from sigmaslam.synthetic.truth import at_pixels
 from sigmaslam.synthetic.visibility import move
 
-SHARES = (0.35, 0.65)
-"""Between these a pair's right matches are on moving things."""
+SHARES = (0.35, 0.5)
+"""Between these are the shares of right matches on moving things: beyond a half the scene may be the lesser body."""
 _SIZE = 384
 _DOMAINS = ("street", "room", "drone")
 _RIGHT = 3.0
@@ -85,11 +85,14 @@ def judge_movers(detect: Callable[[np.ndarray], Features], judge: MatchJudge, se
             camera0.fx, camera0.fy, camera0.cx, camera0.cy, _BASELINE * float(np.median(truth.depth0)), _SIZE, _SIZE
         )
         epipolar = estimate_epipolar_pose(camera.matrix, matches.keypoints0, points1, matches.probability, covariance)
-        noise = np.random.default_rng((seed, index)).normal(0.0, _DISPARITY_NOISE, (2, len(truth.depth0)))
-        landmarks = np.column_stack([matches.keypoints0, camera.fx * camera.baseline / truth.depth0 + noise[0]])
+        disturbance = np.random.default_rng((seed, index)).normal(0.0, _DISPARITY_NOISE, (2, len(truth.depth0)))
+        landmarks = np.column_stack([matches.keypoints0, camera.fx * camera.baseline / truth.depth0 + disturbance[0]])
         depth1 = np.where(truth.depth1 > 0, truth.depth1, np.nan)
-        measurement = np.column_stack([points1, camera.fx * camera.baseline / depth1 + noise[1]])
-        stereo = estimate_relative_pose(camera, landmarks, measurement, matches.probability, covariance)
+        measurement = np.column_stack([points1, camera.fx * camera.baseline / depth1 + disturbance[1]])
+        sigma = np.tile([0.1, 0.1, _DISPARITY_NOISE], (len(landmarks), 1))
+        noise = np.tile(_DISPARITY_NOISE**2 * np.eye(3), (len(landmarks), 1, 1))
+        noise[:, :2, :2] = covariance
+        stereo = estimate_relative_pose(camera, landmarks, sigma, measurement, noise, matches.probability)
         accepted = [
             right,
             np.ones(len(right), bool),
