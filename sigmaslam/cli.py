@@ -464,7 +464,7 @@ def benchmark(
 
         if runs is None:
             raise InputError("the benchmark noise needs --runs, a folder for its renders")
-        command += f" --runs {runs}"
+        command += f" --runs {runs.name}"
         note = Console(stderr=True).print
         typer.echo(write_noise(out, _need_data(data), runs, default_workers(), command, note))
     elif name is Benchmark.ablations:

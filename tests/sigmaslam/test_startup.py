@@ -39,8 +39,9 @@ def error(found: np.ndarray, T_key_camera: np.ndarray) -> np.ndarray:
 def estimate(landmarks: np.ndarray, measurement: np.ndarray, sigma: float = 0.3) -> RelativePose | None:
     """From matches that are all said to be right, and known to `sigma` pixels."""
     count = len(landmarks)
-    covariance = np.tile(sigma**2 * np.eye(2), (count, 1, 1))
-    return estimate_relative_pose(CAMERA, landmarks, measurement, np.ones(count), covariance)
+    noise = np.tile(sigma**2 * np.eye(3), (count, 1, 1))
+    landmark_sigma = np.tile([0.1, 0.1, sigma], (count, 1))
+    return estimate_relative_pose(CAMERA, landmarks, landmark_sigma, measurement, noise, np.ones(count))
 
 
 @pytest.mark.parametrize("planar", [False, True], ids=["scattered", "planar"])

@@ -11,6 +11,7 @@ import torch
 from safetensors.torch import load_file
 
 from sigmaslam import StereoTracker
+from sigmaslam.errors import InputError
 from sigmaslam.models.export import load_verifier
 from sigmaslam.models.verifier import MatchVerifier
 from sigmaslam.readers import StereoFrame, open_sequence
@@ -29,7 +30,7 @@ from sigmaslam.training.filter_tuning import (
 )
 from sigmaslam.trajectory import Trajectory
 
-FRAMES = 6
+FRAMES = 4
 
 
 @pytest.fixture(autouse=True)
@@ -94,7 +95,7 @@ def some_points(record: UpdateRecord) -> UpdateRecord:
 
 def test_recording_leaves_the_tracker_as_it_is(demo, frames, tracked):
     plain = StereoTracker(open_sequence(demo).camera)
-    for frame, estimate in zip(frames, tracked[1], strict=True):
+    for frame, estimate in zip(frames[:3], tracked[1][:3], strict=True):
         expected = plain.step(frame.left, frame.right, frame.timestamp)
         np.testing.assert_array_equal(estimate.T_world_camera, expected.T_world_camera)
         np.testing.assert_array_equal(estimate.covariance, expected.covariance)
@@ -221,10 +222,10 @@ def test_a_few_steps_on_one_update_lower_its_loss(verifier, records):
 
 
 def test_the_seed_orders_the_updates(verifier, records):
-    some = [some_points(record) for record in records[:3]]
+    some = [some_points(record) for record in records[:2]]
     first, second = (list(tune(copy.deepcopy(verifier), some, 1, 0)) for _ in range(2))
     assert first == second
-    assert len(first) == 3
+    assert len(first) == 2
 
 
 # Command
@@ -233,7 +234,7 @@ def test_the_seed_orders_the_updates(verifier, records):
 def test_the_command_writes_weights_that_load(demo, tmp_path, capsys):
     out = tmp_path / "tuned.safetensors"
     main(
-        ["--train", str(demo), "--test", str(demo), "--out", str(out), "--frames", "3", "--epochs", "1", "--last", "1"]
+        ["--train", str(demo), "--test", str(demo), "--out", str(out), "--frames", "2", "--epochs", "1", "--last", "1"]
     )
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[:3] for line in lines[1:]] == [
@@ -269,5 +270,5 @@ def test_what_cannot_be_done_is_refused_at_once(
 
 
 def test_one_frame_has_no_update(demo):
-    with pytest.raises(Exception, match="track more frames"):
+    with pytest.raises(InputError, match="track more frames"):
         record_updates(demo, 1)
