@@ -25,7 +25,7 @@ _CHI_SQUARE_999 = np.array([0.0, 10.827566170662733, 13.815510557964274, 16.2662
 _LEAST_SHARE = 0.3
 # A pose from matches alone has no prediction to agree with. Where fewer than this share of the matches that should be
 # right by their probabilities agree with it, twice as many inliers are asked for: symmetric texture in a mirrored image
-# once gave 26 where 60 should be right. Up to half of the right ones may be on moving things.
+# once gave 35 inliers, 26 by their probabilities, where 67 should be right. Half of the right ones may be on movers.
 _LEAST_SHARE_UNGUIDED = 0.5
 # A fit near the prediction with a larger NIS per degree of freedom may sit in a wrong place: it is checked against one
 # that does without the prediction.
@@ -312,7 +312,8 @@ class StereoTracker:
         )
         if relative is None:
             return None
-        agreeing = int(relative.inliers.sum())
+        # Each by its probability: many doubtful ones are few.
+        agreeing = float(found.probability[relative.inliers].sum())
         fair = agreeing >= _LEAST_SHARE_UNGUIDED * found.probability.sum()
         least = self.config.least_inliers * (1 if fair else 2)
         if agreeing < least:
