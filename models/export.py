@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+import onnx
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file
@@ -312,6 +313,7 @@ def _export(
         )
         assert program is not None
         program.save(path, external_data=False)
+        strip_origins(path)
         feed = {name: np.asarray(value) for name, value in zip(graph.inputs, graph.checked, strict=True)}
         found = OnnxGraph(path)(feed)
         with torch.no_grad():
@@ -322,6 +324,17 @@ def _export(
                 f"{out.name} differs from torch by {difference:.2e}, more than {tolerance:.0e}: not written"
             )
     return difference
+
+
+def strip_origins(path: Path) -> None:
+    """Takes out of a graph where in whose source each node came from: paths of a machine, and half of the file."""
+    model = onnx.load(path)
+    for function in (model.graph, *model.functions):
+        for node in function.node:
+            del node.metadata_props[:]
+            node.doc_string = ""
+    del model.graph.metadata_props[:]
+    onnx.save(model, path)
 
 
 def _relative_difference(found: list[np.ndarray], expected: list[np.ndarray]) -> float:
