@@ -20,7 +20,7 @@ from sigmaslam.frontend.types import Features
 from sigmaslam.synthetic.pairs import HomographyPairs
 from sigmaslam.synthetic.scene_pairs import ScenePairs
 from sigmaslam.synthetic.textures import KINDS
-from sigmaslam.training.stream import PairStream, prepare_worker
+from sigmaslam.training.stream import PairStream, prepare_worker, take_turn
 
 DETECTORS: dict[str, Callable[[int], Callable[[np.ndarray], Features]]] = {
     "learned": lambda count: LearnedDetector(count, threads=1),
@@ -89,9 +89,7 @@ class MatchSets:
 
     def record(self, index: int) -> PairRecord:
         """The record of that index, the same whenever it is asked for."""
-        lap, turn = divmod(index, len(_TURNS))
-        source = _TURNS[turn]
-        own = lap * _TURNS.count(source) + _TURNS[:turn].count(source)
+        source, own = take_turn(_TURNS, index)
         pair = self._streams[source].pair(own)
         rng = np.random.default_rng((self._seed, 3, index))
         image0, image1 = (np.round(255.0 * image).astype(np.uint8) for image in (pair.image0, pair.image1))

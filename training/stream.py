@@ -75,6 +75,16 @@ def open_stream(source: str, seed: int, size: int) -> PairStream:
     return HomographyPairs(seed, size, kinds)
 
 
+def take_turn(turns: tuple[str, ...], index: int) -> tuple[str, int]:
+    """Whose turn it is at that index, and its own index among its pairs.
+
+    Each source sees neighbouring numbers, so that its textures and scenes are used as often as they should be.
+    """
+    lap, turn = divmod(index, len(turns))
+    source = turns[turn]
+    return source, lap * turns.count(source) + turns[:turn].count(source)
+
+
 class MixedPairs:
     """Pairs of several sources in turn.
 
@@ -94,10 +104,7 @@ class MixedPairs:
 
     def pair(self, index: int) -> Pair:
         """The pair of that index, the same whenever it is asked for."""
-        lap, turn = divmod(index, len(self._turns))
-        source = self._turns[turn]
-        # Each source sees neighbouring numbers, so that its textures and scenes are used as often as they should be.
-        own = lap * self._turns.count(source) + self._turns[:turn].count(source)
+        source, own = take_turn(self._turns, index)
         return self._streams[source].pair(own)
 
 

@@ -21,9 +21,8 @@ from sigmaslam.training.calibration import (
     spearman,
     squared_distance,
 )
+from sigmaslam.training.scorer import RIGHT
 
-RIGHT = 3.0
-"""Distance from the truth of a right match, pixels."""
 _CHI_SQUARE_95 = 5.991464547107979
 _CONSTANT_SIGMA = 0.3
 # Scale of the robust fit of what is left of a rectification, pixels, and its iterations.

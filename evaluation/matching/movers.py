@@ -18,12 +18,12 @@ from sigmaslam.startup import estimate_relative_pose
 from sigmaslam.synthetic.scene_pairs import ScenePair, ScenePairs
 from sigmaslam.synthetic.truth import at_pixels
 from sigmaslam.synthetic.visibility import move
+from sigmaslam.training.scorer import RIGHT
 
 SHARES = (0.35, 0.5)
 """Between these are the shares of right matches on moving things: beyond a half the scene may be the lesser body."""
 _SIZE = 384
 _DOMAINS = ("street", "room", "drone")
-_RIGHT = 3.0
 # A thing that moves by less in the image cannot be told from the scene.
 _MOVED = 3.0
 _LEAST_MATCHES = 60
@@ -70,7 +70,7 @@ def judge_movers(detect: Callable[[np.ndarray], Features], judge: MatchJudge, se
         features0, features1 = detect(image0), detect(image1)
         matches = match_features(judge, image0, image1, features0, features1)
         truth = _look_up(pair, matches.keypoints0.astype(np.float64))
-        right = np.linalg.norm(matches.keypoints1 - truth.places, axis=1) < _RIGHT
+        right = np.linalg.norm(matches.keypoints1 - truth.places, axis=1) < RIGHT
         static = right & ~truth.moved
         share = 1.0 - static.sum() / max(right.sum(), 1)
         if right.sum() < _LEAST_MATCHES or not SHARES[0] <= share <= SHARES[1]:

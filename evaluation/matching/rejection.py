@@ -12,6 +12,7 @@ import torch
 from kornia.feature.adalam.adalam import AdalamFilter
 
 from sigmaslam.evaluation.matching.pairs import ImagePair, Motion
+from sigmaslam.evaluation.matching.scores import essential_by_magsac
 from sigmaslam.frontend.classical import SiftDetector
 from sigmaslam.frontend.judge import MatchJudge
 from sigmaslam.frontend.matching import Putative, nearest_anywhere
@@ -21,7 +22,6 @@ KEYPOINTS = 2000
 _RIGHT = 1.5
 """Distance from the epipolar line of a right match, pixels."""
 _THINNED = 0.25
-_MAGSAC_THRESHOLD = 1.0
 _RATIOS = (0.8, 0.9)
 
 
@@ -138,17 +138,8 @@ def _magsac(task: _Task) -> np.ndarray:
         features.keypoints[index].astype(np.float64)
         for features, index in ((task.features0, task.putative.index0), (task.features1, task.putative.index1))
     )
-    cv2.setRNGSeed(0)
-    _, mask = cv2.findEssentialMat(
-        points0,
-        points1,
-        task.pair.truth.K,
-        method=cv2.USAC_MAGSAC,
-        prob=0.9999,
-        threshold=_MAGSAC_THRESHOLD,
-        maxIters=10_000,
-    )
-    return np.zeros(len(points0), bool) if mask is None else mask.ravel() > 0
+    found = essential_by_magsac(points0, points1, task.pair.truth.K)
+    return np.zeros(len(points0), bool) if found is None else found[1].ravel() > 0
 
 
 def _adalam(task: _Task) -> np.ndarray:

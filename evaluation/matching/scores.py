@@ -173,6 +173,41 @@ def corner_error(
     return float(np.linalg.norm(difference, axis=1).mean())
 
 
+def essential_by_magsac(
+    points0: np.ndarray, points1: np.ndarray, K: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Essential matrix (3, 3) and inliers (N, 1) uint8 of matched pixels (N, 2) float64; None where there is none."""
+    if len(points0) < 5:
+        return None
+    E, inliers = cv2.findEssentialMat(
+        points0,
+        points1,
+        K,
+        method=cv2.USAC_MAGSAC,
+        prob=_CONFIDENCE,
+        threshold=_INLIER_THRESHOLD,
+        maxIters=_ITERATIONS,
+    )
+    return (E, inliers) if np.shape(E) == (3, 3) else None
+
+
+def pose_by_magsac(points0: np.ndarray, points1: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Rotation (3, 3) and direction of translation (3,) from camera 0 to camera 1; None where there is none."""
+    found = essential_by_magsac(points0, points1, K)
+    if found is None:
+        return None
+    _, R, direction, _ = cv2.recoverPose(found[0], points0, points1, K, mask=found[1])
+    return R, direction.ravel()
+
+
+def pose_errors_deg(R: np.ndarray, direction: np.ndarray, T_1_0: np.ndarray) -> tuple[float, float]:
+    """Angles between estimated and true rotation, and direction of translation, degrees."""
+    translation = T_1_0[:3, 3]
+    cosine = float(direction @ translation) / np.linalg.norm(translation)
+    rotation = np.linalg.norm(rotation_log(R.T @ T_1_0[:3, :3]))
+    return float(np.degrees(rotation)), float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+
+
 def pose_error_deg(points0: np.ndarray, points1: np.ndarray, truth: Motion) -> float:
     """Larger of the angles between estimated and true rotation, and direction of translation, degrees.
 
@@ -180,24 +215,8 @@ def pose_error_deg(points0: np.ndarray, points1: np.ndarray, truth: Motion) -> f
         points0, points1: (N, 2) matched pixels.
         truth: intrinsics and motion; the translation must not be zero.
     """
-    if len(points0) < 5:
-        return np.inf
-    E, inliers = cv2.findEssentialMat(
-        points0,
-        points1,
-        truth.K,
-        method=cv2.USAC_MAGSAC,
-        prob=_CONFIDENCE,
-        threshold=_INLIER_THRESHOLD,
-        maxIters=_ITERATIONS,
-    )
-    if np.shape(E) != (3, 3):
-        return np.inf
-    _, R, direction, _ = cv2.recoverPose(E, points0, points1, truth.K, mask=inliers)
-    translation = truth.T_1_0[:3, 3]
-    cosine = float(direction.ravel() @ translation) / np.linalg.norm(translation)
-    rotation = np.linalg.norm(rotation_log(R.T @ truth.T_1_0[:3, :3]))
-    return float(np.degrees(max(rotation, np.arccos(np.clip(cosine, -1.0, 1.0)))))
+    pose = pose_by_magsac(points0, points1, truth.K)
+    return np.inf if pose is None else max(pose_errors_deg(*pose, truth.T_1_0))
 
 
 def area_under_curve(errors: Sequence[float], threshold: float) -> float:

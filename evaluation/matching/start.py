@@ -6,22 +6,20 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from sigmaslam.epipolar import estimate_epipolar_pose
 from sigmaslam.evaluation.matching.pairs import ImagePair, Motion
+from sigmaslam.evaluation.matching.scores import pose_by_magsac, pose_errors_deg
 from sigmaslam.frontend.judge import MatchJudge
 from sigmaslam.frontend.matching import nearest_anywhere
 from sigmaslam.frontend.types import Features
 from sigmaslam.match import Matches, match_features
-from sigmaslam.rotation import rotation_log
 
 # With less translation its direction means nothing, metres.
 _LEAST_TRANSLATION = 0.02
 # Ours sees less probable matches too: its weights leave them out.
 _LEAST_PROBABILITY = 0.05
-_MAGSAC_THRESHOLD = 1.0
 _ROUNDS = 5
 
 _Pose = tuple[np.ndarray, np.ndarray] | None
@@ -61,7 +59,8 @@ def compare_starts(
         features0, features1 = detect(pair.image0), detect(pair.image1)
         putative = nearest_anywhere(features0.descriptors, features1.descriptors)
         mutual = putative.select(putative.mutual)
-        points0, points1 = features0.keypoints[mutual.index0], features1.keypoints[mutual.index1]
+        points0 = features0.keypoints[mutual.index0].astype(np.float64)
+        points1 = features1.keypoints[mutual.index1].astype(np.float64)
         matches = match_features(judge, pair.image0, pair.image1, features0, features1, _LEAST_PROBABILITY)
         contenders = _contenders(points0, points1, matches, truth.K)
         # In turn, so that a busy moment of the machine hits everyone.
@@ -81,7 +80,8 @@ def compare_starts(
 def _contenders(
     points0: np.ndarray, points1: np.ndarray, matches: Matches, K: np.ndarray
 ) -> dict[str, Callable[[], _Pose]]:
-    probable = matches.select(matches.probability >= 0.5)
+    probable = matches.probability >= 0.5
+    probable_points = [each[probable].astype(np.float64) for each in (matches.keypoints0, matches.keypoints1)]
 
     def ours() -> _Pose:
         pose = estimate_epipolar_pose(
@@ -90,33 +90,14 @@ def _contenders(
         return None if pose is None else (pose.R, pose.direction)
 
     return {
-        "MAGSAC, mutual nearest neighbours": lambda: _magsac(points0, points1, K),
-        "MAGSAC, our refined matches": lambda: _magsac(probable.keypoints0, probable.keypoints1, K),
+        "MAGSAC, mutual nearest neighbours": lambda: pose_by_magsac(points0, points1, K),
+        "MAGSAC, our refined matches": lambda: pose_by_magsac(probable_points[0], probable_points[1], K),
         "ours": ours,
     }
 
 
-def _magsac(points0: np.ndarray, points1: np.ndarray, K: np.ndarray) -> _Pose:
-    if len(points0) < 5:
-        return None
-    points0, points1 = points0.astype(np.float64), points1.astype(np.float64)
-    cv2.setRNGSeed(0)
-    E, mask = cv2.findEssentialMat(
-        points0, points1, K, method=cv2.USAC_MAGSAC, prob=0.9999, threshold=_MAGSAC_THRESHOLD, maxIters=10_000
-    )
-    if np.shape(E) != (3, 3):
-        return None
-    _, R, direction, _ = cv2.recoverPose(E, points0, points1, K, mask=mask)
-    return R, direction.ravel()
-
-
 def _errors(pose: _Pose, T_1_0: np.ndarray) -> tuple[float, float]:
-    if pose is None:
-        return 180.0, 180.0
-    R, direction = pose
-    rotation = np.linalg.norm(rotation_log(R.T @ T_1_0[:3, :3]))
-    cosine = float(direction @ T_1_0[:3, 3]) / np.linalg.norm(T_1_0[:3, 3])
-    return float(np.degrees(rotation)), float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    return (180.0, 180.0) if pose is None else pose_errors_deg(*pose, T_1_0)
 
 
 def _summary(values: np.ndarray) -> StartScore:

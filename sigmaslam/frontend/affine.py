@@ -9,6 +9,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from sigmaslam.frontend.evidence import sample_patches
 from sigmaslam.frontend.neighbours import nearest_points
 from sigmaslam.frontend.types import Refinement
 
@@ -128,7 +129,9 @@ def _align(
     grid = spacing * np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     window = np.exp(-0.5 * (grid**2).sum(axis=1) / (0.6 * spacing * _RADIUS) ** 2)
     window /= window.sum()
-    template = _normalised(_sample(image0, points0[:, None] + grid @ np.linalg.inv(A).transpose(0, 2, 1)), window)
+    template = _normalised(
+        sample_patches(image0, points0[:, None] + grid @ np.linalg.inv(A).transpose(0, 2, 1)), window
+    )
     square = template.reshape(-1, len(side), len(side))
     along_v, along_u = np.gradient(square, spacing, axis=(1, 2))
     gradient = np.stack([along_u, along_v], axis=-1).reshape(len(template), -1, 2)
@@ -137,19 +140,13 @@ def _align(
     inverse = np.linalg.inv(normal)
     shift = np.zeros_like(points1)
     for _ in range(_ITERATIONS):
-        error = _normalised(_sample(image1, (points1 + shift)[:, None] + grid), window) - template
+        error = _normalised(sample_patches(image1, (points1 + shift)[:, None] + grid), window) - template
         step = np.einsum("nij,nkj,nk->ni", inverse, weighted, error)
         length = np.linalg.norm(step, axis=1, keepdims=True)
         shift -= step * np.minimum(1.0, _LONGEST_STEP * spacing / np.maximum(length, 1e-9))
-    final = _normalised(_sample(image1, (points1 + shift)[:, None] + grid), window)
+    final = _normalised(sample_patches(image1, (points1 + shift)[:, None] + grid), window)
     moved = ((final * template) @ window > _LEAST_CORRELATION) & (np.linalg.norm(shift, axis=1) <= reach)
     return np.where(moved[:, None], points1 + shift, points1), moved
-
-
-def _sample(image: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Bilinear samples (M, K) at places (M, K, 2)."""
-    u, v = (np.ascontiguousarray(places[..., axis], np.float32) for axis in (0, 1))
-    return np.asarray(cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
 def _normalised(patches: np.ndarray, window: np.ndarray) -> np.ndarray:

@@ -70,8 +70,8 @@ def examine_patches(
         smooth0, smooth1 = _smoothed(image0, max(1.0, 1.0 / factor)), _smoothed(image1, max(1.0, factor))
         grid = max(1.0, factor) * _GRID
         offsets = grid if A is None else grid @ back[rows].transpose(0, 2, 1)
-        patches0[rows] = _sample(smooth0, points0[rows, None] + offsets)
-        patches1[rows] = _sample(smooth1, points1[rows, None] + grid)
+        patches0[rows] = sample_patches(smooth0, points0[rows, None] + offsets)
+        patches1[rows] = sample_patches(smooth1, points1[rows, None] + grid)
     centred0, variance0 = _centred(patches0)
     centred1, variance1 = _centred(patches1)
     both = np.sqrt(variance0 * variance1)
@@ -105,8 +105,8 @@ def _smoothed(image: np.ndarray, factor: float) -> np.ndarray:
     return cv2.GaussianBlur(image, (0, 0), _BLUR * factor).astype(np.float32)
 
 
-def _sample(image: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Bilinear samples (M, K) at places (M, K, 2)."""
+def sample_patches(image: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Bilinear samples (M, K) of an image at places (M, K, 2), as float32."""
     samples = np.empty(places.shape[:2], np.float32)
     for begin in range(0, len(places), _MOST_ROWS):
         some = slice(begin, begin + _MOST_ROWS)
