@@ -9,14 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from safetensors.torch import save_file
 from torch import nn
 from torch.utils.data import DataLoader
@@ -36,6 +28,7 @@ from sigmaslam.training.interruption import Interruption
 from sigmaslam.training.journal import Journal
 from sigmaslam.training.losses import PairLoss
 from sigmaslam.training.pictures import draw_sample
+from sigmaslam.training.progress import open_progress
 from sigmaslam.training.recipes import TrainingConfig, check_config
 from sigmaslam.training.stream import MIXES, TrainingPair, open_stream, pair_loader
 from sigmaslam.training.validation import held_out_seed, held_out_sources, matching_accuracy
@@ -110,7 +103,7 @@ class _Run:
         self._loss = loss_module(state.network, place)
         self._began = time.monotonic() - state.seconds
         self._logged = (state.step, time.monotonic())
-        self._progress = _progress(hidden=not place.leads)
+        self._progress = open_progress(hidden=not place.leads)
 
     def finish(self, workers: int) -> None:
         """Trains to the end; stopped, it saves the last whole step and raises KeyboardInterrupt."""
@@ -217,15 +210,3 @@ def _write_result(out: Path, state: TrainingState, card: dict[str, Any]) -> None
 
 def _note(loss: PairLoss) -> str:
     return " ".join(f"{name} {float(value.detach()):.3f}" for name, value in loss._asdict().items())
-
-
-def _progress(hidden: bool) -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
-        disable=hidden,
-    )

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress
 from safetensors.torch import save_file
 
 from sigmaslam.errors import InputError
@@ -22,6 +22,7 @@ from sigmaslam.training.calibration import auroc, average_precision, best_half, 
 from sigmaslam.training.card import describe_origin
 from sigmaslam.training.devices import describe_processor
 from sigmaslam.training.match_sets import PairRecord, load_record, record_path, write_records
+from sigmaslam.training.progress import open_progress
 from sigmaslam.training.scorer import RIGHT, make_sample, score_set, train_scorer
 from sigmaslam.training.validation import held_out_seed
 from sigmaslam.training.verifier import VerifierRows, calibrate, collect_rows, train_verifier
@@ -72,7 +73,7 @@ def train_scoring(out: Path, config: ScoringConfig, workers: int) -> dict[str, A
     origin = describe_origin([out])
     clock = _Clock(out / _SECONDS_NAME)
     torch.set_num_threads(1)
-    with _progress() as progress:
+    with open_progress() as progress:
         folders = [
             _make_records(progress, out / name, seed, count, workers)
             for name, seed, count in (
@@ -226,14 +227,3 @@ def _show(progress: Progress, task: Any, step: int, note: str) -> None:
     progress.update(task, completed=step)
     if step % _SHOW_EVERY == 0:
         progress.update(task, note=note)
-
-
-def _progress() -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
-    )
