@@ -20,7 +20,8 @@ from torch import Tensor, nn
 from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.files import atomic_path, atomic_write_text, make_folder
 from sigmaslam.filters.lie import exp_se3
-from sigmaslam.filters.stereo_pose import STATE_SIZE, Innovate, Predict, Update
+from sigmaslam.filters.stereo_pose import STATE_SIZE, Predict
+from sigmaslam.filters.stereo_window import Transfer
 from sigmaslam.models.card import card_page, read_card, scoring_page
 from sigmaslam.models.extractor import EXTRACTOR_SIZE_MULTIPLE, FeatureExtractor
 from sigmaslam.models.network import DESCRIPTOR_SIZE, STRIDE, FeatureNetwork
@@ -114,7 +115,7 @@ def export_features(weights: Path, out: Path) -> float:
 
 
 def export_filter(folder: Path) -> dict[str, float]:
-    """Writes the three filter graphs and returns the largest difference of each from torch."""
+    """Writes the two filter graphs and returns the largest difference of each from torch."""
     return {
         name: _export(graph, folder / f"{name}.onnx", _FILTER_TOLERANCE) for name, graph in _filter_graphs().items()
     }
@@ -129,7 +130,7 @@ def export_all(
         weights: safetensors file of a training run.
         card: its JSON card; the differences found here are added to the copy in `out`.
         scores: of these weights on real sets, by set, for the card.
-        out: folder that gets features.onnx, pose_*.onnx, features.safetensors and features.json and .md.
+        out: folder that gets features.onnx, pose_predict.onnx, stereo_transfer.onnx, features.safetensors and features.json and .md.
     """
     content = read_card(card)
     if scores is not None:
@@ -199,10 +200,10 @@ def _noisy_texture(rng: np.random.Generator, shape: tuple[int, int]) -> Tensor:
 
 
 def _filter_graphs() -> dict[str, _Graph]:
-    points = torch.export.Dim("points", min=1, max=100_000)
-    state = ["pose", "clone", "offset", "covariance", "intrinsics", "landmarks", "landmark_sigma"]
+    pairs = torch.export.Dim("pairs", min=1, max=10_000)
+    measurements = torch.export.Dim("measurements", min=1, max=1_000_000)
     fixed: dict[int, Any] = {}
-    free = {0: points}
+    by_pair, each = {0: pairs}, {0: measurements}
     return {
         "pose_predict": _Graph(
             Predict(),
@@ -212,84 +213,41 @@ def _filter_graphs() -> dict[str, _Graph]:
             ["predicted_pose", "predicted_covariance"],
             (fixed,) * 5,
         ),
-        "pose_innovate": _Graph(
-            Innovate(),
-            _innovate_example(0, 40),
-            _innovate_example(1, 17),
-            [*state, "noise"],
-            ["predicted", "innovation_covariance", "in_front"],
-            (*(fixed,) * 5, free, free, free),
-        ),
-        "pose_update": _Graph(
-            Update(),
-            _update_example(0, 40),
-            _update_example(1, 23),
-            [*state[:2], "twist", *state[2:], "measurement", "noise", "weight"],
-            [
-                "new_pose",
-                "new_clone",
-                "new_twist",
-                "new_offset",
-                "new_covariance",
-                "nis",
-                "log_likelihood",
-                "squared_residual",
-            ],
-            (*(fixed,) * 6, *(free,) * 5),
+        "stereo_transfer": _Graph(
+            Transfer(),
+            _transfer_example(0, 5, 40),
+            _transfer_example(1, 3, 17),
+            ["relative", "spread", "pair", "calibration", "intrinsics", "landmarks", "landmark_spread"],
+            ["mean", "slope", "left", "in_front"],
+            (by_pair, by_pair, each, fixed, fixed, each, each),
         ),
     }
 
 
 def _predict_example(seed: int) -> tuple[Tensor, ...]:
-    pose, _, twist, _, covariance = _state_example(seed)
-    generator = torch.Generator().manual_seed(seed + 10)
-    densities = 0.1 + torch.rand(3, generator=generator, dtype=torch.float64)
-    return pose, twist, covariance, torch.tensor(0.1 + 0.2 * seed, dtype=torch.float64), densities
-
-
-def _innovate_example(seed: int, count: int) -> tuple[Tensor, ...]:
-    pose, clone, _, offset, covariance = _state_example(seed)
-    intrinsics, landmarks, landmark_sigma, _, noise, _ = _points_example(seed, count)
-    return pose, clone, offset, covariance, intrinsics, landmarks, landmark_sigma, noise
-
-
-def _update_example(seed: int, count: int) -> tuple[Tensor, ...]:
-    pose, clone, twist, offset, covariance = _state_example(seed)
-    intrinsics, landmarks, landmark_sigma, error, noise, weight = _points_example(seed, count)
-    measurement = error + Innovate()(pose, clone, offset, covariance, intrinsics, landmarks, landmark_sigma, noise)[0]
-    return (
-        *(pose, clone, twist, offset, covariance),
-        *(intrinsics, landmarks, landmark_sigma, measurement, noise, weight),
-    )
-
-
-def _state_example(seed: int) -> tuple[Tensor, ...]:
     generator = torch.Generator().manual_seed(seed)
 
     def random(*shape: int) -> Tensor:
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
-    clone = exp_se3(0.3 * random(6))
-    pose = clone @ exp_se3(0.02 * random(6))
     root = 0.004 * random(STATE_SIZE, STATE_SIZE)
-    return pose, clone, random(6), 0.1 * random(1), root @ root.T
+    densities = 0.1 + random(3).abs()
+    step = torch.tensor(0.1 + 0.2 * seed, dtype=torch.float64)
+    return exp_se3(0.3 * random(6)), random(6), root @ root.T, step, densities
 
 
-def _points_example(seed: int, count: int) -> tuple[Tensor, ...]:
-    generator = torch.Generator().manual_seed(seed + 20)
+def _transfer_example(seed: int, pairs: int, measurements: int) -> tuple[Tensor, ...]:
+    generator = torch.Generator().manual_seed(seed)
 
     def uniform(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator, dtype=torch.float64)
 
+    relative = exp_se3(0.1 * uniform(pairs, 6))
+    spread = 0.01 * uniform(pairs, 9, 9).tril()
+    pair = torch.randint(0, pairs, (measurements,), generator=generator)
     intrinsics = torch.tensor([400.0, 410.0, 320.0, 240.0, 80.0], dtype=torch.float64)
-    landmarks = torch.stack([640 * uniform(count), 480 * uniform(count), 1 + 40 * uniform(count)], dim=-1)
-    error = 2.0 * uniform(count, 3) - 1.0
-    root = 0.3 * torch.eye(3, dtype=torch.float64) + 0.1 * uniform(count, 3, 3)
-    noise = root @ root.transpose(1, 2)
-    weight = torch.ones(count, 3, dtype=torch.float64)
-    weight[::3, 2] = 0.0
-    weight[::5] = 0.0
-    return intrinsics, landmarks, 0.2 + 0.4 * uniform(count, 3), error, noise, weight
+    landmarks = torch.stack([640 * uniform(measurements), 480 * uniform(measurements), 40 * uniform(measurements)], -1)
+    return relative, spread, pair, 0.3 * uniform(3), intrinsics, landmarks, uniform(measurements, 3, 3).tril()
 
 
 def _export(

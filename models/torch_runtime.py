@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from sigmaslam.filters.stereo_pose import Innovate, Predict, Update
+from sigmaslam.filters.stereo_pose import Predict
+from sigmaslam.filters.stereo_window import Transfer
 from sigmaslam.models.export import load_network, load_scorer, load_verifier
 from sigmaslam.models.extractor import FeatureExtractor
 from sigmaslam.models.scorer import ScoredMatches
@@ -46,5 +47,5 @@ def scoring_module(name: str) -> TorchModule:
 
 
 def filter_module(name: str) -> TorchModule:
-    """pose_predict, pose_innovate or pose_update."""
-    return TorchModule({"pose_predict": Predict(), "pose_innovate": Innovate(), "pose_update": Update()}[name])
+    """pose_predict or stereo_transfer."""
+    return TorchModule({"pose_predict": Predict(), "stereo_transfer": Transfer()}[name])

@@ -24,7 +24,7 @@ from sigmaslam.trajectory import Trajectory, write_kitti, write_tum
 
 STAGES = ("read", "features", "match", "filter", "map")
 _COLUMNS = (COLUMNS[0], "status", *COLUMNS[1:], *(f"ms_{stage}" for stage in STAGES))
-_GRAPHS = ("features.onnx", "pose_predict.onnx", "pose_innovate.onnx", "pose_update.onnx")
+_GRAPHS = ("features.onnx", "scorer.onnx", "verifier.onnx", "pose_predict.onnx", "stereo_transfer.onnx")
 
 
 class RunWriter:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.resources import as_file, files
 from pathlib import Path
 
@@ -53,3 +53,12 @@ def shipped_weights(name: str) -> Path:
     """Path of a file in the package's folder of weights and graphs."""
     with as_file(files("sigmaslam.models.weights") / name) as path:
         return Path(path)
+
+
+def load_step(name: str, backend: str) -> Callable[[Mapping[str, np.ndarray]], list[np.ndarray]]:
+    """A step of the filter by the name of its graph; backend "onnx", or "torch" for its twin."""
+    if backend == "torch":
+        from sigmaslam.models.torch_runtime import filter_module
+
+        return filter_module(name)
+    return OnnxGraph(shipped_weights(f"{name}.onnx"))

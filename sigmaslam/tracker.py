@@ -7,20 +7,20 @@ import time
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from sigmaslam.camera import StereoCamera
 from sigmaslam.errors import InputError
 from sigmaslam.frontend import StereoView, TemporalMatches, build_frontend
-from sigmaslam.landmarks import KeyframeLandmarks, PointMap, merge_maps
-from sigmaslam.pose_filter import PoseFilter, PoseState, StereoPoints, UpdateResult
+from sigmaslam.landmarks import PointMap, map_points, merge_maps
+from sigmaslam.motion import MotionFilter
 from sigmaslam.rectify import StereoRectifier
 from sigmaslam.rotation import se3_adjoint, se3_inverse, se3_log
 from sigmaslam.startup import estimate_relative_pose
+from sigmaslam.window import CALIBRATION, FrameFit, KeyframeWindow, Views, pose_slice
 
 _LOGGER = logging.getLogger(__name__)
 
-# 99.9 % quantiles of chi-square with 0, 1, 2 and 3 degrees of freedom.
-_CHI_SQUARE_999 = np.array([0.0, 10.827566170662733, 13.815510557964274, 16.26623619623813])
 # A pose that fewer of the matches near the prediction agree with is not believed.
 _LEAST_SHARE = 0.3
 # A pose from matches alone has no prediction to agree with. Where fewer than this share of the matches that should be
@@ -30,6 +30,10 @@ _LEAST_SHARE_UNGUIDED = 0.5
 # A fit near the prediction with a larger NIS per degree of freedom may sit in a wrong place: it is checked against one
 # that does without the prediction.
 _DOUBTFUL_NIS = 2.0
+# A keyframe of which fewer landmarks are in view is not searched for.
+_LEAST_OF_A_KEYFRAME = 8
+# The noise of matches follows the NIS: bounds of its scale, and the exponent of one frame's part in it.
+_NOISE_SCALES, _ADAPTATION = (0.25, 4.0), 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +53,13 @@ class TrackerConfig:
         start_turn: of the angular velocity, rad/s.
         offset_sigma: prior of the disparity offset, pixels.
         offset_walk: its random walk, pixels per root second.
+        turn_sigma: prior of what a turn of the right camera (yaw, pitch) does to disparities at unit normalised
+            coordinates, pixels; zero switches these states off.
+        linearisation: "unscented" or "extended".
+        iterations: linearisations in a frame's update.
+        window: keyframes that are estimated jointly.
+        spacing: a new landmark lies at least so far from landmarks that are there already, pixels.
+        most_misses: after so many frames in a row in which it was not found a landmark is no longer looked for.
         least_inliers: fewer is no pose; without a prediction and a fair share of the matches, fewer than twice as many.
         keyframe_ratio: a new keyframe is taken when the inliers fall below this share of what the keyframe began with.
         search_limit: with a predicted place less certain than this (pixels, one sigma) the search is not guided.
@@ -62,8 +73,14 @@ class TrackerConfig:
     angular_acceleration: float = 0.5
     start_speed: float = 1.0
     start_turn: float = 1.0
-    offset_sigma: float = 0.2
+    offset_sigma: float = 0.5
     offset_walk: float = 0.02
+    turn_sigma: float = 0.3
+    linearisation: str = "unscented"
+    iterations: int = 2
+    window: int = 6
+    spacing: float = 4.0
+    most_misses: int = 3
     least_inliers: int = 15
     keyframe_ratio: float = 0.6
     search_limit: float = 25.0
@@ -113,27 +130,16 @@ class Estimate:
     milliseconds: dict[str, float] = field(default_factory=dict)
 
 
-@dataclass(slots=True)
-class _Keyframe:
-    view: StereoView
-    landmarks: KeyframeLandmarks
-    offset: np.ndarray  # disparity offset as it was known before this keyframe, (1,)
-    offset_variance: float
-    first_inliers: int | None = None
-
-
 @dataclass(frozen=True, slots=True)
-class _Fit:
-    """A posterior that has not been taken over yet, with the rows of the landmarks behind it."""
+class _Found:
+    """Views of the window's landmarks in the current frame, and the probability of each."""
 
-    state: PoseState
-    result: UpdateResult
-    points: StereoPoints
-    rows: np.ndarray
+    views: Views
+    probability: np.ndarray
+    searched: np.ndarray
 
-    @property
-    def nis_per_dof(self) -> float:
-        return self.result.nis / max(self.result.dof, 1)
+    def select(self, index: np.ndarray) -> _Found:
+        return _Found(self.views.select(index), self.probability[index], self.searched)
 
 
 class StereoTracker:
@@ -163,17 +169,26 @@ class StereoTracker:
         self._T_rectified_left = np.eye(4)
         self._T_rectified_left[:3, :3] = self._rectifier.R_rectified_left
         self._frontend = build_frontend(frontend, self.config.max_keypoints, backend)
-        self._filter = PoseFilter(self._camera, self.config.offset_sigma, backend)
-        self._keyframe: _Keyframe | None = None
+        turn = self.config.turn_sigma
+        self._window = KeyframeWindow(
+            self._camera,
+            np.array([self.config.offset_sigma, turn, turn]),
+            backend,
+            self.config.linearisation,
+            self.config.iterations,
+        )
+        self._motion = MotionFilter(backend)
+        self._keyframe_views: list[StereoView] = []
+        self._reference = 0  # inliers of the first frame after the last keyframe
         self._retired: list[PointMap] = []
-        self._densities = np.zeros(3)
-        self._depth = 1.0
+        self._densities = np.zeros(2)
+        self._noise_scale = 1.0
         self._timestamp: float | None = None
+        self._keyframe_at = 0.0
         self._tracked_at = 0.0
         self._tracked_pose = np.eye(4)  # the pose at that time
         self._moving = False  # there has been a pose from the images
         self._velocity_known = False  # since the last start
-        self._origin_covariance = np.zeros((6, 6))  # of the pose where tracking last started anew, in the world
 
     def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> Estimate:
         """Takes one stereo pair.
@@ -192,122 +207,131 @@ class StereoTracker:
         clock = _Stopwatch()
         view = self._frontend.observe(*self._rectifier.rectify(left, right))
         clock.lap("features")
-        if self._timestamp is None or self._keyframe is None:
-            matches, fit = 0, None
-            if self._timestamp is not None:
-                self._predict(timestamp)
-            if self._take_keyframe(view):
-                self._anchor(timestamp)
-            status = "starting"
+        if self._timestamp is not None:
+            self._motion.predict(timestamp - self._timestamp, self._densities)
+        matches, fit, status = 0, None, "starting"
+        if not len(self._window):
+            if self._has_stereo(view):
+                self._start(view, timestamp)
         else:
-            self._predict(timestamp)
-            matches, fit = self._track(view, timestamp, clock)
-            if fit is None:
+            found, fit = self._track(view, timestamp, clock)
+            matches = len(found.probability)
+            if fit is not None:
+                status = "tracking"
+                self._accept(fit, found, view, timestamp)
+            else:
                 status = "lost" if self._moving else "starting"
                 self._recover(view, timestamp)
-            else:
-                status = "tracking"
-                self._accept(fit, view, timestamp)
         clock.lap("map")
         self._timestamp = timestamp
         return self._report(timestamp, status, matches, fit, clock.milliseconds)
 
     def map(self) -> PointMap:
         """All landmarks so far that were seen at least three times."""
-        parts = list(self._retired)
-        if self._keyframe is not None:
-            parts.append(self._keyframe_map())
+        window = self._window
+        parts = [*self._retired, map_points(window.landmarks, window)]
         merged = merge_maps(parts)
         R = self._T_rectified_left[:3, :3]
         return PointMap(merged.points @ R, R.T @ merged.covariances @ R, merged.observations)
 
-    def _predict(self, timestamp: float) -> None:
-        assert self._timestamp is not None
-        self._filter.predict(timestamp - self._timestamp, self._densities)
+    # ---- where landmarks are
 
-    def _track(self, view: StereoView, timestamp: float, clock: _Stopwatch) -> tuple[int, _Fit | None]:
-        """Matches the keyframe with the view, first near the prediction, then anywhere; number of matches and fit."""
-        assert self._keyframe is not None
-        landmarks = self._keyframe.landmarks
-        predicted, S, in_front = self._filter.innovate(
-            landmarks.measured, landmarks.sigma, np.tile(np.eye(3), (len(landmarks.index), 1, 1))
-        )
-        spread = np.linalg.eigvalsh(S[:, :2, :2])[:, 1]
-        matches, fit = 0, None
-        rows = np.flatnonzero(in_front & self._in_image(predicted))
-        enough = len(rows) >= self.config.least_inliers
-        if enough and self._velocity_known and np.median(spread[rows]) < self.config.search_limit**2:
-            ellipses = S[rows, :2, :2]
-            found = self._frontend.match(
-                self._keyframe.view, landmarks.index[rows], view, predicted[rows, :2], ellipses
-            )
+    def _pose_and_step(self) -> tuple[np.ndarray, np.ndarray]:
+        """The predicted pose, and its covariance relative to the last keyframe, perturbed in the world."""
+        key = self._window.poses[-1]
+        adjoint = se3_adjoint(key)
+        return key @ self._motion.step, adjoint @ self._motion.step_covariance @ adjoint.T
+
+    def _track(self, view: StereoView, timestamp: float, clock: _Stopwatch) -> tuple[_Found, FrameFit | None]:
+        """Finds the landmarks in the view, first near the prediction, then anywhere; what was found and the fit."""
+        pose, covariance = self._pose_and_step()
+        found, fit = _NOTHING, None
+        if self._velocity_known:
+            found = self._search(view, pose, covariance)
             clock.lap("match")
-            matches, fit = len(found.key_index), self._fit(found)
+            fit = self._fit(found, pose, covariance)
             clock.lap("filter")
-        if fit is None or fit.nis_per_dof > _DOUBTFUL_NIS:
-            found = self._frontend.match(self._keyframe.view, landmarks.index, view, predicted[:, :2], None)
-            clock.lap("match")
-            other = self._fit_without_prediction(found, timestamp)
-            clock.lap("filter")
+        if fit is None or fit.nis_per_dof > _DOUBTFUL_NIS * self._noise_scale:
+            other_found, other = self._search_anywhere(view, timestamp, clock)
             if fit is None or (other is not None and other.nis_per_dof < fit.nis_per_dof):
-                matches, fit = len(found.key_index), other
-        return matches, fit
+                found, fit = other_found, other
+        return found, fit
+
+    def _search(self, view: StereoView, pose: np.ndarray, covariance: np.ndarray) -> _Found:
+        """Active search: every landmark within the innovation ellipse of its prediction, keyframe by keyframe."""
+        landmarks = self._window.landmarks
+        rows = np.flatnonzero(landmarks.misses < self.config.most_misses)
+        if not len(rows):
+            return _NOTHING
+        predicted, S, in_front = self._window.predict(rows, pose, covariance)
+        S = S[:, :2, :2] + np.eye(2)
+        inside = in_front & self._in_image(predicted)
+        rows, predicted, S = rows[inside], predicted[inside], S[inside]
+        if not len(rows) or np.median(np.linalg.eigvalsh(S)[:, 1]) > self.config.search_limit**2:
+            return _NOTHING
+        parts = []
+        for host, key in enumerate(self._keyframe_views):
+            chosen = np.flatnonzero(landmarks.host[rows] == host)
+            if len(chosen) < _LEAST_OF_A_KEYFRAME:
+                continue
+            matches = self._frontend.match(
+                key, landmarks.feature[rows[chosen]], view, predicted[chosen, :2], S[chosen]
+            )
+            # Features of a keyframe ascend with the rows of its landmarks.
+            place = np.searchsorted(landmarks.feature[rows[chosen]], matches.key_index)
+            parts.append(self._found(rows[chosen][place], matches, rows[chosen]))
+        return _merge(parts)
+
+    def _search_anywhere(self, view: StereoView, timestamp: float, clock: _Stopwatch) -> tuple[_Found, FrameFit | None]:
+        """Start-up and recovery: relative pose from matches alone, then all landmarks near what it predicts."""
+        landmarks = self._window.landmarks
+        rows = np.flatnonzero(landmarks.host == len(self._window) - 1)
+        if len(rows) < self.config.least_inliers:
+            return _NOTHING, None
+        matches = self._frontend.match(
+            self._keyframe_views[-1], landmarks.feature[rows], view, landmarks.measured[rows, :2], None
+        )
+        clock.lap("match")
+        found = self._found(rows[np.searchsorted(landmarks.feature[rows], matches.key_index)], matches, rows[:0])
+        fit = self._fit_without_prediction(found, timestamp)
+        clock.lap("filter")
+        return found, fit
+
+    def _found(self, rows: np.ndarray, matches: TemporalMatches, searched: np.ndarray) -> _Found:
+        """Matches as views of landmarks."""
+        noise = np.zeros((len(rows), 3, 3))
+        if self.config.constant_sigma is None:
+            noise[:, :2, :2] = matches.covariance
+            noise[:, 2, 2] = np.where(np.isfinite(matches.disparity), matches.disparity_sigma, 1.0) ** 2
+        else:
+            place, disparity = self.config.constant_sigma
+            noise[:] = np.diag([place, place, disparity]) ** 2
+        measurement = np.column_stack([matches.points, matches.disparity])
+        return _Found(Views(rows, measurement, self._noise_scale * noise), matches.probability, searched)
 
     def _in_image(self, predicted: np.ndarray) -> np.ndarray:
         u, v = predicted[:, 0], predicted[:, 1]
         return np.asarray((u >= 0) & (v >= 0) & (u < self._camera.width) & (v < self._camera.height))
 
-    def _stereo_points(self, found: TemporalMatches) -> tuple[StereoPoints, np.ndarray]:
-        """Matches as measurements of landmarks, and the landmarks' rows."""
-        assert self._keyframe is not None
-        landmarks = self._keyframe.landmarks
-        rows = np.searchsorted(landmarks.index, found.key_index)
-        noise = np.zeros((len(rows), 3, 3))
-        if self.config.constant_sigma is None:
-            noise[:, :2, :2] = found.covariance
-            noise[:, 2, 2] = np.where(np.isfinite(found.disparity), found.disparity_sigma, 1.0) ** 2
-        else:
-            place, disparity = self.config.constant_sigma
-            noise[:] = np.diag([place, place, disparity]) ** 2
-        measurement = np.column_stack([found.points, found.disparity])
-        return StereoPoints(landmarks.measured[rows], landmarks.sigma[rows], measurement, noise), rows
+    # ---- poses
 
-    def _fit(self, found: TemporalMatches) -> _Fit | None:
-        """Chi-square gate on the innovation, update, gate on the residual, update again."""
-        points, rows = self._stereo_points(found)
-        if len(rows) < self.config.least_inliers:
+    def _fit(self, found: _Found, pose: np.ndarray, covariance: np.ndarray) -> FrameFit | None:
+        """Update from the prediction; most of what was found near it must agree."""
+        count = len(found.probability)
+        if count < self.config.least_inliers:
             return None
-        predicted, S, in_front = self._filter.innovate(points.landmarks, points.landmark_sigma, points.noise)
-        innovation = points.measurement - predicted
-        known = np.isfinite(innovation)
-        # A disparity that is not there: no innovation, unit variance, no covariance with the rest.
-        present = known[:, :, None] & known[:, None, :]
-        S = np.where(present, S, np.eye(3))
-        innovation = np.where(known, innovation, 0.0)
-        distance = np.einsum("mi,mi->m", innovation, np.linalg.solve(S, innovation[..., None])[..., 0])
-        kept = in_front & (distance <= _CHI_SQUARE_999[known.sum(axis=1)])
-        if kept.sum() < self.config.least_inliers:
-            return None
-        state, result = self._filter.evaluate_update(points.select(kept))
-        bad = result.squared_residual > _CHI_SQUARE_999[result.components]
-        if bad.any():
-            kept[np.flatnonzero(kept)[bad]] = False
-            if kept.sum() < self.config.least_inliers:
-                return None
-            state, result = self._filter.evaluate_update(points.select(kept))
-        if kept.sum() < _LEAST_SHARE * len(rows):
-            return None
-        return _Fit(state, result, points.select(kept), rows[kept])
+        fit = self._window.fit_frame(found.views, pose, covariance, self.config.least_inliers)
+        return fit if fit is not None and fit.kept.sum() >= _LEAST_SHARE * count else None
 
-    def _fit_without_prediction(self, found: TemporalMatches, timestamp: float) -> _Fit | None:
-        """Start-up and recovery: relative pose from the matches alone, then the update from a vague prior about it."""
-        points, _ = self._stereo_points(found)
+    def _fit_without_prediction(self, found: _Found, timestamp: float) -> FrameFit | None:
+        """Relative pose from the matches alone, then the update from there; sets the motion by it when it holds."""
+        landmarks, rows = self._window.landmarks, found.views.rows
         relative = estimate_relative_pose(
             self._camera,
-            points.landmarks,
-            points.landmark_sigma,
-            points.measurement,
-            points.noise,
+            landmarks.measured[rows],
+            np.sqrt(landmarks.variance[rows]),
+            found.views.measurement,
+            found.views.noise,
             found.probability,
         )
         if relative is None:
@@ -318,125 +342,177 @@ class StereoTracker:
         least = self.config.least_inliers * (1 if fair else 2)
         if agreeing < least:
             return None
-        before = self._filter.state
-        self._filter.set_pose_from_clone(relative.T_key_camera, np.repeat([0.01 * self._depth, 0.01], 3))
-        # The mean velocity since the last pose, as uncertain as an acceleration over that time makes it.
-        elapsed = timestamp - self._tracked_at
-        sigma = np.sqrt(np.repeat(self._densities[:2], 3) * elapsed)
-        self._filter.set_twist(se3_log(se3_inverse(self._tracked_pose) @ self._filter.state.pose) / elapsed, sigma)
-        fit = self._fit(found.select(relative.inliers))
-        if fit is None or len(fit.rows) < least:
-            self._filter.state = before
+        start = self._window.poses[-1] @ relative.T_key_camera
+        pose, covariance = self._pose_and_step()
+        fit = self._window.fit_frame(found.views, pose, covariance, least, start)
+        if fit is None or fit.kept.sum() < 0.5 * relative.inliers.sum():
             return None
         return fit
 
-    def _forget_twist(self) -> None:
-        sigma = np.repeat([self.config.start_speed * self._depth, self.config.start_turn], 3)
-        self._filter.set_twist(np.zeros(6), sigma)
-
-    def _anchor(self, timestamp: float) -> None:
-        """Remembers the pose that the next velocity is measured from."""
-        self._tracked_at = timestamp
-        self._tracked_pose = self._filter.state.pose
-
-    def _accept(self, fit: _Fit, view: StereoView, timestamp: float) -> None:
-        """Takes the posterior over, sharpens the map, and takes a new keyframe when the old one fades."""
-        assert self._keyframe is not None
-        if self._keyframe.first_inliers is None:
-            self._keyframe.first_inliers = len(fit.rows)
-        faded = len(fit.rows) < self.config.keyframe_ratio * self._keyframe.first_inliers
-        self._filter.state = fit.state
-        self._anchor(timestamp)
+    def _accept(self, fit: FrameFit, found: _Found, view: StereoView, timestamp: float) -> None:
+        """Takes the pose over, and makes the view a keyframe when the old ones fade."""
+        landmarks = self._window.landmarks
+        landmarks.misses[found.searched] += 1
+        seen = found.views.rows[fit.kept]
+        landmarks.misses[seen] = 0
+        landmarks.views[seen] += 1
+        key = self._window.poses[-1]
+        back = se3_adjoint(se3_inverse(key))
+        expected, step_covariance = self._motion.step, self._motion.step_covariance
+        self._motion.correct(se3_inverse(key) @ fit.pose, back @ fit.relative @ back.T)
+        self._tracked_at, self._tracked_pose = timestamp, fit.pose
         self._moving = self._velocity_known = True
-        known = np.isfinite(fit.points.measurement[:, 2])
-        self._keyframe.landmarks.observe(
-            fit.rows[known],
-            fit.points.measurement[known],
-            fit.points.noise[known],
-            se3_inverse(fit.state.clone) @ fit.state.pose,
-            self._camera,
-            float(fit.state.offset[0]),
-        )
-        if faded and self._take_keyframe(view):
-            return
-        # Every view of a keyframe repeats the noise of its landmarks. The pose forgets between frames, the offset does
-        # not: it is estimated in each frame from what was known before the keyframe, and only the last view, the one
-        # with the longest baseline, is remembered.
-        self._filter.hold_offset(self._keyframe.offset, self._keyframe.offset_variance)
+        if self.config.constant_sigma is None:
+            low, high = _NOISE_SCALES
+            self._noise_scale = float(np.clip(self._noise_scale * fit.nis_per_dof**_ADAPTATION, low, high))
+        count = int(fit.kept.sum())
+        if not self._reference:
+            self._reference = count
+        if count < self.config.keyframe_ratio * self._reference and self._has_stereo(view):
+            self._add_keyframe(view, timestamp, fit.pose, expected, step_covariance, found.views.select(fit.kept))
 
     def _recover(self, view: StereoView, timestamp: float) -> None:
         """Without a pose: wait for a while, then go on from this view with the uncertainty of the prediction."""
-        if timestamp - self._tracked_at > self.config.lost_seconds and self._take_keyframe(view):
+        if timestamp - self._tracked_at > self.config.lost_seconds and self._has_stereo(view):
             _LOGGER.warning(
                 "tracking starts anew at %.3f s, %.2f s after the last pose", timestamp, timestamp - self._tracked_at
             )
-            self._origin_covariance = self._origin_covariance + self._filter.forget_origin()
-            self._anchor(timestamp)
+            pose, _ = self._pose_and_step()
+            self._add_keyframe(view, timestamp, pose, self._motion.step, self._motion.step_covariance, None)
             self._forget_twist()
+            self._tracked_at, self._tracked_pose = timestamp, pose
             self._velocity_known = False
 
-    def _take_keyframe(self, view: StereoView) -> bool:
-        """Makes this view the keyframe if it has enough stereo points."""
+    # ---- keyframes
+
+    def _has_stereo(self, view: StereoView) -> bool:
+        return int(np.isfinite(view.disparity).sum()) >= 2 * self.config.least_inliers
+
+    def _start(self, view: StereoView, timestamp: float) -> None:
+        self._add_keyframe(view, timestamp, np.eye(4), np.eye(4), np.zeros((6, 6)), None)
+        self._forget_twist()
+        self._tracked_at = timestamp
+
+    def _add_keyframe(
+        self,
+        view: StereoView,
+        timestamp: float,
+        pose: np.ndarray,
+        step: np.ndarray,
+        step_covariance: np.ndarray,
+        views: Views | None,
+    ) -> None:
+        """Makes the view a keyframe: it sees `views`, and whatever else it has in stereo is new."""
+        window = self._window
+        if len(window) == self.config.window:
+            retired = map_points(window.landmarks.select(window.landmarks.host == 0), window)
+            leaving = window.landmarks.host == 0
+            self._retired.append(retired)
+            if views is not None:
+                staying = ~leaving[views.rows]
+                number = np.cumsum(~leaving) - 1
+                views = Views(number[views.rows[staying]], views.measurement[staying], views.noise[staying])
+            window.retire_oldest()
+            del self._keyframe_views[0]
+        if len(window):
+            adjoint = se3_adjoint(window.poses[-1])
+            step_covariance = adjoint @ step_covariance @ adjoint.T
+        walk = np.array([self.config.offset_walk**2 * (timestamp - self._keyframe_at), 0.0, 0.0])
+        if not len(window):
+            walk[:] = 0.0
+        window.add_keyframe(pose, step, step_covariance, walk)
+        self._keyframe_views.append(view)
+        if views is not None:
+            window.add_views(views)
+        self._add_landmarks(view, views)
+        window.solve()
+        self._motion.start_keyframe()
+        self._keyframe_at = timestamp
+        self._reference = 0
+
+    def _add_landmarks(self, view: StereoView, views: Views | None) -> None:
+        """Stereo points that no landmark has been found at."""
         index = np.flatnonzero(np.isfinite(view.disparity))
-        if len(index) < 2 * self.config.least_inliers:
-            return False
-        if self._keyframe is not None:
-            self._retired.append(self._keyframe_map())
-        measured = np.column_stack([view.features.keypoints[index].astype(np.float64), view.disparity[index]])
-        keypoint = np.full(len(index), self.config.keyframe_sigma)
+        keypoints = view.features.keypoints[index].astype(np.float64)
+        if views is not None and len(views.rows):
+            taken = cKDTree(views.measurement[:, :2])
+            free = taken.query(keypoints)[0] > self.config.spacing
+            index, keypoints = index[free], keypoints[free]
+        measured = np.column_stack([keypoints, view.disparity[index]])
         known = self.config.constant_sigma
         disparity = view.disparity_sigma[index] if known is None else np.full(len(index), known[1])
-        sigma = np.column_stack([keypoint, keypoint, disparity])
-        starting = self._keyframe is None
-        self._filter.clone_pose()
-        state = self._filter.state
-        self._keyframe = _Keyframe(
-            view,
-            KeyframeLandmarks(index, measured, sigma),
-            state.offset,
-            state.offset_variance,
-        )
-        self._depth = self._camera.fx * self._camera.baseline / max(float(np.median(view.disparity[index])), 0.5)
+        place = np.full(len(index), self.config.keyframe_sigma)
+        variance = self._noise_scale * np.column_stack([place, place, disparity]) ** 2
+        self._window.add_landmarks(index, measured, variance)
+        depth = self._camera.fx * self._camera.baseline / max(float(np.nanmedian(view.disparity)), 0.5)
+        self._window.depth = depth
         self._densities = np.array(
-            [
-                (self.config.acceleration * self._depth) ** 2,
-                self.config.angular_acceleration**2,
-                self.config.offset_walk**2,
-            ]
+            [(self.config.acceleration * depth) ** 2, self.config.angular_acceleration**2]
         )
-        if starting:
-            self._forget_twist()
-        return True
 
-    def _keyframe_map(self) -> PointMap:
-        assert self._keyframe is not None
-        state = self._filter.state
-        return self._keyframe.landmarks.to_map(state.clone, self._camera, float(state.offset[0]), least_observations=3)
+    def _forget_twist(self) -> None:
+        self._motion.forget_twist(
+            np.repeat([self.config.start_speed * self._window.depth, self.config.start_turn], 3)
+        )
+
+    # ---- results
 
     def _report(
-        self, timestamp: float, status: str, matches: int, fit: _Fit | None, milliseconds: dict[str, float]
+        self, timestamp: float, status: str, matches: int, fit: FrameFit | None, milliseconds: dict[str, float]
     ) -> Estimate:
-        state = self._filter.state
-        knows = fit.state if fit is not None else state  # the offset as this frame alone adds to it
+        window = self._window
+        if fit is not None:
+            pose, absolute, relative = fit.pose, fit.covariance, fit.relative
+            calibration, spread = fit.calibration, fit.calibration_covariance
+        elif len(window):
+            pose, step = self._pose_and_step()
+            last = pose_slice(len(window) - 1)
+            relative, absolute = step, window.covariance[last, last] + step
+            calibration, spread = window.calibration, window.covariance[CALIBRATION, CALIBRATION]
+        else:
+            pose, relative, absolute = np.eye(4), np.zeros((6, 6)), np.zeros((6, 6))
+            calibration, spread = window.calibration, window.covariance
         # The filter knows the rectified camera; users know the left camera of their calibration.
         T_left_rectified = se3_inverse(self._T_rectified_left)
-        adjoint = se3_adjoint(T_left_rectified)
-        absolute = state.body_covariance(self._origin_covariance)
-        relative = state.relative_covariance() if status == "tracking" else absolute
-        belief = 1.0 - np.sqrt(max(np.linalg.eigvalsh(relative)[-1], 0.0))
+        to_body = se3_adjoint(se3_inverse(pose))
+        adjoint = se3_adjoint(T_left_rectified) @ to_body
+        belief = 1.0 - np.sqrt(max(np.linalg.eigvalsh(to_body @ relative @ to_body.T)[-1], 0.0))
+        covariance = adjoint @ absolute @ adjoint.T
         return Estimate(
             timestamp=timestamp,
-            T_world_camera=T_left_rectified @ state.pose @ self._T_rectified_left,
-            covariance=adjoint @ absolute @ adjoint.T,
+            T_world_camera=T_left_rectified @ pose @ self._T_rectified_left,
+            covariance=0.5 * (covariance + covariance.T),
             status=status,
             belief=float(np.clip(belief, 0.0, 1.0)),
             matches=matches,
-            inliers=len(fit.rows) if fit is not None else 0,
-            nis=fit.result.nis if fit is not None else 0.0,
-            dof=fit.result.dof if fit is not None else 0,
-            calibration=CalibrationEstimate(float(knows.offset[0]), float(np.sqrt(knows.offset_variance))),
+            inliers=int(fit.kept.sum()) if fit is not None else 0,
+            nis=fit.nis if fit is not None else 0.0,
+            dof=fit.dof if fit is not None else 0,
+            calibration=CalibrationEstimate(
+                float(calibration[0]), float(np.sqrt(max(spread[0, 0], 0.0)))
+            ),
             milliseconds=milliseconds,
         )
+
+
+_NOTHING = _Found(
+    Views(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3))), np.zeros(0), np.zeros(0, np.int64)
+)
+
+
+def _merge(parts: list[_Found]) -> _Found:
+    """All that was found."""
+    if not parts:
+        return _NOTHING
+    return _Found(
+        Views(
+            np.concatenate([part.views.rows for part in parts]),
+            np.concatenate([part.views.measurement for part in parts]),
+            np.concatenate([part.views.noise for part in parts]),
+        ),
+        np.concatenate([part.probability for part in parts]),
+        np.concatenate([part.searched for part in parts]),
+    )
 
 
 class _Stopwatch:
