@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sigmaslam.rotation import se3_inverse, se3_log
+from sigmaslam.rotation import nearest_rigid, se3_inverse, se3_log
 from sigmaslam.session import load_step
 
 # Order of the graph's error state, see sigmaslam.filters.stereo_pose; what lies behind the twist is not used here.
@@ -65,7 +65,7 @@ class MotionFilter:
         gain = np.linalg.lstsq(P[_POSE, _POSE], P[_POSE, _TWIST], rcond=1e-14)[0].T
         self.twist = self.twist + gain @ se3_log(step @ se3_inverse(self.step))
         twist = P[_TWIST, _TWIST] - gain @ (P[_POSE, _POSE] - covariance) @ gain.T
-        self.step = step
+        self.step = nearest_rigid(step)
         self._covariance = np.block([[covariance, covariance @ gain.T], [gain @ covariance, 0.5 * (twist + twist.T)]])
 
     def start_keyframe(self) -> None:

@@ -103,6 +103,17 @@ def se3_inverse(T: np.ndarray) -> np.ndarray:
     return inverse
 
 
+def nearest_rigid(T: np.ndarray) -> np.ndarray:
+    """Rigid transforms whose rotations have lost digits, made orthonormal again; (..., 4, 4) -> (..., 4, 4).
+
+    An inverse by transposition doubles what a rotation is off by: products of poses and inverses, one frame after the
+    other, need this or leave the group within a hundred frames.
+    """
+    mended = np.array(T, dtype=np.float64)
+    mended[..., :3, :3] = nearest_rotation(mended[..., :3, :3])
+    return mended
+
+
 def se3_adjoint(T: np.ndarray) -> np.ndarray:
     """Adjoints of rigid transforms: `T exp(x) T^-1 == exp(adjoint @ x)`, x = (translation, rotation).
 

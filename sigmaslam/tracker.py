@@ -75,7 +75,7 @@ class TrackerConfig:
     start_turn: float = 1.0
     offset_sigma: float = 0.5
     offset_walk: float = 0.02
-    turn_sigma: float = 0.3
+    turn_sigma: float = 1.0
     linearisation: str = "unscented"
     iterations: int = 2
     window: int = 6

@@ -20,13 +20,15 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sigmaslam.camera import RectifiedStereo
-from sigmaslam.rotation import se3_adjoint, se3_exp, se3_inverse, se3_log
+from sigmaslam.rotation import nearest_rigid, se3_adjoint, se3_exp, se3_inverse, se3_log
 from sigmaslam.session import load_step
 
 CALIBRATION = slice(0, 3)
 CALIBRATION_SIZE = 3
 # 99.9 % quantiles of chi-square with 0, 1, 2 and 3 degrees of freedom.
 CHI_SQUARE_999 = np.array([0.0, 10.827566170662733, 13.815510557964274, 16.26623619623813])
+# Of the robust loss by which a frame's pose is first found: its scales in standard deviations.
+_ROBUST_SCALES = (6.0, 4.0, 3.0)
 # A disparity that is not there: its variance, pixels squared.
 _UNKNOWN = 1e12
 # Least spread of sigma points: share of the scene's depth, radians, pixels; with it alone slopes are derivatives.
@@ -227,8 +229,8 @@ class KeyframeWindow:
                 new[size:, size:] = old[last, last]
             new[size:, size:] += step_covariance
         self._prior, self.covariance = grown
-        self._prior_poses = np.concatenate([self._prior_poses, expected[None]])
-        self.poses = np.concatenate([self.poses, pose[None]])
+        self._prior_poses = np.concatenate([self._prior_poses, nearest_rigid(expected)[None]])
+        self.poses = np.concatenate([self.poses, nearest_rigid(pose)[None]])
         self.landmarks.dependence = np.pad(self.landmarks.dependence, ((0, 0), (0, 0), (0, 6)))
 
     def add_views(self, views: Views) -> None:
@@ -301,7 +303,7 @@ class KeyframeWindow:
         factor = _factor_with_frame(self._factor(), step_covariance)
         prior = factor @ factor.T
         frame = pose_slice(len(self.poses))
-        kept = np.ones(len(views.rows), bool)
+        components = views.components
         offset = np.zeros(len(prior))
         spread = prior
         if start is not None:
@@ -310,48 +312,54 @@ class KeyframeWindow:
         # Landmarks are estimated along with the pose: measured places and depths in the role of known ones would
         # draw the pose towards no motion.
         moved = np.zeros((len(views.rows), 3))
-        step = passes = 0
+        step, kept = 0, None
         while True:
             slopes = self._linearise_frame(views.rows, pose, offset, spread, moved)
             noise, by_state = self._frame_noise(views.rows, slopes, views.noise)
             expected = slopes.mean - (slopes.by_landmark @ moved[..., None])[..., 0]
             residual, noise = _masked(views.measurement - expected, noise)
-            if step == 0 and start is None:
-                squared = _squared(residual, noise + _spread(by_state, prior))
-                kept = slopes.in_front & (squared <= CHI_SQUARE_999[views.components])
-            elif step >= self._iterations:
-                squared = _squared(residual, noise)
-                agree = slopes.in_front & (squared <= CHI_SQUARE_999[views.components])
-                if passes == 2 or (agree == kept).all():
+            scale = np.linalg.inv(noise)
+            squared = np.einsum("mi,mij,mj->m", residual, scale, residual)
+            usable = slopes.in_front & (squared < _UNKNOWN)
+            if step >= self._iterations:
+                agree = usable & (squared <= CHI_SQUARE_999[components])
+                if step == self._iterations + 2 or (kept is not None and (agree == kept).all()):
                     break
-                kept, passes = agree, passes + 1
-            if kept.sum() < least:
+                kept = agree
+            if usable.sum() < least or (kept is not None and kept.sum() < least):
                 return None
-            weighted = _whiten(np.concatenate([by_state, residual[..., None]], axis=2)[kept], noise[kept])
-            by, rest = weighted[:, :-1], weighted[:, -1]
-            information, vector = by.T @ by, by.T @ rest
-            before = offset
-            offset, posterior = _condition(factor, information, vector + information @ offset)
-            left = residual - by_state @ (offset - before)
+            whitened = _whiten(np.concatenate([by_state, residual[..., None]], axis=2), noise)
+            if kept is not None:
+                solution, posterior = self._weigh(factor, whitened, offset, kept.astype(float))
+            else:
+                # A loss that narrows, first about what the prior expects.
+                if step == 0 and start is None:
+                    squared = _squared(residual, noise + _spread(by_state, prior))
+                for limit in _ROBUST_SCALES:
+                    weight = usable / (1.0 + squared / limit**2) ** 2
+                    solution, posterior = self._weigh(factor, whitened, offset, weight)
+                    left = residual - by_state @ (solution - offset)
+                    squared = np.einsum("mi,mij,mj->m", left, scale, left)
+            left = residual - by_state @ (solution - offset)
             own = self.landmarks.covariance[views.rows] @ slopes.by_landmark.transpose(0, 2, 1)
-            moved = (own @ np.linalg.solve(noise, left[..., None]))[..., 0]
-            spread = posterior
+            moved = (own @ (scale @ left[..., None]))[..., 0]
+            offset, spread = solution, posterior
             step += 1
         kept &= agree
         if kept.sum() < least:
             return None
-        whitened = np.linalg.lstsq(factor, offset, rcond=1e-12)[0]
+        paid = np.linalg.lstsq(factor, offset, rcond=1e-12)[0]
         last = pose_slice(len(self.poses) - 1)
         cross = posterior[frame, last]
         return FrameFit(
-            se3_exp(offset[frame]) @ pose,
+            nearest_rigid(se3_exp(offset[frame]) @ pose),
             posterior[frame, frame] + posterior[last, last] - cross - cross.T,
             posterior[frame, frame],
             self.calibration + offset[CALIBRATION],
             posterior[CALIBRATION, CALIBRATION],
             kept,
-            float(whitened @ whitened + squared[kept].sum()),
-            int(views.components[kept].sum()),
+            float(paid @ paid + squared[kept].sum()),
+            int(components[kept].sum()),
         )
 
     def retire_oldest(self) -> Landmarks:
@@ -361,7 +369,7 @@ class KeyframeWindow:
         offset = self._from_prior()
         moved, covariance = _condition(_root(self._prior), information, vector + information @ offset)
         count = len(self.poses)
-        self._prior_poses = (se3_exp(moved[CALIBRATION_SIZE:].reshape(count, 6)) @ self._prior_poses)[1:]
+        self._prior_poses = nearest_rigid(se3_exp(moved[CALIBRATION_SIZE:].reshape(count, 6)) @ self._prior_poses)[1:]
         self._prior_calibration = self._prior_calibration + moved[CALIBRATION]
         rest = np.r_[0:CALIBRATION_SIZE, CALIBRATION_SIZE + 6 : len(covariance)]
         self._prior = covariance[np.ix_(rest, rest)]
@@ -375,6 +383,16 @@ class KeyframeWindow:
         return retired
 
     # ---- the equations
+
+    @staticmethod
+    def _weigh(
+        factor: np.ndarray, whitened: np.ndarray, offset: np.ndarray, weight: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Posterior mean and covariance from derivatives with residuals (3 M, n + 1) about `offset`, weighted (M,)."""
+        rows = whitened * np.sqrt(np.repeat(weight, 3))[:, None]
+        by, rest = rows[:, :-1], rows[:, -1]
+        information, vector = by.T @ by, by.T @ rest
+        return _condition(factor, information, vector + information @ offset)
 
     def _factor(self) -> np.ndarray:
         return _root(self.covariance)
@@ -421,7 +439,7 @@ class KeyframeWindow:
 
     def _move(self, step: np.ndarray, elimination: _Elimination) -> None:
         self.calibration = self.calibration + step[CALIBRATION]
-        self.poses = se3_exp(step[CALIBRATION_SIZE:].reshape(-1, 6)) @ self.poses
+        self.poses = nearest_rigid(se3_exp(step[CALIBRATION_SIZE:].reshape(-1, 6)) @ self.poses)
         seen = elimination.rows
         self.landmarks.estimate[seen] += elimination.step + elimination.dependence @ step
         self.landmarks.covariance[seen] = elimination.covariance
@@ -494,6 +512,9 @@ class KeyframeWindow:
     ) -> _Slopes:
         """Linearises the views of landmarks (M, 3) of keyframes `host` (M,) by the poses `view` (M,)."""
         count, size = len(poses), len(covariance)
+        if not len(landmarks):  # the graph takes no empty batch
+            flat, square = np.zeros((0, 3)), np.zeros((0, 3, 3))
+            return _Slopes(flat, np.zeros((0, 3, size)), square, square, np.zeros(0, bool))
         pairs, pair = np.unique(host * count + view, return_inverse=True)
         hosts, sights = pairs // count, pairs % count
         relative = se3_inverse(poses[sights]) @ poses[hosts]
