@@ -6,10 +6,11 @@ and the search for matches all need, for every landmark and view, the expected m
   relative pose  6  T_view_host, perturbed from the left: translation, rotation
   calibration    3  what the disparity is off by: constant, with x^2 (yaw of the right camera), with x y (its pitch),
                     all in pixels at unit normalised coordinates
-  landmark       3  (u, v, disparity) in the keyframe that hosts it; its inverse depth enters linearly, so far points
-                    and points at infinity do no harm
+  landmark       4  (u, v, disparity) in the keyframe that hosts it, and what its own disparities are off by in all
+                    views alike (a slanted or half hidden patch is misplaced in the other eye wherever it is seen from);
+                    its inverse depth enters linearly, so far points and points at infinity do no harm
 
-The change is the slope of the regression over sigma points drawn from what is known of these twelve numbers, and what
+The change is the slope of the regression over sigma points drawn from what is known of these numbers, and what
 the slope does not explain is added to the noise (García-Fernández et al. 2015). With a vanishing spread the same
 function gives the Jacobian: the extended filter is the limit of the unscented one.
 """
@@ -24,8 +25,8 @@ from sigmaslam.filters.unscented import odd_and_even
 
 POSE = slice(0, 6)
 CALIBRATION = slice(6, 9)
-LANDMARK = slice(9, 12)
-SIZE = 12
+LANDMARK = slice(9, 13)
+SIZE = 13
 
 # A point whose depth along the view's optical axis is below this share of its depth in the host is not used: it is
 # behind the camera, or about to be. A power of two is exact in float32, through which the exporter takes scalars.
@@ -38,8 +39,8 @@ class Transfer(nn.Module):
     Shapes:
         relative (p, 4, 4) T_view_host of p pairs of poses, spread (p, 9, 9) lower factor of the covariance of relative
         pose and calibration, pair (m,) int64: which of these each measurement belongs to, calibration (3,) pixels,
-        intrinsics (5,) = (fx, fy, cx, cy, fx baseline), landmarks (m, 3), landmark_spread (m, 3, 3) lower factor of
-        their covariance -> mean (m, 3) of (u, v, disparity), slope times spread (m, 3, 12), covariance of what the
+        intrinsics (5,) = (fx, fy, cx, cy, fx baseline), landmarks (m, 4), landmark_spread (m, 4, 4) lower factor of
+        their covariance -> mean (m, 3) of (u, v, disparity), slope times spread (m, 3, 13), covariance of what the
         slope leaves (m, 3, 3), in_front (m,) 1.0 or 0.0; all float64.
     """
 
@@ -63,8 +64,8 @@ class Transfer(nn.Module):
         steps = root * landmark_spread.movedim(-1, 0)
         here = relative.index_select(0, pair)
         by_landmark, _ = _project(here, calibration, intrinsics, landmarks + torch.cat([steps, -steps]))
-        nine, three = SIZE - 3, 3
-        samples = torch.cat([by_pose[:nine], by_landmark[:three], by_pose[nine:], by_landmark[three:]])
+        nine, four = LANDMARK.start, SIZE - LANDMARK.start
+        samples = torch.cat([by_pose[:nine], by_landmark[:four], by_pose[nine:], by_landmark[four:]])
         mean, odd, even = odd_and_even(samples)
         _, depth = _project(here, calibration, intrinsics, landmarks)
         left = torch.stack([(even * even[:, i : i + 1]).sum(dim=-1) for i in range(3)], dim=-1)
@@ -74,8 +75,9 @@ class Transfer(nn.Module):
 def _project(relative: Tensor, calibration: Tensor, intrinsics: Tensor, landmarks: Tensor) -> tuple[Tensor, Tensor]:
     """(u, v, disparity) (..., m, 3) in the view, and the depth there as a share of that in the host (..., m)."""
     fx, fy, cx, cy, focal_baseline = (intrinsics[i] for i in range(5))
-    x, y, d = (landmarks[..., 0] - cx) / fx, (landmarks[..., 1] - cy) / fy, landmarks[..., 2]
-    inverse_depth = (d - _bias(calibration, x - d / fx, y)) / focal_baseline
+    x, y = (landmarks[..., 0] - cx) / fx, (landmarks[..., 1] - cy) / fy
+    d, own = landmarks[..., 2], landmarks[..., 3]
+    inverse_depth = (d - own - _bias(calibration, x - d / fx, y)) / focal_baseline
     # Written out, because millions of tiny matrix products are slow.
     seen = [
         relative[..., i, 0] * x + relative[..., i, 1] * y + relative[..., i, 2] + relative[..., i, 3] * inverse_depth
@@ -83,7 +85,7 @@ def _project(relative: Tensor, calibration: Tensor, intrinsics: Tensor, landmark
     ]
     share = 1.0 / seen[2].clamp_min(0.5 * _NEAREST)
     u, v, rest = seen[0] * share, seen[1] * share, focal_baseline * inverse_depth * share
-    disparity = rest + _bias(calibration, u - rest / fx, v)
+    disparity = rest + own + _bias(calibration, u - rest / fx, v)
     return torch.stack([fx * u + cx, fy * v + cy, disparity], dim=-1), seen[2]
 
 

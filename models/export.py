@@ -246,8 +246,8 @@ def _transfer_example(seed: int, pairs: int, measurements: int) -> tuple[Tensor,
     spread = 0.01 * uniform(pairs, 9, 9).tril()
     pair = torch.randint(0, pairs, (measurements,), generator=generator)
     intrinsics = torch.tensor([400.0, 410.0, 320.0, 240.0, 80.0], dtype=torch.float64)
-    landmarks = torch.stack([640 * uniform(measurements), 480 * uniform(measurements), 40 * uniform(measurements)], -1)
-    return relative, spread, pair, 0.3 * uniform(3), intrinsics, landmarks, uniform(measurements, 3, 3).tril()
+    landmarks = uniform(measurements, 4) * torch.tensor([640.0, 480.0, 40.0, 0.3], dtype=torch.float64)
+    return relative, spread, pair, 0.3 * uniform(3), intrinsics, landmarks, uniform(measurements, 4, 4).tril()
 
 
 def _export(

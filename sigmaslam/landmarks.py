@@ -27,14 +27,14 @@ class PointMap:
 
 def map_points(landmarks: Landmarks, window: KeyframeWindow, least_views: int = 3) -> PointMap:
     """Landmarks of the window that were seen often enough and are closer than half a pixel of disparity says."""
-    uvd = landmarks.estimate.copy()
-    uvd[:, 2] -= window.calibration[0]
+    uvd = window.true_disparity(landmarks.estimate)
     kept = (landmarks.views >= least_views) & (uvd[:, 2] > 0.5)
     uvd, landmarks = uvd[kept], landmarks.select(kept)
     points = window.camera.triangulate(uvd)
     poses = window.poses[landmarks.host]
     R = poses[:, :3, :3]
     jacobian = R @ _triangulation_jacobian(uvd, points, window.camera)
+    jacobian = np.concatenate([jacobian, -jacobian[:, :, 2:]], axis=2)
     spread = jacobian @ landmarks.covariance @ jacobian.transpose(0, 2, 1)
     return PointMap((R @ points[..., None])[..., 0] + poses[:, :3, 3], spread, landmarks.views)
 

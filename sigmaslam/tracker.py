@@ -58,7 +58,8 @@ class TrackerConfig:
         linearisation: "unscented" or "extended".
         iterations: linearisations in a frame's update.
         window: keyframes that are estimated jointly.
-        spacing: a new landmark lies at least so far from landmarks that are there already, pixels.
+        spacing: landmarks are at least so far apart, pixels; what lies closer has the same errors (patches overlap).
+        shared_disparity: share of the variance of a landmark's disparities that is the same in all views.
         most_misses: after so many frames in a row in which it was not found a landmark is no longer looked for.
         least_inliers: fewer is no pose; without a prediction and a fair share of the matches, fewer than twice as many.
         keyframe_ratio: a new keyframe is taken when the inliers fall below this share of what the keyframe began with.
@@ -75,11 +76,12 @@ class TrackerConfig:
     start_turn: float = 1.0
     offset_sigma: float = 0.5
     offset_walk: float = 0.02
-    turn_sigma: float = 1.0
+    turn_sigma: float = 0.0
     linearisation: str = "unscented"
     iterations: int = 2
     window: int = 6
-    spacing: float = 4.0
+    spacing: float = 8.0
+    shared_disparity: float = 0.8
     most_misses: int = 3
     least_inliers: int = 15
     keyframe_ratio: float = 0.6
@@ -302,7 +304,8 @@ class StereoTracker:
         noise = np.zeros((len(rows), 3, 3))
         if self.config.constant_sigma is None:
             noise[:, :2, :2] = matches.covariance
-            noise[:, 2, 2] = np.where(np.isfinite(matches.disparity), matches.disparity_sigma, 1.0) ** 2
+            own = 1.0 - self.config.shared_disparity
+            noise[:, 2, 2] = own * np.where(np.isfinite(matches.disparity), matches.disparity_sigma, 1.0) ** 2
         else:
             place, disparity = self.config.constant_sigma
             noise[:] = np.diag([place, place, disparity]) ** 2
@@ -328,8 +331,8 @@ class StereoTracker:
         landmarks, rows = self._window.landmarks, found.views.rows
         relative = estimate_relative_pose(
             self._camera,
-            landmarks.measured[rows],
-            np.sqrt(landmarks.variance[rows]),
+            landmarks.measured[rows, :3],
+            np.sqrt(_with_shared(landmarks.variance[rows])),
             found.views.measurement,
             found.views.noise,
             found.probability,
@@ -438,11 +441,16 @@ class StereoTracker:
             taken = cKDTree(views.measurement[:, :2])
             free = taken.query(keypoints)[0] > self.config.spacing
             index, keypoints = index[free], keypoints[free]
+        apart = _apart(keypoints, view.features.scores[index], self.config.spacing)
+        index, keypoints = index[apart], keypoints[apart]
         measured = np.column_stack([keypoints, view.disparity[index]])
         known = self.config.constant_sigma
         disparity = view.disparity_sigma[index] if known is None else np.full(len(index), known[1])
-        place = np.full(len(index), self.config.keyframe_sigma)
-        variance = self._noise_scale * np.column_stack([place, place, disparity]) ** 2
+        place = np.full(len(index), self.config.keyframe_sigma**2)
+        shared = self.config.shared_disparity
+        variance = self._noise_scale * np.column_stack(
+            [place, place, (1.0 - shared) * disparity**2, shared * disparity**2]
+        )
         self._window.add_landmarks(index, measured, variance)
         depth = self._camera.fx * self._camera.baseline / max(float(np.nanmedian(view.disparity)), 0.5)
         self._window.depth = depth
@@ -498,6 +506,22 @@ class StereoTracker:
 _NOTHING = _Found(
     Views(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3))), np.zeros(0), np.zeros(0, np.int64)
 )
+
+
+def _apart(keypoints: np.ndarray, scores: np.ndarray, spacing: float) -> np.ndarray:
+    """Ascending indices of keypoints (K, 2) no two of which are closer than `spacing`, by descending score."""
+    close = cKDTree(keypoints).query_ball_point(keypoints, spacing)
+    kept = np.ones(len(keypoints), bool)
+    for k in np.argsort(-scores, kind="stable"):
+        if kept[k]:
+            kept[close[k]] = False
+            kept[k] = True
+    return np.flatnonzero(kept)
+
+
+def _with_shared(variance: np.ndarray) -> np.ndarray:
+    """Variances (K, 3) of (u, v, disparity) from those of landmarks (K, 4)."""
+    return np.column_stack([variance[:, :2], variance[:, 2] + variance[:, 3]])
 
 
 def _merge(parts: list[_Found]) -> _Found:

@@ -25,6 +25,7 @@ from sigmaslam.session import load_step
 
 CALIBRATION = slice(0, 3)
 CALIBRATION_SIZE = 3
+LANDMARK_SIZE = 4
 # 99.9 % quantiles of chi-square with 0, 1, 2 and 3 degrees of freedom.
 CHI_SQUARE_999 = np.array([0.0, 10.827566170662733, 13.815510557964274, 16.26623619623813])
 # Of the robust loss by which a frame's pose is first found: its scales in standard deviations.
@@ -101,10 +102,11 @@ class Landmarks:
     Attributes:
         host: (L,) position of the keyframe that they were first seen in.
         feature: (L,) index among its features.
-        measured, variance: (L, 3), (L, 3) (u, v, disparity) there and its variances.
-        estimate: (L, 3) refined by all views.
-        covariance: (L, 3, 3) of that given poses and calibration.
-        dependence: (L, 3, n) how it moves with the state (calibration and poses of the window).
+        measured, variance: (L, 4), (L, 4) (u, v, disparity) there, zero for what its disparities are off by in all
+            views alike, and their variances.
+        estimate: (L, 4) refined by all views.
+        covariance: (L, 4, 4) of that given poses and calibration.
+        dependence: (L, 4, n) how it moves with the state (calibration and poses of the window).
         views: (L,) how many keyframes and frames have confirmed it.
         misses: (L,) frames in a row in which it was looked for and not found.
         serial: (L,) number that stays.
@@ -128,8 +130,8 @@ class Landmarks:
     def empty(cls, size: int) -> Landmarks:
         """No landmark, for a state of that size."""
         whole = np.zeros(0, np.int64)
-        flat, square = np.zeros((0, 3)), np.zeros((0, 3, 3))
-        return cls(whole, whole, flat, flat, flat, square, np.zeros((0, 3, size)), whole, whole, whole)
+        flat, square = np.zeros((0, LANDMARK_SIZE)), np.zeros((0, LANDMARK_SIZE, LANDMARK_SIZE))
+        return cls(whole, whole, flat, flat, flat, square, np.zeros((0, LANDMARK_SIZE, size)), whole, whole, whole)
 
     def select(self, index: np.ndarray) -> Landmarks:
         """The landmarks of that index or mask."""
@@ -238,17 +240,23 @@ class KeyframeWindow:
         self._observations = self._observations.append(len(self.poses) - 1, views)
 
     def add_landmarks(self, feature: np.ndarray, measured: np.ndarray, variance: np.ndarray) -> None:
-        """Adds landmarks that the last keyframe sees first: index of feature (K,), (u, v, disparity) (K, 3), (K, 3)."""
+        """Adds landmarks that the last keyframe sees first.
+
+        Args:
+            feature: (K,) index among the keyframe's features.
+            measured: (K, 3) (u, v, disparity).
+            variance: (K, 4) of these, and of what the disparities are off by in all views alike.
+        """
         count = len(feature)
         size = len(self.covariance)
         new = Landmarks(
             np.full(count, len(self.poses) - 1),
             feature,
-            measured,
+            np.pad(measured, ((0, 0), (0, 1))),
             variance,
-            measured.copy(),
-            np.eye(3) * variance[:, None, :],
-            np.zeros((count, 3, size)),
+            np.pad(measured, ((0, 0), (0, 1))),
+            np.eye(LANDMARK_SIZE) * variance[:, None, :],
+            np.zeros((count, LANDMARK_SIZE, size)),
             np.ones(count, np.int64),
             np.zeros(count, np.int64),
             self._next_serial + np.arange(count),
@@ -282,7 +290,7 @@ class KeyframeWindow:
         """
         covariance = _factor_with_frame(self._factor(), step_covariance)
         covariance = covariance @ covariance.T
-        slopes = self._linearise_frame(rows, pose, np.zeros(len(covariance)), covariance, np.zeros((len(rows), 3)))
+        slopes = self._linearise_frame(rows, pose, np.zeros(len(covariance)), covariance, np.zeros((len(rows), 4)))
         noise, by_state = self._frame_noise(rows, slopes, np.zeros((len(rows), 3, 3)))
         return slopes.mean, noise + _spread(by_state, covariance), slopes.in_front
 
@@ -311,7 +319,7 @@ class KeyframeWindow:
             spread = _certain_frame(prior, frame)
         # Landmarks are estimated along with the pose: measured places and depths in the role of known ones would
         # draw the pose towards no motion.
-        moved = np.zeros((len(views.rows), 3))
+        moved = np.zeros((len(views.rows), LANDMARK_SIZE))
         step, kept = 0, None
         while True:
             slopes = self._linearise_frame(views.rows, pose, offset, spread, moved)
@@ -382,6 +390,14 @@ class KeyframeWindow:
         self._observations.clone = self._observations.clone - 1
         return retired
 
+    def true_disparity(self, landmarks: np.ndarray) -> np.ndarray:
+        """(u, v, disparity) (K, 3) of landmarks (K, 4) without what the calibration and their own errors add."""
+        x = (landmarks[:, 0] - landmarks[:, 2] - self.camera.cx) / self.camera.fx
+        y = (landmarks[:, 1] - self.camera.cy) / self.camera.fy
+        constant, yaw, pitch = self.calibration
+        bias = landmarks[:, 3] + constant + yaw * x * x + pitch * x * y
+        return np.column_stack([landmarks[:, :2], landmarks[:, 2] - bias])
+
     # ---- the equations
 
     @staticmethod
@@ -420,21 +436,21 @@ class KeyframeWindow:
         size = len(self.covariance)
         stacked = np.concatenate([slopes.by_state, slopes.by_landmark, residual[..., None]], axis=2)
         whitened = np.linalg.solve(np.linalg.cholesky(noise), stacked)
-        by_state, by_landmark, rest = whitened[:, :, :size], whitened[:, :, size : size + 3], whitened[:, :, -1:]
+        by_state, by_landmark, rest = whitened[:, :, :size], whitened[:, :, size:-1], whitened[:, :, -1:]
         products = by_landmark.transpose(0, 2, 1) @ np.concatenate([by_landmark, by_state, rest], axis=2)
         order = np.argsort(owner, kind="stable")
         begins = np.searchsorted(owner[order], np.arange(len(seen)))
-        sums = np.add.reduceat(products[order], begins, axis=0) if len(seen) else np.zeros((0, 3, size + 4))
-        own = sums[:, :, :3] + np.eye(3) / landmarks.variance[seen][:, None, :]
+        sums = np.add.reduceat(products[order], begins, axis=0) if len(seen) else np.zeros((0, LANDMARK_SIZE, LANDMARK_SIZE + size + 1))
+        own = sums[:, :, :LANDMARK_SIZE] + np.eye(LANDMARK_SIZE) / landmarks.variance[seen][:, None, :]
         vector = sums[:, :, -1] + (landmarks.measured[seen] - landmarks.estimate[seen]) / landmarks.variance[seen]
         lower = np.linalg.cholesky(own)
-        reduced = np.linalg.solve(lower, np.concatenate([sums[:, :, 3 : 3 + size], vector[..., None]], axis=2))
+        reduced = np.linalg.solve(lower, np.concatenate([sums[:, :, LANDMARK_SIZE:-1], vector[..., None]], axis=2))
         tall, flat = by_state.reshape(-1, size), reduced[:, :, :size].reshape(-1, size)
         information = tall.T @ tall - flat.T @ flat
         right = tall.T @ rest.ravel() - flat.T @ reduced[:, :, -1].ravel()
         inverse = np.linalg.inv(own)
         return information, right, _Elimination(
-            seen, inverse, -inverse @ sums[:, :, 3 : 3 + size], (inverse @ vector[..., None])[..., 0]
+            seen, inverse, -inverse @ sums[:, :, LANDMARK_SIZE:-1], (inverse @ vector[..., None])[..., 0]
         )
 
     def _move(self, step: np.ndarray, elimination: _Elimination) -> None:
@@ -477,7 +493,7 @@ class KeyframeWindow:
     ) -> _Slopes:
         """Views of landmarks by the frame, with the state moved by `offset` from the window's estimate and `pose`.
 
-        The landmarks follow the state, and lie `moved` (M, 3) from there.
+        The landmarks follow the state, and lie `moved` (M, 4) from there.
         """
         size = len(self.covariance)
         poses = np.concatenate([self.poses, pose[None]])
@@ -510,11 +526,11 @@ class KeyframeWindow:
         host: np.ndarray,
         view: np.ndarray,
     ) -> _Slopes:
-        """Linearises the views of landmarks (M, 3) of keyframes `host` (M,) by the poses `view` (M,)."""
+        """Linearises the views of landmarks (M, 4) of keyframes `host` (M,) by the poses `view` (M,)."""
         count, size = len(poses), len(covariance)
         if not len(landmarks):  # the graph takes no empty batch
-            flat, square = np.zeros((0, 3)), np.zeros((0, 3, 3))
-            return _Slopes(flat, np.zeros((0, 3, size)), square, square, np.zeros(0, bool))
+            square = np.zeros((0, 3, 3))
+            return _Slopes(square[:, 0], np.zeros((0, 3, size)), np.zeros((0, 3, 4)), square, np.zeros(0, bool))
         pairs, pair = np.unique(host * count + view, return_inverse=True)
         hosts, sights = pairs // count, pairs % count
         relative = se3_inverse(poses[sights]) @ poses[hosts]
@@ -528,7 +544,7 @@ class KeyframeWindow:
         known = chain @ covariance @ chain.transpose(0, 2, 1) if self._unscented else np.zeros((len(pairs), 9, 9))
         spread = np.linalg.cholesky(_limited(0.5 * (known + known.transpose(0, 2, 1)), self.depth) + floor)
         own = landmark_covariance if self._unscented else np.zeros_like(landmark_covariance)
-        landmark_spread = np.linalg.cholesky(own + _LEAST_SPREAD**2 * np.eye(3))
+        landmark_spread = np.linalg.cholesky(own + _LEAST_SPREAD**2 * np.eye(LANDMARK_SIZE))
         mean, odd, left, in_front = self._transfer(
             {
                 "relative": relative,
@@ -547,7 +563,7 @@ class KeyframeWindow:
 
 @dataclass(frozen=True, slots=True)
 class _Elimination:
-    """Landmarks given the state: rows (K,), covariance (K, 3, 3), dependence (K, 3, n), step (K, 3) at no step of it."""
+    """Landmarks given the state: rows (K,), covariance (K, 4, 4), dependence (K, 4, n), step (K, 4) at no step of it."""
 
     rows: np.ndarray
     covariance: np.ndarray
