@@ -10,7 +10,7 @@ from enum import StrEnum
 from importlib.metadata import version
 from importlib.resources import as_file, files
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -18,6 +18,9 @@ from rich.logging import RichHandler
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from sigmaslam.errors import InputError, SigmaSlamError
+
+if TYPE_CHECKING:
+    from sigmaslam.readers import StereoSequence
 
 app = typer.Typer(name="sigmaslam", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
@@ -54,6 +57,7 @@ class InputFormat(StrEnum):
     euroc = "euroc"
     folder = "folder"
     video = "video"
+    bag = "bag"
 
 
 class RenderPreset(StrEnum):
@@ -150,27 +154,55 @@ def demo(
 ) -> None:
     """Track the rendered sequence that ships with the package and print the errors against its exact truth."""
     from sigmaslam.evaluation.evaluate import evaluate_run, format_evaluation
+    from sigmaslam.readers import open_sequence
 
     folder = out or Path(tempfile.mkdtemp(prefix="sigmaslam-demo-"))
     with as_file(files("sigmaslam.synthetic") / "demo") as sequence:
-        _track(sequence, folder, InputFormat.kitti, None, frontend, Backend.onnx)
+        _track(open_sequence(sequence, "kitti"), folder, frontend, Backend.onnx)
         typer.echo(format_evaluation(evaluate_run(folder, sequence / "poses.txt")))
     typer.echo(f"Report: {folder / 'report.html'}\nPicture: {folder / 'evaluation.png'}")
 
 
 @app.command()
 def track(
-    source: Annotated[Path, typer.Argument(metavar="INPUT", help="KITTI, EuRoC or plain folder, or a video.")],
     out: Annotated[Path, typer.Option(help="Run folder, new or empty.")],
+    source: Annotated[
+        Path | None,
+        typer.Argument(metavar="INPUT", help="KITTI, EuRoC or plain folder, video or ROS bag.", show_default=False),
+    ] = None,
     format: Annotated[InputFormat, typer.Option(help="Kind of input.")] = InputFormat.auto,
     calibration: Annotated[
         Path | None, typer.Option(help="Calibration YAML (or KITTI calib.txt) instead of the input's own.")
     ] = None,
     frontend: Annotated[Frontend, typer.Option(help="Where correspondences come from.")] = Frontend.learned,
     backend: Annotated[Backend, typer.Option(help="What runs network and filter; torch needs 'train'.")] = Backend.onnx,
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LEFT,RIGHT",
+            help="Live cameras in place of INPUT: numbers, paths or URLs; side-by-side:0 is one that gives both eyes.",
+        ),
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.1, help="With --camera: stop after so long. Ctrl-C stops as well.")
+    ] = None,
+    topic_left: Annotated[
+        str | None, typer.Option(help="Image topic in a bag.", show_default="the one with 'left', cam0 or infra1")
+    ] = None,
+    topic_right: Annotated[
+        str | None, typer.Option(help="Image topic in a bag.", show_default="the one with 'right', cam1 or infra2")
+    ] = None,
 ) -> None:
-    """Track a stereo sequence: trajectory, covariance, map and report."""
-    summary = _track(source, out, format, calibration, frontend, backend)
+    """Track a stereo sequence, recorded or live: trajectory, covariance, map and report."""
+    if backend is Backend.torch:
+        _need_train_extra()
+    sequence = _open_input(source, format, calibration, camera, seconds, (topic_left, topic_right))
+    try:
+        summary = _track(sequence, out, frontend, backend)
+    except KeyboardInterrupt:
+        if (out / "run.json").exists():
+            typer.echo(f"Stopped; what was tracked until then is in {out}")
+        raise
     typer.echo(
         f"{summary['tracking']} of {summary['frames']} frames tracked, {summary['lost']} lost, "
         f"{summary['skipped']} skipped; {summary['median_inliers']:.0f} inliers in the median frame, "
@@ -499,20 +531,33 @@ def main() -> None:
         sys.exit(130)
 
 
-def _track(
-    source: Path,
-    out: Path,
+def _open_input(
+    source: Path | None,
     format: InputFormat,
     calibration: Path | None,
-    frontend: Frontend,
-    backend: Backend,
-) -> dict[str, Any]:
-    from sigmaslam.readers import open_sequence
+    camera: str | None,
+    seconds: float | None,
+    topics: tuple[str | None, str | None],
+) -> StereoSequence:
+    from sigmaslam.readers import open_cameras, open_sequence
+
+    if (source is None) == (camera is None):
+        raise InputError("give either INPUT, a recording, or --camera, live cameras" + (", not both" if source else ""))
+    if source is not None:
+        if seconds is not None:
+            raise InputError("--seconds goes with --camera; a recording is tracked to its end")
+        return open_sequence(source, format.value, calibration, topics)
+    assert camera is not None
+    if calibration is None:
+        raise InputError("--camera needs --calibration: the stereo pair as YAML, in the form that the README shows")
+    if format is not InputFormat.auto or topics != (None, None):
+        raise InputError("--format, --topic-left and --topic-right go with INPUT, not with --camera")
+    return open_cameras(camera, calibration, seconds)
+
+
+def _track(sequence: StereoSequence, out: Path, frontend: Frontend, backend: Backend) -> dict[str, Any]:
     from sigmaslam.run import track_sequence
 
-    if backend is Backend.torch:
-        _need_train_extra()
-    sequence = open_sequence(source, format.value, calibration)
     return track_sequence(sequence, out, frontend.value, backend.value)
 
 

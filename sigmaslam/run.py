@@ -1,8 +1,10 @@
-"""Tracking a whole sequence from disk into a run folder."""
+"""Tracking a whole sequence, from disk or live, into a run folder."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from sigmaslam.errors import SigmaSlamError
 from sigmaslam.outputs import RunWriter, describe_camera
-from sigmaslam.readers import StereoSequence
+from sigmaslam.readers import StereoFrame, StereoSequence
 from sigmaslam.tracker import Estimate, StereoTracker, TrackerConfig
 
 
@@ -26,7 +28,7 @@ def track_sequence(
     """Tracks a sequence and writes the run folder; partial results are kept when it is stopped or fails.
 
     Args:
-        sequence: opened by `sigmaslam.readers.open_sequence`.
+        sequence: opened by `sigmaslam.readers.open_sequence` or `open_cameras`.
         out: run folder, new or empty.
         frontend, backend, config: of `StereoTracker`.
     Returns:
@@ -39,7 +41,9 @@ def track_sequence(
     writer = RunWriter(out)
     ended = "complete"
     try:
-        _track(sequence, tracker, writer)
+        # However this ends, cameras are given back before the results are written.
+        with closing(sequence.frames()) as frames:
+            _track(sequence, frames, tracker, writer)
     except KeyboardInterrupt:
         ended = "interrupted"
         raise
@@ -58,6 +62,7 @@ def track_sequence(
                 "frontend": frontend,
                 "backend": backend,
                 "ended": ended,
+                "dropped": sequence.dropped,
                 "configuration": asdict(tracker.config),
                 "calibration": describe_camera(sequence.camera),
             },
@@ -65,7 +70,7 @@ def track_sequence(
     return summary
 
 
-def _track(sequence: StereoSequence, tracker: StereoTracker, writer: RunWriter) -> None:
+def _track(sequence: StereoSequence, frames: Iterator[StereoFrame], tracker: StereoTracker, writer: RunWriter) -> None:
     with Progress(
         BarColumn(bar_width=16),
         MofNCompleteColumn(),
@@ -76,7 +81,7 @@ def _track(sequence: StereoSequence, tracker: StereoTracker, writer: RunWriter) 
         task = progress.add_task("", total=sequence.length, note="")
         noted, done = 0, 0
         began = since = time.perf_counter()
-        for frame in sequence.frames():
+        for frame in frames:
             read_ms = 1e3 * (time.perf_counter() - since)
             # Frames that could not be read come to light with the next one that could.
             for skipped in sequence.skipped[noted:]:

@@ -124,8 +124,14 @@ def _from_projections(
     left, right = (_matrix(path, entries, key, (3, 4)) for key in keys)
     models = [_model(path, key, P[:, :3], image_size) for key, P in zip(keys, (left, right), strict=True)]
     T_left_right = np.eye(4)
-    T_left_right[:3, 3] = np.linalg.solve(left[:, :3], left[:, 3]) - np.linalg.solve(right[:, :3], right[:, 3])
+    T_left_right[:3, 3] = right_position(left, right)
     return _stereo(path, models[0], models[1], T_left_right)
+
+
+def right_position(P_left: np.ndarray, P_right: np.ndarray) -> np.ndarray:
+    """Position of the right camera in the left one, (3,) metres, from (3, 4) projections of parallel cameras."""
+    left, right = (np.linalg.solve(P[:, :3], P[:, 3]) for P in (P_left, P_right))
+    return left - right
 
 
 def _from_originals(

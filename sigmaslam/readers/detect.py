@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from sigmaslam.errors import InputError
-from sigmaslam.readers import euroc, folder, kitti, video
+from sigmaslam.readers import bag, euroc, folder, kitti, video
 from sigmaslam.readers.sequence import StereoSequence
 
 _OPENERS: dict[str, Callable[[Path, Path | None], StereoSequence]] = {
@@ -14,19 +14,23 @@ _OPENERS: dict[str, Callable[[Path, Path | None], StereoSequence]] = {
     "folder": folder.open_folder,
     "video": video.open_video,
 }
-FORMATS = ("auto", *_OPENERS)
+FORMATS = ("auto", *_OPENERS, "bag")
 
 
 def open_sequence(
-    path: str | os.PathLike[str], format: str = "auto", calibration: str | os.PathLike[str] | None = None
+    path: str | os.PathLike[str],
+    format: str = "auto",
+    calibration: str | os.PathLike[str] | None = None,
+    topics: bag.Topics = (None, None),
 ) -> StereoSequence:
     """Open a stereo sequence and check all of it that can be checked before reading.
 
     Args:
-        path: a folder (KITTI, EuRoC, plain, or with two videos) or a side-by-side video.
+        path: a folder (KITTI, EuRoC, plain, or with two videos), a side-by-side video or a ROS bag.
         format: one of `FORMATS`; 'auto' tries them in that order.
         calibration: replaces the calibration that the format keeps: our YAML form (`StereoCamera.from_yaml`)
             or KITTI's calib.txt or calib_cam_to_cam.txt.
+        topics: left and right image topic of a bag; None finds the only one whose name tells the eye.
 
     Raises:
         InputError: the path is missing, of no known format, or left and right do not belong together.
@@ -39,12 +43,19 @@ def open_sequence(
         raise InputError(f"{path}: no such file or folder")
     if format == "auto":
         format = _detect(path)
+    own_calibration = None if calibration is None else Path(calibration)
+    if format == "bag":
+        return bag.open_bag(path, own_calibration, topics)
+    if topics != (None, None):
+        raise InputError(f"{path}: topics are given, and the format is {format!r}; only bags have topics")
     if format != "video" and not path.is_dir():
         raise InputError(f"{path}: a file; format {format!r} needs a folder")
-    return _OPENERS[format](path, None if calibration is None else Path(calibration))
+    return _OPENERS[format](path, own_calibration)
 
 
 def _detect(path: Path) -> str:
+    if bag.is_bag(path):
+        return "bag"
     if path.is_file():
         return "video"
     if kitti.find_layout(path):
@@ -56,6 +67,7 @@ def _detect(path: Path) -> str:
     if video.find_videos(path):
         return "video"
     looked_for = "".join(
-        f"\n  {module.__name__.rpartition('.')[2]}: {module.LOOKED_FOR}" for module in (kitti, euroc, folder, video)
+        f"\n  {module.__name__.rpartition('.')[2]}: {module.LOOKED_FOR}"
+        for module in (kitti, euroc, folder, video, bag)
     )
     raise InputError(f"{path}: no stereo sequence of a known format; looked for{looked_for}")

@@ -1,7 +1,7 @@
 """Image files: reading one, making it grey 8-bit, and a list of left and right files as a source of pairs."""
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -62,17 +62,29 @@ def read_image(path: Path) -> np.ndarray:
         raise FrameError(f"{path}: file is missing") from None
     except OSError as error:
         raise FrameError(f"{path}: cannot be read ({error.strerror})") from None
+    return decode_image(content, str(path))
+
+
+def decode_image(content: bytes, name: str) -> np.ndarray:
+    """Decode an image file's bytes as they are stored.
+
+    Returns:
+        (H, W) or (H, W, C) array, colours in OpenCV's order.
+
+    Raises:
+        FrameError: it is empty, truncated or no image.
+    """
     if not content:
-        raise FrameError(f"{path}: file is empty (0 bytes)")
+        raise FrameError(f"{name}: file is empty (0 bytes)")
     # OpenCV 4 fills the rest of a truncated JPEG with grey; its end marker must come after its last scan.
     if content[:2] == b"\xff\xd8" and content.rfind(b"\xff\xd9") < content.rfind(b"\xff\xda"):
-        raise FrameError(f"{path}: JPEG is truncated")
+        raise FrameError(f"{name}: JPEG is truncated")
     try:
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None
     if image is None:
-        raise FrameError(f"{path}: not an image, or truncated ({len(content)} bytes)")
+        raise FrameError(f"{name}: not an image, or truncated ({len(content)} bytes)")
     return image
 
 
@@ -141,6 +153,23 @@ def _to_8_bits(image: np.ndarray, significant_bits: int) -> np.ndarray:
     return cv2.convertScaleAbs(image, alpha=255.0 / (2**significant_bits - 1))
 
 
+def first_readable(pairs: Iterable[RawPair | SkippedFrame], source: Path) -> RawPair:
+    """The first pair that can be read.
+
+    Raises:
+        InputError: none of the first pairs can.
+    """
+    tried = 0
+    reason = ""
+    for tried, item in enumerate(pairs, start=1):
+        if isinstance(item, RawPair):
+            return item
+        reason = reason or item.reason
+        if tried > MAX_FAILURES:
+            break
+    raise InputError(f"{source}: none of the first {tried} pairs can be read; the first: {reason}")
+
+
 class ImagePairs:
     """Left and right image files with their timestamps, as a source of pairs.
 
@@ -177,15 +206,7 @@ class ImagePairs:
         Raises:
             InputError: none of the first pairs can.
         """
-        tried = 0
-        reason = ""
-        for tried, item in enumerate(self, start=1):
-            if isinstance(item, RawPair):
-                return item
-            reason = reason or item.reason
-            if tried > MAX_FAILURES:
-                break
-        raise InputError(f"{self._source}: none of the first {tried} pairs can be read; the first: {reason}")
+        return first_readable(self, self._source)
 
     def __iter__(self) -> Iterator[RawPair | SkippedFrame]:
         assert self.timestamps is not None

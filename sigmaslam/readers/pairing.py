@@ -2,9 +2,12 @@
 
 import logging
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections import deque
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -18,7 +21,11 @@ STAMP_TOLERANCE_NS = 5_000_000
 # Nanoseconds since 1970 have 19 digits; 16 leave room for clocks that start elsewhere.
 STAMP_DIGITS = 16
 
+# So many images of one eye wait for the other eye's before they count as alone.
+MAX_WAITING = 50
+
 Key = tuple[int, ...] | str
+T = TypeVar("T")
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -115,6 +122,57 @@ def pair_by_stamp(
     pairs = [(left[int(left_stamps[i])], right[int(right_stamps[to_right[i]])]) for i in chosen]
     # Division of Python integers is rounded once; 19 digits are more than a float holds.
     return pairs, [int(left_stamps[i]) / 1_000_000_000 for i in chosen]
+
+
+@dataclass(frozen=True, slots=True)
+class Stamped(Generic[T]):
+    """Something with the time at which it was taken, nanoseconds."""
+
+    stamp: int
+    item: T
+
+
+def pair_streams(images: Iterable[tuple[int, Stamped[T]]]) -> Iterator[tuple[Stamped[T] | None, Stamped[T] | None]]:
+    """Pairs of mutually nearest stamps, at most 5 ms apart, from two streams that are read once.
+
+    Args:
+        images: (0, left image) and (1, right image), each eye in the order of time, the two mixed in any way.
+
+    Yields:
+        Pairs (left, right); (left, None) or (None, right) for an image without partner, among them those whose
+        stamp is not later than the one before of that eye. At most `MAX_WAITING` images of an eye are held.
+    """
+    waiting: tuple[deque[Stamped[T]], deque[Stamped[T]]] = (deque(), deque())
+    latest = [-1, -1]
+    for eye, image in images:
+        if image.stamp <= latest[eye]:
+            yield (None, image) if eye else (image, None)
+            continue
+        latest[eye] = image.stamp
+        waiting[eye].append(image)
+        yield from _settle(waiting, False)
+    yield from _settle(waiting, True)
+
+
+def _settle(
+    waiting: tuple[deque[Stamped[T]], deque[Stamped[T]]], ended: bool
+) -> Iterator[tuple[Stamped[T] | None, Stamped[T] | None]]:
+    """Decides about the heads of both queues while what follows them is known, or will not come."""
+    left, right = waiting
+    while left or right:
+        if not ended and max(len(left), len(right)) <= MAX_WAITING and min(len(left), len(right)) < 2:
+            return
+        if left and right:
+            apart = abs(left[0].stamp - right[0].stamp)
+            left_alone = len(left) > 1 and abs(left[1].stamp - right[0].stamp) < apart
+            right_alone = len(right) > 1 and abs(left[0].stamp - right[1].stamp) < apart
+            if apart <= STAMP_TOLERANCE_NS and not left_alone and not right_alone:
+                yield left.popleft(), right.popleft()
+                continue
+            left_alone = left_alone if apart <= STAMP_TOLERANCE_NS else left[0].stamp < right[0].stamp
+        else:
+            left_alone = bool(left)
+        yield (left.popleft(), None) if left_alone else (None, right.popleft())
 
 
 def _nearest(stamps: np.ndarray, others: np.ndarray) -> np.ndarray:

@@ -56,8 +56,8 @@ class StereoSequence:
 
     Attributes:
         camera: calibration of the images as stored.
-        source: the file or folder.
-        format: 'kitti', 'euroc', 'folder' or 'video'.
+        source: the file or folder, or the name of a camera.
+        format: 'kitti', 'euroc', 'folder', 'video', 'bag' or 'camera'.
         timestamps: seconds, one per pair, or None where they are only known on reading (videos).
         length: number of pairs, or None where the file does not say.
         skipped: the pairs that the latest run of `frames` could not use.
@@ -67,7 +67,7 @@ class StereoSequence:
         InputError: no image can be read.
     """
 
-    def __init__(self, pairs: PairSource, camera: StereoCamera, source: Path, format: str) -> None:
+    def __init__(self, pairs: PairSource, camera: StereoCamera, source: Path | str, format: str) -> None:
         self.camera = camera
         self.source = source
         self.format = format
@@ -92,7 +92,12 @@ class StereoSequence:
             except FrameError as error:
                 raise InputError(str(error)) from None
 
-    def frames(self) -> Iterator[StereoFrame]:
+    @property
+    def dropped(self) -> int:
+        """Pairs of a live camera that came while nobody was ready for them; 0 for recordings."""
+        return 0
+
+    def frames(self) -> Generator[StereoFrame, None, None]:
         """Pairs in order, read ahead by a thread that ends with the iteration, however that ends.
 
         A pair with an image that is missing, broken or of another size is left out, logged as a warning and
@@ -103,7 +108,7 @@ class StereoSequence:
         """
         self.skipped = []
         failures, any_read = 0, False
-        with closing(read_ahead(self._convert, READ_AHEAD)) as items:
+        with closing(self._items()) as items:
             for item in items:
                 if isinstance(item, StereoFrame):
                     failures, any_read = 0, True
@@ -118,6 +123,9 @@ class StereoSequence:
                     )
         if not any_read:
             raise InputError(f"{self.source}: not one of {len(self.skipped)} pairs can be read")
+
+    def _items(self) -> Generator[StereoFrame | SkippedFrame, None, None]:
+        return read_ahead(self._convert, READ_AHEAD)
 
     def _convert(self) -> Generator[StereoFrame | SkippedFrame, None, None]:
         for item in self._pairs:

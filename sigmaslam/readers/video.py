@@ -141,10 +141,7 @@ class VideoPairs:
         names = [f"{path} frame {index}" for path in self._files]
         if len(images) == 2:
             return RawPair(index, timestamp, images[0], images[1], names[0], names[1])
-        width = images[0].shape[1]
-        if width % 2:
-            raise InputError(f"{self._files[0]}: {width} px wide; a side-by-side video must have an even width")
-        left, right = (np.ascontiguousarray(half) for half in np.split(images[0], 2, axis=1))
+        left, right = split_halves(images[0], str(self._files[0]))
         return RawPair(index, timestamp, left, right, f"{names[0]} (left half)", f"{names[0]} (right half)")
 
     def _report_end(self, frames: int, images: list[np.ndarray | None]) -> None:
@@ -172,12 +169,26 @@ def _open(path: Path) -> cv2.VideoCapture:
     return capture
 
 
+def split_halves(image: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Left and right half of an image that holds both eyes.
+
+    Raises:
+        InputError: the width is odd.
+    """
+    if image.shape[1] % 2:
+        raise InputError(f"{name}: {image.shape[1]} px wide; with both eyes side by side the width must be even")
+    left, right = np.split(image, 2, axis=1)
+    return np.ascontiguousarray(left), np.ascontiguousarray(right)
+
+
+def to_grey(image: np.ndarray) -> np.ndarray:
+    """Grey of what OpenCV captures: it gives BGR for grey videos too, so a warning about colour would say nothing."""
+    return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
+
+
 def _next_image(capture: cv2.VideoCapture) -> np.ndarray | None:
     ok, image = capture.read()
-    if not ok:
-        return None
-    # OpenCV decodes grey videos to BGR too, so a warning about colour would say nothing.
-    return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
+    return to_grey(image) if ok else None
 
 
 def _seconds(capture: cv2.VideoCapture) -> float:

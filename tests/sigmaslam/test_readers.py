@@ -332,8 +332,8 @@ def test_float_images_are_refused(tmp_path):
 def test_missing_folder_and_unknown_format(tmp_path):
     with pytest.raises(InputError, match="no such file or folder"):
         open_sequence(tmp_path / "nothing")
-    with pytest.raises(InputError, match="'bag' is unknown; use one of auto, kitti, euroc, folder, video"):
-        open_sequence(tmp_path, format="bag")
+    with pytest.raises(InputError, match="'ros' is unknown; use one of auto, kitti, euroc, folder, video, bag"):
+        open_sequence(tmp_path, format="ros")
 
 
 def test_auto_lists_what_it_looked_for(tmp_path):
@@ -345,6 +345,7 @@ def test_auto_lists_what_it_looked_for(tmp_path):
         "euroc: folders cam0/data",
         "folder: folders left",
         "video: one",
+        "bag: a ROS bag",
     ):
         assert text in str(caught.value)
 

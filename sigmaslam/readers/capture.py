@@ -1,0 +1,199 @@
+"""Cameras that OpenCV opens, and a pair of images from them that were taken at nearly the same time."""
+
+import logging
+import re
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from sigmaslam.errors import InputError
+from sigmaslam.readers.images import RawPair
+from sigmaslam.readers.pairing import STAMP_TOLERANCE_NS
+from sigmaslam.readers.video import split_halves, to_grey
+
+logger = logging.getLogger(__name__)
+
+# Whether left and right are taken together is judged by the median of so many pairs.
+JUDGED_PAIRS = 30
+_DEFAULT_RATE_HZ = 30.0
+# OpenCV asks V4L2 for so many buffers.
+_BUFFERS = 4
+_OLDEST_S = 10.0
+
+
+class Capture(Protocol):
+    """What is used of cv2.VideoCapture."""
+
+    def grab(self) -> bool:
+        """Wait for the next image and take it."""
+
+    def retrieve(self) -> tuple[bool, np.ndarray]:
+        """Decode the image that was taken."""
+
+    def get(self, prop: int, /) -> float:
+        """A property."""
+
+    def getBackendName(self) -> str:  # noqa: N802
+        """What drives the camera."""
+
+    def release(self) -> None:
+        """Give the camera back."""
+
+
+class PlayedVideo:
+    """A video file as a camera: after the first image, `grab` waits until the next one is due."""
+
+    def __init__(self, capture: Capture) -> None:
+        self._capture = capture
+        self._period = 1.0 / rate_hz(capture)
+        self._grabbed = 0
+        self._began = 0.0
+        self.retrieve = capture.retrieve
+        self.get = capture.get
+        self.getBackendName = capture.getBackendName
+        self.release = capture.release
+
+    def grab(self) -> bool:
+        """Wait until the next image is due; False at the end."""
+        if self._grabbed == 1:
+            self._began = time.monotonic()
+        elif self._grabbed > 1:
+            due = self._began + (self._grabbed - 1) * self._period
+            time.sleep(max(0.0, due - time.monotonic()))
+        self._grabbed += 1
+        return self._capture.grab()
+
+
+def open_capture(device: str, size: tuple[int, int] | None = None) -> Capture:
+    """Open a camera or a video file.
+
+    Args:
+        device: number, path or URL.
+        size: (width, height) to ask the camera for; it may give another one.
+
+    Raises:
+        InputError: OpenCV cannot open it.
+    """
+    # By number, as by name OpenCV tries other things first; /dev/v4l/by-id/* are links to /dev/video*.
+    number = re.fullmatch(r"(?:/dev/video)?(\d+)", device if device.isdecimal() else str(Path(device).resolve()))
+    capture = cv2.VideoCapture(int(number[1])) if number else cv2.VideoCapture(device)
+    if not capture.isOpened():
+        raise InputError(
+            f"camera {device} cannot be opened: is it plugged in, used by no other program, and may you read it "
+            "(group 'video')? `ls /dev/video* /dev/v4l/by-id` shows the cameras"
+        )
+    if Path(device).is_file():
+        return PlayedVideo(capture)
+    if size is not None:
+        capture.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
+        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
+    return capture
+
+
+def rate_hz(capture: Capture) -> float:
+    """Images a second as the camera or file says, else 30."""
+    rate = capture.get(cv2.CAP_PROP_FPS)
+    return rate if 1.0 <= rate <= 1000.0 else _DEFAULT_RATE_HZ
+
+
+class StereoCapture:
+    """A left and a right camera, or one whose image holds both eyes.
+
+    Args:
+        captures: one or two.
+        names: of these, for messages.
+
+    Attributes:
+        period: seconds from one pair to the next.
+        played: whether these are video files.
+        failed: name of the camera that failed last.
+    """
+
+    def __init__(self, captures: Sequence[Capture], names: Sequence[str]) -> None:
+        self.period = 1.0 / rate_hz(captures[0])
+        self.played = any(isinstance(capture, PlayedVideo) for capture in captures)
+        self.failed = ""
+        self._captures = list(captures)
+        self._names = list(names)
+        self._driver_clock = all(capture.getBackendName() == "V4L2" for capture in captures)
+        self._spreads: list[float] = []
+
+    def take(self, index: int) -> RawPair | None:
+        """The next pair, or None where a camera fails; its timestamp is on the monotonic clock.
+
+        That is the driver's time of the left image where it tells one (V4L2), else the time when it was there.
+
+        Raises:
+            InputError: an image with both eyes has an odd width.
+        """
+        times = self._grab_both()
+        if times is None:
+            return None
+        images = []
+        for capture, name in zip(self._captures, self._names, strict=True):
+            done, image = capture.retrieve()
+            if not done:
+                self.failed = name
+                return None
+            images.append(to_grey(image))
+        if len(images) == 2:
+            self._judge(abs(times[1] - times[0]))
+            return RawPair(index, times[0], images[0], images[1], *self._names)
+        name = self._names[0]
+        left, right = split_halves(images[0], name)
+        return RawPair(index, times[0], left, right, f"{name} (left half)", f"{name} (right half)")
+
+    def release(self) -> None:
+        """Give the cameras back."""
+        for capture in self._captures:
+            capture.release()
+
+    def _grab_both(self) -> list[float] | None:
+        """When the images of each eye were taken."""
+        times = []
+        for eye in range(len(self._captures)):
+            moment = self._grab(eye)
+            if moment is None:
+                return None
+            times.append(moment)
+        for _ in range(_BUFFERS):
+            # A driver's buffer may hold images that are older than the other eye's by a frame or more.
+            if not self._driver_clock or max(times) - min(times) < self.period / 2:
+                break
+            older = times.index(min(times))
+            moment = self._grab(older)
+            if moment is None:
+                return None
+            times[older] = moment
+        return times
+
+    def _grab(self, eye: int) -> float | None:
+        capture = self._captures[eye]
+        if not capture.grab():
+            self.failed = self._names[eye]
+            return None
+        now = time.monotonic()
+        if self._driver_clock:
+            moment = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
+            if now - _OLDEST_S < moment <= now:
+                return moment
+            self._driver_clock = False  # this driver has another clock, or none
+        return now
+
+    def _judge(self, spread: float) -> None:
+        if self.played or len(self._spreads) == JUDGED_PAIRS:
+            return
+        self._spreads.append(spread)
+        median = float(np.median(self._spreads))
+        if len(self._spreads) == JUDGED_PAIRS and 1e9 * median > STAMP_TOLERANCE_NS:
+            logger.warning(
+                "%s: left and right are taken %.0f ms apart (median of %d pairs): move slowly, or use cameras with a "
+                "common trigger",
+                " and ".join(self._names),
+                1e3 * median,
+                JUDGED_PAIRS,
+            )
