@@ -12,7 +12,7 @@ from sigmaslam.factor_graph import load_gtsam, swap_tangent
 from sigmaslam.rotation import se3_adjoint, se3_inverse
 
 # Metres and radians: holds the first pose in place. What is not known of it is added to the result.
-_FIXED = 1e-6
+_FIXED = 1e-8
 # A right edge is switched off once in a thousand; a wrong one is seldom wrong by so little.
 _CONFIDENCE = 0.999
 
