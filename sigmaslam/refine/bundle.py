@@ -23,8 +23,8 @@ from sigmaslam.refine.structure import (
 from sigmaslam.refine.tracks import Tracks
 from sigmaslam.rotation import se3_adjoint, se3_inverse
 
-# How often landmarks that ran away to infinity are taken out.
-_MOST_ROUNDS = 5
+# Fewer that agree are no solution.
+_LEAST_SHARE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,36 +116,46 @@ def adjust(
     offset = float(tracks.disparity_offset[0])
     solver = Solver(observations, tracked, adjoint.T @ covariances[frames] @ adjoint, tell)
 
-    def fit(kept: np.ndarray, at: np.ndarray, offset: float) -> Structure:
+    repeated = seen_again(observations, np.ones(len(observations), bool))
+
+    def fit(kept: np.ndarray, at: np.ndarray, offset: float) -> tuple[Structure, np.ndarray]:
+        """Points by themselves, with every view where none was kept, and which of the repeated views are far."""
         tell("points by themselves")
-        return fit_structure(observations, kept, at, offset)
+        lost = np.bincount(observations.landmark[kept], minlength=len(observations.host)) == 0
+        structure = fit_structure(observations, kept | (repeated & lost[observations.landmark]), at, offset)
+        return structure, repeated & ~(structure.significance >= least)[observations.landmark]
 
     least = config.least_significance
-    repeated = seen_again(observations, np.ones(len(observations), bool))
-    structure = fit(repeated, tracked, offset)
-    far = ~(structure.significance[np.unique(observations.landmark[repeated])] >= least)
-    candidates = choose(observations, repeated, structure, tracked, offset, least, gated=False)
-    if not candidates.any():
+    structure, far = fit(repeated, tracked, offset)
+    kept = choose(observations, repeated, structure, tracked, offset, least, gated=False)
+    if not kept.any():
         raise InputError(
             f"none of {len(structure.points)} landmarks is seen by two keyframes and near enough to have a depth: "
             "there is nothing to adjust"
         )
-    solution = solver.solve(candidates, tracked, structure.points, offset, robust=True)
-    kept = candidates
-    for last in (False, True):
-        # Of all candidates, so that what was left out can come back.
-        structure = fit(kept, solution.poses, offset)
-        kept = choose(observations, candidates, structure, solution.poses, offset, least, gated=True)
-        if not kept.any():
-            raise InputError("no observation agrees with the others: are trajectory and tracks of the same run?")
-        if not last:
-            solution = solver.solve(kept, solution.poses, structure.points, offset)
-    for _ in range(_MOST_ROUNDS):
+    solution = solver.solve(kept, tracked, structure.points, offset, robust=True)
+
+    def judge() -> tuple[np.ndarray, Structure]:
+        """Which observations agree with the solution, those left out before included, and points that fit it."""
+        structure, far = fit(kept, solution.poses, offset)
+        agreeing = choose(observations, repeated, structure, solution.poses, offset, least, gated=True)
+        near = int((repeated & ~far).sum())
+        if agreeing.sum() < max(_LEAST_SHARE * near, 1):
+            raise InputError(
+                f"{agreeing.sum()} of {near} observations agree on where things are: too few. Are trajectory and "
+                "tracks of the same run?"
+            )
+        return agreeing, structure
+
+    kept, structure = judge()
+    solution = solver.solve(kept, solution.poses, structure.points, offset)
+    kept, structure = judge()
+    while True:
         solution, curvature, by_offset = solver.solve_with_offset(
             kept, solution.poses, structure.points, solution.offset, config.offset_sigma
         )
         # Some may have run away to infinity since. Half of the limit, or those at the limit would come and go.
-        structure = fit(kept, solution.poses, solution.offset)
+        structure, far = fit(kept, solution.poses, solution.offset)
         near = choose(observations, kept, structure, solution.poses, solution.offset, 0.5 * least, gated=False)
         if np.array_equal(near, kept):
             break
@@ -160,7 +170,7 @@ def adjust(
     bridges = len(solver.bridges(kept))
     components = int(np.where(observations.stereo[kept], 3, 2).sum())
     dof = components - 3 * len(used) - 6 * (len(frames) - 1) - 1 + 6 * bridges
-    before = fit(kept, tracked, offset)
+    before = fit_structure(observations, kept, tracked, offset)
     return Adjustment(
         frames=frames,
         poses=solution.poses @ se3_inverse(T_left_rectified),
@@ -171,8 +181,8 @@ def adjust(
         disparity_offset=solution.offset,
         disparity_offset_sigma=sigma,
         observations=int(kept.sum()),
-        outliers=int((candidates & ~kept).sum()),
-        far_landmarks=int(far.sum()),
+        outliers=int((repeated & ~kept & ~far).sum()),
+        far_landmarks=len(np.unique(observations.landmark[far & ~kept])),
         bridges=bridges,
         dof=dof,
         cost_before=_sum_of_squares(observations, kept, tracked, before.points, offset) / max(dof, 1),

@@ -153,7 +153,9 @@ class Solver:
             marginals = self._gtsam.Marginals(solution.graph, solution.values)
             return swap_tangent(np.stack([marginals.marginalCovariance(key) for key in keys]))
         except RuntimeError as error:
-            raise SigmaSlamError(f"the tracks do not fix every pose, so there is no covariance: {error}") from error
+            raise SigmaSlamError(
+                "the tracks do not fix every keyframe and landmark, so there is no covariance: track with more features"
+            ) from error
 
     def bridges(self, kept: np.ndarray) -> list[PoseEdge]:
         """Where the tracks break off: the tracker's motion from the keyframe before, so that all are connected."""

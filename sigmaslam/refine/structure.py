@@ -13,8 +13,8 @@ from sigmaslam.rotation import se3_inverse
 HUBER = 2.795
 # 99.9 % quantiles of chi-square with 2 and 3 degrees of freedom: without and with a disparity.
 _GATE = np.array([13.815510557964274, 16.26623623681962])
-_NEWTON_STEPS = 20
-_NEWTON_PIXELS = 1e-5
+_NEWTON_STEPS = 8
+_NEWTON_PIXELS = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
