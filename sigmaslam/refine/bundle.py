@@ -63,6 +63,7 @@ class Adjustment:
             at the tracker's poses and offset with the points that fit these best, and now.
         iterations: Levenberg-Marquardt steps of all solves.
         solves: how many times the graph was solved.
+        converged: False when a solve ran out of iterations, or the offset out of steps.
     """
 
     frames: np.ndarray
@@ -82,6 +83,7 @@ class Adjustment:
     cost_after: float
     iterations: int
     solves: int
+    converged: bool
 
 
 def adjust(
@@ -189,6 +191,7 @@ def adjust(
         cost_after=_sum_of_squares(observations, kept, solution.poses, solution.points, solution.offset) / max(dof, 1),
         iterations=solver.iterations,
         solves=solver.solves,
+        converged=solver.converged,
     )
 
 

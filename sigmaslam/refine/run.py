@@ -66,6 +66,7 @@ def refine_run(
         "bridges": adjustment.bridges,
         "iterations": adjustment.iterations,
         "solves": adjustment.solves,
+        "converged": adjustment.converged,
         "dof": adjustment.dof,
         "cost_per_dof_before": adjustment.cost_before,
         "cost_per_dof_after": adjustment.cost_after,

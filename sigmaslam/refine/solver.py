@@ -75,6 +75,7 @@ class Solver:
         self._first_pose_key = len(observations.host)
         self.iterations = 0
         self.solves = 0
+        self.converged = True
 
     def solve(
         self, kept: np.ndarray, poses: np.ndarray, points: np.ndarray, offset: float, robust: bool = False
@@ -105,6 +106,9 @@ class Solver:
             self._tell(f"solve {self.solves}, iteration {self.iterations}, offset {offset:+.4f} px, cost {cost:.1f}")
             if gain <= (_NEARLY_CONVERGED * cost if robust else _CONVERGED):
                 break
+        else:
+            # Huber's is no more than a place to start from.
+            self.converged &= robust
         values = optimiser.values()
         points = points.copy()
         points[landmarks] = [values.atPoint3(key) for key in landmarks.tolist()]
@@ -143,6 +147,8 @@ class Solver:
             # Close by, the difference is that of rounding.
             if abs(step) > 0.1 * _PROBE:
                 curvature = max((slope - before) / step, prior_sigma**-2)
+        else:
+            self.converged = False
         return solution, curvature, by_offset
 
     def pose_covariances(self, solution: Solution) -> np.ndarray:

@@ -15,10 +15,10 @@ from typer.testing import CliRunner
 from sigmaslam.cli import app
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.evaluate import evaluate_run
-from sigmaslam.refine import Adjustment, RefineConfig, adjust, refine_run
+from sigmaslam.refine import Adjustment, RefineConfig, Tracks, adjust, refine_run
 from sigmaslam.refine.run import spread_corrections
 from sigmaslam.refine.structure import collect, fit_structure, point_covariances
-from sigmaslam.rotation import se3_exp, se3_inverse, se3_log
+from sigmaslam.rotation import nearest_rotation, se3_exp, se3_inverse, se3_log
 from sigmaslam.trajectory import Trajectory, read_tum, write_tum
 
 pytest.importorskip("gtsam")
@@ -196,6 +196,7 @@ def test_the_command_writes_what_evaluate_reads(run_folder: Path, tmp_path: Path
     printed = json.loads(result.stdout)
     assert printed == json.loads((out / "refine.json").read_text())
     assert printed["keyframes"] == 12
+    assert printed["converged"]
     assert printed["disparity_offset"] == pytest.approx(OFFSET, abs=4 * printed["disparity_offset_sigma"])
     assert printed["cost_per_dof_after"] == pytest.approx(1.0, abs=0.15)
     assert printed["versions"]["gtsam"]
@@ -305,3 +306,28 @@ def test_times_and_rows_are_those_of_the_run(run_folder: Path, tmp_path: Path):
     before, after = read_tum(run_folder / "trajectory.tum"), read_tum(tmp_path / "out" / "trajectory.tum")
     np.testing.assert_array_equal(before.timestamps, after.timestamps)
     np.testing.assert_allclose(after.poses[0], before.poses[0], atol=1e-9)
+
+
+@pytest.mark.slow
+def test_tracks_of_a_real_drive_are_adjusted(real_data: Path):
+    folder = real_data / "kitti00_stereo_features_gtsam"
+    rows = np.loadtxt(folder / "VO_stereo_factors00s.txt")  # pose, landmark, u left, u right, v, ...
+    poses = np.loadtxt(folder / "VO_camera_poses00s.txt")[:, 1:].reshape(-1, 4, 4)
+    poses[:, :3, :3] = nearest_rotation(poses[:, :3, :3])
+    fx, fy, _, cx, cy, baseline = np.loadtxt(folder / "VO_calibration00s.txt")
+    tracks = Tracks(
+        rows[:, 0].astype(np.int64),
+        rows[:, 1].astype(np.int64),
+        np.column_stack([rows[:, 2], rows[:, 4], rows[:, 2] - rows[:, 3]]),
+        np.tile(0.3**2 * np.eye(3), (len(rows), 1, 1)),
+        np.array([fx, fy, cx, cy, baseline]),
+        np.eye(3),
+        np.array([0.0, 0.2]),
+    )
+    adjustment = adjust(tracks, poses, np.zeros((len(poses), 6, 6)))
+    assert adjustment.bridges == 0
+    assert adjustment.outliers < 0.06 * len(rows)
+    assert adjustment.cost_after < adjustment.cost_before < 1.0
+    # The poses that come with it are adjusted already, without an offset.
+    assert 0.0 < adjustment.disparity_offset < 0.3
+    np.testing.assert_allclose(adjustment.poses[-1, :3, 3], poses[-1, :3, 3], atol=0.5)
