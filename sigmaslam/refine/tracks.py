@@ -1,0 +1,124 @@
+"""The observations that a run leaves in tracks.npz."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sigmaslam.errors import InputError
+
+TRACKS_NAME = "tracks.npz"
+
+
+@dataclass(frozen=True, slots=True)
+class Tracks:
+    """Landmarks as keyframes observed them, with the rectified pair that they were observed by.
+
+    Attributes:
+        frame: (O,) int64, row of the observing keyframe in the trajectory.
+        landmark: (O,) int64, any numbers; the first observation in this order is the landmark's host.
+        measurement: (O, 3) (u, v, disparity) in the rectified left image, pixels; disparity may be NaN.
+        covariance: (O, 3, 3) pixels squared; what belongs to a disparity of NaN has no meaning.
+        intrinsics: (5,) fx, fy, cx, cy in pixels and the baseline in metres.
+        R_rectified_left: (3, 3) takes left-camera to rectified coordinates; both have the same centre.
+        disparity_offset: (2,) measured minus true disparity as the tracker saw it last, and its sigma, pixels.
+    """
+
+    frame: np.ndarray
+    landmark: np.ndarray
+    measurement: np.ndarray
+    covariance: np.ndarray
+    intrinsics: np.ndarray
+    R_rectified_left: np.ndarray
+    disparity_offset: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+# None stands for the number of observations.
+_SHAPES: dict[str, tuple[int | None, ...]] = {
+    "frame": (None,),
+    "landmark": (None,),
+    "measurement": (None, 3),
+    "covariance": (None, 3, 3),
+    "intrinsics": (5,),
+    "R_rectified_left": (3, 3),
+    "disparity_offset": (2,),
+}
+_MEND = "run `sigmaslam track --tracks` again"
+
+
+def read_tracks(path: Path, frames: int) -> Tracks:
+    """Reads and checks tracks.npz.
+
+    Args:
+        path: the file.
+        frames: poses in the trajectory of the same run.
+    Raises:
+        InputError: there is no such file, it is cut off, or what it holds is wrong (the message says where).
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; {_MEND.replace(' again', '')} to make a run with the observations")
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            missing = [name for name in _SHAPES if name not in archive.files]
+            if missing:
+                raise InputError(f"{path}: misses {', '.join(missing)}; {_MEND}")
+            arrays = {name: archive[name] for name in _SHAPES}
+    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(f"{path}: is no numpy archive, or is cut off ({error}); {_MEND}") from error
+    count = len(arrays["frame"]) if arrays["frame"].ndim else 0
+    for name, shape in _SHAPES.items():
+        array = arrays[name]
+        expected = tuple(count if size is None else size for size in shape)
+        kinds = "iu" if name in ("frame", "landmark") else "iuf"
+        if array.shape != expected or array.dtype.kind not in kinds:
+            raise InputError(
+                f"{path}: {name} is {array.dtype} {array.shape} and must be "
+                f"{'integer' if kinds == 'iu' else 'float64'} {expected}; {_MEND}"
+            )
+        arrays[name] = array.astype(np.int64 if kinds == "iu" else np.float64)
+    tracks = Tracks(**arrays)
+    _check(path, tracks, frames)
+    return tracks
+
+
+def _check(path: Path, tracks: Tracks, frames: int) -> None:
+    def refuse(wrong: np.ndarray, what: str) -> None:
+        rows = np.flatnonzero(wrong)
+        if len(rows):
+            raise InputError(f"{path}: observation {rows[0]} and {len(rows) - 1} more: {what}; {_MEND}")
+
+    if len(tracks) == 0:
+        raise InputError(f"{path}: holds no observations; was anything tracked? Look into frames.csv of the run")
+    refuse(
+        (tracks.frame < 0) | (tracks.frame >= frames),
+        f"frame is not in the trajectory beside it, which has {frames} poses; both must come from the same run",
+    )
+    refuse(~np.isfinite(tracks.measurement[:, :2]).all(axis=1), "u or v is not finite")
+    refuse(np.isinf(tracks.measurement[:, 2]), "disparity is infinite")
+    covariance = without_disparity(tracks.measurement, tracks.covariance)
+    finite = np.isfinite(covariance).all(axis=(1, 2))
+    refuse(~finite, "covariance is not finite")
+    refuse(np.linalg.eigvalsh(covariance)[:, 0] <= 0, "covariance is not positive definite")
+    if not np.isfinite(tracks.intrinsics).all() or (tracks.intrinsics[[0, 1, 4]] <= 0).any():
+        raise InputError(f"{path}: intrinsics {tracks.intrinsics} need positive fx, fy and baseline; {_MEND}")
+    R = tracks.R_rectified_left
+    if not np.allclose(R @ R.T, np.eye(3), atol=1e-6) or np.linalg.det(R) < 0:
+        raise InputError(f"{path}: R_rectified_left is no rotation:\n{R}\n{_MEND}")
+    if not np.isfinite(tracks.disparity_offset).all():
+        raise InputError(f"{path}: disparity_offset {tracks.disparity_offset} is not finite; {_MEND}")
+
+
+def without_disparity(measurement: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Covariances (O, 3, 3) in which a disparity of NaN has unit variance and no correlation."""
+    unknown = np.isnan(measurement[:, 2])
+    result = covariance.copy()
+    result[unknown, 2, :] = result[unknown, :, 2] = 0.0
+    result[unknown, 2, 2] = 1.0
+    return result
