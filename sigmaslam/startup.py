@@ -29,10 +29,12 @@ class RelativePose:
     Attributes:
         T_key_camera: (4, 4).
         inliers: (M,) bool, points that agree with it.
+        covariance: (6, 6) of x in T_key_camera exp(x), x = (translation, rotation), from the inliers' noise.
     """
 
     T_key_camera: np.ndarray
     inliers: np.ndarray
+    covariance: np.ndarray
 
 
 def estimate_relative_pose(
@@ -191,12 +193,16 @@ def _refine(views: _Views, T_camera_key: np.ndarray) -> RelativePose | None:
             return None
         T_camera_key = se3_exp(np.linalg.solve(normal, gradient)) @ T_camera_key
         scale = max(_NARROWING * scale, _LAST_SCALE)
-    residual, _, information = views.linearise(T_camera_key)
+    residual, by_pose, information = views.linearise(T_camera_key)
     squared = np.einsum("mi,mij,mj->m", residual, information, residual)
     inliers = (views.weight > 0) & (np.trace(information, axis1=1, axis2=2) > 0) & (squared < _GATE)
     if inliers.sum() < _LEAST_POINTS:
         return None
-    return RelativePose(se3_inverse(T_camera_key), inliers)
+    agreeing = by_pose[inliers]
+    normal = (agreeing.transpose(0, 2, 1) @ information[inliers] @ agreeing).sum(axis=0)
+    if not np.linalg.cond(normal) < _WORST_CONDITION:
+        return None
+    return RelativePose(se3_inverse(T_camera_key), inliers, np.linalg.inv(normal))
 
 
 def _pose(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:

@@ -6,17 +6,17 @@ import logging
 import time
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
-from scipy.spatial import cKDTree
 
 from sigmaslam.camera import StereoCamera
 from sigmaslam.errors import InputError
-from sigmaslam.frontend import StereoView, TemporalMatches, build_frontend
+from sigmaslam.frontend import Features, StereoView, TemporalMatches, build_frontend
 from sigmaslam.landmarks import PointMap, map_points, merge_maps
 from sigmaslam.motion import MotionFilter
 from sigmaslam.rectify import StereoRectifier
 from sigmaslam.rotation import se3_adjoint, se3_inverse, se3_log
-from sigmaslam.startup import estimate_relative_pose
+from sigmaslam.startup import RelativePose, estimate_relative_pose
 from sigmaslam.window import CALIBRATION, FrameFit, KeyframeWindow, Views, pose_slice
 
 _LOGGER = logging.getLogger(__name__)
@@ -30,6 +30,8 @@ _LEAST_SHARE_UNGUIDED = 0.5
 # A fit near the prediction with a larger NIS per degree of freedom may sit in a wrong place: it is checked against one
 # that does without the prediction.
 _DOUBTFUL_NIS = 2.0
+# Without a prediction the view is compared with so many late keyframes.
+_LATE_KEYFRAMES = 3
 # A keyframe of which fewer landmarks are in view is not searched for.
 _LEAST_OF_A_KEYFRAME = 8
 # The noise of matches follows the NIS: bounds of its scale, and the exponent of one frame's part in it.
@@ -62,7 +64,7 @@ class TrackerConfig:
         shared_disparity: share of the variance of a landmark's disparities that is the same in all views.
         most_misses: after so many frames in a row in which it was not found a landmark is no longer looked for.
         least_inliers: fewer is no pose; without a prediction and a fair share of the matches, fewer than twice as many.
-        keyframe_ratio: a new keyframe is taken when the inliers fall below this share of what the keyframe began with.
+        keyframe_ratio: a new keyframe is taken when the inliers fall below this share of the landmarks in the last one.
         search_limit: with a predicted place less certain than this (pixels, one sigma) the search is not guided.
         lost_seconds: after this long without a pose, tracking starts anew from the current view.
     """
@@ -84,7 +86,7 @@ class TrackerConfig:
     shared_disparity: float = 0.8
     most_misses: int = 3
     least_inliers: int = 15
-    keyframe_ratio: float = 0.6
+    keyframe_ratio: float = 0.65
     search_limit: float = 25.0
     lost_seconds: float = 0.5
 
@@ -181,7 +183,7 @@ class StereoTracker:
         )
         self._motion = MotionFilter(backend)
         self._keyframe_views: list[StereoView] = []
-        self._reference = 0  # inliers of the first frame after the last keyframe
+        self._reference = 0  # landmarks in the last keyframe
         self._retired: list[PointMap] = []
         self._densities = np.zeros(2)
         self._noise_scale = 1.0
@@ -216,7 +218,7 @@ class StereoTracker:
             if self._has_stereo(view):
                 self._start(view, timestamp)
         else:
-            found, fit = self._track(view, timestamp, clock)
+            found, fit = self._track(view, clock)
             matches = len(found.probability)
             if fit is not None:
                 status = "tracking"
@@ -244,7 +246,7 @@ class StereoTracker:
         adjoint = se3_adjoint(key)
         return key @ self._motion.step, adjoint @ self._motion.step_covariance @ adjoint.T
 
-    def _track(self, view: StereoView, timestamp: float, clock: _Stopwatch) -> tuple[_Found, FrameFit | None]:
+    def _track(self, view: StereoView, clock: _Stopwatch) -> tuple[_Found, FrameFit | None]:
         """Finds the landmarks in the view, first near the prediction, then anywhere; what was found and the fit."""
         pose, covariance = self._pose_and_step()
         found, fit = _NOTHING, None
@@ -254,23 +256,25 @@ class StereoTracker:
             fit = self._fit(found, pose, covariance)
             clock.lap("filter")
         if fit is None or fit.nis_per_dof > _DOUBTFUL_NIS * self._noise_scale:
-            other_found, other = self._search_anywhere(view, timestamp, clock)
+            other_found, other = self._search_anywhere(view, clock)
             if fit is None or (other is not None and other.nis_per_dof < fit.nis_per_dof):
                 found, fit = other_found, other
         return found, fit
 
-    def _search(self, view: StereoView, pose: np.ndarray, covariance: np.ndarray) -> _Found:
-        """Active search: every landmark within the innovation ellipse of its prediction, keyframe by keyframe."""
+    def _search(self, view: StereoView, pose: np.ndarray, covariance: np.ndarray, anchor: int = -1) -> _Found:
+        """Active search: every landmark within the innovation ellipse of its prediction, keyframe by keyframe.
+
+        The pose's covariance is relative to the keyframe `anchor`.
+        """
         landmarks = self._window.landmarks
         rows = np.flatnonzero(landmarks.misses < self.config.most_misses)
         if not len(rows):
             return _NOTHING
-        predicted, S, in_front = self._window.predict(rows, pose, covariance)
+        predicted, S, in_front = self._window.predict(rows, pose, covariance, anchor)
         S = S[:, :2, :2] + np.eye(2)
         inside = in_front & self._in_image(predicted)
+        inside &= np.linalg.eigvalsh(S)[:, 1] < self.config.search_limit**2
         rows, predicted, S = rows[inside], predicted[inside], S[inside]
-        if not len(rows) or np.median(np.linalg.eigvalsh(S)[:, 1]) > self.config.search_limit**2:
-            return _NOTHING
         parts = []
         for host, key in enumerate(self._keyframe_views):
             chosen = np.flatnonzero(landmarks.host[rows] == host)
@@ -284,20 +288,51 @@ class StereoTracker:
             parts.append(self._found(rows[chosen][place], matches, rows[chosen]))
         return _merge(parts)
 
-    def _search_anywhere(self, view: StereoView, timestamp: float, clock: _Stopwatch) -> tuple[_Found, FrameFit | None]:
-        """Start-up and recovery: relative pose from matches alone, then all landmarks near what it predicts."""
-        landmarks = self._window.landmarks
-        rows = np.flatnonzero(landmarks.host == len(self._window) - 1)
-        if len(rows) < self.config.least_inliers:
-            return _NOTHING, None
-        matches = self._frontend.match(
-            self._keyframe_views[-1], landmarks.feature[rows], view, landmarks.measured[rows, :2], None
+    def _search_anywhere(self, view: StereoView, clock: _Stopwatch) -> tuple[_Found, FrameFit | None]:
+        """Without a prediction: the pose relative to a late keyframe from its features, then landmarks near there."""
+        found = _NOTHING
+        for back in range(1, min(_LATE_KEYFRAMES, len(self._window)) + 1):
+            relative = self._locate(self._keyframe_views[-back], view)
+            clock.lap("match")
+            if relative is None:
+                continue
+            start = self._window.poses[-back] @ relative.T_key_camera
+            adjoint = se3_adjoint(start)
+            # How far the landmarks of other keyframes may be from where this pose expects them.
+            margin = np.diag(np.repeat([0.01 * self._window.depth, 0.01], 3) ** 2)
+            found = self._search(view, start, adjoint @ (relative.covariance + margin) @ adjoint.T, -back)
+            clock.lap("match")
+            pose, covariance = self._pose_and_step()
+            fit = self._window.fit_frame(found.views, pose, covariance, self.config.least_inliers, start)
+            clock.lap("filter")
+            if fit is not None and fit.kept.sum() >= _LEAST_SHARE * len(found.probability):
+                return found, fit
+        return found, None
+
+    def _locate(self, key: StereoView, view: StereoView) -> RelativePose | None:
+        """Pose relative to a keyframe by all of its stereo features, wherever they are in the view."""
+        index = np.flatnonzero(np.isfinite(key.disparity))
+        if len(index) < self.config.least_inliers:
+            return None
+        matches = self._frontend.match(key, index, view, key.features.keypoints[index].astype(np.float64), None)
+        rows = matches.key_index
+        keypoints = key.features.keypoints[rows].astype(np.float64)
+        place = np.full(len(rows), self.config.keyframe_sigma)
+        views = self._found(rows, matches, rows[:0]).views
+        relative = estimate_relative_pose(
+            self._camera,
+            np.column_stack([keypoints, key.disparity[rows]]),
+            np.column_stack([place, place, key.disparity_sigma[rows]]),
+            views.measurement,
+            views.noise,
+            matches.probability,
         )
-        clock.lap("match")
-        found = self._found(rows[np.searchsorted(landmarks.feature[rows], matches.key_index)], matches, rows[:0])
-        fit = self._fit_without_prediction(found, timestamp)
-        clock.lap("filter")
-        return found, fit
+        if relative is None:
+            return None
+        # Each by its probability: many doubtful ones are few.
+        agreeing = float(matches.probability[relative.inliers].sum())
+        fair = agreeing >= _LEAST_SHARE_UNGUIDED * matches.probability.sum()
+        return relative if agreeing >= self.config.least_inliers * (1 if fair else 2) else None
 
     def _found(self, rows: np.ndarray, matches: TemporalMatches, searched: np.ndarray) -> _Found:
         """Matches as views of landmarks."""
@@ -326,32 +361,6 @@ class StereoTracker:
         fit = self._window.fit_frame(found.views, pose, covariance, self.config.least_inliers)
         return fit if fit is not None and fit.kept.sum() >= _LEAST_SHARE * count else None
 
-    def _fit_without_prediction(self, found: _Found, timestamp: float) -> FrameFit | None:
-        """Relative pose from the matches alone, then the update from there; sets the motion by it when it holds."""
-        landmarks, rows = self._window.landmarks, found.views.rows
-        relative = estimate_relative_pose(
-            self._camera,
-            landmarks.measured[rows, :3],
-            np.sqrt(_with_shared(landmarks.variance[rows])),
-            found.views.measurement,
-            found.views.noise,
-            found.probability,
-        )
-        if relative is None:
-            return None
-        # Each by its probability: many doubtful ones are few.
-        agreeing = float(found.probability[relative.inliers].sum())
-        fair = agreeing >= _LEAST_SHARE_UNGUIDED * found.probability.sum()
-        least = self.config.least_inliers * (1 if fair else 2)
-        if agreeing < least:
-            return None
-        start = self._window.poses[-1] @ relative.T_key_camera
-        pose, covariance = self._pose_and_step()
-        fit = self._window.fit_frame(found.views, pose, covariance, least, start)
-        if fit is None or fit.kept.sum() < 0.5 * relative.inliers.sum():
-            return None
-        return fit
-
     def _accept(self, fit: FrameFit, found: _Found, view: StereoView, timestamp: float) -> None:
         """Takes the pose over, and makes the view a keyframe when the old ones fade."""
         landmarks = self._window.landmarks
@@ -369,8 +378,6 @@ class StereoTracker:
             low, high = _NOISE_SCALES
             self._noise_scale = float(np.clip(self._noise_scale * fit.nis_per_dof**_ADAPTATION, low, high))
         count = int(fit.kept.sum())
-        if not self._reference:
-            self._reference = count
         if count < self.config.keyframe_ratio * self._reference and self._has_stereo(view):
             self._add_keyframe(view, timestamp, fit.pose, expected, step_covariance, found.views.select(fit.kept))
 
@@ -431,18 +438,15 @@ class StereoTracker:
         window.solve()
         self._motion.start_keyframe()
         self._keyframe_at = timestamp
-        self._reference = 0
+        self._reference = int((window.landmarks.host == len(window) - 1).sum())
+        self._reference += 0 if views is None else len(views.rows)
 
     def _add_landmarks(self, view: StereoView, views: Views | None) -> None:
         """Stereo points that no landmark has been found at."""
         index = np.flatnonzero(np.isfinite(view.disparity))
+        taken = np.zeros((0, 2)) if views is None else views.measurement[:, :2]
+        index = index[_apart(view.features.select(index), taken, self.config.spacing, view.left.shape)]
         keypoints = view.features.keypoints[index].astype(np.float64)
-        if views is not None and len(views.rows):
-            taken = cKDTree(views.measurement[:, :2])
-            free = taken.query(keypoints)[0] > self.config.spacing
-            index, keypoints = index[free], keypoints[free]
-        apart = _apart(keypoints, view.features.scores[index], self.config.spacing)
-        index, keypoints = index[apart], keypoints[apart]
         measured = np.column_stack([keypoints, view.disparity[index]])
         known = self.config.constant_sigma
         disparity = view.disparity_sigma[index] if known is None else np.full(len(index), known[1])
@@ -508,20 +512,24 @@ _NOTHING = _Found(
 )
 
 
-def _apart(keypoints: np.ndarray, scores: np.ndarray, spacing: float) -> np.ndarray:
-    """Ascending indices of keypoints (K, 2) no two of which are closer than `spacing`, by descending score."""
-    close = cKDTree(keypoints).query_ball_point(keypoints, spacing)
-    kept = np.ones(len(keypoints), bool)
-    for k in np.argsort(-scores, kind="stable"):
-        if kept[k]:
-            kept[close[k]] = False
-            kept[k] = True
-    return np.flatnonzero(kept)
+def _apart(features: Features, taken: np.ndarray, spacing: float, shape: tuple[int, ...]) -> np.ndarray:
+    """Ascending indices of features that are `spacing` from places taken (K, 2) and from each other, best first."""
+    occupied = np.zeros(shape, np.uint8)
+    radius = round(spacing)
 
+    def occupy(place: np.ndarray) -> None:
+        cv2.circle(occupied, (round(float(place[0])), round(float(place[1]))), radius, 1, -1)
 
-def _with_shared(variance: np.ndarray) -> np.ndarray:
-    """Variances (K, 3) of (u, v, disparity) from those of landmarks (K, 4)."""
-    return np.column_stack([variance[:, :2], variance[:, 2] + variance[:, 3]])
+    for place in taken:
+        occupy(place)
+    height, width = shape
+    kept = []
+    columns, rows = np.clip(np.rint(features.keypoints), 0, (width - 1, height - 1)).astype(int).T
+    for k in np.argsort(-features.scores, kind="stable"):
+        if not occupied[rows[k], columns[k]]:
+            kept.append(k)
+            occupy(features.keypoints[k])
+    return np.sort(np.array(kept, np.int64))
 
 
 def _merge(parts: list[_Found]) -> _Found:

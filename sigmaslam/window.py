@@ -278,17 +278,20 @@ class KeyframeWindow:
             if iteration + 1 == iterations:
                 self._drop_outliers()
 
-    def predict(self, rows: np.ndarray, pose: np.ndarray, step_covariance: np.ndarray) -> tuple[np.ndarray, ...]:
+    def predict(
+        self, rows: np.ndarray, pose: np.ndarray, step_covariance: np.ndarray, anchor: int = -1
+    ) -> tuple[np.ndarray, ...]:
         """Where a frame should see landmarks.
 
         Args:
             rows: (K,) which.
             pose: (4, 4) expected T_world_camera.
-            step_covariance: (6, 6) of it relative to the last keyframe, perturbed from the left in the world.
+            step_covariance: (6, 6) of it relative to a keyframe, perturbed from the left in the world.
+            anchor: that keyframe; the last one by default.
         Returns:
             (u, v, disparity) (K, 3), its covariance without the measurement's noise (K, 3, 3), in front (K,) bool.
         """
-        covariance = _factor_with_frame(self._factor(), step_covariance)
+        covariance = _factor_with_frame(self._factor(), step_covariance, anchor % len(self.poses))
         covariance = covariance @ covariance.T
         slopes = self._linearise_frame(rows, pose, np.zeros(len(covariance)), covariance, np.zeros((len(rows), 4)))
         noise, by_state = self._frame_noise(rows, slopes, np.zeros((len(rows), 3, 3)))
@@ -308,7 +311,7 @@ class KeyframeWindow:
         Returns:
             None where too few views agree.
         """
-        factor = _factor_with_frame(self._factor(), step_covariance)
+        factor = _factor_with_frame(self._factor(), step_covariance, len(self.poses) - 1)
         prior = factor @ factor.T
         frame = pose_slice(len(self.poses))
         components = views.components
@@ -587,13 +590,12 @@ def _root(covariance: np.ndarray) -> np.ndarray:
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def _factor_with_frame(factor: np.ndarray, step_covariance: np.ndarray) -> np.ndarray:
-    """Factor of the state with the frame's pose, which is the last keyframe's moved by an independent step."""
+def _factor_with_frame(factor: np.ndarray, step_covariance: np.ndarray, anchor: int) -> np.ndarray:
+    """Factor of the state with the frame's pose, which is that of a keyframe moved by an independent step."""
     size, columns = factor.shape
     grown = np.zeros((size + 6, columns + 6))
     grown[:size, :columns] = factor
-    if size > CALIBRATION_SIZE:
-        grown[size:, :columns] = factor[size - 6 :]
+    grown[size:, :columns] = factor[pose_slice(anchor)]
     grown[size:, columns:] = _root(step_covariance)
     return grown
 
