@@ -261,11 +261,14 @@ class StereoTracker:
                 found, fit = other_found, other
         return found, fit
 
-    def _search(self, view: StereoView, pose: np.ndarray, covariance: np.ndarray, anchor: int = -1) -> _Found:
+    def _search(
+        self, view: StereoView, pose: np.ndarray, covariance: np.ndarray, anchor: int = -1, own: float | None = None
+    ) -> _Found:
         """Active search: every landmark within the innovation ellipse of its prediction, keyframe by keyframe.
 
-        The pose's covariance is relative to the keyframe `anchor`.
+        The pose's covariance is relative to the keyframe `anchor`; `own` as of `_found`.
         """
+        own = 1.0 - self.config.shared_disparity if own is None else own
         landmarks = self._window.landmarks
         rows = np.flatnonzero(landmarks.misses < self.config.most_misses)
         if not len(rows):
@@ -285,7 +288,7 @@ class StereoTracker:
             )
             # Features of a keyframe ascend with the rows of its landmarks.
             place = np.searchsorted(landmarks.feature[rows[chosen]], matches.key_index)
-            parts.append(self._found(rows[chosen][place], matches, rows[chosen]))
+            parts.append(self._found(rows[chosen][place], matches, rows[chosen], own))
         return _merge(parts)
 
     def _search_anywhere(self, view: StereoView, clock: _Stopwatch) -> tuple[_Found, FrameFit | None]:
@@ -300,7 +303,7 @@ class StereoTracker:
             adjoint = se3_adjoint(start)
             # How far the landmarks of other keyframes may be from where this pose expects them.
             margin = np.diag(np.repeat([0.01 * self._window.depth, 0.01], 3) ** 2)
-            found = self._search(view, start, adjoint @ (relative.covariance + margin) @ adjoint.T, -back)
+            found = self._search(view, start, adjoint @ (relative.covariance + margin) @ adjoint.T, -back, 1.0)
             clock.lap("match")
             pose, covariance = self._pose_and_step()
             fit = self._window.fit_frame(found.views, pose, covariance, self.config.least_inliers, start)
@@ -334,12 +337,11 @@ class StereoTracker:
         fair = agreeing >= _LEAST_SHARE_UNGUIDED * matches.probability.sum()
         return relative if agreeing >= self.config.least_inliers * (1 if fair else 2) else None
 
-    def _found(self, rows: np.ndarray, matches: TemporalMatches, searched: np.ndarray) -> _Found:
-        """Matches as views of landmarks."""
+    def _found(self, rows: np.ndarray, matches: TemporalMatches, searched: np.ndarray, own: float = 1.0) -> _Found:
+        """Matches as views of landmarks; `own` is the share of a disparity's variance that is this view's alone."""
         noise = np.zeros((len(rows), 3, 3))
         if self.config.constant_sigma is None:
             noise[:, :2, :2] = matches.covariance
-            own = 1.0 - self.config.shared_disparity
             noise[:, 2, 2] = own * np.where(np.isfinite(matches.disparity), matches.disparity_sigma, 1.0) ** 2
         else:
             place, disparity = self.config.constant_sigma

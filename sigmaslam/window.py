@@ -30,6 +30,8 @@ LANDMARK_SIZE = 4
 CHI_SQUARE_999 = np.array([0.0, 10.827566170662733, 13.815510557964274, 16.26623619623813])
 # Of the robust loss by which a frame's pose is first found: its scales in standard deviations.
 _ROBUST_SCALES = (6.0, 4.0, 3.0)
+# Errors of right matches have longer tails than a Gaussian's: degrees of freedom of the Student-t that is fitted.
+_STUDENT_FREEDOM = 4.0
 # A disparity that is not there: its variance, pixels squared.
 _UNKNOWN = 1e12
 # Least spread of sigma points: share of the scene's depth, radians, pixels; with it alone slopes are derivatives.
@@ -341,7 +343,8 @@ class KeyframeWindow:
                 return None
             whitened = _whiten(np.concatenate([by_state, residual[..., None]], axis=2), noise)
             if kept is not None:
-                solution, posterior = self._weigh(factor, whitened, offset, kept.astype(float))
+                weight = kept * _student_weight(squared, components)
+                solution, posterior = self._weigh(factor, whitened, offset, weight)
             else:
                 # A loss that narrows, first about what the prior expects.
                 if step == 0 and start is None:
@@ -614,6 +617,11 @@ def _certain_frame(prior: np.ndarray, frame: slice) -> np.ndarray:
     spread[frame, :], spread[:, frame] = spread[last, :], spread[:, last]
     spread[frame, frame] = spread[last, last]
     return spread
+
+
+def _student_weight(squared: np.ndarray, components: np.ndarray) -> np.ndarray:
+    """Weights (M,) that make least squares the fit of a Student-t, from squared lengths of whitened residuals."""
+    return (_STUDENT_FREEDOM + components) / (_STUDENT_FREEDOM + squared)
 
 
 def _masked(residual: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
