@@ -128,6 +128,7 @@ class Benchmark(StrEnum):
     ablations = "ablations"
     matches = "matches"
     noise = "noise"
+    consistency = "consistency"
 
 
 def _show_version(wanted: bool) -> None:
@@ -447,10 +448,19 @@ def benchmark(
     eager: Annotated[bool, typer.Option("--eager", help="filters: leave out what takes minutes to compile.")] = False,
     runs: Annotated[
         Path | None,
-        typer.Option(help="ablations, noise: folder of the training runs or renders; what is there is used again."),
+        typer.Option(
+            help="ablations, noise, consistency: folder of the training runs or renders; what is there is used again."
+        ),
     ] = None,
     steps: Annotated[int, typer.Option(min=1, help="ablations: optimiser steps a run.")] = 250,
-    seeds: Annotated[int, typer.Option(min=1, help="ablations: runs of each variant.")] = 3,
+    seeds: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="ablations: runs of each variant; consistency: sequences a scale.",
+            show_default="3, consistency 30",
+        ),
+    ] = None,
     weights: Annotated[
         list[Path] | None,
         typer.Option(
@@ -472,8 +482,8 @@ def benchmark(
     installed. claims: EKF against UKF by Monte Carlo. renders: how fast, and how like real images. features: time
     and scores of the features beside SIFT, ORB and other people's. matches: whether their probability and
     covariance hold, beside AdaLAM and MAGSAC. noise: the tracker with these covariances beside one constant.
-    ablations: what each part of the features gains, by short training runs (an hour). All but the first need the
-    extra 'train'.
+    consistency: whether poses and map are as sure as they say, on 90 rendered sequences (an hour). ablations: what
+    each part of the features gains, by short training runs (an hour). All but the first need the extra 'train'.
     """
     command = f"sigmaslam benchmark {name.value} --out {out}"
     if name is Benchmark.sequences:
@@ -515,11 +525,21 @@ def benchmark(
         command += f" --runs {runs.name}"
         note = Console(stderr=True).print
         typer.echo(write_noise(out, _need_data(data), runs, default_workers(), command, note))
+    elif name is Benchmark.consistency:
+        from sigmaslam.evaluation.benchmarks.consistency import write_consistency
+        from sigmaslam.synthetic.sequence import default_workers
+
+        if runs is None:
+            raise InputError("the benchmark consistency needs --runs, a folder for its renders and results")
+        seeds = seeds or 30
+        command += f" --runs {runs.name} --seeds {seeds}"
+        typer.echo(write_consistency(out, runs, seeds, default_workers(), command, Console(stderr=True).print))
     elif name is Benchmark.ablations:
         from sigmaslam.evaluation.benchmarks.ablations import write_ablations
 
         if runs is None:
             raise InputError("the benchmark ablations needs --runs, a folder for its training runs")
+        seeds = seeds or 3
         command += f" --runs {runs} --steps {steps} --seeds {seeds}"
         note = Console(stderr=True).print
         typer.echo(write_ablations(out, runs, _need_data(data), seeds, steps, command, note))
