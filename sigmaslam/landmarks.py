@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sigmaslam.camera import RectifiedStereo
-from sigmaslam.window import KeyframeWindow, Landmarks
+from sigmaslam.rotation import skew
+from sigmaslam.window import KeyframeWindow, pose_slice
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,37 +17,71 @@ class PointMap:
 
     Attributes:
         points: (M, 3) float64 in the world, metres.
-        covariances: (M, 3, 3) metres squared, relative to the keyframe that saw the point first.
+        covariances: (M, 3, 3) of them in the world, that of the keyframe's pose included, metres squared.
         observations: (M,) views that confirmed it.
+        timestamps: (M,) of the keyframe that saw the point first, seconds.
+        pixels: (M, 2) its place there, in the rectified left image.
     """
 
     points: np.ndarray
     covariances: np.ndarray
     observations: np.ndarray
+    timestamps: np.ndarray
+    pixels: np.ndarray
+
+    @classmethod
+    def empty(cls) -> PointMap:
+        """No points."""
+        flat = np.zeros(0)
+        return cls(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0, np.int64), flat, np.zeros((0, 2)))
+
+    def transform(self, T: np.ndarray) -> PointMap:
+        """The map in another world, T (4, 4) takes this one there."""
+        R = T[:3, :3]
+        return replace(self, points=self.points @ R.T + T[:3, 3], covariances=R @ self.covariances @ R.T)
 
 
-def map_points(landmarks: Landmarks, window: KeyframeWindow, least_views: int = 3) -> PointMap:
-    """Landmarks of the window that were seen often enough and are closer than half a pixel of disparity says."""
+def map_points(
+    window: KeyframeWindow, chosen: np.ndarray, keyframe_times: np.ndarray, least_views: int = 3
+) -> PointMap:
+    """Landmarks of the window that were seen often enough and are closer than half a pixel of disparity says.
+
+    Args:
+        window: whose landmarks.
+        chosen: (L,) bool, which of them.
+        keyframe_times: (K,) time stamps of the window's keyframes.
+        least_views: fewer do not count.
+    """
+    landmarks = window.landmarks
     uvd = window.true_disparity(landmarks.estimate)
-    kept = (landmarks.views >= least_views) & (uvd[:, 2] > 0.5)
+    kept = chosen & (landmarks.views >= least_views) & (uvd[:, 2] > 0.5)
     uvd, landmarks = uvd[kept], landmarks.select(kept)
+    if not len(landmarks):
+        return PointMap.empty()
     points = window.camera.triangulate(uvd)
-    poses = window.poses[landmarks.host]
-    R = poses[:, :3, :3]
-    jacobian = R @ _triangulation_jacobian(uvd, points, window.camera)
-    jacobian = np.concatenate([jacobian, -jacobian[:, :, 2:]], axis=2)
-    spread = jacobian @ landmarks.covariance @ jacobian.transpose(0, 2, 1)
-    return PointMap((R @ points[..., None])[..., 0] + poses[:, :3, 3], spread, landmarks.views)
+    R = window.poses[landmarks.host, :3, :3]
+    by_disparity = R @ _triangulation_jacobian(uvd, points, window.camera)
+    by_landmark = np.concatenate([by_disparity, -by_disparity[:, :, 2:]], axis=2)
+    points = (R @ points[..., None])[..., 0] + window.poses[landmarks.host, :3, 3]
+    by_state = by_landmark @ landmarks.dependence
+    by_state[:, :, 0] -= by_disparity[:, :, 2]
+    turn = skew(points)
+    for host in np.unique(landmarks.host):
+        own, place = landmarks.host == host, pose_slice(host)
+        by_state[own, :, place.start : place.start + 3] += np.eye(3)
+        by_state[own, :, place.start + 3 : place.stop] -= turn[own]
+    covariances = by_state @ window.covariance @ by_state.transpose(0, 2, 1)
+    covariances += by_landmark @ landmarks.covariance @ by_landmark.transpose(0, 2, 1)
+    return PointMap(
+        points, covariances, landmarks.views, keyframe_times[landmarks.host], landmarks.measured[:, :2].copy()
+    )
 
 
 def merge_maps(parts: list[PointMap]) -> PointMap:
     """All points of all parts."""
-    if not parts:
-        return PointMap(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0, np.int64))
+    parts = [PointMap.empty(), *parts]
     return PointMap(
-        np.concatenate([part.points for part in parts]),
-        np.concatenate([part.covariances for part in parts]),
-        np.concatenate([part.observations for part in parts]),
+        *(np.concatenate([getattr(part, name) for part in parts]) for name in PointMap.__slots__)
     )
 
 

@@ -100,12 +100,7 @@ class RunWriter:
         with atomic_path(self._out / "covariance.npy") as path:
             np.save(path, np.stack([estimate.covariance for estimate in self._estimates]))
         with atomic_path(self._out / "map.npz") as path:
-            np.savez_compressed(
-                path,
-                points=point_map.points,
-                covariances=point_map.covariances,
-                observations=point_map.observations,
-            )
+            np.savez_compressed(path, **{name: getattr(point_map, name) for name in PointMap.__slots__})
         write_ply(self._out / "map.ply", point_map)
         write_report(self._out)
         return summary

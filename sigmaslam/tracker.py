@@ -183,12 +183,12 @@ class StereoTracker:
         )
         self._motion = MotionFilter(backend)
         self._keyframe_views: list[StereoView] = []
+        self._keyframe_times: list[float] = []
         self._reference = 0  # landmarks in the last keyframe
         self._retired: list[PointMap] = []
         self._densities = np.zeros(2)
         self._noise_scale = 1.0
         self._timestamp: float | None = None
-        self._keyframe_at = 0.0
         self._tracked_at = 0.0
         self._tracked_pose = np.eye(4)  # the pose at that time
         self._moving = False  # there has been a pose from the images
@@ -232,11 +232,9 @@ class StereoTracker:
 
     def map(self) -> PointMap:
         """All landmarks so far that were seen at least three times."""
-        window = self._window
-        parts = [*self._retired, map_points(window.landmarks, window)]
-        merged = merge_maps(parts)
-        R = self._T_rectified_left[:3, :3]
-        return PointMap(merged.points @ R, R.T @ merged.covariances @ R, merged.observations)
+        whole = np.ones(len(self._window.landmarks), bool)
+        parts = [*self._retired, map_points(self._window, whole, np.array(self._keyframe_times))]
+        return merge_maps(parts).transform(se3_inverse(self._T_rectified_left))
 
     # ---- where landmarks are
 
@@ -417,29 +415,27 @@ class StereoTracker:
         """Makes the view a keyframe: it sees `views`, and whatever else it has in stereo is new."""
         window = self._window
         if len(window) == self.config.window:
-            retired = map_points(window.landmarks.select(window.landmarks.host == 0), window)
             leaving = window.landmarks.host == 0
-            self._retired.append(retired)
+            self._retired.append(map_points(window, leaving, np.array(self._keyframe_times)))
             if views is not None:
                 staying = ~leaving[views.rows]
                 number = np.cumsum(~leaving) - 1
                 views = Views(number[views.rows[staying]], views.measurement[staying], views.noise[staying])
             window.retire_oldest()
-            del self._keyframe_views[0]
+            del self._keyframe_views[0], self._keyframe_times[0]
         if len(window):
             adjoint = se3_adjoint(window.poses[-1])
             step_covariance = adjoint @ step_covariance @ adjoint.T
-        walk = np.array([self.config.offset_walk**2 * (timestamp - self._keyframe_at), 0.0, 0.0])
-        if not len(window):
-            walk[:] = 0.0
+        since = timestamp - self._keyframe_times[-1] if self._keyframe_times else 0.0
+        walk = np.array([self.config.offset_walk**2 * since, 0.0, 0.0])
         window.add_keyframe(pose, step, step_covariance, walk)
         self._keyframe_views.append(view)
+        self._keyframe_times.append(timestamp)
         if views is not None:
             window.add_views(views)
         self._add_landmarks(view, views)
         window.solve()
         self._motion.start_keyframe()
-        self._keyframe_at = timestamp
         self._reference = int((window.landmarks.host == len(window) - 1).sum())
         self._reference += 0 if views is None else len(views.rows)
 

@@ -442,6 +442,9 @@ class KeyframeWindow:
         size = len(self.covariance)
         stacked = np.concatenate([slopes.by_state, slopes.by_landmark, residual[..., None]], axis=2)
         whitened = np.linalg.solve(np.linalg.cholesky(noise), stacked)
+        components = np.isfinite(observations.measurement).sum(axis=1)
+        weight = _student_weight((whitened[:, :, -1] ** 2).sum(axis=1), components)
+        whitened *= np.sqrt(weight)[:, None, None]
         by_state, by_landmark, rest = whitened[:, :, :size], whitened[:, :, size:-1], whitened[:, :, -1:]
         products = by_landmark.transpose(0, 2, 1) @ np.concatenate([by_landmark, by_state, rest], axis=2)
         order = np.argsort(owner, kind="stable")
