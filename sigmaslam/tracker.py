@@ -71,7 +71,7 @@ class TrackerConfig:
 
     max_keypoints: int = 1500
     constant_sigma: tuple[float, float] | None = None
-    keyframe_sigma: float = 0.1
+    keyframe_sigma: float = 0.25
     acceleration: float = 0.1
     angular_acceleration: float = 0.5
     start_speed: float = 1.0

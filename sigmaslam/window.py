@@ -623,8 +623,13 @@ def _certain_frame(prior: np.ndarray, frame: slice) -> np.ndarray:
 
 
 def _student_weight(squared: np.ndarray, components: np.ndarray) -> np.ndarray:
-    """Weights (M,) that make least squares the fit of a Student-t, from squared lengths of whitened residuals."""
-    return (_STUDENT_FREEDOM + components) / (_STUDENT_FREEDOM + squared)
+    """Weights (M,) that make least squares the fit of a Student-t, from squared lengths of whitened residuals.
+
+    The weighted information of such a fit is more than the estimate's precision, (nu + p + 2) / (nu + p) times as much
+    where errors are Student-t: the weights are that much smaller, which hardly moves the estimate.
+    """
+    whole = _STUDENT_FREEDOM + components
+    return whole**2 / ((whole + 2.0) * (_STUDENT_FREEDOM + squared))
 
 
 def _masked(residual: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,151 @@
+"""Keyframes that left the window, remembered to find the way back to them: in this run, or in a later one by a map."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sigmaslam.camera import RectifiedStereo
+from sigmaslam.errors import InputError
+from sigmaslam.frontend import Features, StereoView
+
+# Descriptors of a keyframe and of a view that vote on whether they show the same place.
+_VOTERS = 300
+_PER_FEATURE = ("keypoints", "descriptors", "scores", "sigma")
+_ARRAYS = ("poses", "covariances", "timestamps", "images", "counts", *_PER_FEATURE, "disparity", "disparity_sigma")
+_PREFIX = "keyframe_"
+
+
+@dataclass(frozen=True, slots=True)
+class RememberedKeyframe:
+    """A keyframe as it was when it left the window.
+
+    Attributes:
+        view: its left image and features; the right image is not kept.
+        pose: (4, 4) T_world_keyframe of the rectified camera.
+        covariance: (6, 6) of that, perturbed from the left in the world.
+        timestamp: seconds.
+    """
+
+    view: StereoView
+    pose: np.ndarray
+    covariance: np.ndarray
+    timestamp: float
+
+
+class KeyframeMemory:
+    """A bounded number of keyframes, spread over the places that were visited.
+
+    Args:
+        capacity: more are not kept.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self._capacity = capacity
+        self.keyframes: list[RememberedKeyframe] = []
+
+    def add(self, keyframe: RememberedKeyframe) -> None:
+        """Remembers a keyframe; when there are too many, one of the two that are closest to each other goes."""
+        nothing = np.zeros((0, 0), np.uint8)
+        self.keyframes.append(replace(keyframe, view=replace(keyframe.view, right=nothing)))
+        if len(self.keyframes) > self._capacity:
+            places = np.array([each.pose[:3, 3] for each in self.keyframes])
+            looks = np.array([each.pose[:3, 2] for each in self.keyframes])
+            apart = np.linalg.norm(places[:, None] - places[None], axis=2)
+            spread = max(float(np.median(apart)), 1e-12)
+            apart = apart / spread + np.linalg.norm(looks[:, None] - looks[None], axis=2)
+            np.fill_diagonal(apart, np.inf)
+            del self.keyframes[max(np.unravel_index(np.argmin(apart), apart.shape))]
+
+    def similar(self, view: StereoView, count: int) -> list[RememberedKeyframe]:
+        """Up to `count` keyframes that look most like the view, by mutual nearest descriptors, best first."""
+        wanted = view.features.descriptors[:_VOTERS]
+        if not wanted.shape[1]:
+            return self.keyframes[-count:][::-1]
+        votes = []
+        for keyframe in self.keyframes:
+            similarity = keyframe.view.features.descriptors[:_VOTERS] @ wanted.T
+            if not similarity.size:
+                votes.append(0)
+                continue
+            forward, back = similarity.argmax(axis=1), similarity.argmax(axis=0)
+            votes.append(int((back[forward] == np.arange(len(forward))).sum()))
+        order = np.argsort(-np.array(votes), kind="stable")[:count] if votes else []
+        return [self.keyframes[k] for k in order]
+
+
+def pack_keyframes(keyframes: list[RememberedKeyframe], frontend: str, camera: RectifiedStereo) -> dict[str, Any]:
+    """Arrays of a map file by name."""
+    if not keyframes:
+        return {}
+    views = [keyframe.view for keyframe in keyframes]
+    arrays: dict[str, Any] = {
+        "poses": np.stack([keyframe.pose for keyframe in keyframes]),
+        "covariances": np.stack([keyframe.covariance for keyframe in keyframes]),
+        "timestamps": np.array([keyframe.timestamp for keyframe in keyframes]),
+        "images": np.stack([view.left for view in views]),
+        "counts": np.array([len(view.disparity) for view in views]),
+        "disparity": np.concatenate([view.disparity for view in views]),
+        "disparity_sigma": np.concatenate([view.disparity_sigma for view in views]),
+        **{name: np.concatenate([getattr(view.features, name) for view in views]) for name in _PER_FEATURE},
+    }
+    packed = {_PREFIX + name: value for name, value in arrays.items()}
+    return {**packed, "frontend": np.array(frontend), "intrinsics": _intrinsics(camera)}
+
+
+def read_keyframes(path: Path, frontend: str, camera: RectifiedStereo) -> list[RememberedKeyframe]:
+    """Keyframes of a map file.
+
+    Args:
+        path: map.npz of a run.
+        frontend: that is going to match them.
+        camera: the rectified pair that is going to see them.
+    Raises:
+        InputError: the file is missing, broken, without keyframes, or of another front-end or camera.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as content:
+            arrays = {name: content[name] for name in content.files}
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such map; give map.npz of a run of `sigmaslam track`") from None
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(f"{path}: not a map that can be read ({error}); track the sequence again") from error
+    missing = [name for name in (*(_PREFIX + name for name in _ARRAYS), "frontend", "intrinsics") if name not in arrays]
+    if missing:
+        raise InputError(
+            f"{path}: a map without keyframes to find ({missing[0]} is missing); make it by a run of several keyframes"
+        )
+    if str(arrays["frontend"]) != frontend:
+        raise InputError(
+            f"{path}: made with the front-end {arrays['frontend']}, not {frontend}; give --frontend "
+            f"{arrays['frontend']}, or map again"
+        )
+    expected = _intrinsics(camera)
+    if not np.allclose(arrays["intrinsics"], expected, rtol=1e-4):
+        raise InputError(
+            f"{path}: made by a camera with fx, fy, cx, cy, baseline, width, height of {arrays['intrinsics'].tolist()}, "
+            f"this one has {expected.tolist()}; a map serves the camera that made it"
+        )
+    ends = np.cumsum(arrays[_PREFIX + "counts"])
+    keyframes = []
+    for k, (begin, end) in enumerate(zip(np.r_[0, ends[:-1]], ends, strict=True)):
+        own = {name: arrays[_PREFIX + name][begin:end] for name in (*_PER_FEATURE, "disparity", "disparity_sigma")}
+        view = StereoView(
+            arrays[_PREFIX + "images"][k],
+            np.zeros((0, 0), np.uint8),
+            Features(*(own[name] for name in _PER_FEATURE)),
+            own["disparity"],
+            own["disparity_sigma"],
+        )
+        pose, covariance = arrays[_PREFIX + "poses"][k], arrays[_PREFIX + "covariances"][k]
+        keyframes.append(RememberedKeyframe(view, pose, covariance, float(arrays[_PREFIX + "timestamps"][k])))
+    return keyframes
+
+
+def _intrinsics(camera: RectifiedStereo) -> np.ndarray:
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.baseline, camera.width, camera.height], float)
