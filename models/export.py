@@ -19,8 +19,8 @@ from torch import Tensor, nn
 
 from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.files import atomic_path, atomic_write_text, make_folder
+from sigmaslam.filters.constant_velocity import STATE_SIZE, Predict
 from sigmaslam.filters.lie import exp_se3
-from sigmaslam.filters.stereo_pose import STATE_SIZE, Predict
 from sigmaslam.filters.stereo_window import Transfer
 from sigmaslam.models.card import card_page, read_card, scoring_page
 from sigmaslam.models.extractor import EXTRACTOR_SIZE_MULTIPLE, FeatureExtractor
@@ -130,7 +130,8 @@ def export_all(
         weights: safetensors file of a training run.
         card: its JSON card; the differences found here are added to the copy in `out`.
         scores: of these weights on real sets, by set, for the card.
-        out: folder that gets features.onnx, pose_predict.onnx, stereo_transfer.onnx, features.safetensors and features.json and .md.
+        out: folder that gets features.onnx, pose_predict.onnx, stereo_transfer.onnx, features.safetensors, and
+            features.json and .md.
     """
     content = read_card(card)
     if scores is not None:
@@ -231,7 +232,7 @@ def _predict_example(seed: int) -> tuple[Tensor, ...]:
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
     root = 0.004 * random(STATE_SIZE, STATE_SIZE)
-    densities = 0.1 + random(3).abs()
+    densities = 0.1 + random(2).abs()
     step = torch.tensor(0.1 + 0.2 * seed, dtype=torch.float64)
     return exp_se3(0.3 * random(6)), random(6), root @ root.T, step, densities
 

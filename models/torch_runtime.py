@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from sigmaslam.filters.stereo_pose import Predict
+from sigmaslam.filters.constant_velocity import Predict
 from sigmaslam.filters.stereo_window import Transfer
 from sigmaslam.models.export import load_network, load_scorer, load_verifier
 from sigmaslam.models.extractor import FeatureExtractor

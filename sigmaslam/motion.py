@@ -7,8 +7,8 @@ import numpy as np
 from sigmaslam.rotation import nearest_rigid, se3_inverse, se3_log
 from sigmaslam.session import load_step
 
-# Order of the graph's error state, see sigmaslam.filters.stereo_pose; what lies behind the twist is not used here.
-_POSE, _TWIST, _USED, _STATE_SIZE = slice(0, 6), slice(6, 12), slice(0, 12), 19
+# Order of the graph's error state, see sigmaslam.filters.constant_velocity.
+_POSE, _TWIST, _STATE_SIZE = slice(0, 6), slice(6, 12), 12
 
 
 class MotionFilter:
@@ -26,7 +26,7 @@ class MotionFilter:
         self._predict = load_step("pose_predict", backend)
         self.step = np.eye(4)
         self.twist = np.zeros(6)
-        self._covariance = np.zeros((12, 12))
+        self._covariance = np.zeros((_STATE_SIZE, _STATE_SIZE))
 
     @property
     def step_covariance(self) -> np.ndarray:
@@ -46,18 +46,16 @@ class MotionFilter:
 
     def predict(self, seconds: float, densities: np.ndarray) -> None:
         """Moves on; densities (2,): power spectra of the accelerations, m^2/s^3 and rad^2/s^3."""
-        covariance = np.zeros((_STATE_SIZE, _STATE_SIZE))
-        covariance[_USED, _USED] = self._covariance
         self.step, covariance = self._predict(
             {
                 "pose": self.step,
                 "twist": self.twist,
-                "covariance": covariance,
+                "covariance": self._covariance,
                 "step": np.array(seconds),
-                "densities": np.r_[densities, 0.0],
+                "densities": densities,
             }
         )
-        self._covariance = 0.5 * (covariance + covariance.T)[_USED, _USED]
+        self._covariance = 0.5 * (covariance + covariance.T)
 
     def correct(self, step: np.ndarray, covariance: np.ndarray) -> None:
         """Takes over the posterior of the pose, perturbed from the left in the keyframe, which knew the prediction."""

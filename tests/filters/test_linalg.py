@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from sigmaslam.filters.linalg import cholesky, inverse_and_log_determinant, invert_lower
+from sigmaslam.filters.linalg import cholesky
 
 
 def random_matrices(*shape: int, seed: int = 0) -> Tensor:
@@ -25,7 +25,7 @@ def test_cholesky_of_positive_definite_equals_lapack(size, batch, seed):
 
 @pytest.mark.parametrize("scale", [1e-8, 1.0, 1e6])
 def test_cholesky_is_exact_when_a_state_is_a_copy_of_another(scale):
-    # A clone: the last six rows repeat the first six, whatever the units.
+    # The last six rows repeat the first six, whatever the units.
     choice = torch.cat([torch.eye(9), torch.eye(9)[:6]]).double()
     matrix = scale * choice @ positive_definite(9) @ choice.T
     factor = cholesky(matrix)
@@ -70,54 +70,17 @@ def test_cholesky_reads_only_the_lower_triangle():
 def test_a_batch_equals_a_loop():
     matrices = positive_definite(3, 4, 6)
     factors = cholesky(matrices)
-    inverses, logs = inverse_and_log_determinant(matrices)
-    inverse_factors = invert_lower(factors)
-    assert logs.shape == (3, 4)
     for i in range(3):
         for j in range(4):
-            inverse, log = inverse_and_log_determinant(matrices[i, j])
             torch.testing.assert_close(factors[i, j], cholesky(matrices[i, j]), rtol=0, atol=1e-13)
-            torch.testing.assert_close(inverses[i, j], inverse, rtol=1e-12, atol=1e-13)
-            torch.testing.assert_close(logs[i, j], log, rtol=1e-13, atol=1e-13)
-            torch.testing.assert_close(inverse_factors[i, j], invert_lower(factors[i, j]), rtol=1e-12, atol=1e-13)
-
-
-@pytest.mark.parametrize("information", [1e-6, 1.0, 1e8])
-def test_inverse_and_log_determinant_equal_lapack(information):
-    # The form the update uses: identity plus a semidefinite matrix, up to very precise measurements.
-    root = random_matrices(40, 24)
-    matrix = torch.eye(24, dtype=torch.float64) + information * root.T @ root
-    inverse, log_determinant = inverse_and_log_determinant(matrix)
-    expected = torch.linalg.inv(matrix)
-    torch.testing.assert_close(inverse, expected, rtol=0, atol=1e-12 * float(expected.abs().max()))
-    torch.testing.assert_close(log_determinant, torch.linalg.slogdet(matrix).logabsdet, rtol=1e-12, atol=1e-12)
-
-
-def test_inverse_is_accurate_when_only_some_directions_are_measured():
-    root = random_matrices(3, 24)
-    matrix = torch.eye(24, dtype=torch.float64) + 1e8 * root.T @ root
-    inverse, _ = inverse_and_log_determinant(matrix)
-    torch.testing.assert_close(inverse, torch.linalg.inv(matrix), rtol=0, atol=1e-6)
-    torch.testing.assert_close(inverse, inverse.T, rtol=0, atol=1e-6)
-
-
-def test_invert_lower_equals_triangular_solve():
-    factor = torch.linalg.cholesky(positive_definite(5, 12))
-    expected = torch.linalg.solve_triangular(factor, torch.eye(12, dtype=torch.float64), upper=False)
-    torch.testing.assert_close(invert_lower(factor), expected, rtol=1e-10, atol=1e-12)
 
 
 def test_dtype_follows_the_input():
-    matrix = positive_definite(5).float()
-    assert cholesky(matrix).dtype == torch.float32
-    assert inverse_and_log_determinant(matrix)[0].dtype == torch.float32
-    assert invert_lower(cholesky(matrix)).dtype == torch.float32
+    assert cholesky(positive_definite(5).float()).dtype == torch.float32
 
 
 def test_arguments_are_not_changed():
     matrix = positive_definite(5)
     kept = matrix.clone()
     cholesky(matrix)
-    inverse_and_log_determinant(matrix)
-    invert_lower(matrix)
     assert torch.equal(matrix, kept)

@@ -25,7 +25,7 @@ from sigmaslam.models.verifier import MatchVerifier
 from sigmaslam.session import OnnxGraph, shipped_weights
 from sigmaslam.synthetic.textures import dead_leaves
 
-FILTERS = ("pose_predict", "pose_innovate", "pose_update")
+FILTERS = ("pose_predict", "stereo_transfer")
 
 
 def shipped(name: str) -> Path:
@@ -96,11 +96,12 @@ def test_shipped_filter_equals_torch(name):
 
 
 def assert_filter_graphs_equal_torch(folder: Path, names: tuple[str, ...] = FILTERS) -> None:
-    """On states and numbers of points that the export neither traced nor checked."""
+    """On states and numbers of pairs and measurements that the export neither traced nor checked."""
     examples = {
         "pose_predict": [export._predict_example(seed) for seed in (5, 6)],
-        "pose_innovate": [export._innovate_example(seed, count) for seed, count in ((5, 1), (6, 211))],
-        "pose_update": [export._update_example(seed, count) for seed, count in ((5, 3), (6, 211))],
+        "stereo_transfer": [
+            export._transfer_example(seed, pairs, count) for seed, pairs, count in ((5, 1, 1), (6, 1, 211), (7, 36, 2))
+        ],
     }
     inputs = {name: graph.inputs for name, graph in export._filter_graphs().items()}
     for name in names:

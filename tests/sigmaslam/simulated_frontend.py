@@ -1,0 +1,208 @@
+"""A front end without images: points in a world, seen with exactly the errors that the matches claim."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sigmaslam.camera import CameraModel, StereoCamera
+from sigmaslam.frontend.types import Features, StereoView, TemporalMatches
+from sigmaslam.rotation import se3_exp, se3_inverse, se3_log
+from sigmaslam.tracker import Estimate, StereoTracker, TrackerConfig
+
+
+@dataclass(frozen=True)
+class Scale:
+    """A camera and how it moves.
+
+    Attributes:
+        width, height, focal: of the images, pixels.
+        baseline: metres.
+        nearest, farthest: depth of the points, metres; uniform in inverse depth.
+        motion: (6,) typical motion from frame to frame in the camera's frame, metres and radians.
+        interval: between frames, seconds.
+    """
+
+    width: int
+    height: int
+    focal: float
+    baseline: float
+    nearest: float
+    farthest: float
+    motion: tuple[float, ...]
+    interval: float
+
+
+SCALES = {
+    "driving": Scale(1240, 376, 700.0, 0.54, 6.0, 60.0, (0, 0, 1.0, 0, 0.005, 0), 0.1),
+    "drone": Scale(752, 480, 450.0, 0.11, 1.5, 8.0, (0.03, 0.01, 0.04, 0.005, 0.01, 0.01), 0.05),
+    "endoscope": Scale(640, 512, 450.0, 0.0045, 0.04, 0.12, (0.0006, 0.0003, 0.0008, 0.004, 0.006, 0.01), 0.04),
+}
+# A keypoint keeps so far from the border of both images.
+_BORDER = 5.0
+# What the tracker assumes.
+_ASSUMED = TrackerConfig()
+
+
+class SimulatedFrontend:
+    """Knows the world and which of its frames each image stands for.
+
+    Args:
+        scale: camera and motion.
+        seed: of everything random.
+        frames: how many.
+        points: most that are seen at once.
+        place, disparity: standard deviations per axis of a match, and of a disparity, pixels.
+        offset: of all disparities, pixels.
+        shared: share of a disparity's variance that is the same in all views of a point.
+        outliers: share of matches that are up to 20 px off.
+    """
+
+    name = "simulated"
+
+    def __init__(
+        self,
+        scale: Scale,
+        seed: int,
+        frames: int,
+        points: int = 150,
+        place: float = 0.2,
+        disparity: float = 0.25,
+        offset: float = 0.3,
+        shared: float = _ASSUMED.shared_disparity,
+        outliers: float = 0.0,
+    ) -> None:
+        self._scale, self._random = scale, np.random.default_rng(seed)
+        self._most, self._place, self._disparity = points, place, disparity
+        self._offset, self._outliers = offset, outliers
+        eye = CameraModel(scale.width, scale.height, scale.focal, scale.focal, 0.5 * scale.width, 0.5 * scale.height)
+        to_right = np.eye(4)
+        to_right[0, 3] = scale.baseline
+        self.camera = StereoCamera(eye, eye, to_right)
+        self.poses = self._path(frames)
+        self._points = np.concatenate([self._cloud(pose, 2 if k else 4) for k, pose in enumerate(self.poses[::5])])
+        self._shared = np.sqrt(shared) * disparity * self._random.standard_normal(len(self._points))
+        self._own = np.sqrt(1.0 - shared) * disparity
+        self._priority = self._random.permutation(len(self._points))
+        self._seen: dict[int, np.ndarray] = {}
+
+    def images(self, frame: int) -> np.ndarray:
+        """A black image whose first two pixels are the frame's number."""
+        image = np.zeros((self._scale.height, self._scale.width), np.uint8)
+        image[0, :2] = frame % 256, frame // 256
+        return image
+
+    def observe(self, left: np.ndarray, right: np.ndarray) -> StereoView:
+        """Points in view as features, each with its disparity."""
+        frame = _frame_of(left)
+        truth, visible = self._project(frame)
+        seen = np.flatnonzero(visible)
+        seen = np.sort(seen[np.argsort(self._priority[seen])[: self._most]])
+        self._seen[frame] = seen
+        count = len(seen)
+        keypoints = truth[seen, :2] + _ASSUMED.keyframe_sigma * self._random.standard_normal((count, 2))
+        features = Features(
+            keypoints,
+            np.zeros((count, 0), np.float32),
+            np.ones(count, np.float32),
+            np.full(count, _ASSUMED.keyframe_sigma),
+        )
+        disparity = truth[seen, 2] + self._shared[seen] + self._own * self._random.standard_normal(count)
+        return StereoView(left, right, features, disparity, np.full(count, self._disparity))
+
+    def match(
+        self,
+        key: StereoView,
+        index: np.ndarray,
+        view: StereoView,
+        predicted: np.ndarray,
+        covariance: np.ndarray | None,
+    ) -> TemporalMatches:
+        """The points that both see, wherever they were predicted."""
+        frame = _frame_of(view.left)
+        wanted, seen = self._seen[_frame_of(key.left)][index], self._seen[frame]
+        both = np.isin(wanted, seen)
+        points, count = wanted[both], int(both.sum())
+        truth, _ = self._project(frame)
+        places = truth[points, :2] + self._place * self._random.standard_normal((count, 2))
+        wrong = self._random.random(count) < self._outliers
+        places[wrong] += self._random.uniform(-20, 20, (int(wrong.sum()), 2))
+        return TemporalMatches(
+            index[both],
+            places,
+            view.disparity[np.searchsorted(seen, points)],
+            np.tile(self._place**2 * np.eye(2), (count, 1, 1)),
+            np.full(count, self._disparity),
+            np.ones(count),
+        )
+
+    def _path(self, frames: int) -> np.ndarray:
+        """Poses of a camera whose velocity wanders about the typical one."""
+        scale = self._scale
+        typical = np.array(scale.motion)
+        depth = np.sqrt(scale.nearest * scale.farthest)
+        # Half of what the tracker allows for.
+        sigma = 0.5 * np.repeat([_ASSUMED.acceleration * depth, _ASSUMED.angular_acceleration], 3)
+        motion, poses = typical, [np.eye(4)]
+        for _ in range(frames - 1):
+            change = sigma * scale.interval**1.5 * self._random.standard_normal(6)
+            motion = typical + 0.9 * (motion + change - typical)
+            poses.append(poses[-1] @ se3_exp(motion))
+        return np.array(poses)
+
+    def _cloud(self, pose: np.ndarray, share: int) -> np.ndarray:
+        """Points about the frustum of a pose."""
+        scale, count = self._scale, share * self._most // 2
+        z = 1 / self._random.uniform(1 / scale.farthest, 1 / scale.nearest, count)
+        x = self._random.uniform(-0.7, 0.7, count) * scale.width / scale.focal * z
+        y = self._random.uniform(-0.7, 0.7, count) * scale.height / scale.focal * z
+        return np.asarray(np.column_stack([x, y, z]) @ pose[:3, :3].T + pose[:3, 3])
+
+    def _project(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
+        """(u, v, disparity) of all points without noise, and which are in view."""
+        scale = self._scale
+        T = se3_inverse(self.poses[frame])
+        points = self._points @ T[:3, :3].T + T[:3, 3]
+        z = np.maximum(points[:, 2], 1e-9)
+        u = scale.focal * points[:, 0] / z + 0.5 * scale.width
+        v = scale.focal * points[:, 1] / z + 0.5 * scale.height
+        disparity = scale.focal * scale.baseline / z + self._offset
+        inside = (u - disparity > _BORDER) & (u < scale.width - _BORDER)
+        inside &= (v > _BORDER) & (v < scale.height - _BORDER) & (points[:, 2] > 0.3 * scale.nearest)
+        return np.column_stack([u, v, disparity]), inside
+
+
+def _frame_of(image: np.ndarray) -> int:
+    return int(image[0, 0]) + 256 * int(image[0, 1])
+
+
+@dataclass(frozen=True)
+class SimulatedRun:
+    """A tracker after a run.
+
+    Attributes:
+        tracker: with its window.
+        estimates: of all frames.
+        poses: (N, 4, 4) true.
+        nees: (N - 1,) per degree of freedom, from the second frame on.
+    """
+
+    tracker: StereoTracker
+    estimates: list[Estimate]
+    poses: np.ndarray
+    nees: np.ndarray
+
+
+def run_simulated(
+    tracker: StereoTracker, frontend: SimulatedFrontend, scale: Scale, frames: int | None = None
+) -> SimulatedRun:
+    """All frames through a fresh tracker whose front end is replaced."""
+    tracker._frontend = frontend
+    estimates = []
+    for k in range(frames or len(frontend.poses)):
+        image = frontend.images(k)
+        estimates.append(tracker.step(image, image, k * scale.interval))
+    errors = [se3_log(se3_inverse(T) @ e.T_world_camera) for T, e in zip(frontend.poses, estimates, strict=False)]
+    nees = [x @ np.linalg.solve(e.covariance, x) / 6 for x, e in zip(errors[1:], estimates[1:], strict=True)]
+    return SimulatedRun(tracker, estimates, frontend.poses, np.array(nees))

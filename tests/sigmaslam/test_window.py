@@ -1,0 +1,539 @@
+"""The window against dense least squares over all poses, the calibration and the landmarks together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.stats import chi2
+
+from sigmaslam.camera import RectifiedStereo
+from sigmaslam.rotation import se3_exp, se3_inverse, se3_log
+from sigmaslam.window import CALIBRATION, FrameFit, KeyframeWindow, Views, pose_slice
+
+CAMERA = RectifiedStereo(fx=400.0, fy=410.0, cx=319.5, cy=239.5, baseline=0.2, width=640, height=480)
+# Standard deviations of the prior and of the noise.
+CALIBRATION_SIGMA = np.array([0.5, 0.3, 0.3])
+FIRST_SIGMA = np.repeat([0.02, 0.01], 3)
+STEP_SIGMA = np.repeat([0.05, 0.02], 3)
+HOST_SIGMA = np.array([0.1, 0.1, 0.15, 0.25])
+VIEW_ROOT = np.array([[0.25, 0.0, 0.0], [0.1, 0.25, 0.0], [0.0, 0.05, 0.2]])
+STEP = se3_exp([0.15, -0.05, 0.3, 0.02, -0.05, 0.03])
+KEYFRAMES = 3
+# With deviations so small everything is linear, and equal numbers must be equal.
+NARROW = 1e-3
+
+
+@dataclass(frozen=True)
+class World:
+    """Three keyframes and a frame after them on their way past points, and all that is measured there.
+
+    Attributes:
+        scale: of all standard deviations.
+        expected, poses: (4, 4, 4) as the prior expects them, and true.
+        calibration: (3,) true.
+        host: (L,) keyframe that a landmark belongs to, ascending.
+        landmarks, measured: (L, 4) true, and in the host.
+        views: of each pose.
+    """
+
+    scale: float
+    expected: np.ndarray
+    poses: np.ndarray
+    calibration: np.ndarray
+    host: np.ndarray
+    landmarks: np.ndarray
+    measured: np.ndarray
+    views: list[Views]
+
+
+def project(pose: np.ndarray, host: np.ndarray, calibration: np.ndarray, landmarks: np.ndarray) -> np.ndarray:
+    """(u, v, disparity) (L, 3) of landmarks (L, 4) of hosts (L, 4, 4), by way of the points themselves."""
+
+    def bias(uvd: np.ndarray) -> np.ndarray:
+        x, y = (uvd[:, 0] - uvd[:, 2] - CAMERA.cx) / CAMERA.fx, (uvd[:, 1] - CAMERA.cy) / CAMERA.fy
+        return np.asarray(calibration[0] + calibration[1] * x * x + calibration[2] * x * y)
+
+    true = landmarks[:, :3].copy()
+    true[:, 2] -= landmarks[:, 3] + bias(landmarks)
+    T = se3_inverse(pose) @ host
+    seen = CAMERA.project((T[:, :3, :3] @ CAMERA.triangulate(true)[..., None])[..., 0] + T[:, :3, 3])
+    seen[:, 2] += landmarks[:, 3] + bias(seen)
+    return np.asarray(seen)
+
+
+def world(seed: int = 0, scale: float = 1.0, count: int = 12, hosts: int = KEYFRAMES) -> World:
+    """Everything drawn from the prior; the first `hosts` keyframes have landmarks of their own."""
+    rng = np.random.default_rng(seed)
+    expected, errors = [np.eye(4)], [FIRST_SIGMA * rng.standard_normal(6)]
+    for _ in range(KEYFRAMES):
+        expected.append(expected[-1] @ STEP)
+        errors.append(errors[-1] + STEP_SIGMA * rng.standard_normal(6))
+    poses = se3_exp(scale * np.array(errors)) @ np.array(expected)
+    calibration = scale * CALIBRATION_SIGMA * rng.standard_normal(3)
+    host = np.sort(np.arange(count) % hosts)
+    true = 80 / rng.uniform(2.5, 9.0, count)
+    own = scale * HOST_SIGMA[3] * rng.standard_normal(count)
+    landmarks = np.c_[rng.uniform(120, 520, count), rng.uniform(100, 380, count), true + own, own]
+    measured = landmarks + scale * HOST_SIGMA * rng.standard_normal((count, 4))
+    measured[:, 3] = 0.0
+    views = []
+    for k, pose in enumerate(poses):
+        rows = np.flatnonzero(host < k)
+        seen = project(pose, poses[host[rows]], calibration, landmarks[rows])
+        seen = seen + scale * rng.standard_normal((len(rows), 3)) @ VIEW_ROOT.T
+        seen[(rows + k) % 6 == 0, 2] = np.nan
+        views.append(Views(rows, seen, np.tile(scale**2 * VIEW_ROOT @ VIEW_ROOT.T, (len(rows), 1, 1))))
+    return World(scale, np.array(expected), poses, calibration, host, landmarks, measured, views)
+
+
+def add_keyframe(window: KeyframeWindow, given: World, k: int, views: Views, hosted: bool = True) -> None:
+    sigma = given.scale * (STEP_SIGMA if k else FIRST_SIGMA)
+    pose = window.poses[-1] @ STEP if k else given.expected[0]
+    window.add_keyframe(pose, STEP if k else given.expected[0], np.diag(sigma**2), np.zeros(3))
+    window.add_views(views)
+    own = np.flatnonzero(given.host == k) if hosted else np.zeros(0, np.int64)
+    variance = np.tile((given.scale * HOST_SIGMA) ** 2, (len(own), 1))
+    window.add_landmarks(own, given.measured[own, :3], variance)
+
+
+def unsolved(given: World, linearisation: str = "extended", order: int = 1) -> KeyframeWindow:
+    """The keyframes and their views; order -1 hands them over from the last to the first."""
+    window = KeyframeWindow(CAMERA, given.scale * CALIBRATION_SIGMA, "onnx", linearisation)
+    window.depth = 4.0
+    for k in range(KEYFRAMES):
+        add_keyframe(window, given, k, given.views[k].select(np.arange(len(given.views[k].rows))[::order]))
+    return window
+
+
+def solved(given: World, linearisation: str = "extended", order: int = 1) -> KeyframeWindow:
+    """Iterated until nothing changes."""
+    window = unsolved(given, linearisation, order)
+    window.solve(8)
+    return window
+
+
+def fit(window: KeyframeWindow, given: World, views: Views | None = None, start: np.ndarray | None = None) -> FrameFit:
+    """Of the frame after the keyframes."""
+    step_covariance = np.diag((given.scale * STEP_SIGMA) ** 2)
+    found = window.fit_frame(views or given.views[-1], window.poses[-1] @ STEP, step_covariance, 5, start)
+    assert found is not None
+    return found
+
+
+class Dense:
+    """All unknowns in one vector (calibration, poses, landmarks), solved at once.
+
+    Args:
+        given: world.
+        poses: how many of its poses take part.
+        hosts: keyframes whose landmarks take part.
+    """
+
+    def __init__(self, given: World, poses: int, hosts: Iterable[int] = range(KEYFRAMES)) -> None:
+        self.given, self.size = given, 3 + 6 * poses
+        self.expected = given.expected[:poses]
+        self.views = [v.select(np.isin(given.host[v.rows], list(hosts))) for v in given.views[:poses]]
+        self.whiteners = []
+        for views in self.views:
+            whitener = np.linalg.inv(np.linalg.cholesky(views.noise))
+            # The third row alone has to do with the disparity, and the first two are those of the place alone.
+            whitener[np.isnan(views.measurement[:, 2]), 2] = 0.0
+            self.whiteners.append(whitener)
+        self.at = np.r_[np.zeros(self.size), given.measured.ravel()]
+
+    def residuals(self, at: np.ndarray) -> np.ndarray:
+        """In standard deviations."""
+        given, scale = self.given, self.given.scale
+        calibration, tangents, landmarks = at[:3], at[3 : self.size].reshape(-1, 6), at[self.size :].reshape(-1, 4)
+        poses = se3_exp(tangents) @ self.expected
+        parts = [calibration / CALIBRATION_SIGMA, tangents[0] / FIRST_SIGMA]
+        parts += [(np.diff(tangents, axis=0) / STEP_SIGMA).ravel(), ((landmarks - given.measured) / HOST_SIGMA).ravel()]
+        parts = [part / scale for part in parts]
+        for pose, views, whitener in zip(poses, self.views, self.whiteners, strict=True):
+            seen = project(pose, poses[given.host[views.rows]], calibration, landmarks[views.rows])
+            rest = np.nan_to_num(views.measurement - seen)
+            parts.append((whitener @ rest[..., None]).ravel())
+        return np.concatenate(parts)
+
+    def derivative(self, at: np.ndarray) -> np.ndarray:
+        """Of the residuals by calibration, poses perturbed from the left, and landmarks."""
+        step = 1e-6
+
+        def moved(k: int, by: float) -> np.ndarray:
+            change = np.zeros(len(at))
+            change[k] = by
+            there = at + change
+            tangents = [a[3 : self.size].reshape(-1, 6) for a in (change, at)]
+            there[3 : self.size] = se3_log(se3_exp(tangents[0]) @ se3_exp(tangents[1])).ravel()
+            return self.residuals(there)
+
+        return np.stack([(moved(k, step) - moved(k, -step)) / (2 * step) for k in range(len(at))], axis=1)
+
+    def solve(self) -> Dense:
+        self.at = least_squares(self.residuals, self.at, x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15).x
+        return self
+
+    @property
+    def poses(self) -> np.ndarray:
+        return np.asarray(se3_exp(self.at[3 : self.size].reshape(-1, 6)) @ self.expected)
+
+    @property
+    def cost(self) -> float:
+        return float((self.residuals(self.at) ** 2).sum())
+
+    def information(self) -> np.ndarray:
+        J = self.derivative(self.at)
+        return np.asarray(J.T @ J)
+
+    def covariance(self) -> np.ndarray:
+        """Of calibration and poses."""
+        return np.asarray(np.linalg.inv(self.information())[: self.size, : self.size])
+
+
+def eliminate(information: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """Schur's complement: the information about what is kept."""
+    gone = np.setdiff1d(np.arange(len(information)), kept)
+    cross = information[np.ix_(gone, kept)]
+    return information[np.ix_(kept, kept)] - cross.T @ np.linalg.solve(information[np.ix_(gone, gone)], cross)
+
+
+def in_sigmas(covariance: np.ndarray, expected: np.ndarray) -> float:
+    """Largest difference of two covariances, in deviations of the second."""
+    sigma = np.sqrt(np.diag(expected))
+    return float(np.abs((covariance - expected) / np.outer(sigma, sigma)).max())
+
+
+def assert_same_state(
+    poses: np.ndarray, calibration: np.ndarray, covariance: np.ndarray, dense: Dense, tolerance: float, first: int = 0
+) -> None:
+    """Estimates and covariances of the poses from `first` on, in standard deviations."""
+    chosen = np.r_[0:3, 3 + 6 * first : dense.size]
+    expected = dense.covariance()[np.ix_(chosen, chosen)]
+    difference = np.r_[calibration - dense.at[:3], se3_log(poses @ se3_inverse(dense.poses[first:])).ravel()]
+    assert np.abs(difference / np.sqrt(np.diag(expected))).max() < tolerance
+    assert in_sigmas(covariance, expected) < tolerance
+
+
+@pytest.fixture
+def gaussian(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Least squares alone in a frame's fit, where there are weights for longer tails."""
+    monkeypatch.setattr("sigmaslam.window._STUDENT_FREEDOM", 1e12, raising=False)
+
+
+# ---- the joint solution
+
+
+@pytest.mark.parametrize(("scale", "tolerance"), [(NARROW, 1e-4), (0.1, 1e-2), (1.0, 0.1)])
+def test_the_solution_is_that_of_dense_least_squares(scale: float, tolerance: float):
+    """Exactly so while rotations are small: their prior is not bent into the chart at the estimate."""
+    for seed in range(2):
+        given = world(seed, scale)
+        window, dense = solved(given), Dense(given, KEYFRAMES).solve()
+        assert_same_state(window.poses, window.calibration, window.covariance, dense, tolerance)
+        found = (window.landmarks.estimate - dense.at[dense.size :].reshape(-1, 4)) / (scale * HOST_SIGMA)
+        assert np.abs(found).max() < tolerance
+
+
+def test_landmarks_given_the_state_have_the_dense_covariance_and_follow_it():
+    given = world(3, NARROW)
+    window, dense = solved(given), Dense(given, KEYFRAMES).solve()
+    whole = np.linalg.inv(dense.information())
+    for row in np.flatnonzero(given.host < KEYFRAMES - 1):
+        place = slice(dense.size + 4 * row, dense.size + 4 * row + 4)
+        follows = window.landmarks.dependence[row]
+        found = window.landmarks.covariance[row] + follows @ window.covariance @ follows.T
+        assert in_sigmas(found, whole[place, place]) < 1e-4
+
+
+def test_landmarks_that_nobody_saw_again_stay_as_they_were_measured():
+    given = world(0)
+    window = solved(given)
+    last = given.host == KEYFRAMES - 1
+    np.testing.assert_array_equal(window.landmarks.estimate[last], given.measured[last])
+    np.testing.assert_allclose(window.landmarks.covariance[last], np.tile(np.diag(HOST_SIGMA**2), (last.sum(), 1, 1)))
+    assert (window.landmarks.dependence[last] == 0).all()
+
+
+def test_without_views_the_prior_stays():
+    given = world(0)
+    nothing = given.views[0]
+    window = solved(replace(given, views=[nothing] * 4))
+    expected = np.zeros((21, 21))
+    expected[CALIBRATION, CALIBRATION] = np.diag(CALIBRATION_SIGMA**2)
+    for a in range(KEYFRAMES):
+        for b in range(KEYFRAMES):
+            common = FIRST_SIGMA**2 + min(a, b) * STEP_SIGMA**2
+            expected[pose_slice(a), pose_slice(b)] = np.diag(common)
+    np.testing.assert_allclose(window.covariance, expected, atol=1e-12)
+    np.testing.assert_allclose(window.poses, given.expected[:KEYFRAMES], atol=1e-12)
+
+
+@pytest.mark.parametrize("linearisation", ["extended", "unscented"])
+def test_views_say_nothing_about_where_the_whole_window_is(linearisation: str):
+    """The first keyframe keeps the covariance of its prior, and zero if that is zero."""
+    given = world(1)
+    window = solved(given, linearisation)
+    first = pose_slice(0)
+    np.testing.assert_allclose(window.covariance[first, first], np.diag(FIRST_SIGMA**2), atol=1e-9)
+    window = KeyframeWindow(CAMERA, CALIBRATION_SIGMA, "onnx", linearisation)
+    window.depth = 4.0
+    for k in range(KEYFRAMES):
+        sigma = STEP_SIGMA if k else np.zeros(6)
+        window.add_keyframe(given.expected[k], STEP if k else np.eye(4), np.diag(sigma**2), np.zeros(3))
+        window.add_views(given.views[k])
+        own = np.flatnonzero(given.host == k)
+        window.add_landmarks(own, given.measured[own, :3], np.tile(HOST_SIGMA**2, (len(own), 1)))
+        window.solve()
+    assert np.abs(window.covariance[first]).max() < 1e-15
+    np.testing.assert_allclose(window.poses[0], np.eye(4), atol=1e-12)
+    assert fit(window, given).covariance[0, 0] > 1e-8
+
+
+def test_a_common_uncertainty_of_all_poses_is_not_seen_in_the_views():
+    """A metre and a tenth of a radian that host and frame have in common leave the prediction certain."""
+    window = KeyframeWindow(CAMERA, np.zeros(3), "onnx")
+    window.depth = 4.0
+    given = world(0)
+    window.add_keyframe(STEP, STEP, np.diag(np.repeat([1.0, 0.1], 3) ** 2), np.zeros(3))
+    window.add_landmarks(np.arange(12), given.measured[:, :3], np.full((12, 4), 1e-8))
+    _, covariance, in_front = window.predict(np.arange(12), STEP @ STEP, np.zeros((6, 6)))
+    assert in_front.all()
+    assert np.abs(covariance).max() < 1e-5
+
+
+@pytest.mark.parametrize("linearisation", ["extended", "unscented"])
+def test_order_of_the_views_does_not_matter(linearisation: str):
+    given = world(2)
+    one, other = solved(given, linearisation), solved(given, linearisation, order=-1)
+    np.testing.assert_allclose(one.poses, other.poses, atol=1e-9)
+    np.testing.assert_allclose(one.covariance, other.covariance, atol=1e-8)
+    views = given.views[-1]
+    turned = views.select(np.arange(len(views.rows))[::-1])
+    first, second = fit(one, given), fit(one, given, turned)
+    np.testing.assert_allclose(first.pose, second.pose, atol=1e-9)
+    np.testing.assert_allclose(first.covariance, second.covariance, atol=1e-9)
+    np.testing.assert_array_equal(first.kept, second.kept[::-1])
+
+
+@pytest.mark.usefixtures("gaussian")
+def test_a_disparity_that_is_not_there_is_one_that_is_unknown():
+    given = world(2)
+    filled = []
+    for views in given.views:
+        missing = np.isnan(views.measurement[:, 2])
+        measurement, noise = views.measurement.copy(), views.noise.copy()
+        measurement[missing, 2] = 10.0
+        noise[missing, 2, :], noise[missing, :, 2], noise[missing, 2, 2] = 0.0, 0.0, 1e10
+        filled.append(Views(views.rows, measurement, noise))
+    assert any(np.isnan(views.measurement).any() for views in given.views[1:])
+    one, other = solved(given), solved(replace(given, views=filled))
+    np.testing.assert_allclose(one.poses, other.poses, atol=1e-7)
+    np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-4, atol=1e-9)
+    first, second = fit(one, given), fit(one, given, filled[-1])
+    np.testing.assert_allclose(first.pose, second.pose, atol=1e-6)
+    assert first.dof < second.dof
+
+
+def test_views_that_do_not_fit_are_forgotten():
+    """Two views are sixteen deviations off; after the next solution it is as if they had never been."""
+    given = world(0, count=120)
+    # Claimed to be worse than they are, so that no right one is near the gate.
+    views = [replace(v, noise=4 * v.noise) for v in given.views]
+    wrong = views[2].measurement.copy()
+    wrong[[3, 8], 1] += 8.0
+    right = np.ones(len(wrong), bool)
+    right[[3, 8]] = False
+    broken = unsolved(replace(given, views=[*views[:2], replace(views[2], measurement=wrong), views[3]]))
+    clean = solved(replace(given, views=[*views[:2], views[2].select(right), views[3]]))
+    broken.solve()
+    sigma = np.sqrt(np.diag(clean.covariance)[3:])
+    assert np.abs(se3_log(broken.poses @ se3_inverse(clean.poses)).ravel() / sigma).max() > 0.2
+    broken.solve(8)
+    np.testing.assert_allclose(broken.poses, clean.poses, atol=1e-8)
+    np.testing.assert_allclose(broken.covariance, clean.covariance, atol=1e-8)
+
+
+# ---- the frame
+
+
+@pytest.mark.usefixtures("gaussian")
+@pytest.mark.parametrize(("scale", "tolerance"), [(NARROW, 1e-3), (0.1, 2e-2), (1.0, 0.2)])
+def test_a_frame_equals_one_more_pose_in_dense_least_squares(scale: float, tolerance: float):
+    """Pose, covariance, also relative to the last keyframe, calibration; and the NIS is what it adds to the cost."""
+    for seed in range(2):
+        given = world(seed, scale)
+        found = fit(solved(given), given)
+        assert found.kept.all()
+        before, dense = Dense(given, KEYFRAMES).solve(), Dense(given, KEYFRAMES + 1).solve()
+        covariance = dense.covariance()
+        frame, last = pose_slice(KEYFRAMES), pose_slice(KEYFRAMES - 1)
+        relative = np.zeros((6, dense.size))
+        relative[:, frame], relative[:, last] = np.eye(6), -np.eye(6)
+        sigma = np.sqrt(np.diag(covariance))
+        error = np.r_[found.calibration - dense.at[:3], se3_log(found.pose @ se3_inverse(dense.poses[-1]))]
+        assert np.abs(error / sigma[np.r_[0:3, frame]]).max() < tolerance
+        assert in_sigmas(found.covariance, covariance[frame, frame]) < tolerance
+        assert in_sigmas(found.calibration_covariance, covariance[CALIBRATION, CALIBRATION]) < tolerance
+        assert in_sigmas(found.relative, relative @ covariance @ relative.T) < tolerance
+        assert found.nis == pytest.approx(dense.cost - before.cost, rel=tolerance)
+        assert found.dof == np.isfinite(given.views[-1].measurement).sum()
+
+
+def test_a_frame_leaves_the_window_as_it_was():
+    given = world(0)
+    window = solved(given)
+    poses, covariance, estimate = window.poses.copy(), window.covariance.copy(), window.landmarks.estimate.copy()
+    fit(window, given)
+    np.testing.assert_array_equal(window.poses, poses)
+    np.testing.assert_array_equal(window.covariance, covariance)
+    np.testing.assert_array_equal(window.landmarks.estimate, estimate)
+
+
+def test_a_frame_that_starts_from_elsewhere_ends_at_the_same_place():
+    """The prior's own mean and the truth, ten standard deviations of the result apart."""
+    given = world(0, count=60)
+    window = solved(given)
+    one, other = fit(window, given), fit(window, given, start=given.poses[-1])
+    sigma = np.sqrt(np.diag(one.covariance))
+    assert np.abs(se3_log(one.pose @ se3_inverse(other.pose)) / sigma).max() < 0.05
+    assert in_sigmas(other.covariance, one.covariance) < 0.05
+    np.testing.assert_array_equal(one.kept, other.kept)
+
+
+@pytest.mark.parametrize("linearisation", ["extended", "unscented"])
+def test_wrong_matches_of_a_frame_are_left_out(linearisation: str):
+    """A quarter of the views lie anywhere; the fit is the one without them."""
+    given = world(4, count=80)
+    window = solved(given, linearisation)
+    views = given.views[-1]
+    rng = np.random.default_rng(0)
+    wrong = rng.random(len(views.rows)) < 0.25
+    measurement = views.measurement.copy()
+    measurement[wrong, :2] += rng.choice([-1, 1], (wrong.sum(), 2)) * rng.uniform(8, 60, (wrong.sum(), 2))
+    found, clean = fit(window, given, replace(views, measurement=measurement)), fit(window, given, views.select(~wrong))
+    assert not found.kept[wrong].any()
+    assert found.kept[~wrong].mean() > 0.95
+    sigma = np.sqrt(np.diag(clean.covariance))
+    assert np.abs(se3_log(found.pose @ se3_inverse(clean.pose)) / sigma).max() < 0.05
+
+
+def test_too_few_views_that_agree_are_no_pose():
+    given = world(0, count=30)
+    window, views = solved(given), given.views[-1]
+    scattered = replace(views, measurement=views.measurement + np.random.default_rng(0).uniform(20, 90, (30, 3)))
+    step = np.diag(STEP_SIGMA**2)
+    assert window.fit_frame(scattered, window.poses[-1] @ STEP, step, 15) is None
+    assert window.fit_frame(views.select(np.arange(14)), window.poses[-1] @ STEP, step, 15) is None
+
+
+def test_predictions_are_where_the_frame_then_sees_the_landmarks():
+    """NEES of measured places under the predicted covariance and the noise, over worlds."""
+    values = []
+    for seed in range(12):
+        given = world(seed, count=30)
+        views = given.views[-1].select(np.isfinite(given.views[-1].measurement[:, 2]))
+        window = solved(given, "unscented")
+        mean, covariance, in_front = window.predict(views.rows, window.poses[-1] @ STEP, np.diag(STEP_SIGMA**2))
+        assert in_front.all()
+        error = (views.measurement - mean)[..., None]
+        values.append((error * np.linalg.solve(covariance + views.noise, error)).sum(axis=(1, 2)).mean() / 3)
+    # Views of one frame share its pose: the mean over the worlds scatters as that of a dozen such numbers does.
+    assert 0.6 < np.mean(values) < 1.5
+
+
+@pytest.mark.parametrize("linearisation", ["extended", "unscented"])
+def test_errors_are_as_large_as_the_covariance_says(linearisation: str):
+    """40 worlds from the prior: NEES of frame, window and calibration, and NIS, within 99.9 % of their chi-square."""
+    worlds, frame, state, calibration, nis, dof = 40, 0.0, 0.0, 0.0, 0.0, 0
+    for seed in range(worlds):
+        given = world(100 + seed, count=60)
+        window = unsolved(given, linearisation)
+        window.solve(3)
+        found = fit(window, given)
+        error = se3_log(given.poses[-1] @ se3_inverse(found.pose))
+        frame += error @ np.linalg.solve(found.covariance, error)
+        error = np.r_[
+            given.calibration - window.calibration,
+            se3_log(given.poses[:KEYFRAMES] @ se3_inverse(window.poses)).ravel(),
+        ]
+        state += error @ np.linalg.solve(window.covariance, error)
+        error = given.calibration - found.calibration
+        calibration += error @ np.linalg.solve(found.calibration_covariance, error)
+        nis, dof = nis + found.nis, dof + found.dof
+    for total, freedom in ((frame, 6 * worlds), (state, 21 * worlds), (calibration, 3 * worlds), (nis, dof)):
+        low, high = chi2.ppf([0.0005, 0.9995], freedom)
+        assert low < total < high, (total / freedom, low / freedom, high / freedom)
+
+
+# ---- leaving keyframes
+
+
+def test_what_a_retired_keyframe_leaves_is_the_dense_marginal():
+    """All landmarks are the first keyframe's: with it they go, and Schur's complement is the prior of the rest."""
+    for scale, tolerance in ((NARROW, 1e-4), (0.1, 1e-2)):
+        given = world(1, scale, count=18, hosts=1)
+        window, dense = solved(given), Dense(given, KEYFRAMES).solve()
+        kept = np.r_[0:3, 9 : dense.size]
+        expected = np.linalg.inv(eliminate(dense.information(), kept))
+        window.retire_oldest()
+        assert len(window.landmarks) == 0
+        window.solve()
+        assert in_sigmas(window.covariance, expected) < tolerance
+        error = np.r_[window.calibration - dense.at[:3], se3_log(window.poses @ se3_inverse(dense.poses[1:])).ravel()]
+        assert np.abs(error / np.sqrt(np.diag(expected))).max() < tolerance
+
+
+@pytest.mark.parametrize("linearisation", ["extended", "unscented"])
+def test_a_retired_keyframe_changes_nothing_of_what_is_known_of_the_rest(linearisation: str):
+    given = world(1, 0.1, count=30)
+    window = solved(given, linearisation)
+    rest = np.r_[0:3, 9:21]
+    poses, covariance = window.poses[1:].copy(), window.covariance[np.ix_(rest, rest)].copy()
+    retired = window.retire_oldest()
+    assert (retired.host == 0).all()
+    np.testing.assert_array_equal(window.landmarks.host, given.host[given.host > 0] - 1)
+    np.testing.assert_array_equal(window.landmarks.serial, np.flatnonzero(given.host > 0))
+    window.solve(4)
+    assert in_sigmas(window.covariance, covariance) < 1e-3
+    error = se3_log(window.poses @ se3_inverse(poses)).ravel()
+    assert np.abs(error / np.sqrt(np.diag(covariance)[3:])).max() < 1e-3
+
+
+def test_a_window_that_moves_on_equals_the_whole_problem():
+    """The first keyframe retires and the frame becomes a keyframe, which sees landmarks of the others."""
+    given = world(1, NARROW, count=30)
+    views = given.views[-1].select(given.host[given.views[-1].rows] > 0)
+    given = replace(given, views=[*given.views[:-1], views])
+    window = solved(given)
+    window.retire_oldest()
+    gone = int((given.host == 0).sum())
+    add_keyframe(window, given, KEYFRAMES, replace(views, rows=views.rows - gone), hosted=False)
+    window.solve(8)
+    dense = Dense(given, KEYFRAMES + 1).solve()
+    assert_same_state(window.poses, window.calibration, window.covariance, dense, 1e-4, first=1)
+
+
+def test_a_long_chain_of_windows_stays_rigid():
+    """100 keyframes, each from the last by products with inverses by transposition: defects that double would show."""
+    given = world(0, count=30)
+    at_origin, rows = np.tile(np.eye(4), (30, 1, 1)), np.arange(30)
+    seen = Views(rows, project(STEP, at_origin, np.zeros(3), given.landmarks), np.tile(0.1 * np.eye(3), (30, 1, 1)))
+    window = KeyframeWindow(CAMERA, CALIBRATION_SIGMA, "onnx", "extended")
+    window.depth = 4.0
+    for k in range(100):
+        if len(window) == 2:
+            window.retire_oldest()
+        first = not len(window)
+        pose = np.eye(4) if first else window.poses[-1] @ STEP
+        window.add_keyframe(pose, np.eye(4) if first else STEP, np.diag(STEP_SIGMA**2), np.zeros(3))
+        if k:
+            window.add_views(seen)
+        window.add_landmarks(rows, given.landmarks[:, :3], np.tile(HOST_SIGMA**2, (30, 1)))
+        window.solve()
+    R = window.poses[:, :3, :3]
+    np.testing.assert_allclose(R @ R.transpose(0, 2, 1), np.tile(np.eye(3), (2, 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(window.covariance, window.covariance.T, rtol=0, atol=1e-12)
