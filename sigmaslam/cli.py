@@ -177,6 +177,13 @@ def track(
     ] = None,
     frontend: Annotated[Frontend, typer.Option(help="Where correspondences come from.")] = Frontend.learned,
     backend: Annotated[Backend, typer.Option(help="What runs network and filter; torch needs 'train'.")] = Backend.onnx,
+    map: Annotated[
+        Path | None,
+        typer.Option(help="map.npz of an earlier run with the same camera and front-end: poses are in its world."),
+    ] = None,
+    tracks: Annotated[
+        bool, typer.Option("--tracks", help="Also write tracks.npz, what keyframes saw, for `sigmaslam refine`.")
+    ] = False,
     camera: Annotated[
         str | None,
         typer.Option(
@@ -199,7 +206,7 @@ def track(
         _need_train_extra()
     sequence = _open_input(source, format, calibration, camera, seconds, (topic_left, topic_right))
     try:
-        summary = _track(sequence, out, frontend, backend)
+        summary = _track(sequence, out, frontend, backend, map, tracks)
     except KeyboardInterrupt:
         if (out / "run.json").exists():
             typer.echo(f"Stopped; what was tracked until then is in {out}")
@@ -591,10 +598,17 @@ def _open_input(
     return open_cameras(camera, calibration, seconds)
 
 
-def _track(sequence: StereoSequence, out: Path, frontend: Frontend, backend: Backend) -> dict[str, Any]:
+def _track(
+    sequence: StereoSequence,
+    out: Path,
+    frontend: Frontend,
+    backend: Backend,
+    map_path: Path | None = None,
+    tracks: bool = False,
+) -> dict[str, Any]:
     from sigmaslam.run import track_sequence
 
-    return track_sequence(sequence, out, frontend.value, backend.value)
+    return track_sequence(sequence, out, frontend.value, backend.value, map_path=map_path, tracks=tracks)
 
 
 def _tell_differences(differences: dict[str, float]) -> None:

@@ -80,9 +80,7 @@ def map_points(
 def merge_maps(parts: list[PointMap]) -> PointMap:
     """All points of all parts."""
     parts = [PointMap.empty(), *parts]
-    return PointMap(
-        *(np.concatenate([getattr(part, name) for part in parts]) for name in PointMap.__slots__)
-    )
+    return PointMap(*(np.concatenate([getattr(part, name) for part in parts]) for name in PointMap.__slots__))
 
 
 def _triangulation_jacobian(uvd: np.ndarray, points: np.ndarray, camera: RectifiedStereo) -> np.ndarray:

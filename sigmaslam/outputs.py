@@ -21,6 +21,7 @@ from sigmaslam.report import COLUMNS, write_report
 from sigmaslam.session import shipped_weights
 from sigmaslam.tracker import CalibrationEstimate, Estimate
 from sigmaslam.trajectory import Trajectory, write_kitti, write_tum
+from sigmaslam.window import Views
 
 STAGES = ("read", "features", "match", "filter", "map")
 _COLUMNS = (COLUMNS[0], "status", *COLUMNS[1:], *(f"ms_{stage}" for stage in STAGES))
@@ -32,11 +33,12 @@ class RunWriter:
 
     Args:
         out: folder to make; it must not exist, or be empty.
+        rectified: what `StereoTracker.describe_rectified` says, to write tracks.npz as well.
     Raises:
         InputError: the folder holds something, or cannot be made.
     """
 
-    def __init__(self, out: Path) -> None:
+    def __init__(self, out: Path, rectified: dict[str, Any] | None = None) -> None:
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise InputError(f"{out} exists and is not an empty folder: choose another --out, or remove it")
         try:
@@ -49,6 +51,8 @@ class RunWriter:
         self._rows.writerow(_COLUMNS)
         self._estimates: list[Estimate] = []
         self._skipped = 0
+        self._rectified = rectified
+        self._views: list[tuple[int, Views]] = []
 
     def add(self, estimate: Estimate, read_ms: float) -> None:
         """Takes the result of one frame; its row is on disk when this returns."""
@@ -70,17 +74,23 @@ class RunWriter:
         self._table.flush()
         self._estimates.append(estimate)
 
+    def add_views(self, views: Views | None) -> None:
+        """Takes what the last frame added saw as a keyframe, for tracks.npz; None if it is none."""
+        if views is not None and self._rectified is not None:
+            self._views.append((len(self._estimates) - 1, views))
+
     def add_skipped(self, timestamp: float) -> None:
         """Notes a frame that could not be read."""
         self._rows.writerow([f"{timestamp:.9f}", "skipped", *[""] * (len(_COLUMNS) - 2)])
         self._table.flush()
         self._skipped += 1
 
-    def finish(self, point_map: PointMap, run: dict[str, Any]) -> dict[str, Any]:
+    def finish(self, point_map: PointMap, keyframes: dict[str, Any], run: dict[str, Any]) -> dict[str, Any]:
         """Writes trajectory, covariance, map, run.json and report.html.
 
         Args:
             point_map: the landmarks.
+            keyframes: arrays by name by which a later run finds its place in the map.
             run: what run.json says beside versions, weights and the summary.
         Returns:
             The summary.
@@ -100,19 +110,36 @@ class RunWriter:
         with atomic_path(self._out / "covariance.npy") as path:
             np.save(path, np.stack([estimate.covariance for estimate in self._estimates]))
         with atomic_path(self._out / "map.npz") as path:
-            np.savez_compressed(path, **{name: getattr(point_map, name) for name in PointMap.__slots__})
+            points = {name: getattr(point_map, name) for name in PointMap.__slots__}
+            np.savez_compressed(path, **points, **keyframes)
         write_ply(self._out / "map.ply", point_map)
+        self._write_tracks()
         write_report(self._out)
         return summary
 
+    def _write_tracks(self) -> None:
+        if self._rectified is None or not self._views:
+            return
+        calibration = self._estimates[-1].calibration
+        with atomic_path(self._out / "tracks.npz") as path:
+            np.savez_compressed(
+                path,
+                frame=np.concatenate([np.full(len(views.rows), frame) for frame, views in self._views]),
+                landmark=np.concatenate([views.rows for _, views in self._views]),
+                measurement=np.concatenate([views.measurement for _, views in self._views]),
+                covariance=np.concatenate([views.noise for _, views in self._views]),
+                disparity_offset=np.array([calibration.disparity_offset, calibration.disparity_offset_sigma]),
+                **self._rectified,
+            )
+
     def _summary(self, point_map: PointMap) -> dict[str, Any]:
         statuses = [estimate.status for estimate in self._estimates]
-        tracked = [estimate for estimate in self._estimates if estimate.status == "tracking"]
+        tracked = [estimate for estimate in self._estimates if estimate.inliers]
         last = self._estimates[-1].calibration if self._estimates else None
         return {
             "frames": len(statuses) + self._skipped,
             "skipped": self._skipped,
-            **{status: statuses.count(status) for status in ("starting", "tracking", "lost")},
+            **{status: statuses.count(status) for status in ("starting", "tracking", "relocalised", "lost")},
             "median_inliers": float(np.median([e.inliers for e in tracked])) if tracked else 0.0,
             "map_points": len(point_map.points),
             "calibration_verdict": calibration_verdict(last) if last else "No frame was read.",

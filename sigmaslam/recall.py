@@ -75,7 +75,7 @@ class KeyframeMemory:
                 continue
             forward, back = similarity.argmax(axis=1), similarity.argmax(axis=0)
             votes.append(int((back[forward] == np.arange(len(forward))).sum()))
-        order = np.argsort(-np.array(votes), kind="stable")[:count] if votes else []
+        order = np.argsort(-np.array(votes, np.int64), kind="stable")[:count]
         return [self.keyframes[k] for k in order]
 
 
@@ -128,8 +128,8 @@ def read_keyframes(path: Path, frontend: str, camera: RectifiedStereo) -> list[R
     expected = _intrinsics(camera)
     if not np.allclose(arrays["intrinsics"], expected, rtol=1e-4):
         raise InputError(
-            f"{path}: made by a camera with fx, fy, cx, cy, baseline, width, height of {arrays['intrinsics'].tolist()}, "
-            f"this one has {expected.tolist()}; a map serves the camera that made it"
+            f"{path}: its camera has fx, fy, cx, cy, baseline, width, height of {arrays['intrinsics'].tolist()}, this "
+            f"one {expected.tolist()}; a map serves the camera that made it"
         )
     ends = np.cumsum(arrays[_PREFIX + "counts"])
     keyframes = []

@@ -24,6 +24,8 @@ def track_sequence(
     frontend: str = "learned",
     backend: str = "onnx",
     config: TrackerConfig | None = None,
+    map_path: Path | None = None,
+    tracks: bool = False,
 ) -> dict[str, Any]:
     """Tracks a sequence and writes the run folder; partial results are kept when it is stopped or fails.
 
@@ -31,6 +33,8 @@ def track_sequence(
         sequence: opened by `sigmaslam.readers.open_sequence` or `open_cameras`.
         out: run folder, new or empty.
         frontend, backend, config: of `StereoTracker`.
+        map_path: map.npz of an earlier run, whose world the poses are given in.
+        tracks: write tracks.npz, too: what keyframes saw, for `sigmaslam refine`.
     Returns:
         The summary that run.json holds.
     Raises:
@@ -38,7 +42,9 @@ def track_sequence(
         KeyboardInterrupt: passed on after the partial results are written.
     """
     tracker = StereoTracker(sequence.camera, frontend, backend, config)
-    writer = RunWriter(out)
+    if map_path is not None:
+        tracker.load_map(map_path)
+    writer = RunWriter(out, tracker.describe_rectified() if tracks else None)
     ended = "complete"
     try:
         # However this ends, cameras are given back before the results are written.
@@ -56,6 +62,7 @@ def track_sequence(
     finally:
         summary = writer.finish(
             tracker.map(),
+            tracker.pack_keyframes(),
             {
                 "input": str(sequence.source),
                 "format": sequence.format,
@@ -89,6 +96,7 @@ def _track(sequence: StereoSequence, frames: Iterator[StereoFrame], tracker: Ste
             noted = len(sequence.skipped)
             estimate = tracker.step(frame.left, frame.right, frame.timestamp)
             writer.add(estimate, read_ms)
+            writer.add_views(tracker.keyframe_views)
             done += 1
             since = time.perf_counter()
             progress.update(task, completed=done + noted, note=_note(estimate, done / (since - began)))

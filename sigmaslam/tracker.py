@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import time
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,10 +16,11 @@ from sigmaslam.errors import InputError
 from sigmaslam.frontend import Features, StereoView, TemporalMatches, build_frontend
 from sigmaslam.landmarks import PointMap, map_points, merge_maps
 from sigmaslam.motion import MotionFilter
+from sigmaslam.recall import KeyframeMemory, RememberedKeyframe, pack_keyframes, read_keyframes
 from sigmaslam.rectify import StereoRectifier
-from sigmaslam.rotation import se3_adjoint, se3_inverse, se3_log
+from sigmaslam.rotation import nearest_rigid, se3_adjoint, se3_inverse
 from sigmaslam.startup import RelativePose, estimate_relative_pose
-from sigmaslam.window import CALIBRATION, FrameFit, KeyframeWindow, Views, pose_slice
+from sigmaslam.window import CALIBRATION, FrameFit, KeyframeWindow, Views, join_views, pose_slice
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -30,8 +33,12 @@ _LEAST_SHARE_UNGUIDED = 0.5
 # A fit near the prediction with a larger NIS per degree of freedom may sit in a wrong place: it is checked against one
 # that does without the prediction.
 _DOUBTFUL_NIS = 2.0
+# Variance of a pose that is not known at all, m^2 and rad^2.
+_ANYWHERE = 1e6
 # Without a prediction the view is compared with so many late keyframes.
 _LATE_KEYFRAMES = 3
+# When it is lost, with so many of those that left the window, the ones most like it.
+_SIMILAR_KEYFRAMES = 3
 # A keyframe of which fewer landmarks are in view is not searched for.
 _LEAST_OF_A_KEYFRAME = 8
 # The noise of matches follows the NIS: bounds of its scale, and the exponent of one frame's part in it.
@@ -62,6 +69,7 @@ class TrackerConfig:
         window: keyframes that are estimated jointly.
         spacing: landmarks are at least so far apart, pixels; what lies closer has the same errors (patches overlap).
         shared_disparity: share of the variance of a landmark's disparities that is the same in all views.
+        remembered: keyframes that are kept to find the way back to.
         most_misses: after so many frames in a row in which it was not found a landmark is no longer looked for.
         least_inliers: fewer is no pose; without a prediction and a fair share of the matches, fewer than twice as many.
         keyframe_ratio: a new keyframe is taken when the inliers fall below this share of the landmarks in the last one.
@@ -84,6 +92,7 @@ class TrackerConfig:
     window: int = 6
     spacing: float = 8.0
     shared_disparity: float = 0.8
+    remembered: int = 60
     most_misses: int = 3
     least_inliers: int = 15
     keyframe_ratio: float = 0.65
@@ -112,7 +121,8 @@ class Estimate:
         timestamp: seconds.
         T_world_camera: (4, 4) pose of the left camera; the world is the first left camera.
         covariance: (6, 6) of that pose in the camera's own frame, translation (metres) before rotation (radians).
-        status: "starting", "tracking" or "lost".
+        status: "starting", "tracking", "lost", or "relocalised": found again among keyframes that had left the window,
+            or in the map.
         belief: 1 - sqrt of the largest eigenvalue of the covariance of the pose relative to the keyframe (metres and
             radians together), clipped to [0, 1] (Tables 9.1, 9.2).
         matches, inliers: points matched to the keyframe, and those that passed the gate.
@@ -193,6 +203,32 @@ class StereoTracker:
         self._tracked_pose = np.eye(4)  # the pose at that time
         self._moving = False  # there has been a pose from the images
         self._velocity_known = False  # since the last start
+        self._memory = KeyframeMemory(self.config.remembered)
+        self._in_map = False  # the world is that of a map that was loaded
+        self.keyframe_views: Views | None = None
+        """What the last frame saw if it became a keyframe, by numbers of landmarks that stay."""
+
+    def load_map(self, path: Path) -> None:
+        """Takes the world of a map that `sigmaslam track` has written; tracking starts where a view is found in it.
+
+        Raises:
+            InputError: the file is no map, or made with another front-end or camera.
+        """
+        for keyframe in read_keyframes(path, self._frontend.name, self._camera):
+            self._memory.add(keyframe)
+        self._in_map = True
+
+    def describe_rectified(self) -> dict[str, Any]:
+        """The rectified pair that `keyframe_views` are measured in: intrinsics (5,), R_rectified_left (3, 3)."""
+        camera = self._camera
+        intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.baseline])
+        return {"intrinsics": intrinsics, "R_rectified_left": self._T_rectified_left[:3, :3]}
+
+    def pack_keyframes(self) -> dict[str, Any]:
+        """Keyframes by which a later run finds its place in the map, as arrays by name."""
+        window = self._window
+        late = [self._remembered(k) for k in range(len(window))]
+        return pack_keyframes([*self._memory.keyframes, *late], self._frontend.name, self._camera)
 
     def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> Estimate:
         """Takes one stereo pair.
@@ -209,23 +245,25 @@ class StereoTracker:
                 f"time stamp {timestamp:.6f} s does not come after {self._timestamp:.6f} s: sort the frames by time"
             )
         clock = _Stopwatch()
+        self.keyframe_views = None
         view = self._frontend.observe(*self._rectifier.rectify(left, right))
         clock.lap("features")
         if self._timestamp is not None:
             self._motion.predict(timestamp - self._timestamp, self._densities)
         matches, fit, status = 0, None, "starting"
-        if not len(self._window):
-            if self._has_stereo(view):
-                self._start(view, timestamp)
-        else:
+        if len(self._window):
             found, fit = self._track(view, clock)
             matches = len(found.probability)
-            if fit is not None:
-                status = "tracking"
-                self._accept(fit, found, view, timestamp)
-            else:
-                status = "lost" if self._moving else "starting"
-                self._recover(view, timestamp)
+        if fit is not None:
+            status = "tracking"
+            self._accept(fit, found, view, timestamp)
+        elif self._remember(view, timestamp):
+            status = "relocalised"
+        elif len(self._window):
+            status = "lost" if self._moving else "starting"
+            self._recover(view, timestamp)
+        elif self._has_stereo(view) and not self._in_map:
+            self._start(view, timestamp)
         clock.lap("map")
         self._timestamp = timestamp
         return self._report(timestamp, status, matches, fit, clock.milliseconds)
@@ -281,9 +319,7 @@ class StereoTracker:
             chosen = np.flatnonzero(landmarks.host[rows] == host)
             if len(chosen) < _LEAST_OF_A_KEYFRAME:
                 continue
-            matches = self._frontend.match(
-                key, landmarks.feature[rows[chosen]], view, predicted[chosen, :2], S[chosen]
-            )
+            matches = self._frontend.match(key, landmarks.feature[rows[chosen]], view, predicted[chosen, :2], S[chosen])
             # Features of a keyframe ascend with the rows of its landmarks.
             place = np.searchsorted(landmarks.feature[rows[chosen]], matches.key_index)
             parts.append(self._found(rows[chosen][place], matches, rows[chosen], own))
@@ -381,6 +417,42 @@ class StereoTracker:
         if count < self.config.keyframe_ratio * self._reference and self._has_stereo(view):
             self._add_keyframe(view, timestamp, fit.pose, expected, step_covariance, found.views.select(fit.kept))
 
+    def _remember(self, view: StereoView, timestamp: float) -> bool:
+        """Finds the view among the remembered keyframes and goes on from there; whether it was found."""
+        if not self._has_stereo(view):
+            return False
+        for keyframe in self._memory.similar(view, _SIMILAR_KEYFRAMES):
+            relative = self._locate(keyframe.view, view)
+            if relative is None:
+                continue
+            pose = nearest_rigid(keyframe.pose @ relative.T_key_camera)
+            adjoint = se3_adjoint(pose)
+            for host in range(len(self._window)):
+                self._memory.add(self._remembered(host))
+            whole = np.ones(len(self._window.landmarks), bool)
+            self._retired.append(map_points(self._window, whole, np.array(self._keyframe_times)))
+            self._window.restart()
+            self._keyframe_views, self._keyframe_times = [], []
+            self._add_keyframe(
+                view, timestamp, pose, pose, keyframe.covariance + adjoint @ relative.covariance @ adjoint.T, None
+            )
+            self._forget_twist()
+            self._tracked_at, self._tracked_pose = timestamp, pose
+            self._moving, self._velocity_known = True, False
+            return True
+        return False
+
+    def _remembered(self, host: int) -> RememberedKeyframe:
+        """A keyframe of the window as the memory keeps it."""
+        place = pose_slice(host)
+        window = self._window
+        return RememberedKeyframe(
+            self._keyframe_views[host],
+            window.poses[host],
+            window.covariance[place, place],
+            self._keyframe_times[host],
+        )
+
     def _recover(self, view: StereoView, timestamp: float) -> None:
         """Without a pose: wait for a while, then go on from this view with the uncertainty of the prediction."""
         if timestamp - self._tracked_at > self.config.lost_seconds and self._has_stereo(view):
@@ -417,6 +489,7 @@ class StereoTracker:
         if len(window) == self.config.window:
             leaving = window.landmarks.host == 0
             self._retired.append(map_points(window, leaving, np.array(self._keyframe_times)))
+            self._memory.add(self._remembered(0))
             if views is not None:
                 staying = ~leaving[views.rows]
                 number = np.cumsum(~leaving) - 1
@@ -434,6 +507,10 @@ class StereoTracker:
         if views is not None:
             window.add_views(views)
         self._add_landmarks(view, views)
+        own = window.landmarks.select(window.landmarks.host == len(window) - 1)
+        first = Views(own.serial, own.measured[:, :3], _with_shared(own.variance))
+        seen = [] if views is None else [Views(window.landmarks.serial[views.rows], views.measurement, views.noise)]
+        self.keyframe_views = join_views([*seen, first])
         window.solve()
         self._motion.start_keyframe()
         self._reference = int((window.landmarks.host == len(window) - 1).sum())
@@ -456,14 +533,10 @@ class StereoTracker:
         self._window.add_landmarks(index, measured, variance)
         depth = self._camera.fx * self._camera.baseline / max(float(np.nanmedian(view.disparity)), 0.5)
         self._window.depth = depth
-        self._densities = np.array(
-            [(self.config.acceleration * depth) ** 2, self.config.angular_acceleration**2]
-        )
+        self._densities = np.array([(self.config.acceleration * depth) ** 2, self.config.angular_acceleration**2])
 
     def _forget_twist(self) -> None:
-        self._motion.forget_twist(
-            np.repeat([self.config.start_speed * self._window.depth, self.config.start_turn], 3)
-        )
+        self._motion.forget_twist(np.repeat([self.config.start_speed * self._window.depth, self.config.start_turn], 3))
 
     # ---- results
 
@@ -480,8 +553,8 @@ class StereoTracker:
             relative, absolute = step, window.covariance[last, last] + step
             calibration, spread = window.calibration, window.covariance[CALIBRATION, CALIBRATION]
         else:
-            pose, relative, absolute = np.eye(4), np.zeros((6, 6)), np.zeros((6, 6))
-            calibration, spread = window.calibration, window.covariance
+            pose, calibration, spread = np.eye(4), window.calibration, window.covariance
+            relative = absolute = (_ANYWHERE if self._in_map else 0.0) * np.eye(6)
         # The filter knows the rectified camera; users know the left camera of their calibration.
         T_left_rectified = se3_inverse(self._T_rectified_left)
         to_body = se3_adjoint(se3_inverse(pose))
@@ -498,9 +571,7 @@ class StereoTracker:
             inliers=int(fit.kept.sum()) if fit is not None else 0,
             nis=fit.nis if fit is not None else 0.0,
             dof=fit.dof if fit is not None else 0,
-            calibration=CalibrationEstimate(
-                float(calibration[0]), float(np.sqrt(max(spread[0, 0], 0.0)))
-            ),
+            calibration=CalibrationEstimate(float(calibration[0]), float(np.sqrt(max(spread[0, 0], 0.0)))),
             milliseconds=milliseconds,
         )
 
@@ -530,16 +601,17 @@ def _apart(features: Features, taken: np.ndarray, spacing: float, shape: tuple[i
     return np.sort(np.array(kept, np.int64))
 
 
+def _with_shared(variance: np.ndarray) -> np.ndarray:
+    """Covariances (K, 3, 3) of (u, v, disparity) from variances of landmarks (K, 4)."""
+    return np.asarray(np.eye(3) * np.column_stack([variance[:, :2], variance[:, 2] + variance[:, 3]])[:, None, :])
+
+
 def _merge(parts: list[_Found]) -> _Found:
     """All that was found."""
     if not parts:
         return _NOTHING
     return _Found(
-        Views(
-            np.concatenate([part.views.rows for part in parts]),
-            np.concatenate([part.views.measurement for part in parts]),
-            np.concatenate([part.views.noise for part in parts]),
-        ),
+        join_views([part.views for part in parts]),
         np.concatenate([part.probability for part in parts]),
         np.concatenate([part.searched for part in parts]),
     )

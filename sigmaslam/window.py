@@ -69,6 +69,12 @@ class Views:
         return np.isfinite(self.measurement).sum(axis=1)
 
 
+def join_views(parts: list[Views]) -> Views:
+    """All views of all parts."""
+    names = ("rows", "measurement", "noise")
+    return Views(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
 @dataclass(frozen=True, slots=True)
 class FrameFit:
     """Posterior of a frame's pose together with the window.
@@ -209,6 +215,14 @@ class KeyframeWindow:
 
     def __len__(self) -> int:
         return len(self.poses)
+
+    def restart(self) -> None:
+        """Forgets all keyframes and landmarks; what is known of the calibration stays."""
+        self.poses = self._prior_poses = np.zeros((0, 4, 4))
+        self._prior = self.covariance = self.covariance[CALIBRATION, CALIBRATION]
+        self._prior_calibration = self.calibration
+        self.landmarks = Landmarks.empty(CALIBRATION_SIZE)
+        self._observations = _Observations()
 
     def add_keyframe(self, pose: np.ndarray, step: np.ndarray, step_covariance: np.ndarray, walk: np.ndarray) -> None:
         """Adds a keyframe to the end of the window.
@@ -449,7 +463,11 @@ class KeyframeWindow:
         products = by_landmark.transpose(0, 2, 1) @ np.concatenate([by_landmark, by_state, rest], axis=2)
         order = np.argsort(owner, kind="stable")
         begins = np.searchsorted(owner[order], np.arange(len(seen)))
-        sums = np.add.reduceat(products[order], begins, axis=0) if len(seen) else np.zeros((0, LANDMARK_SIZE, LANDMARK_SIZE + size + 1))
+        sums = (
+            np.add.reduceat(products[order], begins, axis=0)
+            if len(seen)
+            else np.zeros((0, LANDMARK_SIZE, LANDMARK_SIZE + size + 1))
+        )
         own = sums[:, :, :LANDMARK_SIZE] + np.eye(LANDMARK_SIZE) / landmarks.variance[seen][:, None, :]
         vector = sums[:, :, -1] + (landmarks.measured[seen] - landmarks.estimate[seen]) / landmarks.variance[seen]
         lower = np.linalg.cholesky(own)
@@ -458,8 +476,10 @@ class KeyframeWindow:
         information = tall.T @ tall - flat.T @ flat
         right = tall.T @ rest.ravel() - flat.T @ reduced[:, :, -1].ravel()
         inverse = np.linalg.inv(own)
-        return information, right, _Elimination(
-            seen, inverse, -inverse @ sums[:, :, LANDMARK_SIZE:-1], (inverse @ vector[..., None])[..., 0]
+        return (
+            information,
+            right,
+            _Elimination(seen, inverse, -inverse @ sums[:, :, LANDMARK_SIZE:-1], (inverse @ vector[..., None])[..., 0]),
         )
 
     def _move(self, step: np.ndarray, elimination: _Elimination) -> None:
@@ -580,9 +600,7 @@ class _Elimination:
     step: np.ndarray
 
 
-def _condition(
-    factor: np.ndarray, information: np.ndarray, vector: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _condition(factor: np.ndarray, information: np.ndarray, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean and covariance of N(0, factor factor^T) times exp(-x^T information x / 2 + vector^T x); factor (n, k)."""
     whole = np.eye(factor.shape[1]) + factor.T @ information @ factor
     lower = np.linalg.cholesky(0.5 * (whole + whole.T))

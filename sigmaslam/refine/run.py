@@ -118,7 +118,11 @@ def _write(out: Path, trajectory: Trajectory, adjustment: Adjustment) -> None:
     write_kitti(out / "trajectory.kitti", refined, out / "times.txt")
     with atomic_path(out / "covariance.npy") as path:
         np.save(path, adjustment.covariances[keyframe_before(adjustment.frames, len(trajectory))])
-    point_map = PointMap(adjustment.points, adjustment.point_covariances, adjustment.point_views)
+    count = len(adjustment.points)
+    unknown = np.full((count, 3), np.nan)  # which keyframe saw a point first, and where, is not passed on
+    point_map = PointMap(
+        adjustment.points, adjustment.point_covariances, adjustment.point_views, unknown[:, 0], unknown[:, 1:]
+    )
     with atomic_path(out / "map.npz") as path:
         np.savez_compressed(
             path, points=point_map.points, covariances=point_map.covariances, observations=point_map.observations
