@@ -62,13 +62,22 @@ class KeyframeMemory:
             np.fill_diagonal(apart, np.inf)
             del self.keyframes[max(np.unravel_index(np.argmin(apart), apart.shape))]
 
-    def similar(self, view: StereoView, count: int) -> list[RememberedKeyframe]:
-        """Up to `count` keyframes that look most like the view, by mutual nearest descriptors, best first."""
+    def similar(
+        self, view: StereoView, count: int, among: list[RememberedKeyframe] | None = None
+    ) -> list[RememberedKeyframe]:
+        """Up to `count` keyframes that look most like the view, by mutual nearest descriptors, best first.
+
+        Args:
+            view: what they should look like.
+            count: most of them.
+            among: which are asked; all by default.
+        """
+        among = self.keyframes if among is None else among
         wanted = view.features.descriptors[:_VOTERS]
         if not wanted.shape[1]:
-            return self.keyframes[-count:][::-1]
+            return among[-count:][::-1]
         votes = []
-        for keyframe in self.keyframes:
+        for keyframe in among:
             similarity = keyframe.view.features.descriptors[:_VOTERS] @ wanted.T
             if not similarity.size:
                 votes.append(0)
@@ -76,7 +85,7 @@ class KeyframeMemory:
             forward, back = similarity.argmax(axis=1), similarity.argmax(axis=0)
             votes.append(int((back[forward] == np.arange(len(forward))).sum()))
         order = np.argsort(-np.array(votes, np.int64), kind="stable")[:count]
-        return [self.keyframes[k] for k in order]
+        return [among[k] for k in order]
 
 
 def pack_keyframes(keyframes: list[RememberedKeyframe], frontend: str, camera: RectifiedStereo) -> dict[str, Any]:

@@ -131,6 +131,13 @@ def se3_adjoint(T: np.ndarray) -> np.ndarray:
     return adjoint
 
 
+def se3_body(T: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Covariance (6, 6) of a pose in its own frame, from that of its perturbation from the left."""
+    adjoint = se3_adjoint(se3_inverse(T))
+    spread = adjoint @ covariance @ adjoint.T
+    return np.asarray(0.5 * (spread + spread.T))
+
+
 def se3_exp(tangent: np.ndarray) -> np.ndarray:
     """Rigid transforms of tangent vectors (translation, rotation); (..., 6) -> (..., 4, 4)."""
     xi = np.asarray(tangent, dtype=np.float64)

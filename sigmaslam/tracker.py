@@ -18,7 +18,7 @@ from sigmaslam.landmarks import PointMap, map_points, merge_maps
 from sigmaslam.motion import MotionFilter
 from sigmaslam.recall import KeyframeMemory, RememberedKeyframe, pack_keyframes, read_keyframes
 from sigmaslam.rectify import StereoRectifier
-from sigmaslam.rotation import nearest_rigid, se3_adjoint, se3_inverse
+from sigmaslam.rotation import nearest_rigid, se3_adjoint, se3_body, se3_inverse
 from sigmaslam.startup import RelativePose, estimate_relative_pose
 from sigmaslam.window import CALIBRATION, FrameFit, KeyframeWindow, Views, join_views, pose_slice
 
@@ -39,6 +39,8 @@ _ANYWHERE = 1e6
 _LATE_KEYFRAMES = 3
 # When it is lost, with so many of those that left the window, the ones most like it.
 _SIMILAR_KEYFRAMES = 3
+# A loop is looked for beyond so many remembered keyframes, among those that look less than 60 degrees away.
+_RECENT_KEYFRAMES, _LOOP_COSINE = 10, 0.5
 # A keyframe of which fewer landmarks are in view is not searched for.
 _LEAST_OF_A_KEYFRAME = 8
 # The noise of matches follows the NIS: bounds of its scale, and the exponent of one frame's part in it.
@@ -442,6 +444,26 @@ class StereoTracker:
             return True
         return False
 
+    def _close_loop(self, view: StereoView) -> None:
+        """Looks for the newest keyframe among those that were here long ago, and ties it to what is found."""
+        window = self._window
+        pose, place = window.poses[-1], pose_slice(len(window) - 1)
+        reach = window.depth + 3.0 * np.sqrt(np.trace(se3_body(pose, window.covariance[place, place])[:3, :3]))
+
+        def near(keyframe: RememberedKeyframe) -> bool:
+            between = se3_inverse(pose) @ keyframe.pose
+            return bool(np.linalg.norm(between[:3, 3]) < reach and between[2, 2] > _LOOP_COSINE)
+
+        old = [each for each in self._memory.keyframes[:-_RECENT_KEYFRAMES] if near(each)]
+        for keyframe in self._memory.similar(view, 1, old):
+            relative = self._locate(keyframe.view, view)
+            if relative is None:
+                continue
+            found = nearest_rigid(keyframe.pose @ relative.T_key_camera)
+            adjoint = se3_adjoint(found)
+            if window.tie(found, adjoint @ relative.covariance @ adjoint.T, keyframe.covariance):
+                _LOGGER.info("loop closed with the keyframe of %.3f s", keyframe.timestamp)
+
     def _remembered(self, host: int) -> RememberedKeyframe:
         """A keyframe of the window as the memory keeps it."""
         place = pose_slice(host)
@@ -512,6 +534,7 @@ class StereoTracker:
         seen = [] if views is None else [Views(window.landmarks.serial[views.rows], views.measurement, views.noise)]
         self.keyframe_views = join_views([*seen, first])
         window.solve()
+        self._close_loop(view)
         self._motion.start_keyframe()
         self._reference = int((window.landmarks.host == len(window) - 1).sum())
         self._reference += 0 if views is None else len(views.rows)

@@ -28,6 +28,8 @@ CALIBRATION_SIZE = 3
 LANDMARK_SIZE = 4
 # 99.9 % quantiles of chi-square with 0, 1, 2 and 3 degrees of freedom.
 CHI_SQUARE_999 = np.array([0.0, 10.827566170662733, 13.815510557964274, 16.26623619623813])
+# 99.99 % quantile of chi-square with 6 degrees of freedom.
+_CHI_SQUARE_6 = 27.856341436212
 # Of the robust loss by which a frame's pose is first found: its scales in standard deviations.
 _ROBUST_SCALES = (6.0, 4.0, 3.0)
 # Errors of right matches have longer tails than a Gaussian's: degrees of freedom of the Student-t that is fitted.
@@ -293,6 +295,37 @@ class KeyframeWindow:
             self._move(state - offset, elimination)
             if iteration + 1 == iterations:
                 self._drop_outliers()
+
+    def tie(self, pose: np.ndarray, match: np.ndarray, origin: np.ndarray) -> bool:
+        """Ties the last keyframe to a pose that an old keyframe gives it: a loop is closed.
+
+        What happened between the two is independent of where the old one was, so that its covariance is common to both
+        and the match says something about the rest alone.
+
+        Args:
+            pose: (4, 4) T_world_camera of the last keyframe as the old one sees it.
+            match: (6, 6) covariance of that given the old one, perturbed from the left in the world.
+            origin: (6, 6) covariance of the old one's pose, likewise.
+        Returns:
+            False, and nothing is changed, where the two poses contradict each other.
+        """
+        last = pose_slice(len(self.poses) - 1)
+        estimated = self.covariance[last, last] - origin + match
+        apart = se3_log(pose @ se3_inverse(self.poses[-1]))
+        if apart @ np.linalg.lstsq(estimated, apart, rcond=1e-12)[0] > _CHI_SQUARE_6:
+            return False
+        common = np.zeros((len(self._prior), 6))
+        for clone in range(len(self.poses)):
+            common[pose_slice(clone)] = origin
+        drift = self._prior[:, last] - common
+        gain = np.linalg.lstsq(drift[last] + match, drift.T, rcond=1e-12)[0].T
+        step = gain @ se3_log(pose @ se3_inverse(self._prior_poses[-1]))
+        self._prior_poses = nearest_rigid(se3_exp(step[CALIBRATION_SIZE:].reshape(-1, 6)) @ self._prior_poses)
+        self._prior_calibration = self._prior_calibration + step[CALIBRATION]
+        root = _root(self._prior - gain @ drift.T)
+        self._prior = root @ root.T
+        self.solve()
+        return True
 
     def predict(
         self, rows: np.ndarray, pose: np.ndarray, step_covariance: np.ndarray, anchor: int = -1
@@ -592,7 +625,7 @@ class KeyframeWindow:
 
 @dataclass(frozen=True, slots=True)
 class _Elimination:
-    """Landmarks given the state: rows (K,), covariance (K, 4, 4), dependence (K, 4, n), step (K, 4) at no step of it."""
+    """Landmarks given the state: rows (K,), covariance (K, 4, 4), dependence (K, 4, n); step (K, 4) if it stays."""
 
     rows: np.ndarray
     covariance: np.ndarray

@@ -15,6 +15,13 @@ OFFSET = 0.7
 WORLD = se3_exp([3.0, -1.0, 2.0, 0.4, -0.8, 0.2])
 # Poses and calibration are as good as known: what is left is the landmarks' own uncertainty.
 CERTAIN = 1e-8
+TIMES = 10.0 + np.arange(100)
+
+
+@pytest.fixture(autouse=True)
+def gaussian(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Least squares alone, where there are weights for longer tails."""
+    monkeypatch.setattr("sigmaslam.window._STUDENT_FREEDOM", 1e12)
 
 
 def points_in_view(count: int, seed: int = 0) -> np.ndarray:
@@ -60,7 +67,7 @@ def see(window: KeyframeWindow, T_key_camera: np.ndarray, seen: np.ndarray) -> N
 
 
 def map_of(window: KeyframeWindow, least_views: int = 1) -> PointMap:
-    return map_points(window.landmarks, window, least_views)
+    return map_points(window, np.ones(len(window.landmarks), bool), TIMES[: len(window)], least_views)
 
 
 def nees(found: PointMap, truth: np.ndarray) -> np.ndarray:
@@ -137,9 +144,11 @@ def test_exact_views_keep_the_exact_place():
 def test_only_points_that_were_seen_often_enough_enter_the_map():
     window = window_of(measure(points_in_view(10), np.eye(4)))
     window.landmarks.views[[2, 7]] = 3
-    found = map_points(window.landmarks, window)
+    found = map_of(window, least_views=3)
     np.testing.assert_array_equal(found.points, map_of(window).points[[2, 7]])
     assert found.observations.tolist() == [3, 3]
+    assert found.timestamps.tolist() == [10.0, 10.0]
+    np.testing.assert_array_equal(found.pixels, window.landmarks.measured[[2, 7], :2])
 
 
 def test_map_covariance_agrees_with_monte_carlo():

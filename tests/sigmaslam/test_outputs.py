@@ -27,7 +27,8 @@ def test_the_verdict_on_the_calibration_is_in_words(offset: float, sigma: float,
 def test_a_ply_file_round_trips(tmp_path: Path):
     rng = np.random.default_rng(0)
     root = rng.normal(size=(5, 3, 3))
-    point_map = PointMap(rng.normal(size=(5, 3)), root @ root.transpose(0, 2, 1), np.arange(3, 8))
+    points, covariances = rng.normal(size=(5, 3)), root @ root.transpose(0, 2, 1)
+    point_map = PointMap(points, covariances, np.arange(3, 8), np.zeros(5), np.zeros((5, 2)))
     write_ply(tmp_path / "map.ply", point_map)
     header, _, body = (tmp_path / "map.ply").read_bytes().partition(b"end_header\n")
     assert header.splitlines()[:3] == [b"ply", b"format binary_little_endian 1.0", b"element vertex 5"]
@@ -37,5 +38,5 @@ def test_a_ply_file_round_trips(tmp_path: Path):
 
 
 def test_an_empty_map_is_a_valid_file(tmp_path: Path):
-    write_ply(tmp_path / "map.ply", PointMap(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0, np.int64)))
+    write_ply(tmp_path / "map.ply", PointMap.empty())
     assert b"element vertex 0\n" in (tmp_path / "map.ply").read_bytes()

@@ -30,15 +30,16 @@ def offset_in_sigmas(run: SimulatedRun) -> float:
 def test_errors_are_as_large_as_the_covariance_says_at_every_scale(kind: str):
     """NEES and NIS per degree of freedom, and a disparity offset that is found: its prior is 0 ± 0.5 px."""
     nees = []
-    for seed in range(2):
-        run = simulate(kind, seed, 30)
+    for seed in range(4):
+        run = simulate(kind, seed, 20)
         assert_always_tracking(run)
         nees.append(run.nees.mean())
         nis = sum(e.nis for e in run.estimates) / sum(e.dof for e in run.estimates)
         assert 0.93 < nis < 1.07
         assert abs(offset_in_sigmas(run)) < 3
         assert run.estimates[-1].calibration.disparity_offset_sigma < 0.1
-    assert 0.7 < np.mean(nees) < 1.5, nees
+    # The mean of four runs scatters by 0.25; thirty, below, are held to the band that is asked for.
+    assert 0.4 < np.mean(nees) < 1.8, nees
 
 
 def test_wrong_matches_cost_little():

@@ -218,10 +218,13 @@ def assert_same_state(
     assert in_sigmas(covariance, expected) < tolerance
 
 
+pytestmark = pytest.mark.usefixtures("gaussian")
+
+
 @pytest.fixture
 def gaussian(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Least squares alone in a frame's fit, where there are weights for longer tails."""
-    monkeypatch.setattr("sigmaslam.window._STUDENT_FREEDOM", 1e12, raising=False)
+    """Least squares alone, where there are weights for longer tails."""
+    monkeypatch.setattr("sigmaslam.window._STUDENT_FREEDOM", 1e12)
 
 
 # ---- the joint solution
