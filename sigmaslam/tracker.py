@@ -33,8 +33,8 @@ _LEAST_SHARE_UNGUIDED = 0.5
 # A fit near the prediction with a larger NIS per degree of freedom may sit in a wrong place: it is checked against one
 # that does without the prediction.
 _DOUBTFUL_NIS = 2.0
-# Where more than this share of the disparities is negative by more than a pixel, which no disparity offset explains, the
-# eyes are swapped, or nothing fits.
+# Where more than this share of the disparities is negative by more than a pixel, which no disparity offset explains,
+# the eyes are swapped, or nothing fits.
 _MOST_NEGATIVE = 0.1
 # Tracking starts from a view of which this share of the keypoints is seen by both eyes.
 _LEAST_STEREO_SHARE = 0.25

@@ -92,7 +92,21 @@ def test_a_second_of_black_is_lost_and_ends(demo: Demo):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("texture", [noise, clouds, covered])
+@pytest.mark.parametrize(
+    "texture",
+    [
+        noise,
+        pytest.param(
+            clouds,
+            marks=pytest.mark.xfail(
+                strict=True,
+                reason="15 of 15 noise frames tracked with 16-42 chance inliers, NIS 1.9-3.5 per degree of freedom; "
+                "up to 5060 squared sigmas, 0.11 m, 18 deg",
+            ),
+        ),
+        covered,
+    ],
+)
 def test_noise_only_images_are_lost(demo: Demo, texture: Callable[..., np.ndarray]):
     """Independent in both eyes and all frames; the uncertainty grows, and tracking goes on after it."""
     camera, frames, truth = demo
@@ -239,7 +253,7 @@ def test_motion_blur_along_a_line_is_survived(demo: Demo, width: int, height: in
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="9 of 40 frames at 27-64 squared sigmas, up to 10 mm and 0.58 deg")
+@pytest.mark.xfail(strict=True, reason="9 of 40 frames at 23-70 squared sigmas, about 10 mm and 0.5 deg")
 def test_an_exposure_over_five_frames_is_survived(demo: Demo):
     """Average of five consecutive frames; the pose is the mean of the five."""
     camera, frames, truth = demo

@@ -256,6 +256,7 @@ def test_a_run_in_its_own_map_stays_in_its_world(demo_sequence: Path, demo_run: 
     truth = read_kitti(demo_sequence / "poses.txt").poses
     found = read_kitti(tmp_path / "run" / "trajectory.kitti").poses
     assert np.linalg.norm(found[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.01
+    assert not (tmp_path / "run" / "tracks.npz").exists()  # nobody asked for it
 
 
 def test_a_view_that_is_nowhere_in_the_map_has_no_pose(demo: Demo, demo_run: Path):
@@ -294,8 +295,3 @@ def test_tracks_begin_with_their_hosts_and_are_read_by_refine(demo_run: Path):
     read = read_tracks(demo_run / "tracks.npz", 40)
     np.testing.assert_array_equal(read.landmark, tracks["landmark"])
     np.testing.assert_array_equal(read.measurement, tracks["measurement"])
-
-
-def test_tracks_are_written_only_when_asked_for(demo_sequence: Path, tmp_path: Path):
-    track_sequence(open_sequence(demo_sequence), tmp_path / "run", "klt")
-    assert not (tmp_path / "run" / "tracks.npz").exists()
