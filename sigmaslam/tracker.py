@@ -33,6 +33,11 @@ _LEAST_SHARE_UNGUIDED = 0.5
 # A fit near the prediction with a larger NIS per degree of freedom may sit in a wrong place: it is checked against one
 # that does without the prediction.
 _DOUBTFUL_NIS = 2.0
+# Where more than this share of the disparities is negative by more than a pixel, which no disparity offset explains,
+# the eyes are swapped, or nothing fits.
+_MOST_NEGATIVE = 0.1
+# Tracking starts from a view of which this share of the keypoints is seen by both eyes.
+_LEAST_STEREO_SHARE = 0.25
 # Variance of a pose that is not known at all, m^2 and rad^2.
 _ANYWHERE = 1e6
 # Without a prediction the view is compared with so many late keyframes.
@@ -253,7 +258,7 @@ class StereoTracker:
         if self._timestamp is not None:
             self._motion.predict(timestamp - self._timestamp, self._densities)
         matches, fit, status = 0, None, "starting"
-        if len(self._window):
+        if len(self._window) and not self._is_swapped(view):
             found, fit = self._track(view, clock)
             matches = len(found.probability)
         if fit is not None:
@@ -264,7 +269,7 @@ class StereoTracker:
         elif len(self._window):
             status = "lost" if self._moving else "starting"
             self._recover(view, timestamp)
-        elif self._has_stereo(view) and not self._in_map:
+        elif self._has_stereo(view) and np.isfinite(view.disparity).mean() >= _LEAST_STEREO_SHARE and not self._in_map:
             self._start(view, timestamp)
         clock.lap("map")
         self._timestamp = timestamp
@@ -490,7 +495,11 @@ class StereoTracker:
     # ---- keyframes
 
     def _has_stereo(self, view: StereoView) -> bool:
-        return int(np.isfinite(view.disparity).sum()) >= 2 * self.config.least_inliers
+        return int(np.isfinite(view.disparity).sum()) >= 2 * self.config.least_inliers and not self._is_swapped(view)
+
+    def _is_swapped(self, view: StereoView) -> bool:
+        known = view.disparity[np.isfinite(view.disparity)]
+        return len(known) >= self.config.least_inliers and float((known < -1.0).mean()) > _MOST_NEGATIVE
 
     def _start(self, view: StereoView, timestamp: float) -> None:
         self._add_keyframe(view, timestamp, np.eye(4), np.eye(4), np.zeros((6, 6)), None)
