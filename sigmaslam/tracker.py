@@ -33,6 +33,8 @@ _LEAST_SHARE_UNGUIDED = 0.5
 # A fit near the prediction with a larger NIS per degree of freedom may sit in a wrong place: it is checked against one
 # that does without the prediction.
 _DOUBTFUL_NIS = 2.0
+# With so large a NIS a pose needs so many times the least number of inliers.
+_MANY = 3
 # Where more than this share of the disparities is negative by more than a pixel, which no disparity offset explains,
 # the eyes are swapped, or nothing fits.
 _MOST_NEGATIVE = 0.1
@@ -298,10 +300,12 @@ class StereoTracker:
             clock.lap("match")
             fit = self._fit(found, pose, covariance)
             clock.lap("filter")
-        if fit is None or fit.nis_per_dof > _DOUBTFUL_NIS * self._noise_scale:
+        if fit is None or fit.nis_per_dof > _DOUBTFUL_NIS:
             other_found, other = self._search_anywhere(view, clock)
             if fit is None or (other is not None and other.nis_per_dof < fit.nis_per_dof):
                 found, fit = other_found, other
+        if fit is not None and fit.nis_per_dof > _DOUBTFUL_NIS and fit.kept.sum() < _MANY * self.config.least_inliers:
+            return found, None  # chance agreement of a few
         return found, fit
 
     def _search(
@@ -498,6 +502,7 @@ class StereoTracker:
         return int(np.isfinite(view.disparity).sum()) >= 2 * self.config.least_inliers and not self._is_swapped(view)
 
     def _is_swapped(self, view: StereoView) -> bool:
+        """Whether the right image looks like the left eye's: too much lies behind infinity."""
         known = view.disparity[np.isfinite(view.disparity)]
         return len(known) >= self.config.least_inliers and float((known < -1.0).mean()) > _MOST_NEGATIVE
 
