@@ -94,18 +94,7 @@ def test_a_second_of_black_is_lost_and_ends(demo: Demo):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "texture",
-    [
-        noise,
-        pytest.param(
-            clouds,
-            marks=pytest.mark.xfail(
-                strict=True,
-                reason="15 of 15 noise frames tracked with 16-42 chance inliers, NIS 1.9-3.5 per degree of freedom; "
-                "up to 5060 squared sigmas, 0.11 m, 18 deg",
-            ),
-        ),
-        covered,
-    ],
+    [noise, clouds, covered],
 )
 def test_noise_only_images_are_lost(demo: Demo, texture: Callable[..., np.ndarray]):
     """Independent in both eyes and all frames; the uncertainty grows, and tracking goes on after it."""
