@@ -41,6 +41,12 @@ class PointMap:
         return replace(self, points=self.points @ R.T + T[:3, 3], covariances=R @ self.covariances @ R.T)
 
 
+def thin_map(whole: PointMap, count: int) -> PointMap:
+    """The `count` points that most views have confirmed, in their order."""
+    kept = np.sort(np.argsort(-whole.observations, kind="stable")[:count])
+    return PointMap(*(getattr(whole, name)[kept] for name in PointMap.__slots__))
+
+
 def map_points(
     window: KeyframeWindow, chosen: np.ndarray, keyframe_times: np.ndarray, least_views: int = 3
 ) -> PointMap:

@@ -14,7 +14,7 @@ import numpy as np
 from sigmaslam.camera import StereoCamera
 from sigmaslam.errors import InputError
 from sigmaslam.frontend import Features, StereoView, TemporalMatches, build_frontend
-from sigmaslam.landmarks import PointMap, map_points, merge_maps
+from sigmaslam.landmarks import PointMap, map_points, merge_maps, thin_map
 from sigmaslam.motion import MotionFilter
 from sigmaslam.recall import KeyframeMemory, RememberedKeyframe, pack_keyframes, read_keyframes
 from sigmaslam.rectify import StereoRectifier
@@ -78,6 +78,7 @@ class TrackerConfig:
         window: keyframes that are estimated jointly.
         spacing: landmarks are at least so far apart, pixels; what lies closer has the same errors (patches overlap).
         shared_disparity: share of the variance of a landmark's disparities that is the same in all views.
+        most_points: of the map; when there are twice as many, the least confirmed half goes.
         remembered: keyframes that are kept to find the way back to.
         most_misses: after so many frames in a row in which it was not found a landmark is no longer looked for.
         least_inliers: fewer is no pose; without a prediction and a fair share of the matches, fewer than twice as many.
@@ -101,6 +102,7 @@ class TrackerConfig:
     window: int = 6
     spacing: float = 8.0
     shared_disparity: float = 0.8
+    most_points: int = 100_000
     remembered: int = 60
     most_misses: int = 3
     least_inliers: int = 15
@@ -441,7 +443,7 @@ class StereoTracker:
             for host in range(len(self._window)):
                 self._memory.add(self._remembered(host))
             whole = np.ones(len(self._window.landmarks), bool)
-            self._retired.append(map_points(self._window, whole, np.array(self._keyframe_times)))
+            self._retire(whole)
             self._window.restart()
             self._keyframe_views, self._keyframe_times = [], []
             self._add_keyframe(
@@ -472,6 +474,12 @@ class StereoTracker:
             adjoint = se3_adjoint(found)
             if window.tie(found, adjoint @ relative.covariance @ adjoint.T, keyframe.covariance):
                 _LOGGER.info("loop closed with the keyframe of %.3f s", keyframe.timestamp)
+
+    def _retire(self, chosen: np.ndarray) -> None:
+        """Puts landmarks of the window into the map, whose size is bounded."""
+        self._retired.append(map_points(self._window, chosen, np.array(self._keyframe_times)))
+        if sum(len(part.points) for part in self._retired) > 2 * self.config.most_points:
+            self._retired = [thin_map(merge_maps(self._retired), self.config.most_points)]
 
     def _remembered(self, host: int) -> RememberedKeyframe:
         """A keyframe of the window as the memory keeps it."""
@@ -524,7 +532,7 @@ class StereoTracker:
         window = self._window
         if len(window) == self.config.window:
             leaving = window.landmarks.host == 0
-            self._retired.append(map_points(window, leaving, np.array(self._keyframe_times)))
+            self._retire(leaving)
             self._memory.add(self._remembered(0))
             if views is not None:
                 staying = ~leaving[views.rows]
