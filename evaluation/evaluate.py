@@ -26,7 +26,7 @@ from sigmaslam.evaluation.metrics import (
     synchronise,
 )
 from sigmaslam.figures import AXIS_NAMES, BLUE, VERMILLION, plot_trajectory, save_png, style_axes
-from sigmaslam.trajectory import Trajectory, kitti_times_path, read_trajectory, trajectory_format
+from sigmaslam.trajectory import Trajectory, check_covariances, kitti_times_path, read_trajectory, trajectory_format
 
 
 @dataclass(frozen=True, slots=True)
@@ -303,13 +303,7 @@ def _read_covariance(path: Path, count: int) -> np.ndarray | None:
         covariance = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         raise InputError(f"{path}: is no numpy array ({error}); run `sigmaslam track` again") from error
-    if not isinstance(covariance, np.ndarray) or covariance.shape != (count, 6, 6):
-        shape = getattr(covariance, "shape", "an archive")
-        raise InputError(
-            f"{path}: is {shape}, but trajectory.tum beside it has {count} poses and needs ({count}, 6, 6): "
-            "both must come from the same run"
-        )
-    return np.asarray(covariance, dtype=np.float64)
+    return check_covariances(covariance, path, count)
 
 
 def _frame_count(run: Path | None, estimate: Trajectory, truth: Trajectory, matched: int) -> int:

@@ -55,6 +55,16 @@ def make_folder(path: Path) -> None:
         raise InputError(f"{path} cannot be made a folder ({error.strerror or error}): choose another") from error
 
 
+def check_new_folder(path: Path) -> None:
+    """Nothing that is there is written over.
+
+    Raises:
+        InputError: `path` is a file, or a folder that holds something.
+    """
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise InputError(f"{path} exists and is not an empty folder: choose another --out, or remove it")
+
+
 def atomic_write_text(path: str | Path, text: str) -> None:
     """Write `text` as UTF-8; see `atomic_path`."""
     with atomic_path(path) as temporary:

@@ -15,7 +15,7 @@ import numpy as np
 
 from sigmaslam.camera import StereoCamera
 from sigmaslam.errors import InputError
-from sigmaslam.files import atomic_path, atomic_write_text
+from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder
 from sigmaslam.landmarks import PointMap
 from sigmaslam.report import COLUMNS, write_report
 from sigmaslam.session import shipped_weights
@@ -39,8 +39,7 @@ class RunWriter:
     """
 
     def __init__(self, out: Path, rectified: dict[str, Any] | None = None) -> None:
-        if out.exists() and (not out.is_dir() or any(out.iterdir())):
-            raise InputError(f"{out} exists and is not an empty folder: choose another --out, or remove it")
+        check_new_folder(out)
         try:
             out.mkdir(parents=True, exist_ok=True)
             self._table = (out / "frames.csv").open("w", newline="", encoding="utf-8")

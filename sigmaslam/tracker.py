@@ -163,9 +163,6 @@ class _Found:
     probability: np.ndarray
     searched: np.ndarray
 
-    def select(self, index: np.ndarray) -> _Found:
-        return _Found(self.views.select(index), self.probability[index], self.searched)
-
 
 class StereoTracker:
     """Tracks a moving stereo camera through a static scene, frame by frame, in bounded time.
@@ -211,7 +208,6 @@ class StereoTracker:
         self._noise_scale = 1.0
         self._timestamp: float | None = None
         self._tracked_at = 0.0
-        self._tracked_pose = np.eye(4)  # the pose at that time
         self._moving = False  # there has been a pose from the images
         self._velocity_known = False  # since the last start
         self._memory = KeyframeMemory(self.config.remembered)
@@ -421,7 +417,7 @@ class StereoTracker:
         back = se3_adjoint(se3_inverse(key))
         expected, step_covariance = self._motion.step, self._motion.step_covariance
         self._motion.correct(se3_inverse(key) @ fit.pose, back @ fit.relative @ back.T)
-        self._tracked_at, self._tracked_pose = timestamp, fit.pose
+        self._tracked_at = timestamp
         self._moving = self._velocity_known = True
         if self.config.constant_sigma is None:
             low, high = _NOISE_SCALES
@@ -442,15 +438,14 @@ class StereoTracker:
             adjoint = se3_adjoint(pose)
             for host in range(len(self._window)):
                 self._memory.add(self._remembered(host))
-            whole = np.ones(len(self._window.landmarks), bool)
-            self._retire(whole)
+            self._retire(np.ones(len(self._window.landmarks), bool))
             self._window.restart()
             self._keyframe_views, self._keyframe_times = [], []
             self._add_keyframe(
                 view, timestamp, pose, pose, keyframe.covariance + adjoint @ relative.covariance @ adjoint.T, None
             )
             self._forget_twist()
-            self._tracked_at, self._tracked_pose = timestamp, pose
+            self._tracked_at = timestamp
             self._moving, self._velocity_known = True, False
             return True
         return False
@@ -501,7 +496,7 @@ class StereoTracker:
             pose, _ = self._pose_and_step()
             self._add_keyframe(view, timestamp, pose, self._motion.step, self._motion.step_covariance, None)
             self._forget_twist()
-            self._tracked_at, self._tracked_pose = timestamp, pose
+            self._tracked_at = timestamp
             self._velocity_known = False
 
     # ---- keyframes

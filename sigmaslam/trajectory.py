@@ -106,6 +106,27 @@ def read_trajectory(path: str | Path) -> Trajectory:
     return readers[trajectory_format(path)](path)
 
 
+def check_covariances(loaded: object, path: Path, count: int) -> np.ndarray:
+    """What numpy loaded from a covariance.npy, if it is one of as many poses as the trajectory beside it.
+
+    Args:
+        loaded: the content.
+        path: for the message.
+        count: poses of trajectory.tum.
+    Returns:
+        (count, 6, 6) float64.
+    Raises:
+        InputError: it has another shape, or is an archive.
+    """
+    if not isinstance(loaded, np.ndarray) or loaded.shape != (count, 6, 6):
+        shape = getattr(loaded, "shape", "an archive")
+        raise InputError(
+            f"{path}: is {shape}, but trajectory.tum beside it has {count} poses and needs ({count}, 6, 6): "
+            "both must come from the same run"
+        )
+    return np.asarray(loaded, dtype=np.float64)
+
+
 def read_tum(path: str | Path) -> Trajectory:
     """Read rows of `t x y z qx qy qz qw` (seconds, metres, T_world_camera); `#` starts a comment.
 

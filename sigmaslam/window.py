@@ -288,13 +288,12 @@ class KeyframeWindow:
     def solve(self, iterations: int = 2) -> None:
         """Posterior of poses, calibration and landmarks from the prior and all views: Gauss-Newton, then a gate."""
         factor = _root(self._prior)
-        for iteration in range(iterations):
+        for _ in range(iterations):
             information, vector, elimination = self._eliminate(self._observations)
             offset = self._from_prior()
             state, self.covariance = _condition(factor, information, vector + information @ offset)
             self._move(state - offset, elimination)
-            if iteration + 1 == iterations:
-                self._drop_outliers()
+        self._drop_outliers()
 
     def tie(self, pose: np.ndarray, match: np.ndarray, origin: np.ndarray) -> bool:
         """Ties the last keyframe to a pose that an old keyframe gives it: a loop is closed.
@@ -340,7 +339,7 @@ class KeyframeWindow:
         Returns:
             (u, v, disparity) (K, 3), its covariance without the measurement's noise (K, 3, 3), in front (K,) bool.
         """
-        covariance = _factor_with_frame(self._factor(), step_covariance, anchor % len(self.poses))
+        covariance = _factor_with_frame(_root(self.covariance), step_covariance, anchor % len(self.poses))
         covariance = covariance @ covariance.T
         slopes = self._linearise_frame(rows, pose, np.zeros(len(covariance)), covariance, np.zeros((len(rows), 4)))
         noise, by_state = self._frame_noise(rows, slopes, np.zeros((len(rows), 3, 3)))
@@ -360,7 +359,7 @@ class KeyframeWindow:
         Returns:
             None where too few views agree.
         """
-        factor = _factor_with_frame(self._factor(), step_covariance, len(self.poses) - 1)
+        factor = _factor_with_frame(_root(self.covariance), step_covariance, len(self.poses) - 1)
         prior = factor @ factor.T
         frame = pose_slice(len(self.poses))
         components = views.components
@@ -463,9 +462,6 @@ class KeyframeWindow:
         information, vector = by.T @ by, by.T @ rest
         return _condition(factor, information, vector + information @ offset)
 
-    def _factor(self) -> np.ndarray:
-        return _root(self.covariance)
-
     def _from_prior(self) -> np.ndarray:
         """The estimate minus the prior's mean, in the state's coordinates."""
         poses = se3_log(self.poses @ se3_inverse(self._prior_poses)).ravel()
@@ -475,21 +471,11 @@ class KeyframeWindow:
         """Information matrix and vector of the state at the estimate, every landmark's own equations solved for it."""
         landmarks = self.landmarks
         seen, owner = np.unique(observations.landmark, return_inverse=True)
-        slopes = self._linearise(
-            self.poses,
-            self.calibration,
-            self.covariance,
-            landmarks.estimate[observations.landmark],
-            landmarks.covariance[observations.landmark],
-            landmarks.host[observations.landmark],
-            observations.clone,
-        )
-        residual, noise = _masked(observations.measurement - slopes.mean, observations.noise + slopes.left)
+        slopes, residual, noise, components = self._linearise_observations(observations)
         noise[~slopes.in_front] = _UNKNOWN * np.eye(3)
         size = len(self.covariance)
         stacked = np.concatenate([slopes.by_state, slopes.by_landmark, residual[..., None]], axis=2)
         whitened = np.linalg.solve(np.linalg.cholesky(noise), stacked)
-        components = np.isfinite(observations.measurement).sum(axis=1)
         weight = _student_weight((whitened[:, :, -1] ** 2).sum(axis=1), components)
         whitened *= np.sqrt(weight)[:, None, None]
         by_state, by_landmark, rest = whitened[:, :, :size], whitened[:, :, size:-1], whitened[:, :, -1:]
@@ -525,7 +511,15 @@ class KeyframeWindow:
 
     def _drop_outliers(self) -> None:
         """Views that do not fit the solution are forgotten."""
-        observations = self._observations
+        slopes, residual, noise, components = self._linearise_observations(self._observations)
+        agree = slopes.in_front & (_squared(residual, noise) <= CHI_SQUARE_999[components])
+        if not agree.all():
+            self._observations = self._observations.select(agree)
+
+    def _linearise_observations(
+        self, observations: _Observations
+    ) -> tuple[_Slopes, np.ndarray, np.ndarray, np.ndarray]:
+        """Views by keyframes at the estimate: slopes, residuals (O, 3), their noise (O, 3, 3), components (O,)."""
         landmarks = self.landmarks
         slopes = self._linearise(
             self.poses,
@@ -537,10 +531,7 @@ class KeyframeWindow:
             observations.clone,
         )
         residual, noise = _masked(observations.measurement - slopes.mean, observations.noise + slopes.left)
-        components = np.isfinite(observations.measurement).sum(axis=1)
-        agree = slopes.in_front & (_squared(residual, noise) <= CHI_SQUARE_999[components])
-        if not agree.all():
-            self._observations = observations.select(agree)
+        return slopes, residual, noise, np.isfinite(observations.measurement).sum(axis=1)
 
     def _forget(self, kept: np.ndarray) -> None:
         """Keeps only some landmarks, and their views."""

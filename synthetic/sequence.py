@@ -22,7 +22,7 @@ import numpy as np
 import torch
 
 from sigmaslam.errors import InputError
-from sigmaslam.files import atomic_path, atomic_write_text
+from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder
 from sigmaslam.synthetic.landmarks import Landmarks, choose_landmarks, observe
 from sigmaslam.synthetic.layouts import image_paths, write_layout
 from sigmaslam.synthetic.simulation import Frame, Recipe, Simulation, Studio, simulate
@@ -94,8 +94,7 @@ def prepare(out: Path, recipe: Recipe, truth: str) -> dict[str, Any]:
         if there != asked:
             raise InputError(f"{scene} was made with {there}, not {asked}; choose another --out")
         return dict(content["simulation"])
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{out} exists and is not an empty folder; remove it or choose another --out")
+    check_new_folder(out)
     simulation = simulate(recipe)
     description = simulation.to_json()
     (out / "truth").mkdir(parents=True)

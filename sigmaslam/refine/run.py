@@ -15,13 +15,13 @@ import numpy as np
 
 from sigmaslam.errors import InputError
 from sigmaslam.factor_graph import load_gtsam
-from sigmaslam.files import atomic_path, atomic_write_text, make_folder
+from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder, make_folder
 from sigmaslam.landmarks import PointMap
 from sigmaslam.outputs import write_ply
 from sigmaslam.refine.bundle import Adjustment, RefineConfig, adjust
 from sigmaslam.refine.tracks import TRACKS_NAME, read_tracks
 from sigmaslam.rotation import se3_exp, se3_inverse, se3_log
-from sigmaslam.trajectory import Trajectory, read_tum, write_kitti, write_tum
+from sigmaslam.trajectory import Trajectory, check_covariances, read_tum, write_kitti, write_tum
 
 
 def refine_run(
@@ -44,8 +44,7 @@ def refine_run(
     began = time.perf_counter()
     if not (run / "trajectory.tum").is_file():
         raise InputError(f"{run}: holds no trajectory.tum; give a folder written by `sigmaslam track --tracks`")
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{out} exists and is not an empty folder: choose another --out, or remove it")
+    check_new_folder(out)
     trajectory = read_tum(run / "trajectory.tum")
     tracks = read_tracks(run / TRACKS_NAME, len(trajectory))
     covariances = _read_covariances(run / "covariance.npy", len(trajectory))
@@ -135,10 +134,4 @@ def _read_covariances(path: Path, count: int) -> np.ndarray:
         covariances = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         raise InputError(f"{path}: cannot be read ({error}); run `sigmaslam track --tracks` again") from error
-    if not isinstance(covariances, np.ndarray) or covariances.shape != (count, 6, 6):
-        shape = getattr(covariances, "shape", "an archive")
-        raise InputError(
-            f"{path}: is {shape}, but trajectory.tum beside it has {count} poses and needs ({count}, 6, 6): "
-            "both must come from the same run"
-        )
-    return np.asarray(covariances, dtype=np.float64)
+    return check_covariances(covariances, path, count)
