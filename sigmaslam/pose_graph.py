@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sigmaslam.factor_graph import load_gtsam, swap_tangent
-from sigmaslam.rotation import se3_adjoint, se3_inverse
+from sigmaslam.rotation import se3_inverse, turn_covariance
 
 # Metres and radians: holds the first pose in place. What is not known of it is added to the result.
 _FIXED = 1e-8
@@ -99,8 +99,7 @@ def optimise_pose_graph(
     covariances[0] = 0.0
     if first_covariance is not None:
         # The edges are relative, so nothing but the first pose's own covariance depends on where it is.
-        adjoint = se3_adjoint(se3_inverse(optimised) @ optimised[0])
-        covariances = covariances + adjoint @ first_covariance @ adjoint.transpose(0, 2, 1)
+        covariances = covariances + turn_covariance(se3_inverse(optimised) @ optimised[0], first_covariance)
     return PoseGraphResult(optimised, covariances, used)
 
 

@@ -131,10 +131,22 @@ def se3_adjoint(T: np.ndarray) -> np.ndarray:
     return adjoint
 
 
+def turn_covariance(T: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Covariances of tangent vectors seen from elsewhere: of `se3_adjoint(T) @ x`.
+
+    Args:
+        T: (..., 4, 4) rigid transforms.
+        covariance: (..., 6, 6) of x = (translation, rotation).
+    Returns:
+        (..., 6, 6) covariances.
+    """
+    adjoint = se3_adjoint(T)
+    return np.asarray(adjoint @ covariance @ np.swapaxes(adjoint, -1, -2))
+
+
 def se3_body(T: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Covariance (6, 6) of a pose in its own frame, from that of its perturbation from the left."""
-    adjoint = se3_adjoint(se3_inverse(T))
-    spread = adjoint @ covariance @ adjoint.T
+    spread = turn_covariance(se3_inverse(T), covariance)
     return np.asarray(0.5 * (spread + spread.T))
 
 

@@ -21,7 +21,7 @@ from sigmaslam.refine.structure import (
     whitened_residuals,
 )
 from sigmaslam.refine.tracks import Tracks
-from sigmaslam.rotation import se3_adjoint, se3_inverse
+from sigmaslam.rotation import se3_inverse, turn_covariance
 
 # Fewer that agree are no solution.
 _LEAST_SHARE = 0.5
@@ -113,10 +113,10 @@ def adjust(
         raise InputError("all observations are of one keyframe: there is no motion to adjust; track more frames")
     T_left_rectified = np.eye(4)
     T_left_rectified[:3, :3] = tracks.R_rectified_left.T
-    adjoint = se3_adjoint(T_left_rectified)
     tracked = poses[frames] @ T_left_rectified
     offset = float(tracks.disparity_offset[0])
-    solver = Solver(observations, tracked, adjoint.T @ covariances[frames] @ adjoint, tell)
+    rectified = turn_covariance(se3_inverse(T_left_rectified), covariances[frames])
+    solver = Solver(observations, tracked, rectified, tell)
 
     repeated = seen_again(observations, np.ones(len(observations), bool))
 
@@ -176,7 +176,7 @@ def adjust(
     return Adjustment(
         frames=frames,
         poses=solution.poses @ se3_inverse(T_left_rectified),
-        covariances=adjoint @ covariance @ adjoint.T,
+        covariances=turn_covariance(T_left_rectified, covariance),
         points=solution.points[used],
         point_covariances=point_covariances(observations, kept, solution.poses, solution.points)[used],
         point_views=np.bincount(observations.landmark[kept], minlength=len(observations.host))[used],

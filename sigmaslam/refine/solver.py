@@ -17,7 +17,7 @@ from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.factor_graph import load_gtsam, swap_tangent
 from sigmaslam.pose_graph import PoseEdge, connected_parts
 from sigmaslam.refine.structure import HUBER, Observations, offset_gradient, whitened_residuals
-from sigmaslam.rotation import se3_adjoint, se3_exp, se3_inverse, se3_log
+from sigmaslam.rotation import se3_exp, se3_inverse, se3_log, turn_covariance
 
 # Metres and radians: holds the first keyframe in place.
 _FIXED = 1e-8
@@ -178,8 +178,7 @@ class Solver:
     def _motion(self, j: int) -> PoseEdge:
         """The tracker's motion from keyframe j - 1 to j, as uncertain as its covariance has grown."""
         motion = se3_inverse(self._tracked[j - 1]) @ self._tracked[j]
-        adjoint = se3_adjoint(se3_inverse(motion))
-        growth = self._covariances[j] - adjoint @ self._covariances[j - 1] @ adjoint.T
+        growth = self._covariances[j] - turn_covariance(se3_inverse(motion), self._covariances[j - 1])
         try:
             root = np.linalg.cholesky(self._covariances[j])
         except np.linalg.LinAlgError:

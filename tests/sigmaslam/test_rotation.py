@@ -109,3 +109,13 @@ def test_adjoint_moves_a_tangent_through_a_transform():
     T, small = rotation.se3_exp(tangents), 0.1 * np.roll(tangents, 7, axis=0)
     moved = (rotation.se3_adjoint(T) @ small[..., None])[..., 0]
     np.testing.assert_allclose(T @ rotation.se3_exp(small), rotation.se3_exp(moved) @ T, atol=1e-13)
+
+
+def test_a_turned_covariance_is_that_of_moved_tangents():
+    T = rotation.se3_exp(_tangents()[:20])
+    root = np.random.default_rng(1).normal(size=(20, 6, 6))
+    moved = rotation.se3_adjoint(T) @ root
+    turned = rotation.turn_covariance(T, root @ root.transpose(0, 2, 1))
+    np.testing.assert_allclose(turned, moved @ moved.transpose(0, 2, 1), rtol=0, atol=1e-9 * np.abs(turned).max())
+    one_by_one = [rotation.turn_covariance(each, root[0] @ root[0].T) for each in T]
+    np.testing.assert_allclose(rotation.turn_covariance(T, root[0] @ root[0].T), one_by_one, rtol=1e-12, atol=1e-12)
