@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from sigmaslam.camera import RectifiedStereo
+from sigmaslam.chi_square import CHI_SQUARE_999
 from sigmaslam.epipolar import estimate_epipolar_pose
 from sigmaslam.rotation import se3_exp, se3_inverse, skew
 
@@ -16,8 +17,6 @@ _LEAST_POINTS = 8
 # Of the refinement: steps, and scale of the robust loss in standard deviations, from the first to the last.
 _STEPS, _FIRST_SCALE, _NARROWING, _LAST_SCALE = 10, 8.0, 0.75, 2.0
 _WORST_CONDITION = 1e14
-# 99.9 % quantile of chi-square with 3 degrees of freedom.
-_GATE = 16.26623619623813
 # Depth from less disparity than this says nothing about scale.
 _LEAST_DISPARITY = 1.0
 
@@ -195,7 +194,7 @@ def _refine(views: _Views, T_camera_key: np.ndarray) -> RelativePose | None:
         scale = max(_NARROWING * scale, _LAST_SCALE)
     residual, by_pose, information = views.linearise(T_camera_key)
     squared = np.einsum("mi,mij,mj->m", residual, information, residual)
-    inliers = (views.weight > 0) & (np.trace(information, axis1=1, axis2=2) > 0) & (squared < _GATE)
+    inliers = (views.weight > 0) & (np.trace(information, axis1=1, axis2=2) > 0) & (squared < CHI_SQUARE_999[3])
     if inliers.sum() < _LEAST_POINTS:
         return None
     agreeing = by_pose[inliers]

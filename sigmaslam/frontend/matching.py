@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# 99 % quantile of chi-square with 2 degrees of freedom.
-_CHI_SQUARE_99 = 9.21034037197618
+from sigmaslam.chi_square import CHI_SQUARE_99_OF_2
+
 # Similarity of what is not there; no two unit vectors are less alike than -1.
 _NOTHING = -1.0
 # Gathering the descriptors of a pair costs about as much as multiplying so many.
@@ -102,11 +102,11 @@ def nearest_in_ellipses(
         keypoints: (M, 2) of image 1.
         descriptors0, descriptors1: (N, D), (M, D) of unit length.
     """
-    reach = np.sqrt(_CHI_SQUARE_99 * covariance[:, 1, 1])
+    reach = np.sqrt(CHI_SQUARE_99_OF_2 * covariance[:, 1, 1])
     first, second = _pairs_in_band(predicted[:, 1], reach, keypoints[:, 1])
     offset = keypoints[second] - predicted[first]
     # Rows and columns of the ellipse's box first: most pairs of a band are far away.
-    close = np.abs(offset[:, 0]) <= np.sqrt(_CHI_SQUARE_99 * covariance[:, 0, 0])[first]
+    close = np.abs(offset[:, 0]) <= np.sqrt(CHI_SQUARE_99_OF_2 * covariance[:, 0, 0])[first]
     first, second, offset = first[close], second[close], offset[close]
     inside = within_ellipses(offset, covariance[first])
     return _nearest(descriptors0, descriptors1, first[inside], second[inside])
@@ -116,7 +116,7 @@ def within_ellipses(offset: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """(K,) bool, whether offsets (K, 2) lie in the 99 % ellipses of covariances (K, 2, 2)."""
     u, v = offset.T
     uu, uv, vv = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
-    return np.asarray(vv * u * u - 2.0 * uv * u * v + uu * v * v <= _CHI_SQUARE_99 * (uu * vv - uv * uv))
+    return np.asarray(vv * u * u - 2.0 * uv * u * v + uu * v * v <= CHI_SQUARE_99_OF_2 * (uu * vv - uv * uv))
 
 
 def _pairs_in_band(row0: np.ndarray, reach: np.ndarray, row1: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

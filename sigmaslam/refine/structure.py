@@ -6,13 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sigmaslam.chi_square import CHI_SQUARE_999
 from sigmaslam.refine.tracks import Tracks, without_disparity
 from sigmaslam.rotation import se3_inverse
 
 # Whitened residuals beyond the 95 % quantile of chi with 3 degrees of freedom count linearly (Huber's loss).
 HUBER = 2.795
-# 99.9 % quantiles of chi-square with 2 and 3 degrees of freedom: without and with a disparity.
-_GATE = np.array([13.815510557964274, 16.26623623681962])
 _NEWTON_STEPS = 8
 _NEWTON_PIXELS = 1e-3
 
@@ -188,7 +187,7 @@ def choose(
     residuals, in_front = whitened_residuals(observations, poses, points, offset)
     kept = among & in_front & ~far[observations.landmark]
     if gated:
-        kept &= np.sum(residuals**2, axis=1) <= _GATE[observations.stereo.astype(np.int64)]
+        kept &= np.sum(residuals**2, axis=1) <= CHI_SQUARE_999[np.where(observations.stereo, 3, 2)]
     return seen_again(observations, kept)
 
 
