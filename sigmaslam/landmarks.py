@@ -8,7 +8,8 @@ import numpy as np
 
 from sigmaslam.camera import RectifiedStereo
 from sigmaslam.rotation import skew
-from sigmaslam.window import KeyframeWindow, pose_slice
+from sigmaslam.tables import pose_slice
+from sigmaslam.window import KeyframeWindow
 
 
 @dataclass(frozen=True, slots=True)

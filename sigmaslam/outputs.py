@@ -19,9 +19,9 @@ from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder
 from sigmaslam.landmarks import PointMap
 from sigmaslam.report import COLUMNS, write_report
 from sigmaslam.session import shipped_weights
+from sigmaslam.tables import Views
 from sigmaslam.tracker import CalibrationEstimate, Estimate
 from sigmaslam.trajectory import Trajectory, write_kitti, write_tum
-from sigmaslam.window import Views
 
 STAGES = ("read", "features", "match", "filter", "map")
 _COLUMNS = (COLUMNS[0], "status", *COLUMNS[1:], *(f"ms_{stage}" for stage in STAGES))

@@ -20,7 +20,8 @@ from sigmaslam.recall import KeyframeMemory, RememberedKeyframe, pack_keyframes,
 from sigmaslam.rectify import StereoRectifier
 from sigmaslam.rotation import nearest_rigid, se3_adjoint, se3_body, se3_inverse
 from sigmaslam.startup import RelativePose, estimate_relative_pose
-from sigmaslam.window import CALIBRATION, FrameFit, KeyframeWindow, Views, join_views, pose_slice
+from sigmaslam.tables import CALIBRATION, Views, join_views, pose_slice
+from sigmaslam.window import FrameFit, KeyframeWindow
 
 _LOGGER = logging.getLogger(__name__)
 

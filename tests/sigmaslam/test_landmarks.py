@@ -7,7 +7,8 @@ from scipy.stats import chi2
 from sigmaslam.camera import RectifiedStereo
 from sigmaslam.landmarks import PointMap, map_points, merge_maps, thin_map
 from sigmaslam.rotation import se3_exp, se3_inverse
-from sigmaslam.window import KeyframeWindow, Views
+from sigmaslam.tables import Views
+from sigmaslam.window import KeyframeWindow
 
 CAMERA = RectifiedStereo(fx=400.0, fy=410.0, cx=319.5, cy=239.5, baseline=0.2, width=640, height=480)
 SIGMA = np.array([0.3, 0.4, 0.5])
@@ -21,7 +22,7 @@ TIMES = 10.0 + np.arange(100)
 @pytest.fixture(autouse=True)
 def gaussian(monkeypatch: pytest.MonkeyPatch) -> None:
     """Least squares alone, where there are weights for longer tails."""
-    monkeypatch.setattr("sigmaslam.window._STUDENT_FREEDOM", 1e12)
+    monkeypatch.setattr("sigmaslam.residuals.STUDENT_FREEDOM", 1e12)
 
 
 def points_in_view(count: int, seed: int = 0) -> np.ndarray:

@@ -1,0 +1,52 @@
+"""Gaussians of a state as arrays: conditioning, square roots, and parts that are copied."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def condition(factor: np.ndarray, information: np.ndarray, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance of N(0, factor factor^T) times exp(-x^T information x / 2 + vector^T x); factor (n, k)."""
+    whole = np.eye(factor.shape[1]) + factor.T @ information @ factor
+    lower = np.linalg.cholesky(0.5 * (whole + whole.T))
+    reduced = np.linalg.solve(lower, factor.T)
+    return reduced.T @ (reduced @ vector), reduced.T @ reduced
+
+
+def weighted_update(
+    factor: np.ndarray, whitened: np.ndarray, offset: np.ndarray, weight: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Posterior mean and covariance from derivatives with residuals (3 M, n + 1) about `offset`, weighted (M,)."""
+    rows = whitened * np.sqrt(np.repeat(weight, 3))[:, None]
+    by, rest = rows[:, :-1], rows[:, -1]
+    information, vector = by.T @ by, by.T @ rest
+    return condition(factor, information, vector + information @ offset)
+
+
+def matrix_root(covariance: np.ndarray) -> np.ndarray:
+    """A with A A^T = covariance, which may be singular."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def project_covariance(slope: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Covariance that slopes (M, 3, n) make of a covariance."""
+    return np.asarray(slope @ covariance @ slope.transpose(0, 2, 1))
+
+
+def append_moved(factor: np.ndarray, part: slice, step_covariance: np.ndarray) -> np.ndarray:
+    """Factor of a state with one part (6) of it once more behind the rest, moved by an independent step."""
+    size, columns = factor.shape
+    grown = np.zeros((size + 6, columns + 6))
+    grown[:size, :columns] = factor
+    grown[size:, :columns] = factor[part]
+    grown[size:, columns:] = matrix_root(step_covariance)
+    return grown
+
+
+def replace_part(covariance: np.ndarray, part: slice, other: slice) -> np.ndarray:
+    """The covariance as if one part of the state were the same as another of its size."""
+    replaced = covariance.copy()
+    replaced[part, :], replaced[:, part] = replaced[other, :], replaced[:, other]
+    replaced[part, part] = replaced[other, other]
+    return replaced

@@ -1,0 +1,41 @@
+"""Residuals of (u, v, disparity) in units of their noise, with weights for tails longer than a Gaussian's."""
+
+from __future__ import annotations
+
+import numpy as np
+
+# A disparity that is not there: its variance, pixels squared.
+UNKNOWN_VARIANCE = 1e12
+# Errors of right matches have longer tails than a Gaussian's: degrees of freedom of the Student-t that is fitted.
+STUDENT_FREEDOM = 4.0
+
+
+def mask_missing(residual: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (M, 3) without the disparities that are not there, and covariances to match."""
+    missing = ~np.isfinite(residual[:, 2])
+    residual = np.where(np.isfinite(residual), residual, 0.0)
+    noise = noise.copy()
+    noise[missing, 2, :] = 0.0
+    noise[missing, :, 2] = 0.0
+    noise[missing, 2, 2] = UNKNOWN_VARIANCE
+    return residual, noise
+
+
+def squared_lengths(residual: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """(M,) squared Mahalanobis lengths of residuals (M, 3)."""
+    return np.einsum("mi,mi->m", residual, np.linalg.solve(covariance, residual[..., None])[..., 0])
+
+
+def whiten(stacked: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Rows (3 M, k) of stacked (M, 3, k) in units of the noise (M, 3, 3)."""
+    return np.asarray(np.linalg.solve(np.linalg.cholesky(noise), stacked).reshape(-1, stacked.shape[2]))
+
+
+def student_weight(squared: np.ndarray, components: np.ndarray) -> np.ndarray:
+    """Weights (M,) that make least squares the fit of a Student-t, from squared lengths of whitened residuals.
+
+    The weighted information of such a fit is more than the estimate's precision, (nu + p + 2) / (nu + p) times as much
+    where errors are Student-t: the weights are that much smaller, which hardly moves the estimate.
+    """
+    whole = STUDENT_FREEDOM + components
+    return whole**2 / ((whole + 2.0) * (STUDENT_FREEDOM + squared))
