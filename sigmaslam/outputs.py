@@ -15,12 +15,12 @@ import numpy as np
 
 from sigmaslam.camera import StereoCamera
 from sigmaslam.errors import InputError
+from sigmaslam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder
 from sigmaslam.landmarks import PointMap
 from sigmaslam.report import COLUMNS, write_report
 from sigmaslam.session import shipped_weights
 from sigmaslam.tables import Views
-from sigmaslam.tracker import CalibrationEstimate, Estimate
 from sigmaslam.trajectory import Trajectory, write_kitti, write_tum
 
 STAGES = ("read", "features", "match", "filter", "map")

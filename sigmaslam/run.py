@@ -12,10 +12,12 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from sigmaslam.config import TrackerConfig
 from sigmaslam.errors import SigmaSlamError
+from sigmaslam.estimate import Estimate
 from sigmaslam.outputs import RunWriter, describe_camera
 from sigmaslam.readers import StereoFrame, StereoSequence
-from sigmaslam.tracker import Estimate, StereoTracker, TrackerConfig
+from sigmaslam.tracker import StereoTracker
 
 
 def track_sequence(

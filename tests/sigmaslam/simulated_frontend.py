@@ -198,7 +198,7 @@ def run_simulated(
     tracker: StereoTracker, frontend: SimulatedFrontend, scale: Scale, frames: int | None = None
 ) -> SimulatedRun:
     """All frames through a fresh tracker whose front end is replaced."""
-    tracker._frontend = frontend
+    tracker._frontend = tracker._search._frontend = frontend
     estimates = []
     for k in range(frames or len(frontend.poses)):
         image = frontend.images(k)

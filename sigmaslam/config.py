@@ -1,0 +1,62 @@
+"""Settings of the tracker."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class TrackerConfig:
+    """Settings; the defaults serve driving, indoor flight and endoscopy alike, because lengths scale with scene depth.
+
+    Attributes:
+        max_keypoints: per image.
+        constant_sigma: standard deviations of every matched place per axis and of every disparity, pixels, in place of
+            the matches' own; for comparison.
+        keyframe_sigma: of a keypoint of the keyframe itself, pixels; small, because the current place is measured
+            relative to its patch.
+        acceleration: square root of the power spectral density of the linear acceleration, in median scene depths
+            per s^1.5.
+        angular_acceleration: the same for rotation, rad / s^1.5.
+        start_speed: prior standard deviation of the velocity, median scene depths per second.
+        start_turn: of the angular velocity, rad/s.
+        offset_sigma: prior of the disparity offset, pixels.
+        offset_walk: its random walk, pixels per root second.
+        turn_sigma: prior of what a turn of the right camera (yaw, pitch) does to disparities at unit normalised
+            coordinates, pixels; zero switches these states off.
+        linearisation: "unscented" or "extended".
+        iterations: linearisations in a frame's update.
+        window: keyframes that are estimated jointly.
+        spacing: landmarks are at least so far apart, pixels; what lies closer has the same errors (patches overlap).
+        shared_disparity: share of the variance of a landmark's disparities that is the same in all views.
+        most_points: of the map; when there are twice as many, the least confirmed half goes.
+        remembered: keyframes that are kept to find the way back to.
+        most_misses: after so many frames in a row in which it was not found a landmark is no longer looked for.
+        least_inliers: fewer is no pose; without a prediction and a fair share of the matches, fewer than twice as many.
+        keyframe_ratio: a new keyframe is taken when the inliers fall below this share of the landmarks in the last one.
+        search_limit: with a predicted place less certain than this (pixels, one sigma) the search is not guided.
+        lost_seconds: after this long without a pose, tracking starts anew from the current view.
+    """
+
+    max_keypoints: int = 1500
+    constant_sigma: tuple[float, float] | None = None
+    keyframe_sigma: float = 0.25
+    acceleration: float = 0.1
+    angular_acceleration: float = 0.5
+    start_speed: float = 1.0
+    start_turn: float = 1.0
+    offset_sigma: float = 0.5
+    offset_walk: float = 0.02
+    turn_sigma: float = 0.0
+    linearisation: str = "unscented"
+    iterations: int = 2
+    window: int = 6
+    spacing: float = 8.0
+    shared_disparity: float = 0.8
+    most_points: int = 100_000
+    remembered: int = 60
+    most_misses: int = 3
+    least_inliers: int = 15
+    keyframe_ratio: float = 0.65
+    search_limit: float = 25.0
+    lost_seconds: float = 0.5
