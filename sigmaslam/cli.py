@@ -437,12 +437,22 @@ def benchmark(
     data: Annotated[
         Path | None,
         typer.Option(
-            envvar="SIGMASLAM_DATA", help="Folder of the real data sets; sequences without it: the demo alone."
+            envvar="SIGMASLAM_DATA", help="Folder of the real data sets; sequences without it: renders alone."
         ),
     ] = None,
-    frontend: Annotated[
-        list[Frontend] | None,
-        typer.Option(help="sequences: front-ends to compare; may be given more than once."),
+    method: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="sequences: ours, ekf, sift, orb, klt, sift-pnp, klt-pnp, bundle; may be given more than once.",
+            show_default="all",
+        ),
+    ] = None,
+    sequence: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="sequences: demo, street, room, organ, or a folder of the data; may be given more than once.",
+            show_default="all",
+        ),
     ] = None,
     rounds: Annotated[
         int | None,
@@ -456,7 +466,8 @@ def benchmark(
     runs: Annotated[
         Path | None,
         typer.Option(
-            help="ablations, noise, consistency: folder of the training runs or renders; what is there is used again."
+            help="ablations, noise, consistency, sequences: folder of the training runs or renders; what is there is "
+            "used again. sequences: a temporary one without it."
         ),
     ] = None,
     steps: Annotated[int, typer.Option(min=1, help="ablations: optimiser steps a run.")] = 250,
@@ -485,8 +496,9 @@ def benchmark(
 ) -> None:
     """Run a benchmark and write its page.
 
-    sequences: the tracker on every sequence. filters: speed of the filters beside those of other libraries that are
-    installed. claims: EKF against UKF by Monte Carlo. renders: how fast, and how like real images. features: time
+    sequences: the tracker, its EKF, PnP from OpenCV and bundle adjustment on every sequence (half an hour); the extra
+    'train' renders three of them, 'graph' adjusts. filters: speed of the filters beside those of other libraries that
+    are installed. claims: EKF against UKF by Monte Carlo. renders: how fast, and how like real images. features: time
     and scores of the features beside SIFT, ORB and other people's. matches: whether their probability and
     covariance hold, beside AdaLAM and MAGSAC. noise: the tracker with these covariances beside one constant.
     consistency: whether poses and map are as sure as they say, on 90 rendered sequences (an hour). ablations: what
@@ -494,9 +506,13 @@ def benchmark(
     """
     command = f"sigmaslam benchmark {name.value} --out {out}"
     if name is Benchmark.sequences:
-        from sigmaslam.evaluation.benchmarks.sequences import write_results
+        from sigmaslam.evaluation.benchmarks.sequences import METHODS, write_results
 
-        typer.echo(write_results(out, data, [choice.value for choice in frontend or list(Frontend)], command))
+        command += "".join(
+            [f" --method {each}" for each in method or []] + [f" --sequence {x}" for x in sequence or []]
+        )
+        note = Console(stderr=True).print
+        typer.echo(write_results(out, data, command, method or METHODS, sequence, runs, note))
         return
     _need_train_extra()
     if name is Benchmark.filters:

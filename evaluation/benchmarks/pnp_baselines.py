@@ -1,8 +1,8 @@
 """Stereo odometry as one writes it from OpenCV in an afternoon: points of a keyframe, then the pose by PnP.
 
 Two matchers, SIFT with Lowe's ratio test and pyramidal Lucas-Kanade, under one odometry. The landmarks count as known:
-the covariance of a pose is that of one pixel of noise in its own image, added along the chain of keyframes. The settings
-are common ones, the same for every sequence.
+the covariance of a pose is that of one pixel of noise in its own image, added along the chain of keyframes. The
+settings are common ones, the same for every sequence.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ class PnpOdometry:
     def __init__(self, camera: StereoCamera, matcher: str) -> None:
         self._rectifier = StereoRectifier(camera)
         self._camera = self._rectifier.rectified
-        self._matcher: Matcher = {"sift": SiftMatcher, "klt": KltMatcher}[matcher](self._camera)
+        self._matcher: Matcher = SiftMatcher(self._camera) if matcher == "sift" else KltMatcher(self._camera)
         self._T_rectified_left = np.eye(4)
         self._T_rectified_left[:3, :3] = self._rectifier.R_rectified_left
         # Of the rectified left eye, the world being the first of them.
@@ -297,8 +297,9 @@ def _follow(image0: np.ndarray, image1: np.ndarray, pixels: np.ndarray) -> tuple
     """Places (M, 2) in image 1, and whether the way back ends where it began."""
     if not len(pixels):
         return pixels, np.zeros(0, bool)
-    places, there, _ = cv2.calcOpticalFlowPyrLK(image0, image1, pixels, None)
-    back, again, _ = cv2.calcOpticalFlowPyrLK(image1, image0, places, None)
+    nothing: Any = None  # as a guess
+    places, there, _ = cv2.calcOpticalFlowPyrLK(image0, image1, pixels, nothing)
+    back, again, _ = cv2.calcOpticalFlowPyrLK(image1, image0, places, nothing)
     height, width = image1.shape
     inside = ((places >= 0) & (places <= (width - 1, height - 1))).all(axis=1)
     returned = np.linalg.norm(back - pixels, axis=1) <= _FORWARD_BACKWARD

@@ -1,23 +1,37 @@
-"""The tracker on every stereo sequence there is, with every front-end, side by side in one run."""
+"""Our tracker, its EKF, classical odometry and bundle adjustment on every stereo sequence, side by side in one run."""
 
 from __future__ import annotations
 
-import os
-import platform
 import tempfile
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
 
 import numpy as np
 
-from sigmaslam.errors import InputError
+from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.evaluation.benchmarks.page import write_page
+from sigmaslam.evaluation.benchmarks.pnp_baselines import PnpOdometry
+from sigmaslam.evaluation.benchmarks.sequences_page import (
+    LeftOut,
+    Result,
+    ate_cell,
+    format_results,
+    method_label,
+    total_cell,
+)
 from sigmaslam.evaluation.evaluate import Evaluation, evaluate_run
+from sigmaslam.files import make_folder
 from sigmaslam.readers import open_sequence
-from sigmaslam.report import FrameTable, read_frames
+from sigmaslam.refine.run import refine_run
+from sigmaslam.refine.tracks import TRACKS_NAME
+from sigmaslam.report import COLUMNS, FrameTable, read_frames
 from sigmaslam.run import track_sequence
+from sigmaslam.tracker import TrackerConfig
+from sigmaslam.trajectory import Trajectory, read_tum, write_tum
 
 REAL = (
     ("kitti_raw_0926_0039_a", "poses.txt"),
@@ -25,123 +39,197 @@ REAL = (
     ("euroc_v1_01_keyframes_a", "groundtruth.csv"),
     ("euroc_v1_01_static", "groundtruth.csv"),
 )
-"""Folder and its truth; the demo comes first and needs no data."""
-_STAGES = ("features", "match", "filter", "map")
+"""Folder and its truth."""
+RENDERED = ("street", "room", "organ")
+"""Presets, in the sizes and with the disparity offset of the benchmark consistency."""
+SEQUENCES = ("demo", *RENDERED, *(name for name, _ in REAL))
+"""In the order of the page; the demo needs no data, the next ones are rendered."""
+FRAMES = 40
+_SEED = 2000  # seeds below 1000 were looked at while the tracker was made; consistency counts from there
+
+_TRACKED = {
+    "ours": ("learned", TrackerConfig()),
+    "ekf": ("learned", TrackerConfig(linearisation="extended", iterations=1)),
+    "sift": ("sift", TrackerConfig()),
+    "orb": ("orb", TrackerConfig()),
+    "klt": ("klt", TrackerConfig()),
+}
+_PNP = {"sift-pnp": "sift", "klt-pnp": "klt"}
+METHODS = (*_TRACKED, *_PNP, "bundle")
+"""In the order of the page; the bundle adjustment takes the tracks of the first."""
 
 
 @dataclass(frozen=True, slots=True)
-class SequenceResult:
-    """One front-end on one sequence."""
+class _Job:
+    """A sequence; `exact` says that its truth is."""
 
-    sequence: str
-    frontend: str
-    evaluation: Evaluation
-    frames: FrameTable
+    name: str
+    source: Path
+    truth: Path
+    exact: bool
 
 
-def run_sequences(data: Path | None, frontends: Sequence[str]) -> list[SequenceResult]:
-    """Tracks and evaluates everything.
+def write_results(
+    path: Path,
+    data: Path | None,
+    command: str,
+    methods: Sequence[str] = METHODS,
+    sequences: Sequence[str] | None = None,
+    renders: Path | None = None,
+    note: Callable[[str], None] = lambda text: None,
+) -> str:
+    """Runs everything, writes the page and returns it; what is below a line `<!-- notes -->` in the page is kept.
+
+    When it is stopped, what was found until then is written.
 
     Args:
-        data: folder with the real sequences, or None for the demo alone.
-        frontends: names of front-ends.
+        path: Markdown page.
+        data: folder with the real sequences, or None for the rendered ones alone.
+        command: what the page says it was made by.
+        methods, sequences: of `METHODS` and `SEQUENCES`, all unless given.
+        renders: folder for the renders, which are used again; a temporary one unless given.
+        note: is told of progress.
     Raises:
-        InputError: `data` does not hold the sequences.
+        InputError: a name is unknown, or `data` does not hold the sequences.
     """
-    if data is not None:
-        missing = [name for name, _ in REAL if not (data / name).is_dir()]
-        if missing:
-            raise InputError(f"{data} does not hold {', '.join(missing)}: give the folder of the data sets with --data")
-    results = []
-    with as_file(files("sigmaslam.synthetic") / "demo") as demo, tempfile.TemporaryDirectory() as scratch:
-        inputs = [("demo (rendered)", demo, demo / "poses.txt")]
+    results: list[Result | LeftOut] = []
+    try:
+        for result in run_sequences(data, methods, sequences, renders, note):
+            results.append(result)
+    except BaseException:
+        if results:
+            write_page(path, format_results(results, command, complete=False))
+        raise
+    return write_page(path, format_results(results, command))
+
+
+def run_sequences(
+    data: Path | None,
+    methods: Sequence[str] = METHODS,
+    sequences: Sequence[str] | None = None,
+    renders: Path | None = None,
+    note: Callable[[str], None] = lambda text: None,
+) -> Iterator[Result | LeftOut]:
+    """Runs and evaluates everything, one at a time; see `write_results`."""
+    _check_names("method", methods, METHODS)
+    _check_names("sequence", sequences or (), SEQUENCES)
+    wanted = sequences or [name for name in SEQUENCES if data is not None or name not in dict(REAL)]
+    real = [name for name in wanted if name in dict(REAL)]
+    missing = [name for name in real if data is None or not (data / name).is_dir()]
+    if missing:
+        raise InputError(
+            f"{data or 'no folder'} does not hold {', '.join(missing)}: give the folder of the data sets with --data"
+        )
+    with ExitStack() as stack:
+        scratch = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        demo = stack.enter_context(as_file(files("sigmaslam.synthetic") / "demo"))
+        jobs = [_Job("demo (rendered)", demo, demo / "poses.txt", True)] if "demo" in wanted else []
+        for preset in RENDERED:
+            if preset in wanted:
+                try:
+                    jobs.append(_render(preset, renders or scratch / "renders", note))
+                except ImportError as error:
+                    reason = f"{error.name} is not installed: pip install 'sigmaslam[train]'"
+                    yield LeftOut(f"{preset} (rendered)", "", reason)
         if data is not None:
-            inputs += [(name, data / name, data / name / truth) for name, truth in REAL]
-        for name, source, truth in inputs:
-            for frontend in frontends:
-                run = Path(scratch) / f"{name}-{frontend}"
-                track_sequence(open_sequence(source), run, frontend)
-                evaluation = evaluate_run(run, truth, plot=False)
-                results.append(SequenceResult(name, frontend, evaluation, read_frames(run / "frames.csv")))
-    return results
+            jobs += [_Job(name, data / name, data / name / truth, False) for name, truth in REAL if name in wanted]
+        for number, job in enumerate(jobs):
+            runs = scratch / str(number)
+            for method in METHODS:
+                if method not in methods:
+                    continue
+                result = _run(job, method, runs)
+                yield result
+                label = f"{job.name}: {method_label(method)}"
+                if isinstance(result, LeftOut):
+                    note(f"{label} is left out: {result.reason}")
+                else:
+                    note(f"{label}, ATE {ate_cell(result)} m, {total_cell(result)} ms")
 
 
-def format_results(results: Sequence[SequenceResult], command: str) -> str:
-    """The results as a Markdown page."""
-    lines = [
-        "# Results",
-        "",
-        f"Made by `{command}` on {platform.machine()}, {os.cpu_count()} cores, one run, front-ends in turn. Accuracy",
-        "is the same in every run on one machine; times are wall milliseconds. No setting differs between sequences.",
-        "",
-        "- *tracked*: frames with a pose from the images; the first frame of a run is its origin.",
-        "- *ATE*: root mean square position error after the best rigid alignment, metres.",
-        "- *t_rel*, *r_rel*: KITTI segments, of 100 m where the path allows, else of 10 to 50 m.",
-        "- *step*: median error from frame to frame over tracked frames.",
-        "- *NIS*, *NEES*: per degree of freedom, 1 is right; NEES against exact truth means something on renders only.",
-        "",
-    ]
-    for sequence in dict.fromkeys(result.sequence for result in results):
-        rows = [result for result in results if result.sequence == sequence]
-        lines += [f"## {sequence}", "", _ACCURACY_HEADER, "|---|" + "---|" * (_ACCURACY_HEADER.count("|") - 2)]
-        lines += [_accuracy_row(row) for row in rows]
-        lines += ["", _TIME_HEADER, "|---|" + "---|" * (_TIME_HEADER.count("|") - 2)]
-        lines += [_time_row(row) for row in rows]
-        lines.append("")
-    return "\n".join(lines)
+def follow_with_pnp(source: Path, matcher: str, out: Path) -> FrameTable:
+    """Runs a baseline on a sequence; leaves trajectory.tum and covariance.npy in the new folder `out`."""
+    sequence = open_sequence(source)
+    odometry = PnpOdometry(sequence.camera, matcher)
+    steps, timestamps, milliseconds = [], [], []
+    for frame in sequence.frames():
+        began = time.perf_counter()
+        steps.append(odometry.step(frame.left, frame.right))
+        milliseconds.append(1e3 * (time.perf_counter() - began))
+        timestamps.append(frame.timestamp)
+    make_folder(out)
+    trajectory = Trajectory(np.array(timestamps), np.stack([step.T_world_camera for step in steps]))
+    write_tum(out / "trajectory.tum", trajectory)
+    np.save(out / "covariance.npy", np.stack([step.covariance for step in steps]))
+    columns = {name: np.full(len(steps), np.nan) for name in COLUMNS}
+    columns["timestamp"] = trajectory.timestamps
+    columns["matches"] = np.array([step.matches for step in steps], dtype=float)
+    columns["inliers"] = np.array([step.inliers for step in steps], dtype=float)
+    return FrameTable([step.status for step in steps], columns, {"step": np.array(milliseconds)})
 
 
-def write_results(path: Path, data: Path | None, frontends: Sequence[str], command: str) -> str:
-    """Runs everything, writes the page and returns it; what is below a line `<!-- notes -->` in the page is kept."""
-    return write_page(path, format_results(run_sequences(data, frontends), command))
+def _check_names(kind: str, names: Sequence[str], known: Sequence[str]) -> None:
+    for name in names:
+        if name not in known:
+            raise InputError(f"{kind} {name!r} is unknown; choose of {', '.join(known)}")
 
 
-_ACCURACY_COLUMNS = ("front-end", "tracked", "ATE m", "t_rel %", "r_rel deg/100 m", "step mm", "step deg", "inliers")
-_ACCURACY_HEADER = "| " + " | ".join((*_ACCURACY_COLUMNS, "NIS", "NEES", "offset px")) + " |"
-_TIME_HEADER = "| front-end | features | matching | filter | map | total, median (p10 - p90) | frames/s |"
+def _render(preset: str, folder: Path, note: Callable[[str], None]) -> _Job:
+    """Renders a sequence, or finds it there."""
+    from sigmaslam.evaluation.benchmarks.consistency import OFFSET, SCALES
+    from sigmaslam.synthetic.sequence import default_workers, write_sequence
+    from sigmaslam.synthetic.simulation import Recipe
+
+    (scale,) = (scale for scale in SCALES if scale.preset == preset)
+    recipe = Recipe(preset, FRAMES, _SEED, disparity_offset=OFFSET, width=scale.width, height=scale.height)
+    out = folder / f"{preset}{_SEED}"
+    began = time.perf_counter()
+    write_sequence(out, recipe, "sparse", default_workers())
+    note(f"{preset} rendered in {time.perf_counter() - began:.0f} s")
+    return _Job(f"{preset} (rendered, disparities {OFFSET} px too large)", out, out / "poses.txt", True)
 
 
-def _accuracy_row(result: SequenceResult) -> str:
-    evaluation, frames = result.evaluation, result.frames
-    tracked = np.array(frames.status) == "tracking"
-    dof = frames.columns["dof"]
-    nis = np.median(frames.columns["nis"][tracked] / dof[tracked]) if tracked.any() else np.nan
-    # Frame k ends step k - 1; frames that were skipped have no pose and no step.
-    ends_tracked = tracked[np.array(frames.status) != "skipped"][1:]
-    translations, rotations = evaluation.rpe.translations, evaluation.rpe.rotations_deg
-    if len(ends_tracked) != len(translations):
-        ends_tracked = np.ones(len(translations), bool)
-    offset, sigma = frames.columns["disparity_offset"][-1], frames.columns["disparity_offset_sigma"][-1]
-    nees = evaluation.nees.mean if evaluation.nees is not None else np.nan
-    cells = [
-        result.frontend,
-        f"{tracked.sum()} of {len(frames) - 1}",
-        f"{evaluation.ate.rmse:.4f}",
-        _number(evaluation.kitti.mean_translation_percent, ".2f"),
-        _number(evaluation.kitti.mean_rotation_deg_per_100m, ".2f"),
-        _number(1e3 * float(np.median(translations[ends_tracked])) if ends_tracked.any() else np.nan, ".2f"),
-        _number(float(np.median(rotations[ends_tracked])) if ends_tracked.any() else np.nan, ".3f"),
-        _number(float(np.median(frames.columns["inliers"][tracked])) if tracked.any() else np.nan, ".0f"),
-        _number(float(nis), ".2f"),
-        _number(nees, ".2f"),
-        f"{offset:+.2f} ± {sigma:.2f}",
-    ]
-    return "| " + " | ".join(cells) + " |"
+def _run(job: _Job, method: str, runs: Path) -> Result | LeftOut:
+    run = runs / method
+    if method in _PNP:
+        frames = follow_with_pnp(job.source, _PNP[method], run)
+    elif method in _TRACKED:
+        _track(job, method, run)
+        frames = read_frames(run / "frames.csv")
+    else:
+        return _adjust(job, runs)
+    evaluation = evaluate_run(run, job.truth, plot=False)
+    nees = evaluation.nees.mean if job.exact and evaluation.nees else np.nan
+    return Result(job.name, method, evaluation, nees, frames)
 
 
-def _time_row(result: SequenceResult) -> str:
-    frames = result.frames
-    stages = [frames.milliseconds[stage] for stage in _STAGES]
-    total = np.nansum(stages, axis=0)[np.isfinite(stages[0])]
-    low, middle, high = np.percentile(total, [10, 50, 90])
-    cells = [
-        result.frontend,
-        *(f"{np.nanmedian(stage):.1f}" for stage in stages),
-        f"{middle:.0f} ({low:.0f} - {high:.0f})",
-        f"{1e3 / middle:.1f}",
-    ]
-    return "| " + " | ".join(cells) + " |"
+def _track(job: _Job, method: str, run: Path) -> None:
+    frontend, config = _TRACKED[method]
+    track_sequence(open_sequence(job.source), run, frontend, config=config, tracks=method == "ours")
 
 
-def _number(value: float, form: str) -> str:
-    return "-" if not np.isfinite(value) else format(value, form)
+def _adjust(job: _Job, runs: Path) -> Result | LeftOut:
+    """Bundle adjustment of the tracks of ours."""
+    run, out = runs / "ours", runs / "bundle"
+    if not run.is_dir():
+        _track(job, "ours", run)
+    try:
+        refined = refine_run(run, out)
+    except SigmaSlamError as error:
+        # No GTSAM, or nothing to adjust: a camera at rest has one keyframe.
+        return LeftOut(job.name, "bundle", str(error))
+    evaluation = evaluate_run(out, job.truth, plot=False)
+    nees = _keyframe_nees(evaluation, run, out) if job.exact else np.nan
+    return Result(job.name, "bundle", evaluation, nees, None, refined)
+
+
+def _keyframe_nees(evaluation: Evaluation, run: Path, out: Path) -> float:
+    """Of the keyframes alone: the others have the covariance of the keyframe before."""
+    with np.load(run / TRACKS_NAME) as tracks:
+        keyframes = np.unique(tracks["frame"])
+    times = read_tum(out / "trajectory.tum").timestamps[keyframes]
+    nees = evaluation.nees
+    if nees is None:
+        return float("nan")
+    adjusted = np.isin(nees.timestamps, times)
+    return float(nees.per_frame[adjusted].mean()) if adjusted.any() else float("nan")

@@ -1,26 +1,80 @@
 """The benchmark page."""
 
+import sys
 from pathlib import Path
 
 import pytest
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.benchmarks.sequences import run_sequences, write_results
+from sigmaslam.evaluation.benchmarks import sequences
+from sigmaslam.evaluation.benchmarks.sequences import METHODS, run_sequences, write_results
+from sigmaslam.evaluation.benchmarks.sequences_page import method_label
 
 
-def test_the_page_has_a_row_for_each_front_end_and_keeps_the_notes(tmp_path: Path):
+def _rows(page: str, method: str) -> list[list[str]]:
+    """Cells of the rows that begin with this method."""
+    cells = ([cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if line.startswith("|"))
+    return [row for row in cells if row[0] == method_label(method)]
+
+
+def test_the_page_has_a_row_for_each_method_and_keeps_the_notes(tmp_path: Path):
     page = tmp_path / "results.md"
     page.write_text("old table\n<!-- notes -->\nkept words\n")
-    text = write_results(page, None, ["klt"], "the command")
+    text = write_results(page, None, "the command", ("klt", "klt-pnp"), ["demo"])
     assert text == page.read_text()
     assert "old table" not in text
     assert text.endswith("<!-- notes -->\nkept words\n")
     assert "`the command`" in text
-    rows = [line for line in text.splitlines() if line.startswith("| klt |")]
-    assert len(rows) == 2
-    assert "39 of 39" in rows[0]
+    tracker, stages = _rows(text, "klt")
+    (pnp,) = _rows(text, "klt-pnp")
+    assert len(tracker) == len(pnp) == 12
+    assert len(stages) == 6
+    assert tracker[1] == pnp[1] == "39 of 39"
+    assert float(pnp[2]) < 0.01  # metres of 0.8
+    # NIS, NEES, offset: the baseline has no innovation and no offset.
+    assert pnp[7] == pnp[9] == "-"
+    assert float(pnp[8]) > 0
+
+
+@pytest.mark.slow
+def test_every_method_has_its_row(tmp_path: Path):
+    pytest.importorskip("gtsam")
+    text = write_results(tmp_path / "results.md", None, "the command", METHODS, ["demo"])
+    for method in METHODS:
+        row = _rows(text, method)[0]
+        assert len(row) == 12
+        assert float(row[2]) < 0.02
+    assert "keyframes" in _rows(text, "bundle")[0][1]
+
+
+def test_without_gtsam_the_bundle_adjustment_is_left_out_with_a_note(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "gtsam", None)
+    # Tracks that are there already, so that nothing is tracked.
+    monkeypatch.setattr(sequences, "_track", lambda job, method, run: run.mkdir(parents=True))
+    text = write_results(tmp_path / "results.md", None, "the command", ("klt-pnp", "bundle"), ["demo"])
+    assert _rows(text, "bundle") == []
+    assert "*bundle adjustment* is left out: gtsam is not installed" in text
+    assert len(_rows(text, "klt-pnp")) == 1
+
+
+def test_what_was_found_is_written_when_it_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sequences, "_adjust", interrupt)
+    page = tmp_path / "results.md"
+    with pytest.raises(KeyboardInterrupt):
+        write_results(page, None, "the command", ("klt-pnp", "bundle"), ["demo"])
+    assert "Stopped before the end" in page.read_text()
+    assert len(_rows(page.read_text(), "klt-pnp")) == 1
 
 
 def test_a_folder_without_the_sequences_is_refused(tmp_path: Path):
     with pytest.raises(InputError, match="kitti_raw_0926_0039_a"):
-        run_sequences(tmp_path, ["klt"])
+        next(run_sequences(tmp_path, ["klt"]))
+
+
+@pytest.mark.parametrize("names", [{"methods": ["magic"]}, {"sequences": ["magic"]}])
+def test_an_unknown_name_is_refused_with_those_that_are_known(names: dict[str, list[str]]):
+    with pytest.raises(InputError, match=r"'magic' is unknown; choose of (ours|demo), "):
+        next(run_sequences(None, **names))

@@ -1,0 +1,194 @@
+"""The page of the benchmark `sequences`."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from sigmaslam.evaluation.evaluate import Evaluation
+from sigmaslam.report import FrameTable
+
+_LABELS = {
+    "ours": "ours",
+    "ekf": "our EKF",
+    "sift": "ours with SIFT",
+    "orb": "ours with ORB",
+    "klt": "ours with KLT",
+    "sift-pnp": "SIFT + PnP",
+    "klt-pnp": "KLT + PnP",
+    "bundle": "bundle adjustment",
+}
+_STAGES = ("features", "match", "filter", "map")
+_COLUMNS = (
+    "method",
+    "tracked",
+    "ATE m",
+    "t_rel %",
+    "r_rel deg/100 m",
+    "step mm",
+    "step deg",
+    "NIS",
+    "NEES",
+    "offset px",
+    "ms, median (p10 - p90)",
+    "frames/s",
+)
+_STAGE_COLUMNS = ("method", "inliers", "features ms", "matching ms", "filter ms", "map ms")
+_WORDS = """\
+All methods in turn in one run, with {threads} threads in OpenCV and 2 in the network. Accuracy is the same in every run
+on one machine; times are wall milliseconds. No setting of any method differs between sequences.
+
+- *ours*: learned features, unscented updates, two linearisations: what `sigmaslam track` does. *Our EKF*: the same with
+  Jacobians, linearised once. *Ours with*: other features under the same filter.
+- *SIFT + PnP*, *KLT + PnP*: from OpenCV alone (`evaluation/benchmarks/pnp_baselines.py`): points of a keyframe, found
+  again by ratio test or Lucas-Kanade, RANSAC, least squares. Landmarks count as known, the noise as 1 px.
+- *bundle adjustment*: of the tracks of *ours* (`track --tracks`, then `refine`), all keyframes at once; frames in
+  between move with them. Its time is that of the optimisation, on top of the tracking; its NEES that of the keyframes.
+- *tracked*: frames with a pose from the images; the first frame of a run is its origin.
+- *ATE*: root mean square position error after the best rigid alignment, metres.
+- *t_rel*, *r_rel*: KITTI segments, of 100 m where the path allows, else of 10 to 50 m.
+- *step*: median error from frame to frame over tracked frames.
+- *NIS*, *NEES*: per degree of freedom, 1 is right, more is overconfident. NEES is given where the truth is exact: on
+  renders.
+- *offset*: measured minus true disparity, of the methods that estimate it.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """One method on one sequence.
+
+    Attributes:
+        sequence: name.
+        method: key.
+        evaluation: against the truth.
+        nees: mean per degree of freedom; NaN where the truth is not exact.
+        frames: every frame; None for the bundle adjustment.
+        refined: what refine.json says; None but for the bundle adjustment.
+    """
+
+    sequence: str
+    method: str
+    evaluation: Evaluation
+    nees: float
+    frames: FrameTable | None
+    refined: Mapping[str, Any] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LeftOut:
+    """What could not be run, and why; without a method the whole sequence."""
+
+    sequence: str
+    method: str
+    reason: str
+
+
+def method_label(method: str) -> str:
+    """A method as the page calls it."""
+    return _LABELS[method]
+
+
+def format_results(results: Sequence[Result | LeftOut], command: str, complete: bool = True) -> str:
+    """The results as a Markdown page."""
+    machine = f"{platform.machine()}, {os.cpu_count()} cores"
+    lines = ["# Results", "", f"Made by `{command}` on {machine}.", _WORDS.format(threads=cv2.getNumThreads())]
+    if not complete:
+        lines += ["**Stopped before the end: what is missing was not run.**", ""]
+    for missing in results:
+        if isinstance(missing, LeftOut) and not missing.method:
+            lines += [f"{missing.sequence} is left out: {missing.reason}", ""]
+    for sequence in dict.fromkeys(result.sequence for result in results if isinstance(result, Result)):
+        rows = [result for result in results if isinstance(result, Result) and result.sequence == sequence]
+        lines += [f"## {sequence}", "", *_table(_COLUMNS, (_row(row) for row in rows)), ""]
+        for missing in results:
+            if isinstance(missing, LeftOut) and missing.method and missing.sequence == sequence:
+                lines += [f"The row *{_LABELS[missing.method]}* is left out: {missing.reason}", ""]
+        staged = [(row.method, row.frames) for row in rows if row.frames and "filter" in row.frames.milliseconds]
+        if staged:
+            lines += [*_table(_STAGE_COLUMNS, (_stage_row(method, frames) for method, frames in staged)), ""]
+    return "\n".join(lines)
+
+
+def ate_cell(result: Result) -> str:
+    """Metres; more digits inside a body."""
+    rmse = result.evaluation.ate.rmse
+    return f"{rmse:.4f}" if rmse >= 1e-3 else f"{rmse:.6f}"
+
+
+def total_cell(result: Result) -> str:
+    """Milliseconds a frame, and their spread where there is one."""
+    if result.frames is None:
+        seconds, share = _seconds_adjusting(result)
+        return f"{share:.0f} (whole: {seconds:.1f} s)"
+    low, middle, high = np.percentile(_totals(result.frames), [10, 50, 90])
+    return f"{middle:.0f} ({low:.0f} - {high:.0f})"
+
+
+def _table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    return ["| " + " | ".join(cells) + " |" for cells in (columns, ["---"] * len(columns), *rows)]
+
+
+def _row(result: Result) -> list[str]:
+    evaluation, frames, refined = result.evaluation, result.frames, result.refined
+    translations, rotations = evaluation.rpe.translations, evaluation.rpe.rotations_deg
+    ends_tracked, nis = np.ones(len(translations), bool), np.nan
+    if frames is not None:
+        tracked = np.array(frames.status) == "tracking"
+        count = f"{tracked.sum()} of {len(frames) - 1}"
+        # Frame k ends step k - 1; frames that were skipped have no pose and no step.
+        ends = tracked[np.array(frames.status) != "skipped"][1:]
+        ends_tracked = ends if len(ends) == len(translations) else ends_tracked
+        if tracked.any():
+            nis = float(np.median(frames.columns["nis"][tracked] / frames.columns["dof"][tracked]))
+        offset, sigma = (float(frames.columns[name][-1]) for name in ("disparity_offset", "disparity_offset_sigma"))
+        pace = float(np.median(_totals(frames)))
+    else:
+        assert refined is not None
+        count = f"{refined['keyframes']} keyframes"
+        offset, sigma = refined["disparity_offset"], refined["disparity_offset_sigma"]
+        _, pace = _seconds_adjusting(result)
+    return [
+        _LABELS[result.method],
+        count,
+        ate_cell(result),
+        _number(evaluation.kitti.mean_translation_percent, ".2f"),
+        _number(evaluation.kitti.mean_rotation_deg_per_100m, ".2f"),
+        _number(1e3 * float(np.median(translations[ends_tracked])) if ends_tracked.any() else np.nan, ".2f"),
+        _number(float(np.median(rotations[ends_tracked])) if ends_tracked.any() else np.nan, ".3f"),
+        _number(nis, ".2f"),
+        _number(result.nees, ".2f"),
+        f"{offset:+.2f} ± {sigma:.2f}" if np.isfinite(offset) else "-",
+        total_cell(result),
+        f"{1e3 / pace:.1f}",
+    ]
+
+
+def _stage_row(method: str, frames: FrameTable) -> list[str]:
+    tracked = np.array(frames.status) == "tracking"
+    inliers = float(np.median(frames.columns["inliers"][tracked])) if tracked.any() else np.nan
+    stages = (f"{np.nanmedian(frames.milliseconds[stage]):.1f}" for stage in _STAGES)
+    return [_LABELS[method], _number(inliers, ".0f"), *stages]
+
+
+def _totals(frames: FrameTable) -> np.ndarray:
+    """Milliseconds of each frame without the reading of files, which the baselines leave out too."""
+    stages = np.array([values for stage, values in frames.milliseconds.items() if stage != "read"])
+    return np.asarray(np.nansum(stages, axis=0)[np.isfinite(stages).any(axis=0)])
+
+
+def _seconds_adjusting(result: Result) -> tuple[float, float]:
+    """Of the whole optimisation, and milliseconds a frame."""
+    assert result.refined is not None
+    seconds = float(result.refined["seconds_adjust"])
+    return seconds, 1e3 * seconds / result.refined["frames"]
+
+
+def _number(value: float, form: str) -> str:
+    return "-" if not np.isfinite(value) else format(value, form)
