@@ -57,6 +57,16 @@ def test_without_gtsam_the_bundle_adjustment_is_left_out_with_a_note(tmp_path: P
     assert len(_rows(text, "klt-pnp")) == 1
 
 
+def test_without_torch_the_renders_are_left_out_with_a_note(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def fail(*_: object) -> None:
+        raise ImportError(name="torch")
+
+    monkeypatch.setattr(sequences, "_render", fail)
+    text = write_results(tmp_path / "results.md", None, "the command", ("klt-pnp",), ["demo", "street"])
+    assert "street (rendered) is left out: torch is not installed" in text
+    assert len(_rows(text, "klt-pnp")) == 1
+
+
 def test_what_was_found_is_written_when_it_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
