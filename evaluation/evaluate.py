@@ -1,5 +1,6 @@
 """Evaluate a run, or a trajectory of any origin, against the truth."""
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -26,6 +27,7 @@ from sigmaslam.evaluation.metrics import (
     synchronise,
 )
 from sigmaslam.figures import AXIS_NAMES, BLUE, VERMILLION, plot_trajectory, save_png, style_axes
+from sigmaslam.rotation import se3_inverse
 from sigmaslam.trajectory import Trajectory, check_covariances, kitti_times_path, read_trajectory, trajectory_format
 
 
@@ -106,6 +108,7 @@ def evaluate_run(
 
     Frames are paired by time. Where either file is KITTI without times.txt and both have as many poses, they
     are paired by index; where they have not, the 10 Hz of KITTI are assumed and every time must then agree.
+    Of a run with `--track-object` the truth is T_camera_object of any frame that is fixed to the body.
     The frames of a run are those of its `frames.csv`; for a file alone they are as many as fit into the time
     of the truth at the estimate's rate, and never more than there are true poses.
 
@@ -135,6 +138,8 @@ def evaluate_run(
             f"{len(estimate_index)} of the {len(estimate)} poses of {estimate_path} have such times: put the "
             "times.txt of the images beside the pose file"
         )
+    if is_run and _follows_object(run_or_trajectory):
+        true = _of_followed_frame(estimate, true, max_difference)
     covariance = _read_covariance(run_or_trajectory / "covariance.npy", len(estimate)) if is_run else None
     matched_estimate, matched_truth = synchronise(estimate, true, max_difference)
     evaluation = Evaluation(
@@ -294,6 +299,24 @@ def _same_clock(estimate_path: Path, truth_path: Path) -> tuple[Trajectory, Traj
     if len(estimate) == len(truth):
         return estimate, Trajectory(estimate.timestamps, truth.poses), "index"
     return estimate, truth, "time at 10 Hz"
+
+
+def _follows_object(run: Path) -> bool:
+    """Whether a run's poses are those of a body before a camera at rest."""
+    try:
+        return "object" in json.loads((run / "run.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+
+
+def _of_followed_frame(estimate: Trajectory, truth: Trajectory, max_difference: float) -> Trajectory:
+    """The truth of the frame on the body that the run follows; the truth may be of another frame on the body.
+
+    The two frames are taken as the first pair of poses has them to each other. The fixed frame is the camera's in both.
+    """
+    estimate_index, truth_index = associate(estimate, truth, max_difference)
+    first = se3_inverse(truth.poses[truth_index[0]]) @ estimate.poses[estimate_index[0]]
+    return Trajectory(truth.timestamps, truth.poses @ first)
 
 
 def _read_covariance(path: Path, count: int) -> np.ndarray | None:

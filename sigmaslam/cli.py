@@ -200,13 +200,23 @@ def track(
     topic_right: Annotated[
         str | None, typer.Option(help="Image topic in a bag.", show_default="the one with 'right', cam1 or infra2")
     ] = None,
+    track_object: Annotated[
+        str | None,
+        typer.Option(
+            metavar="MASK|BOX",
+            help="The camera is at rest and follows one rigid body: x,y,width,height in pixels of the first left image, "
+            "or an image of its size that is not zero on the body. Poses are then T_camera_object.",
+        ),
+    ] = None,
 ) -> None:
     """Track a stereo sequence, recorded or live: trajectory, covariance, map and report."""
     if backend is Backend.torch:
         _need_train_extra()
+    if track_object is not None and (map is not None or tracks):
+        raise InputError("--map and --tracks are of a moving camera's world: leave them out with --track-object")
     sequence = _open_input(source, format, calibration, camera, seconds, (topic_left, topic_right))
     try:
-        summary = _track(sequence, out, frontend, backend, map, tracks)
+        summary = _track(sequence, out, frontend, backend, map, tracks, track_object)
     except KeyboardInterrupt:
         if (out / "run.json").exists():
             typer.echo(f"Stopped; what was tracked until then is in {out}")
@@ -621,10 +631,19 @@ def _track(
     backend: Backend,
     map_path: Path | None = None,
     tracks: bool = False,
+    track_object: str | None = None,
 ) -> dict[str, Any]:
     from sigmaslam.run import track_sequence
 
-    return track_sequence(sequence, out, frontend.value, backend.value, map_path=map_path, tracks=tracks)
+    return track_sequence(
+        sequence,
+        out,
+        frontend.value,
+        backend.value,
+        map_path=map_path,
+        tracks=tracks,
+        track_object=track_object,
+    )
 
 
 def _tell_differences(differences: dict[str, float]) -> None:

@@ -15,6 +15,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from sigmaslam.config import TrackerConfig
 from sigmaslam.errors import SigmaSlamError
 from sigmaslam.estimate import Estimate
+from sigmaslam.object_region import read_region
+from sigmaslam.object_tracker import ObjectEstimate, ObjectTracker, as_camera_object
 from sigmaslam.outputs import RunWriter, describe_camera
 from sigmaslam.readers import StereoFrame, StereoSequence
 from sigmaslam.tracker import StereoTracker
@@ -28,6 +30,7 @@ def track_sequence(
     config: TrackerConfig | None = None,
     map_path: Path | None = None,
     tracks: bool = False,
+    track_object: str | None = None,
 ) -> dict[str, Any]:
     """Tracks a sequence and writes the run folder; partial results are kept when it is stopped or fails.
 
@@ -37,13 +40,16 @@ def track_sequence(
         frontend, backend, config: of `StereoTracker`.
         map_path: map.npz of an earlier run, whose world the poses are given in.
         tracks: write tracks.npz, too: what keyframes saw, for `sigmaslam refine`.
+        track_object: box or mask, see `read_region`: the camera is at rest and follows one body. Poses are then
+            T_camera_object, their covariances in the body's frame, and the map that of the body in its own frame.
     Returns:
         The summary that run.json holds.
     Raises:
-        InputError: the folder is not empty, or the sequence breaks off; what was computed is on disk then.
+        InputError: the folder is not empty, an argument is wrong, or the sequence breaks off; what was computed is on
+            disk then.
         KeyboardInterrupt: passed on after the partial results are written.
     """
-    tracker = StereoTracker(sequence.camera, frontend, backend, config)
+    tracker = _build_tracker(sequence, frontend, backend, config, track_object)
     if map_path is not None:
         tracker.load_map(map_path)
     writer = RunWriter(out, tracker.describe_rectified() if tracks else None)
@@ -64,7 +70,7 @@ def track_sequence(
     finally:
         summary = writer.finish(
             tracker.map(),
-            tracker.pack_keyframes(),
+            {} if isinstance(tracker, ObjectTracker) else tracker.pack_keyframes(),
             {
                 "input": str(sequence.source),
                 "format": sequence.format,
@@ -74,9 +80,26 @@ def track_sequence(
                 "dropped": sequence.dropped,
                 "configuration": asdict(tracker.config),
                 "calibration": describe_camera(sequence.camera),
+                **_describe_object(tracker, track_object),
             },
         )
     return summary
+
+
+def _build_tracker(
+    sequence: StereoSequence, frontend: str, backend: str, config: TrackerConfig | None, track_object: str | None
+) -> StereoTracker:
+    if track_object is None:
+        return StereoTracker(sequence.camera, frontend, backend, config)
+    region = read_region(track_object, sequence.camera.left.width, sequence.camera.left.height)
+    return ObjectTracker(sequence.camera, region, frontend, backend, config)
+
+
+def _describe_object(tracker: StereoTracker, track_object: str | None) -> dict[str, Any]:
+    """What run.json says of a followed body: its region, and where its frame is in the first left camera's."""
+    if not isinstance(tracker, ObjectTracker):
+        return {}
+    return {"object": {"region": track_object, "origin": tracker.origin.tolist()}}
 
 
 def _track(sequence: StereoSequence, frames: Iterator[StereoFrame], tracker: StereoTracker, writer: RunWriter) -> None:
@@ -97,7 +120,7 @@ def _track(sequence: StereoSequence, frames: Iterator[StereoFrame], tracker: Ste
                 writer.add_skipped(skipped.timestamp)
             noted = len(sequence.skipped)
             estimate = tracker.step(frame.left, frame.right, frame.timestamp)
-            writer.add(estimate, read_ms)
+            writer.add(as_camera_object(estimate) if isinstance(estimate, ObjectEstimate) else estimate, read_ms)
             writer.add_views(tracker.keyframe_views)
             done += 1
             since = time.perf_counter()

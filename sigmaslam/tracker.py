@@ -235,9 +235,10 @@ class StereoTracker:
         self._tracked_at = timestamp
         self._moving = self._velocity_known = True
         self._noise.adapt(fit.nis_per_dof)
-        count = int(fit.kept.sum())
-        if count < self.config.keyframe_ratio * self._reference and self._has_stereo(view):
-            self._add_keyframe(view, timestamp, fit.pose, expected, step_covariance, found.views.select(fit.kept))
+        if int(fit.kept.sum()) < self.config.keyframe_ratio * self._reference:
+            view = self._choose(view, fit.pose)
+            if self._has_stereo(view):
+                self._add_keyframe(view, timestamp, fit.pose, expected, step_covariance, found.views.select(fit.kept))
 
     # ---- places that were visited before
 
@@ -250,13 +251,16 @@ class StereoTracker:
             if relative is None:
                 continue
             pose = nearest_rigid(keyframe.pose @ relative.T_key_camera)
+            chosen = self._choose(view, pose)
+            if not self._has_stereo(chosen):
+                continue
             for host in range(len(self._window)):
                 self._memory.add(self._remembered(host))
             self._retire(np.ones(len(self._window.landmarks), bool))
             self._window.restart()
             self._keyframe_views, self._keyframe_times = [], []
             covariance = keyframe.covariance + turn_covariance(pose, relative.covariance)
-            self._add_keyframe(view, timestamp, pose, pose, covariance, None)
+            self._add_keyframe(chosen, timestamp, pose, pose, covariance, None)
             self._forget_twist()
             self._tracked_at = timestamp
             self._moving, self._velocity_known = True, False
@@ -313,6 +317,10 @@ class StereoTracker:
 
     # ---- keyframes
 
+    def _choose(self, view: StereoView, pose: np.ndarray) -> StereoView:
+        """The view with disparities only where it may become landmarks, seen from `pose`: here everywhere."""
+        return view
+
     def _has_stereo(self, view: StereoView) -> bool:
         return int(np.isfinite(view.disparity).sum()) >= 2 * self.config.least_inliers and not self._is_swapped(view)
 
@@ -322,6 +330,7 @@ class StereoTracker:
         return len(known) >= self.config.least_inliers and float((known < -1.0).mean()) > _MOST_NEGATIVE
 
     def _start(self, view: StereoView, timestamp: float) -> None:
+        view = self._choose(view, np.eye(4))
         self._add_keyframe(view, timestamp, np.eye(4), np.eye(4), np.zeros((6, 6)), None)
         self._forget_twist()
         self._tracked_at = timestamp

@@ -49,6 +49,11 @@ def _write_kitti(out: Path, simulation: Simulation, poses: np.ndarray) -> None:
     relative = np.linalg.inv(poses[0]) @ poses
     relative[0] = np.eye(4)
     write_kitti(out / "poses.txt", Trajectory(simulation.times, relative))
+    if simulation.scene.moving.any() and np.ptp(poses, axis=0).max() == 0.0:
+        # The camera is at rest, and what moves is to be followed: the first of what moves, T_camera_object.
+        body = simulation.scene.bodies[int(np.flatnonzero(simulation.scene.moving)[0])]
+        moved = np.stack([np.linalg.inv(poses[0]) @ body.pose(time) for time in simulation.times])
+        write_kitti(out / "poses_object.txt", Trajectory(simulation.times, moved))
 
 
 def _write_euroc(root: Path, simulation: Simulation, poses: np.ndarray) -> None:

@@ -89,13 +89,11 @@ class SimulatedFrontend:
 
     def images(self, frame: int) -> np.ndarray:
         """A black image whose first two pixels are the frame's number."""
-        image = np.zeros((self._scale.height, self._scale.width), np.uint8)
-        image[0, :2] = frame % 256, frame // 256
-        return image
+        return image_of(frame, self._scale.width, self._scale.height)
 
     def observe(self, left: np.ndarray, right: np.ndarray) -> StereoView:
         """Points in view as features, each with its disparity."""
-        frame = _frame_of(left)
+        frame = frame_of(left)
         truth, visible = self._project(frame)
         seen = np.flatnonzero(visible)
         seen = np.sort(seen[np.argsort(self._priority[seen])[: self._most]])
@@ -120,8 +118,8 @@ class SimulatedFrontend:
         covariance: np.ndarray | None,
     ) -> TemporalMatches:
         """The points that both see, wherever they were predicted."""
-        frame = _frame_of(view.left)
-        wanted, seen = self._seen[_frame_of(key.left)][index], self._seen[frame]
+        frame = frame_of(view.left)
+        wanted, seen = self._seen[frame_of(key.left)][index], self._seen[frame]
         both = np.isin(wanted, seen)
         points, count = wanted[both], int(both.sum())
         truth, _ = self._project(frame)
@@ -173,7 +171,15 @@ class SimulatedFrontend:
         return np.column_stack([u, v, disparity]), inside
 
 
-def _frame_of(image: np.ndarray) -> int:
+def image_of(frame: int, width: int, height: int) -> np.ndarray:
+    """A black image whose first two pixels are the frame's number."""
+    image = np.zeros((height, width), np.uint8)
+    image[0, :2] = frame % 256, frame // 256
+    return image
+
+
+def frame_of(image: np.ndarray) -> int:
+    """The frame that an image stands for."""
     return int(image[0, 0]) + 256 * int(image[0, 1])
 
 
