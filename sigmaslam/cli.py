@@ -204,8 +204,15 @@ def track(
         str | None,
         typer.Option(
             metavar="MASK|BOX",
-            help="The camera is at rest and follows one rigid body: x,y,width,height in pixels of the first left image, "
-            "or an image of its size that is not zero on the body. Poses are then T_camera_object.",
+            help="The camera is at rest and follows one rigid body: x,y,width,height in pixels of the first left "
+            "image, or an image of its size that is not zero on the body. Poses are then T_camera_object.",
+        ),
+    ] = None,
+    location: Annotated[
+        Path | None,
+        typer.Option(
+            help="CSV of a location sensor on what moves, to fuse: timestamp,x,y,z[,qx,qy,qz,qw],sigma_position"
+            "[,sigma_rotation]; any rate, any world (docs/object.md)."
         ),
     ] = None,
 ) -> None:
@@ -216,7 +223,7 @@ def track(
         raise InputError("--map and --tracks are of a moving camera's world: leave them out with --track-object")
     sequence = _open_input(source, format, calibration, camera, seconds, (topic_left, topic_right))
     try:
-        summary = _track(sequence, out, frontend, backend, map, tracks, track_object)
+        summary = _track(sequence, out, frontend, backend, map, tracks, track_object, location)
     except KeyboardInterrupt:
         if (out / "run.json").exists():
             typer.echo(f"Stopped; what was tracked until then is in {out}")
@@ -224,7 +231,8 @@ def track(
     typer.echo(
         f"{summary['tracking']} of {summary['frames']} frames tracked, {summary['lost']} lost, "
         f"{summary['skipped']} skipped; {summary['median_inliers']:.0f} inliers in the median frame, "
-        f"{summary['map_points']} map points.\n{summary['calibration_verdict']}\nReport: {out / 'report.html'}"
+        f"{summary['map_points']} map points.\n{summary['calibration_verdict']}\n"
+        f"{_location_verdict(summary)}Report: {out / 'report.html'}"
     )
 
 
@@ -632,7 +640,9 @@ def _track(
     map_path: Path | None = None,
     tracks: bool = False,
     track_object: str | None = None,
+    location: Path | None = None,
 ) -> dict[str, Any]:
+    from sigmaslam.location import read_locations
     from sigmaslam.run import track_sequence
 
     return track_sequence(
@@ -643,6 +653,23 @@ def _track(
         map_path=map_path,
         tracks=tracks,
         track_object=track_object,
+        locations=None if location is None else read_locations(location),
+    )
+
+
+def _location_verdict(summary: dict[str, Any]) -> str:
+    """A line about the location sensor; empty without one."""
+    if "location" not in summary:
+        return ""
+    used, weakened, unused, ready = (summary["location"][name] for name in ("used", "weakened", "unused", "ready"))
+    if ready is None:
+        return (
+            f"The location sensor was not fused: its {used} readings with a pose do not show how its world lies to "
+            "ours. Is it the same clock? Positions need a path that is no straight line.\n"
+        )
+    return (
+        f"Location sensor: {used} readings used ({weakened} disagreed and count less), {unused} not; poses are fused "
+        f"from {ready:.3f} s on.\n"
     )
 
 

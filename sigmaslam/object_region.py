@@ -48,8 +48,8 @@ def read_region(text: str, width: int, height: int) -> np.ndarray:
     path = Path(text)
     if not path.is_file():
         raise InputError(
-            f"--track-object {text}: neither a box nor an image file; give x,y,width,height in pixels of the first left "
-            "image, or a mask of its size that is not zero on the body"
+            f"--track-object {text}: neither a box nor an image file; give x,y,width,height in pixels of the first "
+            "left image, or a mask of its size that is not zero on the body"
         )
     mask = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if mask is None:

@@ -43,7 +43,7 @@ class ObjectEstimate(Estimate):
     """Result for one stereo pair; T_world_camera and covariance are of the camera in the body's frame."""
 
     @property
-    def T_camera_object(self) -> np.ndarray:
+    def T_camera_object(self) -> np.ndarray:  # noqa: N802
         """(4, 4) pose of the body in the left camera's frame."""
         return se3_inverse(self.T_world_camera)
 

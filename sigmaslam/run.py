@@ -15,11 +15,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from sigmaslam.config import TrackerConfig
 from sigmaslam.errors import SigmaSlamError
 from sigmaslam.estimate import Estimate
+from sigmaslam.location import Locations
+from sigmaslam.location_filter import LocationFilter
 from sigmaslam.object_region import read_region
 from sigmaslam.object_tracker import ObjectEstimate, ObjectTracker, as_camera_object
 from sigmaslam.outputs import RunWriter, describe_camera
 from sigmaslam.readers import StereoFrame, StereoSequence
 from sigmaslam.tracker import StereoTracker
+from sigmaslam.trajectory import write_tum
 
 
 def track_sequence(
@@ -31,6 +34,7 @@ def track_sequence(
     map_path: Path | None = None,
     tracks: bool = False,
     track_object: str | None = None,
+    locations: Locations | None = None,
 ) -> dict[str, Any]:
     """Tracks a sequence and writes the run folder; partial results are kept when it is stopped or fails.
 
@@ -42,14 +46,17 @@ def track_sequence(
         tracks: write tracks.npz, too: what keyframes saw, for `sigmaslam refine`.
         track_object: box or mask, see `read_region`: the camera is at rest and follows one body. Poses are then
             T_camera_object, their covariances in the body's frame, and the map that of the body in its own frame.
+        locations: of a sensor on what moves, camera or body, to fuse; writes trajectory_location.tum, too: the poses
+            in the sensor's world.
     Returns:
-        The summary that run.json holds.
+        The summary that run.json holds; with `locations` what became of them, too, under `location`.
     Raises:
         InputError: the folder is not empty, an argument is wrong, or the sequence breaks off; what was computed is on
             disk then.
         KeyboardInterrupt: passed on after the partial results are written.
     """
     tracker = _build_tracker(sequence, frontend, backend, config, track_object)
+    location = None if locations is None else LocationFilter(locations, track_object is not None)
     if map_path is not None:
         tracker.load_map(map_path)
     writer = RunWriter(out, tracker.describe_rectified() if tracks else None)
@@ -57,7 +64,7 @@ def track_sequence(
     try:
         # However this ends, cameras are given back before the results are written.
         with closing(sequence.frames()) as frames:
-            _track(sequence, frames, tracker, writer)
+            _track(sequence, frames, tracker, writer, location)
     except KeyboardInterrupt:
         ended = "interrupted"
         raise
@@ -81,9 +88,13 @@ def track_sequence(
                 "configuration": asdict(tracker.config),
                 "calibration": describe_camera(sequence.camera),
                 **_describe_object(tracker, track_object),
+                **_describe_location(location),
             },
         )
-    return summary
+        trajectory = None if location is None else location.trajectory()
+        if trajectory is not None:
+            write_tum(out / "trajectory_location.tum", trajectory)
+    return summary if location is None else {**summary, "location": asdict(location.summary)}
 
 
 def _build_tracker(
@@ -102,7 +113,27 @@ def _describe_object(tracker: StereoTracker, track_object: str | None) -> dict[s
     return {"object": {"region": track_object, "origin": tracker.origin.tolist()}}
 
 
-def _track(sequence: StereoSequence, frames: Iterator[StereoFrame], tracker: StereoTracker, writer: RunWriter) -> None:
+def _describe_location(location: LocationFilter | None) -> dict[str, Any]:
+    """What run.json says of a location sensor: what became of its readings, and how its world lies to ours."""
+    if location is None:
+        return {}
+    T, covariance = location.T_sensor_world, location.T_sensor_world_covariance
+    return {
+        "location": {
+            **asdict(location.summary),
+            "T_sensor_world": None if T is None else T.tolist(),
+            "T_sensor_world_covariance": None if covariance is None else covariance.tolist(),
+        }
+    }
+
+
+def _track(
+    sequence: StereoSequence,
+    frames: Iterator[StereoFrame],
+    tracker: StereoTracker,
+    writer: RunWriter,
+    location: LocationFilter | None,
+) -> None:
     with Progress(
         BarColumn(bar_width=16),
         MofNCompleteColumn(),
@@ -120,6 +151,8 @@ def _track(sequence: StereoSequence, frames: Iterator[StereoFrame], tracker: Ste
                 writer.add_skipped(skipped.timestamp)
             noted = len(sequence.skipped)
             estimate = tracker.step(frame.left, frame.right, frame.timestamp)
+            if location is not None:
+                estimate = location.fuse(estimate)
             writer.add(as_camera_object(estimate) if isinstance(estimate, ObjectEstimate) else estimate, read_ms)
             writer.add_views(tracker.keyframe_views)
             done += 1

@@ -1,4 +1,4 @@
-"""A ball with points on it that moves before a camera at rest, and a wall behind: matches have the errors they claim."""
+"""A ball that moves before a camera at rest, and a wall behind: matches have the errors they claim."""
 
 from __future__ import annotations
 

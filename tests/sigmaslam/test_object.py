@@ -1,0 +1,201 @@
+"""A camera at rest follows one body: a simulated ball before a wall, a rendered tool, and a scene that is the body."""
+
+import json
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from simulated_body import (
+    RADIUS,
+    WALL,
+    SimulatedBody,
+    box_around,
+    errors_of,
+    follow,
+    nees_of,
+    wandering,
+)
+from typer.testing import CliRunner
+
+from sigmaslam.cli import app
+from sigmaslam.errors import InputError
+from sigmaslam.evaluation.evaluate import evaluate_run
+from sigmaslam.object_region import read_region
+from sigmaslam.object_tracker import ObjectTracker
+from sigmaslam.readers import open_sequence
+from sigmaslam.rotation import se3_inverse
+from sigmaslam.run import track_sequence
+from sigmaslam.trajectory import Trajectory, read_kitti, write_kitti
+
+# 99.9 % quantile of chi-square with six degrees of freedom, per degree.
+NEES_999 = 22.458 / 6
+
+
+def test_a_box_is_read_in_pixels_of_the_image():
+    region = read_region("10, 20,30,5", 64, 48)
+    assert region.shape == (48, 64)
+    assert region.sum() == 150
+    assert region[20:25, 10:40].all()
+    assert read_region("0,0,64,48", 64, 48).all()
+
+
+def test_a_mask_is_read_whatever_its_channels(tmp_path: Path):
+    mask = np.zeros((48, 64, 3), np.uint8)
+    mask[5:9, 7:11, 1] = 1
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    region = read_region(str(tmp_path / "mask.png"), 64, 48)
+    assert region.sum() == 16
+    assert region[5:9, 7:11].all()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("60,0,10,10", "reaches beyond the left image of 64x48"),
+        ("-1,0,10,10", "reaches beyond"),
+        ("0,0,0,10", "1 pixel or more"),
+        ("1,2,3", "neither a box nor an image file"),
+        ("nowhere.png", "neither a box nor an image file"),
+    ],
+)
+def test_a_wrong_region_is_refused(text: str, words: str):
+    with pytest.raises(InputError, match=words):
+        read_region(text, 64, 48)
+
+
+def test_a_wrong_mask_is_refused(tmp_path: Path):
+    path = tmp_path / "mask.png"
+    cv2.imwrite(str(path), np.zeros((48, 64), np.uint8))
+    with pytest.raises(InputError, match="zero everywhere"):
+        read_region(str(path), 64, 48)
+    with pytest.raises(InputError, match="64x48 pixels, the left image 128x96"):
+        read_region(str(path), 128, 96)
+    path.write_text("no image")
+    with pytest.raises(InputError, match="not an image"):
+        read_region(str(path), 64, 48)
+
+
+@pytest.mark.parametrize(
+    ("grown", "wall", "rest"),
+    [(1.0, 300, 0), (1.6, 300, 10), (1.6, 1500, 10)],
+    ids=["tight box", "loose box, at rest first", "one point in seven of the box is the body's"],
+)
+def test_the_body_is_followed_and_its_covariance_is_right(grown: float, wall: int, rest: int):
+    body = SimulatedBody(wandering(70, seed=1, rest=rest), wall=wall)
+    tracker, estimates = follow(body, box_around(body.poses[0], grown))
+    assert [e.status for e in estimates] == ["starting"] + ["tracking"] * 69
+    errors = errors_of(body, estimates)
+    assert np.linalg.norm(errors[:, :3], axis=1).max() < 0.01
+    nees = nees_of(errors, estimates)
+    assert nees.max() < NEES_999
+    assert 0.3 < nees[rest + 5 :].mean() < 1.8
+    # The wall is 0.25 m and more behind the ball's visible side.
+    points = tracker.map().points + tracker.origin - body.poses[0][:3, 3]
+    assert len(points) > 40
+    assert (np.abs(np.linalg.norm(points, axis=1) - RADIUS) < 0.1).all()
+    assert tracker.origin[2] < WALL
+
+
+def test_new_landmarks_lie_on_the_body():
+    """Half a turn: what was seen first is gone at the end, and there is wall all around."""
+    poses = wandering(80, seed=1)
+    turn = np.linspace(0, np.pi, 80)
+    for k, a in enumerate(turn):
+        poses[k, :3, :3] = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+    body = SimulatedBody(poses, wall=600, ball=500)
+    _, estimates = follow(body, box_around(poses[0], 1.3))
+    assert {e.status for e in estimates[1:]} == {"tracking"}
+    assert np.linalg.norm(errors_of(body, estimates)[:, 3:], axis=1).max() < np.radians(3.0)
+    assert nees_of(errors_of(body, estimates), estimates).mean() < 2.5
+
+
+def test_a_body_that_goes_is_lost_and_is_found_where_it_comes_back():
+    hidden = range(30, 50)
+    body = SimulatedBody(wandering(65, seed=1, rest=5), hidden=hidden)
+    _, estimates = follow(body, box_around(body.poses[0], 1.2))
+    assert [e.status for e in estimates] == ["starting"] + ["tracking"] * 29 + ["lost"] * 20 + ["tracking"] * 15
+    errors = errors_of(body, estimates)
+    assert nees_of(errors, estimates).max() < NEES_999
+    assert np.linalg.norm(errors[50:, :3], axis=1).max() < 0.01
+
+
+def test_a_body_that_never_moves_stays_where_it_is():
+    body = SimulatedBody(wandering(15, seed=1, rest=15))
+    _, estimates = follow(body, box_around(body.poses[0], 1.6))
+    assert {e.status for e in estimates[1:]} == {"tracking"}
+    assert np.linalg.norm(errors_of(body, estimates)[:, :3], axis=1).max() < 0.002
+
+
+def test_a_region_with_nothing_to_follow_is_refused_at_once():
+    body = SimulatedBody(wandering(2), ball=20, wall=0)
+    with pytest.raises(InputError, match=r"only \d+ points in the region"):
+        follow(body, box_around(body.poses[0]))
+
+
+def test_a_scene_that_is_the_body_gives_the_inverse_of_the_camera_s_poses(demo_sequence: Path):
+    """A moving camera and a box around all of the image."""
+    sequence = open_sequence(demo_sequence, "kitti")
+    size = sequence.camera.left.width, sequence.camera.left.height
+    tracker = ObjectTracker(sequence.camera, read_region(f"0,0,{size[0]},{size[1]}", *size))
+    truth = read_kitti(demo_sequence / "poses.txt").poses
+    T_first_body = np.eye(4)
+    for frame, T_first_camera in zip(list(sequence.frames())[:12], truth, strict=False):
+        estimate = tracker.step(frame.left, frame.right, frame.timestamp)
+        T_first_body[:3, 3] = tracker.origin
+        error = estimate.T_camera_object @ se3_inverse(T_first_body) @ T_first_camera
+        assert np.linalg.norm(error[:3, 3]) < 0.005
+        assert np.linalg.norm(error[:3, :3] - np.eye(3)) < 0.005
+
+
+def test_the_command_line_writes_a_run_of_the_body(demo_sequence: Path, tmp_path: Path):
+    run = tmp_path / "run"
+    arguments = ["track", str(demo_sequence), "--out", str(run), "--track-object"]
+    result = CliRunner().invoke(app, [*arguments, "0,0,320,240"])
+    assert result.exit_code == 0, result.output
+    described = json.loads((run / "run.json").read_text())["object"]
+    assert described["region"] == "0,0,320,240"
+    # Truth of another frame on the body: of the first camera's.
+    truth = read_kitti(demo_sequence / "poses.txt")
+    write_kitti(tmp_path / "object.txt", Trajectory(truth.timestamps, se3_inverse(truth.poses)), tmp_path / "times.txt")
+    evaluation = evaluate_run(run, tmp_path / "object.txt", plot=False)
+    assert evaluation.matched == len(truth)
+    assert evaluation.ate_origin.rmse < 0.03
+    assert evaluation.nees is not None
+    assert evaluation.nees.mean < 5
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--track-object", "300,0,100,100"], "reaches beyond the left image of 320x240"),
+        (["--track-object", "0,0,9,9", "--tracks"], "leave them out with --track-object"),
+    ],
+)
+def test_the_command_line_refuses_a_wrong_region_before_it_writes(
+    demo_sequence: Path, tmp_path: Path, options: list[str], words: str
+):
+    run = tmp_path / "run"
+    result = CliRunner().invoke(app, ["track", str(demo_sequence), "--out", str(run), *options])
+    assert isinstance(result.exception, InputError)
+    assert words in str(result.exception)
+    assert not run.exists()
+
+
+@pytest.mark.slow
+def test_a_rendered_tool_is_followed(tmp_path: Path):
+    """`sigmaslam render tool --seed 1`, the box that docs/object.md gives, at half the size."""
+    pytest.importorskip("torch")
+    from sigmaslam.synthetic.sequence import write_sequence
+    from sigmaslam.synthetic.simulation import Recipe
+
+    folder, run = tmp_path / "tool", tmp_path / "run"
+    write_sequence(folder, Recipe("tool", 40, 1, width=320, height=256), "sparse")
+    summary = track_sequence(open_sequence(folder, "kitti"), run, track_object="0,102,195,78")
+    assert summary["lost"] == 0
+    evaluation = evaluate_run(run, folder / "poses_object.txt", plot=False)
+    assert evaluation.path_length > 0.05
+    assert evaluation.ate.rmse < 0.002
+    times = read_kitti(folder / "poses_object.txt").timestamps
+    assert all(a < b for a, b in pairwise(times))
