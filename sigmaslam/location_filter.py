@@ -19,7 +19,7 @@ import numpy as np
 
 from sigmaslam.errors import InputError
 from sigmaslam.location import Locations
-from sigmaslam.location_model import OFFSET, SENSOR_WORLD, SIZE, Pairs, SensorModel, State, find_worlds, residuals
+from sigmaslam.location_model import OFFSET, SENSOR_WORLD, SIZE, Pairs, State, find_worlds, residuals
 from sigmaslam.rotation import nearest_rigid, se3_adjoint, se3_body, se3_exp, se3_inverse, se3_log
 from sigmaslam.tracker import Estimate
 from sigmaslam.trajectory import Trajectory
@@ -209,7 +209,9 @@ class LocationFilter:
             None if readings.rotations is None else readings.rotations[rows],
             readings.covariances[rows],
         )
-        state = find_worlds(pairs, self._known.walked, self._on_object)
+        before = self._known.state
+        known = None if before is None else before.model
+        state = find_worlds(pairs, self._known.walked, self._on_object, known)
         self._known = _Known(state, self._known.walked)
         full = len(self._pairs) >= _MOST_KEPT
         if state is not None:

@@ -22,7 +22,7 @@ _KNOWN_TURN, _WORST_FIT = 0.15, 9.0
 _LEAST_READINGS = 4
 # Where on the camera or the body the sensor sits, metres, one sigma.
 _MOUNT_SIGMA = 1.0
-_STEPS, _SETTLED, _SMALL = 10, 1e-6, 1e-4
+_STEPS, _SETTLED, _SMALL = 10, 1e-5, 1e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class SensorModel:
     on_object: bool
 
     def expect(self, pose: np.ndarray, error: np.ndarray) -> np.ndarray:
-        """T_sensor_mark (..., 4, 4) for the tracker's poses (..., 4, 4), with error states (..., 18) changed by that."""
+        """T_sensor_mark (..., 4, 4) where the tracker has poses (..., 4, 4) and error states are (..., 18) away."""
         moved = se3_exp(error[..., OFFSET]) @ pose
         G = se3_inverse(moved) if self.on_object else moved
         return np.asarray(self.A @ se3_exp(error[..., SENSOR_WORLD]) @ G @ self.B @ se3_exp(error[..., MOUNT]))
@@ -93,7 +93,7 @@ class State:
         return float(np.sqrt(max(np.linalg.eigvalsh(self.covariance[9:12, 9:12])[-1], 0.0)))
 
 
-def find_worlds(pairs: Pairs, walked: np.ndarray, on_object: bool) -> State | None:
+def find_worlds(pairs: Pairs, walked: np.ndarray, on_object: bool, known: SensorModel | None = None) -> State | None:
     """A and B by Gauss-Newton on all pairs at once; None while they do not determine the rotation between the worlds.
 
     The priors are wide: any turn, ten times the readings' extent, a mount within a metre or so.
@@ -102,6 +102,7 @@ def find_worlds(pairs: Pairs, walked: np.ndarray, on_object: bool) -> State | No
         pairs: readings and poses.
         walked: (6, 6) covariance of the tracker's error now.
         on_object: of `SensorModel`.
+        known: a solution to begin with.
     """
     if len(pairs) < _LEAST_READINGS:
         return None
@@ -113,7 +114,7 @@ def find_worlds(pairs: Pairs, walked: np.ndarray, on_object: bool) -> State | No
     turn = 0.0 if pairs.rotations is None else np.pi
     prior = np.diag(np.repeat([10.0 * (reach + _MOUNT_SIGMA), np.pi, _MOUNT_SIGMA, turn], 3) ** 2)
     best, least = None, np.inf
-    for A, B in _guesses(pairs, G):
+    for A, B in _guesses(pairs, G) if known is None else [(known.A, known.B)]:
         solved = _solve(pairs, walked, SensorModel(A, B, on_object), prior)
         if solved[1] < least:
             best, least = solved
@@ -158,9 +159,9 @@ def _solve(pairs: Pairs, walked: np.ndarray, start: SensorModel, prior: np.ndarr
         model = start.moved(np.concatenate([np.zeros(6), worlds]))
         rest, slopes = _linearise(model, pairs)
         by_offset, by_worlds = slopes[..., OFFSET], slopes[..., _WORLDS].reshape(count * width, -1)
-        noise = np.einsum("iab,ijbc,jdc->iajd", by_offset, shared, by_offset)
+        noise = (by_offset[:, None] @ shared @ by_offset.swapaxes(1, 2)[None]).swapaxes(1, 2)
         noise[np.arange(count), :, np.arange(count), :] += pairs.covariances
-        noise = noise.reshape(count * width, count * width)
+        noise = noise.reshape(count * width, -1)
         # The residual where the prior's mean would be, if all were linear.
         whole = rest.ravel() + by_worlds @ worlds
         S = noise + by_worlds @ prior @ by_worlds.T

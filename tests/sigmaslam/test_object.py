@@ -23,7 +23,6 @@ from sigmaslam.cli import app
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.evaluate import evaluate_run
 from sigmaslam.object_region import read_region
-from sigmaslam.object_tracker import ObjectTracker
 from sigmaslam.readers import open_sequence
 from sigmaslam.rotation import se3_inverse
 from sigmaslam.run import track_sequence
@@ -129,27 +128,13 @@ def test_a_body_that_never_moves_stays_where_it_is():
 
 
 def test_a_region_with_nothing_to_follow_is_refused_at_once():
-    body = SimulatedBody(wandering(2), ball=20, wall=0)
+    body = SimulatedBody(wandering(2))
     with pytest.raises(InputError, match=r"only \d+ points in the region"):
-        follow(body, box_around(body.poses[0]))
+        follow(body, box_around(body.poses[0], 0.2))
 
 
-def test_a_scene_that_is_the_body_gives_the_inverse_of_the_camera_s_poses(demo_sequence: Path):
-    """A moving camera and a box around all of the image."""
-    sequence = open_sequence(demo_sequence, "kitti")
-    size = sequence.camera.left.width, sequence.camera.left.height
-    tracker = ObjectTracker(sequence.camera, read_region(f"0,0,{size[0]},{size[1]}", *size))
-    truth = read_kitti(demo_sequence / "poses.txt").poses
-    T_first_body = np.eye(4)
-    for frame, T_first_camera in zip(list(sequence.frames())[:12], truth, strict=False):
-        estimate = tracker.step(frame.left, frame.right, frame.timestamp)
-        T_first_body[:3, 3] = tracker.origin
-        error = estimate.T_camera_object @ se3_inverse(T_first_body) @ T_first_camera
-        assert np.linalg.norm(error[:3, 3]) < 0.005
-        assert np.linalg.norm(error[:3, :3] - np.eye(3)) < 0.005
-
-
-def test_the_command_line_writes_a_run_of_the_body(demo_sequence: Path, tmp_path: Path):
+def test_a_scene_that_is_the_body_gives_the_inverse_of_the_camera_s_poses(demo_sequence: Path, tmp_path: Path):
+    """A moving camera, and a box around all of the image, by the command line."""
     run = tmp_path / "run"
     arguments = ["track", str(demo_sequence), "--out", str(run), "--track-object"]
     result = CliRunner().invoke(app, [*arguments, "0,0,320,240"])
