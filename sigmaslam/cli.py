@@ -266,7 +266,10 @@ def evaluate(
     truth: Annotated[Path, typer.Option(help="Ground truth: TUM, KITTI (with times.txt beside it) or EuRoC csv.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
-    """Compare a trajectory with the truth: ATE, RPE, KITTI t_rel and r_rel, NEES; draws evaluation.png."""
+    """Compare a trajectory with the truth: ATE, RPE, KITTI t_rel and r_rel, NEES; draws evaluation.png.
+
+    Of a run with --track-object the truth is T_camera_object of any frame that is fixed to the body.
+    """
     from sigmaslam.evaluation.evaluate import evaluate_run, format_evaluation
 
     evaluation = evaluate_run(run, truth)

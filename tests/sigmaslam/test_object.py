@@ -1,7 +1,6 @@
 """A camera at rest follows one body: a simulated ball before a wall, a rendered tool, and a scene that is the body."""
 
 import json
-from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -17,6 +16,7 @@ from simulated_body import (
     nees_of,
     wandering,
 )
+from simulated_location import sense
 from typer.testing import CliRunner
 
 from sigmaslam.cli import app
@@ -30,6 +30,7 @@ from sigmaslam.trajectory import Trajectory, read_kitti, write_kitti
 
 # 99.9 % quantile of chi-square with six degrees of freedom, per degree.
 NEES_999 = 22.458 / 6
+BOX = "0,102,195,78"
 
 
 def test_a_box_is_read_in_pixels_of_the_image():
@@ -169,18 +170,32 @@ def test_the_command_line_refuses_a_wrong_region_before_it_writes(
 
 
 @pytest.mark.slow
-def test_a_rendered_tool_is_followed(tmp_path: Path):
-    """`sigmaslam render tool --seed 1`, the box that docs/object.md gives, at half the size."""
+def test_a_rendered_tool_is_followed_and_a_sensor_on_it_takes_drift_away(tmp_path: Path):
+    """`sigmaslam render tool --seed 1` with the box of docs/object.md, at half the size; a sensor at 10 Hz."""
     pytest.importorskip("torch")
     from sigmaslam.synthetic.sequence import write_sequence
-    from sigmaslam.synthetic.simulation import Recipe
+    from sigmaslam.synthetic.simulation import Recipe, simulate
 
-    folder, run = tmp_path / "tool", tmp_path / "run"
-    write_sequence(folder, Recipe("tool", 40, 1, width=320, height=256), "sparse")
-    summary = track_sequence(open_sequence(folder, "kitti"), run, track_object="0,102,195,78")
+    folder, recipe = tmp_path / "tool", Recipe("tool", 75, 1, width=320, height=256)
+    write_sequence(folder, recipe, "sparse")
+    sequence = open_sequence(folder, "kitti")
+    summary = track_sequence(sequence, tmp_path / "alone", track_object=BOX)
     assert summary["lost"] == 0
-    evaluation = evaluate_run(run, folder / "poses_object.txt", plot=False)
-    assert evaluation.path_length > 0.05
-    assert evaluation.ate.rmse < 0.002
-    times = read_kitti(folder / "poses_object.txt").timestamps
-    assert all(a < b for a, b in pairwise(times))
+    alone = evaluate_run(tmp_path / "alone", folder / "poses_object.txt", plot=False)
+    assert alone.path_length > 0.1
+    assert alone.ate.rmse < 0.002
+    assert alone.nees is not None
+    assert alone.nees.mean < 4
+
+    simulation = simulate(recipe)
+    body = simulation.scene.bodies[int(np.flatnonzero(simulation.scene.moving)[0])]
+    times = np.arange(0.017, simulation.times[-1], 0.1)  # not those of the frames
+    camera = simulation.path.poses(np.zeros(1))[0]
+    readings = sense(np.stack([se3_inverse(camera) @ body.pose(time) for time in times]), times, 0, 2e-4, 5e-3)
+    summary = track_sequence(sequence, tmp_path / "fused", track_object=BOX, locations=readings)
+    assert summary["location"]["ready"] is not None
+    fused = evaluate_run(tmp_path / "fused", folder / "poses_object.txt", plot=False)
+    assert fused.ate_origin.rmse < 0.8 * alone.ate_origin.rmse
+    assert fused.ate_origin.rotation_rmse_deg < 0.8 * alone.ate_origin.rotation_rmse_deg
+    assert fused.nees is not None
+    assert 0.5 < fused.nees.mean < 2.0
