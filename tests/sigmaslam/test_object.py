@@ -30,7 +30,7 @@ from sigmaslam.trajectory import Trajectory, read_kitti, write_kitti
 
 # 99.9 % quantile of chi-square with six degrees of freedom, per degree.
 NEES_999 = 22.458 / 6
-BOX = "0,102,195,78"
+BOX = "0,205,390,155"
 
 
 def test_a_box_is_read_in_pixels_of_the_image():
@@ -171,13 +171,13 @@ def test_the_command_line_refuses_a_wrong_region_before_it_writes(
 
 @pytest.mark.slow
 def test_a_rendered_tool_is_followed_and_a_sensor_on_it_takes_drift_away(tmp_path: Path):
-    """`sigmaslam render tool --seed 1` with the box of docs/object.md, at half the size; a sensor at 10 Hz."""
+    """`sigmaslam render tool --frames 75 --seed 1` with the box of docs/object.md; a sensor at 10 Hz."""
     pytest.importorskip("torch")
     from sigmaslam.synthetic.sequence import write_sequence
     from sigmaslam.synthetic.simulation import Recipe, simulate
 
-    folder, recipe = tmp_path / "tool", Recipe("tool", 75, 1, width=320, height=256)
-    write_sequence(folder, recipe, "sparse")
+    folder, recipe = tmp_path / "tool", Recipe("tool", 75, 1)
+    write_sequence(folder, recipe, "sparse", workers=2)
     sequence = open_sequence(folder, "kitti")
     summary = track_sequence(sequence, tmp_path / "alone", track_object=BOX)
     assert summary["lost"] == 0
