@@ -89,8 +89,9 @@ def rms(errors: np.ndarray, part: slice) -> float:
     return float(np.sqrt(np.mean(np.sum(errors[:, part] ** 2, axis=1))))
 
 
-@pytest.mark.parametrize("turn", [None, 0.01], ids=["positions", "poses"])
-@pytest.mark.parametrize("on_object", [False, True], ids=["on the camera", "on the body"])
+@pytest.mark.parametrize(
+    ("turn", "on_object"), [(None, False), (0.01, True)], ids=["positions of the camera", "poses of the body"]
+)
 def test_drift_is_less_and_the_covariance_is_right(turn: float | None, on_object: bool):
     """10 Hz, times between the frames', a world and a mount that nobody knows; poses at 20 Hz."""
     nees, before, after = [], [], []
