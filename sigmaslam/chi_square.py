@@ -4,7 +4,17 @@ import numpy as np
 
 # 99 % with 2 degrees of freedom.
 CHI_SQUARE_99_OF_2 = 9.21034037197618
-# 99.9 % with 0, 1, 2 and 3 degrees of freedom.
-CHI_SQUARE_999 = np.array([0.0, 10.827566170662733, 13.815510557964274, 16.26623619623813])
+# 99.9 % with 0 to 6 degrees of freedom.
+CHI_SQUARE_999 = np.array(
+    [
+        0.0,
+        10.827566170662733,
+        13.815510557964274,
+        16.26623619623813,
+        18.466826952903151,
+        20.515005652432876,
+        22.457744484825323,
+    ]
+)
 # 99.99 % with 6 degrees of freedom.
 CHI_SQUARE_9999_OF_6 = 27.85634123601417

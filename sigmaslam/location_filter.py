@@ -17,15 +17,14 @@ from typing import TypeVar
 
 import numpy as np
 
+from sigmaslam.chi_square import CHI_SQUARE_999
 from sigmaslam.errors import InputError
+from sigmaslam.estimate import Estimate
 from sigmaslam.location import Locations
 from sigmaslam.location_model import OFFSET, SENSOR_WORLD, SIZE, Pairs, State, find_worlds, residuals
-from sigmaslam.rotation import nearest_rigid, se3_adjoint, se3_body, se3_exp, se3_inverse, se3_log
-from sigmaslam.tracker import Estimate
+from sigmaslam.rotation import nearest_rigid, se3_body, se3_exp, se3_inverse, se3_log, turn_covariance
 from sigmaslam.trajectory import Trajectory
 
-# 99.9 % quantiles of chi-square with 3 and 6 degrees of freedom: a reading beyond is weakened until it is there.
-_GATE = {3: 16.26623619623813, 6: 22.457744484825324}
 # Where the variance of the tracker's position or rotation falls below this share, a loop or a map has corrected it.
 _CORRECTED = 0.5
 # All readings are solved for at once until the rotation between the worlds is known to so many radians, one sigma: at
@@ -235,7 +234,7 @@ class LocationFilter:
         cross = points.T @ apart / np.sqrt(len(points))
         predicted, noise = apart.T @ apart, self._readings.covariances[row]
         squared = float(innovation @ np.linalg.solve(predicted + noise, innovation))
-        gate = _GATE[len(innovation)]
+        gate = CHI_SQUARE_999[len(innovation)]  # a reading beyond is weakened until it is there
         if squared > gate:
             self.summary.weakened += 1
             noise = noise + (squared / gate - 1.0) * (predicted + noise)
@@ -256,6 +255,5 @@ _PARTS = (slice(0, 3), slice(3, 6))
 
 def _from_left(estimate: Estimate) -> np.ndarray:
     """(6, 6) covariance of the estimate's pose, perturbed from the left in the world."""
-    adjoint = se3_adjoint(estimate.T_world_camera)
-    covariance = adjoint @ estimate.covariance @ adjoint.T
+    covariance = turn_covariance(estimate.T_world_camera, estimate.covariance)
     return np.asarray(0.5 * (covariance + covariance.T))

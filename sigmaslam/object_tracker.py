@@ -13,13 +13,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sigmaslam.camera import StereoCamera
+from sigmaslam.chi_square import CHI_SQUARE_999
+from sigmaslam.config import TrackerConfig
 from sigmaslam.errors import InputError
+from sigmaslam.estimate import Estimate
 from sigmaslam.frontend import StereoView, TemporalMatches
 from sigmaslam.landmarks import PointMap
 from sigmaslam.object_region import BodyShape, inner_half, pixels_in
-from sigmaslam.rotation import se3_adjoint, se3_inverse
-from sigmaslam.tracker import Estimate, StereoTracker, TrackerConfig, _Found, _Stopwatch
-from sigmaslam.window import CHI_SQUARE_999, FrameFit
+from sigmaslam.rotation import se3_inverse, turn_covariance
+from sigmaslam.search import Found
+from sigmaslam.stopwatch import Stopwatch
+from sigmaslam.tracker import StereoTracker
+from sigmaslam.window import FrameFit
 
 # A landmark that moved so far in the image with the body, pixels, is the body's.
 _MOVED = 3.0
@@ -50,8 +55,7 @@ class ObjectEstimate(Estimate):
     @property
     def object_covariance(self) -> np.ndarray:
         """(6, 6) of `T_camera_object` in the body's own frame, translation (metres) before rotation (radians)."""
-        adjoint = se3_adjoint(self.T_world_camera)
-        covariance = adjoint @ self.covariance @ adjoint.T
+        covariance = turn_covariance(self.T_world_camera, self.covariance)
         return np.asarray(0.5 * (covariance + covariance.T))
 
 
@@ -157,7 +161,7 @@ class ObjectTracker(StereoTracker):
             self._T_world_body[:3, 3] = np.median(points, axis=0)
         super()._start(view, timestamp)
 
-    def _track(self, view: StereoView, clock: _Stopwatch) -> tuple[_Found, FrameFit | None]:
+    def _track(self, view: StereoView, clock: Stopwatch) -> tuple[Found, FrameFit | None]:
         if not self._separated:
             body = self._moving_part(view)
             if body is not None:
@@ -165,7 +169,7 @@ class ObjectTracker(StereoTracker):
                 clock.lap("match")
         return super()._track(view, clock)
 
-    def _accept(self, fit: FrameFit, found: _Found, view: StereoView, timestamp: float) -> None:
+    def _accept(self, fit: FrameFit, found: Found, view: StereoView, timestamp: float) -> None:
         if self._separated:
             self._confirm(found.views.rows[fit.kept], found.views.measurement[fit.kept, :2])
         super()._accept(fit, found, view, timestamp)
@@ -207,8 +211,7 @@ class ObjectTracker(StereoTracker):
         far = _UNSEEN * depth**2 / (camera.fx * camera.baseline)
         body = np.diag([aside, aside, far, aside / size, aside / size, aside / size]) ** 2
         # In the body's frame, whose axes are the camera's still; from there into the left camera's.
-        adjoint = se3_adjoint(se3_inverse(self._T_rectified_left) @ self._T_world_body)
-        return np.asarray(adjoint @ body @ adjoint.T)
+        return turn_covariance(se3_inverse(self._T_rectified_left) @ self._T_world_body, body)
 
     def _moving_part(self, view: StereoView) -> StereoView | None:
         """The first view with what has moved since, if that is enough to give a pose; None while all is at rest."""
@@ -224,7 +227,7 @@ class ObjectTracker(StereoTracker):
             return None
         chosen = np.zeros(len(first.disparity), bool)
         chosen[rows[moved]] = True
-        relative = self._locate(_only(first, chosen), view)
+        relative = self._search.locate(_only(first, chosen), view)
         if relative is None:
             return None
         T = se3_inverse(relative.T_key_camera)

@@ -134,7 +134,7 @@ def box_around(pose: np.ndarray, grown: float = 1.0) -> np.ndarray:
 def follow(body: SimulatedBody, region: np.ndarray) -> tuple[ObjectTracker, list[ObjectEstimate]]:
     """All frames through a fresh tracker whose front end is replaced."""
     tracker = ObjectTracker(body.camera, region, "klt")
-    tracker._frontend = body
+    tracker._frontend = tracker._search._frontend = body
     images = [image_of(k, WIDTH, HEIGHT) for k in range(len(body.poses))]
     return tracker, [tracker.step(image, image, k * INTERVAL) for k, image in enumerate(images)]
 

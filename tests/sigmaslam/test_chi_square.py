@@ -5,5 +5,5 @@ from sigmaslam.chi_square import CHI_SQUARE_99_OF_2, CHI_SQUARE_999, CHI_SQUARE_
 
 
 def test_the_constants_are_the_quantiles():
-    np.testing.assert_allclose(CHI_SQUARE_999[1:], chi2.isf(1e-3, [1, 2, 3]), rtol=1e-12)
+    np.testing.assert_allclose(CHI_SQUARE_999[1:], chi2.isf(1e-3, np.arange(1, 7)), rtol=1e-12)
     np.testing.assert_allclose([CHI_SQUARE_99_OF_2, CHI_SQUARE_9999_OF_6], chi2.isf([1e-2, 1e-4], [2, 6]), rtol=1e-12)
