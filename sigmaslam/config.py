@@ -29,6 +29,7 @@ class TrackerConfig:
         window: keyframes that are estimated jointly.
         spacing: landmarks are at least so far apart, pixels; what lies closer has the same errors (patches overlap).
         shared_disparity: share of the variance of a landmark's disparities that is the same in all views.
+        shared_place: share of the variance of its places, relative to the keyframe's, that is the same in all views.
         most_points: of the map; when there are twice as many, the least confirmed half goes.
         remembered: keyframes that are kept to find the way back to.
         most_misses: after so many frames in a row in which it was not found a landmark is no longer looked for.
@@ -53,6 +54,7 @@ class TrackerConfig:
     window: int = 6
     spacing: float = 8.0
     shared_disparity: float = 0.8
+    shared_place: float = 0.6
     most_points: int = 100_000
     remembered: int = 60
     most_misses: int = 3

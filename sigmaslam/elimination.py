@@ -8,7 +8,7 @@ import numpy as np
 
 from sigmaslam.linearise import Slopes
 from sigmaslam.residuals import student_weight
-from sigmaslam.tables import LANDMARK_SIZE, Landmarks
+from sigmaslam.tables import LANDMARK_SIZE, MODELLED, Landmarks
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,9 +17,9 @@ class Elimination:
 
     Attributes:
         rows: (K,) which.
-        covariance: (K, 4, 4).
-        dependence: (K, 4, n) how they move with the state.
-        step: (K, 4) to their best places if the state stays.
+        covariance: (K, 6, 6).
+        dependence: (K, 6, n) how they move with the state.
+        step: (K, 6) to their best places if the state stays.
     """
 
     rows: np.ndarray
@@ -60,8 +60,10 @@ def eliminate_landmarks(
         if len(seen)
         else np.zeros((0, LANDMARK_SIZE, LANDMARK_SIZE + size + 1))
     )
-    own = sums[:, :, :LANDMARK_SIZE] + np.eye(LANDMARK_SIZE) / landmarks.variance[seen][:, None, :]
-    vector = sums[:, :, -1] + (landmarks.measured[seen] - landmarks.estimate[seen]) / landmarks.variance[seen]
+    apart = landmarks.measured[seen] - landmarks.estimate[seen]
+    precision = _prior_precision(apart, landmarks.variance[seen])
+    own = sums[:, :, :LANDMARK_SIZE] + np.eye(LANDMARK_SIZE) * precision[:, None, :]
+    vector = sums[:, :, -1] + apart * precision
     lower = np.linalg.cholesky(own)
     reduced = np.linalg.solve(lower, np.concatenate([sums[:, :, LANDMARK_SIZE:-1], vector[..., None]], axis=2))
     tall, flat = by_state.reshape(-1, size), reduced[:, :, :size].reshape(-1, size)
@@ -70,3 +72,16 @@ def eliminate_landmarks(
     inverse = np.linalg.inv(own)
     step = (inverse @ vector[..., None])[..., 0]
     return information, right, Elimination(seen, inverse, -inverse @ sums[:, :, LANDMARK_SIZE:-1], step)
+
+
+def _prior_precision(apart: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """(K, 6) precisions of landmarks as measured, from estimates (K, 6) that far from there.
+
+    What their views share has longer tails than a Gaussian's, too: a place where two surfaces meet in the image is
+    wrong in all views alike.
+    """
+    precision = 1.0 / variance
+    for shared in (slice(3, MODELLED), slice(MODELLED, LANDMARK_SIZE)):
+        squared = (apart[:, shared] ** 2 * precision[:, shared]).sum(axis=1)
+        precision[:, shared] *= student_weight(squared, np.array(shared.stop - shared.start))[:, None]
+    return precision

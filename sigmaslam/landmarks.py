@@ -8,7 +8,7 @@ import numpy as np
 
 from sigmaslam.camera import RectifiedStereo
 from sigmaslam.rotation import skew
-from sigmaslam.tables import pose_slice
+from sigmaslam.tables import LANDMARK_SIZE, MODELLED, pose_slice
 from sigmaslam.window import KeyframeWindow
 
 
@@ -68,7 +68,8 @@ def map_points(
     points = window.camera.triangulate(uvd)
     R = window.poses[landmarks.host, :3, :3]
     by_disparity = R @ _triangulation_jacobian(uvd, points, window.camera)
-    by_landmark = np.concatenate([by_disparity, -by_disparity[:, :, 2:]], axis=2)
+    unmoved = np.zeros((len(points), 3, LANDMARK_SIZE - MODELLED))
+    by_landmark = np.concatenate([by_disparity, -by_disparity[:, :, 2:], unmoved], axis=2)
     points = (R @ points[..., None])[..., 0] + window.poses[landmarks.host, :3, 3]
     by_state = by_landmark @ landmarks.dependence
     by_state[:, :, 0] -= by_disparity[:, :, 2]

@@ -28,16 +28,33 @@ class MatchNoise:
             low, high = _SCALES
             self._scale = float(np.clip(self._scale * nis_per_dof**_ADAPTATION, low, high))
 
-    def of_matches(self, matches: TemporalMatches, own: float = 1.0) -> np.ndarray:
-        """(M, 3, 3) of (u, v, disparity); `own` is the share of a disparity's variance that is this view's alone."""
+    def of_matches(self, matches: TemporalMatches) -> np.ndarray:
+        """(M, 3, 3) of (u, v, disparity), whatever other views share of it."""
         noise = np.zeros((len(matches.points), 3, 3))
         if self._config.constant_sigma is None:
             noise[:, :2, :2] = matches.covariance
-            noise[:, 2, 2] = own * np.where(np.isfinite(matches.disparity), matches.disparity_sigma, 1.0) ** 2
+            noise[:, 2, 2] = np.where(np.isfinite(matches.disparity), matches.disparity_sigma, 1.0) ** 2
         else:
             place, disparity = self._config.constant_sigma
             noise[:] = np.diag([place, place, disparity]) ** 2
         return self._scale * noise
+
+    def split(self, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Covariances (M, 3, 3) as `of_matches` gives them, taken apart: what is a view's alone, what it shares.
+
+        Returns:
+            (M, 3, 3) of the view alone; (M, 3, 2) how errors of place that the landmark's views share, of variance
+            one, enter it. Shared errors of disparities are in the landmark.
+        """
+        place, disparity = self._config.shared_place, self._config.shared_disparity
+        common = np.zeros((len(noise), 3, 2))
+        # The symmetric root: the errors keep to the image's axes from view to view.
+        values, vectors = np.linalg.eigh(noise[:, :2, :2])
+        common[:, :2] = (vectors * np.sqrt(place * values)[:, None, :]) @ vectors.transpose(0, 2, 1)
+        alone = noise.copy()
+        alone[:, :2, :2] *= 1.0 - place
+        alone[:, 2, 2] *= 1.0 - disparity
+        return alone, common
 
     def of_keypoints(self, view: StereoView, index: np.ndarray) -> np.ndarray:
         """(K, 4) variances of (u, v, disparity) of a keyframe's features, and of what all their disparities share."""

@@ -126,7 +126,7 @@ class RunWriter:
                 frame=np.concatenate([np.full(len(views.rows), frame) for frame, views in self._views]),
                 landmark=np.concatenate([views.rows for _, views in self._views]),
                 measurement=np.concatenate([views.measurement for _, views in self._views]),
-                covariance=np.concatenate([views.noise for _, views in self._views]),
+                covariance=np.concatenate([views.covariance for _, views in self._views]),
                 disparity_offset=np.array([calibration.disparity_offset, calibration.disparity_offset_sigma]),
                 **self._rectified,
             )

@@ -74,7 +74,7 @@ class LandmarkSearch:
         pose: np.ndarray,
         covariance: np.ndarray,
         anchor: int = -1,
-        own: float | None = None,
+        alone: bool = False,
     ) -> Found:
         """Active search: every landmark within the innovation ellipse of its prediction, keyframe by keyframe.
 
@@ -84,9 +84,8 @@ class LandmarkSearch:
             pose: (4, 4) expected T_world_camera.
             covariance: (6, 6) of it relative to the keyframe `anchor`, perturbed from the left in the world.
             anchor: the last one by default.
-            own: share of a disparity's variance that is this view's alone; by default what the config does not share.
+            alone: the view is too far from the keyframes' to share errors with them.
         """
-        own = 1.0 - self._config.shared_disparity if own is None else own
         landmarks = self._window.landmarks
         rows = np.flatnonzero(landmarks.misses < self._config.most_misses)
         if not len(rows):
@@ -104,7 +103,10 @@ class LandmarkSearch:
             matches = self._frontend.match(key, landmarks.feature[rows[chosen]], view, predicted[chosen, :2], S[chosen])
             # Features of a keyframe ascend with the rows of its landmarks.
             place = np.searchsorted(landmarks.feature[rows[chosen]], matches.key_index)
-            views = Views(rows[chosen][place], _measurement(matches), self._noise.of_matches(matches, own))
+            noise, common = self._noise.of_matches(matches), np.zeros((len(place), 3, 2))
+            if not alone:
+                noise, common = self._noise.split(noise)
+            views = Views(rows[chosen][place], _measurement(matches), noise, common)
             parts.append(Found(views, matches.probability, rows[chosen]))
         return _merge(parts)
 

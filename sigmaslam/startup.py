@@ -29,11 +29,13 @@ class RelativePose:
         T_key_camera: (4, 4).
         inliers: (M,) bool, points that agree with it.
         covariance: (6, 6) of x in T_key_camera exp(x), x = (translation, rotation), from the inliers' noise.
+        misfit: sum of squared errors in sigmas by the probabilities of the points, at most a gate's each.
     """
 
     T_key_camera: np.ndarray
     inliers: np.ndarray
     covariance: np.ndarray
+    misfit: float
 
 
 def estimate_relative_pose(
@@ -47,7 +49,9 @@ def estimate_relative_pose(
     """Pose of the current view in the keyframe, from stereo points and where they are seen now.
 
     The essential matrix uses far points and is blind to errors of depth, but fails without parallax; P3P on stereo
-    points is the opposite. Both are tried and refined, the one that more points agree with is returned.
+    points is the opposite. Both are tried and refined, the one with the smaller misfit is returned. The number of
+    inliers would not do: with a turn in place of a shift, a pose may agree a little with a mover and with the scene
+    alike.
 
     Args:
         camera: the rectified pair.
@@ -72,7 +76,7 @@ def estimate_relative_pose(
         if guess is None:
             continue
         refined = _refine(views, guess)
-        if refined is not None and (best is None or refined.inliers.sum() > best.inliers.sum()):
+        if refined is not None and (best is None or refined.misfit < best.misfit):
             best = refined
     return best
 
@@ -201,7 +205,8 @@ def _refine(views: _Views, T_camera_key: np.ndarray) -> RelativePose | None:
     normal = (agreeing.transpose(0, 2, 1) @ information[inliers] @ agreeing).sum(axis=0)
     if not np.linalg.cond(normal) < _WORST_CONDITION:
         return None
-    return RelativePose(se3_inverse(T_camera_key), inliers, np.linalg.inv(normal))
+    misfit = float(views.weight @ np.minimum(squared, CHI_SQUARE_999[3]))
+    return RelativePose(se3_inverse(T_camera_key), inliers, np.linalg.inv(normal), misfit)
 
 
 def _pose(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 CALIBRATION = slice(0, 3)
 CALIBRATION_SIZE = 3
-LANDMARK_SIZE = 4
+LANDMARK_SIZE = 6
+# The first of its numbers are what the measurement model knows; the others are errors of place that its views share.
+MODELLED = 4
 
 
 def pose_slice(clone: int) -> slice:
@@ -23,37 +25,43 @@ class Views:
     Attributes:
         rows: (M,) which landmarks of the window, each once.
         measurement: (M, 3) (u, v, disparity); the disparity may be NaN.
-        noise: (M, 3, 3) its covariance.
+        noise: (M, 3, 3) covariance of its errors that no other view of the landmark has.
+        common: (M, 3, 2) how errors of place that all views of the landmark share, of variance one, enter it.
     """
 
     rows: np.ndarray
     measurement: np.ndarray
     noise: np.ndarray
+    common: np.ndarray
 
     def select(self, index: np.ndarray) -> Views:
         """The views of that index or mask."""
-        return Views(self.rows[index], self.measurement[index], self.noise[index])
+        return Views(*(getattr(self, name)[index] for name in self.__slots__))
 
     def renumber(self, number: np.ndarray) -> Views:
         """Those of landmarks that stay, under their new rows: number (L,) as of `KeyframeWindow.retire_oldest`."""
         kept = self.select(number[self.rows] >= 0)
-        return Views(number[kept.rows], kept.measurement, kept.noise)
+        return replace(kept, rows=number[kept.rows])
 
     @classmethod
     def empty(cls) -> Views:
         """Nothing is seen."""
-        return cls(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+        return cls(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 2)))
 
     @property
     def components(self) -> np.ndarray:
         """(M,) how many numbers each view measures, 2 or 3."""
         return np.isfinite(self.measurement).sum(axis=1)
 
+    @property
+    def covariance(self) -> np.ndarray:
+        """(M, 3, 3) of the measurement, places relative to those in the landmark's keyframe."""
+        return self.noise + self.common @ self.common.transpose(0, 2, 1)
+
 
 def join_views(parts: list[Views]) -> Views:
     """All views of all parts."""
-    names = ("rows", "measurement", "noise")
-    return Views(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    return Views(*(np.concatenate([getattr(part, name) for part in parts]) for name in Views.__slots__))
 
 
 @dataclass(slots=True)
@@ -63,11 +71,11 @@ class Landmarks:
     Attributes:
         host: (L,) position of the keyframe that they were first seen in.
         feature: (L,) index among its features.
-        measured, variance: (L, 4), (L, 4) (u, v, disparity) there, zero for what its disparities are off by in all
-            views alike, and their variances.
-        estimate: (L, 4) refined by all views.
-        covariance: (L, 4, 4) of that given poses and calibration.
-        dependence: (L, 4, n) how it moves with the state (calibration and poses of the window).
+        measured, variance: (L, 6), (L, 6) (u, v, disparity) there, zero for what its disparities, pixels, and its
+            places, sigmas, are off by in all views alike, and their variances.
+        estimate: (L, 6) refined by all views.
+        covariance: (L, 6, 6) of that given poses and calibration.
+        dependence: (L, 6, n) how it moves with the state (calibration and poses of the window).
         views: (L,) how many keyframes and frames have confirmed it.
         misses: (L,) frames in a row in which it was looked for and not found.
         serial: (L,) number that stays.
@@ -105,7 +113,8 @@ class Landmarks:
     def first_views(self) -> Views:
         """Them as their hosts see them, by serial numbers; all that disparities are off by is noise there."""
         variance = np.column_stack([self.variance[:, :2], self.variance[:, 2] + self.variance[:, 3]])
-        return Views(self.serial, self.measured[:, :3], np.asarray(np.eye(3) * variance[:, None, :]))
+        noise = np.asarray(np.eye(3) * variance[:, None, :])
+        return Views(self.serial, self.measured[:, :3], noise, np.zeros((len(self), 3, 2)))
 
 
 @dataclass(slots=True)
@@ -115,17 +124,18 @@ class Observations:
     Attributes:
         landmark: (O,) row of the landmark that is seen.
         clone: (O,) position of the keyframe that sees it.
-        measurement, noise: (O, 3), (O, 3, 3) as of `Views`.
+        measurement, noise, common: (O, 3), (O, 3, 3), (O, 3, 2) as of `Views`.
     """
 
     landmark: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     clone: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     measurement: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     noise: np.ndarray = field(default_factory=lambda: np.zeros((0, 3, 3)))
+    common: np.ndarray = field(default_factory=lambda: np.zeros((0, 3, 2)))
 
     def select(self, index: np.ndarray) -> Observations:
         """The observations of that index or mask."""
-        return Observations(self.landmark[index], self.clone[index], self.measurement[index], self.noise[index])
+        return Observations(*(getattr(self, name)[index] for name in self.__slots__))
 
     def append(self, clone: int, views: Views) -> Observations:
         """These and the views of the keyframe `clone`."""
@@ -134,9 +144,10 @@ class Observations:
             np.r_[self.clone, np.full(len(views.rows), clone)],
             np.concatenate([self.measurement, views.measurement]),
             np.concatenate([self.noise, views.noise]),
+            np.concatenate([self.common, views.common]),
         )
 
     def renumber(self, number: np.ndarray) -> Observations:
         """Those of landmarks that stay, under their new rows: number (L,) as of `KeyframeWindow.retire_oldest`."""
         kept = self.select(number[self.landmark] >= 0)
-        return Observations(number[kept.landmark], kept.clone, kept.measurement, kept.noise)
+        return replace(kept, landmark=number[kept.landmark])

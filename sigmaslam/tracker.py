@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -205,7 +206,7 @@ class StereoTracker:
             # How far the landmarks of other keyframes may be from where this pose expects them.
             margin = np.diag(np.repeat([0.01 * self._window.depth, 0.01], 3) ** 2)
             uncertain = turn_covariance(start, relative.covariance + margin)
-            found = self._search.near(view, self._keyframe_views, start, uncertain, -back, 1.0)
+            found = self._search.near(view, self._keyframe_views, start, uncertain, -back, alone=True)
             clock.lap("match")
             pose, covariance = self._pose_and_step()
             fit = self._window.fit_frame(found.views, pose, covariance, self.config.least_inliers, start)
@@ -364,7 +365,7 @@ class StereoTracker:
             window.add_views(views)
         self._add_landmarks(view, views)
         first = window.landmarks.select(window.landmarks.host == len(window) - 1).first_views()
-        seen = [] if views is None else [Views(window.landmarks.serial[views.rows], views.measurement, views.noise)]
+        seen = [] if views is None else [replace(views, rows=window.landmarks.serial[views.rows])]
         self.keyframe_views = join_views([*seen, first])
         window.solve()
         self._close_loop(view)

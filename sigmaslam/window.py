@@ -26,7 +26,16 @@ from sigmaslam.gaussian import append_moved, condition, matrix_root, project_cov
 from sigmaslam.linearise import Slopes, ViewLineariser
 from sigmaslam.residuals import UNKNOWN_VARIANCE, mask_missing, squared_lengths, student_weight, whiten
 from sigmaslam.rotation import nearest_rigid, se3_exp, se3_inverse, se3_log
-from sigmaslam.tables import CALIBRATION, CALIBRATION_SIZE, LANDMARK_SIZE, Landmarks, Observations, Views, pose_slice
+from sigmaslam.tables import (
+    CALIBRATION,
+    CALIBRATION_SIZE,
+    LANDMARK_SIZE,
+    MODELLED,
+    Landmarks,
+    Observations,
+    Views,
+    pose_slice,
+)
 
 # Of the robust loss by which a frame's pose is first found: its scales in standard deviations.
 _ROBUST_SCALES = (6.0, 4.0, 3.0)
@@ -145,12 +154,13 @@ class KeyframeWindow:
         """
         count = len(feature)
         size = len(self.covariance)
+        variance = np.pad(variance, ((0, 0), (0, LANDMARK_SIZE - MODELLED)), constant_values=1.0)
         new = Landmarks(
             np.full(count, len(self.poses) - 1),
             feature,
-            np.pad(measured, ((0, 0), (0, 1))),
+            np.pad(measured, ((0, 0), (0, LANDMARK_SIZE - 3))),
             variance,
-            np.pad(measured, ((0, 0), (0, 1))),
+            np.pad(measured, ((0, 0), (0, LANDMARK_SIZE - 3))),
             np.eye(LANDMARK_SIZE) * variance[:, None, :],
             np.zeros((count, LANDMARK_SIZE, size)),
             np.ones(count, np.int64),
@@ -216,7 +226,8 @@ class KeyframeWindow:
         """
         covariance = append_moved(matrix_root(self.covariance), pose_slice(anchor % len(self.poses)), step_covariance)
         covariance = covariance @ covariance.T
-        slopes = self._linearise_frame(rows, pose, np.zeros(len(covariance)), covariance, np.zeros((len(rows), 4)))
+        moved, common = np.zeros((len(rows), LANDMARK_SIZE)), np.zeros((len(rows), 3, 2))
+        slopes = self._linearise_frame(rows, pose, np.zeros(len(covariance)), covariance, moved, common)
         noise, by_state = self._frame_noise(rows, slopes, np.zeros((len(rows), 3, 3)))
         return slopes.mean, noise + project_covariance(by_state, covariance), slopes.in_front
 
@@ -249,7 +260,7 @@ class KeyframeWindow:
         moved = np.zeros((len(views.rows), LANDMARK_SIZE))
         step, kept = 0, None
         while True:
-            slopes = self._linearise_frame(views.rows, pose, offset, spread, moved)
+            slopes = self._linearise_frame(views.rows, pose, offset, spread, moved, views.common)
             noise, by_state = self._frame_noise(views.rows, slopes, views.noise)
             expected = slopes.mean - (slopes.by_landmark @ moved[..., None])[..., 0]
             residual, noise = mask_missing(views.measurement - expected, noise)
@@ -323,7 +334,7 @@ class KeyframeWindow:
         return number
 
     def true_disparity(self, landmarks: np.ndarray) -> np.ndarray:
-        """(u, v, disparity) (K, 3) of landmarks (K, 4) without what the calibration and their own errors add."""
+        """(u, v, disparity) (K, 3) of landmarks (K, 6) without what the calibration and their own errors add."""
         x = (landmarks[:, 0] - landmarks[:, 2] - self.camera.cx) / self.camera.fx
         y = (landmarks[:, 1] - self.camera.cy) / self.camera.fy
         constant, yaw, pitch = self.calibration
@@ -369,17 +380,24 @@ class KeyframeWindow:
             landmarks.covariance[observations.landmark],
             landmarks.host[observations.landmark],
             observations.clone,
+            observations.common,
             self.depth,
         )
         residual, noise = mask_missing(observations.measurement - slopes.mean, observations.noise + slopes.left)
         return slopes, residual, noise, np.isfinite(observations.measurement).sum(axis=1)
 
     def _linearise_frame(
-        self, rows: np.ndarray, pose: np.ndarray, offset: np.ndarray, covariance: np.ndarray, moved: np.ndarray
+        self,
+        rows: np.ndarray,
+        pose: np.ndarray,
+        offset: np.ndarray,
+        covariance: np.ndarray,
+        moved: np.ndarray,
+        common: np.ndarray,
     ) -> Slopes:
         """Views of landmarks by the frame, with the state moved by `offset` from the window's estimate and `pose`.
 
-        The landmarks follow the state, and lie `moved` (M, 4) from there.
+        The landmarks follow the state, and lie `moved` (M, 6) from there.
         """
         size = len(self.covariance)
         poses = np.concatenate([self.poses, pose[None]])
@@ -393,6 +411,7 @@ class KeyframeWindow:
             landmarks.covariance[rows],
             landmarks.host[rows],
             np.full(len(rows), len(self.poses)),
+            common,
             self.depth,
         )
 

@@ -56,6 +56,7 @@ class SimulatedFrontend:
         place, disparity: standard deviations per axis of a match, and of a disparity, pixels.
         offset: of all disparities, pixels.
         shared: share of a disparity's variance that is the same in all views of a point.
+        shared_place: share of the variance of its places in other views that is the same in all of them.
         outliers: share of matches that are up to 20 px off.
     """
 
@@ -71,6 +72,7 @@ class SimulatedFrontend:
         disparity: float = 0.25,
         offset: float = 0.3,
         shared: float = _ASSUMED.shared_disparity,
+        shared_place: float = _ASSUMED.shared_place,
         outliers: float = 0.0,
     ) -> None:
         self._scale, self._random = scale, np.random.default_rng(seed)
@@ -84,6 +86,8 @@ class SimulatedFrontend:
         self._points = np.concatenate([self._cloud(pose, 2 if k else 4) for k, pose in enumerate(self.poses[::5])])
         self._shared = np.sqrt(shared) * disparity * self._random.standard_normal(len(self._points))
         self._own = np.sqrt(1.0 - shared) * disparity
+        self._shared_place = shared_place
+        self._place_errors: dict[int, np.ndarray] = {}
         self._priority = self._random.permutation(len(self._points))
         self._seen: dict[int, np.ndarray] = {}
 
@@ -123,7 +127,13 @@ class SimulatedFrontend:
         both = np.isin(wanted, seen)
         points, count = wanted[both], int(both.sum())
         truth, _ = self._project(frame)
-        places = truth[points, :2] + self._place * self._random.standard_normal((count, 2))
+        # Of a keyframe's points in all views alike, and of this view alone.
+        common = self._place_errors.setdefault(
+            frame_of(key.left), self._random.standard_normal((len(self._points), 2))
+        )[points]
+        own = self._random.standard_normal((count, 2))
+        error = np.sqrt(self._shared_place) * common + np.sqrt(1.0 - self._shared_place) * own
+        places = truth[points, :2] + self._place * error
         wrong = self._random.random(count) < self._outliers
         places[wrong] += self._random.uniform(-20, 20, (int(wrong.sum()), 2))
         return TemporalMatches(

@@ -63,7 +63,7 @@ def see(window: KeyframeWindow, T_key_camera: np.ndarray, seen: np.ndarray) -> N
     """One more keyframe, in a known place, that sees all landmarks."""
     step = se3_inverse(window.poses[-1]) @ WORLD @ T_key_camera
     window.add_keyframe(WORLD @ T_key_camera, step, CERTAIN**2 * np.eye(6), np.zeros(3))
-    window.add_views(Views(np.arange(len(seen)), seen, noise_of(len(seen))))
+    window.add_views(Views(np.arange(len(seen)), seen, noise_of(len(seen)), np.zeros((len(seen), 3, 2))))
     window.landmarks.views = window.landmarks.views + 1
 
 

@@ -35,7 +35,8 @@ def test_errors_are_as_large_as_the_covariance_says_at_every_scale(kind: str):
         assert_always_tracking(run)
         nees.append(run.nees.mean())
         nis = sum(e.nis for e in run.estimates) / sum(e.dof for e in run.estimates)
-        assert 0.93 < nis < 1.07
+        # The tracker allows for longer tails than these errors have.
+        assert 0.9 < nis < 1.1
         assert abs(offset_in_sigmas(run)) < 3
         assert run.estimates[-1].calibration.disparity_offset_sigma < 0.1
     # The mean of four runs scatters by 0.25; thirty, below, are held to the band that is asked for.

@@ -22,6 +22,8 @@ FIRST_SIGMA = np.repeat([0.02, 0.01], 3)
 STEP_SIGMA = np.repeat([0.05, 0.02], 3)
 HOST_SIGMA = np.array([0.1, 0.1, 0.15, 0.25])
 VIEW_ROOT = np.array([[0.25, 0.0, 0.0], [0.1, 0.25, 0.0], [0.0, 0.05, 0.2]])
+# How errors that a landmark's places share enter its views.
+COMMON = np.array([[0.15, 0.02], [0.02, 0.1], [0.0, 0.0]])
 STEP = se3_exp([0.15, -0.05, 0.3, 0.02, -0.05, 0.03])
 KEYFRAMES = 3
 # With deviations so small everything is linear, and equal numbers must be equal.
@@ -37,7 +39,7 @@ class World:
         expected, poses: (4, 4, 4) as the prior expects them, and true.
         calibration: (3,) true.
         host: (L,) keyframe that a landmark belongs to, ascending.
-        landmarks, measured: (L, 4) true, and in the host.
+        landmarks, measured: (L, 6) true, and in the host.
         views: of each pose.
     """
 
@@ -52,7 +54,10 @@ class World:
 
 
 def project(pose: np.ndarray, host: np.ndarray, calibration: np.ndarray, landmarks: np.ndarray) -> np.ndarray:
-    """(u, v, disparity) (L, 3) of landmarks (L, 4) of hosts (L, 4, 4), by way of the points themselves."""
+    """(u, v, disparity) (L, 3) of landmarks (L, 6) of hosts (L, 4, 4), by way of the points themselves.
+
+    Without the errors that its places share.
+    """
 
     def bias(uvd: np.ndarray) -> np.ndarray:
         x, y = (uvd[:, 0] - uvd[:, 2] - CAMERA.cx) / CAMERA.fx, (uvd[:, 1] - CAMERA.cy) / CAMERA.fy
@@ -79,15 +84,17 @@ def world(seed: int = 0, scale: float = 1.0, count: int = 12, hosts: int = KEYFR
     true = 80 / rng.uniform(2.5, 9.0, count)
     own = scale * HOST_SIGMA[3] * rng.standard_normal(count)
     landmarks = np.c_[rng.uniform(120, 520, count), rng.uniform(100, 380, count), true + own, own]
-    measured = landmarks + scale * HOST_SIGMA * rng.standard_normal((count, 4))
+    measured = np.pad(landmarks + scale * HOST_SIGMA * rng.standard_normal((count, 4)), ((0, 0), (0, 2)))
     measured[:, 3] = 0.0
+    landmarks = np.c_[landmarks, np.random.default_rng(100 + seed).standard_normal((count, 2))]
     views = []
     for k, pose in enumerate(poses):
         rows = np.flatnonzero(host < k)
         seen = project(pose, poses[host[rows]], calibration, landmarks[rows])
-        seen = seen + scale * rng.standard_normal((len(rows), 3)) @ VIEW_ROOT.T
+        seen = seen + scale * (rng.standard_normal((len(rows), 3)) @ VIEW_ROOT.T + landmarks[rows, 4:] @ COMMON.T)
         seen[(rows + k) % 6 == 0, 2] = np.nan
-        views.append(Views(rows, seen, np.tile(scale**2 * VIEW_ROOT @ VIEW_ROOT.T, (len(rows), 1, 1))))
+        noise, common = scale**2 * VIEW_ROOT @ VIEW_ROOT.T, scale * COMMON
+        views.append(Views(rows, seen, np.tile(noise, (len(rows), 1, 1)), np.tile(common, (len(rows), 1, 1))))
     return World(scale, np.array(expected), poses, calibration, host, landmarks, measured, views)
 
 
@@ -149,13 +156,15 @@ class Dense:
     def residuals(self, at: np.ndarray) -> np.ndarray:
         """In standard deviations."""
         given, scale = self.given, self.given.scale
-        calibration, tangents, landmarks = at[:3], at[3 : self.size].reshape(-1, 6), at[self.size :].reshape(-1, 4)
+        calibration, tangents, landmarks = at[:3], at[3 : self.size].reshape(-1, 6), at[self.size :].reshape(-1, 6)
         poses = se3_exp(tangents) @ self.expected
         parts = [calibration / CALIBRATION_SIGMA, tangents[0] / FIRST_SIGMA]
-        parts += [(np.diff(tangents, axis=0) / STEP_SIGMA).ravel(), ((landmarks - given.measured) / HOST_SIGMA).ravel()]
-        parts = [part / scale for part in parts]
+        parts.append((np.diff(tangents, axis=0) / STEP_SIGMA).ravel())
+        parts.append(((landmarks - given.measured)[:, :4] / HOST_SIGMA).ravel())
+        parts = [*(part / scale for part in parts), landmarks[:, 4:].ravel()]
         for pose, views, whitener in zip(poses, self.views, self.whiteners, strict=True):
             seen = project(pose, poses[given.host[views.rows]], calibration, landmarks[views.rows])
+            seen = seen + (views.common @ landmarks[views.rows, 4:, None])[..., 0]
             rest = np.nan_to_num(views.measurement - seen)
             parts.append((whitener @ rest[..., None]).ravel())
         return np.concatenate(parts)
@@ -175,7 +184,8 @@ class Dense:
         return np.stack([(moved(k, step) - moved(k, -step)) / (2 * step) for k in range(len(at))], axis=1)
 
     def solve(self) -> Dense:
-        self.at = least_squares(self.residuals, self.at, x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15).x
+        tolerances = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-15)
+        self.at = least_squares(self.residuals, self.at, "3-point", x_scale="jac", **tolerances).x
         return self
 
     @property
@@ -238,7 +248,7 @@ def test_the_solution_is_that_of_dense_least_squares(scale: float, tolerance: fl
         given = world(seed, scale)
         window, dense = solved(given), Dense(given, KEYFRAMES).solve()
         assert_same_state(window.poses, window.calibration, window.covariance, dense, tolerance)
-        found = (window.landmarks.estimate - dense.at[dense.size :].reshape(-1, 4)) / (scale * HOST_SIGMA)
+        found = (window.landmarks.estimate - dense.at[dense.size :].reshape(-1, 6)) / np.r_[scale * HOST_SIGMA, 1, 1]
         assert np.abs(found).max() < tolerance
 
 
@@ -247,7 +257,7 @@ def test_landmarks_given_the_state_have_the_dense_covariance_and_follow_it():
     window, dense = solved(given), Dense(given, KEYFRAMES).solve()
     whole = np.linalg.inv(dense.information())
     for row in np.flatnonzero(given.host < KEYFRAMES - 1):
-        place = slice(dense.size + 4 * row, dense.size + 4 * row + 4)
+        place = slice(dense.size + 6 * row, dense.size + 6 * row + 6)
         follows = window.landmarks.dependence[row]
         found = window.landmarks.covariance[row] + follows @ window.covariance @ follows.T
         assert in_sigmas(found, whole[place, place]) < 1e-4
@@ -258,7 +268,8 @@ def test_landmarks_that_nobody_saw_again_stay_as_they_were_measured():
     window = solved(given)
     last = given.host == KEYFRAMES - 1
     np.testing.assert_array_equal(window.landmarks.estimate[last], given.measured[last])
-    np.testing.assert_allclose(window.landmarks.covariance[last], np.tile(np.diag(HOST_SIGMA**2), (last.sum(), 1, 1)))
+    expected = np.diag(np.r_[HOST_SIGMA**2, 1.0, 1.0])
+    np.testing.assert_allclose(window.landmarks.covariance[last], np.tile(expected, (last.sum(), 1, 1)))
     assert (window.landmarks.dependence[last] == 0).all()
 
 
@@ -332,7 +343,7 @@ def test_a_disparity_that_is_not_there_is_one_that_is_unknown():
         measurement, noise = views.measurement.copy(), views.noise.copy()
         measurement[missing, 2] = 10.0
         noise[missing, 2, :], noise[missing, :, 2], noise[missing, 2, 2] = 0.0, 0.0, 1e10
-        filled.append(Views(views.rows, measurement, noise))
+        filled.append(replace(views, measurement=measurement, noise=noise))
     assert any(np.isnan(views.measurement).any() for views in given.views[1:])
     one, other = solved(given), solved(replace(given, views=filled))
     np.testing.assert_allclose(one.poses, other.poses, atol=1e-7)
@@ -444,7 +455,7 @@ def test_predictions_are_where_the_frame_then_sees_the_landmarks():
         mean, covariance, in_front = window.predict(views.rows, window.poses[-1] @ STEP, np.diag(STEP_SIGMA**2))
         assert in_front.all()
         error = (views.measurement - mean)[..., None]
-        values.append((error * np.linalg.solve(covariance + views.noise, error)).sum(axis=(1, 2)).mean() / 3)
+        values.append((error * np.linalg.solve(covariance + views.covariance, error)).sum(axis=(1, 2)).mean() / 3)
     # Views of one frame share its pose: the mean over the worlds scatters as that of a dozen such numbers does.
     assert 0.6 < np.mean(values) < 1.5
 
@@ -524,7 +535,8 @@ def test_a_long_chain_of_windows_stays_rigid():
     """100 keyframes, each from the last by products with inverses by transposition: defects that double would show."""
     given = world(0, count=30)
     at_origin, rows = np.tile(np.eye(4), (30, 1, 1)), np.arange(30)
-    seen = Views(rows, project(STEP, at_origin, np.zeros(3), given.landmarks), np.tile(0.1 * np.eye(3), (30, 1, 1)))
+    places = project(STEP, at_origin, np.zeros(3), given.landmarks)
+    seen = Views(rows, places, np.tile(0.1 * np.eye(3), (30, 1, 1)), np.zeros((30, 3, 2)))
     window = KeyframeWindow(CAMERA, CALIBRATION_SIGMA, "onnx", "extended")
     window.depth = 4.0
     for k in range(100):
