@@ -4,6 +4,8 @@ import numpy as np
 
 # 99 % with 2 degrees of freedom.
 CHI_SQUARE_99_OF_2 = 9.21034037197618
+# Medians with 0, 1, 2 and 3 degrees of freedom; of nothing no share is larger.
+CHI_SQUARE_MEDIAN = np.array([np.inf, 0.454936423119572, 1.3862943611198906, 2.3659738843753377])
 # 99.9 % with 0 to 6 degrees of freedom.
 CHI_SQUARE_999 = np.array(
     [

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from sigmaslam.chi_square import CHI_SQUARE_999, CHI_SQUARE_MEDIAN
+
 # A disparity that is not there: its variance, pixels squared.
 UNKNOWN_VARIANCE = 1e12
 # Errors of right matches have longer tails than a Gaussian's: degrees of freedom of the Student-t that is fitted.
 # 4 and 1 are no better on rendered streets.
 STUDENT_FREEDOM = 2.0
+# What so many agree on is no matter of a few outliers.
+_NEARLY_ALL = 0.95
 
 
 def mask_missing(residual: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -25,6 +29,23 @@ def mask_missing(residual: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, n
 def squared_lengths(residual: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """(M,) squared Mahalanobis lengths of residuals (M, 3)."""
     return np.einsum("mi,mi->m", residual, np.linalg.solve(covariance, residual[..., None])[..., 0])
+
+
+def common_scale(squared: np.ndarray, components: np.ndarray) -> float:
+    """Factor, 1 or more, by which all variances together are too small: of a blurred image, say.
+
+    The median tells how far the residuals scatter before any gate. It is believed where nearly all agree once their
+    variances are scaled by it; where they do not, the errors are those of a part: outliers among good matches.
+
+    Args:
+        squared: (M,) squared lengths of whitened residuals.
+        components: (M,) how many numbers each residual has.
+    """
+    if not len(squared):
+        return 1.0
+    factor = max(1.0, float(np.median(squared / CHI_SQUARE_MEDIAN[components])))
+    agreeing = float((squared <= factor * CHI_SQUARE_999[components]).mean())
+    return factor if agreeing >= _NEARLY_ALL else 1.0
 
 
 def whiten(stacked: np.ndarray, noise: np.ndarray) -> np.ndarray:

@@ -38,6 +38,10 @@ class Views:
         """The views of that index or mask."""
         return Views(*(getattr(self, name)[index] for name in self.__slots__))
 
+    def scaled(self, factor: float) -> Views:
+        """The same with so many times the variance."""
+        return replace(self, noise=factor * self.noise, common=np.sqrt(factor) * self.common)
+
     def renumber(self, number: np.ndarray) -> Views:
         """Those of landmarks that stay, under their new rows: number (L,) as of `KeyframeWindow.retire_oldest`."""
         kept = self.select(number[self.rows] >= 0)

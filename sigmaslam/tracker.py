@@ -37,6 +37,8 @@ _LEAST_SHARE = 0.3
 _DOUBTFUL_NIS = 2.0
 # With so large a NIS a pose needs so many times the least number of inliers.
 _MANY = 3
+# A view whose matches all scatter by so many times the variance that they claim is no keyframe while many agree.
+_BLURRED = 2.0
 # Where more than this share of the disparities is negative by more than a pixel, which no disparity offset explains,
 # the eyes are swapped, or nothing fits.
 _MOST_NEGATIVE = 0.1
@@ -236,10 +238,14 @@ class StereoTracker:
         self._tracked_at = timestamp
         self._moving = self._velocity_known = True
         self._noise.adapt(fit.nis_per_dof)
-        if int(fit.kept.sum()) < self.config.keyframe_ratio * self._reference:
+        count = int(fit.kept.sum())
+        if count < self.config.keyframe_ratio * self._reference:
+            if fit.noise_scale > _BLURRED and count >= _MANY * self.config.least_inliers:
+                return  # a bad keyframe would spoil what comes after it; the next view may be a better one
             view = self._choose(view, fit.pose)
             if self._has_stereo(view):
-                self._add_keyframe(view, timestamp, fit.pose, expected, step_covariance, found.views.select(fit.kept))
+                views = found.views.select(fit.kept).scaled(fit.noise_scale)
+                self._add_keyframe(view, timestamp, fit.pose, expected, step_covariance, views)
 
     # ---- places that were visited before
 

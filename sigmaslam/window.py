@@ -20,11 +20,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from sigmaslam.camera import RectifiedStereo
-from sigmaslam.chi_square import CHI_SQUARE_999, CHI_SQUARE_9999_OF_6
+from sigmaslam.chi_square import CHI_SQUARE_999, CHI_SQUARE_9999_OF_6, CHI_SQUARE_MEDIAN
 from sigmaslam.elimination import Elimination, eliminate_landmarks
 from sigmaslam.gaussian import append_moved, condition, matrix_root, project_covariance, replace_part, weighted_update
 from sigmaslam.linearise import Slopes, ViewLineariser
-from sigmaslam.residuals import UNKNOWN_VARIANCE, mask_missing, squared_lengths, student_weight, whiten
+from sigmaslam.residuals import UNKNOWN_VARIANCE, common_scale, mask_missing, squared_lengths, student_weight, whiten
 from sigmaslam.rotation import nearest_rigid, se3_exp, se3_inverse, se3_log
 from sigmaslam.tables import (
     CALIBRATION,
@@ -52,6 +52,7 @@ class FrameFit:
         calibration, calibration_covariance: (3,), (3, 3) as this frame adds to it.
         kept: (M,) bool, the views that agree.
         nis, dof: of the kept ones.
+        noise_scale: what the variances of all views are multiplied by in the posterior, 1 or more, as they scatter.
     """
 
     pose: np.ndarray
@@ -62,6 +63,7 @@ class FrameFit:
     kept: np.ndarray
     nis: float
     dof: int
+    noise_scale: float
 
     @property
     def nis_per_dof(self) -> float:
@@ -258,15 +260,19 @@ class KeyframeWindow:
         # Landmarks are estimated along with the pose: measured places and depths in the role of known ones would
         # draw the pose towards no motion.
         moved = np.zeros((len(views.rows), LANDMARK_SIZE))
-        step, kept = 0, None
+        step, kept, noise_scale = 0, None, 1.0
         while True:
             slopes = self._linearise_frame(views.rows, pose, offset, spread, moved, views.common)
             noise, by_state = self._frame_noise(views.rows, slopes, views.noise)
             expected = slopes.mean - (slopes.by_landmark @ moved[..., None])[..., 0]
-            residual, noise = mask_missing(views.measurement - expected, noise)
+            residual, noise = mask_missing(views.measurement - expected, noise_scale * noise)
             scale = np.linalg.inv(noise)
             squared = np.einsum("mi,mij,mj->m", residual, scale, residual)
             usable = slopes.in_front & (squared < UNKNOWN_VARIANCE)
+            if step == self._iterations and kept is None:
+                # Before the gate, which would hide how far they scatter.
+                noise_scale = common_scale(squared[usable], components[usable])
+                squared, scale, noise = squared / noise_scale, scale / noise_scale, noise * noise_scale
             if step >= self._iterations:
                 agree = usable & (squared <= CHI_SQUARE_999[components])
                 if step == self._iterations + 2 or (kept is not None and (agree == kept).all()):
@@ -306,6 +312,7 @@ class KeyframeWindow:
             kept,
             float(paid @ paid + squared[kept].sum()),
             int(components[kept].sum()),
+            noise_scale,
         )
 
     def retire_oldest(self) -> np.ndarray:

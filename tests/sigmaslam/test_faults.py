@@ -218,14 +218,10 @@ def test_a_step_of_the_exposure_is_survived(demo: Demo, gain: float):
 @pytest.mark.parametrize(
     ("width", "height"),
     [
+        (11, 1),
+        (1, 11),
         pytest.param(
-            11, 1, marks=pytest.mark.xfail(strict=True, reason="5 of 40 frames at 27-36 squared sigmas, 20 mm, 0.3 deg")
-        ),
-        pytest.param(
-            21, 1, marks=pytest.mark.xfail(strict=True, reason="2 of 40 frames at 29-50 squared sigmas, 4 mm, 0.8 deg")
-        ),
-        pytest.param(
-            1, 11, marks=pytest.mark.xfail(strict=True, reason="1 of 40 frames at 26 squared sigmas, 5 mm, 0.2 deg")
+            21, 1, marks=pytest.mark.xfail(strict=True, reason="1 of 40 frames at 23.4 squared sigmas, 11 mm, 0.9 deg")
         ),
     ],
 )
@@ -242,7 +238,6 @@ def test_motion_blur_along_a_line_is_survived(demo: Demo, width: int, height: in
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="9 of 40 frames at 23-70 squared sigmas, about 10 mm and 0.5 deg")
 def test_an_exposure_over_five_frames_is_survived(demo: Demo):
     """Average of five consecutive frames; the pose is the mean of the five."""
     camera, frames, truth = demo
