@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from sigmaslam.camera import StereoCamera
+from sigmaslam.chi_square import CHI_SQUARE_9999_OF_6
 from sigmaslam.config import TrackerConfig
 from sigmaslam.errors import InputError
 from sigmaslam.estimate import CalibrationEstimate, Estimate
@@ -223,6 +224,15 @@ class StereoTracker:
         if count < self.config.least_inliers:
             return None
         fit = self._window.fit_frame(found.views, pose, covariance, self.config.least_inliers)
+        if fit is None or fit.prior_cost > CHI_SQUARE_9999_OF_6:
+            # The camera has jumped, and all matches with it, or something moves that gives most of them.
+            expected = np.flatnonzero(self._window.expected_views(found.views, pose, covariance))
+            views = found.views.select(expected)
+            steady = self._window.fit_frame(views, pose, covariance, _MANY * self.config.least_inliers)
+            if steady is not None and steady.kept.sum() >= _LEAST_SHARE * count:
+                kept = np.zeros(count, bool)
+                kept[expected] = steady.kept
+                fit = replace(steady, kept=kept)
         return fit if fit is not None and fit.kept.sum() >= _LEAST_SHARE * count else None
 
     def _accept(self, fit: FrameFit, found: Found, view: StereoView, timestamp: float) -> None:

@@ -53,6 +53,7 @@ class FrameFit:
         kept: (M,) bool, the views that agree.
         nis, dof: of the kept ones.
         noise_scale: what the variances of all views are multiplied by in the posterior, 1 or more, as they scatter.
+        prior_cost: squared sigmas by which it departs from what was known before.
     """
 
     pose: np.ndarray
@@ -64,6 +65,7 @@ class FrameFit:
     nis: float
     dof: int
     noise_scale: float
+    prior_cost: float
 
     @property
     def nis_per_dof(self) -> float:
@@ -233,6 +235,12 @@ class KeyframeWindow:
         noise, by_state = self._frame_noise(rows, slopes, np.zeros((len(rows), 3, 3)))
         return slopes.mean, noise + project_covariance(by_state, covariance), slopes.in_front
 
+    def expected_views(self, views: Views, pose: np.ndarray, step_covariance: np.ndarray) -> np.ndarray:
+        """(M,) bool: which views agree with a predicted pose (99.9 %), the arguments as of `fit_frame`."""
+        predicted, S, in_front = self.predict(views.rows, pose, step_covariance)
+        residual, covariance = mask_missing(views.measurement - predicted, S + views.noise)
+        return np.asarray(in_front & (squared_lengths(residual, covariance) <= CHI_SQUARE_999[views.components]))
+
     def fit_frame(
         self, views: Views, pose: np.ndarray, step_covariance: np.ndarray, least: int, start: np.ndarray | None = None
     ) -> FrameFit | None:
@@ -301,7 +309,8 @@ class KeyframeWindow:
         kept &= agree
         if kept.sum() < least:
             return None
-        paid = np.linalg.lstsq(factor, offset, rcond=1e-12)[0]
+        moved_by = np.linalg.lstsq(factor, offset, rcond=1e-12)[0]
+        paid = float(moved_by @ moved_by)
         cross = posterior[frame, last]
         return FrameFit(
             nearest_rigid(se3_exp(offset[frame]) @ pose),
@@ -310,9 +319,10 @@ class KeyframeWindow:
             self.calibration + offset[CALIBRATION],
             posterior[CALIBRATION, CALIBRATION],
             kept,
-            float(paid @ paid + squared[kept].sum()),
+            paid + float(squared[kept].sum()),
             int(components[kept].sum()),
             noise_scale,
+            paid,
         )
 
     def retire_oldest(self) -> np.ndarray:
