@@ -225,10 +225,15 @@ class StereoTracker:
             return None
         fit = self._window.fit_frame(found.views, pose, covariance, self.config.least_inliers)
         if fit is None or fit.prior_cost > CHI_SQUARE_9999_OF_6:
-            # The camera has jumped, and all matches with it, or something moves that gives most of them.
+            # The camera has jumped, and all matches with it; or something moves that gives most of them, and those that
+            # stand still agree with a pose close to the prediction: it holds on to that first.
             expected = np.flatnonzero(self._window.expected_views(found.views, pose, covariance))
             views = found.views.select(expected)
-            steady = self._window.fit_frame(views, pose, covariance, _MANY * self.config.least_inliers)
+            least = _MANY * self.config.least_inliers
+            steady = self._window.fit_frame(views, pose, 0.01 * covariance, least)
+            if steady is not None:
+                expected = expected[steady.kept]
+                steady = self._window.fit_frame(found.views.select(expected), pose, covariance, least)
             if steady is not None and steady.kept.sum() >= _LEAST_SHARE * count:
                 kept = np.zeros(count, bool)
                 kept[expected] = steady.kept

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sigmaslam.camera import RectifiedStereo
-from sigmaslam.chi_square import CHI_SQUARE_999, CHI_SQUARE_9999_OF_6, CHI_SQUARE_MEDIAN
+from sigmaslam.chi_square import CHI_SQUARE_999, CHI_SQUARE_9999_OF_6
 from sigmaslam.elimination import Elimination, eliminate_landmarks
 from sigmaslam.gaussian import append_moved, condition, matrix_root, project_covariance, replace_part, weighted_update
 from sigmaslam.linearise import Slopes, ViewLineariser
