@@ -238,7 +238,7 @@ class KeyframeWindow:
     def expected_views(self, views: Views, pose: np.ndarray, step_covariance: np.ndarray) -> np.ndarray:
         """(M,) bool: which views agree with a predicted pose (99.9 %), the arguments as of `fit_frame`."""
         predicted, S, in_front = self.predict(views.rows, pose, step_covariance)
-        residual, covariance = mask_missing(views.measurement - predicted, S + views.noise)
+        residual, covariance = mask_missing(views.measurement - predicted, S + views.covariance)
         return np.asarray(in_front & (squared_lengths(residual, covariance) <= CHI_SQUARE_999[views.components]))
 
     def fit_frame(
