@@ -38,7 +38,7 @@ _LEAST_SHARE = 0.3
 _DOUBTFUL_NIS = 2.0
 # With so large a NIS a pose needs so many times the least number of inliers.
 _MANY = 3
-# A view whose matches all scatter by so many times the variance that they claim is no keyframe while many agree.
+# A view whose matches all scatter by so many times the variance that they claim is no keyframe.
 _BLURRED = 2.0
 # Where more than this share of the disparities is negative by more than a pixel, which no disparity offset explains,
 # the eyes are swapped, or nothing fits.
@@ -193,7 +193,8 @@ class StereoTracker:
             other_found, other = self._track_anywhere(view, clock)
             if fit is None or (other is not None and other.nis_per_dof < fit.nis_per_dof):
                 found, fit = other_found, other
-        if fit is not None and fit.nis_per_dof > _DOUBTFUL_NIS and fit.kept.sum() < _MANY * self.config.least_inliers:
+        few = fit is not None and fit.kept.sum() < _MANY * self.config.least_inliers
+        if fit is not None and few and fit.noise_scale * fit.nis_per_dof > _DOUBTFUL_NIS:
             return found, None  # chance agreement of a few
         return found, fit
 
@@ -255,7 +256,7 @@ class StereoTracker:
         self._noise.adapt(fit.nis_per_dof)
         count = int(fit.kept.sum())
         if count < self.config.keyframe_ratio * self._reference:
-            if fit.noise_scale > _BLURRED and count >= _MANY * self.config.least_inliers:
+            if fit.noise_scale > _BLURRED:
                 return  # a bad keyframe would spoil what comes after it; the next view may be a better one
             view = self._choose(view, fit.pose)
             if self._has_stereo(view):
