@@ -13,11 +13,12 @@ import numpy as np
 from sigmaslam.camera import RectifiedStereo
 from sigmaslam.errors import InputError
 from sigmaslam.frontend import Features, StereoView
+from sigmaslam.past import PastPoses, past_slice
 
 # Descriptors of a keyframe and of a view that vote on whether they show the same place.
 _VOTERS = 300
 _PER_FEATURE = ("keypoints", "descriptors", "scores", "sigma")
-_ARRAYS = ("poses", "covariances", "timestamps", "images", "counts", *_PER_FEATURE, "disparity", "disparity_sigma")
+_ARRAYS = ("poses", "covariance", "timestamps", "images", "counts", *_PER_FEATURE, "disparity", "disparity_sigma")
 _PREFIX = "keyframe_"
 
 
@@ -49,18 +50,39 @@ class KeyframeMemory:
         self._capacity = capacity
         self.keyframes: list[RememberedKeyframe] = []
 
-    def add(self, keyframe: RememberedKeyframe) -> None:
-        """Remembers a keyframe; when there are too many, one of the two that are closest to each other goes."""
+    def add(self, keyframe: RememberedKeyframe, spare: float | None = None) -> int | None:
+        """Remembers a keyframe; when there are too many, one of the two that are closest to each other goes.
+
+        Args:
+            keyframe: what is remembered.
+            spare: time stamp of one that must not go.
+        Returns:
+            Which one goes, if one does.
+        """
         nothing = np.zeros((0, 0), np.uint8)
         self.keyframes.append(replace(keyframe, view=replace(keyframe.view, right=nothing)))
-        if len(self.keyframes) > self._capacity:
-            places = np.array([each.pose[:3, 3] for each in self.keyframes])
-            looks = np.array([each.pose[:3, 2] for each in self.keyframes])
-            apart = np.linalg.norm(places[:, None] - places[None], axis=2)
-            spread = max(float(np.median(apart)), 1e-12)
-            apart = apart / spread + np.linalg.norm(looks[:, None] - looks[None], axis=2)
-            np.fill_diagonal(apart, np.inf)
-            del self.keyframes[max(np.unravel_index(np.argmin(apart), apart.shape))]
+        if len(self.keyframes) <= self._capacity:
+            return None
+        places = np.array([each.pose[:3, 3] for each in self.keyframes])
+        looks = np.array([each.pose[:3, 2] for each in self.keyframes])
+        apart = np.linalg.norm(places[:, None] - places[None], axis=2)
+        spread = max(float(np.median(apart)), 1e-12)
+        apart = apart / spread + np.linalg.norm(looks[:, None] - looks[None], axis=2)
+        np.fill_diagonal(apart, np.inf)
+        one, other = (int(k) for k in np.unravel_index(np.argmin(apart), apart.shape))
+        dropped = min(one, other) if self.keyframes[max(one, other)].timestamp == spare else max(one, other)
+        del self.keyframes[dropped]
+        return dropped
+
+    def index(self, timestamp: float) -> int:
+        """Where the keyframe of that time stamp stands."""
+        return next(k for k, keyframe in enumerate(self.keyframes) if keyframe.timestamp == timestamp)
+
+    def refresh(self, past: PastPoses) -> None:
+        """Takes over what is known of the poses now."""
+        for k, keyframe in enumerate(self.keyframes):
+            place = past_slice(k)
+            self.keyframes[k] = replace(keyframe, pose=past.poses[k], covariance=past.covariance[place, place])
 
     def similar(
         self, view: StereoView, count: int, among: list[RememberedKeyframe] | None = None
@@ -88,14 +110,16 @@ class KeyframeMemory:
         return [among[k] for k in order]
 
 
-def pack_keyframes(keyframes: list[RememberedKeyframe], frontend: str, camera: RectifiedStereo) -> dict[str, Any]:
-    """Arrays of a map file by name."""
+def pack_keyframes(
+    keyframes: list[RememberedKeyframe], joint: np.ndarray, frontend: str, camera: RectifiedStereo
+) -> dict[str, Any]:
+    """Arrays of a map file by name; joint (6 K, 6 K) is the covariance of all poses together."""
     if not keyframes:
         return {}
     views = [keyframe.view for keyframe in keyframes]
     arrays: dict[str, Any] = {
         "poses": np.stack([keyframe.pose for keyframe in keyframes]),
-        "covariances": np.stack([keyframe.covariance for keyframe in keyframes]),
+        "covariance": joint,
         "timestamps": np.array([keyframe.timestamp for keyframe in keyframes]),
         "images": np.stack([view.left for view in views]),
         "counts": np.array([len(view.disparity) for view in views]),
@@ -107,13 +131,15 @@ def pack_keyframes(keyframes: list[RememberedKeyframe], frontend: str, camera: R
     return {**packed, "frontend": np.array(frontend), "intrinsics": _intrinsics(camera)}
 
 
-def read_keyframes(path: Path, frontend: str, camera: RectifiedStereo) -> list[RememberedKeyframe]:
+def read_keyframes(path: Path, frontend: str, camera: RectifiedStereo) -> tuple[list[RememberedKeyframe], np.ndarray]:
     """Keyframes of a map file.
 
     Args:
         path: map.npz of a run.
         frontend: that is going to match them.
         camera: the rectified pair that is going to see them.
+    Returns:
+        The keyframes, and the covariance (6 K, 6 K) of all their poses together.
     Raises:
         InputError: the file is missing, broken, without keyframes, or of another front-end or camera.
     """
@@ -141,7 +167,7 @@ def read_keyframes(path: Path, frontend: str, camera: RectifiedStereo) -> list[R
             f"one {expected.tolist()}; a map serves the camera that made it"
         )
     ends = np.cumsum(arrays[_PREFIX + "counts"])
-    keyframes = []
+    keyframes, joint = [], arrays[_PREFIX + "covariance"]
     for k, (begin, end) in enumerate(zip(np.r_[0, ends[:-1]], ends, strict=True)):
         own = {name: arrays[_PREFIX + name][begin:end] for name in (*_PER_FEATURE, "disparity", "disparity_sigma")}
         view = StereoView(
@@ -151,9 +177,9 @@ def read_keyframes(path: Path, frontend: str, camera: RectifiedStereo) -> list[R
             own["disparity"],
             own["disparity_sigma"],
         )
-        pose, covariance = arrays[_PREFIX + "poses"][k], arrays[_PREFIX + "covariances"][k]
+        pose, covariance = arrays[_PREFIX + "poses"][k], joint[past_slice(k), past_slice(k)]
         keyframes.append(RememberedKeyframe(view, pose, covariance, float(arrays[_PREFIX + "timestamps"][k])))
-    return keyframes
+    return keyframes, joint
 
 
 def _intrinsics(camera: RectifiedStereo) -> np.ndarray:

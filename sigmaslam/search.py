@@ -121,9 +121,9 @@ class LandmarkSearch:
         place = np.full(len(rows), self._config.keyframe_sigma)
         relative = estimate_relative_pose(
             self._camera,
-            np.column_stack([keypoints, key.disparity[rows]]),
+            self._window.true_disparity(np.column_stack([keypoints, key.disparity[rows]])),
             np.column_stack([place, place, key.disparity_sigma[rows]]),
-            _measurement(matches),
+            self._window.true_disparity(_measurement(matches)),
             self._noise.of_matches(matches),
             matches.probability,
         )

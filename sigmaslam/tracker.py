@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import deque
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,16 +16,17 @@ from sigmaslam.config import TrackerConfig
 from sigmaslam.errors import InputError
 from sigmaslam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.frontend import StereoView, build_frontend
-from sigmaslam.landmarks import PointMap, map_points, merge_maps, thin_map
+from sigmaslam.landmarks import PointMap, RetiredPoints, host_points, map_points, merge_maps
 from sigmaslam.match_noise import MatchNoise
 from sigmaslam.motion import MotionFilter
+from sigmaslam.past import PastPoses
 from sigmaslam.recall import KeyframeMemory, RememberedKeyframe, pack_keyframes, read_keyframes
 from sigmaslam.rectify import StereoRectifier
 from sigmaslam.rotation import nearest_rigid, se3_adjoint, se3_body, se3_inverse, turn_covariance
 from sigmaslam.search import Found, LandmarkSearch
 from sigmaslam.spacing import select_apart
 from sigmaslam.stopwatch import Stopwatch
-from sigmaslam.tables import CALIBRATION, Views, join_views, pose_slice
+from sigmaslam.tables import CALIBRATION, CALIBRATION_SIZE, Views, join_views, pose_slice
 from sigmaslam.window import FrameFit, KeyframeWindow
 
 __all__ = ["CalibrationEstimate", "Estimate", "StereoTracker", "TrackerConfig"]
@@ -96,13 +98,14 @@ class StereoTracker:
         self._keyframe_views: list[StereoView] = []
         self._keyframe_times: list[float] = []
         self._reference = 0  # landmarks in the last keyframe
-        self._retired: list[PointMap] = []
+        self._retired = RetiredPoints(self.config.most_points)
         self._densities = np.zeros(2)
         self._timestamp: float | None = None
         self._tracked_at = 0.0
         self._moving = False  # there has been a pose from the images
         self._velocity_known = False  # since the last start
         self._memory = KeyframeMemory(self.config.remembered)
+        self._recent: deque[float] = deque(maxlen=_RECENT_KEYFRAMES)  # time stamps of the last that left the window
         self._in_map = False  # the world is that of a map that was loaded
         self.keyframe_views: Views | None = None
         """What the last frame saw if it became a keyframe, by numbers of landmarks that stay."""
@@ -113,8 +116,13 @@ class StereoTracker:
         Raises:
             InputError: the file is no map, or made with another front-end or camera.
         """
-        for keyframe in read_keyframes(path, self._frontend.name, self._camera):
-            self._memory.add(keyframe)
+        keyframes, joint = read_keyframes(path, self._frontend.name, self._camera)
+        poses = np.array([keyframe.pose for keyframe in keyframes])
+        self._window.load_past(PastPoses(poses, joint, np.zeros((len(joint), CALIBRATION_SIZE))))
+        for _ in keyframes:
+            self._retired.append(PointMap.empty())
+        for keyframe in keyframes:
+            self._memorise(keyframe)
         self._in_map = True
 
     def describe_rectified(self) -> dict[str, Any]:
@@ -127,7 +135,10 @@ class StereoTracker:
         """Keyframes by which a later run finds its place in the map, as arrays by name."""
         window = self._window
         late = [self._remembered(k) for k in range(len(window))]
-        return pack_keyframes([*self._memory.keyframes, *late], self._frontend.name, self._camera)
+        past = window.past
+        for k, pose in enumerate(window.poses):
+            past = past.append(pose, window.covariance, pose_slice(k))
+        return pack_keyframes([*self._memory.keyframes, *late], past.covariance, self._frontend.name, self._camera)
 
     def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> Estimate:
         """Takes one stereo pair.
@@ -170,8 +181,10 @@ class StereoTracker:
     def map(self) -> PointMap:
         """All landmarks so far that were seen at least three times."""
         whole = np.ones(len(self._window.landmarks), bool)
-        parts = [*self._retired, map_points(self._window, whole, np.array(self._keyframe_times))]
-        return merge_maps(parts).transform(se3_inverse(self._T_rectified_left))
+        late = map_points(self._window, whole, np.array(self._keyframe_times))
+        return merge_maps([self._retired.in_world(self._window.past), late]).transform(
+            se3_inverse(self._T_rectified_left)
+        )
 
     # ---- a frame against the window
 
@@ -273,17 +286,15 @@ class StereoTracker:
             relative = self._search.locate(keyframe.view, view)
             if relative is None:
                 continue
-            pose = nearest_rigid(keyframe.pose @ relative.T_key_camera)
-            chosen = self._choose(view, pose)
+            chosen = self._choose(view, nearest_rigid(keyframe.pose @ relative.T_key_camera))
             if not self._has_stereo(chosen):
                 continue
-            for host in range(len(self._window)):
-                self._memory.add(self._remembered(host))
-            self._retire(np.ones(len(self._window.landmarks), bool))
-            self._window.restart()
-            self._keyframe_views, self._keyframe_times = [], []
-            covariance = keyframe.covariance + turn_covariance(pose, relative.covariance)
-            self._add_keyframe(chosen, timestamp, pose, pose, covariance, None)
+            while len(self._window):
+                self._retire_oldest(keyframe.timestamp)
+            self._memory.refresh(self._window.past)
+            origin = self._memory.index(keyframe.timestamp)
+            pose = nearest_rigid(self._memory.keyframes[origin].pose @ relative.T_key_camera)
+            self._add_keyframe(chosen, timestamp, pose, pose, turn_covariance(pose, relative.covariance), None, origin)
             self._forget_twist()
             self._tracked_at = timestamp
             self._moving, self._velocity_known = True, False
@@ -300,20 +311,33 @@ class StereoTracker:
             between = se3_inverse(pose) @ keyframe.pose
             return bool(np.linalg.norm(between[:3, 3]) < reach and between[2, 2] > _LOOP_COSINE)
 
-        old = [each for each in self._memory.keyframes[:-_RECENT_KEYFRAMES] if near(each)]
+        old = [each for each in self._memory.keyframes if each.timestamp not in self._recent and near(each)]
         for keyframe in self._memory.similar(view, 1, old):
             relative = self._search.locate(keyframe.view, view)
             if relative is None:
                 continue
-            found = nearest_rigid(keyframe.pose @ relative.T_key_camera)
-            if window.tie(found, turn_covariance(found, relative.covariance), keyframe.covariance):
+            index = self._memory.index(keyframe.timestamp)
+            match = turn_covariance(keyframe.pose @ relative.T_key_camera, relative.covariance)
+            if window.tie(index, relative.T_key_camera, match):
                 _LOGGER.info("loop closed with the keyframe of %.3f s", keyframe.timestamp)
+                self._memory.refresh(window.past)
 
-    def _retire(self, chosen: np.ndarray) -> None:
-        """Puts landmarks of the window into the map, whose size is bounded."""
-        self._retired.append(map_points(self._window, chosen, np.array(self._keyframe_times)))
-        if sum(len(part.points) for part in self._retired) > 2 * self.config.most_points:
-            self._retired = [thin_map(merge_maps(self._retired), self.config.most_points)]
+    def _retire_oldest(self, spare: float | None = None) -> np.ndarray:
+        """The oldest keyframe leaves the window for the memory, its landmarks for the map; new row of each other."""
+        keyframe = self._remembered(0)
+        self._retired.append(host_points(self._window, 0, np.array(self._keyframe_times)))
+        number = self._window.retire_oldest()
+        del self._keyframe_views[0], self._keyframe_times[0]
+        self._memorise(keyframe, spare)
+        self._recent.append(keyframe.timestamp)
+        return number
+
+    def _memorise(self, keyframe: RememberedKeyframe, spare: float | None = None) -> None:
+        """Remembers a keyframe of the window's past; another, not that of the time stamp `spare`, may go for it."""
+        dropped = self._memory.add(keyframe, spare)
+        if dropped is not None:
+            self._retired.drop(dropped, self._window.past)
+            self._window.forget_past(dropped)
 
     def _remembered(self, host: int) -> RememberedKeyframe:
         """A keyframe of the window as the memory keeps it."""
@@ -366,21 +390,19 @@ class StereoTracker:
         step: np.ndarray,
         step_covariance: np.ndarray,
         views: Views | None,
+        origin: int | None = None,
     ) -> None:
         """Makes the view a keyframe: it sees `views`, and whatever else it has in stereo is new."""
         window = self._window
         if len(window) == self.config.window:
-            self._retire(window.landmarks.host == 0)
-            self._memory.add(self._remembered(0))
-            number = window.retire_oldest()
+            number = self._retire_oldest()
             if views is not None:
                 views = views.renumber(number)
-            del self._keyframe_views[0], self._keyframe_times[0]
         if len(window):
             step_covariance = turn_covariance(window.poses[-1], step_covariance)
         since = timestamp - self._keyframe_times[-1] if self._keyframe_times else 0.0
         walk = np.array([self.config.offset_walk**2 * since, 0.0, 0.0])
-        window.add_keyframe(pose, step, step_covariance, walk)
+        window.add_keyframe(pose, step, step_covariance, walk, origin)
         self._keyframe_views.append(view)
         self._keyframe_times.append(timestamp)
         if views is not None:
@@ -390,6 +412,7 @@ class StereoTracker:
         seen = [] if views is None else [replace(views, rows=window.landmarks.serial[views.rows])]
         self.keyframe_views = join_views([*seen, first])
         window.solve()
+        self._memory.refresh(window.past)
         self._close_loop(view)
         self._motion.start_keyframe()
         self._reference = int((window.landmarks.host == len(window) - 1).sum())

@@ -15,7 +15,7 @@ same vector everywhere, so that no linearisation point can leak information into
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from sigmaslam.chi_square import CHI_SQUARE_999, CHI_SQUARE_9999_OF_6
 from sigmaslam.elimination import Elimination, eliminate_landmarks
 from sigmaslam.gaussian import append_moved, condition, matrix_root, project_covariance, replace_part, weighted_update
 from sigmaslam.linearise import Slopes, ViewLineariser
+from sigmaslam.past import PastPoses, past_slice, point_lever
 from sigmaslam.residuals import UNKNOWN_VARIANCE, common_scale, mask_missing, squared_lengths, student_weight, whiten
 from sigmaslam.rotation import nearest_rigid, se3_exp, se3_inverse, se3_log
 from sigmaslam.tables import (
@@ -104,20 +105,28 @@ class KeyframeWindow:
         self._prior_poses = self.poses
         self._prior_calibration = self.calibration
         self._prior = self.covariance
+        self.past = self._prior_past = PastPoses.empty()
         self._next_serial = 0
 
     def __len__(self) -> int:
         return len(self.poses)
 
-    def restart(self) -> None:
-        """Forgets all keyframes and landmarks; what is known of the calibration stays."""
-        self.poses = self._prior_poses = np.zeros((0, 4, 4))
-        self._prior = self.covariance = self.covariance[CALIBRATION, CALIBRATION]
-        self._prior_calibration = self.calibration
-        self.landmarks = Landmarks.empty(CALIBRATION_SIZE)
-        self._observations = Observations()
+    def load_past(self, past: PastPoses) -> None:
+        """Remembers poses of another run, before there is a keyframe."""
+        self.past = self._prior_past = past
 
-    def add_keyframe(self, pose: np.ndarray, step: np.ndarray, step_covariance: np.ndarray, walk: np.ndarray) -> None:
+    def forget_past(self, index: int) -> None:
+        """Forgets a pose that left the window."""
+        self.past, self._prior_past = self.past.drop(index), self._prior_past.drop(index)
+
+    def add_keyframe(
+        self,
+        pose: np.ndarray,
+        step: np.ndarray,
+        step_covariance: np.ndarray,
+        walk: np.ndarray,
+        origin: int | None = None,
+    ) -> None:
         """Adds a keyframe to the end of the window.
 
         Args:
@@ -125,21 +134,34 @@ class KeyframeWindow:
             step: (4, 4) T_last_new as it was expected without its images; of the first one T_world_camera.
             step_covariance: (6, 6) of that, perturbed from the left in the world.
             walk: (3,) variances by which the calibration may have moved since the last keyframe.
+            origin: of the first one, the past pose relative to which `step_covariance` is; the world by default.
         """
         count = len(self.poses)
         expected = self._prior_poses[-1] @ step if count else step
         size = CALIBRATION_SIZE + 6 * count
         grown = np.zeros((2, size + 6, size + 6))
         last = pose_slice(count - 1) if count else slice(0, 0)
-        for new, old in zip(grown, (self._prior, self.covariance), strict=True):
+        pasts = []
+        states = ((self._prior, self._prior_past), (self.covariance, self.past))
+        for new, (old, past) in zip(grown, states, strict=True):
             new[:size, :size] = old
             new[range(CALIBRATION_SIZE), range(CALIBRATION_SIZE)] += walk
+            across = np.zeros((len(past.cross), 6))
             if count:
                 new[size:, :size] = old[last, :]
                 new[:size, size:] = old[:, last]
                 new[size:, size:] = old[last, last]
+                across = past.cross[:, last]
+            elif origin is not None:
+                place = past_slice(origin)
+                new[size:, :size] = past.cross[place]
+                new[:size, size:] = past.cross[place].T
+                new[size:, size:] = past.covariance[place, place]
+                across = past.covariance[:, place]
             new[size:, size:] += step_covariance
+            pasts.append(replace(past, cross=np.concatenate([past.cross, across], axis=1)))
         self._prior, self.covariance = grown
+        self._prior_past, self.past = pasts
         self._prior_poses = np.concatenate([self._prior_poses, nearest_rigid(expected)[None]])
         self.poses = np.concatenate([self.poses, nearest_rigid(pose)[None]])
         self.landmarks.dependence = np.pad(self.landmarks.dependence, ((0, 0), (0, 0), (0, 6)))
@@ -180,37 +202,47 @@ class KeyframeWindow:
         for _ in range(iterations):
             information, vector, elimination = self._eliminate(self._observations)
             offset = self._from_prior()
-            state, self.covariance = condition(factor, information, vector + information @ offset)
+            vector = vector + information @ offset
+            state, self.covariance = condition(factor, information, vector)
             self._move(state - offset, elimination)
+        self.past = self._prior_past.given(self._prior, information, vector)
         self._drop_outliers()
 
-    def tie(self, pose: np.ndarray, match: np.ndarray, origin: np.ndarray) -> bool:
-        """Ties the last keyframe to a pose that an old keyframe gives it: a loop is closed.
-
-        What happened between the two is independent of where the old one was, so that its covariance is common to both
-        and the match says something about the rest alone.
+    def tie(self, index: int, T_past_last: np.ndarray, match: np.ndarray) -> bool:
+        """Ties the last keyframe to a past pose that sees the same: a loop is closed, and the past corrected with it.
 
         Args:
-            pose: (4, 4) T_world_camera of the last keyframe as the old one sees it.
-            match: (6, 6) covariance of that given the old one, perturbed from the left in the world.
-            origin: (6, 6) covariance of the old one's pose, likewise.
+            index: of the past pose.
+            T_past_last: (4, 4) the last keyframe's pose relative to that one.
+            match: (6, 6) its covariance, perturbed from the left in the world.
         Returns:
-            False, and nothing is changed, where the two poses contradict each other.
+            False, and nothing is changed, where it contradicts what is known, or says less than is known already.
         """
-        last = pose_slice(len(self.poses) - 1)
-        estimated = self.covariance[last, last] - origin + match
-        apart = se3_log(pose @ se3_inverse(self.poses[-1]))
-        if apart @ np.linalg.lstsq(estimated, apart, rcond=1e-12)[0] > CHI_SQUARE_9999_OF_6:
+        last, old = pose_slice(len(self.poses) - 1), past_slice(index)
+        across = self.past.cross[old, last]
+        known = self.covariance[last, last] + self.past.covariance[old, old] - across - across.T
+        apart = se3_log(self.past.poses[index] @ T_past_last @ se3_inverse(self.poses[-1]))
+        # What the old keyframe was measured with is the same in all its matches: they must not be counted without end.
+        lever = point_lever(self.poses[-1:, :3, 3])[0]
+        if np.trace(lever @ known @ lever.T) < np.trace(lever @ match @ lever.T):
             return False
-        common = np.zeros((len(self._prior), 6))
-        for clone in range(len(self.poses)):
-            common[pose_slice(clone)] = origin
-        drift = self._prior[:, last] - common
-        gain = np.linalg.lstsq(drift[last] + match, drift.T, rcond=1e-12)[0].T
-        step = gain @ se3_log(pose @ se3_inverse(self._prior_poses[-1]))
+        if apart @ np.linalg.lstsq(known + match, apart, rcond=1e-12)[0] > CHI_SQUARE_9999_OF_6:
+            return False
+        past = self._prior_past
+        # Covariances with what the match measures, the last pose less the old one.
+        own = self._prior[:, last] - past.cross[old].T
+        theirs = past.cross[:, last] - past.covariance[:, old]
+        innovation = own[last] - theirs[old] + match
+        apart = se3_log(past.poses[index] @ T_past_last @ se3_inverse(self._prior_poses[-1]))
+        gain = np.linalg.lstsq(innovation, own.T, rcond=1e-12)[0].T
+        past_gain = np.linalg.lstsq(innovation, theirs.T, rcond=1e-12)[0].T
+        step = gain @ apart
+        self._prior_past = past.moved(
+            past_gain @ apart, past.covariance - past_gain @ theirs.T, past.cross - past_gain @ own.T
+        )
         self._prior_poses = nearest_rigid(se3_exp(step[CALIBRATION_SIZE:].reshape(-1, 6)) @ self._prior_poses)
         self._prior_calibration = self._prior_calibration + step[CALIBRATION]
-        root = matrix_root(self._prior - gain @ drift.T)
+        root = matrix_root(self._prior - gain @ own.T)
         self._prior = root @ root.T
         self.solve()
         return True
@@ -326,7 +358,7 @@ class KeyframeWindow:
         )
 
     def retire_oldest(self) -> np.ndarray:
-        """Drops the oldest keyframe; its landmarks' views become part of the prior.
+        """Drops the oldest keyframe to the past; its landmarks' views become part of the prior.
 
         Returns:
             (L,) new row of each landmark, -1 for those that are gone.
@@ -334,11 +366,19 @@ class KeyframeWindow:
         leaving = self.landmarks.host == 0
         information, vector, _ = self._eliminate(self._observations.select(leaving[self._observations.landmark]))
         offset = self._from_prior()
-        moved, covariance = condition(matrix_root(self._prior), information, vector + information @ offset)
+        vector = vector + information @ offset
+        past = self._prior_past.given(self._prior, information, vector)
+        moved, covariance = condition(matrix_root(self._prior), information, vector)
         count = len(self.poses)
-        self._prior_poses = nearest_rigid(se3_exp(moved[CALIBRATION_SIZE:].reshape(count, 6)) @ self._prior_poses)[1:]
+        prior_poses = nearest_rigid(se3_exp(moved[CALIBRATION_SIZE:].reshape(count, 6)) @ self._prior_poses)
+        self._prior_poses = prior_poses[1:]
         self._prior_calibration = self._prior_calibration + moved[CALIBRATION]
+        oldest = pose_slice(0)
         rest = np.r_[0:CALIBRATION_SIZE, CALIBRATION_SIZE + 6 : len(covariance)]
+        past = past.append(prior_poses[0], covariance, oldest)
+        self._prior_past = replace(past, cross=past.cross[:, rest])
+        past = self.past.append(self.poses[0], self.covariance, oldest)
+        self.past = replace(past, cross=past.cross[:, rest])
         self._prior = covariance[np.ix_(rest, rest)]
         self.covariance = self.covariance[np.ix_(rest, rest)]
         self.poses = self.poses[1:]
@@ -350,13 +390,13 @@ class KeyframeWindow:
         self.landmarks.dependence = self.landmarks.dependence[:, :, rest]
         return number
 
-    def true_disparity(self, landmarks: np.ndarray) -> np.ndarray:
-        """(u, v, disparity) (K, 3) of landmarks (K, 6) without what the calibration and their own errors add."""
-        x = (landmarks[:, 0] - landmarks[:, 2] - self.camera.cx) / self.camera.fx
-        y = (landmarks[:, 1] - self.camera.cy) / self.camera.fy
+    def true_disparity(self, measured: np.ndarray) -> np.ndarray:
+        """(u, v, disparity) (K, 3) without what the calibration adds, and of landmarks (K, 6) their own errors."""
+        x = (measured[:, 0] - measured[:, 2] - self.camera.cx) / self.camera.fx
+        y = (measured[:, 1] - self.camera.cy) / self.camera.fy
         constant, yaw, pitch = self.calibration
-        bias = landmarks[:, 3] + constant + yaw * x * x + pitch * x * y
-        return np.column_stack([landmarks[:, :2], landmarks[:, 2] - bias])
+        bias = measured[:, 3:MODELLED].sum(axis=1) + constant + yaw * x * x + pitch * x * y
+        return np.column_stack([measured[:, :2], measured[:, 2] - bias])
 
     # ---- the equations
 
