@@ -129,6 +129,7 @@ class Benchmark(StrEnum):
     matches = "matches"
     noise = "noise"
     consistency = "consistency"
+    endurance = "endurance"
 
 
 def _show_version(wanted: bool) -> None:
@@ -487,8 +488,8 @@ def benchmark(
     runs: Annotated[
         Path | None,
         typer.Option(
-            help="ablations, noise, consistency, sequences: folder of the training runs or renders; what is there is "
-            "used again. sequences: a temporary one without it."
+            help="ablations, noise, consistency, sequences, endurance: folder of the training runs or renders; what is "
+            "there is used again. sequences, endurance: a temporary one without it."
         ),
     ] = None,
     steps: Annotated[int, typer.Option(min=1, help="ablations: optimiser steps a run.")] = 250,
@@ -500,6 +501,7 @@ def benchmark(
             show_default="3, consistency 30",
         ),
     ] = None,
+    frames: Annotated[int, typer.Option(min=1, help="endurance: frames to track.")] = 10_000,
     weights: Annotated[
         list[Path] | None,
         typer.Option(
@@ -522,8 +524,10 @@ def benchmark(
     are installed. claims: EKF against UKF by Monte Carlo. renders: how fast, and how like real images. features: time
     and scores of the features beside SIFT, ORB and other people's. matches: whether their probability and
     covariance hold, beside AdaLAM and MAGSAC. noise: the tracker with these covariances beside one constant.
-    consistency: whether poses and map are as sure as they say, on 90 rendered sequences (an hour). ablations: what
-    each part of the features gains, by short training runs (an hour). All but the first need the extra 'train'.
+    consistency: whether poses and map are as sure as they say, on 90 rendered sequences (an hour). endurance: memory,
+    time and error over 10,000 frames of a lap over and over (ten minutes to render, then a quarter of an hour and more).
+    ablations: what each part of the features gains, by short training runs (an hour). All but the first need the extra
+    'train'.
     """
     command = f"sigmaslam benchmark {name.value} --out {out}"
     if name is Benchmark.sequences:
@@ -578,6 +582,11 @@ def benchmark(
         seeds = seeds or 30
         command += f" --runs {runs.name} --seeds {seeds}"
         typer.echo(write_consistency(out, runs, seeds, default_workers(), command, Console(stderr=True).print))
+    elif name is Benchmark.endurance:
+        from sigmaslam.evaluation.benchmarks.endurance import write_endurance
+
+        command += f" --frames {frames}"
+        typer.echo(write_endurance(out, frames, command, runs, Console(stderr=True).print))
     elif name is Benchmark.ablations:
         from sigmaslam.evaluation.benchmarks.ablations import write_ablations
 

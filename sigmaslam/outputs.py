@@ -6,6 +6,9 @@ import csv
 import hashlib
 import json
 import platform
+import tempfile
+from array import array
+from collections import Counter
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -48,7 +51,11 @@ class RunWriter:
         self._out = out
         self._rows = csv.writer(self._table)
         self._rows.writerow(_COLUMNS)
-        self._estimates: list[Estimate] = []
+        # Time stamp, pose and covariance of each frame, on disk: memory does not grow with a run.
+        self._poses = tempfile.TemporaryFile()  # noqa: SIM115
+        self._statuses: Counter[str] = Counter()
+        self._inliers = array("i")  # of the frames that have any
+        self._calibration: CalibrationEstimate | None = None
         self._skipped = 0
         self._rectified = rectified
         self._views: list[tuple[int, Views]] = []
@@ -71,12 +78,17 @@ class RunWriter:
             ]
         )
         self._table.flush()
-        self._estimates.append(estimate)
+        row = np.r_[estimate.timestamp, estimate.T_world_camera.ravel(), estimate.covariance.ravel()]
+        self._poses.write(row.astype(np.float64).tobytes())
+        self._statuses[estimate.status] += 1
+        if estimate.inliers:
+            self._inliers.append(estimate.inliers)
+        self._calibration = estimate.calibration
 
     def add_views(self, views: Views | None) -> None:
         """Takes what the last frame added saw as a keyframe, for tracks.npz; None if it is none."""
         if views is not None and self._rectified is not None:
-            self._views.append((len(self._estimates) - 1, views))
+            self._views.append((self._statuses.total() - 1, views))
 
     def add_skipped(self, timestamp: float) -> None:
         """Notes a frame that could not be read."""
@@ -98,16 +110,16 @@ class RunWriter:
         summary = self._summary(point_map)
         content = {**run, "versions": _versions(), "weights_sha256": _weight_hashes(), "summary": summary}
         atomic_write_text(self._out / "run.json", json.dumps(content, indent=2) + "\n")
-        if not self._estimates:
+        self._poses.seek(0)
+        rows = np.frombuffer(self._poses.read()).reshape(-1, 1 + 16 + 36)
+        self._poses.close()
+        if not len(rows):
             return summary
-        trajectory = Trajectory(
-            np.array([estimate.timestamp for estimate in self._estimates]),
-            np.stack([estimate.T_world_camera for estimate in self._estimates]),
-        )
+        trajectory = Trajectory(rows[:, 0], rows[:, 1:17].reshape(-1, 4, 4))
         write_tum(self._out / "trajectory.tum", trajectory)
         write_kitti(self._out / "trajectory.kitti", trajectory, self._out / "times.txt")
         with atomic_path(self._out / "covariance.npy") as path:
-            np.save(path, np.stack([estimate.covariance for estimate in self._estimates]))
+            np.save(path, rows[:, 17:].reshape(-1, 6, 6))
         with atomic_path(self._out / "map.npz") as path:
             points = {name: getattr(point_map, name) for name in PointMap.__slots__}
             np.savez_compressed(path, **points, **keyframes)
@@ -117,9 +129,9 @@ class RunWriter:
         return summary
 
     def _write_tracks(self) -> None:
-        if self._rectified is None or not self._views:
+        calibration = self._calibration
+        if self._rectified is None or not self._views or calibration is None:
             return
-        calibration = self._estimates[-1].calibration
         with atomic_path(self._out / "tracks.npz") as path:
             np.savez_compressed(
                 path,
@@ -132,14 +144,12 @@ class RunWriter:
             )
 
     def _summary(self, point_map: PointMap) -> dict[str, Any]:
-        statuses = [estimate.status for estimate in self._estimates]
-        tracked = [estimate for estimate in self._estimates if estimate.inliers]
-        last = self._estimates[-1].calibration if self._estimates else None
+        last = self._calibration
         return {
-            "frames": len(statuses) + self._skipped,
+            "frames": self._statuses.total() + self._skipped,
             "skipped": self._skipped,
-            **{status: statuses.count(status) for status in ("starting", "tracking", "relocalised", "lost")},
-            "median_inliers": float(np.median([e.inliers for e in tracked])) if tracked else 0.0,
+            **{status: self._statuses[status] for status in ("starting", "tracking", "relocalised", "lost")},
+            "median_inliers": float(np.median(self._inliers)) if self._inliers else 0.0,
             "map_points": len(point_map.points),
             "calibration_verdict": calibration_verdict(last) if last else "No frame was read.",
         }

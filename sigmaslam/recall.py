@@ -47,7 +47,7 @@ class KeyframeMemory:
     """
 
     def __init__(self, capacity: int) -> None:
-        self._capacity = capacity
+        self._capacity = max(capacity, 1)
         self.keyframes: list[RememberedKeyframe] = []
 
     def add(self, keyframe: RememberedKeyframe, spare: float | None = None) -> int | None:
