@@ -525,7 +525,7 @@ def benchmark(
     and scores of the features beside SIFT, ORB and other people's. matches: whether their probability and
     covariance hold, beside AdaLAM and MAGSAC. noise: the tracker with these covariances beside one constant.
     consistency: whether poses and map are as sure as they say, on 90 rendered sequences (an hour). endurance: memory,
-    time and error over 10,000 frames of a lap over and over (ten minutes to render, then a quarter of an hour and more).
+    time and error over 10,000 frames of a lap over and over (ten minutes to render, then a quarter of an hour).
     ablations: what each part of the features gains, by short training runs (an hour). All but the first need the extra
     'train'.
     """

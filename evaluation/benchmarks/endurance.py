@@ -15,6 +15,7 @@ from sigmaslam.evaluation.benchmarks.endurance_page import Block, Endurance, Lap
 from sigmaslam.evaluation.benchmarks.page import write_page
 from sigmaslam.readers import StereoFrame, StereoSequence, open_sequence
 from sigmaslam.readers.images import RawPair
+from sigmaslam.refine.tracks import TRACKS_NAME
 from sigmaslam.report import read_frames
 from sigmaslam.rotation import se3_inverse
 from sigmaslam.run import track_sequence
@@ -140,8 +141,9 @@ def write_endurance(
             config=TrackerConfig(remembered=10),
             tracks=True,
         )
-        with np.load(without / "tracks.npz") as tracks:
-            per_frame = sum(tracks[name].nbytes for name in ("frame", "landmark", "measurement", "covariance")) / some
+        with np.load(without / TRACKS_NAME) as tracks:
+            names = ("frame", "landmark", "measurement", "covariance")
+            tracks_bytes = sum(tracks[name].nbytes for name in names) / some
         open_errors = _errors(without, truth)
         note("tracked without loops")
 
@@ -153,7 +155,7 @@ def write_endurance(
         finally:
             if (run / "trajectory.tum").exists():
                 seconds = time.perf_counter() - began
-                endurance = _measure(run, sequence, truth, block, frames, seconds, open_errors, per_frame)
+                endurance = _measure(run, sequence, truth, block, frames, seconds, open_errors, tracks_bytes)
                 page = write_page(path, format_endurance(endurance, command))
     return page
 

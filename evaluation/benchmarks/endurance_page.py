@@ -124,8 +124,8 @@ def _verdicts(endurance: Endurance) -> list[str]:
             f"| memory flat within {_MEMORY:.0f} % from frame {first.end} on | at most {growth:+.1f} % "
             f"({first.megabytes:.0f} MB then) | {_word(growth <= _MEMORY)} |"
         )
-        half = len(blocks) // 2
-        early, late = (np.median([block.cpu for block in part]) for part in (blocks[1 : half + 1], blocks[half:]))
+        half = max(len(blocks) // 2, 2)
+        early, late = (np.median([block.cpu for block in part]) for part in (blocks[1:half], blocks[half:]))
         change = 100.0 * float(late / early - 1.0)
         lines.append(
             f"| time a frame flat (second half within {_TIME:.0f} % of the first) | {change:+.1f} % "

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 from sigmaslam.camera import RectifiedStereo
-from sigmaslam.landmarks import PointMap, map_points, merge_maps, thin_map
+from sigmaslam.landmarks import PointMap, map_points, merge_maps
 from sigmaslam.rotation import se3_exp, se3_inverse
 from sigmaslam.tables import Views
 from sigmaslam.window import KeyframeWindow
@@ -204,11 +204,3 @@ def test_merging_nothing_gives_an_empty_map():
     assert empty.points.shape == (0, 3)
     assert empty.covariances.shape == (0, 3, 3)
     assert empty.observations.shape == (0,)
-
-
-def test_a_thinned_map_keeps_the_points_that_most_views_confirmed():
-    window = window_of(measure(points_in_view(6), np.eye(4)))
-    window.landmarks.views[:] = [3, 9, 4, 9, 2, 5]
-    thinned = thin_map(map_of(window), 3)
-    assert thinned.observations.tolist() == [9, 9, 5]
-    np.testing.assert_array_equal(thinned.points, map_of(window).points[[1, 3, 5]])

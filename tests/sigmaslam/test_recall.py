@@ -102,12 +102,15 @@ def test_nothing_is_similar_to_nothing():
 
 def test_keyframes_round_trip_through_a_file(tmp_path: Path):
     kept = [keyframe(0, 0.0, 40), keyframe(1, 1.0, 0), keyframe(2, 2.0, 17)]
-    np.savez_compressed(tmp_path / "map.npz", **pack_keyframes(kept, "learned", CAMERA))
-    read = read_keyframes(tmp_path / "map.npz", "learned", CAMERA)
+    joint = np.random.default_rng(0).normal(size=(18, 18))
+    joint = joint @ joint.T
+    np.savez_compressed(tmp_path / "map.npz", **pack_keyframes(kept, joint, "learned", CAMERA))
+    read, joint_read = read_keyframes(tmp_path / "map.npz", "learned", CAMERA)
     assert len(read) == 3
+    np.testing.assert_array_equal(joint_read, joint)
+    np.testing.assert_array_equal(read[1].covariance, joint[6:12, 6:12])
     for before, after in zip(kept, read, strict=True):
         np.testing.assert_array_equal(after.pose, before.pose)
-        np.testing.assert_array_equal(after.covariance, before.covariance)
         assert after.timestamp == before.timestamp
         np.testing.assert_array_equal(after.view.left, before.view.left)
         np.testing.assert_array_equal(after.view.disparity, before.view.disparity)
@@ -119,7 +122,7 @@ def test_keyframes_round_trip_through_a_file(tmp_path: Path):
 
 
 def test_no_keyframes_pack_to_no_arrays():
-    assert pack_keyframes([], "learned", CAMERA) == {}
+    assert pack_keyframes([], np.zeros((0, 0)), "learned", CAMERA) == {}
 
 
 def refused(path: Path, *words: str, frontend: str = "learned", camera: RectifiedStereo = CAMERA) -> None:
@@ -137,7 +140,7 @@ def test_a_missing_map_is_refused(tmp_path: Path):
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
 def test_a_truncated_map_is_refused(tmp_path: Path, share: float):
     path = tmp_path / "map.npz"
-    np.savez_compressed(path, **pack_keyframes([keyframe(0, 0.0)], "learned", CAMERA))
+    np.savez_compressed(path, **pack_keyframes([keyframe(0, 0.0)], np.eye(6), "learned", CAMERA))
     path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
     refused(path, "not a map that can be read", "track the sequence again")
 
@@ -156,13 +159,13 @@ def test_a_map_without_keyframes_is_refused(tmp_path: Path):
 
 def test_a_map_of_another_front_end_is_refused(tmp_path: Path):
     path = tmp_path / "map.npz"
-    np.savez_compressed(path, **pack_keyframes([keyframe(0, 0.0)], "sift", CAMERA))
+    np.savez_compressed(path, **pack_keyframes([keyframe(0, 0.0)], np.eye(6), "sift", CAMERA))
     refused(path, "front-end sift, not learned", "--frontend sift")
 
 
 def test_a_map_of_another_camera_is_refused(tmp_path: Path):
     path = tmp_path / "map.npz"
-    np.savez_compressed(path, **pack_keyframes([keyframe(0, 0.0)], "learned", CAMERA))
+    np.savez_compressed(path, **pack_keyframes([keyframe(0, 0.0)], np.eye(6), "learned", CAMERA))
     refused(path, "0.1", "0.2", "a map serves the camera that made it", camera=replace(CAMERA, baseline=0.2))
 
 

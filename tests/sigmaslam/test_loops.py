@@ -1,0 +1,139 @@
+"""A lap that ends where it began, by the tracker without images: what its loop gains on the way round."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from simulated_frontend import SCALES, SimulatedFrontend, run_simulated
+
+from sigmaslam.rotation import nearest_rigid, se3_exp, se3_inverse, se3_log
+from sigmaslam.startup import RelativePose
+from sigmaslam.tracker import StereoTracker
+
+LAP, FRAMES = 180, 220
+SCALE = SCALES["driving"]
+OFFSET = 0.3
+
+
+class LapFrontend(SimulatedFrontend):
+    """A drive around a circle of 180 m, and on for 40 m."""
+
+    def _path(self, frames: int) -> np.ndarray:
+        step, poses = se3_exp(np.array([0, 0, 1.0, 0, 2 * np.pi / LAP, 0])), [np.eye(4)]
+        for _ in range(frames - 1):
+            poses.append(nearest_rigid(poses[-1] @ step))
+        return np.array(poses)
+
+
+@dataclass(frozen=True)
+class Lap:
+    """Errors after a lap, of keyframes and points of its middle (metres, and NEES per degree of freedom), and after it.
+
+    Attributes:
+        keyframe_error, keyframe_nees: means.
+        point_error, point_nees: medians, the latter over what it should be.
+        end_error: metres, mean of the frames after the lap.
+        poses: (K, 4, 4) remembered.
+    """
+
+    keyframe_error: float
+    keyframe_nees: float
+    point_error: float
+    point_nees: float
+    end_error: float
+    poses: np.ndarray
+
+
+def drive(seed: int, closed: bool = True, wrong: bool = False) -> Lap:
+    """Around once, with loops or without, or with matches of old keyframes that are 5 m off."""
+    frontend = LapFrontend(SCALE, seed, FRAMES, 100, offset=OFFSET)
+    tracker = StereoTracker(frontend.camera, "klt")
+    if not closed:
+        tracker._close_loop = lambda view: None  # type: ignore[method-assign]
+    if wrong:
+        locate = tracker._search.locate
+
+        def mislead(*views):
+            found = locate(*views)
+            if found is None or tracker._timestamp is None or tracker._timestamp < 10.0:
+                return found
+            return RelativePose(
+                found.T_key_camera @ se3_exp(np.array([5.0, 0, 0, 0, 0, 0])), found.inliers, found.covariance
+            )
+
+        tracker._search.locate = mislead  # type: ignore[method-assign]
+    run = run_simulated(tracker, frontend, SCALE)
+    assert [e.status for e in run.estimates[1:]] == ["tracking"] * (FRAMES - 1)
+    kept = tracker._memory.keyframes
+    number = np.array([round(each.timestamp / SCALE.interval) for each in kept])
+    middle = (number >= 40) & (number < 140)
+    true = frontend.poses[number]
+    away = [np.linalg.norm(a[:3, 3] - each.pose[:3, 3]) for a, each in zip(true, kept, strict=True)]
+    errors = [se3_log(a @ se3_inverse(each.pose)) for a, each in zip(true, kept, strict=True)]
+    nees = [e @ np.linalg.lstsq(each.covariance, e, rcond=1e-12)[0] / 6 for e, each in zip(errors, kept, strict=True)]
+    point_error, point_nees = _points(tracker, frontend)
+    end = [
+        np.linalg.norm(e.T_world_camera[:3, 3] - T[:3, 3])
+        for e, T in zip(run.estimates[LAP + 20 :], frontend.poses[LAP + 20 :], strict=True)
+    ]
+    return Lap(
+        float(np.mean(np.array(away)[middle])),
+        float(np.mean(np.array(nees)[middle])),
+        point_error,
+        point_nees,
+        float(np.mean(end)),
+        np.array([each.pose for each in kept]),
+    )
+
+
+def _points(tracker: StereoTracker, frontend: LapFrontend) -> tuple[float, float]:
+    """Median error and NEES of the map's points that were first seen in the middle of the lap."""
+    found = tracker.map()
+    number = np.round(found.timestamps / SCALE.interval).astype(int)
+    error, nees = [], []
+    for k in np.unique(number[(number >= 40) & (number < 140)]):
+        own = number == k
+        truth, visible = frontend._project(k)
+        apart = np.linalg.norm(truth[None, :, :2] - found.pixels[own][:, None], axis=2)
+        apart[:, ~visible] = np.inf
+        off = found.points[own] - frontend._points[apart.argmin(axis=1)]
+        sure = apart.min(axis=1) < 1.5  # pixels, the keypoint's noise is 0.25: no other point was meant
+        error += np.linalg.norm(off[sure], axis=1).tolist()
+        covariances = found.covariances[own][sure]
+        nees += (
+            np.einsum("mi,mi->m", off[sure], np.linalg.solve(covariances, off[sure][..., None])[..., 0]) / 3
+        ).tolist()
+    assert len(error) > 100
+    # The median of a right NEES of three degrees of freedom is 2.366; of a few points another one was meant.
+    return float(np.median(error)), float(np.median(nees)) * 3 / 2.366
+
+
+@pytest.mark.slow
+def test_a_loop_corrects_keyframes_and_points_of_the_way_round(monkeypatch: pytest.MonkeyPatch):
+    """Without any extra; halfway round a loop takes half of the variance, at the end nearly all of it."""
+    monkeypatch.setitem(sys.modules, "gtsam", None)
+    before = [drive(seed, closed=False) for seed in range(5)]
+    after = [drive(seed) for seed in range(5)]
+
+    def factor(name: str) -> float:
+        return float(
+            np.sqrt(np.mean([getattr(b, name) ** 2 for b in before]) / np.mean([getattr(a, name) ** 2 for a in after]))
+        )
+
+    # Where half of the way is gone, a random walk is left with 1 / sqrt(2) of its error.
+    assert factor("keyframe_error") > 1.15
+    assert factor("point_error") > 1.15
+    assert factor("end_error") > 2.0
+    # Five laps, each with errors that all its keyframes share: the mean scatters by a third.
+    assert 0.4 < np.mean([lap.keyframe_nees for lap in after]) < 2.0
+    assert 0.4 < np.mean([lap.point_nees for lap in after]) < 2.0
+
+
+@pytest.mark.slow
+def test_wrong_loops_spoil_nothing():
+    without, misled = drive(0, closed=False), drive(0, wrong=True)
+    np.testing.assert_array_equal(misled.poses, without.poses)
+    assert misled.end_error == without.end_error
