@@ -7,7 +7,7 @@ steps add up to four to eight times what they make together. So the covariance o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -52,6 +52,63 @@ class PastPoses:
         doubt = np.trace(lever @ self.relative(index) @ lever.T, axis1=1, axis2=2)
         doubt[index] = np.inf
         return int(doubt.argmin())
+
+    def relative_to(self, window: np.ndarray, index: int) -> np.ndarray:
+        """(6, 6) covariance of the window's last pose relative to the pose `index`; window (n, n) is its covariance."""
+        own, last = past_slice(index), slice(len(window) - 6, len(window))
+        across = self.cross[own, last]
+        return np.asarray(window[last, last] + self.covariance[own, own] - across - across.T)
+
+    def grow(
+        self, window: np.ndarray, step_covariance: np.ndarray, walk: np.ndarray, origin: int | None
+    ) -> tuple[np.ndarray, PastPoses]:
+        """Covariance of the window, and these, when a pose is appended there.
+
+        Args:
+            window: (n, n) covariance before.
+            step_covariance: (6, 6) of the new pose relative to the last one.
+            walk: (3,) variances that the calibration gains.
+            origin: the pose of these that takes the place of the last one, where the window has none.
+        """
+        size = len(window)
+        grown = np.zeros((size + 6, size + 6))
+        grown[:size, :size] = window
+        grown[range(CALIBRATION_SIZE), range(CALIBRATION_SIZE)] += walk
+        across = np.zeros((len(self.cross), 6))
+        if size > CALIBRATION_SIZE:
+            last = slice(size - 6, size)
+            grown[size:, :size], grown[size:, size:], across = window[last], window[last, last], self.cross[:, last]
+        elif origin is not None:
+            own = past_slice(origin)
+            grown[size:, :size], grown[size:, size:] = self.cross[own], self.covariance[own, own]
+            across = self.covariance[:, own]
+        grown[:size, size:] = grown[size:, :size].T
+        grown[size:, size:] += step_covariance
+        return grown, replace(self, cross=np.concatenate([self.cross, across], axis=1))
+
+    def tie(
+        self, window: np.ndarray, index: int, apart: np.ndarray, match: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, PastPoses]:
+        """Posterior when the window's last pose has been measured relative to the pose `index`.
+
+        Args:
+            window: (n, n) covariance of its state before.
+            index: of the old pose.
+            apart: (6,) by which the two should move against each other.
+            match: (6, 6) covariance of that.
+        Returns:
+            (n,) step of the window's state, its covariance (n, n), and these.
+        """
+        old, last = past_slice(index), slice(len(window) - 6, len(window))
+        # Covariances with what is measured, the last pose less the old one.
+        own = window[:, last] - self.cross[old].T
+        theirs = self.cross[:, last] - self.covariance[:, old]
+        innovation = own[last] - theirs[old] + match
+        gain = np.linalg.lstsq(innovation, own.T, rcond=1e-12)[0].T
+        past_gain = np.linalg.lstsq(innovation, theirs.T, rcond=1e-12)[0].T
+        root = matrix_root(window - gain @ own.T)
+        past = self.moved(past_gain @ apart, self.covariance - past_gain @ theirs.T, self.cross - past_gain @ own.T)
+        return gain @ apart, root @ root.T, past
 
     def drop(self, index: int) -> PastPoses:
         """Those but one."""

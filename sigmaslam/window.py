@@ -24,7 +24,7 @@ from sigmaslam.chi_square import CHI_SQUARE_999, CHI_SQUARE_9999_OF_6
 from sigmaslam.elimination import Elimination, eliminate_landmarks
 from sigmaslam.gaussian import append_moved, condition, matrix_root, project_covariance, replace_part, weighted_update
 from sigmaslam.linearise import Slopes, ViewLineariser
-from sigmaslam.past import PastPoses, past_slice, point_lever
+from sigmaslam.past import PastPoses, point_lever
 from sigmaslam.residuals import UNKNOWN_VARIANCE, common_scale, mask_missing, squared_lengths, student_weight, whiten
 from sigmaslam.rotation import nearest_rigid, se3_exp, se3_inverse, se3_log
 from sigmaslam.tables import (
@@ -138,30 +138,8 @@ class KeyframeWindow:
         """
         count = len(self.poses)
         expected = self._prior_poses[-1] @ step if count else step
-        size = CALIBRATION_SIZE + 6 * count
-        grown = np.zeros((2, size + 6, size + 6))
-        last = pose_slice(count - 1) if count else slice(0, 0)
-        pasts = []
-        states = ((self._prior, self._prior_past), (self.covariance, self.past))
-        for new, (old, past) in zip(grown, states, strict=True):
-            new[:size, :size] = old
-            new[range(CALIBRATION_SIZE), range(CALIBRATION_SIZE)] += walk
-            across = np.zeros((len(past.cross), 6))
-            if count:
-                new[size:, :size] = old[last, :]
-                new[:size, size:] = old[:, last]
-                new[size:, size:] = old[last, last]
-                across = past.cross[:, last]
-            elif origin is not None:
-                place = past_slice(origin)
-                new[size:, :size] = past.cross[place]
-                new[:size, size:] = past.cross[place].T
-                new[size:, size:] = past.covariance[place, place]
-                across = past.covariance[:, place]
-            new[size:, size:] += step_covariance
-            pasts.append(replace(past, cross=np.concatenate([past.cross, across], axis=1)))
-        self._prior, self.covariance = grown
-        self._prior_past, self.past = pasts
+        self._prior, self._prior_past = self._prior_past.grow(self._prior, step_covariance, walk, origin)
+        self.covariance, self.past = self.past.grow(self.covariance, step_covariance, walk, origin)
         self._prior_poses = np.concatenate([self._prior_poses, nearest_rigid(expected)[None]])
         self.poses = np.concatenate([self.poses, nearest_rigid(pose)[None]])
         self.landmarks.dependence = np.pad(self.landmarks.dependence, ((0, 0), (0, 0), (0, 6)))
@@ -218,9 +196,7 @@ class KeyframeWindow:
         Returns:
             False, and nothing is changed, where it contradicts what is known, or says less than is known already.
         """
-        last, old = pose_slice(len(self.poses) - 1), past_slice(index)
-        across = self.past.cross[old, last]
-        known = self.covariance[last, last] + self.past.covariance[old, old] - across - across.T
+        known = self.past.relative_to(self.covariance, index)
         apart = se3_log(self.past.poses[index] @ T_past_last @ se3_inverse(self.poses[-1]))
         # What the old keyframe was measured with is the same in all its matches: they must not be counted without end.
         lever = point_lever(self.poses[-1:, :3, 3])[0]
@@ -228,22 +204,10 @@ class KeyframeWindow:
             return False
         if apart @ np.linalg.lstsq(known + match, apart, rcond=1e-12)[0] > CHI_SQUARE_9999_OF_6:
             return False
-        past = self._prior_past
-        # Covariances with what the match measures, the last pose less the old one.
-        own = self._prior[:, last] - past.cross[old].T
-        theirs = past.cross[:, last] - past.covariance[:, old]
-        innovation = own[last] - theirs[old] + match
-        apart = se3_log(past.poses[index] @ T_past_last @ se3_inverse(self._prior_poses[-1]))
-        gain = np.linalg.lstsq(innovation, own.T, rcond=1e-12)[0].T
-        past_gain = np.linalg.lstsq(innovation, theirs.T, rcond=1e-12)[0].T
-        step = gain @ apart
-        self._prior_past = past.moved(
-            past_gain @ apart, past.covariance - past_gain @ theirs.T, past.cross - past_gain @ own.T
-        )
+        apart = se3_log(self._prior_past.poses[index] @ T_past_last @ se3_inverse(self._prior_poses[-1]))
+        step, self._prior, self._prior_past = self._prior_past.tie(self._prior, index, apart, match)
         self._prior_poses = nearest_rigid(se3_exp(step[CALIBRATION_SIZE:].reshape(-1, 6)) @ self._prior_poses)
         self._prior_calibration = self._prior_calibration + step[CALIBRATION]
-        root = matrix_root(self._prior - gain @ own.T)
-        self._prior = root @ root.T
         self.solve()
         return True
 
