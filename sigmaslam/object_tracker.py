@@ -256,9 +256,7 @@ class ObjectTracker(StereoTracker):
 
     def _restart(self, body: StereoView) -> None:
         """Begins again with the body alone as it was in the first frame; it has not moved until now."""
-        self._window.restart()
-        self._keyframe_views, self._keyframe_times, self._retired = [], [], []
-        self._memory.keyframes.clear()
+        self._forget_all()
         self._first = body
         super()._start(body, self._first_time)
         self._separated, self._velocity_known = True, False

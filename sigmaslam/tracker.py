@@ -332,6 +332,14 @@ class StereoTracker:
         self._recent.append(keyframe.timestamp)
         return number
 
+    def _forget_all(self) -> None:
+        """As before the first keyframe, but for what is known of the calibration."""
+        self._window.restart()
+        self._keyframe_views, self._keyframe_times = [], []
+        self._retired = RetiredPoints(self.config.most_points)
+        self._memory.keyframes.clear()
+        self._recent.clear()
+
     def _memorise(self, keyframe: RememberedKeyframe, spare: float | None = None) -> None:
         """Remembers a keyframe of the window's past; another, not that of the time stamp `spare`, may go for it."""
         dropped = self._memory.add(keyframe, spare)

@@ -111,6 +111,15 @@ class KeyframeWindow:
     def __len__(self) -> int:
         return len(self.poses)
 
+    def restart(self) -> None:
+        """Forgets all poses, past ones as well, and landmarks; what is known of the calibration stays."""
+        self.poses = self._prior_poses = np.zeros((0, 4, 4))
+        self._prior = self.covariance = self.covariance[CALIBRATION, CALIBRATION]
+        self._prior_calibration = self.calibration
+        self.landmarks = Landmarks.empty(CALIBRATION_SIZE)
+        self._observations = Observations()
+        self.past = self._prior_past = PastPoses.empty()
+
     def load_past(self, past: PastPoses) -> None:
         """Remembers poses of another run, before there is a keyframe."""
         self.past = self._prior_past = past
