@@ -13,6 +13,8 @@ UNKNOWN_VARIANCE = 1e12
 STUDENT_FREEDOM = 2.0
 # What so many agree on is no matter of a few outliers.
 _NEARLY_ALL = 0.95
+# Right matches are not worse than three times the standard deviation that they claim, all together.
+_MOST_SCALE = 9.0
 
 
 def mask_missing(residual: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -35,7 +37,8 @@ def common_scale(squared: np.ndarray, components: np.ndarray) -> float:
     """Factor, 1 or more, by which all variances together are too small: of a blurred image, say.
 
     The median tells how far the residuals scatter before any gate. It is believed where nearly all agree once their
-    variances are scaled by it; where they do not, the errors are those of a part: outliers among good matches.
+    variances are scaled by it; where they do not, the errors are those of a part: outliers among good matches. Where
+    it is large nothing fits.
 
     Args:
         squared: (M,) squared lengths of whitened residuals.
@@ -45,7 +48,7 @@ def common_scale(squared: np.ndarray, components: np.ndarray) -> float:
         return 1.0
     factor = max(1.0, float(np.median(squared / CHI_SQUARE_MEDIAN[components])))
     agreeing = float((squared <= factor * CHI_SQUARE_999[components]).mean())
-    return factor if agreeing >= _NEARLY_ALL else 1.0
+    return factor if factor <= _MOST_SCALE and agreeing >= _NEARLY_ALL else 1.0
 
 
 def whiten(stacked: np.ndarray, noise: np.ndarray) -> np.ndarray:

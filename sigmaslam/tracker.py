@@ -206,8 +206,7 @@ class StereoTracker:
             other_found, other = self._track_anywhere(view, clock)
             if fit is None or (other is not None and other.nis_per_dof < fit.nis_per_dof):
                 found, fit = other_found, other
-        few = fit is not None and fit.kept.sum() < _MANY * self.config.least_inliers
-        if fit is not None and few and fit.noise_scale * fit.nis_per_dof > _DOUBTFUL_NIS:
+        if fit is not None and fit.misfit > _DOUBTFUL_NIS and fit.kept.sum() < _MANY * self.config.least_inliers:
             return found, None  # chance agreement of a few
         return found, fit
 

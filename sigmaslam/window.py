@@ -73,6 +73,11 @@ class FrameFit:
         """1 where the covariances are right."""
         return self.nis / max(self.dof, 1)
 
+    @property
+    def misfit(self) -> float:
+        """The same by the noise that the views came with: chance agreement is not made good by a larger one."""
+        return self.noise_scale * self.nis_per_dof
+
 
 class KeyframeWindow:
     """Poses of the last keyframes, the stereo calibration, and the landmarks that tie them; owns the state.

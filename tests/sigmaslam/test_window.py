@@ -552,3 +552,19 @@ def test_a_long_chain_of_windows_stays_rigid():
     R = window.poses[:, :3, :3]
     np.testing.assert_allclose(R @ R.transpose(0, 2, 1), np.tile(np.eye(3), (2, 1, 1)), atol=1e-12)
     np.testing.assert_allclose(window.covariance, window.covariance.T, rtol=0, atol=1e-12)
+
+
+def test_noise_that_is_larger_than_claimed_is_found_before_the_gate_hides_it():
+    given = world(0, count=200)
+    window, views = solved(given), given.views[-1]
+    rng = np.random.default_rng(1)
+    blurred = replace(views, measurement=views.measurement + 2.0 * rng.normal(0, 0.26, views.measurement.shape))
+    step = np.diag(STEP_SIGMA**2)
+    good = window.fit_frame(views, window.poses[-1] @ STEP, step, 15)
+    bad = window.fit_frame(blurred, window.poses[-1] @ STEP, step, 15)
+    assert good is not None
+    assert bad is not None
+    assert good.noise_scale < 1.4
+    assert 2.0 < bad.noise_scale < 8.0
+    assert bad.kept.mean() > 0.95
+    assert np.trace(bad.relative) > 1.5 * np.trace(good.relative)
