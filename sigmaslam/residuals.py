@@ -46,7 +46,11 @@ def common_scale(squared: np.ndarray, components: np.ndarray) -> float:
     """
     if not len(squared):
         return 1.0
-    factor = max(1.0, float(np.median(squared / CHI_SQUARE_MEDIAN[components])))
+    ratio = squared / CHI_SQUARE_MEDIAN[components]
+    # Half of them are expected above 1; by chance no more than three standard deviations of that count besides.
+    if (ratio > 1.0).sum() <= 0.5 * len(ratio) + 1.5 * np.sqrt(len(ratio)):
+        return 1.0
+    factor = float(np.median(ratio))
     agreeing = float((squared <= factor * CHI_SQUARE_999[components]).mean())
     return factor if factor <= _MOST_SCALE and agreeing >= _NEARLY_ALL else 1.0
 
