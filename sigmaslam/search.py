@@ -104,6 +104,8 @@ class LandmarkSearch:
             # Features of a keyframe ascend with the rows of its landmarks.
             place = np.searchsorted(landmarks.feature[rows[chosen]], matches.key_index)
             noise, common = self._noise.of_matches(matches), np.zeros((len(place), 3, 2))
+            if alone and host != anchor % len(keyframes) and len(place) < self._config.least_inliers:
+                continue  # a few that agree by chance would tie keyframes that hardly see each other
             if not alone:
                 noise, common = self._noise.split(noise)
             views = Views(rows[chosen][place], _measurement(matches), noise, common)

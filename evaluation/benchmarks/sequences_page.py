@@ -50,7 +50,7 @@ on one machine; times are wall milliseconds. No setting of any method differs be
   again by ratio test or Lucas-Kanade, RANSAC, least squares. Landmarks count as known, the noise as 1 px.
 - *bundle adjustment*: of the tracks of *ours* (`track --tracks`, then `refine`), all keyframes at once; frames in
   between move with them. Its time is that of the optimisation, on top of the tracking; its NEES that of the keyframes.
-- *tracked*: frames with a pose from the images; the first frame of a run is its origin.
+- *tracked*: frames with a pose from the images, relocalised ones too; the first frame of a run is its origin.
 - *ATE*: root mean square position error after the best rigid alignment, metres.
 - *t_rel*, *r_rel*: KITTI segments, of 100 m where the path allows, else of 10 to 50 m.
 - *step*: median error from frame to frame over tracked frames.
@@ -140,13 +140,14 @@ def _row(result: Result) -> list[str]:
     translations, rotations = evaluation.rpe.translations, evaluation.rpe.rotations_deg
     ends_tracked, nis = np.ones(len(translations), bool), np.nan
     if frames is not None:
-        tracked = np.array(frames.status) == "tracking"
+        tracked = np.isin(frames.status, ("tracking", "relocalised"))
         count = f"{tracked.sum()} of {len(frames) - 1}"
         # Frame k ends step k - 1; frames that were skipped have no pose and no step.
         ends = tracked[np.array(frames.status) != "skipped"][1:]
         ends_tracked = ends if len(ends) == len(translations) else ends_tracked
         if tracked.any():
-            nis = float(np.median(frames.columns["nis"][tracked] / frames.columns["dof"][tracked]))
+            updated = frames.columns["dof"] > 0  # a relocalised frame is not
+            nis = float(np.median(frames.columns["nis"][updated] / frames.columns["dof"][updated]))
         offset, sigma = (float(frames.columns[name][-1]) for name in ("disparity_offset", "disparity_offset_sigma"))
         pace = float(np.median(_totals(frames)))
     else:
