@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sigmaslam.linearise import Slopes
-from sigmaslam.residuals import student_weight
+from sigmaslam.residuals import student_weight, whiten
 from sigmaslam.tables import LANDMARK_SIZE, MODELLED, Landmarks
 
 
@@ -48,7 +48,7 @@ def eliminate_landmarks(
     seen, owner = np.unique(landmark, return_inverse=True)
     size = slopes.by_state.shape[2]
     stacked = np.concatenate([slopes.by_state, slopes.by_landmark, residual[..., None]], axis=2)
-    whitened = np.linalg.solve(np.linalg.cholesky(noise), stacked)
+    whitened = whiten(stacked, noise).reshape(stacked.shape)
     weight = student_weight((whitened[:, :, -1] ** 2).sum(axis=1), components)
     whitened *= np.sqrt(weight)[:, None, None]
     by_state, by_landmark, rest = whitened[:, :, :size], whitened[:, :, size:-1], whitened[:, :, -1:]

@@ -20,6 +20,7 @@ import numpy as np
 from sigmaslam.chi_square import CHI_SQUARE_999
 from sigmaslam.errors import InputError
 from sigmaslam.estimate import Estimate
+from sigmaslam.gaussian import matrix_root
 from sigmaslam.location import Locations
 from sigmaslam.location_model import OFFSET, SENSOR_WORLD, SIZE, Pairs, State, find_worlds, residuals
 from sigmaslam.rotation import nearest_rigid, se3_body, se3_exp, se3_inverse, se3_log, turn_covariance
@@ -223,8 +224,7 @@ class LocationFilter:
     def _update(self, state: State, row: int, pose: np.ndarray) -> None:
         """Unscented update by a reading of the tracker's pose at its time."""
         rotation = None if self._readings.rotations is None else self._readings.rotations[row]
-        values, vectors = np.linalg.eigh(state.covariance)
-        root = np.sqrt(SIZE) * vectors * np.sqrt(np.maximum(values, 0.0))
+        root = np.sqrt(SIZE) * matrix_root(state.covariance)
         points = np.concatenate([root.T, -root.T])
         shifted = points.copy()
         shifted[:, OFFSET] += state.offset

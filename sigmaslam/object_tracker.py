@@ -138,8 +138,7 @@ class ObjectTracker(StereoTracker):
             body = body @ T_left_rectified[:3, :3].T
             slack = 0.1 * np.ptp(body, axis=0).max()
             inside = (points.points >= body.min(axis=0) - slack) & (points.points <= body.max(axis=0) + slack)
-            kept = inside.all(axis=1)
-            points = PointMap(*(getattr(points, name)[kept] for name in PointMap.__slots__))
+            points = points.select(inside.all(axis=1))
         return points.transform(T_body_left)
 
     # ---- what the tracker asks
@@ -157,7 +156,7 @@ class ObjectTracker(StereoTracker):
             self._first, self._first_time = _only(view, chosen), timestamp
             self._references = [(view, np.eye(4))]
             inner = chosen & pixels_in(inner_half(self._region), view.features.keypoints)
-            points = self._camera.triangulate(_places(view, inner if inner.any() else chosen))
+            points = self._camera.triangulate(view.measured(inner if inner.any() else chosen))
             self._T_world_body[:3, 3] = np.median(points, axis=0)
         super()._start(view, timestamp)
 
@@ -190,7 +189,7 @@ class ObjectTracker(StereoTracker):
             return self._first if view is self._first else _only(view, known & inside)
         index = np.flatnonzero(known)
         # The shape is that of measured disparities but for what they are off by.
-        index = index[self._shape.holds(pose, self._window.true_disparity(_padded(_places(view, index)))[:, :3])]
+        index = index[self._shape.holds(pose, self._window.true_disparity(view.measured(index)))]
         index = index[~self._stands_still(view, index, pose)]
         self._references = [self._references[0], *self._references[1:][-_REFERENCES + 1 :], (view, pose)]
         chosen = np.zeros(len(view.disparity), bool)
@@ -202,10 +201,8 @@ class ObjectTracker(StereoTracker):
     def _unseen_motion(self) -> np.ndarray:
         """(6, 6) in the camera's frame: how far the body may have moved while what stands still outnumbers it."""
         assert self._first is not None
-        camera, points = (
-            self._camera,
-            self._camera.triangulate(_places(self._first, np.isfinite(self._first.disparity))),
-        )
+        camera = self._camera
+        points = camera.triangulate(self._first.measured(np.isfinite(self._first.disparity)))
         depth, size = float(np.median(points[:, 2])), float(np.linalg.norm(np.std(points, axis=0)))
         aside = _UNSEEN * depth / camera.fx
         far = _UNSEEN * depth**2 / (camera.fx * camera.baseline)
@@ -221,7 +218,7 @@ class ObjectTracker(StereoTracker):
         keypoints = first.features.keypoints[index].astype(np.float64)
         matches = self._frontend.match(first, index, view, keypoints, None)
         rows = matches.key_index
-        before = _places(first, rows)
+        before = first.measured(rows)
         moved = self._has_moved(before, first.disparity_sigma[rows], matches)
         if moved.sum() < self.config.least_inliers:
             return None
@@ -278,10 +275,10 @@ class ObjectTracker(StereoTracker):
     def _stands_still(self, view: StereoView, index: np.ndarray, pose: np.ndarray) -> np.ndarray:
         """Which of these features are where background was in an earlier view; (K,) bool."""
         still = np.zeros(len(index), bool)
-        places = _places(view, index)
+        places = view.measured(index)
         for earlier, earlier_pose in self._references:
             known = np.flatnonzero(np.nan_to_num(earlier.disparity) > _LEAST_DISPARITY)
-            before = _places(earlier, known)
+            before = earlier.measured(known)
             T = se3_inverse(pose) @ earlier_pose
             moved = self._camera.triangulate(before) @ T[:3, :3].T + T[:3, 3]
             front = moved[:, 2] > 1e-6
@@ -293,7 +290,7 @@ class ObjectTracker(StereoTracker):
             near = np.tile((0.5 * _STILL) ** 2 * np.eye(2), (len(known), 1, 1))
             matches = self._frontend.match(earlier, known, view, before[:, :2], near)
             there = matches.points[
-                np.linalg.norm(matches.points - _places(earlier, matches.key_index)[:, :2], axis=1) < _STILL
+                np.linalg.norm(matches.points - earlier.measured(matches.key_index)[:, :2], axis=1) < _STILL
             ]
             if len(there):
                 distance = np.linalg.norm(places[:, None, :2] - there[None], axis=2).min(axis=1)
@@ -304,12 +301,3 @@ class ObjectTracker(StereoTracker):
 def _only(view: StereoView, chosen: np.ndarray) -> StereoView:
     """The view without the disparities of all but the chosen features (N,) bool."""
     return replace(view, disparity=np.where(chosen, view.disparity, np.nan))
-
-
-def _places(view: StereoView, index: np.ndarray) -> np.ndarray:
-    """(K, 3) (u, v, disparity) of features, by index or mask."""
-    return np.column_stack([view.features.keypoints[index].astype(np.float64), view.disparity[index]])
-
-
-def _padded(uvd: np.ndarray) -> np.ndarray:
-    return np.pad(uvd, ((0, 0), (0, 1)))

@@ -119,11 +119,10 @@ class LandmarkSearch:
             return None
         matches = self._frontend.match(key, index, view, key.features.keypoints[index].astype(np.float64), None)
         rows = matches.key_index
-        keypoints = key.features.keypoints[rows].astype(np.float64)
         place = np.full(len(rows), self._config.keyframe_sigma)
         relative = estimate_relative_pose(
             self._camera,
-            self._window.true_disparity(np.column_stack([keypoints, key.disparity[rows]])),
+            self._window.true_disparity(key.measured(rows)),
             np.column_stack([place, place, key.disparity_sigma[rows]]),
             self._window.true_disparity(_measurement(matches)),
             self._noise.of_matches(matches),

@@ -430,9 +430,7 @@ class StereoTracker:
         index = np.flatnonzero(np.isfinite(view.disparity))
         taken = np.zeros((0, 2)) if views is None else views.measurement[:, :2]
         index = index[select_apart(view.features.select(index), taken, self.config.spacing, view.left.shape)]
-        keypoints = view.features.keypoints[index].astype(np.float64)
-        measured = np.column_stack([keypoints, view.disparity[index]])
-        self._window.add_landmarks(index, measured, self._noise.of_keypoints(view, index))
+        self._window.add_landmarks(index, view.measured(index), self._noise.of_keypoints(view, index))
         depth = self._camera.fx * self._camera.baseline / max(float(np.nanmedian(view.disparity)), 0.5)
         self._window.depth = depth
         self._densities = np.array([(self.config.acceleration * depth) ** 2, self.config.angular_acceleration**2])

@@ -46,6 +46,10 @@ class StereoView:
     disparity: np.ndarray
     disparity_sigma: np.ndarray
 
+    def measured(self, index: np.ndarray) -> np.ndarray:
+        """(K, 3) float64 (u, v, disparity) of the features of that index or mask."""
+        return np.column_stack([self.features.keypoints[index].astype(np.float64), self.disparity[index]])
+
 
 @dataclass(frozen=True, slots=True)
 class TemporalMatches:

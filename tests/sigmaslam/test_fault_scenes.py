@@ -64,6 +64,15 @@ def passing(simulation: Simulation, begins: float, aside: float) -> Simulation:
     return replace(simulation, scene=replace(simulation.scene, bodies=tuple(bodies)))
 
 
+def assert_not_followed(simulation: Simulation) -> None:
+    """Bodies that cover nearly half the image for a while do no harm, and tracking goes on after them."""
+    frames, shares = filmed(simulation)
+    assert shares.max() > 0.45
+    estimates, truth = tracked(simulation, frames)
+    assert_honest(estimates, truth)
+    assert statuses(estimates[-5:]) == ["tracking"] * 5
+
+
 @pytest.mark.slow
 def test_turning_on_the_spot_is_a_rotation_alone():
     """40 degrees to the right and back in 1.5 s, then a way of 0.2 m that begins and ends gently."""
@@ -92,22 +101,14 @@ def test_turning_on_the_spot_is_a_rotation_alone():
 def test_a_truck_that_comes_to_fill_half_the_image_is_not_followed():
     """It cuts in from the left, drives ahead at the camera's own speed for 0.7 s, and leaves."""
     simulation = passing(simulate(Recipe("street", 30, seed=2, movers=0.5, width=640, height=192)), 0.6, 14.0)
-    frames, shares = filmed(simulation)
-    assert shares.max() > 0.45
-    estimates, truth = tracked(simulation, frames)
-    assert_honest(estimates, truth)
-    assert statuses(estimates[-5:]) == ["tracking"] * 5
+    assert_not_followed(simulation)
 
 
 @pytest.mark.slow
 def test_people_that_come_to_fill_half_the_image_are_not_followed():
     """They walk into a room that is being filmed, keep in front of the camera for 0.7 s, and leave."""
     simulation = passing(simulate(Recipe("room", 52, seed=1, movers=0.5, width=320, height=240)), 0.3, 3.0)
-    frames, shares = filmed(simulation)
-    assert shares.max() > 0.45
-    estimates, truth = tracked(simulation, frames)
-    assert_honest(estimates, truth)
-    assert statuses(estimates[-5:]) == ["tracking"] * 5
+    assert_not_followed(simulation)
 
 
 @pytest.mark.slow
