@@ -97,8 +97,7 @@ def match_features(
     kept = putative.mutual & (logit > LEAST_LOGIT)
     index0, index1, logit = putative.index0[kept], putative.index1[kept], logit[kept]
     points0, points1 = features0.keypoints[index0], features1.keypoints[index1]
-    weight = 1.0 / (1.0 + np.exp(-logit.astype(np.float64)))
-    refinement = refine_by_neighbours(image0, image1, points0.astype(np.float64), points1.astype(np.float64), weight)
+    refinement = refine_by_neighbours(image0, image1, points0, points1, logit)
     sigma = features0.sigma[index0], features1.sigma[index1]
     probability, covariance = judge.verify(image0, image1, points0, logit, refinement, sigma)
     places = refinement.places.astype(np.float32)

@@ -9,7 +9,9 @@ import numpy as np
 from sigmaslam.camera import RectifiedStereo
 from sigmaslam.config import TrackerConfig
 from sigmaslam.frontend import Frontend, StereoView, TemporalMatches
+from sigmaslam.frontend.planes import plane_maps
 from sigmaslam.match_noise import MatchNoise
+from sigmaslam.rotation import se3_inverse
 from sigmaslam.startup import RelativePose, estimate_relative_pose
 from sigmaslam.tables import Views, join_views
 from sigmaslam.window import KeyframeWindow
@@ -100,9 +102,15 @@ class LandmarkSearch:
             chosen = np.flatnonzero(landmarks.host[rows] == host)
             if len(chosen) < _LEAST_OF_A_KEYFRAME:
                 continue
-            matches = self._frontend.match(key, landmarks.feature[rows[chosen]], view, predicted[chosen, :2], S[chosen])
+            feature = landmarks.feature[rows[chosen]]
+            maps = None
+            if key.slope is not None:
+                measured = self._window.true_disparity(landmarks.estimate[rows[chosen]])
+                T_view_key = se3_inverse(pose) @ self._window.poses[host]
+                maps = plane_maps(self._camera, measured, key.slope[feature], T_view_key)
+            matches = self._frontend.match(key, feature, view, predicted[chosen, :2], S[chosen], maps)
             # Features of a keyframe ascend with the rows of its landmarks.
-            place = np.searchsorted(landmarks.feature[rows[chosen]], matches.key_index)
+            place = np.searchsorted(feature, matches.key_index)
             noise, common = self._noise.of_matches(matches), np.zeros((len(place), 3, 2))
             if alone and host != anchor % len(keyframes) and len(place) < self._config.least_inliers:
                 continue  # a few that agree by chance would tie keyframes that hardly see each other

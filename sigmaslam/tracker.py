@@ -16,6 +16,7 @@ from sigmaslam.config import TrackerConfig
 from sigmaslam.errors import InputError
 from sigmaslam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.frontend import StereoView, build_frontend
+from sigmaslam.frontend.planes import disparity_slopes
 from sigmaslam.landmarks import PointMap, RetiredPoints, host_points, map_points, merge_maps
 from sigmaslam.match_noise import MatchNoise
 from sigmaslam.motion import MotionFilter
@@ -410,6 +411,7 @@ class StereoTracker:
         since = timestamp - self._keyframe_times[-1] if self._keyframe_times else 0.0
         walk = np.array([self.config.offset_walk**2 * since, 0.0, 0.0])
         window.add_keyframe(pose, step, step_covariance, walk, origin)
+        view = replace(view, slope=disparity_slopes(view.features.keypoints, view.disparity))
         self._keyframe_views.append(view)
         self._keyframe_times.append(timestamp)
         if views is not None:

@@ -89,8 +89,7 @@ def _rows_of(
     points1 = found.features1.keypoints[putative.index1].astype(np.float64)
     refinement: Refinement
     if mapped:
-        weight = 1.0 / (1.0 + np.exp(-logit[kept].astype(np.float64)))
-        refinement = refine_by_neighbours(record.image0, record.image1, points0, points1, weight)
+        refinement = refine_by_neighbours(record.image0, record.image1, points0, points1, logit[kept])
     else:
         refinement = refine(record.image0, record.image1, points0, points1)
     evidence = examine_patches(record.image0, record.image1, points0, refinement.places, refinement.A)

@@ -6,11 +6,11 @@ scaled they do not; here each patch is first warped by the affine map that the n
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
 from sigmaslam.frontend.evidence import sample_patches
 from sigmaslam.frontend.neighbours import nearest_points
+from sigmaslam.frontend.smooth import smoothed
 from sigmaslam.frontend.types import Refinement
 
 _NEIGHBOURS = 24
@@ -23,7 +23,8 @@ _RADIUS = 7
 _ITERATIONS = 6
 _LEAST_CORRELATION = 0.5
 _LONGEST_STEP = 1.0
-_BLUR = 0.8
+# Of a plane seen from elsewhere: no part of a patch is nearer than this share of its centre's distance.
+_LEAST_DEPTH = 0.2
 
 
 def local_maps(points0: np.ndarray, points1: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -58,18 +59,29 @@ def local_maps(points0: np.ndarray, points1: np.ndarray, weight: np.ndarray) -> 
 
 
 def align_patches(
-    image0: np.ndarray, image1: np.ndarray, points0: np.ndarray, points1: np.ndarray, A: np.ndarray, reach: float = 3.0
+    image0: np.ndarray,
+    image1: np.ndarray,
+    points0: np.ndarray,
+    points1: np.ndarray,
+    A: np.ndarray,
+    tilt: np.ndarray | None = None,
+    reach: float = 3.0,
+    radius: int = _RADIUS,
+    iterations: int = _ITERATIONS,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Places in image 1 where the patches around points of image 0, warped by their maps, fit best.
 
     Inverse compositional Lucas-Kanade (Baker & Matthews 2004) over a shift, with gain and offset of the grey values
-    free, on patches of 15 x 15 pixels of the coarser image.
+    free, on patches of 2 radius + 1 pixels of the coarser image.
 
     Args:
         image0, image1: (H, W) uint8.
         points0, points1: (M, 2) matched pixels.
         A: (M, 2, 2) as `local_maps` gives it.
+        tilt: (M, 2) how the maps depart from affine ones, as of `PatchMaps`; not at all by default.
         reach: longest move, pixels of image 1.
+        radius: of the patches, pixels of the coarser image.
+        iterations: Gauss-Newton steps.
     Returns:
         (M, 2) float64 places, unchanged where the patches do not fit or the way is too far, and (M,) bool moved.
     """
@@ -85,63 +97,68 @@ def align_patches(
     for step in np.unique(half_octaves[usable]):
         rows = np.flatnonzero((half_octaves == step) & usable)
         ratio = 2.0 ** (0.5 * step)
-        smooth0, smooth1 = _smoothed(image0, max(1.0, 1.0 / ratio)), _smoothed(image1, max(1.0, ratio))
-        places[rows], moved[rows] = _align(
-            smooth0, smooth1, points0[rows], places[rows], A[rows], max(1.0, ratio), reach * max(1.0, ratio)
-        )
+        smooth0, smooth1 = smoothed(image0, max(1.0, 1.0 / ratio)), smoothed(image1, max(1.0, ratio))
+        spacing = max(1.0, ratio)
+        side = np.arange(-radius, radius + 1, dtype=np.float32)
+        grid = np.float32(spacing) * np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+        offsets = grid @ np.linalg.inv(A[rows]).transpose(0, 2, 1)
+        if tilt is not None:
+            offsets /= np.maximum(1.0 - offsets @ tilt[rows][..., None], _LEAST_DEPTH)
+        template = sample_patches(smooth0, points0[rows, None] + offsets)
+        places[rows], moved[rows] = _align(template, grid, smooth1, places[rows], spacing, reach * spacing, iterations)
     return places, moved
 
 
 def refine_by_neighbours(
-    image0: np.ndarray, image1: np.ndarray, points0: np.ndarray, points1: np.ndarray, weight: np.ndarray
+    image0: np.ndarray, image1: np.ndarray, points0: np.ndarray, points1: np.ndarray, logit: np.ndarray
 ) -> Refinement:
     """Aligns the patches of every match, warped as its neighbours say.
 
     Args:
         image0, image1: (H, W) uint8.
         points0, points1: (M, 2) matched pixels.
-        weight: (M,) trust in each match.
+        logit: (M,) of the scorer: how far each match is trusted.
     """
-    A, distance = local_maps(points0, points1, weight)
+    points0, points1 = points0.astype(np.float64), points1.astype(np.float64)
+    A, distance = local_maps(points0, points1, 1.0 / (1.0 + np.exp(-logit.astype(np.float64))))
     places, moved = align_patches(image0, image1, points0, points1, A)
-    return Refinement(points1.astype(np.float64), places, moved, A, distance)
+    return Refinement(points1, places, moved, A, distance)
 
 
 def _inside(image: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.asarray(((points >= 0) & (points <= (image.shape[1] - 1, image.shape[0] - 1))).all(axis=1))
 
 
-def _smoothed(image: np.ndarray, factor: float) -> np.ndarray:
-    return cv2.GaussianBlur(image.astype(np.float32), (0, 0), _BLUR * factor)
-
-
 def _align(
-    image0: np.ndarray,
+    template: np.ndarray,
+    grid: np.ndarray,
     image1: np.ndarray,
-    points0: np.ndarray,
     points1: np.ndarray,
-    A: np.ndarray,
     spacing: float,
     reach: float,
+    iterations: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """As `align_patches`, for matches of one zoom; `spacing` of the samples is in pixels of image 1."""
-    side = np.arange(-_RADIUS, _RADIUS + 1, dtype=np.float64)
-    grid = spacing * np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
-    window = np.exp(-0.5 * (grid**2).sum(axis=1) / (0.6 * spacing * _RADIUS) ** 2)
+    """As `align_patches`, for matches of one zoom.
+
+    Args:
+        template: (M, K) patches of image 0, warped and sampled at offsets `grid` (K, 2), `spacing` apart, of image 1.
+        image1: (H, W) float32, smoothed.
+        points1, reach, iterations: as there.
+    """
+    count = round(len(grid) ** 0.5)
+    window = np.exp(-0.5 * (grid**2).sum(axis=1) / (0.6 * spacing * (count // 2)) ** 2)
     window /= window.sum()
-    template = _normalised(
-        sample_patches(image0, points0[:, None] + grid @ np.linalg.inv(A).transpose(0, 2, 1)), window
-    )
-    square = template.reshape(-1, len(side), len(side))
-    along_v, along_u = np.gradient(square, spacing, axis=(1, 2))
-    gradient = np.stack([along_u, along_v], axis=-1).reshape(len(template), -1, 2)
-    weighted = gradient * window[:, None]
-    normal = weighted.transpose(0, 2, 1) @ gradient + 1e-6 * np.eye(2)
-    inverse = np.linalg.inv(normal)
+    template = _normalised(template, window)
+    square = template.reshape(-1, count, count)
+    along_v, along_u = np.gradient(square, np.float32(spacing), axis=(1, 2))
+    gradient = np.stack([along_u, along_v], axis=1).reshape(len(template), 2, -1)
+    weighted = gradient * window
+    normal = weighted @ gradient.transpose(0, 2, 1) + np.float32(1e-6) * np.eye(2, dtype=np.float32)
+    towards = np.linalg.inv(normal) @ weighted
     shift = np.zeros_like(points1)
-    for _ in range(_ITERATIONS):
+    for _ in range(iterations):
         error = _normalised(sample_patches(image1, (points1 + shift)[:, None] + grid), window) - template
-        step = np.einsum("nij,nkj,nk->ni", inverse, weighted, error)
+        step = (towards @ error[..., None])[..., 0]
         length = np.linalg.norm(step, axis=1, keepdims=True)
         shift -= step * np.minimum(1.0, _LONGEST_STEP * spacing / np.maximum(length, 1e-9))
     final = _normalised(sample_patches(image1, (points1 + shift)[:, None] + grid), window)
@@ -152,4 +169,4 @@ def _align(
 def _normalised(patches: np.ndarray, window: np.ndarray) -> np.ndarray:
     """Patches (M, K) of weighted mean 0 and variance 1."""
     centred = patches - (patches @ window)[:, None]
-    return np.asarray(centred / np.sqrt((centred * centred) @ window + 1e-2)[:, None])
+    return np.asarray(centred / np.sqrt((centred * centred) @ window + np.float32(1e-2))[:, None])

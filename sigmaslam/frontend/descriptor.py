@@ -7,10 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sigmaslam.frontend.affine import refine_by_neighbours
 from sigmaslam.frontend.judge import LEAST_LOGIT, MatchJudge
 from sigmaslam.frontend.matching import Putative, nearest_anywhere, nearest_in_ellipses, nearest_in_rows
+from sigmaslam.frontend.planes import refine_in_rows, refine_on_planes
 from sigmaslam.frontend.refine import refine
-from sigmaslam.frontend.types import Features, StereoView, TemporalMatches
+from sigmaslam.frontend.types import Features, PatchMaps, Refinement, StereoView, TemporalMatches
 
 _ROW_TOLERANCE = 2.0
 # A little below zero, so that points at infinity survive a disparity offset.
@@ -47,27 +49,33 @@ class JudgedMatches:
         )
 
 
-def judge_shifted(
+Refine = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Refinement]
+"""From keypoints (M, 2), (M, 2) of two images, the first ones' index (M,) and the scorer's logit (M,)."""
+
+
+def judge_refined(
     judge: MatchJudge,
     image0: np.ndarray,
     image1: np.ndarray,
     features0: Features,
     features1: Features,
     putative: Putative,
+    refined: Refine,
 ) -> JudgedMatches:
-    """The mutual matches of images that differ by little more than a shift around each: eyes of a pair, frames.
+    """The mutual matches that the scorer does not refuse, refined and judged.
 
     Args:
         judge: of the matches.
         image0, image1: (H, W) uint8.
         features0, features1: of these.
         putative: nearest neighbours among them.
+        refined: moves them to where the patches agree.
     """
     logit = judge.score(putative, features0, features1)
     kept = putative.mutual & (logit > LEAST_LOGIT)
     index0, index1, logit = putative.index0[kept], putative.index1[kept], logit[kept]
     points0 = features0.keypoints[index0]
-    refinement = refine(image0, image1, points0, features1.keypoints[index1])
+    refinement = refined(points0, features1.keypoints[index1], index0, logit)
     sigma = features0.sigma[index0], features1.sigma[index1]
     probability, covariance = judge.verify(image0, image1, points0, logit, refinement, sigma)
     return JudgedMatches(index0, index1, refinement.places, probability, covariance)
@@ -76,7 +84,7 @@ def judge_shifted(
 def match_stereo(
     judge: MatchJudge, left: np.ndarray, right: np.ndarray, features_left: Features, features_right: Features
 ) -> JudgedMatches:
-    """Stereo matches of a rectified pair: descriptors within a band of rows, then Lucas-Kanade.
+    """Stereo matches of a rectified pair: descriptors within a band of rows, then alignment.
 
     Args:
         judge: of the matches.
@@ -91,13 +99,21 @@ def match_stereo(
         _ROW_TOLERANCE,
         (_LEAST_DISPARITY, _MOST_DISPARITY * left.shape[1]),
     )
-    found = judge_shifted(judge, left, right, features_left, features_right, putative)
+    found = judge_refined(
+        judge,
+        left,
+        right,
+        features_left,
+        features_right,
+        putative,
+        lambda points0, points1, *_: refine_in_rows(left, right, points0, points1),
+    )
     level = np.abs(found.places[:, 1] - features_left.keypoints[found.index0, 1]) <= _ROW_TOLERANCE
     return found.select(level & (found.probability >= _LEAST_PROBABILITY))
 
 
 class DescriptorFrontend:
-    """Matches by mutual nearest descriptor, refined by one Lucas-Kanade level, each with its own covariance.
+    """Matches by mutual nearest descriptor, patches aligned, each with its own covariance.
 
     Args:
         name: for reports.
@@ -126,6 +142,7 @@ class DescriptorFrontend:
         view: StereoView,
         predicted: np.ndarray,
         covariance: np.ndarray | None,
+        maps: PatchMaps | None = None,
     ) -> TemporalMatches:
         """Mutual nearest neighbours within the ellipses of the prediction, or anywhere."""
         wanted = key.features.select(index)
@@ -135,7 +152,15 @@ class DescriptorFrontend:
             if covariance is None
             else nearest_in_ellipses(predicted, covariance, view.features.keypoints, *descriptors)
         )
-        found = judge_shifted(self._judge, key.left, view.left, wanted, view.features, putative)
+
+        def refined(points0: np.ndarray, points1: np.ndarray, index0: np.ndarray, logit: np.ndarray) -> Refinement:
+            if maps is not None:
+                return refine_on_planes(key.left, view.left, points0, points1, maps.select(index0))
+            if covariance is None:
+                return refine_by_neighbours(key.left, view.left, points0, points1, logit)
+            return refine(key.left, view.left, points0, points1)
+
+        found = judge_refined(self._judge, key.left, view.left, wanted, view.features, putative, refined)
         found = found.select(found.probability >= _LEAST_PROBABILITY)
         return TemporalMatches(
             index[found.index0],

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from sigmaslam.frontend.smooth import smoothed
+
 _RADIUS = 5
-_BLUR = 0.7
 _MOST_ZOOM = 5.0
 # OpenCV samples at fewer than 2^15 rows at once.
 _MOST_ROWS = 30_000
@@ -67,7 +68,7 @@ def examine_patches(
     for rows, factor in groups:
         spacing[rows] = max(1.0, factor)
         # The finer image is smoothed as the coarser one's pixels do it.
-        smooth0, smooth1 = _smoothed(image0, max(1.0, 1.0 / factor)), _smoothed(image1, max(1.0, factor))
+        smooth0, smooth1 = smoothed(image0, max(1.0, 1.0 / factor)), smoothed(image1, max(1.0, factor))
         grid = max(1.0, factor) * _GRID
         offsets = grid if A is None else grid @ back[rows].transpose(0, 2, 1)
         patches0[rows] = sample_patches(smooth0, points0[rows, None] + offsets)
@@ -99,10 +100,6 @@ def _window() -> tuple[np.ndarray, np.ndarray]:
 
 
 _GRID, _WINDOW = _window()
-
-
-def _smoothed(image: np.ndarray, factor: float) -> np.ndarray:
-    return cv2.GaussianBlur(image, (0, 0), _BLUR * factor).astype(np.float32)
 
 
 def sample_patches(image: np.ndarray, places: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ import numpy as np
 
 from sigmaslam.frontend.matching import within_ellipses
 from sigmaslam.frontend.refine import lucas_kanade
-from sigmaslam.frontend.types import Features, StereoView, TemporalMatches
+from sigmaslam.frontend.types import Features, PatchMaps, StereoView, TemporalMatches
 
 _WINDOW = 15
 _LEVELS = 4
@@ -50,8 +50,9 @@ class KltFrontend:
         view: StereoView,
         predicted: np.ndarray,
         covariance: np.ndarray | None,
+        maps: PatchMaps | None = None,
     ) -> TemporalMatches:
-        """Corners of the keyframe followed into the current left image, then into the right one."""
+        """Corners of the keyframe followed into the current left image, then into the right one; no patch is warped."""
         points = key.features.keypoints[index]
         places, found = _follow(key.left, view.left, points, predicted)
         if covariance is not None:

@@ -38,6 +38,7 @@ class StereoView:
         features: of the left image.
         disparity: (N,) float64 in pixels, NaN where the keypoint was not found in the right image.
         disparity_sigma: (N,) its standard deviation, NaN likewise.
+        slope: (N, 2) gradient of the disparity around each keypoint, zero where unknown; of keyframes, None of others.
     """
 
     left: np.ndarray
@@ -45,10 +46,28 @@ class StereoView:
     features: Features
     disparity: np.ndarray
     disparity_sigma: np.ndarray
+    slope: np.ndarray | None = None
 
     def measured(self, index: np.ndarray) -> np.ndarray:
         """(K, 3) float64 (u, v, disparity) of the features of that index or mask."""
         return np.column_stack([self.features.keypoints[index].astype(np.float64), self.disparity[index]])
+
+
+@dataclass(frozen=True, slots=True)
+class PatchMaps:
+    """How patches change from one image to another: by homographies about their centres.
+
+    Attributes:
+        A: (M, 2, 2) affine part; infinite where there is no map.
+        tilt: (M, 2) perspective part, 1 / pixels: an offset o of image 0 becomes A o / (1 + tilt . o).
+    """
+
+    A: np.ndarray
+    tilt: np.ndarray
+
+    def select(self, index: np.ndarray) -> PatchMaps:
+        """The maps of that index or mask."""
+        return PatchMaps(self.A[index], self.tilt[index])
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +110,7 @@ class Refinement:
         start, places: (M, 2) float64 in image 1, as detected and refined, pixels; the same where it failed.
         moved: (M,) bool, whether it succeeded.
         A: (M, 2, 2), affine map of image 0 to image 1 around each match by which its patch was warped, infinite where
-            there is none; None: patches were only shifted.
+            there is none; None: patches were only shifted, or nearly.
         distance: (M,) pixels from where the neighbours' map would have the detected match; None likewise.
     """
 
@@ -118,6 +137,7 @@ class Frontend(Protocol):
         view: StereoView,
         predicted: np.ndarray,
         covariance: np.ndarray | None,
+        maps: PatchMaps | None = None,
     ) -> TemporalMatches:
         """Finds keypoints of a keyframe in the current view.
 
@@ -128,5 +148,6 @@ class Frontend(Protocol):
             predicted: (K, 2) where the filter expects them, pixels.
             covariance: (K, 2, 2) of that, pixels squared: only the 99 % ellipse is searched; None: the prediction is
                 worth little.
+            maps: of the K patches, by which they are warped before they are compared.
         """
         ...

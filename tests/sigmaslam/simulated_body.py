@@ -6,7 +6,7 @@ import numpy as np
 from simulated_frontend import frame_of, image_of
 
 from sigmaslam.camera import CameraModel, StereoCamera
-from sigmaslam.frontend.types import Features, StereoView, TemporalMatches
+from sigmaslam.frontend.types import Features, PatchMaps, StereoView, TemporalMatches
 from sigmaslam.object_tracker import ObjectEstimate, ObjectTracker
 from sigmaslam.rotation import se3_exp, se3_inverse, se3_log
 from sigmaslam.tracker import TrackerConfig
@@ -69,6 +69,7 @@ class SimulatedBody:
         view: StereoView,
         predicted: np.ndarray,
         covariance: np.ndarray | None,
+        maps: PatchMaps | None = None,
     ) -> TemporalMatches:
         """The points that both see, within the ellipses where there are any."""
         frame = frame_of(view.left)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sigmaslam.camera import CameraModel, StereoCamera
-from sigmaslam.frontend.types import Features, StereoView, TemporalMatches
+from sigmaslam.frontend.types import Features, PatchMaps, StereoView, TemporalMatches
 from sigmaslam.rotation import se3_exp, se3_inverse, se3_log
 from sigmaslam.tracker import Estimate, StereoTracker, TrackerConfig
 
@@ -120,6 +120,7 @@ class SimulatedFrontend:
         view: StereoView,
         predicted: np.ndarray,
         covariance: np.ndarray | None,
+        maps: PatchMaps | None = None,
     ) -> TemporalMatches:
         """The points that both see, wherever they were predicted."""
         frame = frame_of(view.left)
