@@ -33,7 +33,8 @@ class TrackerConfig:
         most_points: of the map; when there are twice as many, the least confirmed half goes.
         remembered: keyframes that are kept to find the way back to.
         most_misses: after so many frames in a row in which it was not found a landmark is no longer looked for.
-        least_inliers: fewer is no pose; without a prediction and a fair share of the matches, fewer than twice as many.
+        least_inliers: fewer is no pose; without a prediction and a fair share of the matches, fewer than three times as
+            many.
         keyframe_ratio: a new keyframe is taken when the inliers fall below this share of the landmarks in the last one.
         search_limit: with a predicted place less certain than this (pixels, one sigma) the search is not guided.
         lost_seconds: after this long without a pose, tracking starts anew from the current view.

@@ -17,8 +17,9 @@ from sigmaslam.tables import Views, join_views
 from sigmaslam.window import KeyframeWindow
 
 # A pose from matches alone has no prediction to agree with. Where fewer than this share of the matches that should be
-# right by their probabilities agree with it, twice as many inliers are asked for: symmetric texture in a mirrored image
-# once gave 35 inliers, 26 by their probabilities, where 67 should be right. Half of the right ones may be on movers.
+# right by their probabilities agree with it, three times as many inliers are asked for: symmetric texture in a mirrored
+# image once gave 41 inliers, 31 by their probabilities, where 66 should be right. Half of the right ones may be on
+# movers.
 _LEAST_SHARE_UNGUIDED = 0.5
 # A keyframe of which fewer landmarks are in view is not searched for.
 _LEAST_OF_A_KEYFRAME = 8
@@ -141,7 +142,7 @@ class LandmarkSearch:
         # Each by its probability: many doubtful ones are few.
         agreeing = float(matches.probability[relative.inliers].sum())
         fair = agreeing >= _LEAST_SHARE_UNGUIDED * matches.probability.sum()
-        return relative if agreeing >= self._config.least_inliers * (1 if fair else 2) else None
+        return relative if agreeing >= self._config.least_inliers * (1 if fair else 3) else None
 
     def _in_image(self, predicted: np.ndarray) -> np.ndarray:
         u, v = predicted[:, 0], predicted[:, 1]

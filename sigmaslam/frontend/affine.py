@@ -21,6 +21,7 @@ _FITS = 8
 _PRIOR = 1.0
 _RADIUS = 7
 _ITERATIONS = 6
+_TAPER = 0.6
 _LEAST_CORRELATION = 0.5
 _LONGEST_STEP = 1.0
 # Of a plane seen from elsewhere: no part of a patch is nearer than this share of its centre's distance.
@@ -68,6 +69,7 @@ def align_patches(
     reach: float = 3.0,
     radius: int = _RADIUS,
     iterations: int = _ITERATIONS,
+    taper: float = _TAPER,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Places in image 1 where the patches around points of image 0, warped by their maps, fit best.
 
@@ -82,6 +84,7 @@ def align_patches(
         reach: longest move, pixels of image 1.
         radius: of the patches, pixels of the coarser image.
         iterations: Gauss-Newton steps.
+        taper: standard deviation of the patches' Gaussian window, radii.
     Returns:
         (M, 2) float64 places, unchanged where the patches do not fit or the way is too far, and (M,) bool moved.
     """
@@ -105,7 +108,10 @@ def align_patches(
         if tilt is not None:
             offsets /= np.maximum(1.0 - offsets @ tilt[rows][..., None], _LEAST_DEPTH)
         template = sample_patches(smooth0, points0[rows, None] + offsets)
-        places[rows], moved[rows] = _align(template, grid, smooth1, places[rows], spacing, reach * spacing, iterations)
+        window = np.exp(-0.5 * (grid**2).sum(axis=1) / np.float32(taper * spacing * radius) ** 2)
+        places[rows], moved[rows] = _align(
+            template, grid, window / window.sum(), smooth1, places[rows], spacing, reach * spacing, iterations
+        )
     return places, moved
 
 
@@ -132,6 +138,7 @@ def _inside(image: np.ndarray, points: np.ndarray) -> np.ndarray:
 def _align(
     template: np.ndarray,
     grid: np.ndarray,
+    window: np.ndarray,
     image1: np.ndarray,
     points1: np.ndarray,
     spacing: float,
@@ -142,12 +149,11 @@ def _align(
 
     Args:
         template: (M, K) patches of image 0, warped and sampled at offsets `grid` (K, 2), `spacing` apart, of image 1.
+        window: (K,) weights of the samples, of sum 1.
         image1: (H, W) float32, smoothed.
         points1, reach, iterations: as there.
     """
     count = round(len(grid) ** 0.5)
-    window = np.exp(-0.5 * (grid**2).sum(axis=1) / (0.6 * spacing * (count // 2)) ** 2)
-    window /= window.sum()
     template = _normalised(template, window)
     square = template.reshape(-1, count, count)
     along_v, along_u = np.gradient(square, np.float32(spacing), axis=(1, 2))

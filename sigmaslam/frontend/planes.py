@@ -19,12 +19,15 @@ from sigmaslam.frontend.types import PatchMaps, Refinement
 
 _RADIUS = 5
 _ITERATIONS = 3
+# A window that hardly falls off: with less of a patch a still image drifts by its noise.
+_TAPER = 1.0
 _NEIGHBOURS = 16
 # Of a disparity about the plane through its neighbours, and of a slope beforehand: standard deviations, pixels, 1.
 _ROUGH, _STEEP = 0.2, 0.5
 # Scale of the robust weight, sigmas: from the first fit to the last.
 _FIRST_SCALE, _LAST_SCALE = 8.0, 2.0
 _FITS = 5
+# Of what is seen from elsewhere, over its depth in the keyframe.
 _LEAST_DEPTH = 1e-3
 
 
@@ -115,5 +118,6 @@ def _align(
         maps.tilt,
         radius=_RADIUS,
         iterations=_ITERATIONS,
+        taper=_TAPER,
     )
     return Refinement(shifted.start, places, moved | shifted.moved, maps.A)

@@ -205,7 +205,8 @@ def test_one_place_is_aligned_as_among_many(zoomed: View):
     for row in range(0, len(start), 40):
         one = slice(row, row + 1)
         alone, _ = align_patches(zoomed.image0, zoomed.image1, zoomed.points0[one], start[one], zoomed.A[one])
-        np.testing.assert_allclose(alone, places[one], atol=1e-6)
+        # Sums of single precision depend on how many are taken at once.
+        np.testing.assert_allclose(alone, places[one], rtol=0, atol=1e-4)
 
 
 def test_a_place_too_far_away_stays(turned: View):
