@@ -98,6 +98,7 @@ class LandmarkSearch:
         inside = in_front & self._in_image(predicted)
         inside &= np.linalg.eigvalsh(S)[:, 1] < self._config.search_limit**2
         rows, predicted, S = rows[inside], predicted[inside], S[inside]
+        T_view_key = se3_inverse(pose) @ self._window.poses
         parts = []
         for host, key in enumerate(keyframes):
             chosen = np.flatnonzero(landmarks.host[rows] == host)
@@ -107,8 +108,7 @@ class LandmarkSearch:
             maps = None
             if key.slope is not None:
                 measured = self._window.true_disparity(landmarks.estimate[rows[chosen]])
-                T_view_key = se3_inverse(pose) @ self._window.poses[host]
-                maps = plane_maps(self._camera, measured, key.slope[feature], T_view_key)
+                maps = plane_maps(self._camera, measured, key.slope[feature], T_view_key[host])
             matches = self._frontend.match(key, feature, view, predicted[chosen, :2], S[chosen], maps)
             # Features of a keyframe ascend with the rows of its landmarks.
             place = np.searchsorted(feature, matches.key_index)

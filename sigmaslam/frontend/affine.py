@@ -100,8 +100,8 @@ def align_patches(
     for step in np.unique(half_octaves[usable]):
         rows = np.flatnonzero((half_octaves == step) & usable)
         ratio = 2.0 ** (0.5 * step)
-        smooth0, smooth1 = smoothed(image0, max(1.0, 1.0 / ratio)), smoothed(image1, max(1.0, ratio))
         spacing = max(1.0, ratio)
+        smooth0, smooth1 = smoothed(image0, max(1.0, 1.0 / ratio)), smoothed(image1, spacing)
         side = np.arange(-radius, radius + 1, dtype=np.float32)
         grid = np.float32(spacing) * np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
         offsets = grid @ np.linalg.inv(A[rows]).transpose(0, 2, 1)
