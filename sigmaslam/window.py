@@ -55,6 +55,7 @@ class FrameFit:
         nis, dof: of the kept ones.
         noise_scale: what the variances of all views are multiplied by in the posterior, 1 or more, as they scatter.
         prior_cost: squared sigmas by which it departs from what was known before.
+        doubt: by what `relative` was multiplied for errors that all views share.
     """
 
     pose: np.ndarray
@@ -67,6 +68,7 @@ class FrameFit:
     dof: int
     noise_scale: float
     prior_cost: float
+    doubt: float = 1.0
 
     @property
     def nis_per_dof(self) -> float:
@@ -77,6 +79,15 @@ class FrameFit:
     def misfit(self) -> float:
         """The same by the noise that the views came with: chance agreement is not made good by a larger one."""
         return self.noise_scale * self.nis_per_dof
+
+    def doubted(self, factor: float) -> FrameFit:
+        """The same pose, known so much less well relative to the last keyframe."""
+        return replace(
+            self,
+            relative=factor * self.relative,
+            covariance=self.covariance + (factor - 1.0) * self.relative,
+            doubt=factor * self.doubt,
+        )
 
 
 class KeyframeWindow:

@@ -103,11 +103,11 @@ _GRID, _WINDOW = _window()
 
 
 def sample_patches(image: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Bilinear samples (M, K) of an image at places (M, K, 2), as float32."""
+    """Samples (M, K) as float32 of an image that `smoothed` has made, at places (M, K, 2) of the original."""
     samples = np.empty(places.shape[:2], np.float32)
     for begin in range(0, len(places), _MOST_ROWS):
         some = slice(begin, begin + _MOST_ROWS)
-        u, v = (np.ascontiguousarray(places[some, :, axis], np.float32) for axis in (0, 1))
+        u, v = (np.ascontiguousarray(2.0 * places[some, :, axis], np.float32) for axis in (0, 1))
         samples[some] = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return samples
 

@@ -115,3 +115,19 @@ def test_half_the_image_on_movers_from_the_first_frame_is_not_followed():
     assert shares.min() > 0.4
     estimates, truth = tracked(simulation, frames)
     assert_honest(estimates, truth)
+
+
+@pytest.mark.slow
+def test_a_shutter_open_five_times_as_long_is_survived():
+    """In a drive: the second ten of 30 frames are blurred by 11 to 16 px in the median, along their own flow."""
+    simulation = simulate(Recipe("street", 30, seed=1, width=640, height=192))
+    shutter = simulation.sensor.shutter
+    frames = []
+    for k, time in enumerate(simulation.times):
+        sensor = replace(simulation.sensor, shutter=5.0 * shutter if 10 <= k < 20 else shutter)
+        with torch.inference_mode():
+            shot = Studio(replace(simulation, sensor=sensor)).frames(np.array([k]))[0]
+        frames.append(StereoFrame(k, float(time), shot.left, shot.right))
+    estimates, truth = tracked(simulation, frames)
+    assert_honest(estimates, truth)
+    assert statuses(estimates[1:]) == ["tracking"] * 29

@@ -215,16 +215,7 @@ def test_a_step_of_the_exposure_is_survived(demo: Demo, gain: float):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("width", "height"),
-    [
-        (11, 1),
-        (1, 11),
-        pytest.param(
-            21, 1, marks=pytest.mark.xfail(strict=True, reason="1 of 40 frames at 23.4 squared sigmas, 11 mm, 0.9 deg")
-        ),
-    ],
-)
+@pytest.mark.parametrize(("width", "height"), [(11, 1), (1, 11), (21, 1)])
 def test_motion_blur_along_a_line_is_survived(demo: Demo, width: int, height: int):
     """A symmetric kernel in both eyes: centres stay where they are."""
     camera, frames, truth = demo
@@ -238,9 +229,12 @@ def test_motion_blur_along_a_line_is_survived(demo: Demo, width: int, height: in
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, raises=AssertionError, reason="8 of 40 frames at 23 to 43 squared sigmas; 22.5 allowed")
+@pytest.mark.xfail(strict=True, raises=AssertionError, reason="2 of 40 frames at 27 and 41 squared sigmas, not 22.5")
 def test_an_exposure_over_five_frames_is_survived(demo: Demo):
-    """Average of five consecutive frames; the pose is the mean of the five."""
+    """Average of five consecutive frames; the pose is the mean of the five.
+
+    Harder than what a camera does: exposures overlap, so that neighbours share four of five instants, at rest.
+    """
     camera, frames, truth = demo
 
     def average(frame: StereoFrame) -> Pair:

@@ -10,7 +10,7 @@ from sigmaslam.camera import RectifiedStereo
 from sigmaslam.frontend.affine import align_patches
 from sigmaslam.frontend.planes import disparity_slopes, plane_maps, refine_in_rows, refine_on_planes
 from sigmaslam.frontend.refine import refine
-from sigmaslam.frontend.smooth import smoothed
+from sigmaslam.frontend.smooth import sharpness, smoothed
 from sigmaslam.frontend.types import PatchMaps
 from sigmaslam.rotation import se3_exp
 from sigmaslam.synthetic.textures import dead_leaves
@@ -61,29 +61,35 @@ def maps_of(H: np.ndarray, points0: np.ndarray) -> PatchMaps:
 
 def test_the_slope_of_a_plane_is_found():
     points = scattered(300)
-    slope = disparity_slopes(points, 20.0 + points @ ROAD)
+    slope, departure = disparity_slopes(points, 20.0 + points @ ROAD)
+    assert departure.max() < 0.5
     np.testing.assert_allclose(slope, np.tile(ROAD, (300, 1)), atol=0.02)
 
 
 def test_a_wall_in_front_of_the_road_does_not_tilt_it():
     points = scattered(800)
     wall = points[:, 0] > 320
-    slope = disparity_slopes(points, np.where(wall, 200.0, 20.0 + points @ ROAD))
+    slope, departure = disparity_slopes(points, np.where(wall, 200.0, 20.0 + points @ ROAD))
     error = np.abs(slope - np.where(wall[:, None], 0.0, ROAD)).max(axis=1)
     # Of the points at the very edge a few have no neighbours of their own surface on two sides.
     assert (error < 0.03).mean() > 0.97
+    # Where surfaces meet the neighbours of some are mostly of the other one; nowhere else.
+    inner = np.abs(points[:, 0] - 320) > 60
+    assert departure[inner].max() < 1.0
+    assert departure[~inner].max() > 10.0
 
 
 def test_without_neighbours_nothing_slopes():
     points = scattered(30)
     disparity = 20.0 + points @ ROAD
     disparity[5:] = np.nan
-    slope = disparity_slopes(points, disparity)
+    slope, departure = disparity_slopes(points, disparity)
     assert slope.shape == (30, 2)
     assert slope[:5].any()
     assert not slope[5:].any()
-    assert not disparity_slopes(points[:3], disparity[:3]).any()
-    assert disparity_slopes(points[:0], disparity[:0]).shape == (0, 2)
+    assert not departure[5:].any()
+    assert not any(of_few.any() for of_few in disparity_slopes(points[:3], disparity[:3]))
+    assert [of_none.shape for of_none in disparity_slopes(points[:0], disparity[:0])] == [(0, 2), (0,)]
 
 
 # Maps
@@ -162,16 +168,38 @@ def test_no_tilt_is_a_tilt_of_zero():
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.5])
-def test_an_image_is_smoothed_once(factor):
+def test_an_image_is_smoothed_once_on_pixels_and_between_them(factor):
     image = digitised(textured(), 3)
     found = smoothed(image, factor)
     assert smoothed(image, factor) is found
-    np.testing.assert_array_equal(found, cv2.GaussianBlur(image, (0, 0), 0.7 * factor).astype(np.float32))
+    reach = 2 * int(np.ceil(4.0 * 0.7 * factor)) + 1
+    expected = cv2.GaussianBlur(image.astype(np.float32), (reach, reach), 0.7 * factor)
+    np.testing.assert_allclose(found[::2, ::2], expected, atol=1e-3)
+
+
+def test_waves_are_smoothed_by_what_a_gaussian_leaves_of_them_wherever_they_are_sampled():
+    """Of five pixels to the wave, and of eight across."""
+    omega = 2.0 * np.pi / np.array([5.0, 8.0])
+    v, u = np.mgrid[:80, :100] / 2.0
+    wave = 100.0 * np.exp(-0.5 * (0.7 * omega) ** 2).prod() * np.sin(omega[0] * u) * np.sin(omega[1] * v)
+    image = 128.0 + 100.0 * np.sin(omega[0] * u) * np.sin(omega[1] * v)
+    found = smoothed(np.rint(image[::2, ::2]).astype(np.uint8))
+    inner = slice(12, -12), slice(12, -12)
+    assert np.abs(found[inner] - 128.0 - wave[inner]).max() < 0.6
+
+
+@pytest.mark.parametrize(("kernel", "least", "most"), [((11, 1), 0.4, 0.8), ((5, 5), 0.2, 0.6), ((1, 1), 1.0, 1.0)])
+def test_blur_is_less_sharp_and_darkness_is_not(kernel, least, most):
+    image = digitised(textured(), 3)
+    whole = sharpness(image)
+    assert least <= sharpness(cv2.blur(image, kernel)) / whole <= most
+    assert sharpness((0.5 * image + 20.0).astype(np.uint8)) == pytest.approx(whole, rel=0.02)
+    assert sharpness(np.full_like(image, 7)) == 0.0
 
 
 def test_another_image_in_its_place_is_another_image():
     for level in range(100):
         image = np.full((120, 160), level, np.uint8)
-        assert smoothed(image).mean() == level
+        assert smoothed(image).mean() == pytest.approx(level, rel=1e-5)
         del image
         gc.collect()
