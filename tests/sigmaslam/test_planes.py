@@ -164,6 +164,18 @@ def test_no_tilt_is_a_tilt_of_zero():
     np.testing.assert_array_equal(plain, tilted)
 
 
+@pytest.mark.parametrize("shift", [0.1, 0.25])
+def test_what_moves_alike_is_not_misplaced_alike_between_pixels(shift):
+    """All keypoints on pixels, all at the same place between two in the other image: bilinear samples are 0.012 off."""
+    H = np.eye(3)
+    H[0, 2] = shift
+    image0, image1 = digitised(textured(), 1), digitised(warped(textured(), H), 2)
+    points0, points1 = corners(image0, H)
+    places, moved = align_patches(image0, image1, points0, points1 + 0.3, np.tile(np.eye(2), (len(points0), 1, 1)))
+    assert moved.mean() > 0.95
+    assert np.abs((places - points1)[moved].mean(axis=0)).max() < 0.006
+
+
 # Smoothed images
 
 
