@@ -14,7 +14,8 @@ from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path, atomic_write_bytes
 from sigmaslam.frontend.affine import refine_by_neighbours
 from sigmaslam.frontend.classical import OrbDetector, SiftDetector
-from sigmaslam.frontend.judge import LEAST_LOGIT, MatchJudge
+from sigmaslam.frontend.descriptor import judge_refined
+from sigmaslam.frontend.judge import MatchJudge
 from sigmaslam.frontend.learned import LearnedDetector
 from sigmaslam.frontend.matching import nearest_anywhere
 from sigmaslam.frontend.types import Features
@@ -92,18 +93,19 @@ def match_features(
         features0, features1: of these.
         min_probability: as `match_images` takes it.
     """
-    putative = nearest_anywhere(features0.descriptors, features1.descriptors)
-    logit = judge.score(putative, features0, features1)
-    kept = putative.mutual & (logit > LEAST_LOGIT)
-    index0, index1, logit = putative.index0[kept], putative.index1[kept], logit[kept]
-    points0, points1 = features0.keypoints[index0], features1.keypoints[index1]
-    refinement = refine_by_neighbours(image0, image1, points0, points1, logit)
-    sigma = features0.sigma[index0], features1.sigma[index1]
-    probability, covariance = judge.verify(image0, image1, points0, logit, refinement, sigma)
-    places = refinement.places.astype(np.float32)
-    order = np.argsort(-probability, kind="stable")
-    order = order[probability[order] >= min_probability]
-    return Matches(points0, places, probability, covariance, index0, index1).select(order)
+    found = judge_refined(
+        judge,
+        image0,
+        image1,
+        features0,
+        features1,
+        nearest_anywhere(features0.descriptors, features1.descriptors),
+        lambda points0, points1, _, logit: refine_by_neighbours(image0, image1, points0, points1, logit),
+    )
+    order = np.argsort(-found.probability, kind="stable")
+    order = order[found.probability[order] >= min_probability]
+    keypoints, places = features0.keypoints[found.index0], found.places.astype(np.float32)
+    return Matches(keypoints, places, found.probability, found.covariance, found.index0, found.index1).select(order)
 
 
 def match_files(

@@ -48,8 +48,8 @@ class JudgedMatches:
         )
 
 
-Refine = Callable[[np.ndarray, np.ndarray, np.ndarray], Refinement]
-"""From keypoints (M, 2), (M, 2) of two images and the index (M,) of the first ones."""
+Refine = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Refinement]
+"""From keypoints (M, 2), (M, 2) of two images, the index (M,) of the first ones, and the scorer's logit (M,)."""
 
 
 def judge_refined(
@@ -74,7 +74,7 @@ def judge_refined(
     kept = putative.mutual & (logit > LEAST_LOGIT)
     index0, index1, logit = putative.index0[kept], putative.index1[kept], logit[kept]
     points0 = features0.keypoints[index0]
-    refinement = refined(points0, features1.keypoints[index1], index0)
+    refinement = refined(points0, features1.keypoints[index1], index0, logit)
     sigma = features0.sigma[index0], features1.sigma[index1]
     probability, covariance = judge.verify(image0, image1, points0, logit, refinement, sigma)
     return JudgedMatches(index0, index1, refinement.places, probability, covariance)
@@ -105,7 +105,7 @@ def match_stereo(
         features_left,
         features_right,
         putative,
-        lambda points0, points1, _: refine_in_rows(left, right, points0, points1),
+        lambda points0, points1, *_: refine_in_rows(left, right, points0, points1),
     )
     level = np.abs(found.places[:, 1] - features_left.keypoints[found.index0, 1]) <= _ROW_TOLERANCE
     return found.select(level & (found.probability >= _LEAST_PROBABILITY))
@@ -152,7 +152,7 @@ class DescriptorFrontend:
             else nearest_in_ellipses(predicted, covariance, view.features.keypoints, *descriptors)
         )
 
-        def refined(points0: np.ndarray, points1: np.ndarray, index0: np.ndarray) -> Refinement:
+        def refined(points0: np.ndarray, points1: np.ndarray, index0: np.ndarray, _: np.ndarray) -> Refinement:
             if maps is not None:
                 return refine_on_planes(key.left, view.left, points0, points1, maps.select(index0))
             return refine(key.left, view.left, points0, points1)
