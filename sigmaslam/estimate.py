@@ -36,6 +36,8 @@ class Estimate:
         nis, dof: normalised innovation squared and its degrees of freedom; 0 without an update.
         calibration: of the stereo pair.
         milliseconds: wall time by stage.
+        own_covariance: (6, 6) the part of the covariance that the frame's matches add to that of its keyframe; zero
+            without them.
     """
 
     timestamp: float
@@ -49,3 +51,4 @@ class Estimate:
     dof: int
     calibration: CalibrationEstimate
     milliseconds: dict[str, float] = field(default_factory=dict)
+    own_covariance: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))

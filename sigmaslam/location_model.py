@@ -10,11 +10,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sigmaslam.gaussian import project_covariance
 from sigmaslam.rotation import nearest_rotation, rotation_log, se3_exp, se3_inverse
 
-# Where the error states stand: of the tracker's pose, perturbed from the left in its world, of A and B, from the right.
-OFFSET, SENSOR_WORLD, MOUNT = slice(0, 6), slice(6, 12), slice(12, 18)
-SIZE = 18
+# Where the error states stand: of the tracker's drift, perturbed from the left in its world, of A and B, from the
+# right, and what the last frame's pose is off besides, from the left.
+OFFSET, SENSOR_WORLD, MOUNT, OWN = slice(0, 6), slice(6, 12), slice(12, 18), slice(18, 24)
+SIZE, WHOLE = 18, 24
 _WORLDS = slice(6, 18)
 # A way to A and B is taken when A's rotation is known to so many radians, one sigma, and the readings agree with it:
 # squared residuals per component, which drift that the tracker does not know of may raise.
@@ -39,7 +41,7 @@ class SensorModel:
     on_object: bool
 
     def expect(self, pose: np.ndarray, error: np.ndarray) -> np.ndarray:
-        """T_sensor_mark (..., 4, 4) where the tracker has poses (..., 4, 4) and error states are (..., 18) away."""
+        """T_sensor_mark (..., 4, 4) where the tracker has poses (..., 4, 4) and drift, A, B are (..., 18) away."""
         moved = se3_exp(error[..., OFFSET]) @ pose
         G = se3_inverse(moved) if self.on_object else moved
         return np.asarray(self.A @ se3_exp(error[..., SENSOR_WORLD]) @ G @ self.B @ se3_exp(error[..., MOUNT]))
@@ -64,13 +66,15 @@ class Pairs:
 
     Attributes:
         poses: (N, 4, 4) of the camera in the tracker's world.
-        walked: (N, 6, 6) covariance of their error, perturbed from the left, growing from one to the next.
+        walked: (N, 6, 6) covariance of their drift, perturbed from the left, growing from one to the next.
+        own: (N, 6, 6) of what each is off besides, likewise.
         positions, rotations: (N, 3), (N, 3, 3) or None.
         covariances: (N, m, m) of the readings.
     """
 
     poses: np.ndarray
     walked: np.ndarray
+    own: np.ndarray
     positions: np.ndarray
     rotations: np.ndarray | None
     covariances: np.ndarray
@@ -81,10 +85,18 @@ class Pairs:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """What is known: the model, the tracker's error (6,), and the covariance (18, 18) of the error states."""
+    """What is known.
+
+    Attributes:
+        model: the sensor's world and mount.
+        offset: (6,) the tracker's drift.
+        own: (6,) what the last frame's pose is off besides.
+        covariance: (24, 24) of all error states.
+    """
 
     model: SensorModel
     offset: np.ndarray
+    own: np.ndarray
     covariance: np.ndarray
 
     @property
@@ -157,10 +169,10 @@ def _solve(pairs: Pairs, walked: np.ndarray, start: SensorModel, prior: np.ndarr
     worlds = np.zeros(SIZE - 6)
     for _ in range(_STEPS):
         model = start.moved(np.concatenate([np.zeros(6), worlds]))
-        rest, slopes = _linearise(model, pairs)
-        by_offset, by_worlds = slopes[..., OFFSET], slopes[..., _WORLDS].reshape(count * width, -1)
+        rest, by_errors = _linearise(model, pairs)
+        by_offset, by_worlds = by_errors[..., OFFSET], by_errors[..., _WORLDS].reshape(count * width, -1)
         noise = (by_offset[:, None] @ shared @ by_offset.swapaxes(1, 2)[None]).swapaxes(1, 2)
-        noise[np.arange(count), :, np.arange(count), :] += pairs.covariances
+        noise[np.arange(count), :, np.arange(count), :] += pairs.covariances + project_covariance(by_offset, pairs.own)
         noise = noise.reshape(count * width, -1)
         # The residual where the prior's mean would be, if all were linear.
         whole = rest.ravel() + by_worlds @ worlds
@@ -172,20 +184,31 @@ def _solve(pairs: Pairs, walked: np.ndarray, start: SensorModel, prior: np.ndarr
         [np.einsum("ibc,iac->bia", pairs.walked, by_offset).reshape(6, -1), prior @ by_worlds.T], axis=0
     )
     gain = np.linalg.solve(S, cross.T).T
-    covariance = np.zeros((SIZE, SIZE))
+    covariance = np.zeros((WHOLE, WHOLE))
     covariance[OFFSET, OFFSET], covariance[_WORLDS, _WORLDS] = walked, prior
-    covariance -= gain @ cross.T
+    covariance[:SIZE, :SIZE] -= gain @ cross.T
+    covariance[OWN, OWN] = pairs.own[-1]
     model = start.moved(np.concatenate([np.zeros(6), worlds]))
     rest, _ = _linearise(model, pairs)
     misfit = float(rest.ravel() @ np.linalg.solve(noise, rest.ravel()))
-    return State(model, gain[OFFSET] @ whole, 0.5 * (covariance + covariance.T)), misfit
+    return State(model, gain[OFFSET] @ whole, np.zeros(6), 0.5 * (covariance + covariance.T)), misfit
 
 
 def _linearise(model: SensorModel, pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
     """Residuals (N, m) with the tracker's poses as they are, and slopes of what is expected (N, m, 18)."""
-    steps = _SMALL * np.concatenate([np.eye(SIZE), -np.eye(SIZE)])[:, None]
-    rotations = pairs.rotations
-    moved = residuals(model.expect(pairs.poses, steps), pairs.positions, rotations)
-    slopes = (moved[SIZE:] - moved[:SIZE]) / (2.0 * _SMALL)
-    rest = residuals(model.expect(pairs.poses, np.zeros(SIZE)), pairs.positions, rotations)
-    return rest, np.moveaxis(slopes, 0, -1)
+    rest = residuals(model.expect(pairs.poses, np.zeros(SIZE)), pairs.positions, pairs.rotations)
+    return rest, slopes(model, pairs.poses, pairs.positions, pairs.rotations)
+
+
+def slopes(model: SensorModel, poses: np.ndarray, positions: np.ndarray, rotations: np.ndarray | None) -> np.ndarray:
+    """(..., m, 18) how what is expected of readings moves with drift, A and B, by central differences.
+
+    Args:
+        model: of the sensor.
+        poses: (..., 4, 4) of the tracker.
+        positions, rotations: (..., 3), (..., 3, 3) or None of the readings.
+    """
+    count = np.asarray(poses).ndim - 2
+    steps = (_SMALL * np.concatenate([np.eye(SIZE), -np.eye(SIZE)])).reshape(2 * SIZE, *[1] * count, SIZE)
+    moved = residuals(model.expect(poses, steps), positions, rotations)
+    return np.moveaxis((moved[SIZE:] - moved[:SIZE]) / (2.0 * _SMALL), 0, -1)

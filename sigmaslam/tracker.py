@@ -265,8 +265,8 @@ class StereoTracker:
 
     def _blur(self, view: StereoView) -> float:
         """How many times as sharp as the view the sharpest keyframe is; 1 where that may be what is seen."""
-        ratio = sharpness(view.left) / max(self._sharpness)
-        return 1.0 / ratio if ratio < _BLUNT else 1.0
+        own, sharpest = sharpness(view.left), max(self._sharpness)
+        return sharpest / max(own, 0.1 * sharpest) if own < _BLUNT * sharpest else 1.0
 
     def _accept(self, fit: FrameFit, found: Found, view: StereoView, timestamp: float) -> None:
         """Takes the pose over, and makes the view a keyframe when the old ones fade."""
@@ -478,6 +478,7 @@ class StereoTracker:
         adjoint = se3_adjoint(T_left_rectified) @ se3_adjoint(se3_inverse(pose))
         belief = 1.0 - np.sqrt(max(np.linalg.eigvalsh(turn_covariance(se3_inverse(pose), relative))[-1], 0.0))
         covariance = adjoint @ absolute @ adjoint.T
+        own = adjoint @ relative @ adjoint.T if fit is not None else np.zeros((6, 6))
         return Estimate(
             timestamp=timestamp,
             T_world_camera=T_left_rectified @ pose @ self._T_rectified_left,
@@ -490,4 +491,5 @@ class StereoTracker:
             dof=fit.dof if fit is not None else 0,
             calibration=CalibrationEstimate(float(calibration[0]), float(np.sqrt(max(spread[0, 0], 0.0)))),
             milliseconds=milliseconds,
+            own_covariance=0.5 * (own + own.T),
         )
