@@ -32,8 +32,8 @@ SIZE = 384
 # Keypoints an image, drawn evenly in the logarithm: those of 0.3 to 2.5 thousand in an image of 640 x 480 pixels.
 _KEYPOINTS = (150, 1200)
 _LEAST_MATCHES = 24
-TURNS = ("planes", "scenes", "stereo", "scenes", "turned planes", "video")
-"""Sources of pairs, in turn."""
+# In turn; "anywhere" is as between two photographs, "rows" as in a stereo pair, "ellipses" as with a prediction.
+_TURNS = ("planes", "scenes", "stereo", "scenes", "turned planes", "video")
 _ROW_TOLERANCE = 2.0
 _DISPARITY = (-2.0, 0.25 * SIZE)
 _ELLIPSE_SIGMA = (1.0, 25.0)
@@ -89,7 +89,7 @@ class MatchSets:
 
     def record(self, index: int) -> PairRecord:
         """The record of that index, the same whenever it is asked for."""
-        source, own = take_turn(TURNS, index)
+        source, own = take_turn(_TURNS, index)
         pair = self._streams[source].pair(own)
         rng = np.random.default_rng((self._seed, 3, index))
         image0, image1 = (np.round(255.0 * image).astype(np.uint8) for image in (pair.image0, pair.image1))

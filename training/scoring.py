@@ -21,7 +21,7 @@ from sigmaslam.models.verifier import MatchVerifier
 from sigmaslam.training.calibration import auroc, average_precision, best_half, calibration_error, spearman
 from sigmaslam.training.card import describe_origin
 from sigmaslam.training.devices import describe_processor
-from sigmaslam.training.match_sets import TURNS, PairRecord, load_record, record_path, write_records
+from sigmaslam.training.match_sets import PairRecord, load_record, record_path, write_records
 from sigmaslam.training.progress import open_progress
 from sigmaslam.training.scorer import RIGHT, make_sample, score_set, train_scorer
 from sigmaslam.training.validation import held_out_seed
@@ -97,10 +97,9 @@ def train_scoring(out: Path, config: ScoringConfig, workers: int) -> dict[str, A
         verifier = train_verifier(
             rows, config.verifier_steps, config.seed, lambda step, note: _show(progress, task, step, note)
         )
-    # Rounds of all sources calibrate and measure in turn.
-    measures = held_out.pair // len(TURNS) % 2 == 1
-    calibrate(verifier, held_out.select(~measures))
-    metrics = _scorer_metrics(scorer, folders[1]) | _verifier_metrics(verifier, held_out.select(measures))
+    # Pairs in turn calibrate and measure.
+    calibrate(verifier, held_out.select(held_out.pair % 2 == 0))
+    metrics = _scorer_metrics(scorer, folders[1]) | _verifier_metrics(verifier, held_out.select(held_out.pair % 2 == 1))
     card = _make_card(origin, config, scorer, verifier, metrics, clock.seconds())
     _save(out / SCORER_NAME, scorer)
     _save(out / VERIFIER_NAME, verifier)

@@ -11,12 +11,11 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from sigmaslam.errors import SigmaSlamError
-from sigmaslam.frontend.affine import local_maps, refine_by_neighbours
+from sigmaslam.frontend.affine import refine_by_neighbours
 from sigmaslam.frontend.evidence import examine_patches
 from sigmaslam.frontend.judge import LEAST_LOGIT
-from sigmaslam.frontend.planes import refine_in_rows, refine_on_planes
 from sigmaslam.frontend.refine import refine
-from sigmaslam.frontend.types import PatchMaps, Refinement
+from sigmaslam.frontend.types import Refinement
 from sigmaslam.frontend.verifier import describe_matches
 from sigmaslam.models.scorer import MatchScorer
 from sigmaslam.models.verifier import MatchVerifier
@@ -29,14 +28,9 @@ _BATCH = 4096
 _FREEDOM = 20.0
 # Share of a normal distribution within two standard deviations.
 _WITHIN_2 = 0.9544997361036416
-# How the pairs of each source are refined at run time; those that differ by more than a shift, by maps alone.
-_REFINED = {
-    "stereo": ("rows",),
-    "scenes": ("shift", "neighbours", "planes"),
-    "video": ("shift", "neighbours", "planes"),
-    "planes": ("neighbours",),
-    "turned planes": ("neighbours",),
-}
+# Pairs whose images differ by more than a shift are refined by the neighbours' maps alone.
+_SHIFTED = ("stereo", "scenes", "video")
+_MAPPED = ("planes", "turned planes", "scenes", "video")
 _FAR = 1e3
 
 
@@ -77,8 +71,9 @@ def collect_rows(records: Iterable[PairRecord], scorer: MatchScorer, note: Calla
         for found in record.sets.values():
             logit = score_set(scorer, found)
             kept = found.putative.mutual & (logit > LEAST_LOGIT)
-            if kept.any():
-                parts += [_rows_of(record, found, logit, kept, way, number) for way in _REFINED[found.source]]
+            for mapped, sources in ((False, _SHIFTED), (True, _MAPPED)):
+                if found.source in sources and kept.any():
+                    parts.append(_rows_of(record, found, logit, kept, mapped, number))
         note(number + 1)
     if not parts:
         raise SigmaSlamError("the scorer finds no match likely in any pair: train it longer, or on more pairs")
@@ -87,34 +82,22 @@ def collect_rows(records: Iterable[PairRecord], scorer: MatchScorer, note: Calla
 
 
 def _rows_of(
-    record: PairRecord, found: MatchSet, logit: np.ndarray, kept: np.ndarray, way: str, number: int
+    record: PairRecord, found: MatchSet, logit: np.ndarray, kept: np.ndarray, mapped: bool, number: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     putative = found.putative.select(kept)
-    refinement = _refine(record, found, logit, kept, way)
     points0 = found.features0.keypoints[putative.index0].astype(np.float64)
+    points1 = found.features1.keypoints[putative.index1].astype(np.float64)
+    refinement: Refinement
+    if mapped:
+        refinement = refine_by_neighbours(record.image0, record.image1, points0, points1, logit[kept])
+    else:
+        refinement = refine(record.image0, record.image1, points0, points1)
     evidence = examine_patches(record.image0, record.image1, points0, refinement.places, refinement.A)
     sigma0, sigma1 = found.features0.sigma[putative.index0], found.features1.sigma[putative.index1]
     columns = describe_matches(logit[kept], evidence, refinement, sigma0, sigma1)
     error = np.nan_to_num(refinement.places - found.places[kept], nan=_FAR, posinf=_FAR, neginf=-_FAR)
     along_axes = np.einsum("mji,mj->mi", evidence.axes, np.clip(error, -_FAR, _FAR))
     return columns, along_axes.astype(np.float32), np.full(len(columns), number)
-
-
-def _refine(record: PairRecord, found: MatchSet, logit: np.ndarray, kept: np.ndarray, way: str) -> Refinement:
-    """As the run time refines stereo pairs, pairs without a prediction, any two images, and with a prediction."""
-    points0 = found.features0.keypoints[found.putative.index0].astype(np.float64)
-    points1 = found.features1.keypoints[found.putative.index1].astype(np.float64)
-    pair = record.image0, record.image1, points0[kept], points1[kept]
-    if way == "rows":
-        return refine_in_rows(*pair)
-    if way == "shift":
-        return refine(*pair)
-    if way == "neighbours":
-        return refine_by_neighbours(*pair, logit[kept])
-    # What the run time knows of a surface, the truth knows here.
-    known = np.isfinite(found.places).all(axis=1)
-    A, _ = local_maps(points0, np.where(known[:, None], found.places, points1), known.astype(np.float64))
-    return refine_on_planes(*pair, PatchMaps(A[kept], np.zeros((int(kept.sum()), 2))))
 
 
 def verifier_loss(logit: Tensor, log_sigma: Tensor, error: Tensor) -> Tensor:

@@ -228,7 +228,7 @@ def shifted_record(source: str, seed: int = 0) -> PairRecord:
 
 @pytest.mark.parametrize(
     ("source", "times", "mapped"),
-    [("stereo", 1, [0.0]), ("planes", 1, [1.0]), ("turned planes", 1, [1.0]), ("scenes", 3, [0.0, 1.0])],
+    [("stereo", 1, [0.0]), ("planes", 1, [1.0]), ("turned planes", 1, [1.0]), ("scenes", 2, [0.0, 1.0])],
 )
 def test_mutual_matches_are_refined_as_at_run_time(source: str, times: int, mapped: list[float]):
     torch.manual_seed(0)
@@ -259,9 +259,7 @@ def test_matches_that_the_scorer_has_no_hope_for_are_left_out(monkeypatch: pytes
     hope = np.where(np.arange(60) % 2 == 0, -4.1, -3.9).astype(np.float32)
     monkeypatch.setattr(verifier_training, "score_set", lambda scorer, found: hope)
     some = collect_rows(records, MatchScorer(), lambda done: None)
-    # Contrast of the patches in image 0; places change a little with fewer neighbours.
-    np.testing.assert_array_equal(some.columns[:, 2], every.columns[1::2, 2])
-    np.testing.assert_allclose(some.error, every.error[1::2], atol=0.05)
+    np.testing.assert_allclose(some.error, every.error[1::2], atol=1e-6)
     np.testing.assert_array_equal(some.pair, every.pair[1::2])
 
 
