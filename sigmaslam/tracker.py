@@ -425,8 +425,7 @@ class StereoTracker:
         since = timestamp - self._keyframe_times[-1] if self._keyframe_times else 0.0
         walk = np.array([self.config.offset_walk**2 * since, 0.0, 0.0])
         window.add_keyframe(pose, step, step_covariance, walk, origin)
-        slope, _ = disparity_slopes(view.features.keypoints, view.disparity)
-        view = replace(view, slope=slope)
+        view = replace(view, slope=disparity_slopes(view.features.keypoints, view.disparity))
         self._keyframe_views.append(view)
         self._keyframe_times.append(timestamp)
         self._sharpness.append(sharpness(view.left))

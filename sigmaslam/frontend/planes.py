@@ -31,19 +31,17 @@ _FITS = 5
 _LEAST_DEPTH = 1e-3
 
 
-def disparity_slopes(points: np.ndarray, disparity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How the disparity slopes around points, from their neighbours on the same surface.
+def disparity_slopes(points: np.ndarray, disparity: np.ndarray) -> np.ndarray:
+    """Gradients (N, 2) of the disparity around (N, 2) points, from their neighbours on the same surface.
 
     Args:
-        points: (N, 2) pixels of the left image.
-        disparity: (N,) there, NaN where there is none; slope and departure are zero there.
-    Returns:
-        (N, 2) gradients of the disparity, and (N,) pixels by which the neighbours depart from that slope, their median.
+        points: pixels of the left image.
+        disparity: (N,) there, NaN where there is none; the slope is zero there.
     """
-    slope, departure = np.zeros((len(points), 2)), np.zeros(len(points))
+    slope = np.zeros((len(points), 2))
     known = np.flatnonzero(np.isfinite(disparity))
     if len(known) < 4:
-        return slope, departure
+        return slope
     points, disparity = points[known].astype(np.float64), disparity[known]
     near = nearest_points(points, points, min(_NEIGHBOURS + 1, len(points)))[:, 1:]
     apart, rise = points[near] - points[:, None], disparity[near] - disparity[:, None]
@@ -57,8 +55,7 @@ def disparity_slopes(points: np.ndarray, disparity: np.ndarray) -> tuple[np.ndar
         fitted = np.linalg.solve(normal, weighted.transpose(0, 2, 1) @ rise[..., None])[..., 0]
         scale = max(0.6 * scale, _LAST_SCALE)
     slope[known] = fitted
-    departure[known] = np.median(np.abs(rise - (apart @ fitted[..., None])[..., 0]), axis=1)
-    return slope, departure
+    return slope
 
 
 def plane_maps(camera: RectifiedStereo, measured: np.ndarray, slope: np.ndarray, T_view_key: np.ndarray) -> PatchMaps:
@@ -98,17 +95,14 @@ def refine_on_planes(
 def refine_in_rows(left: np.ndarray, right: np.ndarray, points0: np.ndarray, points1: np.ndarray) -> Refinement:
     """The same for the eyes of a rectified pair: how surfaces slope is known from the disparities themselves.
 
-    The maps are near the identity and not handed on: the verifier compares such patches as if they were shifted only,
-    and is told how far the neighbours' disparities depart from the slope, as they do where surfaces meet.
+    The maps are near the identity and not handed on: the verifier judges such pairs as if they were shifted only.
     """
     shifted = refine(left, right, points0, points1)
-    slope, departure = disparity_slopes(points0, points0[:, 0] - shifted.places[:, 0])
+    slope = disparity_slopes(points0, points0[:, 0] - shifted.places[:, 0])
     # The right eye sees u - disparity.
     A = np.tile(np.eye(2), (len(slope), 1, 1))
     A[:, 0] -= slope
-    return replace(
-        _align(left, right, points0, shifted, PatchMaps(A, np.zeros_like(slope))), A=None, distance=departure
-    )
+    return replace(_align(left, right, points0, shifted, PatchMaps(A, np.zeros_like(slope))), A=None)
 
 
 def _align(

@@ -111,8 +111,7 @@ class Refinement:
         moved: (M,) bool, whether it succeeded.
         A: (M, 2, 2), affine map of image 0 to image 1 around each match by which its patch was warped, infinite where
             there is none; None: patches were only shifted, or nearly.
-        distance: (M,) pixels from where the neighbours' map would have the detected match; in stereo pairs those by
-            which the neighbours' disparities depart from the slope there; None where neighbours were not asked.
+        distance: (M,) pixels from where the neighbours' map would have the detected match; None likewise.
     """
 
     start: np.ndarray

@@ -61,35 +61,29 @@ def maps_of(H: np.ndarray, points0: np.ndarray) -> PatchMaps:
 
 def test_the_slope_of_a_plane_is_found():
     points = scattered(300)
-    slope, departure = disparity_slopes(points, 20.0 + points @ ROAD)
-    assert departure.max() < 0.5
+    slope = disparity_slopes(points, 20.0 + points @ ROAD)
     np.testing.assert_allclose(slope, np.tile(ROAD, (300, 1)), atol=0.02)
 
 
 def test_a_wall_in_front_of_the_road_does_not_tilt_it():
     points = scattered(800)
     wall = points[:, 0] > 320
-    slope, departure = disparity_slopes(points, np.where(wall, 200.0, 20.0 + points @ ROAD))
+    slope = disparity_slopes(points, np.where(wall, 200.0, 20.0 + points @ ROAD))
     error = np.abs(slope - np.where(wall[:, None], 0.0, ROAD)).max(axis=1)
     # Of the points at the very edge a few have no neighbours of their own surface on two sides.
     assert (error < 0.03).mean() > 0.97
-    # Where surfaces meet the neighbours of some are mostly of the other one; nowhere else.
-    inner = np.abs(points[:, 0] - 320) > 60
-    assert departure[inner].max() < 1.0
-    assert departure[~inner].max() > 10.0
 
 
 def test_without_neighbours_nothing_slopes():
     points = scattered(30)
     disparity = 20.0 + points @ ROAD
     disparity[5:] = np.nan
-    slope, departure = disparity_slopes(points, disparity)
+    slope = disparity_slopes(points, disparity)
     assert slope.shape == (30, 2)
     assert slope[:5].any()
     assert not slope[5:].any()
-    assert not departure[5:].any()
-    assert not any(of_few.any() for of_few in disparity_slopes(points[:3], disparity[:3]))
-    assert [of_none.shape for of_none in disparity_slopes(points[:0], disparity[:0])] == [(0, 2), (0,)]
+    assert not disparity_slopes(points[:3], disparity[:3]).any()
+    assert disparity_slopes(points[:0], disparity[:0]).shape == (0, 2)
 
 
 # Maps
