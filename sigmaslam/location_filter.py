@@ -205,7 +205,12 @@ class LocationFilter:
             return estimate
         pose = nearest_rigid(se3_exp(state.offset + state.own) @ estimate.T_world_camera)
         blocks = state.covariance.reshape(WHOLE // 6, 6, WHOLE // 6, 6)[[0, -1]][:, :, [0, -1]]
-        return replace(estimate, T_world_camera=pose, covariance=se3_body(pose, blocks.sum(axis=(0, 2))))
+        return replace(
+            estimate,
+            T_world_camera=pose,
+            covariance=se3_body(pose, blocks.sum(axis=(0, 2))),
+            own_covariance=se3_body(pose, state.covariance[OWN, OWN]),
+        )
 
     # ---- readings
 

@@ -187,7 +187,6 @@ def _solve(pairs: Pairs, walked: np.ndarray, start: SensorModel, prior: np.ndarr
     covariance = np.zeros((WHOLE, WHOLE))
     covariance[OFFSET, OFFSET], covariance[_WORLDS, _WORLDS] = walked, prior
     covariance[:SIZE, :SIZE] -= gain @ cross.T
-    covariance[OWN, OWN] = pairs.own[-1]
     model = start.moved(np.concatenate([np.zeros(6), worlds]))
     rest, _ = _linearise(model, pairs)
     misfit = float(rest.ravel() @ np.linalg.solve(noise, rest.ravel()))
