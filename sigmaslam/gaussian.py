@@ -44,6 +44,14 @@ def append_moved(factor: np.ndarray, part: slice, step_covariance: np.ndarray) -
     return grown
 
 
+def renew_part(covariance: np.ndarray, part: slice, own: np.ndarray) -> np.ndarray:
+    """The covariance with one part of the state known anew, by itself."""
+    renewed = covariance.copy()
+    renewed[part, :] = renewed[:, part] = 0.0
+    renewed[part, part] = own
+    return renewed
+
+
 def replace_part(covariance: np.ndarray, part: slice, other: slice) -> np.ndarray:
     """The covariance as if one part of the state were the same as another of its size."""
     replaced = covariance.copy()

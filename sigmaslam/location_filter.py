@@ -20,7 +20,7 @@ import numpy as np
 from sigmaslam.chi_square import CHI_SQUARE_999
 from sigmaslam.errors import InputError
 from sigmaslam.estimate import Estimate
-from sigmaslam.gaussian import matrix_root
+from sigmaslam.gaussian import matrix_root, renew_part
 from sigmaslam.location import Locations
 from sigmaslam.location_model import (
     OFFSET,
@@ -171,9 +171,7 @@ class LocationFilter:
         """Another frame, whose own error, of covariance (6, 6), has nothing to do with that of the one before."""
         state = self._known.state
         if state is not None:
-            covariance = state.covariance.copy()
-            covariance[OWN, :] = covariance[:, OWN] = 0.0
-            covariance[OWN, OWN] = own
+            covariance = renew_part(state.covariance, OWN, own)
             self._known = replace(self._known, state=replace(state, own=np.zeros(6), covariance=covariance))
 
     def _walk(self, growth: np.ndarray) -> None:
@@ -193,9 +191,7 @@ class LocationFilter:
         self._pairs.clear()  # their errors no longer have in common what earlier ones had
         walked, state = _drift(estimate), self._known.state
         if state is not None:
-            covariance = state.covariance.copy()
-            covariance[OFFSET, :] = covariance[:, OFFSET] = 0.0
-            covariance[OFFSET, OFFSET] = walked
+            covariance = renew_part(state.covariance, OFFSET, walked)
             state = replace(state, offset=np.zeros(6), covariance=covariance)
         self._known = _Known(state, walked)
 
@@ -204,11 +200,11 @@ class LocationFilter:
         if state is None:
             return estimate
         pose = nearest_rigid(se3_exp(state.offset + state.own) @ estimate.T_world_camera)
-        blocks = state.covariance.reshape(WHOLE // 6, 6, WHOLE // 6, 6)[[0, -1]][:, :, [0, -1]]
+        both = np.eye(WHOLE)[OFFSET] + np.eye(WHOLE)[OWN]
         return replace(
             estimate,
             T_world_camera=pose,
-            covariance=se3_body(pose, blocks.sum(axis=(0, 2))),
+            covariance=se3_body(pose, both @ state.covariance @ both.T),
             own_covariance=se3_body(pose, state.covariance[OWN, OWN]),
         )
 

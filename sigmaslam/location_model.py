@@ -169,7 +169,8 @@ def _solve(pairs: Pairs, walked: np.ndarray, start: SensorModel, prior: np.ndarr
     worlds = np.zeros(SIZE - 6)
     for _ in range(_STEPS):
         model = start.moved(np.concatenate([np.zeros(6), worlds]))
-        rest, by_errors = _linearise(model, pairs)
+        rest = _rest(model, pairs)
+        by_errors = slopes(model, pairs.poses, pairs.positions, pairs.rotations)
         by_offset, by_worlds = by_errors[..., OFFSET], by_errors[..., _WORLDS].reshape(count * width, -1)
         noise = (by_offset[:, None] @ shared @ by_offset.swapaxes(1, 2)[None]).swapaxes(1, 2)
         noise[np.arange(count), :, np.arange(count), :] += pairs.covariances + project_covariance(by_offset, pairs.own)
@@ -188,15 +189,14 @@ def _solve(pairs: Pairs, walked: np.ndarray, start: SensorModel, prior: np.ndarr
     covariance[OFFSET, OFFSET], covariance[_WORLDS, _WORLDS] = walked, prior
     covariance[:SIZE, :SIZE] -= gain @ cross.T
     model = start.moved(np.concatenate([np.zeros(6), worlds]))
-    rest, _ = _linearise(model, pairs)
+    rest = _rest(model, pairs)
     misfit = float(rest.ravel() @ np.linalg.solve(noise, rest.ravel()))
     return State(model, gain[OFFSET] @ whole, np.zeros(6), 0.5 * (covariance + covariance.T)), misfit
 
 
-def _linearise(model: SensorModel, pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (N, m) with the tracker's poses as they are, and slopes of what is expected (N, m, 18)."""
-    rest = residuals(model.expect(pairs.poses, np.zeros(SIZE)), pairs.positions, pairs.rotations)
-    return rest, slopes(model, pairs.poses, pairs.positions, pairs.rotations)
+def _rest(model: SensorModel, pairs: Pairs) -> np.ndarray:
+    """Residuals (N, m) with the tracker's poses as they are."""
+    return residuals(model.expect(pairs.poses, np.zeros(SIZE)), pairs.positions, pairs.rotations)
 
 
 def slopes(model: SensorModel, poses: np.ndarray, positions: np.ndarray, rotations: np.ndarray | None) -> np.ndarray:

@@ -283,7 +283,7 @@ class StereoTracker:
         self._noise.adapt(fit.nis_per_dof)
         count = int(fit.kept.sum())
         if count < self.config.keyframe_ratio * self._reference:
-            if fit.misfit > _SCATTERED and self._blur(view) > 1.0:
+            if fit.doubt > fit.misfit > _SCATTERED:  # more than the misfit is what blur adds
                 return  # a bad keyframe would spoil what comes after it; the next view may be a better one
             view = self._choose(view, fit.pose)
             if self._has_stereo(view):
