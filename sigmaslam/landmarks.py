@@ -13,6 +13,9 @@ from sigmaslam.rotation import se3_inverse, turn_covariance
 from sigmaslam.tables import LANDMARK_SIZE, MODELLED, pose_slice
 from sigmaslam.window import KeyframeWindow
 
+# A keypoint may lie on either end of what its patch shows: standard deviation of its disparity, over that range.
+_EITHER_SURFACE = 0.5
+
 
 @dataclass(frozen=True, slots=True)
 class PointMap:
@@ -20,7 +23,8 @@ class PointMap:
 
     Attributes:
         points: (M, 3) float64 in the world, metres.
-        covariances: (M, 3, 3) of them in the world, that of the keyframe's pose included, metres squared.
+        covariances: (M, 3, 3) of them in the world, that of the keyframe's pose and what surfaces vary by around them
+            included, metres squared.
         observations: (M,) views that confirmed it.
         timestamps: (M,) of the keyframe that saw the point first, seconds.
         pixels: (M, 2) its place there, in the rectified left image.
@@ -152,6 +156,8 @@ def _triangulate(
             by_state[own, :, pose_slice(host)] += lever[own]
     covariances = by_state @ window.covariance @ by_state.transpose(0, 2, 1)
     covariances += by_landmark @ landmarks.covariance @ by_landmark.transpose(0, 2, 1)
+    by_relief = _EITHER_SURFACE * landmarks.relief[:, None, None] * by_disparity[:, :, 2:]
+    covariances += by_relief @ by_relief.transpose(0, 2, 1)
     return PointMap(
         points, covariances, landmarks.views, keyframe_times[landmarks.host], landmarks.measured[:, :2].copy()
     )

@@ -83,6 +83,7 @@ class Landmarks:
         views: (L,) how many keyframes and frames have confirmed it.
         misses: (L,) frames in a row in which it was looked for and not found.
         serial: (L,) number that stays.
+        relief: (L,) range of the disparities around them, pixels, as of `patch_relief`; for the map.
     """
 
     host: np.ndarray
@@ -95,6 +96,7 @@ class Landmarks:
     views: np.ndarray
     misses: np.ndarray
     serial: np.ndarray
+    relief: np.ndarray
 
     def __len__(self) -> int:
         return len(self.host)
@@ -104,7 +106,8 @@ class Landmarks:
         """No landmark, for a state of that size."""
         whole = np.zeros(0, np.int64)
         flat, square = np.zeros((0, LANDMARK_SIZE)), np.zeros((0, LANDMARK_SIZE, LANDMARK_SIZE))
-        return cls(whole, whole, flat, flat, flat, square, np.zeros((0, LANDMARK_SIZE, size)), whole, whole, whole)
+        by_state = np.zeros((0, LANDMARK_SIZE, size))
+        return cls(whole, whole, flat, flat, flat, square, by_state, whole, whole, whole, np.zeros(0))
 
     def select(self, index: np.ndarray) -> Landmarks:
         """The landmarks of that index or mask."""

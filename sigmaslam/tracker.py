@@ -17,6 +17,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.frontend import StereoView, build_frontend
 from sigmaslam.frontend.planes import disparity_slopes
+from sigmaslam.frontend.relief import patch_relief
 from sigmaslam.frontend.smooth import sharpness
 from sigmaslam.landmarks import PointMap, RetiredPoints, host_points, map_points, merge_maps
 from sigmaslam.match_noise import MatchNoise
@@ -104,7 +105,7 @@ class StereoTracker:
         self._keyframe_views: list[StereoView] = []
         self._keyframe_times: list[float] = []
         self._reference = 0  # landmarks in the last keyframe
-        self._sharpness: deque[float] = deque(maxlen=self.config.window)  # of the keyframes
+        self._sharpness: list[float] = []  # of the window's keyframes
         self._retired = RetiredPoints(self.config.most_points)
         self._densities = np.zeros(2)
         self._timestamp: float | None = None
@@ -341,7 +342,7 @@ class StereoTracker:
         keyframe = self._remembered(0)
         self._retired.append(host_points(self._window, 0, np.array(self._keyframe_times)))
         number = self._window.retire_oldest()
-        del self._keyframe_views[0], self._keyframe_times[0]
+        del self._keyframe_views[0], self._keyframe_times[0], self._sharpness[0]
         self._memorise(keyframe, spare)
         self._recent.append(keyframe.timestamp)
         return number
@@ -349,7 +350,7 @@ class StereoTracker:
     def _forget_all(self) -> None:
         """As before the first keyframe, but for what is known of the calibration."""
         self._window.restart()
-        self._keyframe_views, self._keyframe_times = [], []
+        self._keyframe_views, self._keyframe_times, self._sharpness = [], [], []
         self._retired = RetiredPoints(self.config.most_points)
         self._memory.keyframes.clear()
         self._recent.clear()
@@ -425,13 +426,14 @@ class StereoTracker:
         since = timestamp - self._keyframe_times[-1] if self._keyframe_times else 0.0
         walk = np.array([self.config.offset_walk**2 * since, 0.0, 0.0])
         window.add_keyframe(pose, step, step_covariance, walk, origin)
-        view = replace(view, slope=disparity_slopes(view.features.keypoints, view.disparity))
+        slope = disparity_slopes(view.features.keypoints, view.disparity)
+        view = replace(view, slope=slope)
         self._keyframe_views.append(view)
         self._keyframe_times.append(timestamp)
         self._sharpness.append(sharpness(view.left))
         if views is not None:
             window.add_views(views)
-        self._add_landmarks(view, views)
+        self._add_landmarks(view, views, slope)
         first = window.landmarks.select(window.landmarks.host == len(window) - 1).first_views()
         seen = [] if views is None else [replace(views, rows=window.landmarks.serial[views.rows])]
         self.keyframe_views = join_views([*seen, first])
@@ -442,12 +444,14 @@ class StereoTracker:
         self._reference = int((window.landmarks.host == len(window) - 1).sum())
         self._reference += 0 if views is None else len(views.rows)
 
-    def _add_landmarks(self, view: StereoView, views: Views | None) -> None:
+    def _add_landmarks(self, view: StereoView, views: Views | None, slope: np.ndarray) -> None:
         """Stereo points that no landmark has been found at."""
         index = np.flatnonzero(np.isfinite(view.disparity))
         taken = np.zeros((0, 2)) if views is None else views.measurement[:, :2]
         index = index[select_apart(view.features.select(index), taken, self.config.spacing, view.left.shape)]
-        self._window.add_landmarks(index, view.measured(index), self._noise.of_keypoints(view, index))
+        measured = view.measured(index)
+        relief = patch_relief(view.left, view.right, measured, slope[index])
+        self._window.add_landmarks(index, measured, self._noise.of_keypoints(view, index), relief)
         depth = self._camera.fx * self._camera.baseline / max(float(np.nanmedian(view.disparity)), 0.5)
         self._window.depth = depth
         self._densities = np.array([(self.config.acceleration * depth) ** 2, self.config.angular_acceleration**2])

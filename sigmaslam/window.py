@@ -173,13 +173,16 @@ class KeyframeWindow:
         """Remembers what the last keyframe sees of landmarks of earlier ones."""
         self._observations = self._observations.append(len(self.poses) - 1, views)
 
-    def add_landmarks(self, feature: np.ndarray, measured: np.ndarray, variance: np.ndarray) -> None:
+    def add_landmarks(
+        self, feature: np.ndarray, measured: np.ndarray, variance: np.ndarray, relief: np.ndarray | None = None
+    ) -> None:
         """Adds landmarks that the last keyframe sees first.
 
         Args:
             feature: (K,) index among the keyframe's features.
             measured: (K, 3) (u, v, disparity).
             variance: (K, 4) of these, and of what the disparities are off by in all views alike.
+            relief: (K,) of the surfaces around them, pixels; none by default.
         """
         count = len(feature)
         size = len(self.covariance)
@@ -195,6 +198,7 @@ class KeyframeWindow:
             np.ones(count, np.int64),
             np.zeros(count, np.int64),
             self._next_serial + np.arange(count),
+            np.zeros(count) if relief is None else relief,
         )
         self._next_serial += count
         self.landmarks = self.landmarks.append(new)

@@ -204,3 +204,16 @@ def test_merging_nothing_gives_an_empty_map():
     assert empty.points.shape == (0, 3)
     assert empty.covariances.shape == (0, 3, 3)
     assert empty.observations.shape == (0,)
+
+
+def test_a_point_may_lie_on_either_surface_of_its_patch():
+    """Disparities off by half their range, along the ray: what the covariance gains, by finite differences."""
+    truth = points_in_view(20)
+    window = window_of(measure(truth, np.eye(4)))
+    smooth = map_of(window).covariances
+    window.landmarks.relief = np.linspace(0.0, 8.0, 20)
+    gained = map_of(window).covariances - smooth
+    nudge = np.array([0.0, 0.0, 1e-5])
+    by_disparity = (world_points(truth + nudge) - world_points(truth - nudge)) / 2e-5
+    step = 0.5 * window.landmarks.relief[:, None] * by_disparity
+    np.testing.assert_allclose(gained, step[:, :, None] * step[:, None, :], atol=1e-6 * np.abs(gained).max())
