@@ -17,6 +17,7 @@ from sigmaslam.chi_square import CHI_SQUARE_999
 from sigmaslam.config import TrackerConfig
 from sigmaslam.errors import InputError
 from sigmaslam.estimate import Estimate
+from sigmaslam.frame_fit import FrameFit
 from sigmaslam.frontend import StereoView, TemporalMatches
 from sigmaslam.landmarks import PointMap
 from sigmaslam.object_region import BodyShape, inner_half, pixels_in
@@ -24,7 +25,6 @@ from sigmaslam.rotation import se3_inverse, turn_covariance
 from sigmaslam.search import Found
 from sigmaslam.stopwatch import Stopwatch
 from sigmaslam.tracker import StereoTracker
-from sigmaslam.window import FrameFit
 
 # A landmark that moved so far in the image with the body, pixels, is the body's.
 _MOVED = 3.0
@@ -253,7 +253,7 @@ class ObjectTracker(StereoTracker):
 
     def _restart(self, body: StereoView) -> None:
         """Begins again with the body alone as it was in the first frame; it has not moved until now."""
-        self._forget_all()
+        self._keyframes.restart()
         self._first = body
         super()._start(body, self._first_time)
         self._separated, self._velocity_known = True, False

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections import deque
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,22 +14,21 @@ from sigmaslam.chi_square import CHI_SQUARE_9999_OF_6
 from sigmaslam.config import TrackerConfig
 from sigmaslam.errors import InputError
 from sigmaslam.estimate import CalibrationEstimate, Estimate
+from sigmaslam.frame_fit import FrameFit
 from sigmaslam.frontend import StereoView, build_frontend
 from sigmaslam.frontend.planes import disparity_slopes
 from sigmaslam.frontend.relief import patch_relief
-from sigmaslam.frontend.smooth import sharpness
-from sigmaslam.landmarks import PointMap, RetiredPoints, host_points, map_points, merge_maps
+from sigmaslam.keyframes import Keyframes
+from sigmaslam.landmarks import PointMap
 from sigmaslam.match_noise import MatchNoise
 from sigmaslam.motion import MotionFilter
-from sigmaslam.past import PastPoses
-from sigmaslam.recall import KeyframeMemory, RememberedKeyframe, pack_keyframes, read_keyframes
 from sigmaslam.rectify import StereoRectifier
-from sigmaslam.rotation import nearest_rigid, se3_adjoint, se3_body, se3_inverse, turn_covariance
+from sigmaslam.rotation import nearest_rigid, se3_adjoint, se3_inverse, turn_covariance
 from sigmaslam.search import Found, LandmarkSearch
 from sigmaslam.spacing import select_apart
 from sigmaslam.stopwatch import Stopwatch
-from sigmaslam.tables import CALIBRATION, CALIBRATION_SIZE, Views, join_views, pose_slice
-from sigmaslam.window import FrameFit, KeyframeWindow
+from sigmaslam.tables import CALIBRATION, Views, join_views, pose_slice
+from sigmaslam.window import KeyframeWindow
 
 __all__ = ["CalibrationEstimate", "Estimate", "StereoTracker", "TrackerConfig"]
 
@@ -46,9 +44,6 @@ _MANY = 3
 # A blurred view whose matches scatter by so many times the variance that they claim is no keyframe. A sharp one is: no
 # keyframes at all for 20 frames lost the KITTI drive.
 _SCATTERED = 1.6
-# A view less sharp by this factor than the sharpest of the keyframes is blurred: in drives 0.9 to 1.1 are common from
-# frame to frame and 0.8 half a second later; motion blur over 11 px gives 0.6 to 0.75.
-_BLUNT = 0.75
 # Where more than this share of the disparities is negative by more than a pixel, which no disparity offset explains,
 # the eyes are swapped, or nothing fits.
 _MOST_NEGATIVE = 0.1
@@ -60,8 +55,6 @@ _ANYWHERE = 1e6
 _LATE_KEYFRAMES = 3
 # When it is lost, with so many of those that left the window, the ones most like it.
 _SIMILAR_KEYFRAMES = 3
-# A loop is looked for beyond so many remembered keyframes, among those that look less than 60 degrees away.
-_RECENT_KEYFRAMES, _LOOP_COSINE = 10, 0.5
 
 
 class StereoTracker:
@@ -102,18 +95,13 @@ class StereoTracker:
         self._noise = MatchNoise(self.config)
         self._search = LandmarkSearch(self._camera, self._frontend, self._window, self._noise, self.config)
         self._motion = MotionFilter(backend)
-        self._keyframe_views: list[StereoView] = []
-        self._keyframe_times: list[float] = []
+        self._keyframes = Keyframes(self._window, self.config.remembered, self.config.most_points)
         self._reference = 0  # landmarks in the last keyframe
-        self._sharpness: list[float] = []  # of the window's keyframes
-        self._retired = RetiredPoints(self.config.most_points)
         self._densities = np.zeros(2)
         self._timestamp: float | None = None
         self._tracked_at = 0.0
         self._moving = False  # there has been a pose from the images
         self._velocity_known = False  # since the last start
-        self._memory = KeyframeMemory(self.config.remembered)
-        self._recent: deque[float] = deque(maxlen=_RECENT_KEYFRAMES)  # time stamps of the last that left the window
         self._in_map = False  # the world is that of a map that was loaded
         self.keyframe_views: Views | None = None
         """What the last frame saw if it became a keyframe, by numbers of landmarks that stay."""
@@ -124,13 +112,7 @@ class StereoTracker:
         Raises:
             InputError: the file is no map, or made with another front-end or camera.
         """
-        keyframes, joint = read_keyframes(path, self._frontend.name, self._camera)
-        poses = np.array([keyframe.pose for keyframe in keyframes])
-        self._window.load_past(PastPoses(poses, joint, np.zeros((len(joint), CALIBRATION_SIZE))))
-        for _ in keyframes:
-            self._retired.append(PointMap.empty())
-        for keyframe in keyframes:
-            self._memorise(keyframe)
+        self._keyframes.load(path, self._frontend.name, self._camera)
         self._in_map = True
 
     def describe_rectified(self) -> dict[str, Any]:
@@ -141,12 +123,7 @@ class StereoTracker:
 
     def pack_keyframes(self) -> dict[str, Any]:
         """Keyframes by which a later run finds its place in the map, as arrays by name."""
-        window = self._window
-        late = [self._remembered(k) for k in range(len(window))]
-        past = window.past
-        for k, pose in enumerate(window.poses):
-            past = past.append(pose, window.covariance, pose_slice(k))
-        return pack_keyframes([*self._memory.keyframes, *late], past.covariance, self._frontend.name, self._camera)
+        return self._keyframes.pack(self._frontend.name, self._camera)
 
     def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> Estimate:
         """Takes one stereo pair.
@@ -176,7 +153,7 @@ class StereoTracker:
             status = "tracking"
             # Patches that are blurred are misplaced alike, along the blur and towards where they were expected: many of
             # them say no more than a few.
-            fit = fit.doubted(max(fit.misfit, 1.0) * self._blur(view))
+            fit = fit.doubted(max(fit.misfit, 1.0) * self._keyframes.blur(view))
             self._accept(fit, found, view, timestamp)
         elif self._remember(view, timestamp):
             status = "relocalised"
@@ -191,11 +168,7 @@ class StereoTracker:
 
     def map(self) -> PointMap:
         """All landmarks so far that were seen at least three times."""
-        whole = np.ones(len(self._window.landmarks), bool)
-        late = map_points(self._window, whole, np.array(self._keyframe_times))
-        return merge_maps([self._retired.in_world(self._window.past), late]).transform(
-            se3_inverse(self._T_rectified_left)
-        )
+        return self._keyframes.map().transform(se3_inverse(self._T_rectified_left))
 
     # ---- a frame against the window
 
@@ -209,7 +182,7 @@ class StereoTracker:
         pose, covariance = self._pose_and_step()
         found, fit = Found.nothing(), None
         if self._velocity_known:
-            found = self._search.near(view, self._keyframe_views, pose, covariance)
+            found = self._search.near(view, self._keyframes.views, pose, covariance)
             clock.lap("match")
             fit = self._fit(found, pose, covariance)
             clock.lap("filter")
@@ -225,7 +198,7 @@ class StereoTracker:
         """Without a prediction: the pose relative to a late keyframe from its features, then landmarks near there."""
         found = Found.nothing()
         for back in range(1, min(_LATE_KEYFRAMES, len(self._window)) + 1):
-            relative = self._search.locate(self._keyframe_views[-back], view)
+            relative = self._search.locate(self._keyframes.views[-back], view)
             clock.lap("match")
             if relative is None:
                 continue
@@ -233,7 +206,7 @@ class StereoTracker:
             # How far the landmarks of other keyframes may be from where this pose expects them.
             margin = np.diag(np.repeat([0.01 * self._window.depth, 0.01], 3) ** 2)
             uncertain = turn_covariance(start, relative.covariance + margin)
-            found = self._search.near(view, self._keyframe_views, start, uncertain, -back, alone=True)
+            found = self._search.near(view, self._keyframes.views, start, uncertain, -back, alone=True)
             clock.lap("match")
             pose, covariance = self._pose_and_step()
             fit = self._window.fit_frame(found.views, pose, covariance, self.config.least_inliers, start)
@@ -264,11 +237,6 @@ class StereoTracker:
                 fit = replace(steady, kept=kept)
         return fit if fit is not None and fit.kept.sum() >= _LEAST_SHARE * count else None
 
-    def _blur(self, view: StereoView) -> float:
-        """How many times as sharp as the view the sharpest keyframe is; 1 where that may be what is seen."""
-        own, sharpest = sharpness(view.left), max(self._sharpness)
-        return sharpest / max(own, 0.1 * sharpest) if own < _BLUNT * sharpest else 1.0
-
     def _accept(self, fit: FrameFit, found: Found, view: StereoView, timestamp: float) -> None:
         """Takes the pose over, and makes the view a keyframe when the old ones fade."""
         landmarks = self._window.landmarks
@@ -297,7 +265,8 @@ class StereoTracker:
         """Finds the view among the remembered keyframes and goes on from there; whether it was found."""
         if not self._has_stereo(view):
             return False
-        for keyframe in self._memory.similar(view, _SIMILAR_KEYFRAMES):
+        memory = self._keyframes.memory
+        for keyframe in memory.similar(view, _SIMILAR_KEYFRAMES):
             relative = self._search.locate(keyframe.view, view)
             if relative is None:
                 continue
@@ -305,10 +274,10 @@ class StereoTracker:
             if not self._has_stereo(chosen):
                 continue
             while len(self._window):
-                self._retire_oldest(keyframe.timestamp)
-            self._memory.refresh(self._window.past)
-            origin = self._memory.index(keyframe.timestamp)
-            pose = nearest_rigid(self._memory.keyframes[origin].pose @ relative.T_key_camera)
+                self._keyframes.retire_oldest(keyframe.timestamp)
+            memory.refresh(self._window.past)
+            origin = memory.index(keyframe.timestamp)
+            pose = nearest_rigid(memory.keyframes[origin].pose @ relative.T_key_camera)
             self._add_keyframe(chosen, timestamp, pose, pose, turn_covariance(pose, relative.covariance), None, origin)
             self._forget_twist()
             self._tracked_at = timestamp
@@ -318,60 +287,16 @@ class StereoTracker:
 
     def _close_loop(self, view: StereoView) -> None:
         """Looks for the newest keyframe among those that were here long ago, and ties it to what is found."""
-        window = self._window
-        pose, place = window.poses[-1], pose_slice(len(window) - 1)
-        reach = window.depth + 3.0 * np.sqrt(np.trace(se3_body(pose, window.covariance[place, place])[:3, :3]))
-
-        def near(keyframe: RememberedKeyframe) -> bool:
-            between = se3_inverse(pose) @ keyframe.pose
-            return bool(np.linalg.norm(between[:3, 3]) < reach and between[2, 2] > _LOOP_COSINE)
-
-        old = [each for each in self._memory.keyframes if each.timestamp not in self._recent and near(each)]
-        for keyframe in self._memory.similar(view, 1, old):
+        memory = self._keyframes.memory
+        for keyframe in memory.similar(view, 1, self._keyframes.revisited()):
             relative = self._search.locate(keyframe.view, view)
             if relative is None:
                 continue
-            index = self._memory.index(keyframe.timestamp)
+            index = memory.index(keyframe.timestamp)
             match = turn_covariance(keyframe.pose @ relative.T_key_camera, relative.covariance)
-            if window.tie(index, relative.T_key_camera, match):
+            if self._window.tie(index, relative.T_key_camera, match):
                 _LOGGER.info("loop closed with the keyframe of %.3f s", keyframe.timestamp)
-                self._memory.refresh(window.past)
-
-    def _retire_oldest(self, spare: float | None = None) -> np.ndarray:
-        """The oldest keyframe leaves the window for the memory, its landmarks for the map; new row of each other."""
-        keyframe = self._remembered(0)
-        self._retired.append(host_points(self._window, 0, np.array(self._keyframe_times)))
-        number = self._window.retire_oldest()
-        del self._keyframe_views[0], self._keyframe_times[0], self._sharpness[0]
-        self._memorise(keyframe, spare)
-        self._recent.append(keyframe.timestamp)
-        return number
-
-    def _forget_all(self) -> None:
-        """As before the first keyframe, but for what is known of the calibration."""
-        self._window.restart()
-        self._keyframe_views, self._keyframe_times, self._sharpness = [], [], []
-        self._retired = RetiredPoints(self.config.most_points)
-        self._memory.keyframes.clear()
-        self._recent.clear()
-
-    def _memorise(self, keyframe: RememberedKeyframe, spare: float | None = None) -> None:
-        """Remembers a keyframe of the window's past; another, not that of the time stamp `spare`, may go for it."""
-        dropped = self._memory.add(keyframe, spare)
-        if dropped is not None:
-            self._retired.drop(dropped, self._window.past)
-            self._window.forget_past(dropped)
-
-    def _remembered(self, host: int) -> RememberedKeyframe:
-        """A keyframe of the window as the memory keeps it."""
-        place = pose_slice(host)
-        window = self._window
-        return RememberedKeyframe(
-            self._keyframe_views[host],
-            window.poses[host],
-            window.covariance[place, place],
-            self._keyframe_times[host],
-        )
+                memory.refresh(self._window.past)
 
     def _recover(self, view: StereoView, timestamp: float) -> None:
         """Without a pose: wait for a while, then go on from this view with the uncertainty of the prediction."""
@@ -418,19 +343,17 @@ class StereoTracker:
         """Makes the view a keyframe: it sees `views`, and whatever else it has in stereo is new."""
         window = self._window
         if len(window) == self.config.window:
-            number = self._retire_oldest()
+            number = self._keyframes.retire_oldest()
             if views is not None:
                 views = views.renumber(number)
         if len(window):
             step_covariance = turn_covariance(window.poses[-1], step_covariance)
-        since = timestamp - self._keyframe_times[-1] if self._keyframe_times else 0.0
+        since = timestamp - self._keyframes.times[-1] if self._keyframes.times else 0.0
         walk = np.array([self.config.offset_walk**2 * since, 0.0, 0.0])
         window.add_keyframe(pose, step, step_covariance, walk, origin)
         slope = disparity_slopes(view.features.keypoints, view.disparity)
         view = replace(view, slope=slope)
-        self._keyframe_views.append(view)
-        self._keyframe_times.append(timestamp)
-        self._sharpness.append(sharpness(view.left))
+        self._keyframes.append(view, timestamp)
         if views is not None:
             window.add_views(views)
         self._add_landmarks(view, views, slope)
@@ -438,7 +361,7 @@ class StereoTracker:
         seen = [] if views is None else [replace(views, rows=window.landmarks.serial[views.rows])]
         self.keyframe_views = join_views([*seen, first])
         window.solve()
-        self._memory.refresh(window.past)
+        self._keyframes.memory.refresh(window.past)
         self._close_loop(view)
         self._motion.start_keyframe()
         self._reference = int((window.landmarks.host == len(window) - 1).sum())

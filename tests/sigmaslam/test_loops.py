@@ -68,7 +68,7 @@ def drive(seed: int, closed: bool = True, wrong: bool = False) -> Lap:
         tracker._search.locate = mislead  # type: ignore[method-assign]
     run = run_simulated(tracker, frontend, SCALE)
     assert [e.status for e in run.estimates[1:]] == ["tracking"] * (FRAMES - 1)
-    kept = tracker._memory.keyframes
+    kept = tracker._keyframes.memory.keyframes
     number = np.array([round(each.timestamp / SCALE.interval) for each in kept])
     middle = (number >= 40) & (number < 140)
     true = frontend.poses[number]

@@ -11,9 +11,10 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from sigmaslam.camera import RectifiedStereo
+from sigmaslam.frame_fit import FrameFit
 from sigmaslam.rotation import se3_exp, se3_inverse, se3_log
 from sigmaslam.tables import CALIBRATION, Views, pose_slice
-from sigmaslam.window import FrameFit, KeyframeWindow
+from sigmaslam.window import KeyframeWindow
 
 CAMERA = RectifiedStereo(fx=400.0, fy=410.0, cx=319.5, cy=239.5, baseline=0.2, width=640, height=480)
 # Standard deviations of the prior and of the noise.
