@@ -8,11 +8,14 @@ import cv2
 import numpy as np
 
 from sigmaslam.camera import RectifiedStereo
-from sigmaslam.chi_square import CHI_SQUARE_999
+from sigmaslam.chi_square import CHI_SQUARE_999, CHI_SQUARE_MEDIAN
 from sigmaslam.epipolar import estimate_epipolar_pose
 from sigmaslam.rotation import se3_exp, se3_inverse, skew
 
-_THRESHOLD = 2.0  # pixels
+# Of P3P, pixels: good matches may be a tenth of what is usual off, and then a slow mover is told by half a pixel.
+_THRESHOLDS = (2.0, 0.5)
+# Matches may be as much better than they claim, as a factor of variances.
+_LEAST_SCALE = 1.0 / 16.0
 _LEAST_POINTS = 8
 # Of the refinement: steps, and scale of the robust loss in standard deviations, from the first to the last.
 _STEPS, _FIRST_SCALE, _NARROWING, _LAST_SCALE = 10, 8.0, 0.75, 2.0
@@ -29,13 +32,13 @@ class RelativePose:
         T_key_camera: (4, 4).
         inliers: (M,) bool, points that agree with it.
         covariance: (6, 6) of x in T_key_camera exp(x), x = (translation, rotation), from the inliers' noise.
-        misfit: sum of squared errors in sigmas by the probabilities of the points, at most a gate's each.
+        scale: 1 or less; how much smaller than claimed the variances of most points are.
     """
 
     T_key_camera: np.ndarray
     inliers: np.ndarray
     covariance: np.ndarray
-    misfit: float
+    scale: float
 
 
 def estimate_relative_pose(
@@ -49,9 +52,10 @@ def estimate_relative_pose(
     """Pose of the current view in the keyframe, from stereo points and where they are seen now.
 
     The essential matrix uses far points and is blind to errors of depth, but fails without parallax; P3P on stereo
-    points is the opposite. Both are tried and refined, the one with the smaller misfit is returned. The number of
-    inliers would not do: with a turn in place of a shift, a pose may agree a little with a mover and with the scene
-    alike.
+    points is the opposite. Both are tried and refined, the one with the smallest misfit is returned: the sum of squared
+    errors in sigmas, at most a gate's each. The number of inliers would not do: with a turn in place of a shift, a pose
+    may agree a little with a mover and with the scene alike. Nor would sigmas as they are claimed where matches are
+    better: they are scaled by what half of the points agree to.
 
     Args:
         camera: the rectified pair.
@@ -68,17 +72,20 @@ def estimate_relative_pose(
         return None
     points = camera.triangulate(np.where(near[:, None], landmarks, [0.0, 0.0, 1.0]))
     views = _Views(camera, landmarks, landmark_sigma, measurement, noise, near * probability)
-    best: RelativePose | None = None
-    for guess in (
+    near_points, near_pixels = points[near], np.ascontiguousarray(measurement[near, :2])
+    tried = [
         _from_essential(camera, points, near, landmarks[:, :2], measurement[:, :2], probability, noise[:, :2, :2]),
-        _from_points(camera, points[near], measurement[near, :2]),
-    ):
-        if guess is None:
-            continue
-        refined = _refine(views, guess)
-        if refined is not None and (best is None or refined.misfit < best.misfit):
-            best = refined
-    return best
+        *(_from_points(camera, near_points, near_pixels, threshold) for threshold in _THRESHOLDS),
+    ]
+    guesses = [guess for guess in tried if guess is not None]
+    if not guesses:
+        return None
+    scale = min(_common_scale(views, guess) for guess in guesses)
+    refined = [T for guess in guesses if (T := _refine(views, guess, scale)) is not None]
+    if not refined:
+        return None
+    scale = min(_common_scale(views, T) for T in refined)
+    return _agreed(views, min(refined, key=lambda T: _misfit(views, T, scale)), scale)
 
 
 def _from_essential(
@@ -110,17 +117,19 @@ def _from_essential(
     return T
 
 
-def _from_points(camera: RectifiedStereo, points: np.ndarray, pixels: np.ndarray) -> np.ndarray | None:
+def _from_points(
+    camera: RectifiedStereo, points: np.ndarray, pixels: np.ndarray, threshold: float
+) -> np.ndarray | None:
     """T_camera_key from P3P in RANSAC."""
     cv2.setRNGSeed(0)
     found, rotation, translation, _ = cv2.solvePnPRansac(
         points,
-        np.ascontiguousarray(pixels),
+        pixels,
         camera.matrix,
         None,
         flags=cv2.SOLVEPNP_AP3P,
         iterationsCount=500,
-        reprojectionError=_THRESHOLD,
+        reprojectionError=threshold,
         confidence=0.9999,
     )
     return _pose(rotation, translation) if found else None
@@ -182,13 +191,19 @@ class _Views:
         return np.where(known, residual, 0.0), by_pose, information
 
 
-def _refine(views: _Views, T_camera_key: np.ndarray) -> RelativePose | None:
-    """Gauss-Newton on the stereo points by their covariances, with a robust loss that narrows from step to step."""
+def _refine(views: _Views, T_camera_key: np.ndarray, variance: float) -> np.ndarray | None:
+    """Gauss-Newton on the stereo points by their covariances, with a robust loss that narrows from step to step.
+
+    Args:
+        views: the points.
+        T_camera_key: (4, 4) where it begins.
+        variance: of the loss, in units of what is claimed.
+    """
     scale = _FIRST_SCALE
     for _ in range(_STEPS):
         residual, by_pose, information = views.linearise(T_camera_key)
         squared = np.einsum("mi,mij,mj->m", residual, information, residual)
-        weight = views.weight / (1.0 + squared / scale**2) ** 2
+        weight = views.weight / (1.0 + squared / (variance * scale**2)) ** 2
         weighted = by_pose.transpose(0, 2, 1) @ (information * weight[:, None, None])
         normal = (weighted @ by_pose).sum(axis=0)
         gradient = np.einsum("mij,mj->i", weighted, residual)
@@ -196,17 +211,40 @@ def _refine(views: _Views, T_camera_key: np.ndarray) -> RelativePose | None:
             return None
         T_camera_key = se3_exp(np.linalg.solve(normal, gradient)) @ T_camera_key
         scale = max(_NARROWING * scale, _LAST_SCALE)
-    residual, by_pose, information = views.linearise(T_camera_key)
+    return T_camera_key
+
+
+def _squared_errors(views: _Views, T_camera_key: np.ndarray) -> np.ndarray:
+    """(M,) in sigmas; infinite behind the camera."""
+    residual, _, information = views.linearise(T_camera_key)
     squared = np.einsum("mi,mij,mj->m", residual, information, residual)
-    inliers = (views.weight > 0) & (np.trace(information, axis1=1, axis2=2) > 0) & (squared < CHI_SQUARE_999[3])
+    return np.where(np.trace(information, axis1=1, axis2=2) > 0, squared, np.inf)
+
+
+def _common_scale(views: _Views, T_camera_key: np.ndarray) -> float:
+    """How much smaller than claimed the variances of most points are, by the median of their errors; 1 at most."""
+    squared = _squared_errors(views, T_camera_key)
+    order = np.argsort(squared)
+    half = np.searchsorted(np.cumsum(views.weight[order]), 0.5 * views.weight.sum())
+    return float(np.clip(squared[order[half]] / CHI_SQUARE_MEDIAN[3], _LEAST_SCALE, 1.0))
+
+
+def _misfit(views: _Views, T_camera_key: np.ndarray, scale: float) -> float:
+    """Squared errors in sigmas by the points' weights, at most a gate's each."""
+    return float(views.weight @ np.minimum(_squared_errors(views, T_camera_key) / scale, CHI_SQUARE_999[3]))
+
+
+def _agreed(views: _Views, T_camera_key: np.ndarray, scale: float) -> RelativePose | None:
+    """The pose with what agrees with it, and its covariance as the points claim theirs."""
+    _, by_pose, information = views.linearise(T_camera_key)
+    inliers = (views.weight > 0) & (_squared_errors(views, T_camera_key) < scale * CHI_SQUARE_999[3])
     if inliers.sum() < _LEAST_POINTS:
         return None
     agreeing = by_pose[inliers]
     normal = (agreeing.transpose(0, 2, 1) @ information[inliers] @ agreeing).sum(axis=0)
     if not np.linalg.cond(normal) < _WORST_CONDITION:
         return None
-    misfit = float(views.weight @ np.minimum(squared, CHI_SQUARE_999[3]))
-    return RelativePose(se3_inverse(T_camera_key), inliers, np.linalg.inv(normal), misfit)
+    return RelativePose(se3_inverse(T_camera_key), inliers, np.linalg.inv(normal), scale)
 
 
 def _pose(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:

@@ -209,7 +209,9 @@ class StereoTracker:
             found = self._search.near(view, self._keyframes.views, start, uncertain, -back, alone=True)
             clock.lap("match")
             pose, covariance = self._pose_and_step()
-            fit = self._window.fit_frame(found.views, pose, covariance, self.config.least_inliers, start)
+            fit = self._window.fit_frame(
+                found.views, pose, covariance, self.config.least_inliers, start, relative.scale
+            )
             clock.lap("filter")
             if fit is not None and fit.kept.sum() >= _LEAST_SHARE * len(found.probability):
                 return found, fit

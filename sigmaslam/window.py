@@ -220,7 +220,13 @@ class KeyframeWindow:
         return np.asarray(in_front & (squared_lengths(residual, covariance) <= CHI_SQUARE_999[views.components]))
 
     def fit_frame(
-        self, views: Views, pose: np.ndarray, step_covariance: np.ndarray, least: int, start: np.ndarray | None = None
+        self,
+        views: Views,
+        pose: np.ndarray,
+        step_covariance: np.ndarray,
+        least: int,
+        start: np.ndarray | None = None,
+        scale: float = 1.0,
     ) -> FrameFit | None:
         """Posterior of a frame's pose; nothing is remembered.
 
@@ -230,6 +236,7 @@ class KeyframeWindow:
             least: fewer inliers are no pose.
             start: (4, 4) pose to linearise at first, close to the truth; then the innovations are not gated against
                 the prior but only their rest after the update.
+            scale: how much smaller than claimed the variances are by which views are told to agree.
         Returns:
             None where too few views agree.
         """
@@ -252,15 +259,15 @@ class KeyframeWindow:
             noise, by_state = self._frame_noise(views.rows, slopes, views.noise)
             expected = slopes.mean - (slopes.by_landmark @ moved[..., None])[..., 0]
             residual, noise = mask_missing(views.measurement - expected, noise_scale * noise)
-            scale = np.linalg.inv(noise)
-            squared = np.einsum("mi,mij,mj->m", residual, scale, residual)
+            precision = np.linalg.inv(noise)
+            squared = np.einsum("mi,mij,mj->m", residual, precision, residual)
             usable = slopes.in_front & (squared < UNKNOWN_VARIANCE)
             if step == self._iterations and kept is None:
                 # Before the gate, which would hide how far they scatter.
                 noise_scale = common_scale(squared[usable], components[usable])
-                squared, scale, noise = squared / noise_scale, scale / noise_scale, noise * noise_scale
+                squared, precision, noise = squared / noise_scale, precision / noise_scale, noise * noise_scale
             if step >= self._iterations:
-                agree = usable & (squared <= CHI_SQUARE_999[components])
+                agree = usable & (squared <= scale * CHI_SQUARE_999[components])
                 if step == self._iterations + 2 or (kept is not None and (agree == kept).all()):
                     break
                 kept = agree
@@ -275,13 +282,13 @@ class KeyframeWindow:
                 if step == 0 and start is None:
                     squared = squared_lengths(residual, noise + project_covariance(by_state, prior))
                 for limit in _ROBUST_SCALES:
-                    weight = usable / (1.0 + squared / limit**2) ** 2
+                    weight = usable / (1.0 + squared / (scale * limit**2)) ** 2
                     solution, posterior = weighted_update(factor, whitened, offset, weight)
                     left = residual - by_state @ (solution - offset)
-                    squared = np.einsum("mi,mij,mj->m", left, scale, left)
+                    squared = np.einsum("mi,mij,mj->m", left, precision, left)
             left = residual - by_state @ (solution - offset)
             own = self.landmarks.covariance[views.rows] @ slopes.by_landmark.transpose(0, 2, 1)
-            moved = (own @ (scale @ left[..., None]))[..., 0]
+            moved = (own @ (precision @ left[..., None]))[..., 0]
             offset, spread = solution, posterior
             step += 1
         kept &= agree
