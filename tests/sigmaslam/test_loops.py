@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 from simulated_frontend import SCALES, SimulatedFrontend, run_simulated
 
 from sigmaslam.rotation import nearest_rigid, se3_exp, se3_inverse, se3_log
-from sigmaslam.startup import RelativePose
 from sigmaslam.tracker import StereoTracker
 
 LAP, FRAMES = 180, 220
@@ -61,9 +60,7 @@ def drive(seed: int, closed: bool = True, wrong: bool = False) -> Lap:
             found = locate(*views)
             if found is None or tracker._timestamp is None or tracker._timestamp < 10.0:
                 return found
-            return RelativePose(
-                found.T_key_camera @ se3_exp(np.array([5.0, 0, 0, 0, 0, 0])), found.inliers, found.covariance
-            )
+            return replace(found, T_key_camera=found.T_key_camera @ se3_exp(np.array([5.0, 0, 0, 0, 0, 0])))
 
         tracker._search.locate = mislead  # type: ignore[method-assign]
     run = run_simulated(tracker, frontend, SCALE)
