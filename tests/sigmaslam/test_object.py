@@ -186,6 +186,8 @@ def test_a_rendered_tool_is_followed_and_a_sensor_on_it_takes_drift_away(tmp_pat
     assert alone.ate.rmse < 0.002
     assert alone.nees is not None
     assert alone.nees.mean < 4
+    # Better than the sensor (0.29 degrees), which has little to add to it.
+    assert alone.ate_origin.rotation_rmse_deg < 0.25
 
     simulation = simulate(recipe)
     body = simulation.scene.bodies[int(np.flatnonzero(simulation.scene.moving)[0])]
@@ -196,6 +198,6 @@ def test_a_rendered_tool_is_followed_and_a_sensor_on_it_takes_drift_away(tmp_pat
     assert summary["location"]["ready"] is not None
     fused = evaluate_run(tmp_path / "fused", folder / "poses_object.txt", plot=False)
     assert fused.ate_origin.rmse < 0.8 * alone.ate_origin.rmse
-    assert fused.ate_origin.rotation_rmse_deg < 0.8 * alone.ate_origin.rotation_rmse_deg
+    assert fused.ate_origin.rotation_rmse_deg < alone.ate_origin.rotation_rmse_deg
     assert fused.nees is not None
     assert 0.5 < fused.nees.mean < 2.0
