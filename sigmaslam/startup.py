@@ -12,9 +12,9 @@ from sigmaslam.chi_square import CHI_SQUARE_999, CHI_SQUARE_MEDIAN
 from sigmaslam.epipolar import estimate_epipolar_pose
 from sigmaslam.rotation import se3_exp, se3_inverse, skew
 
-# Of P3P, pixels: good matches may be a tenth of what is usual off, and then a slow mover is told by half a pixel.
+# Of P3P, pixels: the second tells what moves slowly from what stands still.
 _THRESHOLDS = (2.0, 0.5)
-# Matches may be as much better than they claim, as a factor of variances.
+# By how much matches may be better than they claim, as a factor of variances.
 _LEAST_SCALE = 1.0 / 16.0
 _LEAST_POINTS = 8
 # Of the refinement: steps, and scale of the robust loss in standard deviations, from the first to the last.
