@@ -77,7 +77,7 @@ def estimate_relative_pose(
         _from_essential(camera, points, near, landmarks[:, :2], measurement[:, :2], probability, noise[:, :2, :2]),
         *(_from_points(camera, near_points, near_pixels, threshold) for threshold in _THRESHOLDS),
     ]
-    guesses = [guess for guess in tried if guess is not None]
+    guesses = [guess for guess in tried if guess is not None and np.isfinite(guess).all()]
     if not guesses:
         return None
     scale = min(_common_scale(views, guess) for guess in guesses)
