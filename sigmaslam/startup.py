@@ -80,12 +80,16 @@ def estimate_relative_pose(
     guesses = [guess for guess in tried if guess is not None and np.isfinite(guess).all()]
     if not guesses:
         return None
-    scale = min(_common_scale(views, guess) for guess in guesses)
+    scale = min(_agreed_scale(views.weight, _squared_errors(views, guess)) for guess in guesses)
     refined = [T for guess in guesses if (T := _refine(views, guess, scale)) is not None]
     if not refined:
         return None
-    scale = min(_common_scale(views, T) for T in refined)
-    return _agreed(views, min(refined, key=lambda T: _misfit(views, T, scale)), scale)
+    errors = [_squared_errors(views, T) for T in refined]
+    scale = min(_agreed_scale(views.weight, squared) for squared in errors)
+    # Squared errors in sigmas by the points' weights, at most a gate's each.
+    misfit = [float(views.weight @ np.minimum(squared / scale, CHI_SQUARE_999[3])) for squared in errors]
+    best = int(np.argmin(misfit))
+    return _agreed(views, refined[best], errors[best], scale)
 
 
 def _from_essential(
@@ -221,25 +225,19 @@ def _squared_errors(views: _Views, T_camera_key: np.ndarray) -> np.ndarray:
     return np.where(np.trace(information, axis1=1, axis2=2) > 0, squared, np.inf)
 
 
-def _common_scale(views: _Views, T_camera_key: np.ndarray) -> float:
+def _agreed_scale(weight: np.ndarray, squared: np.ndarray) -> float:
     """How much smaller than claimed the variances of most points are, by the median of their errors; 1 at most."""
-    squared = _squared_errors(views, T_camera_key)
     order = np.argsort(squared)
-    half = np.searchsorted(np.cumsum(views.weight[order]), 0.5 * views.weight.sum())
+    half = np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum())
     return float(np.clip(squared[order[half]] / CHI_SQUARE_MEDIAN[3], _LEAST_SCALE, 1.0))
 
 
-def _misfit(views: _Views, T_camera_key: np.ndarray, scale: float) -> float:
-    """Squared errors in sigmas by the points' weights, at most a gate's each."""
-    return float(views.weight @ np.minimum(_squared_errors(views, T_camera_key) / scale, CHI_SQUARE_999[3]))
-
-
-def _agreed(views: _Views, T_camera_key: np.ndarray, scale: float) -> RelativePose | None:
-    """The pose with what agrees with it, and its covariance as the points claim theirs."""
-    _, by_pose, information = views.linearise(T_camera_key)
-    inliers = (views.weight > 0) & (_squared_errors(views, T_camera_key) < scale * CHI_SQUARE_999[3])
+def _agreed(views: _Views, T_camera_key: np.ndarray, squared: np.ndarray, scale: float) -> RelativePose | None:
+    """The pose with what agrees with it by its squared errors (M,), and its covariance as the points claim theirs."""
+    inliers = (views.weight > 0) & (squared < scale * CHI_SQUARE_999[3])
     if inliers.sum() < _LEAST_POINTS:
         return None
+    _, by_pose, information = views.linearise(T_camera_key)
     agreeing = by_pose[inliers]
     normal = (agreeing.transpose(0, 2, 1) @ information[inliers] @ agreeing).sum(axis=0)
     if not np.linalg.cond(normal) < _WORST_CONDITION:
