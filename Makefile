@@ -1,9 +1,14 @@
 # `make demo` and `make test` need Python 3.11-3.13 with venv, and nothing else.
 PYTHON ?= python3
 VENV ?= .venv
-# For example `-c requirements.lock`, the exact versions that CI runs with (Python 3.11).
-INSTALL_FLAGS ?=
-DATA := $(or $(SIGMASLAM_DATA),$(wildcard ../shared/data))
+# The exact versions that CI runs with; empty: the newest ones that pyproject.toml allows.
+INSTALL_FLAGS ?= --constraint requirements.lock
+# Tests on real data read SIGMASLAM_DATA; where it is not set, the folder beside the checkout, if it is there.
+ifeq ($(SIGMASLAM_DATA),)
+ifneq ($(wildcard ../shared/data),)
+export SIGMASLAM_DATA := $(abspath ../shared/data)
+endif
+endif
 
 .PHONY: demo test test-slow lint clean
 
@@ -12,10 +17,10 @@ demo: $(VENV)/.runtime
 
 # One process a core, one thread each.
 test: $(VENV)/.dev
-	OMP_NUM_THREADS=1 SIGMASLAM_DATA="$(DATA)" $(VENV)/bin/python -m pytest --numprocesses auto --dist loadscope
+	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest --numprocesses auto --dist loadscope --durations 20
 
 test-slow: $(VENV)/.dev
-	SIGMASLAM_DATA="$(DATA)" $(VENV)/bin/python -m pytest -m slow
+	$(VENV)/bin/python -m pytest -m slow
 
 lint: $(VENV)/.dev
 	$(VENV)/bin/ruff check .
@@ -29,10 +34,10 @@ $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 
 # The runtime alone: no torch.
-$(VENV)/.runtime: pyproject.toml | $(VENV)/bin/python
+$(VENV)/.runtime: pyproject.toml requirements.lock | $(VENV)/bin/python
 	$(VENV)/bin/python -m pip install --quiet $(INSTALL_FLAGS) --editable .
 	touch $@
 
-$(VENV)/.dev: pyproject.toml | $(VENV)/bin/python
+$(VENV)/.dev: pyproject.toml requirements.lock | $(VENV)/bin/python
 	$(VENV)/bin/python -m pip install --quiet $(INSTALL_FLAGS) --editable ".[dev]"
 	touch $@ $(VENV)/.runtime

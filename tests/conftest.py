@@ -6,13 +6,22 @@ from pathlib import Path
 import pytest
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests that need real data: `-m data` selects them."""
+    for item in items:
+        if "real_data" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.data)
+
+
 @pytest.fixture(scope="session")
 def real_data() -> Path:
-    """Folder of the real data sets; tests that need it are skipped where there is none."""
+    """Absolute path of the real data sets; tests that need them are skipped where SIGMASLAM_DATA is empty or unset."""
     path = os.environ.get("SIGMASLAM_DATA", "")
-    if not path or not Path(path).is_dir():
-        pytest.skip("SIGMASLAM_DATA is not set")
-    return Path(path)
+    if not path:
+        pytest.skip("SIGMASLAM_DATA does not name the folder of the real data sets")
+    if not Path(path).is_dir():
+        pytest.fail(f"SIGMASLAM_DATA is {path}, which is no folder: correct it, or unset it to skip these tests")
+    return Path(path).resolve()
 
 
 @pytest.fixture(scope="session")

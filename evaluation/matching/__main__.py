@@ -8,7 +8,7 @@ import os
 import sys
 from pathlib import Path
 
-from sigmaslam.errors import SigmaSlamError
+from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.evaluation.matching.comparison import compare
 from sigmaslam.evaluation.matching.extractors import CLASSICAL
 from sigmaslam.evaluation.matching.run import format_scores
@@ -32,9 +32,11 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
     arguments = parser.parse_args()
     try:
-        data = Path(os.environ.get("SIGMASLAM_DATA", ""))
+        data = os.environ.get("SIGMASLAM_DATA")
+        if not data:
+            raise InputError("the folder of the real data sets is not known: set SIGMASLAM_DATA")
         names = [*CLASSICAL, *map(str, arguments.weights)]
-        results = compare(names, arguments.sets.split(","), data, lambda text: print(text, file=sys.stderr))
+        results = compare(names, arguments.sets.split(","), Path(data), lambda text: print(text, file=sys.stderr))
     except SigmaSlamError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)

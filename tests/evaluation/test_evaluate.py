@@ -1,5 +1,4 @@
 import json
-import os
 import shutil
 from pathlib import Path
 
@@ -10,13 +9,6 @@ from sigmaslam.errors import InputError
 from sigmaslam.evaluation.evaluate import evaluate_run, format_evaluation
 from sigmaslam.rotation import se3_adjoint, se3_exp, se3_inverse
 from sigmaslam.trajectory import Trajectory, read_kitti, read_trajectory, write_kitti, write_tum
-
-
-def _data(name: str) -> Path:
-    folder = Path(os.environ.get("SIGMASLAM_DATA", "shared/data")) / name
-    if not folder.exists():
-        pytest.skip(f"{folder} is not there; set SIGMASLAM_DATA")
-    return folder
 
 
 def make_run(folder: Path, truth: Trajectory, seed: int = 0) -> None:
@@ -34,9 +26,9 @@ def make_run(folder: Path, truth: Trajectory, seed: int = 0) -> None:
 
 
 @pytest.fixture
-def drive(tmp_path) -> tuple[Path, Path]:
+def drive(real_data: Path, tmp_path) -> tuple[Path, Path]:
     """A run folder over real KITTI motion, and the truth with its times."""
-    source = _data("kitti_raw_0926_0039_a")
+    source = real_data / "kitti_raw_0926_0039_a"
     (tmp_path / "run").mkdir()
     make_run(tmp_path / "run", read_trajectory(source / "poses.txt"))
     return tmp_path / "run", source / "poses.txt"
@@ -86,8 +78,8 @@ def test_missing_frames_lower_the_coverage(drive):
     assert evaluate_run(run, truth, plot=False).coverage == 156 / 186
 
 
-def test_kitti_truth_without_times_is_paired_by_index_when_counts_agree(tmp_path):
-    truth = read_kitti(_data("kitti_gt_trajectories") / "04.txt")
+def test_kitti_truth_without_times_is_paired_by_index_when_counts_agree(real_data: Path, tmp_path):
+    truth = read_kitti(real_data / "kitti_gt_trajectories" / "04.txt")
     write_kitti(tmp_path / "truth.txt", truth)
     write_tum(tmp_path / "estimate.tum", Trajectory(1.4e9 + 0.1036 * np.arange(len(truth)), truth.poses))
     evaluation = evaluate_run(tmp_path / "estimate.tum", tmp_path / "truth.txt")
@@ -97,8 +89,8 @@ def test_kitti_truth_without_times_is_paired_by_index_when_counts_agree(tmp_path
     assert (tmp_path / "evaluation.png").is_file()
 
 
-def test_kitti_truth_without_times_never_pairs_wrong_frames(tmp_path):
-    truth = read_kitti(_data("kitti_gt_trajectories") / "04.txt")
+def test_kitti_truth_without_times_never_pairs_wrong_frames(real_data: Path, tmp_path):
+    truth = read_kitti(real_data / "kitti_gt_trajectories" / "04.txt")
     write_kitti(tmp_path / "truth.txt", truth)
     kept = np.arange(0, 260)
     write_tum(tmp_path / "at_10_hz.tum", truth.subset(kept))
@@ -109,16 +101,16 @@ def test_kitti_truth_without_times_never_pairs_wrong_frames(tmp_path):
         evaluate_run(tmp_path / "drifting.tum", tmp_path / "truth.txt", plot=False)
 
 
-def test_euroc_truth_at_its_own_rate(tmp_path):
-    truth_path = _data("euroc_v1_01_keyframes_a") / "groundtruth.csv"
+def test_euroc_truth_at_its_own_rate(real_data: Path, tmp_path):
+    truth_path = real_data / "euroc_v1_01_keyframes_a" / "groundtruth.csv"
     write_tum(tmp_path / "estimate.tum", read_trajectory(truth_path))
     evaluation = evaluate_run(tmp_path / "estimate.tum", truth_path)
     assert (evaluation.matched, evaluation.frames) == (60, 60)
     assert evaluation.ate.rmse == pytest.approx(0, abs=1e-9)
 
 
-def test_standing_still_has_no_segments(tmp_path):
-    truth_path = _data("euroc_v1_01_static") / "groundtruth.csv"
+def test_standing_still_has_no_segments(real_data: Path, tmp_path):
+    truth_path = real_data / "euroc_v1_01_static" / "groundtruth.csv"
     write_tum(tmp_path / "estimate.tum", read_trajectory(truth_path))
     evaluation = evaluate_run(tmp_path / "estimate.tum", truth_path)
     assert evaluation.to_dict()["kitti"]["mean_translation_percent"] is None

@@ -234,3 +234,14 @@ def test_the_command_says_what_is_missing(
         main()
     assert stopped.value.code == 2
     assert "does not hold denoising" in capsys.readouterr().err
+
+
+def test_without_a_folder_of_data_the_command_does_not_look_in_the_current_one(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setenv("SIGMASLAM_DATA", "")
+    monkeypatch.setattr("sys.argv", ["matching"])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 2
+    assert "set SIGMASLAM_DATA" in capsys.readouterr().err

@@ -1,4 +1,3 @@
-import os
 from pathlib import Path
 
 import numpy as np
@@ -24,12 +23,9 @@ from sigmaslam.trajectory import Trajectory, read_kitti
 
 
 @pytest.fixture(scope="module")
-def truth() -> Trajectory:
+def truth(real_data: Path) -> Trajectory:
     """Real motion of a car, 1201 poses, 920 m."""
-    folder = Path(os.environ.get("SIGMASLAM_DATA", "shared/data")) / "kitti_gt_trajectories"
-    if not folder.exists():
-        pytest.skip(f"{folder} is not there; set SIGMASLAM_DATA")
-    return read_kitti(folder / "10.txt")
+    return read_kitti(real_data / "kitti_gt_trajectories" / "10.txt")
 
 
 def _drift(truth: Trajectory, seed: int = 0, translation: float = 0.02, rotation: float = 1e-3) -> Trajectory:

@@ -1,5 +1,4 @@
 import logging
-import os
 import threading
 from pathlib import Path
 
@@ -12,9 +11,6 @@ from sigmaslam.camera import CameraModel, StereoCamera
 from sigmaslam.errors import CalibrationError, InputError
 from sigmaslam.readers import StereoFrame, open_sequence
 from sigmaslam.readers.sequence import READ_AHEAD, read_ahead
-
-DATA = Path(os.environ.get("SIGMASLAM_DATA", "/nonexistent"))
-needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="SIGMASLAM_DATA is not set")
 
 WIDTH, HEIGHT = 64, 48
 
@@ -100,9 +96,8 @@ def reader_threads():
 # Real data
 
 
-@needs_data
-def test_kitti_odometry_folder():
-    sequence = open_sequence(DATA / "kitti_odometry_01_f000_050")
+def test_kitti_odometry_folder(real_data: Path):
+    sequence = open_sequence(real_data / "kitti_odometry_01_f000_050")
     assert (sequence.format, sequence.length, sequence.skipped) == ("kitti", 51, [])
     assert sequence.camera.is_rectified
     assert sequence.camera.left == CameraModel(1241, 376, 718.856, 718.856, 607.1928, 185.2157)
@@ -113,9 +108,8 @@ def test_kitti_odometry_folder():
     assert frame.left.dtype == np.uint8
 
 
-@needs_data
-def test_kitti_raw_folder_keeps_its_gap():
-    folder = DATA / "kitti_raw_0926_0039_a"
+def test_kitti_raw_folder_keeps_its_gap(real_data: Path):
+    folder = real_data / "kitti_raw_0926_0039_a"
     sequence = open_sequence(folder)
     assert sequence.length == 186
     steps = np.diff(sequence.timestamps)
@@ -126,9 +120,8 @@ def test_kitti_raw_folder_keeps_its_gap():
     assert sequence.camera.baseline == pytest.approx(0.53715, abs=1e-5)
 
 
-@needs_data
-def test_kitti_unrectified_folder_takes_the_original_intrinsics(caplog):
-    folder = DATA / "kitti_raw_0926_0039_a"
+def test_kitti_unrectified_folder_takes_the_original_intrinsics(real_data: Path, caplog):
+    folder = real_data / "kitti_raw_0926_0039_a"
     sequence = open_sequence(folder / "raw_unrectified", calibration=folder / "calib_cam_to_cam.txt")
     assert (sequence.camera.left.distortion_model, sequence.camera.left.width) == ("radtan", 1392)
     assert sequence.camera.baseline == pytest.approx(0.5372, abs=1e-3)
@@ -136,9 +129,8 @@ def test_kitti_unrectified_folder_takes_the_original_intrinsics(caplog):
     assert "10 Hz" in messages(caplog)[0]
 
 
-@needs_data
-def test_euroc_asl_folder():
-    sequence, frames = read_all(DATA / "euroc_v1_01_static")
+def test_euroc_asl_folder(real_data: Path):
+    sequence, frames = read_all(real_data / "euroc_v1_01_static")
     assert (sequence.format, len(frames), sequence.skipped) == ("euroc", 12, [])
     assert sequence.camera.baseline == pytest.approx(0.11008, abs=1e-5)
     assert sequence.camera.left.distortion == (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05)
@@ -147,9 +139,8 @@ def test_euroc_asl_folder():
     np.testing.assert_allclose(np.diff(sequence.timestamps), 0.05, atol=1e-6)
 
 
-@needs_data
-def test_euroc_flat_folder():
-    sequence = open_sequence(DATA / "euroc_v1_01_keyframes_a")
+def test_euroc_flat_folder(real_data: Path):
+    sequence = open_sequence(real_data / "euroc_v1_01_keyframes_a")
     assert (sequence.format, sequence.length) == ("euroc", 60)
     assert sequence.camera.baseline == pytest.approx(0.11008, abs=1e-5)
     frame = next(sequence.frames())

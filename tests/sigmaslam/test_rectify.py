@@ -1,4 +1,3 @@
-import os
 from pathlib import Path
 
 import cv2
@@ -10,9 +9,6 @@ from sigmaslam.errors import CalibrationError, FrameError
 from sigmaslam.readers import open_sequence
 from sigmaslam.readers.calibration import read_kitti_calibration
 from sigmaslam.rectify import StereoRectifier
-
-DATA = Path(os.environ.get("SIGMASLAM_DATA", "/nonexistent"))
-needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="SIGMASLAM_DATA is not set")
 
 RADTAN = (-0.28, 0.07, 2e-4, 2e-5)
 
@@ -128,9 +124,8 @@ def test_valid_mask_leaves_out_the_border():
     assert rectifier.valid_mask.mean() > 0.9 * 255
 
 
-@needs_data
-def test_euroc_rows_align():
-    sequence = open_sequence(DATA / "euroc_v1_01_static")
+def test_euroc_rows_align(real_data: Path):
+    sequence = open_sequence(real_data / "euroc_v1_01_static")
     rectifier = StereoRectifier(sequence.camera)
     frame = next(sequence.frames())
     assert rectifier.rectified.baseline == pytest.approx(0.11008, abs=1e-5)
@@ -138,9 +133,8 @@ def test_euroc_rows_align():
     assert rectifier.valid_mask.mean() > 0.9 * 255
 
 
-@needs_data
-def test_kitti_raw_agrees_with_the_published_rectification():
-    folder = DATA / "kitti_raw_0926_0039_a"
+def test_kitti_raw_agrees_with_the_published_rectification(real_data: Path):
+    folder = real_data / "kitti_raw_0926_0039_a"
     camera = read_kitti_calibration(folder / "calib_cam_to_cam.txt", (1392, 512), (0, 1))
     rectifier = StereoRectifier(camera)
     assert rectifier.rectified.baseline == pytest.approx(0.53715, abs=5e-4)

@@ -1,4 +1,3 @@
-import os
 import shutil
 from pathlib import Path
 
@@ -21,13 +20,6 @@ from sigmaslam.trajectory import (
     write_kitti,
     write_tum,
 )
-
-
-def _data(name: str) -> Path:
-    folder = Path(os.environ.get("SIGMASLAM_DATA", "shared/data")) / name
-    if not folder.exists():
-        pytest.skip(f"{folder} is not there; set SIGMASLAM_DATA")
-    return folder
 
 
 def _trajectory(count: int = 20, origin: float = 1403715273.262142976) -> Trajectory:
@@ -74,23 +66,23 @@ def test_kitti_without_times_is_10_hz(tmp_path):
     np.testing.assert_allclose(read_kitti(tmp_path / "poses.txt").timestamps, [0, 0.1, 0.2, 0.3])
 
 
-def test_real_kitti_poses_become_orthonormal():
-    trajectory = read_trajectory(_data("kitti_gt_trajectories") / "07.txt")
+def test_real_kitti_poses_become_orthonormal(real_data: Path):
+    trajectory = read_trajectory(real_data / "kitti_gt_trajectories" / "07.txt")
     assert len(trajectory) == 1101
     assert trajectory.path_length == pytest.approx(694.7, abs=0.1)
     gram = np.swapaxes(trajectory.rotations, 1, 2) @ trajectory.rotations
     np.testing.assert_allclose(gram, np.tile(np.eye(3), (1101, 1, 1)), atol=1e-14)
 
 
-def test_real_kitti_raw_takes_times_beside():
-    trajectory = read_trajectory(_data("kitti_raw_0926_0039_a") / "poses.txt")
+def test_real_kitti_raw_takes_times_beside(real_data: Path):
+    trajectory = read_trajectory(real_data / "kitti_raw_0926_0039_a" / "poses.txt")
     assert trajectory.timestamps[1] == 0.103361
     assert trajectory.path_length == pytest.approx(154, abs=1)
 
 
 @pytest.mark.parametrize("name", ["euroc_v1_01_keyframes_a", "euroc_v1_01_static"])
-def test_real_euroc_truth_is_of_the_camera(name):
-    path = _data(name) / "groundtruth.csv"
+def test_real_euroc_truth_is_of_the_camera(real_data: Path, name):
+    path = real_data / name / "groundtruth.csv"
     assert trajectory_format(path) == "euroc"
     trajectory = read_trajectory(path)
     assert len(trajectory) == {"euroc_v1_01_keyframes_a": 60, "euroc_v1_01_static": 12}[name]
@@ -104,8 +96,8 @@ def test_real_euroc_truth_is_of_the_camera(name):
     np.testing.assert_allclose(trajectory.positions[0], expected, atol=1e-9)
 
 
-def test_official_euroc_layout_equals_the_excerpt(tmp_path):
-    source = _data("euroc_v1_01_static")
+def test_official_euroc_layout_equals_the_excerpt(real_data: Path, tmp_path):
+    source = real_data / "euroc_v1_01_static"
     state, camera = tmp_path / "mav0/state_groundtruth_estimate0", tmp_path / "mav0/cam0"
     state.mkdir(parents=True)
     camera.mkdir()
