@@ -18,7 +18,7 @@ from sigmaslam.config import TrackerConfig
 from sigmaslam.errors import InputError
 from sigmaslam.estimate import Estimate
 from sigmaslam.frame_fit import FrameFit
-from sigmaslam.frontend import StereoView, TemporalMatches
+from sigmaslam.frontend import Frontend, StereoView, TemporalMatches
 from sigmaslam.landmarks import PointMap
 from sigmaslam.object_region import BodyShape, inner_half, pixels_in
 from sigmaslam.rotation import se3_inverse, turn_covariance
@@ -86,7 +86,7 @@ class ObjectTracker(StereoTracker):
         self,
         camera: StereoCamera,
         region: np.ndarray,
-        frontend: str = "learned",
+        frontend: Frontend | str = "learned",
         backend: str = "onnx",
         config: TrackerConfig | None = None,
     ) -> None:

@@ -15,7 +15,7 @@ from sigmaslam.config import TrackerConfig
 from sigmaslam.errors import InputError
 from sigmaslam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.frame_fit import FrameFit
-from sigmaslam.frontend import StereoView, build_frontend
+from sigmaslam.frontend import Frontend, StereoView, build_frontend
 from sigmaslam.frontend.planes import disparity_slopes
 from sigmaslam.frontend.relief import patch_relief
 from sigmaslam.keyframes import Keyframes
@@ -66,7 +66,7 @@ class StereoTracker:
 
     Args:
         camera: calibration of the raw images; they are rectified here.
-        frontend: "learned", "sift", "orb" or "klt".
+        frontend: "learned", "sift", "orb", "klt", or one of your own.
         backend: "onnx", or "torch" (needs the extra `train`).
         config: settings.
     """
@@ -74,7 +74,7 @@ class StereoTracker:
     def __init__(
         self,
         camera: StereoCamera,
-        frontend: str = "learned",
+        frontend: Frontend | str = "learned",
         backend: str = "onnx",
         config: TrackerConfig | None = None,
     ) -> None:
@@ -83,7 +83,9 @@ class StereoTracker:
         self._camera = self._rectifier.rectified
         self._T_rectified_left = np.eye(4)
         self._T_rectified_left[:3, :3] = self._rectifier.R_rectified_left
-        self._frontend = build_frontend(frontend, self.config.max_keypoints, backend)
+        if isinstance(frontend, str):
+            frontend = build_frontend(frontend, self.config.max_keypoints, backend)
+        self._frontend = frontend
         turn = self.config.turn_sigma
         self._window = KeyframeWindow(
             self._camera,

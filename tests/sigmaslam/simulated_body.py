@@ -133,9 +133,8 @@ def box_around(pose: np.ndarray, grown: float = 1.0) -> np.ndarray:
 
 
 def follow(body: SimulatedBody, region: np.ndarray) -> tuple[ObjectTracker, list[ObjectEstimate]]:
-    """All frames through a fresh tracker whose front end is replaced."""
-    tracker = ObjectTracker(body.camera, region, "klt")
-    tracker._frontend = tracker._search._frontend = body
+    """All frames through a fresh tracker with that front end."""
+    tracker = ObjectTracker(body.camera, region, body)
     images = [image_of(k, WIDTH, HEIGHT) for k in range(len(body.poses))]
     return tracker, [tracker.step(image, image, k * INTERVAL) for k, image in enumerate(images)]
 

@@ -214,8 +214,7 @@ class SimulatedRun:
 def run_simulated(
     tracker: StereoTracker, frontend: SimulatedFrontend, scale: Scale, frames: int | None = None
 ) -> SimulatedRun:
-    """All frames through a fresh tracker whose front end is replaced."""
-    tracker._frontend = tracker._search._frontend = frontend
+    """All frames through a fresh tracker with that front end."""
     estimates = []
     for k in range(frames or len(frontend.poses)):
         image = frontend.images(k)

@@ -49,7 +49,7 @@ class Lap:
 def drive(seed: int, closed: bool = True, wrong: bool = False) -> Lap:
     """Around once, with loops or without, or with matches of old keyframes that are 5 m off."""
     frontend = LapFrontend(SCALE, seed, FRAMES, 100, offset=OFFSET)
-    tracker = StereoTracker(frontend.camera, "klt")
+    tracker = StereoTracker(frontend.camera, frontend)
     if not closed:
         # Old keyframes are looked for all the same, so that the noise is that of the other runs.
         tracker._window.tie = lambda *arguments: False  # type: ignore[method-assign]

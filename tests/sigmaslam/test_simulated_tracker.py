@@ -14,7 +14,7 @@ NEES_95 = 12.592 / 6
 def simulate(kind: str, seed: int, frames: int, points: int = 150, outliers: float = 0.0) -> SimulatedRun:
     scale = SCALES[kind]
     frontend = SimulatedFrontend(scale, seed, frames, points, offset=OFFSET, outliers=outliers)
-    return run_simulated(StereoTracker(frontend.camera, "klt"), frontend, scale)
+    return run_simulated(StereoTracker(frontend.camera, frontend), frontend, scale)
 
 
 def assert_always_tracking(run: SimulatedRun) -> None:
