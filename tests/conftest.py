@@ -5,6 +5,9 @@ from pathlib import Path
 
 import pytest
 
+# Comparisons that fail there show their two sides, as those in tests do.
+pytest.register_assert_rewrite("tests.support")
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the tests that need real data: `-m data` selects them."""

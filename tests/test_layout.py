@@ -1,5 +1,6 @@
-"""The package list, the folders and the links agree; lower layers do not import upper ones."""
+"""The package list, the folders and the links agree; lower layers and tests import what they may."""
 
+import ast
 import re
 import tomllib
 from pathlib import Path
@@ -56,3 +57,22 @@ def test_lower_layers_do_not_import_upper_ones(layer: str):
 @pytest.mark.parametrize("path", sorted(p for n in ("sigmaslam", *MAPPED) for p in (ROOT / n).glob("*.py")), ids=str)
 def test_imports_are_absolute(path: Path):
     assert not re.search(r"^from \.", path.read_text(), re.MULTILINE)
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "tests").rglob("*.py")), ids=lambda path: path.name)
+def test_tests_share_through_the_support_package_alone(path: Path):
+    """No test imports another one, nor a file beside it by its bare name."""
+    siblings = {each.stem for each in path.parent.iterdir() if each.suffix == ".py" or each.is_dir()} - {"sigmaslam"}
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"line {node.lineno}: import from the root on, as tests.support"
+            modules = [node.module or "", *(f"{node.module}.{name.name}" for name in node.names)]
+        elif isinstance(node, ast.Import):
+            modules = [name.name for name in node.names]
+        else:
+            continue
+        for module in modules:
+            parts = module.split(".")
+            assert parts[0] not in siblings, f"line {node.lineno} imports {module}, a file beside it: use tests.support"
+            parts = parts[1:] if parts[0] == "tests" else parts[:1]
+            assert not any(part.startswith("test_") for part in parts), f"line {node.lineno} imports the test {module}"

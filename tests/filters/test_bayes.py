@@ -3,18 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from builders import (
-    assert_close,
-    assert_same_belief,
-    assert_same_update,
-    beliefs,
-    bent_measurement,
-    bent_motion,
-    covariances,
-    noises,
-    random_numbers,
-    tensor,
-)
 from scipy.stats import multivariate_normal
 from torch import Tensor
 
@@ -33,6 +21,18 @@ from sigmaslam.filters import (
     cubature,
     julier,
     merwe,
+)
+from tests.support.filter_builders import (
+    assert_close,
+    assert_same_belief,
+    assert_same_update,
+    beliefs,
+    bent_measurement,
+    bent_motion,
+    covariances,
+    noises,
+    random_numbers,
+    tensor,
 )
 
 SIGMA_SETS = {"cubature": cubature(), "julier": julier(1.0), "merwe": merwe(1.0, 2.0), "simplex": Simplex()}

@@ -2,11 +2,11 @@ import math
 
 import pytest
 import torch
-from builders import random_numbers, tensor
 from torch import Tensor
 
 from sigmaslam.filters.constant_velocity import POSE, STATE_SIZE, TWIST, Predict
 from sigmaslam.filters.lie import adjoint_se3, exp_se3, invert_se3, log_se3
+from tests.support.filter_builders import random_numbers, tensor
 
 NO_NOISE = torch.zeros(2, dtype=torch.float64)
 State = tuple[Tensor, Tensor, Tensor]

@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from builders import assert_close, beliefs, bent_measurement, bent_motion, covariances, random_numbers, tensor
 from torch import Tensor
 
 from sigmaslam.filters import (
@@ -17,6 +16,15 @@ from sigmaslam.filters import (
     small,
 )
 from sigmaslam.filters.noise import Noise
+from tests.support.filter_builders import (
+    assert_close,
+    beliefs,
+    bent_measurement,
+    bent_motion,
+    covariances,
+    random_numbers,
+    tensor,
+)
 
 COUNT = 150
 SIZES = [1, 2, 3, 4, 5, 6, 8]

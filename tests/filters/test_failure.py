@@ -2,17 +2,6 @@
 
 import pytest
 import torch
-from builders import (
-    assert_close,
-    assert_same_belief,
-    assert_same_update,
-    beliefs,
-    bent_measurement,
-    bent_motion,
-    covariances,
-    random_numbers,
-    tensor,
-)
 from torch import Tensor
 
 from sigmaslam.filters import (
@@ -30,6 +19,17 @@ from sigmaslam.filters import (
     julier,
 )
 from sigmaslam.filters.factors import cholesky
+from tests.support.filter_builders import (
+    assert_close,
+    assert_same_belief,
+    assert_same_update,
+    beliefs,
+    bent_measurement,
+    bent_motion,
+    covariances,
+    random_numbers,
+    tensor,
+)
 
 FORMS = ("dense", "low-rank", "qr")
 BAD = 7

@@ -5,16 +5,6 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from builders import (
-    assert_close,
-    assert_same_belief,
-    beliefs,
-    bent_measurement,
-    bent_motion,
-    covariances,
-    random_numbers,
-    tensor,
-)
 from torch import Tensor
 
 from sigmaslam.filters import (
@@ -31,6 +21,16 @@ from sigmaslam.filters import (
     Track,
     UnscentedKalmanFilter,
     julier,
+)
+from tests.support.filter_builders import (
+    assert_close,
+    assert_same_belief,
+    beliefs,
+    bent_measurement,
+    bent_motion,
+    covariances,
+    random_numbers,
+    tensor,
 )
 
 # Annual flow at Aswan, 1871-1970, 1e8 m^3 (Cobb 1978).

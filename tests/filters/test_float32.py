@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import pytest
 import torch
-from builders import random_numbers, tensor
 from torch import Tensor
 
 from sigmaslam.filters import (
@@ -22,6 +21,7 @@ from sigmaslam.filters import (
     MeasurementModel,
     UnscentedKalmanFilter,
 )
+from tests.support.filter_builders import random_numbers, tensor
 
 RUNS = 64
 

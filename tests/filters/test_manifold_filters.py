@@ -4,7 +4,6 @@ import math
 
 import pytest
 import torch
-from builders import assert_close, assert_same_belief, covariances, random_numbers, tensor
 from torch import Tensor
 
 from sigmaslam.filters import (
@@ -25,6 +24,7 @@ from sigmaslam.filters import (
     merwe,
     wrap_angle,
 )
+from tests.support.filter_builders import assert_close, assert_same_belief, covariances, random_numbers, tensor
 
 SPACES: dict[str, Manifold] = {
     "SO2": SO2(),

@@ -4,7 +4,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from builders import covariances, random_numbers, tensor
 from torch import Generator, Tensor
 
 from sigmaslam.evaluation.benchmarks import filter_work
@@ -42,6 +41,7 @@ from sigmaslam.filters.systems import (
     range_and_bearing,
     stereo_measurement,
 )
+from tests.support.filter_builders import covariances, random_numbers, tensor
 
 EKF = ExtendedKalmanFilter(iterations=1)
 CUBATURE = UnscentedKalmanFilter(iterations=1)

@@ -4,7 +4,6 @@ import math
 
 import pytest
 import torch
-from builders import assert_close, beliefs, covariances, random_numbers, tensor
 from torch import Tensor
 
 from sigmaslam.filters import (
@@ -21,6 +20,7 @@ from sigmaslam.filters import (
     merwe,
 )
 from sigmaslam.filters.sigma_points import SigmaPoints
+from tests.support.filter_builders import assert_close, beliefs, covariances, random_numbers, tensor
 
 SETS = {
     "cubature": cubature(),

@@ -4,17 +4,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from builders import (
-    assert_close,
-    assert_same_belief,
-    assert_same_update,
-    beliefs,
-    bent_measurement,
-    bent_motion,
-    covariances,
-    noises,
-    random_numbers,
-)
 
 from sigmaslam.filters import (
     BayesFilter,
@@ -28,6 +17,17 @@ from sigmaslam.filters import (
     UnscentedKalmanFilter,
     julier,
     merwe,
+)
+from tests.support.filter_builders import (
+    assert_close,
+    assert_same_belief,
+    assert_same_update,
+    beliefs,
+    bent_measurement,
+    bent_motion,
+    covariances,
+    noises,
+    random_numbers,
 )
 
 FORMS = ("dense", "low-rank", "qr")

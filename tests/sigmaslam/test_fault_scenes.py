@@ -7,7 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_faults import assert_honest, statuses, track
+
+from tests.support.estimates import statuses, track
+from tests.support.faults import assert_honest
 
 torch = pytest.importorskip("torch")
 
@@ -16,7 +18,7 @@ from sigmaslam.rotation import se3_inverse  # noqa: E402
 from sigmaslam.synthetic.paths import Path  # noqa: E402
 from sigmaslam.synthetic.sensor import expose  # noqa: E402
 from sigmaslam.synthetic.simulation import Recipe, Simulation, Studio, simulate  # noqa: E402
-from sigmaslam.tracker import Estimate  # noqa: E402
+from sigmaslam.tracker import Estimate, StereoTracker  # noqa: E402
 
 
 def filmed(simulation: Simulation) -> tuple[list[StereoFrame], np.ndarray]:
@@ -40,7 +42,7 @@ def filmed(simulation: Simulation) -> tuple[list[StereoFrame], np.ndarray]:
 def tracked(simulation: Simulation, frames: list[StereoFrame]) -> tuple[list[Estimate], np.ndarray]:
     """Estimates, and the true poses in the world of the first one."""
     poses = simulation.path.poses(simulation.times)
-    return track(simulation.rig.calibrated, frames), se3_inverse(poses[0]) @ poses
+    return track(StereoTracker(simulation.rig.calibrated), frames), se3_inverse(poses[0]) @ poses
 
 
 def passing(simulation: Simulation, begins: float, aside: float) -> Simulation:

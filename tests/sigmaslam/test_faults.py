@@ -1,64 +1,18 @@
 """Faults injected into the rendered sequence: the right status, and never a confident wrong pose."""
 
-from collections.abc import Callable, Iterable
-from pathlib import Path
+from collections.abc import Callable
 
 import cv2
 import numpy as np
 import pytest
 
-from sigmaslam import StereoTracker, open_sequence
-from sigmaslam.camera import StereoCamera
+from sigmaslam import StereoTracker
 from sigmaslam.errors import InputError
 from sigmaslam.readers import StereoFrame
 from sigmaslam.rotation import se3_exp, se3_inverse, se3_log
-from sigmaslam.tracker import Estimate
-from sigmaslam.trajectory import read_kitti
-
-WITHIN_3_SIGMA = 22.46  # chi-square, 6 dof, 99.9 %
-Pair = tuple[np.ndarray, np.ndarray]
-Demo = tuple[StereoCamera, list[StereoFrame], np.ndarray]
-
-
-@pytest.fixture(scope="module")
-def demo(demo_sequence: Path) -> Demo:
-    sequence = open_sequence(demo_sequence)
-    return sequence.camera, list(sequence.frames()), read_kitti(demo_sequence / "poses.txt").poses
-
-
-def broken(frames: list[StereoFrame], which: Iterable[int], fault: Callable[[StereoFrame], Pair]) -> list[StereoFrame]:
-    chosen = set(which)
-    return [StereoFrame(f.index, f.timestamp, *fault(f)) if k in chosen else f for k, f in enumerate(frames)]
-
-
-def track(camera: StereoCamera, frames: list[StereoFrame]) -> list[Estimate]:
-    tracker = StereoTracker(camera)
-    return [tracker.step(frame.left, frame.right, frame.timestamp) for frame in frames]
-
-
-def squared_sigmas(estimate: Estimate, truth: np.ndarray) -> float:
-    """Squared error in the body frame by the covariance that is claimed."""
-    error = se3_log(se3_inverse(estimate.T_world_camera) @ truth)
-    return float(error @ np.linalg.solve(estimate.covariance, error))
-
-
-def assert_honest(estimates: list[Estimate], truth: np.ndarray) -> None:
-    """Every frame is lost or starting, or right within three sigma."""
-    wrong = {
-        k: round(distance, 1)
-        for k, estimate in enumerate(estimates)
-        if estimate.status not in ("lost", "starting")
-        and not (distance := squared_sigmas(estimate, truth[k])) < WITHIN_3_SIGMA
-    }
-    assert not wrong, f"confident and wrong: squared sigmas by frame {wrong}"
-
-
-def statuses(estimates: list[Estimate]) -> list[str]:
-    return [estimate.status for estimate in estimates]
-
-
-def sigma(estimate: Estimate) -> float:
-    return float(np.sqrt(np.trace(estimate.covariance[:3, :3])))
+from tests.support.estimates import Demo, position_sigma, squared_error, statuses, track
+from tests.support.faults import Pair, assert_honest, broken
+from tests.support.quantiles import WITHIN_3_SIGMA
 
 
 def noise(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
@@ -83,10 +37,10 @@ def covered(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
 def test_a_second_of_black_is_lost_and_ends(demo: Demo):
     camera, frames, truth = demo
     black = np.zeros_like(frames[0].left)
-    estimates = track(camera, broken(frames, range(10, 30), lambda frame: (black, black)))
+    estimates = track(StereoTracker(camera), broken(frames, range(10, 30), lambda frame: (black, black)))
     assert statuses(estimates[10:30]) == ["lost"] * 20
-    assert (np.diff([sigma(estimate) for estimate in estimates[9:30]]) > 0).all()
-    assert all(squared_sigmas(estimates[k], truth[k]) < WITHIN_3_SIGMA for k in range(10, 30))
+    assert (np.diff([position_sigma(estimate) for estimate in estimates[9:30]]) > 0).all()
+    assert all(squared_error(estimates[k], truth[k]) < WITHIN_3_SIGMA for k in range(10, 30))
     assert statuses(estimates[30:]) == ["tracking"] * 10
     assert_honest(estimates, truth)
 
@@ -101,10 +55,12 @@ def test_noise_only_images_are_lost(demo: Demo, texture: Callable[..., np.ndarra
     camera, frames, truth = demo
     rng = np.random.default_rng(3)
     shape = frames[0].left.shape
-    estimates = track(camera, broken(frames, range(10, 25), lambda frame: (texture(shape, rng), texture(shape, rng))))
+    estimates = track(
+        StereoTracker(camera), broken(frames, range(10, 25), lambda frame: (texture(shape, rng), texture(shape, rng)))
+    )
     assert statuses(estimates[10:25]) == ["lost"] * 15
-    assert sigma(estimates[24]) > 10 * sigma(estimates[9])
-    assert all(squared_sigmas(estimates[k], truth[k]) < WITHIN_3_SIGMA for k in range(10, 25))
+    assert position_sigma(estimates[24]) > 10 * position_sigma(estimates[9])
+    assert all(squared_error(estimates[k], truth[k]) < WITHIN_3_SIGMA for k in range(10, 25))
     assert estimates[-1].status == "tracking"
     assert_honest(estimates, truth)
 
@@ -114,7 +70,9 @@ def test_noise_from_the_start_is_no_start(demo: Demo, texture: Callable[..., np.
     camera, frames, truth = demo
     rng = np.random.default_rng(4)
     shape = frames[0].left.shape
-    estimates = track(camera, broken(frames[:10], range(5), lambda frame: (texture(shape, rng), texture(shape, rng))))
+    estimates = track(
+        StereoTracker(camera), broken(frames[:10], range(5), lambda frame: (texture(shape, rng), texture(shape, rng)))
+    )
     assert statuses(estimates) == ["starting"] * 6 + ["tracking"] * 4
     assert_honest(estimates, se3_inverse(truth[5]) @ truth)
 
@@ -127,7 +85,7 @@ def test_noise_from_the_start_is_no_start(demo: Demo, texture: Callable[..., np.
 def test_a_third_of_the_frames_may_drop_out(demo: Demo, seed: int):
     camera, frames, truth = demo
     kept = np.flatnonzero(np.random.default_rng(seed).random(len(frames)) > 0.3)
-    estimates = track(camera, [frames[k] for k in kept])
+    estimates = track(StereoTracker(camera), [frames[k] for k in kept])
     assert statuses(estimates[1:]) == ["tracking"] * (len(kept) - 1)
     assert_honest(estimates, se3_inverse(truth[kept[0]]) @ truth[kept])
 
@@ -142,7 +100,7 @@ def test_time_going_backwards_is_refused_and_the_next_good_frame_tracked(demo: D
     estimates += [tracker.step(frame.left, frame.right, frame.timestamp) for frame in frames[5:9]]
     assert statuses(estimates[1:]) == ["tracking"] * 8
     assert_honest(estimates, truth)
-    untroubled = track(camera, frames[:9])
+    untroubled = track(StereoTracker(camera), frames[:9])
     np.testing.assert_array_equal(estimates[-1].T_world_camera, untroubled[-1].T_world_camera)
 
 
@@ -152,7 +110,7 @@ def test_time_going_backwards_is_refused_and_the_next_good_frame_tracked(demo: D
 @pytest.mark.slow
 def test_swapped_eyes_from_the_start_are_no_start(demo: Demo):
     camera, frames, truth = demo
-    estimates = track(camera, broken(frames[:20], range(10), lambda frame: (frame.right, frame.left)))
+    estimates = track(StereoTracker(camera), broken(frames[:20], range(10), lambda frame: (frame.right, frame.left)))
     assert statuses(estimates) == ["starting"] * 11 + ["tracking"] * 9
     assert_honest(estimates, se3_inverse(truth[10]) @ truth)
 
@@ -160,7 +118,7 @@ def test_swapped_eyes_from_the_start_are_no_start(demo: Demo):
 @pytest.mark.slow
 def test_eyes_swapped_in_mid_run_are_lost_until_they_are_put_right(demo: Demo):
     camera, frames, truth = demo
-    estimates = track(camera, broken(frames, range(12, 28), lambda frame: (frame.right, frame.left)))
+    estimates = track(StereoTracker(camera), broken(frames, range(12, 28), lambda frame: (frame.right, frame.left)))
     assert statuses(estimates[12:28]) == ["lost"] * 16
     assert statuses(estimates[28:]) == ["tracking"] * 12
     assert_honest(estimates, truth)
@@ -176,7 +134,7 @@ def test_with_the_right_eye_covered_the_left_one_goes_on(demo: Demo, cap: str):
         shape = frame.left.shape
         return frame.left, np.full(shape, 128, np.uint8) if cap == "constant" else covered(shape, rng)
 
-    estimates = track(camera, broken(frames, range(12, 22), fault))
+    estimates = track(StereoTracker(camera), broken(frames, range(12, 22), fault))
     assert statuses(estimates[1:]) == ["tracking"] * 39
     assert_honest(estimates, truth)
 
@@ -191,9 +149,9 @@ def test_with_the_left_eye_or_both_covered_the_tracker_is_lost(demo: Demo, eyes:
         dark = covered(frame.left.shape, rng)
         return dark, frame.right if eyes == "left" else covered(frame.left.shape, rng)
 
-    estimates = track(camera, broken(frames, range(12, 22), fault))
+    estimates = track(StereoTracker(camera), broken(frames, range(12, 22), fault))
     assert statuses(estimates[12:22]) == ["lost"] * 10
-    assert all(squared_sigmas(estimates[k], truth[k]) < WITHIN_3_SIGMA for k in range(12, 22))
+    assert all(squared_error(estimates[k], truth[k]) < WITHIN_3_SIGMA for k in range(12, 22))
     assert statuses(estimates[22:]) == ["tracking"] * 18
     assert_honest(estimates, truth)
 
@@ -209,7 +167,9 @@ def test_a_step_of_the_exposure_is_survived(demo: Demo, gain: float):
     def exposed(image: np.ndarray) -> np.ndarray:
         return np.clip(np.rint(gain * image.astype(float)), 0, 255).astype(np.uint8)
 
-    estimates = track(camera, broken(frames, range(12, 40), lambda frame: (exposed(frame.left), exposed(frame.right))))
+    estimates = track(
+        StereoTracker(camera), broken(frames, range(12, 40), lambda frame: (exposed(frame.left), exposed(frame.right)))
+    )
     assert estimates[-1].status == "tracking"
     assert_honest(estimates, truth)
 
@@ -223,7 +183,9 @@ def test_motion_blur_along_a_line_is_survived(demo: Demo, width: int, height: in
     def blurred(image: np.ndarray) -> np.ndarray:
         return cv2.blur(image, (width, height))
 
-    estimates = track(camera, broken(frames, range(12, 18), lambda frame: (blurred(frame.left), blurred(frame.right))))
+    estimates = track(
+        StereoTracker(camera), broken(frames, range(12, 18), lambda frame: (blurred(frame.left), blurred(frame.right)))
+    )
     assert estimates[-1].status == "tracking"
     assert_honest(estimates, truth)
 
@@ -248,7 +210,7 @@ def test_an_exposure_over_five_frames_is_survived(demo: Demo):
     for k in which:
         mean = np.mean([se3_log(se3_inverse(truth[k]) @ truth[j]) for j in range(k - 2, k + 3)], axis=0)
         expected[k] = truth[k] @ se3_exp(mean)
-    estimates = track(camera, broken(frames, which, average))
+    estimates = track(StereoTracker(camera), broken(frames, which, average))
     assert estimates[-1].status == "tracking"
     assert_honest(estimates, expected)
 
@@ -269,7 +231,7 @@ def test_thirty_seconds_without_motion_are_without_drift(demo: Demo):
         return np.clip(np.rint(image + rng.normal(0, 2, image.shape)), 0, 255).astype(np.uint8)
 
     still = [StereoFrame(k, 0.2 * k, noisy(frames[0].left), noisy(frames[0].right)) for k in range(151)]
-    estimates = track(camera, still)
+    estimates = track(StereoTracker(camera), still)
     assert statuses(estimates[1:]) == ["tracking"] * 150
     assert_honest(estimates, np.tile(np.eye(4), (151, 1, 1)))
     errors = np.array([se3_log(estimate.T_world_camera) for estimate in estimates])
@@ -277,6 +239,6 @@ def test_thirty_seconds_without_motion_are_without_drift(demo: Demo):
     assert np.linalg.norm(drift[:3]) < 2e-4
     assert np.rad2deg(np.linalg.norm(drift[3:])) < 0.02
     # The keyframe's own noise is common to all frames and does not average out.
-    claimed = np.array([sigma(estimate) for estimate in estimates[1:]])
+    claimed = np.array([position_sigma(estimate) for estimate in estimates[1:]])
     assert claimed.min() > np.sqrt((errors[1:, :3] ** 2).sum(axis=1).mean())
     assert claimed[-50:].max() < 1.5 * claimed[:50].max()

@@ -9,6 +9,7 @@ from sigmaslam.landmarks import PointMap, map_points, merge_maps
 from sigmaslam.rotation import se3_exp, se3_inverse
 from sigmaslam.tables import Views
 from sigmaslam.window import KeyframeWindow
+from tests.support.quantiles import squared_sigmas
 
 CAMERA = RectifiedStereo(fx=400.0, fy=410.0, cx=319.5, cy=239.5, baseline=0.2, width=640, height=480)
 SIGMA = np.array([0.3, 0.4, 0.5])
@@ -72,8 +73,7 @@ def map_of(window: KeyframeWindow, least_views: int = 1) -> PointMap:
 
 
 def nees(found: PointMap, truth: np.ndarray) -> np.ndarray:
-    error = found.points - world_points(truth)
-    return np.einsum("ki,ki->k", error, np.linalg.solve(found.covariances, error[..., None])[..., 0])
+    return squared_sigmas(found.points - world_points(truth), found.covariances)
 
 
 def refined_by_views(truth: np.ndarray, views: int, seed: int) -> KeyframeWindow:

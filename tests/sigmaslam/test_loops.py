@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from simulated_frontend import SCALES, SimulatedFrontend, run_simulated
 
 from sigmaslam.rotation import nearest_rigid, se3_exp, se3_inverse, se3_log
 from sigmaslam.tracker import StereoTracker
+from tests.support.quantiles import chi_square_median, squared_sigmas
+from tests.support.simulated_frontend import SCALES, SimulatedFrontend, run_simulated
 
 LAP, FRAMES = 180, 220
 SCALE = SCALES["driving"]
@@ -100,13 +101,10 @@ def _points(tracker: StereoTracker, frontend: LapFrontend) -> tuple[float, float
         off = found.points[own] - frontend._points[apart.argmin(axis=1)]
         sure = apart.min(axis=1) < 1.5  # pixels, the keypoint's noise is 0.25: no other point was meant
         error += np.linalg.norm(off[sure], axis=1).tolist()
-        covariances = found.covariances[own][sure]
-        nees += (
-            np.einsum("mi,mi->m", off[sure], np.linalg.solve(covariances, off[sure][..., None])[..., 0]) / 3
-        ).tolist()
+        nees += (squared_sigmas(off[sure], found.covariances[own][sure]) / 3).tolist()
     assert len(error) > 100
-    # The median of a right NEES of three degrees of freedom is 2.366; of a few points another one was meant.
-    return float(np.median(error)), float(np.median(nees)) * 3 / 2.366
+    # A right NEES has the median of chi-square; of a few points another one was meant.
+    return float(np.median(error)), float(np.median(nees)) * 3 / chi_square_median(3)
 
 
 @pytest.mark.slow

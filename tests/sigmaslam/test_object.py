@@ -6,17 +6,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from simulated_body import (
-    RADIUS,
-    WALL,
-    SimulatedBody,
-    box_around,
-    errors_of,
-    follow,
-    nees_of,
-    wandering,
-)
-from simulated_location import sense
 from typer.testing import CliRunner
 
 from sigmaslam.cli import app
@@ -27,9 +16,21 @@ from sigmaslam.readers import open_sequence
 from sigmaslam.rotation import se3_inverse
 from sigmaslam.run import track_sequence
 from sigmaslam.trajectory import Trajectory, read_kitti, write_kitti
+from tests.support.quantiles import WITHIN_3_SIGMA
+from tests.support.simulated_body import (
+    RADIUS,
+    WALL,
+    SimulatedBody,
+    box_around,
+    errors_of,
+    follow,
+    nees_of,
+    wandering,
+)
+from tests.support.simulated_location import sense
 
-# 99.9 % quantile of chi-square with six degrees of freedom, per degree.
-NEES_999 = 22.458 / 6
+# Per degree of freedom.
+NEES_999 = WITHIN_3_SIGMA / 6
 BOX = "0,205,390,155"
 
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_window import CALIBRATION_SIGMA, CAMERA, KEYFRAMES, NARROW, Dense, in_sigmas, unsolved, world
 
 from sigmaslam.landmarks import PointMap, RetiredPoints
 from sigmaslam.past import PastPoses
@@ -14,6 +13,7 @@ from sigmaslam.pose_graph import PoseEdge, optimise_pose_graph
 from sigmaslam.rotation import se3_body, se3_exp, se3_inverse, se3_log, turn_covariance
 from sigmaslam.tables import pose_slice
 from sigmaslam.window import KeyframeWindow
+from tests.support.dense_window import CALIBRATION_SIGMA, CAMERA, KEYFRAMES, NARROW, Dense, in_sigmas, unsolved, world
 
 STEP_SIGMA = 1e-3 * np.array([0.02, 0.02, 0.02, 0.003, 0.003, 0.003])
 LOOP_SIGMA = STEP_SIGMA / 2

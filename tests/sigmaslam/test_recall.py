@@ -7,18 +7,17 @@ import numpy as np
 import pytest
 
 from sigmaslam import StereoTracker, open_sequence
-from sigmaslam.camera import RectifiedStereo, StereoCamera
+from sigmaslam.camera import RectifiedStereo
 from sigmaslam.errors import InputError
 from sigmaslam.frontend import Features, StereoView
-from sigmaslam.readers import StereoFrame
 from sigmaslam.recall import KeyframeMemory, RememberedKeyframe, pack_keyframes, read_keyframes
 from sigmaslam.refine.tracks import read_tracks
-from sigmaslam.rotation import se3_inverse, se3_log
 from sigmaslam.run import track_sequence
-from sigmaslam.tracker import Estimate, TrackerConfig
+from sigmaslam.tracker import TrackerConfig
 from sigmaslam.trajectory import read_kitti
+from tests.support.estimates import Demo, error_of, mirrored, squared_error
+from tests.support.quantiles import WITHIN_3_SIGMA
 
-WITHIN_3_SIGMA = 22.46  # chi-square, 6 dof, 99.9 %
 CAMERA = RectifiedStereo(fx=200.0, fy=201.0, cx=32.0, cy=24.0, baseline=0.1, width=64, height=48)
 
 
@@ -172,36 +171,12 @@ def test_a_map_of_another_camera_is_refused(tmp_path: Path):
 # ---- the tracker
 
 
-Demo = tuple[StereoCamera, list[StereoFrame], np.ndarray]
-
-
-@pytest.fixture(scope="module")
-def demo(demo_sequence: Path) -> Demo:
-    sequence = open_sequence(demo_sequence)
-    return sequence.camera, list(sequence.frames()), read_kitti(demo_sequence / "poses.txt").poses
-
-
 @pytest.fixture(scope="module")
 def demo_run(demo_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run folder of the whole demo, with tracks."""
     out = tmp_path_factory.mktemp("demo") / "run"
     track_sequence(open_sequence(demo_sequence), out, tracks=True)
     return out
-
-
-def error_of(estimate: Estimate, truth: np.ndarray) -> np.ndarray:
-    """In the body frame, metres and radians."""
-    return se3_log(se3_inverse(estimate.T_world_camera) @ truth)
-
-
-def squared_sigmas(estimate: Estimate, truth: np.ndarray) -> float:
-    error = error_of(estimate, truth)
-    return float(error @ np.linalg.solve(estimate.covariance, error))
-
-
-def mirrored(frame: StereoFrame, timestamp: float) -> StereoFrame:
-    """A possible stereo pair of another world, that of the mirror."""
-    return StereoFrame(frame.index, timestamp, np.fliplr(frame.right).copy(), np.fliplr(frame.left).copy())
 
 
 @pytest.mark.slow
@@ -219,7 +194,7 @@ def test_a_lost_tracker_finds_its_way_back_to_remembered_keyframes(demo: Demo):
         assert tracker.step(black, black, 6.6 + 0.05 * k).status == "lost"
     back = [tracker.step(frame.left, frame.right, 6.8 + 0.05 * k) for k, frame in enumerate(frames[:8])]
     assert [each.status for each in back] == ["relocalised"] + ["tracking"] * 7
-    assert max(squared_sigmas(each, truth[k]) for k, each in enumerate(back)) < WITHIN_3_SIGMA
+    assert max(squared_error(each, truth[k]) for k, each in enumerate(back)) < WITHIN_3_SIGMA
     assert max(np.linalg.norm(error_of(each, truth[k])[:3]) for k, each in enumerate(back)) < 0.01
 
 
@@ -237,7 +212,7 @@ def test_black_frames_and_a_jump_back_are_survived(demo: Demo):
     assert {each.status for each in back} <= {"relocalised", "tracking", "lost"}
     assert all(each.status == "tracking" for each in back[-3:])
     for k, each in enumerate(back):
-        assert each.status == "lost" or squared_sigmas(each, truth[k]) < WITHIN_3_SIGMA
+        assert each.status == "lost" or squared_error(each, truth[k]) < WITHIN_3_SIGMA
 
 
 def test_poses_are_in_the_world_of_the_map(demo: Demo, demo_run: Path):
@@ -249,7 +224,7 @@ def test_poses_are_in_the_world_of_the_map(demo: Demo, demo_run: Path):
         estimate = tracker.step(frames[k].left, frames[k].right, frames[k].timestamp)
         assert estimate.status == ("relocalised" if k == 10 else "tracking")
         assert np.linalg.norm(error_of(estimate, truth[k])[:3]) < 0.01
-        assert squared_sigmas(estimate, truth[k]) < WITHIN_3_SIGMA
+        assert squared_error(estimate, truth[k]) < WITHIN_3_SIGMA
 
 
 @pytest.mark.slow

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from simulated_run import INTRINSICS, OFFSET, Simulation, simulate
 from typer.testing import CliRunner
 
 from sigmaslam.cli import app
@@ -20,6 +19,8 @@ from sigmaslam.refine.run import spread_corrections
 from sigmaslam.refine.structure import collect, fit_structure, point_covariances
 from sigmaslam.rotation import nearest_rotation, se3_exp, se3_inverse, se3_log
 from sigmaslam.trajectory import Trajectory, read_tum, write_tum
+from tests.support.quantiles import squared_sigmas
+from tests.support.simulated_run import INTRINSICS, OFFSET, Simulation, simulate
 
 pytest.importorskip("gtsam")
 
@@ -35,7 +36,7 @@ def pose_errors(run: Simulation, adjustment: Adjustment) -> np.ndarray:
 
 def nees(errors: np.ndarray, covariances: np.ndarray) -> np.ndarray:
     """Per degree of freedom."""
-    return np.einsum("ki,ki->k", errors, np.linalg.solve(covariances, errors[..., None])[..., 0]) / errors.shape[1]
+    return squared_sigmas(errors, covariances) / errors.shape[1]
 
 
 @pytest.mark.parametrize("without_disparity", [0.0, 0.3])

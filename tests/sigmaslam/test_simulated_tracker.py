@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
-from simulated_frontend import SCALES, SimulatedFrontend, SimulatedRun, run_simulated
 
 from sigmaslam.tracker import StereoTracker
+from tests.support.quantiles import chi_square_quantile
+from tests.support.simulated_frontend import SCALES, SimulatedFrontend, SimulatedRun, run_simulated
 
 OFFSET = 0.3
-# 95 % quantile of chi-square with six degrees of freedom, per degree.
-NEES_95 = 12.592 / 6
+# Per degree of freedom.
+NEES_95 = chi_square_quantile(0.95, 6) / 6
 
 
 def simulate(kind: str, seed: int, frames: int, points: int = 150, outliers: float = 0.0) -> SimulatedRun:

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from small_worlds import CAMERA, FISHEYE, RADTAN, camera_pose, small_scene
 
 from sigmaslam.camera import CameraModel
 from sigmaslam.synthetic.facets import Facets, join
@@ -15,6 +14,7 @@ from sigmaslam.synthetic.scene import Body, Lights, Material, Scene, Texture
 from sigmaslam.synthetic.shapes import Box, Cylinder, Ellipsoid, Panel, Tube
 from sigmaslam.synthetic.truth import at_pixels, flow, transfer
 from sigmaslam.synthetic.visibility import Eye
+from tests.support.small_worlds import CAMERA, FISHEYE, RADTAN, camera_pose, small_scene
 
 CAMERAS = pytest.mark.parametrize("camera", [CAMERA, RADTAN, FISHEYE], ids=["pinhole", "radtan", "fisheye"])
 T_0, T_1 = camera_pose((0.0, 0.0, 1.2)), camera_pose((0.3, -0.2, 1.25), 0.05, -0.2)

@@ -3,13 +3,13 @@
 import cv2
 import numpy as np
 import pytest
-from small_worlds import camera_pose, small_scene
 
 from sigmaslam.synthetic import scene_pairs
 from sigmaslam.synthetic.paths import Path
 from sigmaslam.synthetic.scene_pairs import ScenePair, ScenePairs
 from sigmaslam.synthetic.sensor import Sensor
 from sigmaslam.synthetic.worlds.episode import Episode, Wish
+from tests.support.small_worlds import camera_pose, small_scene
 
 
 def small_world(rng: np.random.Generator, wish: Wish) -> Episode:

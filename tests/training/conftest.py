@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors.torch import save_file
-from tiny_runs import make_small
 
 from sigmaslam.models.network import FeatureNetwork
 from sigmaslam.training.recipes import TrainingConfig
+from tests.support.tiny_runs import make_small
 
 
 @pytest.fixture

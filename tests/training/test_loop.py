@@ -11,7 +11,6 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tiny_runs import make_small
 
 from sigmaslam.errors import InputError
 from sigmaslam.models.export import load_network
@@ -21,6 +20,7 @@ from sigmaslam.training.checkpoint import CHECKPOINT_NAME
 from sigmaslam.training.journal import Journal
 from sigmaslam.training.loop import WEIGHTS_NAME, train
 from sigmaslam.training.recipes import TrainingConfig
+from tests.support.tiny_runs import make_small
 
 pytestmark = pytest.mark.usefixtures("small")
 

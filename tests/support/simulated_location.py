@@ -35,7 +35,7 @@ class Drive:
         return np.asarray(se3_inverse(at(np.zeros(1)))[0] @ at(time))
 
 
-def track(drive: Drive, frames: int, sigma: np.ndarray, seed: int) -> list[Estimate]:
+def drifting_estimates(drive: Drive, frames: int, sigma: np.ndarray, seed: int) -> list[Estimate]:
     """Estimates whose errors are a random walk in the camera's frame, with steps of `sigma` (6,)."""
     random = np.random.default_rng(seed)
     times = FRAME * np.arange(frames)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from simulated_frontend import frame_of, image_of
 
 from sigmaslam.camera import CameraModel, StereoCamera
 from sigmaslam.frontend.types import Features, PatchMaps, StereoView, TemporalMatches
 from sigmaslam.object_tracker import ObjectEstimate, ObjectTracker
 from sigmaslam.rotation import se3_exp, se3_inverse, se3_log
 from sigmaslam.tracker import TrackerConfig
+from tests.support.quantiles import squared_sigmas
+from tests.support.simulated_frontend import frame_of, image_of
 
 WIDTH, HEIGHT, FOCAL, BASELINE = 640, 480, 500.0, 0.1
 DISTANCE, RADIUS, WALL = 1.0, 0.25, 1.5
@@ -147,5 +148,5 @@ def errors_of(body: SimulatedBody, estimates: list[ObjectEstimate]) -> np.ndarra
 
 def nees_of(errors: np.ndarray, estimates: list[ObjectEstimate]) -> np.ndarray:
     """(N - 1,) per degree of freedom, from the second frame on."""
-    pairs = zip(errors[1:], estimates[1:], strict=True)
-    return np.array([x @ np.linalg.solve(e.object_covariance, x) / 6 for x, e in pairs])
+    covariances = np.array([estimate.object_covariance for estimate in estimates[1:]])
+    return squared_sigmas(errors[1:], covariances) / 6

@@ -8,8 +8,9 @@ import numpy as np
 
 from sigmaslam.camera import CameraModel, StereoCamera
 from sigmaslam.frontend.types import Features, PatchMaps, StereoView, TemporalMatches
-from sigmaslam.rotation import se3_exp, se3_inverse, se3_log
+from sigmaslam.rotation import se3_exp, se3_inverse
 from sigmaslam.tracker import Estimate, StereoTracker, TrackerConfig
+from tests.support.estimates import squared_error
 
 
 @dataclass(frozen=True)
@@ -219,6 +220,6 @@ def run_simulated(
     for k in range(frames or len(frontend.poses)):
         image = frontend.images(k)
         estimates.append(tracker.step(image, image, k * scale.interval))
-    errors = [se3_log(se3_inverse(T) @ e.T_world_camera) for T, e in zip(frontend.poses, estimates, strict=False)]
-    nees = [x @ np.linalg.solve(e.covariance, x) / 6 for x, e in zip(errors[1:], estimates[1:], strict=True)]
+    pairs = zip(estimates[1:], frontend.poses[1:], strict=False)
+    nees = [squared_error(estimate, truth) / 6 for estimate, truth in pairs]
     return SimulatedRun(tracker, estimates, frontend.poses, np.array(nees))

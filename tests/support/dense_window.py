@@ -1,0 +1,228 @@
+"""Worlds for a window of keyframes, and dense least squares over all poses, the calibration and the landmarks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from sigmaslam.camera import RectifiedStereo
+from sigmaslam.frame_fit import FrameFit
+from sigmaslam.rotation import se3_exp, se3_inverse, se3_log
+from sigmaslam.tables import Views
+from sigmaslam.window import KeyframeWindow
+
+CAMERA = RectifiedStereo(fx=400.0, fy=410.0, cx=319.5, cy=239.5, baseline=0.2, width=640, height=480)
+# Standard deviations of the prior and of the noise.
+CALIBRATION_SIGMA = np.array([0.5, 0.3, 0.3])
+FIRST_SIGMA = np.repeat([0.02, 0.01], 3)
+STEP_SIGMA = np.repeat([0.05, 0.02], 3)
+HOST_SIGMA = np.array([0.1, 0.1, 0.15, 0.25])
+VIEW_ROOT = np.array([[0.25, 0.0, 0.0], [0.1, 0.25, 0.0], [0.0, 0.05, 0.2]])
+# How errors that a landmark's places share enter its views.
+COMMON = np.array([[0.15, 0.02], [0.02, 0.1], [0.0, 0.0]])
+STEP = se3_exp([0.15, -0.05, 0.3, 0.02, -0.05, 0.03])
+KEYFRAMES = 3
+# With deviations so small everything is linear, and equal numbers must be equal.
+NARROW = 1e-3
+
+
+@dataclass(frozen=True)
+class World:
+    """Three keyframes and a frame after them on their way past points, and all that is measured there.
+
+    Attributes:
+        scale: of all standard deviations.
+        expected, poses: (4, 4, 4) as the prior expects them, and true.
+        calibration: (3,) true.
+        host: (L,) keyframe that a landmark belongs to, ascending.
+        landmarks, measured: (L, 6) true, and in the host.
+        views: of each pose.
+    """
+
+    scale: float
+    expected: np.ndarray
+    poses: np.ndarray
+    calibration: np.ndarray
+    host: np.ndarray
+    landmarks: np.ndarray
+    measured: np.ndarray
+    views: list[Views]
+
+
+def project(pose: np.ndarray, host: np.ndarray, calibration: np.ndarray, landmarks: np.ndarray) -> np.ndarray:
+    """(u, v, disparity) (L, 3) of landmarks (L, 6) of hosts (L, 4, 4), by way of the points themselves.
+
+    Without the errors that its places share.
+    """
+
+    def bias(uvd: np.ndarray) -> np.ndarray:
+        x, y = (uvd[:, 0] - uvd[:, 2] - CAMERA.cx) / CAMERA.fx, (uvd[:, 1] - CAMERA.cy) / CAMERA.fy
+        return np.asarray(calibration[0] + calibration[1] * x * x + calibration[2] * x * y)
+
+    true = landmarks[:, :3].copy()
+    true[:, 2] -= landmarks[:, 3] + bias(landmarks)
+    T = se3_inverse(pose) @ host
+    seen = CAMERA.project((T[:, :3, :3] @ CAMERA.triangulate(true)[..., None])[..., 0] + T[:, :3, 3])
+    seen[:, 2] += landmarks[:, 3] + bias(seen)
+    return np.asarray(seen)
+
+
+def world(seed: int = 0, scale: float = 1.0, count: int = 12, hosts: int = KEYFRAMES) -> World:
+    """Everything drawn from the prior; the first `hosts` keyframes have landmarks of their own."""
+    rng = np.random.default_rng(seed)
+    expected, errors = [np.eye(4)], [FIRST_SIGMA * rng.standard_normal(6)]
+    for _ in range(KEYFRAMES):
+        expected.append(expected[-1] @ STEP)
+        errors.append(errors[-1] + STEP_SIGMA * rng.standard_normal(6))
+    poses = se3_exp(scale * np.array(errors)) @ np.array(expected)
+    calibration = scale * CALIBRATION_SIGMA * rng.standard_normal(3)
+    host = np.sort(np.arange(count) % hosts)
+    true = 80 / rng.uniform(2.5, 9.0, count)
+    own = scale * HOST_SIGMA[3] * rng.standard_normal(count)
+    landmarks = np.c_[rng.uniform(120, 520, count), rng.uniform(100, 380, count), true + own, own]
+    measured = np.pad(landmarks + scale * HOST_SIGMA * rng.standard_normal((count, 4)), ((0, 0), (0, 2)))
+    measured[:, 3] = 0.0
+    landmarks = np.c_[landmarks, np.random.default_rng(100 + seed).standard_normal((count, 2))]
+    views = []
+    for k, pose in enumerate(poses):
+        rows = np.flatnonzero(host < k)
+        seen = project(pose, poses[host[rows]], calibration, landmarks[rows])
+        seen = seen + scale * (rng.standard_normal((len(rows), 3)) @ VIEW_ROOT.T + landmarks[rows, 4:] @ COMMON.T)
+        seen[(rows + k) % 6 == 0, 2] = np.nan
+        noise, common = scale**2 * VIEW_ROOT @ VIEW_ROOT.T, scale * COMMON
+        views.append(Views(rows, seen, np.tile(noise, (len(rows), 1, 1)), np.tile(common, (len(rows), 1, 1))))
+    return World(scale, np.array(expected), poses, calibration, host, landmarks, measured, views)
+
+
+def add_keyframe(window: KeyframeWindow, given: World, k: int, views: Views, hosted: bool = True) -> None:
+    sigma = given.scale * (STEP_SIGMA if k else FIRST_SIGMA)
+    pose = window.poses[-1] @ STEP if k else given.expected[0]
+    window.add_keyframe(pose, STEP if k else given.expected[0], np.diag(sigma**2), np.zeros(3))
+    window.add_views(views)
+    own = np.flatnonzero(given.host == k) if hosted else np.zeros(0, np.int64)
+    variance = np.tile((given.scale * HOST_SIGMA) ** 2, (len(own), 1))
+    window.add_landmarks(own, given.measured[own, :3], variance)
+
+
+def unsolved(given: World, linearisation: str = "extended", order: int = 1) -> KeyframeWindow:
+    """The keyframes and their views; order -1 hands them over from the last to the first."""
+    window = KeyframeWindow(CAMERA, given.scale * CALIBRATION_SIGMA, "onnx", linearisation)
+    window.depth = 4.0
+    for k in range(KEYFRAMES):
+        add_keyframe(window, given, k, given.views[k].select(np.arange(len(given.views[k].rows))[::order]))
+    return window
+
+
+def solved(given: World, linearisation: str = "extended", order: int = 1) -> KeyframeWindow:
+    """Iterated until nothing changes."""
+    window = unsolved(given, linearisation, order)
+    window.solve(8)
+    return window
+
+
+def fit(window: KeyframeWindow, given: World, views: Views | None = None, start: np.ndarray | None = None) -> FrameFit:
+    """Of the frame after the keyframes."""
+    step_covariance = np.diag((given.scale * STEP_SIGMA) ** 2)
+    found = window.fit_frame(views or given.views[-1], window.poses[-1] @ STEP, step_covariance, 5, start)
+    assert found is not None
+    return found
+
+
+class Dense:
+    """All unknowns in one vector (calibration, poses, landmarks), solved at once.
+
+    Args:
+        given: world.
+        poses: how many of its poses take part.
+        hosts: keyframes whose landmarks take part.
+    """
+
+    def __init__(self, given: World, poses: int, hosts: Iterable[int] = range(KEYFRAMES)) -> None:
+        self.given, self.size = given, 3 + 6 * poses
+        self.expected = given.expected[:poses]
+        self.views = [v.select(np.isin(given.host[v.rows], list(hosts))) for v in given.views[:poses]]
+        self.whiteners = []
+        for views in self.views:
+            whitener = np.linalg.inv(np.linalg.cholesky(views.noise))
+            # The third row alone has to do with the disparity, and the first two are those of the place alone.
+            whitener[np.isnan(views.measurement[:, 2]), 2] = 0.0
+            self.whiteners.append(whitener)
+        self.at = np.r_[np.zeros(self.size), given.measured.ravel()]
+
+    def residuals(self, at: np.ndarray) -> np.ndarray:
+        """In standard deviations."""
+        given, scale = self.given, self.given.scale
+        calibration, tangents, landmarks = at[:3], at[3 : self.size].reshape(-1, 6), at[self.size :].reshape(-1, 6)
+        poses = se3_exp(tangents) @ self.expected
+        parts = [calibration / CALIBRATION_SIGMA, tangents[0] / FIRST_SIGMA]
+        parts.append((np.diff(tangents, axis=0) / STEP_SIGMA).ravel())
+        parts.append(((landmarks - given.measured)[:, :4] / HOST_SIGMA).ravel())
+        parts = [*(part / scale for part in parts), landmarks[:, 4:].ravel()]
+        for pose, views, whitener in zip(poses, self.views, self.whiteners, strict=True):
+            seen = project(pose, poses[given.host[views.rows]], calibration, landmarks[views.rows])
+            seen = seen + (views.common @ landmarks[views.rows, 4:, None])[..., 0]
+            rest = np.nan_to_num(views.measurement - seen)
+            parts.append((whitener @ rest[..., None]).ravel())
+        return np.concatenate(parts)
+
+    def derivative(self, at: np.ndarray) -> np.ndarray:
+        """Of the residuals by calibration, poses perturbed from the left, and landmarks."""
+        step = 1e-6
+
+        def moved(k: int, by: float) -> np.ndarray:
+            change = np.zeros(len(at))
+            change[k] = by
+            there = at + change
+            tangents = [a[3 : self.size].reshape(-1, 6) for a in (change, at)]
+            there[3 : self.size] = se3_log(se3_exp(tangents[0]) @ se3_exp(tangents[1])).ravel()
+            return self.residuals(there)
+
+        return np.stack([(moved(k, step) - moved(k, -step)) / (2 * step) for k in range(len(at))], axis=1)
+
+    def solve(self) -> Dense:
+        tolerances = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-15)
+        self.at = least_squares(self.residuals, self.at, "3-point", x_scale="jac", **tolerances).x
+        return self
+
+    @property
+    def poses(self) -> np.ndarray:
+        return np.asarray(se3_exp(self.at[3 : self.size].reshape(-1, 6)) @ self.expected)
+
+    @property
+    def cost(self) -> float:
+        return float((self.residuals(self.at) ** 2).sum())
+
+    def information(self) -> np.ndarray:
+        J = self.derivative(self.at)
+        return np.asarray(J.T @ J)
+
+    def covariance(self) -> np.ndarray:
+        """Of calibration and poses."""
+        return np.asarray(np.linalg.inv(self.information())[: self.size, : self.size])
+
+
+def eliminate(information: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """Schur's complement: the information about what is kept."""
+    gone = np.setdiff1d(np.arange(len(information)), kept)
+    cross = information[np.ix_(gone, kept)]
+    return information[np.ix_(kept, kept)] - cross.T @ np.linalg.solve(information[np.ix_(gone, gone)], cross)
+
+
+def in_sigmas(covariance: np.ndarray, expected: np.ndarray) -> float:
+    """Largest difference of two covariances, in deviations of the second."""
+    sigma = np.sqrt(np.diag(expected))
+    return float(np.abs((covariance - expected) / np.outer(sigma, sigma)).max())
+
+
+def assert_same_state(
+    poses: np.ndarray, calibration: np.ndarray, covariance: np.ndarray, dense: Dense, tolerance: float, first: int = 0
+) -> None:
+    """Estimates and covariances of the poses from `first` on, in standard deviations."""
+    chosen = np.r_[0:3, 3 + 6 * first : dense.size]
+    expected = dense.covariance()[np.ix_(chosen, chosen)]
+    difference = np.r_[calibration - dense.at[:3], se3_log(poses @ se3_inverse(dense.poses[first:])).ravel()]
+    assert np.abs(difference / np.sqrt(np.diag(expected))).max() < tolerance
+    assert in_sigmas(covariance, expected) < tolerance

@@ -1,0 +1,31 @@
+"""Faults in frames, and what then has to be true of every estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from sigmaslam.readers import StereoFrame
+from sigmaslam.tracker import Estimate
+from tests.support.estimates import squared_error
+from tests.support.quantiles import WITHIN_3_SIGMA
+
+Pair = tuple[np.ndarray, np.ndarray]
+
+
+def broken(frames: list[StereoFrame], which: Iterable[int], fault: Callable[[StereoFrame], Pair]) -> list[StereoFrame]:
+    """The frames, some of them with other images."""
+    chosen = set(which)
+    return [StereoFrame(f.index, f.timestamp, *fault(f)) if k in chosen else f for k, f in enumerate(frames)]
+
+
+def assert_honest(estimates: list[Estimate], truth: np.ndarray) -> None:
+    """Every frame is lost or starting, or right within three sigma."""
+    wrong = {
+        k: round(distance, 1)
+        for k, estimate in enumerate(estimates)
+        if estimate.status not in ("lost", "starting")
+        and not (distance := squared_error(estimate, truth[k])) < WITHIN_3_SIGMA
+    }
+    assert not wrong, f"confident and wrong: squared sigmas by frame {wrong}"
