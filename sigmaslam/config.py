@@ -30,10 +30,10 @@ class TrackerConfig:
         spacing: landmarks are at least so far apart, pixels; what lies closer has the same errors (patches overlap).
         shared_disparity: share of the variance of a landmark's disparities that is the same in all views.
         shared_place: share of the variance of its places, relative to the keyframe's, that is the same in all views.
-        most_points: of the map; when there are twice as many, the least confirmed half goes.
-        remembered: keyframes that are kept to find the way back to.
-        most_misses: after so many frames in a row in which it was not found a landmark is no longer looked for.
-        least_inliers: fewer is no pose; without a prediction and a fair share of the matches, fewer than three times as
+        max_points: of the map; when there are twice as many, the least confirmed half goes.
+        max_keyframes: keyframes that are kept to find the way back to.
+        max_misses: after so many frames in a row in which it was not found a landmark is no longer looked for.
+        min_inliers: fewer is no pose; without a prediction and a fair share of the matches, fewer than three times as
             many.
         keyframe_ratio: a new keyframe is taken when the inliers fall below this share of the landmarks in the last one.
         search_limit: with a predicted place less certain than this (pixels, one sigma) the search is not guided.
@@ -56,10 +56,10 @@ class TrackerConfig:
     spacing: float = 8.0
     shared_disparity: float = 0.8
     shared_place: float = 0.6
-    most_points: int = 100_000
-    remembered: int = 60
-    most_misses: int = 3
-    least_inliers: int = 15
+    max_points: int = 100_000
+    max_keyframes: int = 60
+    max_misses: int = 3
+    min_inliers: int = 15
     keyframe_ratio: float = 0.65
     search_limit: float = 25.0
     lost_seconds: float = 0.5

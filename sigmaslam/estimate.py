@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+
+from sigmaslam.mapping import KeyframeTracks
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +39,9 @@ class Estimate:
         nis, dof: normalised innovation squared and its degrees of freedom; 0 without an update.
         calibration: of the stereo pair.
         milliseconds: wall time by stage.
-        own_covariance: (6, 6) the part of the covariance that the frame's matches add to that of its keyframe; zero
+        frame_covariance: (6, 6) the part of the covariance that the frame's matches add to that of its keyframe; zero
             without them.
+        tracks: what the frame saw, where it became a keyframe.
     """
 
     timestamp: float
@@ -51,4 +55,24 @@ class Estimate:
     dof: int
     calibration: CalibrationEstimate
     milliseconds: dict[str, float] = field(default_factory=dict)
-    own_covariance: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
+    frame_covariance: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
+    tracks: KeyframeTracks | None = None
+
+    @property
+    def camera(self) -> Estimate:
+        """The camera's estimate in its world: this one."""
+        return self
+
+    @property
+    def pose(self) -> np.ndarray:
+        """(4, 4) what is tracked: `T_world_camera`."""
+        return self.T_world_camera
+
+    @property
+    def pose_covariance(self) -> np.ndarray:
+        """(6, 6) of `pose` in its own frame."""
+        return self.covariance
+
+    def map_camera(self, change: Callable[[Estimate], Estimate]) -> Estimate:
+        """The result with another camera estimate."""
+        return change(self)

@@ -16,11 +16,11 @@ class FrameFit:
         relative: (6, 6) covariance of the pose relative to the last keyframe, perturbed from the left in the world.
         covariance: (6, 6) of the pose, likewise.
         calibration, calibration_covariance: (3,), (3, 3) as this frame adds to it.
-        kept: (M,) bool, the views that agree.
-        nis, dof: of the kept ones.
+        inliers: (M,) bool, the views that agree.
+        nis, dof: of the inliers.
         noise_scale: what the variances of all views are multiplied by in the posterior, 1 or more, as they scatter.
         prior_cost: squared sigmas by which it departs from what was known before.
-        doubt: by what `relative` was multiplied for errors that all views share.
+        inflation: by what `relative` was multiplied for errors that all views share.
     """
 
     pose: np.ndarray
@@ -28,12 +28,17 @@ class FrameFit:
     covariance: np.ndarray
     calibration: np.ndarray
     calibration_covariance: np.ndarray
-    kept: np.ndarray
+    inliers: np.ndarray
     nis: float
     dof: int
     noise_scale: float
     prior_cost: float
-    doubt: float = 1.0
+    inflation: float = 1.0
+
+    @property
+    def count(self) -> int:
+        """How many views agree."""
+        return int(self.inliers.sum())
 
     @property
     def nis_per_dof(self) -> float:
@@ -41,15 +46,15 @@ class FrameFit:
         return self.nis / max(self.dof, 1)
 
     @property
-    def misfit(self) -> float:
-        """The same by the noise that the views came with: chance agreement is not made good by a larger one."""
+    def nis_before_scaling(self) -> float:
+        """NIS per degree of freedom by the noise that the views came with; a larger one excuses no chance agreement."""
         return self.noise_scale * self.nis_per_dof
 
-    def doubted(self, factor: float) -> FrameFit:
+    def inflated(self, factor: float) -> FrameFit:
         """The same pose, known so much less well relative to the last keyframe."""
         return replace(
             self,
             relative=factor * self.relative,
             covariance=self.covariance + (factor - 1.0) * self.relative,
-            doubt=factor * self.doubt,
+            inflation=factor * self.inflation,
         )

@@ -1,8 +1,8 @@
-"""What is kept of keyframes beside their poses: images and features, the map, and those that left the window."""
+"""The keyframes of the window, and those that left it."""
 
 from __future__ import annotations
 
-from collections import deque
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,96 +11,100 @@ import numpy as np
 from sigmaslam.camera import RectifiedStereo
 from sigmaslam.frontend import StereoView
 from sigmaslam.frontend.smooth import sharpness
-from sigmaslam.landmarks import PointMap, RetiredPoints, host_points, map_points, merge_maps
-from sigmaslam.past import PastPoses
-from sigmaslam.recall import KeyframeMemory, RememberedKeyframe, pack_keyframes, read_keyframes
-from sigmaslam.rotation import se3_body, se3_inverse
-from sigmaslam.tables import CALIBRATION_SIZE, pose_slice
+from sigmaslam.keyframe import Keyframe
+from sigmaslam.map_file import pack_keyframes, read_keyframes
+from sigmaslam.place_recognition import closest_pair
+from sigmaslam.point_map import (
+    PointMap,
+    anchor_points,
+    hand_over_points,
+    merge_maps,
+    most_confirmed,
+    points_in_world,
+    window_points,
+)
+from sigmaslam.state_layout import pose_slice
 from sigmaslam.window import KeyframeWindow
-
-# A loop is looked for beyond so many remembered keyframes, among those that look less than 60 degrees away.
-_RECENT, _LOOP_COSINE = 10, 0.5
 
 # A view less sharp by this factor than the sharpest of the keyframes is blurred: in drives 0.9 to 1.1 are common from
 # frame to frame and 0.8 half a second later; motion blur over 11 px gives 0.6 to 0.75.
-_BLUNT = 0.75
+_BLURRED = 0.75
+# A view counts as no less sharp than this share of the sharpest.
+_MIN_SHARPNESS = 0.1
 
 
 class Keyframes:
-    """The keyframes of a window, in its order, and those that left it, in the order of its past.
+    """Keyframes with their poses: moves them from the window to the past, forgets the superfluous ones, makes the map.
 
     Args:
-        window: owns the poses; keyframes leave it here.
-        remembered: keyframes that are kept to find the way back to.
-        most_points: of the map (`RetiredPoints`).
+        window: owns the poses.
+        max_keyframes: more than so many that left the window are not remembered.
+        max_points: of the map; when there are twice as many, the least confirmed half goes.
 
     Attributes:
-        views, times: of those in the window; time stamps in seconds.
-        memory: those that left it.
+        active: keyframes of the window, in its order.
+        remembered: keyframes that left it, in the order of its past.
     """
 
-    def __init__(self, window: KeyframeWindow, remembered: int, most_points: int) -> None:
+    def __init__(self, window: KeyframeWindow, max_keyframes: int, max_points: int) -> None:
         self._window = window
-        self._most_points = most_points
-        self.views: list[StereoView] = []
-        self.times: list[float] = []
-        self.memory = KeyframeMemory(remembered)
-        self._sharpness: list[float] = []
-        self._retired = RetiredPoints(most_points)
-        self._recent: deque[float] = deque(maxlen=_RECENT)  # time stamps of the last that left the window
+        self._max_keyframes = max(max_keyframes, 1)
+        self._max_points = max_points
+        self._next_id = self._first_id = 0
+        self.active: list[Keyframe] = []
+        self.remembered: list[Keyframe] = []
+
+    @property
+    def views(self) -> list[StereoView]:
+        """What the keyframes of the window saw."""
+        return [keyframe.view for keyframe in self.active]
+
+    def index(self, id: int) -> int:
+        """Where a remembered keyframe stands in the past."""
+        return next(k for k, keyframe in enumerate(self.remembered) if keyframe.id == id)
+
+    def pose(self, keyframe: Keyframe) -> np.ndarray:
+        """(4, 4) T_world_keyframe of a remembered one."""
+        return np.asarray(self._window.posterior.past.poses[self.index(keyframe.id)])
+
+    def left_long_ago(self, count: int) -> list[Keyframe]:
+        """Remembered keyframes but for the last `count` that left the window."""
+        recent = max(self._first_id, self.active[0].id - count)
+        return [keyframe for keyframe in self.remembered if keyframe.id < recent]
 
     def append(self, view: StereoView, timestamp: float) -> None:
-        """The newest keyframe of the window."""
-        self.views.append(view)
-        self.times.append(timestamp)
-        self._sharpness.append(sharpness(view.left))
+        """Takes the newest keyframe of the window."""
+        self.active.append(Keyframe(self._next_id, timestamp, view, sharpness(view.left)))
+        self._next_id += 1
 
     def blur(self, view: StereoView) -> float:
-        """How many times as sharp as the view the sharpest keyframe is; 1 where that may be what is seen."""
-        own, sharpest = sharpness(view.left), max(self._sharpness)
-        return sharpest / max(own, 0.1 * sharpest) if own < _BLUNT * sharpest else 1.0
+        """How many times as sharp as the view the sharpest keyframe is; 1 where what is seen may be the reason."""
+        here, sharpest = sharpness(view.left), max(keyframe.sharpness for keyframe in self.active)
+        return sharpest / max(here, _MIN_SHARPNESS * sharpest) if here < _BLURRED * sharpest else 1.0
 
-    def retire_oldest(self, spare: float | None = None) -> np.ndarray:
-        """The oldest one leaves the window for the memory, its landmarks for the map.
+    def marginalise_oldest(self, spare: Keyframe | None = None) -> np.ndarray:
+        """Moves the oldest keyframe to the past, and its landmarks to the map.
 
         Args:
-            spare: time stamp of one that the memory must not drop for it.
+            spare: a remembered one that must not be forgotten for it.
         Returns:
-            New row of each landmark, as of `KeyframeWindow.retire_oldest`.
+            New row of each landmark, as of `KeyframeWindow.marginalise_oldest`.
         """
-        keyframe = self._remembered(0)
-        self._retired.append(host_points(self._window, 0, np.array(self.times)))
-        number = self._window.retire_oldest()
-        del self.views[0], self.times[0], self._sharpness[0]
-        self._memorise(keyframe, spare)
-        self._recent.append(keyframe.timestamp)
-        return number
+        points = anchor_points(self._window, 0, self._times())
+        new_row = self._window.marginalise_oldest()
+        self._remember(self.active.pop(0).leave_window(points), spare)
+        return new_row
 
     def restart(self) -> None:
-        """As before the first one, the window too, but for what is known of the calibration."""
+        """Forgets all keyframes and their poses, but not the calibration."""
         self._window.restart()
-        self.views, self.times, self._sharpness = [], [], []
-        self._retired = RetiredPoints(self._most_points)
-        self.memory.keyframes.clear()
-        self._recent.clear()
-
-    def revisited(self) -> list[RememberedKeyframe]:
-        """Those that left the window long ago and should see what its newest one sees."""
-        window = self._window
-        pose, place = window.poses[-1], pose_slice(len(window) - 1)
-        reach = window.depth + 3.0 * np.sqrt(np.trace(se3_body(pose, window.covariance[place, place])[:3, :3]))
-
-        def near(keyframe: RememberedKeyframe) -> bool:
-            between = se3_inverse(pose) @ keyframe.pose
-            return bool(np.linalg.norm(between[:3, 3]) < reach and between[2, 2] > _LOOP_COSINE)
-
-        return [each for each in self.memory.keyframes if each.timestamp not in self._recent and near(each)]
+        self.active, self.remembered = [], []
+        self._first_id = self._next_id
 
     def map(self) -> PointMap:
         """All landmarks so far that were seen at least three times, in the world of the window."""
-        whole = np.ones(len(self._window.landmarks), bool)
-        late = map_points(self._window, whole, np.array(self.times))
-        return merge_maps([self._retired.in_world(self._window.past), late])
+        past = points_in_world([keyframe.points for keyframe in self.remembered], self._window.posterior.past)
+        return merge_maps([past, window_points(self._window, self._times())])
 
     def load(self, path: Path, frontend: str, camera: RectifiedStereo) -> None:
         """Remembers the keyframes of a map, before there are others.
@@ -108,34 +112,40 @@ class Keyframes:
         Raises:
             InputError: the file is no map, or made with another front-end or camera.
         """
-        keyframes, joint = read_keyframes(path, frontend, camera)
-        poses = np.array([keyframe.pose for keyframe in keyframes])
-        self._window.load_past(PastPoses(poses, joint, np.zeros((len(joint), CALIBRATION_SIZE))))
-        for _ in keyframes:
-            self._retired.append(PointMap.empty())
+        keyframes, past = read_keyframes(path, frontend, camera)
+        self._window.restart(past)
         for keyframe in keyframes:
-            self._memorise(keyframe)
+            self._remember(keyframe)
+        self._next_id = self._first_id = len(keyframes)
 
     def pack(self, frontend: str, camera: RectifiedStereo) -> dict[str, Any]:
         """All of them as arrays by name, by which a later run finds its place in the map."""
-        window = self._window
-        late = [self._remembered(k) for k in range(len(window))]
-        past = window.past
-        for k, pose in enumerate(window.poses):
-            past = past.append(pose, window.covariance, pose_slice(k))
-        return pack_keyframes([*self.memory.keyframes, *late], past.covariance, frontend, camera)
+        state = self._window.posterior
+        past = state.past
+        for k, pose in enumerate(state.poses):
+            past = past.append(pose, state.covariance, pose_slice(k))
+        return pack_keyframes([*self.remembered, *self.active], past, frontend, camera)
 
-    def _memorise(self, keyframe: RememberedKeyframe, spare: float | None = None) -> None:
-        """Remembers a keyframe of the window's past; another, not that of the time stamp `spare`, may go for it."""
-        dropped = self.memory.add(keyframe, spare)
-        if dropped is not None:
-            self._retired.drop(dropped, self._window.past)
-            self._window.forget_past(dropped)
+    def _times(self) -> np.ndarray:
+        return np.array([keyframe.timestamp for keyframe in self.active])
 
-    def _remembered(self, host: int) -> RememberedKeyframe:
-        """A keyframe of the window as the memory keeps it."""
-        place = pose_slice(host)
-        window = self._window
-        return RememberedKeyframe(
-            self.views[host], window.poses[host], window.covariance[place, place], self.times[host]
-        )
+    def _remember(self, keyframe: Keyframe, spare: Keyframe | None = None) -> None:
+        """Takes a keyframe of the window's past, and forgets a superfluous one for it, but not the one to spare."""
+        self.remembered.append(keyframe)
+        if sum(len(each.points) for each in self.remembered) > 2 * self._max_points:
+            kept = most_confirmed([each.points for each in self.remembered], self._max_points)
+            self.remembered = [replace(each, points=points) for each, points in zip(self.remembered, kept, strict=True)]
+        if len(self.remembered) <= self._max_keyframes:
+            return
+        # Of the two that are closest to each other the later one.
+        past = self._window.posterior.past
+        earlier, leaving = closest_pair(past.poses[: len(self.remembered)])
+        if spare is not None and self.remembered[leaving].id == spare.id:
+            leaving = earlier
+        if len(self.remembered[leaving].points):
+            heir = past.closest(leaving)
+            points = hand_over_points(self.remembered[leaving].points, past, leaving, heir)
+            inherited = merge_maps([self.remembered[heir].points, points])
+            self.remembered[heir] = replace(self.remembered[heir], points=inherited)
+        del self.remembered[leaving]
+        self._window.forget_past(leaving)

@@ -9,7 +9,7 @@ import numpy as np
 from sigmaslam.camera import RectifiedStereo
 from sigmaslam.rotation import se3_adjoint, se3_inverse
 from sigmaslam.session import load_step
-from sigmaslam.tables import CALIBRATION, LANDMARK_SIZE, MODELLED, pose_slice
+from sigmaslam.state_layout import CALIBRATION, LANDMARK_SIZE, MODELLED, pose_slice
 
 # Least spread of sigma points: share of the scene's depth, radians, pixels; with it alone slopes are derivatives.
 _LEAST_SPREAD = 1e-6
@@ -18,20 +18,20 @@ _MOST_SPREAD = 0.05
 
 
 @dataclass(frozen=True, slots=True)
-class Slopes:
+class Linearisation:
     """Measurements of landmarks by views, linearised.
 
     Attributes:
         mean: (M, 3) expected (u, v, disparity).
         by_state, by_landmark: (M, 3, n), (M, 3, 6) derivatives.
-        left: (M, 3, 3) covariance of what is not linear.
+        nonlinearity: (M, 3, 3) covariance of what is not linear.
         in_front: (M,) bool, the landmark is in front of the camera.
     """
 
     mean: np.ndarray
     by_state: np.ndarray
     by_landmark: np.ndarray
-    left: np.ndarray
+    nonlinearity: np.ndarray
     in_front: np.ndarray
 
 
@@ -56,43 +56,43 @@ class ViewLineariser:
         covariance: np.ndarray,
         landmarks: np.ndarray,
         landmark_covariance: np.ndarray,
-        host: np.ndarray,
+        anchor: np.ndarray,
         view: np.ndarray,
         common: np.ndarray,
         depth: float,
-    ) -> Slopes:
+    ) -> Linearisation:
         """Linearises M views.
 
         Args:
             poses: (K, 4, 4) T_world_camera.
             calibration: (3,).
             covariance: (n, n) of calibration and poses, which sigma points are drawn from.
-            landmarks, landmark_covariance: (M, 6), (M, 6, 6) in their hosts.
-            host, view: (M,) which of the poses a landmark belongs to, and which sees it.
+            landmarks, landmark_covariance: (M, 6), (M, 6, 6) in their anchor keyframes.
+            anchor, view: (M,) which of the poses a landmark is anchored to, and which sees it.
             common: (M, 3, 2) how shared errors of place enter.
             depth: of the scene, metres.
         """
         count, size = len(poses), len(covariance)
         if not len(landmarks):  # the graph takes no empty batch
             square = np.zeros((0, 3, 3))
-            return Slopes(
+            return Linearisation(
                 square[:, 0], np.zeros((0, 3, size)), np.zeros((0, 3, LANDMARK_SIZE)), square, np.zeros(0, bool)
             )
-        pairs, pair = np.unique(host * count + view, return_inverse=True)
-        hosts, sights = pairs // count, pairs % count
-        relative = se3_inverse(poses[sights]) @ poses[hosts]
+        pairs, pair = np.unique(anchor * count + view, return_inverse=True)
+        anchors, sights = pairs // count, pairs % count
+        relative = se3_inverse(poses[sights]) @ poses[anchors]
         adjoint = se3_adjoint(se3_inverse(poses[sights]))
         chain = np.zeros((len(pairs), 9, size))
-        for k, (from_, to) in enumerate(zip(hosts, sights, strict=True)):
+        for k, (from_, to) in enumerate(zip(anchors, sights, strict=True)):
             chain[k, :6, pose_slice(from_)] = adjoint[k]
             chain[k, :6, pose_slice(to)] -= adjoint[k]
         chain[:, 6:, CALIBRATION] = np.eye(3)
         floor = np.diag(np.r_[np.full(3, depth), np.ones(6)] * _LEAST_SPREAD) ** 2
-        known = chain @ covariance @ chain.transpose(0, 2, 1) if self._unscented else np.zeros((len(pairs), 9, 9))
-        spread = np.linalg.cholesky(_limited(0.5 * (known + known.transpose(0, 2, 1)), depth) + floor)
+        joint = chain @ covariance @ chain.transpose(0, 2, 1) if self._unscented else np.zeros((len(pairs), 9, 9))
+        spread = np.linalg.cholesky(_limited(0.5 * (joint + joint.transpose(0, 2, 1)), depth) + floor)
         own = landmark_covariance[:, :MODELLED, :MODELLED] * float(self._unscented)
         landmark_spread = np.linalg.cholesky(own + _LEAST_SPREAD**2 * np.eye(MODELLED))
-        mean, odd, left, in_front = self._transfer(
+        mean, slopes, nonlinearity, in_front = self._transfer(
             {
                 "relative": relative,
                 "spread": spread,
@@ -103,10 +103,10 @@ class ViewLineariser:
                 "landmark_spread": landmark_spread,
             }
         )
-        by_state = odd[:, :, :9] @ (np.linalg.inv(spread) @ chain)[pair]
-        by_landmark = np.concatenate([odd[:, :, 9:] @ np.linalg.inv(landmark_spread), common], axis=2)
+        by_state = slopes[:, :, :9] @ (np.linalg.inv(spread) @ chain)[pair]
+        by_landmark = np.concatenate([slopes[:, :, 9:] @ np.linalg.inv(landmark_spread), common], axis=2)
         mean = mean + (common @ landmarks[:, MODELLED:, None])[..., 0]
-        return Slopes(mean, by_state, by_landmark, left, in_front > 0.5)
+        return Linearisation(mean, by_state, by_landmark, nonlinearity, in_front > 0.5)
 
 
 def _limited(covariance: np.ndarray, depth: float) -> np.ndarray:

@@ -13,7 +13,6 @@ one unscented update of 24 error states: drift, the sensor's world, its mount, t
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 
@@ -48,8 +47,6 @@ _CORRECTED = 0.5
 _LINEAR_TURN = 0.03
 # And until there are so many of them.
 _MOST_KEPT = 60
-
-AnyEstimate = TypeVar("AnyEstimate", bound=Estimate)
 
 
 @dataclass(slots=True)
@@ -122,7 +119,7 @@ class LocationFilter:
         times = np.array([time for time, _ in self._trajectory])
         return Trajectory(times, self.T_sensor_world @ (se3_inverse(poses) if self._on_object else poses))
 
-    def fuse(self, estimate: AnyEstimate) -> AnyEstimate:
+    def fuse(self, estimate: Estimate) -> Estimate:
         """The estimate with what readings until its time stamp say.
 
         Raises:
@@ -138,7 +135,7 @@ class LocationFilter:
             self._known = self._sure
         self._allow_correction(estimate)
         growth = self._growth(estimate)
-        own = turn_covariance(estimate.T_world_camera, _FRESH * estimate.own_covariance)
+        own = turn_covariance(estimate.T_world_camera, _FRESH * estimate.frame_covariance)
         self._begin(own)
         before, done = self._last, 0.0
         for row in self._due(estimate.timestamp):
@@ -195,7 +192,7 @@ class LocationFilter:
             state = replace(state, offset=np.zeros(6), covariance=covariance)
         self._known = _Known(state, walked)
 
-    def _fused(self, estimate: AnyEstimate) -> AnyEstimate:
+    def _fused(self, estimate: Estimate) -> Estimate:
         state = self._known.state
         if state is None:
             return estimate
@@ -205,7 +202,7 @@ class LocationFilter:
             estimate,
             T_world_camera=pose,
             covariance=se3_body(pose, both @ state.covariance @ both.T),
-            own_covariance=se3_body(pose, state.covariance[OWN, OWN]),
+            frame_covariance=se3_body(pose, state.covariance[OWN, OWN]),
         )
 
     # ---- readings
@@ -304,4 +301,4 @@ def _drift(estimate: Estimate) -> np.ndarray:
 
 def _drifted(estimate: Estimate) -> np.ndarray:
     """The same in the camera's frame."""
-    return estimate.covariance - _FRESH * estimate.own_covariance
+    return estimate.covariance - _FRESH * estimate.frame_covariance

@@ -20,10 +20,10 @@ from sigmaslam.camera import StereoCamera
 from sigmaslam.errors import InputError
 from sigmaslam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder
-from sigmaslam.landmarks import PointMap
+from sigmaslam.mapping import KeyframeTracks
+from sigmaslam.point_map import PointMap
 from sigmaslam.report import COLUMNS, write_report
 from sigmaslam.session import shipped_weights
-from sigmaslam.tables import Views
 from sigmaslam.trajectory import Trajectory, write_kitti, write_tum
 
 STAGES = ("read", "features", "match", "filter", "map")
@@ -58,10 +58,16 @@ class RunWriter:
         self._calibration: CalibrationEstimate | None = None
         self._skipped = 0
         self._rectified = rectified
-        self._views: list[tuple[int, Views]] = []
+        self._tracks: list[tuple[int, KeyframeTracks]] = []
 
-    def add(self, estimate: Estimate, read_ms: float) -> None:
-        """Takes the result of one frame; its row is on disk when this returns."""
+    def add(self, estimate: Estimate, pose: np.ndarray, covariance: np.ndarray, read_ms: float) -> None:
+        """Takes the result of one frame; its row is on disk when this returns.
+
+        Args:
+            estimate: of the camera.
+            pose, covariance: (4, 4), (6, 6) of what is tracked: the camera in the world, or a body in the camera.
+            read_ms: time it took to read the images.
+        """
         milliseconds = {"read": read_ms, **estimate.milliseconds}
         self._rows.writerow(
             [
@@ -78,17 +84,14 @@ class RunWriter:
             ]
         )
         self._table.flush()
-        row = np.r_[estimate.timestamp, estimate.T_world_camera.ravel(), estimate.covariance.ravel()]
+        row = np.r_[estimate.timestamp, pose.ravel(), covariance.ravel()]
         self._poses.write(row.astype(np.float64).tobytes())
         self._statuses[estimate.status] += 1
         if estimate.inliers:
             self._inliers.append(estimate.inliers)
         self._calibration = estimate.calibration
-
-    def add_views(self, views: Views | None) -> None:
-        """Takes what the last frame added saw as a keyframe, for tracks.npz; None if it is none."""
-        if views is not None and self._rectified is not None:
-            self._views.append((self._statuses.total() - 1, views))
+        if estimate.tracks is not None and self._rectified is not None:
+            self._tracks.append((self._statuses.total() - 1, estimate.tracks))
 
     def add_skipped(self, timestamp: float) -> None:
         """Notes a frame that could not be read."""
@@ -130,15 +133,16 @@ class RunWriter:
 
     def _write_tracks(self) -> None:
         calibration = self._calibration
-        if self._rectified is None or not self._views or calibration is None:
+        if self._rectified is None or not self._tracks or calibration is None:
             return
+        seen = KeyframeTracks.concatenate([tracks for _, tracks in self._tracks])
         with atomic_path(self._out / "tracks.npz") as path:
             np.savez_compressed(
                 path,
-                frame=np.concatenate([np.full(len(views.rows), frame) for frame, views in self._views]),
-                landmark=np.concatenate([views.rows for _, views in self._views]),
-                measurement=np.concatenate([views.measurement for _, views in self._views]),
-                covariance=np.concatenate([views.covariance for _, views in self._views]),
+                frame=np.concatenate([np.full(len(tracks), frame) for frame, tracks in self._tracks]),
+                landmark=seen.landmark_id,
+                measurement=seen.measurement,
+                covariance=seen.covariance,
                 disparity_offset=np.array([calibration.disparity_offset, calibration.disparity_offset_sigma]),
                 **self._rectified,
             )

@@ -13,7 +13,7 @@ import numpy as np
 
 from sigmaslam.gaussian import matrix_root
 from sigmaslam.rotation import nearest_rigid, se3_exp, skew
-from sigmaslam.tables import CALIBRATION_SIZE
+from sigmaslam.state_layout import CALIBRATION_SIZE
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,29 +86,31 @@ class PastPoses:
         grown[size:, size:] += step_covariance
         return grown, replace(self, cross=np.concatenate([self.cross, across], axis=1))
 
-    def tie(
-        self, window: np.ndarray, index: int, apart: np.ndarray, match: np.ndarray
+    def add_loop_constraint(
+        self, window: np.ndarray, index: int, difference: np.ndarray, covariance: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, PastPoses]:
         """Posterior when the window's last pose has been measured relative to the pose `index`.
 
         Args:
             window: (n, n) covariance of its state before.
             index: of the old pose.
-            apart: (6,) by which the two should move against each other.
-            match: (6, 6) covariance of that.
+            difference: (6,) by which the two should move against each other.
+            covariance: (6, 6) of that.
         Returns:
             (n,) step of the window's state, its covariance (n, n), and these.
         """
         old, last = past_slice(index), slice(len(window) - 6, len(window))
-        # Covariances with what is measured, the last pose less the old one.
-        own = window[:, last] - self.cross[old].T
-        theirs = self.cross[:, last] - self.covariance[:, old]
-        innovation = own[last] - theirs[old] + match
-        gain = np.linalg.lstsq(innovation, own.T, rcond=1e-12)[0].T
-        past_gain = np.linalg.lstsq(innovation, theirs.T, rcond=1e-12)[0].T
-        root = matrix_root(window - gain @ own.T)
-        past = self.moved(past_gain @ apart, self.covariance - past_gain @ theirs.T, self.cross - past_gain @ own.T)
-        return gain @ apart, root @ root.T, past
+        # Covariances of the states with the difference that is measured: the last pose less the old one.
+        by_window = window[:, last] - self.cross[old].T
+        by_past = self.cross[:, last] - self.covariance[:, old]
+        innovation = by_window[last] - by_past[old] + covariance
+        gain = np.linalg.lstsq(innovation, by_window.T, rcond=1e-12)[0].T
+        past_gain = np.linalg.lstsq(innovation, by_past.T, rcond=1e-12)[0].T
+        root = matrix_root(window - gain @ by_window.T)
+        past = self.moved(
+            past_gain @ difference, self.covariance - past_gain @ by_past.T, self.cross - past_gain @ by_window.T
+        )
+        return gain @ difference, root @ root.T, past
 
     def drop(self, index: int) -> PastPoses:
         """Those but one."""

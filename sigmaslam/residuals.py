@@ -60,11 +60,11 @@ def whiten(stacked: np.ndarray, noise: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.solve(np.linalg.cholesky(noise), stacked).reshape(-1, stacked.shape[2]))
 
 
-def student_weight(squared: np.ndarray, components: np.ndarray) -> np.ndarray:
+def student_weight(squared: np.ndarray, components: np.ndarray, freedom: float = STUDENT_FREEDOM) -> np.ndarray:
     """Weights (M,) that make least squares the fit of a Student-t, from squared lengths of whitened residuals.
 
     The weighted information of such a fit is more than the estimate's precision, (nu + p + 2) / (nu + p) times as much
     where errors are Student-t: the weights are that much smaller, which hardly moves the estimate.
     """
-    whole = STUDENT_FREEDOM + components
-    return whole**2 / ((whole + 2.0) * (STUDENT_FREEDOM + squared))
+    whole = freedom + components
+    return whole**2 / ((whole + 2.0) * (freedom + squared))

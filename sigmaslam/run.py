@@ -13,16 +13,18 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from sigmaslam.config import TrackerConfig
-from sigmaslam.errors import SigmaSlamError
+from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.estimate import Estimate
 from sigmaslam.location import Locations
 from sigmaslam.location_filter import LocationFilter
 from sigmaslam.object_region import read_region
-from sigmaslam.object_tracker import ObjectEstimate, ObjectTracker, as_camera_object
+from sigmaslam.object_tracker import ObjectTracker
 from sigmaslam.outputs import RunWriter, describe_camera
 from sigmaslam.readers import StereoFrame, StereoSequence
 from sigmaslam.tracker import StereoTracker
 from sigmaslam.trajectory import write_tum
+
+Tracker = StereoTracker | ObjectTracker
 
 
 def track_sequence(
@@ -55,11 +57,16 @@ def track_sequence(
             disk then.
         KeyboardInterrupt: passed on after the partial results are written.
     """
+    if track_object is not None and (map_path is not None or tracks):
+        raise InputError("a map and tracks are of a moving camera's world: leave them out where a body is tracked")
     tracker = _build_tracker(sequence, frontend, backend, config, track_object)
     location = None if locations is None else LocationFilter(locations, track_object is not None)
-    if map_path is not None:
-        tracker.load_map(map_path)
-    writer = RunWriter(out, tracker.describe_rectified() if tracks else None)
+    rectified = None
+    if isinstance(tracker, StereoTracker):
+        if map_path is not None:
+            tracker.load_map(map_path)
+        rectified = tracker.describe_rectified() if tracks else None
+    writer = RunWriter(out, rectified)
     ended = "complete"
     try:
         # However this ends, cameras are given back before the results are written.
@@ -77,7 +84,7 @@ def track_sequence(
     finally:
         summary = writer.finish(
             tracker.map(),
-            {} if isinstance(tracker, ObjectTracker) else tracker.pack_keyframes(),
+            tracker.pack_keyframes(),
             {
                 "input": str(sequence.source),
                 "format": sequence.format,
@@ -99,14 +106,14 @@ def track_sequence(
 
 def _build_tracker(
     sequence: StereoSequence, frontend: str, backend: str, config: TrackerConfig | None, track_object: str | None
-) -> StereoTracker:
+) -> Tracker:
     if track_object is None:
         return StereoTracker(sequence.camera, frontend, backend, config)
     region = read_region(track_object, sequence.camera.left.width, sequence.camera.left.height)
     return ObjectTracker(sequence.camera, region, frontend, backend, config)
 
 
-def _describe_object(tracker: StereoTracker, track_object: str | None) -> dict[str, Any]:
+def _describe_object(tracker: Tracker, track_object: str | None) -> dict[str, Any]:
     """What run.json says of a followed body: its region, and where its frame is in the first left camera's."""
     if not isinstance(tracker, ObjectTracker):
         return {}
@@ -130,7 +137,7 @@ def _describe_location(location: LocationFilter | None) -> dict[str, Any]:
 def _track(
     sequence: StereoSequence,
     frames: Iterator[StereoFrame],
-    tracker: StereoTracker,
+    tracker: Tracker,
     writer: RunWriter,
     location: LocationFilter | None,
 ) -> None:
@@ -152,12 +159,11 @@ def _track(
             noted = len(sequence.skipped)
             estimate = tracker.step(frame.left, frame.right, frame.timestamp)
             if location is not None:
-                estimate = location.fuse(estimate)
-            writer.add(as_camera_object(estimate) if isinstance(estimate, ObjectEstimate) else estimate, read_ms)
-            writer.add_views(tracker.keyframe_views)
+                estimate = estimate.map_camera(location.fuse)
+            writer.add(estimate.camera, estimate.pose, estimate.pose_covariance, read_ms)
             done += 1
             since = time.perf_counter()
-            progress.update(task, completed=done + noted, note=_note(estimate, done / (since - began)))
+            progress.update(task, completed=done + noted, note=_note(estimate.camera, done / (since - began)))
         for skipped in sequence.skipped[noted:]:
             writer.add_skipped(skipped.timestamp)
         progress.update(task, completed=done + len(sequence.skipped))

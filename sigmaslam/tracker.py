@@ -3,58 +3,59 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
+from enum import Enum, auto
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sigmaslam.camera import StereoCamera
-from sigmaslam.chi_square import CHI_SQUARE_9999_OF_6
 from sigmaslam.config import TrackerConfig
 from sigmaslam.errors import InputError
 from sigmaslam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.frame_fit import FrameFit
+from sigmaslam.frame_update import FrameUpdate
 from sigmaslam.frontend import Frontend, StereoView, build_frontend
-from sigmaslam.frontend.planes import disparity_slopes
-from sigmaslam.frontend.relief import patch_relief
+from sigmaslam.guided_matching import GuidedMatcher, GuidedMatches
 from sigmaslam.keyframes import Keyframes
-from sigmaslam.landmarks import PointMap
-from sigmaslam.match_noise import MatchNoise
+from sigmaslam.landmark_admission import AdmitAll, LandmarkAdmission
+from sigmaslam.landmark_table import LandmarkViews
+from sigmaslam.linearise import ViewLineariser
+from sigmaslam.localisation import Localiser, Prediction
+from sigmaslam.loop_closure import LoopCloser
+from sigmaslam.mapping import KeyframeTracks, Mapper
+from sigmaslam.measurement_noise import MeasurementNoise
 from sigmaslam.motion import MotionFilter
+from sigmaslam.point_map import PointMap
 from sigmaslam.rectify import StereoRectifier
-from sigmaslam.rotation import nearest_rigid, se3_adjoint, se3_inverse, turn_covariance
-from sigmaslam.search import Found, LandmarkSearch
-from sigmaslam.spacing import select_apart
+from sigmaslam.relocalisation import Relocalisation, Relocaliser
+from sigmaslam.rotation import se3_adjoint, se3_inverse, turn_covariance
+from sigmaslam.state_layout import CALIBRATION, pose_slice
 from sigmaslam.stopwatch import Stopwatch
-from sigmaslam.tables import CALIBRATION, Views, join_views, pose_slice
+from sigmaslam.unguided_matching import UnguidedMatcher
 from sigmaslam.window import KeyframeWindow
 
 __all__ = ["CalibrationEstimate", "Estimate", "StereoTracker", "TrackerConfig"]
 
 _LOGGER = logging.getLogger(__name__)
 
-# A pose that fewer of the matches near the prediction agree with is not believed.
-_LEAST_SHARE = 0.3
-# A fit near the prediction with a larger NIS per degree of freedom may sit in a wrong place: it is checked against one
-# that does without the prediction.
-_DOUBTFUL_NIS = 2.0
-# With so large a NIS a pose needs so many times the least number of inliers.
-_MANY = 3
 # A blurred view whose matches scatter by so many times the variance that they claim is no keyframe. A sharp one is: no
 # keyframes at all for 20 frames lost the KITTI drive.
 _SCATTERED = 1.6
-# Where more than this share of the disparities is negative by more than a pixel, which no disparity offset explains,
-# the eyes are swapped, or nothing fits.
-_MOST_NEGATIVE = 0.1
 # Tracking starts from a view of which this share of the keypoints is seen by both eyes.
-_LEAST_STEREO_SHARE = 0.25
+_MIN_STEREO_SHARE = 0.25
 # Variance of a pose that is not known at all, m^2 and rad^2.
 _ANYWHERE = 1e6
-# Without a prediction the view is compared with so many late keyframes.
-_LATE_KEYFRAMES = 3
-# When it is lost, with so many of those that left the window, the ones most like it.
-_SIMILAR_KEYFRAMES = 3
+
+
+class Phase(Enum):
+    """What a tracker knows; a lost one stays in its phase."""
+
+    WAITING = auto()  # no keyframe yet
+    WAITING_IN_MAP = auto()  # no keyframe yet, and the world is a map's
+    STARTING = auto()  # a keyframe, but no pose from images yet
+    TRACKING = auto()  # poses and a velocity
+    RESUMED = auto()  # there have been poses, but the velocity since the last one is unknown
 
 
 class StereoTracker:
@@ -69,6 +70,7 @@ class StereoTracker:
         frontend: "learned", "sift", "orb", "klt", or one of your own.
         backend: "onnx", or "torch" (needs the extra `train`).
         config: settings.
+        admission: what may become a landmark; by default everything.
     """
 
     def __init__(
@@ -77,36 +79,34 @@ class StereoTracker:
         frontend: Frontend | str = "learned",
         backend: str = "onnx",
         config: TrackerConfig | None = None,
+        admission: LandmarkAdmission | None = None,
     ) -> None:
-        self.config = config or TrackerConfig()
+        self.config = config = config or TrackerConfig()
         self._rectifier = StereoRectifier(camera)
-        self._camera = self._rectifier.rectified
+        self._camera = rectified = self._rectifier.rectified
         self._T_rectified_left = np.eye(4)
         self._T_rectified_left[:3, :3] = self._rectifier.R_rectified_left
         if isinstance(frontend, str):
-            frontend = build_frontend(frontend, self.config.max_keypoints, backend)
+            frontend = build_frontend(frontend, config.max_keypoints, backend)
         self._frontend = frontend
-        turn = self.config.turn_sigma
-        self._window = KeyframeWindow(
-            self._camera,
-            np.array([self.config.offset_sigma, turn, turn]),
-            backend,
-            self.config.linearisation,
-            self.config.iterations,
-        )
-        self._noise = MatchNoise(self.config)
-        self._search = LandmarkSearch(self._camera, self._frontend, self._window, self._noise, self.config)
+        self._admission = admission or AdmitAll(config.min_inliers)
+        lineariser = ViewLineariser(rectified, backend, config.linearisation == "unscented")
+        calibration_sigma = np.array([config.offset_sigma, config.turn_sigma, config.turn_sigma])
+        self._window = window = KeyframeWindow(rectified, calibration_sigma, lineariser)
+        self._noise = noise = MeasurementNoise(config)
         self._motion = MotionFilter(backend)
-        self._keyframes = Keyframes(self._window, self.config.remembered, self.config.most_points)
-        self._reference = 0  # landmarks in the last keyframe
-        self._densities = np.zeros(2)
+        self._keyframes = keyframes = Keyframes(window, config.max_keyframes, config.max_points)
+        update = FrameUpdate(window, config.iterations)
+        guided = GuidedMatcher(rectified, frontend, window, update, noise, config)
+        self._unguided = unguided = UnguidedMatcher(rectified, frontend, window, noise, config)
+        self._localiser = Localiser(window, update, guided, unguided, config)
+        self._mapper = Mapper(rectified, window, keyframes, noise, config)
+        self._loops = LoopCloser(window, keyframes, unguided)
+        self._relocaliser = Relocaliser(window, keyframes, unguided, self._admission, config.min_inliers)
+        self._phase = Phase.WAITING
         self._timestamp: float | None = None
-        self._tracked_at = 0.0
-        self._moving = False  # there has been a pose from the images
-        self._velocity_known = False  # since the last start
-        self._in_map = False  # the world is that of a map that was loaded
-        self.keyframe_views: Views | None = None
-        """What the last frame saw if it became a keyframe, by numbers of landmarks that stay."""
+        self._tracked_at = self._started_at = 0.0
+        self._landmarks_in_keyframe = 0
 
     def load_map(self, path: Path) -> None:
         """Takes the world of a map that `sigmaslam track` has written; tracking starts where a view is found in it.
@@ -115,17 +115,7 @@ class StereoTracker:
             InputError: the file is no map, or made with another front-end or camera.
         """
         self._keyframes.load(path, self._frontend.name, self._camera)
-        self._in_map = True
-
-    def describe_rectified(self) -> dict[str, Any]:
-        """The rectified pair that `keyframe_views` are measured in: intrinsics (5,), R_rectified_left (3, 3)."""
-        camera = self._camera
-        intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.baseline])
-        return {"intrinsics": intrinsics, "R_rectified_left": self._T_rectified_left[:3, :3]}
-
-    def pack_keyframes(self) -> dict[str, Any]:
-        """Keyframes by which a later run finds its place in the map, as arrays by name."""
-        return self._keyframes.pack(self._frontend.name, self._camera)
+        self._phase = Phase.WAITING_IN_MAP
 
     def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> Estimate:
         """Takes one stereo pair.
@@ -137,289 +127,232 @@ class StereoTracker:
             InputError: the time stamp does not increase.
             FrameError: an image has the wrong type or size.
         """
-        if self._timestamp is not None and timestamp <= self._timestamp:
-            raise InputError(
-                f"time stamp {timestamp:.6f} s does not come after {self._timestamp:.6f} s: sort the frames by time"
-            )
+        self._check_time(timestamp)
         clock = Stopwatch()
-        self.keyframe_views = None
         view = self._frontend.observe(*self._rectifier.rectify(left, right))
         clock.lap("features")
-        if self._timestamp is not None:
-            self._motion.predict(timestamp - self._timestamp, self._densities)
-        matches, fit, status = 0, None, "starting"
-        if len(self._window) and not self._is_swapped(view):
-            found, fit = self._track(view, clock)
-            matches = len(found.probability)
+        self._predict(timestamp)
+        matches, fit = self._localise(view, timestamp, clock)
+        tracks = None
         if fit is not None:
             status = "tracking"
-            # Patches that are blurred are misplaced alike, along the blur and towards where they were expected: many of
-            # them say no more than a few.
-            fit = fit.doubted(max(fit.misfit, 1.0) * self._keyframes.blur(view))
-            self._accept(fit, found, view, timestamp)
-        elif self._remember(view, timestamp):
+            fit = self._inflate(fit, view)
+            expected = self._motion.step, self._motion.step_covariance
+            self._correct(fit, matches, timestamp)
+            if self._is_keyframe_due(fit):
+                tracks = self._insert_tracked(view, timestamp, fit, matches, expected)
+        elif (found := self._relocaliser.relocalise(view)) is not None:
             status = "relocalised"
-        elif len(self._window):
-            status = "lost" if self._moving else "starting"
-            self._recover(view, timestamp)
-        elif self._has_stereo(view) and np.isfinite(view.disparity).mean() >= _LEAST_STEREO_SHARE and not self._in_map:
-            self._start(view, timestamp)
+            tracks = self._insert_relocalised(found, timestamp)
+        else:
+            status = "lost" if self._phase in (Phase.TRACKING, Phase.RESUMED) else "starting"
+            tracks = self._start_or_recover(view, timestamp)
+        if tracks is not None:
+            self._loops.close()
         clock.lap("map")
         self._timestamp = timestamp
-        return self._report(timestamp, status, matches, fit, clock.milliseconds)
+        return self._report(timestamp, status, matches, fit, tracks, clock.milliseconds)
 
     def map(self) -> PointMap:
         """All landmarks so far that were seen at least three times."""
         return self._keyframes.map().transform(se3_inverse(self._T_rectified_left))
 
-    # ---- a frame against the window
+    def describe_rectified(self) -> dict[str, Any]:
+        """The rectified pair that tracks are measured in: intrinsics (5,), R_rectified_left (3, 3)."""
+        camera = self._camera
+        intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.baseline])
+        return {"intrinsics": intrinsics, "R_rectified_left": self._T_rectified_left[:3, :3]}
 
-    def _pose_and_step(self) -> tuple[np.ndarray, np.ndarray]:
-        """The predicted pose, and its covariance relative to the last keyframe, perturbed in the world."""
-        key = self._window.poses[-1]
-        return key @ self._motion.step, turn_covariance(key, self._motion.step_covariance)
+    def pack_keyframes(self) -> dict[str, Any]:
+        """Keyframes by which a later run finds its place in the map, as arrays by name."""
+        return self._keyframes.pack(self._frontend.name, self._camera)
 
-    def _track(self, view: StereoView, clock: Stopwatch) -> tuple[Found, FrameFit | None]:
-        """Finds the landmarks in the view, first near the prediction, then anywhere; what was found and the fit."""
-        pose, covariance = self._pose_and_step()
-        found, fit = Found.nothing(), None
-        if self._velocity_known:
-            found = self._search.near(view, self._keyframes.views, pose, covariance)
-            clock.lap("match")
-            fit = self._fit(found, pose, covariance)
-            clock.lap("filter")
-        if fit is None or fit.nis_per_dof > _DOUBTFUL_NIS:
-            other_found, other = self._track_anywhere(view, clock)
-            if fit is None or (other is not None and other.nis_per_dof < fit.nis_per_dof):
-                found, fit = other_found, other
-        if fit is not None and fit.misfit > _DOUBTFUL_NIS and fit.kept.sum() < _MANY * self.config.least_inliers:
-            return found, None  # chance agreement of a few
-        return found, fit
+    # ---- the stages of a frame
 
-    def _track_anywhere(self, view: StereoView, clock: Stopwatch) -> tuple[Found, FrameFit | None]:
-        """Without a prediction: the pose relative to a late keyframe from its features, then landmarks near there."""
-        found = Found.nothing()
-        for back in range(1, min(_LATE_KEYFRAMES, len(self._window)) + 1):
-            relative = self._search.locate(self._keyframes.views[-back], view)
-            clock.lap("match")
-            if relative is None:
-                continue
-            start = self._window.poses[-back] @ relative.T_key_camera
-            # How far the landmarks of other keyframes may be from where this pose expects them.
-            margin = np.diag(np.repeat([0.01 * self._window.depth, 0.01], 3) ** 2)
-            uncertain = turn_covariance(start, relative.covariance + margin)
-            found = self._search.near(view, self._keyframes.views, start, uncertain, -back, alone=True)
-            clock.lap("match")
-            pose, covariance = self._pose_and_step()
-            fit = self._window.fit_frame(
-                found.views, pose, covariance, self.config.least_inliers, start, relative.scale
+    def _check_time(self, timestamp: float) -> None:
+        if self._timestamp is not None and timestamp <= self._timestamp:
+            raise InputError(
+                f"time stamp {timestamp:.6f} s does not come after {self._timestamp:.6f} s: sort the frames by time"
             )
-            clock.lap("filter")
-            if fit is not None and fit.kept.sum() >= _LEAST_SHARE * len(found.probability):
-                return found, fit
-        return found, None
 
-    def _fit(self, found: Found, pose: np.ndarray, covariance: np.ndarray) -> FrameFit | None:
-        """Update from the prediction; most of what was found near it must agree."""
-        count = len(found.probability)
-        if count < self.config.least_inliers:
-            return None
-        fit = self._window.fit_frame(found.views, pose, covariance, self.config.least_inliers)
-        if fit is None or fit.prior_cost > CHI_SQUARE_9999_OF_6:
-            # The camera has jumped, and all matches with it; or something moves that gives most of them, and those that
-            # stand still agree with a pose close to the prediction: it holds on to that first.
-            expected = np.flatnonzero(self._window.expected_views(found.views, pose, covariance))
-            views = found.views.select(expected)
-            least = _MANY * self.config.least_inliers
-            steady = self._window.fit_frame(views, pose, 0.01 * covariance, least)
-            if steady is not None:
-                expected = expected[steady.kept]
-                steady = self._window.fit_frame(found.views.select(expected), pose, covariance, least)
-            if steady is not None and steady.kept.sum() >= _LEAST_SHARE * count:
-                kept = np.zeros(count, bool)
-                kept[expected] = steady.kept
-                fit = replace(steady, kept=kept)
-        return fit if fit is not None and fit.kept.sum() >= _LEAST_SHARE * count else None
+    def _predict(self, timestamp: float) -> None:
+        if self._timestamp is not None:
+            self._motion.predict(timestamp - self._timestamp, self._densities())
 
-    def _accept(self, fit: FrameFit, found: Found, view: StereoView, timestamp: float) -> None:
-        """Takes the pose over, and makes the view a keyframe when the old ones fade."""
-        landmarks = self._window.landmarks
-        landmarks.misses[found.searched] += 1
-        seen = found.views.rows[fit.kept]
-        landmarks.misses[seen] = 0
-        landmarks.views[seen] += 1
-        back = se3_inverse(self._window.poses[-1])
-        expected, step_covariance = self._motion.step, self._motion.step_covariance
+    def _localise(self, view: StereoView, timestamp: float, clock: Stopwatch) -> tuple[GuidedMatches, FrameFit | None]:
+        """Matches with the window's landmarks, and the pose if enough of them agree."""
+        if not len(self._window) or view.is_swapped(self.config.min_inliers):
+            return GuidedMatches.empty(), None
+        first = self._admission.begin_again(view, self._unguided)
+        if first is not None:
+            self._restart(first, timestamp)
+        return self._localiser.localise(view, self._keyframes.views, self._prediction(), clock)
+
+    def _inflate(self, fit: FrameFit, view: StereoView) -> FrameFit:
+        """Patches that are blurred are misplaced alike, along the blur and towards where they were expected.
+
+        Many of them say no more than a few.
+        """
+        return fit.inflated(max(fit.nis_before_scaling, 1.0) * self._keyframes.blur(view))
+
+    def _correct(self, fit: FrameFit, matches: GuidedMatches, timestamp: float) -> None:
+        """Takes the pose over."""
+        seen = matches.views.select(fit.inliers)
+        self._admission.confirm(seen, self._window)
+        self._window.count_sightings(matches.searched, seen.landmark)
+        back = se3_inverse(self._window.posterior.poses[-1])
         self._motion.correct(back @ fit.pose, turn_covariance(back, fit.relative))
-        self._tracked_at = timestamp
-        self._moving = self._velocity_known = True
         self._noise.adapt(fit.nis_per_dof)
-        count = int(fit.kept.sum())
-        if count < self.config.keyframe_ratio * self._reference:
-            if fit.doubt > fit.misfit > _SCATTERED:  # more than the misfit is what blur adds
-                return  # a bad keyframe would spoil what comes after it; the next view may be a better one
-            view = self._choose(view, fit.pose)
-            if self._has_stereo(view):
-                views = found.views.select(fit.kept).scaled(fit.doubt)
-                self._add_keyframe(view, timestamp, fit.pose, expected, step_covariance, views)
+        self._tracked_at = timestamp
+        self._phase = Phase.TRACKING
 
-    # ---- places that were visited before
+    def _is_keyframe_due(self, fit: FrameFit) -> bool:
+        """Whether the landmarks of the last keyframe fade, and the view is good enough to replace it."""
+        # A scale beyond the NIS is that of blur: such a keyframe would spoil what comes after it.
+        blurred = fit.inflation > fit.nis_before_scaling > _SCATTERED
+        return fit.count < self.config.keyframe_ratio * self._landmarks_in_keyframe and not blurred
 
-    def _remember(self, view: StereoView, timestamp: float) -> bool:
-        """Finds the view among the remembered keyframes and goes on from there; whether it was found."""
-        if not self._has_stereo(view):
-            return False
-        memory = self._keyframes.memory
-        for keyframe in memory.similar(view, _SIMILAR_KEYFRAMES):
-            relative = self._search.locate(keyframe.view, view)
-            if relative is None:
-                continue
-            chosen = self._choose(view, nearest_rigid(keyframe.pose @ relative.T_key_camera))
-            if not self._has_stereo(chosen):
-                continue
-            while len(self._window):
-                self._keyframes.retire_oldest(keyframe.timestamp)
-            memory.refresh(self._window.past)
-            origin = memory.index(keyframe.timestamp)
-            pose = nearest_rigid(memory.keyframes[origin].pose @ relative.T_key_camera)
-            self._add_keyframe(chosen, timestamp, pose, pose, turn_covariance(pose, relative.covariance), None, origin)
-            self._forget_twist()
-            self._tracked_at = timestamp
-            self._moving, self._velocity_known = True, False
-            return True
-        return False
+    def _insert_tracked(
+        self,
+        view: StereoView,
+        timestamp: float,
+        fit: FrameFit,
+        matches: GuidedMatches,
+        expected: tuple[np.ndarray, np.ndarray],
+    ) -> KeyframeTracks | None:
+        """Makes a tracked view a keyframe, where its step from the last one was `expected`."""
+        admitted = view.only(self._admission.admit(view, fit.pose, self._window))
+        if not admitted.has_stereo(self._admission.min_points, self.config.min_inliers):
+            return None
+        views = matches.views.select(fit.inliers).inflated(fit.inflation)
+        return self._insert(admitted, timestamp, fit.pose, *expected, views)
 
-    def _close_loop(self, view: StereoView) -> None:
-        """Looks for the newest keyframe among those that were here long ago, and ties it to what is found."""
-        memory = self._keyframes.memory
-        for keyframe in memory.similar(view, 1, self._keyframes.revisited()):
-            relative = self._search.locate(keyframe.view, view)
-            if relative is None:
-                continue
-            index = memory.index(keyframe.timestamp)
-            match = turn_covariance(keyframe.pose @ relative.T_key_camera, relative.covariance)
-            if self._window.tie(index, relative.T_key_camera, match):
-                _LOGGER.info("loop closed with the keyframe of %.3f s", keyframe.timestamp)
-                memory.refresh(self._window.past)
+    def _insert_relocalised(self, found: Relocalisation, timestamp: float) -> KeyframeTracks:
+        """Goes on from where a lost view was found."""
+        covariance = turn_covariance(found.pose, found.covariance)
+        self._phase = Phase.RESUMED
+        return self._insert_at_rest(found.view, timestamp, found.pose, found.pose, covariance, found.origin)
 
-    def _recover(self, view: StereoView, timestamp: float) -> None:
-        """Without a pose: wait for a while, then go on from this view with the uncertainty of the prediction."""
-        if timestamp - self._tracked_at > self.config.lost_seconds and self._has_stereo(view):
-            _LOGGER.warning(
-                "tracking starts anew at %.3f s, %.2f s after the last pose", timestamp, timestamp - self._tracked_at
-            )
-            pose, _ = self._pose_and_step()
-            self._add_keyframe(view, timestamp, pose, self._motion.step, self._motion.step_covariance, None)
-            self._forget_twist()
-            self._tracked_at = timestamp
-            self._velocity_known = False
+    def _start_or_recover(self, view: StereoView, timestamp: float) -> KeyframeTracks | None:
+        """Without a pose: starts, or waits for a while and goes on with the uncertainty of the prediction."""
+        if self._phase is Phase.WAITING_IN_MAP or not self._has_stereo(view):
+            return None
+        if self._phase is Phase.WAITING:
+            seen_by_both = np.isfinite(view.disparity).mean()
+            return self._start(view, timestamp) if seen_by_both >= _MIN_STEREO_SHARE else None
+        since = timestamp - self._tracked_at
+        if since <= self.config.lost_seconds or not self._admission.restarts_anywhere:
+            return None
+        _LOGGER.warning("tracking starts anew at %.3f s, %.2f s after the last pose", timestamp, since)
+        if self._phase is Phase.TRACKING:
+            self._phase = Phase.RESUMED
+        motion = self._motion
+        return self._insert_at_rest(view, timestamp, self._prediction().pose, motion.step, motion.step_covariance)
 
     # ---- keyframes
 
-    def _choose(self, view: StereoView, pose: np.ndarray) -> StereoView:
-        """The view with disparities only where it may become landmarks, seen from `pose`: here everywhere."""
-        return view
+    def _start(self, view: StereoView, timestamp: float) -> KeyframeTracks:
+        """Makes the view the first keyframe, and its camera the world."""
+        self._started_at, self._phase = timestamp, Phase.STARTING
+        view = view.only(self._admission.admit(view, np.eye(4), self._window))
+        return self._insert_at_rest(view, timestamp, np.eye(4), np.eye(4), np.zeros((6, 6)))
 
-    def _has_stereo(self, view: StereoView) -> bool:
-        return int(np.isfinite(view.disparity).sum()) >= 2 * self.config.least_inliers and not self._is_swapped(view)
+    def _restart(self, first: StereoView, timestamp: float) -> None:
+        """Starts again from the first view, now with other landmarks, and predicts the current frame from there."""
+        phase = self._phase
+        self._keyframes.restart()
+        self._start(first, self._started_at)
+        if phase in (Phase.TRACKING, Phase.RESUMED):
+            self._phase = Phase.RESUMED
+        self._motion.predict(timestamp - self._started_at, self._densities())
 
-    def _is_swapped(self, view: StereoView) -> bool:
-        """Whether the right image looks like the left eye's: too much lies behind infinity."""
-        known = view.disparity[np.isfinite(view.disparity)]
-        return len(known) >= self.config.least_inliers and float((known < -1.0).mean()) > _MOST_NEGATIVE
-
-    def _start(self, view: StereoView, timestamp: float) -> None:
-        view = self._choose(view, np.eye(4))
-        self._add_keyframe(view, timestamp, np.eye(4), np.eye(4), np.zeros((6, 6)), None)
-        self._forget_twist()
-        self._tracked_at = timestamp
-
-    def _add_keyframe(
+    def _insert_at_rest(
         self,
         view: StereoView,
         timestamp: float,
         pose: np.ndarray,
         step: np.ndarray,
         step_covariance: np.ndarray,
-        views: Views | None,
         origin: int | None = None,
-    ) -> None:
-        """Makes the view a keyframe: it sees `views`, and whatever else it has in stereo is new."""
-        window = self._window
-        if len(window) == self.config.window:
-            number = self._keyframes.retire_oldest()
-            if views is not None:
-                views = views.renumber(number)
-        if len(window):
-            step_covariance = turn_covariance(window.poses[-1], step_covariance)
-        since = timestamp - self._keyframes.times[-1] if self._keyframes.times else 0.0
-        walk = np.array([self.config.offset_walk**2 * since, 0.0, 0.0])
-        window.add_keyframe(pose, step, step_covariance, walk, origin)
-        slope = disparity_slopes(view.features.keypoints, view.disparity)
-        view = replace(view, slope=slope)
-        self._keyframes.append(view, timestamp)
-        if views is not None:
-            window.add_views(views)
-        self._add_landmarks(view, views, slope)
-        first = window.landmarks.select(window.landmarks.host == len(window) - 1).first_views()
-        seen = [] if views is None else [replace(views, rows=window.landmarks.serial[views.rows])]
-        self.keyframe_views = join_views([*seen, first])
-        window.solve()
-        self._keyframes.memory.refresh(window.past)
-        self._close_loop(view)
+    ) -> KeyframeTracks:
+        """Makes a view a keyframe that sees no known landmark; its velocity is unknown."""
+        tracks = self._insert(view, timestamp, pose, step, step_covariance, None, origin)
+        sigma = np.repeat([self.config.start_speed * self._window.depth, self.config.start_turn], 3)
+        self._motion.forget_twist(sigma)
+        self._tracked_at = timestamp
+        return tracks
+
+    def _insert(
+        self,
+        view: StereoView,
+        timestamp: float,
+        pose: np.ndarray,
+        step: np.ndarray,
+        step_covariance: np.ndarray,
+        views: LandmarkViews | None,
+        origin: int | None = None,
+    ) -> KeyframeTracks:
+        """Makes a view a keyframe; arguments as of `Mapper.insert`."""
+        tracks = self._mapper.insert(view, timestamp, pose, step, step_covariance, views, origin)
         self._motion.start_keyframe()
-        self._reference = int((window.landmarks.host == len(window) - 1).sum())
-        self._reference += 0 if views is None else len(views.rows)
+        self._landmarks_in_keyframe = len(tracks)
+        return tracks
 
-    def _add_landmarks(self, view: StereoView, views: Views | None, slope: np.ndarray) -> None:
-        """Stereo points that no landmark has been found at."""
-        index = np.flatnonzero(np.isfinite(view.disparity))
-        taken = np.zeros((0, 2)) if views is None else views.measurement[:, :2]
-        index = index[select_apart(view.features.select(index), taken, self.config.spacing, view.left.shape)]
-        measured = view.measured(index)
-        relief = patch_relief(view.left, view.right, measured, slope[index])
-        self._window.add_landmarks(index, measured, self._noise.of_keypoints(view, index), relief)
-        depth = self._camera.fx * self._camera.baseline / max(float(np.nanmedian(view.disparity)), 0.5)
-        self._window.depth = depth
-        self._densities = np.array([(self.config.acceleration * depth) ** 2, self.config.angular_acceleration**2])
+    def _has_stereo(self, view: StereoView) -> bool:
+        return view.has_stereo(self._admission.min_points, self.config.min_inliers)
 
-    def _forget_twist(self) -> None:
-        self._motion.forget_twist(np.repeat([self.config.start_speed * self._window.depth, self.config.start_turn], 3))
+    # ---- motion and results
 
-    # ---- results
+    def _densities(self) -> np.ndarray:
+        """(2,) power spectral densities of the accelerations."""
+        config = self.config
+        return np.array([(config.acceleration * self._window.depth) ** 2, config.angular_acceleration**2])
+
+    def _prediction(self) -> Prediction:
+        key = self._window.posterior.poses[-1]
+        covariance = turn_covariance(key, self._motion.step_covariance)
+        return Prediction(key @ self._motion.step, covariance, self._phase is Phase.TRACKING)
 
     def _report(
-        self, timestamp: float, status: str, matches: int, fit: FrameFit | None, milliseconds: dict[str, float]
+        self,
+        timestamp: float,
+        status: str,
+        matches: GuidedMatches,
+        fit: FrameFit | None,
+        tracks: KeyframeTracks | None,
+        milliseconds: dict[str, float],
     ) -> Estimate:
-        window = self._window
+        state = self._window.posterior
         if fit is not None:
             pose, absolute, relative = fit.pose, fit.covariance, fit.relative
             calibration, spread = fit.calibration, fit.calibration_covariance
-        elif len(window):
-            pose, step = self._pose_and_step()
-            last = pose_slice(len(window) - 1)
-            relative, absolute = step, window.covariance[last, last] + step
-            calibration, spread = window.calibration, window.covariance[CALIBRATION, CALIBRATION]
+        elif len(state):
+            prediction = self._prediction()
+            last = pose_slice(len(state) - 1)
+            pose, relative = prediction.pose, prediction.covariance
+            absolute = state.covariance[last, last] + relative
+            calibration, spread = state.calibration, state.covariance[CALIBRATION, CALIBRATION]
         else:
-            pose, calibration, spread = np.eye(4), window.calibration, window.covariance
-            relative = absolute = (_ANYWHERE if self._in_map else 0.0) * np.eye(6)
+            pose, calibration, spread = np.eye(4), state.calibration, state.covariance
+            relative = absolute = (_ANYWHERE if self._phase is Phase.WAITING_IN_MAP else 0.0) * np.eye(6)
         # The filter knows the rectified camera; users know the left camera of their calibration.
         T_left_rectified = se3_inverse(self._T_rectified_left)
         adjoint = se3_adjoint(T_left_rectified) @ se3_adjoint(se3_inverse(pose))
         belief = 1.0 - np.sqrt(max(np.linalg.eigvalsh(turn_covariance(se3_inverse(pose), relative))[-1], 0.0))
         covariance = adjoint @ absolute @ adjoint.T
-        own = adjoint @ relative @ adjoint.T if fit is not None else np.zeros((6, 6))
+        frame_covariance = adjoint @ relative @ adjoint.T if fit is not None else np.zeros((6, 6))
         return Estimate(
             timestamp=timestamp,
             T_world_camera=T_left_rectified @ pose @ self._T_rectified_left,
             covariance=0.5 * (covariance + covariance.T),
             status=status,
             belief=float(np.clip(belief, 0.0, 1.0)),
-            matches=matches,
-            inliers=int(fit.kept.sum()) if fit is not None else 0,
+            matches=len(matches.probability),
+            inliers=fit.count if fit is not None else 0,
             nis=fit.nis if fit is not None else 0.0,
             dof=fit.dof if fit is not None else 0,
             calibration=CalibrationEstimate(float(calibration[0]), float(np.sqrt(max(spread[0, 0], 0.0)))),
             milliseconds=milliseconds,
-            own_covariance=0.5 * (own + own.T),
+            frame_covariance=0.5 * (frame_covariance + frame_covariance.T),
+            tracks=tracks,
         )

@@ -138,7 +138,7 @@ def write_endurance(
         track_sequence(
             WatchedSequence(RepeatedPairs(lap, some), lap, block),
             without,
-            config=TrackerConfig(remembered=10),
+            config=TrackerConfig(max_keyframes=10),
             tracks=True,
         )
         with np.load(without / TRACKS_NAME) as tracks:

@@ -22,7 +22,7 @@ _UNIQUE, _SPECKLE = 10, 50
 _LEAST, _BEYOND = -4, 16
 
 
-def patch_relief(left: np.ndarray, right: np.ndarray, measured: np.ndarray, slope: np.ndarray) -> np.ndarray:
+def patch_disparity_range(left: np.ndarray, right: np.ndarray, measured: np.ndarray, slope: np.ndarray) -> np.ndarray:
     """Range of the disparities within each keypoint's patch, the slope of its surface taken off; (K,) pixels.
 
     Args:
@@ -41,9 +41,9 @@ def patch_relief(left: np.ndarray, right: np.ndarray, measured: np.ndarray, slop
     u, v = np.round(0.5 * measured[:, :2] - 0.25).astype(int).T[..., None, None]
     u, v = np.clip(u + du, 0, width - 1), np.clip(v + dv, 0, height - 1)
     tilted = slope[:, 0, None, None] * u + slope[:, 1, None, None] * v
-    rest = (dense[v, u] - tilted).reshape(len(measured), -1)
-    known = np.isfinite(rest)
-    most, least = np.where(known, rest, -np.inf).max(axis=1), np.where(known, rest, np.inf).min(axis=1)
+    untilted = (dense[v, u] - tilted).reshape(len(measured), -1)
+    known = np.isfinite(untilted)
+    most, least = np.where(known, untilted, -np.inf).max(axis=1), np.where(known, untilted, np.inf).min(axis=1)
     return np.where(known.any(axis=1), 2.0 * (most - least), 0.0)
 
 

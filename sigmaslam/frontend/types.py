@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
+from sigmaslam.table import Table
+
+# Of a pair with the eyes swapped, more than this share of the disparities is negative by more than a pixel, which no
+# disparity offset explains.
+_MOST_NEGATIVE = 0.1
+
 
 @dataclass(frozen=True, slots=True)
-class Features:
+class Features(Table):
     """Keypoints of one image, best first.
 
     Attributes:
@@ -23,10 +29,6 @@ class Features:
     descriptors: np.ndarray
     scores: np.ndarray
     sigma: np.ndarray
-
-    def select(self, index: np.ndarray) -> Features:
-        """The features of that index or mask."""
-        return Features(self.keypoints[index], self.descriptors[index], self.scores[index], self.sigma[index])
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,9 +54,25 @@ class StereoView:
         """(K, 3) float64 (u, v, disparity) of the features of that index or mask."""
         return np.column_stack([self.features.keypoints[index].astype(np.float64), self.disparity[index]])
 
+    def only(self, chosen: np.ndarray) -> StereoView:
+        """The view without the disparities of all but the chosen features (N,) bool."""
+        return replace(self, disparity=np.where(chosen, self.disparity, np.nan))
+
+    def has_stereo(self, min_points: int, min_to_judge: int) -> bool:
+        """Whether enough features have a disparity, and the eyes are not swapped as of `is_swapped`."""
+        return int(np.isfinite(self.disparity).sum()) >= min_points and not self.is_swapped(min_to_judge)
+
+    def is_swapped(self, min_to_judge: int) -> bool:
+        """Whether the right image looks like the left eye's: too much lies behind infinity.
+
+        False with fewer than `min_to_judge` disparities.
+        """
+        known = self.disparity[np.isfinite(self.disparity)]
+        return len(known) >= min_to_judge and float((known < -1.0).mean()) > _MOST_NEGATIVE
+
 
 @dataclass(frozen=True, slots=True)
-class PatchMaps:
+class PatchMaps(Table):
     """How patches change from one image to another: by homographies about their centres.
 
     Attributes:
@@ -65,13 +83,9 @@ class PatchMaps:
     A: np.ndarray
     tilt: np.ndarray
 
-    def select(self, index: np.ndarray) -> PatchMaps:
-        """The maps of that index or mask."""
-        return PatchMaps(self.A[index], self.tilt[index])
-
 
 @dataclass(frozen=True, slots=True)
-class TemporalMatches:
+class TemporalMatches(Table):
     """Where keypoints of a keyframe are in the current view.
 
     Attributes:
@@ -90,16 +104,10 @@ class TemporalMatches:
     disparity_sigma: np.ndarray
     probability: np.ndarray
 
-    def select(self, index: np.ndarray) -> TemporalMatches:
-        """The matches of that index or mask."""
-        return TemporalMatches(
-            self.key_index[index],
-            self.points[index],
-            self.disparity[index],
-            self.covariance[index],
-            self.disparity_sigma[index],
-            self.probability[index],
-        )
+    @property
+    def measured(self) -> np.ndarray:
+        """(M, 3) (u, v, disparity)."""
+        return np.column_stack([self.points, self.disparity])
 
 
 @dataclass(frozen=True, slots=True)

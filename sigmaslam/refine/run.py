@@ -16,8 +16,8 @@ import numpy as np
 from sigmaslam.errors import InputError
 from sigmaslam.factor_graph import load_gtsam
 from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder, make_folder
-from sigmaslam.landmarks import PointMap
 from sigmaslam.outputs import write_ply
+from sigmaslam.point_map import PointMap
 from sigmaslam.refine.bundle import Adjustment, RefineConfig, adjust
 from sigmaslam.refine.tracks import TRACKS_NAME, read_tracks
 from sigmaslam.rotation import se3_exp, se3_inverse, se3_log

@@ -1,29 +1,23 @@
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from sigmaslam.camera import RectifiedStereo
-from sigmaslam.landmarks import PointMap, map_points, merge_maps
+from sigmaslam.landmark_table import LandmarkViews
+from sigmaslam.point_map import PointMap, merge_maps, window_points
 from sigmaslam.rotation import se3_exp, se3_inverse
-from sigmaslam.tables import Views
 from sigmaslam.window import KeyframeWindow
+from tests.support.dense_window import CAMERA, DEPTH, make_window
 from tests.support.quantiles import squared_sigmas
 
-CAMERA = RectifiedStereo(fx=400.0, fy=410.0, cx=319.5, cy=239.5, baseline=0.2, width=640, height=480)
 SIGMA = np.array([0.3, 0.4, 0.5])
 OFFSET = 0.7
 WORLD = se3_exp([3.0, -1.0, 2.0, 0.4, -0.8, 0.2])
 # Poses and calibration are as good as known: what is left is the landmarks' own uncertainty.
 CERTAIN = 1e-8
 TIMES = 10.0 + np.arange(100)
-
-
-@pytest.fixture(autouse=True)
-def gaussian(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Least squares alone, where there are weights for longer tails."""
-    monkeypatch.setattr("sigmaslam.residuals.STUDENT_FREEDOM", 1e12)
 
 
 def points_in_view(count: int, seed: int = 0) -> np.ndarray:
@@ -49,11 +43,9 @@ def world_points(truth: np.ndarray) -> np.ndarray:
 
 def window_of(measured: np.ndarray, sigma: np.ndarray = SIGMA, own: float = 0.0) -> KeyframeWindow:
     """One keyframe with landmarks; `own` is the deviation of what a landmark's disparities are all off by."""
-    window = KeyframeWindow(CAMERA, np.full(3, CERTAIN), linearisation="extended")
-    window.calibration = np.array([OFFSET, 0.0, 0.0])
-    window._prior_calibration = window.calibration
-    window.depth = 4.0
-    window.add_keyframe(WORLD, WORLD, CERTAIN**2 * np.eye(6), np.zeros(3))
+    window = make_window(np.full(3, CERTAIN))
+    window.prior = window.posterior = replace(window.posterior, calibration=np.array([OFFSET, 0.0, 0.0]))
+    window.add_keyframe(WORLD, WORLD, CERTAIN**2 * np.eye(6), np.zeros(3), DEPTH)
     count = len(measured)
     variance = np.column_stack([np.tile(sigma**2, (count, 1)), np.full(count, max(own, CERTAIN) ** 2)])
     window.add_landmarks(np.arange(count), measured, variance)
@@ -62,14 +54,14 @@ def window_of(measured: np.ndarray, sigma: np.ndarray = SIGMA, own: float = 0.0)
 
 def see(window: KeyframeWindow, T_key_camera: np.ndarray, seen: np.ndarray) -> None:
     """One more keyframe, in a known place, that sees all landmarks."""
-    step = se3_inverse(window.poses[-1]) @ WORLD @ T_key_camera
-    window.add_keyframe(WORLD @ T_key_camera, step, CERTAIN**2 * np.eye(6), np.zeros(3))
-    window.add_views(Views(np.arange(len(seen)), seen, noise_of(len(seen)), np.zeros((len(seen), 3, 2))))
+    step = se3_inverse(window.posterior.poses[-1]) @ WORLD @ T_key_camera
+    window.add_keyframe(WORLD @ T_key_camera, step, CERTAIN**2 * np.eye(6), np.zeros(3), DEPTH)
+    window.add_views(LandmarkViews(np.arange(len(seen)), seen, noise_of(len(seen)), np.zeros((len(seen), 3, 2))))
     window.landmarks.views = window.landmarks.views + 1
 
 
-def map_of(window: KeyframeWindow, least_views: int = 1) -> PointMap:
-    return map_points(window, np.ones(len(window.landmarks), bool), TIMES[: len(window)], least_views)
+def map_of(window: KeyframeWindow, min_views: int = 1) -> PointMap:
+    return window_points(window, TIMES[: len(window)], min_views)
 
 
 def nees(found: PointMap, truth: np.ndarray) -> np.ndarray:
@@ -145,7 +137,7 @@ def test_exact_views_keep_the_exact_place():
 def test_only_points_that_were_seen_often_enough_enter_the_map():
     window = window_of(measure(points_in_view(10), np.eye(4)))
     window.landmarks.views[[2, 7]] = 3
-    found = map_of(window, least_views=3)
+    found = map_of(window, min_views=3)
     np.testing.assert_array_equal(found.points, map_of(window).points[[2, 7]])
     assert found.observations.tolist() == [3, 3]
     assert found.timestamps.tolist() == [10.0, 10.0]
@@ -183,10 +175,11 @@ def test_points_at_infinity_do_not_enter_the_map():
 def test_a_turned_right_camera_is_taken_out_of_the_disparity():
     truth = points_in_view(20)
     window = window_of(truth)
-    window.calibration = np.array([0.3, 2.0, -1.0])
+    calibration = np.array([0.3, 2.0, -1.0])
+    window.posterior = replace(window.posterior, calibration=calibration)
     x, y = (truth[:, 0] - truth[:, 2] - CAMERA.cx) / CAMERA.fx, (truth[:, 1] - CAMERA.cy) / CAMERA.fy
     biased = window_of(truth + np.array([0, 0, 1]) * (0.3 + 2 * x * x - x * y)[:, None])
-    biased.calibration = window.calibration
+    biased.posterior = replace(biased.posterior, calibration=calibration)
     # To first order: the bias is taken at the measured disparity.
     np.testing.assert_allclose(biased.true_disparity(biased.landmarks.measured), truth, atol=0.02)
 
@@ -211,9 +204,9 @@ def test_a_point_may_lie_on_either_surface_of_its_patch():
     truth = points_in_view(20)
     window = window_of(measure(truth, np.eye(4)))
     smooth = map_of(window).covariances
-    window.landmarks.relief = np.linspace(0.0, 8.0, 20)
+    window.landmarks.disparity_range = np.linspace(0.0, 8.0, 20)
     gained = map_of(window).covariances - smooth
     nudge = np.array([0.0, 0.0, 1e-5])
     by_disparity = (world_points(truth + nudge) - world_points(truth - nudge)) / 2e-5
-    step = 0.5 * window.landmarks.relief[:, None] * by_disparity
+    step = 0.5 * window.landmarks.disparity_range[:, None] * by_disparity
     np.testing.assert_allclose(gained, step[:, :, None] * step[:, None, :], atol=1e-6 * np.abs(gained).max())

@@ -8,18 +8,52 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from sigmaslam.frontend.types import PatchMaps, StereoView, TemporalMatches
 from sigmaslam.rotation import nearest_rigid, se3_exp, se3_inverse, se3_log
 from sigmaslam.tracker import StereoTracker
 from tests.support.quantiles import chi_square_median, squared_sigmas
-from tests.support.simulated_frontend import SCALES, SimulatedFrontend, run_simulated
+from tests.support.simulated_frontend import SCALES, SimulatedFrontend, frame_of, run_simulated
 
 LAP, FRAMES = 180, 220
 SCALE = SCALES["driving"]
 OFFSET = 0.3
+# Frames after which a keyframe is one of long ago.
+LONG_AGO = 20
 
 
 class LapFrontend(SimulatedFrontend):
-    """A drive around a circle of 180 m, and on for 40 m."""
+    """A drive around a circle of 180 m, and on for 40 m.
+
+    Args:
+        seed: of everything random.
+        loops: what matches without a prediction say of keyframes of long ago: "right", "none", or "wrong": as if the
+            camera were 5 m aside.
+    """
+
+    def __init__(self, seed: int, loops: str = "right") -> None:
+        super().__init__(SCALE, seed, FRAMES, 100, offset=OFFSET)
+        self._loops = loops
+
+    def match(
+        self,
+        key: StereoView,
+        index: np.ndarray,
+        view: StereoView,
+        predicted: np.ndarray,
+        covariance: np.ndarray | None,
+        maps: PatchMaps | None = None,
+    ) -> TemporalMatches:
+        # Drawn whatever is made of it, so that the noise is that of the other runs.
+        found = super().match(key, index, view, predicted, covariance, maps)
+        frame = frame_of(view.left)
+        if covariance is not None or self._loops == "right" or frame - frame_of(key.left) < LONG_AGO:
+            return found
+        if self._loops == "none":
+            return found.select(np.zeros(0, np.int64))
+        points = self._seen[frame_of(key.left)][found.key_index]
+        aside = self.poses[frame] @ se3_exp(np.array([5.0, 0, 0, 0, 0, 0]))
+        seen = self._project_from(aside)[0][points]
+        return replace(found, points=seen[:, :2], disparity=seen[:, 2])
 
     def _path(self, frames: int) -> np.ndarray:
         step, poses = se3_exp(np.array([0, 0, 1.0, 0, 2 * np.pi / LAP, 0])), [np.eye(4)]
@@ -47,44 +81,33 @@ class Lap:
     poses: np.ndarray
 
 
-def drive(seed: int, closed: bool = True, wrong: bool = False) -> Lap:
-    """Around once, with loops or without, or with matches of old keyframes that are 5 m off."""
-    frontend = LapFrontend(SCALE, seed, FRAMES, 100, offset=OFFSET)
+def drive(seed: int, loops: str = "right") -> Lap:
+    """Around once."""
+    frontend = LapFrontend(seed, loops)
     tracker = StereoTracker(frontend.camera, frontend)
-    if not closed:
-        # Old keyframes are looked for all the same, so that the noise is that of the other runs.
-        tracker._window.tie = lambda *arguments: False  # type: ignore[method-assign]
-    if wrong:
-        locate = tracker._search.locate
-
-        def mislead(*views):
-            found = locate(*views)
-            if found is None or tracker._timestamp is None or tracker._timestamp < 10.0:
-                return found
-            return replace(found, T_key_camera=found.T_key_camera @ se3_exp(np.array([5.0, 0, 0, 0, 0, 0])))
-
-        tracker._search.locate = mislead  # type: ignore[method-assign]
     run = run_simulated(tracker, frontend, SCALE)
     assert [e.status for e in run.estimates[1:]] == ["tracking"] * (FRAMES - 1)
-    kept = tracker._keyframes.memory.keyframes
-    number = np.array([round(each.timestamp / SCALE.interval) for each in kept])
+    kept = tracker.pack_keyframes()
+    number = np.round(kept["keyframe_timestamps"] / SCALE.interval).astype(int)
+    poses, joint = kept["keyframe_poses"], kept["keyframe_covariance"]
     middle = (number >= 40) & (number < 140)
     true = frontend.poses[number]
-    away = [np.linalg.norm(a[:3, 3] - each.pose[:3, 3]) for a, each in zip(true, kept, strict=True)]
-    errors = [se3_log(a @ se3_inverse(each.pose)) for a, each in zip(true, kept, strict=True)]
-    nees = [e @ np.linalg.lstsq(each.covariance, e, rcond=1e-12)[0] / 6 for e, each in zip(errors, kept, strict=True)]
+    away = np.linalg.norm(true[:, :3, 3] - poses[:, :3, 3], axis=1)
+    errors = se3_log(true @ se3_inverse(poses))
+    covariances = [joint[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(len(number))]
+    nees = [e @ np.linalg.lstsq(P, e, rcond=1e-12)[0] / 6 for e, P in zip(errors, covariances, strict=True)]
     point_error, point_nees = _points(tracker, frontend)
     end = [
         np.linalg.norm(e.T_world_camera[:3, 3] - T[:3, 3])
         for e, T in zip(run.estimates[LAP + 20 :], frontend.poses[LAP + 20 :], strict=True)
     ]
     return Lap(
-        float(np.mean(np.array(away)[middle])),
+        float(np.mean(away[middle])),
         float(np.mean(np.array(nees)[middle])),
         point_error,
         point_nees,
         float(np.mean(end)),
-        np.array([each.pose for each in kept]),
+        poses,
     )
 
 
@@ -111,7 +134,7 @@ def _points(tracker: StereoTracker, frontend: LapFrontend) -> tuple[float, float
 def test_a_loop_corrects_keyframes_and_points_of_the_way_round(monkeypatch: pytest.MonkeyPatch):
     """Without any extra; halfway round a loop takes half of the variance, at the end nearly all of it."""
     monkeypatch.setitem(sys.modules, "gtsam", None)
-    before = [drive(seed, closed=False) for seed in range(5)]
+    before = [drive(seed, "none") for seed in range(5)]
     after = [drive(seed) for seed in range(5)]
 
     def factor(name: str) -> float:
@@ -130,6 +153,6 @@ def test_a_loop_corrects_keyframes_and_points_of_the_way_round(monkeypatch: pyte
 
 @pytest.mark.slow
 def test_wrong_loops_spoil_nothing():
-    without, misled = drive(0, closed=False), drive(0, wrong=True)
+    without, misled = drive(0, "none"), drive(0, "wrong")
     np.testing.assert_array_equal(misled.poses, without.poses)
     assert misled.end_error == without.end_error

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sigmaslam.landmarks import PointMap
 from sigmaslam.outputs import calibration_verdict, write_ply
+from sigmaslam.point_map import PointMap
 from sigmaslam.tracker import CalibrationEstimate
 
 

@@ -10,19 +10,27 @@ from sigmaslam import StereoTracker, open_sequence
 from sigmaslam.camera import RectifiedStereo
 from sigmaslam.errors import InputError
 from sigmaslam.frontend import Features, StereoView
-from sigmaslam.recall import KeyframeMemory, RememberedKeyframe, pack_keyframes, read_keyframes
+from sigmaslam.keyframe import Keyframe
+from sigmaslam.keyframes import Keyframes
+from sigmaslam.map_file import pack_keyframes, read_keyframes
+from sigmaslam.past import PastPoses
+from sigmaslam.place_recognition import retrieve
 from sigmaslam.refine.tracks import read_tracks
 from sigmaslam.run import track_sequence
 from sigmaslam.tracker import TrackerConfig
 from sigmaslam.trajectory import read_kitti
+from tests.support.dense_window import make_window
 from tests.support.estimates import Demo, error_of, mirrored, squared_error
 from tests.support.quantiles import WITHIN_3_SIGMA
 
 CAMERA = RectifiedStereo(fx=200.0, fy=201.0, cx=32.0, cy=24.0, baseline=0.1, width=64, height=48)
 
 
-def keyframe(number: int, x: float, features: int = 40) -> RememberedKeyframe:
-    """Looks along z from (x, 0, 0); its descriptors are its own."""
+ONE_POSE = PastPoses(np.eye(4)[None], np.eye(6), np.zeros((6, 3)))
+
+
+def view_of(number: int, features: int = 40) -> StereoView:
+    """A view with descriptors of its own."""
     rng = np.random.default_rng(number)
     descriptors = rng.normal(size=(features, 64)).astype(np.float32)
     descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
@@ -34,10 +42,30 @@ def keyframe(number: int, x: float, features: int = 40) -> RememberedKeyframe:
         rng.uniform(0.1, 1.0, features).astype(np.float32),
     )
     disparity = np.where(np.arange(features) % 4 == 0, np.nan, rng.uniform(1, 9, features))
+    return StereoView(image, image, found, disparity, rng.uniform(0.1, 1, features))
+
+
+def keyframe(number: int, features: int = 40) -> Keyframe:
+    return Keyframe(number, 0.5 * number, view_of(number, features))
+
+
+def looking(x: float, R: np.ndarray | None = None) -> np.ndarray:
+    """Pose at (x, 0, 0) that looks along z by default."""
     pose = np.eye(4)
     pose[0, 3] = x
-    view = StereoView(image, image, found, disparity, rng.uniform(0.1, 1, features))
-    return RememberedKeyframe(view, pose, 1e-4 * (number + 1) * np.eye(6), 0.5 * number)
+    pose[:3, :3] = np.eye(3) if R is None else R
+    return pose
+
+
+def visited(poses: list[np.ndarray], max_keyframes: int) -> Keyframes:
+    """Keyframes at these poses that have all left the window."""
+    window = make_window(np.zeros(3), camera=CAMERA)
+    keyframes = Keyframes(window, max_keyframes, 100)
+    for number, pose in enumerate(poses):
+        window.add_keyframe(pose, pose, 1e-4 * np.eye(6), np.zeros(3), 1.0)
+        keyframes.append(view_of(number), 0.5 * number)
+        keyframes.marginalise_oldest()
+    return keyframes
 
 
 def jittered(view: StereoView, rng: np.random.Generator) -> StereoView:
@@ -51,65 +79,69 @@ def jittered(view: StereoView, rng: np.random.Generator) -> StereoView:
 
 
 def test_memory_keeps_to_its_capacity_and_drops_the_right_images():
-    memory = KeyframeMemory(5)
-    for number in range(12):
-        memory.add(keyframe(number, float(number)))
-        assert len(memory.keyframes) == min(number + 1, 5)
-    assert all(each.view.right.size == 0 for each in memory.keyframes)
-    assert all(each.view.left.shape == (48, 64) for each in memory.keyframes)
+    for count in range(1, 12):
+        kept = visited([looking(float(x)) for x in range(count)], 5).remembered
+        assert len(kept) == min(count, 5)
+        assert all(each.view.right.size == 0 for each in kept)
+        assert all(each.view.left.shape == (48, 64) for each in kept)
 
 
 def test_thinning_spares_places_visited_once():
-    """Nine keyframes crowd at the origin, three places are visited once: all three stay."""
-    memory = KeyframeMemory(6)
-    for number, x in enumerate([0.0, 5.0, 0.01, 0.02, 10.0, 0.03, 0.04, 15.0, 0.05, 0.06, 0.07, 0.08]):
-        memory.add(keyframe(number, x))
-    assert {5.0, 10.0, 15.0} <= {float(each.pose[0, 3]) for each in memory.keyframes}
+    """Nine keyframes crowd at the origin, three places are visited once: all three stay, with their poses."""
+    places = [0.0, 5.0, 0.01, 0.02, 10.0, 0.03, 0.04, 15.0, 0.05, 0.06, 0.07, 0.08]
+    keyframes = visited([looking(x) for x in places], 6)
+    assert {1, 4, 7} <= {each.id for each in keyframes.remembered}
+    assert [keyframes.pose(each)[0, 3] for each in keyframes.remembered] == [
+        places[each.id] for each in keyframes.remembered
+    ]
 
 
 def test_thinning_tells_directions_apart():
     """At one place, looking another way: what looks the same way goes first."""
-    memory = KeyframeMemory(3)
-    turned = keyframe(1, 0.0)
-    turned.pose[:3, :3] = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-    for each in (keyframe(0, 0.0), turned, keyframe(2, 0.01), keyframe(3, 1.0)):
-        memory.add(each)
-    assert any(each.timestamp == turned.timestamp for each in memory.keyframes)
+    aside = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    poses = [looking(0.0), looking(0.0, aside), looking(0.01), looking(1.0)]
+    assert 1 in {each.id for each in visited(poses, 3).remembered}
+
+
+def test_keyframes_of_one_time_stamp_are_told_apart():
+    """Two recordings may begin at zero: identity is a number, not a time."""
+    window = make_window(np.zeros(3), camera=CAMERA)
+    keyframes = Keyframes(window, 5, 100)
+    for number in range(3):
+        window.add_keyframe(looking(number), looking(number), 1e-4 * np.eye(6), np.zeros(3), 1.0)
+        keyframes.append(view_of(number), 0.0)
+        keyframes.marginalise_oldest()
+    assert [keyframes.index(each.id) for each in keyframes.remembered] == [0, 1, 2]
+    assert [keyframes.pose(each)[0, 3] for each in keyframes.remembered] == [0.0, 1.0, 2.0]
 
 
 @pytest.mark.parametrize("wanted", [0, 3, 7])
 def test_the_most_similar_keyframe_is_the_one_that_shows_the_place(wanted: int):
-    memory = KeyframeMemory(10)
-    for number in range(8):
-        memory.add(keyframe(number, float(number)))
-    view = jittered(memory.keyframes[wanted].view, np.random.default_rng(99))
-    best = memory.similar(view, 3)
+    kept = [keyframe(number) for number in range(8)]
+    best = retrieve(jittered(kept[wanted].view, np.random.default_rng(99)), 3, kept)
     assert len(best) == 3
-    assert best[0] is memory.keyframes[wanted]
+    assert best[0] is kept[wanted]
 
 
 def test_nothing_is_similar_to_nothing():
-    memory = KeyframeMemory(4)
-    assert memory.similar(keyframe(0, 0.0).view, 3) == []
-    memory.add(keyframe(1, 0.0, features=0))
-    memory.add(keyframe(2, 1.0))
-    assert memory.similar(keyframe(2, 0.0).view, 1)[0].timestamp == keyframe(2, 1.0).timestamp
+    assert retrieve(view_of(0), 3, []) == []
+    kept = [keyframe(1, features=0), keyframe(2)]
+    assert retrieve(view_of(2), 1, kept)[0] is kept[1]
 
 
 # ---- map files
 
 
 def test_keyframes_round_trip_through_a_file(tmp_path: Path):
-    kept = [keyframe(0, 0.0, 40), keyframe(1, 1.0, 0), keyframe(2, 2.0, 17)]
+    kept = [keyframe(0, 40), keyframe(1, 0), keyframe(2, 17)]
     joint = np.random.default_rng(0).normal(size=(18, 18))
-    joint = joint @ joint.T
-    np.savez_compressed(tmp_path / "map.npz", **pack_keyframes(kept, joint, "learned", CAMERA))
-    read, joint_read = read_keyframes(tmp_path / "map.npz", "learned", CAMERA)
+    past = PastPoses(np.stack([looking(x) for x in (0.0, 1.0, 2.0)]), joint @ joint.T, np.zeros((18, 3)))
+    np.savez_compressed(tmp_path / "map.npz", **pack_keyframes(kept, past, "learned", CAMERA))
+    read, past_read = read_keyframes(tmp_path / "map.npz", "learned", CAMERA)
     assert len(read) == 3
-    np.testing.assert_array_equal(joint_read, joint)
-    np.testing.assert_array_equal(read[1].covariance, joint[6:12, 6:12])
+    for name in ("poses", "covariance", "cross"):
+        np.testing.assert_array_equal(getattr(past_read, name), getattr(past, name))
     for before, after in zip(kept, read, strict=True):
-        np.testing.assert_array_equal(after.pose, before.pose)
         assert after.timestamp == before.timestamp
         np.testing.assert_array_equal(after.view.left, before.view.left)
         np.testing.assert_array_equal(after.view.disparity, before.view.disparity)
@@ -121,7 +153,7 @@ def test_keyframes_round_trip_through_a_file(tmp_path: Path):
 
 
 def test_no_keyframes_pack_to_no_arrays():
-    assert pack_keyframes([], np.zeros((0, 0)), "learned", CAMERA) == {}
+    assert pack_keyframes([], PastPoses.empty(), "learned", CAMERA) == {}
 
 
 def refused(path: Path, *words: str, frontend: str = "learned", camera: RectifiedStereo = CAMERA) -> None:
@@ -139,7 +171,7 @@ def test_a_missing_map_is_refused(tmp_path: Path):
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
 def test_a_truncated_map_is_refused(tmp_path: Path, share: float):
     path = tmp_path / "map.npz"
-    np.savez_compressed(path, **pack_keyframes([keyframe(0, 0.0)], np.eye(6), "learned", CAMERA))
+    np.savez_compressed(path, **pack_keyframes([keyframe(0)], ONE_POSE, "learned", CAMERA))
     path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
     refused(path, "not a map that can be read", "track the sequence again")
 
@@ -158,13 +190,13 @@ def test_a_map_without_keyframes_is_refused(tmp_path: Path):
 
 def test_a_map_of_another_front_end_is_refused(tmp_path: Path):
     path = tmp_path / "map.npz"
-    np.savez_compressed(path, **pack_keyframes([keyframe(0, 0.0)], np.eye(6), "sift", CAMERA))
+    np.savez_compressed(path, **pack_keyframes([keyframe(0)], ONE_POSE, "sift", CAMERA))
     refused(path, "front-end sift, not learned", "--frontend sift")
 
 
 def test_a_map_of_another_camera_is_refused(tmp_path: Path):
     path = tmp_path / "map.npz"
-    np.savez_compressed(path, **pack_keyframes([keyframe(0, 0.0)], np.eye(6), "learned", CAMERA))
+    np.savez_compressed(path, **pack_keyframes([keyframe(0)], ONE_POSE, "learned", CAMERA))
     refused(path, "0.1", "0.2", "a map serves the camera that made it", camera=replace(CAMERA, baseline=0.2))
 
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sigmaslam.frontend.relief import patch_relief
+from sigmaslam.frontend.relief import patch_disparity_range
 
 WIDTH, HEIGHT = 320, 160
 EDGE = 180  # columns before it are nearer, so that the left eye sees nothing that is hidden from the right one
@@ -33,8 +33,8 @@ def test_a_step_within_the_patch_is_seen_and_one_beyond_is_not() -> None:
     left, right = _pair(disparity)
     at = _keypoints([EDGE - 3.0, EDGE + 3.0], disparity)
     away = _keypoints([60.0, 120.0, 260.0], disparity)
-    assert np.median(patch_relief(left, right, at, np.zeros((len(at), 2)))) == pytest.approx(STEP, abs=1.5)
-    assert np.quantile(patch_relief(left, right, away, np.zeros((len(away), 2))), 0.9) < 0.1 * STEP
+    assert np.median(patch_disparity_range(left, right, at, np.zeros((len(at), 2)))) == pytest.approx(STEP, abs=1.5)
+    assert np.quantile(patch_disparity_range(left, right, away, np.zeros((len(away), 2))), 0.9) < 0.1 * STEP
 
 
 def test_the_slope_of_the_surface_is_no_relief() -> None:
@@ -42,8 +42,8 @@ def test_the_slope_of_the_surface_is_no_relief() -> None:
     disparity = FAR + slope[1] * np.arange(HEIGHT)[:, None] * np.ones(WIDTH)
     left, right = _pair(disparity)
     points = _keypoints([100.0, 160.0, 220.0], disparity)
-    level = np.median(patch_relief(left, right, points, np.zeros((len(points), 2))))
-    tilted = np.median(patch_relief(left, right, points, np.tile(slope, (len(points), 1))))
+    level = np.median(patch_disparity_range(left, right, points, np.zeros((len(points), 2))))
+    tilted = np.median(patch_disparity_range(left, right, points, np.tile(slope, (len(points), 1))))
     assert level == pytest.approx(12 * slope[1], abs=1.0)
     assert tilted < 0.5 * level
 
@@ -51,5 +51,5 @@ def test_the_slope_of_the_surface_is_no_relief() -> None:
 def test_images_without_texture_say_nothing() -> None:
     blank = np.zeros((HEIGHT, WIDTH), np.uint8)
     points = _keypoints([100.0], np.full((HEIGHT, WIDTH), FAR))
-    assert (patch_relief(blank, blank, points, np.zeros((len(points), 2))) == 0.0).all()
-    assert len(patch_relief(blank, blank, points[:0], np.zeros((0, 2)))) == 0
+    assert (patch_disparity_range(blank, blank, points, np.zeros((len(points), 2))) == 0.0).all()
+    assert len(patch_disparity_range(blank, blank, points[:0], np.zeros((0, 2)))) == 0

@@ -10,8 +10,10 @@ from scipy.optimize import least_squares
 
 from sigmaslam.camera import RectifiedStereo
 from sigmaslam.frame_fit import FrameFit
+from sigmaslam.frame_update import FrameUpdate
+from sigmaslam.landmark_table import LandmarkViews
+from sigmaslam.linearise import ViewLineariser
 from sigmaslam.rotation import se3_exp, se3_inverse, se3_log
-from sigmaslam.tables import Views
 from sigmaslam.window import KeyframeWindow
 
 CAMERA = RectifiedStereo(fx=400.0, fy=410.0, cx=319.5, cy=239.5, baseline=0.2, width=640, height=480)
@@ -27,6 +29,8 @@ STEP = se3_exp([0.15, -0.05, 0.3, 0.02, -0.05, 0.03])
 KEYFRAMES = 3
 # With deviations so small everything is linear, and equal numbers must be equal.
 NARROW = 1e-3
+# Of the scene, metres; linearisations of a frame's update; degrees of freedom of a Student-t that is as good as normal.
+DEPTH, ITERATIONS, GAUSSIAN = 4.0, 2, 1e12
 
 
 @dataclass(frozen=True)
@@ -49,7 +53,7 @@ class World:
     host: np.ndarray
     landmarks: np.ndarray
     measured: np.ndarray
-    views: list[Views]
+    views: list[LandmarkViews]
 
 
 def project(pose: np.ndarray, host: np.ndarray, calibration: np.ndarray, landmarks: np.ndarray) -> np.ndarray:
@@ -93,14 +97,22 @@ def world(seed: int = 0, scale: float = 1.0, count: int = 12, hosts: int = KEYFR
         seen = seen + scale * (rng.standard_normal((len(rows), 3)) @ VIEW_ROOT.T + landmarks[rows, 4:] @ COMMON.T)
         seen[(rows + k) % 6 == 0, 2] = np.nan
         noise, common = scale**2 * VIEW_ROOT @ VIEW_ROOT.T, scale * COMMON
-        views.append(Views(rows, seen, np.tile(noise, (len(rows), 1, 1)), np.tile(common, (len(rows), 1, 1))))
+        views.append(LandmarkViews(rows, seen, np.tile(noise, (len(rows), 1, 1)), np.tile(common, (len(rows), 1, 1))))
     return World(scale, np.array(expected), poses, calibration, host, landmarks, measured, views)
 
 
-def add_keyframe(window: KeyframeWindow, given: World, k: int, views: Views, hosted: bool = True) -> None:
+def make_window(
+    calibration_sigma: np.ndarray, linearisation: str = "extended", camera: RectifiedStereo = CAMERA
+) -> KeyframeWindow:
+    """An empty window of Gaussian errors: least squares alone, where there are weights for longer tails."""
+    lineariser = ViewLineariser(camera, "onnx", linearisation == "unscented")
+    return KeyframeWindow(camera, calibration_sigma, lineariser, student_freedom=GAUSSIAN)
+
+
+def add_keyframe(window: KeyframeWindow, given: World, k: int, views: LandmarkViews, hosted: bool = True) -> None:
     sigma = given.scale * (STEP_SIGMA if k else FIRST_SIGMA)
-    pose = window.poses[-1] @ STEP if k else given.expected[0]
-    window.add_keyframe(pose, STEP if k else given.expected[0], np.diag(sigma**2), np.zeros(3))
+    pose = window.posterior.poses[-1] @ STEP if k else given.expected[0]
+    window.add_keyframe(pose, STEP if k else given.expected[0], np.diag(sigma**2), np.zeros(3), DEPTH)
     window.add_views(views)
     own = np.flatnonzero(given.host == k) if hosted else np.zeros(0, np.int64)
     variance = np.tile((given.scale * HOST_SIGMA) ** 2, (len(own), 1))
@@ -109,10 +121,9 @@ def add_keyframe(window: KeyframeWindow, given: World, k: int, views: Views, hos
 
 def unsolved(given: World, linearisation: str = "extended", order: int = 1) -> KeyframeWindow:
     """The keyframes and their views; order -1 hands them over from the last to the first."""
-    window = KeyframeWindow(CAMERA, given.scale * CALIBRATION_SIGMA, "onnx", linearisation)
-    window.depth = 4.0
+    window = make_window(given.scale * CALIBRATION_SIGMA, linearisation)
     for k in range(KEYFRAMES):
-        add_keyframe(window, given, k, given.views[k].select(np.arange(len(given.views[k].rows))[::order]))
+        add_keyframe(window, given, k, given.views[k].select(np.arange(len(given.views[k]))[::order]))
     return window
 
 
@@ -123,10 +134,13 @@ def solved(given: World, linearisation: str = "extended", order: int = 1) -> Key
     return window
 
 
-def fit(window: KeyframeWindow, given: World, views: Views | None = None, start: np.ndarray | None = None) -> FrameFit:
+def fit(
+    window: KeyframeWindow, given: World, views: LandmarkViews | None = None, start: np.ndarray | None = None
+) -> FrameFit:
     """Of the frame after the keyframes."""
     step_covariance = np.diag((given.scale * STEP_SIGMA) ** 2)
-    found = window.fit_frame(views or given.views[-1], window.poses[-1] @ STEP, step_covariance, 5, start)
+    update = FrameUpdate(window, ITERATIONS)
+    found = update.fit(views or given.views[-1], window.posterior.poses[-1] @ STEP, step_covariance, 5, start)
     assert found is not None
     return found
 
@@ -143,7 +157,7 @@ class Dense:
     def __init__(self, given: World, poses: int, hosts: Iterable[int] = range(KEYFRAMES)) -> None:
         self.given, self.size = given, 3 + 6 * poses
         self.expected = given.expected[:poses]
-        self.views = [v.select(np.isin(given.host[v.rows], list(hosts))) for v in given.views[:poses]]
+        self.views = [v.select(np.isin(given.host[v.landmark], list(hosts))) for v in given.views[:poses]]
         self.whiteners = []
         for views in self.views:
             whitener = np.linalg.inv(np.linalg.cholesky(views.noise))
@@ -162,8 +176,8 @@ class Dense:
         parts.append(((landmarks - given.measured)[:, :4] / HOST_SIGMA).ravel())
         parts = [*(part / scale for part in parts), landmarks[:, 4:].ravel()]
         for pose, views, whitener in zip(poses, self.views, self.whiteners, strict=True):
-            seen = project(pose, poses[given.host[views.rows]], calibration, landmarks[views.rows])
-            seen = seen + (views.common @ landmarks[views.rows, 4:, None])[..., 0]
+            seen = project(pose, poses[given.host[views.landmark]], calibration, landmarks[views.landmark])
+            seen = seen + (views.common @ landmarks[views.landmark, 4:, None])[..., 0]
             rest = np.nan_to_num(views.measurement - seen)
             parts.append((whitener @ rest[..., None]).ravel())
         return np.concatenate(parts)

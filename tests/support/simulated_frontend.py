@@ -171,8 +171,12 @@ class SimulatedFrontend:
 
     def _project(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """(u, v, disparity) of all points without noise, and which are in view."""
+        return self._project_from(self.poses[frame])
+
+    def _project_from(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The same from any pose (4, 4)."""
         scale = self._scale
-        T = se3_inverse(self.poses[frame])
+        T = se3_inverse(pose)
         points = self._points @ T[:3, :3].T + T[:3, 3]
         z = np.maximum(points[:, 2], 1e-9)
         u = scale.focal * points[:, 0] / z + 0.5 * scale.width

@@ -11,7 +11,7 @@ from sigmaslam.frontend import StereoView, TemporalMatches
 _SCALES, _ADAPTATION = (0.25, 4.0), 0.1
 
 
-class MatchNoise:
+class MeasurementNoise:
     """Covariances of what is measured in images; owns their common scale.
 
     Args:
@@ -58,8 +58,8 @@ class MatchNoise:
 
     def of_keypoints(self, view: StereoView, index: np.ndarray) -> np.ndarray:
         """(K, 4) variances of (u, v, disparity) of a keyframe's features, and of what all their disparities share."""
-        known = self._config.constant_sigma
-        disparity = view.disparity_sigma[index] if known is None else np.full(len(index), known[1])
+        constant = self._config.constant_sigma
+        disparity = view.disparity_sigma[index] if constant is None else np.full(len(index), constant[1])
         place = np.full(len(index), self._config.keyframe_sigma**2)
         shared = self._config.shared_disparity
         return self._scale * np.column_stack([place, place, (1.0 - shared) * disparity**2, shared * disparity**2])

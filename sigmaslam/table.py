@@ -1,0 +1,43 @@
+"""Dataclasses whose fields are columns of equal length."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import Any, Self
+
+import numpy as np
+
+
+class Table:
+    """Rows of a dataclass whose fields are arrays (M, ...) or tables; None stands for a column that is not there."""
+
+    __slots__ = ()
+
+    def __len__(self) -> int:
+        return len(getattr(self, fields(self)[0].name))  # type: ignore[arg-type]
+
+    def select(self, rows: np.ndarray) -> Self:
+        """The rows of that index or mask."""
+        return type(self)(*(_select(column, rows) for column in self.columns()))
+
+    def columns(self) -> list[Any]:
+        """The columns in the order of the fields."""
+        return [getattr(self, field.name) for field in fields(self)]  # type: ignore[arg-type]
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Self]) -> Self:
+        """All rows of all parts, of which there is at least one."""
+        return cls(*(_concatenate(columns) for columns in zip(*(part.columns() for part in parts), strict=True)))
+
+
+def _select(column: Any, rows: np.ndarray) -> Any:
+    if column is None:
+        return None
+    return column.select(rows) if isinstance(column, Table) else column[rows]
+
+
+def _concatenate(columns: tuple[Any, ...]) -> Any:
+    if columns[0] is None:
+        return None
+    return columns[0].concatenate(columns) if isinstance(columns[0], Table) else np.concatenate(columns)
