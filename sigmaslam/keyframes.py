@@ -54,11 +54,6 @@ class Keyframes:
         self.active: list[Keyframe] = []
         self.remembered: list[Keyframe] = []
 
-    @property
-    def views(self) -> list[StereoView]:
-        """What the keyframes of the window saw."""
-        return [keyframe.view for keyframe in self.active]
-
     def index(self, id: int) -> int:
         """Where a remembered keyframe stands in the past."""
         return next(k for k, keyframe in enumerate(self.remembered) if keyframe.id == id)
@@ -90,7 +85,7 @@ class Keyframes:
         Returns:
             New row of each landmark, as of `KeyframeWindow.marginalise_oldest`.
         """
-        points = anchor_points(self._window, 0, self._times())
+        points = anchor_points(self._window, 0, _times(self.active))
         new_row = self._window.marginalise_oldest()
         self._remember(self.active.pop(0).leave_window(points), spare)
         return new_row
@@ -104,7 +99,7 @@ class Keyframes:
     def map(self) -> PointMap:
         """All landmarks so far that were seen at least three times, in the world of the window."""
         past = points_in_world([keyframe.points for keyframe in self.remembered], self._window.posterior.past)
-        return merge_maps([past, window_points(self._window, self._times())])
+        return merge_maps([past, window_points(self._window, _times(self.active))])
 
     def load(self, path: Path, frontend: str, camera: RectifiedStereo) -> None:
         """Remembers the keyframes of a map, before there are others.
@@ -126,9 +121,6 @@ class Keyframes:
             past = past.append(pose, state.covariance, pose_slice(k))
         return pack_keyframes([*self.remembered, *self.active], past, frontend, camera)
 
-    def _times(self) -> np.ndarray:
-        return np.array([keyframe.timestamp for keyframe in self.active])
-
     def _remember(self, keyframe: Keyframe, spare: Keyframe | None = None) -> None:
         """Takes a keyframe of the window's past, and forgets a superfluous one for it, but not the one to spare."""
         self.remembered.append(keyframe)
@@ -149,3 +141,8 @@ class Keyframes:
             self.remembered[heir] = replace(self.remembered[heir], points=inherited)
         del self.remembered[leaving]
         self._window.forget_past(leaving)
+
+
+def _times(keyframes: list[Keyframe]) -> np.ndarray:
+    """(K,) time stamps, seconds."""
+    return np.array([keyframe.timestamp for keyframe in keyframes])

@@ -12,6 +12,7 @@ from sigmaslam.frame_fit import FrameFit
 from sigmaslam.frame_update import FrameUpdate
 from sigmaslam.frontend import StereoView
 from sigmaslam.guided_matching import GuidedMatcher, GuidedMatches
+from sigmaslam.motion import MotionFilter
 from sigmaslam.rotation import turn_covariance
 from sigmaslam.stopwatch import Stopwatch
 from sigmaslam.unguided_matching import UnguidedMatcher
@@ -38,12 +39,16 @@ class Prediction:
     Attributes:
         pose: (4, 4) T_world_camera.
         covariance: (6, 6) of it relative to the last keyframe, perturbed from the left in the world.
-        guides: the velocity is known, so that the pose says where to search.
     """
 
     pose: np.ndarray
     covariance: np.ndarray
-    guides: bool
+
+    @classmethod
+    def of(cls, window: KeyframeWindow, motion: MotionFilter) -> Prediction:
+        """The last keyframe of the window, moved on."""
+        key = window.posterior.poses[-1]
+        return cls(key @ motion.step, turn_covariance(key, motion.step_covariance))
 
 
 class Localiser:
@@ -72,7 +77,7 @@ class Localiser:
         self._config = config
 
     def localise(
-        self, view: StereoView, keyframes: list[StereoView], prediction: Prediction, clock: Stopwatch
+        self, view: StereoView, keyframes: list[StereoView], prediction: Prediction, guided: bool, clock: Stopwatch
     ) -> tuple[GuidedMatches, FrameFit | None]:
         """Matches and pose of a view, first near the prediction, then anywhere; no pose where too little agrees.
 
@@ -80,10 +85,11 @@ class Localiser:
             view: the current one.
             keyframes: what the window's keyframes saw.
             prediction: of its pose.
+            guided: the velocity is known, so that the prediction says where to search.
             clock: takes the time of the stages `match` and `filter`.
         """
         matches, fit = GuidedMatches.empty(), None
-        if prediction.guides:
+        if guided:
             matches = self._guided.match_guided(view, keyframes, prediction.pose, prediction.covariance)
             clock.lap("match")
             fit = self._fit_near(matches, prediction)

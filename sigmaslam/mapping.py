@@ -8,17 +8,24 @@ import numpy as np
 
 from sigmaslam.camera import RectifiedStereo
 from sigmaslam.config import TrackerConfig
+from sigmaslam.frame_fit import FrameFit
 from sigmaslam.frontend import StereoView
 from sigmaslam.frontend.planes import disparity_slopes
 from sigmaslam.frontend.relief import patch_disparity_range
+from sigmaslam.guided_matching import GuidedMatches
 from sigmaslam.keyframes import Keyframes
+from sigmaslam.landmark_admission import LandmarkAdmission
 from sigmaslam.landmark_table import LandmarkViews
 from sigmaslam.measurement_noise import MeasurementNoise
+from sigmaslam.motion import MotionFilter
 from sigmaslam.rotation import turn_covariance
 from sigmaslam.spacing import select_apart
 from sigmaslam.table import Table
 from sigmaslam.window import KeyframeWindow
 
+# A blurred view whose matches scatter by so many times the variance that they claim is no keyframe. A sharp one is: no
+# keyframes at all for 20 frames lost the KITTI drive.
+_SCATTERED = 1.6
 # The scene is no farther away than where its disparity is this, pixels.
 _MIN_DISPARITY = 0.5
 
@@ -45,7 +52,9 @@ class Mapper:
         camera: the rectified pair.
         window: takes keyframes and landmarks.
         keyframes: of the window.
+        motion: is relative to the last keyframe.
         noise: of what is measured.
+        admission: what may become a landmark.
         config: settings.
     """
 
@@ -54,14 +63,46 @@ class Mapper:
         camera: RectifiedStereo,
         window: KeyframeWindow,
         keyframes: Keyframes,
+        motion: MotionFilter,
         noise: MeasurementNoise,
+        admission: LandmarkAdmission,
         config: TrackerConfig,
     ) -> None:
         self._camera = camera
         self._window = window
         self._keyframes = keyframes
+        self._motion = motion
         self._noise = noise
+        self._admission = admission
         self._config = config
+        self._landmarks_in_keyframe = 0
+
+    def insert_if_due(
+        self,
+        view: StereoView,
+        timestamp: float,
+        fit: FrameFit,
+        matches: GuidedMatches,
+        expected: tuple[np.ndarray, np.ndarray],
+    ) -> KeyframeTracks | None:
+        """Makes a tracked view a keyframe when the landmarks of the last one fade, and the view can replace it.
+
+        Args:
+            view: the tracked view.
+            timestamp: seconds.
+            fit: its pose.
+            matches: with the window's landmarks.
+            expected: step (4, 4) from the last keyframe without its images, and its covariance (6, 6).
+        """
+        # A scale beyond the NIS is that of blur: such a keyframe would spoil what comes after it.
+        blurred = fit.inflation > fit.nis_before_scaling > _SCATTERED
+        if fit.count >= self._config.keyframe_ratio * self._landmarks_in_keyframe or blurred:
+            return None
+        admitted = view.only(self._admission.admit(view, fit.pose, self._window))
+        if not admitted.has_stereo(self._admission.min_points, self._config.min_inliers):
+            return None
+        views = matches.views.select(fit.inliers).inflated(fit.inflation)
+        return self.insert(admitted, timestamp, fit.pose, *expected, views)
 
     def insert(
         self,
@@ -103,6 +144,8 @@ class Mapper:
         self._add_landmarks(view, views)
         seen = LandmarkViews.concatenate([views, window.landmarks.anchor_views(len(window) - 1)])
         window.solve()
+        self._motion.start_keyframe()
+        self._landmarks_in_keyframe = len(seen)
         return KeyframeTracks(window.landmarks.id[seen.landmark], seen.measurement, seen.covariance)
 
     def _add_landmarks(self, view: StereoView, views: LandmarkViews) -> None:

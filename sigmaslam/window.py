@@ -141,14 +141,21 @@ class KeyframeWindow:
         """Posterior of poses, calibration and landmarks from the prior and all views: Gauss-Newton, then a gate."""
         factor = matrix_root(self.prior.covariance)
         for _ in range(iterations):
-            information, vector, elimination = self._eliminate(self._observations)
+            information, vector, elimination = _eliminate(self, self._observations)
             offset = self.posterior.minus(self.prior)
             vector = vector + information @ offset
             state, covariance = condition(factor, information, vector)
-            self._move(state - offset, covariance, elimination)
+            step = state - offset
+            self.posterior = self.posterior.moved(step, covariance)
+            rows = elimination.landmark
+            self.landmarks.estimate[rows] += elimination.step + elimination.dependence @ step
+            self.landmarks.covariance[rows] = elimination.covariance
+            self.landmarks.dependence[rows] = elimination.dependence
         past = self.prior.past.given(self.prior.covariance, information, vector)
         self.posterior = replace(self.posterior, past=past)
-        self._drop_outliers()
+        agree = _agree(self, self._observations)
+        if not agree.all():
+            self._observations = self._observations.select(agree)
 
     def add_loop_constraint(self, index: int, T_past_last: np.ndarray, covariance: np.ndarray) -> bool:
         """Closes a loop: the last keyframe sees what a past pose saw, and the past is corrected with the window.
@@ -181,7 +188,8 @@ class KeyframeWindow:
             (L,) new row of each landmark, -1 for those that are gone.
         """
         leaving = self.landmarks.anchor == 0
-        information, vector, _ = self._eliminate(self._observations.select(leaving[self._observations.views.landmark]))
+        observed = leaving[self._observations.views.landmark]
+        information, vector, _ = _eliminate(self, self._observations.select(observed))
         vector = vector + information @ self.posterior.minus(self.prior)
         self.prior = self.prior.given(information, vector).marginalise_oldest()
         self.posterior = self.posterior.marginalise_oldest()
@@ -206,43 +214,39 @@ class KeyframeWindow:
         bias = measured[:, 3:MODELLED].sum(axis=1) + constant + yaw * x * x + pitch * x * y
         return np.column_stack([measured[:, :2], measured[:, 2] - bias])
 
-    # ---- the equations
 
-    def _eliminate(self, observations: KeyframeViews) -> tuple[np.ndarray, np.ndarray, Elimination]:
-        """Information matrix and vector of the state at the posterior, every landmark's own equations solved for it."""
-        linear, residual, noise, components = self._linearise(observations)
-        noise = np.where(linear.in_front[:, None, None], noise, UNKNOWN_VARIANCE * np.eye(3))
-        return eliminate_landmarks(
-            self.landmarks, observations.views.landmark, linear, residual, noise, components, self.student_freedom
-        )
+# ---- the equations
 
-    def _move(self, step: np.ndarray, covariance: np.ndarray, elimination: Elimination) -> None:
-        self.posterior = self.posterior.moved(step, covariance)
-        rows = elimination.landmark
-        self.landmarks.estimate[rows] += elimination.step + elimination.dependence @ step
-        self.landmarks.covariance[rows] = elimination.covariance
-        self.landmarks.dependence[rows] = elimination.dependence
 
-    def _drop_outliers(self) -> None:
-        """Forgets views that do not fit the solution."""
-        linear, residual, noise, components = self._linearise(self._observations)
-        agree = linear.in_front & (squared_lengths(residual, noise) <= CHI_SQUARE_999[components])
-        if not agree.all():
-            self._observations = self._observations.select(agree)
+def _eliminate(window: KeyframeWindow, observations: KeyframeViews) -> tuple[np.ndarray, np.ndarray, Elimination]:
+    """Information matrix and vector of the state at the posterior, every landmark's own equations solved for it."""
+    linear, residual, noise, components = _linearise(window, observations)
+    noise = np.where(linear.in_front[:, None, None], noise, UNKNOWN_VARIANCE * np.eye(3))
+    landmark = observations.views.landmark
+    return eliminate_landmarks(window.landmarks, landmark, linear, residual, noise, components, window.student_freedom)
 
-    def _linearise(self, observations: KeyframeViews) -> tuple[Linearisation, np.ndarray, np.ndarray, np.ndarray]:
-        """Views by keyframes at the posterior, residuals (O, 3), their noise (O, 3, 3), components (O,)."""
-        landmarks, views = self.landmarks, observations.views
-        linear = self.lineariser.linearise(
-            self.posterior.poses,
-            self.posterior.calibration,
-            self.posterior.covariance,
-            landmarks.estimate[views.landmark],
-            landmarks.covariance[views.landmark],
-            landmarks.anchor[views.landmark],
-            observations.keyframe,
-            views.common,
-            self.depth,
-        )
-        residual, noise = mask_missing(views.measurement - linear.mean, views.noise + linear.nonlinearity)
-        return linear, residual, noise, views.components
+
+def _agree(window: KeyframeWindow, observations: KeyframeViews) -> np.ndarray:
+    """(O,) bool: which views fit the posterior (99.9 %)."""
+    linear, residual, noise, components = _linearise(window, observations)
+    return np.asarray(linear.in_front & (squared_lengths(residual, noise) <= CHI_SQUARE_999[components]))
+
+
+def _linearise(
+    window: KeyframeWindow, observations: KeyframeViews
+) -> tuple[Linearisation, np.ndarray, np.ndarray, np.ndarray]:
+    """Views by keyframes at the posterior, residuals (O, 3), their noise (O, 3, 3), components (O,)."""
+    state, landmarks, views = window.posterior, window.landmarks, observations.views
+    linear = window.lineariser.linearise(
+        state.poses,
+        state.calibration,
+        state.covariance,
+        landmarks.estimate[views.landmark],
+        landmarks.covariance[views.landmark],
+        landmarks.anchor[views.landmark],
+        observations.keyframe,
+        views.common,
+        window.depth,
+    )
+    residual, noise = mask_missing(views.measurement - linear.mean, views.noise + linear.nonlinearity)
+    return linear, residual, noise, views.components

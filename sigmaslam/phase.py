@@ -1,0 +1,52 @@
+"""What a tracker has come to know so far."""
+
+from __future__ import annotations
+
+from enum import Enum, auto
+
+
+class Phase(Enum):
+    """A tracker that is lost stays in its phase."""
+
+    WAITING = auto()  # no keyframe yet
+    WAITING_IN_MAP = auto()  # no keyframe yet, and the world is a map's
+    STARTING = auto()  # a keyframe, but no pose from images yet
+    TRACKING = auto()  # poses and a velocity
+    RESUMED = auto()  # there have been poses, but the velocity since the last one is unknown
+
+
+class Course:
+    """The phase of a tracker, and when it came to it.
+
+    Attributes:
+        phase: the current one.
+        timestamp: of the last frame, seconds; None before the first.
+        started_at, tracked_at: time stamps of the first keyframe and of the last pose.
+    """
+
+    def __init__(self) -> None:
+        self.phase = Phase.WAITING
+        self.timestamp: float | None = None
+        self.started_at = self.tracked_at = 0.0
+
+    def start(self, timestamp: float) -> None:
+        """There is a first keyframe."""
+        self.phase, self.started_at, self.tracked_at = Phase.STARTING, timestamp, timestamp
+
+    def track(self, timestamp: float) -> None:
+        """There is a pose from images."""
+        self.phase, self.tracked_at = Phase.TRACKING, timestamp
+
+    def resume(self, timestamp: float) -> None:
+        """There is a new keyframe, but no velocity."""
+        self.phase, self.tracked_at = Phase.RESUMED, timestamp
+
+    @property
+    def has_moved(self) -> bool:
+        """There have been poses from images."""
+        return self.phase in (Phase.TRACKING, Phase.RESUMED)
+
+    @property
+    def is_waiting(self) -> bool:
+        """There is no keyframe yet."""
+        return self.phase in (Phase.WAITING, Phase.WAITING_IN_MAP)
