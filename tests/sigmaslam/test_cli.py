@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 
 from sigmaslam.trajectory import read_tum
-from tests.support.commands import assert_refused, command_line, environment, run_here, run_process
+from tests.support.commands import Finished, assert_refused, command_line, environment, run_here, run_process
 
 FRAMES = 8
 
 
-@pytest.fixture
-def short_sequence(demo_sequence: Path, tmp_path: Path) -> Path:
-    """The first frames of the demo, to be broken."""
-    folder = tmp_path / "sequence"
+@pytest.fixture(scope="module")
+def whole_sequence(demo_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first frames of the demo."""
+    folder = tmp_path_factory.mktemp("whole") / "sequence"
     for name in ("image_0", "image_1"):
         (folder / name).mkdir(parents=True)
         for image in sorted((demo_sequence / name).iterdir())[:FRAMES]:
@@ -33,13 +33,25 @@ def short_sequence(demo_sequence: Path, tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def tracked(whole_sequence: Path) -> tuple[Path, Finished]:
+    """The run folder of these frames, and what the command said."""
+    out = whole_sequence.with_name("run")
+    return out, run_process("track", whole_sequence, "--out", out)
+
+
+@pytest.fixture
+def short_sequence(whole_sequence: Path, tmp_path: Path) -> Path:
+    """The first frames of the demo, to be broken."""
+    return shutil.copytree(whole_sequence, tmp_path / "sequence")
+
+
 def rows(run: Path) -> list[list[str]]:
     return [line.split(",") for line in (run / "frames.csv").read_text().splitlines()[1:]]
 
 
-def test_track_writes_every_output_and_evaluate_reads_them(short_sequence: Path, tmp_path: Path):
-    out = tmp_path / "run"
-    result = run_process("track", short_sequence, "--out", out)
+def test_track_writes_every_output_and_evaluate_reads_them(whole_sequence: Path, tracked: tuple[Path, Finished]):
+    out, result = tracked
     assert result.returncode == 0, result.stderr
     assert len(read_tum(out / "trajectory.tum")) == FRAMES
     assert len((out / "trajectory.kitti").read_text().splitlines()) == FRAMES
@@ -56,16 +68,15 @@ def test_track_writes_every_output_and_evaluate_reads_them(short_sequence: Path,
     assert len(run["weights_sha256"]["features.onnx"]) == 64
     assert "<svg" in (out / "report.html").read_text()
 
-    result = run_here("evaluate", out, "--truth", short_sequence / "poses.txt", "--json")
+    result = run_here("evaluate", out, "--truth", whole_sequence / "poses.txt", "--json")
     assert result.returncode == 0, result.stderr
     assert json.loads(result.stdout)["matched"] == FRAMES
 
 
-def test_two_runs_are_identical_to_the_bit(short_sequence: Path, tmp_path: Path):
-    for name in ("a", "b"):
-        assert run_process("track", short_sequence, "--out", tmp_path / name).returncode == 0
+def test_two_runs_are_identical_to_the_bit(whole_sequence: Path, tracked: tuple[Path, Finished], tmp_path: Path):
+    assert run_process("track", whole_sequence, "--out", tmp_path / "again").returncode == 0
     for name in ("trajectory.tum", "trajectory.kitti", "covariance.npy", "map.ply"):
-        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
+        assert (tracked[0] / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
 
 
 def test_a_missing_folder_is_refused(tmp_path: Path):

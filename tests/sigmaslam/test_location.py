@@ -215,7 +215,9 @@ def test_the_command_line_fuses_and_says_what_became_of_the_readings(demo_sequen
         quaternions = matrix_to_quaternion(readings.rotations)
         for time, position, quaternion in zip(readings.timestamps, readings.positions, quaternions, strict=True):
             rows.writerow([time, *position, *quaternion, 0.001, 0.002])
-    result = CliRunner().invoke(app, ["track", str(demo_sequence), "--out", str(run), "--location", str(path)])
+    result = CliRunner().invoke(
+        app, ["track", str(demo_sequence), "--out", str(run), "--location", str(path), "--frontend", "klt"]
+    )
     assert result.exit_code == 0, result.output
     assert "Location sensor: 19 readings used" in result.output
     # The first is of the first frame, before there is a motion.
