@@ -42,3 +42,9 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
+
+
+@pytest.fixture
+def without_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs in this process draw no figures, which would take longer than to track a few frames."""
+    monkeypatch.setattr("sigmaslam.outputs.write_report", lambda run_dir: None)

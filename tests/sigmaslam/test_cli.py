@@ -89,6 +89,7 @@ def test_unequal_counts_are_refused_with_both_numbers(short_sequence: Path, tmp_
     assert_refused(run_here("track", short_sequence, "--out", tmp_path / "run"), str(FRAMES), str(FRAMES - 1))
 
 
+@pytest.mark.usefixtures("without_report")
 @pytest.mark.parametrize("content", [b"", b"no image at all"])
 def test_an_unreadable_image_costs_one_frame_and_a_warning(short_sequence: Path, tmp_path: Path, content: bytes):
     broken = sorted((short_sequence / "image_0").iterdir())[4]
@@ -132,6 +133,7 @@ def test_a_calibration_for_another_image_size_is_refused(short_sequence: Path, t
     assert_refused(result, "640x480", "320x240")
 
 
+@pytest.mark.usefixtures("without_report")
 @pytest.mark.parametrize("kind", ["colour", "16-bit"])
 def test_colour_and_16_bit_images_are_converted_with_a_warning(short_sequence: Path, tmp_path: Path, kind: str):
     for path in [*(short_sequence / "image_0").iterdir(), *(short_sequence / "image_1").iterdir()]:

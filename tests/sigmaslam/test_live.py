@@ -344,6 +344,7 @@ def test_track_writes_what_a_camera_saw(demo_video: Path, demo_sequence: Path, t
     assert run["dropped"] + run["summary"]["frames"] > 10
 
 
+@pytest.mark.usefixtures("without_report")
 def test_an_unplugged_camera_leaves_what_was_tracked(tmp_path: Path):
     out = tmp_path / "run"
     with pytest.raises(InputError, match="camera 1 gives no more images"):

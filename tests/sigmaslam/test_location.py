@@ -204,6 +204,7 @@ def test_on_a_rendered_sequence_single_frames_do_not_become_drift(
     assert 0.4 < np.mean(nees) < 2.0
 
 
+@pytest.mark.usefixtures("without_report")
 def test_the_command_line_fuses_and_says_what_became_of_the_readings(demo_sequence: Path, tmp_path: Path):
     truth = read_kitti(demo_sequence / "poses.txt")
     readings = sense(truth.poses[::2], truth.timestamps[::2], 0, 0.001, 0.002, MOUNT)
