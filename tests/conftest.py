@@ -1,6 +1,7 @@
 """Fixtures that more than one file needs."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -31,3 +32,19 @@ def real_data() -> Path:
 def demo_sequence() -> Path:
     """The rendered sequence that ships with the package."""
     return Path(__file__).resolve().parents[1] / "synthetic" / "demo"
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """Of torch: small models run best on one thread, and many processes do not get into each other's way."""
+    torch = pytest.importorskip("torch")
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture
+def without_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs in this process draw no figures, which would take longer than to track a few frames."""
+    monkeypatch.setattr("sigmaslam.outputs.write_report", lambda run_dir: None)

@@ -23,6 +23,7 @@ from sigmaslam.filters import (
     merwe,
 )
 from tests.support.filter_builders import (
+    FORMS,
     assert_close,
     assert_same_belief,
     assert_same_update,
@@ -38,7 +39,6 @@ from tests.support.filter_builders import (
 SIGMA_SETS = {"cubature": cubature(), "julier": julier(1.0), "merwe": merwe(1.0, 2.0), "simplex": Simplex()}
 FILTERS = {name: UnscentedKalmanFilter(points=points) for name, points in SIGMA_SETS.items()}
 FILTERS["ekf"] = ExtendedKalmanFilter()
-FORMS = ("dense", "low-rank", "qr")
 EACH_FILTER = list(FILTERS)
 
 SIZE, CONTROLS, NOISES, MEASUREMENTS = 5, 2, 3, 3

@@ -23,15 +23,7 @@ from sigmaslam.filters.consistency import (
     whiteness,
 )
 from sigmaslam.filters.consistency_plots import plot_coverage, plot_nees, plot_whiteness
-
-
-def random_numbers(*shape: int, seed: int = 0) -> Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-def covariances(*shape: int, seed: int = 0) -> Tensor:
-    root = random_numbers(*shape, shape[-1], seed=seed)
-    return root @ root.mT + 0.1 * torch.eye(shape[-1], dtype=torch.float64)
+from tests.support.filter_builders import covariances, random_numbers
 
 
 def correlated(runs: int, steps: int, size: int, correlation: float, seed: int = 0) -> Tensor:

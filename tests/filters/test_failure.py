@@ -20,6 +20,7 @@ from sigmaslam.filters import (
 )
 from sigmaslam.filters.factors import cholesky
 from tests.support.filter_builders import (
+    FORMS,
     assert_close,
     assert_same_belief,
     assert_same_update,
@@ -31,7 +32,6 @@ from tests.support.filter_builders import (
     tensor,
 )
 
-FORMS = ("dense", "low-rank", "qr")
 BAD = 7
 BATCHES = {"large": 10_000, "few": 20}
 

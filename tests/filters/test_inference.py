@@ -26,21 +26,9 @@ from sigmaslam.filters import (
     wrap_angle,
 )
 from sigmaslam.filters.inference import Estimate, Observation, maximum_a_posteriori, maximum_likelihood
+from tests.support.filter_builders import covariances, random_numbers, tensor
 
 BEACONS = torch.tensor([[0.0, 0.0], [4.0, -1.0], [1.0, 5.0]], dtype=torch.float64)
-
-
-def random_numbers(*shape: int, seed: int = 0) -> Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-def covariances(*shape: int, seed: int = 0) -> Tensor:
-    root = random_numbers(*shape, shape[-1], seed=seed)
-    return root @ root.mT + 0.1 * torch.eye(shape[-1], dtype=torch.float64)
-
-
-def numbers(*values: float) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def linear_problem(*batch: int, size: int = 3, measured: int = 6) -> tuple[LinearMeasurement, Tensor]:
@@ -111,12 +99,12 @@ def test_linear_maximum_likelihood_equals_the_closed_form() -> None:
 @pytest.mark.parametrize("batch", [1, 200])  # LAPACK, and unrolled
 def test_linear_maximum_likelihood_keeps_the_digits_that_normal_equations_lose(batch: int) -> None:
     # Läuchli's columns, almost parallel, with rows of noise and columns of units that are many decades apart.
-    near, units = 1e-5, numbers(1e6, 1.0, 1e-6)
-    deviation = numbers(1e-6, 1.0, 1e3, 1e-2)
+    near, units = 1e-5, tensor(1e6, 1.0, 1e-6)
+    deviation = tensor(1e-6, 1.0, 1e3, 1e-2)
     plain = torch.cat([torch.ones(1, 3, dtype=torch.float64), near * torch.eye(3, dtype=torch.float64)])
     matrix = deviation[:, None] * plain * units
-    truth = numbers(1.0, 2.0, 3.0) / units
-    value = deviation * (plain @ numbers(1.0, 2.0, 3.0))
+    truth = tensor(1.0, 2.0, 3.0) / units
+    value = deviation * (plain @ tensor(1.0, 2.0, 3.0))
     estimate = maximum_likelihood(
         [Observation(LinearMeasurement(matrix, Diagonal(deviation**2)), value.expand(batch, 4))],
         torch.zeros(batch, 3, dtype=torch.float64),
@@ -139,8 +127,8 @@ def test_linear_problem_takes_one_step_from_anywhere() -> None:
 
 
 def test_location_from_ranges_equals_scipy() -> None:
-    value = ranges(numbers(2.0, 1.0)) + 0.1 * random_numbers(3)
-    estimate = maximum_likelihood([Observation(ranging(), value)], numbers(1.0, 1.0))
+    value = ranges(tensor(2.0, 1.0)) + 0.1 * random_numbers(3)
+    estimate = maximum_likelihood([Observation(ranging(), value)], tensor(1.0, 1.0))
     found = least_squares(
         lambda x: ((value - ranges(torch.from_numpy(x))) / 0.1).numpy(), [1.0, 1.0], xtol=1e-15, ftol=1e-15, gtol=1e-14
     )
@@ -151,17 +139,17 @@ def test_location_from_ranges_equals_scipy() -> None:
 
 
 def test_several_sensors_with_models_of_their_own_are_one_sensor_with_all_components() -> None:
-    point = numbers(2.0, 1.0)
+    point = tensor(2.0, 1.0)
     far, near = ranges(point) + 0.1 * random_numbers(3), bearings(point) + 0.05 * random_numbers(3, seed=1)
     fix = LinearMeasurement(torch.eye(2, dtype=torch.float64), covariances(2))
     apart = [Observation(ranging(), far), Observation(sighting(), near), Observation(fix, point)]
     assert isinstance(fix.noise, Tensor)
     joined = MeasurementModel(
         lambda state: torch.cat([ranges(state), bearings(state), state], dim=-1),
-        torch.block_diag(torch.diag(numbers(*3 * [0.1**2], *3 * [0.05**2])), fix.noise),
+        torch.block_diag(torch.diag(tensor(*3 * [0.1**2], *3 * [0.05**2])), fix.noise),
     )
     together = Observation(joined, torch.cat([far, near, point]))
-    initial = numbers(1.5, 1.5)
+    initial = tensor(1.5, 1.5)
     assert_same(maximum_likelihood(apart, initial), maximum_likelihood([together], initial))
 
 
@@ -188,7 +176,7 @@ def test_one_step_equals_the_kalman_update_and_both_forms_of_its_covariance() ->
 
 @pytest.mark.parametrize(("space", "size"), [(None, 2), (SE2(), 3)])
 def test_steps_equal_the_iterated_extended_kalman_filter(space: Manifold | None, size: int) -> None:
-    point = numbers(2.0, 1.0, 0.4)[:size]
+    point = tensor(2.0, 1.0, 0.4)[:size]
     prior = Gaussian(point + 0.2 * random_numbers(6, size), 0.05 * covariances(6, size, seed=1))
     value = bearings(point) + 0.05 * random_numbers(6, 3, seed=2)
     for steps in (1, 10):
@@ -199,8 +187,8 @@ def test_steps_equal_the_iterated_extended_kalman_filter(space: Manifold | None,
 
 
 def test_maximum_a_posteriori_equals_scipy() -> None:
-    prior = Gaussian(numbers(2.3, 0.6), covariances(2))
-    value = ranges(numbers(2.0, 1.0)) + 0.3 * random_numbers(3)
+    prior = Gaussian(tensor(2.3, 0.6), covariances(2))
+    value = ranges(tensor(2.0, 1.0)) + 0.3 * random_numbers(3)
     estimate = maximum_a_posteriori(prior, [Observation(ranging(0.3), value)])
 
     def residuals(x: np.ndarray) -> np.ndarray:
@@ -217,23 +205,23 @@ def test_maximum_a_posteriori_equals_scipy() -> None:
 
 def test_prior_by_root_equals_prior_by_covariance() -> None:
     root = random_numbers(2, 5)
-    value = ranges(numbers(2.0, 1.0))
+    value = ranges(tensor(2.0, 1.0))
     by_root, by_covariance = (
         maximum_a_posteriori(prior, [Observation(ranging(), value)])
-        for prior in (Gaussian(numbers(2.2, 1.3), factor=root), Gaussian(numbers(2.2, 1.3), root @ root.T))
+        for prior in (Gaussian(tensor(2.2, 1.3), factor=root), Gaussian(tensor(2.2, 1.3), root @ root.T))
     )
     assert_same(by_root, by_covariance)
 
 
 @pytest.mark.parametrize("batch", [1, 200])
 def test_exactly_known_directions_of_the_prior_stay_known(batch: int) -> None:
-    prior = Gaussian(numbers(2.0, 1.5).expand(batch, 2), torch.diag(numbers(0.0, 1.0)))
-    value = ranges(numbers(2.0, 1.0)) + 0.1 * random_numbers(3)
+    prior = Gaussian(tensor(2.0, 1.5).expand(batch, 2), torch.diag(tensor(0.0, 1.0)))
+    value = ranges(tensor(2.0, 1.0)) + 0.1 * random_numbers(3)
     estimate = maximum_a_posteriori(prior, [Observation(ranging(), value)])
     height = MeasurementModel(
-        lambda y: ranges(torch.cat([torch.full_like(y, 2.0), y], dim=-1)), Diagonal(numbers(0.01, 0.01, 0.01))
+        lambda y: ranges(torch.cat([torch.full_like(y, 2.0), y], dim=-1)), Diagonal(tensor(0.01, 0.01, 0.01))
     )
-    alone = maximum_a_posteriori(Gaussian(numbers(1.5), torch.eye(1).double()), [Observation(height, value)])
+    alone = maximum_a_posteriori(Gaussian(tensor(1.5), torch.eye(1).double()), [Observation(height, value)])
     assert bool((estimate.belief.mean[:, 0] == 2.0).all())
     assert_equal(estimate.belief.mean[:, 1:], alone.belief.mean.expand(batch, 1))
     expected = torch.nn.functional.pad(alone.belief.covariance, (1, 0, 1, 0))
@@ -241,8 +229,8 @@ def test_exactly_known_directions_of_the_prior_stay_known(batch: int) -> None:
 
 
 def test_vague_prior_leads_to_maximum_likelihood() -> None:
-    value = ranges(numbers(2.0, 1.0)) + 0.1 * random_numbers(3)
-    prior = Gaussian(numbers(1.5, 1.5), 1e12 * torch.eye(2, dtype=torch.float64))
+    value = ranges(tensor(2.0, 1.0)) + 0.1 * random_numbers(3)
+    prior = Gaussian(tensor(1.5, 1.5), 1e12 * torch.eye(2, dtype=torch.float64))
     vague = maximum_a_posteriori(prior, [Observation(ranging(), value)])
     assert_same(vague, maximum_likelihood([Observation(ranging(), value)], prior.mean), 1e-8)
 
@@ -258,7 +246,7 @@ def test_without_observations_the_prior_stays() -> None:
 
 
 def test_errors_and_costs_are_distributed_as_the_estimate_says() -> None:
-    runs, truth = 2000, numbers(2.0, 1.0, 0.4)
+    runs, truth = 2000, tensor(2.0, 1.0, 0.4)
     values = [
         bearings(truth) + 0.02 * random_numbers(runs, 3),
         ranges(truth) + 0.05 * random_numbers(runs, 3, seed=1),
@@ -273,7 +261,7 @@ def test_errors_and_costs_are_distributed_as_the_estimate_says() -> None:
 
 
 def test_covariance_on_a_curved_space_is_the_inverse_information_in_the_chart_at_the_mean() -> None:
-    points = random_numbers(8, 3, seed=1) + numbers(0.0, 0.0, 6.0)
+    points = random_numbers(8, 3, seed=1) + tensor(0.0, 0.0, 6.0)
     model = MeasurementModel(project, Diagonal(torch.full((24,), 0.25, dtype=torch.float64)))
     prior = Gaussian(SE3().from_matrix(torch.eye(4, dtype=torch.float64)), 0.02 * covariances(6, seed=3))
     truth = SE3().retract(prior.mean, 0.2 * random_numbers(6, seed=2))
@@ -304,7 +292,7 @@ def blocks() -> MeasurementModel:
 
 
 def blocks_value() -> Tensor:
-    return blocks().function(numbers(2.0, 1.0)) + 0.05 * random_numbers(6, seed=8)
+    return blocks().function(tensor(2.0, 1.0)) + 0.05 * random_numbers(6, seed=8)
 
 
 @pytest.mark.parametrize("per_component", [False, True])
@@ -312,7 +300,7 @@ def test_weight_two_is_the_observation_twice(per_component: bool) -> None:
     once = Observation(blocks(), blocks_value())
     weight = torch.full((6,), 2.0, dtype=torch.float64) if per_component else 2.0
     heavy = Observation(blocks(), blocks_value(), weight=weight)
-    initial = numbers(1.5, 1.5)
+    initial = tensor(1.5, 1.5)
     assert_same(maximum_likelihood([once, once], initial), maximum_likelihood([heavy], initial))
 
 
@@ -322,29 +310,29 @@ def test_weight_zero_nan_and_mask_leave_out() -> None:
     masked = MeasurementModel(model.function, model.noise, mask=kept)
     assert isinstance(model.noise, BlockDiagonal)
     only = MeasurementModel(lambda state: model.function(state)[..., kept], model.noise.covariance()[kept][:, kept])
-    expected = maximum_likelihood([Observation(only, value[kept])], numbers(1.5, 1.5))
+    expected = maximum_likelihood([Observation(only, value[kept])], tensor(1.5, 1.5))
     for observation in (
         Observation(model, value, weight=kept.double()),
         Observation(model, torch.where(kept, value, torch.nan)),
         Observation(masked, value),
     ):
-        estimate = maximum_likelihood([observation], numbers(1.5, 1.5))
+        estimate = maximum_likelihood([observation], tensor(1.5, 1.5))
         assert_same(estimate, expected)
         assert int(estimate.degrees_of_freedom) == 2
     nothing = Observation(ranging(0.01), torch.full((3,), torch.nan, dtype=torch.float64))
-    absent = Observation(ranging(0.01), numbers(9.0, 9.0, 9.0), weight=0.0)
-    assert_same(maximum_likelihood([Observation(only, value[kept]), nothing, absent], numbers(1.5, 1.5)), expected)
+    absent = Observation(ranging(0.01), tensor(9.0, 9.0, 9.0), weight=0.0)
+    assert_same(maximum_likelihood([Observation(only, value[kept]), nothing, absent], tensor(1.5, 1.5)), expected)
 
 
 def test_weights_differ_between_elements_of_a_batch() -> None:
-    value, initial = ranges(numbers(2.0, 1.0)) + 0.1 * random_numbers(3), numbers(1.5, 1.5)
-    observations = [Observation(ranging(), value), Observation(sighting(), bearings(numbers(2.2, 1.0)))]
-    of_element = numbers(0.0, 1.0, 7.0)
+    value, initial = ranges(tensor(2.0, 1.0)) + 0.1 * random_numbers(3), tensor(1.5, 1.5)
+    observations = [Observation(ranging(), value), Observation(sighting(), bearings(tensor(2.2, 1.0)))]
+    of_element = tensor(0.0, 1.0, 7.0)
     batch = maximum_likelihood(
         [observations[0], Observation(observations[1].model, observations[1].value, weight=of_element)],
         initial.expand(3, 2),
     )
-    of_component = numbers(1.0, 0.5, 3.0).expand(1, 3)
+    of_component = tensor(1.0, 0.5, 3.0).expand(1, 3)
     weighted = maximum_likelihood([Observation(ranging(), value, weight=of_component)], initial.expand(3, 2))
     noise = Diagonal(0.01 / of_component[0])
     for k in range(3):
@@ -359,15 +347,15 @@ def test_weights_differ_between_elements_of_a_batch() -> None:
 
 
 def test_rotation_from_vector_pairs_equals_the_closed_form() -> None:
-    truth = SO3().retract(numbers(0.0, 0.0, 0.0, 1.0).expand(5, 4), random_numbers(5, 3))
+    truth = SO3().retract(tensor(0.0, 0.0, 0.0, 1.0).expand(5, 4), random_numbers(5, 3))
     vectors = random_numbers(6, 3, seed=1)
-    weights = numbers(1.0, 2.0, 0.5, 1.0, 3.0, 1.0)
+    weights = tensor(1.0, 2.0, 0.5, 1.0, 3.0, 1.0)
     seen = vectors @ SO3().to_matrix(truth).mT + 0.05 * random_numbers(5, 6, 3, seed=2)
     model = MeasurementModel(
         lambda rotation: (vectors @ SO3().to_matrix(rotation).mT).flatten(-2), 0.05**2 * torch.eye(18).double()
     )
     observation = Observation(model, seen.flatten(-2), weight=weights.repeat_interleave(3).expand(1, 18))
-    estimate = maximum_likelihood([observation], numbers(0.0, 0.0, 0.0, 1.0), SO3())
+    estimate = maximum_likelihood([observation], tensor(0.0, 0.0, 0.0, 1.0), SO3())
     assert bool(estimate.converged.all())
     for k in range(5):
         rotation, _ = Rotation.align_vectors(seen[k].numpy(), vectors.numpy(), weights=weights.numpy())
@@ -375,9 +363,9 @@ def test_rotation_from_vector_pairs_equals_the_closed_form() -> None:
 
 
 def test_resection_of_a_stereo_pose_equals_scipy() -> None:
-    points = random_numbers(10, 3, seed=1) + numbers(0.0, 0.0, 6.0)
+    points = random_numbers(10, 3, seed=1) + tensor(0.0, 0.0, 6.0)
     start = SE3().from_matrix(torch.eye(4, dtype=torch.float64))
-    truth = SE3().retract(start, numbers(0.3, -0.2, 0.5, 0.05, 0.2, -0.1))
+    truth = SE3().retract(start, tensor(0.3, -0.2, 0.5, 0.05, 0.2, -0.1))
     value = project(truth, points) + 0.5 * random_numbers(30)
     model = MeasurementModel(project, Diagonal(torch.full((30,), 0.25, dtype=torch.float64)))
     estimate = maximum_likelihood([Observation(model, value, (points,))], start, SE3())
@@ -401,16 +389,16 @@ def test_given_jacobian_equals_automatic_differentiation(with_prior: bool) -> No
         return torch.nn.functional.pad(direction @ SE2().to_matrix(state)[..., :2, :2], (0, 1))
 
     given = MeasurementModel(ranges, ranging().noise, jacobian=slope)
-    pose, tilt = numbers(2.0, 1.0, 0.4), Observation(sighting(), bearings(numbers(2.1, 1.0, 0.4)))
+    pose, tilt = tensor(2.0, 1.0, 0.4), Observation(sighting(), bearings(tensor(2.1, 1.0, 0.4)))
     value = ranges(pose) + 0.1 * random_numbers(4, 3)
     estimates = []
     for model in (given, ranging()):
         observations = [Observation(model, value), tilt]
         if with_prior:
-            prior = Gaussian((pose + numbers(0.3, 0.3, 0.8)).expand(4, 3), covariances(4, 3))
+            prior = Gaussian((pose + tensor(0.3, 0.3, 0.8)).expand(4, 3), covariances(4, 3))
             estimates.append(maximum_a_posteriori(prior, observations, SE2()))
         else:
-            estimates.append(maximum_likelihood(observations, pose + numbers(0.3, 0.3, 0.3), SE2()))
+            estimates.append(maximum_likelihood(observations, pose + tensor(0.3, 0.3, 0.3), SE2()))
     assert_same(estimates[0], estimates[1])
 
 
@@ -418,9 +406,9 @@ def test_given_jacobian_equals_automatic_differentiation(with_prior: bool) -> No
 
 
 def test_batch_equals_loop_and_dimensions_broadcast() -> None:
-    points = numbers(2.0, 1.0) + 0.5 * random_numbers(4, 3, 2)
+    points = tensor(2.0, 1.0) + 0.5 * random_numbers(4, 3, 2)
     value = ranges(points) + 0.1 * random_numbers(4, 3, 3, seed=1)
-    initial = numbers(1.5, 1.5) + 0.3 * random_numbers(3, 2, seed=2)
+    initial = tensor(1.5, 1.5) + 0.3 * random_numbers(3, 2, seed=2)
     prior = Gaussian(initial, covariances(3, 2))
     likeliest = maximum_likelihood([Observation(ranging(), value)], initial)
     posterior = maximum_a_posteriori(prior, [Observation(ranging(), value)])
@@ -433,9 +421,9 @@ def test_batch_equals_loop_and_dimensions_broadcast() -> None:
 
 
 def test_an_element_that_has_converged_does_not_change() -> None:
-    value = ranges(numbers(2.0, 1.0)) + 0.1 * random_numbers(3)
+    value = ranges(tensor(2.0, 1.0)) + 0.1 * random_numbers(3)
     observations = [Observation(ranging(), value)]
-    starts = torch.stack([numbers(2.0, 1.0), numbers(40.0, 60.0)])
+    starts = torch.stack([tensor(2.0, 1.0), tensor(40.0, 60.0)])
     both = maximum_likelihood(observations, starts)
     steps = int(both.iterations[0])
     assert bool(both.converged.all())
@@ -448,7 +436,7 @@ def test_an_element_that_has_converged_does_not_change() -> None:
 
 
 def test_single_precision_finds_the_same_pose() -> None:
-    points = random_numbers(10, 3, seed=1) + numbers(0.0, 0.0, 6.0)
+    points = random_numbers(10, 3, seed=1) + tensor(0.0, 0.0, 6.0)
     start = SE3().from_matrix(torch.eye(4, dtype=torch.float64))
     truth = SE3().retract(start.expand(3, 7), 0.03 * random_numbers(3, 6, seed=2))
     value = project(truth, points) + 0.5 * random_numbers(3, 30)
@@ -470,7 +458,7 @@ def test_single_precision_finds_the_same_pose() -> None:
 
 
 def test_single_precision_converges_where_round_off_of_a_large_cost_hides_its_slope() -> None:
-    value = (100 * ranges(numbers(2.0, 1.0)) + random_numbers(100, 3)).float()
+    value = (100 * ranges(tensor(2.0, 1.0)) + random_numbers(100, 3)).float()
     noise = Diagonal(torch.full((3,), 1e-4))  # a hundred times too sure
     model = MeasurementModel(lambda state: 100 * ranges(state), noise)
     estimate = maximum_likelihood([Observation(model, value)], torch.tensor([2.5, 0.5]))
@@ -500,8 +488,8 @@ def test_gradient_flows_through_a_linear_problem() -> None:
 
 
 def test_gradient_of_a_converged_estimate_is_that_of_its_definition() -> None:
-    prior = Gaussian(numbers(2.3, 0.6), covariances(2))
-    value = ranges(numbers(2.0, 1.0)) + 0.3 * random_numbers(3)
+    prior = Gaussian(tensor(2.3, 0.6), covariances(2))
+    value = ranges(tensor(2.0, 1.0)) + 0.3 * random_numbers(3)
 
     def solve(value: Tensor) -> Tensor:
         return maximum_a_posteriori(prior, [Observation(ranging(0.3), value)]).belief.mean
@@ -521,17 +509,17 @@ def test_halved_steps_recover_a_start_from_which_full_steps_diverge() -> None:
     for _ in range(4):
         x = x - math.atan(x) * (1 + x * x)
     assert abs(x) > 1e6
-    starts = numbers(0.5, 3.0, -10.0, 20.0)[:, None]
+    starts = tensor(0.5, 3.0, -10.0, 20.0)[:, None]
     for estimate in (
-        maximum_likelihood([Observation(arctangent(), numbers(0.0))], starts),
-        maximum_a_posteriori(Gaussian(starts, 1e8 * torch.eye(1).double()), [Observation(arctangent(), numbers(0.0))]),
+        maximum_likelihood([Observation(arctangent(), tensor(0.0))], starts),
+        maximum_a_posteriori(Gaussian(starts, 1e8 * torch.eye(1).double()), [Observation(arctangent(), tensor(0.0))]),
     ):
         assert bool(estimate.converged.all())
         torch.testing.assert_close(estimate.belief.mean, torch.zeros_like(starts), rtol=0.0, atol=1e-6)
 
 
 def test_cost_never_rises() -> None:
-    value, starts = ranges(numbers(2.0, 1.0)), 20 * random_numbers(50, 2)
+    value, starts = ranges(tensor(2.0, 1.0)), 20 * random_numbers(50, 2)
     costs = [
         maximum_likelihood([Observation(ranging(), value)], starts, iterations=steps).cost for steps in range(1, 8)
     ]
@@ -541,8 +529,8 @@ def test_cost_never_rises() -> None:
 
 def test_step_into_where_the_model_is_not_defined_is_shortened() -> None:
     model = MeasurementModel(torch.log, torch.eye(1, dtype=torch.float64))
-    estimate = maximum_likelihood([Observation(model, numbers(-2.0))], numbers(5.0))
-    assert_equal(estimate.belief.mean, torch.exp(numbers(-2.0)))
+    estimate = maximum_likelihood([Observation(model, tensor(-2.0))], tensor(5.0))
+    assert_equal(estimate.belief.mean, torch.exp(tensor(-2.0)))
 
 
 def test_unobservable_elements_are_named_with_what_nothing_sees() -> None:
@@ -566,10 +554,10 @@ def test_unobservable_elements_are_named_with_what_nothing_sees() -> None:
 def test_too_few_observations_are_unobservable(batch: int) -> None:
     model = LinearMeasurement(random_numbers(1, 3), torch.eye(1, dtype=torch.float64))
     with pytest.raises(FilterError, match="do not determine the state"):
-        maximum_likelihood([Observation(model, numbers(1.0))], torch.zeros(batch, 3, dtype=torch.float64))
-    pose = torch.zeros(batch, 3, dtype=torch.float64) + numbers(2.0, 1.0, 0.3)
+        maximum_likelihood([Observation(model, tensor(1.0))], torch.zeros(batch, 3, dtype=torch.float64))
+    pose = torch.zeros(batch, 3, dtype=torch.float64) + tensor(2.0, 1.0, 0.3)
     with pytest.raises(FilterError, match=r"direction \[0, 0, 1\]"):
-        maximum_likelihood([Observation(ranging(), ranges(numbers(2.1, 1.0)))], pose, SE2())
+        maximum_likelihood([Observation(ranging(), ranges(tensor(2.1, 1.0)))], pose, SE2())
 
 
 def test_prior_that_is_lost_in_the_round_off_of_precise_observations_is_not_passed_over() -> None:
@@ -577,9 +565,9 @@ def test_prior_that_is_lost_in_the_round_off_of_precise_observations_is_not_pass
     prior = Gaussian(torch.zeros(2), 1e10 * torch.eye(2))
     with pytest.raises(FilterError, match=r"differ in precision by more than the digits of torch.float32"):
         maximum_a_posteriori(prior, [sum_of_both])
-    double = Observation(LinearMeasurement(*(m.double() for m in (torch.ones(1, 2), 1e-10 * torch.eye(1)))), numbers(1))
+    double = Observation(LinearMeasurement(*(m.double() for m in (torch.ones(1, 2), 1e-10 * torch.eye(1)))), tensor(1))
     estimate = maximum_a_posteriori(prior.to(torch.float64), [double])
-    torch.testing.assert_close(estimate.belief.mean, numbers(0.5, 0.5), rtol=0.0, atol=1e-4)
+    torch.testing.assert_close(estimate.belief.mean, tensor(0.5, 0.5), rtol=0.0, atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -594,8 +582,8 @@ def test_prior_that_is_lost_in_the_round_off_of_precise_observations_is_not_pass
 def test_one_bad_element_is_named_and_does_not_take_the_batch_down(
     spoil: Callable[[Tensor, Tensor, Tensor], object], message: str
 ) -> None:
-    mean, prior = numbers(1.5, 1.5).expand(3, 2), torch.eye(2, dtype=torch.float64).repeat(3, 1, 1)
-    noise, value = 0.01 * torch.eye(3, dtype=torch.float64).repeat(3, 1, 1), ranges(numbers(2.0, 1.0)).repeat(3, 1)
+    mean, prior = tensor(1.5, 1.5).expand(3, 2), torch.eye(2, dtype=torch.float64).repeat(3, 1, 1)
+    noise, value = 0.01 * torch.eye(3, dtype=torch.float64).repeat(3, 1, 1), ranges(tensor(2.0, 1.0)).repeat(3, 1)
 
     def solve(on_failure: str) -> Estimate:
         observations = [Observation(MeasurementModel(ranges, noise), value)]
@@ -612,13 +600,13 @@ def test_one_bad_element_is_named_and_does_not_take_the_batch_down(
 
 
 def test_what_cannot_be_asked_is_refused_with_the_reason() -> None:
-    start, value = numbers(1.0, 1.0), numbers(1.0, 1.0, 1.0)
+    start, value = tensor(1.0, 1.0), tensor(1.0, 1.0, 1.0)
     bent = MeasurementModel(lambda x, v: ranges(x) + v, torch.eye(3).double(), additive=False)
     flat = LinearMeasurement(torch.eye(3).double(), torch.eye(3).double())
     with pytest.raises(ValueError, match="observation 1: only additive noise"):
         maximum_likelihood([Observation(ranging(), value), Observation(bent, value)], start)
     with pytest.raises(TypeError, match=r"LinearMeasurement is for states in R\^n"):
-        maximum_likelihood([Observation(flat, value)], numbers(1.0, 1.0, 0.0), SE2())
+        maximum_likelihood([Observation(flat, value)], tensor(1.0, 1.0, 0.0), SE2())
     with pytest.raises(ValueError, match="at least one observation"):
         maximum_likelihood([], start)
     with pytest.raises(ValueError, match="weights must be at least 0"):

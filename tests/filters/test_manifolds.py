@@ -13,6 +13,7 @@ from torch.func import jacfwd, jacrev, jvp, vmap
 from sigmaslam.filters.layout import concatenate, stack
 from sigmaslam.filters.lie import adjoint_se3, exp_se3, log_se3, skew
 from sigmaslam.filters.manifolds import SE2, SE3, SO2, SO3, Euclidean, Manifold, Product
+from tests.support.filter_builders import random_numbers
 
 Group = SE2 | SO3 | SE3
 
@@ -24,10 +25,6 @@ each_manifold = pytest.mark.parametrize("manifold", MANIFOLDS, ids=str)
 # Turns of nothing, of 1e-300 to 0.1, across the ends of the series, and to just under half a turn.
 TINY = [0.0, *(10.0**k for k in (-300, -160, -30, -20, -10, -8, -6, -4, -3, -2, -1))]
 ANGLES = [*TINY, *np.linspace(0.05, 3.14, 400), math.pi - 1e-6, math.pi - 1e-9]
-
-
-def random_numbers(*shape: int, seed: int = 0) -> Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def random_axes(count: int, seed: int = 0) -> Tensor:

@@ -4,10 +4,7 @@ from torch import Tensor
 
 from sigmaslam.filters.linalg import cholesky
 from sigmaslam.filters.unscented import covariance_of, odd_and_even, sigma_offsets
-
-
-def random_numbers(*shape: int, seed: int = 0) -> Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+from tests.support.filter_builders import random_numbers
 
 
 def correlated_covariance(size: int, seed: int = 0) -> Tensor:

@@ -10,16 +10,9 @@ from sigmaslam.frontend.scorer import nearest_matches
 from sigmaslam.models.scorer import SIDE_CHANNELS, MatchScorer, ScoredMatches
 from sigmaslam.training.calibration import auroc
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 # points0 (B, M, 2), points1 (B, M, 2), side (B, M, 9), near (B, M, K), weight (B, M)
 Inputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")

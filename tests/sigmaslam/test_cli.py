@@ -1,7 +1,6 @@
 """The command line on the shipped sequence, and what it says to bad input."""
 
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -14,19 +13,15 @@ import numpy as np
 import pytest
 
 from sigmaslam.trajectory import read_tum
+from tests.support.commands import Finished, assert_refused, command_line, environment, run_here, run_process
 
 FRAMES = 8
 
 
-def sigmaslam(*arguments: str | Path, timeout: float = 120) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "sigmaslam", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
-
-
-@pytest.fixture
-def short_sequence(demo_sequence: Path, tmp_path: Path) -> Path:
-    """The first frames of the demo, to be broken."""
-    folder = tmp_path / "sequence"
+@pytest.fixture(scope="module")
+def whole_sequence(demo_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first frames of the demo."""
+    folder = tmp_path_factory.mktemp("whole") / "sequence"
     for name in ("image_0", "image_1"):
         (folder / name).mkdir(parents=True)
         for image in sorted((demo_sequence / name).iterdir())[:FRAMES]:
@@ -38,13 +33,25 @@ def short_sequence(demo_sequence: Path, tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def tracked(whole_sequence: Path) -> tuple[Path, Finished]:
+    """The run folder of these frames, and what the command said."""
+    out = whole_sequence.with_name("run")
+    return out, run_process("track", whole_sequence, "--out", out)
+
+
+@pytest.fixture
+def short_sequence(whole_sequence: Path, tmp_path: Path) -> Path:
+    """The first frames of the demo, to be broken."""
+    return shutil.copytree(whole_sequence, tmp_path / "sequence")
+
+
 def rows(run: Path) -> list[list[str]]:
     return [line.split(",") for line in (run / "frames.csv").read_text().splitlines()[1:]]
 
 
-def test_track_writes_every_output_and_evaluate_reads_them(short_sequence: Path, tmp_path: Path):
-    out = tmp_path / "run"
-    result = sigmaslam("track", short_sequence, "--out", out)
+def test_track_writes_every_output_and_evaluate_reads_them(whole_sequence: Path, tracked: tuple[Path, Finished]):
+    out, result = tracked
     assert result.returncode == 0, result.stderr
     assert len(read_tum(out / "trajectory.tum")) == FRAMES
     assert len((out / "trajectory.kitti").read_text().splitlines()) == FRAMES
@@ -61,42 +68,34 @@ def test_track_writes_every_output_and_evaluate_reads_them(short_sequence: Path,
     assert len(run["weights_sha256"]["features.onnx"]) == 64
     assert "<svg" in (out / "report.html").read_text()
 
-    result = sigmaslam("evaluate", out, "--truth", short_sequence / "poses.txt", "--json")
+    result = run_here("evaluate", out, "--truth", whole_sequence / "poses.txt", "--json")
     assert result.returncode == 0, result.stderr
     assert json.loads(result.stdout)["matched"] == FRAMES
 
 
-def test_two_runs_are_identical_to_the_bit(short_sequence: Path, tmp_path: Path):
-    for name in ("a", "b"):
-        assert sigmaslam("track", short_sequence, "--out", tmp_path / name).returncode == 0
+def test_two_runs_are_identical_to_the_bit(whole_sequence: Path, tracked: tuple[Path, Finished], tmp_path: Path):
+    assert run_process("track", whole_sequence, "--out", tmp_path / "again").returncode == 0
     for name in ("trajectory.tum", "trajectory.kitti", "covariance.npy", "map.ply"):
-        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
-
-
-def refused(result: subprocess.CompletedProcess[str], *words: str) -> None:
-    """One line of error with these words, exit code 2, no traceback."""
-    assert result.returncode == 2, result.stderr
-    assert "Traceback" not in result.stderr
-    for word in words:
-        assert word in result.stderr
+        assert (tracked[0] / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
 
 
 def test_a_missing_folder_is_refused(tmp_path: Path):
-    refused(sigmaslam("track", tmp_path / "nowhere", "--out", tmp_path / "run"), "nowhere")
+    assert_refused(run_process("track", tmp_path / "nowhere", "--out", tmp_path / "run"), "nowhere")
     assert not (tmp_path / "run").exists()
 
 
 def test_unequal_counts_are_refused_with_both_numbers(short_sequence: Path, tmp_path: Path):
     sorted((short_sequence / "image_1").iterdir())[3].unlink()
-    refused(sigmaslam("track", short_sequence, "--out", tmp_path / "run"), str(FRAMES), str(FRAMES - 1))
+    assert_refused(run_here("track", short_sequence, "--out", tmp_path / "run"), str(FRAMES), str(FRAMES - 1))
 
 
+@pytest.mark.usefixtures("without_report")
 @pytest.mark.parametrize("content", [b"", b"no image at all"])
 def test_an_unreadable_image_costs_one_frame_and_a_warning(short_sequence: Path, tmp_path: Path, content: bytes):
     broken = sorted((short_sequence / "image_0").iterdir())[4]
     broken.write_bytes(content)
     out = tmp_path / "run"
-    result = sigmaslam("track", short_sequence, "--out", out)
+    result = run_here("track", short_sequence, "--out", out)
     assert result.returncode == 0, result.stderr
     assert broken.name in result.stderr.replace("\n", "")
     assert [row[1] for row in rows(out)].count("skipped") == 1
@@ -110,8 +109,8 @@ def test_a_sequence_that_breaks_off_leaves_what_was_computed(short_sequence: Pat
     times[5] = "0.0"
     (short_sequence / "times.txt").write_text("\n".join(times) + "\n")
     out = tmp_path / "run"
-    result = sigmaslam("track", short_sequence, "--out", out)
-    refused(result, "time")
+    result = run_here("track", short_sequence, "--out", out)
+    assert_refused(result, "time")
     if out.exists():  # a reader may refuse the file before the first frame
         assert len(read_tum(out / "trajectory.tum")) == 5
 
@@ -120,9 +119,9 @@ def test_a_calibration_with_a_missing_key_or_wrong_size_is_refused(short_sequenc
     calibration = short_sequence / "calib.txt"
     lines = calibration.read_text().splitlines()
     calibration.write_text(lines[0] + "\n")
-    refused(sigmaslam("track", short_sequence, "--out", tmp_path / "run"), "calib.txt", "P1")
+    assert_refused(run_here("track", short_sequence, "--out", tmp_path / "run"), "calib.txt", "P1")
     calibration.write_text("\n".join([lines[0], " ".join(lines[1].split()[:-1])]) + "\n")
-    refused(sigmaslam("track", short_sequence, "--out", tmp_path / "run"), "calib.txt", "12")
+    assert_refused(run_here("track", short_sequence, "--out", tmp_path / "run"), "calib.txt", "12")
 
 
 def test_a_calibration_for_another_image_size_is_refused(short_sequence: Path, tmp_path: Path):
@@ -130,10 +129,11 @@ def test_a_calibration_for_another_image_size_is_refused(short_sequence: Path, t
     T = [[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
     calibration = tmp_path / "stereo.yaml"
     calibration.write_text(json.dumps({"left": camera, "right": camera, "T_left_right": T}))
-    result = sigmaslam("track", short_sequence, "--out", tmp_path / "run", "--calibration", calibration)
-    refused(result, "640x480", "320x240")
+    result = run_here("track", short_sequence, "--out", tmp_path / "run", "--calibration", calibration)
+    assert_refused(result, "640x480", "320x240")
 
 
+@pytest.mark.usefixtures("without_report")
 @pytest.mark.parametrize("kind", ["colour", "16-bit"])
 def test_colour_and_16_bit_images_are_converted_with_a_warning(short_sequence: Path, tmp_path: Path, kind: str):
     for path in [*(short_sequence / "image_0").iterdir(), *(short_sequence / "image_1").iterdir()]:
@@ -142,7 +142,7 @@ def test_colour_and_16_bit_images_are_converted_with_a_warning(short_sequence: P
         image = cv2.merge([grey] * 3) if kind == "colour" else grey.astype(np.uint16) * 256
         cv2.imwrite(str(path), image)
     out = tmp_path / "run"
-    result = sigmaslam("track", short_sequence, "--out", out)
+    result = run_here("track", short_sequence, "--out", out)
     assert result.returncode == 0, result.stderr
     assert ("colour" if kind == "colour" else "16") in result.stderr
     assert [row[1] for row in rows(out)].count("tracking") == FRAMES - 1
@@ -152,18 +152,20 @@ def test_an_output_folder_that_holds_something_is_refused_untouched(short_sequen
     out = tmp_path / "run"
     out.mkdir()
     (out / "precious.txt").write_text("keep")
-    refused(sigmaslam("track", short_sequence, "--out", out), str(out.name), "--out")
+    assert_refused(run_here("track", short_sequence, "--out", out), str(out.name), "--out")
     assert [path.name for path in out.iterdir()] == ["precious.txt"]
 
 
 def test_an_unknown_option_value_is_refused(short_sequence: Path, tmp_path: Path):
-    refused(sigmaslam("track", short_sequence, "--out", tmp_path / "run", "--frontend", "surf"), "surf", "sift")
+    assert_refused(
+        run_process("track", short_sequence, "--out", tmp_path / "run", "--frontend", "surf"), "surf", "sift"
+    )
 
 
 def test_ctrl_c_leaves_a_usable_run(demo_sequence: Path, tmp_path: Path):
     out = tmp_path / "run"
-    command = [sys.executable, "-m", "sigmaslam", "track", str(demo_sequence), "--out", str(out)]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    command = command_line("track", demo_sequence, "--out", out)
+    process = subprocess.Popen(command, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline and not ((out / "frames.csv").exists() and len(rows(out)) >= 3):
         time.sleep(0.05)
@@ -186,22 +188,23 @@ def test_the_runtime_imports_without_torch_or_kornia(demo_sequence: Path):
         "statuses = [tracker.step(f.left, f.right, f.timestamp).status for f, _ in zip(sequence.frames(), range(3))]\n"
         "assert statuses == ['starting', 'tracking', 'tracking'], statuses\n"
     )
-    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=120)
+    result = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=120, env=environment()
+    )
     assert result.returncode == 0, result.stderr
 
 
 def test_training_without_its_extra_says_how_to_install_it(tmp_path: Path):
     (tmp_path / "torch.py").write_text("raise ModuleNotFoundError(\"No module named 'torch'\", name='torch')\n")
-    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    command = [sys.executable, "-m", "sigmaslam", "train", "--out", str(tmp_path / "run")]
-    result = subprocess.run(command, capture_output=True, text=True, env=environment, check=False, timeout=60)
-    refused(result, "sigmaslam[train]")
+    command = command_line("train", "--out", tmp_path / "run")
+    result = subprocess.run(command, capture_output=True, text=True, env=environment(tmp_path), check=False, timeout=60)
+    assert_refused(result, "sigmaslam[train]")
 
 
 @pytest.mark.parametrize(
     "command", ["demo", "track", "evaluate", "match", "render", "train", "train-scorer", "export", "benchmark"]
 )
 def test_every_command_has_help(command: str):
-    result = sigmaslam(command, "--help")
+    result = run_here(command, "--help")
     assert result.returncode == 0
     assert "Usage" in result.stdout

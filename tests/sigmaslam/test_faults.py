@@ -11,7 +11,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.readers import StereoFrame
 from sigmaslam.rotation import se3_exp, se3_inverse, se3_log
 from tests.support.estimates import Demo, position_sigma, squared_error, statuses, track
-from tests.support.faults import Pair, assert_honest, broken
+from tests.support.faults import Pair, assert_honest, broken, changed
 from tests.support.quantiles import WITHIN_3_SIGMA
 
 
@@ -167,9 +167,7 @@ def test_a_step_of_the_exposure_is_survived(demo: Demo, gain: float):
     def exposed(image: np.ndarray) -> np.ndarray:
         return np.clip(np.rint(gain * image.astype(float)), 0, 255).astype(np.uint8)
 
-    estimates = track(
-        StereoTracker(camera), broken(frames, range(12, 40), lambda frame: (exposed(frame.left), exposed(frame.right)))
-    )
+    estimates = track(StereoTracker(camera), changed(frames, range(12, 40), exposed))
     assert estimates[-1].status == "tracking"
     assert_honest(estimates, truth)
 
@@ -183,9 +181,7 @@ def test_motion_blur_along_a_line_is_survived(demo: Demo, width: int, height: in
     def blurred(image: np.ndarray) -> np.ndarray:
         return cv2.blur(image, (width, height))
 
-    estimates = track(
-        StereoTracker(camera), broken(frames, range(12, 18), lambda frame: (blurred(frame.left), blurred(frame.right)))
-    )
+    estimates = track(StereoTracker(camera), changed(frames, range(12, 18), blurred))
     assert estimates[-1].status == "tracking"
     assert_honest(estimates, truth)
 

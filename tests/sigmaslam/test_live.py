@@ -3,7 +3,6 @@
 import json
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections import deque
@@ -15,7 +14,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sigmaslam.camera import CameraModel, StereoCamera
 from sigmaslam.cli import app
 from sigmaslam.errors import CalibrationError, InputError
 from sigmaslam.readers import StereoFrame, open_cameras
@@ -24,17 +22,15 @@ from sigmaslam.readers.camera import LivePairs, LiveSequence
 from sigmaslam.readers.capture import JUDGED_PAIRS, StereoCapture, open_capture
 from sigmaslam.run import track_sequence
 from sigmaslam.trajectory import read_tum
+from tests.support.commands import command_line, environment, run_process
+from tests.support.simulated_stereo import parallel_camera
+from tests.support.videos import write_video
 
 WIDTH, HEIGHT = 64, 48
+CAMERA = parallel_camera(WIDTH, HEIGHT, 50.0, 0.1)
 PERIOD = 0.01
+RATE_HZ = 50.0
 FOREVER = 10**9
-
-
-def stereo_camera(width: int = WIDTH, height: int = HEIGHT) -> StereoCamera:
-    eye = CameraModel(width, height, 50.0, 50.0, width / 2, height / 2)
-    T = np.eye(4)
-    T[0, 3] = 0.1
-    return StereoCamera(eye, eye, T)
 
 
 class FakeCamera:
@@ -96,7 +92,7 @@ class FakeCamera:
 
 def live(*cameras: FakeCamera, seconds: float | None = None) -> LiveSequence:
     names = [f"camera {index}" for index in range(len(cameras))]
-    return LiveSequence(LivePairs(StereoCapture(cameras, names), "0,1", seconds), stereo_camera(), "0,1")
+    return LiveSequence(LivePairs(StereoCapture(cameras, names), "0,1", seconds), CAMERA, "0,1")
 
 
 def number(frame: StereoFrame) -> int:
@@ -255,16 +251,6 @@ def test_the_drivers_clock_gives_the_time_of_exposure():
 # Devices
 
 
-def write_video(path: Path, images: list[np.ndarray], rate_hz: float = 50.0) -> Path:
-    height, width = images[0].shape
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), rate_hz, (width, height))
-    assert writer.isOpened()
-    for image in images:
-        writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
-    writer.release()
-    return path
-
-
 def shade(index: int, eye: int, width: int = WIDTH) -> np.ndarray:
     return np.full((HEIGHT, width), 50 + 5 * index + 3 * eye, np.uint8)
 
@@ -273,9 +259,9 @@ def shade(index: int, eye: int, width: int = WIDTH) -> np.ndarray:
 def videos(tmp_path: Path) -> Path:
     """left.avi, right.avi, both.avi and stereo.yaml."""
     for eye, name in enumerate(("left", "right")):
-        write_video(tmp_path / f"{name}.avi", [shade(index, eye) for index in range(20)])
-    write_video(tmp_path / "both.avi", [np.hstack([shade(index, 0), shade(index, 1)]) for index in range(20)])
-    stereo_camera().to_yaml(tmp_path / "stereo.yaml")
+        write_video(tmp_path / f"{name}.avi", [shade(index, eye) for index in range(20)], RATE_HZ)
+    write_video(tmp_path / "both.avi", [np.hstack([shade(index, 0), shade(index, 1)]) for index in range(20)], RATE_HZ)
+    CAMERA.to_yaml(tmp_path / "stereo.yaml")
     return tmp_path
 
 
@@ -305,10 +291,10 @@ def test_a_camera_that_cannot_be_opened_is_named(device: str):
 
 
 def test_sizes_that_do_not_fit_are_refused(videos: Path):
-    stereo_camera(128, 96).to_yaml(videos / "large.yaml")
+    parallel_camera(128, 96, 50.0, 0.1).to_yaml(videos / "large.yaml")
     with pytest.raises(CalibrationError, match=r"left image is 64x48, the calibration is for 128x96"):
         open_cameras(f"side-by-side:{videos}/both.avi", videos / "large.yaml")
-    wide = write_video(videos / "wide.avi", [shade(index, 1, 80) for index in range(3)])
+    wide = write_video(videos / "wide.avi", [shade(index, 1, 80) for index in range(3)], RATE_HZ)
     with pytest.raises(
         CalibrationError, match=r"different sizes: camera .*left.avi is 64x48, camera .*wide.avi is 80x48"
     ):
@@ -327,11 +313,6 @@ def test_one_image_for_both_eyes_needs_an_even_width(monkeypatch: pytest.MonkeyP
 # The command
 
 
-def sigmaslam(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "sigmaslam", "track", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-
-
 @pytest.fixture(scope="module")
 def demo_video(demo_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The demo side by side, twice there and back, at 10 Hz."""
@@ -343,8 +324,16 @@ def demo_video(demo_sequence: Path, tmp_path_factory: pytest.TempPathFactory) ->
 def test_track_writes_what_a_camera_saw(demo_video: Path, demo_sequence: Path, tmp_path: Path):
     out = tmp_path / "run"
     calibration = demo_sequence / "calib.txt"
-    result = sigmaslam(
-        "--camera", f"side-by-side:{demo_video}", "--calibration", calibration, "--out", out, "--seconds", "1.5"
+    result = run_process(
+        "track",
+        "--camera",
+        f"side-by-side:{demo_video}",
+        "--calibration",
+        calibration,
+        "--out",
+        out,
+        "--seconds",
+        "1.5",
     )
     assert result.returncode == 0, result.stderr
     trajectory = read_tum(out / "trajectory.tum")
@@ -355,6 +344,7 @@ def test_track_writes_what_a_camera_saw(demo_video: Path, demo_sequence: Path, t
     assert run["dropped"] + run["summary"]["frames"] > 10
 
 
+@pytest.mark.usefixtures("without_report")
 def test_an_unplugged_camera_leaves_what_was_tracked(tmp_path: Path):
     out = tmp_path / "run"
     with pytest.raises(InputError, match="camera 1 gives no more images"):
@@ -367,8 +357,8 @@ def test_an_unplugged_camera_leaves_what_was_tracked(tmp_path: Path):
 def test_ctrl_c_leaves_a_usable_run(demo_video: Path, demo_sequence: Path, tmp_path: Path):
     out = tmp_path / "run"
     options = ["--camera", f"side-by-side:{demo_video}", "--calibration", str(demo_sequence / "calib.txt")]
-    command = [sys.executable, "-m", "sigmaslam", "track", *options, "--out", str(out)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    command = command_line("track", *options, "--out", out)
+    process = subprocess.Popen(command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
     table = out / "frames.csv"
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline and not (table.exists() and len(table.read_text().splitlines()) > 3):

@@ -1,6 +1,7 @@
 """Files of location sensors, and their fusion with a tracker that drifts as it says."""
 
 import csv
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,8 @@ from sigmaslam.errors import InputError
 from sigmaslam.evaluation.evaluate import evaluate_run
 from sigmaslam.location import Locations, read_locations
 from sigmaslam.location_filter import LocationFilter
-from sigmaslam.readers import open_sequence
 from sigmaslam.rotation import matrix_to_quaternion, se3_exp, se3_inverse, se3_log
-from sigmaslam.tracker import Estimate, StereoTracker
+from sigmaslam.tracker import Estimate
 from sigmaslam.trajectory import read_kitti, read_tum
 from tests.support.quantiles import WITHIN_3_SIGMA, squared_sigmas
 from tests.support.simulated_location import FRAME, Drive, drifting_estimates, estimate_of, sense
@@ -184,33 +184,27 @@ def test_readings_of_another_clock_are_refused_at_the_first_frame():
         location.fuse(estimate_of(100.0, np.eye(4), np.zeros((6, 6))))
 
 
-@pytest.fixture(scope="module")
-def demo_estimates(demo_sequence: Path) -> list[Estimate]:
-    sequence = open_sequence(demo_sequence, "kitti")
-    tracker = StereoTracker(sequence.camera)
-    return [tracker.step(frame.left, frame.right, frame.timestamp) for frame in sequence.frames()]
-
-
 @pytest.mark.parametrize(("sigma", "most"), [(0.001, 1.0), (0.00025, 1.15)])
 def test_on_a_rendered_sequence_single_frames_do_not_become_drift(
-    demo_sequence: Path, demo_estimates: list[Estimate], sigma: float, most: float
+    demo_sequence: Path, demo_estimates: Callable[[str], list[Estimate]], sigma: float, most: float
 ):
     """One keyframe, errors of 2 mm that are no random walk; 1.4 times as large with the sharper sensor as if they were.
 
     The sensor's unknown world takes up what drift there is.
     """
-    truth = read_kitti(demo_sequence / "poses.txt")
+    truth, estimates = read_kitti(demo_sequence / "poses.txt"), demo_estimates("learned")
     rows = np.arange(0, len(truth), 2)
     nees, after = [], []
     for seed in range(6):
         location = LocationFilter(sense(truth.poses[rows], truth.timestamps[rows], seed, sigma, 0.002, MOUNT))
-        fused = [location.fuse(estimate) for estimate in demo_estimates]
+        fused = [location.fuse(estimate) for estimate in estimates]
         nees.append(nees_of(truth.poses, fused))
         after.append(rms(errors_of(truth.poses, fused), slice(0, 3)))
-    assert np.mean(after) < most * rms(errors_of(truth.poses, demo_estimates), slice(0, 3))
+    assert np.mean(after) < most * rms(errors_of(truth.poses, estimates), slice(0, 3))
     assert 0.4 < np.mean(nees) < 2.0
 
 
+@pytest.mark.usefixtures("without_report")
 def test_the_command_line_fuses_and_says_what_became_of_the_readings(demo_sequence: Path, tmp_path: Path):
     truth = read_kitti(demo_sequence / "poses.txt")
     readings = sense(truth.poses[::2], truth.timestamps[::2], 0, 0.001, 0.002, MOUNT)
@@ -222,7 +216,9 @@ def test_the_command_line_fuses_and_says_what_became_of_the_readings(demo_sequen
         quaternions = matrix_to_quaternion(readings.rotations)
         for time, position, quaternion in zip(readings.timestamps, readings.positions, quaternions, strict=True):
             rows.writerow([time, *position, *quaternion, 0.001, 0.002])
-    result = CliRunner().invoke(app, ["track", str(demo_sequence), "--out", str(run), "--location", str(path)])
+    result = CliRunner().invoke(
+        app, ["track", str(demo_sequence), "--out", str(run), "--location", str(path), "--frontend", "klt"]
+    )
     assert result.exit_code == 0, result.output
     assert "Location sensor: 19 readings used" in result.output
     # The first is of the first frame, before there is a motion.

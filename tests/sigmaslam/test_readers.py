@@ -11,6 +11,7 @@ from sigmaslam.camera import CameraModel, StereoCamera
 from sigmaslam.errors import CalibrationError, InputError
 from sigmaslam.readers import StereoFrame, open_sequence
 from sigmaslam.readers.sequence import READ_AHEAD, read_ahead
+from tests.support.videos import write_video
 
 WIDTH, HEIGHT = 64, 48
 
@@ -581,24 +582,18 @@ def test_euroc_equidistant_and_missing_sensor(tmp_path):
 # Videos
 
 
+RATE_HZ = 25.0
+
+
 def smooth(index, eye, width=WIDTH):
     """A picture that survives JPEG."""
     u, v = np.meshgrid(np.arange(width), np.arange(HEIGHT))
     return np.clip(60 + u + v + 5 * index + 30 * eye, 0, 255).astype(np.uint8)
 
 
-def write_video(path, images, rate_hz=25.0):
-    height, width = images[0].shape
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), rate_hz, (width, height))
-    assert writer.isOpened()
-    for image in images:
-        writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
-    writer.release()
-
-
 def check_video_frames(frames: list[StereoFrame], count):
     assert [frame.index for frame in frames] == list(range(count))
-    np.testing.assert_allclose([frame.timestamp for frame in frames], np.arange(count) / 25, atol=1e-3)
+    np.testing.assert_allclose([frame.timestamp for frame in frames], np.arange(count) / RATE_HZ, atol=1e-3)
     for frame in frames:
         np.testing.assert_allclose(frame.left, smooth(frame.index, 0), atol=4)
         np.testing.assert_allclose(frame.right, smooth(frame.index, 1), atol=4)
@@ -607,7 +602,7 @@ def check_video_frames(frames: list[StereoFrame], count):
 @pytest.mark.parametrize("format", ["auto", "folder", "video"])
 def test_two_videos(tmp_path, format):
     for eye, name in enumerate(("left.avi", "right.avi")):
-        write_video(tmp_path / name, [smooth(index, eye) for index in range(7)])
+        write_video(tmp_path / name, [smooth(index, eye) for index in range(7)], RATE_HZ)
     stereo_camera().to_yaml(tmp_path / "calibration.yaml")
     sequence, frames = read_all(tmp_path, format=format)
     assert (sequence.format, sequence.length, sequence.timestamps) == ("video", 7, None)
@@ -616,7 +611,7 @@ def test_two_videos(tmp_path, format):
 
 def test_side_by_side_video(tmp_path):
     path = tmp_path / "both.avi"
-    write_video(path, [np.hstack([smooth(index, 0), smooth(index, 1)]) for index in range(7)])
+    write_video(path, [np.hstack([smooth(index, 0), smooth(index, 1)]) for index in range(7)], RATE_HZ)
     with pytest.raises(CalibrationError, match="no calibration"):
         open_sequence(path)
     calibration = tmp_path / "elsewhere.yaml"
@@ -630,8 +625,8 @@ def test_side_by_side_video(tmp_path):
 
 
 def test_videos_of_unequal_length(tmp_path):
-    write_video(tmp_path / "left.avi", [smooth(index, 0) for index in range(7)])
-    write_video(tmp_path / "right.avi", [smooth(index, 1) for index in range(5)])
+    write_video(tmp_path / "left.avi", [smooth(index, 0) for index in range(7)], RATE_HZ)
+    write_video(tmp_path / "right.avi", [smooth(index, 1) for index in range(5)], RATE_HZ)
     with pytest.raises(InputError, match=r"unequal left and right videos: 7 frames in .*, 5 in "):
         open_sequence(tmp_path)
 

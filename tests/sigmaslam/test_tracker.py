@@ -1,5 +1,6 @@
 """The tracker as a whole, on rendered images with exact truth and on real ones."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,9 @@ from tests.support.estimates import Demo, mirrored, position_sigma, squared_erro
 from tests.support.faults import broken
 from tests.support.quantiles import WITHIN_3_SIGMA
 
+# The whole demo by the name of the front end.
+Tracked = Callable[[str], list[Estimate]]
+
 
 def trajectory_of(estimates: list[Estimate]) -> Trajectory:
     return Trajectory(np.array([e.timestamp for e in estimates]), np.stack([e.T_world_camera for e in estimates]))
@@ -29,10 +33,10 @@ def position_error(estimates: list[Estimate], demo: Demo) -> float:
 
 
 @pytest.mark.parametrize("frontend", ["learned", "sift", "orb", "klt"])
-def test_every_front_end_follows_the_rendered_camera(demo: Demo, frontend: str):
+def test_every_front_end_follows_the_rendered_camera(demo: Demo, demo_estimates: Tracked, frontend: str):
     """Within two centimetres and half a degree over 1.1 m and 2 s."""
-    camera, frames, truth = demo
-    estimates = track(StereoTracker(camera, frontend), frames)
+    _, frames, truth = demo
+    estimates = demo_estimates(frontend)
     assert [e.status for e in estimates] == ["starting"] + ["tracking"] * (len(frames) - 1)
     assert position_error(estimates, demo) < 0.02
     last = se3_log(se3_inverse(truth[-1]) @ estimates[-1].T_world_camera)
@@ -40,9 +44,8 @@ def test_every_front_end_follows_the_rendered_camera(demo: Demo, frontend: str):
     assert np.rad2deg(np.linalg.norm(last[3:])) < 0.5
 
 
-def test_the_covariance_is_positive_definite_and_grows_along_the_way(demo: Demo):
-    camera, frames, _ = demo
-    estimates = track(StereoTracker(camera, "klt"), frames)
+def test_the_covariance_is_positive_definite_and_grows_along_the_way(demo_estimates: Tracked):
+    estimates = demo_estimates("klt")
     smallest = [np.linalg.eigvalsh(e.covariance)[0] for e in estimates[1:]]
     assert min(smallest) > 0
     sigma = [position_sigma(e) for e in estimates]

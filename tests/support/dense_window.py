@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -165,6 +165,11 @@ class Dense:
             whitener[np.isnan(views.measurement[:, 2]), 2] = 0.0
             self.whiteners.append(whitener)
         self.at = np.r_[np.zeros(self.size), given.measured.ravel()]
+        # The landmark that each residual has to do with, -1 of none.
+        landmarks = np.arange(len(given.host))
+        of_views = [np.repeat(views.rows, 3) for views in self.views]
+        of_priors = [np.full(self.size, -1), np.repeat(landmarks, 4), np.repeat(landmarks, 2)]
+        self.landmark_of = np.concatenate([*of_priors, *of_views])
 
     def residuals(self, at: np.ndarray) -> np.ndarray:
         """In standard deviations."""
@@ -184,21 +189,37 @@ class Dense:
 
     def derivative(self, at: np.ndarray) -> np.ndarray:
         """Of the residuals by calibration, poses perturbed from the left, and landmarks."""
-        step = 1e-6
 
-        def moved(k: int, by: float) -> np.ndarray:
-            change = np.zeros(len(at))
-            change[k] = by
+        def turned(change: np.ndarray) -> np.ndarray:
             there = at + change
             tangents = [a[3 : self.size].reshape(-1, 6) for a in (change, at)]
             there[3 : self.size] = se3_log(se3_exp(tangents[0]) @ se3_exp(tangents[1])).ravel()
-            return self.residuals(there)
+            return there
 
-        return np.stack([(moved(k, step) - moved(k, -step)) / (2 * step) for k in range(len(at))], axis=1)
+        return self._differences(turned)
+
+    def _differences(self, moved: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """Of the residuals by changes; a residual has to do with one landmark at most, so all move at once."""
+        step = 1e-6
+
+        def difference(change: np.ndarray) -> np.ndarray:
+            return (self.residuals(moved(step * change)) - self.residuals(moved(-step * change))) / (2 * step)
+
+        unit = np.eye(len(self.at))
+        J = np.zeros((len(self.landmark_of), len(self.at)))
+        for k in range(self.size):
+            J[:, k] = difference(unit[k])
+        rows = np.flatnonzero(self.landmark_of >= 0)
+        for k in range(self.size, self.size + 6):
+            J[rows, k + 6 * self.landmark_of[rows]] = difference(unit[k::6].sum(axis=0))[rows]
+        return J
 
     def solve(self) -> Dense:
+        def jacobian(at: np.ndarray) -> np.ndarray:
+            return self._differences(lambda change: at + change)
+
         tolerances = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-15)
-        self.at = least_squares(self.residuals, self.at, "3-point", x_scale="jac", **tolerances).x
+        self.at = least_squares(self.residuals, self.at, jacobian, x_scale="jac", **tolerances).x
         return self
 
     @property

@@ -20,6 +20,13 @@ def broken(frames: list[StereoFrame], which: Iterable[int], fault: Callable[[Ste
     return [StereoFrame(f.index, f.timestamp, *fault(f)) if k in chosen else f for k, f in enumerate(frames)]
 
 
+def changed(
+    frames: list[StereoFrame], which: Iterable[int], change: Callable[[np.ndarray], np.ndarray]
+) -> list[StereoFrame]:
+    """The frames, some of them with both images changed in the same way."""
+    return broken(frames, which, lambda frame: (change(frame.left), change(frame.right)))
+
+
 def assert_honest(estimates: list[Estimate], truth: np.ndarray) -> None:
     """Every frame is lost or starting, or right within three sigma."""
     wrong = {

@@ -8,6 +8,9 @@ from torch import Tensor
 from sigmaslam.filters import BlockDiagonal, Dense, Diagonal, Gaussian, MeasurementModel, MotionModel, Update
 from sigmaslam.filters.noise import Noise
 
+# Of an update.
+FORMS = ("dense", "low-rank", "qr")
+
 
 def random_numbers(*shape: int, seed: int = 0) -> Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)

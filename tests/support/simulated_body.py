@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from sigmaslam.camera import CameraModel, StereoCamera
-from sigmaslam.frontend.types import Features, PatchMaps, StereoView, TemporalMatches
+from sigmaslam.frontend.types import PatchMaps, StereoView, TemporalMatches
 from sigmaslam.object_tracker import ObjectEstimate, ObjectTracker
 from sigmaslam.rotation import se3_exp, se3_inverse, se3_log
-from sigmaslam.tracker import TrackerConfig
-from tests.support.quantiles import squared_sigmas
-from tests.support.simulated_frontend import frame_of, image_of
+from tests.support.quantiles import chi_square_quantile, squared_sigmas
+from tests.support.simulated_stereo import SimulatedErrors, frame_of, image_of, parallel_camera
 
 WIDTH, HEIGHT, FOCAL, BASELINE = 640, 480, 500.0, 0.1
 DISTANCE, RADIUS, WALL = 1.0, 0.25, 1.5
 INTERVAL = 0.05
-_ASSUMED = TrackerConfig()
-# 99 % quantile of chi-square with two degrees of freedom.
-_ELLIPSE = 9.21
+_ELLIPSE = chi_square_quantile(0.99, 2)
 
 
 class SimulatedBody:
@@ -34,20 +30,14 @@ class SimulatedBody:
 
     def __init__(self, poses: np.ndarray, seed: int = 0, ball: int = 300, wall: int = 300, hidden: range = range(0)):
         self.poses, self._hidden, self._random = poses, hidden, np.random.default_rng(seed)
-        eye = CameraModel(WIDTH, HEIGHT, FOCAL, FOCAL, 0.5 * WIDTH, 0.5 * HEIGHT)
-        to_right = np.eye(4)
-        to_right[0, 3] = BASELINE
-        self.camera = StereoCamera(eye, eye, to_right)
+        self.camera = parallel_camera(WIDTH, HEIGHT, FOCAL, BASELINE)
         normal = self._random.standard_normal((ball, 3))
         self._normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
         spread = 0.9 * np.array([WIDTH, HEIGHT]) / FOCAL * WALL
         flat = self._random.uniform(-0.5, 0.5, (wall, 2)) * spread
         self._wall = np.column_stack([flat, np.full(wall, WALL)])
         self.is_ball = np.arange(ball + wall) < ball
-        self._place, self._disparity = 0.2, 0.25
-        share = _ASSUMED.shared_disparity
-        self._shared = np.sqrt(share) * self._disparity * self._random.standard_normal(ball + wall)
-        self._own = np.sqrt(1.0 - share) * self._disparity
+        self._errors = SimulatedErrors(self._random, ball + wall)
         self.seen: dict[int, np.ndarray] = {}
 
     def observe(self, left: np.ndarray, right: np.ndarray) -> StereoView:
@@ -55,13 +45,8 @@ class SimulatedBody:
         frame = frame_of(left)
         truth, visible = self._project(frame)
         seen = np.flatnonzero(visible)
-        self.seen[frame], count = seen, len(seen)
-        keypoints = truth[seen, :2] + _ASSUMED.keyframe_sigma * self._random.standard_normal((count, 2))
-        features = Features(
-            keypoints, np.zeros((count, 0), np.float32), np.ones(count, np.float32), np.full(count, 0.25)
-        )
-        disparity = truth[seen, 2] + self._shared[seen] + self._own * self._random.standard_normal(count)
-        return StereoView(left, right, features, disparity, np.full(count, self._disparity))
+        self.seen[frame] = seen
+        return self._errors.view(left, right, truth, seen)
 
     def match(
         self,
@@ -76,20 +61,13 @@ class SimulatedBody:
         frame = frame_of(view.left)
         wanted, seen = self.seen[frame_of(key.left)][index], self.seen[frame]
         truth, _ = self._project(frame)
-        places = truth[wanted, :2] + self._place * self._random.standard_normal((len(wanted), 2))
+        places = truth[wanted, :2] + self._errors.place * self._random.standard_normal((len(wanted), 2))
         both = np.isin(wanted, seen)
         if covariance is not None:
             apart = places - predicted
             both &= np.einsum("ki,kij,kj->k", apart, np.linalg.inv(covariance), apart) < _ELLIPSE
-        points, count = wanted[both], int(both.sum())
-        return TemporalMatches(
-            index[both],
-            places[both],
-            view.disparity[np.searchsorted(seen, points)],
-            np.tile(self._place**2 * np.eye(2), (count, 1, 1)),
-            np.full(count, self._disparity),
-            np.ones(count),
-        )
+        disparity = view.disparity[np.searchsorted(seen, wanted[both])]
+        return self._errors.matches(index[both], places[both], disparity)
 
     def _project(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """(u, v, disparity) of all points without noise, and which are in view."""

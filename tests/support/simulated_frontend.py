@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sigmaslam.camera import CameraModel, StereoCamera
-from sigmaslam.frontend.types import Features, PatchMaps, StereoView, TemporalMatches
+from sigmaslam.frontend.types import PatchMaps, StereoView, TemporalMatches
 from sigmaslam.rotation import se3_exp, se3_inverse
-from sigmaslam.tracker import Estimate, StereoTracker, TrackerConfig
+from sigmaslam.tracker import Estimate, StereoTracker
 from tests.support.estimates import squared_error
+from tests.support.simulated_stereo import ASSUMED, SimulatedErrors, frame_of, image_of, parallel_camera
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,6 @@ SCALES = {
 }
 # A keypoint keeps so far from the border of both images.
 _BORDER = 5.0
-# What the tracker assumes.
-_ASSUMED = TrackerConfig()
 
 
 class SimulatedFrontend:
@@ -72,21 +70,16 @@ class SimulatedFrontend:
         place: float = 0.2,
         disparity: float = 0.25,
         offset: float = 0.3,
-        shared: float = _ASSUMED.shared_disparity,
-        shared_place: float = _ASSUMED.shared_place,
+        shared: float = ASSUMED.shared_disparity,
+        shared_place: float = ASSUMED.shared_place,
         outliers: float = 0.0,
     ) -> None:
         self._scale, self._random = scale, np.random.default_rng(seed)
-        self._most, self._place, self._disparity = points, place, disparity
-        self._offset, self._outliers = offset, outliers
-        eye = CameraModel(scale.width, scale.height, scale.focal, scale.focal, 0.5 * scale.width, 0.5 * scale.height)
-        to_right = np.eye(4)
-        to_right[0, 3] = scale.baseline
-        self.camera = StereoCamera(eye, eye, to_right)
+        self._most, self._offset, self._outliers = points, offset, outliers
+        self.camera = parallel_camera(scale.width, scale.height, scale.focal, scale.baseline)
         self.poses = self._path(frames)
         self._points = np.concatenate([self._cloud(pose, 2 if k else 4) for k, pose in enumerate(self.poses[::5])])
-        self._shared = np.sqrt(shared) * disparity * self._random.standard_normal(len(self._points))
-        self._own = np.sqrt(1.0 - shared) * disparity
+        self._errors = SimulatedErrors(self._random, len(self._points), place, disparity, shared)
         self._shared_place = shared_place
         self._place_errors: dict[int, np.ndarray] = {}
         self._priority = self._random.permutation(len(self._points))
@@ -103,16 +96,7 @@ class SimulatedFrontend:
         seen = np.flatnonzero(visible)
         seen = np.sort(seen[np.argsort(self._priority[seen])[: self._most]])
         self._seen[frame] = seen
-        count = len(seen)
-        keypoints = truth[seen, :2] + _ASSUMED.keyframe_sigma * self._random.standard_normal((count, 2))
-        features = Features(
-            keypoints,
-            np.zeros((count, 0), np.float32),
-            np.ones(count, np.float32),
-            np.full(count, _ASSUMED.keyframe_sigma),
-        )
-        disparity = truth[seen, 2] + self._shared[seen] + self._own * self._random.standard_normal(count)
-        return StereoView(left, right, features, disparity, np.full(count, self._disparity))
+        return self._errors.view(left, right, truth, seen)
 
     def match(
         self,
@@ -135,17 +119,10 @@ class SimulatedFrontend:
         )[points]
         own = self._random.standard_normal((count, 2))
         error = np.sqrt(self._shared_place) * common + np.sqrt(1.0 - self._shared_place) * own
-        places = truth[points, :2] + self._place * error
+        places = truth[points, :2] + self._errors.place * error
         wrong = self._random.random(count) < self._outliers
         places[wrong] += self._random.uniform(-20, 20, (int(wrong.sum()), 2))
-        return TemporalMatches(
-            index[both],
-            places,
-            view.disparity[np.searchsorted(seen, points)],
-            np.tile(self._place**2 * np.eye(2), (count, 1, 1)),
-            np.full(count, self._disparity),
-            np.ones(count),
-        )
+        return self._errors.matches(index[both], places, view.disparity[np.searchsorted(seen, points)])
 
     def _path(self, frames: int) -> np.ndarray:
         """Poses of a camera whose velocity wanders about the typical one."""
@@ -153,7 +130,7 @@ class SimulatedFrontend:
         typical = np.array(scale.motion)
         depth = np.sqrt(scale.nearest * scale.farthest)
         # Half of what the tracker allows for.
-        sigma = 0.5 * np.repeat([_ASSUMED.acceleration * depth, _ASSUMED.angular_acceleration], 3)
+        sigma = 0.5 * np.repeat([ASSUMED.acceleration * depth, ASSUMED.angular_acceleration], 3)
         motion, poses = typical, [np.eye(4)]
         for _ in range(frames - 1):
             change = sigma * scale.interval**1.5 * self._random.standard_normal(6)
@@ -185,18 +162,6 @@ class SimulatedFrontend:
         inside = (u - disparity > _BORDER) & (u < scale.width - _BORDER)
         inside &= (v > _BORDER) & (v < scale.height - _BORDER) & (points[:, 2] > 0.3 * scale.nearest)
         return np.column_stack([u, v, disparity]), inside
-
-
-def image_of(frame: int, width: int, height: int) -> np.ndarray:
-    """A black image whose first two pixels are the frame's number."""
-    image = np.zeros((height, width), np.uint8)
-    image[0, :2] = frame % 256, frame // 256
-    return image
-
-
-def frame_of(image: np.ndarray) -> int:
-    """The frame that an image stands for."""
-    return int(image[0, 0]) + 256 * int(image[0, 1])
 
 
 @dataclass(frozen=True)

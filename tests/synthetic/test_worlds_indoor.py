@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 from types import ModuleType
@@ -20,6 +19,7 @@ from sigmaslam.synthetic.visibility import Eye
 from sigmaslam.synthetic.worlds import colon, organ, room, tool
 from sigmaslam.synthetic.worlds.episode import MOTIONS, Episode, Wish
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 WORLDS = [room, colon, organ, tool]
 DURATION = 8.0
 TIMES = np.linspace(0.5, DURATION - 0.5, 4)
@@ -51,14 +51,6 @@ def look(renderer: Renderer, poses: np.ndarray, times: np.ndarray, focal: float)
     depth[hit] = 1.0 / sight.evaluate(torch.from_numpy(view)[hit], facet[hit], places[:, hit])[2]
     body = torch.where(hit, renderer.body[facet.clamp_min(0)], -1)
     return depth.reshape(-1, 30, 40).numpy(), body.reshape(-1, 30, 40).numpy()
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.mark.parametrize("world", WORLDS)

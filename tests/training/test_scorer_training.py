@@ -25,13 +25,7 @@ from sigmaslam.training.scorer import (
     vary_sample,
 )
 
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def match_set(count: int, seed: int = 0) -> MatchSet:

@@ -16,17 +16,10 @@ from sigmaslam.training.calibration import calibration_error
 from sigmaslam.training.match_sets import MatchSet, PairRecord
 from sigmaslam.training.verifier import VerifierRows, calibrate, collect_rows, train_verifier, verifier_loss
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 CHI_SQUARE_95 = stats.chi2(2).ppf(0.95)
 FREEDOM = 20.0
 SHIFT = np.array([6.0, -4.0])
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def student_errors(count: int, sigma: tuple[float, float]) -> Tensor:
