@@ -15,13 +15,12 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.progress import Progress
 
 from sigmaslam.evaluation.benchmarks import filter_work
 from sigmaslam.evaluation.benchmarks.filter_peers import Peer, available, single_thread_environment
 from sigmaslam.evaluation.benchmarks.filter_work import BatchedWork, StereoWork
 from sigmaslam.evaluation.benchmarks.page import write_page
+from sigmaslam.progress import open_progress
 
 POINTS = (10, 50, 100, 200, 500)
 MANY_POINTS = (1000, 2000, 5000)
@@ -132,8 +131,8 @@ def format_page(rounds: int, compiled: bool, command: str) -> str:
         "",
     ]
     tables = len(POINTS) + 1 + len(KINDS) * len(BATCHES)
-    with Progress(console=Console(stderr=True)) as progress:
-        task = progress.add_task("timing", total=tables)
+    with open_progress() as progress:
+        task = progress.add_task("timing", total=tables, note="")
 
         def advance() -> None:
             progress.advance(task)
