@@ -18,11 +18,11 @@ from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path, atomic_write_text, make_folder
 from sigmaslam.models.scorer import MatchScorer
 from sigmaslam.models.verifier import MatchVerifier
+from sigmaslam.progress import open_progress
 from sigmaslam.training.calibration import auroc, average_precision, best_half, calibration_error, spearman
 from sigmaslam.training.card import describe_origin
 from sigmaslam.training.devices import describe_processor
 from sigmaslam.training.match_sets import PairRecord, load_record, record_path, write_records
-from sigmaslam.training.progress import open_progress
 from sigmaslam.training.scorer import RIGHT, make_sample, score_set, train_scorer
 from sigmaslam.training.validation import held_out_seed
 from sigmaslam.training.verifier import VerifierRows, calibrate, collect_rows, train_verifier

@@ -278,14 +278,14 @@ def plot_claims(comparisons: Sequence[Comparison], samples: int = 400_000) -> Fi
     return figure
 
 
-def write_claims(path: Path, figure: Path, command: str | None = None) -> str:
+def write_claims(path: Path, figure: Path, command: str) -> str:
     """Runs everything, writes page and figure and returns the page; what is below `<!-- notes -->` in it is kept."""
     bananas, comparisons = compare_bananas(), compare_filters()
     try:
         link = figure.resolve().relative_to(path.resolve().parent).as_posix()
     except ValueError:
         link = figure.as_posix()
-    page = format_claims(bananas, comparisons, link, command or f"sigmaslam benchmark claims --out {path}")
+    page = format_claims(bananas, comparisons, link, command)
     save_png(plot_claims(comparisons), figure)
     return write_page(path, page)
 
