@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
+from sigmaslam.evaluation.calibration import RIGHT
 from sigmaslam.files import atomic_path
 from sigmaslam.frontend.scorer import NEIGHBOURS, nearest_matches, side_information
 from sigmaslam.models.scorer import SIDE_CHANNELS, MatchScorer
@@ -18,8 +19,6 @@ from sigmaslam.training.devices import Workplace
 from sigmaslam.training.interruption import Interruption
 from sigmaslam.training.match_sets import MatchSet
 
-RIGHT = 3.0
-"""A match this near to the truth is right, pixels."""
 LEARNING_RATE = 3e-3
 SETS_A_STEP = 8
 _MOST_MATCHES = 512

@@ -14,16 +14,17 @@ import torch
 from rich.progress import Progress
 from safetensors.torch import save_file
 
+from sigmaslam.chi_square import CHI_SQUARE_68_OF_2, CHI_SQUARE_95_OF_2
 from sigmaslam.errors import InputError
+from sigmaslam.evaluation.calibration import RIGHT, auroc, average_precision, best_half, calibration_error, spearman
 from sigmaslam.files import atomic_path, atomic_write_text, make_folder
 from sigmaslam.models.scorer import MatchScorer
 from sigmaslam.models.verifier import MatchVerifier
 from sigmaslam.progress import open_progress
-from sigmaslam.training.calibration import auroc, average_precision, best_half, calibration_error, spearman
 from sigmaslam.training.card import describe_origin
 from sigmaslam.training.devices import describe_processor
 from sigmaslam.training.match_sets import PairRecord, load_record, record_path, write_records
-from sigmaslam.training.scorer import RIGHT, make_sample, score_set, train_scorer
+from sigmaslam.training.scorer import make_sample, score_set, train_scorer
 from sigmaslam.training.validation import held_out_seed
 from sigmaslam.training.verifier import VerifierRows, calibrate, collect_rows, train_verifier
 
@@ -31,7 +32,6 @@ SCORER_NAME, VERIFIER_NAME, CARD_NAME = "scorer.safetensors", "verifier.safetens
 _CONFIG_NAME, _CHECKPOINT_NAME, _SECONDS_NAME = "config.json", "scorer.pt", "seconds.txt"
 _HELD_OUT_SHARE = 0.1
 _SHOW_EVERY = 20
-_CHI_SQUARE_95, _CHI_SQUARE_68 = 5.991464547107979, 2.278868566
 _LIMITS = [
     "learned from renders alone; matches of our features, SIFT and ORB",
     "a moving object's matches are right matches: whether they move with the scene is asked by the estimator",
@@ -189,8 +189,8 @@ def _verifier_metrics(verifier: MatchVerifier, rows: VerifierRows) -> dict[str, 
         "expected_calibration_error": calibration_error(1.0 / (1.0 + np.exp(-logit)), right),
         "spearman_sigma_error": spearman(size, length),
         "best_half_rms": best_half(size, length),
-        "inside_95_ellipse": float((square < _CHI_SQUARE_95).mean()),
-        "inside_68_ellipse": float((square < _CHI_SQUARE_68).mean()),
+        "inside_95_ellipse": float((square < CHI_SQUARE_95_OF_2).mean()),
+        "inside_68_ellipse": float((square < CHI_SQUARE_68_OF_2).mean()),
     }
 
 

@@ -10,7 +10,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
+from sigmaslam.chi_square import NORMAL_WITHIN_2
 from sigmaslam.errors import SigmaSlamError
+from sigmaslam.evaluation.calibration import RIGHT
 from sigmaslam.frontend.affine import refine_by_neighbours
 from sigmaslam.frontend.evidence import examine_patches
 from sigmaslam.frontend.judge import LEAST_LOGIT
@@ -20,14 +22,12 @@ from sigmaslam.frontend.verifier import describe_matches
 from sigmaslam.models.scorer import MatchScorer
 from sigmaslam.models.verifier import MatchVerifier
 from sigmaslam.training.match_sets import MatchSet, PairRecord
-from sigmaslam.training.scorer import RIGHT, score_set
+from sigmaslam.training.scorer import score_set
 
 _LEARNING_RATE = 3e-3
 _BATCH = 4096
 # Degrees of freedom of Student's t: few near-misses among the right matches must not widen the sigma of all.
 _FREEDOM = 20.0
-# Share of a normal distribution within two standard deviations.
-_WITHIN_2 = 0.9544997361036416
 # Pairs whose images differ by more than a shift are refined by the neighbours' maps alone.
 _SHIFTED = ("stereo", "scenes", "video")
 _MAPPED = ("planes", "turned planes", "scenes", "video")
@@ -165,4 +165,4 @@ def calibrate(verifier: MatchVerifier, rows: VerifierRows) -> None:
     with torch.no_grad():
         verifier.logit_shift.copy_(scale * verifier.logit_shift + shift)
         verifier.logit_scale.copy_(scale * verifier.logit_scale)
-        verifier.sigma_scale.mul_(torch.quantile(deviation, _WITHIN_2) / 2.0)
+        verifier.sigma_scale.mul_(torch.quantile(deviation, NORMAL_WITHIN_2) / 2.0)

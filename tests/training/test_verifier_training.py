@@ -6,13 +6,13 @@ import torch
 from scipy import stats
 from torch import Tensor
 
+from sigmaslam.evaluation.calibration import calibration_error
 from sigmaslam.frontend.matching import Putative
 from sigmaslam.frontend.types import Features
 from sigmaslam.models.scorer import MatchScorer
 from sigmaslam.models.verifier import VERIFIER_COLUMNS, MatchVerifier
 from sigmaslam.synthetic.textures import dead_leaves
 from sigmaslam.training import verifier as verifier_training
-from sigmaslam.training.calibration import calibration_error
 from sigmaslam.training.match_sets import MatchSet, PairRecord
 from sigmaslam.training.verifier import VerifierRows, calibrate, collect_rows, train_verifier, verifier_loss
 
