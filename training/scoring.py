@@ -29,7 +29,8 @@ from sigmaslam.training.validation import held_out_seed
 from sigmaslam.training.verifier import VerifierRows, calibrate, collect_rows, train_verifier
 
 SCORER_NAME, VERIFIER_NAME, CARD_NAME = "scorer.safetensors", "verifier.safetensors", "matching.json"
-_CONFIG_NAME, _CHECKPOINT_NAME, _SECONDS_NAME = "config.json", "scorer.pt", "seconds.txt"
+_CONFIG_NAME, _SECONDS_NAME = "config.json", "seconds.txt"
+_SCORER_CHECKPOINT, _VERIFIER_CHECKPOINT = "scorer_checkpoint.safetensors", "verifier_checkpoint.safetensors"
 _HELD_OUT_SHARE = 0.1
 _SHOW_EVERY = 20
 _LIMITS = [
@@ -88,14 +89,18 @@ def train_scoring(out: Path, config: ScoringConfig, workers: int) -> dict[str, A
             sets,
             config.steps,
             config.seed,
-            out / _CHECKPOINT_NAME,
+            out / _SCORER_CHECKPOINT,
             lambda step, note: _show(progress, task, step, note),
         )
         clock.seconds()
         rows, held_out = (_collect(progress, folder, scorer) for folder in folders)
         task = progress.add_task("training the verifier", total=config.verifier_steps, note="")
         verifier = train_verifier(
-            rows, config.verifier_steps, config.seed, lambda step, note: _show(progress, task, step, note)
+            rows,
+            config.verifier_steps,
+            config.seed,
+            out / _VERIFIER_CHECKPOINT,
+            lambda step, note: _show(progress, task, step, note),
         )
     # Pairs in turn calibrate and measure.
     calibrate(verifier, held_out.select(held_out.pair % 2 == 0))

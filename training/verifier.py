@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -23,6 +25,7 @@ from sigmaslam.models.scorer import MatchScorer
 from sigmaslam.models.verifier import MatchVerifier
 from sigmaslam.training.match_sets import MatchSet, PairRecord
 from sigmaslam.training.scorer import score_set
+from sigmaslam.training.steps import train_steps
 
 _LEARNING_RATE = 3e-3
 _BATCH = 4096
@@ -113,33 +116,40 @@ def verifier_loss(logit: Tensor, log_sigma: Tensor, error: Tensor) -> Tensor:
     return binary_cross_entropy_with_logits(logit, right) + (likelihood * right).sum() / right.sum().clamp_min(1.0)
 
 
-def train_verifier(rows: VerifierRows, steps: int, seed: int, note: Callable[[int, str], None]) -> MatchVerifier:
-    """Trains from random weights.
+def train_verifier(
+    rows: VerifierRows, steps: int, seed: int, checkpoint: Path, note: Callable[[int, str], None]
+) -> MatchVerifier:
+    """Trains from random weights, or goes on from the checkpoint.
 
     Args:
         rows: to learn from.
         steps: of the optimiser.
         seed: of weights and batches.
+        checkpoint: file for the state, every 250 steps and when the run is stopped.
         note: is told of every step and the loss.
+    Raises:
+        InputError: the checkpoint is of another training.
+        KeyboardInterrupt: the run was stopped; it goes on from the checkpoint.
     """
     torch.manual_seed(seed)
-    generator = torch.Generator().manual_seed(seed)
     verifier = MatchVerifier()
     columns, error = torch.from_numpy(rows.columns), torch.from_numpy(rows.error)
     verifier.mean.copy_(columns.mean(dim=0))
     verifier.spread.copy_(columns.std(dim=0) + 1e-3)
     optimizer = torch.optim.AdamW(verifier.parameters(), _LEARNING_RATE, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, _LEARNING_RATE, total_steps=steps)
-    for step in range(steps):
-        batch = torch.randint(len(columns), (_BATCH,), generator=generator)
-        logit, log_sigma = verifier(columns[batch])
-        loss = verifier_loss(logit, log_sigma, error[batch])
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        optimizer.step()
-        schedule.step()
-        note(step + 1, f"loss {float(loss.detach()):.3f}")
-    return verifier.eval()
+
+    def losses(done: int) -> Iterator[Tensor]:
+        generator = torch.Generator().manual_seed(seed)
+        for step in count():
+            batch = torch.randint(len(columns), (_BATCH,), generator=generator)
+            if step >= done:
+                logit, log_sigma = verifier(columns[batch])
+                yield verifier_loss(logit, log_sigma, error[batch])
+
+    made_of = {"steps": steps, "seed": seed, "rows": len(columns)}
+    train_steps(verifier, optimizer, schedule, steps, losses, checkpoint, made_of, note)
+    return verifier
 
 
 def calibrate(verifier: MatchVerifier, rows: VerifierRows) -> None:
