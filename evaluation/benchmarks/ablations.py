@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.benchmarks.page import write_page
+from sigmaslam.evaluation.benchmarks.page import header, row, write_page
 from sigmaslam.evaluation.matching.extractors import LearnedExtractor
 from sigmaslam.evaluation.matching.run import Scores, score
 from sigmaslam.evaluation.matching.sets import SELECTION
@@ -184,12 +184,12 @@ def _extractor(run: Path, variant: Variant) -> LearnedExtractor:
 
 def _table(results: Sequence[tuple[Variant, list[Scores]]]) -> Iterator[str]:
     columns = [(name, key) for name in SELECTION for key in _SHOWN[name]]
-    yield "| question | variant | **choice** | " + " | ".join(f"{name} {key}" for name, key in columns) + " |"
-    yield "|---|---|" + "---:|" * (len(columns) + 1)
+    names = (f"{name} {key}" for name, key in columns)
+    yield from header("question", "variant", "**choice**", *names, numbers_from=2)
     for variant, runs in results:
         cells = [_spread([selection_score(scores) for scores in runs])]
         cells += [_spread([scores[name][key] for scores in runs]) for name, key in columns]
-        yield f"| {variant.question} | {variant.name} | " + " | ".join(cells) + " |"
+        yield row(variant.question, variant.name, *cells)
 
 
 def _spread(values: Sequence[float]) -> str:

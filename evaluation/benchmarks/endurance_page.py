@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import platform
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+
+from sigmaslam.evaluation.benchmarks.page import machine
 
 # What is asked for.
 _MEMORY, _TIME, _LOOP = 5.0, 10.0, 0.2
@@ -79,11 +79,10 @@ class Endurance:
 def format_endurance(endurance: Endurance, command: str) -> str:
     """The run as a Markdown page."""
     words = _WORDS.format(lap_frames=endurance.lap_frames, length=endurance.lap_length)
-    machine = f"{platform.machine()}, {os.cpu_count()} cores"
     lines = [
         "# Endurance",
         "",
-        f"Made by `{command}` on {machine}, in {endurance.seconds / 60:.0f} minutes.",
+        f"Made by `{command}` on {machine()}, in {endurance.seconds / 60:.0f} minutes.",
         "",
         words,
     ]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import platform
 import statistics
 import subprocess
 import sys
@@ -19,7 +18,7 @@ import numpy as np
 from sigmaslam.evaluation.benchmarks import filter_work
 from sigmaslam.evaluation.benchmarks.filter_peers import Peer, available, single_thread_environment
 from sigmaslam.evaluation.benchmarks.filter_work import BatchedWork, StereoWork
-from sigmaslam.evaluation.benchmarks.page import write_page
+from sigmaslam.evaluation.benchmarks.page import machine, row, write_page
 from sigmaslam.progress import open_progress
 
 POINTS = (10, 50, 100, 200, 500)
@@ -122,7 +121,7 @@ def format_page(rounds: int, compiled: bool, command: str) -> str:
     lines = [
         "# Speed of the filters",
         "",
-        f"Made by `{command}` on {platform.machine()}, {os.cpu_count()} cores, one",
+        f"Made by `{command}` on {machine()}, one",
         f"thread; process CPU time, contenders in turn, {rounds} rounds. {versions}.",
         "",
         "Work: one prediction and one update of an unscented filter with the cubature set, one linearisation, sigma",
@@ -155,15 +154,15 @@ def _stereo_section(peers: Sequence[Peer], rounds: int, compiled: bool, advance:
         "Milliseconds for plain numpy, which has the low-rank form; for the others how many times longer they take,",
         "with the lowest and highest round. Below 1 is faster.",
         "",
-        _row("", *(f"m = {points}" for points in POINTS)),
-        _row("---", *["---"] * len(POINTS)),
+        row("", *(f"m = {points}" for points in POINTS)),
+        row("---", *["---"] * len(POINTS)),
     ]
     for name in results[0]:
         if name == _REFERENCE:
             cells = [f"{1e3 * result[name].median:.3g} ms" for result in results]
         else:
             cells = [_ratio(*result[name].ratio(result[_REFERENCE])) for result in results]
-        lines.append(_row(name, *cells))
+        lines.append(row(name, *cells))
     best = _COMPILED if compiled else _EAGER
     if "filterpy" in results[-1]:
         middle, low, high = results[-1]["filterpy"].ratio(results[-1][best])
@@ -181,10 +180,10 @@ def _linear_cost_section(rounds: int, compiled: bool, advance: Callable[[], None
     lines = [
         "Microseconds a point, for many points:",
         "",
-        _row("", *(f"m = {points}" for points in (POINTS[-1], *MANY_POINTS))),
-        _row("---", *["---"] * len(cells)),
+        row("", *(f"m = {points}" for points in (POINTS[-1], *MANY_POINTS))),
+        row("---", *["---"] * len(cells)),
     ]
-    lines += [_row(name, *(f"{column[i]:.2f}" for column in cells)) for i, name in enumerate(names)]
+    lines += [row(name, *(f"{column[i]:.2f}" for column in cells)) for i, name in enumerate(names)]
     return [*lines, ""]
 
 
@@ -202,11 +201,11 @@ def _batch_section(
         "",
         "Filter steps a second, with the lowest and highest round; float32 where there is one.",
         "",
-        _row("", *(f"B = {batch:,}" for batch in BATCHES)),
-        _row("---", *["---"] * len(BATCHES)),
+        row("", *(f"B = {batch:,}" for batch in BATCHES)),
+        row("---", *["---"] * len(BATCHES)),
     ]
     for name in columns[0]:
-        lines.append(_row(name, *(_rate(column[name]) for column in columns)))
+        lines.append(row(name, *(_rate(column[name]) for column in columns)))
     return [*lines, ""]
 
 
@@ -217,10 +216,6 @@ _TITLES = {
     "linear": "Linear: 4 states, constant velocity, Kalman filter",
 }
 _PACKAGES = ("torch", "numpy", "filterpy", "stonesoup", "dynamax", "jax", "pypose", "torch-kf")
-
-
-def _row(*cells: str) -> str:
-    return "| " + " | ".join(cells) + " |"
 
 
 def _ratio(middle: float, low: float, high: float) -> str:
