@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -84,24 +84,12 @@ def train_scoring(out: Path, config: ScoringConfig, workers: int) -> dict[str, A
         ]
         clock.seconds()
         sets = [found for record in _records(folders[0]) for found in record.sets.values()]
-        task = progress.add_task("training the scorer", total=config.steps, note="")
-        scorer = train_scorer(
-            sets,
-            config.steps,
-            config.seed,
-            out / _SCORER_CHECKPOINT,
-            lambda step, note: _show(progress, task, step, note),
-        )
+        told = _open_bar(progress, "training the scorer", config.steps)
+        scorer = train_scorer(sets, config.steps, config.seed, out / _SCORER_CHECKPOINT, told)
         clock.seconds()
         rows, held_out = (_collect(progress, folder, scorer) for folder in folders)
-        task = progress.add_task("training the verifier", total=config.verifier_steps, note="")
-        verifier = train_verifier(
-            rows,
-            config.verifier_steps,
-            config.seed,
-            out / _VERIFIER_CHECKPOINT,
-            lambda step, note: _show(progress, task, step, note),
-        )
+        told = _open_bar(progress, "training the verifier", config.verifier_steps)
+        verifier = train_verifier(rows, config.verifier_steps, config.seed, out / _VERIFIER_CHECKPOINT, told)
     # Pairs in turn calibrate and measure.
     calibrate(verifier, held_out.select(held_out.pair % 2 == 0))
     metrics = _scorer_metrics(scorer, folders[1]) | _verifier_metrics(verifier, held_out.select(held_out.pair % 2 == 1))
@@ -228,7 +216,13 @@ def _save(path: Path, module: torch.nn.Module) -> None:
         save_file({name: value.contiguous() for name, value in module.state_dict().items()}, temporary)
 
 
-def _show(progress: Progress, task: Any, step: int, note: str) -> None:
-    progress.update(task, completed=step)
-    if step % _SHOW_EVERY == 0:
-        progress.update(task, note=note)
+def _open_bar(progress: Progress, title: str, steps: int) -> Callable[[int, str], None]:
+    """A bar for a training; returns what is to be told of every step and its loss."""
+    task = progress.add_task(title, total=steps, note="")
+
+    def show(step: int, note: str) -> None:
+        progress.update(task, completed=step)
+        if step % _SHOW_EVERY == 0:
+            progress.update(task, note=note)
+
+    return show

@@ -123,13 +123,9 @@ def train_verifier(
 
     Args:
         rows: to learn from.
-        steps: of the optimiser.
-        seed: of weights and batches.
-        checkpoint: file for the state, every 250 steps and when the run is stopped.
-        note: is told of every step and the loss.
+        steps, seed, checkpoint, note: as `train_scorer` takes them.
     Raises:
-        InputError: the checkpoint is of another training.
-        KeyboardInterrupt: the run was stopped; it goes on from the checkpoint.
+        InputError, KeyboardInterrupt: as there.
     """
     torch.manual_seed(seed)
     verifier = MatchVerifier()

@@ -213,20 +213,7 @@ def benchmark(
     ablations: what each part of the features gains, by short training runs (an hour). All but the first need the extra
     'train'.
     """
-    values = {
-        "data": data,
-        "method": method,
-        "sequence": sequence,
-        "rounds": rounds,
-        "eager": eager,
-        "runs": runs,
-        "steps": steps,
-        "seeds": seeds,
-        "frames": frames,
-        "weights": weights,
-        "peer": peer,
-        "sets": sets,
-    }
+    values = {option: value for option, value in locals().items() if option not in ("context", "name", "out")}
     run = _BENCHMARKS[name.value]
     served = [option for option in values if option in inspect.signature(run).parameters]
     for option in values:
