@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from sigmaslam.files import atomic_write_text
@@ -29,6 +30,11 @@ def header(*names: str, numbers_from: int | None = None) -> list[str]:
     """The first two lines of a table; columns of numbers, from the given one on, are flush right."""
     count = len(names) if numbers_from is None else numbers_from
     return [row(*names), "|" + "---|" * count + "---:|" * (len(names) - count)]
+
+
+def table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """A whole table of words."""
+    return [row(*cells) for cells in (columns, ["---"] * len(columns), *rows)]
 
 
 def row(*cells: str) -> str:

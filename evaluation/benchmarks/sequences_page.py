@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
 
-from sigmaslam.evaluation.benchmarks.page import machine, row
+from sigmaslam.evaluation.benchmarks.page import machine, table
 from sigmaslam.evaluation.evaluate import Evaluation
 from sigmaslam.report import FrameTable
 
@@ -104,13 +104,13 @@ def format_results(results: Sequence[Result | LeftOut], command: str, complete: 
             lines += [f"{missing.sequence} is left out: {missing.reason}", ""]
     for sequence in dict.fromkeys(result.sequence for result in results if isinstance(result, Result)):
         found = [result for result in results if isinstance(result, Result) and result.sequence == sequence]
-        lines += [f"## {sequence}", "", *_table(_COLUMNS, (_row(result) for result in found)), ""]
+        lines += [f"## {sequence}", "", *table(_COLUMNS, (_row(result) for result in found)), ""]
         for missing in results:
             if isinstance(missing, LeftOut) and missing.method and missing.sequence == sequence:
                 lines += [f"The row *{_LABELS[missing.method]}* is left out: {missing.reason}", ""]
         staged = [(each.method, each.frames) for each in found if each.frames and "filter" in each.frames.milliseconds]
         if staged:
-            lines += [*_table(_STAGE_COLUMNS, (_stage_row(method, frames) for method, frames in staged)), ""]
+            lines += [*table(_STAGE_COLUMNS, (_stage_row(method, frames) for method, frames in staged)), ""]
     return "\n".join(lines)
 
 
@@ -127,10 +127,6 @@ def total_cell(result: Result) -> str:
         return f"{share:.0f} (whole: {seconds:.1f} s)"
     low, middle, high = np.percentile(_totals(result.frames), [10, 50, 90])
     return f"{middle:.0f} ({low:.0f} - {high:.0f})"
-
-
-def _table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    return [row(*cells) for cells in (columns, ["---"] * len(columns), *rows)]
 
 
 def _row(result: Result) -> list[str]:
