@@ -8,6 +8,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from sigmaslam.camera import RectifiedStereo
+from sigmaslam.mahalanobis import squared_mahalanobis
 
 EDGE = 0.02
 """Where inverse depth bends by more than this share of itself within a pixel, a point's true depth is in doubt."""
@@ -51,9 +52,7 @@ def ratio_with_error(values: Sequence[float], others: Sequence[float]) -> tuple[
 
 def point_nees(points: np.ndarray, covariances: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Normalised errors squared of points (M, 3) with covariances (M, 3, 3), per degree of freedom, (M,)."""
-    errors = points - truth
-    solved = np.linalg.solve(covariances, errors[..., None])[..., 0]
-    return np.asarray((errors * solved).sum(axis=-1) / 3.0)
+    return np.asarray(squared_mahalanobis(points - truth, covariances) / 3.0)
 
 
 def depth_edges(depths: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from sigmaslam.errors import InputError
+from sigmaslam.mahalanobis import squared_mahalanobis
 from sigmaslam.rotation import rotation_log, se3_inverse, se3_log
 from sigmaslam.trajectory import Trajectory
 
@@ -356,9 +357,9 @@ def pose_nees(
     used = is_regular(covariance[result.index])
     used[0] = False
     errors, P = result.errors[used], covariance[result.index[used]]
-    full = _mahalanobis_squared(errors, P) / 6
-    translation = _mahalanobis_squared(errors[:, :3], P[:, :3, :3]) / 3
-    rotation = _mahalanobis_squared(errors[:, 3:], P[:, 3:, 3:]) / 3
+    full = squared_mahalanobis(errors, P) / 6
+    translation = squared_mahalanobis(errors[:, :3], P[:, :3, :3]) / 3
+    rotation = squared_mahalanobis(errors[:, 3:], P[:, 3:, 3:]) / 3
     some = len(full) > 0
     return PoseNees(
         mean=float(full.mean()) if some else math.nan,
@@ -377,11 +378,6 @@ def is_regular(covariance: np.ndarray) -> np.ndarray:
     sigma = np.sqrt(np.where(regular[:, None], variance, 1.0))
     correlation = np.where(regular[:, None, None], covariance, 0.0) / (sigma[:, :, None] * sigma[:, None, :])
     return np.asarray(regular & (np.linalg.eigvalsh(correlation)[:, 0] > 1e-12))
-
-
-def _mahalanobis_squared(errors: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    solved = np.linalg.solve(covariance, errors[..., None])[..., 0]
-    return np.asarray(np.sum(errors * solved, axis=-1))
 
 
 def _motions(poses: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ from sigmaslam.frontend.matching import nearest_anywhere
 from sigmaslam.frontend.types import Features
 from sigmaslam.readers.images import read_grey
 
-_DETECTORS = {"learned": LearnedDetector, "sift": SiftDetector, "orb": OrbDetector}
+DETECTORS = {"learned": LearnedDetector, "sift": SiftDetector, "orb": OrbDetector}
 # What is less probable is left out by default.
 LEAST_PROBABILITY = 0.5
 _LEAST_SIDE = 96
@@ -183,11 +183,11 @@ def draw_lines(
 
 
 def _detector(frontend: str, max_keypoints: int) -> Callable[[np.ndarray], Features]:
-    if frontend not in _DETECTORS:
-        raise InputError(f"there is no front-end '{frontend}' for two images: choose one of {', '.join(_DETECTORS)}")
+    if frontend not in DETECTORS:
+        raise InputError(f"there is no front-end '{frontend}' for two images: choose one of {', '.join(DETECTORS)}")
     if max_keypoints < _LEAST_KEYPOINTS:
         raise InputError(f"--max-keypoints is {max_keypoints}: give at least {_LEAST_KEYPOINTS}")
-    return _DETECTORS[frontend](max_keypoints)
+    return DETECTORS[frontend](max_keypoints)
 
 
 def _check_probability(min_probability: float) -> None:

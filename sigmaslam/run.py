@@ -9,9 +9,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
 from sigmaslam.config import TrackerConfig
 from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.estimate import Estimate
@@ -20,6 +17,7 @@ from sigmaslam.location_filter import LocationFilter
 from sigmaslam.object_region import read_region
 from sigmaslam.object_tracker import ObjectTracker
 from sigmaslam.outputs import RunWriter, describe_camera
+from sigmaslam.progress import open_progress
 from sigmaslam.readers import StereoFrame, StereoSequence
 from sigmaslam.tracker import StereoTracker
 from sigmaslam.trajectory import write_tum
@@ -141,14 +139,8 @@ def _track(
     writer: RunWriter,
     location: LocationFilter | None,
 ) -> None:
-    with Progress(
-        BarColumn(bar_width=16),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
-        console=Console(stderr=True),
-    ) as progress:
-        task = progress.add_task("", total=sequence.length, note="")
+    with open_progress() as progress:
+        task = progress.add_task("frames", total=sequence.length, note="")
         noted, done = 0, 0
         began = since = time.perf_counter()
         for frame in frames:

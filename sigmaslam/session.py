@@ -14,6 +14,7 @@ from sigmaslam.errors import InputError
 # This fusion moves a constant factor into a float32 attribute of the product, also when the product is float64: the
 # covariances of the filter would be wrong in the eighth digit.
 _DISABLED = ["MatMulScaleFusion"]
+BACKENDS = ("onnx", "torch")
 
 
 class OnnxGraph:
@@ -56,7 +57,7 @@ def shipped_weights(name: str) -> Path:
 
 
 def load_step(name: str, backend: str) -> Callable[[Mapping[str, np.ndarray]], list[np.ndarray]]:
-    """A step of the filter by the name of its graph; backend "onnx", or "torch" for its twin."""
+    """A step of the filter by the name of its graph; one of `BACKENDS`: "torch" is its twin."""
     if backend == "torch":
         from sigmaslam.models.torch_runtime import filter_module
 

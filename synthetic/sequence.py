@@ -23,11 +23,11 @@ import torch
 
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder
+from sigmaslam.synthetic.choices import TRUTHS
 from sigmaslam.synthetic.landmarks import Landmarks, choose_landmarks, observe
 from sigmaslam.synthetic.layouts import image_paths, write_layout
 from sigmaslam.synthetic.simulation import Frame, Recipe, Simulation, Studio, simulate
 
-TRUTHS = ("dense", "sparse")
 SCENE_NAME, LANDMARKS_NAME = "scene.json", "landmarks.npz"
 _CHUNK = 8  # frames handed to a process at a time, at most
 _TRACK_KEYS = ("landmark", "left", "right", "left_visible", "right_visible", "depth")

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from sigmaslam.errors import InputError
+from sigmaslam.synthetic.choices import MOTIONS
 from sigmaslam.synthetic.paths import Path
 from sigmaslam.synthetic.presets import EXPOSURES, PRESETS, SENSORS, Layout
 from sigmaslam.synthetic.renderer import Renderer, Views
@@ -18,7 +19,7 @@ from sigmaslam.synthetic.scene import Scene
 from sigmaslam.synthetic.sensor import Sensor, expose, exposure_gains
 from sigmaslam.synthetic.truth import flow
 from sigmaslam.synthetic.visibility import Eye
-from sigmaslam.synthetic.worlds.episode import MOTIONS, Wish
+from sigmaslam.synthetic.worlds.episode import Wish
 
 _BRIGHTNESS = 0.48  # mean of the linear image that the exposure aims at
 _METERED = 5  # frames that are looked at for it

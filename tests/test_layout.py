@@ -17,7 +17,7 @@ FORBIDDEN = {
     "sigmaslam": ("training", "synthetic", "torch"),
 }
 # The command line reaches everything, each part where its command needs it.
-EXCEPTIONS = ("cli.py",)
+EXCEPTIONS = (Path("sigmaslam/cli"),)
 
 
 def test_the_package_list_names_every_folder_with_modules():
@@ -46,7 +46,7 @@ def test_the_link_inside_the_package_leads_to_the_folder(name: str):
 def test_lower_layers_do_not_import_upper_ones(layer: str):
     for path in (ROOT / layer).rglob("*.py"):
         inner = path.relative_to(ROOT)
-        if any((ROOT / parent).is_symlink() for parent in inner.parents) or path.name in EXCEPTIONS:
+        if any((ROOT / parent).is_symlink() for parent in inner.parents) or inner.parent in EXCEPTIONS:
             continue
         # Imports at the start of a line: those inside functions are lazy, for extras.
         for module in re.findall(r"^(?:from|import) ([\w.]+)", path.read_text(), re.MULTILINE):

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from sigmaslam.training.checkpoint import TrainingState
+from sigmaslam.training.choices import MIXES
 from sigmaslam.training.devices import Workplace, describe_hardware
-from sigmaslam.training.stream import MIXES
 
 CARD_NAME = "features.json"
 _LIMITS = [

@@ -1,28 +1,22 @@
-"""A run at the end of a step, in memory and as a safetensors file: going on from it is as if it had not stopped."""
+"""A run that trains the features, in memory and as a checkpoint."""
 
 from __future__ import annotations
 
 import hashlib
-import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
-from torch import Tensor
 
 from sigmaslam.errors import InputError
-from sigmaslam.files import atomic_path
 from sigmaslam.models.export import load_network
 from sigmaslam.models.network import FeatureNetwork
 from sigmaslam.training.devices import Workplace, place_network
 from sigmaslam.training.recipes import TrainingConfig
+from sigmaslam.training.snapshot import check_same, read_snapshot, restore, write_snapshot
 
 CHECKPOINT_NAME = "checkpoint.safetensors"
 _OLD_NAME = "checkpoint.pt"
-_FORMAT = "sigmaslam training 2"
 
 
 @dataclass(slots=True)
@@ -94,26 +88,16 @@ def begin(config: TrainingConfig, recipe: str | None, start: Path | None, place:
 
 def save_checkpoint(path: Path, state: TrainingState) -> None:
     """Writes the state; the file appears whole or not at all."""
-    optimizer = state.optimizer.state_dict()
-    tensors = {f"network.{name}": value for name, value in state.network.state_dict().items()}
-    for index, values in optimizer["state"].items():
-        tensors |= {f"optimizer.{index}.{name}": value for name, value in values.items()}
-    tensors["random.torch"] = torch.get_rng_state()
-    metadata = {
+    facts = {
         "config": asdict(state.config),
         "recipe": state.recipe,
         "started_from": state.started_from,
         "origin": state.origin,
-        "step": state.step,
         "seconds": state.seconds,
         "metrics": state.metrics,
         "validated": state.validated,
-        "optimizer": optimizer["param_groups"],
-        "schedule": state.schedule.state_dict(),
     }
-    written = {"format": _FORMAT, **{name: json.dumps(value) for name, value in metadata.items()}}
-    with atomic_path(path) as temporary:
-        save_file({name: value.cpu().contiguous() for name, value in tensors.items()}, temporary, written)
+    write_snapshot(path, state.network, state.optimizer, state.schedule, state.step, facts)
 
 
 def resume_checkpoint(
@@ -129,18 +113,16 @@ def resume_checkpoint(
     Raises:
         InputError: the file cannot be read, or the run was begun with something else.
     """
-    metadata, tensors = _read(path)
-    _check_same(path, "", {**asdict(config), "recipe": recipe}, {**metadata["config"], "recipe": metadata["recipe"]})
+    snapshot = read_snapshot(path)
+    facts = snapshot.facts
+    check_same(path, "", {**asdict(config), "recipe": recipe}, {**facts["config"], "recipe": facts["recipe"]})
     if start is not None:
-        _check_same(path, "weights with ", _identify(start) or {}, metadata["started_from"] or {})
+        check_same(path, "weights with ", _identify(start) or {}, facts["started_from"] or {})
     state = begin(config, recipe, None, place)
-    state.started_from, state.origin = metadata["started_from"], metadata["origin"]
-    state.network.load_state_dict(_below("network", tensors))
-    state.optimizer.load_state_dict({"state": _optimizer_state(state, tensors), "param_groups": metadata["optimizer"]})
-    state.schedule.load_state_dict(metadata["schedule"])
-    state.step, state.seconds = int(metadata["step"]), float(metadata["seconds"])
-    state.metrics, state.validated = dict(metadata["metrics"]), int(metadata["validated"])
-    torch.set_rng_state(tensors["random.torch"])
+    state.step = restore(snapshot, state.network, state.optimizer, state.schedule)
+    state.started_from, state.origin = facts["started_from"], facts["origin"]
+    state.seconds, state.metrics = float(facts["seconds"]), dict(facts["metrics"])
+    state.validated = int(facts["validated"])
     return state
 
 
@@ -158,39 +140,3 @@ def _identify(weights: Path | None) -> dict[str, str] | None:
     if not weights.is_file():
         raise InputError(f"{weights} does not exist: give the path of a .safetensors file with --from")
     return {"name": weights.name, "sha256": hashlib.sha256(weights.read_bytes()).hexdigest()}
-
-
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    try:
-        with safe_open(path, framework="pt") as file:
-            written = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no dict
-    except (OSError, SafetensorError) as error:
-        raise InputError(f"{path} cannot be read ({error}): begin again in another --out") from error
-    if written.pop("format", None) != _FORMAT:
-        raise InputError(f"{path} is no checkpoint of this version: begin again in another --out")
-    return {name: json.loads(value) for name, value in written.items()}, tensors
-
-
-def _check_same(path: Path, what: str, given: dict[str, Any], written: dict[str, Any]) -> None:
-    other = [name for name in {**given, **written} if given.get(name) != written.get(name)]
-    if other:
-        was, now = (", ".join(f"{name} {values.get(name)}" for name in other) for values in (written, given))
-        raise InputError(f"{path} was made with {what}{was}, not {now}: resume with the same options")
-
-
-def _below(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {name.removeprefix(f"{prefix}."): value for name, value in tensors.items() if name.startswith(f"{prefix}.")}
-
-
-def _optimizer_state(state: TrainingState, tensors: dict[str, Tensor]) -> dict[int, dict[str, Tensor]]:
-    """By the number of the parameter, laid out in memory as the parameter is."""
-    parameters = list(state.network.parameters())
-    found: dict[int, dict[str, Tensor]] = {}
-    for key, value in _below("optimizer", tensors).items():
-        number, name = key.split(".")
-        parameter = parameters[int(number)]
-        if value.shape == parameter.shape:
-            value = torch.empty_like(parameter, requires_grad=False).copy_(value)
-        found.setdefault(int(number), {})[name] = value
-    return found

@@ -14,6 +14,7 @@ from torch import nn
 from torch.utils.data import DataLoader
 
 from sigmaslam.files import atomic_path, atomic_write_text, make_folder
+from sigmaslam.progress import open_progress
 from sigmaslam.training.card import CARD_NAME, describe_origin, make_card
 from sigmaslam.training.checkpoint import (
     CHECKPOINT_NAME,
@@ -23,14 +24,14 @@ from sigmaslam.training.checkpoint import (
     resume_checkpoint,
     save_checkpoint,
 )
+from sigmaslam.training.choices import MIXES
 from sigmaslam.training.devices import Workplace, loss_module, open_workplace, to_device
 from sigmaslam.training.interruption import Interruption
 from sigmaslam.training.journal import Journal
 from sigmaslam.training.losses import PairLoss
 from sigmaslam.training.pictures import draw_sample
-from sigmaslam.training.progress import open_progress
 from sigmaslam.training.recipes import TrainingConfig, check_config
-from sigmaslam.training.stream import MIXES, TrainingPair, open_stream, pair_loader
+from sigmaslam.training.stream import TrainingPair, open_stream, pair_loader
 from sigmaslam.training.validation import held_out_seed, held_out_sources, matching_accuracy
 
 WEIGHTS_NAME = "features.safetensors"

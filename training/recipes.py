@@ -8,7 +8,7 @@ from pathlib import Path
 from sigmaslam.errors import InputError
 from sigmaslam.models.network import DESCRIPTOR_SIZE, STRIDE, STRIDES
 from sigmaslam.session import shipped_weights
-from sigmaslam.training.stream import MIXES
+from sigmaslam.training.choices import MIXES
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,7 +17,7 @@ class TrainingConfig:
 
     Attributes:
         steps: optimiser steps.
-        data: what the pairs are made of, a key of `stream.MIXES`.
+        data: what the pairs are made of, a key of `choices.MIXES`.
         batch_size: pairs a step, of all processes together.
         size: side of the training images, pixels.
         points: keypoints per image in the loss.

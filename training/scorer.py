@@ -3,29 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from itertools import count, islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from sigmaslam.files import atomic_path
+from sigmaslam.evaluation.calibration import RIGHT
 from sigmaslam.frontend.scorer import NEIGHBOURS, nearest_matches, side_information
 from sigmaslam.models.scorer import SIDE_CHANNELS, MatchScorer
-from sigmaslam.training.devices import Workplace
-from sigmaslam.training.interruption import Interruption
 from sigmaslam.training.match_sets import MatchSet
+from sigmaslam.training.steps import train_steps
 
-RIGHT = 3.0
-"""A match this near to the truth is right, pixels."""
 LEARNING_RATE = 3e-3
 SETS_A_STEP = 8
 _MOST_MATCHES = 512
 # Weight of the round before the first, of those in between, and of the last.
 _ROUND_WEIGHTS = (0.2, 0.4, 1.0)
-_SAVE_EVERY = 250
 
 # points0 (M, 2), points1 (M, 2), side (M, 9), near (M, K), error (M,) in pixels
 Sample = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -122,52 +118,24 @@ def train_scorer(
         checkpoint: file for the state, every 250 steps and when the run is stopped.
         note: is told of every step and the loss.
     Raises:
+        InputError: the checkpoint is of another training.
         KeyboardInterrupt: the run was stopped; it goes on from the checkpoint.
     """
     torch.manual_seed(seed)
     scorer = MatchScorer()
     optimizer = torch.optim.AdamW(scorer.parameters(), LEARNING_RATE, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, LEARNING_RATE, total_steps=steps, pct_start=0.05)
-    done = 0
-    if checkpoint.is_file():
-        state: dict[str, Any] = torch.load(checkpoint, weights_only=True)
-        done = state["step"]
-        scorer.load_state_dict(state["scorer"])
-        optimizer.load_state_dict(state["optimizer"])
-        schedule.load_state_dict(state["schedule"])
-    order = _endless_order(len(sets), seed)
-    for _ in range(done * SETS_A_STEP):
-        next(order)
 
-    def save(step: int) -> None:
-        parts = {"scorer": scorer.state_dict(), "optimizer": optimizer.state_dict(), "schedule": schedule.state_dict()}
-        with atomic_path(checkpoint) as path:
-            torch.save({"step": step, **parts}, path)
+    def losses(done: int) -> Iterator[Tensor]:
+        order = islice(_endless_order(len(sets), seed), done * SETS_A_STEP, None)
+        for step in count(done):
+            rng = np.random.default_rng((seed, 4, step))
+            *inputs, weight, error = collate([vary_sample(sets[next(order)], rng) for _ in range(SETS_A_STEP)])
+            yield scorer_loss(scorer(*inputs, weight), weight, error)
 
-    interruption = Interruption(Workplace(torch.device("cpu")))
-    step = done
-    with interruption.listening():
-        try:
-            while step < steps:
-                with interruption.whole_step():
-                    rng = np.random.default_rng((seed, 4, step))
-                    *inputs, weight, error = collate([vary_sample(sets[next(order)], rng) for _ in range(SETS_A_STEP)])
-                    scorer.train()
-                    loss = scorer_loss(scorer(*inputs, weight), weight, error)
-                    optimizer.zero_grad(set_to_none=True)
-                    loss.backward()
-                    nn.utils.clip_grad_norm_(scorer.parameters(), 1.0)
-                    optimizer.step()
-                    schedule.step()
-                    step += 1
-                note(step, f"loss {float(loss.detach()):.3f}")
-                if step % _SAVE_EVERY == 0 or step == steps:
-                    save(step)
-        except KeyboardInterrupt:
-            if not interruption.torn and step > done:
-                save(step)
-            raise
-    return scorer.eval()
+    made_of = {"steps": steps, "seed": seed, "sets": len(sets)}
+    train_steps(scorer, optimizer, schedule, steps, losses, checkpoint, made_of, note, most_gradient=1.0)
+    return scorer
 
 
 def _endless_order(count: int, seed: int) -> Iterator[int]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,24 +14,25 @@ import torch
 from rich.progress import Progress
 from safetensors.torch import save_file
 
+from sigmaslam.chi_square import CHI_SQUARE_68_OF_2, CHI_SQUARE_95_OF_2
 from sigmaslam.errors import InputError
+from sigmaslam.evaluation.calibration import RIGHT, auroc, average_precision, best_half, calibration_error, spearman
 from sigmaslam.files import atomic_path, atomic_write_text, make_folder
 from sigmaslam.models.scorer import MatchScorer
 from sigmaslam.models.verifier import MatchVerifier
-from sigmaslam.training.calibration import auroc, average_precision, best_half, calibration_error, spearman
+from sigmaslam.progress import open_progress
 from sigmaslam.training.card import describe_origin
 from sigmaslam.training.devices import describe_processor
 from sigmaslam.training.match_sets import PairRecord, load_record, record_path, write_records
-from sigmaslam.training.progress import open_progress
-from sigmaslam.training.scorer import RIGHT, make_sample, score_set, train_scorer
+from sigmaslam.training.scorer import make_sample, score_set, train_scorer
 from sigmaslam.training.validation import held_out_seed
 from sigmaslam.training.verifier import VerifierRows, calibrate, collect_rows, train_verifier
 
 SCORER_NAME, VERIFIER_NAME, CARD_NAME = "scorer.safetensors", "verifier.safetensors", "matching.json"
-_CONFIG_NAME, _CHECKPOINT_NAME, _SECONDS_NAME = "config.json", "scorer.pt", "seconds.txt"
+_CONFIG_NAME, _SECONDS_NAME = "config.json", "seconds.txt"
+_SCORER_CHECKPOINT, _VERIFIER_CHECKPOINT = "scorer_checkpoint.safetensors", "verifier_checkpoint.safetensors"
 _HELD_OUT_SHARE = 0.1
 _SHOW_EVERY = 20
-_CHI_SQUARE_95, _CHI_SQUARE_68 = 5.991464547107979, 2.278868566
 _LIMITS = [
     "learned from renders alone; matches of our features, SIFT and ORB",
     "a moving object's matches are right matches: whether they move with the scene is asked by the estimator",
@@ -83,20 +84,12 @@ def train_scoring(out: Path, config: ScoringConfig, workers: int) -> dict[str, A
         ]
         clock.seconds()
         sets = [found for record in _records(folders[0]) for found in record.sets.values()]
-        task = progress.add_task("training the scorer", total=config.steps, note="")
-        scorer = train_scorer(
-            sets,
-            config.steps,
-            config.seed,
-            out / _CHECKPOINT_NAME,
-            lambda step, note: _show(progress, task, step, note),
-        )
+        told = _open_bar(progress, "training the scorer", config.steps)
+        scorer = train_scorer(sets, config.steps, config.seed, out / _SCORER_CHECKPOINT, told)
         clock.seconds()
         rows, held_out = (_collect(progress, folder, scorer) for folder in folders)
-        task = progress.add_task("training the verifier", total=config.verifier_steps, note="")
-        verifier = train_verifier(
-            rows, config.verifier_steps, config.seed, lambda step, note: _show(progress, task, step, note)
-        )
+        told = _open_bar(progress, "training the verifier", config.verifier_steps)
+        verifier = train_verifier(rows, config.verifier_steps, config.seed, out / _VERIFIER_CHECKPOINT, told)
     # Pairs in turn calibrate and measure.
     calibrate(verifier, held_out.select(held_out.pair % 2 == 0))
     metrics = _scorer_metrics(scorer, folders[1]) | _verifier_metrics(verifier, held_out.select(held_out.pair % 2 == 1))
@@ -189,8 +182,8 @@ def _verifier_metrics(verifier: MatchVerifier, rows: VerifierRows) -> dict[str, 
         "expected_calibration_error": calibration_error(1.0 / (1.0 + np.exp(-logit)), right),
         "spearman_sigma_error": spearman(size, length),
         "best_half_rms": best_half(size, length),
-        "inside_95_ellipse": float((square < _CHI_SQUARE_95).mean()),
-        "inside_68_ellipse": float((square < _CHI_SQUARE_68).mean()),
+        "inside_95_ellipse": float((square < CHI_SQUARE_95_OF_2).mean()),
+        "inside_68_ellipse": float((square < CHI_SQUARE_68_OF_2).mean()),
     }
 
 
@@ -223,7 +216,13 @@ def _save(path: Path, module: torch.nn.Module) -> None:
         save_file({name: value.contiguous() for name, value in module.state_dict().items()}, temporary)
 
 
-def _show(progress: Progress, task: Any, step: int, note: str) -> None:
-    progress.update(task, completed=step)
-    if step % _SHOW_EVERY == 0:
-        progress.update(task, note=note)
+def _open_bar(progress: Progress, title: str, steps: int) -> Callable[[int, str], None]:
+    """A bar for a training; returns what is to be told of every step and its loss."""
+    task = progress.add_task(title, total=steps, note="")
+
+    def show(step: int, note: str) -> None:
+        progress.update(task, completed=step)
+        if step % _SHOW_EVERY == 0:
+            progress.update(task, note=note)
+
+    return show

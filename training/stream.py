@@ -16,23 +16,13 @@ from sigmaslam.models.detector import detect, to_cells
 from sigmaslam.synthetic.pairs import HomographyPairs
 from sigmaslam.synthetic.scene_pairs import ScenePairs
 from sigmaslam.synthetic.textures import KINDS
+from sigmaslam.training.choices import MIXES
 
 # image0 (1, H, W), image1 (1, H, W), keypoints0 (N, 2), places1 (N, 2), visible (N,), keypoints1 (2 N, 2)
 TrainingPair = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
 NOWHERE = -1000.0
 """Both coordinates of a keypoint that fills up."""
-# What the pairs of a run are made of: its sources take turns.
-MIXES: dict[str, tuple[str, ...]] = {
-    "leaves": ("leaves",),
-    "noise": ("noise",),
-    "patterns": ("patterns",),
-    "scenes": ("scenes",),
-    "mix": ("leaves", "scenes", "leaves", "scenes", "leaves"),
-    "blend": ("leaves", "leaves", "leaves", "scenes"),
-    "turned": ("turned leaves", "leaves", "turned leaves", "scenes"),
-    "endoscope": ("endoscopy", "leaves", "endoscopy", "leaves"),
-}
 
 
 class Pair(Protocol):

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from sigmaslam.models.extractor import FeatureExtractor
 from sigmaslam.models.network import FeatureNetwork
-from sigmaslam.training.stream import MIXES, Pair, open_stream
+from sigmaslam.training.choices import MIXES
+from sigmaslam.training.stream import Pair, open_stream
 
 _PAIRS = 48
 _KEYPOINTS = 256

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
+from sigmaslam.chi_square import NORMAL_WITHIN_2
 from sigmaslam.errors import SigmaSlamError
+from sigmaslam.evaluation.calibration import RIGHT
 from sigmaslam.frontend.affine import refine_by_neighbours
 from sigmaslam.frontend.evidence import examine_patches
 from sigmaslam.frontend.judge import LEAST_LOGIT
@@ -20,14 +24,13 @@ from sigmaslam.frontend.verifier import describe_matches
 from sigmaslam.models.scorer import MatchScorer
 from sigmaslam.models.verifier import MatchVerifier
 from sigmaslam.training.match_sets import MatchSet, PairRecord
-from sigmaslam.training.scorer import RIGHT, score_set
+from sigmaslam.training.scorer import score_set
+from sigmaslam.training.steps import train_steps
 
 _LEARNING_RATE = 3e-3
 _BATCH = 4096
 # Degrees of freedom of Student's t: few near-misses among the right matches must not widen the sigma of all.
 _FREEDOM = 20.0
-# Share of a normal distribution within two standard deviations.
-_WITHIN_2 = 0.9544997361036416
 # Pairs whose images differ by more than a shift are refined by the neighbours' maps alone.
 _SHIFTED = ("stereo", "scenes", "video")
 _MAPPED = ("planes", "turned planes", "scenes", "video")
@@ -113,33 +116,36 @@ def verifier_loss(logit: Tensor, log_sigma: Tensor, error: Tensor) -> Tensor:
     return binary_cross_entropy_with_logits(logit, right) + (likelihood * right).sum() / right.sum().clamp_min(1.0)
 
 
-def train_verifier(rows: VerifierRows, steps: int, seed: int, note: Callable[[int, str], None]) -> MatchVerifier:
-    """Trains from random weights.
+def train_verifier(
+    rows: VerifierRows, steps: int, seed: int, checkpoint: Path, note: Callable[[int, str], None]
+) -> MatchVerifier:
+    """Trains from random weights, or goes on from the checkpoint.
 
     Args:
         rows: to learn from.
-        steps: of the optimiser.
-        seed: of weights and batches.
-        note: is told of every step and the loss.
+        steps, seed, checkpoint, note: as `train_scorer` takes them.
+    Raises:
+        InputError, KeyboardInterrupt: as there.
     """
     torch.manual_seed(seed)
-    generator = torch.Generator().manual_seed(seed)
     verifier = MatchVerifier()
     columns, error = torch.from_numpy(rows.columns), torch.from_numpy(rows.error)
     verifier.mean.copy_(columns.mean(dim=0))
     verifier.spread.copy_(columns.std(dim=0) + 1e-3)
     optimizer = torch.optim.AdamW(verifier.parameters(), _LEARNING_RATE, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, _LEARNING_RATE, total_steps=steps)
-    for step in range(steps):
-        batch = torch.randint(len(columns), (_BATCH,), generator=generator)
-        logit, log_sigma = verifier(columns[batch])
-        loss = verifier_loss(logit, log_sigma, error[batch])
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        optimizer.step()
-        schedule.step()
-        note(step + 1, f"loss {float(loss.detach()):.3f}")
-    return verifier.eval()
+
+    def losses(done: int) -> Iterator[Tensor]:
+        generator = torch.Generator().manual_seed(seed)
+        for step in count():
+            batch = torch.randint(len(columns), (_BATCH,), generator=generator)
+            if step >= done:
+                logit, log_sigma = verifier(columns[batch])
+                yield verifier_loss(logit, log_sigma, error[batch])
+
+    made_of = {"steps": steps, "seed": seed, "rows": len(columns)}
+    train_steps(verifier, optimizer, schedule, steps, losses, checkpoint, made_of, note)
+    return verifier
 
 
 def calibrate(verifier: MatchVerifier, rows: VerifierRows) -> None:
@@ -165,4 +171,4 @@ def calibrate(verifier: MatchVerifier, rows: VerifierRows) -> None:
     with torch.no_grad():
         verifier.logit_shift.copy_(scale * verifier.logit_shift + shift)
         verifier.logit_scale.copy_(scale * verifier.logit_scale)
-        verifier.sigma_scale.mul_(torch.quantile(deviation, _WITHIN_2) / 2.0)
+        verifier.sigma_scale.mul_(torch.quantile(deviation, NORMAL_WITHIN_2) / 2.0)

@@ -1,4 +1,4 @@
-"""What the network and its detector gain from each of their parts: short runs, several seeds, judged on real images.
+"""What the network gains from its size, its stride and its data: short runs, several seeds, judged on real images.
 
 Choices are made on the sets of `matching.SELECTION` alone; the other sets are never touched here.
 """
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.benchmarks.page import write_page
+from sigmaslam.evaluation.benchmarks.page import header, row, write_page
 from sigmaslam.evaluation.matching.extractors import LearnedExtractor
 from sigmaslam.evaluation.matching.run import Scores, score
 from sigmaslam.evaluation.matching.sets import SELECTION
@@ -40,27 +40,16 @@ class Variant:
     Attributes:
         question: what is compared with it.
         name: of the variant.
-        training: fields of `TrainingConfig` that differ; runs with the same ones share their weights.
-        extraction: a key of `extraction.EXTRACTIONS`.
+        training: fields of `TrainingConfig` that differ.
     """
 
     question: str
     name: str
     training: dict[str, Any] = field(default_factory=dict)
-    extraction: str = "default"
 
 
 VARIANTS = (
     Variant("", "default"),
-    Variant("detector", "Shi-Tomasi corners", extraction="shi_tomasi"),
-    Variant("detector", "Shi-Tomasi corners after a blur of 1 px", extraction="shi_tomasi_blurred"),
-    Variant("detector", "blobs and saddles", extraction="saddles"),
-    Variant("scales", "one scale", extraction="one_scale"),
-    Variant("scales", "three scales", extraction="three_scales"),
-    Variant("ranking", "strength alone", extraction="strength"),
-    Variant("ranking", "quality alone", extraction="quality"),
-    Variant("ranking", "over predicted sigma too", extraction="sigma"),
-    Variant("sub-pixel", "whole pixels", extraction="whole_pixels"),
     Variant("descriptor", "32 numbers", {"descriptor_size": 32}),
     Variant("descriptor", "128 numbers", {"descriptor_size": 128}),
     Variant("stride", "8", {"stride": 8}),
@@ -158,9 +147,9 @@ def _run(runs: Path, variant: Variant, seed: int, steps: int) -> Path:
 
 def _scores(run: Path, variant: Variant, data: Path, note: Callable[[str], None]) -> Scores:
     """Scores of a variant, kept beside the weights of its run."""
-    kept = run / f"scores-{variant.extraction}.json"
+    kept = run / "scores.json"
     if not kept.is_file():
-        note(f"scoring {run.name}, {variant.extraction}")
+        note(f"scoring {run.name}")
         scores = score(_extractor(run, variant), SELECTION, data)
         atomic_write_text(kept, json.dumps(scores, indent=1) + "\n")
     content: Scores = json.loads(kept.read_text(encoding="utf-8"))
@@ -168,8 +157,8 @@ def _scores(run: Path, variant: Variant, data: Path, note: Callable[[str], None]
 
 
 def _extractor(run: Path, variant: Variant) -> LearnedExtractor:
-    from sigmaslam.evaluation.benchmarks.extraction import EXTRACTIONS
     from sigmaslam.models.export import load_network
+    from sigmaslam.models.extractor import FeatureExtractor
     from sigmaslam.models.network import DESCRIPTOR_SIZE, STRIDE
     from sigmaslam.models.torch_runtime import TorchModule
     from sigmaslam.training.loop import WEIGHTS_NAME
@@ -179,17 +168,17 @@ def _extractor(run: Path, variant: Variant) -> LearnedExtractor:
         for key, default in (("descriptor_size", DESCRIPTOR_SIZE), ("stride", STRIDE))
     )
     network = load_network(run / WEIGHTS_NAME, size, stride)
-    return LearnedExtractor(TorchModule(EXTRACTIONS[variant.extraction](network)))
+    return LearnedExtractor(TorchModule(FeatureExtractor(network)))
 
 
 def _table(results: Sequence[tuple[Variant, list[Scores]]]) -> Iterator[str]:
     columns = [(name, key) for name in SELECTION for key in _SHOWN[name]]
-    yield "| question | variant | **choice** | " + " | ".join(f"{name} {key}" for name, key in columns) + " |"
-    yield "|---|---|" + "---:|" * (len(columns) + 1)
+    names = (f"{name} {key}" for name, key in columns)
+    yield from header("question", "variant", "**choice**", *names, numbers_from=2)
     for variant, runs in results:
         cells = [_spread([selection_score(scores) for scores in runs])]
         cells += [_spread([scores[name][key] for scores in runs]) for name, key in columns]
-        yield f"| {variant.question} | {variant.name} | " + " | ".join(cells) + " |"
+        yield row(variant.question, variant.name, *cells)
 
 
 def _spread(values: Sequence[float]) -> str:

@@ -252,7 +252,7 @@ def _read_result(job: _Job, method: str) -> Result | None:
 def _code_hash() -> str:
     """Of everything between the images and a result: the tracker, its graphs, and this benchmark."""
     package = Path(inspect.getfile(TrackerConfig)).parent
-    sources = [path for path in package.glob("*.py") if path.name != "cli.py"]
+    sources = list(package.glob("*.py"))
     sources += [path for folder in ("frontend", "readers") for path in (package / folder).glob("*.py")]
     sources += shipped_weights("features.onnx").parent.glob("*.onnx")
     sources += [Path(__file__), Path(consistency.__file__), Path(consistency.__file__).with_name("metrics.py")]

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import platform
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 
+from sigmaslam.evaluation.benchmarks.page import header, machine, row
 from sigmaslam.evaluation.consistency import mean_with_error, ratio_with_error, root_mean_square_with_error
 
 
@@ -123,7 +122,7 @@ def format_page(results: Results, offset: float, frames: int, first_seed: int, c
     lines = [
         "# Is it as sure as it says?",
         "",
-        f"Made by `{command}` on {platform.machine()}, {os.cpu_count()} cores. {seeds} rendered sequences a scale",
+        f"Made by `{command}` on {machine()}. {seeds} rendered sequences a scale",
         f"(seeds {first_seed} to {first_seed + seeds - 1}, used for nothing else), {frames} frames each, exact truth.",
         f"All disparities are {offset} px larger than the calibration says, and nobody tells the tracker. Images are",
         "reduced so that this can be afforded: "
@@ -176,14 +175,14 @@ def _goals(results: Results) -> Iterator[str]:
             cells.append(f"{goal.write(value)} ± {goal.write(error)}" + ("" if goal.holds(value) else ", **missed**"))
             if not goal.holds(value):
                 missed.append(f"{goal.label} in {scale.name} ({goal.write(value)})")
-        yield f"| {goal.label} | {goal.write(goal.low)} to {goal.write(goal.high)} | " + " | ".join(cells) + " |"
+        yield row(goal.label, f"{goal.write(goal.low)} to {goal.write(goal.high)}", *cells)
     yield ""
     yield "Missed: " + "; ".join(missed) + "." if missed else "All goals are met."
 
 
 def _tables(methods: Mapping[str, Sequence[Result]]) -> Iterator[str]:
     ours = next(iter(methods.values()))
-    yield from _header(_POSE_HEADER)
+    yield from header(*_POSE_HEADER, numbers_from=1)
     for method, found in methods.items():
         ate = [result.ate for result in found]
         cells = [
@@ -199,11 +198,11 @@ def _tables(methods: Mapping[str, Sequence[Result]]) -> Iterator[str]:
             f"{sum(result.lost for result in found)}",
             f"{np.mean([r.filter_ms for r in found]):.0f} / {np.mean([r.total_ms for r in found]):.0f}",
         ]
-        yield f"| {method} | " + " | ".join(cells) + " |"
+        yield row(method, *cells)
     yield ""
     yield "Map points:"
     yield ""
-    yield from _header(_MAP_HEADER)
+    yield from header(*_MAP_HEADER, numbers_from=1)
     for method, found in methods.items():
         points, edges = (sum(getattr(result, name) for result in found) for name in ("points", "edges"))
         cells = [
@@ -214,12 +213,7 @@ def _tables(methods: Mapping[str, Sequence[Result]]) -> Iterator[str]:
             _cell(found, lambda r: 100 * r.point_inside, ".0f"),
             _cell(found, lambda r: 100 * r.point_gross, ".1f") + " %",
         ]
-        yield f"| {method} | " + " | ".join(cells) + " |"
-
-
-def _header(names: Sequence[str]) -> Iterator[str]:
-    yield "| " + " | ".join(names) + " |"
-    yield "|---|" + "---:|" * (len(names) - 1)
+        yield row(method, *cells)
 
 
 def _cell(found: Sequence[Result], value: Callable[[Result], float], form: str = ".2f") -> str:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import platform
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+
+from sigmaslam.evaluation.benchmarks.page import machine, table
 
 # What is asked for.
 _MEMORY, _TIME, _LOOP = 5.0, 10.0, 0.2
@@ -79,11 +79,10 @@ class Endurance:
 def format_endurance(endurance: Endurance, command: str) -> str:
     """The run as a Markdown page."""
     words = _WORDS.format(lap_frames=endurance.lap_frames, length=endurance.lap_length)
-    machine = f"{platform.machine()}, {os.cpu_count()} cores"
     lines = [
         "# Endurance",
         "",
-        f"Made by `{command}` on {machine}, in {endurance.seconds / 60:.0f} minutes.",
+        f"Made by `{command}` on {machine()}, in {endurance.seconds / 60:.0f} minutes.",
         "",
         words,
     ]
@@ -91,25 +90,23 @@ def format_endurance(endurance: Endurance, command: str) -> str:
         lines += [f"**Stopped after {endurance.frames} of {endurance.asked} frames.**", ""]
     lines += [*_verdicts(endurance), ""]
     if endurance.blocks:
-        lines += ["## Memory and time", "", "| frames | MB | CPU ms | wall ms, median (p10 - p90) | keyframes | lost |"]
-        lines += ["| --- | --- | --- | --- | --- | --- |"]
-        for block in endurance.blocks:
-            low, middle, high = block.spread
-            lines.append(
-                f"| {block.end} | {block.megabytes:.0f} | {block.cpu:.1f} | {middle:.1f} ({low:.1f} - {high:.1f}) | "
-                f"{100 * block.keyframes:.0f} % | {block.lost} |"
-            )
-        lines.append("")
+        columns = ("frames", "MB", "CPU ms", "wall ms, median (p10 - p90)", "keyframes", "lost")
+        lines += ["## Memory and time", "", *table(columns, map(_block_row, endurance.blocks)), ""]
     if endurance.laps:
-        lines += ["## Errors", "", "| lap | at its end mm | % of a lap | median mm | most mm |"]
-        lines += ["| --- | --- | --- | --- | --- |"]
-        for number, lap in enumerate(endurance.laps, start=1):
-            lines.append(
-                f"| {number} | {1e3 * lap.end:.1f} | {_percent(lap.end, endurance)} | {1e3 * lap.median:.1f} | "
-                f"{1e3 * lap.most:.1f} |"
-            )
-        lines.append("")
+        rows = (
+            [f"{number}", f"{1e3 * lap.end:.1f}", _percent(lap.end, endurance)]
+            + [f"{1e3 * error:.1f}" for error in (lap.median, lap.most)]
+            for number, lap in enumerate(endurance.laps, start=1)
+        )
+        lines += ["## Errors", "", *table(("lap", "at its end mm", "% of a lap", "median mm", "most mm"), rows), ""]
     return "\n".join(lines)
+
+
+def _block_row(block: Block) -> list[str]:
+    low, middle, high = block.spread
+    wall = f"{middle:.1f} ({low:.1f} - {high:.1f})"
+    keyframes = f"{100 * block.keyframes:.0f} %"
+    return [f"{block.end}", f"{block.megabytes:.0f}", f"{block.cpu:.1f}", wall, keyframes, f"{block.lost}"]
 
 
 def _verdicts(endurance: Endurance) -> list[str]:

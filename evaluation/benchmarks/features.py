@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import platform
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -18,7 +16,7 @@ import numpy as np
 
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.benchmarks.filters import Contender, Timing, time_interleaved
-from sigmaslam.evaluation.benchmarks.page import write_page
+from sigmaslam.evaluation.benchmarks.page import header, machine, row, write_page
 from sigmaslam.evaluation.matching import check_sets, compare, format_scores, load_extractor
 from sigmaslam.evaluation.matching.extractors import CLASSICAL, MAX_KEYPOINTS
 from sigmaslam.evaluation.matching.sets import ALL
@@ -123,8 +121,15 @@ def format_costs(costs: Sequence[Cost], reference: str) -> list[str]:
     lines = [
         "## Cost",
         "",
-        f"| extractor | ms (quartiles) | time / {Path(reference).name} | keypoints | loading ms | parameters |",
-        "|---|---:|---:|---:|---:|---:|",
+        *header(
+            "extractor",
+            "ms (quartiles)",
+            f"time / {Path(reference).name}",
+            "keypoints",
+            "loading ms",
+            "parameters",
+            numbers_from=1,
+        ),
     ]
     for cost in costs:
         low, middle, high = np.percentile(1e3 * np.array(cost.timing.seconds), [25, 50, 75])
@@ -137,7 +142,7 @@ def format_costs(costs: Sequence[Cost], reference: str) -> list[str]:
             "" if cost.loading is None else f"{1e3 * cost.loading:.0f}",
             "" if cost.parameters is None else f"{cost.parameters:,}",
         )
-        lines.append("| " + " | ".join(cells) + " |")
+        lines.append(row(*cells))
     return lines
 
 
@@ -183,7 +188,7 @@ def _introduction(command: str, rounds: int) -> list[str]:
     return [
         "# Features",
         "",
-        f"Made by `{command}` on {platform.machine()}, {os.cpu_count()} cores. {versions}.",
+        f"Made by `{command}` on {machine()}. {versions}.",
         "",
         f"- *ms*: from an 8-bit {_WIDTH}x{_HEIGHT} image to at most {MAX_KEYPOINTS:,} keypoints with descriptors; CPU",
         f"  time on one thread, extractors in turn, {rounds} rounds; the ratio with its lowest and highest round.",

@@ -18,7 +18,7 @@ from scipy.stats import chi2, t
 from torch import Generator, Tensor
 
 from sigmaslam.evaluation import scenarios
-from sigmaslam.evaluation.benchmarks.page import write_page
+from sigmaslam.evaluation.benchmarks.page import header, row, write_page
 from sigmaslam.evaluation.scenarios import Outcome, Scenario, run
 from sigmaslam.figures import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION, save_png, style_axes
 from sigmaslam.filters import (
@@ -44,8 +44,14 @@ _SHOWN = 0.6
 _SAMPLES = 50_000
 # A relative change that nobody would notice, however sure it is.
 _TOO_SMALL = 1e-3
-_COMPARISON_HEADER = (
-    "| scenario | runs | RMSE EKF | UKF | change % | bias EKF | UKF | share % | NEES EKF | UKF | closer % | verdict |"
+_COMPARISON_COLUMNS = (
+    "scenario",
+    "runs",
+    *("RMSE EKF", "UKF", "change %"),
+    *("bias EKF", "UKF", "share %"),
+    *("NEES EKF", "UKF"),
+    "closer %",
+    "verdict",
 )
 _BANANA_FILTERS: tuple[tuple[str, BayesFilter, str], ...] = (
     ("EKF, R^3", ExtendedKalmanFilter(), VERMILLION),
@@ -224,18 +230,17 @@ def format_claims(bananas: Sequence[BananaRow], comparisons: Sequence[Comparison
         "of samples inside the filter's 95 % region. On SE(2) that is an ellipsoid in exponential coordinates, a",
         "banana in the plane.",
         "",
-        "| heading spread rad | filter | mean of x off by mm | divergence | inside 95 % |",
-        "|---|---|---|---|---|",
+        *header("heading spread rad", "filter", "mean of x off by mm", "divergence", "inside 95 %"),
     ]
-    for row in bananas:
+    for banana in bananas:
         cells = [
-            f"{row.spread:g}",
-            row.name.replace("R^3", "R³"),
-            _spread(row.bias, 1e3, "+.1f"),
-            _spread(row.divergence, 1.0, ".4f"),
-            _spread(row.coverage, 100.0, ".2f"),
+            f"{banana.spread:g}",
+            banana.name.replace("R^3", "R³"),
+            _spread(banana.bias, 1e3, "+.1f"),
+            _spread(banana.divergence, 1.0, ".4f"),
+            _spread(banana.coverage, 100.0, ".2f"),
         ]
-        lines.append("| " + " | ".join(cells) + " |")
+        lines.append(row(*cells))
     lines += [
         "",
         "## UKF against EKF (9.6)",
@@ -246,8 +251,7 @@ def format_claims(bananas: Sequence[BananaRow], comparisons: Sequence[Comparison
         "which the UKF has the lower RMSE. *verdict*: on accuracy and on bias, the better one if zero is outside the",
         f"interval and the change at least {100 * _TOO_SMALL:g} %.",
         "",
-        _COMPARISON_HEADER,
-        "|---" * (_COMPARISON_HEADER.count("|") - 1) + "|",
+        *header(*_COMPARISON_COLUMNS),
     ]
     for item in comparisons:
         cells = [
@@ -264,7 +268,7 @@ def format_claims(bananas: Sequence[BananaRow], comparisons: Sequence[Comparison
             f"{100 * item.better:.0f}",
             f"{_verdict(item.change)}; {_verdict(item.bias_change)}",
         ]
-        lines.append("| " + " | ".join(cells) + " |")
+        lines.append(row(*cells))
     lines.append("")
     return "\n".join(lines) + "\n"
 
@@ -278,14 +282,14 @@ def plot_claims(comparisons: Sequence[Comparison], samples: int = 400_000) -> Fi
     return figure
 
 
-def write_claims(path: Path, figure: Path, command: str | None = None) -> str:
+def write_claims(path: Path, figure: Path, command: str) -> str:
     """Runs everything, writes page and figure and returns the page; what is below `<!-- notes -->` in it is kept."""
     bananas, comparisons = compare_bananas(), compare_filters()
     try:
         link = figure.resolve().relative_to(path.resolve().parent).as_posix()
     except ValueError:
         link = figure.as_posix()
-    page = format_claims(bananas, comparisons, link, command or f"sigmaslam benchmark claims --out {path}")
+    page = format_claims(bananas, comparisons, link, command)
     save_png(plot_claims(comparisons), figure)
     return write_page(path, page)
 
@@ -313,12 +317,12 @@ def _plot_banana(axes: Axes, samples: int) -> None:
 
 
 def _plot_changes(axes: Axes, comparisons: Sequence[Comparison]) -> None:
-    for row, item in enumerate(reversed(comparisons)):
+    for height, item in enumerate(reversed(comparisons)):
         change = item.change
         colour = BLUE if change.high < 0 else VERMILLION if change.low > 0 else GREY
         ends = 100 * np.clip([change.low, change.high], -1.0, 1.0)
-        axes.plot(ends, [row, row], color=colour, lw=2.2, solid_capstyle="butt")
-        axes.plot(100 * change.mean, row, "o", color=colour, ms=5)
+        axes.plot(ends, [height, height], color=colour, lw=2.2, solid_capstyle="butt")
+        axes.plot(100 * change.mean, height, "o", color=colour, ms=5)
     axes.axvline(0.0, color=BLACK, lw=1)
     axes.set_yticks(
         range(len(comparisons)), [item.name.replace("R^2", "R²") for item in reversed(comparisons)], fontsize=8

@@ -270,18 +270,6 @@ def wrap(angle: Any) -> Any:
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
-def step_stereo_dense(work: StereoWork) -> Belief:
-    """One step of the stereo problem with the textbook update: S = Z Z^T + R of size 4m is formed and solved."""
-    mean, covariance = _predict_stereo(work)
-    return _update(
-        mean,
-        covariance,
-        lambda states: project_stereo(np, states, work.points),
-        work.measurement_noise,
-        work.measurement,
-    )
-
-
 def step_stereo_low_rank(work: StereoWork) -> Belief:
     """One step of the stereo problem in O(m n^2): whitened by R^-1/2, then a system of the 2n deviations.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import platform
 import statistics
 import subprocess
 import sys
@@ -15,13 +14,12 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.progress import Progress
 
 from sigmaslam.evaluation.benchmarks import filter_work
 from sigmaslam.evaluation.benchmarks.filter_peers import Peer, available, single_thread_environment
 from sigmaslam.evaluation.benchmarks.filter_work import BatchedWork, StereoWork
-from sigmaslam.evaluation.benchmarks.page import write_page
+from sigmaslam.evaluation.benchmarks.page import machine, table, write_page
+from sigmaslam.progress import open_progress
 
 POINTS = (10, 50, 100, 200, 500)
 MANY_POINTS = (1000, 2000, 5000)
@@ -123,7 +121,7 @@ def format_page(rounds: int, compiled: bool, command: str) -> str:
     lines = [
         "# Speed of the filters",
         "",
-        f"Made by `{command}` on {platform.machine()}, {os.cpu_count()} cores, one",
+        f"Made by `{command}` on {machine()}, one",
         f"thread; process CPU time, contenders in turn, {rounds} rounds. {versions}.",
         "",
         "Work: one prediction and one update of an unscented filter with the cubature set, one linearisation, sigma",
@@ -132,8 +130,8 @@ def format_page(rounds: int, compiled: bool, command: str) -> str:
         "",
     ]
     tables = len(POINTS) + 1 + len(KINDS) * len(BATCHES)
-    with Progress(console=Console(stderr=True)) as progress:
-        task = progress.add_task("timing", total=tables)
+    with open_progress() as progress:
+        task = progress.add_task("timing", total=tables, note="")
 
         def advance() -> None:
             progress.advance(task)
@@ -150,21 +148,20 @@ def _stereo_section(peers: Sequence[Peer], rounds: int, compiled: bool, advance:
     for points in POINTS:
         results.append(time_interleaved(stereo_contenders(filter_work.stereo(points, _SEED), peers, compiled), rounds))
         advance()
+
+    def cells(name: str) -> list[str]:
+        if name == _REFERENCE:
+            return [f"{1e3 * result[name].median:.3g} ms" for result in results]
+        return [_ratio(*result[name].ratio(result[_REFERENCE])) for result in results]
+
     lines = [
         "## One 12-state stereo pose, m points (4m rows), float64",
         "",
         "Milliseconds for plain numpy, which has the low-rank form; for the others how many times longer they take,",
         "with the lowest and highest round. Below 1 is faster.",
         "",
-        _row("", *(f"m = {points}" for points in POINTS)),
-        _row("---", *["---"] * len(POINTS)),
+        *table(["", *(f"m = {points}" for points in POINTS)], ([name, *cells(name)] for name in results[0])),
     ]
-    for name in results[0]:
-        if name == _REFERENCE:
-            cells = [f"{1e3 * result[name].median:.3g} ms" for result in results]
-        else:
-            cells = [_ratio(*result[name].ratio(result[_REFERENCE])) for result in results]
-        lines.append(_row(name, *cells))
     best = _COMPILED if compiled else _EAGER
     if "filterpy" in results[-1]:
         middle, low, high = results[-1]["filterpy"].ratio(results[-1][best])
@@ -173,20 +170,18 @@ def _stereo_section(peers: Sequence[Peer], rounds: int, compiled: bool, advance:
 
 
 def _linear_cost_section(rounds: int, compiled: bool, advance: Callable[[], None]) -> list[str]:
-    cells = []
-    for points in (POINTS[-1], *MANY_POINTS):
+    counts, cells = (POINTS[-1], *MANY_POINTS), []
+    for points in counts:
         results = time_interleaved(stereo_contenders(filter_work.stereo(points, _SEED), [], compiled), rounds)
         cells.append([1e6 * timing.median / points for timing in results.values()])
     advance()
-    names = list(results)
-    lines = [
+    rows = [[name, *(f"{column[i]:.2f}" for column in cells)] for i, name in enumerate(results)]
+    return [
         "Microseconds a point, for many points:",
         "",
-        _row("", *(f"m = {points}" for points in (POINTS[-1], *MANY_POINTS))),
-        _row("---", *["---"] * len(cells)),
+        *table(["", *(f"m = {count}" for count in counts)], rows),
+        "",
     ]
-    lines += [_row(name, *(f"{column[i]:.2f}" for column in cells)) for i, name in enumerate(names)]
-    return [*lines, ""]
 
 
 def _batch_section(
@@ -198,17 +193,15 @@ def _batch_section(
         timings = time_interleaved([contender for contender, _ in contenders], rounds)
         columns.append({c.name: [size / s for s in timings[c.name].seconds] for c, size in contenders})
         advance()
-    lines = [
+    rows = [[name, *(_rate(column[name]) for column in columns)] for name in columns[0]]
+    return [
         f"## {_TITLES[kind]}",
         "",
         "Filter steps a second, with the lowest and highest round; float32 where there is one.",
         "",
-        _row("", *(f"B = {batch:,}" for batch in BATCHES)),
-        _row("---", *["---"] * len(BATCHES)),
+        *table(["", *(f"B = {batch:,}" for batch in BATCHES)], rows),
+        "",
     ]
-    for name in columns[0]:
-        lines.append(_row(name, *(_rate(column[name]) for column in columns)))
-    return [*lines, ""]
 
 
 _TITLES = {
@@ -218,10 +211,6 @@ _TITLES = {
     "linear": "Linear: 4 states, constant velocity, Kalman filter",
 }
 _PACKAGES = ("torch", "numpy", "filterpy", "stonesoup", "dynamax", "jax", "pypose", "torch-kf")
-
-
-def _row(*cells: str) -> str:
-    return "| " + " | ".join(cells) + " |"
 
 
 def _ratio(middle: float, low: float, high: float) -> str:

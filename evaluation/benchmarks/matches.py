@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import platform
 from collections.abc import Callable
 from dataclasses import astuple, fields
 from pathlib import Path
@@ -11,7 +9,7 @@ from pathlib import Path
 import cv2
 import torch
 
-from sigmaslam.evaluation.benchmarks.page import write_page
+from sigmaslam.evaluation.benchmarks.page import header, machine, row, write_page
 from sigmaslam.evaluation.matching.judgement import (
     HomographyJudgement,
     RowJudgement,
@@ -62,7 +60,7 @@ def _introduction(command: str) -> list[str]:
     return [
         "# Matches: do probability and covariance hold?",
         "",
-        f"Made by `{command}` on {platform.machine()}, {os.cpu_count()} cores, one thread, in one run. Nothing was",
+        f"Made by `{command}` on {machine()}, one thread, in one run. Nothing was",
         "trained or tuned on these images. Shares in percent unless they are called sigma, AUROC or correlation.",
         "",
     ]
@@ -80,13 +78,13 @@ def _homographies(data: Path, judge: MatchJudge) -> list[str]:
         "the right ones inside their 95 % ellipse; Set12's warps are exact, the homographies of boat and",
         "churchill are themselves off by tenths of a pixel.",
         "",
-        *_header("set", "features", *(field.name.replace("_", " ") for field in fields(HomographyJudgement))),
+        *header("set", "features", *(field.name.replace("_", " ") for field in fields(HomographyJudgement))),
     ]
     for name in _HOMOGRAPHIES:
         pairs = load_set(name, data)
         for kind, make in DETECTORS.items():
             found = judge_homographies(pairs, make(_PHOTOGRAPH_KEYPOINTS), judge)
-            lines.append(_row(name, kind, *(f"{value:.3f}" for value in astuple(found))))
+            lines.append(row(name, kind, *(f"{value:.3f}" for value in astuple(found))))
     return [*lines, ""]
 
 
@@ -99,7 +97,7 @@ def _rows(data: Path, judge: MatchJudge) -> list[str]:
         "pairs of a set, is taken out; *constant*: mended, with 0.3 px for every match. A normal error has 68.3",
         "and 95.4 %.",
         "",
-        *_header("set", "features", *(field.name.replace("_", " ") for field in fields(RowJudgement))),
+        *header("set", "features", *(field.name.replace("_", " ") for field in fields(RowJudgement))),
     ]
     for name in _STEREO:
         pairs = [pair for pair in load_set(name, data) if isinstance(pair.truth, SameRows)]
@@ -107,7 +105,7 @@ def _rows(data: Path, judge: MatchJudge) -> list[str]:
             found = judge_rows(pairs, make(_STEREO_KEYPOINTS), judge)
             matches, *shares, correlation, median, sigma, bias = astuple(found)
             cells = [f"{matches:.0f}", *(f"{100 * share:.1f}" for share in shares), f"{correlation:.2f}"]
-            lines.append(_row(name, kind, *cells, f"{median:.3f}", f"{sigma:.3f}", f"{bias:+.3f}"))
+            lines.append(row(name, kind, *cells, f"{median:.3f}", f"{sigma:.3f}", f"{bias:+.3f}"))
     return [*lines, ""]
 
 
@@ -120,7 +118,7 @@ def _rejection(data: Path, judge: MatchJudge) -> list[str]:
         "matches are taken out at random until a quarter is right. Time without detection and descriptors: ours",
         "with neighbours and side information.",
         "",
-        *_header("set", "right", "contender", "F1", "precision", "recall", "ms"),
+        *header("set", "right", "contender", "F1", "precision", "recall", "ms"),
     ]
     for name, pairs in _motions(data):
         for thinned in (False, True):
@@ -128,7 +126,7 @@ def _rejection(data: Path, judge: MatchJudge) -> list[str]:
             for contender, reached in found.items():
                 shares = (f"{100 * value:.1f}" for value in (reached.f1, reached.precision, reached.recall))
                 lines.append(
-                    _row(
+                    row(
                         f"{name}, thinned" if thinned else name,
                         f"{100 * share:.0f} %",
                         contender,
@@ -147,14 +145,14 @@ def _starts(data: Path, judge: MatchJudge) -> list[str]:
         "EuRoC is no better than some tenths of a degree in the direction of a short step: there the contenders",
         "cannot differ much.",
         "",
-        *_header("set", "features", "estimator", "median rotation", "median direction", "mean of the larger", "ms"),
+        *header("set", "features", "estimator", "median rotation", "median direction", "mean of the larger", "ms"),
     ]
     sets = [*_motions(data), ("euroc next", [p for p in load_set("euroc", data) if isinstance(p.truth, Motion)])]
     for name, pairs in sets:
         for kind in ("learned", "sift"):
             for contender, reached in compare_starts(pairs, DETECTORS[kind](_PHOTOGRAPH_KEYPOINTS), judge).items():
                 errors = (f"{value:.3f}" for value in (reached.rotation, reached.direction, reached.mean))
-                lines.append(_row(name, kind, contender, *errors, f"{reached.milliseconds:.1f}"))
+                lines.append(row(name, kind, contender, *errors, f"{reached.milliseconds:.1f}"))
     return [*lines, ""]
 
 
@@ -175,15 +173,7 @@ def _movers(data: Path, judge: MatchJudge) -> list[str]:
         "A mover's match is a right match; which ones move with the scene is for the estimator to say. Share of",
         "what is accepted that lies on the static scene:",
         "",
-        *_header(*(field.name.replace("_", " ") for field in fields(MoverJudgement))),
-        _row(str(found.pairs), *(f"{100 * value:.1f}" for value in astuple(found)[1:])),
+        *header(*(field.name.replace("_", " ") for field in fields(MoverJudgement))),
+        row(str(found.pairs), *(f"{100 * value:.1f}" for value in astuple(found)[1:])),
         "",
     ]
-
-
-def _header(*cells: str) -> list[str]:
-    return [_row(*cells), "|---|" + "---|" * (len(cells) - 1)]
-
-
-def _row(*cells: str) -> str:
-    return "| " + " | ".join(cells) + " |"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import platform
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmaslam.evaluation.benchmarks.page import write_page
+from sigmaslam.evaluation.benchmarks.page import header, machine, row, write_page
 from sigmaslam.evaluation.benchmarks.sequences import REAL
 from sigmaslam.evaluation.evaluate import evaluate_run
 from sigmaslam.readers import open_sequence
@@ -120,15 +118,14 @@ def _page(
     lines = [
         "# Every match its own covariance, or one for all",
         "",
-        f"Made by `{command}` on {platform.machine()}, {os.cpu_count()} cores. The tracker with the",
+        f"Made by `{command}` on {machine()}. The tracker with the",
         "learned features; only R and the landmarks' disparity sigma differ. NEES and NIS per degree of freedom, 1 is",
         "right; NEES says something on renders alone, whose truth is exact.",
         "",
         f"The constant is chosen on three rendered sequences of {_FRAMES} frames (seed {_TUNING_SEED}) by the",
         "geometric mean of the ATE:",
         "",
-        "| sigma of places / disparity, px | ATE, geometric mean, mm | NEES, geometric mean |",
-        "|---|---|---|",
+        *header("sigma of places / disparity, px", "ATE, geometric mean, mm", "NEES, geometric mean"),
     ]
     for constant, found in tuning.items():
         ate, nees = (_geometric_mean([getattr(each, name) for each in found]) for name in ("ate", "nees"))
@@ -136,8 +133,7 @@ def _page(
         lines.append(f"| {constant[0]} / {constant[1]}{mark} | {1e3 * ate:.2f} | {nees:.2f} |")
     lines += [
         "",
-        "| sequence | tracked, own / constant | ATE m, own / constant | ratio | step mm | NEES | NIS |",
-        "|---|---|---|---|---|---|---|",
+        *header("sequence", "tracked, own / constant", "ATE m, own / constant", "ratio", "step mm", "NEES", "NIS"),
     ]
     for name, (own, same) in results.items():
         cells = [
@@ -148,7 +144,7 @@ def _page(
             f"{own.nees:.2f} / {same.nees:.2f}",
             f"{own.nis:.2f} / {same.nis:.2f}",
         ]
-        lines.append("| " + " | ".join((name, *cells)) + " |")
+        lines.append(row(name, *cells))
     for label, chosen_names in (("all", list(results)), ("renders", [n for n in results if n not in dict(REAL)])):
         pairs = [results[name] for name in chosen_names]
         ate, step, nees = (

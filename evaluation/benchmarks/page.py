@@ -1,7 +1,10 @@
-"""Pages that benchmarks write and people annotate."""
+"""Pages that benchmarks write and people annotate, and what their tables are made of."""
 
 from __future__ import annotations
 
+import os
+import platform
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from sigmaslam.files import atomic_write_text
@@ -16,3 +19,24 @@ def write_page(path: Path, page: str) -> str:
         page += mark + notes
     atomic_write_text(path, page)
     return page
+
+
+def machine() -> str:
+    """Kind of processor, and its cores."""
+    return f"{platform.machine()}, {os.cpu_count()} cores"
+
+
+def header(*names: str, numbers_from: int | None = None) -> list[str]:
+    """The first two lines of a table; columns of numbers, from the given one on, are flush right."""
+    count = len(names) if numbers_from is None else numbers_from
+    return [row(*names), "|" + "---|" * count + "---:|" * (len(names) - count)]
+
+
+def table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """A whole table of words."""
+    return [row(*cells) for cells in (columns, ["---"] * len(columns), *rows)]
+
+
+def row(*cells: str) -> str:
+    """A line of a table."""
+    return "| " + " | ".join(cells) + " |"

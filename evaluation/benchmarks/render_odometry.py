@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from sigmaslam.errors import InputError
+from sigmaslam.evaluation.benchmarks.page import row
 from sigmaslam.evaluation.evaluate import evaluate_run
 from sigmaslam.evaluation.matching.scores import mutual_nearest
 from sigmaslam.frontend.classical import SiftDetector
@@ -183,10 +184,10 @@ def format_odometry(real: Drive, renders: Sequence[Drive]) -> list[str]:
         if required and not alike:
             off.append(f"{title} (x{ratio:.2f})")
         cells = [title, *(format(value, form) for value in (truth, *values)), f"{ratio:.2f}"]
-        lines.append("| " + " | ".join([*cells, ("yes" if alike else "**no**") if required else ""]) + " |")
+        lines.append(row(*cells, ("yes" if alike else "**no**") if required else ""))
     # Around zero a ratio says nothing.
     cells = ["disparity offset px", *(f"{drive.offset:+.2f}" for drive in (real, *renders))]
-    lines.append("| " + " | ".join([*cells, "", ""]) + " |")
+    lines.append(row(*cells, "", ""))
     verdict = f"Off by more than a factor of {LIMIT:g}: {', '.join(off)}." if off else "Every one is within the limit."
     return [*lines, "", verdict]
 

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sigmaslam.evaluation.benchmarks.page import row
+
 if TYPE_CHECKING:
     from sigmaslam.synthetic.simulation import Studio
 
@@ -76,7 +78,7 @@ def format_speeds(speeds: list[Speed]) -> list[str]:
         reached = "" if speed.goal is None else "yes" if np.median(speed.rates) >= speed.goal else "**no**"
         goal = "" if speed.goal is None else f"{speed.goal:g}"
         cells = (speed.name, _spread(speed.rates), goal, reached, _spread(speed.cpu), f"{speed.preparation:.1f}")
-        lines.append("| " + " | ".join(cells) + " |")
+        lines.append(row(*cells))
     return lines
 
 

@@ -21,7 +21,7 @@ from sigmaslam.evaluation.benchmarks import image_statistics as statistics
 from sigmaslam.evaluation.benchmarks import render_odometry as odometry
 from sigmaslam.evaluation.benchmarks import render_speed as speed
 from sigmaslam.evaluation.benchmarks.image_statistics import ImageSet
-from sigmaslam.evaluation.benchmarks.page import write_page
+from sigmaslam.evaluation.benchmarks.page import row, write_page
 from sigmaslam.evaluation.matching.photographs import read_grey
 from sigmaslam.figures import BLACK, GREY, SERIES, save_png, style_axes
 from sigmaslam.readers import open_sequence
@@ -194,18 +194,18 @@ def draw(sets: dict[str, ImageSet]) -> Figure:
     """A row a kind of scene, a column a statistic; real sets in black and grey."""
     figure = Figure(figsize=(20, 14), layout="constrained")
     grid = figure.subplots(len(_PANELS), 5)
-    for row, (title, renders, real) in zip(grid, _PANELS, strict=True):
+    for line, (title, renders, real) in zip(grid, _PANELS, strict=True):
         names = [*real, *renders]
         colours = dict(zip(names, [BLACK, GREY][: len(real)] + list(SERIES), strict=False))
         for name in names:
             style = {"color": colours[name], "lw": 2.2 if name in real else 1.5, "label": name}
-            _draw_set(row, sets[name], style)
-        for axes, (label, heading) in zip(row, _AXES, strict=True):
+            _draw_set(line, sets[name], style)
+        for axes, (label, heading) in zip(line, _AXES, strict=True):
             axes.set_xlabel(label)
             axes.set_title(f"{title}: {heading}", fontsize=10)
             style_axes(axes)
-        row[4].set_ylim(0, None)  # last, or what is drawn later would be cut off
-        row[0].legend(fontsize=9)
+        line[4].set_ylim(0, None)  # last, or what is drawn later would be cut off
+        line[0].legend(fontsize=9)
     return figure
 
 
@@ -218,8 +218,8 @@ _AXES = (
 )
 
 
-def _draw_set(row: Sequence[Axes], images: ImageSet, style: dict[str, Any]) -> None:
-    gradient, spectrum, corner, brightness, noise = row
+def _draw_set(line: Sequence[Axes], images: ImageSet, style: dict[str, Any]) -> None:
+    gradient, spectrum, corner, brightness, noise = line
     gradient.semilogx(_centres(statistics.GRADIENT_EDGES, log=True)[1:-1], images.gradient[1:-1], **style)
     spectrum.loglog(images.frequencies, images.density, **style)
     stronger = np.cumsum(images.strength[::-1])[::-1]
@@ -278,7 +278,7 @@ def _statistics_section(sets: dict[str, ImageSet], figure: Path) -> list[str]:
             f"{100 * images.brightness[-1]:.1f}",
             f"{images.median_noise:.2f} ({np.nanmin(images.noise):.2f} - {np.nanmax(images.noise):.2f})",
         )
-        lines.append("| " + " | ".join(cells) + " |")
+        lines.append(row(*cells))
     yardstick = real_yardstick(sets)
     lines += [
         "",
@@ -295,7 +295,7 @@ def _statistics_section(sets: dict[str, ImageSet], figure: Path) -> list[str]:
             f"**{entry.words}**" if one not in REAL and entry.distance > yardstick[key] else entry.words
             for key, entry in difference.items()
         ]
-        lines.append(f"| {one} against {other} | " + " | ".join(words) + " |")
+        lines.append(row(f"{one} against {other}", *words))
         if one not in REAL:
             found = [f"{key} {words} ({times:.1f} yardsticks)" for key, times, words in gaps(difference, yardstick)]
             sentences.append(f"- {one} against {other}: {'; '.join(found) if found else 'nothing'}.")

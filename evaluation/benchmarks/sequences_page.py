@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import os
-import platform
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
 
+from sigmaslam.evaluation.benchmarks.page import machine, table
 from sigmaslam.evaluation.evaluate import Evaluation
 from sigmaslam.report import FrameTable
 
@@ -97,22 +96,21 @@ def method_label(method: str) -> str:
 
 def format_results(results: Sequence[Result | LeftOut], command: str, complete: bool = True) -> str:
     """The results as a Markdown page."""
-    machine = f"{platform.machine()}, {os.cpu_count()} cores"
-    lines = ["# Results", "", f"Made by `{command}` on {machine}.", _WORDS.format(threads=cv2.getNumThreads())]
+    lines = ["# Results", "", f"Made by `{command}` on {machine()}.", _WORDS.format(threads=cv2.getNumThreads())]
     if not complete:
         lines += ["**Stopped before the end: what is missing was not run.**", ""]
     for missing in results:
         if isinstance(missing, LeftOut) and not missing.method:
             lines += [f"{missing.sequence} is left out: {missing.reason}", ""]
     for sequence in dict.fromkeys(result.sequence for result in results if isinstance(result, Result)):
-        rows = [result for result in results if isinstance(result, Result) and result.sequence == sequence]
-        lines += [f"## {sequence}", "", *_table(_COLUMNS, (_row(row) for row in rows)), ""]
+        found = [result for result in results if isinstance(result, Result) and result.sequence == sequence]
+        lines += [f"## {sequence}", "", *table(_COLUMNS, (_row(result) for result in found)), ""]
         for missing in results:
             if isinstance(missing, LeftOut) and missing.method and missing.sequence == sequence:
                 lines += [f"The row *{_LABELS[missing.method]}* is left out: {missing.reason}", ""]
-        staged = [(row.method, row.frames) for row in rows if row.frames and "filter" in row.frames.milliseconds]
+        staged = [(each.method, each.frames) for each in found if each.frames and "filter" in each.frames.milliseconds]
         if staged:
-            lines += [*_table(_STAGE_COLUMNS, (_stage_row(method, frames) for method, frames in staged)), ""]
+            lines += [*table(_STAGE_COLUMNS, (_stage_row(method, frames) for method, frames in staged)), ""]
     return "\n".join(lines)
 
 
@@ -129,10 +127,6 @@ def total_cell(result: Result) -> str:
         return f"{share:.0f} (whole: {seconds:.1f} s)"
     low, middle, high = np.percentile(_totals(result.frames), [10, 50, 90])
     return f"{middle:.0f} ({low:.0f} - {high:.0f})"
-
-
-def _table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    return ["| " + " | ".join(cells) + " |" for cells in (columns, ["---"] * len(columns), *rows)]
 
 
 def _row(result: Result) -> list[str]:

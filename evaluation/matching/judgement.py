@@ -7,23 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sigmaslam.chi_square import CHI_SQUARE_95_OF_2
+from sigmaslam.evaluation.calibration import RIGHT, auroc, average_precision, best_half, calibration_error, spearman
 from sigmaslam.evaluation.matching.pairs import Homography, ImagePair, SameRows
 from sigmaslam.frontend.affine import refine_by_neighbours
 from sigmaslam.frontend.descriptor import match_stereo
 from sigmaslam.frontend.judge import LEAST_LOGIT, MatchJudge
 from sigmaslam.frontend.matching import nearest_anywhere
 from sigmaslam.frontend.types import Features
-from sigmaslam.training.calibration import (
-    auroc,
-    average_precision,
-    best_half,
-    calibration_error,
-    spearman,
-    squared_distance,
-)
-from sigmaslam.training.scorer import RIGHT
+from sigmaslam.mahalanobis import squared_mahalanobis
 
-_CHI_SQUARE_95 = 5.991464547107979
 _CONSTANT_SIGMA = 0.3
 # Scale of the robust fit of what is left of a rectification, pixels, and its iterations.
 _RECTIFICATION_SCALE, _RECTIFICATION_FITS = 0.3, 20
@@ -117,7 +110,7 @@ def judge_homographies(pairs: Sequence[ImagePair], detect: Detect, judge: MatchJ
         spearman(before, length),
         spearman(size, length),
         best_half(size, length),
-        float((squared_distance(error, covariance.astype(np.float64)) < _CHI_SQUARE_95).mean()),
+        float((squared_mahalanobis(error, covariance.astype(np.float64)) < CHI_SQUARE_95_OF_2).mean()),
         float(np.median(length)),
     )
 

@@ -10,6 +10,7 @@ import torch
 
 from sigmaslam.camera import RectifiedStereo
 from sigmaslam.epipolar import estimate_epipolar_pose
+from sigmaslam.evaluation.calibration import RIGHT
 from sigmaslam.frontend.judge import MatchJudge
 from sigmaslam.frontend.types import Features
 from sigmaslam.match import match_features
@@ -18,7 +19,6 @@ from sigmaslam.startup import estimate_relative_pose
 from sigmaslam.synthetic.scene_pairs import ScenePair, ScenePairs
 from sigmaslam.synthetic.truth import at_pixels
 from sigmaslam.synthetic.visibility import move
-from sigmaslam.training.scorer import RIGHT
 
 SHARES = (0.35, 0.5)
 """Between these are the shares of right matches on moving things: beyond a half the scene may be the lesser body."""

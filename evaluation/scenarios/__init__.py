@@ -1,12 +1,6 @@
 """Monte-Carlo scenarios for filters: simulated runs, all at once, and what a filter makes of them."""
 
-from sigmaslam.evaluation.scenarios.classics import (
-    bearings,
-    coordinated_turn,
-    growth,
-    growth_with_kept_points,
-    reentry,
-)
+from sigmaslam.evaluation.scenarios.classics import bearings, coordinated_turn, growth, reentry
 from sigmaslam.evaluation.scenarios.poses import CAMERA, localisation, stereo_pose, vague_prior
 from sigmaslam.evaluation.scenarios.scenario import Outcome, Scenario, run
 
@@ -17,7 +11,6 @@ __all__ = [
     "bearings",
     "coordinated_turn",
     "growth",
-    "growth_with_kept_points",
     "localisation",
     "reentry",
     "run",

@@ -9,10 +9,8 @@ from torch import Generator, Tensor
 
 from sigmaslam.evaluation.scenarios.scenario import Scenario, matrix, normal
 from sigmaslam.filters import (
-    BayesFilter,
     Diagonal,
     Gaussian,
-    LinearMeasurement,
     LinearMotion,
     MeasurementModel,
     MotionModel,
@@ -40,26 +38,6 @@ def growth(runs: int, generator: Generator, steps: int = 500) -> Scenario:
     values = 0.05 * states * states + normal(generator, steps, runs, 1)
     prior = Gaussian(torch.full((runs, 1), 0.1, dtype=torch.float64), unit)
     return Scenario(states, values, prior, motion, measurement, (wave,))
-
-
-def growth_with_kept_points(scenario: Scenario, bayes: BayesFilter) -> Tensor:
-    """Estimates (T, runs, 1) of `growth` by one set of sigma points for state and both noises, not redrawn between.
-
-    State and measurement are moved as one state of two components, of which the second is then given exactly.
-    """
-
-    def move_and_see(x: Tensor, noise: Tensor, wave: Tensor) -> Tensor:
-        moved = _grow(x[..., 0], wave[..., 0]) + noise[..., 0]
-        return stack([moved, 0.05 * moved * moved + noise[..., 1]])
-
-    both = MotionModel(move_and_see, torch.eye(2, dtype=torch.float64), additive=False)
-    given = LinearMeasurement(matrix([0.0, 1.0]), matrix([0.0]))
-    belief, means = scenario.prior, []
-    for wave, value in zip(scenario.motion_inputs[0], scenario.values, strict=True):
-        seen = bayes.update(bayes.predict(belief, both, wave).belief, given, value).belief
-        belief = Gaussian(seen.mean[..., :1], seen.covariance[..., :1, :1])
-        means.append(belief.mean)
-    return torch.stack(means)
 
 
 def bearings(runs: int, generator: Generator) -> Scenario:

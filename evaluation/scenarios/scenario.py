@@ -65,12 +65,6 @@ class Outcome:
         """Root mean square length of the position error over steps and runs."""
         return float(self.position_error.square().sum(dim=-1).mean().sqrt())
 
-    def block_nees(self, components: Sequence[int]) -> Tensor:
-        """(T, runs) NEES of some of the chart's components alone."""
-        index = torch.tensor(components)
-        block = self.covariance.index_select(-1, index).index_select(-2, index)
-        return nees(self.error.index_select(-1, index), block)
-
 
 def run(scenario: Scenario, bayes: BayesFilter) -> Outcome:
     """A filter on all runs of a scenario.

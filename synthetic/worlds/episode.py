@@ -10,8 +10,6 @@ import numpy as np
 from sigmaslam.synthetic.paths import Path
 from sigmaslam.synthetic.scene import Scene, Texture
 
-MOTIONS = ("normal", "stops", "rotation", "loop", "rest")
-
 
 @dataclass(frozen=True, slots=True)
 class Episode:

@@ -13,7 +13,7 @@ from sigmaslam.evaluation.benchmarks.filters import Contender, Timing, time_inte
 @pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-8), ("float32", 1e-2)])
 def test_our_stereo_step_is_the_references(points: int, dtype: str, tolerance: float):
     work = filter_work.stereo(points, seed=1)
-    check(work, filter_work.step_stereo_dense(work), dtype, tolerance)
+    check(work, filter_work.step_stereo_low_rank(work), dtype, tolerance)
 
 
 @pytest.mark.parametrize("kind", ["localisation", "position", "landmark", "linear"])

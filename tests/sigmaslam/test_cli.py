@@ -208,3 +208,10 @@ def test_every_command_has_help(command: str):
     result = run_here(command, "--help")
     assert result.returncode == 0
     assert "Usage" in result.stdout
+
+
+def test_an_option_that_the_benchmark_does_not_serve_is_refused(tmp_path: Path):
+    page = tmp_path / "page.md"
+    refused(sigmaslam("benchmark", "claims", "--out", page, "--rounds", "3"), "--rounds", "claims")
+    refused(sigmaslam("benchmark", "sequences", "--out", page, "--eager"), "--eager", "sequences")
+    assert not page.exists()

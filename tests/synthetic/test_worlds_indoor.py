@@ -13,11 +13,12 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from sigmaslam.camera import CameraModel
+from sigmaslam.synthetic.choices import MOTIONS
 from sigmaslam.synthetic.renderer import Renderer
 from sigmaslam.synthetic.scene import Scene, Texture
 from sigmaslam.synthetic.visibility import Eye
 from sigmaslam.synthetic.worlds import colon, organ, room, tool
-from sigmaslam.synthetic.worlds.episode import MOTIONS, Episode, Wish
+from sigmaslam.synthetic.worlds.episode import Episode, Wish
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 WORLDS = [room, colon, organ, tool]

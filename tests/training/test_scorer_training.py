@@ -9,11 +9,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
+from sigmaslam.errors import InputError
 from sigmaslam.frontend.matching import Putative
 from sigmaslam.frontend.scorer import NEIGHBOURS, nearest_matches
 from sigmaslam.frontend.types import Features
 from sigmaslam.models.scorer import MatchScorer
 from sigmaslam.training import scorer as scorer_training
+from sigmaslam.training import steps
 from sigmaslam.training.match_sets import MatchSet
 from sigmaslam.training.scorer import (
     Sample,
@@ -24,6 +26,7 @@ from sigmaslam.training.scorer import (
     train_scorer,
     vary_sample,
 )
+from sigmaslam.training.snapshot import read_snapshot
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -253,35 +256,43 @@ def assert_same_weights(a: MatchScorer, b: MatchScorer) -> None:
 def test_a_run_that_was_stopped_ends_bit_for_bit_as_one_that_was_not(
     sets: list[MatchSet], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(scorer_training, "_SAVE_EVERY", 2)
-    whole = train(sets, tmp_path / "whole.pt")
-    stopped = tmp_path / "stopped.pt"
+    monkeypatch.setattr(steps, "SAVE_EVERY", 2)
+    whole = train(sets, tmp_path / "whole.safetensors")
+    stopped = tmp_path / "stopped.safetensors"
     with pytest.raises(KeyboardInterrupt):
         train(sets, stopped, stop_in=3)
-    assert torch.load(stopped, weights_only=True)["step"] == 3
+    assert read_snapshot(stopped).facts["step"] == 3
     torch.rand(7)
-    steps: list[int] = []
-    again = train_scorer(sets, 4, 0, stopped, lambda step, _: steps.append(step))
-    assert steps == [4]
+    taken: list[int] = []
+    again = train_scorer(sets, 4, 0, stopped, lambda step, _: taken.append(step))
+    assert taken == [4]
     assert_same_weights(again, whole)
 
 
 def test_a_finished_run_is_read_from_its_checkpoint(sets: list[MatchSet], tmp_path: Path):
-    whole = train(sets, tmp_path / "scorer.pt")
-    assert_same_weights(train(sets, tmp_path / "scorer.pt", stop_in=1), whole)
+    whole = train(sets, tmp_path / "scorer.safetensors")
+    assert_same_weights(train(sets, tmp_path / "scorer.safetensors", stop_in=1), whole)
 
 
 def test_a_run_that_is_stopped_keeps_the_steps_it_made(sets: list[MatchSet], tmp_path: Path):
     """As its documentation has it; a checkpoint is due every 250 steps otherwise."""
 
     with pytest.raises(KeyboardInterrupt):
-        train(sets, tmp_path / "scorer.pt", stop_in=3)
-    assert (tmp_path / "scorer.pt").is_file()
+        train(sets, tmp_path / "scorer.safetensors", stop_in=3)
+    assert (tmp_path / "scorer.safetensors").is_file()
+
+
+def test_a_checkpoint_of_another_training_is_refused(sets: list[MatchSet], tmp_path: Path):
+    train(sets, tmp_path / "scorer.safetensors")
+    with pytest.raises(InputError, match=r"made with seed 0, not seed 1: resume"):
+        train(sets, tmp_path / "scorer.safetensors", seed=1)
+    with pytest.raises(InputError, match=r"made with sets 5, not sets 4: resume"):
+        train(sets[1:], tmp_path / "scorer.safetensors")
 
 
 def test_the_same_seed_trains_the_same_weights_and_another_one_others(sets: list[MatchSet], tmp_path: Path):
     first, second, other = (
-        train(sets, tmp_path / f"{name}.pt", seed=seed) for name, seed in (("a", 0), ("b", 0), ("c", 1))
+        train(sets, tmp_path / f"{name}.safetensors", seed=seed) for name, seed in (("a", 0), ("b", 0), ("c", 1))
     )
     assert_same_weights(first, second)
     assert not torch.equal(first.trust[1][0].weight, other.trust[1][0].weight)

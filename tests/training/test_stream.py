@@ -9,7 +9,8 @@ import torch
 from sigmaslam.errors import InputError
 from sigmaslam.synthetic import pairs
 from sigmaslam.training import stream
-from sigmaslam.training.stream import MIXES, MixedPairs, PairDataset, open_stream, pair_loader
+from sigmaslam.training.choices import MIXES
+from sigmaslam.training.stream import MixedPairs, PairDataset, open_stream, pair_loader
 
 
 @pytest.fixture(autouse=True)

@@ -6,7 +6,7 @@ import torch
 
 from sigmaslam.models.network import FeatureNetwork
 from sigmaslam.training import validation
-from sigmaslam.training.stream import MIXES
+from sigmaslam.training.choices import MIXES
 from sigmaslam.training.validation import PairMatches, held_out_sources, match_pair, matching_accuracy
 
 

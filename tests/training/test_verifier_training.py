@@ -1,18 +1,21 @@
 """The match verifier's rows, loss, training and calibration on rows whose law is known."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 from scipy import stats
 from torch import Tensor
 
+from sigmaslam.errors import InputError
+from sigmaslam.evaluation.calibration import calibration_error
 from sigmaslam.frontend.matching import Putative
 from sigmaslam.frontend.types import Features
 from sigmaslam.models.scorer import MatchScorer
 from sigmaslam.models.verifier import VERIFIER_COLUMNS, MatchVerifier
 from sigmaslam.synthetic.textures import dead_leaves
 from sigmaslam.training import verifier as verifier_training
-from sigmaslam.training.calibration import calibration_error
 from sigmaslam.training.match_sets import MatchSet, PairRecord
 from sigmaslam.training.verifier import VerifierRows, calibrate, collect_rows, train_verifier, verifier_loss
 
@@ -165,7 +168,9 @@ def test_calibration_leaves_the_weights():
 # Training
 
 
-def test_training_finds_the_sigma_and_the_probability_of_each_kind_of_match(monkeypatch: pytest.MonkeyPatch):
+def test_training_finds_the_sigma_and_the_probability_of_each_kind_of_match(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
     """Two kinds that one column tells apart."""
     monkeypatch.setattr(verifier_training, "_BATCH", 512)
     rng = np.random.default_rng(0)
@@ -177,7 +182,7 @@ def test_training_finds_the_sigma_and_the_probability_of_each_kind_of_match(monk
     error[rng.random(4000) < np.where(kind, 0.1, 0.7)] = 100.0
     notes: list[int] = []
     rows = VerifierRows(columns, error.astype(np.float32), np.zeros(4000, int))
-    verifier = train_verifier(rows, 150, 0, lambda step, _: notes.append(step))
+    verifier = train_verifier(rows, 150, 0, tmp_path / "verifier.safetensors", lambda step, _: notes.append(step))
     assert notes == list(range(1, 151))
     with torch.no_grad():
         logit, log_sigma = verifier(torch.from_numpy(columns))
@@ -186,12 +191,41 @@ def test_training_finds_the_sigma_and_the_probability_of_each_kind_of_match(monk
         assert float(torch.sigmoid(logit[which]).mean()) == pytest.approx(share, abs=0.08)
 
 
-def test_the_same_seed_trains_the_same_weights(monkeypatch: pytest.MonkeyPatch):
+@pytest.fixture
+def small_batch(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(verifier_training, "_BATCH", 64)
+
+
+def assert_same_weights(a: MatchVerifier, b: MatchVerifier) -> None:
+    for name, value in a.state_dict().items():
+        assert torch.equal(value, b.state_dict()[name]), name
+
+
+@pytest.mark.usefixtures("small_batch")
+def test_a_stopped_run_ends_bit_for_bit_as_one_that_was_not(tmp_path: Path):
+    def stop(step: int, note: str) -> None:
+        if step == 3:
+            raise KeyboardInterrupt
+
+    rows, taken = known_rows(untrained(), 300, 1.0, 1.0, 0.0), []
+    whole = train_verifier(rows, 5, 0, tmp_path / "whole.safetensors", lambda step, note: None)
+    stopped = tmp_path / "stopped.safetensors"
+    with pytest.raises(KeyboardInterrupt):
+        train_verifier(rows, 5, 0, stopped, stop)
+    assert_same_weights(train_verifier(rows, 5, 0, stopped, lambda step, note: taken.append(step)), whole)
+    assert taken == [4, 5]
+    with pytest.raises(InputError, match=r"made with steps 5, not steps 6"):
+        train_verifier(rows, 6, 0, stopped, stop)
+
+
+@pytest.mark.usefixtures("small_batch")
+def test_the_same_seed_trains_the_same_weights(tmp_path: Path):
     rows = known_rows(untrained(), 300, 1.0, 1.0, 0.0)
-    first, second, other = (train_verifier(rows, 3, seed, lambda step, note: None) for seed in (0, 0, 1))
-    for name, value in first.state_dict().items():
-        assert torch.equal(value, second.state_dict()[name]), name
+    first, second, other = (
+        train_verifier(rows, 3, seed, tmp_path / f"{name}.safetensors", lambda step, note: None)
+        for name, seed in (("a", 0), ("b", 0), ("c", 1))
+    )
+    assert_same_weights(first, second)
     assert not torch.equal(first.layers[0].weight, other.layers[0].weight)
     torch.testing.assert_close(first.mean, torch.from_numpy(rows.columns.mean(axis=0)), rtol=0, atol=1e-5)
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.stats import rankdata
 
+RIGHT = 3.0
+"""A match this near to the truth is right, pixels."""
 _BINS = 15
 
 
@@ -12,18 +15,12 @@ def auroc(score: np.ndarray, right: np.ndarray) -> float:
 
     NaN unless there are both.
     """
-    rank = _mean_ranks(score)
+    rank = rankdata(score)
     count = int(right.sum())
     others = len(right) - count
     if count == 0 or others == 0:
         return float("nan")
     return float((rank[right].sum() - 0.5 * count * (count + 1)) / (count * others))
-
-
-def _mean_ranks(values: np.ndarray) -> np.ndarray:
-    """Ranks from 1, ties sharing their mean."""
-    _, group, counts = np.unique(values, return_inverse=True, return_counts=True)
-    return np.asarray((np.cumsum(counts) - 0.5 * (counts - 1))[group])
 
 
 def average_precision(score: np.ndarray, right: np.ndarray) -> float:
@@ -35,7 +32,8 @@ def average_precision(score: np.ndarray, right: np.ndarray) -> float:
 
 def spearman(a: np.ndarray, b: np.ndarray) -> float:
     """Rank correlation of two (M,); NaN where one of them is the same throughout."""
-    ranks0, ranks1 = _mean_ranks(a), _mean_ranks(b)
+    ranks0, ranks1 = rankdata(a), rankdata(b)
+    # scipy's spearmanr differs in the last bit.
     if len(a) < 2 or np.ptp(ranks0) == 0 or np.ptp(ranks1) == 0:
         return float("nan")
     return float(np.corrcoef(ranks0, ranks1)[0, 1])
@@ -52,8 +50,3 @@ def calibration_error(probability: np.ndarray, right: np.ndarray) -> float:
     bins = np.minimum((probability * _BINS).astype(int), _BINS - 1)
     gap = np.bincount(bins, probability, _BINS) - np.bincount(bins, right.astype(np.float64), _BINS)
     return float(np.abs(gap).sum() / max(len(right), 1))
-
-
-def squared_distance(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """(M,) Mahalanobis distance squared of errors (M, D) under covariances (M, D, D)."""
-    return np.asarray(np.einsum("mi,mi->m", error, np.linalg.solve(covariance, error[..., None])[..., 0]))

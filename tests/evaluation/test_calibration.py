@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sigmaslam.training.calibration import (
+from sigmaslam.evaluation.calibration import (
     auroc,
     average_precision,
     best_half,
     calibration_error,
     spearman,
-    squared_distance,
 )
 
 RNG = np.random.default_rng(0)
@@ -94,22 +93,6 @@ def test_best_half_is_small_for_the_true_sigma_and_one_for_a_constant_error():
     sigma = np.exp(rng.standard_normal(2000))
     assert best_half(sigma, sigma * rng.standard_normal(2000)) < 0.4
     assert best_half(sigma, np.full(2000, 3.0)) == pytest.approx(1.0)
-
-
-@pytest.mark.parametrize("size", [1, 2, 3])
-def test_squared_distance_equals_the_inverse_written_out(size: int):
-    rng = np.random.default_rng(4)
-    root, error = rng.standard_normal((50, size, size)), rng.standard_normal((50, size))
-    covariance = root @ root.transpose(0, 2, 1) + 0.1 * np.eye(size)
-    expected = [e @ np.linalg.inv(C) @ e for e, C in zip(error, covariance, strict=True)]
-    np.testing.assert_allclose(squared_distance(error, covariance), expected)
-
-
-def test_squared_distance_of_draws_is_chi_square():
-    covariance = np.array([[2.0, 0.7], [0.7, 0.5]])
-    error = np.random.default_rng(5).multivariate_normal(np.zeros(2), covariance, 5000)
-    square = squared_distance(error, np.tile(covariance, (5000, 1, 1)))
-    assert stats.kstest(square, stats.chi2(2).cdf).pvalue > 0.01
 
 
 # Probability

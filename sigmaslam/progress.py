@@ -1,18 +1,20 @@
-"""The progress bar of training runs."""
+"""The progress bar of everything that takes long, on the standard error."""
 
 from __future__ import annotations
 
+from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 
 def open_progress(hidden: bool = False) -> Progress:
-    """Tasks with a field `note`; nothing is shown where it is hidden."""
+    """Tasks with a field `note`, which stands behind the bar; nothing is shown where it is hidden."""
     return Progress(
         TextColumn("{task.description}"),
-        BarColumn(),
+        BarColumn(bar_width=16),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
         TextColumn("{task.fields[note]}"),
+        console=Console(stderr=True),
         disable=hidden,
     )

@@ -1,0 +1,5 @@
+"""The command line: parses, calls, prints. Exit code 2 on bad input."""
+
+from sigmaslam.cli.commands import app, main
+
+__all__ = ["app", "main"]

@@ -1,0 +1,5 @@
+"""`python -m sigmaslam.cli`."""
+
+from sigmaslam.cli import main
+
+main()

@@ -1,0 +1,14 @@
+"""What a command says when an optional part of the package is not installed."""
+
+from __future__ import annotations
+
+from sigmaslam.errors import InputError
+
+
+def need_train_extra() -> None:
+    """Refuses a command of the extra `train` where torch or kornia is missing."""
+    try:
+        import kornia  # noqa: F401
+        import torch  # noqa: F401
+    except ImportError as error:
+        raise InputError(f"{error.name} is not installed: pip install 'sigmaslam[train]'") from error

@@ -1,0 +1,179 @@
+"""`sigmaslam demo` and `sigmaslam track`."""
+
+from __future__ import annotations
+
+import tempfile
+from enum import StrEnum
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from sigmaslam.cli.extras import need_train_extra
+from sigmaslam.errors import InputError
+from sigmaslam.frontend import FRONTENDS
+from sigmaslam.readers import StereoSequence, open_cameras, open_sequence
+from sigmaslam.readers.detect import FORMATS
+from sigmaslam.session import BACKENDS
+
+# mypy reads the members of an enum from literals alone.
+Frontend = StrEnum("Frontend", FRONTENDS)  # type: ignore[misc]
+"""Where correspondences come from."""
+Backend = StrEnum("Backend", BACKENDS)  # type: ignore[misc]
+"""What runs the network and the filter."""
+InputFormat = StrEnum("InputFormat", FORMATS)  # type: ignore[misc]
+"""Kinds of input."""
+
+
+def demo(
+    out: Annotated[
+        Path | None, typer.Option(help="Run folder, new or empty.", show_default="a new temporary folder")
+    ] = None,
+    frontend: Annotated[Frontend, typer.Option(help="Where correspondences come from.")] = Frontend["learned"],
+) -> None:
+    """Track the rendered sequence that ships with the package and print the errors against its exact truth."""
+    from sigmaslam.evaluation.evaluate import evaluate_run, format_evaluation
+
+    folder = out or Path(tempfile.mkdtemp(prefix="sigmaslam-demo-"))
+    with as_file(files("sigmaslam.synthetic") / "demo") as sequence:
+        _track(open_sequence(sequence, "kitti"), folder, frontend, Backend["onnx"])
+        typer.echo(format_evaluation(evaluate_run(folder, sequence / "poses.txt")))
+    typer.echo(f"Report: {folder / 'report.html'}\nPicture: {folder / 'evaluation.png'}")
+
+
+def track(
+    out: Annotated[Path, typer.Option(help="Run folder, new or empty.")],
+    source: Annotated[
+        Path | None,
+        typer.Argument(metavar="INPUT", help="KITTI, EuRoC or plain folder, video or ROS bag.", show_default=False),
+    ] = None,
+    format: Annotated[InputFormat, typer.Option(help="Kind of input.")] = InputFormat["auto"],
+    calibration: Annotated[
+        Path | None, typer.Option(help="Calibration YAML (or KITTI calib.txt) instead of the input's own.")
+    ] = None,
+    frontend: Annotated[Frontend, typer.Option(help="Where correspondences come from.")] = Frontend["learned"],
+    backend: Annotated[
+        Backend,
+        typer.Option(help="What runs network and filter; torch needs 'train'."),
+    ] = Backend["onnx"],
+    map: Annotated[
+        Path | None,
+        typer.Option(help="map.npz of an earlier run with the same camera and front-end: poses are in its world."),
+    ] = None,
+    tracks: Annotated[
+        bool, typer.Option("--tracks", help="Also write tracks.npz, what keyframes saw, for `sigmaslam refine`.")
+    ] = False,
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LEFT,RIGHT",
+            help="Live cameras in place of INPUT: numbers, paths or URLs; side-by-side:0 is one that gives both eyes.",
+        ),
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.1, help="With --camera: stop after so long. Ctrl-C stops as well.")
+    ] = None,
+    topic_left: Annotated[
+        str | None, typer.Option(help="Image topic in a bag.", show_default="the one with 'left', cam0 or infra1")
+    ] = None,
+    topic_right: Annotated[
+        str | None, typer.Option(help="Image topic in a bag.", show_default="the one with 'right', cam1 or infra2")
+    ] = None,
+    track_object: Annotated[
+        str | None,
+        typer.Option(
+            metavar="MASK|BOX",
+            help="The camera is at rest and follows one rigid body: x,y,width,height in pixels of the first left "
+            "image, or an image of its size that is not zero on the body. Poses are then T_camera_object.",
+        ),
+    ] = None,
+    location: Annotated[
+        Path | None,
+        typer.Option(
+            help="CSV of a location sensor on what moves, to fuse: timestamp,x,y,z[,qx,qy,qz,qw],sigma_position"
+            "[,sigma_rotation]; any rate, any world (docs/object.md)."
+        ),
+    ] = None,
+) -> None:
+    """Track a stereo sequence, recorded or live: trajectory, covariance, map and report."""
+    if backend.value == "torch":
+        need_train_extra()
+    if track_object is not None and (map is not None or tracks):
+        raise InputError("--map and --tracks are of a moving camera's world: leave them out with --track-object")
+    sequence = _open_input(source, format, calibration, camera, seconds, (topic_left, topic_right))
+    try:
+        summary = _track(sequence, out, frontend, backend, map, tracks, track_object, location)
+    except KeyboardInterrupt:
+        if (out / "run.json").exists():
+            typer.echo(f"Stopped; what was tracked until then is in {out}")
+        raise
+    typer.echo(
+        f"{summary['tracking']} of {summary['frames']} frames tracked, {summary['lost']} lost, "
+        f"{summary['skipped']} skipped; {summary['median_inliers']:.0f} inliers in the median frame, "
+        f"{summary['map_points']} map points.\n{summary['calibration_verdict']}\n"
+        f"{_location_verdict(summary)}Report: {out / 'report.html'}"
+    )
+
+
+def _open_input(
+    source: Path | None,
+    format: InputFormat,
+    calibration: Path | None,
+    camera: str | None,
+    seconds: float | None,
+    topics: tuple[str | None, str | None],
+) -> StereoSequence:
+    if (source is None) == (camera is None):
+        raise InputError("give either INPUT, a recording, or --camera, live cameras" + (", not both" if source else ""))
+    if source is not None:
+        if seconds is not None:
+            raise InputError("--seconds goes with --camera; a recording is tracked to its end")
+        return open_sequence(source, format.value, calibration, topics)
+    assert camera is not None
+    if calibration is None:
+        raise InputError("--camera needs --calibration: the stereo pair as YAML, in the form that the README shows")
+    if format.value != "auto" or topics != (None, None):
+        raise InputError("--format, --topic-left and --topic-right go with INPUT, not with --camera")
+    return open_cameras(camera, calibration, seconds)
+
+
+def _track(
+    sequence: StereoSequence,
+    out: Path,
+    frontend: Frontend,
+    backend: Backend,
+    map_path: Path | None = None,
+    tracks: bool = False,
+    track_object: str | None = None,
+    location: Path | None = None,
+) -> dict[str, Any]:
+    from sigmaslam.location import read_locations
+    from sigmaslam.run import track_sequence
+
+    return track_sequence(
+        sequence,
+        out,
+        frontend.value,
+        backend.value,
+        map_path=map_path,
+        tracks=tracks,
+        track_object=track_object,
+        locations=None if location is None else read_locations(location),
+    )
+
+
+def _location_verdict(summary: dict[str, Any]) -> str:
+    """A line about the location sensor; empty without one."""
+    if "location" not in summary:
+        return ""
+    used, weakened, unused, ready = (summary["location"][name] for name in ("used", "weakened", "unused", "ready"))
+    if ready is None:
+        return (
+            f"The location sensor was not fused: its {used} readings with a pose do not show how its world lies to "
+            "ours. Is it the same clock? Positions need a path that is no straight line.\n"
+        )
+    return (
+        f"Location sensor: {used} readings used ({weakened} disagreed and count less), {unused} not; poses are fused "
+        f"from {ready:.3f} s on.\n"
+    )
