@@ -12,8 +12,9 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from sigmaslam.filters.groups import wrap_angle
 from sigmaslam.filters.layout import stack
-from sigmaslam.filters.models import LinearMotion, MeasurementModel, MotionModel, wrap_angle
+from sigmaslam.filters.models import LinearMotion, MeasurementModel, MotionModel
 from sigmaslam.filters.noise import Noise
 
 
