@@ -14,9 +14,6 @@ from torch import Tensor
 
 from sigmaslam.filters import linalg, small
 
-# Round-off of an exact zero, as a share of the diagonal: a clone is a copy of a pose, a first pose is known.
-_TOLERANCES = {torch.float64: 1e-13, torch.float32: 2e-6}
-
 
 def cholesky(matrix: Tensor) -> tuple[Tensor, Tensor | None]:
     """Lower factor L, L L^T = matrix, of positive semidefinite matrices.
@@ -27,7 +24,7 @@ def cholesky(matrix: Tensor) -> tuple[Tensor, Tensor | None]:
         (..., n, n) lower triangular factor; (...,) bool, True where the matrix is positive semidefinite and finite, or
         None where that is known to hold for all. Where it does not, the factor is arbitrary.
     """
-    tolerance = _TOLERANCES[matrix.dtype]
+    tolerance = linalg.PIVOT_TOLERANCES[matrix.dtype]
     if small.is_small(matrix):
         return small.cholesky(matrix, tolerance)
     factor, failure = torch.linalg.cholesky_ex(matrix)
