@@ -34,12 +34,6 @@ class Prediction:
         """(...,) bool, False for elements that the policy on failure had to deal with."""
         return _all_of(self.belief) if self._healthy is None else self._healthy
 
-    @property
-    def cross_covariance(self) -> Tensor:
-        """Covariance (..., n, n) of the prior state (rows) with the predicted one."""
-        root, columns = self._joint()
-        return root @ columns.odd.mT
-
     def joint_root(self) -> tuple[Tensor, list[Tensor], Tensor]:
         """Deviations of the predicted state from the prior's (..., n, n), all others (..., n, c), the prior's root."""
         root, columns = self._joint()
