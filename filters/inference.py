@@ -218,12 +218,10 @@ class _Term:
                 # Without a prior the chart is at the state, where the given derivative is.
                 columns = problem.columns(anchor, zeta, state) if problem.has_prior else problem.root
                 jacobian = model.jacobian(state, *self.inputs)
-            seen = Taylor()(
+            seen = Taylor(jacobian)(
                 lambda offsets: model.function(problem.retract(anchor, shift + offsets), *self.inputs),
                 columns,
                 model.residual,
-                None,
-                jacobian,
             )
             slope = seen.columns.odd
             innovation = seen.from_mean(self.value, model.residual)

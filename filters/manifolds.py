@@ -107,7 +107,13 @@ class SO2:
 
 
 @dataclass(frozen=True)
-class _Group:
+class LieGroup:
+    """A group whose points are composed: what SE2, SO3 and SE3 have in common.
+
+    Attributes:
+        side: "right", point * Exp(v), where v is seen from the moving frame; or "left", Exp(v) * point, from the fixed.
+    """
+
     side: str = "right"
     flat: ClassVar[bool] = False
 
@@ -120,11 +126,10 @@ class _Group:
 
 
 @dataclass(frozen=True)
-class SE2(_Group):
+class SE2(LieGroup):
     """Rigid motions of the plane: points (..., 3) are x, y, angle, tangents (..., 3) twists in the same order.
 
-    Attributes:
-        side: "right", point * Exp(v), where v is seen from the moving frame; or "left", Exp(v) * point, from the fixed.
+    For `side` see `LieGroup`.
     """
 
     point_size: ClassVar[int] = 3
@@ -171,11 +176,10 @@ class SE2(_Group):
 
 
 @dataclass(frozen=True)
-class SO3(_Group):
+class SO3(LieGroup):
     """Rotations: points (..., 4) are unit quaternions x, y, z, w of either sign, tangents (..., 3) rotation vectors.
 
-    Attributes:
-        side: "right", point * Exp(v), where v is seen from the moving frame; or "left", Exp(v) * point, from the fixed.
+    For `side` see `LieGroup`.
     """
 
     point_size: ClassVar[int] = 4
@@ -204,14 +208,11 @@ class SO3(_Group):
 
 
 @dataclass(frozen=True)
-class SE3(_Group):
+class SE3(LieGroup):
     """Rigid motions: points (..., 7) are translation and unit quaternion x, y, z, w, tangents (..., 6) twists.
 
     A twist is (translation, rotation), and what it leads to is the exponential of the group, so its translation bends
-    with its rotation.
-
-    Attributes:
-        side: "right", point * Exp(v), where v is seen from the moving frame; or "left", Exp(v) * point, from the fixed.
+    with its rotation. For `side` see `LieGroup`.
     """
 
     point_size: ClassVar[int] = 7
