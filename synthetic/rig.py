@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sigmaslam.camera import CameraModel, StereoCamera
+from sigmaslam.synthetic.geometry import rigid_motion
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,9 +109,8 @@ def loose_rig(
         degrees: standard deviation of the angles between the axes.
         share: standard deviation of the relative differences in focal length, centre and distortion.
     """
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(np.deg2rad(degrees) * rng.standard_normal(3)).as_matrix()
-    T[:3, 3] = baseline * np.array([1.0, *(share * rng.standard_normal(2))])
+    R = Rotation.from_rotvec(np.deg2rad(degrees) * rng.standard_normal(3)).as_matrix()
+    T = rigid_motion(R, baseline * np.array([1.0, *(share * rng.standard_normal(2))]))
     # Python's own numbers: they go to JSON and YAML.
     focal, *distortion = (1.0 + share * rng.standard_normal(1 + len(camera.distortion))).tolist()
     aside, down = (share * camera.width * rng.standard_normal(2)).tolist()

@@ -16,11 +16,11 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from sigmaslam.errors import InputError
 from sigmaslam.rotation import rotation_exp
+from sigmaslam.synthetic.geometry import arc_length
 from sigmaslam.synthetic.paths import (
     KNOT_INTERVAL,
     LARGEST_NOISE,
     Path,
-    arc_length,
     at_rest,
     carried_frames,
     integral,
@@ -257,7 +257,7 @@ def insertion(rng: np.random.Generator, duration: float, centreline: np.ndarray,
         radius: of the tube, metres; the camera stays within 0.6 of it.
     """
     knots = np.asarray(centreline, dtype=np.float64)
-    axis = CubicSpline(np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(knots, axis=0), axis=1))]), knots)
+    axis = CubicSpline(arc_length(knots), knots)
     length = float(axis.x[-1])
     along = np.linspace(0, length, 500)
     frames = carried_frames(axis(along, 1))

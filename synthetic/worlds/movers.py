@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sigmaslam.synthetic.geometry import rigid_motion
 from sigmaslam.synthetic.paths import Path, noise
 from sigmaslam.synthetic.scene import Body
 from sigmaslam.synthetic.shapes import Box, Cylinder, Ellipsoid, Panel
@@ -38,10 +39,7 @@ class Part:
 
     def pose(self) -> np.ndarray:
         """T_model_part, (4, 4)."""
-        T = np.eye(4)
-        T[:3, :3] = Rotation.from_rotvec(self.rotation).as_matrix()
-        T[:3, 3] = self.position
-        return T
+        return rigid_motion(Rotation.from_rotvec(self.rotation).as_matrix(), self.position)
 
 
 Model = tuple[Part, ...]
