@@ -9,16 +9,16 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.factors import apply, finite, multiply, solve_lower_transposed, square, triangularise
 from sigmaslam.filters.failure import POLICIES, OnFailure, Suspects, jittered, raise_unless_healthy
 from sigmaslam.filters.gaussian import Gaussian
+from sigmaslam.filters.linalg.square_roots import apply, finite, multiply, solve_lower_transposed, square, triangularise
+from sigmaslam.filters.linalg.unrolled import join
 from sigmaslam.filters.manifolds import Manifold
 from sigmaslam.filters.models import AnyMeasurement, AnyMotion, LinearMeasurement, LinearMotion
 from sigmaslam.filters.noise import Noise, as_noise
 from sigmaslam.filters.results import Prediction, Update
 from sigmaslam.filters.sequence import filter_sequence, smooth
 from sigmaslam.filters.sigma_points import Columns, SigmaPoints, cubature
-from sigmaslam.filters.small import join
 from sigmaslam.filters.transforms import Difference, Exact, Taylor, Transform, Transformed, Unscented
 from sigmaslam.filters.updates import FORMS, Form, Solution, choose_form, solve
 

@@ -18,7 +18,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.factors import (
+from sigmaslam.filters.failure import FilterError, name_elements
+from sigmaslam.filters.gaussian import Gaussian
+from sigmaslam.filters.linalg.square_roots import (
     apply,
     identity,
     multiply,
@@ -26,8 +28,6 @@ from sigmaslam.filters.factors import (
     solve_lower_transposed,
     triangularise,
 )
-from sigmaslam.filters.failure import FilterError, name_elements
-from sigmaslam.filters.gaussian import Gaussian
 from sigmaslam.filters.manifolds import Manifold
 from sigmaslam.filters.models import AnyMeasurement, LinearMeasurement
 from sigmaslam.filters.noise import Dense, Noise, Rooted, as_noise

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from sigmaslam.filters.factors import apply
+from sigmaslam.filters.linalg.square_roots import apply
 from sigmaslam.filters.noise import Noise
 
 Function = Callable[..., Tensor]

@@ -9,7 +9,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.factors import cholesky, identity, log_diagonal, solve_lower, square, triangularise
+from sigmaslam.filters.linalg.square_roots import cholesky, identity, log_diagonal, solve_lower, square, triangularise
 
 
 class Noise(Protocol):

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.factors import multiply
 from sigmaslam.filters.gaussian import Gaussian
+from sigmaslam.filters.linalg.square_roots import multiply
 from sigmaslam.filters.noise import Noise
 from sigmaslam.filters.sigma_points import Columns
 from sigmaslam.filters.updates import Form, Solution, log_likelihood

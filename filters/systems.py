@@ -12,8 +12,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.groups import wrap_angle
 from sigmaslam.filters.layout import stack
+from sigmaslam.filters.lie_groups import wrap_angle
 from sigmaslam.filters.models import LinearMotion, MeasurementModel, MotionModel
 from sigmaslam.filters.noise import Noise
 

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from sigmaslam.errors import InputError
 from sigmaslam.synthetic.geometry import rigid_motion
-from sigmaslam.synthetic.paths import Path
-from sigmaslam.synthetic.shapes import SHAPES, Shape
+from sigmaslam.synthetic.motion.paths import Path
+from sigmaslam.synthetic.rendering.shapes import SHAPES, Shape
 
 
 @dataclass(frozen=True, slots=True)

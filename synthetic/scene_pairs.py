@@ -10,11 +10,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from sigmaslam.camera import CameraModel
+from sigmaslam.synthetic.camera.sensor import Sensor, expose, random_sensor
 from sigmaslam.synthetic.geometry import rigid_motion
-from sigmaslam.synthetic.renderer import Renderer, Views
-from sigmaslam.synthetic.sensor import Sensor, expose, random_sensor
+from sigmaslam.synthetic.rendering.renderer import Renderer, Views
+from sigmaslam.synthetic.rendering.visibility import Eye
 from sigmaslam.synthetic.truth import at_pixels, transfer
-from sigmaslam.synthetic.visibility import Eye
 from sigmaslam.synthetic.worlds import colon, hall, organ, room, street
 from sigmaslam.synthetic.worlds.episode import Wish
 

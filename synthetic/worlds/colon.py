@@ -8,10 +8,10 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from sigmaslam.synthetic.geometry import arc_length
-from sigmaslam.synthetic.paths import Path
+from sigmaslam.synthetic.motion.paths import Path
+from sigmaslam.synthetic.motion.trajectories import insertion
+from sigmaslam.synthetic.rendering.shapes import Tube
 from sigmaslam.synthetic.scene import Body, Material, Scene
-from sigmaslam.synthetic.shapes import Tube
-from sigmaslam.synthetic.trajectories import insertion
 from sigmaslam.synthetic.worlds.episode import Episode, Wish
 from sigmaslam.synthetic.worlds.tissue import (
     NEAR,

@@ -11,9 +11,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sigmaslam.synthetic.geometry import rigid_motion
-from sigmaslam.synthetic.paths import Path, noise
+from sigmaslam.synthetic.motion.paths import Path, noise
+from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel
 from sigmaslam.synthetic.scene import Body
-from sigmaslam.synthetic.shapes import Box, Cylinder, Ellipsoid, Panel
 
 _HALF_VIEW = (np.tan(np.deg2rad(35.0)), 0.75 * np.tan(np.deg2rad(35.0)))
 """Half the view at distance 1 for which shares are meant: 70 degrees across, 4 : 3."""

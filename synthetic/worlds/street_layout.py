@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sigmaslam.synthetic.geometry import rigid_motion
+from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel
 from sigmaslam.synthetic.scene import Body
-from sigmaslam.synthetic.shapes import Box, Cylinder, Ellipsoid, Panel
 from sigmaslam.synthetic.worlds.movers import Model, stand
 from sigmaslam.synthetic.worlds.street_furniture import (
     bush,

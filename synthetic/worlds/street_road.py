@@ -9,9 +9,9 @@ from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 from scipy.spatial import cKDTree
 
 from sigmaslam.synthetic.geometry import arc_length
-from sigmaslam.synthetic.paths import noise
+from sigmaslam.synthetic.motion.paths import noise
+from sigmaslam.synthetic.rendering.shapes import Panel, Terrain
 from sigmaslam.synthetic.scene import Body
-from sigmaslam.synthetic.shapes import Panel, Terrain
 
 CAMERA_HEIGHT = 1.65
 """Of the camera above the road, metres."""

@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from sigmaslam.rotation import rotation_exp
 from sigmaslam.synthetic.geometry import rigid_motion
-from sigmaslam.synthetic.paths import Path, at_rest, noise, with_stops
+from sigmaslam.synthetic.motion.paths import Path, at_rest, noise, with_stops
+from sigmaslam.synthetic.motion.trajectories import tool as tool_motion
+from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid
 from sigmaslam.synthetic.scene import Body, Lights, Material, Texture
-from sigmaslam.synthetic.shapes import Box, Cylinder, Ellipsoid
-from sigmaslam.synthetic.trajectories import tool as tool_motion
 from sigmaslam.synthetic.worlds.episode import Wish
 from sigmaslam.synthetic.worlds.movers import Model, Part, bisect, covered_share, scaled
 

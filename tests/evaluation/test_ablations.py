@@ -21,7 +21,7 @@ from sigmaslam.evaluation.matching.sets import SELECTION
 from sigmaslam.models.detector import BORDER, find_peaks, to_cells
 from sigmaslam.models.extractor import FeatureExtractor
 from sigmaslam.models.network import FeatureNetwork
-from sigmaslam.synthetic.textures import dead_leaves
+from sigmaslam.synthetic.rendering.textures import dead_leaves
 from sigmaslam.training import loop
 from sigmaslam.training.loop import WEIGHTS_NAME
 

@@ -22,7 +22,7 @@ from sigmaslam.filters.consistency import (
     whiten,
     whiteness,
 )
-from sigmaslam.filters.consistency_plots import plot_coverage, plot_nees, plot_whiteness
+from sigmaslam.filters.consistency.plots import plot_coverage, plot_nees, plot_whiteness
 
 
 def random_numbers(*shape: int, seed: int = 0) -> Tensor:

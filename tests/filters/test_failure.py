@@ -29,7 +29,7 @@ from sigmaslam.filters import (
     UnscentedKalmanFilter,
     julier,
 )
-from sigmaslam.filters.factors import cholesky
+from sigmaslam.filters.linalg.square_roots import cholesky
 
 FORMS = ("dense", "low-rank", "qr")
 BAD = 7

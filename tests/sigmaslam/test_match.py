@@ -18,7 +18,7 @@ from sigmaslam.frontend.learned import LearnedDetector
 from sigmaslam.frontend.matching import nearest_anywhere
 from sigmaslam.frontend.types import Features
 from sigmaslam.match import draw_matches, match_features
-from sigmaslam.synthetic.textures import dead_leaves
+from sigmaslam.synthetic.rendering.textures import dead_leaves
 
 FIELDS = ("keypoints0", "keypoints1", "probability", "covariance", "index0", "index1")
 SHAPES_OF_NONE = [(0, 2), (0, 2), (0,), (0, 2, 2), (0,), (0,)]

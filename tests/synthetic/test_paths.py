@@ -5,7 +5,7 @@ import pytest
 
 from sigmaslam.rotation import rotation_exp, rotation_log
 from sigmaslam.synthetic.geometry import arc_length
-from sigmaslam.synthetic.paths import (
+from sigmaslam.synthetic.motion.paths import (
     LARGEST_NOISE,
     Path,
     Stop,

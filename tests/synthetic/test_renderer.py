@@ -9,12 +9,12 @@ import torch
 from small_worlds import CAMERA, FISHEYE, RADTAN, camera_pose, small_scene
 
 from sigmaslam.camera import CameraModel
-from sigmaslam.synthetic.facets import Facets, join
-from sigmaslam.synthetic.renderer import Renderer, Views
+from sigmaslam.synthetic.rendering.facets import Facets, join
+from sigmaslam.synthetic.rendering.renderer import Renderer, Views
+from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel, Tube
+from sigmaslam.synthetic.rendering.visibility import Eye
 from sigmaslam.synthetic.scene import Body, Lights, Material, Scene, Texture
-from sigmaslam.synthetic.shapes import Box, Cylinder, Ellipsoid, Panel, Tube
 from sigmaslam.synthetic.truth import at_pixels, flow, transfer
-from sigmaslam.synthetic.visibility import Eye
 
 CAMERAS = pytest.mark.parametrize("camera", [CAMERA, RADTAN, FISHEYE], ids=["pinhole", "radtan", "fisheye"])
 T_0, T_1 = camera_pose((0.0, 0.0, 1.2)), camera_pose((0.3, -0.2, 1.25), 0.05, -0.2)

@@ -6,7 +6,7 @@ import pytest
 
 from sigmaslam.errors import InputError
 from sigmaslam.rotation import rotation_log
-from sigmaslam.synthetic.trajectories import (
+from sigmaslam.synthetic.motion.trajectories import (
     CAMERA_HEIGHT,
     Box,
     Path,

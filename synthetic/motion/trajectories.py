@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from sigmaslam.errors import InputError
 from sigmaslam.rotation import rotation_exp
 from sigmaslam.synthetic.geometry import arc_length
-from sigmaslam.synthetic.paths import (
+from sigmaslam.synthetic.motion.paths import (
     KNOT_INTERVAL,
     LARGEST_NOISE,
     Path,

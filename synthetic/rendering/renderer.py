@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from sigmaslam.camera import CameraModel
-from sigmaslam.synthetic.facets import join
 from sigmaslam.synthetic.geometry import rigid_motion
+from sigmaslam.synthetic.rendering.facets import join
+from sigmaslam.synthetic.rendering.shading import Samples, Shader, meet
+from sigmaslam.synthetic.rendering.visibility import Eye, Sight, Surfaces, move
 from sigmaslam.synthetic.scene import Material, Scene
-from sigmaslam.synthetic.shading import Samples, Shader, meet
-from sigmaslam.synthetic.visibility import Eye, Sight, Surfaces, move
 
 # Places of the sub-samples of a pixel on an edge.
 _OFFSETS = ((-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))

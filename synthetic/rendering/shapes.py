@@ -12,8 +12,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter
 
-from sigmaslam.synthetic.facets import Facets, flat, grid, join, mesh
 from sigmaslam.synthetic.geometry import arc_length, carried_normals
+from sigmaslam.synthetic.rendering.facets import Facets, flat, grid, join, mesh
 
 # Faces of one body begin this far apart in their texture, metres times the body's size: no two look alike.
 _FACE_STEP = np.array([1.37, 2.71])

@@ -1,4 +1,4 @@
-"""Figures of `sigmaslam.filters.consistency`; save them with `Figure.savefig`."""
+"""Figures of `sigmaslam.filters.consistency.statistics`; save them with `Figure.savefig`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 from torch import Tensor
 
-from sigmaslam.filters.consistency import Consistency, Coverage, Whiteness
+from sigmaslam.filters.consistency.statistics import Consistency, Coverage, Whiteness
 from sigmaslam.plot_style import BLUE, GREEN, GREY, SERIES, style_axes
 
 # A mean beyond this multiple of the band flattens it on a linear axis.
