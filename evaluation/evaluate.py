@@ -26,7 +26,8 @@ from sigmaslam.evaluation.metrics import (
     relative_pose_error,
     synchronise,
 )
-from sigmaslam.figures import AXIS_NAMES, BLUE, VERMILLION, plot_trajectory, save_png, style_axes
+from sigmaslam.figures import AXIS_NAMES, plot_trajectory, save_png
+from sigmaslam.plot_style import BLUE, VERMILLION, style_axes
 from sigmaslam.rotation import se3_inverse
 from sigmaslam.trajectory import Trajectory, check_covariances, kitti_times_path, read_trajectory, trajectory_format
 

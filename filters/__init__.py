@@ -7,8 +7,9 @@ from sigmaslam.filters.failure import FilterError
 from sigmaslam.filters.gaussian import Gaussian
 from sigmaslam.filters.inference import Estimate, Observation, maximum_a_posteriori, maximum_likelihood
 from sigmaslam.filters.layout import stack
+from sigmaslam.filters.lie_groups import wrap_angle
 from sigmaslam.filters.manifolds import SE2, SE3, SO2, SO3, Euclidean, Manifold, Product
-from sigmaslam.filters.models import LinearMeasurement, LinearMotion, MeasurementModel, MotionModel, wrap_angle
+from sigmaslam.filters.models import LinearMeasurement, LinearMotion, MeasurementModel, MotionModel
 from sigmaslam.filters.noise import BlockDiagonal, Dense, Diagonal
 from sigmaslam.filters.results import Prediction, Update
 from sigmaslam.filters.sequence import Track

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.factors import apply, finite, multiply, solve_lower_transposed, square, triangularise
 from sigmaslam.filters.failure import POLICIES, OnFailure, Suspects, jittered, raise_unless_healthy
 from sigmaslam.filters.gaussian import Gaussian
+from sigmaslam.filters.linalg.square_roots import apply, finite, multiply, solve_lower_transposed, square, triangularise
+from sigmaslam.filters.linalg.unrolled import join
 from sigmaslam.filters.manifolds import Manifold
 from sigmaslam.filters.models import AnyMeasurement, AnyMotion, LinearMeasurement, LinearMotion
 from sigmaslam.filters.noise import Noise, as_noise
 from sigmaslam.filters.results import Prediction, Update
-from sigmaslam.filters.sequence import Track, filter_sequence, smooth
+from sigmaslam.filters.sequence import filter_sequence, smooth
 from sigmaslam.filters.sigma_points import Columns, SigmaPoints, cubature
-from sigmaslam.filters.small import join
 from sigmaslam.filters.transforms import Difference, Exact, Taylor, Transform, Transformed, Unscented
 from sigmaslam.filters.updates import FORMS, Form, Solution, choose_form, solve
 
@@ -151,21 +151,8 @@ class BayesFilter:
         posterior = self._deal_with(usable, posterior, belief, "update", suspects)
         return Update(posterior, innovation, form, count, _both(usable, sound), at_prior, columns, added, root)
 
-    def filter(
-        self,
-        belief: Gaussian,
-        motion: AnyMotion,
-        measurement: AnyMeasurement,
-        values: Tensor,
-        motion_inputs: Sequence[Tensor] = (),
-        measurement_inputs: Sequence[Tensor] = (),
-    ) -> Track:
-        """A whole sequence of T measurements (T, ..., m), see `sigmaslam.filters.sequence.filter_sequence`."""
-        return filter_sequence(self, belief, motion, measurement, values, motion_inputs, measurement_inputs)
-
-    def smooth(self, track: Track) -> Gaussian:
-        """Beliefs (T, ...) given all measurements, see `sigmaslam.filters.sequence.smooth`."""
-        return smooth(self, track)
+    filter = filter_sequence
+    smooth = smooth
 
     def _by_root(self, belief: Gaussian) -> bool:
         if self.form != "auto":
@@ -225,9 +212,9 @@ class BayesFilter:
             self._require_flat("LinearMotion")
             return Transformed(None, motion.function(mean, *inputs), Columns(multiply(motion.matrix, root)))
         size = root.shape[-1]
-        jacobian = None
-        if isinstance(self.transform, Taylor) and motion.jacobian is not None:
-            jacobian = motion.jacobian(mean, *inputs)
+        transform = self.transform
+        if isinstance(transform, Taylor) and motion.jacobian is not None:
+            transform = Taylor(motion.jacobian(mean, *inputs))
 
         def evaluate(offsets: Tensor) -> Tensor:
             if motion.additive:
@@ -235,7 +222,7 @@ class BayesFilter:
             return motion.function(self.retract(mean, offsets[..., :size]), offsets[..., size:], *inputs)
 
         columns = root if motion.additive else _block_diagonal(root, noise.factor())
-        return self.transform(evaluate, columns, self.chart, self.retract, jacobian)
+        return transform(evaluate, columns, self.chart, self.retract)
 
     def _innovate(
         self,
@@ -258,11 +245,11 @@ class BayesFilter:
         shift = None if previous is None else previous.shift
         spread = None if previous is None else previous.spread()
         columns = root if spread is None else multiply(root, spread)
-        jacobian = None
+        transform = self.transform
         # A given derivative is in the chart of the point that it is taken at, which is the prior's only at first.
         in_chart = shift is None or self.chart is None
-        if isinstance(self.transform, Taylor) and measurement.jacobian is not None and in_chart:
-            jacobian = measurement.jacobian(mean if shift is None else mean + shift, *inputs)
+        if isinstance(transform, Taylor) and measurement.jacobian is not None and in_chart:
+            transform = Taylor(measurement.jacobian(mean if shift is None else mean + shift, *inputs))
 
         def evaluate(offsets: Tensor) -> Tensor:
             moved = offsets if measurement.additive else offsets[..., :size]
@@ -272,7 +259,7 @@ class BayesFilter:
             return measurement.function(state, offsets[..., size:], *inputs)
 
         offsets = columns if measurement.additive else _block_diagonal(columns, noise.factor())
-        seen = self.transform(evaluate, offsets, measurement.residual, None, jacobian)
+        seen = transform(evaluate, offsets, measurement.residual)
         if seen.mean.shape[-1] != value.shape[-1]:
             raise ValueError(
                 f"the measurement's function returns {seen.mean.shape[-1]} components, the value has {value.shape[-1]}"

@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.factors import cholesky, square, triangularise
 from sigmaslam.filters.layout import choose
+from sigmaslam.filters.linalg.square_roots import cholesky, square, triangularise
 
 
 class Gaussian:

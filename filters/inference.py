@@ -18,7 +18,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.factors import (
+from sigmaslam.filters.failure import FilterError, name_elements
+from sigmaslam.filters.gaussian import Gaussian
+from sigmaslam.filters.linalg.square_roots import (
     apply,
     identity,
     multiply,
@@ -26,8 +28,6 @@ from sigmaslam.filters.factors import (
     solve_lower_transposed,
     triangularise,
 )
-from sigmaslam.filters.failure import FilterError, name_elements
-from sigmaslam.filters.gaussian import Gaussian
 from sigmaslam.filters.manifolds import Manifold
 from sigmaslam.filters.models import AnyMeasurement, LinearMeasurement
 from sigmaslam.filters.noise import Dense, Noise, Rooted, as_noise
@@ -218,12 +218,10 @@ class _Term:
                 # Without a prior the chart is at the state, where the given derivative is.
                 columns = problem.columns(anchor, zeta, state) if problem.has_prior else problem.root
                 jacobian = model.jacobian(state, *self.inputs)
-            seen = Taylor()(
+            seen = Taylor(jacobian)(
                 lambda offsets: model.function(problem.retract(anchor, shift + offsets), *self.inputs),
                 columns,
                 model.residual,
-                None,
-                jacobian,
             )
             slope = seen.columns.odd
             innovation = seen.from_mean(self.value, model.residual)

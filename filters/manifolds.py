@@ -23,9 +23,9 @@ from typing import ClassVar, Protocol
 import torch
 from torch import Tensor
 
-from sigmaslam.filters import groups
-from sigmaslam.filters.groups import Quaternion, Vector
+from sigmaslam.filters import lie_groups
 from sigmaslam.filters.layout import concatenate, stack
+from sigmaslam.filters.lie_groups import Quaternion, Vector
 
 
 class Manifold(Protocol):
@@ -98,16 +98,22 @@ class SO2:
     def retract(self, point: Tensor, tangent: Tensor) -> Tensor:
         """The sum as an angle, (..., 1)."""
         _check(self, point=point, tangent=tangent)
-        return groups.wrap_angle(point + tangent)
+        return lie_groups.wrap_angle(point + tangent)
 
     def local(self, point: Tensor, other: Tensor) -> Tensor:
         """The difference as an angle, (..., 1)."""
         _check(self, point=point, other=other)
-        return groups.wrap_angle(other - point)
+        return lie_groups.wrap_angle(other - point)
 
 
 @dataclass(frozen=True)
-class _Group:
+class LieGroup:
+    """A group whose points are composed: what SE2, SO3 and SE3 have in common.
+
+    Attributes:
+        side: "right", point * Exp(v), where v is seen from the moving frame; or "left", Exp(v) * point, from the fixed.
+    """
+
     side: str = "right"
     flat: ClassVar[bool] = False
 
@@ -120,11 +126,10 @@ class _Group:
 
 
 @dataclass(frozen=True)
-class SE2(_Group):
+class SE2(LieGroup):
     """Rigid motions of the plane: points (..., 3) are x, y, angle, tangents (..., 3) twists in the same order.
 
-    Attributes:
-        side: "right", point * Exp(v), where v is seen from the moving frame; or "left", Exp(v) * point, from the fixed.
+    For `side` see `LieGroup`.
     """
 
     point_size: ClassVar[int] = 3
@@ -135,31 +140,31 @@ class SE2(_Group):
         _check(self, point=point, tangent=tangent)
         x, y, angle = point.unbind(-1)
         u, v, added = tangent.unbind(-1)
-        a, b = groups.exp_se2((u, v), added)
+        a, b = lie_groups.exp_se2((u, v), added)
         if self.side == "right":
-            a, b = groups.turn(torch.sin(angle), torch.cos(angle), (a, b))
+            a, b = lie_groups.turn(torch.sin(angle), torch.cos(angle), (a, b))
         else:
-            x, y = groups.turn(torch.sin(added), torch.cos(added), (x, y))
-        return stack([x + a, y + b, groups.wrap_angle(angle + added)])
+            x, y = lie_groups.turn(torch.sin(added), torch.cos(added), (x, y))
+        return stack([x + a, y + b, lie_groups.wrap_angle(angle + added)])
 
     def local(self, point: Tensor, other: Tensor) -> Tensor:
         """The twist that retract takes from `point` to `other`: (..., 3), (..., 3) -> (..., 3)."""
         _check(self, point=point, other=other)
         x, y, angle = point.unbind(-1)
         a, b, other_angle = other.unbind(-1)
-        between = groups.wrap_angle(other_angle - angle)
+        between = lie_groups.wrap_angle(other_angle - angle)
         if self.side == "right":
-            step = groups.turn(-torch.sin(angle), torch.cos(angle), (a - x, b - y))
+            step = lie_groups.turn(-torch.sin(angle), torch.cos(angle), (a - x, b - y))
         else:
-            x, y = groups.turn(torch.sin(between), torch.cos(between), (x, y))
+            x, y = lie_groups.turn(torch.sin(between), torch.cos(between), (x, y))
             step = (a - x, b - y)
-        return stack([*groups.log_se2(step, between), between])
+        return stack([*lie_groups.log_se2(step, between), between])
 
     def from_matrix(self, matrix: Tensor) -> Tensor:
         """Points (..., 3) of homogeneous matrices (..., 3, 3)."""
         _check_matrix(self, matrix, 3)
         angle = torch.atan2(matrix[..., 1, 0], matrix[..., 0, 0])
-        return stack([matrix[..., 0, 2], matrix[..., 1, 2], groups.wrap_angle(angle)])
+        return stack([matrix[..., 0, 2], matrix[..., 1, 2], lie_groups.wrap_angle(angle)])
 
     def to_matrix(self, point: Tensor) -> Tensor:
         """Homogeneous matrices (..., 3, 3) of points (..., 3)."""
@@ -171,11 +176,10 @@ class SE2(_Group):
 
 
 @dataclass(frozen=True)
-class SO3(_Group):
+class SO3(LieGroup):
     """Rotations: points (..., 4) are unit quaternions x, y, z, w of either sign, tangents (..., 3) rotation vectors.
 
-    Attributes:
-        side: "right", point * Exp(v), where v is seen from the moving frame; or "left", Exp(v) * point, from the fixed.
+    For `side` see `LieGroup`.
     """
 
     point_size: ClassVar[int] = 4
@@ -184,34 +188,33 @@ class SO3(_Group):
     def retract(self, point: Tensor, tangent: Tensor) -> Tensor:
         """The rotation of which the vector is taken, at unit length: (..., 4), (..., 3) -> (..., 4)."""
         _check(self, point=point, tangent=tangent)
-        added = groups.exp_so3(_vector(tangent))
-        return stack(groups.normalise(_product(self.side, _quaternion(point), added)))
+        added = lie_groups.exp_so3(_vector(tangent))
+        return stack(lie_groups.normalise(_product(self.side, _quaternion(point), added)))
 
     def local(self, point: Tensor, other: Tensor) -> Tensor:
         """The rotation vector that takes `point` to `other`: (..., 4), (..., 4) -> (..., 3)."""
         _check(self, point=point, other=other)
-        return stack(groups.log_so3(_product(self.side, groups.conjugate(_quaternion(point)), _quaternion(other))))
+        return stack(
+            lie_groups.log_so3(_product(self.side, lie_groups.conjugate(_quaternion(point)), _quaternion(other)))
+        )
 
     def from_matrix(self, matrix: Tensor) -> Tensor:
         """Points (..., 4), with w >= 0, of rotation matrices (..., 3, 3)."""
         _check_matrix(self, matrix, 3)
-        return stack(groups.quaternion_from_matrix(matrix))
+        return stack(lie_groups.quaternion_from_matrix(matrix))
 
     def to_matrix(self, point: Tensor) -> Tensor:
         """Rotation matrices (..., 3, 3) of points (..., 4)."""
         _check(self, point=point)
-        return groups.matrix_from_quaternion(_quaternion(point))
+        return lie_groups.matrix_from_quaternion(_quaternion(point))
 
 
 @dataclass(frozen=True)
-class SE3(_Group):
+class SE3(LieGroup):
     """Rigid motions: points (..., 7) are translation and unit quaternion x, y, z, w, tangents (..., 6) twists.
 
     A twist is (translation, rotation), and what it leads to is the exponential of the group, so its translation bends
-    with its rotation.
-
-    Attributes:
-        side: "right", point * Exp(v), where v is seen from the moving frame; or "left", Exp(v) * point, from the fixed.
+    with its rotation. For `side` see `LieGroup`.
     """
 
     point_size: ClassVar[int] = 7
@@ -221,38 +224,38 @@ class SE3(_Group):
         """The motion of which the twist is taken, its quaternion at unit length: (..., 7), (..., 6) -> (..., 7)."""
         _check(self, point=point, tangent=tangent)
         start, turned = _rigid(point)
-        step, added = groups.exp_se3(*_twist(tangent))
+        step, added = lie_groups.exp_se3(*_twist(tangent))
         if self.side == "right":
-            step = groups.rotate(turned, step)
+            step = lie_groups.rotate(turned, step)
         else:
-            start = groups.rotate(added, start)
+            start = lie_groups.rotate(added, start)
         translation = [a + b for a, b in zip(start, step, strict=True)]
-        return stack([*translation, *groups.normalise(_product(self.side, turned, added))])
+        return stack([*translation, *lie_groups.normalise(_product(self.side, turned, added))])
 
     def local(self, point: Tensor, other: Tensor) -> Tensor:
         """The twist that retract takes from `point` to `other`: (..., 7), (..., 7) -> (..., 6)."""
         _check(self, point=point, other=other)
         (start, turned), (end, other_turned) = _rigid(point), _rigid(other)
-        back = groups.conjugate(turned)
+        back = lie_groups.conjugate(turned)
         between = _product(self.side, back, other_turned)
         if self.side == "right":
-            step = groups.rotate(back, _difference(end, start))
+            step = lie_groups.rotate(back, _difference(end, start))
         else:
-            step = _difference(end, groups.rotate(between, start))
-        translation, rotation = groups.log_se3(step, between)
+            step = _difference(end, lie_groups.rotate(between, start))
+        translation, rotation = lie_groups.log_se3(step, between)
         return stack([*translation, *rotation])
 
     def from_matrix(self, matrix: Tensor) -> Tensor:
         """Points (..., 7), with w >= 0, of homogeneous matrices (..., 4, 4)."""
         _check_matrix(self, matrix, 4)
-        quaternion = groups.quaternion_from_matrix(matrix[..., :3, :3])
+        quaternion = lie_groups.quaternion_from_matrix(matrix[..., :3, :3])
         return stack([*matrix[..., :3, 3].unbind(-1), *quaternion])
 
     def to_matrix(self, point: Tensor) -> Tensor:
         """Homogeneous matrices (..., 4, 4) of points (..., 7)."""
         _check(self, point=point)
         _, quaternion = _rigid(point)
-        return _homogeneous(groups.matrix_from_quaternion(quaternion), point[..., :3])
+        return _homogeneous(lie_groups.matrix_from_quaternion(quaternion), point[..., :3])
 
 
 @dataclass(frozen=True, init=False)
@@ -352,7 +355,7 @@ def _difference(end: Vector, start: Vector) -> Vector:
 
 def _product(side: str, point: Quaternion, added: Quaternion) -> Quaternion:
     """The rotation added on the given side of the point."""
-    return groups.multiply(point, added) if side == "right" else groups.multiply(added, point)
+    return lie_groups.multiply(point, added) if side == "right" else lie_groups.multiply(added, point)
 
 
 def _homogeneous(rotation: Tensor, translation: Tensor) -> Tensor:

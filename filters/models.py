@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
-from sigmaslam.filters.factors import apply
+from sigmaslam.filters.linalg.square_roots import apply
 from sigmaslam.filters.noise import Noise
 
 Function = Callable[..., Tensor]
@@ -113,8 +112,3 @@ class LinearMeasurement:
 
 AnyMotion = MotionModel | LinearMotion
 AnyMeasurement = MeasurementModel | LinearMeasurement
-
-
-def wrap_angle(angle: Tensor) -> Tensor:
-    """The same angle in [-pi, pi), radians, any shape."""
-    return torch.remainder(angle + torch.pi, 2 * torch.pi) - torch.pi

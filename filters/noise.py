@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.factors import cholesky, identity, log_diagonal, solve_lower, square, triangularise
+from sigmaslam.filters.linalg.square_roots import cholesky, identity, log_diagonal, solve_lower, square, triangularise
 
 
 class Noise(Protocol):
@@ -137,7 +138,27 @@ class BlockDiagonal:
         return BlockDiagonal(_masked(self.blocks, mask.unflatten(-1, (count, size))))
 
 
-class Dense:
+class _Correlated(ABC):
+    """A covariance whose root is a full triangle."""
+
+    @abstractmethod
+    def factor(self) -> Tensor:
+        """Lower triangular root of R, (..., m, m)."""
+
+    def triangularised(self, pieces: Sequence[Tensor]) -> Tensor:
+        """Lower root of R and more deviations."""
+        return triangularise([*pieces, self.factor()])
+
+    def whitened(self, columns: Tensor) -> Tensor:
+        """R^-1/2 columns, (..., m, c)."""
+        return solve_lower(self.factor(), columns, regular=True)
+
+    def log_determinant(self) -> Tensor:
+        """log |R|, (...,)."""
+        return log_diagonal(self.factor())
+
+
+class Dense(_Correlated):
     """Any covariance."""
 
     def __init__(self, covariance: Tensor) -> None:
@@ -163,24 +184,12 @@ class Dense:
         """Lower triangular root of R, (..., m, m)."""
         return _flagged(*cholesky(self._covariance))
 
-    def triangularised(self, pieces: Sequence[Tensor]) -> Tensor:
-        """Lower root of R and more deviations."""
-        return triangularise([*pieces, self.factor()])
-
-    def whitened(self, columns: Tensor) -> Tensor:
-        """R^-1/2 columns, (..., m, c)."""
-        return solve_lower(self.factor(), columns, regular=True)
-
-    def log_determinant(self) -> Tensor:
-        """log |R|, (...,)."""
-        return log_diagonal(self.factor())
-
     def masked(self, mask: Tensor) -> Dense:
         """Unit variance and no correlation where mask (..., m) is False."""
         return Dense(_masked(self._covariance, mask))
 
 
-class Rooted:
+class Rooted(_Correlated):
     """A covariance by its lower triangular root."""
 
     def __init__(self, root: Tensor) -> None:
@@ -203,18 +212,6 @@ class Rooted:
     def factor(self) -> Tensor:
         """Root of R, (..., m, m)."""
         return self._root
-
-    def triangularised(self, pieces: Sequence[Tensor]) -> Tensor:
-        """Lower root of R and more deviations."""
-        return triangularise([*pieces, self._root])
-
-    def whitened(self, columns: Tensor) -> Tensor:
-        """R^-1/2 columns, (..., m, c)."""
-        return solve_lower(self._root, columns, regular=True)
-
-    def log_determinant(self) -> Tensor:
-        """log |R|, (...,)."""
-        return log_diagonal(self._root)
 
     def masked(self, mask: Tensor) -> Dense:
         """Unit variance and no correlation where mask (..., m) is False."""

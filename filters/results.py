@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.factors import multiply
 from sigmaslam.filters.gaussian import Gaussian
+from sigmaslam.filters.linalg.square_roots import multiply
 from sigmaslam.filters.noise import Noise
 from sigmaslam.filters.sigma_points import Columns
 from sigmaslam.filters.updates import Form, Solution, log_likelihood
@@ -33,12 +33,6 @@ class Prediction:
     def healthy(self) -> Tensor:
         """(...,) bool, False for elements that the policy on failure had to deal with."""
         return _all_of(self.belief) if self._healthy is None else self._healthy
-
-    @property
-    def cross_covariance(self) -> Tensor:
-        """Covariance (..., n, n) of the prior state (rows) with the predicted one."""
-        root, columns = self._joint()
-        return root @ columns.odd.mT
 
     def joint_root(self) -> tuple[Tensor, list[Tensor], Tensor]:
         """Deviations of the predicted state from the prior's (..., n, n), all others (..., n, c), the prior's root."""

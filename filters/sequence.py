@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.factors import apply, multiply, solve_lower_transposed, square, triangularise
 from sigmaslam.filters.failure import FilterError
 from sigmaslam.filters.gaussian import Gaussian
+from sigmaslam.filters.linalg.square_roots import apply, multiply, solve_lower_transposed, square, triangularise
 from sigmaslam.filters.models import AnyMeasurement, AnyMotion
 from sigmaslam.filters.results import Prediction, Update
 

@@ -15,8 +15,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.factors import square
-from sigmaslam.filters.small import ROWS, join
+from sigmaslam.filters.linalg.square_roots import square
+from sigmaslam.filters.linalg.unrolled import ROWS, join
 
 
 @dataclass(frozen=True, slots=True)

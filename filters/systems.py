@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from sigmaslam.filters.layout import stack
-from sigmaslam.filters.models import LinearMotion, MeasurementModel, MotionModel, wrap_angle
+from sigmaslam.filters.lie_groups import wrap_angle
+from sigmaslam.filters.models import LinearMotion, MeasurementModel, MotionModel
 from sigmaslam.filters.noise import Noise
 
 
@@ -121,23 +122,6 @@ def differential_drive(noise: Noise | Tensor, time_step: float) -> MotionModel:
         )
 
     return MotionModel(drive, noise, additive=False)
-
-
-def landmark_in_robot_frame(noise: Noise | Tensor) -> MeasurementModel:
-    """Position of a landmark seen from the robot, metres forward and to the left, (9.45).
-
-    The state is (x, y, theta); the landmark (..., 2), its known position in the world, metres, is an input of `update`.
-
-    Args:
-        noise: covariance (..., 2, 2), square metres.
-    """
-
-    def see(state: Tensor, landmark: Tensor) -> Tensor:
-        x, y = landmark[..., 0] - state[..., 0], landmark[..., 1] - state[..., 1]
-        cosine, sine = torch.cos(state[..., 2]), torch.sin(state[..., 2])
-        return stack([x * cosine + y * sine, y * cosine - x * sine])
-
-    return MeasurementModel(see, noise)
 
 
 def range_and_bearing(noise: Noise | Tensor) -> MeasurementModel:

@@ -18,6 +18,7 @@ from sigmaslam.filters.sigma_points import Columns, SigmaPoints, Symmetric
 
 Evaluate = Callable[[Tensor], Tensor]
 Difference = Callable[[Tensor, Tensor], Tensor]
+Recentre = Callable[[Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,17 +46,11 @@ class Transform(Protocol):
     """Sends a Gaussian with a root (..., n, c) of its covariance through a function."""
 
     def __call__(
-        self,
-        evaluate: Evaluate,
-        columns: Tensor,
-        difference: Difference | None,
-        recentre: Callable[[Tensor, Tensor], Tensor] | None = None,
-        jacobian: Tensor | None = None,
+        self, evaluate: Evaluate, columns: Tensor, difference: Difference | None, recentre: Recentre | None = None
     ) -> Transformed:
         """Values, through `difference` where they are not vectors.
 
-        `recentre(reference, mean)` makes a new reference of the mean, where deviations are to be seen from there;
-        `jacobian` (..., m, n) is the derivative at the mean where the model gives one.
+        `recentre(reference, mean)` makes a new reference of the mean, where deviations are to be seen from there.
         """
         ...
 
@@ -67,12 +62,7 @@ class Unscented:
     points: SigmaPoints = field(default_factory=Symmetric)
 
     def __call__(
-        self,
-        evaluate: Evaluate,
-        columns: Tensor,
-        difference: Difference | None,
-        recentre: Callable[[Tensor, Tensor], Tensor] | None = None,
-        jacobian: Tensor | None = None,
+        self, evaluate: Evaluate, columns: Tensor, difference: Difference | None, recentre: Recentre | None = None
     ) -> Transformed:
         """One call of the function for all points."""
         size = columns.shape[-1]
@@ -93,24 +83,25 @@ class Unscented:
         return Transformed(reference, mean, self.points.deviations(local, mean, size, with_centre))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Taylor:
-    """By the first derivative at the mean (9.26, Table 9.1), by forward-mode differentiation unless it is given."""
+    """By the first derivative at the mean (9.26, Table 9.1).
+
+    Attributes:
+        jacobian: (..., m, n) the derivative where the model gives it; None: by forward-mode differentiation.
+    """
+
+    jacobian: Tensor | None = None
 
     def __call__(
-        self,
-        evaluate: Evaluate,
-        columns: Tensor,
-        difference: Difference | None,
-        recentre: Callable[[Tensor, Tensor], Tensor] | None = None,
-        jacobian: Tensor | None = None,
+        self, evaluate: Evaluate, columns: Tensor, difference: Difference | None, recentre: Recentre | None = None
     ) -> Transformed:
         """All directional derivatives in one pass."""
         directions = columns.movedim(-1, 0)
-        if jacobian is not None or difference is not None:
+        if self.jacobian is not None or difference is not None:
             reference = evaluate(torch.zeros_like(directions[:1]))[0]
-        if jacobian is not None:
-            odd = jacobian @ columns
+        if self.jacobian is not None:
+            odd = self.jacobian @ columns
             mean = reference if difference is None else torch.zeros_like(odd[..., 0])
             return Transformed(None if difference is None else reference, mean, Columns(odd))
 
@@ -127,14 +118,7 @@ class Taylor:
 class Exact:
     """Refuses functions: the Kalman filter is for linear models, which need no transform."""
 
-    def __call__(
-        self,
-        evaluate: Evaluate,
-        columns: Tensor,
-        difference: Difference | None,
-        recentre: Callable[[Tensor, Tensor], Tensor] | None = None,
-        jacobian: Tensor | None = None,
-    ) -> Transformed:
+    def __call__(self, *arguments: object, **options: object) -> Transformed:
         """Raises TypeError."""
         raise TypeError(
             "the Kalman filter takes LinearMotion and LinearMeasurement on R^n; use ExtendedKalmanFilter or "

@@ -20,7 +20,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.factors import (
+from sigmaslam.filters.layout import choose
+from sigmaslam.filters.linalg.square_roots import (
     apply,
     cholesky,
     identity,
@@ -31,10 +32,9 @@ from sigmaslam.filters.factors import (
     square,
     triangularise,
 )
-from sigmaslam.filters.layout import choose
+from sigmaslam.filters.linalg.unrolled import is_small, join, stacked_update
 from sigmaslam.filters.noise import Dense, Noise, Rooted
 from sigmaslam.filters.sigma_points import Columns
-from sigmaslam.filters.small import is_small, join, stacked_update
 
 Form = Literal["dense", "low-rank", "qr"]
 FORMS: tuple[Form, ...] = ("dense", "low-rank", "qr")

@@ -19,16 +19,16 @@ from torch import Tensor, nn
 
 from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.files import atomic_path, atomic_write_text, make_folder
-from sigmaslam.filters.constant_velocity import STATE_SIZE, Predict
-from sigmaslam.filters.lie import exp_se3
-from sigmaslam.filters.stereo_window import Transfer
+from sigmaslam.filters.onnx.constant_velocity import STATE_SIZE, Predict
+from sigmaslam.filters.onnx.se3 import exp_se3
+from sigmaslam.filters.onnx.stereo_window import Transfer
 from sigmaslam.models.card import card_page, read_card, scoring_page
 from sigmaslam.models.extractor import EXTRACTOR_SIZE_MULTIPLE, FeatureExtractor
 from sigmaslam.models.network import DESCRIPTOR_SIZE, STRIDE, FeatureNetwork
 from sigmaslam.models.scorer import NEIGHBOURS, SIDE_CHANNELS, MatchScorer, ScoredMatches
 from sigmaslam.models.verifier import VERIFIER_COLUMNS, MatchCovariance, MatchVerifier
 from sigmaslam.session import OnnxGraph
-from sigmaslam.synthetic.textures import dead_leaves
+from sigmaslam.synthetic.rendering.textures import dead_leaves
 
 _OPSET = 20
 # ONNX Runtime and torch may order sums differently; more than this is a wrong graph.

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from sigmaslam.filters.constant_velocity import Predict
-from sigmaslam.filters.stereo_window import Transfer
+from sigmaslam.filters.onnx.constant_velocity import Predict
+from sigmaslam.filters.onnx.stereo_window import Transfer
 from sigmaslam.models.export import load_network, load_scorer, load_verifier
 from sigmaslam.models.extractor import FeatureExtractor
 from sigmaslam.models.scorer import ScoredMatches

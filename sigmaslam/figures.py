@@ -11,13 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sigmaslam.files import atomic_path
+from sigmaslam.plot_style import GREY, SERIES, style_axes
 from sigmaslam.trajectory import Trajectory
-
-# Okabe and Ito's palette, which people with colour-blindness can tell apart.
-BLUE, VERMILLION, GREEN, ORANGE = "#0072B2", "#D55E00", "#009E73", "#E69F00"
-SKY, PURPLE, GREY, BLACK = "#56B4E9", "#CC79A7", "#8C8C8C", "#1A1A1A"
-SERIES = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
-"""Colours of series in the order to use them."""
 
 AXIS_NAMES = ("x", "y", "z")
 
@@ -76,14 +71,6 @@ def plot_trajectory(
     axes.legend(loc="best", fontsize=8, framealpha=0.85, markerscale=1.0 if points is None else 3.0)
     style_axes(axes)
     return horizontal, vertical, height
-
-
-def style_axes(axes: Axes) -> None:
-    """A light grid, and no frame at the top and right."""
-    axes.grid(True, color="#D9D9D9", lw=0.6)
-    axes.set_axisbelow(True)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
 
 
 def save_png(figure: Figure, path: str | Path, dots_per_inch: int = 130) -> None:

@@ -8,7 +8,7 @@ from sigmaslam.config import TrackerConfig
 from sigmaslam.rotation import nearest_rigid, se3_inverse, se3_log
 from sigmaslam.session import load_step
 
-# Order of the graph's error state, see sigmaslam.filters.constant_velocity.
+# Order of the graph's error state, see sigmaslam.filters.onnx.constant_velocity.
 _POSE, _TWIST, _STATE_SIZE = slice(0, 6), slice(6, 12), 12
 
 

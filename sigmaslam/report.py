@@ -16,8 +16,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
 from sigmaslam.errors import InputError
-from sigmaslam.figures import BLUE, GREEN, GREY, PURPLE, SERIES, VERMILLION, plot_trajectory, style_axes, to_svg
+from sigmaslam.figures import plot_trajectory, to_svg
 from sigmaslam.files import atomic_write_text
+from sigmaslam.plot_style import BLUE, GREEN, GREY, PURPLE, SERIES, VERMILLION, style_axes
 from sigmaslam.trajectory import Trajectory, read_tum
 
 COLUMNS = (

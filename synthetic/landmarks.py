@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from sigmaslam.synthetic.rendering.visibility import Sight
 from sigmaslam.synthetic.simulation import Studio
 from sigmaslam.synthetic.truth import arrive
-from sigmaslam.synthetic.visibility import Sight
 
 _MOST_VIEWS = 200
 _FRAMES_A_VIEW = 5  # new landmarks are taken in every so many frames ...

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sigmaslam.synthetic.bank import TextureBank
-from sigmaslam.synthetic.fills import fixed_point, log_uniform
-from sigmaslam.synthetic.sensor import expose, random_sensor
-from sigmaslam.synthetic.textures import leaf_outline
+from sigmaslam.synthetic.camera.sensor import expose, random_sensor
+from sigmaslam.synthetic.rendering.bank import TextureBank
+from sigmaslam.synthetic.rendering.fills import fixed_point, log_uniform
+from sigmaslam.synthetic.rendering.textures import leaf_outline
 
 _TEXTURE_SIZE = 448
 

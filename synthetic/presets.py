@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 
 from sigmaslam.camera import CameraModel, DistortionModel
-from sigmaslam.synthetic.rig import Miscalibration, Rig, loose_rig, parallel_rig
-from sigmaslam.synthetic.sensor import Sensor
+from sigmaslam.synthetic.camera.rig import Miscalibration, Rig, loose_rig, parallel_rig
+from sigmaslam.synthetic.camera.sensor import Sensor
 from sigmaslam.synthetic.worlds import colon, hall, organ, room, street, tool
 from sigmaslam.synthetic.worlds.episode import Episode, Wish
 

@@ -13,8 +13,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sigmaslam.errors import InputError
-from sigmaslam.synthetic.paths import Path
-from sigmaslam.synthetic.shapes import SHAPES, Shape
+from sigmaslam.synthetic.geometry import rigid_motion
+from sigmaslam.synthetic.motion.paths import Path
+from sigmaslam.synthetic.rendering.shapes import SHAPES, Shape
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,10 +78,7 @@ class Body:
         """T_world_body at that time, (4, 4)."""
         if self.path is not None:
             return self.path.poses(np.array([time]))[0]
-        T = np.eye(4)
-        T[:3, :3] = Rotation.from_rotvec(self.rotation).as_matrix()
-        T[:3, 3] = self.position
-        return T
+        return rigid_motion(Rotation.from_rotvec(self.rotation).as_matrix(), self.position)
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,10 +10,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from sigmaslam.camera import CameraModel
-from sigmaslam.synthetic.renderer import Renderer, Views
-from sigmaslam.synthetic.sensor import Sensor, expose, random_sensor
+from sigmaslam.synthetic.camera.sensor import Sensor, expose, random_sensor
+from sigmaslam.synthetic.geometry import rigid_motion
+from sigmaslam.synthetic.rendering.renderer import Renderer, Views
+from sigmaslam.synthetic.rendering.visibility import Eye
 from sigmaslam.synthetic.truth import at_pixels, transfer
-from sigmaslam.synthetic.visibility import Eye
 from sigmaslam.synthetic.worlds import colon, hall, organ, room, street
 from sigmaslam.synthetic.worlds.episode import Wish
 
@@ -174,9 +175,7 @@ def _to_right_eye(rng: np.random.Generator, depth: float) -> np.ndarray:
 
 def _step_aside(rng: np.random.Generator, depth: float) -> np.ndarray:
     """A small random motion of the camera, (4, 4): mostly a turn, a roll now and then."""
-    T = np.eye(4)
     turn = np.deg2rad(6.0) * rng.standard_normal(3)
     turn[2] += np.deg2rad(rng.uniform(-40.0, 40.0)) if rng.random() < 0.4 else 0.0
-    T[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
-    T[:3, 3] = depth * rng.uniform(0.0, 0.08) * rng.standard_normal(3) * np.array([1.0, 0.5, 0.5])
-    return T
+    step = depth * rng.uniform(0.0, 0.08) * rng.standard_normal(3) * np.array([1.0, 0.5, 0.5])
+    return rigid_motion(Rotation.from_rotvec(turn).as_matrix(), step)

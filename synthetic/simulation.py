@@ -10,15 +10,15 @@ import numpy as np
 import torch
 
 from sigmaslam.errors import InputError
+from sigmaslam.synthetic.camera.rig import Miscalibration, Rig
+from sigmaslam.synthetic.camera.sensor import Sensor, expose, exposure_gains
 from sigmaslam.synthetic.choices import MOTIONS
-from sigmaslam.synthetic.paths import Path
+from sigmaslam.synthetic.motion.paths import Path
 from sigmaslam.synthetic.presets import EXPOSURES, PRESETS, SENSORS, Layout
-from sigmaslam.synthetic.renderer import Renderer, Views
-from sigmaslam.synthetic.rig import Miscalibration, Rig
+from sigmaslam.synthetic.rendering.renderer import Renderer, Views
+from sigmaslam.synthetic.rendering.visibility import Eye
 from sigmaslam.synthetic.scene import Scene
-from sigmaslam.synthetic.sensor import Sensor, expose, exposure_gains
 from sigmaslam.synthetic.truth import flow
-from sigmaslam.synthetic.visibility import Eye
 from sigmaslam.synthetic.worlds.episode import Wish
 
 _BRIGHTNESS = 0.48  # mean of the linear image that the exposure aims at

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from sigmaslam.synthetic.renderer import Views
-from sigmaslam.synthetic.visibility import Sight, move
+from sigmaslam.synthetic.rendering.renderer import Views
+from sigmaslam.synthetic.rendering.visibility import Sight, move
 
 _BORDER = 1e-6  # pixels; what stands still at the image's edge stays in it whatever the rounding
 

@@ -2,22 +2,26 @@
 
 import ast
 import re
+import subprocess
+import sys
 import tomllib
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
 
+import sigmaslam
+
 ROOT = Path(__file__).resolve().parents[1]
 MAPPED = ("evaluation", "filters", "models", "synthetic", "training")
-# What a layer must never import.
+# What a layer must never import, nor anything that it imports: names of modules or of folders outside the layer.
 FORBIDDEN = {
     "filters": ("models", "training", "synthetic", "evaluation", "tracker", "frontend", "camera"),
     "synthetic": ("models", "training", "evaluation", "tracker", "filters"),
     "models": ("training", "evaluation", "tracker", "frontend"),
     "sigmaslam": ("training", "synthetic", "torch"),
 }
-# The command line reaches everything, each part where its command needs it.
-EXCEPTIONS = (Path("sigmaslam/cli"),)
 
 
 def test_the_package_list_names_every_folder_with_modules():
@@ -44,19 +48,74 @@ def test_the_link_inside_the_package_leads_to_the_folder(name: str):
 
 @pytest.mark.parametrize("layer", FORBIDDEN)
 def test_lower_layers_do_not_import_upper_ones(layer: str):
-    for path in (ROOT / layer).rglob("*.py"):
-        inner = path.relative_to(ROOT)
-        if any((ROOT / parent).is_symlink() for parent in inner.parents) or inner.parent in EXCEPTIONS:
+    importer: dict[str, str] = {}
+    pending = _modules_of(layer)
+    while pending:
+        module = pending.pop()
+        for imported in _imports(module) - importer.keys():
+            importer[imported] = module
+            pending.append(imported)
+    for module in importer:
+        if f"{module}.".startswith(f"sigmaslam.{layer}."):
             continue
-        # Imports at the start of a line: those inside functions are lazy, for extras.
-        for module in re.findall(r"^(?:from|import) ([\w.]+)", path.read_text(), re.MULTILINE):
-            parts = module.removeprefix("sigmaslam.").split(".")
-            assert parts[0] not in FORBIDDEN[layer], f"{inner} imports {module}"
+        parts = module.split(".")
+        # Of others' modules only the package counts.
+        if set(parts if parts[0] == "sigmaslam" else parts[:1]) & set(FORBIDDEN[layer]):
+            chain = [module]
+            while chain[0] in importer and importer[chain[0]] not in chain:
+                chain.insert(0, importer[chain[0]])
+            pytest.fail(f"{layer} imports {module}: {' -> '.join(chain)}")
 
 
-@pytest.mark.parametrize("path", sorted(p for n in ("sigmaslam", *MAPPED) for p in (ROOT / n).glob("*.py")), ids=str)
-def test_imports_are_absolute(path: Path):
-    assert not re.search(r"^from \.", path.read_text(), re.MULTILINE)
+def test_imports_for_type_checking_and_inside_functions_do_not_count():
+    source = """
+import a
+from typing import TYPE_CHECKING
+if TYPE_CHECKING:
+    import b
+else:
+    import c
+def function():
+    import d
+try:
+    from e import f
+except ImportError:
+    f = None
+class Class:
+    from g import h
+"""
+    assert set(_top_level_imports(ast.parse(source))) == {
+        "a",
+        "typing",
+        "typing.TYPE_CHECKING",
+        "c",
+        "e",
+        "e.f",
+        "g",
+        "g.h",
+    }
+
+
+@pytest.mark.parametrize("module", ["sigmaslam.filters", "sigmaslam.filters.consistency.plots"])
+def test_the_filters_load_neither_opencv_nor_onnxruntime(module: str):
+    code = f"import sys, {module}; print(*sorted({{name.split('.')[0] for name in sys.modules}}))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split())
+    assert {"sigmaslam", "torch"} <= loaded
+    assert not loaded & {"cv2", "onnxruntime"}
+
+
+def test_every_public_name_of_the_package_is_there():
+    for name in sigmaslam.__all__:
+        assert getattr(sigmaslam, name).__name__ == name
+        assert name in dir(sigmaslam)
+    with pytest.raises(AttributeError, match="has no attribute 'Tracker'"):
+        _ = sigmaslam.Tracker
+
+
+def test_imports_are_absolute():
+    for path in _files().values():
+        assert not re.search(r"^from \.", path.read_text(), re.MULTILINE), path
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "tests").rglob("*.py")), ids=lambda path: path.name)
@@ -76,3 +135,56 @@ def test_tests_share_through_the_support_package_alone(path: Path):
             assert parts[0] not in siblings, f"line {node.lineno} imports {module}, a file beside it: use tests.support"
             parts = parts[1:] if parts[0] == "tests" else parts[:1]
             assert not any(part.startswith("test_") for part in parts), f"line {node.lineno} imports the test {module}"
+
+
+@cache
+def _files() -> dict[str, Path]:
+    """The file of each module of the project, by its dotted name."""
+    files = {}
+    for name in ("sigmaslam", *MAPPED):
+        for path in (ROOT / name).rglob("*.py"):
+            inner = path.relative_to(ROOT)
+            if any((ROOT / parent).is_symlink() for parent in inner.parents):
+                continue
+            parts = inner.with_suffix("").parts
+            if parts[-1] == "__init__":
+                parts = parts[:-1]
+            files[".".join(parts if name == "sigmaslam" else ("sigmaslam", *parts))] = path
+    return files
+
+
+def _modules_of(layer: str) -> list[str]:
+    return [module for module, path in _files().items() if path.relative_to(ROOT).parts[0] == layer]
+
+
+@cache
+def _imports(module: str) -> frozenset[str]:
+    """Modules that an import of this one runs: what it imports itself, and the packages it lies in.
+
+    Modules of others have no imports here.
+    """
+    if module not in _files():
+        return frozenset()
+    named = set(_top_level_imports(ast.parse(_files()[module].read_text())))
+    # `from package import name` names a module only if there is one.
+    imported = {name for name in named if not name.startswith("sigmaslam") or name in _files()}
+    for name in [module, *imported]:
+        parts = name.split(".")
+        imported |= {".".join(parts[:count]) for count in range(1, len(parts))}
+    return frozenset(imported - {module})
+
+
+def _top_level_imports(tree: ast.AST) -> Iterator[str]:
+    """Names of modules, and of what is imported from them, outside functions and `if TYPE_CHECKING:`."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.module is not None
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
+            for other in node.orelse:
+                yield from _top_level_imports(ast.Module([other], []))
+        elif not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            yield from _top_level_imports(node)

@@ -18,8 +18,8 @@ from sigmaslam.frontend.learned import LearnedDetector
 from sigmaslam.frontend.matching import Putative, nearest_anywhere, nearest_in_ellipses, nearest_in_rows
 from sigmaslam.frontend.types import Features
 from sigmaslam.synthetic.pairs import HomographyPairs
+from sigmaslam.synthetic.rendering.textures import KINDS
 from sigmaslam.synthetic.scene_pairs import ScenePairs
-from sigmaslam.synthetic.textures import KINDS
 from sigmaslam.training.stream import PairStream, prepare_worker, take_turn
 
 DETECTORS: dict[str, Callable[[int], Callable[[np.ndarray], Features]]] = {

@@ -148,7 +148,7 @@ def format_costs(costs: Sequence[Cost], reference: str) -> list[str]:
 
 def photograph_like(shape: tuple[int, int]) -> np.ndarray:
     """(H, W) uint8 dead leaves, whose statistics are those of photographs, with a lens's blur and a sensor's noise."""
-    from sigmaslam.synthetic.textures import dead_leaves
+    from sigmaslam.synthetic.rendering.textures import dead_leaves
 
     rng = np.random.default_rng(_SEED)
     image = cv2.GaussianBlur(dead_leaves(shape, rng).astype(np.float32), (0, 0), 0.7)

@@ -20,7 +20,7 @@ from torch import Generator, Tensor
 from sigmaslam.evaluation import scenarios
 from sigmaslam.evaluation.benchmarks.page import header, row, write_page
 from sigmaslam.evaluation.scenarios import Outcome, Scenario, run
-from sigmaslam.figures import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION, save_png, style_axes
+from sigmaslam.figures import save_png
 from sigmaslam.filters import (
     SE2,
     SO2,
@@ -34,6 +34,7 @@ from sigmaslam.filters import (
     UnscentedKalmanFilter,
 )
 from sigmaslam.filters.systems import differential_drive
+from sigmaslam.plot_style import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION, style_axes
 
 # Independent groups of runs or samples, from whose scatter the intervals come.
 _GROUPS = 20

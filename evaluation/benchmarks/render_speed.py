@@ -153,8 +153,8 @@ def _work(kind: str, preset: str, seed: int) -> tuple[float, list[list[_Lap]]]:
 def _work_stereo(preset: str, seed: int) -> tuple[float, list[list[_Lap]]]:
     import torch
 
+    from sigmaslam.synthetic.camera.rig import Miscalibration
     from sigmaslam.synthetic.presets import PRESETS
-    from sigmaslam.synthetic.rig import Miscalibration
     from sigmaslam.synthetic.simulation import Recipe, Studio, simulate
 
     frames = _STEREO_PAIRS * (_REPEATS + 1)

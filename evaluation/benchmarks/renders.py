@@ -23,7 +23,8 @@ from sigmaslam.evaluation.benchmarks import render_speed as speed
 from sigmaslam.evaluation.benchmarks.image_statistics import ImageSet
 from sigmaslam.evaluation.benchmarks.page import row, write_page
 from sigmaslam.evaluation.matching.photographs import read_grey
-from sigmaslam.figures import BLACK, GREY, SERIES, save_png, style_axes
+from sigmaslam.figures import save_png
+from sigmaslam.plot_style import BLACK, GREY, SERIES, style_axes
 from sigmaslam.readers import open_sequence
 
 _RAW = "KITTI raw"  # before it was rectified: what the sensor itself does

@@ -16,9 +16,9 @@ from sigmaslam.frontend.types import Features
 from sigmaslam.match import match_features
 from sigmaslam.rotation import rotation_log
 from sigmaslam.startup import estimate_relative_pose
+from sigmaslam.synthetic.rendering.visibility import move
 from sigmaslam.synthetic.scene_pairs import ScenePair, ScenePairs
 from sigmaslam.synthetic.truth import at_pixels
-from sigmaslam.synthetic.visibility import move
 
 SHARES = (0.35, 0.5)
 """Between these are the shares of right matches on moving things: beyond a half the scene may be the lesser body."""

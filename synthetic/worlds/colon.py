@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from sigmaslam.synthetic.paths import Path
+from sigmaslam.synthetic.geometry import arc_length
+from sigmaslam.synthetic.motion.paths import Path
+from sigmaslam.synthetic.motion.trajectories import insertion
+from sigmaslam.synthetic.rendering.shapes import Tube
 from sigmaslam.synthetic.scene import Body, Material, Scene
-from sigmaslam.synthetic.shapes import Tube
-from sigmaslam.synthetic.trajectories import insertion
 from sigmaslam.synthetic.worlds.episode import Episode, Wish
 from sigmaslam.synthetic.worlds.tissue import (
     NEAR,
@@ -75,7 +76,7 @@ def _centreline(rng: np.random.Generator, length: float, radius: float) -> np.nd
 
 
 def _insertion(rng: np.random.Generator, seconds: float, centreline: np.ndarray, tube: Tube) -> Path:
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centreline, axis=0), axis=1))])
+    arc = arc_length(centreline)
     way = CubicSpline(arc, centreline)(np.linspace(0.01, arc[-1] - _AHEAD, 40))
     free = tube.radius - tube.folds - 4 * tube.bumps - CLEARANCE
     return insertion(rng, seconds, way, 0.7 * free / 0.6)  # which stays within 0.6 of the radius that it is given

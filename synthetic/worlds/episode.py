@@ -7,7 +7,7 @@ from pathlib import Path as FilePath
 
 import numpy as np
 
-from sigmaslam.synthetic.paths import Path
+from sigmaslam.synthetic.motion.paths import Path
 from sigmaslam.synthetic.scene import Scene, Texture
 
 

@@ -7,10 +7,11 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sigmaslam.synthetic import trajectories
-from sigmaslam.synthetic.paths import Path, at_rest, with_stops
+from sigmaslam.synthetic.geometry import rigid_motion
+from sigmaslam.synthetic.motion import trajectories
+from sigmaslam.synthetic.motion.paths import Path, at_rest, with_stops
+from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel
 from sigmaslam.synthetic.scene import Body, Lights, Scene
-from sigmaslam.synthetic.shapes import Box, Cylinder, Ellipsoid, Panel
 from sigmaslam.synthetic.worlds.episode import Episode, Wish
 from sigmaslam.synthetic.worlds.movers import Model, Part, bounds, centred, follow, stand
 from sigmaslam.synthetic.worlds.street_furniture import person
@@ -356,10 +357,7 @@ def _flight(rng: np.random.Generator, wish: Wish, size: np.ndarray, clearance: f
 
 
 def _pose(place: np.ndarray, yaw: float) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler("z", yaw).as_matrix()
-    T[:3, 3] = place
-    return T
+    return rigid_motion(Rotation.from_euler("z", yaw).as_matrix(), place)
 
 
 def _palette(rng: np.random.Generator, wish: Wish) -> Palette:

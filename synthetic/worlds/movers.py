@@ -10,9 +10,10 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sigmaslam.synthetic.paths import Path, noise
+from sigmaslam.synthetic.geometry import rigid_motion
+from sigmaslam.synthetic.motion.paths import Path, noise
+from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel
 from sigmaslam.synthetic.scene import Body
-from sigmaslam.synthetic.shapes import Box, Cylinder, Ellipsoid, Panel
 
 _HALF_VIEW = (np.tan(np.deg2rad(35.0)), 0.75 * np.tan(np.deg2rad(35.0)))
 """Half the view at distance 1 for which shares are meant: 70 degrees across, 4 : 3."""
@@ -38,23 +39,20 @@ class Part:
 
     def pose(self) -> np.ndarray:
         """T_model_part, (4, 4)."""
-        T = np.eye(4)
-        T[:3, :3] = Rotation.from_rotvec(self.rotation).as_matrix()
-        T[:3, 3] = self.position
-        return T
+        return rigid_motion(Rotation.from_rotvec(self.rotation).as_matrix(), self.position)
 
 
 Model = tuple[Part, ...]
 """A thing in its own frame."""
 
 
-def stand(model: Model, T_world_model: np.ndarray, *, shadow: bool = True) -> list[Body]:
+def stand(model: Model, T_world_model: np.ndarray) -> list[Body]:
     """The model at rest at a pose (4, 4)."""
     R = Rotation.from_matrix(T_world_model[:3, :3])
     rotations = (R * Rotation.from_rotvec([part.rotation for part in model])).as_rotvec().tolist()
     positions = np.array([part.position for part in model]) @ T_world_model[:3, :3].T + T_world_model[:3, 3]
     return [
-        Body(part.shape, part.material, tuple(position), tuple(rotation), shadow=shadow)
+        Body(part.shape, part.material, tuple(position), tuple(rotation))
         for part, position, rotation in zip(model, positions.tolist(), rotations, strict=True)
     ]
 
@@ -144,10 +142,10 @@ def follow(
     share: float,
     models: Sequence[Model],
     distance: tuple[float, float],
-    *,
-    upright: bool = True,
 ) -> list[Body]:
     """Bodies that keep in front of a camera, with smooth motions of their own.
+
+    They turn about z only, and stay when the camera bobs.
 
     Args:
         rng: source of all randomness.
@@ -156,11 +154,10 @@ def follow(
         share: of the image that they cover together, on average.
         models: about the origin, of any size; they are enlarged to cover the share.
         distance: nearest and farthest that their nearest points come, metres.
-        upright: they turn about z only, and stay when the camera bobs; else they also follow its pitch and roll.
     """
     times = knot_times(duration)
     at = camera.poses(times)
-    frame = _level(at[:, :3, :3]) if upright else at[:, :3, :3]
+    frame = _level(at[:, :3, :3])
     ways = []
     for k, model in enumerate(models):
         # Side by side across the view, each with a wandering of its own.
@@ -172,8 +169,6 @@ def follow(
         T = np.tile(np.eye(4), (len(times), 1, 1))
         turn = rng.uniform(-np.pi, np.pi) + 0.4 * noise(rng, times, 1, 0.02, 0.1)[:, 0]
         T[:, :3, :3] = Rotation.from_euler("z", turn[:, None]).as_matrix()
-        if not upright:
-            T[:, :3, :3] = frame @ T[:, :3, :3]
         rays = (frame @ np.column_stack([place, np.ones(len(times))])[:, :, None])[:, :, 0]
         reach = float(np.linalg.norm(np.maximum(*np.abs(bounds(model, 0.0)))))
         ways.append((model, T, rays, depth, reach))

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sigmaslam.synthetic.paths import Path
+from sigmaslam.synthetic.motion.paths import Path
+from sigmaslam.synthetic.motion.trajectories import inspect
+from sigmaslam.synthetic.rendering.shapes import Sheet
 from sigmaslam.synthetic.scene import Body, Material, Scene
-from sigmaslam.synthetic.shapes import Sheet
-from sigmaslam.synthetic.trajectories import inspect
 from sigmaslam.synthetic.worlds.episode import Episode, Wish
 from sigmaslam.synthetic.worlds.tissue import (
     NEAR,

@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sigmaslam.synthetic.paths import Path, at_rest, with_stops
+from sigmaslam.synthetic.motion.paths import Path, at_rest, with_stops
+from sigmaslam.synthetic.motion.trajectories import Box as FreeSpace
+from sigmaslam.synthetic.motion.trajectories import closed_loop, hand_held, pure_rotation
+from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel, Shape
 from sigmaslam.synthetic.scene import Body, Lights, Material, Scene, Texture
-from sigmaslam.synthetic.shapes import Box, Cylinder, Ellipsoid, Panel, Shape
-from sigmaslam.synthetic.trajectories import Box as FreeSpace
-from sigmaslam.synthetic.trajectories import closed_loop, hand_held, pure_rotation
 from sigmaslam.synthetic.worlds.episode import Episode, Wish
 from sigmaslam.synthetic.worlds.movers import Model, Part, follow
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from sigmaslam.synthetic import trajectories
-from sigmaslam.synthetic.paths import Path, at_rest, with_stops
+from sigmaslam.synthetic.motion import trajectories
+from sigmaslam.synthetic.motion.paths import Path, at_rest, with_stops
 from sigmaslam.synthetic.scene import Lights, Scene
 from sigmaslam.synthetic.worlds.episode import Episode, Wish
 from sigmaslam.synthetic.worlds.street_layout import Street

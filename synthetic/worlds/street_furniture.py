@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sigmaslam.synthetic.shapes import Box, Cylinder, Ellipsoid, Panel
+from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel
 from sigmaslam.synthetic.worlds.movers import Model, Part
 from sigmaslam.synthetic.worlds.street_palette import Palette
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sigmaslam.synthetic.shapes import Box, Cylinder, Panel
+from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Panel
 from sigmaslam.synthetic.worlds.movers import Model, Part
 from sigmaslam.synthetic.worlds.street_palette import Palette
 

@@ -8,8 +8,9 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sigmaslam.synthetic.geometry import rigid_motion
+from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel
 from sigmaslam.synthetic.scene import Body
-from sigmaslam.synthetic.shapes import Box, Cylinder, Ellipsoid, Panel
 from sigmaslam.synthetic.worlds.movers import Model, stand
 from sigmaslam.synthetic.worlds.street_furniture import (
     bush,
@@ -301,10 +302,7 @@ class Street:
 
 
 def _upright(place: np.ndarray, z: float, rng: np.random.Generator) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler("z", rng.uniform(0, np.pi)).as_matrix()
-    T[:3, 3] = [*place, z]
-    return T
+    return rigid_motion(Rotation.from_euler("z", rng.uniform(0, np.pi)).as_matrix(), [*place, z])
 
 
 def _yawed_and_pitched(yaw: float, pitch: float) -> tuple[float, float, float, float]:

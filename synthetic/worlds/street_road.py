@@ -8,9 +8,10 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 from scipy.spatial import cKDTree
 
-from sigmaslam.synthetic.paths import noise
+from sigmaslam.synthetic.geometry import arc_length
+from sigmaslam.synthetic.motion.paths import noise
+from sigmaslam.synthetic.rendering.shapes import Panel, Terrain
 from sigmaslam.synthetic.scene import Body
-from sigmaslam.synthetic.shapes import Panel, Terrain
 
 CAMERA_HEIGHT = 1.65
 """Of the camera above the road, metres."""
@@ -40,7 +41,7 @@ class Road:
 
     def __init__(self, rng: np.random.Generator, way: np.ndarray, closed: bool, opposite: float) -> None:
         way = way[np.append(True, np.linalg.norm(np.diff(way, axis=0), axis=1) > 1e-6)]
-        arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way[:, :2], axis=0), axis=1))])
+        arc = arc_length(way[:, :2])
         self._way, self._arc = way, arc
         s = np.linspace(0.0, arc[-1], max(2, int(arc[-1] / _STEP) + 1))
         points = np.stack([np.interp(s, arc, way[:, k]) for k in range(3)], axis=-1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sigmaslam.synthetic.paths import Path, noise
+from sigmaslam.synthetic.motion.paths import Path, noise
 from sigmaslam.synthetic.scene import Body
 from sigmaslam.synthetic.worlds.episode import Wish
 from sigmaslam.synthetic.worlds.movers import Model, bisect, covered_share, knot_times, ride

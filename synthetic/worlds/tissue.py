@@ -9,10 +9,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sigmaslam.rotation import rotation_exp
-from sigmaslam.synthetic.paths import Path, at_rest, noise, with_stops
+from sigmaslam.synthetic.geometry import rigid_motion
+from sigmaslam.synthetic.motion.paths import Path, at_rest, noise, with_stops
+from sigmaslam.synthetic.motion.trajectories import tool as tool_motion
+from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid
 from sigmaslam.synthetic.scene import Body, Lights, Material, Texture
-from sigmaslam.synthetic.shapes import Box, Cylinder, Ellipsoid
-from sigmaslam.synthetic.trajectories import tool as tool_motion
 from sigmaslam.synthetic.worlds.episode import Wish
 from sigmaslam.synthetic.worlds.movers import Model, Part, bisect, covered_share, scaled
 
@@ -167,10 +168,7 @@ def reaching(
     x = np.cross(np.eye(3)[int(np.argmin(np.abs(target - port)))], z)
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     roll = Rotation.from_rotvec((rng.uniform(-np.pi, np.pi) + 0.35 * turning[:, 2:]) * [0.0, 0.0, 1.0])
-    T = np.tile(np.eye(4), (len(tip), 1, 1))
-    T[:, :3, :3] = np.stack([x, np.cross(z, x), z], axis=-1) @ roll.as_matrix()
-    T[:, :3, 3] = tip
-    return _through(free, T)
+    return _through(free, rigid_motion(np.stack([x, np.cross(z, x), z], axis=-1) @ roll.as_matrix(), tip))
 
 
 def instrument(

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from sigmaslam.synthetic.paths import Path, at_rest, view_rotations
+from sigmaslam.synthetic.motion.paths import Path, at_rest, view_rotations
+from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Panel, Sheet
 from sigmaslam.synthetic.scene import Body, Lights, Material, Scene
-from sigmaslam.synthetic.shapes import Box, Cylinder, Panel, Sheet
 from sigmaslam.synthetic.worlds.episode import Episode, Wish
 from sigmaslam.synthetic.worlds.tissue import NEAR, endoscope_light, instrument, lump, moved, placed, reaching, wet
 

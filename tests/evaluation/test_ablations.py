@@ -15,7 +15,7 @@ from sigmaslam.evaluation.benchmarks.ablations import VARIANTS, Variant, configu
 from sigmaslam.evaluation.matching.run import Scores
 from sigmaslam.evaluation.matching.sets import SELECTION
 from sigmaslam.models.network import FeatureNetwork
-from sigmaslam.synthetic.textures import dead_leaves
+from sigmaslam.synthetic.rendering.textures import dead_leaves
 from sigmaslam.training import loop
 from sigmaslam.training.loop import WEIGHTS_NAME
 

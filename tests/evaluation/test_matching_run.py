@@ -22,7 +22,7 @@ from sigmaslam.frontend.judge import MatchJudge
 from sigmaslam.frontend.types import Features
 from sigmaslam.match import match_features
 from sigmaslam.readers import open_sequence
-from sigmaslam.synthetic.textures import dead_leaves
+from sigmaslam.synthetic.rendering.textures import dead_leaves
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from sigmaslam.evaluation.matching.pairs import Disparity, Homography, Motion, r
 from sigmaslam.evaluation.matching.photographs import find_occluded, middlebury, warped_pair
 from sigmaslam.evaluation.matching.sequences import sequence_pairs
 from sigmaslam.readers import open_sequence
-from sigmaslam.synthetic.textures import dead_leaves
+from sigmaslam.synthetic.rendering.textures import dead_leaves
 
 
 def _spot(height: int, width: int, place: np.ndarray) -> np.ndarray:

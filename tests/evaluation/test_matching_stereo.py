@@ -15,7 +15,7 @@ from sigmaslam.evaluation.matching.stereo import StereoStep, estimate_step, is_g
 from sigmaslam.evaluation.matching.tracks import TRACKED_KEYPOINTS, follow_corners, score_klt
 from sigmaslam.readers import open_sequence
 from sigmaslam.rotation import rotation_exp, se3_exp
-from sigmaslam.synthetic.textures import dead_leaves
+from sigmaslam.synthetic.rendering.textures import dead_leaves
 
 SHIFT = 7.3
 

@@ -22,7 +22,7 @@ from sigmaslam.filters.consistency import (
     whiten,
     whiteness,
 )
-from sigmaslam.filters.consistency_plots import plot_coverage, plot_nees, plot_whiteness
+from sigmaslam.filters.consistency.plots import plot_coverage, plot_nees, plot_whiteness
 from tests.support.filter_builders import covariances, random_numbers
 
 

@@ -18,7 +18,7 @@ from sigmaslam.filters import (
     UnscentedKalmanFilter,
     julier,
 )
-from sigmaslam.filters.factors import cholesky
+from sigmaslam.filters.linalg.square_roots import cholesky
 from tests.support.filter_builders import (
     FORMS,
     assert_close,

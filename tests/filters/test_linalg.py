@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from sigmaslam.filters.linalg import cholesky
+from sigmaslam.filters.linalg.semidefinite import cholesky
 
 
 def random_matrices(*shape: int, seed: int = 0) -> Tensor:

@@ -39,7 +39,6 @@ from sigmaslam.filters.consistency import check_nees, nees
 from sigmaslam.filters.systems import (
     constant_velocity,
     differential_drive,
-    landmark_in_robot_frame,
     project_stereo,
     range_and_bearing,
     stereo_measurement,
@@ -113,7 +112,9 @@ def test_drive_noise_spreads_forward_and_in_heading_only() -> None:
 
 def test_range_and_bearing_is_the_landmark_in_the_robot_frame_in_polar_form() -> None:
     state, landmark = 3.0 * random_numbers(10, 3), 5.0 * random_numbers(10, 2, seed=1)
-    x, y = landmark_in_robot_frame(torch.eye(2)).function(state, landmark).unbind(-1)
+    ahead, aside = (landmark - state[:, :2]).unbind(-1)
+    cosine, sine = torch.cos(state[:, 2]), torch.sin(state[:, 2])
+    x, y = ahead * cosine + aside * sine, aside * cosine - ahead * sine
     distance, bearing = range_and_bearing(torch.eye(2)).function(state, landmark).unbind(-1)
     torch.testing.assert_close(distance * torch.cos(bearing), x)
     torch.testing.assert_close(distance * torch.sin(bearing), y)

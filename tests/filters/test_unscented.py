@@ -2,8 +2,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.linalg import cholesky
-from sigmaslam.filters.unscented import covariance_of, odd_and_even, sigma_offsets
+from sigmaslam.filters.linalg.semidefinite import cholesky
+from sigmaslam.filters.onnx.unscented import covariance_of, odd_and_even, sigma_offsets
 from tests.support.filter_builders import random_numbers
 
 

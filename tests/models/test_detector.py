@@ -16,7 +16,7 @@ from sigmaslam.models.detector import (
     to_cells,
     to_half_cells,
 )
-from sigmaslam.synthetic.textures import dead_leaves
+from sigmaslam.synthetic.rendering.textures import dead_leaves
 
 SIGMA = 1.4
 INNER = (slice(BORDER, -BORDER), slice(BORDER, -BORDER))

@@ -23,7 +23,7 @@ from sigmaslam.models.scorer import MatchScorer
 from sigmaslam.models.torch_runtime import TorchFeatures, filter_module, scoring_module
 from sigmaslam.models.verifier import MatchVerifier
 from sigmaslam.session import OnnxGraph, shipped_weights
-from sigmaslam.synthetic.textures import dead_leaves
+from sigmaslam.synthetic.rendering.textures import dead_leaves
 
 FILTERS = ("pose_predict", "stereo_transfer")
 

@@ -16,7 +16,7 @@ from sigmaslam.models.network import (
     sample_map,
     sample_window,
 )
-from sigmaslam.synthetic.textures import dead_leaves
+from sigmaslam.synthetic.rendering.textures import dead_leaves
 
 
 @pytest.fixture(scope="module")

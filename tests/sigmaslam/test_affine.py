@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sigmaslam.frontend.affine import align_patches, local_maps
-from sigmaslam.synthetic.textures import dead_leaves
+from sigmaslam.synthetic.rendering.textures import dead_leaves
 
 WIDTH, HEIGHT = 640, 480
 FIELDS = {

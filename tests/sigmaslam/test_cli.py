@@ -212,6 +212,6 @@ def test_every_command_has_help(command: str):
 
 def test_an_option_that_the_benchmark_does_not_serve_is_refused(tmp_path: Path):
     page = tmp_path / "page.md"
-    refused(sigmaslam("benchmark", "claims", "--out", page, "--rounds", "3"), "--rounds", "claims")
-    refused(sigmaslam("benchmark", "sequences", "--out", page, "--eager"), "--eager", "sequences")
+    assert_refused(run_here("benchmark", "claims", "--out", page, "--rounds", "3"), "--rounds", "claims")
+    assert_refused(run_here("benchmark", "sequences", "--out", page, "--eager"), "--eager", "sequences")
     assert not page.exists()

@@ -15,8 +15,8 @@ torch = pytest.importorskip("torch")
 
 from sigmaslam.readers import StereoFrame  # noqa: E402
 from sigmaslam.rotation import se3_inverse  # noqa: E402
-from sigmaslam.synthetic.paths import Path  # noqa: E402
-from sigmaslam.synthetic.sensor import expose  # noqa: E402
+from sigmaslam.synthetic.camera.sensor import expose  # noqa: E402
+from sigmaslam.synthetic.motion.paths import Path  # noqa: E402
 from sigmaslam.synthetic.simulation import Recipe, Simulation, Studio, simulate  # noqa: E402
 from sigmaslam.tracker import Estimate, StereoTracker  # noqa: E402
 

@@ -16,7 +16,7 @@ from sigmaslam.frontend.learned import LearnedDetector
 from sigmaslam.frontend.matching import nearest_anywhere
 from sigmaslam.frontend.types import Features
 from sigmaslam.match import draw_matches, match_features
-from sigmaslam.synthetic.textures import dead_leaves
+from sigmaslam.synthetic.rendering.textures import dead_leaves
 from tests.support.commands import assert_refused, run_here, run_process
 
 FIELDS = ("keypoints0", "keypoints1", "probability", "covariance", "index0", "index1")

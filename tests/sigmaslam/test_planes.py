@@ -11,7 +11,7 @@ from sigmaslam.frontend.refine import refine
 from sigmaslam.frontend.smooth import sharpness, smoothed
 from sigmaslam.frontend.types import PatchMaps
 from sigmaslam.rotation import se3_exp
-from sigmaslam.synthetic.textures import dead_leaves
+from sigmaslam.synthetic.rendering.textures import dead_leaves
 
 WIDTH, HEIGHT = 640, 480
 CAMERA = RectifiedStereo(WIDTH, HEIGHT, 500.0, 480.0, 320.5, 241.5, 0.3)

@@ -2,9 +2,10 @@ import cv2
 import numpy as np
 import pytest
 
-from sigmaslam.synthetic import bank, pairs
+from sigmaslam.synthetic import pairs
 from sigmaslam.synthetic.pairs import HomographyPair, HomographyPairs
-from sigmaslam.synthetic.textures import paint
+from sigmaslam.synthetic.rendering import bank
+from sigmaslam.synthetic.rendering.textures import paint
 
 
 @pytest.fixture(autouse=True)

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from sigmaslam.rotation import rotation_exp, rotation_log
-from sigmaslam.synthetic.paths import (
+from sigmaslam.synthetic.geometry import arc_length
+from sigmaslam.synthetic.motion.paths import (
     LARGEST_NOISE,
     Path,
     Stop,
-    arc_length,
     at_rest,
     carried_frames,
     noise,

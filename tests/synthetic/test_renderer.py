@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from sigmaslam.camera import CameraModel
-from sigmaslam.synthetic.facets import Facets, join
-from sigmaslam.synthetic.renderer import Renderer, Views
+from sigmaslam.synthetic.rendering.facets import Facets, join
+from sigmaslam.synthetic.rendering.renderer import Renderer, Views
+from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel, Tube
+from sigmaslam.synthetic.rendering.visibility import Eye
 from sigmaslam.synthetic.scene import Body, Lights, Material, Scene, Texture
-from sigmaslam.synthetic.shapes import Box, Cylinder, Ellipsoid, Panel, Tube
 from sigmaslam.synthetic.truth import at_pixels, flow, transfer
-from sigmaslam.synthetic.visibility import Eye
 from tests.support.small_worlds import CAMERA, FISHEYE, RADTAN, camera_pose, small_scene
 
 CAMERAS = pytest.mark.parametrize("camera", [CAMERA, RADTAN, FISHEYE], ids=["pinhole", "radtan", "fisheye"])

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from sigmaslam.synthetic import scene_pairs
-from sigmaslam.synthetic.paths import Path
+from sigmaslam.synthetic.camera.sensor import Sensor
+from sigmaslam.synthetic.motion.paths import Path
 from sigmaslam.synthetic.scene_pairs import ScenePair, ScenePairs
-from sigmaslam.synthetic.sensor import Sensor
 from sigmaslam.synthetic.worlds.episode import Episode, Wish
 from tests.support.small_worlds import camera_pose, small_scene
 

@@ -12,8 +12,8 @@ import pytest
 from sigmaslam.camera import RectifiedStereo
 from sigmaslam.errors import InputError
 from sigmaslam.readers import open_sequence
-from sigmaslam.synthetic import atlas
 from sigmaslam.synthetic.presets import PRESETS
+from sigmaslam.synthetic.rendering import atlas
 from sigmaslam.synthetic.sequence import write_sequence
 from sigmaslam.synthetic.simulation import Recipe, Simulation, Studio, simulate
 

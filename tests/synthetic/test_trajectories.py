@@ -6,7 +6,7 @@ import pytest
 
 from sigmaslam.errors import InputError
 from sigmaslam.rotation import rotation_log
-from sigmaslam.synthetic.trajectories import (
+from sigmaslam.synthetic.motion.trajectories import (
     CAMERA_HEIGHT,
     Box,
     Path,
@@ -33,9 +33,7 @@ RADIUS = 0.012
 
 # Each with bounds on speed (m/s), acceleration (m/s^2), angular rate (deg/s) and angular acceleration (deg/s^2).
 GENERATORS: dict[str, tuple[Generator, tuple[float, float, float, float]]] = {
-    "hand held, around": (lambda rng: hand_held(rng, 20, ROOM), (0.9, 4, 45, 400)),
-    "hand held, ahead": (lambda rng: hand_held(rng, 20, ROOM, "ahead"), (0.9, 4, 45, 400)),
-    "hand held, at a point": (lambda rng: hand_held(rng, 20, ROOM, (1.0, 0.0, 1.0)), (0.9, 4, 45, 400)),
+    "hand held": (lambda rng: hand_held(rng, 20, ROOM), (0.9, 4, 45, 400)),
     "drone": (lambda rng: drone(rng, 20, HALL), (3.3, 5, 120, 500)),
     "drive": (lambda rng: drive(rng, 60), (18, 6, 60, 200)),
     "insertion": (lambda rng: insertion(rng, 20, TUBE, RADIUS), (0.03, 0.6, 60, 600)),
@@ -99,14 +97,6 @@ def test_a_person_walks_at_walking_speed_with_the_camera_upright(seed: int) -> N
     assert (T[:, 2, 1] < -0.7).all()  # y is down
     bounce = velocity[:, 2] - velocity[:, 2].mean()
     assert 0.01 < bounce.std() < 0.2
-
-
-def test_a_person_who_looks_at_a_point_has_it_in_view() -> None:
-    target = np.array([1.0, 1.5, 1.2])
-    T, _, _ = motion(hand_held(np.random.default_rng(0), 30, ROOM, (1.0, 1.5, 1.2)))
-    to = target - T[:, :3, 3]
-    cosine = (T[:, :3, 2] * to).sum(axis=1) / np.linalg.norm(to, axis=1)
-    assert np.rad2deg(np.arccos(cosine)).max() < 35
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -213,20 +203,15 @@ def test_pure_rotation_does_not_move() -> None:
     assert largest(rate) > 15
 
 
-@pytest.mark.parametrize("laps", [1, 3])
 @pytest.mark.parametrize("seed", range(3))
-def test_a_closed_loop_ends_as_it_began(seed: int, laps: int) -> None:
-    path = closed_loop(np.random.default_rng(seed), 30, ROOM, laps)
+def test_a_closed_loop_ends_as_it_began(seed: int) -> None:
+    path = closed_loop(np.random.default_rng(seed), 30, ROOM)
     np.testing.assert_allclose(path.poses(30.0), path.poses(0.0), atol=1e-12)
     T, velocity, rate = motion(path, 0.01)
     np.testing.assert_allclose(velocity[-1], velocity[0], atol=0.02)
     np.testing.assert_allclose(rate[-1], rate[0], atol=2.0)
     assert (np.abs(T[:, :3, 3] - ROOM.centre) <= ROOM.half).all()
-    # Half a lap away is elsewhere; each lap comes by the same place.
-    lap = 3000 // laps
-    assert largest(T[lap // 2, :3, 3] - T[0, :3, 3]) > 1.0
-    if laps > 1:
-        np.testing.assert_allclose(T[lap, :3, 3], T[0, :3, 3], atol=0.02)
+    assert largest(T[1500, :3, 3] - T[0, :3, 3]) > 1.0
 
 
 def test_stops_hold_a_walk_still() -> None:

@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from sigmaslam.camera import CameraModel
 from sigmaslam.synthetic.choices import MOTIONS
-from sigmaslam.synthetic.renderer import Renderer
+from sigmaslam.synthetic.rendering.renderer import Renderer
+from sigmaslam.synthetic.rendering.visibility import Eye
 from sigmaslam.synthetic.scene import Scene, Texture
-from sigmaslam.synthetic.visibility import Eye
 from sigmaslam.synthetic.worlds import colon, organ, room, tool
 from sigmaslam.synthetic.worlds.episode import Episode, Wish
 

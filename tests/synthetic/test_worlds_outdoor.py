@@ -7,10 +7,10 @@ import torch
 from scipy.spatial import cKDTree
 
 from sigmaslam.camera import CameraModel
-from sigmaslam.synthetic import trajectories
-from sigmaslam.synthetic.renderer import Renderer
+from sigmaslam.synthetic.motion import trajectories
+from sigmaslam.synthetic.rendering.renderer import Renderer
+from sigmaslam.synthetic.rendering.visibility import Eye
 from sigmaslam.synthetic.scene import Scene
-from sigmaslam.synthetic.visibility import Eye
 from sigmaslam.synthetic.worlds import hall, street
 from sigmaslam.synthetic.worlds.episode import Episode, Wish
 

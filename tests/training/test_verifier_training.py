@@ -14,7 +14,7 @@ from sigmaslam.frontend.matching import Putative
 from sigmaslam.frontend.types import Features
 from sigmaslam.models.scorer import MatchScorer
 from sigmaslam.models.verifier import VERIFIER_COLUMNS, MatchVerifier
-from sigmaslam.synthetic.textures import dead_leaves
+from sigmaslam.synthetic.rendering.textures import dead_leaves
 from sigmaslam.training import verifier as verifier_training
 from sigmaslam.training.match_sets import MatchSet, PairRecord
 from sigmaslam.training.verifier import VerifierRows, calibrate, collect_rows, train_verifier, verifier_loss

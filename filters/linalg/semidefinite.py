@@ -8,9 +8,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-# A pivot below this share of its diagonal entry is round-off of an exact zero (a pose that is the reference itself is
-# known): its column is dropped. The factor is then that of the semidefinite matrix itself, nothing is added.
-_PIVOT_TOLERANCE = 1e-13
+PIVOT_TOLERANCES = {torch.float64: 1e-13, torch.float32: 2e-6}
+"""A pivot below this share of its diagonal entry is round-off of an exact zero: a clone is a copy of a pose, a first
+pose is known. Its column is dropped. The factor is then that of the semidefinite matrix itself, nothing is added."""
 
 
 def cholesky(matrix: Tensor) -> Tensor:
@@ -24,8 +24,7 @@ def cholesky(matrix: Tensor) -> Tensor:
     size = matrix.shape[-1]
     rest = matrix
     columns = []
-    share = _PIVOT_TOLERANCE if matrix.dtype == torch.float64 else 2e-6
-    tolerance = torch.tensor(share, dtype=matrix.dtype, device=matrix.device)
+    tolerance = torch.tensor(PIVOT_TOLERANCES[matrix.dtype], dtype=matrix.dtype, device=matrix.device)
     diagonal = torch.diagonal(matrix, dim1=-2, dim2=-1)
     below = torch.ones(size, size, dtype=matrix.dtype, device=matrix.device).tril()
     for j in range(size):

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sigmaslam.synthetic.atlas import SIZE, Atlas
-from sigmaslam.synthetic.facets import Facets
+from sigmaslam.synthetic.rendering.atlas import SIZE, Atlas
+from sigmaslam.synthetic.rendering.facets import Facets
+from sigmaslam.synthetic.rendering.visibility import Sight, apply
 from sigmaslam.synthetic.scene import Lights, Material
-from sigmaslam.synthetic.visibility import Sight, apply
 
 _LONGEST = 2  # of a footprint's axes, longer by more than this the mip level rises instead
 _KNEE = 0.2  # albedo is what was asked for from here to 1 - this; beyond it nears 0 and 1 without reaching them

@@ -21,7 +21,7 @@ Quaternion = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 def wrap_angle(angle: Tensor) -> Tensor:
-    """The same angle in (-pi, pi]; one that is there already keeps every digit."""
+    """The same angle in (-pi, pi], radians, any shape; one that is there already keeps every digit."""
     turn = 2.0 * math.pi
     rest = torch.sub(angle, torch.round(angle / turn), alpha=turn)
     # Round-off of the quotient leaves an ulp on the wrong side.

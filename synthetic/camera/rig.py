@@ -9,6 +9,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sigmaslam.camera import CameraModel, StereoCamera
+from sigmaslam.synthetic.geometry import rigid_motion
+
+# Standard deviations of a loose pair: of the angles between its axes, and of the relative differences in focal length,
+# centre and distortion.
+_LOOSE_DEGREES, _LOOSE_SHARE = 0.8, 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,12 +96,7 @@ def parallel_rig(camera: CameraModel, baseline: float, errors: Miscalibration = 
 
 
 def loose_rig(
-    camera: CameraModel,
-    baseline: float,
-    rng: np.random.Generator,
-    errors: Miscalibration = Miscalibration(),
-    degrees: float = 0.8,
-    share: float = 0.01,
+    camera: CameraModel, baseline: float, rng: np.random.Generator, errors: Miscalibration = Miscalibration()
 ) -> Rig:
     """A pair as it comes from the bench, to be rectified: axes, focal lengths and distortions differ a little.
 
@@ -105,15 +105,12 @@ def loose_rig(
         baseline: metres.
         rng: source of the differences.
         errors: of the calibration.
-        degrees: standard deviation of the angles between the axes.
-        share: standard deviation of the relative differences in focal length, centre and distortion.
     """
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(np.deg2rad(degrees) * rng.standard_normal(3)).as_matrix()
-    T[:3, 3] = baseline * np.array([1.0, *(share * rng.standard_normal(2))])
+    R = Rotation.from_rotvec(np.deg2rad(_LOOSE_DEGREES) * rng.standard_normal(3)).as_matrix()
+    T = rigid_motion(R, baseline * np.array([1.0, *(_LOOSE_SHARE * rng.standard_normal(2))]))
     # Python's own numbers: they go to JSON and YAML.
-    focal, *distortion = (1.0 + share * rng.standard_normal(1 + len(camera.distortion))).tolist()
-    aside, down = (share * camera.width * rng.standard_normal(2)).tolist()
+    focal, *distortion = (1.0 + _LOOSE_SHARE * rng.standard_normal(1 + len(camera.distortion))).tolist()
+    aside, down = (_LOOSE_SHARE * camera.width * rng.standard_normal(2)).tolist()
     right = replace(
         camera,
         fx=camera.fx * focal,

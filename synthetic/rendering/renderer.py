@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from sigmaslam.camera import CameraModel
-from sigmaslam.synthetic.facets import join
+from sigmaslam.synthetic.geometry import rigid_motion
+from sigmaslam.synthetic.rendering.facets import join
+from sigmaslam.synthetic.rendering.shading import Samples, Shader, meet
+from sigmaslam.synthetic.rendering.visibility import Eye, Sight, Surfaces, move
 from sigmaslam.synthetic.scene import Material, Scene
-from sigmaslam.synthetic.shading import Samples, Shader, meet
-from sigmaslam.synthetic.visibility import Eye, Sight, Surfaces, move
 
 # Places of the sub-samples of a pixel on an edge.
 _OFFSETS = ((-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))
@@ -124,9 +125,9 @@ class Renderer:
         direction = np.array(lights.sun_direction) / np.linalg.norm(lights.sun_direction)
         across = np.cross(direction, np.eye(3)[int(np.argmin(np.abs(direction)))])
         across /= np.linalg.norm(across)
-        T = np.tile(np.eye(4), (len(times), 1, 1))
-        T[:, :3, :3] = np.stack([across, np.cross(-direction, across), -direction], axis=-1)
-        T[:, :3, 3] = centre + _SUN_DISTANCE * radius * direction
+        R = np.stack([across, np.cross(-direction, across), -direction], axis=-1)
+        place = np.broadcast_to(centre + _SUN_DISTANCE * radius * direction, (len(times), 3))
+        T = rigid_motion(R, place)
         side = _SHADOW_GRID
         focal = 0.5 * side * _SUN_DISTANCE
         eye = Eye(CameraModel(side, side, focal, focal, (side - 1) / 2, (side - 1) / 2))

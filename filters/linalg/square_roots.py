@@ -12,10 +12,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from sigmaslam.filters import linalg, small
-
-# Round-off of an exact zero, as a share of the diagonal: a clone is a copy of a pose, a first pose is known.
-_TOLERANCES = {torch.float64: 1e-13, torch.float32: 2e-6}
+from sigmaslam.filters.linalg import semidefinite, unrolled
 
 
 def cholesky(matrix: Tensor) -> tuple[Tensor, Tensor | None]:
@@ -27,9 +24,9 @@ def cholesky(matrix: Tensor) -> tuple[Tensor, Tensor | None]:
         (..., n, n) lower triangular factor; (...,) bool, True where the matrix is positive semidefinite and finite, or
         None where that is known to hold for all. Where it does not, the factor is arbitrary.
     """
-    tolerance = _TOLERANCES[matrix.dtype]
-    if small.is_small(matrix):
-        return small.cholesky(matrix, tolerance)
+    tolerance = semidefinite.PIVOT_TOLERANCES[matrix.dtype]
+    if unrolled.is_small(matrix):
+        return unrolled.cholesky(matrix, tolerance)
     factor, failure = torch.linalg.cholesky_ex(matrix)
     if may_look(matrix):
         if not bool(failure.any()):
@@ -38,16 +35,16 @@ def cholesky(matrix: Tensor) -> tuple[Tensor, Tensor | None]:
         return factor, failure == 0
     # LAPACK knows positive definite matrices only.
     healthy = failure == 0
-    semidefinite = linalg.cholesky(matrix)
+    lower = semidefinite.cholesky(matrix)
     # Where a pivot was dropped, it is still there on the diagonal of what is missing, and must not be negative; beside
     # it there may be as much as its root.
-    missing = (matrix - semidefinite @ semidefinite.mT).tril()
+    missing = (matrix - lower @ lower.mT).tril()
     diagonal = torch.diagonal(matrix, dim1=-2, dim2=-1).abs()
     pivots = torch.diagonal(missing, dim1=-2, dim2=-1)
     allowed = tolerance * diagonal.unsqueeze(-1) * diagonal.unsqueeze(-2)
     # Comparisons are False for NaN.
     restored = (pivots >= -tolerance * diagonal).all(dim=-1) & (missing * missing <= allowed).all(dim=-1).all(dim=-1)
-    return torch.where(healthy[..., None, None], factor, semidefinite), healthy | restored
+    return torch.where(healthy[..., None, None], factor, lower), healthy | restored
 
 
 def may_look(array: Tensor) -> bool:
@@ -69,8 +66,8 @@ def triangularise(pieces: Sequence[Tensor], diagonal: Tensor | None = None) -> T
     pieces = _broadcast(pieces, None if diagonal is None else diagonal.shape[:-1])
     size = pieces[0].shape[-2]
     columns = sum(piece.shape[-1] for piece in pieces)
-    if small.is_small(pieces[0], columns):
-        return small.triangularise(pieces, diagonal)
+    if unrolled.is_small(pieces[0], columns):
+        return unrolled.triangularise(pieces, diagonal)
     if diagonal is not None:
         pieces = _broadcast([*pieces, torch.diag_embed(diagonal)])
         columns += size
@@ -90,22 +87,22 @@ def solve_lower(factor: Tensor, right: Tensor, regular: bool = False) -> Tensor:
     A zero pivot is a known direction, of which nothing is asked; with `regular` it is an error, and the result is not
     finite.
     """
-    if small.is_small(factor, right.shape[-1]):
-        return small.solve_lower(factor, right, regular)
+    if unrolled.is_small(factor, right.shape[-1]):
+        return unrolled.solve_lower(factor, right, regular)
     return torch.linalg.solve_triangular(factor if regular else _without_zero_pivots(factor), right, upper=False)
 
 
 def solve_lower_transposed(factor: Tensor, right: Tensor) -> Tensor:
     """L^-T B for lower triangular L (..., n, n) and B (..., n, c); a zero pivot is a known direction."""
-    if small.is_small(factor, right.shape[-1]):
-        return small.solve_lower_transposed(factor, right)
+    if unrolled.is_small(factor, right.shape[-1]):
+        return unrolled.solve_lower_transposed(factor, right)
     return torch.linalg.solve_triangular(_without_zero_pivots(factor).mT, right, upper=True)
 
 
 def multiply(left: Tensor, right: Tensor) -> Tensor:
     """Matrix product (..., r, k) @ (..., k, c)."""
-    if small.is_small(left, right.shape[-1]) or (left.shape[-2] <= small.ROWS and small.is_small(right)):
-        return small.multiply(left, right)
+    if unrolled.is_small(left, right.shape[-1]) or (left.shape[-2] <= unrolled.ROWS and unrolled.is_small(right)):
+        return unrolled.multiply(left, right)
     return left @ right
 
 
@@ -113,7 +110,7 @@ def square(pieces: Sequence[Tensor]) -> Tensor:
     """A A^T for A = [pieces side by side], pieces (..., n, c_i) -> (..., n, n)."""
     total = None
     for piece in pieces:
-        part = small.multiply(piece, piece.mT) if small.is_small(piece) else piece @ piece.mT
+        part = unrolled.multiply(piece, piece.mT) if unrolled.is_small(piece) else piece @ piece.mT
         total = part if total is None else total + part
     assert total is not None
     return total
@@ -121,8 +118,8 @@ def square(pieces: Sequence[Tensor]) -> Tensor:
 
 def apply(matrix: Tensor, vector: Tensor) -> Tensor:
     """Matrix times vector, (..., r, k), (..., k) -> (..., r)."""
-    if small.is_small(matrix) or (matrix.shape[-2] <= small.ROWS and small.is_small(vector.unsqueeze(-2))):
-        return small.apply(matrix, vector)
+    if unrolled.is_small(matrix) or (matrix.shape[-2] <= unrolled.ROWS and unrolled.is_small(vector.unsqueeze(-2))):
+        return unrolled.apply(matrix, vector)
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
 
 

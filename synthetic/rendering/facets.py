@@ -56,7 +56,7 @@ def join(parts: Sequence[Facets]) -> Facets:
     return Facets(**columns)
 
 
-def flat(corners: np.ndarray, *, triangle: bool = False, closed: bool = False) -> Facets:
+def flat(corners: np.ndarray, *, closed: bool = False) -> Facets:
     """One facet from its origin and the ends of its two edges, (3, 3); texture axes run along the edges.
 
     The normal is e_u x e_v.
@@ -71,7 +71,7 @@ def flat(corners: np.ndarray, *, triangle: bool = False, closed: bool = False) -
         origin[None],
         edge_u[None],
         edge_v[None],
-        np.array([triangle]),
+        np.zeros(1, dtype=bool),
         uv,
         normals,
         np.array([closed]),

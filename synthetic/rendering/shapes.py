@@ -12,7 +12,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter
 
-from sigmaslam.synthetic.facets import Facets, flat, grid, join, mesh
+from sigmaslam.synthetic.geometry import arc_length, carried_normals
+from sigmaslam.synthetic.rendering.facets import Facets, flat, grid, join, mesh
 
 # Faces of one body begin this far apart in their texture, metres times the body's size: no two look alike.
 _FACE_STEP = np.array([1.37, 2.71])
@@ -222,7 +223,7 @@ class Tube:
     def facets(self) -> Facets:
         """The facets in the shape's own frame."""
         knots = np.array(self.centreline)
-        arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(knots, axis=0), axis=1))])
+        arc = arc_length(knots)
         curve = CubicSpline(arc, knots)
         s = np.linspace(0.0, arc[-1], self.rings + 1)
         centre, tangent = curve(s), curve(s, 1)
@@ -253,13 +254,7 @@ def transported_frame(tangent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Args:
         tangent: (n, 3) unit tangents.
     """
-    start = np.eye(3)[int(np.argmin(np.abs(tangent[0])))]
-    side = np.empty_like(tangent)
-    current = start
-    for k, t in enumerate(tangent):
-        current = current - (current @ t) * t
-        current = current / np.linalg.norm(current)
-        side[k] = current
+    side = carried_normals(tangent, np.eye(3)[int(np.argmin(np.abs(tangent[0])))])
     return side, np.cross(tangent, side)
 
 

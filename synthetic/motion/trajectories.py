@@ -6,7 +6,7 @@ are smooth to the angular acceleration, see `Path`.
 
 from dataclasses import replace
 from pathlib import Path as FilePath
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -16,11 +16,11 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from sigmaslam.errors import InputError
 from sigmaslam.rotation import rotation_exp
-from sigmaslam.synthetic.paths import (
+from sigmaslam.synthetic.geometry import arc_length
+from sigmaslam.synthetic.motion.paths import (
     KNOT_INTERVAL,
     LARGEST_NOISE,
     Path,
-    arc_length,
     at_rest,
     carried_frames,
     integral,
@@ -71,13 +71,8 @@ class Box(NamedTuple):
     half: tuple[float, float, float]
 
 
-def hand_held(
-    rng: np.random.Generator,
-    duration: float,
-    box: Box,
-    look: Literal["around", "ahead"] | tuple[float, float, float] = "around",
-) -> Path:
-    """A camera that is carried by a walking person.
+def hand_held(rng: np.random.Generator, duration: float, box: Box) -> Path:
+    """A camera that is carried by a walking person, who looks all around.
 
     Walks at 0.3-0.8 m/s, slower where the way turns back, with the bounce and sway of steps, up to 40 deg/s, with
     tremor of the hand (0.15 degrees, 0.3 mm rms).
@@ -86,8 +81,6 @@ def hand_held(
         rng: source of all randomness.
         duration: seconds.
         box: that the camera stays in.
-        look: all around, along the way, or at a point of the world (x, y, z). Along the way the view lags where
-            the way turns faster than the camera may; give it a box of 4 m or more to each side.
     """
     t, inside = padded_clock(duration)
     base = rng.uniform(0.42, 0.62)
@@ -106,17 +99,11 @@ def hand_held(
     sway = np.stack([np.sin(strides), np.cos(strides), np.sin(2 * strides + 0.7)], axis=-1)
     position = route + step * sway + tremor * noise(rng, t, 3, 1.0, 5.0) + np.array(box.centre)
 
-    if look == "around":
-        turning = 60 * noise(rng, t, 1, 0.01, 0.05)[:, 0] + rng.uniform(10, 25) * noise(rng, t, 1, 0.08, 0.3)[:, 0]
-        yaw, pitch = rng.uniform(-np.pi, np.pi) + _DEGREE * turning, np.full(t.shape, -6 * _DEGREE)
-    else:
-        view = np.gradient(route, t, axis=0) * [1, 1, 0.3] if look == "ahead" else np.array(look) - position
-        yaw = np.unwrap(np.arctan2(view[:, 1], view[:, 0])) + _DEGREE * 5 * noise(rng, t, 1, 0.1, 0.4)[:, 0]
-        pitch = np.arctan2(view[:, 2], np.linalg.norm(view[:, :2], axis=1))
+    turning = 60 * noise(rng, t, 1, 0.01, 0.05)[:, 0] + rng.uniform(10, 25) * noise(rng, t, 1, 0.08, 0.3)[:, 0]
+    yaw, pitch = rng.uniform(-np.pi, np.pi) + _DEGREE * turning, np.full(t.shape, -6 * _DEGREE)
     pitch = pitch + _DEGREE * 4 * noise(rng, t, 1, 0.1, 0.5)[:, 0]
     roll = _DEGREE * 2.5 * noise(rng, t, 1, 0.1, 0.4)[:, 0]
-    fastest = rng.uniform(18, 31) if look == "around" else rng.uniform(27, 32)
-    angles = smooth_to_rate(t, np.stack([yaw, pitch, roll], axis=-1), _DEGREE * fastest)
+    angles = smooth_to_rate(t, np.stack([yaw, pitch, roll], axis=-1), _DEGREE * rng.uniform(18, 31))
     angles = angles + _DEGREE * 0.15 / 3**0.5 * noise(rng, t, 3, 1.0, 5.0)
     return path_through(t[inside], position[inside], view_rotations(*angles[inside].T))
 
@@ -257,7 +244,7 @@ def insertion(rng: np.random.Generator, duration: float, centreline: np.ndarray,
         radius: of the tube, metres; the camera stays within 0.6 of it.
     """
     knots = np.asarray(centreline, dtype=np.float64)
-    axis = CubicSpline(np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(knots, axis=0), axis=1))]), knots)
+    axis = CubicSpline(arc_length(knots), knots)
     length = float(axis.x[-1])
     along = np.linspace(0, length, 500)
     frames = carried_frames(axis(along, 1))
@@ -345,14 +332,13 @@ def pure_rotation(rng: np.random.Generator, duration: float, position: tuple[flo
     return path_through(t[inside], fixed[inside], view_rotations(*angles[inside].T))
 
 
-def closed_loop(rng: np.random.Generator, duration: float, box: Box, laps: int = 1) -> Path:
+def closed_loop(rng: np.random.Generator, duration: float, box: Box) -> Path:
     """A camera that looks ahead on a round course and ends at its start, with the same pose and velocity.
 
     Args:
         rng: source of all randomness.
-        duration: seconds of all laps; with the box it makes the speed, which varies by a quarter.
+        duration: seconds of a round; with the box it makes the speed, which varies by a quarter.
         box: that the course fills.
-        laps: rounds on the same course; the sway of the camera differs between them.
     """
     knots = max(8, int(np.ceil(duration / KNOT_INTERVAL)))
     t = np.linspace(0.0, duration, knots + 1)
@@ -364,8 +350,7 @@ def closed_loop(rng: np.random.Generator, duration: float, box: Box, laps: int =
     course[-1] = course[0]
     arc = arc_length(course)
     around = CubicSpline(arc, course, bc_type="periodic")
-    waves = 3 * laps
-    place = laps * t / duration + 0.25 / (2 * np.pi * 3) * np.sin(2 * np.pi * waves * t / duration + phases[0])
+    place = t / duration + 0.25 / (2 * np.pi * 3) * np.sin(2 * np.pi * 3 * t / duration + phases[0])
     place = arc[-1] * (place - place[0])
 
     def sway(channels: int, low: float, high: float) -> np.ndarray:
@@ -377,7 +362,7 @@ def closed_loop(rng: np.random.Generator, duration: float, box: Box, laps: int =
     forward = around(np.mod(place, arc[-1]), 1)
     yaw = np.unwrap(np.arctan2(forward[:, 1], forward[:, 0]))
     turned = (yaw[-1] - yaw[0]) * t / duration
-    smooth = gaussian_filter1d((yaw - turned)[:-1], min(0.7, 0.05 * duration / laps) / interval(t), mode="wrap")
+    smooth = gaussian_filter1d((yaw - turned)[:-1], min(0.7, 0.05 * duration) / interval(t), mode="wrap")
     yaw = turned + np.append(smooth, smooth[0]) + _DEGREE * 4 * sway(1, 0.1, 0.4)[:, 0]
     pitch, roll = (_DEGREE * np.array([3.0, 2.0]) * sway(2, 0.1, 0.4) + _DEGREE * 0.15 * sway(2, 1.0, 3.0)).T
     position = around(np.mod(place, arc[-1])) + np.array(box.centre)

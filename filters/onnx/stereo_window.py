@@ -20,8 +20,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from sigmaslam.filters.lie import exp_se3
-from sigmaslam.filters.unscented import odd_and_even
+from sigmaslam.filters.onnx.se3 import exp_se3
+from sigmaslam.filters.onnx.unscented import odd_and_even
 
 POSE = slice(0, 6)
 CALIBRATION = slice(6, 9)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from sigmaslam.synthetic.textures import paint
+from sigmaslam.synthetic.rendering.textures import paint
 
 SIZE = 512  # side of a texture, texels
 _LEVELS = 8  # down to 4 x 4

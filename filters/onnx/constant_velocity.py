@@ -10,9 +10,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from sigmaslam.filters.lie import adjoint_se3, exp_se3, invert_se3, log_se3
-from sigmaslam.filters.linalg import cholesky
-from sigmaslam.filters.unscented import covariance_of, sigma_offsets
+from sigmaslam.filters.linalg.semidefinite import cholesky
+from sigmaslam.filters.onnx.se3 import adjoint_se3, exp_se3, invert_se3, log_se3
+from sigmaslam.filters.onnx.unscented import covariance_of, sigma_offsets
 
 POSE = slice(0, 6)
 TWIST = slice(6, 12)

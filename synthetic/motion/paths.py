@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from sigmaslam.errors import InputError
 from sigmaslam.rotation import rotation_log
+from sigmaslam.synthetic.geometry import carried_normals
 
 
 class Stop(NamedTuple):
@@ -262,11 +263,6 @@ def integral(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.asarray(cumulative_trapezoid(y, x, axis=0, initial=0.0))
 
 
-def arc_length(curve: np.ndarray) -> np.ndarray:
-    """(N,) length of a curve (N, 3) up to each point."""
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
-
-
 def wandering_curve(rng: np.random.Generator, half: np.ndarray, sizes: float) -> tuple[np.ndarray, np.ndarray]:
     """A curve (N, 3) that fills +-half and is at least `sizes` times its largest half long; its parameter (N,)."""
     if not half.max() > 0.02:
@@ -281,10 +277,5 @@ def carried_frames(tangents: np.ndarray) -> np.ndarray:
     """Frames (N, 3, 3) whose third axes are the tangents (N, 3), carried from one to the next without twist."""
     tangents = tangents / np.linalg.norm(tangents, axis=1, keepdims=True)
     least = np.eye(3)[np.argmin(np.abs(tangents[0]))]
-    x = np.cross(least, tangents[0])
-    frames = []
-    for tangent in tangents:
-        x = x - tangent * (tangent @ x)
-        x = x / np.linalg.norm(x)
-        frames.append(np.stack([x, np.cross(tangent, x), tangent], axis=-1))
-    return np.stack(frames)
+    x = carried_normals(tangents, np.cross(least, tangents[0]))
+    return np.stack([x, np.cross(tangents, x), tangents], axis=-1)

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from sigmaslam.synthetic.fills import (
+from sigmaslam.synthetic.rendering.fills import (
     FILLS,
     bricks,
     cells,

@@ -1,4 +1,4 @@
-"""Figures of `sigmaslam.filters.consistency`; save them with `sigmaslam.figures.save_png` or `Figure.savefig`."""
+"""Figures of `sigmaslam.filters.consistency.statistics`; save them with `Figure.savefig`."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 from torch import Tensor
 
-from sigmaslam.figures import BLUE, GREEN, GREY, SERIES, style_axes
-from sigmaslam.filters.consistency import Consistency, Coverage, Whiteness
+from sigmaslam.filters.consistency.statistics import Consistency, Coverage, Whiteness
+from sigmaslam.plot_style import BLUE, GREEN, GREY, SERIES, style_axes
 
 # A mean beyond this multiple of the band flattens it on a linear axis.
 _LINEAR_UP_TO = 5.0

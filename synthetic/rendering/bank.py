@@ -6,7 +6,7 @@ from collections import OrderedDict
 
 import numpy as np
 
-from sigmaslam.synthetic.textures import KINDS, paint
+from sigmaslam.synthetic.rendering.textures import KINDS, paint
 
 
 class TextureBank:

@@ -1,0 +1,31 @@
+"""Does a filter's covariance describe its errors? The tests, and plots of them in `plots`."""
+
+from sigmaslam.filters.consistency.statistics import (
+    LEVELS,
+    Consistency,
+    Coverage,
+    Whiteness,
+    axis_coverage,
+    check_nees,
+    chi_square_band,
+    coverage,
+    nees,
+    nis,
+    whiten,
+    whiteness,
+)
+
+__all__ = [
+    "LEVELS",
+    "Consistency",
+    "Coverage",
+    "Whiteness",
+    "axis_coverage",
+    "check_nees",
+    "chi_square_band",
+    "coverage",
+    "nees",
+    "nis",
+    "whiten",
+    "whiteness",
+]

@@ -1,0 +1,1 @@
+"""Square roots of covariances and products of batched matrices."""

@@ -1,0 +1,17 @@
+"""Colours and axes of every figure."""
+
+from matplotlib.axes import Axes
+
+# Okabe and Ito's palette, which people with colour-blindness can tell apart.
+BLUE, VERMILLION, GREEN, ORANGE = "#0072B2", "#D55E00", "#009E73", "#E69F00"
+SKY, PURPLE, GREY, BLACK = "#56B4E9", "#CC79A7", "#8C8C8C", "#1A1A1A"
+SERIES = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
+"""Colours of series in the order to use them."""
+
+
+def style_axes(axes: Axes) -> None:
+    """Draw a light grid, and no frame at the top and right."""
+    axes.grid(True, color="#D9D9D9", lw=0.6)
+    axes.set_axisbelow(True)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)

@@ -1,0 +1,1 @@
+"""From shapes and textures to images: ray casting and shading."""
