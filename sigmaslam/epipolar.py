@@ -64,7 +64,6 @@ def estimate_epipolar_pose(
     if len(probable) < _LEAST_MATCHES:
         return None
     points0, points1 = points0.astype(np.float64), points1.astype(np.float64)
-    cv2.setRNGSeed(0)
     essential, mask = cv2.findEssentialMat(
         points0[probable],
         points1[probable],

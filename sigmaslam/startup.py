@@ -125,7 +125,6 @@ def _from_points(
     camera: RectifiedStereo, points: np.ndarray, pixels: np.ndarray, threshold: float
 ) -> np.ndarray | None:
     """T_camera_key from P3P in RANSAC."""
-    cv2.setRNGSeed(0)
     found, rotation, translation, _ = cv2.solvePnPRansac(
         points,
         pixels,
