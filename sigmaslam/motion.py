@@ -4,22 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from sigmaslam.config import TrackerConfig
 from sigmaslam.rotation import nearest_rigid, se3_inverse, se3_log
 from sigmaslam.session import load_step
 
 # Order of the graph's error state, see sigmaslam.filters.onnx.constant_velocity.
 _POSE, _TWIST, _STATE_SIZE = slice(0, 6), slice(6, 12), 12
-
-
-def densities(config: TrackerConfig, depth: float) -> np.ndarray:
-    """(2,) power spectral densities of the accelerations in a scene of that depth (metres): m^2/s^3 and rad^2/s^3."""
-    return np.array([(config.acceleration * depth) ** 2, config.angular_acceleration**2])
-
-
-def initial_twist_sigma(config: TrackerConfig, depth: float) -> np.ndarray:
-    """(6,) standard deviations of a velocity that nothing is known of, m/s and rad/s."""
-    return np.repeat([config.start_speed * depth, config.start_turn], 3)
 
 
 class MotionFilter:

@@ -12,7 +12,8 @@ from sigmaslam.keyframes import Keyframes
 from sigmaslam.landmark_admission import LandmarkAdmission
 from sigmaslam.localisation import Prediction
 from sigmaslam.mapping import KeyframeTracks, Mapper
-from sigmaslam.motion import MotionFilter, densities, initial_twist_sigma
+from sigmaslam.motion import MotionFilter
+from sigmaslam.motion_prior import densities, initial_twist_sigma
 from sigmaslam.phase import Course, Phase
 from sigmaslam.relocalisation import Relocalisation
 from sigmaslam.rotation import turn_covariance

@@ -22,7 +22,8 @@ from sigmaslam.localisation import Localiser, Prediction
 from sigmaslam.loop_closure import LoopCloser
 from sigmaslam.mapping import Mapper
 from sigmaslam.measurement_noise import MeasurementNoise
-from sigmaslam.motion import MotionFilter, densities
+from sigmaslam.motion import MotionFilter
+from sigmaslam.motion_prior import densities
 from sigmaslam.phase import Course, Phase
 from sigmaslam.point_map import PointMap
 from sigmaslam.recovery import Recovery
