@@ -12,8 +12,8 @@ from sigmaslam.filters.manifolds import SE2, SE3, SO2, SO3, Euclidean, Manifold,
 from sigmaslam.filters.models import LinearMeasurement, LinearMotion, MeasurementModel, MotionModel
 from sigmaslam.filters.noise import BlockDiagonal, Dense, Diagonal
 from sigmaslam.filters.results import Prediction, Update
-from sigmaslam.filters.sequence import Track
 from sigmaslam.filters.sigma_points import Simplex, cubature, julier, merwe
+from sigmaslam.filters.time_series import Track
 
 __all__ = [
     "SE2",

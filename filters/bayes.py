@@ -17,8 +17,8 @@ from sigmaslam.filters.manifolds import Manifold
 from sigmaslam.filters.models import AnyMeasurement, AnyMotion, LinearMeasurement, LinearMotion
 from sigmaslam.filters.noise import Noise, as_noise
 from sigmaslam.filters.results import Prediction, Update
-from sigmaslam.filters.sequence import filter_sequence, smooth
 from sigmaslam.filters.sigma_points import Columns, SigmaPoints, cubature
+from sigmaslam.filters.time_series import filter_sequence, smooth
 from sigmaslam.filters.transforms import Difference, Exact, Taylor, Transform, Transformed, Unscented
 from sigmaslam.filters.updates import FORMS, Form, Solution, choose_form, solve
 

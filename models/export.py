@@ -22,12 +22,12 @@ from sigmaslam.files import atomic_path, atomic_write_text, make_folder
 from sigmaslam.filters.onnx.constant_velocity import STATE_SIZE, Predict
 from sigmaslam.filters.onnx.se3 import exp_se3
 from sigmaslam.filters.onnx.stereo_window import Transfer
+from sigmaslam.inference.onnx_graph import OnnxGraph
 from sigmaslam.models.card import card_page, read_card, scoring_page
 from sigmaslam.models.extractor import EXTRACTOR_SIZE_MULTIPLE, FeatureExtractor
 from sigmaslam.models.network import DESCRIPTOR_SIZE, STRIDE, FeatureNetwork
 from sigmaslam.models.scorer import NEIGHBOURS, SIDE_CHANNELS, MatchScorer, ScoredMatches
 from sigmaslam.models.verifier import VERIFIER_COLUMNS, MatchCovariance, MatchVerifier
-from sigmaslam.session import OnnxGraph
 from sigmaslam.synthetic.rendering.textures import dead_leaves
 
 _OPSET = 20

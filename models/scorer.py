@@ -8,9 +8,9 @@ import torch
 from torch import Tensor, nn
 
 SIDE_CHANNELS = 9
-"""Of `sigmaslam.frontend.scorer.side_information`."""
+"""Of `sigmaslam.frontend.scorer_inputs.side_information`."""
 NEIGHBOURS = 12
-"""Of `sigmaslam.frontend.scorer.nearest_matches`."""
+"""Of `sigmaslam.frontend.scorer_inputs.nearest_matches`."""
 _WIDTH = 32
 _ROUNDS = 2
 # A neighbour supports a hypothesis as far as it lies near where that has it: scales in pixels, for a neighbour next to

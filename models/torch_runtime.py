@@ -11,11 +11,11 @@ from torch import nn
 
 from sigmaslam.filters.onnx.constant_velocity import Predict
 from sigmaslam.filters.onnx.stereo_window import Transfer
+from sigmaslam.inference.onnx_graph import shipped_weights
 from sigmaslam.models.export import load_network, load_scorer, load_verifier
 from sigmaslam.models.extractor import FeatureExtractor
 from sigmaslam.models.scorer import ScoredMatches
 from sigmaslam.models.verifier import MatchCovariance
-from sigmaslam.session import shipped_weights
 
 
 class TorchModule:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 VERIFIER_COLUMNS = 14
-"""Of `sigmaslam.frontend.verifier.describe_matches`."""
+"""Of `sigmaslam.frontend.verifier_inputs.describe_matches`."""
 _WIDTH = 48
 # Of log sigma, pixels.
 _LEAST_LOG_SIGMA, _MOST_LOG_SIGMA = -4.0, 2.5
@@ -41,7 +41,7 @@ class MatchVerifier(nn.Module):
         """Logit that the match is right, (M,), and log sigma along the patch's axes, (M, 2), pixels of image 1.
 
         Args:
-            columns: (M, 14) of `sigmaslam.frontend.verifier.describe_matches`.
+            columns: (M, 14) of `sigmaslam.frontend.verifier_inputs.describe_matches`.
         """
         found = self.layers((columns - self.mean) / self.spread)
         theory = 0.5 * (columns[:, 1:2] - columns[:, 4:6])

@@ -3,29 +3,29 @@
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from sigmaslam.camera import StereoCamera
-    from sigmaslam.config import TrackerConfig
     from sigmaslam.errors import SigmaSlamError
-    from sigmaslam.estimate import Estimate
-    from sigmaslam.location_filter import LocationFilter
-    from sigmaslam.match import Matches, match_images
-    from sigmaslam.object_tracker import ObjectTracker
+    from sigmaslam.frontend.image_pair import Matches, match_images
+    from sigmaslam.fusion.location_filter import LocationFilter
+    from sigmaslam.geometry.camera import StereoCamera
     from sigmaslam.readers import open_sequence
-    from sigmaslam.tracker import StereoTracker
+    from sigmaslam.slam.config import TrackerConfig
+    from sigmaslam.slam.estimate import Estimate
+    from sigmaslam.slam.object_tracker import ObjectTracker
+    from sigmaslam.slam.tracker import StereoTracker
 else:
     from importlib import import_module
 
     # Loaded when asked for (PEP 562): `import sigmaslam.filters` needs neither OpenCV nor ONNX Runtime.
     _MODULES = {
-        "Estimate": "estimate",
-        "LocationFilter": "location_filter",
-        "Matches": "match",
-        "ObjectTracker": "object_tracker",
+        "Estimate": "slam.estimate",
+        "LocationFilter": "fusion.location_filter",
+        "Matches": "frontend.image_pair",
+        "ObjectTracker": "slam.object_tracker",
         "SigmaSlamError": "errors",
-        "StereoCamera": "camera",
-        "StereoTracker": "tracker",
-        "TrackerConfig": "config",
-        "match_images": "match",
+        "StereoCamera": "geometry.camera",
+        "StereoTracker": "slam.tracker",
+        "TrackerConfig": "slam.config",
+        "match_images": "frontend.image_pair",
         "open_sequence": "readers",
     }
 

@@ -11,10 +11,10 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from sigmaslam.camera import CameraModel
 from sigmaslam.files import atomic_write_text
+from sigmaslam.geometry.camera import CameraModel
+from sigmaslam.geometry.trajectory import Trajectory, write_kitti
 from sigmaslam.synthetic.simulation import Simulation
-from sigmaslam.trajectory import Trajectory, write_kitti
 
 _FIRST_STAMP = 1_600_000_000_000_000_000  # nanoseconds; EuRoC's stamps count from 1970
 _DISTORTION_NAMES = {"none": "radial-tangential", "radtan": "radial-tangential", "equidistant": "equidistant"}

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from sigmaslam.camera import CameraModel, DistortionModel
+from sigmaslam.geometry.camera import CameraModel, DistortionModel
 from sigmaslam.synthetic.camera.rig import Miscalibration, Rig, loose_rig, parallel_rig
 from sigmaslam.synthetic.camera.sensor import Sensor
 from sigmaslam.synthetic.worlds import colon, hall, organ, room, street, tool

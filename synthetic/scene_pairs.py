@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from sigmaslam.camera import CameraModel
+from sigmaslam.geometry.camera import CameraModel
 from sigmaslam.synthetic.camera.sensor import Sensor, expose, random_sensor
 from sigmaslam.synthetic.geometry import rigid_motion
 from sigmaslam.synthetic.rendering.renderer import Renderer, Views

@@ -23,6 +23,27 @@ FORBIDDEN = {
     "sigmaslam": ("training", "synthetic", "torch"),
 }
 
+# Tables of names that the command line offers, and their packages: they import nothing.
+NAMES = {f"sigmaslam.{layer}{module}" for layer in ("training", "synthetic") for module in ("", ".choices")}
+# The runtime from the ground up: a folder imports only from floors below its own.
+FLOORS = (
+    ("errors", "table"),
+    ("files", "progress", "plot_style"),
+    ("geometry",),
+    ("inference",),
+    ("estimation", "readers"),
+    ("frontend",),
+    ("two_view",),
+    ("slam",),
+    ("fusion",),
+    ("runs",),
+    ("bundle_adjustment",),
+    ("cli",),
+    ("__main__", ""),
+)
+# Of the tracker.
+MAX_LINES, MAX_METHODS = 300, 12
+
 
 def test_the_package_list_names_every_folder_with_modules():
     configuration = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
@@ -56,7 +77,7 @@ def test_lower_layers_do_not_import_upper_ones(layer: str):
             importer[imported] = module
             pending.append(imported)
     for module in importer:
-        if f"{module}.".startswith(f"sigmaslam.{layer}."):
+        if f"{module}.".startswith(f"sigmaslam.{layer}.") or module in NAMES:
             continue
         parts = module.split(".")
         # Of others' modules only the package counts.
@@ -65,6 +86,33 @@ def test_lower_layers_do_not_import_upper_ones(layer: str):
             while chain[0] in importer and importer[chain[0]] not in chain:
                 chain.insert(0, importer[chain[0]])
             pytest.fail(f"{layer} imports {module}: {' -> '.join(chain)}")
+
+
+def test_folders_of_the_runtime_import_only_what_stands_below_them():
+    floor = {room: k for k, rooms in enumerate(FLOORS) for room in rooms}
+    for module in _modules_of("sigmaslam"):
+        room = _room(module)
+        for imported in _imports(module):
+            other = _room(imported)
+            if other in floor and other != room:
+                assert floor[other] < floor[room], f"{module} imports {imported}"
+
+
+def test_every_module_of_the_runtime_has_its_floor():
+    rooms = {room for rooms in FLOORS for room in rooms}
+    assert {_room(module) for module in _modules_of("sigmaslam")} == rooms
+
+
+@pytest.mark.parametrize("room", ["estimation", "slam"])
+def test_the_tracker_s_modules_and_classes_stay_small(room: str):
+    for module, path in _files().items():
+        if _room(module) == room:
+            source = path.read_text()
+            assert len(source.splitlines()) <= MAX_LINES, module
+            for node in ast.walk(ast.parse(source)):
+                if isinstance(node, ast.ClassDef):
+                    methods = [each for each in node.body if isinstance(each, ast.FunctionDef)]
+                    assert len(methods) <= MAX_METHODS, f"{module}.{node.name}"
 
 
 def test_imports_for_type_checking_and_inside_functions_do_not_count():
@@ -135,6 +183,12 @@ def test_tests_share_through_the_support_package_alone(path: Path):
             assert parts[0] not in siblings, f"line {node.lineno} imports {module}, a file beside it: use tests.support"
             parts = parts[1:] if parts[0] == "tests" else parts[:1]
             assert not any(part.startswith("test_") for part in parts), f"line {node.lineno} imports the test {module}"
+
+
+def _room(module: str) -> str:
+    """The folder or file of a module in the runtime package."""
+    parts = module.split(".")
+    return parts[1] if len(parts) > 1 else ""
 
 
 @cache

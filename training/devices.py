@@ -14,9 +14,9 @@ from torch.nn.parallel import DistributedDataParallel
 
 from sigmaslam.errors import InputError
 from sigmaslam.models.network import FeatureMaps, FeatureNetwork
-from sigmaslam.training.losses import PairLoss
-from sigmaslam.training.step import pair_loss
-from sigmaslam.training.stream import TrainingPair
+from sigmaslam.training.features.losses import PairLoss
+from sigmaslam.training.features.step import pair_loss
+from sigmaslam.training.features.stream import TrainingPair
 
 
 @dataclass(frozen=True, slots=True)

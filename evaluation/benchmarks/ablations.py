@@ -16,12 +16,12 @@ import numpy as np
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.benchmarks.page import header, row, write_page
 from sigmaslam.evaluation.matching.extractors import LearnedExtractor
-from sigmaslam.evaluation.matching.run import Scores, score
+from sigmaslam.evaluation.matching.score_sets import Scores, score
 from sigmaslam.evaluation.matching.sets import SELECTION
 from sigmaslam.files import atomic_write_text, make_folder
 
 if TYPE_CHECKING:
-    from sigmaslam.training.recipes import TrainingConfig
+    from sigmaslam.training.features.recipes import TrainingConfig
 
 # What a choice is made by: the mean of these over the sets of SELECTION.
 _CHOSEN_BY = ("mma_1", "mma_3")
@@ -110,7 +110,7 @@ def selection_score(scores: Scores) -> float:
 
 def configuration(variant: Variant, seed: int, steps: int) -> TrainingConfig:
     """The short run of a variant."""
-    from sigmaslam.training.recipes import TrainingConfig
+    from sigmaslam.training.features.recipes import TrainingConfig
 
     return TrainingConfig(steps=steps, batch_size=_BATCH, size=_SIZE, seed=seed, validate_every=0, **variant.training)
 
@@ -130,8 +130,8 @@ def _check_runs(runs: Path, steps: int) -> None:
 
 
 def _train_missing(runs: Path, variant: Variant, seed: int, steps: int, note: Callable[[str], None]) -> None:
-    from sigmaslam.training.checkpoint import CHECKPOINT_NAME
-    from sigmaslam.training.loop import WEIGHTS_NAME, train
+    from sigmaslam.training.features.checkpoint import CHECKPOINT_NAME
+    from sigmaslam.training.features.loop import WEIGHTS_NAME, train
 
     folder = _run(runs, variant, seed, steps)
     if not (folder / WEIGHTS_NAME).is_file():
@@ -161,7 +161,7 @@ def _extractor(run: Path, variant: Variant) -> LearnedExtractor:
     from sigmaslam.models.extractor import FeatureExtractor
     from sigmaslam.models.network import DESCRIPTOR_SIZE, STRIDE
     from sigmaslam.models.torch_runtime import TorchModule
-    from sigmaslam.training.loop import WEIGHTS_NAME
+    from sigmaslam.training.features.loop import WEIGHTS_NAME
 
     size, stride = (
         int(variant.training.get(key, default))

@@ -21,20 +21,20 @@ import numpy as np
 import torch
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation import consistency
 from sigmaslam.evaluation.benchmarks.consistency_page import Result, Results, Scale, format_page
 from sigmaslam.evaluation.benchmarks.page import write_page
-from sigmaslam.evaluation.evaluate import evaluate_run
+from sigmaslam.evaluation.metrics import map_consistency as consistency
+from sigmaslam.evaluation.run_evaluation import evaluate_run
 from sigmaslam.files import atomic_write_text, make_folder
+from sigmaslam.geometry.rectification import StereoRectifier
+from sigmaslam.geometry.trajectory import read_trajectory
+from sigmaslam.inference.onnx_graph import shipped_weights
 from sigmaslam.readers import open_sequence
-from sigmaslam.rectify import StereoRectifier
-from sigmaslam.report import read_frames
-from sigmaslam.run import track_sequence
-from sigmaslam.session import shipped_weights
-from sigmaslam.synthetic.sequence import SCENE_NAME, write_sequence
+from sigmaslam.runs.report import read_frames
+from sigmaslam.runs.track import track_sequence
+from sigmaslam.slam.tracker import TrackerConfig
+from sigmaslam.synthetic.render_sequence import SCENE_NAME, write_sequence
 from sigmaslam.synthetic.simulation import Recipe, Simulation, Studio
-from sigmaslam.tracker import TrackerConfig
-from sigmaslam.trajectory import read_trajectory
 
 # All three are written rectified, so that the injected offset is one of disparities, exactly.
 SCALES = (

@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 
 from sigmaslam.evaluation.benchmarks.page import header, machine, row
-from sigmaslam.evaluation.consistency import mean_with_error, ratio_with_error, root_mean_square_with_error
+from sigmaslam.evaluation.metrics.map_consistency import mean_with_error, ratio_with_error, root_mean_square_with_error
 
 
 @dataclass(frozen=True, slots=True)

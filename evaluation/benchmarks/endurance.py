@@ -10,19 +10,19 @@ from pathlib import Path
 
 import numpy as np
 
+from sigmaslam.bundle_adjustment.track_file import TRACKS_NAME
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.benchmarks.endurance_page import Block, Endurance, Lap, format_endurance
 from sigmaslam.evaluation.benchmarks.page import write_page
+from sigmaslam.geometry.se3 import se3_inverse
+from sigmaslam.geometry.trajectory import Trajectory, read_trajectory
 from sigmaslam.readers import StereoFrame, StereoSequence, open_sequence
 from sigmaslam.readers.images import RawPair
-from sigmaslam.refine.tracks import TRACKS_NAME
-from sigmaslam.report import read_frames
-from sigmaslam.rotation import se3_inverse
-from sigmaslam.run import track_sequence
-from sigmaslam.synthetic.sequence import default_workers, write_sequence
+from sigmaslam.runs.report import read_frames
+from sigmaslam.runs.track import track_sequence
+from sigmaslam.slam.tracker import TrackerConfig
+from sigmaslam.synthetic.render_sequence import default_workers, write_sequence
 from sigmaslam.synthetic.simulation import Recipe
-from sigmaslam.tracker import TrackerConfig
-from sigmaslam.trajectory import Trajectory, read_trajectory
 
 LAP = Recipe("room", 400, 3000, "loop", width=320, height=240)
 """A path that ends one frame before its start, with the same velocity."""

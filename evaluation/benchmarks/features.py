@@ -15,13 +15,13 @@ import cv2
 import numpy as np
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.benchmarks.filters import Contender, Timing, time_interleaved
 from sigmaslam.evaluation.benchmarks.page import header, machine, row, write_page
+from sigmaslam.evaluation.filters.speed import Contender, Timing, time_interleaved
 from sigmaslam.evaluation.matching import check_sets, compare, format_scores, load_extractor
 from sigmaslam.evaluation.matching.extractors import CLASSICAL, MAX_KEYPOINTS
 from sigmaslam.evaluation.matching.sets import ALL
 from sigmaslam.files import atomic_write_text
-from sigmaslam.session import OnnxGraph, shipped_weights
+from sigmaslam.inference.onnx_graph import OnnxGraph, shipped_weights
 
 ROUNDS = 15
 """At least so many rounds, in each of which every extractor is timed."""

@@ -21,8 +21,8 @@ from sigmaslam.evaluation.matching.pairs import ImagePair, Motion, SameRows
 from sigmaslam.evaluation.matching.rejection import KEYPOINTS, compare_rejection
 from sigmaslam.evaluation.matching.sets import check_sets, load_set
 from sigmaslam.evaluation.matching.start import compare_starts
-from sigmaslam.frontend.judge import MatchJudge
-from sigmaslam.training.match_sets import DETECTORS
+from sigmaslam.frontend.match_confidence import MatchJudge
+from sigmaslam.training.matching.match_sets import DETECTORS
 
 _HOMOGRAPHIES, _STEREO = ("set12", "boat", "churchill"), ("kitti", "euroc")
 _PHOTOGRAPH_KEYPOINTS, _STEREO_KEYPOINTS = 1024, 1500

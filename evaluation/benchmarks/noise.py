@@ -12,13 +12,13 @@ import numpy as np
 
 from sigmaslam.evaluation.benchmarks.page import header, machine, row, write_page
 from sigmaslam.evaluation.benchmarks.sequences import REAL
-from sigmaslam.evaluation.evaluate import evaluate_run
+from sigmaslam.evaluation.run_evaluation import evaluate_run
 from sigmaslam.readers import open_sequence
-from sigmaslam.report import read_frames
-from sigmaslam.run import track_sequence
-from sigmaslam.synthetic.sequence import write_sequence
+from sigmaslam.runs.report import read_frames
+from sigmaslam.runs.track import track_sequence
+from sigmaslam.slam.tracker import TrackerConfig
+from sigmaslam.synthetic.render_sequence import write_sequence
 from sigmaslam.synthetic.simulation import Recipe
-from sigmaslam.tracker import TrackerConfig
 
 CONSTANTS = ((0.15, 0.2), (0.2, 0.3), (0.3, 0.4), (0.5, 0.6))
 """Sigma of a place per axis and of a disparity, pixels, that are tried."""

@@ -13,9 +13,9 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
-from sigmaslam.camera import RectifiedStereo, StereoCamera
-from sigmaslam.rectify import StereoRectifier
-from sigmaslam.rotation import rotation_exp, se3_adjoint, se3_inverse, se3_log, skew
+from sigmaslam.geometry.camera import RectifiedStereo, StereoCamera
+from sigmaslam.geometry.rectification import StereoRectifier
+from sigmaslam.geometry.se3 import rotation_exp, se3_adjoint, se3_inverse, se3_log, skew
 
 _KEYPOINTS = 1500  # as many as the tracker asks for
 _PIXEL_SIGMA = 1.0

@@ -12,15 +12,15 @@ import numpy as np
 
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.benchmarks.page import row
-from sigmaslam.evaluation.evaluate import evaluate_run
 from sigmaslam.evaluation.matching.scores import mutual_nearest
+from sigmaslam.evaluation.run_evaluation import evaluate_run
 from sigmaslam.frontend.classical import SiftDetector
+from sigmaslam.geometry.se3 import rotation_log
+from sigmaslam.geometry.trajectory import read_trajectory
 from sigmaslam.readers import open_sequence
-from sigmaslam.report import read_frames
-from sigmaslam.rotation import rotation_log
-from sigmaslam.run import track_sequence
-from sigmaslam.tracker import TrackerConfig
-from sigmaslam.trajectory import read_trajectory
+from sigmaslam.runs.report import read_frames
+from sigmaslam.runs.track import track_sequence
+from sigmaslam.slam.tracker import TrackerConfig
 
 REAL_DRIVE = "kitti_raw_0926_0039_a"
 PROFILE = "kitti_gt_trajectories/07.txt"
@@ -113,7 +113,7 @@ def render_drives(folder: Path, data: Path, note: Callable[[str], None] = lambda
         data: folder of the real data sets.
         note: told what is being done.
     """
-    from sigmaslam.synthetic.sequence import default_workers, write_sequence
+    from sigmaslam.synthetic.render_sequence import default_workers, write_sequence
     from sigmaslam.synthetic.simulation import Recipe
 
     drives = []

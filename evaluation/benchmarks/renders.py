@@ -23,9 +23,9 @@ from sigmaslam.evaluation.benchmarks import render_speed as speed
 from sigmaslam.evaluation.benchmarks.image_statistics import ImageSet
 from sigmaslam.evaluation.benchmarks.page import row, write_page
 from sigmaslam.evaluation.matching.photographs import read_grey
-from sigmaslam.figures import save_png
 from sigmaslam.plot_style import BLACK, GREY, SERIES, style_axes
 from sigmaslam.readers import open_sequence
+from sigmaslam.runs.figures import save_png
 
 _RAW = "KITTI raw"  # before it was rectified: what the sensor itself does
 _SET12, _KITTI, _EUROC = "denoising/Set12", odometry.REAL_DRIVE, "euroc_v1_01_keyframes_a"

@@ -12,6 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
+from sigmaslam.bundle_adjustment.refine_run import refine_run
+from sigmaslam.bundle_adjustment.track_file import TRACKS_NAME
 from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.evaluation.benchmarks.page import write_page
 from sigmaslam.evaluation.benchmarks.pnp_baselines import PnpOdometry
@@ -23,15 +25,13 @@ from sigmaslam.evaluation.benchmarks.sequences_page import (
     method_label,
     total_cell,
 )
-from sigmaslam.evaluation.evaluate import Evaluation, evaluate_run
+from sigmaslam.evaluation.run_evaluation import Evaluation, evaluate_run
 from sigmaslam.files import make_folder
+from sigmaslam.geometry.trajectory import Trajectory, read_tum, write_tum
 from sigmaslam.readers import open_sequence
-from sigmaslam.refine.run import refine_run
-from sigmaslam.refine.tracks import TRACKS_NAME
-from sigmaslam.report import COLUMNS, FrameTable, read_frames
-from sigmaslam.run import track_sequence
-from sigmaslam.tracker import TrackerConfig
-from sigmaslam.trajectory import Trajectory, read_tum, write_tum
+from sigmaslam.runs.report import COLUMNS, FrameTable, read_frames
+from sigmaslam.runs.track import track_sequence
+from sigmaslam.slam.tracker import TrackerConfig
 
 REAL = (
     ("kitti_raw_0926_0039_a", "poses.txt"),
@@ -177,7 +177,7 @@ def _check_names(kind: str, names: Sequence[str], known: Sequence[str]) -> None:
 def _render(preset: str, folder: Path, note: Callable[[str], None]) -> _Job:
     """Renders a sequence, or finds it there."""
     from sigmaslam.evaluation.benchmarks.consistency import OFFSET, SCALES
-    from sigmaslam.synthetic.sequence import default_workers, write_sequence
+    from sigmaslam.synthetic.render_sequence import default_workers, write_sequence
     from sigmaslam.synthetic.simulation import Recipe
 
     (scale,) = (scale for scale in SCALES if scale.preset == preset)

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 
 from sigmaslam.evaluation.benchmarks.page import machine, table
-from sigmaslam.evaluation.evaluate import Evaluation
-from sigmaslam.report import FrameTable
+from sigmaslam.evaluation.run_evaluation import Evaluation
+from sigmaslam.runs.report import FrameTable
 
 _LABELS = {
     "ours": "ours",

@@ -11,7 +11,7 @@ from pathlib import Path
 from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.evaluation.matching.comparison import compare
 from sigmaslam.evaluation.matching.extractors import CLASSICAL
-from sigmaslam.evaluation.matching.run import format_scores
+from sigmaslam.evaluation.matching.score_sets import format_scores
 from sigmaslam.evaluation.matching.sets import ALL, SELECTION
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from sigmaslam.errors import FrameError, InputError
 from sigmaslam.evaluation.matching.extractors import CLASSICAL, Extractor, load_extractor, remembering
 from sigmaslam.evaluation.matching.pairs import ImagePair
-from sigmaslam.evaluation.matching.run import Scores, score_pairs, score_refined
+from sigmaslam.evaluation.matching.score_sets import Scores, score_pairs, score_refined
 from sigmaslam.evaluation.matching.sets import REFINED, STEPS, TRACKS, check_sets, load_set, load_steps, load_tracks
 from sigmaslam.evaluation.matching.stereo import score_steps
 from sigmaslam.evaluation.matching.tracks import KLT, TRACKED_KEYPOINTS, score_klt

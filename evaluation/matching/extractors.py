@@ -13,7 +13,7 @@ from sigmaslam.evaluation.matching.peers import PeerExtractor, read_signature
 from sigmaslam.frontend.classical import OrbDetector, SiftDetector
 from sigmaslam.frontend.learned import Graph, extract
 from sigmaslam.frontend.types import Features
-from sigmaslam.session import OnnxGraph
+from sigmaslam.inference.onnx_graph import OnnxGraph
 
 MAX_KEYPOINTS = 1024
 CLASSICAL = ("sift", "orb")

@@ -7,15 +7,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sigmaslam.chi_square import CHI_SQUARE_95_OF_2
-from sigmaslam.evaluation.calibration import RIGHT, auroc, average_precision, best_half, calibration_error, spearman
+from sigmaslam.estimation.chi_square import CHI_SQUARE_95_OF_2
+from sigmaslam.estimation.mahalanobis import squared_mahalanobis
 from sigmaslam.evaluation.matching.pairs import Homography, ImagePair, SameRows
-from sigmaslam.frontend.affine import refine_by_neighbours
+from sigmaslam.evaluation.metrics.calibration import (
+    RIGHT,
+    auroc,
+    average_precision,
+    best_half,
+    calibration_error,
+    spearman,
+)
+from sigmaslam.frontend.affine_alignment import refine_by_neighbours
 from sigmaslam.frontend.descriptor import match_stereo
-from sigmaslam.frontend.judge import LEAST_LOGIT, MatchJudge
-from sigmaslam.frontend.matching import nearest_anywhere
+from sigmaslam.frontend.match_confidence import LEAST_LOGIT, MatchJudge
+from sigmaslam.frontend.nearest_neighbours import nearest_anywhere
 from sigmaslam.frontend.types import Features
-from sigmaslam.mahalanobis import squared_mahalanobis
 
 _CONSTANT_SIGMA = 0.3
 # Scale of the robust fit of what is left of a rectification, pixels, and its iterations.

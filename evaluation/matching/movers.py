@@ -8,17 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from sigmaslam.camera import RectifiedStereo
-from sigmaslam.epipolar import estimate_epipolar_pose
-from sigmaslam.evaluation.calibration import RIGHT
-from sigmaslam.frontend.judge import MatchJudge
+from sigmaslam.evaluation.metrics.calibration import RIGHT
+from sigmaslam.frontend.image_pair import match_features
+from sigmaslam.frontend.match_confidence import MatchJudge
 from sigmaslam.frontend.types import Features
-from sigmaslam.match import match_features
-from sigmaslam.rotation import rotation_log
-from sigmaslam.startup import estimate_relative_pose
+from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam.geometry.se3 import rotation_log
 from sigmaslam.synthetic.rendering.visibility import move
 from sigmaslam.synthetic.scene_pairs import ScenePair, ScenePairs
 from sigmaslam.synthetic.truth import at_pixels
+from sigmaslam.two_view.epipolar import estimate_epipolar_pose
+from sigmaslam.two_view.stereo_pose import estimate_relative_pose
 
 SHARES = (0.35, 0.5)
 """Between these are the shares of right matches on moving things: beyond a half the scene may be the lesser body."""

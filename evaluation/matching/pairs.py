@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sigmaslam.rotation import skew
+from sigmaslam.geometry.se3 import skew
 
 LONG_SIDE = 640
 

@@ -11,7 +11,7 @@ import numpy as np
 import onnxruntime
 
 from sigmaslam.errors import FrameError, InputError
-from sigmaslam.session import OnnxGraph
+from sigmaslam.inference.onnx_graph import OnnxGraph
 
 _SIZE_MULTIPLE = 32
 _NAMES = {

@@ -14,8 +14,8 @@ from kornia.feature.adalam.adalam import AdalamFilter
 from sigmaslam.evaluation.matching.pairs import ImagePair, Motion
 from sigmaslam.evaluation.matching.scores import essential_by_magsac
 from sigmaslam.frontend.classical import SiftDetector
-from sigmaslam.frontend.judge import MatchJudge
-from sigmaslam.frontend.matching import Putative, nearest_anywhere
+from sigmaslam.frontend.match_confidence import MatchJudge
+from sigmaslam.frontend.nearest_neighbours import Putative, nearest_anywhere
 from sigmaslam.frontend.types import Features
 
 KEYPOINTS = 2000

@@ -11,9 +11,9 @@ import numpy as np
 from sigmaslam import frontend
 from sigmaslam.evaluation.matching.pairs import Disparity, Homography, ImagePair, Motion, SameRows
 from sigmaslam.frontend.descriptor import match_stereo
-from sigmaslam.frontend.judge import MatchJudge
-from sigmaslam.match import Matches, match_features
-from sigmaslam.rotation import rotation_log
+from sigmaslam.frontend.image_pair import Matches, match_features
+from sigmaslam.frontend.match_confidence import MatchJudge
+from sigmaslam.geometry.se3 import rotation_log
 
 CORNER_THRESHOLDS = (1, 3, 5)
 POSE_THRESHOLDS = (1, 5, 10)

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmaslam.camera import RectifiedStereo
 from sigmaslam.evaluation.matching.pairs import ImagePair, Motion, SameRows, resize
 from sigmaslam.evaluation.matching.stereo import StereoStep
+from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam.geometry.rectification import StereoRectifier
+from sigmaslam.geometry.se3 import se3_inverse
+from sigmaslam.geometry.trajectory import read_trajectory
 from sigmaslam.readers import StereoSequence, open_sequence
-from sigmaslam.rectify import StereoRectifier
-from sigmaslam.rotation import se3_inverse
-from sigmaslam.trajectory import read_trajectory
 
 _KITTI_STEP = 6
 

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sigmaslam.epipolar import estimate_epipolar_pose
 from sigmaslam.evaluation.matching.pairs import ImagePair, Motion
 from sigmaslam.evaluation.matching.scores import pose_by_magsac, pose_errors_deg
-from sigmaslam.frontend.judge import MatchJudge
-from sigmaslam.frontend.matching import nearest_anywhere
+from sigmaslam.frontend.image_pair import Matches, match_features
+from sigmaslam.frontend.match_confidence import MatchJudge
+from sigmaslam.frontend.nearest_neighbours import nearest_anywhere
 from sigmaslam.frontend.types import Features
-from sigmaslam.match import Matches, match_features
+from sigmaslam.two_view.epipolar import estimate_epipolar_pose
 
 # With less translation its direction means nothing, metres.
 _LEAST_TRANSLATION = 0.02

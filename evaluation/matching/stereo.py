@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sigmaslam.camera import RectifiedStereo
 from sigmaslam.evaluation.matching.extractors import Extractor, remembering
 from sigmaslam.evaluation.matching.scores import Features, match_judged, match_rows_refined, mutual_nearest
-from sigmaslam.rotation import rotation_log
+from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam.geometry.se3 import rotation_log
 
 GOOD_POSITION = 0.05
 """Metres."""

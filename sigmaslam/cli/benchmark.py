@@ -48,14 +48,14 @@ def _sequences(
 
 @_registered
 def _filters(out: Path, command: str, *, rounds: int | None, eager: bool) -> str:
-    from sigmaslam.evaluation.benchmarks.filters import write_in_one_thread
+    from sigmaslam.evaluation.filters.speed import write_in_one_thread
 
     return write_in_one_thread(out, rounds or 7, not eager, command + (" --eager" if eager else ""))
 
 
 @_registered
 def _claims(out: Path, command: str) -> str:
-    from sigmaslam.evaluation.benchmarks.filter_claims import write_claims
+    from sigmaslam.evaluation.filters.claims import write_claims
 
     with Console(stderr=True).status("simulating a dozen scenarios (two to seven minutes)"):
         return write_claims(out, out.with_suffix(".png"), command)
@@ -107,7 +107,7 @@ def _matches(out: Path, command: str, *, data: Path | None) -> str:
 @_registered
 def _noise(out: Path, command: str, *, data: Path | None, runs: Path | None) -> str:
     from sigmaslam.evaluation.benchmarks.noise import write_noise
-    from sigmaslam.synthetic.sequence import default_workers
+    from sigmaslam.synthetic.render_sequence import default_workers
 
     folder = _need_runs(runs, "noise", "renders")
     command += f" --runs {folder.name}"
@@ -117,7 +117,7 @@ def _noise(out: Path, command: str, *, data: Path | None, runs: Path | None) -> 
 @_registered
 def _consistency(out: Path, command: str, *, runs: Path | None, seeds: int | None) -> str:
     from sigmaslam.evaluation.benchmarks.consistency import write_consistency
-    from sigmaslam.synthetic.sequence import default_workers
+    from sigmaslam.synthetic.render_sequence import default_workers
 
     folder, seeds = _need_runs(runs, "consistency", "renders and results"), seeds or 30
     command += f" --runs {folder.name} --seeds {seeds}"

@@ -18,7 +18,7 @@ def evaluate(
 
     Of a run with --track-object the truth is T_camera_object of any frame that is fixed to the body.
     """
-    from sigmaslam.evaluation.evaluate import evaluate_run, format_evaluation
+    from sigmaslam.evaluation.run_evaluation import evaluate_run, format_evaluation
 
     evaluation = evaluate_run(run, truth)
     typer.echo(json.dumps(evaluation.to_dict(), indent=2) if as_json else format_evaluation(evaluation))

@@ -27,8 +27,8 @@ def export(
     from sigmaslam.evaluation.matching import read_scores
     from sigmaslam.models.export import export_all, export_scoring
     from sigmaslam.training.card import CARD_NAME
-    from sigmaslam.training.loop import WEIGHTS_NAME
-    from sigmaslam.training.scoring import SCORER_NAME
+    from sigmaslam.training.features.loop import WEIGHTS_NAME
+    from sigmaslam.training.matching.scoring import SCORER_NAME
 
     if (run / SCORER_NAME).is_file():
         if scores is not None:

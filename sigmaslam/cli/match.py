@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from sigmaslam.match import DETECTORS, match_files
+from sigmaslam.frontend.image_pair import DETECTORS, match_files
 
 # mypy reads the members of an enum from literals alone.
 Detector = StrEnum("Detector", list(DETECTORS))  # type: ignore[misc]

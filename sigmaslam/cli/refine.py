@@ -18,7 +18,7 @@ def refine(
 
     The offline reference for the filter. Writes trajectory, covariance, map and refine.json; prints the latter.
     """
-    from sigmaslam.refine import refine_run
+    from sigmaslam.bundle_adjustment import refine_run
 
     with Console(stderr=True).status("reading") as status:
         summary = refine_run(run, out, tell=status.update)

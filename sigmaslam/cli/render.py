@@ -56,7 +56,7 @@ def render(
     Writes a KITTI folder (drone and colon: EuRoC, unrectified), poses, truth/NNNNNN.npz, landmarks.npz, scene.json.
     """
     need_train_extra()
-    from sigmaslam.synthetic.sequence import default_workers, write_sequence
+    from sigmaslam.synthetic.render_sequence import default_workers, write_sequence
     from sigmaslam.synthetic.simulation import Recipe
 
     recipe = Recipe(

@@ -13,9 +13,9 @@ import typer
 from sigmaslam.cli.extras import need_train_extra
 from sigmaslam.errors import InputError
 from sigmaslam.frontend import FRONTENDS
+from sigmaslam.inference.onnx_graph import BACKENDS
 from sigmaslam.readers import StereoSequence, open_cameras, open_sequence
-from sigmaslam.readers.detect import FORMATS
-from sigmaslam.session import BACKENDS
+from sigmaslam.readers.open import FORMATS
 
 # mypy reads the members of an enum from literals alone.
 Frontend = StrEnum("Frontend", FRONTENDS)  # type: ignore[misc]
@@ -33,7 +33,7 @@ def demo(
     frontend: Annotated[Frontend, typer.Option(help="Where correspondences come from.")] = Frontend["learned"],
 ) -> None:
     """Track the rendered sequence that ships with the package and print the errors against its exact truth."""
-    from sigmaslam.evaluation.evaluate import evaluate_run, format_evaluation
+    from sigmaslam.evaluation.run_evaluation import evaluate_run, format_evaluation
 
     folder = out or Path(tempfile.mkdtemp(prefix="sigmaslam-demo-"))
     with as_file(files("sigmaslam.synthetic") / "demo") as sequence:
@@ -148,8 +148,8 @@ def _track(
     track_object: str | None = None,
     location: Path | None = None,
 ) -> dict[str, Any]:
-    from sigmaslam.location import read_locations
-    from sigmaslam.run import track_sequence
+    from sigmaslam.fusion.readings import read_locations
+    from sigmaslam.runs.track import track_sequence
 
     return track_sequence(
         sequence,

@@ -43,8 +43,8 @@ def train(
     """
     need_train_extra()
     from sigmaslam.training.devices import leads
-    from sigmaslam.training.loop import train as run_training
-    from sigmaslam.training.recipes import choose_config, starting_weights
+    from sigmaslam.training.features.loop import train as run_training
+    from sigmaslam.training.features.recipes import choose_config, starting_weights
 
     config = choose_config(recipe.value, steps, None if data is None else data.value, seed)
     # What a resumed run began with is written in its checkpoint.
@@ -70,7 +70,7 @@ def train_scorer(
     hour on 2 cores; stopped by Ctrl-C, the same command goes on.
     """
     need_train_extra()
-    from sigmaslam.training.scoring import ScoringConfig, train_scoring
+    from sigmaslam.training.matching.scoring import ScoringConfig, train_scoring
 
     card = train_scoring(out, ScoringConfig(pairs, steps, verifier_steps, seed), workers)
     typer.echo(json.dumps(card, indent=2))

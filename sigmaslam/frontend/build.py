@@ -5,9 +5,9 @@ from __future__ import annotations
 from sigmaslam.errors import InputError
 from sigmaslam.frontend.classical import OrbDetector, SiftDetector
 from sigmaslam.frontend.descriptor import DescriptorFrontend
-from sigmaslam.frontend.judge import MatchJudge
 from sigmaslam.frontend.klt import KltFrontend
 from sigmaslam.frontend.learned import LearnedDetector
+from sigmaslam.frontend.match_confidence import MatchJudge
 from sigmaslam.frontend.types import Frontend
 
 FRONTENDS = ("learned", "sift", "orb", "klt")

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sigmaslam.frontend.judge import LEAST_LOGIT, MatchJudge
-from sigmaslam.frontend.matching import Putative, nearest_anywhere, nearest_in_ellipses, nearest_in_rows
-from sigmaslam.frontend.planes import refine_in_rows, refine_on_planes
-from sigmaslam.frontend.refine import refine
+from sigmaslam.frontend.lucas_kanade import refine
+from sigmaslam.frontend.match_confidence import LEAST_LOGIT, MatchJudge
+from sigmaslam.frontend.nearest_neighbours import Putative, nearest_anywhere, nearest_in_ellipses, nearest_in_rows
+from sigmaslam.frontend.plane_alignment import refine_in_rows, refine_on_planes
 from sigmaslam.frontend.types import Features, PatchMaps, Refinement, StereoView, TemporalMatches
 
 _ROW_TOLERANCE = 2.0

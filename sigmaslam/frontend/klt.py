@@ -5,8 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from sigmaslam.frontend.matching import within_ellipses
-from sigmaslam.frontend.refine import lucas_kanade
+from sigmaslam.frontend.lucas_kanade import lucas_kanade
+from sigmaslam.frontend.nearest_neighbours import within_ellipses
 from sigmaslam.frontend.types import Features, PatchMaps, StereoView, TemporalMatches
 
 _WINDOW = 15

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from sigmaslam.frontend.types import Features
-from sigmaslam.session import OnnxGraph, shipped_weights
+from sigmaslam.inference.onnx_graph import OnnxGraph, shipped_weights
 
 Graph = Callable[[Mapping[str, np.ndarray]], list[np.ndarray]]
 """What runs the network: an `OnnxGraph`, or the same network in torch."""

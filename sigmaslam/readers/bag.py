@@ -9,9 +9,9 @@ from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from sigmaslam.camera import StereoCamera
 from sigmaslam.errors import CalibrationError, FrameError, InputError, SigmaSlamError
-from sigmaslam.readers.calibration import read_calibration
+from sigmaslam.geometry.camera import StereoCamera
+from sigmaslam.readers.calibration_files import read_calibration
 from sigmaslam.readers.images import RawPair, SkippedFrame, first_readable
 from sigmaslam.readers.kitti import common_size
 from sigmaslam.readers.pairing import STAMP_TOLERANCE_NS, Stamped, pair_streams
@@ -23,7 +23,7 @@ from sigmaslam.readers.ros_messages import (
     stamp_ns,
     stereo_from_infos,
 )
-from sigmaslam.readers.sequence import StereoSequence
+from sigmaslam.readers.stereo_sequence import StereoSequence
 
 logger = logging.getLogger(__name__)
 

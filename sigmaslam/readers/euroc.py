@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmaslam.camera import CalibrationYaml, CameraModel, DistortionModel, StereoCamera
 from sigmaslam.errors import CalibrationError, InputError
-from sigmaslam.readers.calibration import read_calibration
+from sigmaslam.geometry.camera import CalibrationYaml, CameraModel, DistortionModel, StereoCamera
+from sigmaslam.readers.calibration_files import read_calibration
 from sigmaslam.readers.images import ImagePairs
 from sigmaslam.readers.kitti import common_size
 from sigmaslam.readers.pairing import is_stamp, list_images, pair_by_stamp
-from sigmaslam.readers.sequence import StereoSequence
+from sigmaslam.readers.stereo_sequence import StereoSequence
 
 LOOKED_FOR = (
     "folders cam0/data + cam1/data or mav0/cam0/data + mav0/cam1/data, or images/<ns>_0.* and <ns>_1.* "

@@ -13,7 +13,7 @@ from sigmaslam.readers.pairing import (
     pair_by_stamp,
     read_times,
 )
-from sigmaslam.readers.sequence import StereoSequence
+from sigmaslam.readers.stereo_sequence import StereoSequence
 from sigmaslam.readers.video import beside_calibration, find_videos, open_video
 
 LOOKED_FOR = "folders left + right with images"

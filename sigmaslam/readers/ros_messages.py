@@ -7,9 +7,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sigmaslam.camera import CameraModel, DistortionModel, StereoCamera
 from sigmaslam.errors import CalibrationError, FrameError, InputError
-from sigmaslam.readers.calibration import right_position
+from sigmaslam.geometry.camera import CameraModel, DistortionModel, StereoCamera
+from sigmaslam.readers.calibration_files import right_position
 from sigmaslam.readers.euroc import DISTORTION_MODELS
 from sigmaslam.readers.images import decode_image
 

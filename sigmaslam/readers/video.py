@@ -10,12 +10,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sigmaslam.camera import StereoCamera
 from sigmaslam.errors import CalibrationError, InputError
-from sigmaslam.readers.calibration import ImageSize, read_calibration
+from sigmaslam.geometry.camera import StereoCamera
+from sigmaslam.readers.calibration_files import ImageSize, read_calibration
 from sigmaslam.readers.images import IMAGE_SUFFIXES, RawPair
 from sigmaslam.readers.kitti import common_size
-from sigmaslam.readers.sequence import StereoSequence
+from sigmaslam.readers.stereo_sequence import StereoSequence
 
 logger = logging.getLogger(__name__)
 

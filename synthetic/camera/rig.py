@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sigmaslam.camera import CameraModel, StereoCamera
+from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.synthetic.geometry import rigid_motion
 
 # Standard deviations of a loose pair: of the angles between its axes, and of the relative differences in focal length,

@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from sigmaslam.errors import InputError
-from sigmaslam.rotation import rotation_log
+from sigmaslam.geometry.se3 import rotation_log
 from sigmaslam.synthetic.geometry import carried_normals
 
 

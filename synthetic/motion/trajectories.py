@@ -15,7 +15,8 @@ from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from sigmaslam.errors import InputError
-from sigmaslam.rotation import rotation_exp
+from sigmaslam.geometry.se3 import rotation_exp
+from sigmaslam.geometry.trajectory import read_kitti
 from sigmaslam.synthetic.geometry import arc_length
 from sigmaslam.synthetic.motion.paths import (
     KNOT_INTERVAL,
@@ -34,7 +35,6 @@ from sigmaslam.synthetic.motion.paths import (
     wandering_curve,
     with_stops,
 )
-from sigmaslam.trajectory import read_kitti
 
 __all__ = [
     "Box",

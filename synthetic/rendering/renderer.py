@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sigmaslam.camera import CameraModel
+from sigmaslam.geometry.camera import CameraModel
 from sigmaslam.synthetic.geometry import rigid_motion
 from sigmaslam.synthetic.rendering.facets import join
 from sigmaslam.synthetic.rendering.shading import Samples, Shader, meet

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sigmaslam.camera import CameraModel
+from sigmaslam.geometry.camera import CameraModel
 
 _FRAGMENTS = 1 << 22  # filled at a time; bounds the memory
 _SPAN_TOLERANCE = 1e-6  # pixels by which a span is widened, so that neighbours leave no crack

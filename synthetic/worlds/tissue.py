@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sigmaslam.rotation import rotation_exp
+from sigmaslam.geometry.se3 import rotation_exp
 from sigmaslam.synthetic.geometry import rigid_motion
 from sigmaslam.synthetic.motion.paths import Path, at_rest, noise, with_stops
 from sigmaslam.synthetic.motion.trajectories import tool as tool_motion

@@ -12,12 +12,12 @@ from safetensors.torch import save_file
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.benchmarks import ablations
 from sigmaslam.evaluation.benchmarks.ablations import VARIANTS, Variant, configuration, selection_score, write_ablations
-from sigmaslam.evaluation.matching.run import Scores
+from sigmaslam.evaluation.matching.score_sets import Scores
 from sigmaslam.evaluation.matching.sets import SELECTION
 from sigmaslam.models.network import FeatureNetwork
 from sigmaslam.synthetic.rendering.textures import dead_leaves
-from sigmaslam.training import loop
-from sigmaslam.training.loop import WEIGHTS_NAME
+from sigmaslam.training.features import loop
+from sigmaslam.training.features.loop import WEIGHTS_NAME
 
 COUNT = 200
 STEPS = 10
@@ -126,7 +126,7 @@ def test_scores_are_kept_beside_the_weights_and_not_computed_again(tmp_path: Pat
 
 
 def test_a_run_that_was_stopped_goes_on(tmp_path: Path, calls: Calls):
-    from sigmaslam.training.checkpoint import CHECKPOINT_NAME
+    from sigmaslam.training.features.checkpoint import CHECKPOINT_NAME
 
     stopped = tmp_path / "runs" / f"stride_8-{STEPS}-0"
     write(tmp_path, seeds=1)

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from sigmaslam.camera import RectifiedStereo
 from sigmaslam.evaluation.benchmarks.consistency import depths_around
 from sigmaslam.evaluation.benchmarks.consistency_page import Result, Scale, format_page
-from sigmaslam.evaluation.consistency import (
+from sigmaslam.evaluation.metrics.map_consistency import (
     coverage,
     depth_edges,
     mean_with_error,
@@ -19,6 +18,7 @@ from sigmaslam.evaluation.consistency import (
     ratio_with_error,
     root_mean_square_with_error,
 )
+from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.synthetic.simulation import Recipe, Studio, simulate
 
 CAMERA = RectifiedStereo(fx=100.0, fy=100.0, cx=31.5, cy=23.5, baseline=0.1, width=64, height=48)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.evaluate import evaluate_run, format_evaluation
-from sigmaslam.rotation import se3_adjoint, se3_exp, se3_inverse
-from sigmaslam.trajectory import Trajectory, read_kitti, read_trajectory, write_kitti, write_tum
+from sigmaslam.evaluation.run_evaluation import evaluate_run, format_evaluation
+from sigmaslam.geometry.se3 import se3_adjoint, se3_exp, se3_inverse
+from sigmaslam.geometry.trajectory import Trajectory, read_kitti, read_trajectory, write_kitti, write_tum
 
 
 def make_run(folder: Path, truth: Trajectory, seed: int = 0) -> None:

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from sigmaslam.cli import app
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.benchmarks import features
-from sigmaslam.evaluation.benchmarks.filters import Timing
+from sigmaslam.evaluation.filters.speed import Timing
 from sigmaslam.models.network import FeatureNetwork
 
 

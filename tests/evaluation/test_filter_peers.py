@@ -7,9 +7,10 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from sigmaslam.evaluation.benchmarks import filter_peers, filter_work
-from sigmaslam.evaluation.benchmarks.filter_peers import PEERS, Peer
-from sigmaslam.evaluation.benchmarks.filter_work import Belief, StereoWork, Work
+from sigmaslam.evaluation.filters import peers as filter_peers
+from sigmaslam.evaluation.filters import work as filter_work
+from sigmaslam.evaluation.filters.peers import PEERS, Peer
+from sigmaslam.evaluation.filters.work import Belief, StereoWork, Work
 
 WORKS: tuple[Work, ...] = (
     filter_work.stereo(4, seed=1),

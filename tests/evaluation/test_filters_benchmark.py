@@ -5,8 +5,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sigmaslam.evaluation.benchmarks import filter_ours, filter_work
-from sigmaslam.evaluation.benchmarks.filters import Contender, Timing, time_interleaved
+from sigmaslam.evaluation.filters import ours as filter_ours
+from sigmaslam.evaluation.filters import work as filter_work
+from sigmaslam.evaluation.filters.speed import Contender, Timing, time_interleaved
 
 
 @pytest.mark.parametrize("points", [3, 30])

@@ -14,13 +14,13 @@ from sigmaslam.evaluation.matching import compare, comparison, format_scores, lo
 from sigmaslam.evaluation.matching.__main__ import main
 from sigmaslam.evaluation.matching.pairs import Homography, ImagePair, SameRows
 from sigmaslam.evaluation.matching.peers import read_signature
-from sigmaslam.evaluation.matching.run import score_refined
+from sigmaslam.evaluation.matching.score_sets import score_refined
 from sigmaslam.evaluation.matching.scores import score_points, summarize
 from sigmaslam.evaluation.matching.sequences import sequence_pairs, sequence_steps
 from sigmaslam.evaluation.matching.sets import ALL, REFINED, SELECTION, STEPS, TRACKS
-from sigmaslam.frontend.judge import MatchJudge
+from sigmaslam.frontend.image_pair import match_features
+from sigmaslam.frontend.match_confidence import MatchJudge
 from sigmaslam.frontend.types import Features
-from sigmaslam.match import match_features
 from sigmaslam.readers import open_sequence
 from sigmaslam.synthetic.rendering.textures import dead_leaves
 

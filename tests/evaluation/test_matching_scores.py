@@ -14,7 +14,7 @@ from sigmaslam.evaluation.matching.scores import (
     score_points,
     summarize,
 )
-from sigmaslam.rotation import rotation_exp
+from sigmaslam.geometry.se3 import rotation_exp
 
 IMAGE = np.zeros((480, 640), np.uint8)
 K = np.array([[570.0, 0.0, 320.0], [0.0, 560.0, 240.0], [0.0, 0.0, 1.0]])

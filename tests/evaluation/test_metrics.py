@@ -7,7 +7,7 @@ from evo.core import sync as evo_sync
 from evo.core.trajectory import PoseTrajectory3D
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.metrics import (
+from sigmaslam.evaluation.metrics.trajectories import (
     absolute_trajectory_error,
     align,
     align_umeyama,
@@ -18,8 +18,8 @@ from sigmaslam.evaluation.metrics import (
     relative_pose_error,
     synchronise,
 )
-from sigmaslam.rotation import rotation_exp, se3_adjoint, se3_exp, se3_inverse
-from sigmaslam.trajectory import Trajectory, read_kitti
+from sigmaslam.geometry.se3 import rotation_exp, se3_adjoint, se3_exp, se3_inverse
+from sigmaslam.geometry.trajectory import Trajectory, read_kitti
 
 
 @pytest.fixture(scope="module")

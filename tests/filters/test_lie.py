@@ -6,8 +6,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.func import jacrev
 
-from sigmaslam import rotation
 from sigmaslam.filters.onnx.se3 import adjoint_se3, exp_se3, invert_se3, log_se3, skew
+from sigmaslam.geometry import se3 as rotation
 
 
 def twists(count: int, angles: Tensor, seed: int = 0) -> Tensor:

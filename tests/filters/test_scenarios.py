@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Generator, Tensor
 
-from sigmaslam.evaluation.benchmarks import filter_work
-from sigmaslam.evaluation.scenarios import (
+from sigmaslam.evaluation.filters import work as filter_work
+from sigmaslam.evaluation.filters.scenarios import (
     CAMERA,
     Outcome,
     Scenario,

@@ -3,9 +3,9 @@ import torch
 from torch import Tensor
 from torch.func import jacrev, vmap
 
-from sigmaslam.camera import RectifiedStereo
 from sigmaslam.filters.onnx.se3 import exp_se3, invert_se3
 from sigmaslam.filters.onnx.stereo_window import CALIBRATION, LANDMARK, POSE, SIZE, Transfer
+from sigmaslam.geometry.camera import RectifiedStereo
 from tests.support.filter_builders import random_numbers, tensor
 
 CAMERA = RectifiedStereo(fx=400.0, fy=410.0, cx=320.0, cy=240.0, baseline=0.2, width=640, height=480)

@@ -8,6 +8,7 @@ import torch
 from safetensors.torch import save_file
 
 from sigmaslam.errors import InputError
+from sigmaslam.inference.onnx_graph import OnnxGraph, shipped_weights
 from sigmaslam.models import export
 from sigmaslam.models.export import (
     export_features,
@@ -22,7 +23,6 @@ from sigmaslam.models.network import FeatureNetwork
 from sigmaslam.models.scorer import MatchScorer
 from sigmaslam.models.torch_runtime import TorchFeatures, filter_module, scoring_module
 from sigmaslam.models.verifier import MatchVerifier
-from sigmaslam.session import OnnxGraph, shipped_weights
 from sigmaslam.synthetic.rendering.textures import dead_leaves
 
 FILTERS = ("pose_predict", "stereo_transfer")

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from sigmaslam.evaluation.calibration import auroc
-from sigmaslam.frontend.scorer import nearest_matches
+from sigmaslam.evaluation.metrics.calibration import auroc
+from sigmaslam.frontend.scorer_inputs import nearest_matches
 from sigmaslam.models.scorer import SIDE_CHANNELS, MatchScorer, ScoredMatches
 
 pytestmark = pytest.mark.usefixtures("one_thread")

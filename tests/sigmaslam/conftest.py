@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from sigmaslam.geometry.trajectory import read_kitti
 from sigmaslam.readers import open_sequence
-from sigmaslam.tracker import Estimate, StereoTracker
-from sigmaslam.trajectory import read_kitti
+from sigmaslam.slam.tracker import Estimate, StereoTracker
 from tests.support.estimates import Demo, track
 
 

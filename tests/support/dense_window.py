@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from sigmaslam.camera import RectifiedStereo
-from sigmaslam.frame_fit import FrameFit
-from sigmaslam.frame_update import FrameUpdate
-from sigmaslam.landmark_table import LandmarkViews
-from sigmaslam.linearise import ViewLineariser
-from sigmaslam.rotation import se3_exp, se3_inverse, se3_log
-from sigmaslam.window import KeyframeWindow
+from sigmaslam.estimation.frame_fit import FrameFit
+from sigmaslam.estimation.frame_update import FrameUpdate
+from sigmaslam.estimation.keyframe_window import KeyframeWindow
+from sigmaslam.estimation.landmark_table import LandmarkViews
+from sigmaslam.estimation.sigma_point_linearisation import ViewLineariser
+from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
 
 CAMERA = RectifiedStereo(fx=400.0, fy=410.0, cx=319.5, cy=239.5, baseline=0.2, width=640, height=480)
 # Standard deviations of the prior and of the noise.

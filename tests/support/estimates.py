@@ -6,10 +6,10 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from sigmaslam.camera import StereoCamera
+from sigmaslam.geometry.camera import StereoCamera
+from sigmaslam.geometry.se3 import se3_inverse, se3_log
 from sigmaslam.readers import StereoFrame
-from sigmaslam.rotation import se3_inverse, se3_log
-from sigmaslam.tracker import Estimate, StereoTracker
+from sigmaslam.slam.tracker import Estimate, StereoTracker
 from tests.support.quantiles import squared_sigmas
 
 # The rendered sequence that ships with the package: camera, frames, and true poses (N, 4, 4).

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from sigmaslam.readers import StereoFrame
-from sigmaslam.tracker import Estimate
+from sigmaslam.slam.tracker import Estimate
 from tests.support.estimates import squared_error
 from tests.support.quantiles import WITHIN_3_SIGMA
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from sigmaslam.frontend.types import PatchMaps, StereoView, TemporalMatches
-from sigmaslam.object_tracker import ObjectEstimate, ObjectTracker
-from sigmaslam.rotation import se3_exp, se3_inverse, se3_log
+from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
+from sigmaslam.slam.object_tracker import ObjectEstimate, ObjectTracker
 from tests.support.quantiles import chi_square_quantile, squared_sigmas
 from tests.support.simulated_stereo import SimulatedErrors, frame_of, image_of, parallel_camera
 

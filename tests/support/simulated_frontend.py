@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sigmaslam.frontend.types import PatchMaps, StereoView, TemporalMatches
-from sigmaslam.rotation import se3_exp, se3_inverse
-from sigmaslam.tracker import Estimate, StereoTracker
+from sigmaslam.geometry.se3 import se3_exp, se3_inverse
+from sigmaslam.slam.tracker import Estimate, StereoTracker
 from tests.support.estimates import squared_error
 from tests.support.simulated_stereo import ASSUMED, SimulatedErrors, frame_of, image_of, parallel_camera
 

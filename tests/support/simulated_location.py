@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sigmaslam.location import Locations
-from sigmaslam.rotation import se3_adjoint, se3_exp, se3_inverse
-from sigmaslam.tracker import CalibrationEstimate, Estimate
+from sigmaslam.fusion.readings import Locations
+from sigmaslam.geometry.se3 import se3_adjoint, se3_exp, se3_inverse
+from sigmaslam.slam.tracker import CalibrationEstimate, Estimate
 
 FRAME = 0.05
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmaslam.refine.tracks import Tracks
-from sigmaslam.rotation import rotation_exp, se3_exp, se3_inverse
-from sigmaslam.trajectory import Trajectory, write_tum
+from sigmaslam.bundle_adjustment.track_file import Tracks
+from sigmaslam.geometry.se3 import rotation_exp, se3_exp, se3_inverse
+from sigmaslam.geometry.trajectory import Trajectory, write_tum
 
 INTRINSICS = np.array([400.0, 410.0, 320.0, 240.0, 0.2])
 WIDTH, HEIGHT = 640, 480

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from sigmaslam.camera import CameraModel, StereoCamera
 from sigmaslam.frontend.types import Features, StereoView, TemporalMatches
-from sigmaslam.tracker import TrackerConfig
+from sigmaslam.geometry.camera import CameraModel, StereoCamera
+from sigmaslam.slam.tracker import TrackerConfig
 
 # What the tracker assumes.
 ASSUMED = TrackerConfig()

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sigmaslam.camera import CameraModel
+from sigmaslam.geometry.camera import CameraModel
 from sigmaslam.synthetic.motion.paths import Path
 from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel, Sheet
 from sigmaslam.synthetic.scene import Body, Lights, Material, Scene, Texture

@@ -5,8 +5,8 @@ import functools
 import pytest
 
 from sigmaslam.synthetic import pairs
-from sigmaslam.training import loop
-from sigmaslam.training.validation import matching_accuracy
+from sigmaslam.training.features import loop
+from sigmaslam.training.features.validation import matching_accuracy
 
 
 def make_small(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from sigmaslam.synthetic.sequence import write_sequence
+from sigmaslam.synthetic.render_sequence import write_sequence
 from sigmaslam.synthetic.simulation import Recipe, Simulation, Studio
 
 

@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 
-from sigmaslam.rotation import rotation_exp, rotation_log
+from sigmaslam.geometry.se3 import rotation_exp, rotation_log
 from sigmaslam.synthetic.geometry import arc_length
 from sigmaslam.synthetic.motion.paths import (
     LARGEST_NOISE,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from sigmaslam.camera import CameraModel
+from sigmaslam.geometry.camera import CameraModel
 from sigmaslam.synthetic.rendering.facets import Facets, join
 from sigmaslam.synthetic.rendering.renderer import Renderer, Views
 from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel, Tube

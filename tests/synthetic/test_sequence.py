@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from sigmaslam.camera import RectifiedStereo
 from sigmaslam.errors import InputError
+from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.readers import open_sequence
 from sigmaslam.synthetic.presets import PRESETS
+from sigmaslam.synthetic.render_sequence import write_sequence
 from sigmaslam.synthetic.rendering import atlas
-from sigmaslam.synthetic.sequence import write_sequence
 from sigmaslam.synthetic.simulation import Recipe, Simulation, Studio, simulate
 
 SIZE = {"width": 96, "height": 72}

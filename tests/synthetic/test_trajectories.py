@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from sigmaslam.errors import InputError
-from sigmaslam.rotation import rotation_log
+from sigmaslam.geometry.se3 import rotation_log
+from sigmaslam.geometry.trajectory import read_kitti
 from sigmaslam.synthetic.motion.trajectories import (
     CAMERA_HEIGHT,
     Box,
@@ -21,7 +22,6 @@ from sigmaslam.synthetic.motion.trajectories import (
     tool,
     with_stops,
 )
-from sigmaslam.trajectory import read_kitti
 
 Generator = Callable[[np.random.Generator], Path]
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from sigmaslam.camera import CameraModel
+from sigmaslam.geometry.camera import CameraModel
 from sigmaslam.synthetic.choices import MOTIONS
 from sigmaslam.synthetic.rendering.renderer import Renderer
 from sigmaslam.synthetic.rendering.visibility import Eye

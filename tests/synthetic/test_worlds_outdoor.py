@@ -6,7 +6,7 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from sigmaslam.camera import CameraModel
+from sigmaslam.geometry.camera import CameraModel
 from sigmaslam.synthetic.motion import trajectories
 from sigmaslam.synthetic.rendering.renderer import Renderer
 from sigmaslam.synthetic.rendering.visibility import Eye

@@ -7,7 +7,7 @@ import torch
 from safetensors.torch import save_file
 
 from sigmaslam.models.network import FeatureNetwork
-from sigmaslam.training.recipes import TrainingConfig
+from sigmaslam.training.features.recipes import TrainingConfig
 from tests.support.tiny_runs import make_small
 
 

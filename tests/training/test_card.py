@@ -10,8 +10,8 @@ from sigmaslam.errors import InputError
 from sigmaslam.evaluation.matching import read_scores
 from sigmaslam.models.card import card_page, read_card
 from sigmaslam.training.card import current_commit, describe_origin, make_card
-from sigmaslam.training.checkpoint import TrainingState, begin
 from sigmaslam.training.devices import Workplace
+from sigmaslam.training.features.checkpoint import TrainingState, begin
 
 PLACE = Workplace(torch.device("cpu"))
 

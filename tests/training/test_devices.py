@@ -11,8 +11,8 @@ from safetensors.torch import load_file
 from sigmaslam.errors import InputError
 from sigmaslam.models.network import FeatureNetwork
 from sigmaslam.training.devices import Bfloat16Network, NetworkLoss, Workplace, open_workplace
-from sigmaslam.training.loop import WEIGHTS_NAME
-from sigmaslam.training.stream import pair_loader
+from sigmaslam.training.features.loop import WEIGHTS_NAME
+from sigmaslam.training.features.stream import pair_loader
 
 # One process of two: trains, then writes what it has come to, and the gradient of the first step.
 PROCESS = """
@@ -21,8 +21,8 @@ import torch
 from pathlib import Path
 from safetensors.torch import save_file
 from sigmaslam.synthetic import pairs
-from sigmaslam.training import loop
-from sigmaslam.training.recipes import TrainingConfig
+from sigmaslam.training.features import loop
+from sigmaslam.training.features.recipes import TrainingConfig
 
 pairs._TEXTURE_SIZE = 128
 out, config = Path(sys.argv[1]), TrainingConfig(**json.loads(sys.argv[2]))

@@ -8,10 +8,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from sigmaslam.models.network import FeatureNetwork
-from sigmaslam.training import step
-from sigmaslam.training.losses import MatchLoss, match_loss, place_loss
-from sigmaslam.training.step import _zoom, pair_loss
-from sigmaslam.training.stream import NOWHERE
+from sigmaslam.training.features import step
+from sigmaslam.training.features.losses import MatchLoss, match_loss, place_loss
+from sigmaslam.training.features.step import _zoom, pair_loss
+from sigmaslam.training.features.stream import NOWHERE
 
 
 def unit(*shape: int, seed: int = 0) -> Tensor:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from sigmaslam.errors import SigmaSlamError
-from sigmaslam.training import match_sets
-from sigmaslam.training.match_sets import (
+from sigmaslam.training.matching import match_sets
+from sigmaslam.training.matching.match_sets import (
     DETECTORS,
     SIZE,
     MatchSet,

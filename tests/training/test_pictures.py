@@ -3,10 +3,10 @@ import pytest
 import torch
 
 from sigmaslam.models.network import FeatureNetwork
-from sigmaslam.training import pictures
-from sigmaslam.training.pictures import draw_sample
-from sigmaslam.training.stream import open_stream
-from sigmaslam.training.validation import PairMatches
+from sigmaslam.training.features import pictures
+from sigmaslam.training.features.pictures import draw_sample
+from sigmaslam.training.features.stream import open_stream
+from sigmaslam.training.features.validation import PairMatches
 
 
 def coloured(picture: np.ndarray, channel: int) -> np.ndarray:

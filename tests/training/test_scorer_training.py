@@ -10,14 +10,14 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from sigmaslam.errors import InputError
-from sigmaslam.frontend.matching import Putative
-from sigmaslam.frontend.scorer import NEIGHBOURS, nearest_matches
+from sigmaslam.frontend.nearest_neighbours import Putative
+from sigmaslam.frontend.scorer_inputs import NEIGHBOURS, nearest_matches
 from sigmaslam.frontend.types import Features
 from sigmaslam.models.scorer import MatchScorer
-from sigmaslam.training import scorer as scorer_training
 from sigmaslam.training import steps
-from sigmaslam.training.match_sets import MatchSet
-from sigmaslam.training.scorer import (
+from sigmaslam.training.matching import scorer_training as scorer_training
+from sigmaslam.training.matching.match_sets import MatchSet
+from sigmaslam.training.matching.scorer_training import (
     Sample,
     collate,
     make_sample,

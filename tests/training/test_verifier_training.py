@@ -9,15 +9,21 @@ from scipy import stats
 from torch import Tensor
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.calibration import calibration_error
-from sigmaslam.frontend.matching import Putative
+from sigmaslam.evaluation.metrics.calibration import calibration_error
+from sigmaslam.frontend.nearest_neighbours import Putative
 from sigmaslam.frontend.types import Features
 from sigmaslam.models.scorer import MatchScorer
 from sigmaslam.models.verifier import VERIFIER_COLUMNS, MatchVerifier
 from sigmaslam.synthetic.rendering.textures import dead_leaves
-from sigmaslam.training import verifier as verifier_training
-from sigmaslam.training.match_sets import MatchSet, PairRecord
-from sigmaslam.training.verifier import VerifierRows, calibrate, collect_rows, train_verifier, verifier_loss
+from sigmaslam.training.matching import verifier_training as verifier_training
+from sigmaslam.training.matching.match_sets import MatchSet, PairRecord
+from sigmaslam.training.matching.verifier_training import (
+    VerifierRows,
+    calibrate,
+    collect_rows,
+    train_verifier,
+    verifier_loss,
+)
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CHI_SQUARE_95 = stats.chi2(2).ppf(0.95)

@@ -1,0 +1,1 @@
+"""The filter library beside its peers, and on textbook problems."""

@@ -1,0 +1,1 @@
+"""Measures of trajectories, of probabilities and covariances, and of maps."""

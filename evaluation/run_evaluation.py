@@ -1,0 +1,359 @@
+"""Evaluate a run, or a trajectory of any origin, against the truth."""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from sigmaslam.errors import InputError
+from sigmaslam.evaluation.metrics.trajectories import (
+    AbsoluteError,
+    KittiErrors,
+    PoseNees,
+    RelativeError,
+    absolute_trajectory_error,
+    align,
+    associate,
+    kitti_errors,
+    pose_errors,
+    pose_nees,
+    relative_pose_error,
+    synchronise,
+)
+from sigmaslam.geometry.se3 import se3_inverse
+from sigmaslam.geometry.trajectory import (
+    Trajectory,
+    check_covariances,
+    kitti_times_path,
+    read_trajectory,
+    trajectory_format,
+)
+from sigmaslam.plot_style import BLUE, VERMILLION, style_axes
+from sigmaslam.runs.figures import AXIS_NAMES, plot_trajectory, save_png
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """Everything that was found about one trajectory.
+
+    Attributes:
+        estimate_path, truth_path: the files that were compared.
+        association: how frames were paired: "time", "index" (a file without times, as many poses in both) or
+            "time at 10 Hz" (a KITTI file without times).
+        matched: number of estimated poses with a true one.
+        frames: number of frames that a full trajectory would have (see `evaluate_run`).
+        path_length, estimate_path_length: of the matched poses, metres.
+        ate, ate_origin: absolute error after the best rigid alignment, and with only the first poses equal.
+        rpe: error of the motion from frame to frame.
+        kitti: segment errors.
+        nees: of poses relative to the first; None where there is no covariance.
+        figure_path: the plots; None where none were asked for.
+    """
+
+    estimate_path: Path
+    truth_path: Path
+    association: str
+    matched: int
+    frames: int
+    path_length: float
+    estimate_path_length: float
+    ate: AbsoluteError
+    ate_origin: AbsoluteError
+    rpe: RelativeError
+    kitti: KittiErrors
+    nees: PoseNees | None
+    figure_path: Path | None
+
+    @property
+    def coverage(self) -> float:
+        """Share of the frames that have a pose and a truth, 0 to 1."""
+        return self.matched / self.frames
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, texts and lists for JSON; None stands for what could not be computed."""
+        rpe, nees = asdict(self.rpe), asdict(self.nees) if self.nees else None
+        del rpe["translations"], rpe["rotations_deg"]
+        if nees:
+            nees["count"] = len(nees.pop("per_frame"))
+            del nees["timestamps"]
+        result = {
+            "estimate": str(self.estimate_path),
+            "truth": str(self.truth_path),
+            "association": self.association,
+            "matched": self.matched,
+            "frames": self.frames,
+            "coverage": self.coverage,
+            "path_length": self.path_length,
+            "estimate_path_length": self.estimate_path_length,
+            "ate": asdict(self.ate),
+            "ate_origin": asdict(self.ate_origin),
+            "rpe": rpe,
+            "kitti": asdict(self.kitti),
+            "nees": nees,
+            "figure": str(self.figure_path) if self.figure_path else None,
+        }
+        return {key: _plain(value) for key, value in result.items()}
+
+
+def evaluate_run(
+    run_or_trajectory: Path,
+    truth: Path,
+    *,
+    lengths: Sequence[float] | None = None,
+    step: int | None = None,
+    delta: int = 1,
+    max_difference: float = 0.02,
+    plot: bool = True,
+) -> Evaluation:
+    """Compare a run folder or a trajectory file with the truth.
+
+    Frames are paired by time. Where either file is KITTI without times.txt and both have as many poses, they
+    are paired by index; where they have not, the 10 Hz of KITTI are assumed and every time must then agree.
+    Of a run with `--track-object` the truth is T_camera_object of any frame that is fixed to the body.
+    The frames of a run are those of its `frames.csv`; for a file alone they are as many as fit into the time
+    of the truth at the estimate's rate, and never more than there are true poses.
+
+    Args:
+        run_or_trajectory: a folder with `trajectory.tum` (and `covariance.npy`, (N, 6, 6) in the body frame),
+            or a TUM or KITTI file.
+        truth: TUM, KITTI, or EuRoC ground truth.
+        lengths, step: segments of the KITTI errors (see `kitti_errors`).
+        delta: frames in a step of the relative error.
+        max_difference: seconds that paired timestamps may differ.
+        plot: write `evaluation.png` into the run folder or beside the trajectory.
+    Raises:
+        InputError: a file is missing or wrong, or the timestamps do not meet.
+    """
+    run_or_trajectory, truth = Path(run_or_trajectory), Path(truth)
+    is_run = run_or_trajectory.is_dir()
+    estimate_path = run_or_trajectory / "trajectory.tum" if is_run else run_or_trajectory
+    if is_run and not estimate_path.is_file():
+        raise InputError(f"{run_or_trajectory}: holds no trajectory.tum; give a folder written by `sigmaslam track`")
+    estimate, true, association = _same_clock(estimate_path, truth)
+    if association == "time at 10 Hz":
+        max_difference = min(max_difference, 1e-3)
+    estimate_index, _ = associate(estimate, true, max_difference)
+    if association == "time at 10 Hz" and len(estimate_index) < len(estimate):
+        raise InputError(
+            f"{truth}: a KITTI file without times.txt beside it is taken as 10 Hz, but only "
+            f"{len(estimate_index)} of the {len(estimate)} poses of {estimate_path} have such times: put the "
+            "times.txt of the images beside the pose file"
+        )
+    if is_run and _follows_object(run_or_trajectory):
+        true = _of_followed_frame(estimate, true, max_difference)
+    covariance = _read_covariance(run_or_trajectory / "covariance.npy", len(estimate)) if is_run else None
+    matched_estimate, matched_truth = synchronise(estimate, true, max_difference)
+    evaluation = Evaluation(
+        estimate_path=estimate_path,
+        truth_path=truth,
+        association=association,
+        matched=len(matched_estimate),
+        frames=_frame_count(run_or_trajectory if is_run else None, estimate, true, len(matched_estimate)),
+        path_length=matched_truth.path_length,
+        estimate_path_length=matched_estimate.path_length,
+        ate=absolute_trajectory_error(estimate, true, "se3", max_difference),
+        ate_origin=absolute_trajectory_error(estimate, true, "origin", max_difference),
+        rpe=relative_pose_error(estimate, true, delta, max_difference),
+        kitti=kitti_errors(estimate, true, lengths, step, max_difference),
+        nees=pose_nees(estimate, true, covariance, max_difference) if covariance is not None else None,
+        figure_path=estimate_path.parent / "evaluation.png" if plot else None,
+    )
+    if evaluation.figure_path:
+        figure = draw_evaluation(evaluation, estimate, true, covariance, max_difference)
+        save_png(figure, evaluation.figure_path)
+    return evaluation
+
+
+def format_evaluation(evaluation: Evaluation) -> str:
+    """The evaluation as a text table."""
+    e = evaluation
+    lines = [
+        f"estimate  {e.estimate_path}",
+        f"truth     {e.truth_path} (paired by {e.association})",
+        f"frames    {e.matched} of {e.frames} ({100 * e.coverage:.1f} %)",
+        f"path      {e.path_length:.2f} m true, {e.estimate_path_length:.2f} m estimated",
+        "",
+        f"{'':<24}{'rmse [m]':>11}{'mean [m]':>11}{'median [m]':>12}{'max [m]':>11}{'rotation [deg]':>16}",
+    ]
+    for name, ate in (("ATE, best alignment", e.ate), ("ATE, first pose", e.ate_origin)):
+        lines.append(
+            f"{name:<24}{ate.rmse:>11.4f}{ate.mean:>11.4f}{ate.median:>12.4f}{ate.maximum:>11.4f}"
+            f"{ate.rotation_rmse_deg:>16.4f}"
+        )
+    name = f"RPE, {e.rpe.delta} frame" + ("s" if e.rpe.delta > 1 else "")
+    lines.append(
+        f"{name:<24}{e.rpe.translation_rmse:>11.4f}{e.rpe.translations.mean():>11.4f}"
+        f"{e.rpe.translation_median:>12.4f}{e.rpe.translations.max():>11.4f}{e.rpe.rotation_rmse_deg:>16.4f}"
+    )
+    lines.append("")
+    if len(e.kitti.lengths):
+        lines.append(f"{'KITTI segments':<24}{'count':>11}{'t_rel [%]':>11}{'r_rel [deg/100 m]':>19}")
+        k = e.kitti
+        columns = (k.lengths, k.counts, k.translation_percent, k.rotation_deg_per_100m)
+        for length, count, translation, rotation in zip(*columns, strict=True):
+            lines.append(f"{f'  {length:g} m':<24}{count:>11}{translation:>11.3f}{rotation:>19.3f}")
+        lines.append(
+            f"{'  all':<24}{e.kitti.counts.sum():>11}{e.kitti.mean_translation_percent:>11.3f}"
+            f"{e.kitti.mean_rotation_deg_per_100m:>19.3f}"
+        )
+    else:
+        lines.append("KITTI segments: none, the path is shorter than a segment")
+    if e.nees is None:
+        lines += ["", "NEES: no covariance"]
+    elif len(e.nees.per_frame) == 0:
+        lines += ["", "NEES: no frame has a regular covariance"]
+    else:
+        lines += [
+            "",
+            f"NEES per degree of freedom (1 is right, more is overconfident): {e.nees.mean:.2f}; translation "
+            f"{e.nees.mean_translation:.2f}, rotation {e.nees.mean_rotation:.2f}, median {e.nees.median:.2f}",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def draw_evaluation(
+    evaluation: Evaluation,
+    estimate: Trajectory,
+    truth: Trajectory,
+    covariance: np.ndarray | None = None,
+    max_difference: float = 0.02,
+) -> Figure:
+    """View from above, height, errors over time with 3 sigma, and segment errors.
+
+    Args:
+        evaluation: of these trajectories.
+        estimate, truth: trajectories in one clock.
+        covariance: (N, 6, 6) of the estimate, body frame, translation first.
+        max_difference: seconds that paired timestamps may differ.
+    """
+    figure = Figure(figsize=(11, 11), layout="constrained")
+    grid = figure.add_gridspec(3, 2, height_ratios=(1.5, 1, 1))
+    matched_estimate, matched_truth = synchronise(estimate, truth, max_difference)
+    aligned = align(matched_estimate, matched_truth, "se3")
+    seconds = matched_estimate.timestamps - matched_estimate.timestamps[0]
+
+    above = figure.add_subplot(grid[0, 0])
+    _, _, height = plot_trajectory(above, {"truth": matched_truth, "estimate": aligned})
+    above.set_title(f"From above, best alignment: ATE {evaluation.ate.rmse:.3g} m rmse", fontsize=10)
+
+    side = figure.add_subplot(grid[0, 1])
+    side.plot(seconds, matched_truth.positions[:, height], "-", color=BLUE, lw=1.6, label="truth")
+    side.plot(seconds, aligned.positions[:, height], "--", color=VERMILLION, lw=1.6, label="estimate")
+    side.set(xlabel="time [s]", ylabel=f"{AXIS_NAMES[height]} [m]")
+    side.set_title("Third axis, best alignment", fontsize=10)
+    side.legend(fontsize=8)
+
+    errors = pose_errors(estimate, truth, max_difference)
+    units = ((slice(0, 3), 1.0, "position error [m]"), (slice(3, 6), 180 / math.pi, "rotation error [deg]"))
+    panels = [above, side]
+    for column, (part, unit, label) in enumerate(units):
+        panel = figure.add_subplot(grid[1, column])
+        size = unit * np.linalg.norm(errors.errors[:, part], axis=1)
+        panel.plot(seconds, size, color=BLUE, lw=1.3, label="error")
+        if covariance is not None:
+            variance = np.trace(covariance[errors.index][:, part, part], axis1=1, axis2=2)
+            sigma = unit * np.sqrt(np.maximum(variance, 0.0))
+            panel.plot(seconds, 3 * sigma, color=VERMILLION, lw=1.3, ls="--", label="3 sigma of the estimate")
+        panel.set(xlabel="time [s]", ylabel=label)
+        panel.set_ylim(bottom=0)
+        panel.set_title("Error, first poses equal", fontsize=10)
+        panel.legend(fontsize=8, loc="upper left")
+        panels.append(panel)
+
+    kitti = evaluation.kitti
+    values = (
+        (kitti.translation_percent, kitti.mean_translation_percent, "t_rel [%]"),
+        (kitti.rotation_deg_per_100m, kitti.mean_rotation_deg_per_100m, "r_rel [deg/100 m]"),
+    )
+    for column, (by_length, mean, label) in enumerate(values):
+        panel = figure.add_subplot(grid[2, column])
+        _draw_segments(panel, kitti.lengths, by_length, mean)
+        panel.set(xlabel="segment length [m]", ylabel=label)
+        panels.append(panel)
+    for panel in panels:
+        style_axes(panel)
+    return figure
+
+
+def _draw_segments(panel: Axes, lengths: np.ndarray, by_length: np.ndarray, mean: float) -> None:
+    panel.set_title("Segment errors", fontsize=10)
+    if len(lengths) == 0:
+        panel.text(0.5, 0.5, "path shorter than a segment", ha="center", va="center", transform=panel.transAxes)
+        panel.set_xticks([])
+        panel.set_yticks([])
+        return
+    panel.plot(lengths, by_length, "o-", color=BLUE, lw=1.3, label="mean of each length")
+    panel.axhline(mean, color=VERMILLION, lw=1.3, ls="--", label=f"mean of all segments: {mean:.3g}")
+    panel.set_xticks(lengths)
+    panel.set_ylim(0, 1.2 * max(float(np.max(by_length)), 1e-9))
+    panel.legend(fontsize=8, loc="best")
+
+
+def _same_clock(estimate_path: Path, truth_path: Path) -> tuple[Trajectory, Trajectory, str]:
+    """Both trajectories, in one clock, and how that was reached."""
+    estimate, truth = read_trajectory(estimate_path), read_trajectory(truth_path)
+    untimed = any(
+        trajectory_format(path) == "kitti" and kitti_times_path(path) is None for path in (estimate_path, truth_path)
+    )
+    if not untimed:
+        return estimate, truth, "time"
+    if len(estimate) == len(truth):
+        return estimate, Trajectory(estimate.timestamps, truth.poses), "index"
+    return estimate, truth, "time at 10 Hz"
+
+
+def _follows_object(run: Path) -> bool:
+    """Whether a run's poses are those of a body before a camera at rest."""
+    try:
+        return "object" in json.loads((run / "run.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+
+
+def _of_followed_frame(estimate: Trajectory, truth: Trajectory, max_difference: float) -> Trajectory:
+    """The truth of the frame on the body that the run follows; the truth may be of another frame on the body.
+
+    The two frames are taken as the first pair of poses has them to each other. The fixed frame is the camera's in both.
+    """
+    estimate_index, truth_index = associate(estimate, truth, max_difference)
+    first = se3_inverse(truth.poses[truth_index[0]]) @ estimate.poses[estimate_index[0]]
+    return Trajectory(truth.timestamps, truth.poses @ first)
+
+
+def _read_covariance(path: Path, count: int) -> np.ndarray | None:
+    if not path.is_file():
+        return None
+    try:
+        covariance = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(f"{path}: is no numpy array ({error}); run `sigmaslam track` again") from error
+    return check_covariances(covariance, path, count)
+
+
+def _frame_count(run: Path | None, estimate: Trajectory, truth: Trajectory, matched: int) -> int:
+    frames = run / "frames.csv" if run else None
+    if frames and frames.is_file():
+        rows = [line for line in frames.read_text(encoding="utf-8").splitlines() if line.strip()]
+        return max(len(rows) - 1, matched)
+    if len(estimate) < 2:
+        return max(len(truth), matched)
+    interval = float(np.median(np.diff(estimate.timestamps)))
+    fitting = round(float(truth.timestamps[-1] - truth.timestamps[0]) / interval) + 1
+    return max(matched, min(len(truth), max(len(estimate), fitting)))
+
+
+def _plain(value: Any) -> Any:
+    """Arrays as lists, and None for NaN, which JSON does not know."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return [_plain(item) for item in value.tolist()]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,203 @@
+"""Bundle adjustment of a run's tracks (extra `graph`)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sigmaslam.bundle_adjustment.solver import Solver
+from sigmaslam.bundle_adjustment.structure import (
+    Observations,
+    Structure,
+    choose,
+    collect,
+    fit_structure,
+    point_covariances,
+    seen_again,
+    whitened_residuals,
+)
+from sigmaslam.bundle_adjustment.track_file import Tracks
+from sigmaslam.errors import InputError
+from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
+
+# Fewer that agree are no solution.
+_LEAST_SHARE = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class RefineConfig:
+    """Settings.
+
+    Attributes:
+        offset_sigma: prior of the disparity offset about zero, pixels; wide, as rectifications of real data are off by
+            up to a pixel.
+        least_significance: landmarks whose inverse depth is not this many standard deviations above zero are left
+            out: points in Euclidean coordinates cannot be at infinity.
+    """
+
+    offset_sigma: float = 1.0
+    least_significance: float = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Adjustment:
+    """What the adjustment found.
+
+    Attributes:
+        frames: (K,) rows of the keyframes in the trajectory.
+        poses: (K, 4, 4) T_world_camera of the left camera.
+        covariances: (K, 6, 6) of these in the camera's own frame, (translation, rotation), given the first pose.
+        points: (L, 3) landmarks in the world, metres.
+        point_covariances: (L, 3, 3) given poses and offset.
+        point_views: (L,) observations of each landmark in use.
+        disparity_offset, disparity_offset_sigma: pixels.
+        observations: how many are in use.
+        outliers: how many were found wrong.
+        far_landmarks: left out because they cannot be told from infinity.
+        bridges: gaps in the tracks that are spanned by the tracker's own motion.
+        dof: degrees of freedom of the residuals.
+        cost_before, cost_after: sum of squared whitened residuals of the observations in use, per degree of freedom,
+            at the tracker's poses and offset with the points that fit these best, and now.
+        iterations: Levenberg-Marquardt steps of all solves.
+        solves: how many times the graph was solved.
+        converged: False when a solve ran out of iterations, or the offset out of steps.
+    """
+
+    frames: np.ndarray
+    poses: np.ndarray
+    covariances: np.ndarray
+    points: np.ndarray
+    point_covariances: np.ndarray
+    point_views: np.ndarray
+    disparity_offset: float
+    disparity_offset_sigma: float
+    observations: int
+    outliers: int
+    far_landmarks: int
+    bridges: int
+    dof: int
+    cost_before: float
+    cost_after: float
+    iterations: int
+    solves: int
+    converged: bool
+
+
+def adjust(
+    tracks: Tracks,
+    poses: np.ndarray,
+    covariances: np.ndarray,
+    config: RefineConfig | None = None,
+    tell: Callable[[str], None] = lambda note: None,
+) -> Adjustment:
+    """Bundle adjustment of a run's tracks.
+
+    First with Huber's loss; then observations beyond the 99.9 % quantile are left out and the others weighted as
+    their covariances say, twice, the second time with the offset.
+
+    Args:
+        tracks: the observations.
+        poses: (N, 4, 4) T_world_camera of all frames, as tracked.
+        covariances: (N, 6, 6) of these; only the growth over gaps in the tracks is used.
+        config: settings.
+        tell: is told what goes on.
+    Raises:
+        InputError: gtsam is not installed, there is nothing to adjust, or the tracks do not fix all poses.
+    """
+    config = config or RefineConfig()
+    observations, frames = collect(tracks)
+    if len(frames) < 2:
+        raise InputError("all observations are of one keyframe: there is no motion to adjust; track more frames")
+    T_left_rectified = np.eye(4)
+    T_left_rectified[:3, :3] = tracks.R_rectified_left.T
+    tracked = poses[frames] @ T_left_rectified
+    offset = float(tracks.disparity_offset[0])
+    rectified = turn_covariance(se3_inverse(T_left_rectified), covariances[frames])
+    solver = Solver(observations, tracked, rectified, tell)
+
+    repeated = seen_again(observations, np.ones(len(observations), bool))
+
+    def fit(kept: np.ndarray, at: np.ndarray, offset: float) -> tuple[Structure, np.ndarray]:
+        """Points by themselves, with every view where none was kept, and which of the repeated views are far."""
+        tell("points by themselves")
+        lost = np.bincount(observations.landmark[kept], minlength=len(observations.host)) == 0
+        structure = fit_structure(observations, kept | (repeated & lost[observations.landmark]), at, offset)
+        return structure, repeated & ~(structure.significance >= least)[observations.landmark]
+
+    least = config.least_significance
+    structure, far = fit(repeated, tracked, offset)
+    kept = choose(observations, repeated, structure, tracked, offset, least, gated=False)
+    if not kept.any():
+        raise InputError(
+            f"none of {len(structure.points)} landmarks is seen by two keyframes and near enough to have a depth: "
+            "there is nothing to adjust"
+        )
+    solution = solver.solve(kept, tracked, structure.points, offset, robust=True)
+
+    def judge() -> tuple[np.ndarray, Structure]:
+        """Which observations agree with the solution, those left out before included, and points that fit it."""
+        structure, far = fit(kept, solution.poses, offset)
+        agreeing = choose(observations, repeated, structure, solution.poses, offset, least, gated=True)
+        near = int((repeated & ~far).sum())
+        if agreeing.sum() < max(_LEAST_SHARE * near, 1):
+            raise InputError(
+                f"{agreeing.sum()} of {near} observations agree on where things are: too few. Are trajectory and "
+                "tracks of the same run?"
+            )
+        return agreeing, structure
+
+    kept, structure = judge()
+    solution = solver.solve(kept, solution.poses, structure.points, offset)
+    kept, structure = judge()
+    while True:
+        solution, curvature, by_offset = solver.solve_with_offset(
+            kept, solution.poses, structure.points, solution.offset, config.offset_sigma
+        )
+        # Some may have run away to infinity since. Half of the limit, or those at the limit would come and go.
+        structure, far = fit(kept, solution.poses, solution.offset)
+        near = choose(observations, kept, structure, solution.poses, solution.offset, 0.5 * least, gated=False)
+        if np.array_equal(near, kept):
+            break
+        kept = near
+
+    sigma = 1.0 / math.sqrt(curvature)
+    covariance = solver.pose_covariances(solution)
+    # The offset is not in the graph: what its uncertainty does to the poses.
+    covariance += sigma**2 * by_offset[:, :, None] * by_offset[:, None, :]
+    covariance[0] = 0.0
+    used = np.unique(observations.landmark[kept])
+    bridges = len(solver.bridges(kept))
+    components = int(np.where(observations.stereo[kept], 3, 2).sum())
+    dof = components - 3 * len(used) - 6 * (len(frames) - 1) - 1 + 6 * bridges
+    before = fit_structure(observations, kept, tracked, offset)
+    return Adjustment(
+        frames=frames,
+        poses=solution.poses @ se3_inverse(T_left_rectified),
+        covariances=turn_covariance(T_left_rectified, covariance),
+        points=solution.points[used],
+        point_covariances=point_covariances(observations, kept, solution.poses, solution.points)[used],
+        point_views=np.bincount(observations.landmark[kept], minlength=len(observations.host))[used],
+        disparity_offset=solution.offset,
+        disparity_offset_sigma=sigma,
+        observations=int(kept.sum()),
+        outliers=int((repeated & ~kept & ~far).sum()),
+        far_landmarks=len(np.unique(observations.landmark[far & ~kept])),
+        bridges=bridges,
+        dof=dof,
+        cost_before=_sum_of_squares(observations, kept, tracked, before.points, offset) / max(dof, 1),
+        cost_after=_sum_of_squares(observations, kept, solution.poses, solution.points, solution.offset) / max(dof, 1),
+        iterations=solver.iterations,
+        solves=solver.solves,
+        converged=solver.converged,
+    )
+
+
+def _sum_of_squares(
+    observations: Observations, kept: np.ndarray, poses: np.ndarray, points: np.ndarray, offset: float
+) -> float:
+    points = np.nan_to_num(points)
+    residuals, _ = whitened_residuals(observations, poses, points, offset)
+    return float(np.sum(residuals[kept] ** 2))

@@ -1,0 +1,137 @@
+"""Refining a run folder into another one."""
+
+from __future__ import annotations
+
+import json
+import platform
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sigmaslam.bundle_adjustment.adjustment import Adjustment, RefineConfig, adjust
+from sigmaslam.bundle_adjustment.gtsam_bridge import load_gtsam
+from sigmaslam.bundle_adjustment.track_file import TRACKS_NAME, read_tracks
+from sigmaslam.errors import InputError
+from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder, make_folder
+from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
+from sigmaslam.geometry.trajectory import Trajectory, check_covariances, read_tum, write_kitti, write_tum
+from sigmaslam.runs.run_folder import write_ply
+from sigmaslam.slam.point_map import PointMap
+
+
+def refine_run(
+    run: Path, out: Path, config: RefineConfig | None = None, tell: Callable[[str], None] = lambda note: None
+) -> dict[str, Any]:
+    """Bundle adjustment of the tracks of a run; writes trajectory, covariance, map and refine.json.
+
+    Args:
+        run: folder of `sigmaslam track --tracks`.
+        out: folder, new or empty.
+        config: settings.
+        tell: is told what goes on.
+    Returns:
+        What refine.json holds.
+    Raises:
+        InputError: gtsam is not installed, a file of the run is missing or wrong, or `out` holds something.
+    """
+    load_gtsam()
+    config = config or RefineConfig()
+    began = time.perf_counter()
+    if not (run / "trajectory.tum").is_file():
+        raise InputError(f"{run}: holds no trajectory.tum; give a folder written by `sigmaslam track --tracks`")
+    check_new_folder(out)
+    trajectory = read_tum(run / "trajectory.tum")
+    tracks = read_tracks(run / TRACKS_NAME, len(trajectory))
+    covariances = _read_covariances(run / "covariance.npy", len(trajectory))
+    make_folder(out)
+    read = time.perf_counter()
+
+    adjustment = adjust(tracks, trajectory.poses, covariances, config, tell)
+    adjusted = time.perf_counter()
+    summary = {
+        "run": str(run),
+        "configuration": asdict(config),
+        "frames": len(trajectory),
+        "keyframes": len(adjustment.frames),
+        "landmarks": len(adjustment.points),
+        "observations": adjustment.observations,
+        "outliers": adjustment.outliers,
+        "far_landmarks": adjustment.far_landmarks,
+        "bridges": adjustment.bridges,
+        "iterations": adjustment.iterations,
+        "solves": adjustment.solves,
+        "converged": adjustment.converged,
+        "dof": adjustment.dof,
+        "cost_per_dof_before": adjustment.cost_before,
+        "cost_per_dof_after": adjustment.cost_after,
+        "disparity_offset_before": float(tracks.disparity_offset[0]),
+        "disparity_offset_before_sigma": float(tracks.disparity_offset[1]),
+        "disparity_offset": adjustment.disparity_offset,
+        "disparity_offset_sigma": adjustment.disparity_offset_sigma,
+        "seconds_read": read - began,
+        "seconds_adjust": adjusted - read,
+        "versions": {
+            "python": platform.python_version(),
+            **{name: version(name) for name in ("sigmaslam", "numpy", "gtsam")},
+        },
+    }
+    _write(out, trajectory, adjustment)
+    atomic_write_text(out / "refine.json", json.dumps(summary, indent=2) + "\n")
+    return summary
+
+
+def spread_corrections(trajectory: Trajectory, frames: np.ndarray, poses: np.ndarray) -> Trajectory:
+    """All frames, each moved like the keyframes before and after it, in between by time on SE(3).
+
+    Args:
+        trajectory: N frames as tracked.
+        frames: (K,) rows of the keyframes, increasing.
+        poses: (K, 4, 4) their refined poses.
+    """
+    corrections = poses @ se3_inverse(trajectory.poses[frames])
+    before = keyframe_before(frames, len(trajectory))
+    after = np.minimum(before + 1, len(frames) - 1)
+    since = trajectory.timestamps - trajectory.timestamps[frames[before]]
+    interval = trajectory.timestamps[frames[after]] - trajectory.timestamps[frames[before]]
+    # Nothing to go by before the first keyframe and after the last.
+    share = np.where(interval > 0, since / np.where(interval > 0, interval, 1.0), 0.0).clip(0.0, 1.0)
+    change = se3_log(se3_inverse(corrections[before]) @ corrections[after])
+    refined = corrections[before] @ se3_exp(share[:, None] * change) @ trajectory.poses
+    refined[frames] = poses
+    return Trajectory(trajectory.timestamps, refined)
+
+
+def keyframe_before(frames: np.ndarray, count: int) -> np.ndarray:
+    """For each of `count` frames the last keyframe (0 to K - 1) up to it, or the first where there is none."""
+    return np.maximum(np.searchsorted(frames, np.arange(count), side="right") - 1, 0)
+
+
+def _write(out: Path, trajectory: Trajectory, adjustment: Adjustment) -> None:
+    refined = spread_corrections(trajectory, adjustment.frames, adjustment.poses)
+    write_tum(out / "trajectory.tum", refined)
+    write_kitti(out / "trajectory.kitti", refined, out / "times.txt")
+    with atomic_path(out / "covariance.npy") as path:
+        np.save(path, adjustment.covariances[keyframe_before(adjustment.frames, len(trajectory))])
+    count = len(adjustment.points)
+    unknown = np.full((count, 3), np.nan)  # which keyframe saw a point first, and where, is not passed on
+    point_map = PointMap(
+        adjustment.points, adjustment.point_covariances, adjustment.point_views, unknown[:, 0], unknown[:, 1:]
+    )
+    with atomic_path(out / "map.npz") as path:
+        np.savez_compressed(
+            path, points=point_map.points, covariances=point_map.covariances, observations=point_map.observations
+        )
+    write_ply(out / "map.ply", point_map)
+
+
+def _read_covariances(path: Path, count: int) -> np.ndarray:
+    try:
+        covariances = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); run `sigmaslam track --tracks` again") from error
+    return check_covariances(covariances, path, count)

@@ -1,0 +1,73 @@
+"""Constant velocity: pose since the last keyframe and twist, the chapter's twelve states (9.37) on SE(3)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sigmaslam.geometry.se3 import nearest_rigid, se3_inverse, se3_log
+from sigmaslam.inference.onnx_graph import load_step
+
+# Order of the graph's error state, see sigmaslam.filters.onnx.constant_velocity.
+_POSE, _TWIST, _STATE_SIZE = slice(0, 6), slice(6, 12), 12
+
+
+class MotionFilter:
+    """Predicts the pose relative to the last keyframe, and learns the velocity from poses that images give.
+
+    Attributes:
+        step: (4, 4) T_keyframe_camera.
+        twist: (6,) velocity of the camera in its own frame, m/s and rad/s.
+
+    Args:
+        backend: "onnx" or "torch".
+    """
+
+    def __init__(self, backend: str = "onnx") -> None:
+        self._predict = load_step("pose_predict", backend)
+        self.step = np.eye(4)
+        self.twist = np.zeros(6)
+        self._covariance = np.zeros((_STATE_SIZE, _STATE_SIZE))
+
+    @property
+    def step_covariance(self) -> np.ndarray:
+        """(6, 6) of `step`, perturbed from the left in the keyframe."""
+        return self._covariance[_POSE, _POSE]
+
+    def forget_twist(self, sigma: np.ndarray) -> None:
+        """No velocity is known but that it is about zero; sigma (6,) m/s and rad/s."""
+        self.set_twist(np.zeros(6), sigma)
+
+    def set_twist(self, twist: np.ndarray, sigma: np.ndarray) -> None:
+        """Replaces the velocity by one that is independent of the pose."""
+        self.twist = twist
+        self._covariance[_TWIST, :] = 0.0
+        self._covariance[:, _TWIST] = 0.0
+        self._covariance[_TWIST, _TWIST] = np.diag(sigma**2)
+
+    def predict(self, seconds: float, densities: np.ndarray) -> None:
+        """Moves on; densities (2,): power spectra of the accelerations, m^2/s^3 and rad^2/s^3."""
+        self.step, covariance = self._predict(
+            {
+                "pose": self.step,
+                "twist": self.twist,
+                "covariance": self._covariance,
+                "step": np.array(seconds),
+                "densities": densities,
+            }
+        )
+        self._covariance = 0.5 * (covariance + covariance.T)
+
+    def correct(self, step: np.ndarray, covariance: np.ndarray) -> None:
+        """Takes over the posterior of the pose, perturbed from the left in the keyframe, which knew the prediction."""
+        P = self._covariance
+        gain = np.linalg.lstsq(P[_POSE, _POSE], P[_POSE, _TWIST], rcond=1e-14)[0].T
+        self.twist = self.twist + gain @ se3_log(step @ se3_inverse(self.step))
+        twist = P[_TWIST, _TWIST] - gain @ (P[_POSE, _POSE] - covariance) @ gain.T
+        self.step = nearest_rigid(step)
+        self._covariance = np.block([[covariance, covariance @ gain.T], [gain @ covariance, 0.5 * (twist + twist.T)]])
+
+    def start_keyframe(self) -> None:
+        """The current pose is the keyframe's from now on."""
+        self.step = np.eye(4)
+        self._covariance[_POSE, :] = 0.0
+        self._covariance[:, _POSE] = 0.0

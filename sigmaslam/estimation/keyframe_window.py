@@ -1,0 +1,252 @@
+"""The back end: a window of keyframes whose landmarks are marginalised.
+
+Every keyframe of the window keeps the views of its landmarks. The joint posterior of the keyframes' poses and the
+stereo calibration follows from what is known of them without these landmarks (the prior) and from all views at once,
+each landmark eliminated from its own equations (the MSCKF's null space by Schur's complement). So every measurement
+counts once, a landmark's error is shared by all its views as it should be, and a long track connects all the keyframes
+that saw it. A keyframe that leaves the window takes its landmarks along: their views become part of the prior.
+
+Poses are perturbed from the left, in the world: views see relative poses alone, for which a common motion of all is the
+same vector everywhere, so that no linearisation point can leak information into what cannot be seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sigmaslam.estimation.chi_square import CHI_SQUARE_999, CHI_SQUARE_9999_OF_6
+from sigmaslam.estimation.gaussian import condition, matrix_root
+from sigmaslam.estimation.landmark_elimination import Elimination, eliminate_landmarks
+from sigmaslam.estimation.landmark_table import KeyframeViews, LandmarkTable, LandmarkViews
+from sigmaslam.estimation.marginalised_poses import PastPoses, point_lever
+from sigmaslam.estimation.robust import STUDENT_FREEDOM, UNKNOWN_VARIANCE, mask_missing, squared_lengths
+from sigmaslam.estimation.sigma_point_linearisation import Linearisation, ViewLineariser
+from sigmaslam.estimation.state_layout import CALIBRATION_SIZE, LANDMARK_SIZE, MODELLED, pose_slice
+from sigmaslam.estimation.window_state import WindowState
+from sigmaslam.geometry.camera import RectifiedStereo
+
+
+class KeyframeWindow:
+    """Poses of the last keyframes, the stereo calibration, and the landmarks that connect them; owns the state.
+
+    Args:
+        camera: the rectified pair.
+        calibration_sigma: (3,) prior of the calibration, pixels; zero switches a state off.
+        lineariser: of views of landmarks.
+        student_freedom: degrees of freedom of the errors' Student-t; infinite: Gaussian.
+
+    Attributes:
+        prior: what is known without the landmarks of the window.
+        posterior: what is known with them.
+        landmarks: estimated with the posterior.
+        depth: of the scene that the last keyframe sees, metres.
+    """
+
+    def __init__(
+        self,
+        camera: RectifiedStereo,
+        calibration_sigma: np.ndarray,
+        lineariser: ViewLineariser,
+        student_freedom: float = STUDENT_FREEDOM,
+    ) -> None:
+        self.camera = camera
+        self.lineariser = lineariser
+        self.student_freedom = student_freedom
+        self.prior = self.posterior = WindowState.initial(calibration_sigma)
+        self.landmarks = LandmarkTable.empty(CALIBRATION_SIZE)
+        self.depth = 1.0
+        self._observations = KeyframeViews()
+        self._next_id = 0
+
+    def __len__(self) -> int:
+        return len(self.posterior)
+
+    def restart(self, past: PastPoses | None = None) -> None:
+        """Forgets all poses and landmarks, but not the calibration; `past` are poses of another run to begin with."""
+        self.posterior = self.posterior.without_poses()
+        if past is not None:
+            self.posterior = replace(self.posterior, past=past)
+        self.prior = self.posterior
+        self.landmarks = LandmarkTable.empty(CALIBRATION_SIZE)
+        self._observations = KeyframeViews()
+
+    def add_keyframe(
+        self,
+        pose: np.ndarray,
+        step: np.ndarray,
+        step_covariance: np.ndarray,
+        walk: np.ndarray,
+        depth: float,
+        origin: int | None = None,
+    ) -> None:
+        """Adds a keyframe to the end of the window.
+
+        Args:
+            pose: (4, 4) estimate of T_world_camera.
+            step: (4, 4) T_last_new as it was expected without its images; of the first one T_world_camera.
+            step_covariance: (6, 6) of that, perturbed from the left in the world.
+            walk: (3,) variances by which the calibration may have moved since the last keyframe.
+            depth: of the scene that it sees, metres.
+            origin: of the first one, the past pose relative to which `step_covariance` is; the world by default.
+        """
+        expected = self.prior.poses[-1] @ step if len(self.prior) else step
+        self.prior = self.prior.grow(expected, step_covariance, walk, origin)
+        self.posterior = self.posterior.grow(pose, step_covariance, walk, origin)
+        self.depth = depth
+        self.landmarks.dependence = np.pad(self.landmarks.dependence, ((0, 0), (0, 0), (0, 6)))
+
+    def add_views(self, views: LandmarkViews) -> None:
+        """Takes what the last keyframe sees of landmarks of earlier ones."""
+        self._observations = self._observations.append(len(self) - 1, views)
+
+    def add_landmarks(
+        self, feature: np.ndarray, measured: np.ndarray, variance: np.ndarray, disparity_range: np.ndarray | None = None
+    ) -> None:
+        """Adds landmarks that the last keyframe sees first.
+
+        Args:
+            feature: (K,) index among the keyframe's features.
+            measured: (K, 3) (u, v, disparity).
+            variance: (K, 4) of these, and of what the disparities are off by in all views alike.
+            disparity_range: (K,) around them, pixels; zero by default.
+        """
+        count = len(feature)
+        size = len(self.posterior.covariance)
+        variance = np.pad(variance, ((0, 0), (0, LANDMARK_SIZE - MODELLED)), constant_values=1.0)
+        new = LandmarkTable(
+            np.full(count, len(self) - 1),
+            feature,
+            np.pad(measured, ((0, 0), (0, LANDMARK_SIZE - 3))),
+            variance,
+            np.pad(measured, ((0, 0), (0, LANDMARK_SIZE - 3))),
+            np.eye(LANDMARK_SIZE) * variance[:, None, :],
+            np.zeros((count, LANDMARK_SIZE, size)),
+            np.ones(count, np.int64),
+            np.zeros(count, np.int64),
+            self._next_id + np.arange(count),
+            np.zeros(count) if disparity_range is None else disparity_range,
+        )
+        self._next_id += count
+        self.landmarks = LandmarkTable.concatenate([self.landmarks, new])
+
+    def count_sightings(self, searched: np.ndarray, seen: np.ndarray) -> None:
+        """Notes which landmarks a frame searched for and which of them it saw, both by row."""
+        self.landmarks.misses[searched] += 1
+        self.landmarks.misses[seen] = 0
+        self.landmarks.views[seen] += 1
+
+    def solve(self, iterations: int = 2) -> None:
+        """Posterior of poses, calibration and landmarks from the prior and all views: Gauss-Newton, then a gate."""
+        factor = matrix_root(self.prior.covariance)
+        for _ in range(iterations):
+            information, vector, elimination = _eliminate(self, self._observations)
+            offset = self.posterior.minus(self.prior)
+            vector = vector + information @ offset
+            state, covariance = condition(factor, information, vector)
+            step = state - offset
+            self.posterior = self.posterior.moved(step, covariance)
+            rows = elimination.landmark
+            self.landmarks.estimate[rows] += elimination.step + elimination.dependence @ step
+            self.landmarks.covariance[rows] = elimination.covariance
+            self.landmarks.dependence[rows] = elimination.dependence
+        past = self.prior.past.given(self.prior.covariance, information, vector)
+        self.posterior = replace(self.posterior, past=past)
+        agree = _agree(self, self._observations)
+        if not agree.all():
+            self._observations = self._observations.select(agree)
+
+    def add_loop_constraint(self, index: int, T_past_last: np.ndarray, covariance: np.ndarray) -> bool:
+        """Closes a loop: the last keyframe sees what a past pose saw, and the past is corrected with the window.
+
+        Args:
+            index: of the past pose.
+            T_past_last: (4, 4) the last keyframe's pose relative to that one.
+            covariance: (6, 6) of that, perturbed from the left in the world.
+        Returns:
+            False, and nothing is changed, where it contradicts what is known, or says less than is known already.
+        """
+        posterior = self.posterior
+        known = posterior.past.relative_to(posterior.covariance, index)
+        # What the old keyframe was measured with is the same in all its matches: they must not be counted without end.
+        lever = point_lever(posterior.poses[-1:, :3, 3])[0]
+        if np.trace(lever @ known @ lever.T) < np.trace(lever @ covariance @ lever.T):
+            return False
+        difference = posterior.loop_difference(index, T_past_last)
+        squared = difference @ np.linalg.lstsq(known + covariance, difference, rcond=1e-12)[0]
+        if squared > CHI_SQUARE_9999_OF_6:
+            return False
+        self.prior = self.prior.add_loop_constraint(index, T_past_last, covariance)
+        self.solve()
+        return True
+
+    def marginalise_oldest(self) -> np.ndarray:
+        """Drops the oldest keyframe to the past; its landmarks' views become part of the prior.
+
+        Returns:
+            (L,) new row of each landmark, -1 for those that are gone.
+        """
+        leaving = self.landmarks.anchor == 0
+        observed = leaving[self._observations.views.landmark]
+        information, vector, _ = _eliminate(self, self._observations.select(observed))
+        vector = vector + information @ self.posterior.minus(self.prior)
+        self.prior = self.prior.given(information, vector).marginalise_oldest()
+        self.posterior = self.posterior.marginalise_oldest()
+        new_row = np.where(leaving, -1, np.cumsum(~leaving) - 1)
+        self._observations = self._observations.without_oldest(new_row)
+        oldest, size = pose_slice(0), self.landmarks.dependence.shape[2]
+        remaining = np.r_[0 : oldest.start, oldest.stop : size]
+        self.landmarks = self.landmarks.select(~leaving)
+        self.landmarks.anchor = self.landmarks.anchor - 1
+        self.landmarks.dependence = self.landmarks.dependence[:, :, remaining]
+        return new_row
+
+    def forget_past(self, index: int) -> None:
+        """Forgets a pose that left the window."""
+        self.prior, self.posterior = self.prior.forget(index), self.posterior.forget(index)
+
+    def true_disparity(self, measured: np.ndarray) -> np.ndarray:
+        """(u, v, disparity) (K, 3) without what the calibration adds, and of landmarks (K, 6) their own errors."""
+        x = (measured[:, 0] - measured[:, 2] - self.camera.cx) / self.camera.fx
+        y = (measured[:, 1] - self.camera.cy) / self.camera.fy
+        constant, yaw, pitch = self.posterior.calibration
+        bias = measured[:, 3:MODELLED].sum(axis=1) + constant + yaw * x * x + pitch * x * y
+        return np.column_stack([measured[:, :2], measured[:, 2] - bias])
+
+
+# ---- the equations
+
+
+def _eliminate(window: KeyframeWindow, observations: KeyframeViews) -> tuple[np.ndarray, np.ndarray, Elimination]:
+    """Information matrix and vector of the state at the posterior, every landmark's own equations solved for it."""
+    linear, residual, noise, components = _linearise(window, observations)
+    noise = np.where(linear.in_front[:, None, None], noise, UNKNOWN_VARIANCE * np.eye(3))
+    landmark = observations.views.landmark
+    return eliminate_landmarks(window.landmarks, landmark, linear, residual, noise, components, window.student_freedom)
+
+
+def _agree(window: KeyframeWindow, observations: KeyframeViews) -> np.ndarray:
+    """(O,) bool: which views fit the posterior (99.9 %)."""
+    linear, residual, noise, components = _linearise(window, observations)
+    return np.asarray(linear.in_front & (squared_lengths(residual, noise) <= CHI_SQUARE_999[components]))
+
+
+def _linearise(
+    window: KeyframeWindow, observations: KeyframeViews
+) -> tuple[Linearisation, np.ndarray, np.ndarray, np.ndarray]:
+    """Views by keyframes at the posterior, residuals (O, 3), their noise (O, 3, 3), components (O,)."""
+    state, landmarks, views = window.posterior, window.landmarks, observations.views
+    linear = window.lineariser.linearise(
+        state.poses,
+        state.calibration,
+        state.covariance,
+        landmarks.estimate[views.landmark],
+        landmarks.covariance[views.landmark],
+        landmarks.anchor[views.landmark],
+        observations.keyframe,
+        views.common,
+        window.depth,
+    )
+    residual, noise = mask_missing(views.measurement - linear.mean, views.noise + linear.nonlinearity)
+    return linear, residual, noise, views.components

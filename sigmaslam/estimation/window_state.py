@@ -1,0 +1,107 @@
+"""The Gaussian of a window: stereo calibration, keyframe poses, and the poses that left the window."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sigmaslam.estimation.gaussian import condition, matrix_root
+from sigmaslam.estimation.marginalised_poses import PastPoses
+from sigmaslam.estimation.state_layout import CALIBRATION, CALIBRATION_SIZE, pose_slice
+from sigmaslam.geometry.se3 import nearest_rigid, se3_exp, se3_inverse, se3_log
+
+
+@dataclass(frozen=True, slots=True)
+class WindowState:
+    """Mean and covariance of calibration and poses, which are perturbed from the left in the world.
+
+    Attributes:
+        calibration: (3,) disparity offset, and what yaw and pitch of the right camera add to disparities, pixels.
+        poses: (K, 4, 4) T_world_keyframe, the oldest first.
+        covariance: (3 + 6 K, 3 + 6 K) of both.
+        past: marginalised poses, jointly Gaussian with the state.
+    """
+
+    calibration: np.ndarray
+    poses: np.ndarray
+    covariance: np.ndarray
+    past: PastPoses
+
+    @classmethod
+    def initial(cls, calibration_sigma: np.ndarray) -> WindowState:
+        """No poses; a calibration error of mean zero with standard deviations (3,), pixels."""
+        covariance = np.diag(calibration_sigma.astype(float) ** 2)
+        return cls(np.zeros(CALIBRATION_SIZE), np.zeros((0, 4, 4)), covariance, PastPoses.empty())
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    def minus(self, other: WindowState) -> np.ndarray:
+        """(n,) error-state difference of two means."""
+        poses = se3_log(self.poses @ se3_inverse(other.poses)).ravel()
+        return np.r_[self.calibration - other.calibration, poses]
+
+    def moved(self, step: np.ndarray, covariance: np.ndarray) -> WindowState:
+        """The means moved by an error-state step (n,), with another covariance; marginalised poses stay."""
+        poses = nearest_rigid(se3_exp(step[CALIBRATION_SIZE:].reshape(-1, 6)) @ self.poses)
+        return replace(self, calibration=self.calibration + step[CALIBRATION], poses=poses, covariance=covariance)
+
+    def given(self, information: np.ndarray, vector: np.ndarray) -> WindowState:
+        """Posterior when exp(-x^T information x / 2 + vector^T x) is learned about the error state x."""
+        past = self.past.given(self.covariance, information, vector)
+        step, covariance = condition(matrix_root(self.covariance), information, vector)
+        return replace(self.moved(step, covariance), past=past)
+
+    def grow(
+        self, pose: np.ndarray, step_covariance: np.ndarray, walk: np.ndarray, origin: int | None = None
+    ) -> WindowState:
+        """Appends a pose.
+
+        Args:
+            pose: (4, 4) mean of T_world_keyframe.
+            step_covariance: (6, 6) of it relative to the last keyframe, perturbed from the left in the world.
+            walk: (3,) variances by which the calibration may have moved since.
+            origin: in an empty window, the marginalised pose that takes the place of the last keyframe; the world by
+                default.
+        """
+        covariance, past = self.past.grow(self.covariance, step_covariance, walk, origin)
+        poses = np.concatenate([self.poses, nearest_rigid(pose)[None]])
+        return replace(self, poses=poses, covariance=covariance, past=past)
+
+    def marginalise_oldest(self) -> WindowState:
+        """Moves the oldest pose to the past."""
+        oldest = pose_slice(0)
+        remaining = np.r_[0:CALIBRATION_SIZE, oldest.stop : len(self.covariance)]
+        past = self.past.append(self.poses[0], self.covariance, oldest)
+        return replace(
+            self,
+            poses=self.poses[1:],
+            covariance=self.covariance[np.ix_(remaining, remaining)],
+            past=replace(past, cross=past.cross[:, remaining]),
+        )
+
+    def add_loop_constraint(self, index: int, T_past_last: np.ndarray, covariance: np.ndarray) -> WindowState:
+        """Posterior when the last pose has been measured relative to a marginalised one: a loop is closed.
+
+        Args:
+            index: of the marginalised pose.
+            T_past_last: (4, 4) the last pose relative to it, as measured.
+            covariance: (6, 6) of that, perturbed from the left in the world.
+        """
+        difference = self.loop_difference(index, T_past_last)
+        step, posterior, past = self.past.add_loop_constraint(self.covariance, index, difference, covariance)
+        return replace(self.moved(step, posterior), past=past)
+
+    def loop_difference(self, index: int, T_past_last: np.ndarray) -> np.ndarray:
+        """(6,) by which the last pose must move in the world to agree with a measurement from a marginalised one."""
+        return np.asarray(se3_log(self.past.poses[index] @ T_past_last @ se3_inverse(self.poses[-1])))
+
+    def forget(self, index: int) -> WindowState:
+        """Drops a marginalised pose."""
+        return replace(self, past=self.past.drop(index))
+
+    def without_poses(self) -> WindowState:
+        """What is known of the calibration alone."""
+        covariance = self.covariance[CALIBRATION, CALIBRATION]
+        return WindowState(self.calibration, np.zeros((0, 4, 4)), covariance, PastPoses.empty())

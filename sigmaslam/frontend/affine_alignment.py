@@ -1,0 +1,178 @@
+"""Wide-baseline matches made consistent and exact: the map around each match from its neighbours, then patch alignment.
+
+The classical Lucas-Kanade step (`refine`) takes both patches to differ by a shift. Between views that are turned and
+scaled they do not; here each patch is first warped by the affine map that the neighbouring matches agree on.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sigmaslam.frontend.image_smoothing import smoothed
+from sigmaslam.frontend.knn import nearest_points
+from sigmaslam.frontend.patch_evidence import sample_patches
+from sigmaslam.frontend.types import Refinement
+
+_NEIGHBOURS = 24
+# Scale of the robust weight, pixels: from the first fit to the last.
+_FIRST_SCALE, _LAST_SCALE = 12.0, 2.0
+_FITS = 8
+# What holds a map back that its neighbours leave undetermined.
+_PRIOR = 1.0
+_RADIUS = 7
+_ITERATIONS = 6
+_TAPER = 0.6
+_LEAST_CORRELATION = 0.5
+_LONGEST_STEP = 1.0
+# Of a plane seen from elsewhere: no part of a patch is nearer than this share of its centre's distance.
+_LEAST_DEPTH = 0.2
+
+
+def local_maps(points0: np.ndarray, points1: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The affine map around each match that its nearest matches agree on, by iterated weighted least squares.
+
+    Args:
+        points0, points1: (M, 2) matched pixels.
+        weight: (M,) trust in each match, as its probability.
+    Returns:
+        A (M, 2, 2), points1 - points1[i] = A[i] (points0 - points0[i]) near match i, and the distance (M,) in pixels
+        of points1[i] from where the map of its neighbours, itself among them, would have it. Both are infinite for
+        fewer than 4 matches.
+    """
+    count = len(points0)
+    if count < 4:
+        return np.full((count, 2, 2), np.inf), np.full(count, np.inf)
+    near = nearest_points(points0, points0, min(_NEIGHBOURS, count))
+    from0, from1 = points0[near] - points0[:, None], points1[near] - points1[:, None]
+    design = np.concatenate([from0, np.ones((*near.shape, 1))], axis=2)
+    trust = weight[near]
+    fitted = trust
+    scale = _FIRST_SCALE
+    for _ in range(_FITS):
+        weighted = design * fitted[..., None]
+        normal = weighted.transpose(0, 2, 1) @ design + np.diag([_PRIOR, _PRIOR, 1e-3])
+        solution = np.linalg.solve(normal, weighted.transpose(0, 2, 1) @ from1)
+        distance = np.linalg.norm(from1 - design @ solution, axis=2)
+        # Geman-McClure: a match far from the others' map does not pull it.
+        fitted = trust / (1.0 + (distance / scale) ** 2) ** 2
+        scale = max(0.7 * scale, _LAST_SCALE)
+    return solution[:, :2].transpose(0, 2, 1), np.linalg.norm(solution[:, 2], axis=1)
+
+
+def align_patches(
+    image0: np.ndarray,
+    image1: np.ndarray,
+    points0: np.ndarray,
+    points1: np.ndarray,
+    A: np.ndarray,
+    tilt: np.ndarray | None = None,
+    reach: float = 3.0,
+    radius: int = _RADIUS,
+    iterations: int = _ITERATIONS,
+    taper: float = _TAPER,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Places in image 1 where the patches around points of image 0, warped by their maps, fit best.
+
+    Inverse compositional Lucas-Kanade (Baker & Matthews 2004) over a shift, with gain and offset of the grey values
+    free, on patches of 2 radius + 1 pixels of the coarser image.
+
+    Args:
+        image0, image1: (H, W) uint8.
+        points0, points1: (M, 2) matched pixels.
+        A: (M, 2, 2) as `local_maps` gives it.
+        tilt: (M, 2) how the maps depart from affine ones, as of `PatchMaps`; not at all by default.
+        reach: longest move, pixels of image 1.
+        radius: of the patches, pixels of the coarser image.
+        iterations: Gauss-Newton steps.
+        taper: standard deviation of the patches' Gaussian window, radii.
+    Returns:
+        (M, 2) float64 places, unchanged where the patches do not fit or the way is too far, and (M,) bool moved.
+    """
+    places, moved = points1.astype(np.float64), np.zeros(len(points1), bool)
+    # No opaque surface shows its mirror image: a negative determinant is as bad as none.
+    determinant = np.where(
+        np.isfinite(A).all(axis=(1, 2)), np.linalg.det(np.nan_to_num(A, posinf=0.0, neginf=0.0)), 0.0
+    )
+    zoom = np.sqrt(np.maximum(determinant, 0.0))
+    usable = (zoom > 0.2) & (zoom < 5.0) & _inside(image0, points0) & _inside(image1, points1)
+    # The finer image is smoothed as much as the coarser one's pixels do, in steps of half an octave.
+    half_octaves = np.round(2.0 * np.log2(np.clip(zoom, 0.2, 5.0))).astype(int)
+    for step in np.unique(half_octaves[usable]):
+        rows = np.flatnonzero((half_octaves == step) & usable)
+        ratio = 2.0 ** (0.5 * step)
+        spacing = max(1.0, ratio)
+        smooth0, smooth1 = smoothed(image0, max(1.0, 1.0 / ratio)), smoothed(image1, spacing)
+        side = np.arange(-radius, radius + 1, dtype=np.float32)
+        grid = np.float32(spacing) * np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+        offsets = grid @ np.linalg.inv(A[rows]).transpose(0, 2, 1)
+        if tilt is not None:
+            offsets /= np.maximum(1.0 - offsets @ tilt[rows][..., None], _LEAST_DEPTH)
+        template = sample_patches(smooth0, points0[rows, None] + offsets)
+        window = np.exp(-0.5 * (grid**2).sum(axis=1) / np.float32(taper * spacing * radius) ** 2)
+        places[rows], moved[rows] = _align(
+            template, grid, window / window.sum(), smooth1, places[rows], spacing, reach * spacing, iterations
+        )
+    return places, moved
+
+
+def refine_by_neighbours(
+    image0: np.ndarray, image1: np.ndarray, points0: np.ndarray, points1: np.ndarray, logit: np.ndarray
+) -> Refinement:
+    """Aligns the patches of every match, warped as its neighbours say.
+
+    Args:
+        image0, image1: (H, W) uint8.
+        points0, points1: (M, 2) matched pixels.
+        logit: (M,) of the scorer: how far each match is trusted.
+    """
+    points0, points1 = points0.astype(np.float64), points1.astype(np.float64)
+    A, distance = local_maps(points0, points1, 1.0 / (1.0 + np.exp(-logit.astype(np.float64))))
+    places, moved = align_patches(image0, image1, points0, points1, A)
+    return Refinement(points1, places, moved, A, distance)
+
+
+def _inside(image: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return np.asarray(((points >= 0) & (points <= (image.shape[1] - 1, image.shape[0] - 1))).all(axis=1))
+
+
+def _align(
+    template: np.ndarray,
+    grid: np.ndarray,
+    window: np.ndarray,
+    image1: np.ndarray,
+    points1: np.ndarray,
+    spacing: float,
+    reach: float,
+    iterations: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """As `align_patches`, for matches of one zoom.
+
+    Args:
+        template: (M, K) patches of image 0, warped and sampled at offsets `grid` (K, 2), `spacing` apart, of image 1.
+        window: (K,) weights of the samples, of sum 1.
+        image1: (H, W) float32, smoothed.
+        points1, reach, iterations: as there.
+    """
+    count = round(len(grid) ** 0.5)
+    template = _normalised(template, window)
+    square = template.reshape(-1, count, count)
+    along_v, along_u = np.gradient(square, np.float32(spacing), axis=(1, 2))
+    gradient = np.stack([along_u, along_v], axis=1).reshape(len(template), 2, -1)
+    weighted = gradient * window
+    normal = weighted @ gradient.transpose(0, 2, 1) + np.float32(1e-6) * np.eye(2, dtype=np.float32)
+    towards = np.linalg.inv(normal) @ weighted
+    shift = np.zeros_like(points1)
+    for _ in range(iterations):
+        error = _normalised(sample_patches(image1, (points1 + shift)[:, None] + grid), window) - template
+        step = (towards @ error[..., None])[..., 0]
+        length = np.linalg.norm(step, axis=1, keepdims=True)
+        shift -= step * np.minimum(1.0, _LONGEST_STEP * spacing / np.maximum(length, 1e-9))
+    final = _normalised(sample_patches(image1, (points1 + shift)[:, None] + grid), window)
+    moved = ((final * template) @ window > _LEAST_CORRELATION) & (np.linalg.norm(shift, axis=1) <= reach)
+    return np.where(moved[:, None], points1 + shift, points1), moved
+
+
+def _normalised(patches: np.ndarray, window: np.ndarray) -> np.ndarray:
+    """Patches (M, K) of weighted mean 0 and variance 1."""
+    centred = patches - (patches @ window)[:, None]
+    return np.asarray(centred / np.sqrt((centred * centred) @ window + np.float32(1e-2))[:, None])

@@ -1,0 +1,204 @@
+"""Two images in, matches with a probability and a covariance out: `sigmaslam match`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from sigmaslam.errors import InputError
+from sigmaslam.files import atomic_path, atomic_write_bytes
+from sigmaslam.frontend.affine_alignment import refine_by_neighbours
+from sigmaslam.frontend.classical import OrbDetector, SiftDetector
+from sigmaslam.frontend.descriptor import judge_refined
+from sigmaslam.frontend.learned import LearnedDetector
+from sigmaslam.frontend.match_confidence import MatchJudge
+from sigmaslam.frontend.nearest_neighbours import nearest_anywhere
+from sigmaslam.frontend.types import Features
+from sigmaslam.readers.images import read_grey
+
+DETECTORS = {"learned": LearnedDetector, "sift": SiftDetector, "orb": OrbDetector}
+# What is less probable is left out by default.
+LEAST_PROBABILITY = 0.5
+_LEAST_SIDE = 96
+_LEAST_KEYPOINTS = 4
+_MOST_LINES = 200
+
+
+@dataclass(frozen=True, slots=True)
+class Matches:
+    """Correspondences between two images, one to one, the most probable first.
+
+    Attributes:
+        keypoints0, keypoints1: (M, 2) float32 pixel coordinates (u, v) in image 0 and 1, as the images are stored;
+            keypoints1 refined to a fraction of a pixel.
+        probability: (M,) float32, that keypoints1 is within 3 px of the true place of keypoints0 in image 1; calibrated
+            on renders: of matches near 0.8 about 80 per cent are right.
+        covariance: (M, 2, 2) float32, pixels squared, of keypoints1 minus that true place, if the match is right.
+        index0, index1: (M,) which keypoints of either image they are, from the best score down.
+    """
+
+    keypoints0: np.ndarray
+    keypoints1: np.ndarray
+    probability: np.ndarray
+    covariance: np.ndarray
+    index0: np.ndarray
+    index1: np.ndarray
+
+    def select(self, index: np.ndarray) -> Matches:
+        """The matches of that index or mask."""
+        return Matches(*(getattr(self, field.name)[index] for field in fields(self)))
+
+
+def match_images(
+    image0: np.ndarray,
+    image1: np.ndarray,
+    frontend: str = "learned",
+    max_keypoints: int = 1024,
+    min_probability: float = LEAST_PROBABILITY,
+) -> Matches:
+    """Matches between two images of one scene.
+
+    Args:
+        image0, image1: (H, W) uint8 grey, of any two sizes from 96 pixels.
+        frontend: "learned", "sift" or "orb".
+        max_keypoints: most an image, from 4; the time and memory of matching grow with its square.
+        min_probability: matches with less are left out; 0 keeps every mutual nearest neighbour that is not hopeless.
+    Raises:
+        InputError: an image has another shape or type or is too small, or an option is out of range.
+    """
+    detect = _detector(frontend, max_keypoints)
+    _check_probability(min_probability)
+    features0, features1 = detect(_checked(image0, "image0")), detect(_checked(image1, "image1"))
+    return match_features(MatchJudge(), image0, image1, features0, features1, min_probability)
+
+
+def match_features(
+    judge: MatchJudge,
+    image0: np.ndarray,
+    image1: np.ndarray,
+    features0: Features,
+    features1: Features,
+    min_probability: float = LEAST_PROBABILITY,
+) -> Matches:
+    """Mutual nearest neighbours among all keypoints, moved to where the patches, warped as the neighbours say, agree.
+
+    Args:
+        judge: of the matches.
+        image0, image1: (H, W) uint8.
+        features0, features1: of these.
+        min_probability: as `match_images` takes it.
+    """
+    found = judge_refined(
+        judge,
+        image0,
+        image1,
+        features0,
+        features1,
+        nearest_anywhere(features0.descriptors, features1.descriptors),
+        lambda points0, points1, _, logit: refine_by_neighbours(image0, image1, points0, points1, logit),
+    )
+    order = np.argsort(-found.probability, kind="stable")
+    order = order[found.probability[order] >= min_probability]
+    keypoints, places = features0.keypoints[found.index0], found.places.astype(np.float32)
+    return Matches(keypoints, places, found.probability, found.covariance, found.index0, found.index1).select(order)
+
+
+def match_files(
+    path0: Path,
+    path1: Path,
+    out: Path,
+    frontend: str,
+    max_keypoints: int,
+    min_probability: float = LEAST_PROBABILITY,
+    picture: Path | None = None,
+) -> str:
+    """Matches two image files, writes the fields of `Matches` as .npz and perhaps a picture; returns a summary.
+
+    Raises:
+        InputError: a file cannot be read or written, an image is too small, or an option is out of range.
+    """
+    for option, path, suffix in (("--out", out, ".npz"), ("--picture", picture, ".png")):
+        if path is not None and path.suffix != suffix:
+            raise InputError(f"{option} {path} does not end in {suffix}: choose a name that does")
+    if picture is not None and picture.resolve() in (path0.resolve(), path1.resolve()):
+        raise InputError(f"--picture {picture} would overwrite an image that is to be matched: choose another name")
+    detect = _detector(frontend, max_keypoints)
+    _check_probability(min_probability)
+    judge = MatchJudge()
+    image0, image1 = (_checked(read_grey(path), str(path)) for path in (path0, path1))
+    start = time.perf_counter()
+    features0, features1 = detect(image0), detect(image1)
+    detected = time.perf_counter()
+    matches = match_features(judge, image0, image1, features0, features1, min_probability)
+    end = time.perf_counter()
+    with atomic_path(out) as temporary:
+        np.savez_compressed(temporary, **asdict(matches))
+        if picture is not None:
+            atomic_write_bytes(picture, cv2.imencode(".png", draw_matches(image0, image1, matches))[1].tobytes())
+    counts = f"{len(features0.keypoints)} and {len(features1.keypoints)} keypoints"
+    count = len(matches.probability)
+    sigma = np.sqrt(0.5 * np.trace(matches.covariance, axis1=1, axis2=2))
+    found = (
+        f"{count} matches, {matches.probability.sum():.0f} expected to be right, median sigma {np.median(sigma):.2f} px"
+        if count
+        else ""
+    )
+    milliseconds = f"features {1e3 * (detected - start):.0f} ms, matching {1e3 * (end - detected):.0f} ms"
+    return f"{counts}, {found or 'no matches'}; {milliseconds}"
+
+
+def draw_matches(image0: np.ndarray, image1: np.ndarray, matches: Matches) -> np.ndarray:
+    """Both images (H, W) uint8 side by side, lines from purple (probability 0) to yellow (1); (H, W, 3) BGR.
+
+    Of many matches 200 are drawn, evenly chosen from the first to the last.
+    """
+    palette = cv2.applyColorMap(np.arange(256, dtype=np.uint8), cv2.COLORMAP_VIRIDIS).reshape(256, 3).tolist()
+    count = len(matches.probability)
+    # The most probable last: their lines lie on top.
+    rows = np.linspace(count - 1, 0, min(count, _MOST_LINES)).round().astype(int)
+    colours = [palette[round(255.0 * float(probability))] for probability in matches.probability[rows]]
+    return draw_lines(image0, image1, matches.keypoints0[rows], matches.keypoints1[rows], colours)
+
+
+def draw_lines(
+    image0: np.ndarray, image1: np.ndarray, points0: np.ndarray, points1: np.ndarray, colours: Sequence[Sequence[float]]
+) -> np.ndarray:
+    """Both images (H, W) uint8 side by side with lines between points (M, 2) in BGR colours, the last on top."""
+    (height0, width0), (height1, width1) = image0.shape, image1.shape
+    grey = np.zeros((max(height0, height1), width0 + width1), np.uint8)
+    grey[:height0, :width0], grey[:height1, width0:] = image0, image1
+    canvas = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
+    thickness = 1 + canvas.shape[1] // 2000
+    for point0, point1, colour in zip(points0, points1 + (width0, 0), colours, strict=True):
+        start, end = point0.round().astype(int).tolist(), point1.round().astype(int).tolist()
+        cv2.line(canvas, start, end, colour, thickness, cv2.LINE_AA)
+        for place in (start, end):
+            cv2.circle(canvas, place, 3 * thickness, colour, thickness, cv2.LINE_AA)
+    return canvas
+
+
+def _detector(frontend: str, max_keypoints: int) -> Callable[[np.ndarray], Features]:
+    if frontend not in DETECTORS:
+        raise InputError(f"there is no front-end '{frontend}' for two images: choose one of {', '.join(DETECTORS)}")
+    if max_keypoints < _LEAST_KEYPOINTS:
+        raise InputError(f"--max-keypoints is {max_keypoints}: give at least {_LEAST_KEYPOINTS}")
+    return DETECTORS[frontend](max_keypoints)
+
+
+def _check_probability(min_probability: float) -> None:
+    if not 0.0 <= min_probability <= 1.0:
+        raise InputError(f"--min-probability is {min_probability}: give a number from 0 to 1")
+
+
+def _checked(image: np.ndarray, name: str) -> np.ndarray:
+    if image.ndim != 2 or image.dtype != np.uint8:
+        raise InputError(f"{name} is {image.dtype} of shape {image.shape}: give a grey (H, W) uint8 image")
+    height, width = image.shape
+    if min(height, width) < _LEAST_SIDE:
+        raise InputError(f"{name} is {width}x{height} pixels: give one of at least {_LEAST_SIDE} on each side")
+    return image

@@ -1,0 +1,83 @@
+"""Probability and covariance of matches, from the shipped graphs or the same networks in torch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from sigmaslam.frontend.nearest_neighbours import Putative
+from sigmaslam.frontend.patch_evidence import examine_patches
+from sigmaslam.frontend.scorer_inputs import nearest_matches, side_information
+from sigmaslam.frontend.types import Features, Refinement
+from sigmaslam.frontend.verifier_inputs import describe_matches
+from sigmaslam.inference.onnx_graph import OnnxGraph, shipped_weights
+
+LEAST_LOGIT = -4.0
+"""Matches with less from the scorer are not worth a look at their patches; the verifier has seen none of them."""
+
+_Graph = Callable[[Mapping[str, np.ndarray]], list[np.ndarray]]
+
+
+class MatchJudge:
+    """Says how likely a match is right, and how far off it may be.
+
+    Args:
+        backend: "onnx", or "torch" (needs the extra `train`).
+    """
+
+    def __init__(self, backend: str = "onnx") -> None:
+        if backend == "torch":
+            from sigmaslam.models.torch_runtime import scoring_module
+
+            self._scorer: _Graph = scoring_module("scorer")
+            self._verifier: _Graph = scoring_module("verifier")
+        else:
+            self._scorer = OnnxGraph(shipped_weights("scorer.onnx"))
+            self._verifier = OnnxGraph(shipped_weights("verifier.onnx"))
+
+    def score(self, putative: Putative, features0: Features, features1: Features) -> np.ndarray:
+        """(M,) logit that each match is right, from its neighbours and its margins; no image is looked at.
+
+        Args:
+            putative: nearest neighbours, mutual or not, of one pair of images.
+            features0, features1: of these.
+        """
+        if len(putative.index0) == 0:
+            return np.zeros(0, np.float32)
+        points0, points1 = (
+            np.asarray(features.keypoints[index], np.float32)
+            for features, index in ((features0, putative.index0), (features1, putative.index1))
+        )
+        feed = {
+            "points0": points0,
+            "points1": points1,
+            "side": side_information(putative, features0, features1),
+            "near": nearest_matches(points0, putative.mutual),
+        }
+        return self._scorer(feed)[0]
+
+    def verify(
+        self,
+        image0: np.ndarray,
+        image1: np.ndarray,
+        points0: np.ndarray,
+        logit: np.ndarray,
+        refinement: Refinement,
+        sigma: tuple[np.ndarray, np.ndarray],
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Probability (M,) and covariance (M, 2, 2) of the refined places given points0, pixels squared.
+
+        Args:
+            image0, image1: (H, W) uint8.
+            points0: (M, 2) in image 0.
+            logit: (M,) as `score` gives it.
+            refinement: of their places in image 1.
+            sigma: (M,) of the detected keypoints in either image, pixels.
+        """
+        if len(points0) == 0:
+            return np.zeros(0, np.float32), np.zeros((0, 2, 2), np.float32)
+        evidence = examine_patches(image0, image1, points0, refinement.places, refinement.A)
+        columns = describe_matches(logit, evidence, refinement, *sigma)
+        probability, covariance = self._verifier({"columns": columns, "axes": evidence.axes.astype(np.float32)})
+        return probability, covariance

@@ -1,0 +1,46 @@
+"""What the match verifier is told of refined matches."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sigmaslam.frontend.patch_evidence import Evidence
+from sigmaslam.frontend.types import Refinement
+
+_MOST_LOGIT = 8.0
+_MOST_DISTANCE = 50.0
+
+
+def describe_matches(
+    logit: np.ndarray, evidence: Evidence, refinement: Refinement, sigma0: np.ndarray, sigma1: np.ndarray
+) -> np.ndarray:
+    """The columns that the verifier takes.
+
+    Args:
+        logit: (M,) of the scorer.
+        evidence: of the patches at the refined places.
+        refinement: how they came there.
+        sigma0, sigma1: (M,) of the keypoints of either image, pixels.
+    Returns:
+        (M, 14) float32: logit / 4; logs of half the squared difference of the patches, of both contrasts and both
+        sharpnesses; moves along both axes; whether refined, whether by the neighbours' map; logs of both sigmas and
+        of the spacing; distance from the neighbours' map.
+    """
+    shift = np.einsum("mji,mj->mi", evidence.axes, refinement.places - refinement.start) / evidence.spacing[:, None]
+    distance = np.zeros(len(logit)) if refinement.distance is None else refinement.distance
+    return np.column_stack(
+        [
+            np.clip(logit, -_MOST_LOGIT, _MOST_LOGIT) / 4.0,
+            np.log(0.5 * (1.0 - evidence.correlation) + 1e-3),
+            np.log(evidence.contrast0),
+            np.log(evidence.contrast1),
+            np.log(evidence.sharpness + 1e-3),
+            np.log1p(np.abs(shift)),
+            refinement.moved,
+            np.full(len(logit), refinement.A is not None),
+            np.log(sigma0 * evidence.zoom + 0.05),
+            np.log(sigma1 + 0.05),
+            np.log(evidence.spacing),
+            np.log1p(np.minimum(distance, _MOST_DISTANCE)),
+        ]
+    ).astype(np.float32)

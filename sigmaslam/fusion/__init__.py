@@ -1,0 +1,1 @@
+"""Location sensors fused with the tracker's poses."""

@@ -1,0 +1,163 @@
+"""Files of a location sensor: GPS, motion capture, an electromagnetic tracker."""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sigmaslam.errors import InputError
+from sigmaslam.geometry.se3 import quaternion_to_matrix
+
+_POSITION = ("timestamp", "x", "y", "z")
+_QUATERNION = ("qx", "qy", "qz", "qw")
+_SPHERE = ("sigma_position",)
+_AXES = ("sigma_x", "sigma_y", "sigma_z")
+_TRIANGLE = ("cxx", "cxy", "cxz", "cyy", "cyz", "czz")
+_TURN = "sigma_rotation"
+# A quaternion's length may be so much off one: files have few digits.
+_LENGTH_TOLERANCE = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Locations:
+    """Readings of a location sensor in its own world, ordered by time.
+
+    Attributes:
+        timestamps: (N,) seconds, in the clock of the images, strictly increasing.
+        positions: (N, 3) metres.
+        rotations: (N, 3, 3) of the sensor's axes in its world; None from a sensor of positions.
+        covariances: (N, m, m) metres and radians squared: position along the axes of the sensor's world, m = 3; with
+            rotations m = 6, the rotation about the sensor's own axes.
+        source: the file.
+    """
+
+    timestamps: np.ndarray
+    positions: np.ndarray
+    rotations: np.ndarray | None
+    covariances: np.ndarray
+    source: Path | None = None
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+
+def read_locations(path: Path) -> Locations:
+    """Reads a CSV file of `sigmaslam track --location`.
+
+    Its first line names the columns, in any order: timestamp (seconds, in the clock of the images), x, y, z (metres);
+    for poses also qx, qy, qz, qw. The covariance of the position is sigma_position, or sigma_x, sigma_y, sigma_z
+    (metres), or cxx, cxy, cxz, cyy, cyz, czz (metres squared); that of the rotation is sigma_rotation (radians, about
+    any axis). Other columns are left alone.
+
+    Raises:
+        InputError: a column is missing or a value is wrong; the message gives file, line and value.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = [
+                (number, row) for number, row in enumerate(csv.reader(file), 1) if any(cell.strip() for cell in row)
+            ]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(
+            f"{path}: not a CSV file that can be read ({error}); see docs/object.md for its form"
+        ) from None
+    if len(rows) < 2:
+        raise InputError(f"{path}: holds no readings; its first line names the columns, each further line is a reading")
+    names = [cell.strip().lstrip("#").strip() for cell in rows[0][1]]
+    wanted = _columns(path, names)
+    table = np.array([_numbers(path, number, row, names, wanted) for number, row in rows[1:]])
+    lines = [number for number, _ in rows[1:]]
+    value = dict(zip(wanted, table.T, strict=True))
+    for k in np.flatnonzero(np.diff(value["timestamp"]) <= 0)[:1]:
+        raise InputError(
+            f"{path}, line {lines[k + 1]}: timestamp {float(value['timestamp'][k + 1])!r} does not come after "
+            f"{float(value['timestamp'][k])!r}; sort the readings by time and leave out double ones"
+        )
+    covariances = _position_covariances(path, lines, value)
+    rotations = None
+    if _QUATERNION[0] in value:
+        rotations = _rotations(path, lines, np.column_stack([value[name] for name in _QUATERNION]))
+        _check_sigma(path, lines, _TURN, value[_TURN])
+        grown = np.zeros((len(table), 6, 6))
+        grown[:, :3, :3] = covariances
+        grown[:, 3:, 3:] = value[_TURN][:, None, None] ** 2 * np.eye(3)
+        covariances = grown
+    positions = np.column_stack([value[name] for name in _POSITION[1:]])
+    return Locations(value["timestamp"], positions, rotations, covariances, path)
+
+
+def _columns(path: Path, names: list[str]) -> list[str]:
+    """The columns to read."""
+
+    def need(some: tuple[str, ...]) -> list[str]:
+        missing = [name for name in some if name not in names]
+        if missing:
+            raise InputError(
+                f"{path}, line 1: column {missing[0]} is missing, there are {', '.join(names)}; see docs/object.md"
+            )
+        return list(some)
+
+    wanted = need(_POSITION)
+    spreads = [some for some in (_SPHERE, _AXES, _TRIANGLE) if some[0] in names]
+    if len(spreads) != 1:
+        raise InputError(
+            f"{path}, line 1: the covariance of the position must be given once, there are {', '.join(names)}; give "
+            f"the column {_SPHERE[0]}, or {', '.join(_AXES)}, or {', '.join(_TRIANGLE)}"
+        )
+    wanted += need(spreads[0])
+    if any(name in names for name in _QUATERNION):
+        wanted += need((*_QUATERNION, _TURN))
+    return wanted
+
+
+def _numbers(path: Path, line: int, row: list[str], names: list[str], wanted: list[str]) -> list[float]:
+    if len(row) != len(names):
+        raise InputError(f"{path}, line {line}: {len(row)} values for {len(names)} columns; mend or remove the line")
+    cells = dict(zip(names, row, strict=True))
+    values = []
+    for name in wanted:
+        try:
+            number = float(cells[name])
+        except ValueError:
+            number = math.nan
+        if not math.isfinite(number):
+            raise InputError(f"{path}, line {line}: {name} is {cells[name]!r}, no number; mend or remove the line")
+        values.append(number)
+    return values
+
+
+def _check_sigma(path: Path, lines: list[int], name: str, sigma: np.ndarray) -> None:
+    for k in np.flatnonzero(sigma <= 0)[:1]:
+        raise InputError(f"{path}, line {lines[k]}: {name} is {sigma[k]:g}; a standard deviation is larger than zero")
+
+
+def _position_covariances(path: Path, lines: list[int], value: dict[str, np.ndarray]) -> np.ndarray:
+    if _TRIANGLE[0] in value:
+        xx, xy, xz, yy, yz, zz = (value[name] for name in _TRIANGLE)
+        rows = [np.stack(row, axis=-1) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))]
+        covariances = np.stack(rows, axis=-2)
+        for k in np.flatnonzero(np.linalg.eigvalsh(covariances)[:, 0] <= 0)[:1]:
+            raise InputError(
+                f"{path}, line {lines[k]}: {', '.join(_TRIANGLE)} are no covariance, an eigenvalue is not larger than "
+                "zero; give variances and covariances in metres squared"
+            )
+        return covariances
+    names = _AXES if _AXES[0] in value else _SPHERE * 3
+    for name in names:
+        _check_sigma(path, lines, name, value[name])
+    sigma = np.column_stack([value[name] for name in names])
+    return np.asarray(sigma[:, None, :] ** 2 * np.eye(3))
+
+
+def _rotations(path: Path, lines: list[int], quaternions: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(quaternions, axis=1)
+    for k in np.flatnonzero(np.abs(length - 1.0) > _LENGTH_TOLERANCE)[:1]:
+        raise InputError(
+            f"{path}, line {lines[k]}: the quaternion qx, qy, qz, qw has length {length[k]:.4g}, a rotation's has 1; "
+            "check the order of the columns"
+        )
+    return quaternion_to_matrix(quaternions)

@@ -1,0 +1,1 @@
+"""Poses, cameras, rectification and trajectories as arrays."""

@@ -1,0 +1,1 @@
+"""Networks and filter steps as ONNX graphs."""

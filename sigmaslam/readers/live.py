@@ -1,0 +1,187 @@
+"""Live cameras as a sequence: the latest pair wins, those nobody was ready for are dropped."""
+
+import logging
+import threading
+import time
+from collections.abc import Generator, Iterator
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+
+from sigmaslam.errors import InputError
+from sigmaslam.geometry.camera import StereoCamera
+from sigmaslam.readers.calibration_files import read_calibration
+from sigmaslam.readers.capture import Capture, StereoCapture, open_capture
+from sigmaslam.readers.images import MAX_FAILURES, RawPair, SkippedFrame
+from sigmaslam.readers.kitti import common_size
+from sigmaslam.readers.stereo_sequence import StereoFrame, StereoSequence
+
+logger = logging.getLogger(__name__)
+
+SIDE_BY_SIDE = "side-by-side:"
+# What waited in the drivers' buffers while the tracker was made is old; for so long images are thrown away.
+SETTLE_S = 0.5
+# Without a pair for so long the run ends.
+STALL_S = 10.0
+_RETRY_S = 0.01
+_JOIN_S = 2.0
+
+
+def open_cameras(device: str, calibration: Path, seconds: float | None = None) -> "LiveSequence":
+    """Open live cameras.
+
+    Args:
+        device: 'LEFT,RIGHT' or 'side-by-side:DEVICE'. Each is a number, a path (/dev/video2), a URL, or a video
+            file, which is played at its own rate as if it were a camera.
+        calibration: our YAML form, whose image size the cameras are asked for, or KITTI's.
+        seconds: ends the sequence after so long.
+
+    Raises:
+        InputError: a camera cannot be opened or gives no images.
+        CalibrationError: the calibration cannot be read, or the images have another size than it or each other.
+    """
+    both = device.startswith(SIDE_BY_SIDE)
+    devices = [device.removeprefix(SIDE_BY_SIDE)] if both else device.split(",")
+    if len(devices) != (1 if both else 2) or not all(devices) or len(set(devices)) < len(devices):
+        raise InputError(f"camera {device!r}: give two different ones as LEFT,RIGHT (0,1), or {SIDE_BY_SIDE}0")
+    size = None
+    if calibration.suffix.lower() in (".yaml", ".yml"):
+        eye = StereoCamera.from_yaml(calibration).left
+        size = (2 * eye.width if both else eye.width, eye.height)
+    captures: list[Capture] = []
+    try:
+        for name in devices:
+            captures.append(open_capture(name, size))
+        pairs = LivePairs(StereoCapture(captures, [f"camera {name}" for name in devices]), device, seconds)
+        return LiveSequence(pairs, read_calibration(calibration, common_size(pairs.first_pair)), device)
+    except BaseException:
+        for capture in captures:
+            capture.release()
+        raise
+
+
+class LiveSequence(StereoSequence):
+    """Pairs as they come, with their calibration; `frames` can be run once."""
+
+    def __init__(self, pairs: "LivePairs", camera: StereoCamera, device: str) -> None:
+        super().__init__(pairs, camera, device, "camera")
+        self._live = pairs
+
+    @property
+    def dropped(self) -> int:
+        """Pairs that came while nobody was ready for them."""
+        return self._live.dropped
+
+    def _items(self) -> Generator[StereoFrame | SkippedFrame, None, None]:
+        # Not read ahead: what waits in a queue gets old.
+        return self._convert()
+
+
+class LivePairs:
+    """The latest pair, each time it is asked for, as a source of pairs; timestamps begin at 0 with the first.
+
+    A thread takes pairs all the time, so that no driver holds old ones.
+
+    Args:
+        capture: the cameras; they are given back when the iteration ends.
+        name: for messages.
+        seconds: ends the iteration after so long.
+
+    Attributes:
+        timestamps, length: None; nobody knows.
+        dropped: pairs of the iteration that came while nobody was ready for them.
+    """
+
+    def __init__(self, capture: StereoCapture, name: str, seconds: float | None = None) -> None:
+        self.timestamps: list[float] | None = None
+        self.length: int | None = None
+        self.dropped = 0
+        self._capture = capture
+        self._name = name
+        self._seconds = seconds
+        self._thread: threading.Thread | None = None
+        self._stop = threading.Event()
+        # Guards what follows: where the thread puts a pair and the iteration takes it.
+        self._changed = threading.Condition()
+        self._latest: RawPair | None = None
+        self._ended = False
+        self._error: BaseException | None = None
+
+    @cached_property
+    def first_pair(self) -> RawPair:
+        """The first pair, for its size; InputError if there is none."""
+        for _ in range(MAX_FAILURES + 1):
+            pair = self._capture.take(0)
+            if pair is not None:
+                return pair
+        raise InputError(
+            f"{self._capture.failed} gives no images; is another program using it? Two cameras on one USB hub may ask "
+            "for more than it carries: use another port, or smaller images and a calibration for them"
+        )
+
+    def __iter__(self) -> Iterator[RawPair]:
+        if self._thread is not None:
+            raise InputError(f"camera {self._name}: live images can be read once; open the camera again")
+        self._thread = threading.Thread(target=self._take_all, name="sigmaslam-camera", daemon=True)
+        self._thread.start()
+        began, last, used = 0.0, -1.0, 0
+        try:
+            while (pair := self._wait()) is not None:
+                began = began if used else pair.timestamp
+                last = max(pair.timestamp - began, last + 1e-6)
+                if self._seconds is not None and last >= self._seconds:
+                    return
+                used += 1
+                yield replace(pair, timestamp=last)
+        finally:
+            self._stop.set()
+            self._thread.join(_JOIN_S)
+            if self.dropped:
+                logger.warning(
+                    "%d of %d pairs were dropped: tracking takes longer than the %.0f ms from one pair to the next",
+                    self.dropped,
+                    self.dropped + used,
+                    1e3 * self._capture.period,
+                )
+
+    def _wait(self) -> RawPair | None:
+        """The latest pair, or None at the end of a video."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._latest is not None or self._ended, STALL_S)
+            pair, self._latest = self._latest, None
+        if pair is not None:
+            return pair
+        if self._error is not None:
+            raise self._error
+        if self._ended and self._capture.played:
+            return None
+        what = f"{self._capture.failed} gives" if self._ended else f"for {STALL_S:g} s camera {self._name} gave"
+        raise InputError(f"{what} no more images: unplugged? The run ends here")
+
+    def _take_all(self) -> None:
+        """What the thread does."""
+        settled = time.monotonic() + (0.0 if self._capture.played else SETTLE_S)
+        patience = 0 if self._capture.played else MAX_FAILURES
+        index, failures = 0, 0
+        try:
+            while not self._stop.is_set() and failures <= patience:
+                pair = self._capture.take(index)
+                if pair is None:
+                    failures += 1
+                    self._stop.wait(_RETRY_S)
+                    continue
+                failures = 0
+                if pair.timestamp < settled:
+                    continue
+                index += 1
+                with self._changed:
+                    self.dropped += self._latest is not None
+                    self._latest = pair
+                    self._changed.notify()
+        except BaseException as error:
+            self._error = error
+        finally:
+            self._capture.release()
+            with self._changed:
+                self._ended = True
+                self._changed.notify()

@@ -1,0 +1,73 @@
+"""The one door to all readers."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from sigmaslam.errors import InputError
+from sigmaslam.readers import bag, euroc, folder, kitti, video
+from sigmaslam.readers.stereo_sequence import StereoSequence
+
+_OPENERS: dict[str, Callable[[Path, Path | None], StereoSequence]] = {
+    "kitti": kitti.open_kitti,
+    "euroc": euroc.open_euroc,
+    "folder": folder.open_folder,
+    "video": video.open_video,
+}
+FORMATS = ("auto", *_OPENERS, "bag")
+
+
+def open_sequence(
+    path: str | os.PathLike[str],
+    format: str = "auto",
+    calibration: str | os.PathLike[str] | None = None,
+    topics: bag.Topics = (None, None),
+) -> StereoSequence:
+    """Open a stereo sequence and check all of it that can be checked before reading.
+
+    Args:
+        path: a folder (KITTI, EuRoC, plain, or with two videos), a side-by-side video or a ROS bag.
+        format: one of `FORMATS`; 'auto' tries them in that order.
+        calibration: replaces the calibration that the format keeps: our YAML form (`StereoCamera.from_yaml`)
+            or KITTI's calib.txt or calib_cam_to_cam.txt.
+        topics: left and right image topic of a bag; None finds the only one whose name tells the eye.
+
+    Raises:
+        InputError: the path is missing, of no known format, or left and right do not belong together.
+        CalibrationError: the calibration is missing, wrong, or of another image size.
+    """
+    path = Path(path)
+    if format not in FORMATS:
+        raise InputError(f"format {format!r} is unknown; use one of {', '.join(FORMATS)}")
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder")
+    if format == "auto":
+        format = _detect(path)
+    own_calibration = None if calibration is None else Path(calibration)
+    if format == "bag":
+        return bag.open_bag(path, own_calibration, topics)
+    if topics != (None, None):
+        raise InputError(f"{path}: topics are given, and the format is {format!r}; only bags have topics")
+    if format != "video" and not path.is_dir():
+        raise InputError(f"{path}: a file; format {format!r} needs a folder")
+    return _OPENERS[format](path, own_calibration)
+
+
+def _detect(path: Path) -> str:
+    if bag.is_bag(path):
+        return "bag"
+    if path.is_file():
+        return "video"
+    if kitti.find_layout(path):
+        return "kitti"
+    if euroc.find_asl_root(path) or euroc.is_flat(path):
+        return "euroc"
+    if folder.has_image_folders(path):
+        return "folder"
+    if video.find_videos(path):
+        return "video"
+    looked_for = "".join(
+        f"\n  {module.__name__.rpartition('.')[2]}: {module.LOOKED_FOR}"
+        for module in (kitti, euroc, folder, video, bag)
+    )
+    raise InputError(f"{path}: no stereo sequence of a known format; looked for{looked_for}")

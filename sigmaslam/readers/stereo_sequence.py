@@ -1,0 +1,195 @@
+"""A stereo sequence: checked when it is opened, then read ahead in the background."""
+
+import logging
+import queue
+import threading
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+import numpy as np
+
+from sigmaslam.errors import CalibrationError, FrameError, InputError
+from sigmaslam.geometry.camera import CameraModel, StereoCamera
+from sigmaslam.readers.images import MAX_FAILURES, GreyConverter, RawPair, SkippedFrame
+
+logger = logging.getLogger(__name__)
+
+READ_AHEAD = 4
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class StereoFrame:
+    """One stereo pair.
+
+    Attributes:
+        index: number of the pair in the sequence; skipped pairs leave a gap.
+        timestamp: seconds.
+        left, right: (H, W) uint8 grey images, as stored (not rectified here).
+    """
+
+    index: int
+    timestamp: float
+    left: np.ndarray
+    right: np.ndarray
+
+
+class PairSource(Protocol):
+    """What a reader gives: pairs in order, those that cannot be read as SkippedFrame."""
+
+    timestamps: list[float] | None
+    length: int | None
+
+    @property
+    def first_pair(self) -> RawPair:
+        """The first pair that can be read; InputError if none can."""
+
+    def __iter__(self) -> Iterator[RawPair | SkippedFrame]: ...
+
+
+class StereoSequence:
+    """Stereo pairs with their calibration.
+
+    Attributes:
+        camera: calibration of the images as stored.
+        source: the file or folder, or the name of a camera.
+        format: 'kitti', 'euroc', 'folder', 'video', 'bag' or 'camera'.
+        timestamps: seconds, one per pair, or None where they are only known on reading (videos).
+        length: number of pairs, or None where the file does not say.
+        skipped: the pairs that the latest run of `frames` could not use.
+
+    Raises:
+        CalibrationError: the first images have another size than the calibration (the message gives both).
+        InputError: no image can be read.
+    """
+
+    def __init__(self, pairs: PairSource, camera: StereoCamera, source: Path | str, format: str) -> None:
+        self.camera = camera
+        self.source = source
+        self.format = format
+        self.timestamps = pairs.timestamps
+        self.length = pairs.length
+        self.skipped: list[SkippedFrame] = []
+        self._pairs = pairs
+        self._grey = GreyConverter()
+        first = pairs.first_pair
+        for eye, image, name, model in (
+            ("left", first.left, first.left_name, camera.left),
+            ("right", first.right, first.right_name, camera.right),
+        ):
+            mismatch = _size_mismatch(image, model)
+            if mismatch:
+                raise CalibrationError(
+                    f"{name}: {eye} {mismatch}; give the calibration made at the size of these images"
+                )
+            # Fixes the scale of 16-bit images before the first run, so that every run gives the same pixels.
+            try:
+                self._grey.convert(image, name)
+            except FrameError as error:
+                raise InputError(str(error)) from None
+
+    @property
+    def dropped(self) -> int:
+        """Pairs of a live camera that came while nobody was ready for them; 0 for recordings."""
+        return 0
+
+    def frames(self) -> Generator[StereoFrame, None, None]:
+        """Pairs in order, read ahead by a thread that ends with the iteration, however that ends.
+
+        A pair with an image that is missing, broken or of another size is left out, logged as a warning and
+        noted in `skipped`.
+
+        Raises:
+            InputError: more than `MAX_FAILURES` pairs in a row fail, or none can be read.
+        """
+        self.skipped = []
+        failures, any_read = 0, False
+        with closing(self._items()) as items:
+            for item in items:
+                if isinstance(item, StereoFrame):
+                    failures, any_read = 0, True
+                    yield item
+                    continue
+                failures += 1
+                self.skipped.append(item)
+                logger.warning("pair %d is skipped: %s", item.index, item.reason)
+                if failures > MAX_FAILURES:
+                    raise InputError(
+                        f"{self.source}: {failures} pairs in a row cannot be read; the last: {item.reason}"
+                    )
+        if not any_read:
+            raise InputError(f"{self.source}: not one of {len(self.skipped)} pairs can be read")
+
+    def _items(self) -> Generator[StereoFrame | SkippedFrame, None, None]:
+        return read_ahead(self._convert, READ_AHEAD)
+
+    def _convert(self) -> Generator[StereoFrame | SkippedFrame, None, None]:
+        for item in self._pairs:
+            if isinstance(item, SkippedFrame):
+                yield item
+                continue
+            try:
+                left = self._check(item.left, item.left_name, self.camera.left)
+                right = self._check(item.right, item.right_name, self.camera.right)
+                yield StereoFrame(item.index, item.timestamp, left, right)
+            except FrameError as error:
+                yield SkippedFrame(item.index, item.timestamp, str(error))
+
+    def _check(self, image: np.ndarray, name: str, model: CameraModel) -> np.ndarray:
+        mismatch = _size_mismatch(image, model)
+        if mismatch:
+            raise FrameError(f"{name}: {mismatch}")
+        return self._grey.convert(image, name)
+
+
+def _size_mismatch(image: np.ndarray, model: CameraModel) -> str | None:
+    height, width = image.shape[:2]
+    if (width, height) == (model.width, model.height):
+        return None
+    return f"image is {width}x{height}, the calibration is for {model.width}x{model.height}"
+
+
+def read_ahead(produce: Callable[[], Generator[T, None, None]], depth: int) -> Generator[T, None, None]:
+    """Run a generator in a background thread, at most `depth` items ahead of the consumer.
+
+    Its exceptions reach the consumer in their place. Closing this generator ends the thread.
+    """
+    ready: queue.Queue[tuple[T | None, BaseException | None]] = queue.Queue(depth)
+    stop = threading.Event()
+
+    def put(item: T | None, error: BaseException | None) -> None:
+        while not stop.is_set():
+            try:
+                ready.put((item, error), timeout=0.05)
+                return
+            except queue.Full:
+                continue
+
+    def run() -> None:
+        try:
+            with closing(produce()) as items:
+                for item in items:
+                    put(item, None)
+                    if stop.is_set():
+                        return
+            put(None, StopIteration())
+        except BaseException as error:
+            put(None, error)
+
+    thread = threading.Thread(target=run, name="sigmaslam-read-ahead", daemon=True)
+    thread.start()
+    try:
+        while True:
+            item, error = ready.get()
+            if isinstance(error, StopIteration):
+                return
+            if error is not None:
+                raise error
+            yield item  # type: ignore[misc]
+    finally:
+        stop.set()
+        thread.join()

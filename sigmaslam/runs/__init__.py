@@ -1,0 +1,1 @@
+"""Tracking whole recordings into run folders, with a report."""

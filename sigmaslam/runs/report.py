@@ -1,0 +1,356 @@
+"""The report of a run: one HTML file without links to anything outside it."""
+
+import csv
+import json
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
+
+from sigmaslam.errors import InputError
+from sigmaslam.files import atomic_write_text
+from sigmaslam.geometry.trajectory import Trajectory, read_tum
+from sigmaslam.plot_style import BLUE, GREEN, GREY, PURPLE, SERIES, VERMILLION, style_axes
+from sigmaslam.runs.figures import plot_trajectory, to_svg
+
+COLUMNS = (
+    "timestamp",
+    "matches",
+    "inliers",
+    "nis",
+    "dof",
+    "belief",
+    "disparity_offset",
+    "disparity_offset_sigma",
+)
+"""Columns of numbers that frames.csv must have, next to `status` and any number of `ms_...`."""
+STATUSES = ("starting", "tracking", "lost", "relocalised", "skipped")
+STATUS_COLOURS = {"lost": VERMILLION, "relocalised": PURPLE, "skipped": GREY}
+
+MOST_VERTICES = 1000
+"""Frames above which lines become pictures inside the SVG, to keep the report small."""
+MOST_COLUMNS = 250
+"""Steps across filled areas; of more frames the means, or every so many, are drawn."""
+MOST_CONFIGURATION = 20_000
+"""Characters of run.json that are shown."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameTable:
+    """The rows of frames.csv.
+
+    Attributes:
+        status: one of `STATUSES` for each of N frames.
+        columns: by name of `COLUMNS`, (N,) float64; NaN where the field is empty.
+        milliseconds: by stage ("read", "features", ...), (N,) float64; NaN where empty.
+    """
+
+    status: list[str]
+    columns: dict[str, np.ndarray]
+    milliseconds: dict[str, np.ndarray]
+
+    def __len__(self) -> int:
+        return len(self.status)
+
+    @property
+    def seconds(self) -> np.ndarray:
+        """(N,) time since the first frame."""
+        timestamps = self.columns["timestamp"]
+        return np.asarray(timestamps - timestamps[0])
+
+    @property
+    def total_milliseconds(self) -> np.ndarray:
+        """(N,) time spent on each frame; NaN where no stage has a time."""
+        stages = np.array(list(self.milliseconds.values())).reshape(-1, len(self))
+        measured = np.isfinite(stages).any(axis=0)
+        return np.where(measured, np.nansum(stages, axis=0), np.nan)
+
+
+def read_frames(path: Path) -> FrameTable:
+    """Read frames.csv.
+
+    Raises:
+        InputError: the file is missing or empty, a column is missing, or a field is no number or no status.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8") as stream:
+            reader = csv.DictReader(stream)
+            names = reader.fieldnames or []
+            rows = list(reader)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: cannot be read ({error}); give a folder written by `sigmaslam track`") from error
+    missing = [name for name in (*COLUMNS, "status") if name not in names]
+    if missing:
+        raise InputError(f"{path}: has no column {', '.join(missing)}; run `sigmaslam track` again")
+    if not rows:
+        raise InputError(f"{path}: holds no frames; run `sigmaslam track` again")
+    for number, row in enumerate(rows, start=2):
+        if row["status"] not in STATUSES:
+            raise InputError(f"{path}: line {number}: status {row['status']!r} is none of {', '.join(STATUSES)}")
+    stages = [name for name in names if re.fullmatch(r"ms_[a-z0-9_]+", name)]
+    return FrameTable(
+        status=[row["status"] for row in rows],
+        columns={name: _column(path, rows, name) for name in COLUMNS},
+        milliseconds={name.removeprefix("ms_"): _column(path, rows, name) for name in stages},
+    )
+
+
+def write_report(run_dir: str | Path) -> Path:
+    """Write `report.html` from the files of a run folder.
+
+    Reads trajectory.tum and frames.csv, and map.npz and run.json where they are.
+
+    Returns:
+        The path of the report.
+    Raises:
+        InputError: trajectory.tum or frames.csv is missing, or a file is wrong.
+    """
+    run_dir = Path(run_dir)
+    trajectory = read_tum(run_dir / "trajectory.tum")
+    frames = read_frames(run_dir / "frames.csv")
+    points = _read_points(run_dir / "map.npz")
+    run = _read_run(run_dir / "run.json")
+    configuration = json.dumps(run, indent=2, ensure_ascii=False)
+    if len(configuration) > MOST_CONFIGURATION:
+        configuration = configuration[:MOST_CONFIGURATION] + "\n… (run.json has more)"
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("sigmaslam.runs", "templates"), autoescape=True, undefined=jinja2.StrictUndefined
+    )
+    summary = run.get("summary")
+    text = environment.get_template("report.html").render(
+        name=run_dir.resolve().name,
+        facts=_facts(trajectory, frames, points),
+        statuses=[(status, frames.status.count(status)) for status in STATUSES],
+        verdict=summary.get("calibration_verdict") if isinstance(summary, dict) else None,
+        figures=_figures(trajectory, frames, points),
+        configuration=configuration if run else None,
+    )
+    path = run_dir / "report.html"
+    atomic_write_text(path, text)
+    return path
+
+
+def _column(path: Path, rows: list[dict[str, str]], name: str) -> np.ndarray:
+    values = np.full(len(rows), np.nan)
+    for index, row in enumerate(rows):
+        field = (row[name] or "").strip()
+        if not field:
+            if name == "timestamp":
+                raise InputError(f"{path}: line {index + 2}: has no timestamp; every frame needs one")
+            continue
+        try:
+            values[index] = float(field)
+        except ValueError as error:
+            raise InputError(
+                f"{path}: line {index + 2}: {name} is {field!r}, not a number; leave it empty if unknown"
+            ) from error
+    return values
+
+
+def _read_points(path: Path) -> np.ndarray | None:
+    """Map points (M, 3), or None where the run has no map."""
+    if not path.is_file():
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            points = np.asarray(archive["points"], dtype=np.float64)
+    except (OSError, ValueError, KeyError, EOFError, TypeError) as error:
+        raise InputError(f"{path}: holds no array `points` ({error}); run `sigmaslam track` again") from error
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"{path}: points must be (M, 3), not {points.shape}; run `sigmaslam track` again")
+    return points
+
+
+def _read_run(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        return {}
+    try:
+        run = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: is no JSON ({error}); run `sigmaslam track` again") from error
+    return run if isinstance(run, dict) else {}
+
+
+def _facts(trajectory: Trajectory, frames: FrameTable, points: np.ndarray | None) -> list[tuple[str, str]]:
+    """Label and value of the summary."""
+    total = frames.total_milliseconds
+    # The first frame pays for loading; the median frame is what a user waits for.
+    speed = _median(total)
+    ratio = _median(_nis_per_dof(frames))
+    facts = [
+        ("frames", f"{len(frames)}"),
+        ("poses", f"{len(trajectory)}"),
+        ("duration", f"{frames.seconds[-1]:.1f} s"),
+        ("path length", f"{trajectory.path_length:.2f} m"),
+        ("speed", f"{1000 / speed:.1f} frames/s" if speed else "–"),
+        ("median inliers", _number(_median(frames.columns["inliers"]), ".0f")),
+        ("median NIS per dof", _number(ratio, ".2f")),
+    ]
+    if points is not None:
+        facts.append(("map points", f"{len(points)}"))
+    return facts
+
+
+def _median(values: np.ndarray) -> float | None:
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) else None
+
+
+def _number(value: float | None, form: str) -> str:
+    return "–" if value is None else format(value, form)
+
+
+def _nis_per_dof(frames: FrameTable) -> np.ndarray:
+    nis, dof = frames.columns["nis"], frames.columns["dof"]
+    return np.where(dof > 0, nis / np.where(dof > 0, dof, 1.0), np.nan)
+
+
+def _figures(trajectory: Trajectory, frames: FrameTable, points: np.ndarray | None) -> list[tuple[str, str, Markup]]:
+    """Title, caption and SVG of each figure; what is in no frame has none."""
+    figures = []
+    if len(trajectory):
+        figure = Figure(figsize=(8, 5.5), layout="constrained")
+        plot_trajectory(figure.add_subplot(), {"trajectory": trajectory}, points)
+        caption = "From above; the dot marks the start."
+        if points is not None and len(points):
+            caption += f" An even selection of the {len(points)} map points; far ones are cut off."
+        figures.append(("Trajectory and map", caption, figure))
+    series: list[tuple[str, str, Callable[[Axes, FrameTable], bool]]] = [
+        ("Matches and inliers", "Inliers are the matches that the filter used.", _draw_inliers),
+        (
+            "Normalised innovation squared",
+            "Per degree of freedom; about 1 where the claimed uncertainty is right, above the band where it is "
+            "too small. The band holds 95 % of the frames of a consistent filter.",
+            _draw_nis,
+        ),
+        ("Disparity offset", "Estimated error of the calibration, with its 2-sigma band.", _draw_offset),
+        ("Belief", "How far the tracker believes each of its poses, 0 to 1.", _draw_belief),
+        ("Time spent", "Milliseconds per stage, stacked.", _draw_milliseconds),
+    ]
+    for title, caption, draw in series:
+        figure = Figure(figsize=(8, 2.6), layout="constrained")
+        axes = figure.add_subplot()
+        if not draw(axes, frames):
+            continue
+        _mark_statuses(axes, frames)
+        axes.set_xlabel("time [s]")
+        axes.margins(x=0.01)
+        style_axes(axes)
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+        figures.append((title, caption, figure))
+    return [
+        (title, caption, Markup(to_svg(figure, f"figure{number}")))
+        for number, (title, caption, figure) in enumerate(figures)
+    ]
+
+
+def _line(axes: Axes, frames: FrameTable, values: np.ndarray, label: str, colour: str, **style: Any) -> None:
+    rasterised = len(frames) > MOST_VERTICES
+    axes.plot(frames.seconds, values, color=colour, label=label, rasterized=rasterised, **{"lw": 1.2, **style})
+
+
+def _draw_inliers(axes: Axes, frames: FrameTable) -> bool:
+    matches, inliers = frames.columns["matches"], frames.columns["inliers"]
+    _line(axes, frames, matches, "matches", BLUE)
+    _line(axes, frames, inliers, "inliers", VERMILLION)
+    axes.set_ylabel("count")
+    axes.set_ylim(bottom=0)
+    return bool(np.isfinite(matches).any() or np.isfinite(inliers).any())
+
+
+def _draw_nis(axes: Axes, frames: FrameTable) -> bool:
+    ratio = _nis_per_dof(frames)
+    ratio = np.where(ratio > 0, ratio, np.nan)
+    if not np.isfinite(ratio).any():
+        return False
+    # Wilson and Hilferty: (chi2 / dof)^(1/3) is nearly normal.
+    every = -(-len(frames) // MOST_COLUMNS)
+    dof = frames.columns["dof"][::every]
+    dof = np.where(dof > 0, dof, np.nan)
+    spread = np.sqrt(2 / (9 * dof))
+    low, high = (np.maximum(1 - 2 / (9 * dof) + sign * 1.96 * spread, 1e-3) ** 3 for sign in (-1, 1))
+    axes.fill_between(frames.seconds[::every], low, high, color=GREEN, alpha=0.25, lw=0, label="95 %")
+    _line(axes, frames, ratio, "NIS / dof", BLUE, ls="", marker=".", ms=3)
+    axes.axhline(1.0, color=GREEN, lw=1)
+    axes.set_yscale("log")
+    axes.set_ylim(min(0.5, 0.9 * float(np.nanmin(ratio))), max(2.0, 1.1 * float(np.nanmax(ratio))))
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.set_ylabel("NIS / dof")
+    return True
+
+
+def _draw_offset(axes: Axes, frames: FrameTable) -> bool:
+    offset, sigma = frames.columns["disparity_offset"], frames.columns["disparity_offset_sigma"]
+    axes.fill_between(
+        frames.seconds,
+        offset - 2 * sigma,
+        offset + 2 * sigma,
+        color=BLUE,
+        alpha=0.25,
+        lw=0,
+        label="2 sigma",
+        rasterized=len(frames) > MOST_VERTICES,
+    )
+    _line(axes, frames, offset, "offset", BLUE)
+    axes.axhline(0.0, color=GREY, lw=1)
+    axes.set_ylabel("disparity offset [px]")
+    return bool(np.isfinite(offset).any())
+
+
+def _draw_belief(axes: Axes, frames: FrameTable) -> bool:
+    belief = frames.columns["belief"]
+    _line(axes, frames, belief, "belief", BLUE)
+    axes.set_ylabel("belief")
+    axes.set_ylim(-0.03, 1.03)
+    return bool(np.isfinite(belief).any())
+
+
+def _draw_milliseconds(axes: Axes, frames: FrameTable) -> bool:
+    measured = np.isfinite(frames.total_milliseconds)
+    if not measured.any():
+        return False
+    seconds = frames.seconds[measured]
+    stages = np.nan_to_num(np.array([values[measured] for values in frames.milliseconds.values()]))
+    every = -(-len(seconds) // MOST_COLUMNS)
+    starts = np.arange(0, len(seconds), every)
+    means = np.add.reduceat(stages, starts, axis=1) / np.diff(np.append(starts, len(seconds)))
+    colours = [SERIES[number % len(SERIES)] for number in range(len(means))]
+    names = [name.replace("_", " ") for name in frames.milliseconds]
+    axes.stackplot(seconds[starts], means, labels=names, colors=colours, lw=0)
+    axes.set_ylabel("ms per frame" if every == 1 else f"ms per frame,\nmeans of {every}")
+    axes.set_ylim(bottom=0)
+    return True
+
+
+def _mark_statuses(axes: Axes, frames: FrameTable) -> None:
+    """Shade the frames that were not tracked."""
+    seconds = frames.seconds
+    half = 0.5 * float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.5
+    first = 0
+    for index in range(1, len(frames) + 1):
+        status = frames.status[first]
+        if index < len(frames) and frames.status[index] == status:
+            continue
+        if status in STATUS_COLOURS:
+            shown = axes.get_legend_handles_labels()[1]
+            axes.axvspan(
+                seconds[first] - half,
+                seconds[index - 1] + half,
+                color=STATUS_COLOURS[status],
+                alpha=0.3,
+                lw=0,
+                label=status if status not in shown else None,
+                zorder=0,
+            )
+        first = index

@@ -1,0 +1,165 @@
+"""Tracking a whole sequence, from disk or live, into a run folder."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from sigmaslam.errors import InputError, SigmaSlamError
+from sigmaslam.fusion.location_filter import LocationFilter
+from sigmaslam.fusion.readings import Locations
+from sigmaslam.geometry.trajectory import write_tum
+from sigmaslam.progress import open_progress
+from sigmaslam.readers import StereoFrame, StereoSequence
+from sigmaslam.runs.run_folder import RunWriter, describe_camera
+from sigmaslam.slam.config import TrackerConfig
+from sigmaslam.slam.estimate import Estimate
+from sigmaslam.slam.object_region import read_region
+from sigmaslam.slam.object_tracker import ObjectTracker
+from sigmaslam.slam.tracker import StereoTracker
+
+Tracker = StereoTracker | ObjectTracker
+
+
+def track_sequence(
+    sequence: StereoSequence,
+    out: Path,
+    frontend: str = "learned",
+    backend: str = "onnx",
+    config: TrackerConfig | None = None,
+    map_path: Path | None = None,
+    tracks: bool = False,
+    track_object: str | None = None,
+    locations: Locations | None = None,
+) -> dict[str, Any]:
+    """Tracks a sequence and writes the run folder; partial results are kept when it is stopped or fails.
+
+    Args:
+        sequence: opened by `sigmaslam.readers.open_sequence` or `open_cameras`.
+        out: run folder, new or empty.
+        frontend, backend, config: of `StereoTracker`.
+        map_path: map.npz of an earlier run, whose world the poses are given in.
+        tracks: write tracks.npz, too: what keyframes saw, for `sigmaslam refine`.
+        track_object: box or mask, see `read_region`: the camera is at rest and follows one body. Poses are then
+            T_camera_object, their covariances in the body's frame, and the map that of the body in its own frame.
+        locations: of a sensor on what moves, camera or body, to fuse; writes trajectory_location.tum, too: the poses
+            in the sensor's world.
+    Returns:
+        The summary that run.json holds; with `locations` what became of them, too, under `location`.
+    Raises:
+        InputError: the folder is not empty, an argument is wrong, or the sequence breaks off; what was computed is on
+            disk then.
+        KeyboardInterrupt: passed on after the partial results are written.
+    """
+    if track_object is not None and (map_path is not None or tracks):
+        raise InputError("a map and tracks are of a moving camera's world: leave them out where a body is tracked")
+    tracker = _build_tracker(sequence, frontend, backend, config, track_object)
+    location = None if locations is None else LocationFilter(locations, track_object is not None)
+    rectified = None
+    if isinstance(tracker, StereoTracker):
+        if map_path is not None:
+            tracker.load_map(map_path)
+        rectified = tracker.describe_rectified() if tracks else None
+    writer = RunWriter(out, rectified)
+    ended = "complete"
+    try:
+        # However this ends, cameras are given back before the results are written.
+        with closing(sequence.frames()) as frames:
+            _track(sequence, frames, tracker, writer, location)
+    except KeyboardInterrupt:
+        ended = "interrupted"
+        raise
+    except SigmaSlamError as error:
+        ended = f"failed: {error}"
+        raise
+    except BaseException as error:
+        ended = f"crashed: {error!r}"
+        raise
+    finally:
+        summary = writer.finish(
+            tracker.map(),
+            tracker.pack_keyframes(),
+            {
+                "input": str(sequence.source),
+                "format": sequence.format,
+                "frontend": frontend,
+                "backend": backend,
+                "ended": ended,
+                "dropped": sequence.dropped,
+                "configuration": asdict(tracker.config),
+                "calibration": describe_camera(sequence.camera),
+                **_describe_object(tracker, track_object),
+                **_describe_location(location),
+            },
+        )
+        trajectory = None if location is None else location.trajectory()
+        if trajectory is not None:
+            write_tum(out / "trajectory_location.tum", trajectory)
+    return summary if location is None else {**summary, "location": asdict(location.summary)}
+
+
+def _build_tracker(
+    sequence: StereoSequence, frontend: str, backend: str, config: TrackerConfig | None, track_object: str | None
+) -> Tracker:
+    if track_object is None:
+        return StereoTracker(sequence.camera, frontend, backend, config)
+    region = read_region(track_object, sequence.camera.left.width, sequence.camera.left.height)
+    return ObjectTracker(sequence.camera, region, frontend, backend, config)
+
+
+def _describe_object(tracker: Tracker, track_object: str | None) -> dict[str, Any]:
+    """What run.json says of a followed body: its region, and where its frame is in the first left camera's."""
+    if not isinstance(tracker, ObjectTracker):
+        return {}
+    return {"object": {"region": track_object, "origin": tracker.origin.tolist()}}
+
+
+def _describe_location(location: LocationFilter | None) -> dict[str, Any]:
+    """What run.json says of a location sensor: what became of its readings, and how its world lies to ours."""
+    if location is None:
+        return {}
+    T, covariance = location.T_sensor_world, location.T_sensor_world_covariance
+    return {
+        "location": {
+            **asdict(location.summary),
+            "T_sensor_world": None if T is None else T.tolist(),
+            "T_sensor_world_covariance": None if covariance is None else covariance.tolist(),
+        }
+    }
+
+
+def _track(
+    sequence: StereoSequence,
+    frames: Iterator[StereoFrame],
+    tracker: Tracker,
+    writer: RunWriter,
+    location: LocationFilter | None,
+) -> None:
+    with open_progress() as progress:
+        task = progress.add_task("frames", total=sequence.length, note="")
+        noted, done = 0, 0
+        began = since = time.perf_counter()
+        for frame in frames:
+            read_ms = 1e3 * (time.perf_counter() - since)
+            # Frames that could not be read come to light with the next one that could.
+            for skipped in sequence.skipped[noted:]:
+                writer.add_skipped(skipped.timestamp)
+            noted = len(sequence.skipped)
+            estimate = tracker.step(frame.left, frame.right, frame.timestamp)
+            if location is not None:
+                estimate = estimate.map_camera(location.fuse)
+            writer.add(estimate.camera, estimate.pose, estimate.pose_covariance, read_ms)
+            done += 1
+            since = time.perf_counter()
+            progress.update(task, completed=done + noted, note=_note(estimate.camera, done / (since - began)))
+        for skipped in sequence.skipped[noted:]:
+            writer.add_skipped(skipped.timestamp)
+        progress.update(task, completed=done + len(sequence.skipped))
+
+
+def _note(estimate: Estimate, rate: float) -> str:
+    return f"{rate:.1f}/s, {estimate.inliers} inliers, belief {estimate.belief:.3f}, {estimate.status}"

@@ -1,0 +1,1 @@
+"""The tracker: matching, mapping, loops, relocalisation, and bodies before a camera at rest."""

@@ -1,0 +1,78 @@
+"""What the tracker says about one stereo pair."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sigmaslam.slam.mapping import KeyframeTracks
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationEstimate:
+    """What the images say about the stereo calibration.
+
+    Attributes:
+        disparity_offset: measured minus true disparity, pixels.
+        disparity_offset_sigma: its standard deviation, pixels.
+    """
+
+    disparity_offset: float
+    disparity_offset_sigma: float
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """Result for one stereo pair.
+
+    Attributes:
+        timestamp: seconds.
+        T_world_camera: (4, 4) pose of the left camera; the world is the first left camera.
+        covariance: (6, 6) of that pose in the camera's own frame, translation (metres) before rotation (radians).
+        status: "starting", "tracking", "lost", or "relocalised": found again among keyframes that had left the window,
+            or in the map.
+        belief: 1 - sqrt of the largest eigenvalue of the covariance of the pose relative to the keyframe (metres and
+            radians together), clipped to [0, 1] (Tables 9.1, 9.2).
+        matches, inliers: points matched to the keyframe, and those that passed the gate.
+        nis, dof: normalised innovation squared and its degrees of freedom; 0 without an update.
+        calibration: of the stereo pair.
+        milliseconds: wall time by stage.
+        frame_covariance: (6, 6) the part of the covariance that the frame's matches add to that of its keyframe; zero
+            without them.
+        tracks: what the frame saw, where it became a keyframe.
+    """
+
+    timestamp: float
+    T_world_camera: np.ndarray
+    covariance: np.ndarray
+    status: str
+    belief: float
+    matches: int
+    inliers: int
+    nis: float
+    dof: int
+    calibration: CalibrationEstimate
+    milliseconds: dict[str, float] = field(default_factory=dict)
+    frame_covariance: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
+    tracks: KeyframeTracks | None = None
+
+    @property
+    def camera(self) -> Estimate:
+        """The camera's estimate in its world: this one."""
+        return self
+
+    @property
+    def pose(self) -> np.ndarray:
+        """(4, 4) what is tracked: `T_world_camera`."""
+        return self.T_world_camera
+
+    @property
+    def pose_covariance(self) -> np.ndarray:
+        """(6, 6) of `pose` in its own frame."""
+        return self.covariance
+
+    def map_camera(self, change: Callable[[Estimate], Estimate]) -> Estimate:
+        """The result with another camera estimate."""
+        return change(self)

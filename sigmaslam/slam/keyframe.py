@@ -1,0 +1,34 @@
+"""One keyframe: what it saw, and what became of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from sigmaslam.frontend import StereoView
+from sigmaslam.slam.point_map import PointMap
+
+
+@dataclass(frozen=True, slots=True)
+class Keyframe:
+    """A view that is kept; its pose is in the window's state, or among the poses that left the window.
+
+    Attributes:
+        id: number that no other keyframe of the tracker has.
+        timestamp: seconds.
+        view: what it saw; the right image is given up with the window.
+        sharpness: of its left image.
+        points: landmarks that it was the anchor of, in its frame, once it has left the window.
+    """
+
+    id: int
+    timestamp: float
+    view: StereoView
+    sharpness: float = 0.0
+    points: PointMap = field(default_factory=PointMap.empty)
+
+    def leave_window(self, points: PointMap) -> Keyframe:
+        """The keyframe as it is remembered, with the points (in its frame) that leave with it."""
+        view = replace(self.view, right=np.zeros((0, 0), np.uint8))
+        return replace(self, view=view, points=points)

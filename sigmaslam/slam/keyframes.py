@@ -1,0 +1,148 @@
+"""The keyframes of the window, and those that left it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sigmaslam.estimation.keyframe_window import KeyframeWindow
+from sigmaslam.estimation.state_layout import pose_slice
+from sigmaslam.frontend import StereoView
+from sigmaslam.frontend.image_smoothing import sharpness
+from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam.slam.keyframe import Keyframe
+from sigmaslam.slam.map_file import pack_keyframes, read_keyframes
+from sigmaslam.slam.place_recognition import closest_pair
+from sigmaslam.slam.point_map import (
+    PointMap,
+    anchor_points,
+    hand_over_points,
+    merge_maps,
+    most_confirmed,
+    points_in_world,
+    window_points,
+)
+
+# A view less sharp by this factor than the sharpest of the keyframes is blurred: in drives 0.9 to 1.1 are common from
+# frame to frame and 0.8 half a second later; motion blur over 11 px gives 0.6 to 0.75.
+_BLURRED = 0.75
+# A view counts as no less sharp than this share of the sharpest.
+_MIN_SHARPNESS = 0.1
+
+
+class Keyframes:
+    """Keyframes with their poses: moves them from the window to the past, forgets the superfluous ones, makes the map.
+
+    Args:
+        window: owns the poses.
+        max_keyframes: more than so many that left the window are not remembered.
+        max_points: of the map; when there are twice as many, the least confirmed half goes.
+
+    Attributes:
+        active: keyframes of the window, in its order.
+        remembered: keyframes that left it, in the order of its past.
+    """
+
+    def __init__(self, window: KeyframeWindow, max_keyframes: int, max_points: int) -> None:
+        self._window = window
+        self._max_keyframes = max(max_keyframes, 1)
+        self._max_points = max_points
+        self._next_id = self._first_id = 0
+        self.active: list[Keyframe] = []
+        self.remembered: list[Keyframe] = []
+
+    def index(self, id: int) -> int:
+        """Where a remembered keyframe stands in the past."""
+        return next(k for k, keyframe in enumerate(self.remembered) if keyframe.id == id)
+
+    def pose(self, keyframe: Keyframe) -> np.ndarray:
+        """(4, 4) T_world_keyframe of a remembered one."""
+        return np.asarray(self._window.posterior.past.poses[self.index(keyframe.id)])
+
+    def left_long_ago(self, count: int) -> list[Keyframe]:
+        """Remembered keyframes but for the last `count` that left the window."""
+        recent = max(self._first_id, self.active[0].id - count)
+        return [keyframe for keyframe in self.remembered if keyframe.id < recent]
+
+    def append(self, view: StereoView, timestamp: float) -> None:
+        """Takes the newest keyframe of the window."""
+        self.active.append(Keyframe(self._next_id, timestamp, view, sharpness(view.left)))
+        self._next_id += 1
+
+    def blur(self, view: StereoView) -> float:
+        """How many times as sharp as the view the sharpest keyframe is; 1 where what is seen may be the reason."""
+        here, sharpest = sharpness(view.left), max(keyframe.sharpness for keyframe in self.active)
+        return sharpest / max(here, _MIN_SHARPNESS * sharpest) if here < _BLURRED * sharpest else 1.0
+
+    def marginalise_oldest(self, spare: Keyframe | None = None) -> np.ndarray:
+        """Moves the oldest keyframe to the past, and its landmarks to the map.
+
+        Args:
+            spare: a remembered one that must not be forgotten for it.
+        Returns:
+            New row of each landmark, as of `KeyframeWindow.marginalise_oldest`.
+        """
+        points = anchor_points(self._window, 0, _times(self.active))
+        new_row = self._window.marginalise_oldest()
+        self._remember(self.active.pop(0).leave_window(points), spare)
+        return new_row
+
+    def restart(self) -> None:
+        """Forgets all keyframes and their poses, but not the calibration."""
+        self._window.restart()
+        self.active, self.remembered = [], []
+        self._first_id = self._next_id
+
+    def map(self) -> PointMap:
+        """All landmarks so far that were seen at least three times, in the world of the window."""
+        past = points_in_world([keyframe.points for keyframe in self.remembered], self._window.posterior.past)
+        return merge_maps([past, window_points(self._window, _times(self.active))])
+
+    def load(self, path: Path, frontend: str, camera: RectifiedStereo) -> None:
+        """Remembers the keyframes of a map, before there are others.
+
+        Raises:
+            InputError: the file is no map, or made with another front-end or camera.
+        """
+        keyframes, past = read_keyframes(path, frontend, camera)
+        self._window.restart(past)
+        for keyframe in keyframes:
+            self._remember(keyframe)
+        self._next_id = self._first_id = len(keyframes)
+
+    def pack(self, frontend: str, camera: RectifiedStereo) -> dict[str, Any]:
+        """All of them as arrays by name, by which a later run finds its place in the map."""
+        state = self._window.posterior
+        past = state.past
+        for k, pose in enumerate(state.poses):
+            past = past.append(pose, state.covariance, pose_slice(k))
+        return pack_keyframes([*self.remembered, *self.active], past, frontend, camera)
+
+    def _remember(self, keyframe: Keyframe, spare: Keyframe | None = None) -> None:
+        """Takes a keyframe of the window's past, and forgets a superfluous one for it, but not the one to spare."""
+        self.remembered.append(keyframe)
+        if sum(len(each.points) for each in self.remembered) > 2 * self._max_points:
+            kept = most_confirmed([each.points for each in self.remembered], self._max_points)
+            self.remembered = [replace(each, points=points) for each, points in zip(self.remembered, kept, strict=True)]
+        if len(self.remembered) <= self._max_keyframes:
+            return
+        # Of the two that are closest to each other the later one.
+        past = self._window.posterior.past
+        earlier, leaving = closest_pair(past.poses[: len(self.remembered)])
+        if spare is not None and self.remembered[leaving].id == spare.id:
+            leaving = earlier
+        if len(self.remembered[leaving].points):
+            heir = past.closest(leaving)
+            points = hand_over_points(self.remembered[leaving].points, past, leaving, heir)
+            inherited = merge_maps([self.remembered[heir].points, points])
+            self.remembered[heir] = replace(self.remembered[heir], points=inherited)
+        del self.remembered[leaving]
+        self._window.forget_past(leaving)
+
+
+def _times(keyframes: list[Keyframe]) -> np.ndarray:
+    """(K,) time stamps, seconds."""
+    return np.array([keyframe.timestamp for keyframe in keyframes])

@@ -1,0 +1,60 @@
+"""Which features may become landmarks: all of a static scene, or those of one body."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from sigmaslam.estimation.keyframe_window import KeyframeWindow
+from sigmaslam.estimation.landmark_table import LandmarkViews
+from sigmaslam.frontend import StereoView
+from sigmaslam.slam.unguided_matching import UnguidedMatcher
+
+
+class LandmarkAdmission(Protocol):
+    """Decides what a tracker's map is made of.
+
+    Attributes:
+        min_points: a view with fewer admitted stereo points is no keyframe.
+        restarts_anywhere: a tracker that has lost its way may go on from whatever it sees.
+    """
+
+    min_points: int
+    restarts_anywhere: bool
+
+    def admit(self, view: StereoView, pose: np.ndarray, window: KeyframeWindow) -> np.ndarray:
+        """(N,) bool: which features of a view from `pose` (4, 4), T_world_camera, may become landmarks."""
+        ...
+
+    def confirm(self, views: LandmarkViews, window: KeyframeWindow) -> None:
+        """Takes note of the views that agree with a frame's pose."""
+        ...
+
+    def begin_again(self, view: StereoView, matcher: UnguidedMatcher) -> StereoView | None:
+        """The first view with what has been admitted wrongly left out, to start from it again; None: go on."""
+        ...
+
+
+class AdmitAll:
+    """The scene is static: every stereo point may become a landmark.
+
+    Args:
+        min_inliers: fewer are no pose; a keyframe has twice as many.
+    """
+
+    restarts_anywhere = True
+
+    def __init__(self, min_inliers: int) -> None:
+        self.min_points = 2 * min_inliers
+
+    def admit(self, view: StereoView, pose: np.ndarray, window: KeyframeWindow) -> np.ndarray:
+        """All of them."""
+        return np.ones(len(view.disparity), bool)
+
+    def confirm(self, views: LandmarkViews, window: KeyframeWindow) -> None:
+        """Nothing to note."""
+
+    def begin_again(self, view: StereoView, matcher: UnguidedMatcher) -> StereoView | None:
+        """Never."""
+        return None

@@ -1,0 +1,149 @@
+"""The pose of a frame in the window: near the prediction first, then anywhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sigmaslam.estimation.chi_square import CHI_SQUARE_9999_OF_6
+from sigmaslam.estimation.constant_velocity import MotionFilter
+from sigmaslam.estimation.frame_fit import FrameFit
+from sigmaslam.estimation.frame_update import FrameUpdate
+from sigmaslam.estimation.keyframe_window import KeyframeWindow
+from sigmaslam.frontend import StereoView
+from sigmaslam.geometry.se3 import turn_covariance
+from sigmaslam.slam.config import TrackerConfig
+from sigmaslam.slam.guided_matching import GuidedMatcher, GuidedMatches
+from sigmaslam.slam.stopwatch import Stopwatch
+from sigmaslam.slam.unguided_matching import UnguidedMatcher
+
+# Reject a pose that fewer of the guided matches agree with.
+_MIN_SHARE = 0.3
+# A fit near the prediction with a larger NIS per degree of freedom may sit in a wrong place: it is compared with one
+# that does without the prediction.
+_DOUBTFUL_NIS = 2.0
+# With so large a NIS a pose needs so many times the least number of inliers.
+_DOUBTFUL_INLIERS = 3
+# Without a prediction the view is compared with so many of the last keyframes.
+_LAST_KEYFRAMES = 3
+# How far the landmarks of other keyframes may be from where an unguided pose expects them: share of the scene's depth,
+# and radians.
+_MARGIN = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """A pose before its images.
+
+    Attributes:
+        pose: (4, 4) T_world_camera.
+        covariance: (6, 6) of it relative to the last keyframe, perturbed from the left in the world.
+    """
+
+    pose: np.ndarray
+    covariance: np.ndarray
+
+    @classmethod
+    def of(cls, window: KeyframeWindow, motion: MotionFilter) -> Prediction:
+        """The last keyframe of the window, moved on."""
+        key = window.posterior.poses[-1]
+        return cls(key @ motion.step, turn_covariance(key, motion.step_covariance))
+
+
+class Localiser:
+    """Matches a view with the landmarks of the window and estimates its pose.
+
+    Args:
+        window: of keyframes.
+        update: estimates poses against it.
+        guided: finds landmarks near a prediction.
+        unguided: finds keyframes anywhere.
+        config: settings.
+    """
+
+    def __init__(
+        self,
+        window: KeyframeWindow,
+        update: FrameUpdate,
+        guided: GuidedMatcher,
+        unguided: UnguidedMatcher,
+        config: TrackerConfig,
+    ) -> None:
+        self._window = window
+        self._update = update
+        self._guided = guided
+        self._unguided = unguided
+        self._config = config
+
+    def localise(
+        self, view: StereoView, keyframes: list[StereoView], prediction: Prediction, guided: bool, clock: Stopwatch
+    ) -> tuple[GuidedMatches, FrameFit | None]:
+        """Matches and pose of a view, first near the prediction, then anywhere; no pose where too little agrees.
+
+        Args:
+            view: the current one.
+            keyframes: what the window's keyframes saw.
+            prediction: of its pose.
+            guided: the velocity is known, so that the prediction says where to search.
+            clock: takes the time of the stages `match` and `filter`.
+        """
+        matches, fit = GuidedMatches.empty(), None
+        if guided:
+            matches = self._guided.match_guided(view, keyframes, prediction.pose, prediction.covariance)
+            clock.lap("match")
+            fit = self._fit_near(matches, prediction)
+            clock.lap("filter")
+        if fit is None or fit.nis_per_dof > _DOUBTFUL_NIS:
+            other_matches, other = self._localise_anywhere(view, keyframes, prediction, clock)
+            if fit is None or (other is not None and other.nis_per_dof < fit.nis_per_dof):
+                matches, fit = other_matches, other
+        min_inliers = _DOUBTFUL_INLIERS * self._config.min_inliers
+        if fit is not None and fit.nis_before_scaling > _DOUBTFUL_NIS and fit.count < min_inliers:
+            return matches, None  # chance agreement of a few
+        return matches, fit
+
+    def _fit_near(self, matches: GuidedMatches, prediction: Prediction) -> FrameFit | None:
+        """Update from the prediction; most of what was found near it must agree."""
+        pose, covariance = prediction.pose, prediction.covariance
+        count, min_inliers = len(matches.probability), self._config.min_inliers
+        if count < min_inliers:
+            return None
+        fit = self._update.fit(matches.views, pose, covariance, min_inliers)
+        if fit is None or fit.prior_cost > CHI_SQUARE_9999_OF_6:
+            # The camera has jumped, and all matches with it; or something moves that gives most of them, and those that
+            # stand still agree with a pose close to the prediction: that one is tried first.
+            expected = np.flatnonzero(self._update.agrees(matches.views, pose, covariance))
+            min_steady = _DOUBTFUL_INLIERS * min_inliers
+            steady = self._update.fit(matches.views.select(expected), pose, 0.01 * covariance, min_steady)
+            if steady is not None:
+                expected = expected[steady.inliers]
+                steady = self._update.fit(matches.views.select(expected), pose, covariance, min_steady)
+            if steady is not None and steady.count >= _MIN_SHARE * count:
+                inliers = np.zeros(count, bool)
+                inliers[expected] = steady.inliers
+                fit = replace(steady, inliers=inliers)
+        return fit if fit is not None and fit.count >= _MIN_SHARE * count else None
+
+    def _localise_anywhere(
+        self, view: StereoView, keyframes: list[StereoView], prediction: Prediction, clock: Stopwatch
+    ) -> tuple[GuidedMatches, FrameFit | None]:
+        """Without a prediction: the pose relative to one of the last keyframes, then landmarks near there."""
+        matches = GuidedMatches.empty()
+        for back in range(1, min(_LAST_KEYFRAMES, len(keyframes)) + 1):
+            relative = self._unguided.relative_pose_to(keyframes[-back], view)
+            clock.lap("match")
+            if relative is None:
+                continue
+            start = self._window.posterior.poses[-back] @ relative.T_key_camera
+            margin = np.diag(np.repeat([_MARGIN * self._window.depth, _MARGIN], 3) ** 2)
+            uncertain = turn_covariance(start, relative.covariance + margin)
+            matches = self._guided.match_guided(view, keyframes, start, uncertain, -back, alone=True)
+            clock.lap("match")
+            fit = self._update.fit(
+                matches.views, prediction.pose, prediction.covariance, self._config.min_inliers, start, relative.scale
+            )
+            clock.lap("filter")
+            if fit is not None and fit.count >= _MIN_SHARE * len(matches.probability):
+                return matches, fit
+        return matches, None

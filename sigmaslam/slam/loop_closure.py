@@ -1,0 +1,64 @@
+"""Loops: the newest keyframe sees a place that was left long ago."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from sigmaslam.estimation.keyframe_window import KeyframeWindow
+from sigmaslam.estimation.state_layout import pose_slice
+from sigmaslam.geometry.se3 import se3_body, se3_inverse, turn_covariance
+from sigmaslam.slam.keyframe import Keyframe
+from sigmaslam.slam.keyframes import Keyframes
+from sigmaslam.slam.place_recognition import retrieve
+from sigmaslam.slam.unguided_matching import UnguidedMatcher
+
+_LOGGER = logging.getLogger(__name__)
+
+# A loop is looked for beyond so many keyframes that left the window last, among those that look less than 60 degrees
+# away.
+_RECENT, _LOOP_COSINE = 10, 0.5
+# And are nearer than the scene is deep and so many standard deviations of where they are.
+_REACH_SIGMAS = 3.0
+
+
+class LoopCloser:
+    """Constrains the newest keyframe to one that left the window long ago.
+
+    Args:
+        window: owns the poses.
+        keyframes: of the window and its past.
+        matcher: finds keyframes in views.
+    """
+
+    def __init__(self, window: KeyframeWindow, keyframes: Keyframes, matcher: UnguidedMatcher) -> None:
+        self._window = window
+        self._keyframes = keyframes
+        self._matcher = matcher
+
+    def close(self) -> None:
+        """Closes a loop where the newest keyframe sees what one of long ago saw."""
+        view = self._keyframes.active[-1].view
+        for keyframe in retrieve(view, 1, self._revisited()):
+            relative = self._matcher.relative_pose_to(keyframe.view, view)
+            if relative is None:
+                continue
+            pose = self._keyframes.pose(keyframe) @ relative.T_key_camera
+            covariance = turn_covariance(pose, relative.covariance)
+            index = self._keyframes.index(keyframe.id)
+            if self._window.add_loop_constraint(index, relative.T_key_camera, covariance):
+                _LOGGER.info("loop closed with the keyframe of %.3f s", keyframe.timestamp)
+
+    def _revisited(self) -> list[Keyframe]:
+        """Keyframes that left the window long ago and should see what its newest one sees."""
+        state = self._window.posterior
+        pose, place = state.poses[-1], pose_slice(len(state) - 1)
+        sigma = np.sqrt(np.trace(se3_body(pose, state.covariance[place, place])[:3, :3]))
+        reach = self._window.depth + _REACH_SIGMAS * sigma
+
+        def is_near(keyframe: Keyframe) -> bool:
+            between = se3_inverse(pose) @ self._keyframes.pose(keyframe)
+            return bool(np.linalg.norm(between[:3, 3]) < reach and between[2, 2] > _LOOP_COSINE)
+
+        return [keyframe for keyframe in self._keyframes.left_long_ago(_RECENT) if is_near(keyframe)]

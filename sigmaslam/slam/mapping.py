@@ -1,0 +1,159 @@
+"""New keyframes and landmarks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sigmaslam.estimation.constant_velocity import MotionFilter
+from sigmaslam.estimation.frame_fit import FrameFit
+from sigmaslam.estimation.keyframe_window import KeyframeWindow
+from sigmaslam.estimation.landmark_table import LandmarkViews
+from sigmaslam.frontend import StereoView
+from sigmaslam.frontend.feature_spacing import select_apart
+from sigmaslam.frontend.patch_disparity_range import patch_disparity_range
+from sigmaslam.frontend.plane_alignment import disparity_slopes
+from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam.geometry.se3 import turn_covariance
+from sigmaslam.slam.config import TrackerConfig
+from sigmaslam.slam.guided_matching import GuidedMatches
+from sigmaslam.slam.keyframes import Keyframes
+from sigmaslam.slam.landmark_admission import LandmarkAdmission
+from sigmaslam.slam.measurement_noise import MeasurementNoise
+from sigmaslam.table import Table
+
+# A blurred view whose matches scatter by so many times the variance that they claim is no keyframe. A sharp one is: no
+# keyframes at all for 20 frames lost the KITTI drive.
+_SCATTERED = 1.6
+# The scene is no farther away than where its disparity is this, pixels.
+_MIN_DISPARITY = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframeTracks(Table):
+    """What one keyframe saw.
+
+    Attributes:
+        landmark_id: (M,) number that no other landmark of the run has.
+        measurement: (M, 3) (u, v, disparity) in the rectified pair; the disparity may be NaN.
+        covariance: (M, 3, 3) of it, places relative to those in the landmark's first keyframe.
+    """
+
+    landmark_id: np.ndarray
+    measurement: np.ndarray
+    covariance: np.ndarray
+
+
+class Mapper:
+    """Makes views keyframes of the window.
+
+    Args:
+        camera: the rectified pair.
+        window: takes keyframes and landmarks.
+        keyframes: of the window.
+        motion: is relative to the last keyframe.
+        noise: of what is measured.
+        admission: what may become a landmark.
+        config: settings.
+    """
+
+    def __init__(
+        self,
+        camera: RectifiedStereo,
+        window: KeyframeWindow,
+        keyframes: Keyframes,
+        motion: MotionFilter,
+        noise: MeasurementNoise,
+        admission: LandmarkAdmission,
+        config: TrackerConfig,
+    ) -> None:
+        self._camera = camera
+        self._window = window
+        self._keyframes = keyframes
+        self._motion = motion
+        self._noise = noise
+        self._admission = admission
+        self._config = config
+        self._landmarks_in_keyframe = 0
+
+    def insert_if_due(
+        self,
+        view: StereoView,
+        timestamp: float,
+        fit: FrameFit,
+        matches: GuidedMatches,
+        expected: tuple[np.ndarray, np.ndarray],
+    ) -> KeyframeTracks | None:
+        """Makes a tracked view a keyframe when the landmarks of the last one fade, and the view can replace it.
+
+        Args:
+            view: the tracked view.
+            timestamp: seconds.
+            fit: its pose.
+            matches: with the window's landmarks.
+            expected: step (4, 4) from the last keyframe without its images, and its covariance (6, 6).
+        """
+        # A scale beyond the NIS is that of blur: such a keyframe would spoil what comes after it.
+        blurred = fit.inflation > fit.nis_before_scaling > _SCATTERED
+        if fit.count >= self._config.keyframe_ratio * self._landmarks_in_keyframe or blurred:
+            return None
+        admitted = view.only(self._admission.admit(view, fit.pose, self._window))
+        if not admitted.has_stereo(self._admission.min_points, self._config.min_inliers):
+            return None
+        views = matches.views.select(fit.inliers).inflated(fit.inflation)
+        return self.insert(admitted, timestamp, fit.pose, *expected, views)
+
+    def insert(
+        self,
+        view: StereoView,
+        timestamp: float,
+        pose: np.ndarray,
+        step: np.ndarray,
+        step_covariance: np.ndarray,
+        views: LandmarkViews | None = None,
+        origin: int | None = None,
+    ) -> KeyframeTracks:
+        """Makes a view a keyframe: it sees `views` of known landmarks, and whatever else it has in stereo is new.
+
+        Args:
+            view: with disparities where landmarks may be.
+            timestamp: seconds.
+            pose: (4, 4) estimate of T_world_camera.
+            step: (4, 4) T_last_new as expected without its images; of the first keyframe T_world_camera.
+            step_covariance: (6, 6) of that, perturbed from the left in the last keyframe.
+            views: of the window's landmarks.
+            origin: of the first one, the past pose relative to which `step_covariance` is.
+        Returns:
+            What the keyframe saw, known landmarks before new ones.
+        """
+        window, keyframes = self._window, self._keyframes
+        views = LandmarkViews.empty() if views is None else views
+        if len(window) == self._config.window:
+            views = views.renumber(keyframes.marginalise_oldest())
+        if len(window):
+            step_covariance = turn_covariance(window.posterior.poses[-1], step_covariance)
+        since = timestamp - keyframes.active[-1].timestamp if keyframes.active else 0.0
+        walk = np.array([self._config.offset_walk**2 * since, 0.0, 0.0])
+        median = max(float(np.nanmedian(view.disparity)), _MIN_DISPARITY)
+        depth = self._camera.fx * self._camera.baseline / median
+        window.add_keyframe(pose, step, step_covariance, walk, depth, origin)
+        view = replace(view, slope=disparity_slopes(view.features.keypoints, view.disparity))
+        keyframes.append(view, timestamp)
+        window.add_views(views)
+        self._add_landmarks(view, views)
+        seen = LandmarkViews.concatenate([views, window.landmarks.anchor_views(len(window) - 1)])
+        window.solve()
+        self._motion.start_keyframe()
+        self._landmarks_in_keyframe = len(seen)
+        return KeyframeTracks(window.landmarks.id[seen.landmark], seen.measurement, seen.covariance)
+
+    def _add_landmarks(self, view: StereoView, views: LandmarkViews) -> None:
+        """Makes landmarks of the stereo points that no landmark has been found at."""
+        assert view.slope is not None
+        index = np.flatnonzero(np.isfinite(view.disparity))
+        taken = views.measurement[:, :2]
+        index = index[select_apart(view.features.select(index), taken, self._config.spacing, view.left.shape)]
+        measured = view.measured(index)
+        disparity_range = patch_disparity_range(view.left, view.right, measured, view.slope[index])
+        self._window.add_landmarks(index, measured, self._noise.of_keypoints(view, index), disparity_range)

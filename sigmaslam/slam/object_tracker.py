@@ -1,0 +1,160 @@
+"""The reverse job (9.5.1, figure 9.8): a stereo camera at rest follows one rigid body that moves.
+
+In the body's frame it is the camera that moves, so the tracker is the same; the scene is the outlier. What is added is
+where landmarks may be: on the body (`BodyAdmission`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from sigmaslam.errors import InputError
+from sigmaslam.frontend import Frontend, build_frontend
+from sigmaslam.geometry.camera import StereoCamera
+from sigmaslam.geometry.rectification import StereoRectifier
+from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
+from sigmaslam.slam.body_admission import BodyAdmission
+from sigmaslam.slam.config import TrackerConfig
+from sigmaslam.slam.estimate import Estimate
+from sigmaslam.slam.point_map import PointMap
+from sigmaslam.slam.tracker import StereoTracker
+
+# Hands move things faster than cameras are carried.
+OBJECT_CONFIG = TrackerConfig(acceleration=1.0, angular_acceleration=3.0, start_turn=3.0)
+# Of the body's size: points so far outside the box about its own ones are not the body's.
+_SLACK = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectEstimate:
+    """Result for one stereo pair.
+
+    Attributes:
+        camera: the camera's estimate in the body's frame, which is its world.
+    """
+
+    camera: Estimate
+
+    @property
+    def timestamp(self) -> float:
+        """Seconds."""
+        return self.camera.timestamp
+
+    @property
+    def status(self) -> str:
+        """As of `Estimate`."""
+        return self.camera.status
+
+    @property
+    def T_camera_object(self) -> np.ndarray:  # noqa: N802
+        """(4, 4) pose of the body in the left camera's frame."""
+        return se3_inverse(self.camera.T_world_camera)
+
+    @property
+    def object_covariance(self) -> np.ndarray:
+        """(6, 6) of `T_camera_object` in the body's own frame, translation (metres) before rotation (radians)."""
+        covariance = turn_covariance(self.camera.T_world_camera, self.camera.covariance)
+        return np.asarray(0.5 * (covariance + covariance.T))
+
+    @property
+    def pose(self) -> np.ndarray:
+        """(4, 4) what is tracked: `T_camera_object`."""
+        return self.T_camera_object
+
+    @property
+    def pose_covariance(self) -> np.ndarray:
+        """(6, 6) of `pose` in its own frame."""
+        return self.object_covariance
+
+    def map_camera(self, change: Callable[[Estimate], Estimate]) -> ObjectEstimate:
+        """The result with another camera estimate."""
+        return ObjectEstimate(change(self.camera))
+
+
+class ObjectTracker:
+    """Follows one rigid body before a stereo camera at rest.
+
+    The body's frame has the axes of the left camera in the first frame; its origin is the median of the body's stereo
+    points there (of the inner half of the region).
+
+    Example:
+        tracker = ObjectTracker(camera, read_region("400,200,300,250", width, height))
+        estimate = tracker.step(left, right, timestamp)
+        estimate.T_camera_object, estimate.object_covariance
+
+    Args:
+        camera: calibration of the raw images.
+        region: (H, W) bool, where the body is in the first raw left image; background inside does little harm.
+        frontend, backend: of `StereoTracker`.
+        config: likewise; by default `OBJECT_CONFIG`, with more acceleration.
+    """
+
+    def __init__(
+        self,
+        camera: StereoCamera,
+        region: np.ndarray,
+        frontend: Frontend | str = "learned",
+        backend: str = "onnx",
+        config: TrackerConfig | None = None,
+    ) -> None:
+        self.config = config = config or OBJECT_CONFIG
+        rectifier = StereoRectifier(camera)
+        T_rectified_left = np.eye(4)
+        T_rectified_left[:3, :3] = rectifier.R_rectified_left
+        self._T_left_rectified = se3_inverse(T_rectified_left)
+        if isinstance(frontend, str):
+            frontend = build_frontend(frontend, config.max_keypoints, backend)
+        raw = region.astype(np.uint8) * 255
+        rectified_region = rectifier.rectify(raw, raw)[0] > 127
+        self._body = BodyAdmission(rectifier.rectified, rectified_region, frontend, config)
+        self._tracker = StereoTracker(camera, frontend, backend, config, self._body)
+
+    @property
+    def origin(self) -> np.ndarray:
+        """(3,) of the body's frame in the first left camera's, metres."""
+        return np.asarray((self._T_left_rectified @ self._body.T_camera_body)[:3, 3])
+
+    def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> ObjectEstimate:
+        """Takes one stereo pair; arguments and errors as of `StereoTracker.step`.
+
+        Raises:
+            InputError: also when too little of the region in the first frame is seen by both eyes.
+        """
+        estimate = self._tracker.step(left, right, timestamp)
+        if not self._body.started:
+            raise InputError(
+                "the first frame has too few points that both eyes see: start where the images are good, "
+                "and check the calibration"
+            )
+        covariance = estimate.covariance
+        if not self._body.separated and estimate.status != "starting":
+            # In the body's frame, whose axes are the camera's still; from there into the left camera's.
+            T_left_body = self._T_left_rectified @ self._body.T_camera_body
+            covariance = covariance + turn_covariance(T_left_body, self._body.unseen_motion())
+        T_body_camera = self._T_body_left() @ estimate.T_world_camera
+        return ObjectEstimate(replace(estimate, T_world_camera=T_body_camera, covariance=covariance))
+
+    def map(self) -> PointMap:
+        """The body's points, in its frame."""
+        points = self._tracker.map()
+        body = self._body.points()
+        if len(body):
+            # What was taken for the body's while it rested, and never moved with it, mostly lies beside it.
+            body = body @ self._T_left_rectified[:3, :3].T
+            slack = _SLACK * np.ptp(body, axis=0).max()
+            inside = (points.points >= body.min(axis=0) - slack) & (points.points <= body.max(axis=0) + slack)
+            points = points.select(inside.all(axis=1))
+        return points.transform(self._T_body_left())
+
+    def pack_keyframes(self) -> dict[str, Any]:
+        """No arrays: a later run cannot find its place by a body."""
+        return {}
+
+    def _T_body_left(self) -> np.ndarray:  # noqa: N802
+        T = np.eye(4)
+        T[:3, 3] = -self.origin
+        return T

@@ -1,0 +1,80 @@
+"""Relocalisation: a lost view is found among the keyframes that left the window, or in a map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sigmaslam.estimation.keyframe_window import KeyframeWindow
+from sigmaslam.frontend import StereoView
+from sigmaslam.geometry.se3 import nearest_rigid
+from sigmaslam.slam.keyframes import Keyframes
+from sigmaslam.slam.landmark_admission import LandmarkAdmission
+from sigmaslam.slam.place_recognition import retrieve
+from sigmaslam.slam.unguided_matching import UnguidedMatcher
+
+# A view is compared with so many remembered keyframes, the ones most like it.
+_RETRIEVED = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Relocalisation:
+    """Where a view was found; the window is empty.
+
+    Attributes:
+        view: with disparities where landmarks may be.
+        pose: (4, 4) T_world_camera.
+        covariance: (6, 6) of the pose relative to the past pose `origin`, perturbed from the right.
+        origin: index of that past pose.
+    """
+
+    view: StereoView
+    pose: np.ndarray
+    covariance: np.ndarray
+    origin: int
+
+
+class Relocaliser:
+    """Finds views among remembered keyframes.
+
+    Args:
+        window: emptied where a view is found.
+        keyframes: of the window and its past.
+        matcher: finds keyframes in views.
+        admission: what may become a landmark.
+        min_inliers: fewer are no pose.
+    """
+
+    def __init__(
+        self,
+        window: KeyframeWindow,
+        keyframes: Keyframes,
+        matcher: UnguidedMatcher,
+        admission: LandmarkAdmission,
+        min_inliers: int,
+    ) -> None:
+        self._window = window
+        self._keyframes = keyframes
+        self._matcher = matcher
+        self._admission = admission
+        self._min_inliers = min_inliers
+
+    def relocalise(self, view: StereoView) -> Relocalisation | None:
+        """Finds the view and moves all keyframes of the window to the past; None, and no change, if it is nowhere."""
+        min_points = self._admission.min_points
+        if not view.has_stereo(min_points, self._min_inliers):
+            return None
+        keyframes = self._keyframes
+        for keyframe in retrieve(view, _RETRIEVED, keyframes.remembered):
+            relative = self._matcher.relative_pose_to(keyframe.view, view)
+            if relative is None:
+                continue
+            pose = nearest_rigid(keyframes.pose(keyframe) @ relative.T_key_camera)
+            admitted = view.only(self._admission.admit(view, pose, self._window))
+            if not admitted.has_stereo(min_points, self._min_inliers):
+                continue
+            while keyframes.active:
+                keyframes.marginalise_oldest(spare=keyframe)
+            return Relocalisation(admitted, pose, relative.covariance, keyframes.index(keyframe.id))
+        return None

@@ -1,0 +1,185 @@
+"""The tracker: one stereo pair in, one pose with covariance out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sigmaslam.errors import InputError
+from sigmaslam.estimation.constant_velocity import MotionFilter
+from sigmaslam.estimation.frame_fit import FrameFit
+from sigmaslam.estimation.frame_update import FrameUpdate
+from sigmaslam.estimation.keyframe_window import KeyframeWindow
+from sigmaslam.estimation.sigma_point_linearisation import ViewLineariser
+from sigmaslam.frontend import Frontend, StereoView, build_frontend
+from sigmaslam.geometry.camera import StereoCamera
+from sigmaslam.geometry.rectification import StereoRectifier
+from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
+from sigmaslam.slam.config import TrackerConfig
+from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
+from sigmaslam.slam.guided_matching import GuidedMatcher, GuidedMatches
+from sigmaslam.slam.keyframes import Keyframes
+from sigmaslam.slam.landmark_admission import AdmitAll, LandmarkAdmission
+from sigmaslam.slam.localisation import Localiser, Prediction
+from sigmaslam.slam.loop_closure import LoopCloser
+from sigmaslam.slam.mapping import Mapper
+from sigmaslam.slam.measurement_noise import MeasurementNoise
+from sigmaslam.slam.motion_prior import densities
+from sigmaslam.slam.phase import Course, Phase
+from sigmaslam.slam.point_map import PointMap
+from sigmaslam.slam.recovery import Recovery
+from sigmaslam.slam.relocalisation import Relocaliser
+from sigmaslam.slam.reporting import Reporter
+from sigmaslam.slam.stopwatch import Stopwatch
+from sigmaslam.slam.unguided_matching import UnguidedMatcher
+
+__all__ = ["CalibrationEstimate", "Estimate", "StereoTracker", "TrackerConfig"]
+
+
+class StereoTracker:
+    """Tracks a moving stereo camera through a static scene, frame by frame, in bounded time.
+
+    Example:
+        tracker = StereoTracker(StereoCamera.from_yaml("stereo.yaml"))
+        estimate = tracker.step(left, right, timestamp)
+
+    Args:
+        camera: calibration of the raw images; they are rectified here.
+        frontend: "learned", "sift", "orb", "klt", or one of your own.
+        backend: "onnx", or "torch" (needs the extra `train`).
+        config: settings.
+        admission: what may become a landmark; by default everything.
+    """
+
+    def __init__(
+        self,
+        camera: StereoCamera,
+        frontend: Frontend | str = "learned",
+        backend: str = "onnx",
+        config: TrackerConfig | None = None,
+        admission: LandmarkAdmission | None = None,
+    ) -> None:
+        self.config = config = config or TrackerConfig()
+        self._rectifier = StereoRectifier(camera)
+        self._camera = rectified = self._rectifier.rectified
+        self._T_rectified_left = np.eye(4)
+        self._T_rectified_left[:3, :3] = self._rectifier.R_rectified_left
+        if isinstance(frontend, str):
+            frontend = build_frontend(frontend, config.max_keypoints, backend)
+        self._frontend = frontend
+        self._admission = admission = admission or AdmitAll(config.min_inliers)
+        lineariser = ViewLineariser(rectified, backend, config.linearisation == "unscented")
+        calibration_sigma = np.array([config.offset_sigma, config.turn_sigma, config.turn_sigma])
+        self._window = window = KeyframeWindow(rectified, calibration_sigma, lineariser)
+        self._noise = noise = MeasurementNoise(config)
+        self._motion = motion = MotionFilter(backend)
+        self._course = course = Course()
+        self._keyframes = keyframes = Keyframes(window, config.max_keyframes, config.max_points)
+        update = FrameUpdate(window, config.iterations)
+        guided = GuidedMatcher(rectified, frontend, window, update, noise, config)
+        self._unguided = unguided = UnguidedMatcher(rectified, frontend, window, noise, config)
+        self._localiser = Localiser(window, update, guided, unguided, config)
+        self._mapper = Mapper(rectified, window, keyframes, motion, noise, admission, config)
+        self._loops = LoopCloser(window, keyframes, unguided)
+        self._relocaliser = Relocaliser(window, keyframes, unguided, admission, config.min_inliers)
+        self._recovery = Recovery(course, window, keyframes, motion, self._mapper, admission, config)
+        self._reporter = Reporter(self._T_rectified_left, window, motion, course)
+
+    def load_map(self, path: Path) -> None:
+        """Takes the world of a map that `sigmaslam track` has written; tracking starts where a view is found in it.
+
+        Raises:
+            InputError: the file is no map, or made with another front-end or camera.
+        """
+        self._keyframes.load(path, self._frontend.name, self._camera)
+        self._course.phase = Phase.WAITING_IN_MAP
+
+    def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> Estimate:
+        """Takes one stereo pair.
+
+        Args:
+            left, right: (H, W) uint8, raw images of the calibrated size.
+            timestamp: seconds, larger than the one before.
+        Raises:
+            InputError: the time stamp does not increase.
+            FrameError: an image has the wrong type or size.
+        """
+        self._check_time(timestamp)
+        clock = Stopwatch()
+        view = self._frontend.observe(*self._rectifier.rectify(left, right))
+        clock.lap("features")
+        self._predict(timestamp)
+        matches, fit = self._localise(view, timestamp, clock)
+        if fit is not None:
+            status = "tracking"
+            expected = self._motion.step, self._motion.step_covariance
+            fit = self._correct(fit, matches, view, timestamp)
+            tracks = self._mapper.insert_if_due(view, timestamp, fit, matches, expected)
+        elif (found := self._relocaliser.relocalise(view)) is not None:
+            status = "relocalised"
+            tracks = self._recovery.resume(found, timestamp)
+        else:
+            status = "lost" if self._course.has_moved else "starting"
+            tracks = self._recovery.start_or_recover(view, timestamp)
+        if tracks is not None:
+            self._loops.close()
+        clock.lap("map")
+        self._course.timestamp = timestamp
+        return self._reporter.report(timestamp, status, matches, fit, tracks, clock.milliseconds)
+
+    def map(self) -> PointMap:
+        """All landmarks so far that were seen at least three times."""
+        return self._keyframes.map().transform(se3_inverse(self._T_rectified_left))
+
+    def describe_rectified(self) -> dict[str, Any]:
+        """The rectified pair that tracks are measured in: intrinsics (5,), R_rectified_left (3, 3)."""
+        camera = self._camera
+        intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.baseline])
+        return {"intrinsics": intrinsics, "R_rectified_left": self._T_rectified_left[:3, :3]}
+
+    def pack_keyframes(self) -> dict[str, Any]:
+        """Keyframes by which a later run finds its place in the map, as arrays by name."""
+        return self._keyframes.pack(self._frontend.name, self._camera)
+
+    # ---- the stages of a frame
+
+    def _check_time(self, timestamp: float) -> None:
+        before = self._course.timestamp
+        if before is not None and timestamp <= before:
+            raise InputError(
+                f"time stamp {timestamp:.6f} s does not come after {before:.6f} s: sort the frames by time"
+            )
+
+    def _predict(self, timestamp: float) -> None:
+        """Constant velocity since the last frame."""
+        if self._course.timestamp is not None:
+            seconds = timestamp - self._course.timestamp
+            self._motion.predict(seconds, densities(self.config, self._window.depth))
+
+    def _localise(self, view: StereoView, timestamp: float, clock: Stopwatch) -> tuple[GuidedMatches, FrameFit | None]:
+        """Matches with the window's landmarks, and the pose if enough of them agree."""
+        if self._course.is_waiting or view.is_swapped(self.config.min_inliers):
+            return GuidedMatches.empty(), None
+        first = self._admission.begin_again(view, self._unguided)
+        if first is not None:
+            self._recovery.begin_again(first, timestamp)
+        keyframes = [keyframe.view for keyframe in self._keyframes.active]
+        prediction = Prediction.of(self._window, self._motion)
+        guided = self._course.phase is Phase.TRACKING
+        return self._localiser.localise(view, keyframes, prediction, guided, clock)
+
+    def _correct(self, fit: FrameFit, matches: GuidedMatches, view: StereoView, timestamp: float) -> FrameFit:
+        """Takes a pose over, less certain where the view is blurred."""
+        # Patches that are blurred are misplaced alike, along the blur and towards where they were expected: many of
+        # them say no more than a few.
+        fit = fit.inflated(max(fit.nis_before_scaling, 1.0) * self._keyframes.blur(view))
+        seen = matches.views.select(fit.inliers)
+        self._admission.confirm(seen, self._window)
+        self._window.count_sightings(matches.searched, seen.landmark)
+        back = se3_inverse(self._window.posterior.poses[-1])
+        self._motion.correct(back @ fit.pose, turn_covariance(back, fit.relative))
+        self._noise.adapt(fit.nis_per_dof)
+        self._course.track(timestamp)
+        return fit

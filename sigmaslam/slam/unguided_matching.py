@@ -1,0 +1,67 @@
+"""The pose of a view relative to a keyframe from their features alone, without a prediction."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sigmaslam.estimation.keyframe_window import KeyframeWindow
+from sigmaslam.frontend import Frontend, StereoView
+from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam.slam.config import TrackerConfig
+from sigmaslam.slam.measurement_noise import MeasurementNoise
+from sigmaslam.two_view.stereo_pose import RelativePose, estimate_relative_pose
+
+# A pose from matches alone has no prediction to agree with. Where fewer than this share of the matches that should be
+# right by their probabilities agree with it, three times as many inliers are required: symmetric texture in a mirrored
+# image once gave 41 inliers, 31 by their probabilities, where 66 should be right. Half of the right ones may be on
+# movers.
+_MIN_SHARE, _FEW_AGREE = 0.5, 3
+
+
+class UnguidedMatcher:
+    """Finds keyframes in views, wherever they are.
+
+    Args:
+        camera: the rectified pair.
+        frontend: matches features.
+        window: whose calibration corrects the disparities.
+        noise: of what is matched.
+        config: settings.
+    """
+
+    def __init__(
+        self,
+        camera: RectifiedStereo,
+        frontend: Frontend,
+        window: KeyframeWindow,
+        noise: MeasurementNoise,
+        config: TrackerConfig,
+    ) -> None:
+        self._camera = camera
+        self._frontend = frontend
+        self._window = window
+        self._noise = noise
+        self._config = config
+
+    def relative_pose_to(self, key: StereoView, view: StereoView) -> RelativePose | None:
+        """Pose of a view relative to a keyframe by all of its stereo features; None where too few agree."""
+        index = np.flatnonzero(np.isfinite(key.disparity))
+        if len(index) < self._config.min_inliers:
+            return None
+        matches = self._frontend.match(key, index, view, key.features.keypoints[index].astype(np.float64), None)
+        rows = matches.key_index
+        place = np.full(len(rows), self._config.keyframe_sigma)
+        relative = estimate_relative_pose(
+            self._camera,
+            self._window.true_disparity(key.measured(rows)),
+            np.column_stack([place, place, key.disparity_sigma[rows]]),
+            self._window.true_disparity(matches.measured),
+            self._noise.of_matches(matches),
+            matches.probability,
+        )
+        if relative is None:
+            return None
+        # Each by its probability: many doubtful ones are few.
+        agreeing = float(matches.probability[relative.inliers].sum())
+        fair = agreeing >= _MIN_SHARE * matches.probability.sum()
+        return relative if agreeing >= self._config.min_inliers * (1 if fair else _FEW_AGREE) else None

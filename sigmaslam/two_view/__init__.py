@@ -1,0 +1,1 @@
+"""Relative poses of two views from their matches alone."""

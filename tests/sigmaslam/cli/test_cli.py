@@ -1,0 +1,217 @@
+"""The command line on the shipped sequence, and what it says to bad input."""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from sigmaslam.geometry.trajectory import read_tum
+from tests.support.commands import Finished, assert_refused, command_line, environment, run_here, run_process
+
+FRAMES = 8
+
+
+@pytest.fixture(scope="module")
+def whole_sequence(demo_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first frames of the demo."""
+    folder = tmp_path_factory.mktemp("whole") / "sequence"
+    for name in ("image_0", "image_1"):
+        (folder / name).mkdir(parents=True)
+        for image in sorted((demo_sequence / name).iterdir())[:FRAMES]:
+            shutil.copy(image, folder / name)
+    shutil.copy(demo_sequence / "calib.txt", folder)
+    for name in ("times.txt", "poses.txt"):
+        lines = (demo_sequence / name).read_text().splitlines(keepends=True)
+        (folder / name).write_text("".join(lines[:FRAMES]))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def tracked(whole_sequence: Path) -> tuple[Path, Finished]:
+    """The run folder of these frames, and what the command said."""
+    out = whole_sequence.with_name("run")
+    return out, run_process("track", whole_sequence, "--out", out)
+
+
+@pytest.fixture
+def short_sequence(whole_sequence: Path, tmp_path: Path) -> Path:
+    """The first frames of the demo, to be broken."""
+    return shutil.copytree(whole_sequence, tmp_path / "sequence")
+
+
+def rows(run: Path) -> list[list[str]]:
+    return [line.split(",") for line in (run / "frames.csv").read_text().splitlines()[1:]]
+
+
+def test_track_writes_every_output_and_evaluate_reads_them(whole_sequence: Path, tracked: tuple[Path, Finished]):
+    out, result = tracked
+    assert result.returncode == 0, result.stderr
+    assert len(read_tum(out / "trajectory.tum")) == FRAMES
+    assert len((out / "trajectory.kitti").read_text().splitlines()) == FRAMES
+    covariance = np.load(out / "covariance.npy")
+    assert covariance.shape == (FRAMES, 6, 6)
+    assert (np.linalg.eigvalsh(covariance[1:]) > 0).all()
+    assert len(rows(out)) == FRAMES
+    with np.load(out / "map.npz") as archive:
+        assert len(archive["points"]) == len(archive["covariances"]) == len(archive["observations"]) > 50
+        vertices = len(archive["points"])
+    assert f"element vertex {vertices}\n".encode() in (out / "map.ply").read_bytes()
+    run = json.loads((out / "run.json").read_text())
+    assert run["ended"] == "complete"
+    assert len(run["weights_sha256"]["features.onnx"]) == 64
+    assert "<svg" in (out / "report.html").read_text()
+
+    result = run_here("evaluate", out, "--truth", whole_sequence / "poses.txt", "--json")
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout)["matched"] == FRAMES
+
+
+def test_two_runs_are_identical_to_the_bit(whole_sequence: Path, tracked: tuple[Path, Finished], tmp_path: Path):
+    assert run_process("track", whole_sequence, "--out", tmp_path / "again").returncode == 0
+    for name in ("trajectory.tum", "trajectory.kitti", "covariance.npy", "map.ply"):
+        assert (tracked[0] / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
+
+
+def test_a_missing_folder_is_refused(tmp_path: Path):
+    assert_refused(run_process("track", tmp_path / "nowhere", "--out", tmp_path / "run"), "nowhere")
+    assert not (tmp_path / "run").exists()
+
+
+def test_unequal_counts_are_refused_with_both_numbers(short_sequence: Path, tmp_path: Path):
+    sorted((short_sequence / "image_1").iterdir())[3].unlink()
+    assert_refused(run_here("track", short_sequence, "--out", tmp_path / "run"), str(FRAMES), str(FRAMES - 1))
+
+
+@pytest.mark.usefixtures("without_report")
+@pytest.mark.parametrize("content", [b"", b"no image at all"])
+def test_an_unreadable_image_costs_one_frame_and_a_warning(short_sequence: Path, tmp_path: Path, content: bytes):
+    broken = sorted((short_sequence / "image_0").iterdir())[4]
+    broken.write_bytes(content)
+    out = tmp_path / "run"
+    result = run_here("track", short_sequence, "--out", out)
+    assert result.returncode == 0, result.stderr
+    assert broken.name in result.stderr.replace("\n", "")
+    assert [row[1] for row in rows(out)].count("skipped") == 1
+    assert len(read_tum(out / "trajectory.tum")) == FRAMES - 1
+    assert json.loads((out / "run.json").read_text())["summary"]["skipped"] == 1
+
+
+def test_a_sequence_that_breaks_off_leaves_what_was_computed(short_sequence: Path, tmp_path: Path):
+    """Time stamps that go back cannot be mended: exit code 2, and the frames before are on disk."""
+    times = (short_sequence / "times.txt").read_text().splitlines()
+    times[5] = "0.0"
+    (short_sequence / "times.txt").write_text("\n".join(times) + "\n")
+    out = tmp_path / "run"
+    result = run_here("track", short_sequence, "--out", out)
+    assert_refused(result, "time")
+    if out.exists():  # a reader may refuse the file before the first frame
+        assert len(read_tum(out / "trajectory.tum")) == 5
+
+
+def test_a_calibration_with_a_missing_key_or_wrong_size_is_refused(short_sequence: Path, tmp_path: Path):
+    calibration = short_sequence / "calib.txt"
+    lines = calibration.read_text().splitlines()
+    calibration.write_text(lines[0] + "\n")
+    assert_refused(run_here("track", short_sequence, "--out", tmp_path / "run"), "calib.txt", "P1")
+    calibration.write_text("\n".join([lines[0], " ".join(lines[1].split()[:-1])]) + "\n")
+    assert_refused(run_here("track", short_sequence, "--out", tmp_path / "run"), "calib.txt", "12")
+
+
+def test_a_calibration_for_another_image_size_is_refused(short_sequence: Path, tmp_path: Path):
+    camera = {"width": 640, "height": 480, "fx": 400.0, "fy": 400.0, "cx": 320.0, "cy": 240.0}
+    T = [[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    calibration = tmp_path / "stereo.yaml"
+    calibration.write_text(json.dumps({"left": camera, "right": camera, "T_left_right": T}))
+    result = run_here("track", short_sequence, "--out", tmp_path / "run", "--calibration", calibration)
+    assert_refused(result, "640x480", "320x240")
+
+
+@pytest.mark.usefixtures("without_report")
+@pytest.mark.parametrize("kind", ["colour", "16-bit"])
+def test_colour_and_16_bit_images_are_converted_with_a_warning(short_sequence: Path, tmp_path: Path, kind: str):
+    for path in [*(short_sequence / "image_0").iterdir(), *(short_sequence / "image_1").iterdir()]:
+        grey = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        assert grey is not None
+        image = cv2.merge([grey] * 3) if kind == "colour" else grey.astype(np.uint16) * 256
+        cv2.imwrite(str(path), image)
+    out = tmp_path / "run"
+    result = run_here("track", short_sequence, "--out", out)
+    assert result.returncode == 0, result.stderr
+    assert ("colour" if kind == "colour" else "16") in result.stderr
+    assert [row[1] for row in rows(out)].count("tracking") == FRAMES - 1
+
+
+def test_an_output_folder_that_holds_something_is_refused_untouched(short_sequence: Path, tmp_path: Path):
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / "precious.txt").write_text("keep")
+    assert_refused(run_here("track", short_sequence, "--out", out), str(out.name), "--out")
+    assert [path.name for path in out.iterdir()] == ["precious.txt"]
+
+
+def test_an_unknown_option_value_is_refused(short_sequence: Path, tmp_path: Path):
+    assert_refused(
+        run_process("track", short_sequence, "--out", tmp_path / "run", "--frontend", "surf"), "surf", "sift"
+    )
+
+
+def test_ctrl_c_leaves_a_usable_run(demo_sequence: Path, tmp_path: Path):
+    out = tmp_path / "run"
+    command = command_line("track", demo_sequence, "--out", out)
+    process = subprocess.Popen(command, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and not ((out / "frames.csv").exists() and len(rows(out)) >= 3):
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(timeout=60) == 130
+    assert json.loads((out / "run.json").read_text())["ended"] == "interrupted"
+    count = len(read_tum(out / "trajectory.tum"))
+    assert 3 <= count < 40
+    assert len(np.load(out / "covariance.npy")) == count == len(rows(out))
+
+
+def test_the_runtime_imports_without_torch_or_kornia(demo_sequence: Path):
+    """The whole path but training runs where only the runtime is installed."""
+    script = (
+        "import sys; sys.modules.update(torch=None, kornia=None, onnx=None, onnxscript=None, safetensors=None)\n"
+        "import sigmaslam.cli, sigmaslam.evaluation.run_evaluation\n"
+        "from sigmaslam import StereoTracker, open_sequence\n"
+        f"sequence = open_sequence({str(demo_sequence)!r})\n"
+        "tracker = StereoTracker(sequence.camera)\n"
+        "statuses = [tracker.step(f.left, f.right, f.timestamp).status for f, _ in zip(sequence.frames(), range(3))]\n"
+        "assert statuses == ['starting', 'tracking', 'tracking'], statuses\n"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=120, env=environment()
+    )
+    assert result.returncode == 0, result.stderr
+
+
+def test_training_without_its_extra_says_how_to_install_it(tmp_path: Path):
+    (tmp_path / "torch.py").write_text("raise ModuleNotFoundError(\"No module named 'torch'\", name='torch')\n")
+    command = command_line("train", "--out", tmp_path / "run")
+    result = subprocess.run(command, capture_output=True, text=True, env=environment(tmp_path), check=False, timeout=60)
+    assert_refused(result, "sigmaslam[train]")
+
+
+@pytest.mark.parametrize(
+    "command", ["demo", "track", "evaluate", "match", "render", "train", "train-scorer", "export", "benchmark"]
+)
+def test_every_command_has_help(command: str):
+    result = run_here(command, "--help")
+    assert result.returncode == 0
+    assert "Usage" in result.stdout
+
+
+def test_an_option_that_the_benchmark_does_not_serve_is_refused(tmp_path: Path):
+    page = tmp_path / "page.md"
+    assert_refused(run_here("benchmark", "claims", "--out", page, "--rounds", "3"), "--rounds", "claims")
+    assert_refused(run_here("benchmark", "sequences", "--out", page, "--eager"), "--eager", "sequences")
+    assert not page.exists()

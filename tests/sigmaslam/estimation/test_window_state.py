@@ -1,0 +1,122 @@
+"""The Gaussian of a window against dense linear algebra: marginalising, closing loops and forgetting in any order."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sigmaslam.estimation.marginalised_poses import PastPoses
+from sigmaslam.estimation.window_state import WindowState
+from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
+
+POSES, PAST = 3, 2
+LOOP_SIGMA = 1e-5 * np.array([1.0, 2.0, 3.0, 0.5, 0.4, 0.3])
+
+
+def random_state(seed: int) -> WindowState:
+    """Poses anywhere; errors so small that exponentials add up."""
+    rng = np.random.default_rng(seed)
+    size = 3 + 6 * (POSES + PAST)
+    root = 1e-4 * rng.normal(size=(size, size))
+    joint, own = root @ root.T, 3 + 6 * POSES
+    poses = se3_exp(rng.normal(0.0, [2.0, 2.0, 2.0, 0.5, 0.5, 0.5], (POSES + PAST, 6)))
+    past = PastPoses(poses[POSES:], joint[own:, own:], joint[own:, :own])
+    return WindowState(1e-3 * rng.normal(size=3), poses[:POSES], joint[:own, :own], past)
+
+
+def measured(state: WindowState, index: int, seed: int) -> np.ndarray:
+    """The last pose as a past one sees it, with an error."""
+    error = se3_exp(LOOP_SIGMA * np.random.default_rng(1000 + seed).normal(size=6))
+    return np.asarray(se3_inverse(state.past.poses[index]) @ error @ state.poses[-1])
+
+
+def joint_of(state: WindowState) -> np.ndarray:
+    """Covariance of calibration, past poses and poses of the window, in the order in which they were."""
+    whole = np.block([[state.covariance, state.past.cross.T], [state.past.cross, state.past.covariance]])
+    own = len(state.covariance)
+    order = np.r_[0:3, own : len(whole), 3:own]
+    return whole[np.ix_(order, order)]
+
+
+def poses_of(state: WindowState) -> np.ndarray:
+    return np.concatenate([state.past.poses, state.poses])
+
+
+def assert_same(one: WindowState, other: WindowState) -> None:
+    scale = np.sqrt(np.diag(joint_of(other)))
+    np.testing.assert_allclose(one.calibration, other.calibration, atol=1e-6 * scale[:3].min())
+    difference = se3_log(poses_of(one) @ se3_inverse(poses_of(other))).ravel()
+    assert np.abs(difference / scale[3:]).max() < 1e-6
+    assert np.abs((joint_of(one) - joint_of(other)) / np.outer(scale, scale)).max() < 1e-6
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000), index=st.integers(0, PAST - 1))
+def test_marginalising_and_closing_a_loop_commute(seed: int, index: int):
+    state = random_state(seed)
+    T, covariance = measured(state, index, seed), np.diag(LOOP_SIGMA**2)
+    first = state.add_loop_constraint(index, T, covariance).marginalise_oldest()
+    then = state.marginalise_oldest().add_loop_constraint(index, T, covariance)
+    assert_same(first, then)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000), index=st.integers(0, PAST - 1))
+def test_a_loop_is_the_update_of_all_poses_together(seed: int, index: int):
+    """The Kalman update of the joint covariance, written down densely."""
+    state = random_state(seed)
+    T, R = measured(state, index, seed), np.diag(LOOP_SIGMA**2)
+    after = state.add_loop_constraint(index, T, R)
+    P = joint_of(state)
+    H = np.zeros((6, len(P)))
+    H[:, -6:], H[:, 3 + 6 * index : 9 + 6 * index] = np.eye(6), -np.eye(6)
+    gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+    step = gain @ se3_log(state.past.poses[index] @ T @ se3_inverse(state.poses[-1]))
+    scale = np.sqrt(np.diag(P))
+    moved = se3_log(poses_of(after) @ se3_inverse(poses_of(state))).ravel()
+    assert np.abs((np.r_[after.calibration - state.calibration, moved] - step) / scale).max() < 1e-6
+    assert np.abs((joint_of(after) - (P - gain @ H @ P)) / np.outer(scale, scale)).max() < 1e-6
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_learning_of_the_window_and_marginalising_commute(seed: int):
+    """What is learned of the poses that stay; the pose that leaves follows it either way."""
+    state = random_state(seed)
+    rng = np.random.default_rng(seed)
+    rows = rng.normal(size=(4, len(state.covariance))) / 1e-4
+    rows[:, 3:9] = 0.0
+    information, vector = rows.T @ rows, rows.T @ rng.normal(size=4)
+    stays = np.r_[0:3, 9 : len(vector)]
+    first = state.given(information, vector).marginalise_oldest()
+    then = state.marginalise_oldest().given(information[np.ix_(stays, stays)], vector[stays])
+    assert_same(first, then)
+
+
+@pytest.mark.parametrize("index", range(PAST))
+def test_forgetting_a_pose_leaves_the_others_as_they_were(index: int):
+    state = random_state(index)
+    remaining = np.delete(np.arange(3 + 6 * (PAST + POSES)), np.arange(3 + 6 * index, 9 + 6 * index))
+    after = state.forget(index)
+    np.testing.assert_array_equal(joint_of(after), joint_of(state)[np.ix_(remaining, remaining)])
+    np.testing.assert_array_equal(poses_of(after), np.delete(poses_of(state), index, axis=0))
+
+
+def test_a_new_pose_is_as_far_from_the_last_as_its_step_says():
+    state, step = random_state(0), 1e-4 * np.eye(6)
+    grown = state.grow(np.eye(4), step, np.array([4.0, 0.0, 0.0]))
+    before, after = state.covariance, grown.covariance
+    np.testing.assert_array_equal(after[-6:, -6:], before[-6:, -6:] + step)
+    np.testing.assert_array_equal(after[-6:, 3:-6], before[-6:, 3:])
+    np.testing.assert_array_equal(after[:3, :3], before[:3, :3] + np.diag([4.0, 0.0, 0.0]))
+    np.testing.assert_array_equal(grown.past.cross[:, -6:], state.past.cross[:, -6:])
+
+
+def test_of_a_state_without_poses_the_calibration_remains():
+    state = random_state(1)
+    alone = state.without_poses()
+    assert len(alone) == len(alone.past) == 0
+    np.testing.assert_array_equal(alone.covariance, state.covariance[:3, :3])
+    np.testing.assert_array_equal(alone.calibration, state.calibration)

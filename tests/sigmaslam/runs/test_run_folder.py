@@ -1,0 +1,42 @@
+"""What a run says and writes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sigmaslam.runs.run_folder import calibration_verdict, write_ply
+from sigmaslam.slam.point_map import PointMap
+from sigmaslam.slam.tracker import CalibrationEstimate
+
+
+@pytest.mark.parametrize(
+    ("offset", "sigma", "words"),
+    [
+        (0.01, 0.03, "nothing wrong"),
+        (0.27, 0.04, "off by +0.27 ± 0.04 px"),
+        (-0.27, 0.04, "off by -0.27 ± 0.04 px"),
+        (0.09, 0.01, "nothing wrong"),  # certain, but too small to matter
+        (0.3, 0.25, "says little"),
+    ],
+)
+def test_the_verdict_on_the_calibration_is_in_words(offset: float, sigma: float, words: str):
+    assert words in calibration_verdict(CalibrationEstimate(offset, sigma))
+
+
+def test_a_ply_file_round_trips(tmp_path: Path):
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(5, 3, 3))
+    points, covariances = rng.normal(size=(5, 3)), root @ root.transpose(0, 2, 1)
+    point_map = PointMap(points, covariances, np.arange(3, 8), np.zeros(5), np.zeros((5, 2)))
+    write_ply(tmp_path / "map.ply", point_map)
+    header, _, body = (tmp_path / "map.ply").read_bytes().partition(b"end_header\n")
+    assert header.splitlines()[:3] == [b"ply", b"format binary_little_endian 1.0", b"element vertex 5"]
+    vertices = np.frombuffer(body, "<f4").reshape(5, 4)
+    np.testing.assert_allclose(vertices[:, :3], point_map.points, rtol=1e-6)
+    np.testing.assert_allclose(vertices[:, 3] ** 2, np.linalg.eigvalsh(point_map.covariances)[:, -1], rtol=1e-5)
+
+
+def test_an_empty_map_is_a_valid_file(tmp_path: Path):
+    write_ply(tmp_path / "map.ply", PointMap.empty())
+    assert b"element vertex 0\n" in (tmp_path / "map.ply").read_bytes()

@@ -1,0 +1,158 @@
+"""A lap that ends where it began, by the tracker without images: what its loop gains on the way round."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from sigmaslam.frontend.types import PatchMaps, StereoView, TemporalMatches
+from sigmaslam.geometry.se3 import nearest_rigid, se3_exp, se3_inverse, se3_log
+from sigmaslam.slam.tracker import StereoTracker
+from tests.support.quantiles import chi_square_median, squared_sigmas
+from tests.support.simulated_frontend import SCALES, SimulatedFrontend, frame_of, run_simulated
+
+LAP, FRAMES = 180, 220
+SCALE = SCALES["driving"]
+OFFSET = 0.3
+# Frames after which a keyframe is one of long ago.
+LONG_AGO = 20
+
+
+class LapFrontend(SimulatedFrontend):
+    """A drive around a circle of 180 m, and on for 40 m.
+
+    Args:
+        seed: of everything random.
+        loops: what matches without a prediction say of keyframes of long ago: "right", "none", or "wrong": as if the
+            camera were 5 m aside.
+    """
+
+    def __init__(self, seed: int, loops: str = "right") -> None:
+        super().__init__(SCALE, seed, FRAMES, 100, offset=OFFSET)
+        self._loops = loops
+
+    def match(
+        self,
+        key: StereoView,
+        index: np.ndarray,
+        view: StereoView,
+        predicted: np.ndarray,
+        covariance: np.ndarray | None,
+        maps: PatchMaps | None = None,
+    ) -> TemporalMatches:
+        # Drawn whatever is made of it, so that the noise is that of the other runs.
+        found = super().match(key, index, view, predicted, covariance, maps)
+        frame = frame_of(view.left)
+        if covariance is not None or self._loops == "right" or frame - frame_of(key.left) < LONG_AGO:
+            return found
+        if self._loops == "none":
+            return found.select(np.zeros(0, np.int64))
+        points = self._seen[frame_of(key.left)][found.key_index]
+        aside = self.poses[frame] @ se3_exp(np.array([5.0, 0, 0, 0, 0, 0]))
+        seen = self._project_from(aside)[0][points]
+        return replace(found, points=seen[:, :2], disparity=seen[:, 2])
+
+    def _path(self, frames: int) -> np.ndarray:
+        step, poses = se3_exp(np.array([0, 0, 1.0, 0, 2 * np.pi / LAP, 0])), [np.eye(4)]
+        for _ in range(frames - 1):
+            poses.append(nearest_rigid(poses[-1] @ step))
+        return np.array(poses)
+
+
+@dataclass(frozen=True)
+class Lap:
+    """Errors after a lap, of keyframes and points of its middle (metres, and NEES per degree of freedom), and after it.
+
+    Attributes:
+        keyframe_error, keyframe_nees: means.
+        point_error, point_nees: medians, the latter over what it should be.
+        end_error: metres, mean of the frames after the lap.
+        poses: (K, 4, 4) remembered.
+    """
+
+    keyframe_error: float
+    keyframe_nees: float
+    point_error: float
+    point_nees: float
+    end_error: float
+    poses: np.ndarray
+
+
+def drive(seed: int, loops: str = "right") -> Lap:
+    """Around once."""
+    frontend = LapFrontend(seed, loops)
+    tracker = StereoTracker(frontend.camera, frontend)
+    run = run_simulated(tracker, frontend, SCALE)
+    assert [e.status for e in run.estimates[1:]] == ["tracking"] * (FRAMES - 1)
+    kept = tracker.pack_keyframes()
+    number = np.round(kept["keyframe_timestamps"] / SCALE.interval).astype(int)
+    poses, joint = kept["keyframe_poses"], kept["keyframe_covariance"]
+    middle = (number >= 40) & (number < 140)
+    true = frontend.poses[number]
+    away = np.linalg.norm(true[:, :3, 3] - poses[:, :3, 3], axis=1)
+    errors = se3_log(true @ se3_inverse(poses))
+    covariances = [joint[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(len(number))]
+    nees = [e @ np.linalg.lstsq(P, e, rcond=1e-12)[0] / 6 for e, P in zip(errors, covariances, strict=True)]
+    point_error, point_nees = _points(tracker, frontend)
+    end = [
+        np.linalg.norm(e.T_world_camera[:3, 3] - T[:3, 3])
+        for e, T in zip(run.estimates[LAP + 20 :], frontend.poses[LAP + 20 :], strict=True)
+    ]
+    return Lap(
+        float(np.mean(away[middle])),
+        float(np.mean(np.array(nees)[middle])),
+        point_error,
+        point_nees,
+        float(np.mean(end)),
+        poses,
+    )
+
+
+def _points(tracker: StereoTracker, frontend: LapFrontend) -> tuple[float, float]:
+    """Median error and NEES of the map's points that were first seen in the middle of the lap."""
+    found = tracker.map()
+    number = np.round(found.timestamps / SCALE.interval).astype(int)
+    error, nees = [], []
+    for k in np.unique(number[(number >= 40) & (number < 140)]):
+        own = number == k
+        truth, visible = frontend._project(k)
+        apart = np.linalg.norm(truth[None, :, :2] - found.pixels[own][:, None], axis=2)
+        apart[:, ~visible] = np.inf
+        off = found.points[own] - frontend._points[apart.argmin(axis=1)]
+        sure = apart.min(axis=1) < 1.5  # pixels, the keypoint's noise is 0.25: no other point was meant
+        error += np.linalg.norm(off[sure], axis=1).tolist()
+        nees += (squared_sigmas(off[sure], found.covariances[own][sure]) / 3).tolist()
+    assert len(error) > 100
+    # A right NEES has the median of chi-square; of a few points another one was meant.
+    return float(np.median(error)), float(np.median(nees)) * 3 / chi_square_median(3)
+
+
+@pytest.mark.slow
+def test_a_loop_corrects_keyframes_and_points_of_the_way_round(monkeypatch: pytest.MonkeyPatch):
+    """Without any extra; halfway round a loop takes half of the variance, at the end nearly all of it."""
+    monkeypatch.setitem(sys.modules, "gtsam", None)
+    before = [drive(seed, "none") for seed in range(5)]
+    after = [drive(seed) for seed in range(5)]
+
+    def factor(name: str) -> float:
+        return float(
+            np.sqrt(np.mean([getattr(b, name) ** 2 for b in before]) / np.mean([getattr(a, name) ** 2 for a in after]))
+        )
+
+    # Where half of the way is gone, a random walk is left with 1 / sqrt(2) of its error.
+    assert factor("keyframe_error") > 1.15
+    assert factor("point_error") > 1.15
+    assert factor("end_error") > 2.0
+    # Five laps, each with errors that all its keyframes share: the mean scatters by a third.
+    assert 0.4 < np.mean([lap.keyframe_nees for lap in after]) < 2.0
+    assert 0.4 < np.mean([lap.point_nees for lap in after]) < 2.0
+
+
+@pytest.mark.slow
+def test_wrong_loops_spoil_nothing():
+    without, misled = drive(0, "none"), drive(0, "wrong")
+    np.testing.assert_array_equal(misled.poses, without.poses)
+    assert misled.end_error == without.end_error

@@ -1,0 +1,307 @@
+"""Keyframes that left the window: kept within bounds, found again, and a map to localise in."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sigmaslam import StereoTracker, open_sequence
+from sigmaslam.bundle_adjustment.track_file import read_tracks
+from sigmaslam.errors import InputError
+from sigmaslam.estimation.marginalised_poses import PastPoses
+from sigmaslam.frontend import Features, StereoView
+from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam.geometry.trajectory import read_kitti
+from sigmaslam.runs.track import track_sequence
+from sigmaslam.slam.keyframe import Keyframe
+from sigmaslam.slam.keyframes import Keyframes
+from sigmaslam.slam.map_file import pack_keyframes, read_keyframes
+from sigmaslam.slam.place_recognition import retrieve
+from sigmaslam.slam.tracker import TrackerConfig
+from tests.support.dense_window import make_window
+from tests.support.estimates import Demo, error_of, mirrored, squared_error
+from tests.support.quantiles import WITHIN_3_SIGMA
+
+CAMERA = RectifiedStereo(fx=200.0, fy=201.0, cx=32.0, cy=24.0, baseline=0.1, width=64, height=48)
+
+
+ONE_POSE = PastPoses(np.eye(4)[None], np.eye(6), np.zeros((6, 3)))
+
+
+def view_of(number: int, features: int = 40) -> StereoView:
+    """A view with descriptors of its own."""
+    rng = np.random.default_rng(number)
+    descriptors = rng.normal(size=(features, 64)).astype(np.float32)
+    descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
+    image = rng.integers(0, 256, (48, 64), dtype=np.uint8)
+    found = Features(
+        rng.uniform(0, 48, (features, 2)).astype(np.float32),
+        descriptors,
+        rng.uniform(size=features).astype(np.float32),
+        rng.uniform(0.1, 1.0, features).astype(np.float32),
+    )
+    disparity = np.where(np.arange(features) % 4 == 0, np.nan, rng.uniform(1, 9, features))
+    return StereoView(image, image, found, disparity, rng.uniform(0.1, 1, features))
+
+
+def keyframe(number: int, features: int = 40) -> Keyframe:
+    return Keyframe(number, 0.5 * number, view_of(number, features))
+
+
+def looking(x: float, R: np.ndarray | None = None) -> np.ndarray:
+    """Pose at (x, 0, 0) that looks along z by default."""
+    pose = np.eye(4)
+    pose[0, 3] = x
+    pose[:3, :3] = np.eye(3) if R is None else R
+    return pose
+
+
+def visited(poses: list[np.ndarray], max_keyframes: int) -> Keyframes:
+    """Keyframes at these poses that have all left the window."""
+    window = make_window(np.zeros(3), camera=CAMERA)
+    keyframes = Keyframes(window, max_keyframes, 100)
+    for number, pose in enumerate(poses):
+        window.add_keyframe(pose, pose, 1e-4 * np.eye(6), np.zeros(3), 1.0)
+        keyframes.append(view_of(number), 0.5 * number)
+        keyframes.marginalise_oldest()
+    return keyframes
+
+
+def jittered(view: StereoView, rng: np.random.Generator) -> StereoView:
+    """The same place seen again: descriptors a little different, in another order."""
+    order = rng.permutation(len(view.features.descriptors))
+    noisy = view.features.descriptors[order] + rng.normal(scale=0.03, size=(len(order), 64)).astype(np.float32)
+    return replace(view, features=replace(view.features, descriptors=noisy))
+
+
+# ---- memory
+
+
+def test_memory_keeps_to_its_capacity_and_drops_the_right_images():
+    for count in range(1, 12):
+        kept = visited([looking(float(x)) for x in range(count)], 5).remembered
+        assert len(kept) == min(count, 5)
+        assert all(each.view.right.size == 0 for each in kept)
+        assert all(each.view.left.shape == (48, 64) for each in kept)
+
+
+def test_thinning_spares_places_visited_once():
+    """Nine keyframes crowd at the origin, three places are visited once: all three stay, with their poses."""
+    places = [0.0, 5.0, 0.01, 0.02, 10.0, 0.03, 0.04, 15.0, 0.05, 0.06, 0.07, 0.08]
+    keyframes = visited([looking(x) for x in places], 6)
+    assert {1, 4, 7} <= {each.id for each in keyframes.remembered}
+    assert [keyframes.pose(each)[0, 3] for each in keyframes.remembered] == [
+        places[each.id] for each in keyframes.remembered
+    ]
+
+
+def test_thinning_tells_directions_apart():
+    """At one place, looking another way: what looks the same way goes first."""
+    aside = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    poses = [looking(0.0), looking(0.0, aside), looking(0.01), looking(1.0)]
+    assert 1 in {each.id for each in visited(poses, 3).remembered}
+
+
+def test_keyframes_of_one_time_stamp_are_told_apart():
+    """Two recordings may begin at zero: identity is a number, not a time."""
+    window = make_window(np.zeros(3), camera=CAMERA)
+    keyframes = Keyframes(window, 5, 100)
+    for number in range(3):
+        window.add_keyframe(looking(number), looking(number), 1e-4 * np.eye(6), np.zeros(3), 1.0)
+        keyframes.append(view_of(number), 0.0)
+        keyframes.marginalise_oldest()
+    assert [keyframes.index(each.id) for each in keyframes.remembered] == [0, 1, 2]
+    assert [keyframes.pose(each)[0, 3] for each in keyframes.remembered] == [0.0, 1.0, 2.0]
+
+
+@pytest.mark.parametrize("wanted", [0, 3, 7])
+def test_the_most_similar_keyframe_is_the_one_that_shows_the_place(wanted: int):
+    kept = [keyframe(number) for number in range(8)]
+    best = retrieve(jittered(kept[wanted].view, np.random.default_rng(99)), 3, kept)
+    assert len(best) == 3
+    assert best[0] is kept[wanted]
+
+
+def test_nothing_is_similar_to_nothing():
+    assert retrieve(view_of(0), 3, []) == []
+    kept = [keyframe(1, features=0), keyframe(2)]
+    assert retrieve(view_of(2), 1, kept)[0] is kept[1]
+
+
+# ---- map files
+
+
+def test_keyframes_round_trip_through_a_file(tmp_path: Path):
+    kept = [keyframe(0, 40), keyframe(1, 0), keyframe(2, 17)]
+    joint = np.random.default_rng(0).normal(size=(18, 18))
+    past = PastPoses(np.stack([looking(x) for x in (0.0, 1.0, 2.0)]), joint @ joint.T, np.zeros((18, 3)))
+    np.savez_compressed(tmp_path / "map.npz", **pack_keyframes(kept, past, "learned", CAMERA))
+    read, past_read = read_keyframes(tmp_path / "map.npz", "learned", CAMERA)
+    assert len(read) == 3
+    for name in ("poses", "covariance", "cross"):
+        np.testing.assert_array_equal(getattr(past_read, name), getattr(past, name))
+    for before, after in zip(kept, read, strict=True):
+        assert after.timestamp == before.timestamp
+        np.testing.assert_array_equal(after.view.left, before.view.left)
+        np.testing.assert_array_equal(after.view.disparity, before.view.disparity)
+        np.testing.assert_array_equal(after.view.disparity_sigma, before.view.disparity_sigma)
+        for name in ("keypoints", "descriptors", "scores", "sigma"):
+            stored, expected = getattr(after.view.features, name), getattr(before.view.features, name)
+            np.testing.assert_array_equal(stored, expected)
+            assert stored.dtype == expected.dtype
+
+
+def test_no_keyframes_pack_to_no_arrays():
+    assert pack_keyframes([], PastPoses.empty(), "learned", CAMERA) == {}
+
+
+def refused(path: Path, *words: str, frontend: str = "learned", camera: RectifiedStereo = CAMERA) -> None:
+    """One message that names the file and says these words."""
+    with pytest.raises(InputError) as caught:
+        read_keyframes(path, frontend, camera)
+    for word in (str(path), *words):
+        assert word in str(caught.value)
+
+
+def test_a_missing_map_is_refused(tmp_path: Path):
+    refused(tmp_path / "nowhere.npz", "no such map", "give map.npz")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
+def test_a_truncated_map_is_refused(tmp_path: Path, share: float):
+    path = tmp_path / "map.npz"
+    np.savez_compressed(path, **pack_keyframes([keyframe(0)], ONE_POSE, "learned", CAMERA))
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    refused(path, "not a map that can be read", "track the sequence again")
+
+
+def test_a_map_that_is_no_archive_is_refused(tmp_path: Path):
+    path = tmp_path / "map.npz"
+    path.write_text("x y z\n")
+    refused(path, "not a map that can be read", "track the sequence again")
+
+
+def test_a_map_without_keyframes_is_refused(tmp_path: Path):
+    path = tmp_path / "map.npz"
+    np.savez_compressed(path, points=np.zeros((3, 3)))
+    refused(path, "without keyframes", "make it by a run")
+
+
+def test_a_map_of_another_front_end_is_refused(tmp_path: Path):
+    path = tmp_path / "map.npz"
+    np.savez_compressed(path, **pack_keyframes([keyframe(0)], ONE_POSE, "sift", CAMERA))
+    refused(path, "front-end sift, not learned", "--frontend sift")
+
+
+def test_a_map_of_another_camera_is_refused(tmp_path: Path):
+    path = tmp_path / "map.npz"
+    np.savez_compressed(path, **pack_keyframes([keyframe(0)], ONE_POSE, "learned", CAMERA))
+    refused(path, "0.1", "0.2", "a map serves the camera that made it", camera=replace(CAMERA, baseline=0.2))
+
+
+# ---- the tracker
+
+
+@pytest.fixture(scope="module")
+def demo_run(demo_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run folder of the whole demo, with tracks."""
+    out = tmp_path_factory.mktemp("demo") / "run"
+    track_sequence(open_sequence(demo_sequence), out, tracks=True)
+    return out
+
+
+@pytest.mark.slow
+def test_a_lost_tracker_finds_its_way_back_to_remembered_keyframes(demo: Demo):
+    """Tracked, moved to another world so long that the window holds nothing else, black, and back at the start."""
+    camera, frames, truth = demo
+    tracker = StereoTracker(camera, config=TrackerConfig(window=2, keyframe_ratio=0.8))
+    black = np.zeros_like(frames[0].left)
+    for frame in frames[:21]:
+        tracker.step(frame.left, frame.right, frame.timestamp)
+    for k, frame in enumerate(frames[8:20]):
+        other = mirrored(frame, 6.0 + 0.05 * k)
+        tracker.step(other.left, other.right, other.timestamp)
+    for k in range(4):
+        assert tracker.step(black, black, 6.6 + 0.05 * k).status == "lost"
+    back = [tracker.step(frame.left, frame.right, 6.8 + 0.05 * k) for k, frame in enumerate(frames[:8])]
+    assert [each.status for each in back] == ["relocalised"] + ["tracking"] * 7
+    assert max(squared_error(each, truth[k]) for k, each in enumerate(back)) < WITHIN_3_SIGMA
+    assert max(np.linalg.norm(error_of(each, truth[k])[:3]) for k, each in enumerate(back)) < 0.01
+
+
+@pytest.mark.slow
+def test_black_frames_and_a_jump_back_are_survived(demo: Demo):
+    """Early frames again after a second of nothing: found by what the window still knows, or by the memory."""
+    camera, frames, truth = demo
+    tracker = StereoTracker(camera)
+    black = np.zeros_like(frames[0].left)
+    for frame in frames[:35]:
+        tracker.step(frame.left, frame.right, frame.timestamp)
+    lost = [tracker.step(black, black, 1.75 + 0.05 * k) for k in range(20)]
+    assert {each.status for each in lost} == {"lost"}
+    back = [tracker.step(frame.left, frame.right, 2.75 + 0.05 * k) for k, frame in enumerate(frames[:8])]
+    assert {each.status for each in back} <= {"relocalised", "tracking", "lost"}
+    assert all(each.status == "tracking" for each in back[-3:])
+    for k, each in enumerate(back):
+        assert each.status == "lost" or squared_error(each, truth[k]) < WITHIN_3_SIGMA
+
+
+def test_poses_are_in_the_world_of_the_map(demo: Demo, demo_run: Path):
+    """Beginning in mid-run, where the map knows the place from elsewhere."""
+    camera, frames, truth = demo
+    tracker = StereoTracker(camera)
+    tracker.load_map(demo_run / "map.npz")
+    for k in range(10, 16):
+        estimate = tracker.step(frames[k].left, frames[k].right, frames[k].timestamp)
+        assert estimate.status == ("relocalised" if k == 10 else "tracking")
+        assert np.linalg.norm(error_of(estimate, truth[k])[:3]) < 0.01
+        assert squared_error(estimate, truth[k]) < WITHIN_3_SIGMA
+
+
+@pytest.mark.slow
+def test_a_run_in_its_own_map_stays_in_its_world(demo_sequence: Path, demo_run: Path, tmp_path: Path):
+    summary = track_sequence(open_sequence(demo_sequence), tmp_path / "run", map_path=demo_run / "map.npz")
+    assert (summary["starting"], summary["relocalised"], summary["tracking"]) == (0, 1, 39)
+    truth = read_kitti(demo_sequence / "poses.txt").poses
+    found = read_kitti(tmp_path / "run" / "trajectory.kitti").poses
+    assert np.linalg.norm(found[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.01
+    assert not (tmp_path / "run" / "tracks.npz").exists()  # nobody asked for it
+
+
+def test_a_view_that_is_nowhere_in_the_map_has_no_pose(demo: Demo, demo_run: Path):
+    camera, frames, _ = demo
+    tracker = StereoTracker(camera)
+    tracker.load_map(demo_run / "map.npz")
+    for k in range(4):
+        frame = mirrored(frames[k], 0.05 * k)
+        estimate = tracker.step(frame.left, frame.right, frame.timestamp)
+        assert estimate.status == "starting"
+        assert np.linalg.eigvalsh(estimate.covariance)[0] > 1e5
+        assert estimate.belief == 0.0
+    estimate = tracker.step(frames[5].left, frames[5].right, 0.3)
+    assert estimate.status == "relocalised"
+
+
+def test_tracks_begin_with_their_hosts_and_are_read_by_refine(demo_run: Path):
+    with np.load(demo_run / "tracks.npz") as archive:
+        tracks = {name: archive[name] for name in archive.files}
+    count = len(tracks["frame"])
+    assert count > 500
+    assert tracks["frame"].shape == tracks["landmark"].shape == (count,)
+    assert tracks["measurement"].shape == (count, 3)
+    assert tracks["covariance"].shape == (count, 3, 3)
+    assert tracks["intrinsics"].shape == (5,)
+    assert tracks["R_rectified_left"].shape == (3, 3)
+    assert tracks["disparity_offset"].shape == (2,)
+    # Rows ascend with time, so the first of a landmark is its host, which has it in stereo.
+    assert (np.diff(tracks["frame"]) >= 0).all()
+    landmarks, first = np.unique(tracks["landmark"], return_index=True)
+    assert np.isfinite(tracks["measurement"][first]).all()
+    # Nothing is seen twice in one keyframe, and a good part is seen again in a later one.
+    pairs = np.column_stack([tracks["frame"], tracks["landmark"]])
+    assert len(np.unique(pairs, axis=0)) == count
+    assert count - len(landmarks) > 100
+    read = read_tracks(demo_run / "tracks.npz", 40)
+    np.testing.assert_array_equal(read.landmark, tracks["landmark"])
+    np.testing.assert_array_equal(read.measurement, tracks["measurement"])
