@@ -167,7 +167,7 @@ class Dense:
         self.at = np.r_[np.zeros(self.size), given.measured.ravel()]
         # The landmark that each residual has to do with, -1 of none.
         landmarks = np.arange(len(given.host))
-        of_views = [np.repeat(views.rows, 3) for views in self.views]
+        of_views = [np.repeat(views.landmark, 3) for views in self.views]
         of_priors = [np.full(self.size, -1), np.repeat(landmarks, 4), np.repeat(landmarks, 2)]
         self.landmark_of = np.concatenate([*of_priors, *of_views])
 
