@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from sigmaslam.filters.linalg.square_roots import apply
-from sigmaslam.filters.noise import Noise
+from sigmaslam.filters.noise_covariance import Noise
 
 Function = Callable[..., Tensor]
 Residual = Callable[[Tensor, Tensor], Tensor]

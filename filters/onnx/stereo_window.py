@@ -20,7 +20,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from sigmaslam.filters.onnx.se3 import exp_se3
+from sigmaslam.filters.onnx.exportable_se3 import exp_se3
 from sigmaslam.filters.onnx.unscented import odd_and_even
 
 POSE = slice(0, 6)
@@ -33,7 +33,7 @@ SIZE = 13
 _NEAREST = 0.0625
 
 
-class Transfer(nn.Module):
+class StereoTransfer(nn.Module):
     """Sigma points of relative pose, calibration and landmark through the stereo measurement.
 
     Shapes:

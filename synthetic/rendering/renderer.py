@@ -28,7 +28,7 @@ _SUN_DISTANCE = 40.0  # in radii; far enough to be parallel
 
 
 @dataclass(frozen=True, slots=True)
-class Views:
+class RenderedViews:
     """What V views with the same eye see.
 
     Attributes:
@@ -142,7 +142,7 @@ class Renderer:
         times: np.ndarray,
         T_world_lamp: np.ndarray | None = None,
         sunlight: Sight | None = None,
-    ) -> Views:
+    ) -> RenderedViews:
         """Draws V views.
 
         Args:
@@ -186,7 +186,9 @@ class Renderer:
         if not eye.ideal:
             image[~seen] = 0.0
         body = torch.where(facet >= 0, self.body[facet.clamp_min(0)], -1)
-        return Views(image.reshape(shape), depth.reshape(shape), facet.reshape(shape), body.reshape(shape), sight)
+        return RenderedViews(
+            image.reshape(shape), depth.reshape(shape), facet.reshape(shape), body.reshape(shape), sight
+        )
 
     def _edge_radiance(
         self,

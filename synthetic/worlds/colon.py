@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 
 from sigmaslam.synthetic.geometry import arc_length
 from sigmaslam.synthetic.motion.paths import Path
-from sigmaslam.synthetic.motion.trajectories import insertion
+from sigmaslam.synthetic.motion.random_motions import insertion
 from sigmaslam.synthetic.rendering.shapes import Tube
 from sigmaslam.synthetic.scene import Body, Material, Scene
 from sigmaslam.synthetic.worlds.episode import Episode, Wish

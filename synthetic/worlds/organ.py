@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sigmaslam.synthetic.motion.paths import Path
-from sigmaslam.synthetic.motion.trajectories import inspect
+from sigmaslam.synthetic.motion.random_motions import inspect
 from sigmaslam.synthetic.rendering.shapes import Sheet
 from sigmaslam.synthetic.scene import Body, Material, Scene
 from sigmaslam.synthetic.worlds.episode import Episode, Wish

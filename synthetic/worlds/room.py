@@ -8,12 +8,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sigmaslam.synthetic.motion.paths import Path, at_rest, with_stops
-from sigmaslam.synthetic.motion.trajectories import Box as FreeSpace
-from sigmaslam.synthetic.motion.trajectories import closed_loop, hand_held, pure_rotation
+from sigmaslam.synthetic.motion.random_motions import FreeSpace, closed_loop, hand_held, pure_rotation
 from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel, Shape
 from sigmaslam.synthetic.scene import Body, Lights, Material, Scene, Texture
 from sigmaslam.synthetic.worlds.episode import Episode, Wish
-from sigmaslam.synthetic.worlds.movers import Model, Part, follow
+from sigmaslam.synthetic.worlds.part_models import Model, Part, follow
 
 CLEARANCE = 0.3
 """Metres between the camera and any surface, at least."""

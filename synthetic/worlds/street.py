@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from sigmaslam.synthetic.motion import trajectories
+from sigmaslam.synthetic.motion import random_motions
 from sigmaslam.synthetic.motion.paths import Path, at_rest, with_stops
 from sigmaslam.synthetic.scene import Lights, Scene
 from sigmaslam.synthetic.worlds.episode import Episode, Wish
+from sigmaslam.synthetic.worlds.palette import Palette
 from sigmaslam.synthetic.worlds.street_layout import Street
-from sigmaslam.synthetic.worlds.street_palette import Palette
 from sigmaslam.synthetic.worlds.street_road import CAMERA_HEIGHT, Road
 from sigmaslam.synthetic.worlds.street_traffic import add_traffic
 
@@ -57,19 +57,21 @@ def _drive(rng: np.random.Generator, wish: Wish) -> tuple[Path, np.ndarray]:
         duration -= 0.5 * ease + 1.0
     if wish.motion == "loop":
         size = max(8.0 * duration / 5.4, 20.0)
-        box = trajectories.Box((0.0, 0.0, CAMERA_HEIGHT), (size * rng.uniform(0.8, 1.0), size * 0.9, 0.01 * size))
-        path = trajectories.closed_loop(rng, duration, box)
+        box = random_motions.FreeSpace(
+            (0.0, 0.0, CAMERA_HEIGHT), (size * rng.uniform(0.8, 1.0), size * 0.9, 0.01 * size)
+        )
+        path = random_motions.closed_loop(rng, duration, box)
     elif wish.profile is not None:
-        path = trajectories.drive_profile(wish.profile, duration, rng)
+        path = random_motions.drive_profile(wish.profile, duration, rng)
     else:
-        path = trajectories.drive(rng, duration)
+        path = random_motions.drive(rng, duration)
     times = np.linspace(0.0, path.end, max(20, int(path.end / 0.05)))
     way = path.poses(times)[:, :3, 3]
     if stay:
         pose = path.poses(0.5 * path.end)
         x, y, z = pose[:3, 3].tolist()
         still = wish.motion == "rest"
-        path = at_rest(pose, wish.duration) if still else trajectories.pure_rotation(rng, wish.duration, (x, y, z))
+        path = at_rest(pose, wish.duration) if still else random_motions.pure_rotation(rng, wish.duration, (x, y, z))
     elif wish.motion == "stops" and not path.stops:
         path = with_stops(path, rng, stops, ease)
     return path, way

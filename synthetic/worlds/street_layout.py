@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from sigmaslam.synthetic.geometry import rigid_motion
 from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel
 from sigmaslam.synthetic.scene import Body
-from sigmaslam.synthetic.worlds.movers import Model, stand
+from sigmaslam.synthetic.worlds.palette import Palette
+from sigmaslam.synthetic.worlds.part_models import Model, stand
 from sigmaslam.synthetic.worlds.street_furniture import (
     bush,
     car,
@@ -24,7 +25,6 @@ from sigmaslam.synthetic.worlds.street_furniture import (
     van,
 )
 from sigmaslam.synthetic.worlds.street_houses import house, wall
-from sigmaslam.synthetic.worlds.street_palette import Palette
 from sigmaslam.synthetic.worlds.street_road import Road, footprint
 
 _HALF_LANE = 1.9  # metres from the middle of a lane to its edge

@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 from sigmaslam.synthetic.motion.paths import Path, noise
 from sigmaslam.synthetic.scene import Body
 from sigmaslam.synthetic.worlds.episode import Wish
-from sigmaslam.synthetic.worlds.movers import Model, bisect, covered_share, knot_times, ride
+from sigmaslam.synthetic.worlds.palette import Palette
+from sigmaslam.synthetic.worlds.part_models import Model, bisect, covered_share, knot_times, ride
 from sigmaslam.synthetic.worlds.street_furniture import car, person, truck, van
-from sigmaslam.synthetic.worlds.street_palette import Palette
 from sigmaslam.synthetic.worlds.street_road import Road
 
 _SMALL = 0.12  # share up to which cars come and go besides

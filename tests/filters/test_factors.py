@@ -6,7 +6,7 @@ from torch import Tensor
 
 from sigmaslam import filters
 from sigmaslam.filters.linalg import square_roots, unrolled
-from sigmaslam.filters.noise import Noise
+from sigmaslam.filters.noise_covariance import Noise
 from tests.support.filter_assertions import assert_close
 from tests.support.filter_builders import beliefs, bent_measurement, bent_motion, covariances, random_numbers, tensor
 

@@ -11,7 +11,7 @@ from scipy.stats import kstest
 from torch import Tensor
 
 from sigmaslam import filters
-from sigmaslam.filters.inference import Estimate, Observation, maximum_a_posteriori, maximum_likelihood
+from sigmaslam.filters.inference import Observation, PointEstimate, maximum_a_posteriori, maximum_likelihood
 from tests.support.filter_builders import covariances, random_numbers, tensor
 
 BEACONS = torch.tensor([[0.0, 0.0], [4.0, -1.0], [1.0, 5.0]], dtype=torch.float64)
@@ -53,16 +53,16 @@ def project(pose: Tensor, points: Tensor) -> Tensor:
     return torch.stack([400 * x / z, 400 * (x - 0.2) / z, 400 * y / z], dim=-1).flatten(-2)
 
 
-def element(estimate: Estimate, *index: int) -> Estimate:
+def element(estimate: PointEstimate, *index: int) -> PointEstimate:
     rest = (estimate.cost, estimate.degrees_of_freedom, estimate.iterations, estimate.converged, estimate.healthy)
-    return Estimate(estimate.belief[index], *(field[index] for field in rest))
+    return PointEstimate(estimate.belief[index], *(field[index] for field in rest))
 
 
 def assert_equal(first: Tensor, second: Tensor, tolerance: float = 1e-10) -> None:
     torch.testing.assert_close(first, second, rtol=tolerance, atol=tolerance)
 
 
-def assert_same(first: Estimate, second: Estimate, tolerance: float = 1e-10) -> None:
+def assert_same(first: PointEstimate, second: PointEstimate, tolerance: float = 1e-10) -> None:
     assert_equal(first.belief.mean, second.belief.mean, tolerance)
     assert_equal(first.belief.covariance, second.belief.covariance, tolerance)
     assert_equal(first.cost, second.cost, tolerance)
@@ -584,7 +584,7 @@ def test_one_bad_element_is_named_and_does_not_take_the_batch_down(
     mean, prior = tensor(1.5, 1.5).expand(3, 2), torch.eye(2, dtype=torch.float64).repeat(3, 1, 1)
     noise, value = 0.01 * torch.eye(3, dtype=torch.float64).repeat(3, 1, 1), ranges(tensor(2.0, 1.0)).repeat(3, 1)
 
-    def solve(on_failure: str) -> Estimate:
+    def solve(on_failure: str) -> PointEstimate:
         observations = [Observation(filters.MeasurementModel(ranges, noise), value)]
         return maximum_a_posteriori(filters.Gaussian(mean, prior), observations, on_failure=on_failure)  # type: ignore[arg-type]
 

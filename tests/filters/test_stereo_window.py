@@ -3,8 +3,8 @@ import torch
 from torch import Tensor
 from torch.func import jacrev, vmap
 
-from sigmaslam.filters.onnx.se3 import exp_se3, invert_se3
-from sigmaslam.filters.onnx.stereo_window import CALIBRATION, LANDMARK, POSE, SIZE, Transfer
+from sigmaslam.filters.onnx.exportable_se3 import exp_se3, invert_se3
+from sigmaslam.filters.onnx.stereo_window import CALIBRATION, LANDMARK, POSE, SIZE, StereoTransfer
 from sigmaslam.geometry.camera import RectifiedStereo
 from tests.support.filter_builders import random_numbers, tensor
 
@@ -34,7 +34,7 @@ def transfer(
     if pair is None:
         pair = torch.zeros(len(landmarks), dtype=torch.int64)
     each = landmark_spread.expand(len(landmarks), 4, 4)
-    found: tuple[Tensor, Tensor, Tensor, Tensor] = Transfer()(
+    found: tuple[Tensor, Tensor, Tensor, Tensor] = StereoTransfer()(
         relative, spread.expand(len(relative), 9, 9), pair, calibration, INTRINSICS, landmarks, each
     )
     return found

@@ -19,15 +19,15 @@ from torch import Tensor, nn
 
 from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.files import atomic_path, atomic_write_text, make_folder
-from sigmaslam.filters.onnx.constant_velocity import STATE_SIZE, Predict
-from sigmaslam.filters.onnx.se3 import exp_se3
-from sigmaslam.filters.onnx.stereo_window import Transfer
+from sigmaslam.filters.onnx.exportable_se3 import exp_se3
+from sigmaslam.filters.onnx.pose_prediction import STATE_SIZE, Predict
+from sigmaslam.filters.onnx.stereo_window import StereoTransfer
 from sigmaslam.inference.onnx_graph import OnnxGraph
-from sigmaslam.models.card import card_page, read_card, scoring_page
 from sigmaslam.models.extractor import EXTRACTOR_SIZE_MULTIPLE, FeatureExtractor
-from sigmaslam.models.network import DESCRIPTOR_SIZE, STRIDE, FeatureNetwork
-from sigmaslam.models.scorer import NEIGHBOURS, SIDE_CHANNELS, MatchScorer, ScoredMatches
-from sigmaslam.models.verifier import VERIFIER_COLUMNS, MatchCovariance, MatchVerifier
+from sigmaslam.models.feature_network import DESCRIPTOR_SIZE, STRIDE, FeatureNetwork
+from sigmaslam.models.model_card import card_page, read_card, scoring_page
+from sigmaslam.models.scorer_network import NEIGHBOURS, SIDE_CHANNELS, MatchScorer, ScoredMatches
+from sigmaslam.models.verifier_network import VERIFIER_COLUMNS, MatchCovariance, MatchVerifier
 from sigmaslam.synthetic.rendering.textures import dead_leaves
 
 _OPSET = 20
@@ -215,7 +215,7 @@ def _filter_graphs() -> dict[str, _Graph]:
             (fixed,) * 5,
         ),
         "stereo_transfer": _Graph(
-            Transfer(),
+            StereoTransfer(),
             _transfer_example(0, 5, 40),
             _transfer_example(1, 3, 17),
             ["relative", "spread", "pair", "calibration", "intrinsics", "landmarks", "landmark_spread"],
