@@ -415,8 +415,8 @@ def _prepare(k: int, observation: Observation, like: Tensor, batch: torch.Size, 
     elif not model.additive:
         raise ValueError(f"observation {k}: only additive noise is supported; use a filter, or make the noise additive")
     noise = as_noise(model.noise)
-    if noise.size != value.shape[-1]:
-        raise ValueError(f"observation {k}: the value has {value.shape[-1]} components, its noise {noise.size}")
+    if (size := noise.variance().shape[-1]) != value.shape[-1]:
+        raise ValueError(f"observation {k}: the value has {value.shape[-1]} components, its noise {size}")
     if value.dtype != like.dtype:
         raise ValueError(f"observation {k}: the value is {value.dtype}, the state {like.dtype}")
     value = value.expand(*batch, value.shape[-1])

@@ -109,7 +109,7 @@ def _models(work: Work, tensor: Callable[[Any], Tensor]) -> tuple[Any, Any, list
         return unicycle, fix, [tensor(work.control)], []
     assert isinstance(work, LocalisationWork)
     see = filters.MeasurementModel(
-        lambda states, landmark: range_and_bearing(_TORCH, states, landmark), R, _range_and_bearing_difference
+        lambda states, landmark: range_and_bearing(_TORCH, states, landmark), R, residual=_range_and_bearing_difference
     )
     return unicycle, see, [tensor(work.control)], [tensor(work.landmark)]
 

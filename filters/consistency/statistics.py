@@ -302,39 +302,26 @@ def coverage(
     levels: Sequence[float] = LEVELS,
     *,
     factor: Tensor | None = None,
+    by_axis: bool = False,
     probability: float = 0.95,
 ) -> Coverage:
-    """Share of errors inside the covariance's ellipsoid of each level.
+    """Share of errors inside the covariance's ellipsoid of each level, or inside the interval of each axis.
 
     Args:
         error: (..., n) errors; every leading dimension counts as samples.
         covariance, factor: one of them, as for `whiten`.
-        levels: probabilities of the ellipsoids.
+        levels: probabilities of the regions.
+        by_axis: count |x_i| <= k sigma_i on each axis i, k the normal distribution's for each level. Correlations
+            between the axes play no part, and an axis of which only others are NaN still counts.
         probability: of Wilson's interval. It takes the samples to be independent: those of one run are not, and the
             interval is then too narrow.
     Returns:
-        See `Coverage`; shares are (L,).
+        See `Coverage`; shares are (L,) and counts (), by axis (n, L) and (n,).
     Raises:
         ValueError: as `whiten`, or a level or the probability is not between 0 and 1.
     """
-    return _shares(nees(error, covariance, factor=factor).flatten(), error.shape[-1], levels, probability)
-
-
-def axis_coverage(
-    error: Tensor,
-    covariance: Tensor | None = None,
-    levels: Sequence[float] = LEVELS,
-    *,
-    factor: Tensor | None = None,
-    probability: float = 0.95,
-) -> Coverage:
-    """Share of errors with |x_i| <= k sigma_i on each axis i, k the normal distribution's for each level.
-
-    Arguments and errors as `coverage`; correlations between the axes play no part.
-
-    Returns:
-        See `Coverage`; shares are (n, L), counts (n,). An axis of which only others are NaN still counts.
-    """
+    if not by_axis:
+        return _shares(nees(error, covariance, factor=factor).flatten(), error.shape[-1], levels, probability)
     _require_shapes(error.shape, covariance, factor)
     if factor is not None:
         variance = factor.square().sum(dim=-1)

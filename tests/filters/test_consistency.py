@@ -1,6 +1,7 @@
 import io
 import math
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from torch import Tensor
 from sigmaslam.filters import consistency
 from sigmaslam.filters.consistency.plots import plot_coverage, plot_nees, plot_whiteness
 from tests.support.filter_builders import covariances, random_numbers
+
+axis_coverage = partial(consistency.coverage, by_axis=True)
 
 
 def correlated(runs: int, steps: int, size: int, correlation: float, seed: int = 0) -> Tensor:
@@ -159,7 +162,7 @@ def test_shapes_that_do_not_fit_are_refused(arguments, message):
         consistency.nees,
         consistency.nis,
         consistency.coverage,
-        consistency.axis_coverage,
+        axis_coverage,
     ):
         with pytest.raises(ValueError, match=message):
             function(*arguments)
@@ -440,7 +443,7 @@ def test_coverage_of_an_honest_covariance_is_its_level():
     found = consistency.coverage(error, P)
     torch.testing.assert_close(found.share, found.level, rtol=0, atol=0.012)
     assert (found.share.shape, int(found.count), int(found.nan_count)) == ((5,), 20000, 0)
-    by_axis = consistency.axis_coverage(error, P)
+    by_axis = axis_coverage(error, P)
     assert by_axis.share.shape == (4, 5)
     torch.testing.assert_close(by_axis.share, by_axis.level.expand(4, 5), rtol=0, atol=0.012)
 
@@ -454,7 +457,7 @@ def test_coverage_of_an_overconfident_covariance_falls_short():
 
 def test_axis_coverage_counts_within_k_sigma_and_finds_the_axis():
     error, P = random_numbers(1000, 3), torch.diag(torch.tensor([1.0, 0.25, 1.0], dtype=torch.float64))
-    found = consistency.axis_coverage(error, P, levels=(0.6827,))
+    found = axis_coverage(error, P, levels=(0.6827,))
     expected = (error.abs() <= norm.ppf((1 + 0.6827) / 2) * P.diagonal().sqrt()).double().mean(dim=0)
     torch.testing.assert_close(found.share[:, 0], expected)
     assert ((found.low <= 0.6827) & (found.high >= 0.6827)).flatten().tolist() == [True, False, True]
@@ -463,7 +466,7 @@ def test_axis_coverage_counts_within_k_sigma_and_finds_the_axis():
 def test_coverage_from_a_factor_equals_that_from_the_covariance():
     error, factor = random_numbers(50, 3, seed=1), random_numbers(3, 5, seed=2)
     P = factor @ factor.T
-    for function in (consistency.coverage, consistency.axis_coverage):
+    for function in (consistency.coverage, axis_coverage):
         torch.testing.assert_close(function(error, factor=factor).share, function(error, P).share)
 
 
@@ -480,7 +483,7 @@ def test_nan_is_counted_in_coverage():
     error, P = random_numbers(100, 2), torch.eye(2, dtype=torch.float64).repeat(100, 1, 1)
     error[3, 1] = math.nan
     P[5, 0, 0] = -1.0
-    found, by_axis = consistency.coverage(error, P), consistency.axis_coverage(error, P)
+    found, by_axis = consistency.coverage(error, P), axis_coverage(error, P)
     assert (int(found.count), int(found.nan_count)) == (98, 2)
     assert by_axis.nan_count.tolist() == [1, 1]
     nothing = consistency.coverage(torch.full((4, 2), math.nan), torch.eye(2))
@@ -541,7 +544,7 @@ def test_autocorrelation_is_drawn_with_its_band():
 
 
 def test_coverage_is_drawn_with_its_interval():
-    found = consistency.axis_coverage(random_numbers(80, 2), torch.eye(2, dtype=torch.float64))
+    found = axis_coverage(random_numbers(80, 2), torch.eye(2, dtype=torch.float64))
     figure = plot_coverage(found, labels=["x", "y"], title="Position, metres")
     axes = figure.axes[0]
     for row, container in enumerate(axes.containers):
@@ -573,4 +576,4 @@ def test_figures_refuse_what_does_not_fit():
     with pytest.raises(ValueError, match=r"seconds must be \(30,\)"):
         plot_nees(some_check(), seconds=torch.arange(5.0))
     with pytest.raises(ValueError, match="labels must be 2"):
-        plot_coverage(consistency.axis_coverage(random_numbers(8, 2), torch.eye(2, dtype=torch.float64)), labels=["x"])
+        plot_coverage(axis_coverage(random_numbers(8, 2), torch.eye(2, dtype=torch.float64)), labels=["x"])
