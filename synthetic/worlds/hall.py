@@ -11,8 +11,8 @@ from sigmaslam.synthetic.geometry import rigid_motion
 from sigmaslam.synthetic.motion import random_motions
 from sigmaslam.synthetic.motion.paths import Path, at_rest, with_stops
 from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel
-from sigmaslam.synthetic.scene import Body, Lights, Scene
-from sigmaslam.synthetic.worlds.episode import Episode, Wish
+from sigmaslam.synthetic.scene import Body, Scene
+from sigmaslam.synthetic.worlds.episode import Episode, Wish, daylight
 from sigmaslam.synthetic.worlds.palette import Palette
 from sigmaslam.synthetic.worlds.part_models import Model, Part, bounds, centred, follow, stand
 from sigmaslam.synthetic.worlds.street_furniture import person
@@ -42,13 +42,7 @@ def generate(rng: np.random.Generator, wish: Wish) -> Episode:
         makers = (hall.load, hall.flying_machine, hall.crates)
         models = [makers[int(rng.integers(3))]() for _ in range(1 + int(rng.random() < 0.6) + int(wish.movers > 0.2))]
         bodies += follow(rng, path, wish.duration, wish.movers, [centred(m) for m in models], (0.6, 1.4))
-    elevation, azimuth = np.deg2rad(rng.uniform(25, 70)), rng.uniform(0, 2 * np.pi)
-    sun = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
-    lights = Lights(
-        ambient=float(rng.uniform(0.2, 0.4)),
-        sun=float(rng.uniform(0.6, 1.2)),
-        sun_direction=(float(sun[0]), float(sun[1]), float(sun[2])),
-    )
+    lights = daylight(rng, 25, (0.6, 1.2))
     return Episode(Scene(tuple(bodies), tuple(hall.palette.materials), lights, sky=float(rng.uniform(0.8, 2.2))), path)
 
 

@@ -9,8 +9,8 @@ from scipy.ndimage import gaussian_filter1d
 
 from sigmaslam.synthetic.motion import random_motions
 from sigmaslam.synthetic.motion.paths import Path, at_rest, with_stops
-from sigmaslam.synthetic.scene import Lights, Scene
-from sigmaslam.synthetic.worlds.episode import Episode, Wish
+from sigmaslam.synthetic.scene import Scene
+from sigmaslam.synthetic.worlds.episode import Episode, Wish, daylight
 from sigmaslam.synthetic.worlds.palette import Palette
 from sigmaslam.synthetic.worlds.street_layout import Street
 from sigmaslam.synthetic.worlds.street_road import CAMERA_HEIGHT, Road
@@ -38,11 +38,7 @@ def generate(rng: np.random.Generator, wish: Wish) -> Episode:
         street.clear(path.positions[0, :2], 7.0)  # what moves with the view goes round
     street.build()
     bodies = street.bodies + add_traffic(rng, wish, path, road, palette)
-    elevation, azimuth = np.deg2rad(rng.uniform(20, 70)), rng.uniform(0, 2 * np.pi)
-    sun = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
-    lights = Lights(
-        ambient=float(rng.uniform(0.2, 0.4)), sun=float(rng.uniform(0.7, 1.3)), sun_direction=tuple(sun.tolist())
-    )
+    lights = daylight(rng, 20, (0.7, 1.3))
     scene = Scene(tuple(bodies), tuple(palette.materials), lights, sky=float(rng.uniform(0.8, 2.2)))
     return Episode(scene, path)
 
