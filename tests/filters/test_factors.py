@@ -121,7 +121,7 @@ def each_noise() -> dict[str, Noise]:
 def test_noise_agrees_with_its_covariance(kind):
     noise = each_noise()[kind]
     R, columns = noise.covariance(), random_numbers(3, 6, 4)
-    assert noise.size == 6
+    assert noise.variance().shape[-1] == 6
     assert_close(noise.factor() @ noise.factor().mT, R, 1e-13)
     assert_close(noise.log_determinant(), torch.logdet(R), 1e-12)
     white = noise.whitened(columns)
