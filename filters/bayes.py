@@ -265,12 +265,12 @@ class BayesFilter:
                 f"the measurement's function returns {seen.mean.shape[-1]} components, the value has {value.shape[-1]}"
             )
         innovation = seen.from_mean(value, measurement.residual)
-        found = seen.columns if measurement.additive else _with_noise_columns(seen.columns, size)
+        seen_columns = seen.columns if measurement.additive else _with_noise_columns(seen.columns, size)
         if previous is None or spread is None:
-            return innovation, found
+            return innovation, seen_columns
         # The slope was taken along L M; the update wants it along L, and M is far from singular.
-        odd = solve_lower_transposed(spread, found.odd.mT).mT
-        return innovation + apply(odd, previous.mean), Columns(odd, found.even, found.negative)
+        odd = solve_lower_transposed(spread, seen_columns.odd.mT).mT
+        return innovation + apply(odd, previous.mean), Columns(odd, seen_columns.even, seen_columns.negative)
 
     def _correct(self, belief: Gaussian, solution: TangentPosterior) -> Gaussian:
         """The posterior of the state, with its covariance in the chart at the new mean."""

@@ -122,8 +122,8 @@ def maximum_likelihood(
     root = identity(size, initial).expand(*batch, size, size)
     start = initial.expand(*batch, initial.shape[-1])
     problem = _LeastSquares(terms, space, root, has_prior=False)
-    unknown = Gaussian(start, factor=torch.full_like(root, torch.nan), factor_is_lower=True)
-    return _estimate("maximum likelihood", problem, unknown, None, iterations, tolerance, on_failure)
+    failed_estimate = Gaussian(start, factor=torch.full_like(root, torch.nan), factor_is_lower=True)
+    return _estimate("maximum likelihood", problem, failed_estimate, None, iterations, tolerance, on_failure)
 
 
 def maximum_a_posteriori(
@@ -329,7 +329,7 @@ def _gauss_newton(problem: _LeastSquares, anchor: Tensor, sound: Tensor, iterati
     lost = epsilon * torch.sqrt(sum((term.magnitude().detach() for term in problem.terms), torch.zeros_like(cost)))
     linear = problem.is_linear
     for _ in range(1 if linear else iterations):
-        if _known_to_hold(~active):
+        if _holds_everywhere(~active):
             break
         if not problem.has_prior:
             moving = active.unsqueeze(-1)
@@ -351,7 +351,7 @@ def _gauss_newton(problem: _LeastSquares, anchor: Tensor, sound: Tensor, iterati
             reached = problem.cost(anchor, candidate)
             fine = reached <= cost + lost * torch.sqrt(2 * cost.detach())
             fine = fine | (torch.isfinite(reached) & ((length <= negligible) | linear))
-            if _known_to_hold(fine | ~usable):
+            if _holds_everywhere(fine | ~usable):
                 break
             scale = torch.where(fine, scale, 0.5 * scale)
 
@@ -427,7 +427,7 @@ def _prepare(k: int, observation: Observation, like: Tensor, batch: torch.Size, 
         weight = _expand_weight(k, observation.weight, value)
         present = present & (weight > 0)
         scale = torch.sqrt(torch.where(weight > 0, weight, 1.0))
-    mask = None if _known_to_hold(present) else present
+    mask = None if _holds_everywhere(present) else present
     if mask is not None:
         value, noise = torch.where(mask, value, 0.0), noise.masked(mask)
     if isinstance(noise, Dense):
@@ -468,7 +468,7 @@ def _check_options(iterations: int, on_failure: str) -> None:
         raise ValueError(f"on_failure is {on_failure!r}; choose raise or hold")
 
 
-def _known_to_hold(condition: Tensor) -> bool:
+def _holds_everywhere(condition: Tensor) -> bool:
     """Whether a condition holds everywhere; compiled, where looking would break the graph, nothing is known."""
     return not torch.compiler.is_compiling() and bool(condition.all())
 

@@ -27,8 +27,8 @@ class TorchModule:
     def __call__(self, feed: Mapping[str, np.ndarray]) -> list[np.ndarray]:
         """Outputs in the order of the module."""
         with torch.inference_mode():
-            found = self._module(*(torch.from_numpy(np.asarray(value)) for value in feed.values()))
-        return [value.numpy() for value in found]
+            outputs = self._module(*(torch.from_numpy(np.asarray(value)) for value in feed.values()))
+        return [value.numpy() for value in outputs]
 
 
 class TorchFeatures(TorchModule):

@@ -30,8 +30,8 @@ _USES = 32  # ... each of which serves so many pairs before it is replaced
 _VIEWS = 8  # of a scene
 _SCENES_A_BANK = 64  # share their textures
 _DURATION = 8.0  # seconds of an episode
-_MOST_MOVED = 0.4
-_LEAST_SHARED = 0.15  # of a raster of points, between the views of a pair
+_MAX_MOVING_SHARE = 0.4
+_MIN_OVERLAP = 0.15  # of a raster of points, between the views of a pair
 _RASTER = 12
 _BASELINES = (0.01, 0.12)  # of stereo pairs, in median depths, drawn evenly in the logarithm
 
@@ -63,7 +63,7 @@ class ScenePairs:
         size: side of the square images in pixels.
         domains: keys of `DOMAINS`, drawn alike.
         stereo: the two views are the eyes of a rectified stereo pair, through sensors of one kind.
-        most_moved: share of the image that may move on its own in a scene.
+        max_moving_share: share of the image that may move on its own in a scene.
     """
 
     def __init__(
@@ -72,13 +72,13 @@ class ScenePairs:
         size: int = 224,
         domains: tuple[str, ...] = tuple(DOMAINS),
         stereo: bool = False,
-        most_moved: float = _MOST_MOVED,
+        max_moving_share: float = _MAX_MOVING_SHARE,
     ) -> None:
         unknown = set(domains) - set(DOMAINS)
         if unknown or not domains:
             raise ValueError(f"unknown domains {sorted(unknown)}; give one or more of {', '.join(DOMAINS)}")
         self.seed, self.size, self.domains, self.stereo = seed, size, domains, stereo
-        self._most_moved = most_moved
+        self._max_moving_share = max_moving_share
         self._kept: OrderedDict[int, list[RenderedViews]] = OrderedDict()
 
     def pair(self, index: int) -> ScenePair:
@@ -87,7 +87,7 @@ class ScenePairs:
         views = self._views(self._scene_of(index))
         order = rng.permutation([(i, j) for i in range(_VIEWS) for j in range(_VIEWS) if self._go_together(i, j)])
         # Of views that hardly overlap there is little to learn; if all are so, the last ones will do.
-        i, j = next(((i, j) for i, j in order if self._shared(views[i], views[j]) >= _LEAST_SHARED), order[-1])
+        i, j = next(((i, j) for i, j in order if self._overlap(views[i], views[j]) >= _MIN_OVERLAP), order[-1])
         sensor = random_sensor(rng) if self.stereo else None
         images = [self._photograph(views[k], rng, sensor) for k in (i, j)]
         return ScenePair(images[0], images[1], views[i], views[j])
@@ -114,7 +114,7 @@ class ScenePairs:
         domain = self.domains[int(rng.integers(len(self.domains)))]
         wish = Wish(
             _DURATION,
-            movers=float(rng.uniform(0.0, self._most_moved)) if rng.random() < 0.5 else 0.0,
+            movers=float(rng.uniform(0.0, self._max_moving_share)) if rng.random() < 0.5 else 0.0,
             first_texture=4 * (self.seed + scene // _SCENES_A_BANK),
             textures=4,
         )
@@ -144,7 +144,7 @@ class ScenePairs:
         # White is where the light of few pixels ends, so that the sensor's contrast means the same everywhere.
         return expose(np.minimum(light, 1.0), sensor or random_sensor(rng), rng, flow).astype(np.float32) / 255.0
 
-    def _shared(self, views0: RenderedViews, views1: RenderedViews) -> float:
+    def _overlap(self, views0: RenderedViews, views1: RenderedViews) -> float:
         ticks = (np.arange(_RASTER) + 0.5) * self.size / _RASTER
         raster = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
         return float(_transfer(views0, views1, raster)[1].mean())

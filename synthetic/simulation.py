@@ -58,13 +58,13 @@ class Recipe:
 
     def check(self) -> None:
         """Raises InputError where a value is out of range."""
-        for name, value, known in (
+        for name, value, choices in (
             ("preset", self.preset, PRESETS),
             ("motion", self.motion, MOTIONS),
             ("sensor", self.sensor, SENSORS),
         ):
-            if value not in known:
-                raise InputError(f"{name} {value!r} is unknown; choose one of {', '.join(known)}")
+            if value not in choices:
+                raise InputError(f"{name} {value!r} is unknown; choose one of {', '.join(choices)}")
         if self.frames < 1:
             raise InputError(f"frames is {self.frames}; give at least 1")
         if self.seed < 0:

@@ -65,9 +65,9 @@ def arrive(target: Sight, view: Tensor, points: Tensor, facet: Tensor, occlusion
 def at_pixels(views: RenderedViews, view: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
     """What is seen at pixels (2, N) of views (N,): facets (N,), -1 for none, and places on the grid (2, N)."""
     places = views.sight.eye.to_grid(pixels)
-    known = places.isfinite().all(dim=0)
+    on_grid = places.isfinite().all(dim=0)
     facet = torch.full_like(view, -1)
-    facet[known] = views.sight.resolve(view[known], places[:, known])
+    facet[on_grid] = views.sight.resolve(view[on_grid], places[:, on_grid])
     return facet, places
 
 

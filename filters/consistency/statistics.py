@@ -267,11 +267,11 @@ def whiteness(innovations: Tensor, lags: int, probability: float = 0.95) -> Whit
     if not 1 <= lags < innovations.shape[1]:
         raise ValueError(f"lags must be between 1 and {innovations.shape[1] - 1}, less than the steps, not {lags}")
     given = _to_float64(innovations)
-    known = ~given.isnan()
-    given = torch.where(known, given, 0.0)
+    valid = ~given.isnan()
+    given = torch.where(valid, given, 0.0)
     by_component, pairs_by_component = [], []
     for lag in range(1, lags + 1):
-        both = known[:, :-lag] & known[:, lag:]
+        both = valid[:, :-lag] & valid[:, lag:]
         earlier, later = given[:, :-lag] * both, given[:, lag:] * both
         power = (earlier.square().sum(dim=(0, 1)) * later.square().sum(dim=(0, 1))).sqrt()
         by_component.append((earlier * later).sum(dim=(0, 1)) / power)
@@ -292,7 +292,7 @@ def whiteness(innovations: Tensor, lags: int, probability: float = 0.95) -> Whit
         share_inside=float(inside[autocorrelation.isfinite()].double().mean()),
         statistic=statistic,
         p_value=float(chi2.sf(statistic, int(tested.sum()))),
-        nan_count=int((~known).sum()),
+        nan_count=int((~valid).sum()),
     )
 
 
@@ -336,8 +336,8 @@ def _shares(squared: Tensor, dof: int, levels: Sequence[float], probability: flo
     _require_probability(probability)
     if len(levels) == 0 or not all(0 < level < 1 for level in levels):
         raise ValueError(f"levels must be probabilities between 0 and 1, at least one, not {tuple(levels)}")
-    known = ~squared.isnan()
-    count = known.sum(dim=0)
+    valid = ~squared.isnan()
+    count = valid.sum(dim=0)
     bounds = torch.as_tensor(chi2.ppf(np.asarray(levels), dof)).to(squared)
     samples = count.unsqueeze(-1).to(squared)
     # NaN is not inside.
@@ -353,7 +353,7 @@ def _shares(squared: Tensor, dof: int, levels: Sequence[float], probability: flo
         high=(centre + half).clamp(max=1.0),
         probability=probability,
         count=count,
-        nan_count=(~known).sum(dim=0),
+        nan_count=(~valid).sum(dim=0),
     )
 
 

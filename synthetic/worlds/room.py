@@ -375,8 +375,8 @@ def _fill_middle(f: _Furniture, size: np.ndarray, free: FreeSpace) -> None:
     for _ in range(60):
         tall, radius = rng.random() < 0.35, rng.uniform(0.25, 0.85)
         place = rng.uniform(-1, 1, 2) * (reach - radius)
-        apart = np.linalg.norm(np.maximum(np.abs(place - centre[:2]) - half[:2], 0.0))
-        if tall and apart < radius + CLEARANCE + 0.15:  # room for the right camera too
+        distance = np.linalg.norm(np.maximum(np.abs(place - centre[:2]) - half[:2], 0.0))
+        if tall and distance < radius + CLEARANCE + 0.15:  # room for the right camera too
             continue
         crowded = len(taken) > 2 + size[0] * size[1] / 5
         if crowded or any(np.linalg.norm(place - other) < radius + r for other, r in taken):

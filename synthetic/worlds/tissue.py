@@ -204,11 +204,11 @@ def instrument(
         result[:, :3, 3] *= 30.0
         return result
 
-    own, eye = large(path.poses(times)), large(camera.poses(times))
+    tool_poses, eye = large(path.poses(times)), large(camera.poses(times))
 
     def error(radius: float) -> float:
         model = scaled(_instrument(np.random.default_rng(seed), radius, first_material, rich), 30.0)
-        return float(covered_share([(model, own)], eye).mean()) - share
+        return float(covered_share([(model, tool_poses)], eye).mean()) - share
 
     radius = bisect(error, *radii, steps=5)
     model = _instrument(np.random.default_rng(seed), radius, first_material, rich)
