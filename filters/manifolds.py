@@ -108,8 +108,7 @@ class Euclidean(Manifold):
 class SO2(Manifold):
     """Angles, radians in (-pi, pi]."""
 
-    point_size = 1
-    tangent_size = 1
+    point_size, tangent_size = 1, 1
 
     def _retract(self, point: Tensor, tangent: Tensor) -> Tensor:
         return lie_groups.wrap_angle(point + tangent)
@@ -138,13 +137,9 @@ class LieGroup(Manifold):
 
 @dataclass(frozen=True)
 class SE2(LieGroup):
-    """Rigid motions of the plane: points (..., 3) are x, y, angle, tangents (..., 3) twists in the same order.
+    """Rigid motions of the plane: points (..., 3) are x, y, angle, tangents (..., 3) twists in the same order."""
 
-    For `side` see `LieGroup`.
-    """
-
-    point_size = 3
-    tangent_size = 3
+    point_size, tangent_size = 3, 3
 
     def _retract(self, point: Tensor, tangent: Tensor) -> Tensor:
         x, y, angle = point.unbind(-1)
@@ -184,13 +179,9 @@ class SE2(LieGroup):
 
 @dataclass(frozen=True)
 class SO3(LieGroup):
-    """Rotations: points (..., 4) are unit quaternions x, y, z, w of either sign, tangents (..., 3) rotation vectors.
+    """Rotations: points (..., 4) are unit quaternions x, y, z, w of either sign, tangents (..., 3) rotation vectors."""
 
-    For `side` see `LieGroup`.
-    """
-
-    point_size = 4
-    tangent_size = 3
+    point_size, tangent_size = 4, 3
 
     def _retract(self, point: Tensor, tangent: Tensor) -> Tensor:
         added = lie_groups.exp_so3(_vector(tangent))
@@ -217,11 +208,10 @@ class SE3(LieGroup):
     """Rigid motions: points (..., 7) are translation and unit quaternion x, y, z, w, tangents (..., 6) twists.
 
     A twist is (translation, rotation), and what it leads to is the exponential of the group, so its translation bends
-    with its rotation. For `side` see `LieGroup`.
+    with its rotation.
     """
 
-    point_size = 7
-    tangent_size = 6
+    point_size, tangent_size = 7, 6
 
     def _retract(self, point: Tensor, tangent: Tensor) -> Tensor:
         start, turned = _rigid(point)

@@ -18,9 +18,17 @@ class Noise(ABC):
     def covariance(self) -> Tensor:
         """R, (..., m, m)."""
 
+    def masked(self, mask: Tensor) -> Noise:
+        """The noise with unit variance, and no correlation, where mask (..., m) is False."""
+        return Dense(_masked(self.covariance(), mask))
+
     @abstractmethod
     def variance(self) -> Tensor:
         """Diagonal of R, (..., m)."""
+
+    def log_determinant(self) -> Tensor:
+        """log |R|, (...,)."""
+        return log_diagonal(self.factor())
 
     @abstractmethod
     def factor(self) -> Tensor:
@@ -33,14 +41,6 @@ class Noise(ABC):
     def whitened(self, columns: Tensor) -> Tensor:
         """R^-1/2 columns, (..., m, c)."""
         return solve_lower(self.factor(), columns, regular=True)
-
-    def log_determinant(self) -> Tensor:
-        """log |R|, (...,)."""
-        return log_diagonal(self.factor())
-
-    def masked(self, mask: Tensor) -> Noise:
-        """The noise with unit variance, and no correlation, where mask (..., m) is False."""
-        return Dense(_masked(self.covariance(), mask))
 
 
 class Diagonal(Noise):

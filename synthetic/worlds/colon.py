@@ -26,10 +26,6 @@ def generate(rng: np.random.Generator, wish: Wish) -> Episode:
     """A colon of 20-40 mm radius with haustral folds; what is seen is mostly 15-150 mm away.
 
     A tool is in view in two of five worlds, and always where `wish.movers` is not 0; its bodies are all that moves.
-
-    Args:
-        rng: source of all randomness.
-        wish: what is asked for.
     """
     radius = float(rng.uniform(0.02, 0.036))
     folds, bumps = float(rng.uniform(0.25, 0.4)) * radius, float(rng.uniform(0.02, 0.045)) * radius

@@ -25,12 +25,7 @@ _TEXTURES = {"leaves": 2, "plaster": 1, "bricks": 2, "glyphs": 1, "wood": 1, "no
 
 
 def generate(rng: np.random.Generator, wish: Wish) -> Episode:
-    """A hall of 12-30 m full of machines, shelves, pipes and crates, or a yard; a drone flies through what is free.
-
-    Args:
-        rng: source of all randomness.
-        wish: what is asked for.
-    """
+    """A hall of 12-30 m full of machines, shelves, pipes and crates, or a yard; a drone flies through what is free."""
     outdoors = bool(rng.random() < 0.25)
     size = np.array([rng.uniform(12, 30), rng.uniform(12, 22), rng.uniform(5.5, 9.0)])
     clearance = _CLEARANCE + _FREE_FOR_MOVERS * (wish.movers > 0)

@@ -19,10 +19,6 @@ def generate(rng: np.random.Generator, wish: Wish) -> Episode:
     """A bumpy sheet of tissue with organs and fat on it, 50-150 mm below a slanted laparoscope.
 
     A tool is in view in two of five worlds, and always where `wish.movers` is not 0; its bodies are all that moves.
-
-    Args:
-        rng: source of all randomness.
-        wish: what is asked for.
     """
     height = float(rng.uniform(0.075, 0.115))
     highest = 0.35 * height  # of anything: the camera comes down to 0.75 of its height

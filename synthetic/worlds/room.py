@@ -35,10 +35,6 @@ def generate(rng: np.random.Generator, wish: Wish) -> Episode:
     """A room of 4-9 m with furniture along its walls and low things in its middle; a walk with a hand-held camera.
 
     The camera keeps `CLEARANCE` from everything that does not move.
-
-    Args:
-        rng: source of all randomness.
-        wish: what is asked for.
     """
     size = np.array([rng.uniform(4.0, 9.0), rng.uniform(4.0, 7.0), rng.uniform(2.4, 3.2)])
     # Where the camera may be: in the middle of the room, off the furniture along the walls.

@@ -22,12 +22,7 @@ _TEXTURES = {"facade": 3, "leaves": 2, "asphalt": 1, "grass": 1, "bricks": 2, "c
 
 
 def generate(rng: np.random.Generator, wish: Wish) -> Episode:
-    """A street with houses, trees and cars along a drive; the camera is 1.65 m above the ground.
-
-    Args:
-        rng: source of all randomness.
-        wish: what is asked for.
-    """
+    """A street with houses, trees and cars along a drive; the camera is 1.65 m above the ground."""
     path, way = _drive(rng, wish)
     opposite = float(rng.uniform(3.1, 3.6)) if rng.random() < 0.75 or wish.movers > 0 else 0.0
     road = Road(rng, way, wish.motion == "loop", opposite)

@@ -264,15 +264,7 @@ class Street:
                 self._put(Ellipsoid(radii, 6), palette.choose("land"), _upright(place, z - 1, rng))
 
     def _stand(
-        self,
-        model: Model,
-        s: float,
-        left: float,
-        long: float,
-        wide: float,
-        *,
-        turn: float = 0.0,
-        above: float = 0.0,
+        self, model: Model, s: float, left: float, long: float, wide: float, *, turn: float = 0.0, above: float = 0.0
     ) -> None:
         """Puts a model beside the road unless its place is taken or in a lane."""
         place, heading = self._road.at(s, left)

@@ -18,10 +18,6 @@ def generate(rng: np.random.Generator, wish: Wish) -> Episode:
 
     `wish.motion` and `wish.movers` are the instrument's. Its bodies are all that have a path (`Scene.moving`); they
     come last, the shaft first of them, and keep rigid to each other.
-
-    Args:
-        rng: source of all randomness.
-        wish: what is asked for.
     """
     surgical = rng.random() < 0.6
     distance = float(rng.uniform(0.1, 0.135))

@@ -22,14 +22,7 @@ def some_landmarks(count: int, seed: int = 0) -> Tensor:
     return tensor(30.0, 30.0, 4.0, -0.2) + uniform * tensor(580.0, 420.0, 36.0, 0.4)
 
 
-def transfer(
-    relative: Tensor,
-    spread: Tensor,
-    landmarks: Tensor,
-    landmark_spread: Tensor,
-    calibration: Tensor = NO_TURN,
-    pair: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def transfer(relative, spread, landmarks, landmark_spread, calibration=NO_TURN, pair=None):
     """One pair for all landmarks unless given; one landmark_spread (4, 4) for all unless (m, 4, 4)."""
     if pair is None:
         pair = torch.zeros(len(landmarks), dtype=torch.int64)
