@@ -4,14 +4,14 @@ from sigmaslam.filters.bayes import BayesFilter, ExtendedKalmanFilter, KalmanFil
 from sigmaslam.filters.belief import degree_of_belief
 from sigmaslam.filters.compiled import compile_step
 from sigmaslam.filters.failure import FilterError
-from sigmaslam.filters.gaussian import Gaussian
-from sigmaslam.filters.inference import Estimate, Observation, maximum_a_posteriori, maximum_likelihood
+from sigmaslam.filters.gaussian_belief import Gaussian
+from sigmaslam.filters.inference import Observation, PointEstimate, maximum_a_posteriori, maximum_likelihood
 from sigmaslam.filters.layout import stack
 from sigmaslam.filters.lie_groups import wrap_angle
 from sigmaslam.filters.manifolds import SE2, SE3, SO2, SO3, Euclidean, Manifold, Product
 from sigmaslam.filters.models import LinearMeasurement, LinearMotion, MeasurementModel, MotionModel
-from sigmaslam.filters.noise import BlockDiagonal, Dense, Diagonal
-from sigmaslam.filters.results import Prediction, Update
+from sigmaslam.filters.noise_covariance import BlockDiagonal, Dense, Diagonal
+from sigmaslam.filters.results import TimeUpdate, Update
 from sigmaslam.filters.sigma_points import Simplex, cubature, julier, merwe
 from sigmaslam.filters.time_series import Track
 
@@ -24,7 +24,6 @@ __all__ = [
     "BlockDiagonal",
     "Dense",
     "Diagonal",
-    "Estimate",
     "Euclidean",
     "ExtendedKalmanFilter",
     "FilterError",
@@ -36,9 +35,10 @@ __all__ = [
     "MeasurementModel",
     "MotionModel",
     "Observation",
-    "Prediction",
+    "PointEstimate",
     "Product",
     "Simplex",
+    "TimeUpdate",
     "Track",
     "UnscentedKalmanFilter",
     "Update",

@@ -10,17 +10,17 @@ import torch
 from torch import Tensor
 
 from sigmaslam.filters.failure import POLICIES, OnFailure, Suspects, jittered, raise_unless_healthy
-from sigmaslam.filters.gaussian import Gaussian
+from sigmaslam.filters.gaussian_belief import Gaussian
 from sigmaslam.filters.linalg.square_roots import apply, finite, multiply, solve_lower_transposed, square, triangularise
 from sigmaslam.filters.linalg.unrolled import join
 from sigmaslam.filters.manifolds import Manifold
 from sigmaslam.filters.models import AnyMeasurement, AnyMotion, LinearMeasurement, LinearMotion
-from sigmaslam.filters.noise import Noise, as_noise
-from sigmaslam.filters.results import Prediction, Update
+from sigmaslam.filters.noise_covariance import Noise, as_noise
+from sigmaslam.filters.results import TimeUpdate, Update
 from sigmaslam.filters.sigma_points import Columns, SigmaPoints, cubature
 from sigmaslam.filters.time_series import filter_sequence, smooth
 from sigmaslam.filters.transforms import Difference, Exact, Taylor, Transform, Transformed, Unscented
-from sigmaslam.filters.updates import FORMS, Form, Solution, choose_form, solve
+from sigmaslam.filters.updates import FORMS, Form, TangentPosterior, choose_form, solve
 
 # Squared linearisation error of a whole measurement, in units of its noise's variance, from which on an update is worth
 # a second linearisation.
@@ -58,7 +58,7 @@ class BayesFilter:
         if self.iterations != "auto" and self.iterations < 1:
             raise ValueError(f"iterations is {self.iterations}; it must be 'auto' or at least 1")
 
-    def predict(self, belief: Gaussian, motion: AnyMotion, *inputs: Tensor) -> Prediction:
+    def predict(self, belief: Gaussian, motion: AnyMotion, *inputs: Tensor) -> TimeUpdate:
         """The belief after a motion: the "action" of (9.21); (9.22), Table 9.1 and steps 2 and 3 of Table 9.2.
 
         Args:
@@ -87,9 +87,9 @@ class BayesFilter:
             predicted = Gaussian(mean, _predicted_covariance(columns, entering, noise_matrix))
         usable = _both(finite(mean, predicted.held), usable)
         predicted = self._deal_with(usable, predicted, belief, "predict", {})
-        return Prediction(predicted, _both(usable, sound), lambda: (root, columns), entering, noise_matrix)
+        return TimeUpdate(predicted, _both(usable, sound), lambda: (root, columns), entering, noise_matrix)
 
-    def _predict_linear(self, belief: Gaussian, motion: LinearMotion, inputs: tuple[Tensor, ...]) -> Prediction:
+    def _predict_linear(self, belief: Gaussian, motion: LinearMotion, inputs: tuple[Tensor, ...]) -> TimeUpdate:
         """A P A^T + B2 Q B2^T, (9.22): no root is needed, so a covariance is not checked for being semidefinite."""
         self._require_flat("LinearMotion")
         noise = as_noise(motion.noise)
@@ -103,7 +103,7 @@ class BayesFilter:
             root = belief.factor
             return root, Columns(multiply(motion.matrix, root))
 
-        return Prediction(predicted, healthy, joint, noise, motion.noise_matrix)
+        return TimeUpdate(predicted, healthy, joint, noise, motion.noise_matrix)
 
     def update(self, belief: Gaussian, measurement: AnyMeasurement, value: Tensor, *inputs: Tensor) -> Update:
         """The belief after a measurement: the "perception" of (9.21); Table 9.1 and steps 4 to 7 of Table 9.2.
@@ -127,7 +127,7 @@ class BayesFilter:
         if _is_additive(measurement):
             added = noise = noise if mask is None else noise.masked(mask)
 
-        def linearise(previous: Solution | None) -> tuple[Tensor, Columns, Form, Solution]:
+        def linearise(previous: TangentPosterior | None) -> tuple[Tensor, Columns, Form, TangentPosterior]:
             innovation, columns = self._innovate(belief.mean, root, measurement, noise, value, inputs, previous)
             if mask is not None:
                 innovation, columns = torch.where(mask, innovation, 0.0), _masked(columns, mask, added is None)
@@ -232,7 +232,7 @@ class BayesFilter:
         noise: Noise,
         value: Tensor,
         inputs: tuple[Tensor, ...],
-        previous: Solution | None,
+        previous: TangentPosterior | None,
     ) -> tuple[Tensor, Columns]:
         """Innovation and deviations of a linearisation at the prior, or at the posterior of the previous one."""
         if isinstance(measurement, LinearMeasurement):
@@ -265,14 +265,14 @@ class BayesFilter:
                 f"the measurement's function returns {seen.mean.shape[-1]} components, the value has {value.shape[-1]}"
             )
         innovation = seen.from_mean(value, measurement.residual)
-        found = seen.columns if measurement.additive else _with_noise_columns(seen.columns, size)
+        seen_columns = seen.columns if measurement.additive else _with_noise_columns(seen.columns, size)
         if previous is None or spread is None:
-            return innovation, found
+            return innovation, seen_columns
         # The slope was taken along L M; the update wants it along L, and M is far from singular.
-        odd = solve_lower_transposed(spread, found.odd.mT).mT
-        return innovation + apply(odd, previous.mean), Columns(odd, found.even, found.negative)
+        odd = solve_lower_transposed(spread, seen_columns.odd.mT).mT
+        return innovation + apply(odd, previous.mean), Columns(odd, seen_columns.even, seen_columns.negative)
 
-    def _correct(self, belief: Gaussian, solution: Solution) -> Gaussian:
+    def _correct(self, belief: Gaussian, solution: TangentPosterior) -> Gaussian:
         """The posterior of the state, with its covariance in the chart at the new mean."""
         mean = self.retract(belief.mean, solution.shift)
         if self.chart is None:

@@ -31,7 +31,7 @@ def degree_of_belief(covariance: Tensor) -> Tensor:
             "a single variance is a (1, 1) matrix"
         )
     lower = covariance.tril()
-    unknown = lower.isnan().flatten(-2).any(dim=-1)
+    is_nan = lower.isnan().flatten(-2).any(dim=-1)
     finite = lower.isfinite().flatten(-2).all(dim=-1)
     # The solver raises for the whole batch at the first matrix that is not finite.
     regular = torch.where(finite[..., None, None], covariance, 0.0)
@@ -41,4 +41,4 @@ def degree_of_belief(covariance: Tensor) -> Tensor:
     inside = 1.0 - torch.where(partial, norm, 1.0).sqrt()
     certain = finite & (norm == 0)
     belief = torch.where(partial, inside, certain.to(inside.dtype))
-    return torch.where(unknown, torch.nan, belief)
+    return torch.where(is_nan, torch.nan, belief)

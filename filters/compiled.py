@@ -29,7 +29,7 @@ def compile_step(step: F) -> F:
         raise TypeError(f"compile_step takes a plain function (def or lambda), got {type(step).__name__}")
     # torch keeps compiled code by the function's code, which two functions made by one factory share; as what they
     # refer to is not checked, each needs code of its own.
-    own = FunctionType(step.__code__.replace(), step.__globals__, step.__name__, step.__defaults__, step.__closure__)
+    copy = FunctionType(step.__code__.replace(), step.__globals__, step.__name__, step.__defaults__, step.__closure__)
     options: dict[str, object] = {
         # Tensors' shapes are checked at each call; the models, which are constants, are not.
         "guard_filter_fn": torch.compiler.keep_tensor_guards_unsafe,
@@ -37,4 +37,4 @@ def compile_step(step: F) -> F:
     }
     if not torch.cuda.is_available():
         options["cpp_wrapper"] = True  # Python's share of a call is most of it for a single filter
-    return torch.compile(own, dynamic=False, fullgraph=True, options=options)  # type: ignore[arg-type,return-value]
+    return torch.compile(copy, dynamic=False, fullgraph=True, options=options)  # type: ignore[arg-type,return-value]

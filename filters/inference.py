@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from sigmaslam.filters.failure import FilterError, name_elements
-from sigmaslam.filters.gaussian import Gaussian
+from sigmaslam.filters.gaussian_belief import Gaussian
 from sigmaslam.filters.linalg.square_roots import (
     apply,
     identity,
@@ -30,7 +30,7 @@ from sigmaslam.filters.linalg.square_roots import (
 )
 from sigmaslam.filters.manifolds import Manifold
 from sigmaslam.filters.models import AnyMeasurement, LinearMeasurement
-from sigmaslam.filters.noise import Dense, Noise, Rooted, as_noise
+from sigmaslam.filters.noise_covariance import Dense, Noise, Rooted, as_noise
 from sigmaslam.filters.transforms import Taylor
 
 # A step is halved at most this often while it raises the cost.
@@ -61,7 +61,7 @@ class Observation:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Estimate:
+class PointEstimate:
     """The state that explains the observations best.
 
     Attributes:
@@ -92,7 +92,7 @@ def maximum_likelihood(
     iterations: int = 20,
     tolerance: float = 1e-10,
     on_failure: Literal["raise", "hold"] = "raise",
-) -> Estimate:
+) -> PointEstimate:
     """The state under which the observations are likeliest, (9.1)-(9.7).
 
     If all models are `LinearMeasurement`, this is weighted least squares, and one step. Else steps go on, element by
@@ -121,9 +121,9 @@ def maximum_likelihood(
     size = initial.shape[-1] if space is None else space.tangent_size
     root = identity(size, initial).expand(*batch, size, size)
     start = initial.expand(*batch, initial.shape[-1])
-    problem = _Problem(terms, space, root, has_prior=False)
-    unknown = Gaussian(start, factor=torch.full_like(root, torch.nan), factor_is_lower=True)
-    return _estimate("maximum likelihood", problem, unknown, None, iterations, tolerance, on_failure)
+    problem = _LeastSquares(terms, space, root, has_prior=False)
+    failed_estimate = Gaussian(start, factor=torch.full_like(root, torch.nan), factor_is_lower=True)
+    return _estimate("maximum likelihood", problem, failed_estimate, None, iterations, tolerance, on_failure)
 
 
 def maximum_a_posteriori(
@@ -134,7 +134,7 @@ def maximum_a_posteriori(
     iterations: int = 20,
     tolerance: float = 1e-10,
     on_failure: Literal["raise", "hold"] = "raise",
-) -> Estimate:
+) -> PointEstimate:
     """The likeliest state given prior and observations, (9.8)-(9.20).
 
     Starts at the mean of the prior; the first step is the Kalman update, and at convergence it is the iterated extended
@@ -165,7 +165,7 @@ def maximum_a_posteriori(
     )
     if sound is not None:
         sound = sound.expand(batch)
-    problem = _Problem(terms, space, start.factor, has_prior=True)
+    problem = _LeastSquares(terms, space, start.factor, has_prior=True)
     return _estimate("maximum a posteriori", problem, start, sound, iterations, tolerance, on_failure)
 
 
@@ -205,7 +205,7 @@ class _Term:
         difference = self.value - predicted if compare is None else compare(self.value, predicted)
         return self._whiten(difference.unsqueeze(-1)).squeeze(-1)
 
-    def linearised(self, problem: _Problem, anchor: Tensor, zeta: Tensor) -> Tensor:
+    def linearised(self, problem: _LeastSquares, anchor: Tensor, zeta: Tensor) -> Tensor:
         """Whitened derivative by zeta, with the whitened residual as one more column, (..., m, n + 1)."""
         shift = apply(problem.root, zeta)
         state = problem.retract(anchor, shift)
@@ -242,7 +242,7 @@ class _Term:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Problem:
+class _LeastSquares:
     """Least squares in zeta (..., n), with the state anchor [+] root zeta.
 
     With a prior the anchor is its mean for good. Without one, the root is the identity and the anchor goes along.
@@ -296,7 +296,7 @@ class _Problem:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Solution:
+class _Minimum:
     """Where Gauss-Newton ended; `factor` (..., n, n) is the lower root of the information on zeta of its last step."""
 
     anchor: Tensor
@@ -309,7 +309,7 @@ class _Solution:
     determined: Tensor
 
 
-def _gauss_newton(problem: _Problem, anchor: Tensor, sound: Tensor, iterations: int, tolerance: float) -> _Solution:
+def _gauss_newton(problem: _LeastSquares, anchor: Tensor, sound: Tensor, iterations: int, tolerance: float) -> _Minimum:
     size = problem.root.shape[-1]
     epsilon = torch.finfo(anchor.dtype).eps
     # Steps, in standard deviations, that change the cost by so little that its round-off has a say.
@@ -329,7 +329,7 @@ def _gauss_newton(problem: _Problem, anchor: Tensor, sound: Tensor, iterations: 
     lost = epsilon * torch.sqrt(sum((term.magnitude().detach() for term in problem.terms), torch.zeros_like(cost)))
     linear = problem.is_linear
     for _ in range(1 if linear else iterations):
-        if _known_to_hold(~active):
+        if _holds_everywhere(~active):
             break
         if not problem.has_prior:
             moving = active.unsqueeze(-1)
@@ -351,7 +351,7 @@ def _gauss_newton(problem: _Problem, anchor: Tensor, sound: Tensor, iterations: 
             reached = problem.cost(anchor, candidate)
             fine = reached <= cost + lost * torch.sqrt(2 * cost.detach())
             fine = fine | (torch.isfinite(reached) & ((length <= negligible) | linear))
-            if _known_to_hold(fine | ~usable):
+            if _holds_everywhere(fine | ~usable):
                 break
             scale = torch.where(fine, scale, 0.5 * scale)
 
@@ -364,18 +364,18 @@ def _gauss_newton(problem: _Problem, anchor: Tensor, sound: Tensor, iterations: 
         converged = converged | (moved & (close | linear))
         active = moved & ~close
         previous = length
-    return _Solution(anchor, zeta, factor, cost, count, converged, finite, determined)
+    return _Minimum(anchor, zeta, factor, cost, count, converged, finite, determined)
 
 
 def _estimate(
     stage: str,
-    problem: _Problem,
+    problem: _LeastSquares,
     start: Gaussian,
     sound_prior: Tensor | None,
     iterations: int,
     tolerance: float,
     on_failure: Literal["raise", "hold"],
-) -> Estimate:
+) -> PointEstimate:
     terms = problem.terms
     causes = [] if sound_prior is None else [("the prior covariance is not positive semidefinite", sound_prior)]
     causes += [
@@ -402,7 +402,7 @@ def _estimate(
     freedom = torch.zeros_like(solution.iterations) - (0 if problem.has_prior else problem.root.shape[-1])
     for term in terms:
         freedom = freedom + term.count
-    return Estimate(belief, solution.cost, freedom, solution.iterations, solution.converged, healthy)
+    return PointEstimate(belief, solution.cost, freedom, solution.iterations, solution.converged, healthy)
 
 
 def _prepare(k: int, observation: Observation, like: Tensor, batch: torch.Size, space: Manifold | None) -> _Term:
@@ -415,8 +415,8 @@ def _prepare(k: int, observation: Observation, like: Tensor, batch: torch.Size, 
     elif not model.additive:
         raise ValueError(f"observation {k}: only additive noise is supported; use a filter, or make the noise additive")
     noise = as_noise(model.noise)
-    if noise.size != value.shape[-1]:
-        raise ValueError(f"observation {k}: the value has {value.shape[-1]} components, its noise {noise.size}")
+    if (size := noise.variance().shape[-1]) != value.shape[-1]:
+        raise ValueError(f"observation {k}: the value has {value.shape[-1]} components, its noise {size}")
     if value.dtype != like.dtype:
         raise ValueError(f"observation {k}: the value is {value.dtype}, the state {like.dtype}")
     value = value.expand(*batch, value.shape[-1])
@@ -427,7 +427,7 @@ def _prepare(k: int, observation: Observation, like: Tensor, batch: torch.Size, 
         weight = _expand_weight(k, observation.weight, value)
         present = present & (weight > 0)
         scale = torch.sqrt(torch.where(weight > 0, weight, 1.0))
-    mask = None if _known_to_hold(present) else present
+    mask = None if _holds_everywhere(present) else present
     if mask is not None:
         value, noise = torch.where(mask, value, 0.0), noise.masked(mask)
     if isinstance(noise, Dense):
@@ -468,7 +468,7 @@ def _check_options(iterations: int, on_failure: str) -> None:
         raise ValueError(f"on_failure is {on_failure!r}; choose raise or hold")
 
 
-def _known_to_hold(condition: Tensor) -> bool:
+def _holds_everywhere(condition: Tensor) -> bool:
     """Whether a condition holds everywhere; compiled, where looking would break the graph, nothing is known."""
     return not torch.compiler.is_compiling() and bool(condition.all())
 
@@ -487,8 +487,8 @@ def _raise(
     stage: str,
     healthy: Tensor,
     causes: Sequence[tuple[str, Tensor]],
-    problem: _Problem,
-    solution: _Solution,
+    problem: _LeastSquares,
+    solution: _Minimum,
 ) -> None:
     first = tuple((~healthy).nonzero()[0].tolist())
     cause = next(text for text, holds in causes if not bool(holds.expand_as(healthy)[first]))

@@ -23,10 +23,10 @@ Quaternion = tuple[Tensor, Tensor, Tensor, Tensor]
 def wrap_angle(angle: Tensor) -> Tensor:
     """The same angle in (-pi, pi], radians, any shape; one that is there already keeps every digit."""
     turn = 2.0 * math.pi
-    rest = torch.sub(angle, torch.round(angle / turn), alpha=turn)
+    wrapped = torch.sub(angle, torch.round(angle / turn), alpha=turn)
     # Round-off of the quotient leaves an ulp on the wrong side.
-    rest = torch.where(rest > math.pi, rest - turn, rest)
-    return torch.where(rest <= -math.pi, rest + turn, rest)
+    wrapped = torch.where(wrapped > math.pi, wrapped - turn, wrapped)
+    return torch.where(wrapped <= -math.pi, wrapped + turn, wrapped)
 
 
 def cross(left: Vector, right: Vector) -> Vector:

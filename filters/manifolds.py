@@ -17,8 +17,8 @@ ValueError; arguments are never changed.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor
@@ -28,35 +28,55 @@ from sigmaslam.filters.layout import concatenate, stack
 from sigmaslam.filters.lie_groups import Quaternion, Vector
 
 
-class Manifold(Protocol):
-    """A space with a tangent space at each point: what a filter needs of it."""
+class Manifold(ABC):
+    """A space with a tangent space at each point: what a filter needs of it.
+
+    Subclasses implement `_retract` and `_local`, which may rely on the sizes of their arguments.
+    """
 
     @property
+    @abstractmethod
     def point_size(self) -> int:
         """Length p of a point."""
-        ...
 
     @property
+    @abstractmethod
     def tangent_size(self) -> int:
         """Length n of a tangent."""
-        ...
 
     @property
     def flat(self) -> bool:
         """Whether retract is addition and local is subtraction."""
-        ...
+        return False
 
     def retract(self, point: Tensor, tangent: Tensor) -> Tensor:
         """The point that a tangent leads to, point [+] tangent: (..., p), (..., n) -> (..., p)."""
-        ...
+        self._check("point", point, self.point_size)
+        self._check("tangent", tangent, self.tangent_size)
+        return self._retract(point, tangent)
 
     def local(self, point: Tensor, other: Tensor) -> Tensor:
         """The shortest tangent that leads to another point, other [-] point: (..., p), (..., p) -> (..., n)."""
-        ...
+        self._check("point", point, self.point_size)
+        self._check("other", other, self.point_size)
+        return self._local(point, other)
+
+    @abstractmethod
+    def _retract(self, point: Tensor, tangent: Tensor) -> Tensor: ...
+
+    @abstractmethod
+    def _local(self, point: Tensor, other: Tensor) -> Tensor: ...
+
+    def _check(self, name: str, vector: Tensor, size: int) -> None:
+        if vector.shape[-1:] != (size,):
+            raise ValueError(
+                f"{self}: {name} must have shape (..., {size}), got {tuple(vector.shape)}; "
+                f"points have {self.point_size} numbers and tangents {self.tangent_size}"
+            )
 
 
 @dataclass(frozen=True)
-class Euclidean:
+class Euclidean(Manifold):
     """R^n: retract adds, local subtracts.
 
     Attributes:
@@ -64,7 +84,8 @@ class Euclidean:
     """
 
     size: int
-    flat: ClassVar[bool] = True
+
+    flat = True
 
     @property
     def point_size(self) -> int:
@@ -76,38 +97,28 @@ class Euclidean:
         """Length of a tangent."""
         return self.size
 
-    def retract(self, point: Tensor, tangent: Tensor) -> Tensor:
-        """point + tangent, (..., n)."""
-        _check(self, point=point, tangent=tangent)
+    def _retract(self, point: Tensor, tangent: Tensor) -> Tensor:
         return point + tangent
 
-    def local(self, point: Tensor, other: Tensor) -> Tensor:
-        """other - point, (..., n)."""
-        _check(self, point=point, other=other)
+    def _local(self, point: Tensor, other: Tensor) -> Tensor:
         return other - point
 
 
 @dataclass(frozen=True)
-class SO2:
+class SO2(Manifold):
     """Angles, radians in (-pi, pi]."""
 
-    point_size: ClassVar[int] = 1
-    tangent_size: ClassVar[int] = 1
-    flat: ClassVar[bool] = False
+    point_size, tangent_size = 1, 1
 
-    def retract(self, point: Tensor, tangent: Tensor) -> Tensor:
-        """The sum as an angle, (..., 1)."""
-        _check(self, point=point, tangent=tangent)
+    def _retract(self, point: Tensor, tangent: Tensor) -> Tensor:
         return lie_groups.wrap_angle(point + tangent)
 
-    def local(self, point: Tensor, other: Tensor) -> Tensor:
-        """The difference as an angle, (..., 1)."""
-        _check(self, point=point, other=other)
+    def _local(self, point: Tensor, other: Tensor) -> Tensor:
         return lie_groups.wrap_angle(other - point)
 
 
 @dataclass(frozen=True)
-class LieGroup:
+class LieGroup(Manifold):
     """A group whose points are composed: what SE2, SO3 and SE3 have in common.
 
     Attributes:
@@ -115,7 +126,6 @@ class LieGroup:
     """
 
     side: str = "right"
-    flat: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if self.side not in ("left", "right"):
@@ -127,17 +137,11 @@ class LieGroup:
 
 @dataclass(frozen=True)
 class SE2(LieGroup):
-    """Rigid motions of the plane: points (..., 3) are x, y, angle, tangents (..., 3) twists in the same order.
+    """Rigid motions of the plane: points (..., 3) are x, y, angle, tangents (..., 3) twists in the same order."""
 
-    For `side` see `LieGroup`.
-    """
+    point_size, tangent_size = 3, 3
 
-    point_size: ClassVar[int] = 3
-    tangent_size: ClassVar[int] = 3
-
-    def retract(self, point: Tensor, tangent: Tensor) -> Tensor:
-        """The motion of which the twist is taken, before or after the point: (..., 3), (..., 3) -> (..., 3)."""
-        _check(self, point=point, tangent=tangent)
+    def _retract(self, point: Tensor, tangent: Tensor) -> Tensor:
         x, y, angle = point.unbind(-1)
         u, v, added = tangent.unbind(-1)
         a, b = lie_groups.exp_se2((u, v), added)
@@ -147,9 +151,7 @@ class SE2(LieGroup):
             x, y = lie_groups.turn(torch.sin(added), torch.cos(added), (x, y))
         return stack([x + a, y + b, lie_groups.wrap_angle(angle + added)])
 
-    def local(self, point: Tensor, other: Tensor) -> Tensor:
-        """The twist that retract takes from `point` to `other`: (..., 3), (..., 3) -> (..., 3)."""
-        _check(self, point=point, other=other)
+    def _local(self, point: Tensor, other: Tensor) -> Tensor:
         x, y, angle = point.unbind(-1)
         a, b, other_angle = other.unbind(-1)
         between = lie_groups.wrap_angle(other_angle - angle)
@@ -168,7 +170,7 @@ class SE2(LieGroup):
 
     def to_matrix(self, point: Tensor) -> Tensor:
         """Homogeneous matrices (..., 3, 3) of points (..., 3)."""
-        _check(self, point=point)
+        self._check("point", point, self.point_size)
         x, y, angle = point.unbind(-1)
         sine, cosine = torch.sin(angle), torch.cos(angle)
         rotation = torch.stack([torch.stack([cosine, -sine], dim=-1), torch.stack([sine, cosine], dim=-1)], dim=-2)
@@ -177,23 +179,15 @@ class SE2(LieGroup):
 
 @dataclass(frozen=True)
 class SO3(LieGroup):
-    """Rotations: points (..., 4) are unit quaternions x, y, z, w of either sign, tangents (..., 3) rotation vectors.
+    """Rotations: points (..., 4) are unit quaternions x, y, z, w of either sign, tangents (..., 3) rotation vectors."""
 
-    For `side` see `LieGroup`.
-    """
+    point_size, tangent_size = 4, 3
 
-    point_size: ClassVar[int] = 4
-    tangent_size: ClassVar[int] = 3
-
-    def retract(self, point: Tensor, tangent: Tensor) -> Tensor:
-        """The rotation of which the vector is taken, at unit length: (..., 4), (..., 3) -> (..., 4)."""
-        _check(self, point=point, tangent=tangent)
+    def _retract(self, point: Tensor, tangent: Tensor) -> Tensor:
         added = lie_groups.exp_so3(_vector(tangent))
         return stack(lie_groups.normalise(_product(self.side, _quaternion(point), added)))
 
-    def local(self, point: Tensor, other: Tensor) -> Tensor:
-        """The rotation vector that takes `point` to `other`: (..., 4), (..., 4) -> (..., 3)."""
-        _check(self, point=point, other=other)
+    def _local(self, point: Tensor, other: Tensor) -> Tensor:
         return stack(
             lie_groups.log_so3(_product(self.side, lie_groups.conjugate(_quaternion(point)), _quaternion(other)))
         )
@@ -205,7 +199,7 @@ class SO3(LieGroup):
 
     def to_matrix(self, point: Tensor) -> Tensor:
         """Rotation matrices (..., 3, 3) of points (..., 4)."""
-        _check(self, point=point)
+        self._check("point", point, self.point_size)
         return lie_groups.matrix_from_quaternion(_quaternion(point))
 
 
@@ -214,15 +208,12 @@ class SE3(LieGroup):
     """Rigid motions: points (..., 7) are translation and unit quaternion x, y, z, w, tangents (..., 6) twists.
 
     A twist is (translation, rotation), and what it leads to is the exponential of the group, so its translation bends
-    with its rotation. For `side` see `LieGroup`.
+    with its rotation.
     """
 
-    point_size: ClassVar[int] = 7
-    tangent_size: ClassVar[int] = 6
+    point_size, tangent_size = 7, 6
 
-    def retract(self, point: Tensor, tangent: Tensor) -> Tensor:
-        """The motion of which the twist is taken, its quaternion at unit length: (..., 7), (..., 6) -> (..., 7)."""
-        _check(self, point=point, tangent=tangent)
+    def _retract(self, point: Tensor, tangent: Tensor) -> Tensor:
         start, turned = _rigid(point)
         step, added = lie_groups.exp_se3(*_twist(tangent))
         if self.side == "right":
@@ -232,9 +223,7 @@ class SE3(LieGroup):
         translation = [a + b for a, b in zip(start, step, strict=True)]
         return stack([*translation, *lie_groups.normalise(_product(self.side, turned, added))])
 
-    def local(self, point: Tensor, other: Tensor) -> Tensor:
-        """The twist that retract takes from `point` to `other`: (..., 7), (..., 7) -> (..., 6)."""
-        _check(self, point=point, other=other)
+    def _local(self, point: Tensor, other: Tensor) -> Tensor:
         (start, turned), (end, other_turned) = _rigid(point), _rigid(other)
         back = lie_groups.conjugate(turned)
         between = _product(self.side, back, other_turned)
@@ -253,13 +242,13 @@ class SE3(LieGroup):
 
     def to_matrix(self, point: Tensor) -> Tensor:
         """Homogeneous matrices (..., 4, 4) of points (..., 7)."""
-        _check(self, point=point)
+        self._check("point", point, self.point_size)
         _, quaternion = _rigid(point)
         return _homogeneous(lie_groups.matrix_from_quaternion(quaternion), point[..., :3])
 
 
 @dataclass(frozen=True, init=False)
-class Product:
+class Product(Manifold):
     """Several manifolds side by side, `Product(SE3(), Euclidean(6))`.
 
     Attributes:
@@ -291,17 +280,13 @@ class Product:
         """Whether every part is flat."""
         return all(part.flat for part in self.parts)
 
-    def retract(self, point: Tensor, tangent: Tensor) -> Tensor:
-        """Each part's retract, (..., p), (..., n) -> (..., p)."""
-        _check(self, point=point, tangent=tangent)
+    def _retract(self, point: Tensor, tangent: Tensor) -> Tensor:
         if self.flat:
             return point + tangent
         pieces = zip(self.parts, self._points(point), self._tangents(tangent), strict=True)
         return concatenate([part.retract(x, v) for part, x, v in pieces])
 
-    def local(self, point: Tensor, other: Tensor) -> Tensor:
-        """Each part's local, (..., p), (..., p) -> (..., n)."""
-        _check(self, point=point, other=other)
+    def _local(self, point: Tensor, other: Tensor) -> Tensor:
         if self.flat:
             return other - point
         pieces = zip(self.parts, self._points(point), self._points(other), strict=True)
@@ -312,16 +297,6 @@ class Product:
 
     def _tangents(self, tangent: Tensor) -> tuple[Tensor, ...]:
         return tangent.split([part.tangent_size for part in self.parts], dim=-1)
-
-
-def _check(manifold: Manifold, *, point: Tensor, tangent: Tensor | None = None, other: Tensor | None = None) -> None:
-    sizes = {"point": manifold.point_size, "tangent": manifold.tangent_size, "other": manifold.point_size}
-    for name, vector in (("point", point), ("tangent", tangent), ("other", other)):
-        if vector is not None and vector.shape[-1:] != (sizes[name],):
-            raise ValueError(
-                f"{manifold}: {name} must have shape (..., {sizes[name]}), got {tuple(vector.shape)}; "
-                f"points have {sizes['point']} numbers and tangents {sizes['tangent']}"
-            )
 
 
 def _check_matrix(manifold: Manifold, matrix: Tensor, size: int) -> None:

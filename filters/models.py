@@ -8,33 +8,59 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from sigmaslam.filters.linalg.square_roots import apply
-from sigmaslam.filters.noise import Noise
+from sigmaslam.filters.noise_covariance import Noise
 
 Function = Callable[..., Tensor]
 Residual = Callable[[Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MotionModel:
-    """How a state moves: x' = f(x, *inputs) [+] w, or x' = f(x, w, *inputs) when the noise is not additive.
+class NonlinearModel:
+    """What `MotionModel` and `MeasurementModel` have in common: y = f(x, *inputs) + w, or y = f(x, w, *inputs).
 
-    The function is called once for all sigma points: with states (k, ..., p) and, if not additive, noise (k, ..., q),
-    while inputs have the batch shape (..., ·) and broadcast. Components are read as `x[..., i]`.
+    The function is called once for all sigma points: with states (k, ..., p) and, if the noise is not additive, noise
+    (k, ..., q), while inputs have the batch shape (..., ·) and broadcast. Components are read as `x[..., i]`.
 
     Attributes:
-        function: f, to states (k, ..., p).
-        noise: covariance Q (..., q, q), or a `Noise`. Additive: in the tangent at f(x), q = n, unless `noise_matrix`.
+        function: f, to (k, ..., m) of states or measurements.
+        noise: covariance (..., q, q) of w, or a `Noise`.
         additive: whether w is added to f(x).
-        noise_matrix: B2 (..., n, q) of (9.22): additive noise enters as B2 w.
         jacobian: derivative of f (and of w, side by side) in tangent coordinates, called like the function at one
-            point, (..., n, n) or (..., n, n + q); None: by automatic differentiation. Only the EKF asks for it.
+            point, (..., m, n) or (..., m, n + q); None: by automatic differentiation. Only the EKF asks for it.
     """
 
     function: Function
     noise: Noise | Tensor
     additive: bool = True
-    noise_matrix: Tensor | None = None
     jacobian: Function | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionModel(NonlinearModel):
+    """How a state moves: x' = f(x, *inputs) [+] w, or x' = f(x, w, *inputs); see `NonlinearModel`.
+
+    Attributes:
+        noise_matrix: B2 (..., n, q) of (9.22): additive noise enters as B2 w, in the tangent at f(x); None: w.
+    """
+
+    noise_matrix: Tensor | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasurementModel(NonlinearModel):
+    """What a sensor sees: z = h(x, *inputs) + v, or z = h(x, v, *inputs); see `NonlinearModel`.
+
+    A component that is NaN in the measured value, or False in the mask, has weight zero. A `Diagonal` or
+    `BlockDiagonal` noise keeps the cost of an update linear in m.
+
+    Attributes:
+        residual: (measured (..., m), predicted (..., m)) -> their difference, where that is not a plain difference
+            (an angle, see `wrap_angle`); None: subtraction.
+        mask: (..., m) bool, True for components that take part; None: all.
+    """
+
+    residual: Residual | None = None
+    mask: Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,32 +89,6 @@ class LinearMotion:
         elif inputs:
             raise ValueError("an input was given, but this motion has no control matrix")
         return moved
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MeasurementModel:
-    """What a sensor sees: z = h(x, *inputs) + v, or z = h(x, v, *inputs) when the noise is not additive.
-
-    Called as the function of `MotionModel`. A component that is NaN in the measured value, or False in the mask, has
-    weight zero.
-
-    Attributes:
-        function: h, to (k, ..., m).
-        noise: covariance R (..., r, r), or a `Noise`; additive: r = m. `Diagonal` and `BlockDiagonal` keep the cost of
-            an update linear in m.
-        residual: (measured (..., m), predicted (..., m)) -> their difference, where that is not a plain difference
-            (an angle, see `wrap_angle`); None: subtraction.
-        additive: whether v is added to h(x).
-        jacobian: as in `MotionModel`, (..., m, n) or (..., m, n + r).
-        mask: (..., m) bool, True for components that take part; None: all.
-    """
-
-    function: Function
-    noise: Noise | Tensor
-    residual: Residual | None = None
-    additive: bool = True
-    jacobian: Function | None = None
-    mask: Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,15 +8,15 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.gaussian import Gaussian
+from sigmaslam.filters.gaussian_belief import Gaussian
 from sigmaslam.filters.linalg.square_roots import multiply
-from sigmaslam.filters.noise import Noise
+from sigmaslam.filters.noise_covariance import Noise
 from sigmaslam.filters.sigma_points import Columns
-from sigmaslam.filters.updates import Form, Solution, log_likelihood
+from sigmaslam.filters.updates import Form, TangentPosterior, log_likelihood
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Prediction:
+class TimeUpdate:
     """What `predict` returns.
 
     Attributes:
@@ -62,7 +62,7 @@ class Update:
     form: Form
     count: Tensor | int
     _healthy: Tensor | None = field(repr=False)
-    _solution: Solution = field(repr=False)
+    _solution: TangentPosterior = field(repr=False)
     _columns: Columns = field(repr=False)
     _noise: Noise | None = field(repr=False)
     _prior_root: Tensor = field(repr=False)

@@ -15,7 +15,7 @@ from torch import Tensor
 from sigmaslam.filters.layout import stack
 from sigmaslam.filters.lie_groups import wrap_angle
 from sigmaslam.filters.models import LinearMotion, MeasurementModel, MotionModel
-from sigmaslam.filters.noise import Noise
+from sigmaslam.filters.noise_covariance import Noise
 
 
 class Rectified(Protocol):

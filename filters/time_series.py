@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from sigmaslam.filters.failure import FilterError
-from sigmaslam.filters.gaussian import Gaussian
+from sigmaslam.filters.gaussian_belief import Gaussian
 from sigmaslam.filters.linalg.square_roots import apply, multiply, solve_lower_transposed, square, triangularise
 from sigmaslam.filters.models import AnyMeasurement, AnyMotion
-from sigmaslam.filters.results import Prediction, Update
+from sigmaslam.filters.results import TimeUpdate, Update
 
 if TYPE_CHECKING:
     from sigmaslam.filters.bayes import BayesFilter
@@ -40,7 +40,7 @@ class Track:
     count: Tensor
     log_likelihood: Tensor
     healthy: Tensor
-    _predictions: Sequence[Prediction] = field(repr=False)
+    _predictions: Sequence[TimeUpdate] = field(repr=False)
 
 
 def filter_sequence(
@@ -73,7 +73,7 @@ def filter_sequence(
         if any(len(given) != length for given in inputs):
             lengths = ", ".join(str(len(given)) for given in inputs)
             raise ValueError(f"{steps} measurements need {name} inputs of length {length}, got {lengths}")
-    predictions: list[Prediction] = []
+    predictions: list[TimeUpdate] = []
     predicted: list[Gaussian] = [belief]
     updates: list[Update] = []
     for k in range(steps):
@@ -120,7 +120,7 @@ def smooth(bayes: BayesFilter, track: Track) -> Gaussian:
     return _stack(smoothed[::-1])
 
 
-def _smooth_step(bayes: BayesFilter, filtered: Gaussian, prediction: Prediction, later: Gaussian) -> Gaussian:
+def _smooth_step(bayes: BayesFilter, filtered: Gaussian, prediction: TimeUpdate, later: Gaussian) -> Gaussian:
     odd, others, root = prediction.joint_root()
     size = root.shape[-1]
     pieces = [torch.cat([odd, root], dim=-2)]

@@ -33,7 +33,7 @@ from sigmaslam.filters.linalg.square_roots import (
     triangularise,
 )
 from sigmaslam.filters.linalg.unrolled import is_small, join, stacked_update
-from sigmaslam.filters.noise import Dense, Noise, Rooted
+from sigmaslam.filters.noise_covariance import Dense, Noise, Rooted
 from sigmaslam.filters.sigma_points import Columns
 
 Form = Literal["dense", "low-rank", "qr"]
@@ -41,7 +41,7 @@ FORMS: tuple[Form, ...] = ("dense", "low-rank", "qr")
 
 
 @dataclass(frozen=True, slots=True)
-class Solution:
+class TangentPosterior:
     """Posterior of L zeta, the state's tangent at the prior mean.
 
     Attributes:
@@ -66,7 +66,7 @@ class Solution:
     matrix: Tensor | None
     healthy: Tensor | None
 
-    def where(self, chosen: Tensor, other: Solution) -> Solution:
+    def where(self, chosen: Tensor, other: TangentPosterior) -> TangentPosterior:
         """This solution where chosen (...,) bool is true, the other of the same form elsewhere."""
 
         def pick(first: Tensor | None, second: Tensor | None, trailing: int) -> Tensor | None:
@@ -104,7 +104,7 @@ def choose_form(columns: Columns, measurements: int, additive: bool) -> Form:
     return "low-rank" if additive and columns.negative is None and measurements > count else "dense"
 
 
-def solve(form: Form, innovation: Tensor, columns: Columns, noise: Noise | None, prior: Tensor) -> Solution:
+def solve(form: Form, innovation: Tensor, columns: Columns, noise: Noise | None, prior: Tensor) -> TangentPosterior:
     """Posterior of zeta in the form asked for.
 
     Args:
@@ -134,7 +134,7 @@ def solve(form: Form, innovation: Tensor, columns: Columns, noise: Noise | None,
     return solver(white, prior, noise)
 
 
-def _dense(innovation: Tensor, columns: Columns, noise: Noise | None, prior: Tensor) -> Solution:
+def _dense(innovation: Tensor, columns: Columns, noise: Noise | None, prior: Tensor) -> TangentPosterior:
     size = columns.odd.shape[-1]
     S = columns.covariance()
     if noise is not None:
@@ -144,7 +144,7 @@ def _dense(innovation: Tensor, columns: Columns, noise: Noise | None, prior: Ten
     gain, residual = white[..., :size], white[..., size]
     covariance = identity(size, S) - square([gain.mT])
     mean = apply(gain.mT, residual)
-    return Solution(
+    return TangentPosterior(
         mean=mean,
         shift=apply(prior, mean),
         covariance=multiply(multiply(prior, covariance), prior.mT),
@@ -157,7 +157,7 @@ def _dense(innovation: Tensor, columns: Columns, noise: Noise | None, prior: Ten
     )
 
 
-def _low_rank(white: Tensor, prior: Tensor, noise: Noise) -> Solution:
+def _low_rank(white: Tensor, prior: Tensor, noise: Noise) -> TangentPosterior:
     """White deviations (..., m, k), the last n of them odd, with the white innovation as one more column."""
     count = white.shape[-1] - 1
     first = count - prior.shape[-1]
@@ -175,7 +175,7 @@ def _low_rank(white: Tensor, prior: Tensor, noise: Noise) -> Solution:
         remaining = white[..., count:] - deviations @ eta
         return (remaining * remaining).sum(dim=(-2, -1)) + (eta * eta).sum(dim=(-2, -1))
 
-    return Solution(
+    return TangentPosterior(
         mean=solve_lower_transposed(inner, projected[..., first:, :]).squeeze(-1),
         shift=apply(spread.mT, projected[..., first:, 0]),
         covariance=square([spread.mT]),
@@ -188,7 +188,7 @@ def _low_rank(white: Tensor, prior: Tensor, noise: Noise) -> Solution:
     )
 
 
-def _qr(white: Tensor, prior: Tensor, noise: Noise) -> Solution:
+def _qr(white: Tensor, prior: Tensor, noise: Noise) -> TangentPosterior:
     """As `_low_rank`, by triangularising the rows [W^T, I, 0] and [e^T, 0, 1]; the 1 keeps the last pivot off zero."""
     if is_small(white.mT):
         mean, root, inner, last, determinant = stacked_update(white, prior.shape[-1], prior)
@@ -201,7 +201,7 @@ def _qr(white: Tensor, prior: Tensor, noise: Noise) -> Solution:
         root = triangularise([solve_lower(inner, prior.mT, regular=True).mT])
         last = triangle[..., count, count]
         determinant = torch.diagonal(triangle, dim1=-2, dim2=-1)[..., :count]
-    return Solution(
+    return TangentPosterior(
         mean=mean,
         shift=apply(prior, mean),
         covariance=None,
@@ -226,7 +226,7 @@ def _spread(information_root: Tensor) -> Tensor:
     return triangularise([solve_lower_transposed(information_root, unit), _width(unit) * unit])
 
 
-def log_likelihood(solution: Solution, count: Tensor | int) -> Tensor:
+def log_likelihood(solution: TangentPosterior, count: Tensor | int) -> Tensor:
     """Gaussian log-density of the innovation, (...,); count is the number of components that took part."""
     nis = solution.nis()
     if isinstance(count, Tensor):

@@ -18,7 +18,7 @@ _SIGMA = 1.4
 _REACH = 4
 _NMS_WINDOW = 3
 # Less is round-off: one grey level of 255 gives 1e-6.
-_LEAST_RESPONSE = 1e-9
+_MIN_RESPONSE = 1e-9
 # Response is compared with its surroundings to this power: 0 keeps the strongest peaks wherever they crowd, 1 spreads
 # them as evenly as texture allows.
 _EVENING_POWER = 0.75
@@ -99,7 +99,7 @@ def find_peaks(response: Tensor, count: int) -> tuple[Tensor, Tensor]:
     flat = functional.pixel_shuffle(response, CELL)
     scores = functional.pixel_shuffle(evened, CELL)
     peak = functional.max_pool2d(scores, _NMS_WINDOW, stride=1, padding=_NMS_WINDOW // 2)
-    kept = torch.where((scores >= peak) & (flat > _LEAST_RESPONSE), scores, torch.zeros_like(scores))
+    kept = torch.where((scores >= peak) & (flat > _MIN_RESPONSE), scores, torch.zeros_like(scores))
     inner = kept[:, :, BORDER:-BORDER, BORDER:-BORDER]
     kept = functional.pad(inner, (BORDER, BORDER, BORDER, BORDER))
     strength, index = torch.topk(kept.flatten(1), count, dim=1)

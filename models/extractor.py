@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from sigmaslam.models.detector import detect, to_cells, to_half_cells
-from sigmaslam.models.network import SIZE_MULTIPLE, FeatureNetwork, sample_map
+from sigmaslam.models.feature_network import SIZE_MULTIPLE, FeatureNetwork, sample_map
 
 EXTRACTOR_SIZE_MULTIPLE = 2 * SIZE_MULTIPLE
 """Sides of the image: the network's multiple, at half size too."""

@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from torch import nn
 
-from sigmaslam.filters.onnx.constant_velocity import Predict
-from sigmaslam.filters.onnx.stereo_window import Transfer
+from sigmaslam.filters.onnx.pose_prediction import Predict
+from sigmaslam.filters.onnx.stereo_window import StereoTransfer
 from sigmaslam.inference.onnx_graph import shipped_weights
-from sigmaslam.models.export import load_network, load_scorer, load_verifier
 from sigmaslam.models.extractor import FeatureExtractor
-from sigmaslam.models.scorer import ScoredMatches
-from sigmaslam.models.verifier import MatchCovariance
+from sigmaslam.models.onnx_export import load_network, load_scorer, load_verifier
+from sigmaslam.models.scorer_network import ScoredMatches
+from sigmaslam.models.verifier_network import MatchCovariance
 
 
 class TorchModule:
@@ -27,8 +27,8 @@ class TorchModule:
     def __call__(self, feed: Mapping[str, np.ndarray]) -> list[np.ndarray]:
         """Outputs in the order of the module."""
         with torch.inference_mode():
-            found = self._module(*(torch.from_numpy(np.asarray(value)) for value in feed.values()))
-        return [value.numpy() for value in found]
+            outputs = self._module(*(torch.from_numpy(np.asarray(value)) for value in feed.values()))
+        return [value.numpy() for value in outputs]
 
 
 class TorchFeatures(TorchModule):
@@ -48,4 +48,4 @@ def scoring_module(name: str) -> TorchModule:
 
 def filter_module(name: str) -> TorchModule:
     """pose_predict or stereo_transfer."""
-    return TorchModule({"pose_predict": Predict(), "stereo_transfer": Transfer()}[name])
+    return TorchModule({"pose_predict": Predict(), "stereo_transfer": StereoTransfer()}[name])

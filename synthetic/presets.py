@@ -22,7 +22,7 @@ class Preset:
     """A kind of sequence.
 
     Attributes:
-        generate: makes the world.
+        generate: makes a random world as wished for.
         width, height: pixels.
         focal: pixels, at this width.
         baseline: metres.

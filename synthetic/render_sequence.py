@@ -23,9 +23,9 @@ import torch
 
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder
-from sigmaslam.synthetic.choices import TRUTHS
-from sigmaslam.synthetic.landmarks import Landmarks, choose_landmarks, observe
+from sigmaslam.synthetic.landmark_tracks import Landmarks, choose_landmarks, observe
 from sigmaslam.synthetic.layouts import image_paths, write_layout
+from sigmaslam.synthetic.render_choices import TRUTHS
 from sigmaslam.synthetic.simulation import Frame, Recipe, Simulation, Studio, simulate
 
 SCENE_NAME, LANDMARKS_NAME = "scene.json", "landmarks.npz"

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from sigmaslam.geometry.camera import CameraModel
 from sigmaslam.synthetic.camera.sensor import Sensor, expose, random_sensor
 from sigmaslam.synthetic.geometry import rigid_motion
-from sigmaslam.synthetic.rendering.renderer import Renderer, Views
+from sigmaslam.synthetic.rendering.renderer import RenderedViews, Renderer
 from sigmaslam.synthetic.rendering.visibility import Eye
 from sigmaslam.synthetic.truth import at_pixels, transfer
 from sigmaslam.synthetic.worlds import colon, hall, organ, room, street
@@ -30,8 +30,8 @@ _USES = 32  # ... each of which serves so many pairs before it is replaced
 _VIEWS = 8  # of a scene
 _SCENES_A_BANK = 64  # share their textures
 _DURATION = 8.0  # seconds of an episode
-_MOST_MOVED = 0.4
-_LEAST_SHARED = 0.15  # of a raster of points, between the views of a pair
+_MAX_MOVING_SHARE = 0.4
+_MIN_OVERLAP = 0.15  # of a raster of points, between the views of a pair
 _RASTER = 12
 _BASELINES = (0.01, 0.12)  # of stereo pairs, in median depths, drawn evenly in the logarithm
 
@@ -47,8 +47,8 @@ class ScenePair:
 
     image0: np.ndarray
     image1: np.ndarray
-    views0: Views
-    views1: Views
+    views0: RenderedViews
+    views1: RenderedViews
 
     def transfer(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where points (N, 2) of image 0 lie in image 1 (N, 2), and whether they are seen there (N,) bool."""
@@ -63,7 +63,7 @@ class ScenePairs:
         size: side of the square images in pixels.
         domains: keys of `DOMAINS`, drawn alike.
         stereo: the two views are the eyes of a rectified stereo pair, through sensors of one kind.
-        most_moved: share of the image that may move on its own in a scene.
+        max_moving_share: share of the image that may move on its own in a scene.
     """
 
     def __init__(
@@ -72,14 +72,14 @@ class ScenePairs:
         size: int = 224,
         domains: tuple[str, ...] = tuple(DOMAINS),
         stereo: bool = False,
-        most_moved: float = _MOST_MOVED,
+        max_moving_share: float = _MAX_MOVING_SHARE,
     ) -> None:
         unknown = set(domains) - set(DOMAINS)
         if unknown or not domains:
             raise ValueError(f"unknown domains {sorted(unknown)}; give one or more of {', '.join(DOMAINS)}")
         self.seed, self.size, self.domains, self.stereo = seed, size, domains, stereo
-        self._most_moved = most_moved
-        self._kept: OrderedDict[int, list[Views]] = OrderedDict()
+        self._max_moving_share = max_moving_share
+        self._kept: OrderedDict[int, list[RenderedViews]] = OrderedDict()
 
     def pair(self, index: int) -> ScenePair:
         """The pair of that index, the same whenever it is asked for."""
@@ -87,7 +87,7 @@ class ScenePairs:
         views = self._views(self._scene_of(index))
         order = rng.permutation([(i, j) for i in range(_VIEWS) for j in range(_VIEWS) if self._go_together(i, j)])
         # Of views that hardly overlap there is little to learn; if all are so, the last ones will do.
-        i, j = next(((i, j) for i, j in order if self._shared(views[i], views[j]) >= _LEAST_SHARED), order[-1])
+        i, j = next(((i, j) for i, j in order if self._overlap(views[i], views[j]) >= _MIN_OVERLAP), order[-1])
         sensor = random_sensor(rng) if self.stereo else None
         images = [self._photograph(views[k], rng, sensor) for k in (i, j)]
         return ScenePair(images[0], images[1], views[i], views[j])
@@ -100,7 +100,7 @@ class ScenePairs:
         turn, place = divmod(index, _SCENES)
         return (turn + place * _USES // _SCENES) // _USES * _SCENES + place
 
-    def _views(self, scene: int) -> list[Views]:
+    def _views(self, scene: int) -> list[RenderedViews]:
         if scene not in self._kept:
             with torch.inference_mode():
                 self._kept[scene] = self._render(scene)
@@ -109,12 +109,12 @@ class ScenePairs:
         self._kept.move_to_end(scene)
         return self._kept[scene]
 
-    def _render(self, scene: int) -> list[Views]:
+    def _render(self, scene: int) -> list[RenderedViews]:
         rng = np.random.default_rng((self.seed, 0, scene))
         domain = self.domains[int(rng.integers(len(self.domains)))]
         wish = Wish(
             _DURATION,
-            movers=float(rng.uniform(0.0, self._most_moved)) if rng.random() < 0.5 else 0.0,
+            movers=float(rng.uniform(0.0, self._max_moving_share)) if rng.random() < 0.5 else 0.0,
             first_texture=4 * (self.seed + scene // _SCENES_A_BANK),
             textures=4,
         )
@@ -122,7 +122,7 @@ class ScenePairs:
         renderer = Renderer(episode.scene)
         middle = rng.uniform(1.0, _DURATION - 1.0)
         span = np.exp(rng.uniform(np.log(0.1), np.log(2.0)))
-        result: list[Views] = []
+        result: list[RenderedViews] = []
         for k in range(0, _VIEWS, 2 if self.stereo else 1):
             time = np.clip(middle + span * rng.uniform(-0.5, 0.5), 0.0, _DURATION)[None]
             T = episode.path.poses(time)
@@ -137,20 +137,20 @@ class ScenePairs:
                 result.append(renderer.render(eye, T @ _to_right_eye(rng, _median_depth(result[0])), time))
         return result
 
-    def _photograph(self, views: Views, rng: np.random.Generator, sensor: Sensor | None) -> np.ndarray:
+    def _photograph(self, views: RenderedViews, rng: np.random.Generator, sensor: Sensor | None) -> np.ndarray:
         light = views.image[0].numpy()
         light = light * (rng.uniform(0.3, 0.6) / max(float(light.mean()), 1e-6))
         flow = rng.normal(0.0, 4.0, 2) if rng.random() < 0.15 else None
         # White is where the light of few pixels ends, so that the sensor's contrast means the same everywhere.
         return expose(np.minimum(light, 1.0), sensor or random_sensor(rng), rng, flow).astype(np.float32) / 255.0
 
-    def _shared(self, views0: Views, views1: Views) -> float:
+    def _overlap(self, views0: RenderedViews, views1: RenderedViews) -> float:
         ticks = (np.arange(_RASTER) + 0.5) * self.size / _RASTER
         raster = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
         return float(_transfer(views0, views1, raster)[1].mean())
 
 
-def _transfer(views0: Views, views1: Views, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _transfer(views0: RenderedViews, views1: RenderedViews, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     view = torch.zeros(len(points), dtype=torch.int64)
     facet, places = at_pixels(views0, view, torch.from_numpy(points.T.astype(np.float64)))
     hit = facet >= 0
@@ -162,7 +162,7 @@ def _transfer(views0: Views, views1: Views, points: np.ndarray) -> tuple[np.ndar
     return places1, visible
 
 
-def _median_depth(views: Views) -> float:
+def _median_depth(views: RenderedViews) -> float:
     return float(views.depth[torch.isfinite(views.depth)].median())
 
 

@@ -12,10 +12,10 @@ import torch
 from sigmaslam.errors import InputError
 from sigmaslam.synthetic.camera.rig import Miscalibration, Rig
 from sigmaslam.synthetic.camera.sensor import Sensor, expose, exposure_gains
-from sigmaslam.synthetic.choices import MOTIONS
 from sigmaslam.synthetic.motion.paths import Path
 from sigmaslam.synthetic.presets import EXPOSURES, PRESETS, SENSORS, Layout
-from sigmaslam.synthetic.rendering.renderer import Renderer, Views
+from sigmaslam.synthetic.render_choices import MOTIONS
+from sigmaslam.synthetic.rendering.renderer import RenderedViews, Renderer
 from sigmaslam.synthetic.rendering.visibility import Eye
 from sigmaslam.synthetic.scene import Scene
 from sigmaslam.synthetic.truth import flow
@@ -58,13 +58,13 @@ class Recipe:
 
     def check(self) -> None:
         """Raises InputError where a value is out of range."""
-        for name, value, known in (
+        for name, value, choices in (
             ("preset", self.preset, PRESETS),
             ("motion", self.motion, MOTIONS),
             ("sensor", self.sensor, SENSORS),
         ):
-            if value not in known:
-                raise InputError(f"{name} {value!r} is unknown; choose one of {', '.join(known)}")
+            if value not in choices:
+                raise InputError(f"{name} {value!r} is unknown; choose one of {', '.join(choices)}")
         if self.frames < 1:
             raise InputError(f"frames is {self.frames}; give at least 1")
         if self.seed < 0:
@@ -207,7 +207,7 @@ class Studio:
         self.renderer = Renderer(simulation.scene, device)
         self.left, self.right = Eye(simulation.rig.left), Eye(simulation.rig.true_right)
 
-    def views(self, numbers: np.ndarray) -> tuple[Views, Views]:
+    def views(self, numbers: np.ndarray) -> tuple[RenderedViews, RenderedViews]:
         """What the left and the right camera see in the frames of these numbers, before the sensor."""
         simulation, renderer = self.simulation, self.renderer
         times = numbers / simulation.fps
@@ -217,7 +217,7 @@ class Studio:
         T_right = T_left @ simulation.rig.true_right_pose
         return left, renderer.render(self.right, T_right, times, T_left, sunlight)
 
-    def frames(self, numbers: np.ndarray, views: tuple[Views, Views] | None = None) -> list[Frame]:
+    def frames(self, numbers: np.ndarray, views: tuple[RenderedViews, RenderedViews] | None = None) -> list[Frame]:
         """The frames of these numbers; on a GPU it pays to ask for many at once.
 
         Args:
@@ -255,7 +255,7 @@ class Studio:
             )
         return result
 
-    def _expose(self, views: Views, index: int, number: int, eye: int, field: np.ndarray | None) -> np.ndarray:
+    def _expose(self, views: RenderedViews, index: int, number: int, eye: int, field: np.ndarray | None) -> np.ndarray:
         simulation = self.simulation
         gain = simulation.sensor.gain * float(simulation.gains[number, eye])
         sensor = replace(simulation.sensor, gain=gain)

@@ -7,13 +7,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from sigmaslam.synthetic.rendering.renderer import Views
+from sigmaslam.synthetic.rendering.renderer import RenderedViews
 from sigmaslam.synthetic.rendering.visibility import Sight, move
 
 _BORDER = 1e-6  # pixels; what stands still at the image's edge stays in it whatever the rounding
 
 
-class Transfer(NamedTuple):
+class ProjectedPoints(NamedTuple):
     """N points of a source view in a target view.
 
     Attributes:
@@ -29,7 +29,7 @@ class Transfer(NamedTuple):
 
 def transfer(
     source: Sight, source_view: Tensor, facet: Tensor, places: Tensor, target: Sight, target_view: Tensor
-) -> Transfer:
+) -> ProjectedPoints:
     """Moves N seen points from views of one sight to views of another; bodies move along.
 
     Args:
@@ -41,7 +41,7 @@ def transfer(
     return arrive(target, target_view, source.points(source_view, facet, places), facet)
 
 
-def arrive(target: Sight, view: Tensor, points: Tensor, facet: Tensor, occlusion: bool = True) -> Transfer:
+def arrive(target: Sight, view: Tensor, points: Tensor, facet: Tensor, occlusion: bool = True) -> ProjectedPoints:
     """Points (3, N), each in the frame of its facet's mover, seen from views (N,) of a sight.
 
     Without `occlusion` what hides them is not asked for, which saves drawing the target.
@@ -59,19 +59,19 @@ def arrive(target: Sight, view: Tensor, points: Tensor, facet: Tensor, occlusion
     if occlusion:
         index = visible.nonzero().squeeze(1)
         visible[index] = ~target.hidden(view[index], seen_at[:, index], 1.0 / depth[index], facet[index])
-    return Transfer(pixels, depth, visible)
+    return ProjectedPoints(pixels, depth, visible)
 
 
-def at_pixels(views: Views, view: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
+def at_pixels(views: RenderedViews, view: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
     """What is seen at pixels (2, N) of views (N,): facets (N,), -1 for none, and places on the grid (2, N)."""
     places = views.sight.eye.to_grid(pixels)
-    known = places.isfinite().all(dim=0)
+    on_grid = places.isfinite().all(dim=0)
     facet = torch.full_like(view, -1)
-    facet[known] = views.sight.resolve(view[known], places[:, known])
+    facet[on_grid] = views.sight.resolve(view[on_grid], places[:, on_grid])
     return facet, places
 
 
-def flow(source: Views, target: Sight, occlusion: bool = True) -> tuple[Tensor, Tensor]:
+def flow(source: RenderedViews, target: Sight, occlusion: bool = True) -> tuple[Tensor, Tensor]:
     """Flow of every pixel from the views of `source` to those of the same number in `target`.
 
     Returns:

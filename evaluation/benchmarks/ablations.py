@@ -117,7 +117,7 @@ def configuration(variant: Variant, seed: int, steps: int) -> TrainingConfig:
 
 def _check_runs(runs: Path, steps: int) -> None:
     """Refuses runs that were made with another network or another training."""
-    from sigmaslam.models.network import FeatureNetwork
+    from sigmaslam.models.feature_network import FeatureNetwork
 
     network = {name: list(value.shape) for name, value in FeatureNetwork().state_dict().items()}
     made_with = {"network": network, "training": asdict(configuration(VARIANTS[0], 0, steps))}
@@ -157,9 +157,9 @@ def _scores(run: Path, variant: Variant, data: Path, note: Callable[[str], None]
 
 
 def _extractor(run: Path, variant: Variant) -> LearnedExtractor:
-    from sigmaslam.models.export import load_network
     from sigmaslam.models.extractor import FeatureExtractor
-    from sigmaslam.models.network import DESCRIPTOR_SIZE, STRIDE
+    from sigmaslam.models.feature_network import DESCRIPTOR_SIZE, STRIDE
+    from sigmaslam.models.onnx_export import load_network
     from sigmaslam.models.torch_runtime import TorchModule
     from sigmaslam.training.features.loop import WEIGHTS_NAME
 

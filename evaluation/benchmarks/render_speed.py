@@ -135,7 +135,7 @@ def _work(kind: str, preset: str, seed: int) -> tuple[float, list[list[_Lap]]]:
     if kind == "stereo":
         return _work_stereo(preset, seed)
     if kind == "homography":
-        from sigmaslam.synthetic.pairs import HomographyPairs
+        from sigmaslam.synthetic.homography_pairs import HomographyPairs
 
         make: Callable[[int], object] = HomographyPairs(seed, _PAIR_SIZE).pair
         first, pairs, repeats = 8, _HOMOGRAPHY_PAIRS, _REPEATS

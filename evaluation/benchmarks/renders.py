@@ -325,7 +325,7 @@ def _lefts(folder: Path, step: int) -> list[np.ndarray]:
 
 
 def _leaves() -> list[np.ndarray]:
-    from sigmaslam.synthetic.pairs import HomographyPairs
+    from sigmaslam.synthetic.homography_pairs import HomographyPairs
 
     pairs = HomographyPairs(0, _LEAVES_SIZE)
     return [np.rint(255.0 * pairs.pair(k).image0).astype(np.uint8) for k in range(_LEAVES)]

@@ -61,7 +61,7 @@ def judge_movers(detect: Callable[[np.ndarray], Features], judge: MatchJudge, se
         seed: of the pairs.
         tried: how many are rendered.
     """
-    stream = ScenePairs(seed, _SIZE, _DOMAINS, most_moved=0.5)
+    stream = ScenePairs(seed, _SIZE, _DOMAINS, max_moving_share=0.5)
     counts = np.zeros((4, 2))
     found, right_poses = 0, 0
     for index in range(tried):

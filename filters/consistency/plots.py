@@ -101,8 +101,8 @@ def plot_coverage(coverage: Coverage, labels: Sequence[str] | None = None, title
     """Share of errors inside each region against the share that should be; below the diagonal is overconfident.
 
     Args:
-        coverage: from `coverage` or `axis_coverage`.
-        labels: one a row of shares, so one for `coverage` and n for `axis_coverage`.
+        coverage: from the function of that name.
+        labels: one a row of shares: n by axis, else one.
         title: over the figure.
     Raises:
         ValueError: the number of labels does not fit.

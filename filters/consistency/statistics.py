@@ -267,11 +267,11 @@ def whiteness(innovations: Tensor, lags: int, probability: float = 0.95) -> Whit
     if not 1 <= lags < innovations.shape[1]:
         raise ValueError(f"lags must be between 1 and {innovations.shape[1] - 1}, less than the steps, not {lags}")
     given = _to_float64(innovations)
-    known = ~given.isnan()
-    given = torch.where(known, given, 0.0)
+    valid = ~given.isnan()
+    given = torch.where(valid, given, 0.0)
     by_component, pairs_by_component = [], []
     for lag in range(1, lags + 1):
-        both = known[:, :-lag] & known[:, lag:]
+        both = valid[:, :-lag] & valid[:, lag:]
         earlier, later = given[:, :-lag] * both, given[:, lag:] * both
         power = (earlier.square().sum(dim=(0, 1)) * later.square().sum(dim=(0, 1))).sqrt()
         by_component.append((earlier * later).sum(dim=(0, 1)) / power)
@@ -292,7 +292,7 @@ def whiteness(innovations: Tensor, lags: int, probability: float = 0.95) -> Whit
         share_inside=float(inside[autocorrelation.isfinite()].double().mean()),
         statistic=statistic,
         p_value=float(chi2.sf(statistic, int(tested.sum()))),
-        nan_count=int((~known).sum()),
+        nan_count=int((~valid).sum()),
     )
 
 
@@ -302,39 +302,26 @@ def coverage(
     levels: Sequence[float] = LEVELS,
     *,
     factor: Tensor | None = None,
+    by_axis: bool = False,
     probability: float = 0.95,
 ) -> Coverage:
-    """Share of errors inside the covariance's ellipsoid of each level.
+    """Share of errors inside the covariance's ellipsoid of each level, or inside the interval of each axis.
 
     Args:
         error: (..., n) errors; every leading dimension counts as samples.
         covariance, factor: one of them, as for `whiten`.
-        levels: probabilities of the ellipsoids.
+        levels: probabilities of the regions.
+        by_axis: count |x_i| <= k sigma_i on each axis i, k the normal distribution's for each level. Correlations
+            between the axes play no part, and an axis of which only others are NaN still counts.
         probability: of Wilson's interval. It takes the samples to be independent: those of one run are not, and the
             interval is then too narrow.
     Returns:
-        See `Coverage`; shares are (L,).
+        See `Coverage`; shares are (L,) and counts (), by axis (n, L) and (n,).
     Raises:
         ValueError: as `whiten`, or a level or the probability is not between 0 and 1.
     """
-    return _shares(nees(error, covariance, factor=factor).flatten(), error.shape[-1], levels, probability)
-
-
-def axis_coverage(
-    error: Tensor,
-    covariance: Tensor | None = None,
-    levels: Sequence[float] = LEVELS,
-    *,
-    factor: Tensor | None = None,
-    probability: float = 0.95,
-) -> Coverage:
-    """Share of errors with |x_i| <= k sigma_i on each axis i, k the normal distribution's for each level.
-
-    Arguments and errors as `coverage`; correlations between the axes play no part.
-
-    Returns:
-        See `Coverage`; shares are (n, L), counts (n,). An axis of which only others are NaN still counts.
-    """
+    if not by_axis:
+        return _shares(nees(error, covariance, factor=factor).flatten(), error.shape[-1], levels, probability)
     _require_shapes(error.shape, covariance, factor)
     if factor is not None:
         variance = factor.square().sum(dim=-1)
@@ -349,8 +336,8 @@ def _shares(squared: Tensor, dof: int, levels: Sequence[float], probability: flo
     _require_probability(probability)
     if len(levels) == 0 or not all(0 < level < 1 for level in levels):
         raise ValueError(f"levels must be probabilities between 0 and 1, at least one, not {tuple(levels)}")
-    known = ~squared.isnan()
-    count = known.sum(dim=0)
+    valid = ~squared.isnan()
+    count = valid.sum(dim=0)
     bounds = torch.as_tensor(chi2.ppf(np.asarray(levels), dof)).to(squared)
     samples = count.unsqueeze(-1).to(squared)
     # NaN is not inside.
@@ -366,7 +353,7 @@ def _shares(squared: Tensor, dof: int, levels: Sequence[float], probability: flo
         high=(centre + half).clamp(max=1.0),
         probability=probability,
         count=count,
-        nan_count=(~known).sum(dim=0),
+        nan_count=(~valid).sum(dim=0),
     )
 
 

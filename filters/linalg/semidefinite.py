@@ -22,19 +22,19 @@ def cholesky(matrix: Tensor) -> Tensor:
         (..., n, n) lower triangular, with zero columns where a pivot vanishes.
     """
     size = matrix.shape[-1]
-    rest = matrix
+    remainder = matrix
     columns = []
     tolerance = torch.tensor(PIVOT_TOLERANCES[matrix.dtype], dtype=matrix.dtype, device=matrix.device)
     diagonal = torch.diagonal(matrix, dim1=-2, dim2=-1)
     below = torch.ones(size, size, dtype=matrix.dtype, device=matrix.device).tril()
     for j in range(size):
-        pivot = rest[..., j, j]
+        pivot = remainder[..., j, j]
         kept = pivot > tolerance * diagonal[..., j]
         scale = torch.where(
             kept, torch.rsqrt(torch.where(kept, pivot, torch.ones_like(pivot))), torch.zeros_like(pivot)
         )
-        column = rest[..., :, j] * below[:, j] * scale.unsqueeze(-1)
+        column = remainder[..., :, j] * below[:, j] * scale.unsqueeze(-1)
         columns.append(column)
         if j + 1 < size:
-            rest = rest - column.unsqueeze(-1) * column.unsqueeze(-2)
+            remainder = remainder - column.unsqueeze(-1) * column.unsqueeze(-2)
     return torch.stack(columns, dim=-1)

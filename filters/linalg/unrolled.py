@@ -66,24 +66,24 @@ def cholesky(matrix: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
     """
     size = matrix.shape[-1]
     healthy = torch.ones_like(matrix[..., 0, 0], dtype=torch.bool)
-    rest = [[matrix[..., i, j] for j in range(i + 1)] for i in range(size)]
+    remainder = [[matrix[..., i, j] for j in range(i + 1)] for i in range(size)]
     for j in range(size):
-        pivot = rest[j][j]
+        pivot = remainder[j][j]
         floor = tolerance * matrix[..., j, j].abs()
         kept = pivot > floor
         healthy = healthy & (pivot >= -floor)  # False for NaN as well
         dropped = ~kept
         inverse = torch.rsqrt(pivot.masked_fill(dropped, 1.0)).masked_fill(dropped, 0.0)
-        rest[j][j] = pivot * inverse
+        remainder[j][j] = pivot * inverse
         for i in range(j + 1, size):
             # What a dropped pivot leaves below it must vanish too, else the matrix is indefinite.
             allowed = tolerance * (matrix[..., i, i] * matrix[..., j, j]).abs()
-            healthy = healthy & (kept | (rest[i][j] * rest[i][j] <= allowed))
-            rest[i][j] = rest[i][j] * inverse
+            healthy = healthy & (kept | (remainder[i][j] * remainder[i][j] <= allowed))
+            remainder[i][j] = remainder[i][j] * inverse
         for i in range(j + 1, size):
             for k in range(j + 1, i + 1):
-                rest[i][k] = rest[i][k] - rest[i][j] * rest[k][j]
-    return _from_lower(rest), healthy
+                remainder[i][k] = remainder[i][k] - remainder[i][j] * remainder[k][j]
+    return _from_lower(remainder), healthy
 
 
 def triangularise(pieces: Sequence[Tensor], diagonal: Tensor | None) -> Tensor:

@@ -20,7 +20,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from sigmaslam.filters.onnx.se3 import exp_se3
+from sigmaslam.filters.onnx.exportable_se3 import exp_se3
 from sigmaslam.filters.onnx.unscented import odd_and_even
 
 POSE = slice(0, 6)
@@ -33,7 +33,7 @@ SIZE = 13
 _NEAREST = 0.0625
 
 
-class Transfer(nn.Module):
+class StereoTransfer(nn.Module):
     """Sigma points of relative pose, calibration and landmark through the stereo measurement.
 
     Shapes:
@@ -68,24 +68,24 @@ class Transfer(nn.Module):
         samples = torch.cat([by_pose[:nine], by_landmark[:four], by_pose[nine:], by_landmark[four:]])
         mean, odd, even = odd_and_even(samples)
         _, depth = _project(here, calibration, intrinsics, landmarks)
-        left = torch.stack([(even * even[:, i : i + 1]).sum(dim=-1) for i in range(3)], dim=-1)
-        return mean, odd, left, (depth > _NEAREST).to(mean.dtype)
+        residual_covariance = torch.stack([(even * even[:, i : i + 1]).sum(dim=-1) for i in range(3)], dim=-1)
+        return mean, odd, residual_covariance, (depth > _NEAREST).to(mean.dtype)
 
 
 def _project(relative: Tensor, calibration: Tensor, intrinsics: Tensor, landmarks: Tensor) -> tuple[Tensor, Tensor]:
     """(u, v, disparity) (..., m, 3) in the view, and the depth there as a share of that in the host (..., m)."""
     fx, fy, cx, cy, focal_baseline = (intrinsics[i] for i in range(5))
     x, y = (landmarks[..., 0] - cx) / fx, (landmarks[..., 1] - cy) / fy
-    d, own = landmarks[..., 2], landmarks[..., 3]
-    inverse_depth = (d - own - _bias(calibration, x - d / fx, y)) / focal_baseline
+    d, landmark_offset = landmarks[..., 2], landmarks[..., 3]
+    inverse_depth = (d - landmark_offset - _bias(calibration, x - d / fx, y)) / focal_baseline
     # Written out, because millions of tiny matrix products are slow.
     seen = [
         relative[..., i, 0] * x + relative[..., i, 1] * y + relative[..., i, 2] + relative[..., i, 3] * inverse_depth
         for i in range(3)
     ]
     share = 1.0 / seen[2].clamp_min(0.5 * _NEAREST)
-    u, v, rest = seen[0] * share, seen[1] * share, focal_baseline * inverse_depth * share
-    disparity = rest + own + _bias(calibration, u - rest / fx, v)
+    u, v, true_disparity = seen[0] * share, seen[1] * share, focal_baseline * inverse_depth * share
+    disparity = true_disparity + landmark_offset + _bias(calibration, u - true_disparity / fx, v)
     return torch.stack([fx * u + cx, fy * v + cy, disparity], dim=-1), seen[2]
 
 

@@ -10,7 +10,7 @@ import typer
 
 from sigmaslam.cli.extras import need_train_extra
 from sigmaslam.progress import open_progress
-from sigmaslam.synthetic.choices import MOTIONS, PRESET_NAMES, SENSOR_NAMES, TRUTHS
+from sigmaslam.synthetic.render_choices import MOTIONS, PRESET_NAMES, SENSOR_NAMES, TRUTHS
 
 # mypy reads the members of an enum from literals alone.
 RenderPreset = StrEnum("RenderPreset", PRESET_NAMES)  # type: ignore[misc]

@@ -12,9 +12,9 @@ import numpy as np
 
 from sigmaslam.errors import InputError
 
-FEWEST_GAUSSIAN_PHOTONS = 20.0
+MIN_GAUSSIAN_PHOTONS = 20.0
 """Below this mean count shot noise is drawn from the exact Poisson law, above from the Gaussian of its moments."""
-MOST_MOTION_TAPS = 32
+MAX_MOTION_TAPS = 32
 _DISC_RADII = (0.0, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0)  # pixels; larger discs are cut to the last
 
 
@@ -84,7 +84,7 @@ def expose(
     In this order: motion blur, depth of field, point spread, vignetting, gain, shot noise, black level, read noise,
     saturation, salt and pepper, gamma, quantisation, JPEG.
 
-    Shot noise is Poisson where fewer than `FEWEST_GAUSSIAN_PHOTONS` photons are expected. Elsewhere it is Gaussian
+    Shot noise is Poisson where fewer than `MIN_GAUSSIAN_PHOTONS` photons are expected. Elsewhere it is Gaussian
     with the Poisson law's mean and variance (its skewness, at most 0.22, is lost), so that one draw from a table of
     quantiles serves shot and read noise together, in a fraction of the time of Poisson draws.
 
@@ -177,8 +177,8 @@ def exposure_gains(rng: np.random.Generator, frames: int, drift: float, differen
     periods = np.exp(rng.uniform(np.log(40.0), np.log(600.0), (2, 3)))
     phases = rng.uniform(0, 2 * np.pi, (2, 3))
     frame = np.arange(frames)[:, None, None]
-    common, apart = np.moveaxis((share * np.sin(2 * np.pi * frame / periods + phases)).sum(axis=-1), -1, 0)
-    logs = np.stack([drift * common + 0.5 * difference * apart, drift * common - 0.5 * difference * apart], axis=-1)
+    common, ratio = np.moveaxis((share * np.sin(2 * np.pi * frame / periods + phases)).sum(axis=-1), -1, 0)
+    logs = np.stack([drift * common + 0.5 * difference * ratio, drift * common - 0.5 * difference * ratio], axis=-1)
     return np.asarray(np.exp(logs))
 
 
@@ -192,7 +192,7 @@ def _blur_motion(light: np.ndarray, flow: np.ndarray, shutter: float) -> np.ndar
     valid = np.isfinite(flow).all(axis=-1)
     along_x, along_y = (np.where(valid, np.float32(shutter) * flow[..., i], np.float32(0)) for i in (0, 1))
     longest = float(np.sqrt((along_x**2 + along_y**2).max()))
-    taps = min(MOST_MOTION_TAPS, int(np.ceil(longest)) + 1)  # a pixel apart, between which remap interpolates
+    taps = min(MAX_MOTION_TAPS, int(np.ceil(longest)) + 1)  # a pixel apart, between which remap interpolates
     if longest < 0.05:
         return light
     x, y = (np.arange(n, dtype=np.float32) for n in light.shape[::-1])
@@ -259,7 +259,7 @@ def _add_noise(light: np.ndarray, sensor: Sensor, rng: np.random.Generator) -> n
     """A new signal (H, W) float32: the light with shot and read noise."""
     per_photon = np.float32(1.0 / sensor.photons_at_white)
     variance: np.ndarray = np.maximum(light, np.float32(0)) * per_photon
-    few = (light < FEWEST_GAUSSIAN_PHOTONS * per_photon) & (light > 0)
+    few = (light < MIN_GAUSSIAN_PHOTONS * per_photon) & (light > 0)
     counted = light
     if few.any():
         variance[few] = 0.0

@@ -93,15 +93,15 @@ class Path:
     def poses(self, t: np.ndarray | float) -> np.ndarray:
         """T_world_body at times t (...,), seconds -> (..., 4, 4) float64."""
         t = np.asarray(t, dtype=np.float64)
-        own = np.clip(self._own_clock(t.ravel()), self.times[0], self.times[-1])
-        T = np.tile(np.eye(4), (own.size, 1, 1))
+        clock = np.clip(self._knot_clock(t.ravel()), self.times[0], self.times[-1])
+        T = np.tile(np.eye(4), (clock.size, 1, 1))
         if self._splines is None:
             T[:, :3, :3] = Rotation.from_rotvec(self.rotations[0].copy()).as_matrix()
             T[:, :3, 3] = self.positions[0]
         else:
             position, rotation = self._splines
-            T[:, :3, :3] = rotation(own).as_matrix()
-            T[:, :3, 3] = position(own)
+            T[:, :3, :3] = rotation(clock).as_matrix()
+            T[:, :3, 3] = position(clock)
         return T.reshape(*t.shape, 4, 4)
 
     def to_json(self) -> dict[str, Any]:
@@ -126,7 +126,7 @@ class Path:
         rotations = RotationSpline(self.times, Rotation.from_rotvec(self.rotations.copy()))
         return CubicSpline(self.times, self.positions), rotations
 
-    def _own_clock(self, t: np.ndarray) -> np.ndarray:
+    def _knot_clock(self, t: np.ndarray) -> np.ndarray:
         """Times on the knots' clock: behind t by what was rested so far, with continuous jerk."""
         behind = np.zeros_like(t)
         rested = 0.0
@@ -276,6 +276,6 @@ def wandering_curve(rng: np.random.Generator, half: np.ndarray, sizes: float) ->
 def carried_frames(tangents: np.ndarray) -> np.ndarray:
     """Frames (N, 3, 3) whose third axes are the tangents (N, 3), carried from one to the next without twist."""
     tangents = tangents / np.linalg.norm(tangents, axis=1, keepdims=True)
-    least = np.eye(3)[np.argmin(np.abs(tangents[0]))]
-    x = carried_normals(tangents, np.cross(least, tangents[0]))
+    axis = np.eye(3)[np.argmin(np.abs(tangents[0]))]
+    x = carried_normals(tangents, np.cross(axis, tangents[0]))
     return np.stack([x, np.cross(tangents, x), tangents], axis=-1)

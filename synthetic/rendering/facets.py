@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sigmaslam.table import Table
+
 
 @dataclass(frozen=True, slots=True)
-class Facets:
+class Facets(Table):
     """F facets o + a e_u + b e_v with a, b in [0, 1], or with a, b >= 0 and a + b <= 1 for a triangle.
 
     Attributes:
@@ -30,30 +32,18 @@ class Facets:
     closed: np.ndarray
     surface: np.ndarray
 
-    def __len__(self) -> int:
-        return len(self.origin)
-
     def placed(self, T: np.ndarray) -> Facets:
         """The same facets after a rigid motion T (4, 4)."""
         R = T[:3, :3]
-        return Facets(
-            self.origin @ R.T + T[:3, 3],
-            self.edge_u @ R.T,
-            self.edge_v @ R.T,
-            self.triangle,
-            self.uv,
-            self.normals @ R.T,
-            self.closed,
-            self.surface,
-        )
+        origin = self.origin @ R.T + T[:3, 3]
+        edge_u, edge_v, normals = (vectors @ R.T for vectors in (self.edge_u, self.edge_v, self.normals))
+        return replace(self, origin=origin, edge_u=edge_u, edge_v=edge_v, normals=normals)
 
 
 def join(parts: Sequence[Facets]) -> Facets:
-    """All facets in one; surfaces keep apart."""
+    """All facets in one table; the numbers of the surfaces stay distinct."""
     first = np.cumsum([0, *(int(part.surface.max()) + 1 for part in parts)])
-    columns = {f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Facets)}
-    columns["surface"] = np.concatenate([part.surface + k for part, k in zip(parts, first[:-1], strict=True)])
-    return Facets(**columns)
+    return Facets.concatenate([replace(p, surface=p.surface + k) for p, k in zip(parts, first[:-1], strict=True)])
 
 
 def flat(corners: np.ndarray, *, closed: bool = False) -> Facets:
@@ -122,13 +112,18 @@ def grid(points: np.ndarray, uv: np.ndarray, *, wraps: bool = False, closed: boo
         wraps: whether the last column of vertices is the first one again.
         closed: whether only its front side is ever seen.
     """
-    m, n = points.shape[:2]
     across = np.gradient(points, axis=1)
     if wraps:
         across[:, [0, -1]] = ((points[:, 1] - points[:, -2]) / 2)[:, None]
     normal = np.cross(np.gradient(points, axis=0), across)
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    return grid_mesh(points, uv, normal, closed=closed)
+
+
+def grid_mesh(points: np.ndarray, uv: np.ndarray, normals: np.ndarray, *, closed: bool = False) -> Facets:
+    """As `mesh`, over a grid of vertices (m, n, 3), (m, n, 2), (m, n, 3); each cell becomes two triangles."""
+    m, n = points.shape[:2]
     index = np.arange(m * n).reshape(m, n)
     a, b, c, d = (x.ravel() for x in (index[:-1, :-1], index[1:, :-1], index[:-1, 1:], index[1:, 1:]))
     corners = np.concatenate([np.stack([a, b, c], axis=1), np.stack([d, c, b], axis=1)])
-    return mesh(points.reshape(-1, 3), uv.reshape(-1, 2), normal.reshape(-1, 3), corners, closed=closed)
+    return mesh(points.reshape(-1, 3), uv.reshape(-1, 2), normals.reshape(-1, 3), corners, closed=closed)

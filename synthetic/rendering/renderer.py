@@ -28,7 +28,7 @@ _SUN_DISTANCE = 40.0  # in radii; far enough to be parallel
 
 
 @dataclass(frozen=True, slots=True)
-class Views:
+class RenderedViews:
     """What V views with the same eye see.
 
     Attributes:
@@ -142,7 +142,7 @@ class Renderer:
         times: np.ndarray,
         T_world_lamp: np.ndarray | None = None,
         sunlight: Sight | None = None,
-    ) -> Views:
+    ) -> RenderedViews:
         """Draws V views.
 
         Args:
@@ -181,12 +181,14 @@ class Renderer:
         shadow = _steps(lit.reshape(shape))
         mixed = (outline | shadow).reshape(-1).nonzero().squeeze(1)
         if len(mixed):
-            known = torch.where(shadow.reshape(-1)[mixed], -1, lit[mixed].long())
-            image[mixed] = self._edge_radiance(sight, eye, mixed, view[mixed], known, sunlight, T_view_lamp)
+            was_lit = torch.where(shadow.reshape(-1)[mixed], -1, lit[mixed].long())
+            image[mixed] = self._edge_radiance(sight, eye, mixed, view[mixed], was_lit, sunlight, T_view_lamp)
         if not eye.ideal:
             image[~seen] = 0.0
         body = torch.where(facet >= 0, self.body[facet.clamp_min(0)], -1)
-        return Views(image.reshape(shape), depth.reshape(shape), facet.reshape(shape), body.reshape(shape), sight)
+        return RenderedViews(
+            image.reshape(shape), depth.reshape(shape), facet.reshape(shape), body.reshape(shape), sight
+        )
 
     def _edge_radiance(
         self,
@@ -222,9 +224,9 @@ class Renderer:
         samples: Samples,
         T_view_lamp: Tensor,
         taps: int,
-        known: Tensor | None = None,
+        was_lit: Tensor | None = None,
     ) -> _Light:
-        """Light of N rays, on the CPU in parts that fit its cache; where known (N,) is 0 or 1 it says who is lit."""
+        """Light of N rays, on the CPU in parts that fit its cache; was_lit (N,) is 0 or 1 where that is known."""
         count = len(samples.view)
         step = _CHUNK if self.device.type == "cpu" else max(count, 1)
         parts = []
@@ -232,9 +234,11 @@ class Renderer:
             part = samples.part(slice(start, start + step))
             hits, look = meet(sight, part), self._shader.look_up(part.facet)
             points = self._shader.points(look, hits)
-            lit = torch.ones_like(part.view, dtype=torch.bool) if known is None else known[start : start + step] != 0
+            lit = (
+                torch.ones_like(part.view, dtype=torch.bool) if was_lit is None else was_lit[start : start + step] != 0
+            )
             if sunlight is not None:
-                asked = None if known is None else (known[start : start + step] < 0).nonzero().squeeze(1)
+                asked = None if was_lit is None else (was_lit[start : start + step] < 0).nonzero().squeeze(1)
                 lit = self._lit(sunlight, part, points, lit, asked)
             radiance = self._shader.radiance(sight, part, look, hits, points, lit, T_view_lamp, taps)
             parts.append(_Light(radiance, hits.depth, lit))

@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter
 
 from sigmaslam.synthetic.geometry import arc_length, carried_normals
-from sigmaslam.synthetic.rendering.facets import Facets, flat, grid, join, mesh
+from sigmaslam.synthetic.rendering.facets import Facets, flat, grid, grid_mesh, join, mesh
 
 # Faces of one body begin this far apart in their texture, metres times the body's size: no two look alike.
 _FACE_STEP = np.array([1.37, 2.71])
@@ -104,9 +104,7 @@ class Cylinder:
         outward[:, :, :2] = ring[:, None]
         outward[:, :, 2] = (self.radius - top) / self.length
         outward /= np.linalg.norm(outward, axis=-1, keepdims=True)
-        a = 2 * np.arange(self.sides)
-        corners = np.concatenate([np.stack([a, a + 2, a + 1], axis=1), np.stack([a + 3, a + 1, a + 2], axis=1)])
-        parts = [mesh(points.reshape(-1, 3), uv.reshape(-1, 2), outward.reshape(-1, 3), corners, closed=True)]
+        parts = [grid_mesh(points, uv, outward, closed=True)]
         for z, radius, sign in ((-self.length / 2, self.radius, -1.0), (self.length / 2, top, 1.0)):
             if radius > 0:
                 rim = np.concatenate([radius * ring[:-1], np.full((self.sides, 1), z)], axis=1)
@@ -114,7 +112,9 @@ class Cylinder:
                 fan = fan.astype(np.int64) if sign > 0 else fan[:, ::-1].astype(np.int64)
                 normal = np.tile([0.0, 0.0, sign], (self.sides, 1))
                 parts.append(mesh(rim, rim[:, :2], normal, fan, closed=True))
-        return join(_apart(parts, max(self.radius, top)))
+        for k, part in enumerate(parts):
+            part.uv[:, 0] += k * max(self.radius, top) * _FACE_STEP
+        return join(parts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,12 +140,7 @@ class Ellipsoid:
         outward /= np.linalg.norm(outward, axis=-1, keepdims=True)
         # The texture wraps round; towards the poles it is squeezed, as on any globe.
         uv = np.stack([around * radii[:2].mean(), polar * radii.mean()], axis=-1)
-        rows, columns = polar.shape
-        index = np.arange(rows * columns).reshape(rows, columns)
-        a, b, c, d = (x.ravel() for x in (index[:-1, :-1], index[1:, :-1], index[:-1, 1:], index[1:, 1:]))
-        corners = np.concatenate([np.stack([a, b, c], axis=1), np.stack([d, c, b], axis=1)])
-        points = (direction * radii).reshape(-1, 3)
-        return mesh(points, uv.reshape(-1, 2), outward.reshape(-1, 3), corners, closed=True)
+        return grid_mesh(direction * radii, uv, outward, closed=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,7 +223,9 @@ class Tube:
         s = np.linspace(0.0, arc[-1], self.rings + 1)
         centre, tangent = curve(s), curve(s, 1)
         tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-        side, up = transported_frame(tangent)
+        # Two unit vectors across the axis that turn as little as possible along it.
+        side = carried_normals(tangent, np.eye(3)[int(np.argmin(np.abs(tangent[0])))])
+        up = np.cross(tangent, side)
         angle = 2 * np.pi * np.arange(self.sides + 1) / self.sides
         rng = np.random.default_rng((self.seed, 7))
         noise = _smooth_noise((self.rings + 1, self.sides), self.sides / 5.0, self.seed)
@@ -239,8 +236,8 @@ class Tube:
         fold = np.exp(3.0 * (np.cos(phase) - 1.0)) * (0.6 + 0.4 * np.cos(3 * angle + rng.uniform(0, 2 * np.pi)))
         radius = self.radius - self.folds * fold + self.bumps * noise
         # The far end is rounded off to a cap.
-        left = np.clip((arc[-1] - s) / (1.5 * self.radius), 0.0, 1.0)
-        radius = radius * np.sqrt(np.maximum(1.0 - (1.0 - left) ** 2, 1e-6))[:, None]
+        to_end = np.clip((arc[-1] - s) / (1.5 * self.radius), 0.0, 1.0)
+        radius = radius * np.sqrt(np.maximum(1.0 - (1.0 - to_end) ** 2, 1e-6))[:, None]
         ring = np.cos(angle)[None, :, None] * side[:, None] + np.sin(angle)[None, :, None] * up[:, None]
         points = centre[:, None] + radius[..., None] * ring
         uv = np.stack(np.broadcast_arrays(s[:, None], self.radius * angle[None]), axis=-1)
@@ -248,24 +245,8 @@ class Tube:
         return grid(points, uv, wraps=True, closed=True)
 
 
-def transported_frame(tangent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors across a curve that turn as little as possible along it, each (n, 3).
-
-    Args:
-        tangent: (n, 3) unit tangents.
-    """
-    side = carried_normals(tangent, np.eye(3)[int(np.argmin(np.abs(tangent[0])))])
-    return side, np.cross(tangent, side)
-
-
 Shape = Panel | Box | Cylinder | Ellipsoid | Terrain | Sheet | Tube
 SHAPES: tuple[type[Shape], ...] = (Panel, Box, Cylinder, Ellipsoid, Terrain, Sheet, Tube)
-
-
-def _apart(parts: list[Facets], size: float) -> list[Facets]:
-    for k, part in enumerate(parts):
-        part.uv[:, 0] += k * size * _FACE_STEP
-    return parts
 
 
 def _smooth_noise(shape: tuple[int, int], length: float, seed: int) -> np.ndarray:

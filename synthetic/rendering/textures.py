@@ -64,7 +64,7 @@ def dead_leaves(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
         (H, W) uint8.
     """
     area = shape[0] * shape[1]
-    palette = _Palette(shape, rng)
+    palette = _LeafPatterns(shape, rng)
     canvas = palette.fill(shape, rng)
     largest = max(0.35 * min(shape), _SMALLEST_LEAF + 1.0)
     radii = leaf_radii(rng, int(rng.integers(200, 900)), rng.uniform(1.1, 2.6), _SMALLEST_LEAF, largest)
@@ -110,7 +110,7 @@ def leaf_outline(radius: float, rng: np.random.Generator) -> np.ndarray:
     return (corners * cmath.rect(1.0, 2 * np.pi * turn)).view(np.float64).reshape(-1, 2)
 
 
-class _Palette:
+class _LeafPatterns:
     """The fills and greys of one image: each image favours others, as a photograph does."""
 
     def __init__(self, shape: tuple[int, int], rng: np.random.Generator) -> None:
@@ -142,7 +142,7 @@ class _Palette:
         return FILLS[self._names[number]](shape, rng)
 
 
-def _draw_leaf(canvas: np.ndarray, radius: float, palette: _Palette, rng: np.random.Generator) -> None:
+def _draw_leaf(canvas: np.ndarray, radius: float, palette: _LeafPatterns, rng: np.random.Generator) -> None:
     """Draws one leaf of a random shape at a random place into the canvas."""
     height, width = canvas.shape
     u, v, style, shaded, blurred, lit, slope_u, slope_v = rng.random(8).tolist()

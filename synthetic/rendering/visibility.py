@@ -26,7 +26,7 @@ _NEARER = 1e-5  # relative; what is nearer by less does not hide
 _FAR_NEARER = 0.02
 _FINER = 1.4  # the grid of a distorted camera than its pixels, for outlines lie between its places
 _WIDEST_SLOPE = 4.0  # tangent of the widest ray that is drawn
-_FEWEST = 1e-12
+_MIN_INVERSE_DEPTH = 1e-12
 # Places of the grid around a ray, from the corner of its cell: the cell's own four, and the ring around them.
 _NEXT = ((0, 0), (1, 0), (0, 1), (1, 1))
 _RING = tuple((du, dv) for dv in range(-1, 3) for du in range(-1, 3) if (du, dv) not in _NEXT)
@@ -150,11 +150,11 @@ class Sight:
         )
         # One product for what stands still, which is most, and one for each that moves.
         for k in range(self.T_view_mover.shape[1]):
-            own = (self.surfaces.mover == k).nonzero().squeeze(1)
+            target = (self.surfaces.mover == k).nonzero().squeeze(1)
             T = self.T_view_mover[:, k]
-            turned = vectors[:, own].unsqueeze(1) @ T[:, :3, :3].transpose(1, 2)
+            turned = vectors[:, target].unsqueeze(1) @ T[:, :3, :3].transpose(1, 2)
             turned[0] += T[:, None, :3, 3]
-            result[:, :, own] = turned
+            result[:, :, target] = turned
         return result[0], result[1], result[2]
 
     @cached_property
@@ -201,36 +201,38 @@ class Sight:
         a, b, w = values
         low = -_INSIDE_TOLERANCE * w
         beyond = torch.where(self.surfaces.triangle.index_select(0, facet), a + b, torch.maximum(a, b))
-        return (w > _FEWEST) & (torch.minimum(a, b) >= low) & (beyond <= w - 2 * low)
+        return (w > _MIN_INVERSE_DEPTH) & (torch.minimum(a, b) >= low) & (beyond <= w - 2 * low)
 
     def resolve(self, view: Tensor, places: Tensor) -> Tensor:
         """The facet seen at places (2, N) of views (N,), -1 for none; exact where the grid around shows it."""
         around = self._around(view, places, _NEXT)
         facet = around[0].clone()
         mixed = (around != around[0]).any(dim=0).nonzero().squeeze(1)
-        found, best = self._nearest_met(view[mixed], around[:, mixed], places[:, mixed])
-        facet[mixed] = found
+        nearest, best = self._nearest_met(view[mixed], around[:, mixed], places[:, mixed])
+        facet[mixed] = nearest
         # Facets smaller than the grid: the next ring may have it. The open sky meets nothing.
         lost = ((best == 0) & (around[:, mixed] >= 0).any(dim=0)).nonzero().squeeze(1)
-        rest = mixed[lost]
-        wider = self._around(view[rest], places[:, rest], _RING)
-        found, best = self._nearest_met(view[rest], wider, places[:, rest])
-        sky = (around[:, rest] < 0).any(dim=0)
-        facet[rest] = torch.where((best > 0) | sky, found, self._closest(view[rest], places[:, rest]))
+        unresolved = mixed[lost]
+        wider = self._around(view[unresolved], places[:, unresolved], _RING)
+        nearest, best = self._nearest_met(view[unresolved], wider, places[:, unresolved])
+        sky = (around[:, unresolved] < 0).any(dim=0)
+        facet[unresolved] = torch.where(
+            (best > 0) | sky, nearest, self._closest(view[unresolved], places[:, unresolved])
+        )
         return facet
 
-    def hidden(self, view: Tensor, places: Tensor, inverse_depth: Tensor, own: Tensor) -> Tensor:
-        """Whether another facet than `own` (N,) is nearer than 1 / inverse_depth at places (2, N), (N,) bool."""
+    def hidden(self, view: Tensor, places: Tensor, inverse_depth: Tensor, target: Tensor) -> Tensor:
+        """Whether another facet than `target` (N,) is nearer than 1 / inverse_depth at places (2, N), (N,) bool."""
         around = self._around(view, places, _NEXT)
-        result = torch.zeros_like(own, dtype=torch.bool)
+        result = torch.zeros_like(target, dtype=torch.bool)
         uniform = (around == around[0]).all(dim=0)
         for kind, count in ((uniform, 1), (~uniform, 4)):
             candidates = around[:count]
-            foreign = ((candidates != own) & (candidates >= 0)).any(dim=0)
+            foreign = ((candidates != target) & (candidates >= 0)).any(dim=0)
             index = (kind & foreign).nonzero().squeeze(1)
             candidates, limit = candidates[:, index], inverse_depth[index]
             w, hit = self._try(view[index], candidates, places[:, index])
-            met = hit & (w > (1 + _NEARER) * limit) & (candidates != own[index])
+            met = hit & (w > (1 + _NEARER) * limit) & (candidates != target[index])
             # Facets smaller than the grid may lie between its places: then all planes around are nearer by far.
             behind = ((w > (1 + _FAR_NEARER) * limit) & (candidates >= 0)).all(dim=0)
             result[index] = met.any(dim=0) | behind

@@ -9,19 +9,11 @@ from scipy.interpolate import CubicSpline
 
 from sigmaslam.synthetic.geometry import arc_length
 from sigmaslam.synthetic.motion.paths import Path
-from sigmaslam.synthetic.motion.trajectories import insertion
+from sigmaslam.synthetic.motion.random_motions import insertion
 from sigmaslam.synthetic.rendering.shapes import Tube
 from sigmaslam.synthetic.scene import Body, Material, Scene
+from sigmaslam.synthetic.worlds import tissue
 from sigmaslam.synthetic.worlds.episode import Episode, Wish
-from sigmaslam.synthetic.worlds.tissue import (
-    NEAR,
-    carried,
-    endoscope_light,
-    instrument,
-    moved,
-    reaching,
-    wet,
-)
 
 CLEARANCE = 0.004
 """Metres between the endoscope and the wall, at least."""
@@ -34,10 +26,6 @@ def generate(rng: np.random.Generator, wish: Wish) -> Episode:
     """A colon of 20-40 mm radius with haustral folds; what is seen is mostly 15-150 mm away.
 
     A tool is in view in two of five worlds, and always where `wish.movers` is not 0; its bodies are all that moves.
-
-    Args:
-        rng: source of all randomness.
-        wish: what is asked for.
     """
     radius = float(rng.uniform(0.02, 0.036))
     folds, bumps = float(rng.uniform(0.25, 0.4)) * radius, float(rng.uniform(0.02, 0.045)) * radius
@@ -54,16 +42,16 @@ def generate(rng: np.random.Generator, wish: Wish) -> Episode:
     )
     # Textures are mirrored: an even number of them round the tube leaves no seam.
     coarse, fine = np.pi * radius / rng.integers((1, 2), (3, 5))
-    materials = [wet(rng, wish, (float(coarse), float(fine)))]
+    materials = [tissue.wet(rng, wish, (float(coarse), float(fine)))]
     bodies = [Body(tube, 0)]
-    path = moved(rng, wish, lambda seconds: _insertion(rng, seconds, centreline, tube), turn=(0.15, 0.15, 0.4))
+    path = tissue.moved(rng, wish, lambda seconds: _insertion(rng, seconds, centreline, tube), turn=(0.15, 0.15, 0.4))
     if wish.movers > 0 or rng.random() < 0.4:
-        own_bodies, own_materials = _tool(rng, wish, path, radius)
-        bodies += own_bodies
-        materials += own_materials
+        tool_bodies, tool_materials = _tool(rng, wish, path, radius)
+        bodies += tool_bodies
+        materials += tool_materials
     # In a tube much light is scattered from wall to wall.
-    lights = replace(endoscope_light(rng, 1.5 * radius), ambient=float(rng.uniform(0.1, 0.3)))
-    return Episode(Scene(tuple(bodies), tuple(materials), lights, 0.0, NEAR), path)
+    lights = replace(tissue.endoscope_light(rng, 1.5 * radius), ambient=float(rng.uniform(0.1, 0.3)))
+    return Episode(Scene(tuple(bodies), tuple(materials), lights, 0.0, tissue.NEAR), path)
 
 
 def _centreline(rng: np.random.Generator, length: float, radius: float) -> np.ndarray:
@@ -88,6 +76,8 @@ def _tool(rng: np.random.Generator, wish: Wish, path: Path, radius: float) -> tu
     around = rng.uniform(0, 2 * np.pi)
     port = 0.45 * radius * np.array([np.cos(around), np.sin(around), 0.0])
     target = 0.3 * port + np.array([0.0, 0.0, distance])
-    motion = carried(path, reaching(rng, wish.duration, port, target, 0.3 * distance, 0.0005), wish.duration)
+    motion = tissue.carried(
+        path, tissue.reaching(rng, wish.duration, port, target, 0.3 * distance, 0.0005), wish.duration
+    )
     share = wish.movers or float(rng.uniform(0.03, 0.12))
-    return instrument(rng, wish, motion, path, (0.03 * radius, 0.22 * radius), share, 1, rich=False)
+    return tissue.instrument(rng, wish, motion, path, (0.03 * radius, 0.22 * radius), share, 1, rich=False)

@@ -8,7 +8,7 @@ from pathlib import Path as FilePath
 import numpy as np
 
 from sigmaslam.synthetic.motion.paths import Path
-from sigmaslam.synthetic.scene import Scene, Texture
+from sigmaslam.synthetic.scene import Lights, Scene, Texture
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,3 +47,11 @@ class Wish:
     def texture(self, rng: np.random.Generator, kind: str, tile: float, contrast: float = 1.0) -> Texture:
         """A texture of that kind out of the bank."""
         return Texture(kind, self.first_texture + int(rng.integers(self.textures)), tile, contrast)
+
+
+def daylight(rng: np.random.Generator, lowest: float, sun: tuple[float, float]) -> Lights:
+    """The sun from anywhere between `lowest` and 70 degrees above the horizon, of a strength in that range."""
+    elevation, azimuth = np.deg2rad(rng.uniform(lowest, 70)), rng.uniform(0, 2 * np.pi)
+    x, y = np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation)
+    direction = float(x), float(y), float(np.sin(elevation))
+    return Lights(ambient=float(rng.uniform(0.2, 0.4)), sun=float(rng.uniform(*sun)), sun_direction=direction)

@@ -8,14 +8,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sigmaslam.synthetic.geometry import rigid_motion
-from sigmaslam.synthetic.motion import trajectories
+from sigmaslam.synthetic.motion import random_motions
 from sigmaslam.synthetic.motion.paths import Path, at_rest, with_stops
 from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel
-from sigmaslam.synthetic.scene import Body, Lights, Scene
-from sigmaslam.synthetic.worlds.episode import Episode, Wish
-from sigmaslam.synthetic.worlds.movers import Model, Part, bounds, centred, follow, stand
+from sigmaslam.synthetic.scene import Body, Scene
+from sigmaslam.synthetic.worlds.episode import Episode, Wish, daylight
+from sigmaslam.synthetic.worlds.palette import Palette
+from sigmaslam.synthetic.worlds.part_models import Model, Part, bounds, centred, follow, stand
 from sigmaslam.synthetic.worlds.street_furniture import person
-from sigmaslam.synthetic.worlds.street_palette import Palette
 
 _CLEARANCE = 0.7
 """Metres around the camera's way that stay free."""
@@ -25,12 +25,7 @@ _TEXTURES = {"leaves": 2, "plaster": 1, "bricks": 2, "glyphs": 1, "wood": 1, "no
 
 
 def generate(rng: np.random.Generator, wish: Wish) -> Episode:
-    """A hall of 12-30 m full of machines, shelves, pipes and crates, or a yard; a drone flies through what is free.
-
-    Args:
-        rng: source of all randomness.
-        wish: what is asked for.
-    """
+    """A hall of 12-30 m full of machines, shelves, pipes and crates, or a yard; a drone flies through what is free."""
     outdoors = bool(rng.random() < 0.25)
     size = np.array([rng.uniform(12, 30), rng.uniform(12, 22), rng.uniform(5.5, 9.0)])
     clearance = _CLEARANCE + _FREE_FOR_MOVERS * (wish.movers > 0)
@@ -42,13 +37,7 @@ def generate(rng: np.random.Generator, wish: Wish) -> Episode:
         makers = (hall.load, hall.flying_machine, hall.crates)
         models = [makers[int(rng.integers(3))]() for _ in range(1 + int(rng.random() < 0.6) + int(wish.movers > 0.2))]
         bodies += follow(rng, path, wish.duration, wish.movers, [centred(m) for m in models], (0.6, 1.4))
-    elevation, azimuth = np.deg2rad(rng.uniform(25, 70)), rng.uniform(0, 2 * np.pi)
-    sun = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
-    lights = Lights(
-        ambient=float(rng.uniform(0.2, 0.4)),
-        sun=float(rng.uniform(0.6, 1.2)),
-        sun_direction=(float(sun[0]), float(sun[1]), float(sun[2])),
-    )
+    lights = daylight(rng, 25, (0.6, 1.2))
     return Episode(Scene(tuple(bodies), tuple(hall.palette.materials), lights, sky=float(rng.uniform(0.8, 2.2))), path)
 
 
@@ -342,18 +331,18 @@ def _flight(rng: np.random.Generator, wish: Wish, size: np.ndarray, clearance: f
     low, high = 0.35 + clearance, size[2] - 1.2 - clearance
     middle = rng.uniform(-1, 1, 2) * (size[:2] / 2 - clearance - 0.9 - half)
     centre = (float(middle[0]), float(middle[1]), float(0.5 * (low + high)))
-    box = trajectories.Box(centre, (float(half[0]), float(half[1]), float(0.5 * (high - low))))
+    box = random_motions.FreeSpace(centre, (float(half[0]), float(half[1]), float(0.5 * (high - low))))
     if wish.motion == "rest":
-        pose = trajectories.drone(rng, 4.0, box).poses(2.0)
+        pose = random_motions.drone(rng, 4.0, box).poses(2.0)
         return at_rest(pose, wish.duration)
     if wish.motion == "rotation":
-        return trajectories.pure_rotation(rng, wish.duration, centre)
+        return random_motions.pure_rotation(rng, wish.duration, centre)
     if wish.motion == "loop":
-        return trajectories.closed_loop(rng, wish.duration, box)
+        return random_motions.closed_loop(rng, wish.duration, box)
     if wish.motion == "stops":
         ease = min(1.5, wish.duration / 6)
-        return with_stops(trajectories.drone(rng, max(wish.duration - 1.0 - ease, 3 * ease), box), rng, 1, ease)
-    return trajectories.drone(rng, wish.duration, box)
+        return with_stops(random_motions.drone(rng, max(wish.duration - 1.0 - ease, 3 * ease), box), rng, 1, ease)
+    return random_motions.drone(rng, wish.duration, box)
 
 
 def _pose(place: np.ndarray, yaw: float) -> np.ndarray:

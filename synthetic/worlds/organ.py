@@ -6,21 +6,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sigmaslam.synthetic.motion.paths import Path
-from sigmaslam.synthetic.motion.trajectories import inspect
+from sigmaslam.synthetic.motion.random_motions import inspect
 from sigmaslam.synthetic.rendering.shapes import Sheet
 from sigmaslam.synthetic.scene import Body, Material, Scene
+from sigmaslam.synthetic.worlds import tissue
 from sigmaslam.synthetic.worlds.episode import Episode, Wish
-from sigmaslam.synthetic.worlds.tissue import (
-    NEAR,
-    carried,
-    endoscope_light,
-    instrument,
-    lump,
-    mounted,
-    moved,
-    reaching,
-    wet,
-)
 
 _SIDE = 0.6  # metres of the sheet of tissue
 
@@ -29,16 +19,14 @@ def generate(rng: np.random.Generator, wish: Wish) -> Episode:
     """A bumpy sheet of tissue with organs and fat on it, 50-150 mm below a slanted laparoscope.
 
     A tool is in view in two of five worlds, and always where `wish.movers` is not 0; its bodies are all that moves.
-
-    Args:
-        rng: source of all randomness.
-        wish: what is asked for.
     """
     height = float(rng.uniform(0.075, 0.115))
     highest = 0.35 * height  # of anything: the camera comes down to 0.75 of its height
     bumps = float(rng.uniform(0.06, 0.11)) * height
     sheet = Sheet((_SIDE, _SIDE), bumps, float(rng.uniform(0.04, 0.08)), int(rng.integers(2**31)), 72)
-    materials = [wet(rng, wish, (float(rng.uniform(0.05, 0.11)), float(rng.uniform(0.03, 0.1)))) for _ in range(3)]
+    materials = [
+        tissue.wet(rng, wish, (float(rng.uniform(0.05, 0.11)), float(rng.uniform(0.03, 0.1)))) for _ in range(3)
+    ]
     fat = wish.texture(rng, "noise", 0.04, 0.6), wish.texture(rng, "cells", 0.05, float(rng.uniform(0.1, 0.4)))
     materials.append(Material(0.65, fat, specular=1.5, gloss=150.0, bump=2.0))
     bodies = [Body(sheet, 0)]
@@ -49,7 +37,7 @@ def generate(rng: np.random.Generator, wish: Wish) -> Episode:
         ground = surface[int(np.argmin(((surface[:, :2] - place) ** 2).sum(axis=1))), 2]
         along, across, up = (float(r) for r in radii)
         z = min(highest - up, float(ground + rng.uniform(-0.6, -0.1) * up))
-        bodies.append(lump(rng, (along, across, up), (float(place[0]), float(place[1]), z), material, rings))
+        bodies.append(tissue.lump(rng, (along, across, up), (float(place[0]), float(place[1]), z), material, rings))
 
     for _ in range(int(rng.integers(4, 9))):  # organs
         radii = rng.uniform((0.03, 0.02, 0.6 * highest), (0.09, 0.06, 1.4 * highest))
@@ -61,12 +49,16 @@ def generate(rng: np.random.Generator, wish: Wish) -> Episode:
             lay(radii, middle + rng.normal(0, 0.014, 2), 3, 8)
     tilt = np.eye(4)
     tilt[:3, :3] = Rotation.from_euler("x", rng.uniform(0.0, 0.3)).as_matrix()
-    path = moved(rng, wish, lambda seconds: mounted(inspect(rng, seconds, height, 0.5 * height), tilt), (0.1, 0.1, 0.3))
+
+    def look(seconds: float) -> Path:
+        return tissue.mounted(inspect(rng, seconds, height, 0.5 * height), tilt)
+
+    path = tissue.moved(rng, wish, look, (0.1, 0.1, 0.3))
     if wish.movers > 0 or rng.random() < 0.4:
-        own_bodies, own_materials = _tool(rng, wish, path, height, len(materials))
-        bodies += own_bodies
-        materials += own_materials
-    return Episode(Scene(tuple(bodies), tuple(materials), endoscope_light(rng, height), 0.0, NEAR), path)
+        tool_bodies, tool_materials = _tool(rng, wish, path, height, len(materials))
+        bodies += tool_bodies
+        materials += tool_materials
+    return Episode(Scene(tuple(bodies), tuple(materials), tissue.endoscope_light(rng, height), 0.0, tissue.NEAR), path)
 
 
 def _tool(
@@ -77,6 +69,8 @@ def _tool(
     around = rng.uniform(0, 2 * np.pi)
     port = 0.7 * height * np.array([np.cos(around), np.sin(around), 0.25])
     target = np.array([0.0, 0.0, distance]) + 0.1 * port
-    motion = carried(path, reaching(rng, wish.duration, port, target, 0.3 * distance, 0.004), wish.duration)
+    motion = tissue.carried(
+        path, tissue.reaching(rng, wish.duration, port, target, 0.3 * distance, 0.004), wish.duration
+    )
     share = wish.movers or float(rng.uniform(0.03, 0.1))
-    return instrument(rng, wish, motion, path, (0.02 * height, 0.25 * height), share, first, rich=False)
+    return tissue.instrument(rng, wish, motion, path, (0.02 * height, 0.25 * height), share, first, rich=False)

@@ -8,12 +8,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sigmaslam.synthetic.motion.paths import Path, at_rest, with_stops
-from sigmaslam.synthetic.motion.trajectories import Box as FreeSpace
-from sigmaslam.synthetic.motion.trajectories import closed_loop, hand_held, pure_rotation
+from sigmaslam.synthetic.motion.random_motions import FreeSpace, closed_loop, hand_held, pure_rotation
 from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel, Shape
 from sigmaslam.synthetic.scene import Body, Lights, Material, Scene, Texture
 from sigmaslam.synthetic.worlds.episode import Episode, Wish
-from sigmaslam.synthetic.worlds.movers import Model, Part, follow
+from sigmaslam.synthetic.worlds.part_models import Model, Part, follow
 
 CLEARANCE = 0.3
 """Metres between the camera and any surface, at least."""
@@ -36,10 +35,6 @@ def generate(rng: np.random.Generator, wish: Wish) -> Episode:
     """A room of 4-9 m with furniture along its walls and low things in its middle; a walk with a hand-held camera.
 
     The camera keeps `CLEARANCE` from everything that does not move.
-
-    Args:
-        rng: source of all randomness.
-        wish: what is asked for.
     """
     size = np.array([rng.uniform(4.0, 9.0), rng.uniform(4.0, 7.0), rng.uniform(2.4, 3.2)])
     # Where the camera may be: in the middle of the room, off the furniture along the walls.
@@ -376,8 +371,8 @@ def _fill_middle(f: _Furniture, size: np.ndarray, free: FreeSpace) -> None:
     for _ in range(60):
         tall, radius = rng.random() < 0.35, rng.uniform(0.25, 0.85)
         place = rng.uniform(-1, 1, 2) * (reach - radius)
-        apart = np.linalg.norm(np.maximum(np.abs(place - centre[:2]) - half[:2], 0.0))
-        if tall and apart < radius + CLEARANCE + 0.15:  # room for the right camera too
+        distance = np.linalg.norm(np.maximum(np.abs(place - centre[:2]) - half[:2], 0.0))
+        if tall and distance < radius + CLEARANCE + 0.15:  # room for the right camera too
             continue
         crowded = len(taken) > 2 + size[0] * size[1] / 5
         if crowded or any(np.linalg.norm(place - other) < radius + r for other, r in taken):

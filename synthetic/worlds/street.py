@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from sigmaslam.synthetic.motion import trajectories
+from sigmaslam.synthetic.motion import random_motions
 from sigmaslam.synthetic.motion.paths import Path, at_rest, with_stops
-from sigmaslam.synthetic.scene import Lights, Scene
-from sigmaslam.synthetic.worlds.episode import Episode, Wish
+from sigmaslam.synthetic.scene import Scene
+from sigmaslam.synthetic.worlds.episode import Episode, Wish, daylight
+from sigmaslam.synthetic.worlds.palette import Palette
 from sigmaslam.synthetic.worlds.street_layout import Street
-from sigmaslam.synthetic.worlds.street_palette import Palette
 from sigmaslam.synthetic.worlds.street_road import CAMERA_HEIGHT, Road
 from sigmaslam.synthetic.worlds.street_traffic import add_traffic
 
@@ -22,12 +22,7 @@ _TEXTURES = {"facade": 3, "leaves": 2, "asphalt": 1, "grass": 1, "bricks": 2, "c
 
 
 def generate(rng: np.random.Generator, wish: Wish) -> Episode:
-    """A street with houses, trees and cars along a drive; the camera is 1.65 m above the ground.
-
-    Args:
-        rng: source of all randomness.
-        wish: what is asked for.
-    """
+    """A street with houses, trees and cars along a drive; the camera is 1.65 m above the ground."""
     path, way = _drive(rng, wish)
     opposite = float(rng.uniform(3.1, 3.6)) if rng.random() < 0.75 or wish.movers > 0 else 0.0
     road = Road(rng, way, wish.motion == "loop", opposite)
@@ -38,11 +33,7 @@ def generate(rng: np.random.Generator, wish: Wish) -> Episode:
         street.clear(path.positions[0, :2], 7.0)  # what moves with the view goes round
     street.build()
     bodies = street.bodies + add_traffic(rng, wish, path, road, palette)
-    elevation, azimuth = np.deg2rad(rng.uniform(20, 70)), rng.uniform(0, 2 * np.pi)
-    sun = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
-    lights = Lights(
-        ambient=float(rng.uniform(0.2, 0.4)), sun=float(rng.uniform(0.7, 1.3)), sun_direction=tuple(sun.tolist())
-    )
+    lights = daylight(rng, 20, (0.7, 1.3))
     scene = Scene(tuple(bodies), tuple(palette.materials), lights, sky=float(rng.uniform(0.8, 2.2)))
     return Episode(scene, path)
 
@@ -57,19 +48,21 @@ def _drive(rng: np.random.Generator, wish: Wish) -> tuple[Path, np.ndarray]:
         duration -= 0.5 * ease + 1.0
     if wish.motion == "loop":
         size = max(8.0 * duration / 5.4, 20.0)
-        box = trajectories.Box((0.0, 0.0, CAMERA_HEIGHT), (size * rng.uniform(0.8, 1.0), size * 0.9, 0.01 * size))
-        path = trajectories.closed_loop(rng, duration, box)
+        box = random_motions.FreeSpace(
+            (0.0, 0.0, CAMERA_HEIGHT), (size * rng.uniform(0.8, 1.0), size * 0.9, 0.01 * size)
+        )
+        path = random_motions.closed_loop(rng, duration, box)
     elif wish.profile is not None:
-        path = trajectories.drive_profile(wish.profile, duration, rng)
+        path = random_motions.drive_profile(wish.profile, duration, rng)
     else:
-        path = trajectories.drive(rng, duration)
+        path = random_motions.drive(rng, duration)
     times = np.linspace(0.0, path.end, max(20, int(path.end / 0.05)))
     way = path.poses(times)[:, :3, 3]
     if stay:
         pose = path.poses(0.5 * path.end)
         x, y, z = pose[:3, 3].tolist()
         still = wish.motion == "rest"
-        path = at_rest(pose, wish.duration) if still else trajectories.pure_rotation(rng, wish.duration, (x, y, z))
+        path = at_rest(pose, wish.duration) if still else random_motions.pure_rotation(rng, wish.duration, (x, y, z))
     elif wish.motion == "stops" and not path.stops:
         path = with_stops(path, rng, stops, ease)
     return path, way

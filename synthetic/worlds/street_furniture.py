@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel
-from sigmaslam.synthetic.worlds.movers import Model, Part
-from sigmaslam.synthetic.worlds.street_palette import Palette
+from sigmaslam.synthetic.worlds.palette import Palette
+from sigmaslam.synthetic.worlds.part_models import Model, Part
 
 _ACROSS = (float(np.pi / 2), 0.0, 0.0)  # turns a cylinder's axis from z to y
 # These turn a panel upright, its width level.

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Panel
-from sigmaslam.synthetic.worlds.movers import Model, Part
-from sigmaslam.synthetic.worlds.street_palette import Palette
+from sigmaslam.synthetic.worlds.palette import Palette
+from sigmaslam.synthetic.worlds.part_models import Model, Part
 
 _BURIED = 2.5  # metres that a house reaches into the ground, for slopes
 _FACING_STREET = (float(np.pi / 2), 0.0, 0.0)

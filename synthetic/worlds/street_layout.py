@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from sigmaslam.synthetic.geometry import rigid_motion
 from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel
 from sigmaslam.synthetic.scene import Body
-from sigmaslam.synthetic.worlds.movers import Model, stand
+from sigmaslam.synthetic.worlds.palette import Palette
+from sigmaslam.synthetic.worlds.part_models import Model, stand
 from sigmaslam.synthetic.worlds.street_furniture import (
     bush,
     car,
@@ -24,7 +25,6 @@ from sigmaslam.synthetic.worlds.street_furniture import (
     van,
 )
 from sigmaslam.synthetic.worlds.street_houses import house, wall
-from sigmaslam.synthetic.worlds.street_palette import Palette
 from sigmaslam.synthetic.worlds.street_road import Road, footprint
 
 _HALF_LANE = 1.9  # metres from the middle of a lane to its edge
@@ -264,15 +264,7 @@ class Street:
                 self._put(Ellipsoid(radii, 6), palette.choose("land"), _upright(place, z - 1, rng))
 
     def _stand(
-        self,
-        model: Model,
-        s: float,
-        left: float,
-        long: float,
-        wide: float,
-        *,
-        turn: float = 0.0,
-        above: float = 0.0,
+        self, model: Model, s: float, left: float, long: float, wide: float, *, turn: float = 0.0, above: float = 0.0
     ) -> None:
         """Puts a model beside the road unless its place is taken or in a lane."""
         place, heading = self._road.at(s, left)

@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 from sigmaslam.synthetic.motion.paths import Path, noise
 from sigmaslam.synthetic.scene import Body
 from sigmaslam.synthetic.worlds.episode import Wish
-from sigmaslam.synthetic.worlds.movers import Model, bisect, covered_share, knot_times, ride
+from sigmaslam.synthetic.worlds.palette import Palette
+from sigmaslam.synthetic.worlds.part_models import Model, bisect, covered_share, knot_times, ride
 from sigmaslam.synthetic.worlds.street_furniture import car, person, truck, van
-from sigmaslam.synthetic.worlds.street_palette import Palette
 from sigmaslam.synthetic.worlds.street_road import Road
 
 _SMALL = 0.12  # share up to which cars come and go besides
@@ -37,10 +37,10 @@ def add_traffic(rng: np.random.Generator, wish: Wish, path: Path, road: Road, pa
     s = road.arc_of(camera[:, :3, 3])
     chosen = np.unique(np.linspace(0, len(times) - 1, 8).astype(int))
     bodies: list[Body] = []
-    left_over = wish.movers
+    remaining_share = wish.movers
     if wish.movers < _SMALL and road.opposite and wish.motion != "loop":
         coming = [_oncoming(rng, times, s, road, palette) for _ in range(1 + int(wish.duration / 8))]
-        left_over -= float(covered_share([(m, T[chosen]) for m, T in coming], camera[chosen]).mean())
+        remaining_share -= float(covered_share([(m, T[chosen]) for m, T in coming], camera[chosen]).mean())
         bodies += [body for model, T in coming for body in ride(model, times, T)]
     makers = [truck] if wish.movers > 0.16 else [van] if wish.movers > 0.07 else [car]
     if wish.motion != "loop" and (wish.movers > 0.25 or (wish.movers > 0.1 and rng.random() < 0.5)):
@@ -59,7 +59,7 @@ def add_traffic(rng: np.random.Generator, wish: Wish, path: Path, road: Road, pa
 
     def error(gap: float) -> float:
         chosen_poses = [(model, T[chosen]) for model, T in placed(gap)]
-        return float(covered_share(chosen_poses, camera[chosen]).mean()) - max(left_over, 0.2 * wish.movers)
+        return float(covered_share(chosen_poses, camera[chosen]).mean()) - max(remaining_share, 0.2 * wish.movers)
 
     gap = bisect(error, 2.0, 60.0)
     return bodies + [body for model, T in placed(gap) for body in ride(model, times, T)]

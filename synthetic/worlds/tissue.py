@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 from sigmaslam.geometry.se3 import rotation_exp
 from sigmaslam.synthetic.geometry import rigid_motion
 from sigmaslam.synthetic.motion.paths import Path, at_rest, noise, with_stops
-from sigmaslam.synthetic.motion.trajectories import tool as tool_motion
+from sigmaslam.synthetic.motion.random_motions import tool as tool_motion
 from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid
 from sigmaslam.synthetic.scene import Body, Lights, Material, Texture
 from sigmaslam.synthetic.worlds.episode import Wish
-from sigmaslam.synthetic.worlds.movers import Model, Part, bisect, covered_share, scaled
+from sigmaslam.synthetic.worlds.part_models import Model, Part, bisect, covered_share, scaled
 
 NEAR = 0.002
 """Nearest distance drawn in surgical worlds, metres."""
@@ -204,11 +204,11 @@ def instrument(
         result[:, :3, 3] *= 30.0
         return result
 
-    own, eye = large(path.poses(times)), large(camera.poses(times))
+    tool_poses, eye = large(path.poses(times)), large(camera.poses(times))
 
     def error(radius: float) -> float:
         model = scaled(_instrument(np.random.default_rng(seed), radius, first_material, rich), 30.0)
-        return float(covered_share([(model, own)], eye).mean()) - share
+        return float(covered_share([(model, tool_poses)], eye).mean()) - share
 
     radius = bisect(error, *radii, steps=5)
     model = _instrument(np.random.default_rng(seed), radius, first_material, rich)

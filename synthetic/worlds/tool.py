@@ -18,10 +18,6 @@ def generate(rng: np.random.Generator, wish: Wish) -> Episode:
 
     `wish.motion` and `wish.movers` are the instrument's. Its bodies are all that have a path (`Scene.moving`); they
     come last, the shaft first of them, and keep rigid to each other.
-
-    Args:
-        rng: source of all randomness.
-        wish: what is asked for.
     """
     surgical = rng.random() < 0.6
     distance = float(rng.uniform(0.1, 0.135))
@@ -41,8 +37,8 @@ def generate(rng: np.random.Generator, wish: Wish) -> Episode:
     path = moved(rng, wish, make, (0.08, 0.08, 0.3))
     camera, share = at_rest(T, wish.duration), wish.movers or float(rng.uniform(0.12, 0.3))
     thick = 0.03 * distance, 0.27 * distance
-    own_bodies, own_materials = instrument(rng, wish, path, camera, thick, share, len(materials), rich=True)
-    scene = Scene(tuple(bodies + own_bodies), tuple(materials + own_materials), lights, 0.0, NEAR)
+    tool_bodies, tool_materials = instrument(rng, wish, path, camera, thick, share, len(materials), rich=True)
+    scene = Scene(tuple(bodies + tool_bodies), tuple(materials + tool_materials), lights, 0.0, NEAR)
     return Episode(scene, camera)
 
 

@@ -14,7 +14,7 @@ from sigmaslam.evaluation.benchmarks import ablations
 from sigmaslam.evaluation.benchmarks.ablations import VARIANTS, Variant, configuration, selection_score, write_ablations
 from sigmaslam.evaluation.matching.score_sets import Scores
 from sigmaslam.evaluation.matching.sets import SELECTION
-from sigmaslam.models.network import FeatureNetwork
+from sigmaslam.models.feature_network import FeatureNetwork
 from sigmaslam.synthetic.rendering.textures import dead_leaves
 from sigmaslam.training.features import loop
 from sigmaslam.training.features.loop import WEIGHTS_NAME

@@ -13,7 +13,7 @@ from sigmaslam.cli import app
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.benchmarks import features
 from sigmaslam.evaluation.filters.speed import Timing
-from sigmaslam.models.network import FeatureNetwork
+from sigmaslam.models.feature_network import FeatureNetwork
 
 
 def test_costs_are_compared_round_by_round_with_the_reference():

@@ -6,27 +6,10 @@ import torch
 from scipy.stats import multivariate_normal
 from torch import Tensor
 
-from sigmaslam.filters import (
-    BayesFilter,
-    Diagonal,
-    ExtendedKalmanFilter,
-    Gaussian,
-    KalmanFilter,
-    LinearMeasurement,
-    LinearMotion,
-    MeasurementModel,
-    MotionModel,
-    Simplex,
-    UnscentedKalmanFilter,
-    cubature,
-    julier,
-    merwe,
-)
+from sigmaslam import filters
+from sigmaslam.filters.updates import FORMS
+from tests.support.filter_assertions import assert_close, assert_same_belief, assert_same_update
 from tests.support.filter_builders import (
-    FORMS,
-    assert_close,
-    assert_same_belief,
-    assert_same_update,
     beliefs,
     bent_measurement,
     bent_motion,
@@ -36,9 +19,14 @@ from tests.support.filter_builders import (
     tensor,
 )
 
-SIGMA_SETS = {"cubature": cubature(), "julier": julier(1.0), "merwe": merwe(1.0, 2.0), "simplex": Simplex()}
-FILTERS = {name: UnscentedKalmanFilter(points=points) for name, points in SIGMA_SETS.items()}
-FILTERS["ekf"] = ExtendedKalmanFilter()
+SIGMA_SETS = {
+    "cubature": filters.cubature(),
+    "julier": filters.julier(1.0),
+    "merwe": filters.merwe(1.0, 2.0),
+    "simplex": filters.Simplex(),
+}
+FILTERS = {name: filters.UnscentedKalmanFilter(points=points) for name, points in SIGMA_SETS.items()}
+FILTERS["ekf"] = filters.ExtendedKalmanFilter()
 EACH_FILTER = list(FILTERS)
 
 SIZE, CONTROLS, NOISES, MEASUREMENTS = 5, 2, 3, 3
@@ -55,22 +43,24 @@ CONTROL = random_numbers(STEPS, CONTROLS, seed=9)
 VALUES = random_numbers(STEPS, MEASUREMENTS, seed=10)
 
 
-def linear_models(additive: bool = True, jacobian: bool = False) -> tuple[MotionModel, MeasurementModel]:
+def linear_models(
+    additive: bool = True, jacobian: bool = False
+) -> tuple[filters.MotionModel, filters.MeasurementModel]:
     """The linear-Gaussian system as plain functions."""
     if not additive:
         return (
-            MotionModel(lambda x, w, u: x @ A.mT + u @ B1.mT + w @ B2.mT, Q, additive=False),
-            MeasurementModel(lambda x, v: x @ H.mT + v, R, additive=False),
+            filters.MotionModel(lambda x, w, u: x @ A.mT + u @ B1.mT + w @ B2.mT, Q, additive=False),
+            filters.MeasurementModel(lambda x, v: x @ H.mT + v, R, additive=False),
         )
     return (
-        MotionModel(
+        filters.MotionModel(
             lambda x, u: x @ A.mT + u @ B1.mT, Q, noise_matrix=B2, jacobian=(lambda x, u: A) if jacobian else None
         ),
-        MeasurementModel(lambda x: x @ H.mT, R, jacobian=(lambda x: H) if jacobian else None),
+        filters.MeasurementModel(lambda x: x @ H.mT, R, jacobian=(lambda x: H) if jacobian else None),
     )
 
 
-def assert_equals_textbook(bayes: BayesFilter, motion, measurement) -> None:
+def assert_equals_textbook(bayes: filters.BayesFilter, motion, measurement) -> None:
     """Several steps against (9.22)-(9.25) in numpy, the likelihood against scipy."""
     belief = PRIOR
     mean, P = PRIOR.mean.numpy(), PRIOR.covariance.numpy()
@@ -78,7 +68,7 @@ def assert_equals_textbook(bayes: BayesFilter, motion, measurement) -> None:
     for k in range(STEPS):
         predicted = bayes.predict(belief, motion, CONTROL[k])
         mean, P = a @ mean + b1 @ CONTROL[k].numpy(), a @ P @ a.T + b2 @ q @ b2.T
-        assert_same_belief(predicted.belief, Gaussian(torch.as_tensor(mean), torch.as_tensor(P)), 1e-10)
+        assert_same_belief(predicted.belief, filters.Gaussian(torch.as_tensor(mean), torch.as_tensor(P)), 1e-10)
 
         update = bayes.update(predicted.belief, measurement, VALUES[k])
         z, S = VALUES[k].numpy(), h @ P @ h.T + r
@@ -93,7 +83,7 @@ def assert_equals_textbook(bayes: BayesFilter, motion, measurement) -> None:
         for name, value in expected.items():
             assert_close(getattr(update, name), torch.as_tensor(value), 1e-10)
         mean, P = mean + K @ innovation, P - K @ S @ K.T
-        assert_same_belief(update.belief, Gaussian(torch.as_tensor(mean), torch.as_tensor(P)), 1e-10)
+        assert_same_belief(update.belief, filters.Gaussian(torch.as_tensor(mean), torch.as_tensor(P)), 1e-10)
         assert bool(update.healthy)
         assert update.count == MEASUREMENTS
         belief = update.belief
@@ -101,8 +91,8 @@ def assert_equals_textbook(bayes: BayesFilter, motion, measurement) -> None:
 
 @pytest.mark.parametrize("form", ["auto", *FORMS])
 def test_kalman_filter_equals_textbook(form):
-    motion, measurement = LinearMotion(A, Q, B1, B2), LinearMeasurement(H, R)
-    assert_equals_textbook(KalmanFilter(form=form), motion, measurement)
+    motion, measurement = filters.LinearMotion(A, Q, B1, B2), filters.LinearMeasurement(H, R)
+    assert_equals_textbook(filters.KalmanFilter(form=form), motion, measurement)
 
 
 @pytest.mark.parametrize("name", EACH_FILTER)
@@ -112,18 +102,18 @@ def test_nonlinear_filters_equal_textbook_on_a_linear_model(name):
 
 @pytest.mark.parametrize("form", FORMS)
 def test_unscented_filter_equals_textbook_in_every_form(form):
-    assert_equals_textbook(UnscentedKalmanFilter(form=form), *linear_models())
+    assert_equals_textbook(filters.UnscentedKalmanFilter(form=form), *linear_models())
 
 
 def test_extended_filter_with_given_jacobians_equals_textbook():
-    assert_equals_textbook(ExtendedKalmanFilter(), *linear_models(jacobian=True))
+    assert_equals_textbook(filters.ExtendedKalmanFilter(), *linear_models(jacobian=True))
 
 
 @pytest.mark.parametrize("iterations", [2, 3])
 @pytest.mark.parametrize("name", EACH_FILTER)
 def test_iterations_change_nothing_on_a_linear_model(name, iterations):
     bayes = FILTERS[name]
-    again = BayesFilter(bayes.transform, iterations=iterations)
+    again = filters.BayesFilter(bayes.transform, iterations=iterations)
     assert_equals_textbook(again, *linear_models())
 
 
@@ -135,7 +125,7 @@ def test_augmented_equals_additive_on_a_linear_model(name):
 
 @pytest.mark.parametrize("form", FORMS)
 def test_augmented_equals_additive_in_every_form(form):
-    assert_equals_textbook(UnscentedKalmanFilter(form=form), *linear_models(additive=False))
+    assert_equals_textbook(filters.UnscentedKalmanFilter(form=form), *linear_models(additive=False))
 
 
 def augmented(model):
@@ -145,7 +135,7 @@ def augmented(model):
 
 def test_augmented_extended_filter_equals_additive_on_a_nonlinear_model():
     motion, measurement = bent_motion(4), bent_measurement(4, 3)
-    prior, z, bayes = beliefs(4, seed=3), random_numbers(3, seed=5), ExtendedKalmanFilter()
+    prior, z, bayes = beliefs(4, seed=3), random_numbers(3, seed=5), filters.ExtendedKalmanFilter()
     added, argument = bayes.predict(prior, motion), bayes.predict(prior, augmented(motion))
     assert_same_belief(argument.belief, added.belief, 1e-12)
     assert_same_update(bayes.update(prior, augmented(measurement), z), bayes.update(prior, measurement, z), 1e-12)
@@ -161,16 +151,16 @@ def test_extended_filter_takes_derivatives_that_equal_its_own():
     def distance(x: Tensor) -> Tensor:
         return (landmark - x).norm(dim=-1, keepdim=True)
 
-    prior, z, noise = beliefs(7, 2, seed=3), tensor(2.5), Diagonal(tensor(0.1))
+    prior, z, noise = beliefs(7, 2, seed=3), tensor(2.5), filters.Diagonal(tensor(0.1))
     for iterations in (1, 3):
-        bayes = ExtendedKalmanFilter(iterations=iterations)
-        given = bayes.update(prior, MeasurementModel(distance, noise, jacobian=slope), z)
-        assert_same_update(given, bayes.update(prior, MeasurementModel(distance, noise), z), 1e-12)
+        bayes = filters.ExtendedKalmanFilter(iterations=iterations)
+        given = bayes.update(prior, filters.MeasurementModel(distance, noise, jacobian=slope), z)
+        assert_same_update(given, bayes.update(prior, filters.MeasurementModel(distance, noise), z), 1e-12)
 
 
 def test_iterated_extended_filter_stops_at_the_maximum_of_the_posterior():
     prior, measurement, z = beliefs(3, seed=4), bent_measurement(3, 5), random_numbers(5, seed=8)
-    found = ExtendedKalmanFilter(iterations=60).update(prior, measurement, z).belief.mean.requires_grad_()
+    found = filters.ExtendedKalmanFilter(iterations=60).update(prior, measurement, z).belief.mean.requires_grad_()
     error, residual = found - prior.mean, z - measurement.function(found)
     cost = error @ torch.linalg.solve(prior.covariance, error) + residual @ torch.linalg.solve(
         measurement.noise, residual
@@ -183,11 +173,11 @@ def test_iterated_extended_filter_stops_at_the_maximum_of_the_posterior():
 @pytest.mark.parametrize("batch", [(3,), (2, 3), (1, 2, 2)])
 def test_batch_equals_loop(kind, batch):
     motion, measurement = bent_motion(4), bent_measurement(4, 3)
-    bayes = ExtendedKalmanFilter() if kind == "ekf" else UnscentedKalmanFilter()
+    bayes = filters.ExtendedKalmanFilter() if kind == "ekf" else filters.UnscentedKalmanFilter()
     if kind == "kf":
-        bayes = KalmanFilter()
-        motion = LinearMotion(random_numbers(4, 4), covariances(4))
-        measurement = LinearMeasurement(random_numbers(3, 4), covariances(3))
+        bayes = filters.KalmanFilter()
+        motion = filters.LinearMotion(random_numbers(4, 4), covariances(4))
+        measurement = filters.LinearMeasurement(random_numbers(3, 4), covariances(3))
     prior, values = beliefs(*batch, 4), random_numbers(*batch, 3, seed=6)
     predicted, update = bayes.predict(prior, motion).belief, bayes.update(prior, measurement, values)
     for index in np.ndindex(*batch):
@@ -201,25 +191,25 @@ def test_batch_equals_loop(kind, batch):
 @pytest.mark.parametrize("form", FORMS)
 def test_noise_matrices_and_inputs_broadcast_over_the_batch(form):
     """Each of them single, per element of the last batch dimension, and per element of both."""
-    bayes, prior = UnscentedKalmanFilter(form=form), beliefs(2, 3, 4)
+    bayes, prior = filters.UnscentedKalmanFilter(form=form), beliefs(2, 3, 4)
     values = random_numbers(2, 3, 2, seed=5)
     for batch in ((), (3,), (2, 3), (2, 1)):
         Qs, Rs = covariances(*batch, 2, seed=1), covariances(*batch, 2, seed=2)
         matrix, control, scale = (
             random_numbers(*batch, *shape, seed=3 + k) for k, shape in enumerate(((4, 2), (4,), (1,)))
         )
-        motion = MotionModel(lambda x, u: x + torch.sin(u), Qs, noise_matrix=matrix)
-        measurement = MeasurementModel(lambda x, s: torch.sin(x[..., :2] * s), Rs)
+        motion = filters.MotionModel(lambda x, u: x + torch.sin(u), Qs, noise_matrix=matrix)
+        measurement = filters.MeasurementModel(lambda x, s: torch.sin(x[..., :2] * s), Rs)
         predicted, update = bayes.predict(prior, motion, control), bayes.update(prior, measurement, values, scale)
 
         def at(array: Tensor, index: tuple[int, int], leading: int = len(batch)) -> Tensor:
             return array.expand(2, 3, *array.shape[leading:])[index]
 
         for index in np.ndindex(2, 3):
-            single = MotionModel(motion.function, at(Qs, index), noise_matrix=at(matrix, index))
+            single = filters.MotionModel(motion.function, at(Qs, index), noise_matrix=at(matrix, index))
             alone = bayes.predict(prior[index], single, at(control, index))
             assert_same_belief(predicted.belief[index], alone.belief, 1e-12)
-            seen = MeasurementModel(measurement.function, at(Rs, index))
+            seen = filters.MeasurementModel(measurement.function, at(Rs, index))
             again = bayes.update(prior[index], seen, values[index], at(scale, index))
             assert_same_belief(update.belief[index], again.belief, 1e-12)
             assert_close(update.log_likelihood[index], again.log_likelihood, 1e-12)
@@ -229,9 +219,11 @@ def test_noise_matrices_and_inputs_broadcast_over_the_batch(form):
 def test_order_of_independent_measurements_does_not_matter(form):
     variance, order = random_numbers(6, seed=1).square() + 0.1, torch.tensor([3, 0, 5, 1, 2, 4])
     prior, z = beliefs(3), random_numbers(6, seed=4)
-    measurement = bent_measurement(3, 6, Diagonal(variance))
-    shuffled = MeasurementModel(lambda x: measurement.function(x)[..., order], Diagonal(variance[order]))
-    bayes = UnscentedKalmanFilter(form=form)
+    measurement = bent_measurement(3, 6, filters.Diagonal(variance))
+    shuffled = filters.MeasurementModel(
+        lambda x: measurement.function(x)[..., order], filters.Diagonal(variance[order])
+    )
+    bayes = filters.UnscentedKalmanFilter(form=form)
     first, second = bayes.update(prior, measurement, z), bayes.update(prior, shuffled, z[order])
     assert_same_belief(second.belief, first.belief, 1e-12)
     assert_close(second.nis, first.nis, 1e-12)
@@ -243,20 +235,20 @@ def test_two_updates_equal_one_joint_update_on_a_linear_model(form):
     first, second = noises(4, seed=1)["blocks"], noises(2, seed=2)["dense"]
     joint = torch.block_diag(first.covariance(), second.covariance())
     matrix, z, prior = random_numbers(6, 5, seed=3), random_numbers(6, seed=4), beliefs(5)
-    bayes = KalmanFilter(form=form)
-    one = bayes.update(prior, LinearMeasurement(matrix[:4], first), z[:4])
-    two = bayes.update(one.belief, LinearMeasurement(matrix[4:], second), z[4:])
-    both = bayes.update(prior, LinearMeasurement(matrix, joint), z)
+    bayes = filters.KalmanFilter(form=form)
+    one = bayes.update(prior, filters.LinearMeasurement(matrix[:4], first), z[:4])
+    two = bayes.update(one.belief, filters.LinearMeasurement(matrix[4:], second), z[4:])
+    both = bayes.update(prior, filters.LinearMeasurement(matrix, joint), z)
     assert_same_belief(two.belief, both.belief, 1e-12)
     assert_close(one.nis + two.nis, both.nis, 1e-12)
     assert_close(one.log_likelihood + two.log_likelihood, both.log_likelihood, 1e-12)
 
 
 def test_two_predictions_equal_one_of_the_product():
-    bayes, prior = KalmanFilter(), beliefs(SIZE)
-    motion = LinearMotion(A, covariances(SIZE, seed=5))
+    bayes, prior = filters.KalmanFilter(), beliefs(SIZE)
+    motion = filters.LinearMotion(A, covariances(SIZE, seed=5))
     twice = bayes.predict(bayes.predict(prior, motion).belief, motion).belief
-    both = LinearMotion(A @ A, motion.noise + A @ motion.noise @ A.mT)
+    both = filters.LinearMotion(A @ A, motion.noise + A @ motion.noise @ A.mT)
     assert_same_belief(twice, bayes.predict(prior, both).belief, 1e-12)
 
 
@@ -264,7 +256,7 @@ def test_arguments_are_not_changed():
     prior, z = beliefs(2, 4), random_numbers(2, 3)
     z[0, 1] = torch.nan
     kept = prior.mean.clone(), prior.covariance.clone(), z.clone()
-    bayes = UnscentedKalmanFilter(on_failure="hold")
+    bayes = filters.UnscentedKalmanFilter(on_failure="hold")
     bayes.predict(prior, bent_motion(4))
     bayes.update(prior, bent_measurement(4, 3), z)
     for before, after in zip(kept, (prior.mean, prior.covariance, z), strict=True):
@@ -273,9 +265,9 @@ def test_arguments_are_not_changed():
 
 @pytest.mark.parametrize("form", ["auto", *FORMS])
 def test_dtype_follows_the_belief(form):
-    bayes, prior = UnscentedKalmanFilter(form=form), beliefs(4).to(torch.float32)
-    motion = MotionModel(torch.sin, covariances(4).float())
-    measurement = MeasurementModel(lambda x: torch.sin(x[..., :2]), Diagonal(torch.ones(2)))
+    bayes, prior = filters.UnscentedKalmanFilter(form=form), beliefs(4).to(torch.float32)
+    motion = filters.MotionModel(torch.sin, covariances(4).float())
+    measurement = filters.MeasurementModel(lambda x: torch.sin(x[..., :2]), filters.Diagonal(torch.ones(2)))
     update = bayes.update(bayes.predict(prior, motion).belief, measurement, torch.zeros(2))
     for array in (update.belief.mean, update.belief.covariance, update.nis, update.log_likelihood, update.gain):
         assert array.dtype == torch.float32
@@ -285,10 +277,10 @@ def test_wrong_options_are_refused_by_name():
     for options in ({"form": "joseph"}, {"on_failure": "ignore"}, {"iterations": 0}):
         (name,) = options
         with pytest.raises(ValueError, match=name):
-            UnscentedKalmanFilter(**options)
+            filters.UnscentedKalmanFilter(**options)
     with pytest.raises(TypeError, match="UnscentedKalmanFilter"):
-        KalmanFilter().predict(PRIOR, linear_models()[0], CONTROL[0])
+        filters.KalmanFilter().predict(PRIOR, linear_models()[0], CONTROL[0])
     with pytest.raises(ValueError, match=r"returns 3 components.*has 2"):
-        UnscentedKalmanFilter().update(PRIOR, linear_models()[1], torch.zeros(2, dtype=torch.float64))
+        filters.UnscentedKalmanFilter().update(PRIOR, linear_models()[1], torch.zeros(2, dtype=torch.float64))
     with pytest.raises(ValueError, match="control"):
-        KalmanFilter().predict(PRIOR, LinearMotion(A, covariances(SIZE), B1))
+        filters.KalmanFilter().predict(PRIOR, filters.LinearMotion(A, covariances(SIZE), B1))

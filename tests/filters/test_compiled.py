@@ -3,28 +3,20 @@
 import pytest
 import torch
 
-from sigmaslam.filters import (
-    Diagonal,
-    Gaussian,
-    LinearMotion,
-    MeasurementModel,
-    UnscentedKalmanFilter,
-    compile_step,
-    stack,
-)
+from sigmaslam import filters
 
 
 def make_step(scale: float):
     """A step that differs from its siblings in a constant only."""
-    ukf = UnscentedKalmanFilter(iterations=1, on_failure="hold")
-    motion = LinearMotion(torch.eye(2), Diagonal(torch.full((2,), 0.01)))
-    polar = MeasurementModel(
-        lambda x: stack([scale * torch.hypot(x[..., 0], x[..., 1]), torch.atan2(x[..., 1], x[..., 0])]),
-        Diagonal(torch.full((2,), 0.1)),
+    ukf = filters.UnscentedKalmanFilter(iterations=1, on_failure="hold")
+    motion = filters.LinearMotion(torch.eye(2), filters.Diagonal(torch.full((2,), 0.01)))
+    polar = filters.MeasurementModel(
+        lambda x: filters.stack([scale * torch.hypot(x[..., 0], x[..., 1]), torch.atan2(x[..., 1], x[..., 0])]),
+        filters.Diagonal(torch.full((2,), 0.1)),
     )
 
     def step(mean, root, value):
-        belief = Gaussian(mean, factor=root, factor_is_lower=True)
+        belief = filters.Gaussian(mean, factor=root, factor_is_lower=True)
         result = ukf.update(ukf.predict(belief, motion).belief, polar, value)
         return result.belief.mean, result.belief.covariance, result.nis, result.healthy
 
@@ -35,16 +27,16 @@ def make_step(scale: float):
 @pytest.mark.parametrize("batch", [(), (200,)], ids=["one", "batch"])
 def test_steps_of_one_factory_do_not_share_compiled_code(batch):
     generator = torch.Generator().manual_seed(0)
-    prior = Gaussian(2 + torch.randn(*batch, 2, generator=generator), 0.1 * torch.eye(2))
+    prior = filters.Gaussian(2 + torch.randn(*batch, 2, generator=generator), 0.1 * torch.eye(2))
     value = 2 + torch.randn(*batch, 2, generator=generator)
     for scale in (1.0, 3.0):
         step = make_step(scale)
         expected = step(prior.mean, prior.factor, value)
-        found = compile_step(step)(prior.mean, prior.factor, value)
+        found = filters.compile_step(step)(prior.mean, prior.factor, value)
         for a, b in zip(found, expected, strict=True):
             torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
 
 
 def test_only_plain_functions_are_compiled():
     with pytest.raises(TypeError, match="plain function"):
-        compile_step(torch.nn.Linear(2, 2))
+        filters.compile_step(torch.nn.Linear(2, 2))

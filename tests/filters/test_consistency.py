@@ -1,6 +1,7 @@
 import io
 import math
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,19 +12,11 @@ from matplotlib.figure import Figure
 from scipy.stats import binomtest, chi2, norm, t
 from torch import Tensor
 
-from sigmaslam.filters.consistency import (
-    Consistency,
-    axis_coverage,
-    check_nees,
-    chi_square_band,
-    coverage,
-    nees,
-    nis,
-    whiten,
-    whiteness,
-)
+from sigmaslam.filters import consistency
 from sigmaslam.filters.consistency.plots import plot_coverage, plot_nees, plot_whiteness
 from tests.support.filter_builders import covariances, random_numbers
+
+axis_coverage = partial(consistency.coverage, by_axis=True)
 
 
 def correlated(runs: int, steps: int, size: int, correlation: float, seed: int = 0) -> Tensor:
@@ -53,10 +46,10 @@ def run_kalman_filter(runs: int, steps: int, process_scale: float, seed: int = 0
         truth = truth @ F.T + push[step]
         mean, P = mean @ F.T, F @ P @ F.T + process_scale * Q
         innovation, S = truth @ H.T + noise[step] - mean @ H.T, H @ P @ H.T + R
-        innovations.append(whiten(innovation, S))
+        innovations.append(consistency.whiten(innovation, S))
         K = P @ H.T / S
         mean, P = mean + innovation @ K.T, P - K @ S @ K.T
-        values.append(nees(mean - truth, P))
+        values.append(consistency.nees(mean - truth, P))
     return torch.stack(values, dim=1), torch.stack(innovations, dim=1)
 
 
@@ -65,9 +58,9 @@ def run_kalman_filter(runs: int, steps: int, process_scale: float, seed: int = 0
 
 def test_nees_of_known_values():
     error = torch.tensor([3.0, 4.0])
-    assert float(nees(error, torch.eye(2))) == pytest.approx(25.0)
-    assert float(nees(error, torch.diag(torch.tensor([9.0, 4.0])))) == pytest.approx(1.0 + 4.0)
-    assert float(nis(error, factor=torch.diag(torch.tensor([3.0, 2.0])))) == pytest.approx(1.0 + 4.0)
+    assert float(consistency.nees(error, torch.eye(2))) == pytest.approx(25.0)
+    assert float(consistency.nees(error, torch.diag(torch.tensor([9.0, 4.0])))) == pytest.approx(1.0 + 4.0)
+    assert float(consistency.nis(error, factor=torch.diag(torch.tensor([3.0, 2.0])))) == pytest.approx(1.0 + 4.0)
 
 
 @settings(max_examples=25, deadline=None)
@@ -75,39 +68,43 @@ def test_nees_of_known_values():
 def test_nees_equals_the_quadratic_form(size, batch, seed):
     error, P = random_numbers(*batch, size, seed=seed), covariances(*batch, size, seed=seed)
     expected = (error.unsqueeze(-2) @ torch.linalg.solve(P, error.unsqueeze(-1)))[..., 0, 0]
-    torch.testing.assert_close(nees(error, P), expected, rtol=1e-9, atol=1e-9)
-    torch.testing.assert_close(nis(error, P), expected, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(consistency.nees(error, P), expected, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(consistency.nis(error, P), expected, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("columns", [5, 8])
 def test_any_square_root_gives_what_the_covariance_gives(columns):
     error, factor = random_numbers(10, 5, seed=1), random_numbers(10, 5, columns, seed=2)
     P = factor @ factor.mT
-    torch.testing.assert_close(whiten(error, factor=factor), whiten(error, P), rtol=1e-7, atol=1e-9)
-    torch.testing.assert_close(nees(error, factor=factor), nees(error, P), rtol=1e-7, atol=1e-9)
+    torch.testing.assert_close(
+        consistency.whiten(error, factor=factor), consistency.whiten(error, P), rtol=1e-7, atol=1e-9
+    )
+    torch.testing.assert_close(consistency.nees(error, factor=factor), consistency.nees(error, P), rtol=1e-7, atol=1e-9)
 
 
 def test_a_factor_keeps_the_digits_that_its_covariance_loses():
     # Condition 1e9, its square beyond float64.
     factor = torch.tensor([[1.0, 0.0], [1.0, 1e-9]], dtype=torch.float64)
     error = factor @ torch.tensor([1.0, 2.0], dtype=torch.float64)
-    assert nees(error, factor @ factor.T).isnan()
-    assert float(nees(error, factor=factor)) == pytest.approx(5.0, rel=1e-5)
+    assert consistency.nees(error, factor @ factor.T).isnan()
+    assert float(consistency.nees(error, factor=factor)) == pytest.approx(5.0, rel=1e-5)
 
 
 def test_nees_does_not_depend_on_units():
     error, P = random_numbers(6), covariances(6)
     units = torch.tensor([1e-6, 1e-3, 1.0, 1e2, 1e4, 1e6], dtype=torch.float64)
-    torch.testing.assert_close(nees(error * units, P * units[:, None] * units), nees(error, P), rtol=1e-9, atol=0)
+    torch.testing.assert_close(
+        consistency.nees(error * units, P * units[:, None] * units), consistency.nees(error, P), rtol=1e-9, atol=0
+    )
 
 
 def test_a_batch_equals_a_loop_and_leading_dimensions_broadcast():
     error, P = random_numbers(4, 3, 5), covariances(3, 5)
-    values = nees(error, P)
+    values = consistency.nees(error, P)
     assert values.shape == (4, 3)
     for i in range(4):
         for j in range(3):
-            torch.testing.assert_close(values[i, j], nees(error[i, j], P[j]), rtol=1e-10, atol=1e-12)
+            torch.testing.assert_close(values[i, j], consistency.nees(error[i, j], P[j]), rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize("as_factor", [False, True])
@@ -119,34 +116,34 @@ def test_a_bad_covariance_is_nan_and_leaves_the_others_alone(as_factor):
     P = factor @ factor.mT
     if not as_factor:
         P[5] = -P[5]
-    values = nees(error, factor=factor) if as_factor else nees(error, P)
+    values = consistency.nees(error, factor=factor) if as_factor else consistency.nees(error, P)
     assert values.isnan().tolist() == [False, True, True, True, False, not as_factor]
-    torch.testing.assert_close(values[[0, 4]], nees(error[[0, 4]], P[[0, 4]]))
+    torch.testing.assert_close(values[[0, 4]], consistency.nees(error[[0, 4]], P[[0, 4]]))
 
 
 def test_a_singular_covariance_is_nan_whatever_the_round_off():
     error, root = random_numbers(500, 6), random_numbers(500, 6, 5)
     wide = torch.cat([root, 2 * root], dim=-1)
     for dtype in (torch.float64, torch.float32):
-        assert nees(error.to(dtype), (root @ root.mT).to(dtype)).isnan().all()
-        assert nees(error.to(dtype), factor=wide.to(dtype)).isnan().all()
+        assert consistency.nees(error.to(dtype), (root @ root.mT).to(dtype)).isnan().all()
+        assert consistency.nees(error.to(dtype), factor=wide.to(dtype)).isnan().all()
 
 
 def test_nees_can_be_trained_through():
     error, P = random_numbers(2, 3).requires_grad_(), covariances(2, 3).requires_grad_()
 
     def of_symmetric_part(error: Tensor, P: Tensor) -> Tensor:
-        return nees(error, (P + P.mT) / 2)
+        return consistency.nees(error, (P + P.mT) / 2)
 
     assert torch.autograd.gradcheck(of_symmetric_part, (error, P))
 
 
 def test_dtype_follows_the_input():
     error, P = random_numbers(4, 3).float(), covariances(3).float()
-    assert nees(error, P).dtype == torch.float32
-    assert check_nees(nees(error, P)[:, None], 3).low.dtype == torch.float32
-    assert whiteness(whiten(error, P)[None], 2).band.dtype == torch.float32
-    assert coverage(error, P).share.dtype == torch.float32
+    assert consistency.nees(error, P).dtype == torch.float32
+    assert consistency.check_nees(consistency.nees(error, P)[:, None], 3).low.dtype == torch.float32
+    assert consistency.whiteness(consistency.whiten(error, P)[None], 2).band.dtype == torch.float32
+    assert consistency.coverage(error, P).share.dtype == torch.float32
 
 
 @pytest.mark.parametrize(
@@ -160,32 +157,38 @@ def test_dtype_follows_the_input():
     ],
 )
 def test_shapes_that_do_not_fit_are_refused(arguments, message):
-    for function in (whiten, nees, nis, coverage, axis_coverage):
+    for function in (
+        consistency.whiten,
+        consistency.nees,
+        consistency.nis,
+        consistency.coverage,
+        axis_coverage,
+    ):
         with pytest.raises(ValueError, match=message):
             function(*arguments)
 
 
 def test_a_factor_with_too_few_columns_is_refused():
     with pytest.raises(ValueError, match="k >= 3"):
-        nees(torch.zeros(3), factor=torch.ones(3, 2))
+        consistency.nees(torch.zeros(3), factor=torch.ones(3, 2))
     with pytest.raises(ValueError, match="either covariance or factor"):
-        nees(torch.zeros(3), torch.eye(3), factor=torch.eye(3))
+        consistency.nees(torch.zeros(3), torch.eye(3), factor=torch.eye(3))
 
 
 # The chi-square band
 
 
 def test_band_of_a_known_case():
-    low, high = chi_square_band(12, runs=200)
+    low, high = consistency.chi_square_band(12, runs=200)
     assert (round(low, 2), round(high, 2)) == (11.33, 12.69)
     # Bar-Shalom et al. (2001), example 5.4.2: 50 runs of a state of two.
-    low, high = chi_square_band(2, runs=50)
+    low, high = consistency.chi_square_band(2, runs=50)
     assert (low, high) == (pytest.approx(1.484, abs=2e-3), pytest.approx(2.592, abs=2e-3))
 
 
 @pytest.mark.parametrize(("dof", "runs", "probability"), [(1, 1, 0.9), (6, 20, 0.95), (19, 300, 0.99)])
 def test_band_holds_its_probability_with_equal_tails(dof, runs, probability):
-    low, high = chi_square_band(dof, runs, probability)
+    low, high = consistency.chi_square_band(dof, runs, probability)
     assert chi2.cdf(low * runs, dof * runs) == pytest.approx((1 - probability) / 2)
     assert chi2.sf(high * runs, dof * runs) == pytest.approx((1 - probability) / 2)
 
@@ -193,12 +196,12 @@ def test_band_holds_its_probability_with_equal_tails(dof, runs, probability):
 def test_band_refuses_what_makes_no_sense():
     for dof in (0, -1, math.nan, math.inf):
         with pytest.raises(ValueError, match="dof must be positive"):
-            chi_square_band(dof)
+            consistency.chi_square_band(dof)
     with pytest.raises(ValueError, match="runs must be at least 1"):
-        chi_square_band(3, runs=0)
+        consistency.chi_square_band(3, runs=0)
     for probability in (0.0, 1.0, 95.0, math.nan):
         with pytest.raises(ValueError, match="probability must be between 0 and 1"):
-            chi_square_band(3, probability=probability)
+            consistency.chi_square_band(3, probability=probability)
 
 
 # Consistency of runs
@@ -206,8 +209,8 @@ def test_band_refuses_what_makes_no_sense():
 
 def test_check_agrees_with_its_definitions():
     values = random_numbers(20, 30, 4).square().sum(dim=-1)
-    check = check_nees(values, 4, probability=0.9)
-    band = chi_square_band(4, 20, 0.9)
+    check = consistency.check_nees(values, 4, probability=0.9)
+    band = consistency.chi_square_band(4, 20, 0.9)
     torch.testing.assert_close(check.mean_per_step, values.mean(dim=0))
     torch.testing.assert_close(check.low, torch.full((30,), band[0], dtype=torch.float64))
     torch.testing.assert_close(check.high, torch.full((30,), band[1], dtype=torch.float64))
@@ -228,7 +231,7 @@ def test_check_agrees_with_its_definitions():
 def test_false_alarms_are_as_rare_as_promised_when_steps_are_correlated():
     repeats = 250
     errors = correlated(repeats * 30, 40, 3, correlation=0.9).reshape(repeats, 30, 40, 3)
-    checks = [check_nees(values, 3) for values in errors.square().sum(dim=-1)]
+    checks = [consistency.check_nees(values, 3) for values in errors.square().sum(dim=-1)]
     alarms = sum(not check.consistent for check in checks)
     assert binomtest(alarms, repeats, 0.05).pvalue > 1e-3
     assert np.mean([check.share_inside for check in checks]) == pytest.approx(0.95, abs=0.01)
@@ -237,43 +240,48 @@ def test_false_alarms_are_as_rare_as_promised_when_steps_are_correlated():
 
 def test_an_honest_filter_passes_and_an_overconfident_one_is_caught():
     errors = correlated(100, 50, 6, correlation=0.5, seed=4)
-    honest = check_nees(nees(errors, torch.eye(6, dtype=torch.float64)), 6)
+    honest = consistency.check_nees(consistency.nees(errors, torch.eye(6, dtype=torch.float64)), 6)
     assert honest.consistent
     assert honest.share_inside > 0.85
     for deviations in (0.8, 1.2):
         P = deviations**2 * torch.eye(6, dtype=torch.float64)
-        wrong = check_nees(nees(errors, P), 6)
+        wrong = consistency.check_nees(consistency.nees(errors, P), 6)
         assert not wrong.consistent
         assert wrong.share_inside < 0.2
         assert wrong.normalised_mean == pytest.approx(1 / deviations**2, rel=0.05)
     # A fifth of the variance is enough to be found.
-    assert check_nees(nees(errors, 0.8 * torch.eye(6, dtype=torch.float64)), 6).normalised_interval[0] > 1
+    assert (
+        consistency.check_nees(
+            consistency.nees(errors, 0.8 * torch.eye(6, dtype=torch.float64)), 6
+        ).normalised_interval[0]
+        > 1
+    )
 
 
 def test_a_kalman_filter_is_consistent_and_white_until_its_process_noise_is_wrong():
     values, innovations = run_kalman_filter(100, 60, process_scale=1.0, seed=3)
-    assert check_nees(values, 2).consistent
-    assert check_nees(innovations.square().sum(dim=-1), 1).consistent
-    assert whiteness(innovations, 20).p_value > 0.01
+    assert consistency.check_nees(values, 2).consistent
+    assert consistency.check_nees(innovations.square().sum(dim=-1), 1).consistent
+    assert consistency.whiteness(innovations, 20).p_value > 0.01
     values, innovations = run_kalman_filter(100, 60, process_scale=0.3, seed=3)
-    assert check_nees(values, 2).normalised_interval[0] > 1.1
-    assert whiteness(innovations, 20).p_value < 1e-4
+    assert consistency.check_nees(values, 2).normalised_interval[0] > 1.1
+    assert consistency.whiteness(innovations, 20).p_value < 1e-4
     values, innovations = run_kalman_filter(100, 60, process_scale=3.0, seed=3)
-    assert check_nees(values, 2).normalised_interval[1] < 0.9
-    assert whiteness(innovations, 20).p_value < 1e-4
+    assert consistency.check_nees(values, 2).normalised_interval[1] < 0.9
+    assert consistency.whiteness(innovations, 20).p_value < 1e-4
 
 
 def test_nan_is_counted_and_fails_the_check():
     values = correlated(50, 20, 3, correlation=0.5).square().sum(dim=-1)
-    assert check_nees(values, 3).consistent
+    assert consistency.check_nees(values, 3).consistent
     values[7, 3] = values[9, 3] = math.nan
     values[:, 5] = math.nan
-    check = check_nees(values, 3)
+    check = consistency.check_nees(values, 3)
     assert (check.nan_count, check.count) == (52, 948)
     assert not check.consistent
     assert check.interval[0] < 3 < check.interval[1]
     # The band is that of the runs that are left.
-    assert (float(check.low[3]), float(check.high[3])) == pytest.approx(chi_square_band(3, 48))
+    assert (float(check.low[3]), float(check.high[3])) == pytest.approx(consistency.chi_square_band(3, 48))
     assert float(check.mean_per_step[3]) == pytest.approx(float(values[:, 3].nanmean()))
     assert check.mean_per_step.isnan().nonzero().flatten().tolist() == [5]
 
@@ -285,7 +293,7 @@ def test_steps_without_a_measurement_are_left_out():
     measured = torch.arange(6) < dof.unsqueeze(-1)
     values = (random_numbers(60, 40, 6) * measured).square().sum(dim=-1)
     values[dof == 0] = math.nan
-    check = check_nees(values, dof)
+    check = consistency.check_nees(values, dof)
     assert (check.nan_count, check.count) == (0, int((dof > 0).sum()))
     assert check.consistent
     assert check.share_inside == pytest.approx(0.95, abs=0.08)
@@ -303,20 +311,20 @@ def test_steps_without_a_measurement_are_left_out():
 def test_dof_of_each_step_equals_dof_of_each_value():
     values = random_numbers(10, 6, 3).square().sum(dim=-1)
     dof = torch.tensor([3, 3, 2, 1, 0, 3])
-    by_step, by_value = check_nees(values, dof), check_nees(values, dof.expand(10, 6))
+    by_step, by_value = consistency.check_nees(values, dof), consistency.check_nees(values, dof.expand(10, 6))
     torch.testing.assert_close(by_step.low, by_value.low, equal_nan=True)
     assert by_step.interval == by_value.interval
 
 
 def test_one_run_has_a_band_but_no_interval():
-    check = check_nees(random_numbers(1, 300, 3).square().sum(dim=-1), 3)
+    check = consistency.check_nees(random_numbers(1, 300, 3).square().sum(dim=-1), 3)
     assert check.share_inside == pytest.approx(0.95, abs=0.05)
     assert all(math.isnan(end) for end in check.interval)
     assert not check.consistent
 
 
 def test_a_check_of_nothing_but_nan_is_nan():
-    check = check_nees(torch.full((3, 4), math.nan), 2)
+    check = consistency.check_nees(torch.full((3, 4), math.nan), 2)
     assert (check.count, check.nan_count, check.consistent) == (0, 12, False)
     for number in (check.mean, check.normalised_mean, check.median, check.expected_median, check.share_inside):
         assert math.isnan(number)
@@ -325,12 +333,12 @@ def test_a_check_of_nothing_but_nan_is_nan():
 def test_an_infinite_value_fails_the_check():
     values = random_numbers(10, 6, 3).square().sum(dim=-1)
     values[0, 0] = math.inf
-    assert not check_nees(values, 3).consistent
+    assert not consistency.check_nees(values, 3).consistent
 
 
 def test_the_arguments_of_a_check_are_not_changed():
     values = torch.tensor([[1.0, math.nan], [2.0, 3.0]])
-    check_nees(values, 2)
+    consistency.check_nees(values, 2)
     torch.testing.assert_close(values, torch.tensor([[1.0, math.nan], [2.0, 3.0]]), equal_nan=True)
 
 
@@ -348,7 +356,7 @@ def test_the_arguments_of_a_check_are_not_changed():
 )
 def test_a_check_refuses_what_makes_no_sense(values, dof, probability, message):
     with pytest.raises(ValueError, match=message):
-        check_nees(values, dof, probability)
+        consistency.check_nees(values, dof, probability)
 
 
 # Whiteness
@@ -356,13 +364,13 @@ def test_a_check_refuses_what_makes_no_sense(values, dof, probability, message):
 
 def test_false_alarms_of_whiteness_are_as_rare_as_promised():
     repeats = 200
-    found = [whiteness(noise, 8) for noise in random_numbers(repeats, 10, 40, 2)]
+    found = [consistency.whiteness(noise, 8) for noise in random_numbers(repeats, 10, 40, 2)]
     assert binomtest(sum(one.p_value < 0.05 for one in found), repeats, 0.05).pvalue > 1e-3
     assert np.mean([one.share_inside for one in found]) == pytest.approx(0.95, abs=0.015)
 
 
 def test_autocorrelation_is_that_of_the_process():
-    found = whiteness(correlated(200, 100, 2, correlation=0.6), 6)
+    found = consistency.whiteness(correlated(200, 100, 2, correlation=0.6), 6)
     expected = 0.6 ** torch.arange(1, 7, dtype=torch.float64)
     torch.testing.assert_close(found.autocorrelation, expected, rtol=0, atol=0.03)
     assert found.share_inside == 0
@@ -372,7 +380,7 @@ def test_autocorrelation_is_that_of_the_process():
 
 
 def test_statistic_is_the_sum_of_squares_in_units_of_the_band():
-    found = whiteness(random_numbers(3, 20, 1), 6)
+    found = consistency.whiteness(random_numbers(3, 20, 1), 6)
     expected = (norm.ppf(0.975) * found.autocorrelation / found.band).square().sum()
     assert found.statistic == pytest.approx(float(expected))
     assert found.p_value == pytest.approx(chi2.sf(float(expected), 6))
@@ -380,7 +388,7 @@ def test_statistic_is_the_sum_of_squares_in_units_of_the_band():
 
 def test_components_of_opposite_correlation_are_caught():
     noise = torch.cat([correlated(50, 60, 1, 0.3, seed=1), correlated(50, 60, 1, -0.3, seed=2)], dim=-1)
-    found = whiteness(noise, 1)
+    found = consistency.whiteness(noise, 1)
     assert found.share_inside == 1  # their mean is small
     assert found.p_value < 1e-10
 
@@ -388,18 +396,18 @@ def test_components_of_opposite_correlation_are_caught():
 def test_whiteness_does_not_depend_on_scale():
     noise = correlated(5, 40, 3, correlation=0.2)
     scaled = noise * torch.tensor([0.1, 1.0, 7.0], dtype=torch.float64)
-    assert whiteness(scaled, 5).statistic == pytest.approx(whiteness(noise, 5).statistic)
+    assert consistency.whiteness(scaled, 5).statistic == pytest.approx(consistency.whiteness(noise, 5).statistic)
 
 
 def test_a_bias_is_not_white():
-    assert whiteness(random_numbers(20, 50, 2) + 0.5, 5).p_value < 1e-6
+    assert consistency.whiteness(random_numbers(20, 50, 2) + 0.5, 5).p_value < 1e-6
 
 
 def test_nan_takes_only_its_pairs_from_whiteness():
     noise = random_numbers(4, 30, 2)
     noise[0, 10, 0] = math.nan
     noise[2, :, 1] = math.nan
-    found = whiteness(noise, 3)
+    found = consistency.whiteness(noise, 3)
     assert found.nan_count == 31
     assert found.autocorrelation.isfinite().all()
     # Lag 1: 4 runs of 29 pairs, less the two pairs of one value, and less one run.
@@ -410,7 +418,7 @@ def test_nan_takes_only_its_pairs_from_whiteness():
 def test_a_component_never_measured_changes_nothing():
     noise = random_numbers(4, 30, 2)
     more = torch.cat([noise, torch.full((4, 30, 1), math.nan, dtype=torch.float64)], dim=-1)
-    alone, together = whiteness(noise, 5), whiteness(more, 5)
+    alone, together = consistency.whiteness(noise, 5), consistency.whiteness(more, 5)
     torch.testing.assert_close(together.autocorrelation, alone.autocorrelation)
     torch.testing.assert_close(together.band, alone.band)
     assert together.p_value == pytest.approx(alone.p_value)
@@ -418,12 +426,12 @@ def test_a_component_never_measured_changes_nothing():
 
 def test_whiteness_refuses_what_makes_no_sense():
     with pytest.raises(ValueError, match=r"\(runs, steps, m\)"):
-        whiteness(torch.zeros(4, 30), 3)
+        consistency.whiteness(torch.zeros(4, 30), 3)
     for lags in (0, 30):
         with pytest.raises(ValueError, match="lags must be between 1 and 29"):
-            whiteness(torch.zeros(4, 30, 1), lags)
+            consistency.whiteness(torch.zeros(4, 30, 1), lags)
     with pytest.raises(ValueError, match="probability must be"):
-        whiteness(torch.zeros(4, 30, 1), 3, probability=0)
+        consistency.whiteness(torch.zeros(4, 30, 1), 3, probability=0)
 
 
 # Coverage
@@ -432,7 +440,7 @@ def test_whiteness_refuses_what_makes_no_sense():
 def test_coverage_of_an_honest_covariance_is_its_level():
     P = covariances(4)
     error = random_numbers(200, 100, 4) @ torch.linalg.cholesky(P).T
-    found = coverage(error, P)
+    found = consistency.coverage(error, P)
     torch.testing.assert_close(found.share, found.level, rtol=0, atol=0.012)
     assert (found.share.shape, int(found.count), int(found.nan_count)) == ((5,), 20000, 0)
     by_axis = axis_coverage(error, P)
@@ -441,7 +449,7 @@ def test_coverage_of_an_honest_covariance_is_its_level():
 
 
 def test_coverage_of_an_overconfident_covariance_falls_short():
-    found = coverage(random_numbers(500, 3), 0.64 * torch.eye(3, dtype=torch.float64))
+    found = consistency.coverage(random_numbers(500, 3), 0.64 * torch.eye(3, dtype=torch.float64))
     assert (found.high < found.level).all()
     expected = chi2.cdf(0.64 * chi2.ppf(found.level.numpy(), 3), 3)
     torch.testing.assert_close(found.share, torch.as_tensor(expected), rtol=0, atol=0.06)
@@ -458,7 +466,7 @@ def test_axis_coverage_counts_within_k_sigma_and_finds_the_axis():
 def test_coverage_from_a_factor_equals_that_from_the_covariance():
     error, factor = random_numbers(50, 3, seed=1), random_numbers(3, 5, seed=2)
     P = factor @ factor.T
-    for function in (coverage, axis_coverage):
+    for function in (consistency.coverage, axis_coverage):
         torch.testing.assert_close(function(error, factor=factor).share, function(error, P).share)
 
 
@@ -466,7 +474,7 @@ def test_coverage_from_a_factor_equals_that_from_the_covariance():
 def test_interval_of_coverage_is_that_of_wilson(inside):
     error = torch.full((60, 1), 10.0, dtype=torch.float64)
     error[:inside] = 0.0
-    found = coverage(error, torch.eye(1, dtype=torch.float64), levels=(0.9,), probability=0.99)
+    found = consistency.coverage(error, torch.eye(1, dtype=torch.float64), levels=(0.9,), probability=0.99)
     expected = binomtest(inside, 60).proportion_ci(0.99, method="wilson")
     assert (float(found.low), float(found.high)) == pytest.approx((expected.low, expected.high), abs=1e-12)
 
@@ -475,10 +483,10 @@ def test_nan_is_counted_in_coverage():
     error, P = random_numbers(100, 2), torch.eye(2, dtype=torch.float64).repeat(100, 1, 1)
     error[3, 1] = math.nan
     P[5, 0, 0] = -1.0
-    found, by_axis = coverage(error, P), axis_coverage(error, P)
+    found, by_axis = consistency.coverage(error, P), axis_coverage(error, P)
     assert (int(found.count), int(found.nan_count)) == (98, 2)
     assert by_axis.nan_count.tolist() == [1, 1]
-    nothing = coverage(torch.full((4, 2), math.nan), torch.eye(2))
+    nothing = consistency.coverage(torch.full((4, 2), math.nan), torch.eye(2))
     assert int(nothing.count) == 0
     assert nothing.share.isnan().all()
 
@@ -486,16 +494,16 @@ def test_nan_is_counted_in_coverage():
 def test_coverage_refuses_levels_that_are_no_probabilities():
     for levels in ((), (0.5, 1.0), (0.0,), (95.0,)):
         with pytest.raises(ValueError, match="levels must be probabilities"):
-            coverage(torch.zeros(3), torch.eye(3), levels=levels)
+            consistency.coverage(torch.zeros(3), torch.eye(3), levels=levels)
 
 
 # Figures
 
 
-def some_check(runs: int = 20, scale: float = 1.0) -> Consistency:
+def some_check(runs: int = 20, scale: float = 1.0) -> consistency.Consistency:
     values = scale * random_numbers(runs, 30, 3).square().sum(dim=-1)
     values[:, 12] = math.nan
-    return check_nees(values, 3)
+    return consistency.check_nees(values, 3)
 
 
 def band_of(figure: Figure) -> np.ndarray:
@@ -513,7 +521,7 @@ def test_nees_is_drawn_with_its_band():
     check = some_check()
     figure = plot_nees(check, seconds=0.1 * torch.arange(30), quantity="NIS")
     corners = band_of(figure)
-    assert (corners[:, 1].min(), corners[:, 1].max()) == pytest.approx(chi_square_band(3, 20))
+    assert (corners[:, 1].min(), corners[:, 1].max()) == pytest.approx(consistency.chi_square_band(3, 20))
     # There is no band at the step without a value.
     assert not ((corners[:, 0] > 1.15 + 1e-6) & (corners[:, 0] < 1.25 - 1e-6)).any()
     np.testing.assert_allclose(line_of(figure, "mean NIS")[:, 1], check.mean_per_step.numpy())
@@ -527,7 +535,7 @@ def test_nees_far_off_is_drawn_on_a_logarithmic_axis():
 
 
 def test_autocorrelation_is_drawn_with_its_band():
-    found = whiteness(random_numbers(10, 50, 2), 12)
+    found = consistency.whiteness(random_numbers(10, 50, 2), 12)
     figure = plot_whiteness(found)
     assert np.abs(band_of(figure)[:, 1]).max() == pytest.approx(float(found.band.max()))
     points = line_of(figure, "innovations")
@@ -552,9 +560,9 @@ def test_coverage_is_drawn_with_its_interval():
     "draw",
     [
         lambda: plot_nees(some_check(runs=1)),
-        lambda: plot_nees(check_nees(torch.full((2, 1), math.nan), 3)),
-        lambda: plot_whiteness(whiteness(random_numbers(2, 5, 1), 1)),
-        lambda: plot_coverage(coverage(torch.full((4, 2), math.nan), torch.eye(2))),
+        lambda: plot_nees(consistency.check_nees(torch.full((2, 1), math.nan), 3)),
+        lambda: plot_whiteness(consistency.whiteness(random_numbers(2, 5, 1), 1)),
+        lambda: plot_coverage(consistency.coverage(torch.full((4, 2), math.nan), torch.eye(2))),
     ],
     ids=["one run", "nothing but NaN", "one lag", "no samples"],
 )

@@ -4,26 +4,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmaslam.filters import (
-    BlockDiagonal,
-    Dense,
-    Diagonal,
-    Gaussian,
-    LinearMeasurement,
-    MeasurementModel,
-    UnscentedKalmanFilter,
-)
+from sigmaslam import filters
 from sigmaslam.filters.linalg import square_roots, unrolled
-from sigmaslam.filters.noise import Noise
-from tests.support.filter_builders import (
-    assert_close,
-    beliefs,
-    bent_measurement,
-    bent_motion,
-    covariances,
-    random_numbers,
-    tensor,
-)
+from sigmaslam.filters.noise_covariance import Noise
+from tests.support.filter_assertions import assert_close
+from tests.support.filter_builders import beliefs, bent_measurement, bent_motion, covariances, random_numbers, tensor
 
 COUNT = 150
 SIZES = [1, 2, 3, 4, 5, 6, 8]
@@ -126,9 +111,9 @@ def test_cholesky_flags_each_bad_element_only(count):
 
 def each_noise() -> dict[str, Noise]:
     return {
-        "diagonal": Diagonal(0.1 + random_numbers(3, 6).square()),
-        "blocks": BlockDiagonal(covariances(3, 2, 3)),
-        "dense": Dense(covariances(3, 6)),
+        "diagonal": filters.Diagonal(0.1 + random_numbers(3, 6).square()),
+        "blocks": filters.BlockDiagonal(covariances(3, 2, 3)),
+        "dense": filters.Dense(covariances(3, 6)),
     }
 
 
@@ -136,7 +121,7 @@ def each_noise() -> dict[str, Noise]:
 def test_noise_agrees_with_its_covariance(kind):
     noise = each_noise()[kind]
     R, columns = noise.covariance(), random_numbers(3, 6, 4)
-    assert noise.size == 6
+    assert noise.variance().shape[-1] == 6
     assert_close(noise.factor() @ noise.factor().mT, R, 1e-13)
     assert_close(noise.log_determinant(), torch.logdet(R), 1e-12)
     white = noise.whitened(columns)
@@ -149,14 +134,22 @@ def test_noise_agrees_with_its_covariance(kind):
 
 
 def test_wrong_shapes_of_noise_are_named():
-    for make, shape in ((Diagonal, ()), (BlockDiagonal, (3, 2)), (BlockDiagonal, (3, 2, 4)), (Dense, (3, 2))):
+    for make, shape in (
+        (filters.Diagonal, ()),
+        (filters.BlockDiagonal, (3, 2)),
+        (filters.BlockDiagonal, (3, 2, 4)),
+        (filters.Dense, (3, 2)),
+    ):
         with pytest.raises(ValueError, match="expected, got"):
             make(torch.ones(shape))
 
 
 def test_gaussian_is_the_same_by_covariance_and_by_any_root():
     root = random_numbers(3, 4, 6)
-    by_root, by_covariance = Gaussian(random_numbers(3, 4), factor=root), Gaussian(random_numbers(3, 4), root @ root.mT)
+    by_root, by_covariance = (
+        filters.Gaussian(random_numbers(3, 4), factor=root),
+        filters.Gaussian(random_numbers(3, 4), root @ root.mT),
+    )
     assert_close(by_root.covariance, by_covariance.covariance, 1e-13)
     assert_close(by_root.factor, by_covariance.factor, 1e-12)
     assert by_root.is_square_root
@@ -182,16 +175,18 @@ def test_wrong_gaussians_are_refused():
         ((mean, P.expand(4, 2, 2)), "does not broadcast"),
     ):
         with pytest.raises(ValueError, match=message):
-            Gaussian(*arguments)
+            filters.Gaussian(*arguments)
     with pytest.raises(ValueError, match="either a covariance or a factor"):
-        Gaussian(mean, P, factor=P)
+        filters.Gaussian(mean, P, factor=P)
 
 
 MOTION, MEASUREMENT = bent_motion(2), bent_measurement(2, 2)
 
 
-def step(bayes: UnscentedKalmanFilter, mean: Tensor, held: Tensor, z: Tensor, by_root: bool) -> tuple[Tensor, ...]:
-    belief = Gaussian(mean, factor=held, factor_is_lower=True) if by_root else Gaussian(mean, held)
+def step(
+    bayes: filters.UnscentedKalmanFilter, mean: Tensor, held: Tensor, z: Tensor, by_root: bool
+) -> tuple[Tensor, ...]:
+    belief = filters.Gaussian(mean, factor=held, factor_is_lower=True) if by_root else filters.Gaussian(mean, held)
     predicted = bayes.predict(belief, MOTION).belief
     update = bayes.update(predicted, MEASUREMENT, z)
     return update.belief.mean, update.belief.held, update.nis, update.log_likelihood, update.healthy
@@ -203,7 +198,7 @@ def test_compiled_step_equals_eager(form):
     belief, z = beliefs(40, 2), random_numbers(40, 2)
     z[3, 1] = torch.nan
     held = belief.factor if form == "qr" else belief.covariance
-    bayes = UnscentedKalmanFilter(form=form, on_failure="hold")
+    bayes = filters.UnscentedKalmanFilter(form=form, on_failure="hold")
     compiled = torch.compile(step, fullgraph=True)
     found = compiled(bayes, belief.mean, held, z, form == "qr")
     for a, b in zip(found, step(bayes, belief.mean, held, z, form == "qr"), strict=True):
@@ -215,11 +210,13 @@ FORMS = ("dense", "low-rank", "qr")
 
 def outputs(form: str, mean: Tensor, root: Tensor, variance: Tensor, z: Tensor, by_root: bool, m: int) -> Tensor:
     """All that predict and update give, as one number per element."""
-    bayes = UnscentedKalmanFilter(form=form)
+    bayes = filters.UnscentedKalmanFilter(form=form)
     root = root.tril()
-    belief = Gaussian(mean, factor=root, factor_is_lower=True) if by_root else Gaussian(mean, root @ root.mT)
+    belief = (
+        filters.Gaussian(mean, factor=root, factor_is_lower=True) if by_root else filters.Gaussian(mean, root @ root.mT)
+    )
     predicted = bayes.predict(belief, bent_motion(3)).belief
-    measurement = MeasurementModel(bent_measurement(3, m).function, Diagonal(variance))
+    measurement = filters.MeasurementModel(bent_measurement(3, m).function, filters.Diagonal(variance))
     update = bayes.update(predicted, measurement, z)
     total = update.nis + update.log_likelihood + update.innovation.sum(dim=-1)
     weights = random_numbers(3, 3, seed=9)
@@ -273,10 +270,10 @@ def test_gradients_are_finite_with_known_states_and_no_innovation(form, count):
     mean = random_numbers(count, 3).requires_grad_()
     held = root.requires_grad_()
     variance = torch.full((2,), 0.3, dtype=torch.float64, requires_grad=True)
-    belief = Gaussian(mean, factor=held, factor_is_lower=True)
-    measurement = LinearMeasurement(random_numbers(2, 3), Diagonal(variance))
+    belief = filters.Gaussian(mean, factor=held, factor_is_lower=True)
+    measurement = filters.LinearMeasurement(random_numbers(2, 3), filters.Diagonal(variance))
     z = (mean.detach() @ measurement.matrix.mT).requires_grad_()
-    update = UnscentedKalmanFilter(form=form).update(belief, measurement, z)
+    update = filters.UnscentedKalmanFilter(form=form).update(belief, measurement, z)
     total = update.belief.mean.sum() + update.log_likelihood.sum() + update.nis.sum() + update.belief.covariance.sum()
     for gradient in torch.autograd.grad(total, [mean, held, variance, z]):
         assert bool(gradient.isfinite().all())

@@ -4,33 +4,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmaslam.filters import (
-    BlockDiagonal,
-    Diagonal,
-    ExtendedKalmanFilter,
-    FilterError,
-    Gaussian,
-    KalmanFilter,
-    LinearMeasurement,
-    LinearMotion,
-    MeasurementModel,
-    MotionModel,
-    UnscentedKalmanFilter,
-    julier,
-)
+from sigmaslam import filters
 from sigmaslam.filters.linalg.square_roots import cholesky
-from tests.support.filter_builders import (
-    FORMS,
-    assert_close,
-    assert_same_belief,
-    assert_same_update,
-    beliefs,
-    bent_measurement,
-    bent_motion,
-    covariances,
-    random_numbers,
-    tensor,
-)
+from sigmaslam.filters.updates import FORMS
+from tests.support.filter_assertions import assert_close, assert_same_belief, assert_same_update
+from tests.support.filter_builders import beliefs, bent_measurement, bent_motion, covariances, random_numbers, tensor
 
 BAD = 7
 BATCHES = {"large": 10_000, "few": 20}
@@ -43,7 +21,7 @@ def with_negative_eigenvalue(covariance: Tensor, share: float) -> Tensor:
     return vectors @ torch.diag_embed(values) @ vectors.mT
 
 
-def spoil(kind: str, belief: Gaussian, z: Tensor, variance: Tensor) -> tuple[Gaussian, Tensor, Tensor]:
+def spoil(kind: str, belief: filters.Gaussian, z: Tensor, variance: Tensor) -> tuple[filters.Gaussian, Tensor, Tensor]:
     mean, P, z, variance = (a.clone() for a in (belief.mean, belief.covariance, z, variance))
     if kind == "mean":
         mean[BAD, 1] = torch.nan
@@ -55,7 +33,7 @@ def spoil(kind: str, belief: Gaussian, z: Tensor, variance: Tensor) -> tuple[Gau
         z[BAD, 0] = torch.inf
     else:
         variance[BAD, 0] = -10.0
-    return Gaussian(mean, P), z, variance
+    return filters.Gaussian(mean, P), z, variance
 
 
 @pytest.mark.parametrize("policy", ["hold", "jitter"])
@@ -65,11 +43,11 @@ def spoil(kind: str, belief: Gaussian, z: Tensor, variance: Tensor) -> tuple[Gau
 def test_one_bad_element_is_held_and_flagged_and_leaves_the_others_alone(count, form, kind, policy):
     belief, z = beliefs(count, 3), random_numbers(count, 2, seed=4)
     variance = 0.1 + random_numbers(count, 2, seed=5).square()
-    bayes = UnscentedKalmanFilter(form=form, on_failure=policy)
+    bayes = filters.UnscentedKalmanFilter(form=form, on_failure=policy)
     see = bent_measurement(3, 2).function
-    good = bayes.update(belief, MeasurementModel(see, Diagonal(variance)), z)
+    good = bayes.update(belief, filters.MeasurementModel(see, filters.Diagonal(variance)), z)
     spoilt, z, variance = spoil(kind, belief, z, variance)
-    update = bayes.update(spoilt, MeasurementModel(see, Diagonal(variance)), z)
+    update = bayes.update(spoilt, filters.MeasurementModel(see, filters.Diagonal(variance)), z)
     others = torch.arange(count) != BAD
     assert bool(good.healthy.all())
     assert torch.equal(update.healthy, others)
@@ -94,11 +72,11 @@ def test_jitter_mends_a_slightly_indefinite_covariance(count, size):
     belief, z = beliefs(count, size), random_numbers(count, 2, seed=4)
     P = belief.covariance.clone()
     P[2] = with_negative_eigenvalue(P[2], 1e-5)
-    bayes = UnscentedKalmanFilter(on_failure="jitter")
+    bayes = filters.UnscentedKalmanFilter(on_failure="jitter")
     measurement = bent_measurement(size, 2)
-    update = bayes.update(Gaussian(belief.mean, P), measurement, z)
+    update = bayes.update(filters.Gaussian(belief.mean, P), measurement, z)
     nearest = P[2] + 1e-5 * torch.linalg.matrix_norm(P[2], 2) * torch.eye(size, dtype=torch.float64)
-    expected = bayes.update(Gaussian(belief.mean[2], nearest), measurement, z[2])
+    expected = bayes.update(filters.Gaussian(belief.mean[2], nearest), measurement, z[2])
     assert not bool(update.healthy[2])
     assert int(update.healthy.sum()) == count - 1
     assert_same_belief(update.belief[2], expected.belief, 1e-2)
@@ -130,21 +108,23 @@ def test_error_names_stage_element_matrix_and_smallest_eigenvalue():
     belief = beliefs(4, 5, 3)
     P = belief.covariance.clone()
     P[2, 3] = torch.diag(tensor(1.0, -2.5, 1.0))
-    bad = Gaussian(belief.mean, P)
+    bad = filters.Gaussian(belief.mean, P)
     for stage in ("predict", "update"):
         step = {"predict": (bent_motion(3),), "update": (bent_measurement(3, 2), random_numbers(4, 5, 2))}[stage]
-        with pytest.raises(FilterError, match=rf"{stage}.*\(2, 3\).*1 of 20.*prior covariance.*eigenvalue -2\.5"):
-            getattr(UnscentedKalmanFilter(), stage)(bad, *step)
+        with pytest.raises(
+            filters.FilterError, match=rf"{stage}.*\(2, 3\).*1 of 20.*prior covariance.*eigenvalue -2\.5"
+        ):
+            getattr(filters.UnscentedKalmanFilter(), stage)(bad, *step)
     measurement = bent_measurement(3, 2, -5.0 * torch.eye(2, dtype=torch.float64))
-    with pytest.raises(FilterError, match=r"update.*the filter.*measurement noise.*eigenvalue -"):
-        UnscentedKalmanFilter(form="dense").update(belief[0, 0], measurement, random_numbers(2))
+    with pytest.raises(filters.FilterError, match=r"update.*the filter.*measurement noise.*eigenvalue -"):
+        filters.UnscentedKalmanFilter(form="dense").update(belief[0, 0], measurement, random_numbers(2))
 
 
 def test_error_of_a_sequence_begins_with_the_step():
     values = random_numbers(6, 3, 2)
     values[4, 1, 0] = torch.inf
-    with pytest.raises(FilterError, match=r"^step 4 of 6: update failed.*\(1,\).*1 of 3"):
-        UnscentedKalmanFilter().filter(beliefs(3, 3), bent_motion(3), bent_measurement(3, 2), values)
+    with pytest.raises(filters.FilterError, match=r"^step 4 of 6: update failed.*\(1,\).*1 of 3"):
+        filters.UnscentedKalmanFilter().filter(beliefs(3, 3), bent_motion(3), bent_measurement(3, 2), values)
 
 
 def test_held_element_goes_on_after_a_bad_step():
@@ -152,7 +132,7 @@ def test_held_element_goes_on_after_a_bad_step():
     broken, missing = values.clone(), values.clone()
     broken[2, 1, 0] = torch.inf
     missing[2, 1] = torch.nan
-    bayes = UnscentedKalmanFilter(on_failure="hold")
+    bayes = filters.UnscentedKalmanFilter(on_failure="hold")
     found = bayes.filter(prior, bent_motion(3), bent_measurement(3, 2), broken)
     expected = bayes.filter(prior, bent_motion(3), bent_measurement(3, 2), missing)
     assert_same_belief(found.filtered, expected.filtered, 1e-12)
@@ -164,22 +144,22 @@ def test_held_element_goes_on_after_a_bad_step():
 def test_error_of_an_unbatched_prior_with_batched_noise_is_a_filter_error(form):
     variance = torch.ones(3, 2, dtype=torch.float64)
     variance[1, 0] = torch.nan
-    measurement = bent_measurement(3, 2, Diagonal(variance))
-    with pytest.raises(FilterError, match=r"\(1,\)"):
-        UnscentedKalmanFilter(form=form).update(beliefs(3), measurement, random_numbers(2))
+    measurement = bent_measurement(3, 2, filters.Diagonal(variance))
+    with pytest.raises(filters.FilterError, match=r"\(1,\)"):
+        filters.UnscentedKalmanFilter(form=form).update(beliefs(3), measurement, random_numbers(2))
 
 
 @pytest.mark.parametrize("kind", ["kf", "ukf"])
 @pytest.mark.parametrize("form", FORMS)
 def test_component_without_noise_is_never_dropped_silently(form, kind):
     """It is either fused as exact, or the element is flagged."""
-    prior, z, noise = beliefs(3), tensor(0.3, -0.2), Diagonal(tensor(0.0, 1.0))
+    prior, z, noise = beliefs(3), tensor(0.3, -0.2), filters.Diagonal(tensor(0.0, 1.0))
     if kind == "kf":
-        measurement = LinearMeasurement(torch.eye(3, dtype=torch.float64)[:2], noise)
-        update = KalmanFilter(form=form, on_failure="hold").update(prior, measurement, z)
+        measurement = filters.LinearMeasurement(torch.eye(3, dtype=torch.float64)[:2], noise)
+        update = filters.KalmanFilter(form=form, on_failure="hold").update(prior, measurement, z)
     else:
-        measurement = MeasurementModel(lambda x: x[..., :2], noise)
-        update = UnscentedKalmanFilter(form=form, on_failure="hold").update(prior, measurement, z)
+        measurement = filters.MeasurementModel(lambda x: x[..., :2], noise)
+        update = filters.UnscentedKalmanFilter(form=form, on_failure="hold").update(prior, measurement, z)
     assert not bool(update.healthy) or abs(float(update.belief.mean[0] - z[0])) < 1e-9
 
 
@@ -187,21 +167,21 @@ def test_component_without_noise_is_never_dropped_silently(form, kind):
 def test_indefinite_block_of_noise_is_flagged(form):
     """Unless the sum with the spread of the state is definite, which is all that the dense form asks."""
     blocks = torch.stack([torch.eye(2), -1e3 * torch.eye(2)]).double()
-    bayes = UnscentedKalmanFilter(form=form, on_failure="hold")
-    measurement = bent_measurement(3, 4, BlockDiagonal(blocks))
+    bayes = filters.UnscentedKalmanFilter(form=form, on_failure="hold")
+    measurement = bent_measurement(3, 4, filters.BlockDiagonal(blocks))
     update = bayes.update(beliefs(3), measurement, random_numbers(4))
     assert not bool(update.healthy)
     assert_same_belief(update.belief, beliefs(3), 1e-12)
 
 
-def known_and_copied(batch: int, by_root: bool) -> tuple[Gaussian, Tensor]:
+def known_and_copied(batch: int, by_root: bool) -> tuple[filters.Gaussian, Tensor]:
     """States a, b, a copy of both, and a known one, (batch, 5); and the matrix that makes it of a, b."""
     spread = torch.zeros(5, 2, dtype=torch.float64)
     spread[0, 0] = spread[1, 1] = spread[2, 0] = spread[3, 1] = 1.0
     P, mean = covariances(batch, 2, seed=3), random_numbers(batch, 2, seed=4) @ spread.mT
     if by_root:
-        return Gaussian(mean, factor=spread @ torch.linalg.cholesky(P)), spread
-    return Gaussian(mean, spread @ P @ spread.mT), spread
+        return filters.Gaussian(mean, factor=spread @ torch.linalg.cholesky(P)), spread
+    return filters.Gaussian(mean, spread @ P @ spread.mT), spread
 
 
 @pytest.mark.parametrize("iterations", [1, 3])
@@ -212,16 +192,16 @@ def known_and_copied(batch: int, by_root: bool) -> tuple[Gaussian, Tensor]:
 def test_copies_and_known_states_update_as_the_states_they_stand_for(batch, by_root, form, kind, iterations):
     belief, spread = known_and_copied(batch, by_root)
     full = bent_measurement(5, 3)
-    reduced = MeasurementModel(lambda x: full.function(x @ spread.mT), full.noise)
+    reduced = filters.MeasurementModel(lambda x: full.function(x @ spread.mT), full.noise)
     z, P = random_numbers(batch, 3, seed=6), belief.covariance[..., :2, :2]
-    bayes = again = ExtendedKalmanFilter(form=form, iterations=iterations)
+    bayes = again = filters.ExtendedKalmanFilter(form=form, iterations=iterations)
     if kind == "ukf":
         # Three of the five pairs of points are at the centre, which the set of two states gives the same weight.
-        bayes = UnscentedKalmanFilter(form=form, iterations=iterations)
-        again = UnscentedKalmanFilter(points=julier(3.0), form=form, iterations=iterations)
+        bayes = filters.UnscentedKalmanFilter(form=form, iterations=iterations)
+        again = filters.UnscentedKalmanFilter(points=filters.julier(3.0), form=form, iterations=iterations)
     update = bayes.update(belief, full, z)
-    expected = again.update(Gaussian(belief.mean[..., :2], P), reduced, z).belief
-    lifted = Gaussian(expected.mean @ spread.mT, spread @ expected.covariance @ spread.mT)
+    expected = again.update(filters.Gaussian(belief.mean[..., :2], P), reduced, z).belief
+    lifted = filters.Gaussian(expected.mean @ spread.mT, spread @ expected.covariance @ spread.mT)
     assert_same_belief(update.belief, lifted, 1e-7)
     assert bool(update.healthy.all())
     found = update.belief
@@ -234,29 +214,31 @@ def test_copies_and_known_states_update_as_the_states_they_stand_for(batch, by_r
 @pytest.mark.parametrize("batch", [3, 200])
 def test_no_process_noise_keeps_what_is_known(batch, form):
     belief, _ = known_and_copied(batch, False)
-    bayes = UnscentedKalmanFilter(form=form)
-    still = MotionModel(lambda x: x, Diagonal(torch.zeros(5, dtype=torch.float64)))
-    measurement = LinearMeasurement(random_numbers(3, 5), covariances(3))
+    bayes = filters.UnscentedKalmanFilter(form=form)
+    still = filters.MotionModel(lambda x: x, filters.Diagonal(torch.zeros(5, dtype=torch.float64)))
+    measurement = filters.LinearMeasurement(random_numbers(3, 5), covariances(3))
     exact, values = belief, random_numbers(5, batch, 3)
     for z in values:
         predicted = bayes.predict(belief, still)
         belief = bayes.update(predicted.belief, measurement, z).belief
         exact = (
-            KalmanFilter(form="dense")
-            .predict(exact, LinearMotion(torch.eye(5, dtype=torch.float64), torch.zeros(5, 5, dtype=torch.float64)))
+            filters.KalmanFilter(form="dense")
+            .predict(
+                exact, filters.LinearMotion(torch.eye(5, dtype=torch.float64), torch.zeros(5, 5, dtype=torch.float64))
+            )
             .belief
         )
-        exact = KalmanFilter(form="dense").update(exact, measurement, z).belief
+        exact = filters.KalmanFilter(form="dense").update(exact, measurement, z).belief
         assert bool(predicted.healthy.all())
     assert_same_belief(belief, exact, 1e-9)
 
 
 @pytest.mark.parametrize("form", FORMS)
 def test_prior_without_any_uncertainty_stays(form):
-    belief = Gaussian(random_numbers(2, 3), torch.zeros(2, 3, 3, dtype=torch.float64))
-    update = UnscentedKalmanFilter(form=form).update(belief, bent_measurement(3, 4), random_numbers(2, 4))
+    belief = filters.Gaussian(random_numbers(2, 3), torch.zeros(2, 3, 3, dtype=torch.float64))
+    update = filters.UnscentedKalmanFilter(form=form).update(belief, bent_measurement(3, 4), random_numbers(2, 4))
     assert_same_belief(update.belief, belief, 1e-15)
-    moved = UnscentedKalmanFilter(form=form).predict(belief, bent_motion(3))
+    moved = filters.UnscentedKalmanFilter(form=form).predict(belief, bent_motion(3))
     assert_close(moved.belief.covariance, bent_motion(3).noise.expand(2, 3, 3), 1e-14)
 
 
@@ -274,25 +256,31 @@ def test_points_behind_the_camera_are_the_models_to_guard():
         across = landmark[0] - x[..., 0]
         return torch.stack([500 * across / depth, 500 * (across - 0.1) / depth], dim=-1)
 
-    prior = Gaussian(torch.zeros(2, dtype=torch.float64), torch.diag(tensor(1.0, 9.0)))
+    prior = filters.Gaussian(torch.zeros(2, dtype=torch.float64), torch.diag(tensor(1.0, 9.0)))
     assert float(prior.mean[1] + 3.0 * 2**0.5) > float(landmark[1])
     z = seen(tensor(0.1, 0.3), 0.1)
     for form in FORMS:
-        bayes = UnscentedKalmanFilter(form=form, iterations=3)
-        update = bayes.update(prior, MeasurementModel(lambda x: seen(x, 0.1), Diagonal(tensor(1.0, 1.0))), z)
+        bayes = filters.UnscentedKalmanFilter(form=form, iterations=3)
+        update = bayes.update(
+            prior, filters.MeasurementModel(lambda x: seen(x, 0.1), filters.Diagonal(tensor(1.0, 1.0))), z
+        )
         assert bool(update.healthy)
         assert bool(update.belief.mean.isfinite().all())
         assert float(torch.linalg.eigvalsh(update.belief.covariance)[0]) > 0
         # A depth of exactly zero is infinite, which is flagged.
-        touching = Gaussian(tensor(0.0, 2.0), prior.covariance)
-        ekf = ExtendedKalmanFilter(form=form, on_failure="hold")
-        flagged = ekf.update(touching, MeasurementModel(lambda x: seen(x, 0.0), Diagonal(tensor(1.0, 1.0))), z)
+        touching = filters.Gaussian(tensor(0.0, 2.0), prior.covariance)
+        ekf = filters.ExtendedKalmanFilter(form=form, on_failure="hold")
+        flagged = ekf.update(
+            touching, filters.MeasurementModel(lambda x: seen(x, 0.0), filters.Diagonal(tensor(1.0, 1.0))), z
+        )
         assert not bool(flagged.healthy)
         assert_same_belief(flagged.belief, touching, 1e-15)
 
 
 def test_policies_do_not_matter_where_nothing_fails():
     prior, measurement, z = beliefs(4, 3), bent_measurement(3, 2), random_numbers(4, 2)
-    updates = [UnscentedKalmanFilter(on_failure=p).update(prior, measurement, z) for p in ("raise", "hold", "jitter")]
+    updates = [
+        filters.UnscentedKalmanFilter(on_failure=p).update(prior, measurement, z) for p in ("raise", "hold", "jitter")
+    ]
     for update in updates[1:]:
         assert_same_update(update, updates[0], 0.0)

@@ -7,31 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmaslam.filters import (
-    SE2,
-    BayesFilter,
-    Diagonal,
-    ExtendedKalmanFilter,
-    Gaussian,
-    KalmanFilter,
-    LinearMeasurement,
-    LinearMotion,
-    MeasurementModel,
-    MotionModel,
-    Track,
-    UnscentedKalmanFilter,
-    julier,
-)
-from tests.support.filter_builders import (
-    assert_close,
-    assert_same_belief,
-    beliefs,
-    bent_measurement,
-    bent_motion,
-    covariances,
-    random_numbers,
-    tensor,
-)
+from sigmaslam import filters
+from tests.support.filter_assertions import assert_close, assert_same_belief
+from tests.support.filter_builders import beliefs, bent_measurement, bent_motion, covariances, random_numbers, tensor
 
 # Annual flow at Aswan, 1871-1970, 1e8 m^3 (Cobb 1978).
 NILE = tensor(
@@ -41,14 +19,14 @@ NILE = tensor(
     *[781, 865, 845, 944, 984, 897, 822, 1010, 771, 676, 649, 846, 812, 742, 801, 1040, 860, 874, 848, 890],
     *[744, 749, 838, 1050, 918, 986, 797, 923, 975, 815, 1020, 906, 901, 1170, 912, 746, 919, 718, 714, 740],
 )[:, None]
-LEVEL = LinearMotion(tensor(1.0)[None], tensor(1469.1)[None])
-FLOW = LinearMeasurement(tensor(1.0)[None], tensor(15099.0)[None])
+LEVEL = filters.LinearMotion(tensor(1.0)[None], tensor(1469.1)[None])
+FLOW = filters.LinearMeasurement(tensor(1.0)[None], tensor(15099.0)[None])
 
 
 @pytest.mark.parametrize("form", ["auto", "low-rank", "qr"])
 def test_nile_has_the_published_values(form):
-    bayes = KalmanFilter(form=form)
-    track = bayes.filter(Gaussian(tensor(0.0), tensor(1e7)[None]), LEVEL, FLOW, NILE)
+    bayes = filters.KalmanFilter(form=form)
+    track = bayes.filter(filters.Gaussian(tensor(0.0), tensor(1e7)[None]), LEVEL, FLOW, NILE)
     smoothed = bayes.smooth(track)
     found = [
         track.log_likelihood.sum(),
@@ -70,13 +48,13 @@ PRIOR = beliefs(3, SIZE, seed=5)
 VALUES = random_numbers(STEPS, 3, MEASUREMENTS, seed=6)
 VALUES[4, 1] = torch.nan
 VALUES[7, 2, 0] = torch.nan
-LINEAR = LinearMotion(A, Q, noise_matrix=B2)
-SEEN = LinearMeasurement(H, R)
+LINEAR = filters.LinearMotion(A, Q, noise_matrix=B2)
+SEEN = filters.LinearMeasurement(H, R)
 
 
 @cache
-def linear_track(form: str = "auto") -> Track:
-    return KalmanFilter(form=form).filter(PRIOR, LINEAR, SEEN, VALUES)
+def linear_track(form: str = "auto") -> filters.Track:
+    return filters.KalmanFilter(form=form).filter(PRIOR, LINEAR, SEEN, VALUES)
 
 
 def batch_solution(element: int) -> tuple[np.ndarray, np.ndarray]:
@@ -106,24 +84,29 @@ def batch_solution(element: int) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize(
     "bayes",
-    [KalmanFilter(), KalmanFilter(form="qr"), UnscentedKalmanFilter(points=julier(1.0)), ExtendedKalmanFilter()],
+    [
+        filters.KalmanFilter(),
+        filters.KalmanFilter(form="qr"),
+        filters.UnscentedKalmanFilter(points=filters.julier(1.0)),
+        filters.ExtendedKalmanFilter(),
+    ],
     ids=["kf", "kf qr", "ukf", "ekf"],
 )
 def test_smoother_equals_the_batch_solution_of_a_linear_model(bayes):
     motion, measurement = LINEAR, SEEN
-    if bayes.transform != KalmanFilter().transform:
-        motion = MotionModel(lambda x, w: x @ A.mT + w @ B2.mT, Q, additive=False)
-        measurement = MeasurementModel(lambda x: x @ H.mT, R)
+    if bayes.transform != filters.KalmanFilter().transform:
+        motion = filters.MotionModel(lambda x, w: x @ A.mT + w @ B2.mT, Q, additive=False)
+        measurement = filters.MeasurementModel(lambda x: x @ H.mT, R)
     smoothed = bayes.smooth(bayes.filter(PRIOR, motion, measurement, VALUES))
     for element in range(3):
         mean, covariance = batch_solution(element)
-        expected = Gaussian(torch.as_tensor(mean), torch.as_tensor(covariance))
+        expected = filters.Gaussian(torch.as_tensor(mean), torch.as_tensor(covariance))
         assert_same_belief(smoothed[:, element], expected, 1e-10)
 
 
 def test_covariance_only_shrinks_from_predicted_to_filtered_to_smoothed():
     track = linear_track()
-    smoothed = KalmanFilter().smooth(track)
+    smoothed = filters.KalmanFilter().smooth(track)
     for less, more in ((track.filtered, track.predicted), (smoothed, track.filtered)):
         smallest = torch.linalg.eigvalsh(more.covariance - less.covariance).amin()
         assert float(smallest) > -1e-12
@@ -132,11 +115,11 @@ def test_covariance_only_shrinks_from_predicted_to_filtered_to_smoothed():
 
 @pytest.mark.parametrize("form", ["auto", "qr"])
 def test_sequence_equals_a_loop(form):
-    bayes = UnscentedKalmanFilter(form=form)
+    bayes = filters.UnscentedKalmanFilter(form=form)
     u, s = random_numbers(STEPS - 1, 3, SIZE, seed=8), random_numbers(STEPS, 3, 1, seed=9)
     still, seen = bent_motion(SIZE), bent_measurement(SIZE, MEASUREMENTS)
-    motion = MotionModel(lambda x, u: still.function(x) + torch.sin(x * u), still.noise)
-    measurement = MeasurementModel(lambda x, s: seen.function(x) * (1 + 0.1 * s), seen.noise)
+    motion = filters.MotionModel(lambda x, u: still.function(x) + torch.sin(x * u), still.noise)
+    measurement = filters.MeasurementModel(lambda x, s: seen.function(x) * (1 + 0.1 * s), seen.noise)
     track = bayes.filter(PRIOR, motion, measurement, VALUES, [u], [s])
     belief = PRIOR
     for k in range(STEPS):
@@ -156,15 +139,15 @@ def test_sequence_equals_a_loop(form):
 
 def test_batch_of_sequences_equals_single_sequences():
     track = linear_track()
-    smoothed = KalmanFilter().smooth(track)
+    smoothed = filters.KalmanFilter().smooth(track)
     for element in range(3):
-        alone = KalmanFilter().filter(PRIOR[element], LINEAR, SEEN, VALUES[:, element])
+        alone = filters.KalmanFilter().filter(PRIOR[element], LINEAR, SEEN, VALUES[:, element])
         assert_same_belief(track.filtered[:, element], alone.filtered, 1e-12)
-        assert_same_belief(smoothed[:, element], KalmanFilter().smooth(alone), 1e-12)
+        assert_same_belief(smoothed[:, element], filters.KalmanFilter().smooth(alone), 1e-12)
 
 
 def test_smoother_in_square_roots_equals_the_one_in_covariances():
-    bayes, by_root = UnscentedKalmanFilter(), UnscentedKalmanFilter(form="qr")
+    bayes, by_root = filters.UnscentedKalmanFilter(), filters.UnscentedKalmanFilter(form="qr")
     motion, measurement = bent_motion(SIZE), bent_measurement(SIZE, MEASUREMENTS)
     first = bayes.smooth(bayes.filter(PRIOR, motion, measurement, VALUES))
     second = by_root.smooth(by_root.filter(PRIOR, motion, measurement, VALUES))
@@ -175,18 +158,20 @@ def test_smoother_in_square_roots_equals_the_one_in_covariances():
 
 def test_smoother_is_positive_semidefinite_in_float32():
     """Precise measurements of a vague state; covariances subtracted from each other would lose the sign."""
-    motion = LinearMotion(A.float(), 1e-6 * torch.eye(SIZE))
-    measurement = LinearMeasurement(H.float(), 1e-8 * torch.eye(MEASUREMENTS))
-    prior = Gaussian(torch.zeros(3, SIZE), 1e4 * torch.eye(SIZE))
+    motion = filters.LinearMotion(A.float(), 1e-6 * torch.eye(SIZE))
+    measurement = filters.LinearMeasurement(H.float(), 1e-8 * torch.eye(MEASUREMENTS))
+    prior = filters.Gaussian(torch.zeros(3, SIZE), 1e4 * torch.eye(SIZE))
     truth = 10 * random_numbers(3, SIZE)
     values = torch.stack([torch.linalg.matrix_power(A, k) @ truth.mT for k in range(20)]).mT @ H.mT
-    bayes = KalmanFilter()
+    bayes = filters.KalmanFilter()
     smoothed = bayes.smooth(bayes.filter(prior, motion, measurement, values.float()))
     assert bool(smoothed.mean.isfinite().all())
     assert smoothed.is_square_root
     double = [m.double() for m in (motion.matrix, motion.noise, measurement.matrix, measurement.noise)]
     exact = bayes.smooth(
-        bayes.filter(prior.to(torch.float64), LinearMotion(*double[:2]), LinearMeasurement(*double[2:]), values)
+        bayes.filter(
+            prior.to(torch.float64), filters.LinearMotion(*double[:2]), filters.LinearMeasurement(*double[2:]), values
+        )
     )
     sigma = exact.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     found = smoothed.to(torch.float64).covariance.diagonal(dim1=-2, dim2=-1).sqrt()
@@ -194,12 +179,15 @@ def test_smoother_is_positive_semidefinite_in_float32():
 
 
 def test_wrong_lengths_are_named():
-    bayes, motion = KalmanFilter(), LinearMotion(A, covariances(SIZE), torch.eye(SIZE, dtype=torch.float64))
+    bayes, motion = (
+        filters.KalmanFilter(),
+        filters.LinearMotion(A, covariances(SIZE), torch.eye(SIZE, dtype=torch.float64)),
+    )
     with pytest.raises(ValueError, match=r"12 measurements need motion inputs of length 11, got 12"):
         bayes.filter(PRIOR, motion, SEEN, VALUES, [random_numbers(12, 3, SIZE)])
-    measurement = MeasurementModel(lambda x, s: x[..., :2] * s, R)
+    measurement = filters.MeasurementModel(lambda x, s: x[..., :2] * s, R)
     with pytest.raises(ValueError, match=r"12 measurements need measurement inputs of length 12, got 11"):
-        UnscentedKalmanFilter().filter(PRIOR, LINEAR, measurement, VALUES, (), [random_numbers(11, 3, 1)])
+        filters.UnscentedKalmanFilter().filter(PRIOR, LINEAR, measurement, VALUES, (), [random_numbers(11, 3, 1)])
     with pytest.raises(ValueError, match=r"values \(T, \.\.\., m\) with T > 0 expected, got \(0, 3, 2\)"):
         bayes.filter(PRIOR, LINEAR, SEEN, VALUES[:0])
     with pytest.raises(ValueError, match=r"got \(2,\)"):
@@ -207,19 +195,19 @@ def test_wrong_lengths_are_named():
 
 
 def test_one_measurement_is_a_sequence():
-    track = KalmanFilter().filter(PRIOR, LINEAR, SEEN, VALUES[:1])
-    assert_same_belief(KalmanFilter().smooth(track), track.filtered, 0.0)
+    track = filters.KalmanFilter().filter(PRIOR, LINEAR, SEEN, VALUES[:1])
+    assert_same_belief(filters.KalmanFilter().smooth(track), track.filtered, 0.0)
     assert_same_belief(track.predicted[0], PRIOR, 0.0)
 
 
-def drive(bayes: BayesFilter, runs: int, steps: int) -> tuple[Track, Tensor]:
+def drive(bayes: filters.BayesFilter, runs: int, steps: int) -> tuple[filters.Track, Tensor]:
     """Planar poses that odometry moves and positions correct; and the true poses (steps, runs, 3)."""
-    space = SE2()
-    prior = Gaussian(torch.zeros(runs, 3, dtype=torch.float64), torch.diag(tensor(0.04, 0.04, 0.04)))
+    space = filters.SE2()
+    prior = filters.Gaussian(torch.zeros(runs, 3, dtype=torch.float64), torch.diag(tensor(0.04, 0.04, 0.04)))
     sigma = tensor(0.02, 0.01, 0.03)
     step = tensor(0.5, 0.0, 0.25)
-    motion = MotionModel(lambda x: space.retract(x, step.to(x)), Diagonal(sigma.square()))
-    measurement = MeasurementModel(lambda x: x[..., :2], Diagonal(tensor(0.04, 0.04)))
+    motion = filters.MotionModel(lambda x: space.retract(x, step.to(x)), filters.Diagonal(sigma.square()))
+    measurement = filters.MeasurementModel(lambda x: x[..., :2], filters.Diagonal(tensor(0.04, 0.04)))
     pose = space.retract(prior.mean, 0.2 * random_numbers(runs, 3))
     poses = [pose]
     for k in range(1, steps):
@@ -230,13 +218,13 @@ def drive(bayes: BayesFilter, runs: int, steps: int) -> tuple[Track, Tensor]:
     return bayes.filter(prior, motion, measurement, z), truth
 
 
-@pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])
+@pytest.mark.parametrize("kind", [filters.UnscentedKalmanFilter, filters.ExtendedKalmanFilter])
 def test_smoother_on_a_manifold_is_consistent_and_better(kind):
-    runs, bayes, space = 300, kind(SE2()), SE2()
+    runs, bayes, space = 300, kind(filters.SE2()), filters.SE2()
     track, truth = drive(bayes, runs, 15)
     smoothed = bayes.smooth(track)
 
-    def nees(belief: Gaussian) -> Tensor:
+    def nees(belief: filters.Gaussian) -> Tensor:
         error = space.local(belief.mean, truth)
         return (error * torch.linalg.solve(belief.covariance, error)).sum(dim=-1)
 

@@ -11,16 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmaslam.filters import (
-    BayesFilter,
-    Diagonal,
-    Gaussian,
-    KalmanFilter,
-    LinearMeasurement,
-    LinearMotion,
-    MeasurementModel,
-    UnscentedKalmanFilter,
-)
+from sigmaslam import filters
 from tests.support.filter_builders import random_numbers, tensor
 
 RUNS = 64
@@ -37,7 +28,7 @@ class Case:
     matrix: Tensor | None
     sigma: float
     measurements: int
-    bayes: BayesFilter
+    bayes: filters.BayesFilter
 
 
 def turned(rotation: Tensor, vector: Tensor) -> Tensor:
@@ -66,10 +57,10 @@ def velocity_model(step: float = 0.1) -> Tensor:
     return transition
 
 
-def bayes_filter(form: str, linear: bool) -> BayesFilter:
+def bayes_filter(form: str, linear: bool) -> filters.BayesFilter:
     if linear:
-        return KalmanFilter(form=form, on_failure="hold")
-    return UnscentedKalmanFilter(form=form, iterations=3, on_failure="hold")
+        return filters.KalmanFilter(form=form, on_failure="hold")
+    return filters.UnscentedKalmanFilter(form=form, iterations=3, on_failure="hold")
 
 
 def precise_stereo(form: str, count: int = 20) -> Case:
@@ -100,17 +91,17 @@ def nearly_singular_prior(form: str) -> Case:
 
 def follow(case: Case, dtype: torch.dtype, steps: int) -> tuple[Tensor, Tensor, Tensor]:
     """Means and covariances in float64, and the truth, (steps, runs, ...)."""
-    noise = Diagonal(torch.full((case.measurements,), case.sigma**2, dtype=dtype))
-    measurement = MeasurementModel(case.see, noise)
+    noise = filters.Diagonal(torch.full((case.measurements,), case.sigma**2, dtype=dtype))
+    measurement = filters.MeasurementModel(case.see, noise)
     if case.matrix is not None:
-        measurement = LinearMeasurement(case.matrix.to(dtype), noise)
-    motion = LinearMotion(case.transition.to(dtype), Diagonal(case.process.square().to(dtype)))
+        measurement = filters.LinearMeasurement(case.matrix.to(dtype), noise)
+    motion = filters.LinearMotion(case.transition.to(dtype), filters.Diagonal(case.process.square().to(dtype)))
     truth = random_numbers(RUNS, 12, seed=2) @ case.root.mT
     mean = torch.zeros(RUNS, 12, dtype=dtype)
     if case.bayes.form == "dense":
-        belief = Gaussian(mean, (case.root @ case.root.mT).to(dtype))
+        belief = filters.Gaussian(mean, (case.root @ case.root.mT).to(dtype))
     else:
-        belief = Gaussian(mean, factor=case.root.to(dtype))
+        belief = filters.Gaussian(mean, factor=case.root.to(dtype))
     said = []
     for step in range(steps):
         if step > 0:

@@ -10,30 +10,16 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 from torch import Tensor
 
-from sigmaslam.filters import (
-    SE2,
-    SE3,
-    SO3,
-    BlockDiagonal,
-    Diagonal,
-    ExtendedKalmanFilter,
-    FilterError,
-    Gaussian,
-    KalmanFilter,
-    LinearMeasurement,
-    Manifold,
-    MeasurementModel,
-    wrap_angle,
-)
-from sigmaslam.filters.inference import Estimate, Observation, maximum_a_posteriori, maximum_likelihood
+from sigmaslam import filters
+from sigmaslam.filters.inference import Observation, PointEstimate, maximum_a_posteriori, maximum_likelihood
 from tests.support.filter_builders import covariances, random_numbers, tensor
 
 BEACONS = torch.tensor([[0.0, 0.0], [4.0, -1.0], [1.0, 5.0]], dtype=torch.float64)
 
 
-def linear_problem(*batch: int, size: int = 3, measured: int = 6) -> tuple[LinearMeasurement, Tensor]:
+def linear_problem(*batch: int, size: int = 3, measured: int = 6) -> tuple[filters.LinearMeasurement, Tensor]:
     matrix, noise = random_numbers(*batch, measured, size, seed=1), covariances(*batch, measured, seed=2)
-    return LinearMeasurement(matrix, noise), random_numbers(*batch, measured, seed=3)
+    return filters.LinearMeasurement(matrix, noise), random_numbers(*batch, measured, seed=3)
 
 
 def ranges(state: Tensor) -> Tensor:
@@ -46,35 +32,37 @@ def bearings(state: Tensor) -> Tensor:
     """Directions to the beacons from points (..., 2), or as seen from poses (..., 3) of SE2."""
     offset = BEACONS.to(state.dtype) - state[..., None, :2]
     seen = torch.atan2(offset[..., 1], offset[..., 0])
-    return wrap_angle(seen - state[..., 2:]) if state.shape[-1] == 3 else seen
+    return filters.wrap_angle(seen - state[..., 2:]) if state.shape[-1] == 3 else seen
 
 
-def ranging(deviation: float = 0.1) -> MeasurementModel:
-    return MeasurementModel(ranges, Diagonal(torch.full((3,), deviation**2, dtype=torch.float64)))
+def ranging(deviation: float = 0.1) -> filters.MeasurementModel:
+    return filters.MeasurementModel(ranges, filters.Diagonal(torch.full((3,), deviation**2, dtype=torch.float64)))
 
 
-def sighting(deviation: float = 0.05) -> MeasurementModel:
-    noise = Diagonal(torch.full((3,), deviation**2, dtype=torch.float64))
-    return MeasurementModel(bearings, noise, residual=lambda measured, seen: wrap_angle(measured - seen))
+def sighting(deviation: float = 0.05) -> filters.MeasurementModel:
+    noise = filters.Diagonal(torch.full((3,), deviation**2, dtype=torch.float64))
+    return filters.MeasurementModel(
+        bearings, noise, residual=lambda measured, seen: filters.wrap_angle(measured - seen)
+    )
 
 
 def project(pose: Tensor, points: Tensor) -> Tensor:
     """Left and right column and row (..., 3 k) of points (..., k, 3) in a stereo camera at the pose (..., 7)."""
-    T = SE3().to_matrix(pose)
+    T = filters.SE3().to_matrix(pose)
     x, y, z = ((points - T[..., None, :3, 3]) @ T[..., :3, :3]).unbind(-1)
     return torch.stack([400 * x / z, 400 * (x - 0.2) / z, 400 * y / z], dim=-1).flatten(-2)
 
 
-def element(estimate: Estimate, *index: int) -> Estimate:
+def element(estimate: PointEstimate, *index: int) -> PointEstimate:
     rest = (estimate.cost, estimate.degrees_of_freedom, estimate.iterations, estimate.converged, estimate.healthy)
-    return Estimate(estimate.belief[index], *(field[index] for field in rest))
+    return PointEstimate(estimate.belief[index], *(field[index] for field in rest))
 
 
 def assert_equal(first: Tensor, second: Tensor, tolerance: float = 1e-10) -> None:
     torch.testing.assert_close(first, second, rtol=tolerance, atol=tolerance)
 
 
-def assert_same(first: Estimate, second: Estimate, tolerance: float = 1e-10) -> None:
+def assert_same(first: PointEstimate, second: PointEstimate, tolerance: float = 1e-10) -> None:
     assert_equal(first.belief.mean, second.belief.mean, tolerance)
     assert_equal(first.belief.covariance, second.belief.covariance, tolerance)
     assert_equal(first.cost, second.cost, tolerance)
@@ -106,7 +94,7 @@ def test_linear_maximum_likelihood_keeps_the_digits_that_normal_equations_lose(b
     truth = tensor(1.0, 2.0, 3.0) / units
     value = deviation * (plain @ tensor(1.0, 2.0, 3.0))
     estimate = maximum_likelihood(
-        [Observation(LinearMeasurement(matrix, Diagonal(deviation**2)), value.expand(batch, 4))],
+        [Observation(filters.LinearMeasurement(matrix, filters.Diagonal(deviation**2)), value.expand(batch, 4))],
         torch.zeros(batch, 3, dtype=torch.float64),
     )
     torch.testing.assert_close(estimate.belief.mean, truth.expand(batch, 3), rtol=1e-10, atol=0.0)
@@ -141,10 +129,10 @@ def test_location_from_ranges_equals_scipy() -> None:
 def test_several_sensors_with_models_of_their_own_are_one_sensor_with_all_components() -> None:
     point = tensor(2.0, 1.0)
     far, near = ranges(point) + 0.1 * random_numbers(3), bearings(point) + 0.05 * random_numbers(3, seed=1)
-    fix = LinearMeasurement(torch.eye(2, dtype=torch.float64), covariances(2))
+    fix = filters.LinearMeasurement(torch.eye(2, dtype=torch.float64), covariances(2))
     apart = [Observation(ranging(), far), Observation(sighting(), near), Observation(fix, point)]
     assert isinstance(fix.noise, Tensor)
-    joined = MeasurementModel(
+    joined = filters.MeasurementModel(
         lambda state: torch.cat([ranges(state), bearings(state), state], dim=-1),
         torch.block_diag(torch.diag(tensor(*3 * [0.1**2], *3 * [0.05**2])), fix.noise),
     )
@@ -160,9 +148,9 @@ def test_one_step_equals_the_kalman_update_and_both_forms_of_its_covariance() ->
     model, value = linear_problem(4)
     H, R = model.matrix, model.noise
     assert isinstance(R, Tensor)
-    prior = Gaussian(random_numbers(4, 3, seed=4), covariances(4, 3, seed=5))
+    prior = filters.Gaussian(random_numbers(4, 3, seed=4), covariances(4, 3, seed=5))
     estimate = maximum_a_posteriori(prior, [Observation(model, value)])
-    update = KalmanFilter().update(prior, model, value)
+    update = filters.KalmanFilter().update(prior, model, value)
     assert_equal(estimate.belief.mean, update.belief.mean)
     assert_equal(2 * estimate.cost, update.nis)
     P = prior.covariance
@@ -174,20 +162,20 @@ def test_one_step_equals_the_kalman_update_and_both_forms_of_its_covariance() ->
     assert_equal(estimate.belief.mean, corrected)
 
 
-@pytest.mark.parametrize(("space", "size"), [(None, 2), (SE2(), 3)])
-def test_steps_equal_the_iterated_extended_kalman_filter(space: Manifold | None, size: int) -> None:
+@pytest.mark.parametrize(("space", "size"), [(None, 2), (filters.SE2(), 3)])
+def test_steps_equal_the_iterated_extended_kalman_filter(space: filters.Manifold | None, size: int) -> None:
     point = tensor(2.0, 1.0, 0.4)[:size]
-    prior = Gaussian(point + 0.2 * random_numbers(6, size), 0.05 * covariances(6, size, seed=1))
+    prior = filters.Gaussian(point + 0.2 * random_numbers(6, size), 0.05 * covariances(6, size, seed=1))
     value = bearings(point) + 0.05 * random_numbers(6, 3, seed=2)
     for steps in (1, 10):
         estimate = maximum_a_posteriori(prior, [Observation(sighting(), value)], space, iterations=steps)
-        update = ExtendedKalmanFilter(space, iterations=steps, form="qr").update(prior, sighting(), value)
+        update = filters.ExtendedKalmanFilter(space, iterations=steps, form="qr").update(prior, sighting(), value)
         assert_equal(estimate.belief.mean, update.belief.mean)
         assert_equal(estimate.belief.covariance, update.belief.covariance)
 
 
 def test_maximum_a_posteriori_equals_scipy() -> None:
-    prior = Gaussian(tensor(2.3, 0.6), covariances(2))
+    prior = filters.Gaussian(tensor(2.3, 0.6), covariances(2))
     value = ranges(tensor(2.0, 1.0)) + 0.3 * random_numbers(3)
     estimate = maximum_a_posteriori(prior, [Observation(ranging(0.3), value)])
 
@@ -208,20 +196,23 @@ def test_prior_by_root_equals_prior_by_covariance() -> None:
     value = ranges(tensor(2.0, 1.0))
     by_root, by_covariance = (
         maximum_a_posteriori(prior, [Observation(ranging(), value)])
-        for prior in (Gaussian(tensor(2.2, 1.3), factor=root), Gaussian(tensor(2.2, 1.3), root @ root.T))
+        for prior in (
+            filters.Gaussian(tensor(2.2, 1.3), factor=root),
+            filters.Gaussian(tensor(2.2, 1.3), root @ root.T),
+        )
     )
     assert_same(by_root, by_covariance)
 
 
 @pytest.mark.parametrize("batch", [1, 200])
 def test_exactly_known_directions_of_the_prior_stay_known(batch: int) -> None:
-    prior = Gaussian(tensor(2.0, 1.5).expand(batch, 2), torch.diag(tensor(0.0, 1.0)))
+    prior = filters.Gaussian(tensor(2.0, 1.5).expand(batch, 2), torch.diag(tensor(0.0, 1.0)))
     value = ranges(tensor(2.0, 1.0)) + 0.1 * random_numbers(3)
     estimate = maximum_a_posteriori(prior, [Observation(ranging(), value)])
-    height = MeasurementModel(
-        lambda y: ranges(torch.cat([torch.full_like(y, 2.0), y], dim=-1)), Diagonal(tensor(0.01, 0.01, 0.01))
+    height = filters.MeasurementModel(
+        lambda y: ranges(torch.cat([torch.full_like(y, 2.0), y], dim=-1)), filters.Diagonal(tensor(0.01, 0.01, 0.01))
     )
-    alone = maximum_a_posteriori(Gaussian(tensor(1.5), torch.eye(1).double()), [Observation(height, value)])
+    alone = maximum_a_posteriori(filters.Gaussian(tensor(1.5), torch.eye(1).double()), [Observation(height, value)])
     assert bool((estimate.belief.mean[:, 0] == 2.0).all())
     assert_equal(estimate.belief.mean[:, 1:], alone.belief.mean.expand(batch, 1))
     expected = torch.nn.functional.pad(alone.belief.covariance, (1, 0, 1, 0))
@@ -230,13 +221,13 @@ def test_exactly_known_directions_of_the_prior_stay_known(batch: int) -> None:
 
 def test_vague_prior_leads_to_maximum_likelihood() -> None:
     value = ranges(tensor(2.0, 1.0)) + 0.1 * random_numbers(3)
-    prior = Gaussian(tensor(1.5, 1.5), 1e12 * torch.eye(2, dtype=torch.float64))
+    prior = filters.Gaussian(tensor(1.5, 1.5), 1e12 * torch.eye(2, dtype=torch.float64))
     vague = maximum_a_posteriori(prior, [Observation(ranging(), value)])
     assert_same(vague, maximum_likelihood([Observation(ranging(), value)], prior.mean), 1e-8)
 
 
 def test_without_observations_the_prior_stays() -> None:
-    prior = Gaussian(random_numbers(4, 3), covariances(4, 3))
+    prior = filters.Gaussian(random_numbers(4, 3), covariances(4, 3))
     estimate = maximum_a_posteriori(prior, [])
     assert_equal(estimate.belief.mean, prior.mean)
     assert_equal(estimate.belief.covariance, prior.covariance)
@@ -252,8 +243,8 @@ def test_errors_and_costs_are_distributed_as_the_estimate_says() -> None:
         ranges(truth) + 0.05 * random_numbers(runs, 3, seed=1),
     ]
     observations = [Observation(sighting(0.02), values[0]), Observation(ranging(0.05), values[1])]
-    estimate = maximum_likelihood(observations, truth, SE2())
-    error = SE2().local(estimate.belief.mean, truth.expand(runs, 3))
+    estimate = maximum_likelihood(observations, truth, filters.SE2())
+    error = filters.SE2().local(estimate.belief.mean, truth.expand(runs, 3))
     nees = (error * torch.linalg.solve(estimate.belief.covariance, error)).sum(dim=-1)
     assert estimate.degrees_of_freedom.unique().tolist() == [3]
     for squares in (nees, 2 * estimate.cost):
@@ -262,32 +253,34 @@ def test_errors_and_costs_are_distributed_as_the_estimate_says() -> None:
 
 def test_covariance_on_a_curved_space_is_the_inverse_information_in_the_chart_at_the_mean() -> None:
     points = random_numbers(8, 3, seed=1) + tensor(0.0, 0.0, 6.0)
-    model = MeasurementModel(project, Diagonal(torch.full((24,), 0.25, dtype=torch.float64)))
-    prior = Gaussian(SE3().from_matrix(torch.eye(4, dtype=torch.float64)), 0.02 * covariances(6, seed=3))
-    truth = SE3().retract(prior.mean, 0.2 * random_numbers(6, seed=2))
+    model = filters.MeasurementModel(project, filters.Diagonal(torch.full((24,), 0.25, dtype=torch.float64)))
+    prior = filters.Gaussian(
+        filters.SE3().from_matrix(torch.eye(4, dtype=torch.float64)), 0.02 * covariances(6, seed=3)
+    )
+    truth = filters.SE3().retract(prior.mean, 0.2 * random_numbers(6, seed=2))
     value = project(truth, points) + 0.5 * random_numbers(24)
-    mean = maximum_a_posteriori(prior, [Observation(model, value, (points,))], SE3()).belief.mean
+    mean = maximum_a_posteriori(prior, [Observation(model, value, (points,))], filters.SE3()).belief.mean
     root = torch.linalg.inv(prior.factor)
 
     def residuals(tangent: Tensor) -> Tensor:
-        state = SE3().retract(mean, tangent)
-        return torch.cat([(value - project(state, points)) / 0.5, root @ SE3().local(prior.mean, state)])
+        state = filters.SE3().retract(mean, tangent)
+        return torch.cat([(value - project(state, points)) / 0.5, root @ filters.SE3().local(prior.mean, state)])
 
     zero = torch.zeros(6, dtype=torch.float64)
     slope = torch.autograd.functional.jacobian(residuals, zero)
     torch.testing.assert_close(slope.T @ residuals(zero), zero, rtol=0.0, atol=1e-6)
-    covariance = maximum_a_posteriori(prior, [Observation(model, value, (points,))], SE3()).belief.covariance
+    covariance = maximum_a_posteriori(prior, [Observation(model, value, (points,))], filters.SE3()).belief.covariance
     torch.testing.assert_close(covariance, torch.linalg.inv(slope.T @ slope), rtol=1e-7, atol=1e-12)
 
 
 # Weights and what is missing
 
 
-def blocks() -> MeasurementModel:
+def blocks() -> filters.MeasurementModel:
     """Ranges and bearings, in pairs that are correlated."""
-    return MeasurementModel(
+    return filters.MeasurementModel(
         lambda state: torch.stack([ranges(state), bearings(state)], dim=-1).flatten(-2),
-        BlockDiagonal(0.01 * covariances(3, 2, seed=7)),
+        filters.BlockDiagonal(0.01 * covariances(3, 2, seed=7)),
     )
 
 
@@ -307,9 +300,11 @@ def test_weight_two_is_the_observation_twice(per_component: bool) -> None:
 def test_weight_zero_nan_and_mask_leave_out() -> None:
     model, value = blocks(), blocks_value()
     kept = torch.tensor([True, True, False, True, False, True])
-    masked = MeasurementModel(model.function, model.noise, mask=kept)
-    assert isinstance(model.noise, BlockDiagonal)
-    only = MeasurementModel(lambda state: model.function(state)[..., kept], model.noise.covariance()[kept][:, kept])
+    masked = filters.MeasurementModel(model.function, model.noise, mask=kept)
+    assert isinstance(model.noise, filters.BlockDiagonal)
+    only = filters.MeasurementModel(
+        lambda state: model.function(state)[..., kept], model.noise.covariance()[kept][:, kept]
+    )
     expected = maximum_likelihood([Observation(only, value[kept])], tensor(1.5, 1.5))
     for observation in (
         Observation(model, value, weight=kept.double()),
@@ -334,12 +329,12 @@ def test_weights_differ_between_elements_of_a_batch() -> None:
     )
     of_component = tensor(1.0, 0.5, 3.0).expand(1, 3)
     weighted = maximum_likelihood([Observation(ranging(), value, weight=of_component)], initial.expand(3, 2))
-    noise = Diagonal(0.01 / of_component[0])
+    noise = filters.Diagonal(0.01 / of_component[0])
     for k in range(3):
         second = Observation(observations[1].model, observations[1].value, weight=of_element[k])
         alone = maximum_likelihood([observations[0], second], initial)
         assert_equal(batch.belief.mean[k], alone.belief.mean)
-        same = maximum_likelihood([Observation(MeasurementModel(ranges, noise), value)], initial)
+        same = maximum_likelihood([Observation(filters.MeasurementModel(ranges, noise), value)], initial)
         assert_equal(weighted.belief.mean[k], same.belief.mean)
 
 
@@ -347,28 +342,28 @@ def test_weights_differ_between_elements_of_a_batch() -> None:
 
 
 def test_rotation_from_vector_pairs_equals_the_closed_form() -> None:
-    truth = SO3().retract(tensor(0.0, 0.0, 0.0, 1.0).expand(5, 4), random_numbers(5, 3))
+    truth = filters.SO3().retract(tensor(0.0, 0.0, 0.0, 1.0).expand(5, 4), random_numbers(5, 3))
     vectors = random_numbers(6, 3, seed=1)
     weights = tensor(1.0, 2.0, 0.5, 1.0, 3.0, 1.0)
-    seen = vectors @ SO3().to_matrix(truth).mT + 0.05 * random_numbers(5, 6, 3, seed=2)
-    model = MeasurementModel(
-        lambda rotation: (vectors @ SO3().to_matrix(rotation).mT).flatten(-2), 0.05**2 * torch.eye(18).double()
+    seen = vectors @ filters.SO3().to_matrix(truth).mT + 0.05 * random_numbers(5, 6, 3, seed=2)
+    model = filters.MeasurementModel(
+        lambda rotation: (vectors @ filters.SO3().to_matrix(rotation).mT).flatten(-2), 0.05**2 * torch.eye(18).double()
     )
     observation = Observation(model, seen.flatten(-2), weight=weights.repeat_interleave(3).expand(1, 18))
-    estimate = maximum_likelihood([observation], tensor(0.0, 0.0, 0.0, 1.0), SO3())
+    estimate = maximum_likelihood([observation], tensor(0.0, 0.0, 0.0, 1.0), filters.SO3())
     assert bool(estimate.converged.all())
     for k in range(5):
         rotation, _ = Rotation.align_vectors(seen[k].numpy(), vectors.numpy(), weights=weights.numpy())
-        np.testing.assert_allclose(SO3().to_matrix(estimate.belief.mean[k]), rotation.as_matrix(), atol=1e-8)
+        np.testing.assert_allclose(filters.SO3().to_matrix(estimate.belief.mean[k]), rotation.as_matrix(), atol=1e-8)
 
 
 def test_resection_of_a_stereo_pose_equals_scipy() -> None:
     points = random_numbers(10, 3, seed=1) + tensor(0.0, 0.0, 6.0)
-    start = SE3().from_matrix(torch.eye(4, dtype=torch.float64))
-    truth = SE3().retract(start, tensor(0.3, -0.2, 0.5, 0.05, 0.2, -0.1))
+    start = filters.SE3().from_matrix(torch.eye(4, dtype=torch.float64))
+    truth = filters.SE3().retract(start, tensor(0.3, -0.2, 0.5, 0.05, 0.2, -0.1))
     value = project(truth, points) + 0.5 * random_numbers(30)
-    model = MeasurementModel(project, Diagonal(torch.full((30,), 0.25, dtype=torch.float64)))
-    estimate = maximum_likelihood([Observation(model, value, (points,))], start, SE3())
+    model = filters.MeasurementModel(project, filters.Diagonal(torch.full((30,), 0.25, dtype=torch.float64)))
+    estimate = maximum_likelihood([Observation(model, value, (points,))], start, filters.SE3())
 
     def residuals(x: np.ndarray) -> np.ndarray:
         pose = np.concatenate([x[:3], Rotation.from_rotvec(x[3:]).as_quat()])
@@ -377,7 +372,7 @@ def test_resection_of_a_stereo_pose_equals_scipy() -> None:
     found = least_squares(residuals, np.zeros(6), xtol=1e-15, ftol=1e-15, gtol=1e-14)
     np.testing.assert_allclose(estimate.cost, found.cost, rtol=1e-9)
     np.testing.assert_allclose(estimate.belief.mean[:3], found.x[:3], atol=1e-6)
-    rotation = SO3().to_matrix(estimate.belief.mean[3:])
+    rotation = filters.SO3().to_matrix(estimate.belief.mean[3:])
     np.testing.assert_allclose(rotation, Rotation.from_rotvec(found.x[3:]).as_matrix(), atol=1e-7)
 
 
@@ -386,19 +381,19 @@ def test_given_jacobian_equals_automatic_differentiation(with_prior: bool) -> No
     def slope(state: Tensor) -> Tensor:
         away = state[..., None, :2] - BEACONS
         direction = away / torch.linalg.vector_norm(away, dim=-1, keepdim=True)
-        return torch.nn.functional.pad(direction @ SE2().to_matrix(state)[..., :2, :2], (0, 1))
+        return torch.nn.functional.pad(direction @ filters.SE2().to_matrix(state)[..., :2, :2], (0, 1))
 
-    given = MeasurementModel(ranges, ranging().noise, jacobian=slope)
+    given = filters.MeasurementModel(ranges, ranging().noise, jacobian=slope)
     pose, tilt = tensor(2.0, 1.0, 0.4), Observation(sighting(), bearings(tensor(2.1, 1.0, 0.4)))
     value = ranges(pose) + 0.1 * random_numbers(4, 3)
     estimates = []
     for model in (given, ranging()):
         observations = [Observation(model, value), tilt]
         if with_prior:
-            prior = Gaussian((pose + tensor(0.3, 0.3, 0.8)).expand(4, 3), covariances(4, 3))
-            estimates.append(maximum_a_posteriori(prior, observations, SE2()))
+            prior = filters.Gaussian((pose + tensor(0.3, 0.3, 0.8)).expand(4, 3), covariances(4, 3))
+            estimates.append(maximum_a_posteriori(prior, observations, filters.SE2()))
         else:
-            estimates.append(maximum_likelihood(observations, pose + tensor(0.3, 0.3, 0.3), SE2()))
+            estimates.append(maximum_likelihood(observations, pose + tensor(0.3, 0.3, 0.3), filters.SE2()))
     assert_same(estimates[0], estimates[1])
 
 
@@ -409,7 +404,7 @@ def test_batch_equals_loop_and_dimensions_broadcast() -> None:
     points = tensor(2.0, 1.0) + 0.5 * random_numbers(4, 3, 2)
     value = ranges(points) + 0.1 * random_numbers(4, 3, 3, seed=1)
     initial = tensor(1.5, 1.5) + 0.3 * random_numbers(3, 2, seed=2)
-    prior = Gaussian(initial, covariances(3, 2))
+    prior = filters.Gaussian(initial, covariances(3, 2))
     likeliest = maximum_likelihood([Observation(ranging(), value)], initial)
     posterior = maximum_a_posteriori(prior, [Observation(ranging(), value)])
     for batch in (likeliest, posterior):
@@ -437,21 +432,21 @@ def test_an_element_that_has_converged_does_not_change() -> None:
 
 def test_single_precision_finds_the_same_pose() -> None:
     points = random_numbers(10, 3, seed=1) + tensor(0.0, 0.0, 6.0)
-    start = SE3().from_matrix(torch.eye(4, dtype=torch.float64))
-    truth = SE3().retract(start.expand(3, 7), 0.03 * random_numbers(3, 6, seed=2))
+    start = filters.SE3().from_matrix(torch.eye(4, dtype=torch.float64))
+    truth = filters.SE3().retract(start.expand(3, 7), 0.03 * random_numbers(3, 6, seed=2))
     value = project(truth, points) + 0.5 * random_numbers(3, 30)
     prior_covariance = 0.1 * torch.eye(6, dtype=torch.float64)
     estimates = []
     for dtype in (torch.float64, torch.float32):
-        model = MeasurementModel(project, Diagonal(torch.full((30,), 0.25, dtype=dtype)))
+        model = filters.MeasurementModel(project, filters.Diagonal(torch.full((30,), 0.25, dtype=dtype)))
         observations = [Observation(model, value.to(dtype), (points.to(dtype),))]
-        prior = Gaussian(start, prior_covariance).to(dtype)
-        estimates.append(maximum_likelihood(observations, prior.mean, SE3()))
-        estimates.append(maximum_a_posteriori(prior, observations, SE3()))
+        prior = filters.Gaussian(start, prior_covariance).to(dtype)
+        estimates.append(maximum_likelihood(observations, prior.mean, filters.SE3()))
+        estimates.append(maximum_a_posteriori(prior, observations, filters.SE3()))
     for double, single in zip(estimates[:2], estimates[2:], strict=True):
         assert single.belief.mean.dtype == single.cost.dtype == torch.float32
         assert bool(single.converged.all())
-        apart = SE3().local(double.belief.mean, single.belief.mean.double())
+        apart = filters.SE3().local(double.belief.mean, single.belief.mean.double())
         deviation = torch.sqrt(torch.diagonal(double.belief.covariance, dim1=-2, dim2=-1))
         assert float((apart / deviation).abs().max()) < 0.02
         torch.testing.assert_close(single.belief.covariance.double(), double.belief.covariance, rtol=1e-2, atol=1e-8)
@@ -459,8 +454,8 @@ def test_single_precision_finds_the_same_pose() -> None:
 
 def test_single_precision_converges_where_round_off_of_a_large_cost_hides_its_slope() -> None:
     value = (100 * ranges(tensor(2.0, 1.0)) + random_numbers(100, 3)).float()
-    noise = Diagonal(torch.full((3,), 1e-4))  # a hundred times too sure
-    model = MeasurementModel(lambda state: 100 * ranges(state), noise)
+    noise = filters.Diagonal(torch.full((3,), 1e-4))  # a hundred times too sure
+    model = filters.MeasurementModel(lambda state: 100 * ranges(state), noise)
     estimate = maximum_likelihood([Observation(model, value)], torch.tensor([2.5, 0.5]))
     assert float(estimate.cost.median()) > 1e3
     assert bool(estimate.converged.all())
@@ -471,8 +466,8 @@ def test_gradient_flows_through_a_linear_problem() -> None:
 
     def solve(mean: Tensor, root: Tensor, noise_root: Tensor, value: Tensor, weight: Tensor) -> tuple[Tensor, ...]:
         noise = noise_root @ noise_root.mT + torch.eye(3, dtype=torch.float64)
-        prior = Gaussian(mean, root @ root.mT + torch.eye(2, dtype=torch.float64))
-        observation = Observation(LinearMeasurement(H, noise), value, weight=weight)
+        prior = filters.Gaussian(mean, root @ root.mT + torch.eye(2, dtype=torch.float64))
+        observation = Observation(filters.LinearMeasurement(H, noise), value, weight=weight)
         after = maximum_a_posteriori(prior, [observation])
         likely = maximum_likelihood([observation], mean.detach())
         return after.belief.mean, after.belief.covariance, after.cost, likely.belief.mean, likely.cost
@@ -488,7 +483,7 @@ def test_gradient_flows_through_a_linear_problem() -> None:
 
 
 def test_gradient_of_a_converged_estimate_is_that_of_its_definition() -> None:
-    prior = Gaussian(tensor(2.3, 0.6), covariances(2))
+    prior = filters.Gaussian(tensor(2.3, 0.6), covariances(2))
     value = ranges(tensor(2.0, 1.0)) + 0.3 * random_numbers(3)
 
     def solve(value: Tensor) -> Tensor:
@@ -500,8 +495,8 @@ def test_gradient_of_a_converged_estimate_is_that_of_its_definition() -> None:
 # Control of steps, and failures
 
 
-def arctangent(slope: float = 1.0) -> MeasurementModel:
-    return MeasurementModel(lambda x: slope * torch.atan(x), torch.eye(1, dtype=torch.float64))
+def arctangent(slope: float = 1.0) -> filters.MeasurementModel:
+    return filters.MeasurementModel(lambda x: slope * torch.atan(x), torch.eye(1, dtype=torch.float64))
 
 
 def test_halved_steps_recover_a_start_from_which_full_steps_diverge() -> None:
@@ -512,7 +507,9 @@ def test_halved_steps_recover_a_start_from_which_full_steps_diverge() -> None:
     starts = tensor(0.5, 3.0, -10.0, 20.0)[:, None]
     for estimate in (
         maximum_likelihood([Observation(arctangent(), tensor(0.0))], starts),
-        maximum_a_posteriori(Gaussian(starts, 1e8 * torch.eye(1).double()), [Observation(arctangent(), tensor(0.0))]),
+        maximum_a_posteriori(
+            filters.Gaussian(starts, 1e8 * torch.eye(1).double()), [Observation(arctangent(), tensor(0.0))]
+        ),
     ):
         assert bool(estimate.converged.all())
         torch.testing.assert_close(estimate.belief.mean, torch.zeros_like(starts), rtol=0.0, atol=1e-6)
@@ -528,7 +525,7 @@ def test_cost_never_rises() -> None:
 
 
 def test_step_into_where_the_model_is_not_defined_is_shortened() -> None:
-    model = MeasurementModel(torch.log, torch.eye(1, dtype=torch.float64))
+    model = filters.MeasurementModel(torch.log, torch.eye(1, dtype=torch.float64))
     estimate = maximum_likelihood([Observation(model, tensor(-2.0))], tensor(5.0))
     assert_equal(estimate.belief.mean, torch.exp(tensor(-2.0)))
 
@@ -536,36 +533,38 @@ def test_step_into_where_the_model_is_not_defined_is_shortened() -> None:
 def test_unobservable_elements_are_named_with_what_nothing_sees() -> None:
     matrix = random_numbers(5, 4, 3)
     matrix[[1, 3], :, 2] = matrix[[1, 3], :, 0] - 2 * matrix[[1, 3], :, 1]
-    observations = [Observation(LinearMeasurement(matrix, torch.eye(4).double()), random_numbers(5, 4))]
+    observations = [Observation(filters.LinearMeasurement(matrix, torch.eye(4).double()), random_numbers(5, 4))]
     initial = torch.zeros(5, 3, dtype=torch.float64)
-    with pytest.raises(FilterError, match=r"elements \(1,\), \(3,\) \(2 of 5\).*direction \[-0.5, 1, 0.5\]"):
+    with pytest.raises(filters.FilterError, match=r"elements \(1,\), \(3,\) \(2 of 5\).*direction \[-0.5, 1, 0.5\]"):
         maximum_likelihood(observations, initial)
     held = maximum_likelihood(observations, initial, on_failure="hold")
     assert held.healthy.tolist() == [True, False, True, False, True]
     assert held.converged.tolist() == held.healthy.tolist()
     assert bool((held.belief.mean[[1, 3]] == 0.0).all())
     assert bool(held.belief.covariance[[1, 3]].isnan().any())
-    well = Observation(LinearMeasurement(matrix[::2], torch.eye(4).double()), random_numbers(5, 4)[::2])
+    well = Observation(filters.LinearMeasurement(matrix[::2], torch.eye(4).double()), random_numbers(5, 4)[::2])
     assert_equal(held.belief.mean[::2], maximum_likelihood([well], initial[::2]).belief.mean)
-    maximum_a_posteriori(Gaussian(initial, torch.eye(3).double()), observations)
+    maximum_a_posteriori(filters.Gaussian(initial, torch.eye(3).double()), observations)
 
 
 @pytest.mark.parametrize("batch", [1, 150])
 def test_too_few_observations_are_unobservable(batch: int) -> None:
-    model = LinearMeasurement(random_numbers(1, 3), torch.eye(1, dtype=torch.float64))
-    with pytest.raises(FilterError, match="do not determine the state"):
+    model = filters.LinearMeasurement(random_numbers(1, 3), torch.eye(1, dtype=torch.float64))
+    with pytest.raises(filters.FilterError, match="do not determine the state"):
         maximum_likelihood([Observation(model, tensor(1.0))], torch.zeros(batch, 3, dtype=torch.float64))
     pose = torch.zeros(batch, 3, dtype=torch.float64) + tensor(2.0, 1.0, 0.3)
-    with pytest.raises(FilterError, match=r"direction \[0, 0, 1\]"):
-        maximum_likelihood([Observation(ranging(), ranges(tensor(2.1, 1.0)))], pose, SE2())
+    with pytest.raises(filters.FilterError, match=r"direction \[0, 0, 1\]"):
+        maximum_likelihood([Observation(ranging(), ranges(tensor(2.1, 1.0)))], pose, filters.SE2())
 
 
 def test_prior_that_is_lost_in_the_round_off_of_precise_observations_is_not_passed_over() -> None:
-    sum_of_both = Observation(LinearMeasurement(torch.ones(1, 2), 1e-10 * torch.eye(1)), torch.ones(1))
-    prior = Gaussian(torch.zeros(2), 1e10 * torch.eye(2))
-    with pytest.raises(FilterError, match=r"differ in precision by more than the digits of torch.float32"):
+    sum_of_both = Observation(filters.LinearMeasurement(torch.ones(1, 2), 1e-10 * torch.eye(1)), torch.ones(1))
+    prior = filters.Gaussian(torch.zeros(2), 1e10 * torch.eye(2))
+    with pytest.raises(filters.FilterError, match=r"differ in precision by more than the digits of torch.float32"):
         maximum_a_posteriori(prior, [sum_of_both])
-    double = Observation(LinearMeasurement(*(m.double() for m in (torch.ones(1, 2), 1e-10 * torch.eye(1)))), tensor(1))
+    double = Observation(
+        filters.LinearMeasurement(*(m.double() for m in (torch.ones(1, 2), 1e-10 * torch.eye(1)))), tensor(1)
+    )
     estimate = maximum_a_posteriori(prior.to(torch.float64), [double])
     torch.testing.assert_close(estimate.belief.mean, tensor(0.5, 0.5), rtol=0.0, atol=1e-4)
 
@@ -585,13 +584,13 @@ def test_one_bad_element_is_named_and_does_not_take_the_batch_down(
     mean, prior = tensor(1.5, 1.5).expand(3, 2), torch.eye(2, dtype=torch.float64).repeat(3, 1, 1)
     noise, value = 0.01 * torch.eye(3, dtype=torch.float64).repeat(3, 1, 1), ranges(tensor(2.0, 1.0)).repeat(3, 1)
 
-    def solve(on_failure: str) -> Estimate:
-        observations = [Observation(MeasurementModel(ranges, noise), value)]
-        return maximum_a_posteriori(Gaussian(mean, prior), observations, on_failure=on_failure)  # type: ignore[arg-type]
+    def solve(on_failure: str) -> PointEstimate:
+        observations = [Observation(filters.MeasurementModel(ranges, noise), value)]
+        return maximum_a_posteriori(filters.Gaussian(mean, prior), observations, on_failure=on_failure)  # type: ignore[arg-type]
 
     good = solve("raise")
     spoil(prior, noise, value)
-    with pytest.raises(FilterError, match=rf"elements \(1,\) \(1 of 3\), in the first: .*{message}"):
+    with pytest.raises(filters.FilterError, match=rf"elements \(1,\) \(1 of 3\), in the first: .*{message}"):
         solve("raise")
     held = solve("hold")
     assert held.healthy.tolist() == [True, False, True]
@@ -601,12 +600,12 @@ def test_one_bad_element_is_named_and_does_not_take_the_batch_down(
 
 def test_what_cannot_be_asked_is_refused_with_the_reason() -> None:
     start, value = tensor(1.0, 1.0), tensor(1.0, 1.0, 1.0)
-    bent = MeasurementModel(lambda x, v: ranges(x) + v, torch.eye(3).double(), additive=False)
-    flat = LinearMeasurement(torch.eye(3).double(), torch.eye(3).double())
+    bent = filters.MeasurementModel(lambda x, v: ranges(x) + v, torch.eye(3).double(), additive=False)
+    flat = filters.LinearMeasurement(torch.eye(3).double(), torch.eye(3).double())
     with pytest.raises(ValueError, match="observation 1: only additive noise"):
         maximum_likelihood([Observation(ranging(), value), Observation(bent, value)], start)
     with pytest.raises(TypeError, match=r"LinearMeasurement is for states in R\^n"):
-        maximum_likelihood([Observation(flat, value)], tensor(1.0, 1.0, 0.0), SE2())
+        maximum_likelihood([Observation(flat, value)], tensor(1.0, 1.0, 0.0), filters.SE2())
     with pytest.raises(ValueError, match="at least one observation"):
         maximum_likelihood([], start)
     with pytest.raises(ValueError, match="weights must be at least 0"):
@@ -616,11 +615,13 @@ def test_what_cannot_be_asked_is_refused_with_the_reason() -> None:
     with pytest.raises(ValueError, match="2 components, its noise 3"):
         maximum_likelihood([Observation(ranging(), value[:2])], start)
     with pytest.raises(ValueError, match=r"returns 3 components, its value has 2"):
-        maximum_likelihood([Observation(MeasurementModel(ranges, torch.eye(2).double()), value[:2])], start)
+        maximum_likelihood([Observation(filters.MeasurementModel(ranges, torch.eye(2).double()), value[:2])], start)
     with pytest.raises(ValueError, match=r"float32, the state torch.float64"):
         maximum_likelihood([Observation(ranging(), value.float())], start)
     with pytest.raises(ValueError, match=r"have batch \(4,\), .*expand the state"):
-        maximum_likelihood([Observation(MeasurementModel(ranges, Diagonal(torch.ones(4, 3).double())), value)], start)
+        maximum_likelihood(
+            [Observation(filters.MeasurementModel(ranges, filters.Diagonal(torch.ones(4, 3).double())), value)], start
+        )
     with pytest.raises(ValueError, match="must be at least 1"):
         maximum_likelihood([Observation(ranging(), value)], start, iterations=0)
     with pytest.raises(ValueError, match="choose raise or hold"):

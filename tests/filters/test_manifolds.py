@@ -12,7 +12,7 @@ from torch.func import jacfwd, jacrev, jvp, vmap
 
 from sigmaslam.filters.layout import concatenate, stack
 from sigmaslam.filters.manifolds import SE2, SE3, SO2, SO3, Euclidean, Manifold, Product
-from sigmaslam.filters.onnx.se3 import adjoint_se3, exp_se3, log_se3, skew
+from sigmaslam.filters.onnx.exportable_se3 import adjoint_se3, exp_se3, log_se3, skew
 from tests.support.filter_builders import random_numbers
 
 Group = SE2 | SO3 | SE3

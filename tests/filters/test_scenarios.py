@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Generator, Tensor
 
+from sigmaslam import filters
 from sigmaslam.evaluation.filters import work as filter_work
 from sigmaslam.evaluation.filters.scenarios import (
     CAMERA,
@@ -20,21 +21,6 @@ from sigmaslam.evaluation.filters.scenarios import (
     stereo_pose,
     vague_prior,
 )
-from sigmaslam.filters import (
-    SE2,
-    SO2,
-    BayesFilter,
-    Diagonal,
-    Euclidean,
-    ExtendedKalmanFilter,
-    Gaussian,
-    LinearMeasurement,
-    MotionModel,
-    Product,
-    UnscentedKalmanFilter,
-    julier,
-    stack,
-)
 from sigmaslam.filters.consistency import check_nees, nees
 from sigmaslam.filters.systems import (
     constant_velocity,
@@ -45,10 +31,10 @@ from sigmaslam.filters.systems import (
 )
 from tests.support.filter_builders import covariances, random_numbers, tensor
 
-EKF = ExtendedKalmanFilter(iterations=1)
-CUBATURE = UnscentedKalmanFilter(iterations=1)
-KAPPA_2 = UnscentedKalmanFilter(points=julier(2.0), iterations=1)
-SPLIT = Product(Euclidean(2), SO2())
+EKF = filters.ExtendedKalmanFilter(iterations=1)
+CUBATURE = filters.UnscentedKalmanFilter(iterations=1)
+KAPPA_2 = filters.UnscentedKalmanFilter(points=filters.julier(2.0), iterations=1)
+SPLIT = filters.Product(filters.Euclidean(2), filters.SO2())
 
 
 def seeded(seed: int = 0) -> Generator:
@@ -93,8 +79,10 @@ def test_stereo_pixels_equal_the_plain_formula_for_shared_and_own_points(shape: 
 def test_a_step_of_the_12_states_equals_the_reference(m: int) -> None:
     work = filter_work.stereo(m, seed=m)
     motion = constant_velocity(tensor(0.5, 0.5, 0.5, 0.1, 0.1, 0.1), filter_work.TIME_STEP)
-    noise = Diagonal(torch.as_tensor(work.measurement_noise).diagonal())
-    belief = CUBATURE.predict(Gaussian(torch.as_tensor(work.mean), torch.as_tensor(work.covariance)), motion).belief
+    noise = filters.Diagonal(torch.as_tensor(work.measurement_noise).diagonal())
+    belief = CUBATURE.predict(
+        filters.Gaussian(torch.as_tensor(work.mean), torch.as_tensor(work.covariance)), motion
+    ).belief
     measurement = stereo_measurement(torch.as_tensor(work.points), CAMERA, noise)
     belief = CUBATURE.update(belief, measurement, torch.as_tensor(work.measurement)).belief
     mean, covariance = filter_work.step(work)
@@ -104,7 +92,7 @@ def test_a_step_of_the_12_states_equals_the_reference(m: int) -> None:
 
 def test_drive_noise_spreads_forward_and_in_heading_only() -> None:
     motion = differential_drive(torch.diag(tensor(0.04, 0.01)), 0.5)
-    still = Gaussian(tensor(1.0, 2.0, 0.5 * math.pi), torch.zeros(3, 3, dtype=torch.float64))
+    still = filters.Gaussian(tensor(1.0, 2.0, 0.5 * math.pi), torch.zeros(3, 3, dtype=torch.float64))
     moved = EKF.predict(still, motion, tensor(2.0, 0.2)).belief
     torch.testing.assert_close(moved.mean, tensor(1.0, 3.0, 0.5 * math.pi + 0.1))
     torch.testing.assert_close(moved.covariance.diagonal(), tensor(0.0, 0.01, 0.0025))
@@ -122,7 +110,7 @@ def test_range_and_bearing_is_the_landmark_in_the_robot_frame_in_polar_form() ->
 
 def test_a_bearing_across_the_cut_moves_the_robot_little() -> None:
     model = range_and_bearing(torch.diag(tensor(0.01, 0.0001)))
-    belief = Gaussian(tensor(0.0, 0.0, math.pi - 0.01), 1e-3 * covariances(3))
+    belief = filters.Gaussian(tensor(0.0, 0.0, math.pi - 0.01), 1e-3 * covariances(3))
     seen = CUBATURE.update(belief, model, tensor(5.0, 0.02), tensor(-5.0, 0.0))
     assert float(seen.innovation.abs().max()) < 0.05
 
@@ -132,7 +120,7 @@ def test_a_bearing_across_the_cut_moves_the_robot_little() -> None:
 
 def assert_stereo_pose_is_consistent(groups: int) -> None:
     # The share of one experiment of 200 runs scatters by 0.03, because the steps of a run are correlated.
-    nees = run(stereo_pose(200 * groups, seeded()), UnscentedKalmanFilter()).nees
+    nees = run(stereo_pose(200 * groups, seeded()), filters.UnscentedKalmanFilter()).nees
     share = np.mean([check_nees(part.mT, 12).share_inside for part in nees.split(200, dim=1)])
     check = check_nees(nees.mT, 12)
     assert share >= 0.93
@@ -152,14 +140,14 @@ def test_stereo_pose_filter_is_consistent_in_twenty_experiments() -> None:
 
 @pytest.mark.parametrize("pixel_sigma", [0.1, 0.5])
 def test_many_points_from_a_vague_prior_leave_the_default_filter_consistent(pixel_sigma: float) -> None:
-    outcome = run(vague_prior(300, seeded(), pixel_sigma=pixel_sigma), UnscentedKalmanFilter())
+    outcome = run(vague_prior(300, seeded(), pixel_sigma=pixel_sigma), filters.UnscentedKalmanFilter())
     assert float(outcome.nees.mean()) <= 13.0
     assert float(outcome.nees.median()) == pytest.approx(11.34, rel=0.1)
 
 
 def test_one_linearisation_is_overconfident_from_a_vague_prior_and_two_are_not() -> None:
     scenario = vague_prior(200, seeded(1))
-    once, twice = (run(scenario, UnscentedKalmanFilter(iterations=k)).nees.mean() for k in (1, 2))
+    once, twice = (run(scenario, filters.UnscentedKalmanFilter(iterations=k)).nees.mean() for k in (1, 2))
     assert float(once) > 100.0
     assert float(twice) <= 13.0
 
@@ -179,7 +167,7 @@ def rmse_of_experiments(outcome: Outcome) -> Tensor:
 
 def test_se2_filter_localises_and_is_consistent() -> None:
     rate = 10
-    outcome = run(localisation(400, seeded(), rate), UnscentedKalmanFilter(SE2()))
+    outcome = run(localisation(400, seeded(), rate), filters.UnscentedKalmanFilter(filters.SE2()))
     assert float(rmse_of_experiments(outcome).median()) <= 0.46
     assert 0.9 <= float(position_nees(outcome, rate).mean()) <= 1.1
 
@@ -188,7 +176,9 @@ def test_se2_filter_localises_and_is_consistent() -> None:
 @pytest.mark.parametrize("iterations", ["auto", 3])
 def test_se2_filter_localises_in_twenty_experiments(iterations: Any) -> None:
     rate = 10
-    outcome = run(localisation(2000, seeded(), rate), UnscentedKalmanFilter(SE2(), iterations=iterations))
+    outcome = run(
+        localisation(2000, seeded(), rate), filters.UnscentedKalmanFilter(filters.SE2(), iterations=iterations)
+    )
     assert outcome.rmse <= 0.46
     assert 0.9 <= float(position_nees(outcome, rate).mean()) <= 1.1
 
@@ -196,8 +186,8 @@ def test_se2_filter_localises_in_twenty_experiments(iterations: Any) -> None:
 @pytest.mark.slow
 def test_localisation_at_100_hz_reproduces_the_published_order() -> None:
     rate, scenario = 100, localisation(500, seeded(), 100)
-    default = run(scenario, UnscentedKalmanFilter(SE2()))
-    split = run(scenario, UnscentedKalmanFilter(SPLIT))
+    default = run(scenario, filters.UnscentedKalmanFilter(filters.SE2()))
+    split = run(scenario, filters.UnscentedKalmanFilter(SPLIT))
     assert default.rmse <= 0.46
     assert 0.9 <= float(position_nees(default, rate).mean()) <= 1.1
     assert split.rmse > 1.3 * default.rmse
@@ -214,11 +204,11 @@ def test_growth_mse_is_that_of_the_literature() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("bayes", "known", "error"), [(EKF, 117.9, 1.2), (KAPPA_2, 51.7, 0.3), (CUBATURE, 71.9, 0.4)])
-def test_growth_mse_of_1000_runs(bayes: BayesFilter, known: float, error: float) -> None:
+def test_growth_mse_of_1000_runs(bayes: filters.BayesFilter, known: float, error: float) -> None:
     assert_reproduces(run(growth(1000, seeded()), bayes).rmse_by_run.square(), known, error)
 
 
-def growth_with_kept_points(scenario: Scenario, bayes: BayesFilter) -> Tensor:
+def growth_with_kept_points(scenario: Scenario, bayes: filters.BayesFilter) -> Tensor:
     """Estimates (T, runs, 1) of `growth` by one set of sigma points for state and both noises, not redrawn between.
 
     State and measurement are moved as one state of two components, of which the second is then given exactly.
@@ -226,14 +216,14 @@ def growth_with_kept_points(scenario: Scenario, bayes: BayesFilter) -> Tensor:
 
     def move_and_see(x: Tensor, noise: Tensor, wave: Tensor) -> Tensor:
         moved = scenario.motion.function(x[..., 0], wave[..., 0]) + noise[..., 0]
-        return stack([moved, 0.05 * moved * moved + noise[..., 1]])
+        return filters.stack([moved, 0.05 * moved * moved + noise[..., 1]])
 
-    both = MotionModel(move_and_see, torch.eye(2, dtype=torch.float64), additive=False)
-    given = LinearMeasurement(tensor([[0.0, 1.0]]), tensor([[0.0]]))
+    both = filters.MotionModel(move_and_see, torch.eye(2, dtype=torch.float64), additive=False)
+    given = filters.LinearMeasurement(tensor([[0.0, 1.0]]), tensor([[0.0]]))
     belief, means = scenario.prior, []
     for wave, value in zip(scenario.motion_inputs[0], scenario.values, strict=True):
         seen = bayes.update(bayes.predict(belief, both, wave).belief, given, value).belief
-        belief = Gaussian(seen.mean[..., :1], seen.covariance[..., :1, :1])
+        belief = filters.Gaussian(seen.mean[..., :1], seen.covariance[..., :1, :1])
         means.append(belief.mean)
     return torch.stack(means)
 
@@ -256,13 +246,13 @@ def test_coordinated_turn_is_followed_better_by_sigma_points() -> None:
 
 @pytest.mark.slow
 def test_coordinated_turn_of_the_ekf() -> None:
-    bayes = ExtendedKalmanFilter(iterations=1, on_failure="hold")
+    bayes = filters.ExtendedKalmanFilter(iterations=1, on_failure="hold")
     assert_reproduces(kept_runs(run(coordinated_turn(500, seeded()), bayes)), 28.1, 0.9)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("bayes", [EKF, CUBATURE])
-def test_bearings_only_rmse_of_1000_runs(bayes: BayesFilter) -> None:
+def test_bearings_only_rmse_of_1000_runs(bayes: filters.BayesFilter) -> None:
     # Over all steps and runs; the mean of the runs' own RMSE is 0.111 for the EKF and 0.109 for the UKF.
     assert run(bearings(1000, seeded()), bayes).rmse == pytest.approx(0.1123, abs=0.003)
 

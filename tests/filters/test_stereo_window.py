@@ -3,8 +3,8 @@ import torch
 from torch import Tensor
 from torch.func import jacrev, vmap
 
-from sigmaslam.filters.onnx.se3 import exp_se3, invert_se3
-from sigmaslam.filters.onnx.stereo_window import CALIBRATION, LANDMARK, POSE, SIZE, Transfer
+from sigmaslam.filters.onnx.exportable_se3 import exp_se3, invert_se3
+from sigmaslam.filters.onnx.stereo_window import CALIBRATION, LANDMARK, POSE, SIZE, StereoTransfer
 from sigmaslam.geometry.camera import RectifiedStereo
 from tests.support.filter_builders import random_numbers, tensor
 
@@ -22,19 +22,12 @@ def some_landmarks(count: int, seed: int = 0) -> Tensor:
     return tensor(30.0, 30.0, 4.0, -0.2) + uniform * tensor(580.0, 420.0, 36.0, 0.4)
 
 
-def transfer(
-    relative: Tensor,
-    spread: Tensor,
-    landmarks: Tensor,
-    landmark_spread: Tensor,
-    calibration: Tensor = NO_TURN,
-    pair: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def transfer(relative, spread, landmarks, landmark_spread, calibration=NO_TURN, pair=None):
     """One pair for all landmarks unless given; one landmark_spread (4, 4) for all unless (m, 4, 4)."""
     if pair is None:
         pair = torch.zeros(len(landmarks), dtype=torch.int64)
     each = landmark_spread.expand(len(landmarks), 4, 4)
-    found: tuple[Tensor, Tensor, Tensor, Tensor] = Transfer()(
+    found: tuple[Tensor, Tensor, Tensor, Tensor] = StereoTransfer()(
         relative, spread.expand(len(relative), 9, 9), pair, calibration, INTRINSICS, landmarks, each
     )
     return found

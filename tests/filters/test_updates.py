@@ -5,31 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sigmaslam.filters import (
-    BayesFilter,
-    Dense,
-    Diagonal,
-    ExtendedKalmanFilter,
-    Gaussian,
-    KalmanFilter,
-    LinearMeasurement,
-    MeasurementModel,
-    UnscentedKalmanFilter,
-    julier,
-    merwe,
-)
-from tests.support.filter_builders import (
-    FORMS,
-    assert_close,
-    assert_same_belief,
-    assert_same_update,
-    beliefs,
-    bent_measurement,
-    bent_motion,
-    covariances,
-    noises,
-    random_numbers,
-)
+from sigmaslam import filters
+from sigmaslam.filters.updates import FORMS
+from tests.support.filter_assertions import assert_close, assert_same_belief, assert_same_update
+from tests.support.filter_builders import beliefs, bent_measurement, bent_motion, covariances, noises, random_numbers
 
 KINDS = ("diagonal", "blocks", "dense")
 STATES = 4
@@ -37,23 +16,23 @@ STATES = 4
 OF_LIKELIHOOD = 1e-6
 
 
-def filters(form: str) -> dict[str, BayesFilter]:
+def kalman_filters(form: str) -> dict[str, filters.BayesFilter]:
     return {
-        "ukf": UnscentedKalmanFilter(form=form),
-        "ukf julier": UnscentedKalmanFilter(points=julier(1.0), form=form),
-        "ukf iterated": UnscentedKalmanFilter(form=form, iterations=3),
-        "ekf": ExtendedKalmanFilter(form=form),
+        "ukf": filters.UnscentedKalmanFilter(form=form),
+        "ukf julier": filters.UnscentedKalmanFilter(points=filters.julier(1.0), form=form),
+        "ukf iterated": filters.UnscentedKalmanFilter(form=form, iterations=3),
+        "ekf": filters.ExtendedKalmanFilter(form=form),
     }
 
 
-@pytest.mark.parametrize("name", filters("qr"))
+@pytest.mark.parametrize("name", kalman_filters("qr"))
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("measurements", [2, 8, 40])
 def test_low_rank_and_qr_updates_equal_dense(measurements, kind, name):
     """Fewer measurements than columns, about as many, and more."""
     prior, z = beliefs(3, STATES), random_numbers(3, measurements, seed=5)
     measurement = bent_measurement(STATES, measurements, noises(measurements)[kind])
-    dense, low_rank, qr = (filters(form)[name].update(prior, measurement, z) for form in FORMS)
+    dense, low_rank, qr = (kalman_filters(form)[name].update(prior, measurement, z) for form in FORMS)
     assert (dense.form, low_rank.form, qr.form) == FORMS
     assert_same_update(low_rank, dense, 1e-12)
     assert_same_update(qr, dense, 1e-12)
@@ -64,7 +43,8 @@ def test_forms_agree_over_several_steps(measurements):
     motion, measurement = bent_motion(STATES), bent_measurement(STATES, measurements, noises(measurements)["blocks"])
     values = random_numbers(8, 3, measurements, seed=5)
     tracks = [
-        UnscentedKalmanFilter(form=form).filter(beliefs(3, STATES), motion, measurement, values) for form in FORMS
+        filters.UnscentedKalmanFilter(form=form).filter(beliefs(3, STATES), motion, measurement, values)
+        for form in FORMS
     ]
     for track in tracks[1:]:
         assert_same_belief(track.filtered, tracks[0].filtered, 1e-11)
@@ -76,33 +56,33 @@ def test_forms_agree_over_several_steps(measurements):
 def test_kinds_of_noise_agree_where_they_are_the_same_matrix(kind):
     noise, prior, z = noises(6)[kind], beliefs(STATES), random_numbers(6, seed=3)
     for form in FORMS:
-        bayes = UnscentedKalmanFilter(form=form)
+        bayes = filters.UnscentedKalmanFilter(form=form)
         found = bayes.update(prior, bent_measurement(STATES, 6, noise), z)
-        expected = bayes.update(prior, bent_measurement(STATES, 6, Dense(noise.covariance())), z)
+        expected = bayes.update(prior, bent_measurement(STATES, 6, filters.Dense(noise.covariance())), z)
         assert_same_update(found, expected, 1e-12)
 
 
 @pytest.mark.parametrize(
     ("bayes", "measurements", "expected"),
     [
-        (UnscentedKalmanFilter(), 2 * STATES, "dense"),
-        (UnscentedKalmanFilter(), 2 * STATES + 1, "low-rank"),
-        (ExtendedKalmanFilter(), STATES, "dense"),
-        (ExtendedKalmanFilter(), STATES + 1, "low-rank"),
-        (UnscentedKalmanFilter(points=merwe(0.5, 0.0, allow_negative=True)), 40, "dense"),
+        (filters.UnscentedKalmanFilter(), 2 * STATES, "dense"),
+        (filters.UnscentedKalmanFilter(), 2 * STATES + 1, "low-rank"),
+        (filters.ExtendedKalmanFilter(), STATES, "dense"),
+        (filters.ExtendedKalmanFilter(), STATES + 1, "low-rank"),
+        (filters.UnscentedKalmanFilter(points=filters.merwe(0.5, 0.0, allow_negative=True)), 40, "dense"),
     ],
 )
 def test_form_follows_the_larger_of_measurement_and_columns(bayes, measurements, expected):
     prior, z = beliefs(STATES), random_numbers(measurements)
-    noise = Diagonal(torch.ones(measurements, dtype=torch.float64))
+    noise = filters.Diagonal(torch.ones(measurements, dtype=torch.float64))
     assert bayes.update(prior, bent_measurement(STATES, measurements, noise), z).form == expected
 
 
 def test_form_is_qr_in_float32_and_for_square_roots():
-    prior, measurement = beliefs(STATES), bent_measurement(STATES, 2, Diagonal(torch.ones(2)))
-    by_root = Gaussian(prior.mean, factor=random_numbers(STATES, 2 * STATES))
-    double = replace(measurement, noise=Diagonal(torch.ones(2, dtype=torch.float64)))
-    bayes = UnscentedKalmanFilter()
+    prior, measurement = beliefs(STATES), bent_measurement(STATES, 2, filters.Diagonal(torch.ones(2)))
+    by_root = filters.Gaussian(prior.mean, factor=random_numbers(STATES, 2 * STATES))
+    double = replace(measurement, noise=filters.Diagonal(torch.ones(2, dtype=torch.float64)))
+    bayes = filters.UnscentedKalmanFilter()
     assert bayes.update(prior.to(torch.float32), measurement, torch.zeros(2)).form == "qr"
     update = bayes.update(by_root, double, torch.zeros(2, dtype=torch.float64))
     assert update.form == "qr"
@@ -115,16 +95,16 @@ def test_form_is_qr_in_float32_and_for_square_roots():
 def test_belief_by_any_root_equals_belief_by_covariance(form):
     root = random_numbers(3, STATES, 2 * STATES, seed=2)
     mean, z = random_numbers(3, STATES), random_numbers(3, 6, seed=3)
-    bayes = UnscentedKalmanFilter(form=form)
+    bayes = filters.UnscentedKalmanFilter(form=form)
     measurement = bent_measurement(STATES, 6)
-    found = bayes.update(Gaussian(mean, factor=root), measurement, z)
-    assert_same_update(found, bayes.update(Gaussian(mean, root @ root.mT), measurement, z), 1e-11)
+    found = bayes.update(filters.Gaussian(mean, factor=root), measurement, z)
+    assert_same_update(found, bayes.update(filters.Gaussian(mean, root @ root.mT), measurement, z), 1e-11)
 
 
 def test_negative_weights_update_as_the_textbook_in_the_dense_form():
-    points, prior, z = merwe(0.4, 0.0, allow_negative=True), beliefs(STATES), random_numbers(2, seed=3)
+    points, prior, z = filters.merwe(0.4, 0.0, allow_negative=True), beliefs(STATES), random_numbers(2, seed=3)
     measurement = bent_measurement(STATES, 2)
-    update = UnscentedKalmanFilter(points=points, form="dense").update(prior, measurement, z)
+    update = filters.UnscentedKalmanFilter(points=points, form="dense").update(prior, measurement, z)
     spread = 0.4**2 * STATES
     root = torch.linalg.cholesky(prior.covariance) * spread**0.5
     x = torch.cat([prior.mean + root.mT, prior.mean - root.mT, prior.mean[None]])
@@ -144,7 +124,7 @@ def test_negative_weights_update_as_the_textbook_in_the_dense_form():
 
 @pytest.mark.parametrize("form", ["low-rank", "qr"])
 def test_negative_weights_are_refused_by_forms_that_cannot_take_them(form):
-    bayes = UnscentedKalmanFilter(points=merwe(0.5, 0.0, allow_negative=True), form=form)
+    bayes = filters.UnscentedKalmanFilter(points=filters.merwe(0.5, 0.0, allow_negative=True), form=form)
     with pytest.raises(ValueError, match="form='dense'"):
         bayes.update(beliefs(STATES), bent_measurement(STATES, 6), random_numbers(6))
 
@@ -155,11 +135,11 @@ def test_negative_weights_are_refused_by_forms_that_cannot_take_them(form):
 @pytest.mark.parametrize(("measurements", "kept"), [(4, (1, 2)), (4, (3,)), (12, (0, 1, 3, 6, 7, 10))])
 def test_missing_components_equal_a_model_without_them(measurements, kept, form, kind, augmented):
     """NaN in the value and False in the mask, with the noise added or among the arguments."""
-    bayes = ExtendedKalmanFilter(form=form) if augmented else UnscentedKalmanFilter(form=form)
+    bayes = filters.ExtendedKalmanFilter(form=form) if augmented else filters.UnscentedKalmanFilter(form=form)
     prior, z, keep = beliefs(3, STATES), random_numbers(3, measurements, seed=6), torch.tensor(kept)
     full = bent_measurement(STATES, measurements, noises(measurements)[kind])
     seen, covariance = full.function, noises(measurements)[kind].covariance()
-    less = MeasurementModel(lambda x: seen(x)[..., keep], covariance[keep][:, keep])
+    less = filters.MeasurementModel(lambda x: seen(x)[..., keep], covariance[keep][:, keep])
     if augmented:
         full = replace(full, function=lambda x, v: seen(x) + v, additive=False)
     mask = torch.zeros(measurements, dtype=torch.bool).index_fill(0, keep, True)
@@ -184,10 +164,10 @@ def test_missing_components_leave_noise_that_is_not_additive_alone(size):
     """
     prior, z = beliefs(STATES), random_numbers(2, seed=3)
     H, spread, noise = random_numbers(2, STATES), random_numbers(2, size, seed=4), covariances(size)
-    augmented = MeasurementModel(lambda x, v: x @ H.mT + v @ spread.mT, noise, additive=False)
+    augmented = filters.MeasurementModel(lambda x, v: x @ H.mT + v @ spread.mT, noise, additive=False)
     z[0] = torch.nan
-    found = ExtendedKalmanFilter().update(prior, augmented, z)
-    expected = KalmanFilter().update(prior, LinearMeasurement(H, spread @ noise @ spread.mT), z)
+    found = filters.ExtendedKalmanFilter().update(prior, augmented, z)
+    expected = filters.KalmanFilter().update(prior, filters.LinearMeasurement(H, spread @ noise @ spread.mT), z)
     assert_same_belief(found.belief, expected.belief, 1e-12)
 
 
@@ -197,7 +177,7 @@ def test_missing_components_leave_noise_that_is_not_additive_alone(size):
 def test_nothing_measured_changes_nothing(form, kind, measurements):
     prior = beliefs(3, STATES)
     z = torch.full((3, measurements), torch.nan, dtype=torch.float64)
-    bayes = UnscentedKalmanFilter(form=form, iterations=2)
+    bayes = filters.UnscentedKalmanFilter(form=form, iterations=2)
     update = bayes.update(prior, bent_measurement(STATES, measurements, noises(measurements)[kind]), z)
     assert_same_belief(update.belief, prior, 1e-14)
     for array in (update.innovation, update.nis, update.log_likelihood, update.gain, torch.as_tensor(update.count)):
@@ -211,7 +191,7 @@ def test_each_element_of_the_batch_has_its_own_mask(form, kind):
     prior, z = beliefs(6, STATES), random_numbers(6, 8, seed=5)
     z[random_numbers(6, 8, seed=8) > 0.3] = torch.nan
     z[0] = random_numbers(8)
-    bayes, measurement = UnscentedKalmanFilter(form=form), bent_measurement(STATES, 8, noises(8)[kind])
+    bayes, measurement = filters.UnscentedKalmanFilter(form=form), bent_measurement(STATES, 8, noises(8)[kind])
     update = bayes.update(prior, measurement, z)
     assert update.count.tolist() == (~z.isnan()).sum(dim=-1).tolist()
     for k in range(6):
@@ -228,16 +208,20 @@ def test_missing_components_of_a_linear_measurement_equal_a_model_without_them()
     nan = z.clone()
     nan[[1, 2]] = torch.nan
     for form in FORMS:
-        found = KalmanFilter(form=form).update(prior, LinearMeasurement(H, noise), nan)
-        expected = KalmanFilter(form=form).update(prior, LinearMeasurement(H[keep], noise[keep][:, keep]), z[keep])
+        found = filters.KalmanFilter(form=form).update(prior, filters.LinearMeasurement(H, noise), nan)
+        expected = filters.KalmanFilter(form=form).update(
+            prior, filters.LinearMeasurement(H[keep], noise[keep][:, keep]), z[keep]
+        )
         assert_same_belief(found.belief, expected.belief, 1e-12)
         assert_close(found.log_likelihood, expected.log_likelihood, OF_LIKELIHOOD)
 
 
 def test_likelihood_with_missing_components_keeps_its_digits():
     prior, H, noise, z = beliefs(STATES), random_numbers(4, STATES), covariances(4), random_numbers(4, seed=3)
-    found = KalmanFilter().update(prior, LinearMeasurement(H, noise, mask=torch.tensor([True] * 3 + [False])), z)
-    expected = KalmanFilter().update(prior, LinearMeasurement(H[:3], noise[:3, :3]), z[:3])
+    found = filters.KalmanFilter().update(
+        prior, filters.LinearMeasurement(H, noise, mask=torch.tensor([True] * 3 + [False])), z
+    )
+    expected = filters.KalmanFilter().update(prior, filters.LinearMeasurement(H[:3], noise[:3, :3]), z[:3])
     assert_close(found.log_likelihood, expected.log_likelihood, 1e-12)
 
 
@@ -246,7 +230,7 @@ def test_likelihood_with_missing_components_keeps_its_digits():
 def test_large_batch_equals_single_filters(size, form):
     """The unrolled path of many small filters against LAPACK's of each alone."""
     count, measurements = 130, min(size + 1, 4)
-    bayes = UnscentedKalmanFilter(form=form)
+    bayes = filters.UnscentedKalmanFilter(form=form)
     motion, measurement = bent_motion(size), bent_measurement(size, measurements)
     prior, z = beliefs(count, size), random_numbers(count, measurements, seed=6)
     z[:7, 0] = torch.nan

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from sigmaslam.models.detector import BORDER, detect, to_cells
 from sigmaslam.models.extractor import FeatureExtractor
-from sigmaslam.models.network import DESCRIPTOR_SIZE, FeatureNetwork
+from sigmaslam.models.feature_network import DESCRIPTOR_SIZE, FeatureNetwork
 from sigmaslam.synthetic.rendering.textures import dead_leaves
 
 

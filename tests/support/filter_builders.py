@@ -1,15 +1,12 @@
-"""Random numbers, models and comparisons that the tests of the filters share; no randomness but from a seed."""
+"""Random numbers, beliefs and models that the tests of the filters share; no randomness but from a seed."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from sigmaslam.filters import BlockDiagonal, Dense, Diagonal, Gaussian, MeasurementModel, MotionModel, Update
-from sigmaslam.filters.noise import Noise
-
-# Of an update.
-FORMS = ("dense", "low-rank", "qr")
+from sigmaslam.filters import BlockDiagonal, Dense, Diagonal, Gaussian, MeasurementModel, MotionModel
+from sigmaslam.filters.noise_covariance import Noise
 
 
 def random_numbers(*shape: int, seed: int = 0) -> Tensor:
@@ -59,23 +56,3 @@ def noises(measurements: int, seed: int = 0) -> dict[str, Noise]:
         "blocks": BlockDiagonal(covariances(measurements // 2, 2, seed=seed, scale=0.3)),
         "dense": Dense(covariances(measurements, seed=seed, scale=0.3)),
     }
-
-
-def assert_close(found: Tensor, expected: Tensor, tolerance: float) -> None:
-    """Relative to the largest expected entry, or absolute where that is below one."""
-    assert found.shape == expected.shape, f"{tuple(found.shape)} found, {tuple(expected.shape)} expected"
-    scale = max(1.0, float(expected.detach().abs().max())) if expected.numel() else 1.0
-    torch.testing.assert_close(found, expected, rtol=0, atol=tolerance * scale)
-
-
-def assert_same_belief(found: Gaussian, expected: Gaussian, tolerance: float) -> None:
-    assert_close(found.mean, expected.mean, tolerance)
-    assert_close(found.covariance, expected.covariance, tolerance)
-
-
-def assert_same_update(found: Update, expected: Update, tolerance: float) -> None:
-    """All that an update says, but for the signs that a root is free in."""
-    assert_same_belief(found.belief, expected.belief, tolerance)
-    for name in ("innovation", "nis", "log_likelihood", "innovation_covariance", "gain"):
-        assert_close(getattr(found, name), getattr(expected, name), tolerance)
-    assert torch.equal(found.healthy, expected.healthy)

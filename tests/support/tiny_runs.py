@@ -4,12 +4,12 @@ import functools
 
 import pytest
 
-from sigmaslam.synthetic import pairs
+from sigmaslam.synthetic import homography_pairs
 from sigmaslam.training.features import loop
 from sigmaslam.training.features.validation import matching_accuracy
 
 
 def make_small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Small textures, and one held-out pair of leaves."""
-    monkeypatch.setattr(pairs, "_TEXTURE_SIZE", 128)
+    monkeypatch.setattr(homography_pairs, "_TEXTURE_SIZE", 128)
     monkeypatch.setattr(loop, "matching_accuracy", functools.partial(matching_accuracy, pairs=1, size=96))

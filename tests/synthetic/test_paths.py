@@ -135,9 +135,9 @@ def test_a_stop_is_really_at_rest_and_eased(winding: Path, seed: int) -> None:
 
 def test_stops_keep_the_way_and_never_go_back(winding: Path) -> None:
     path = with_stops(winding, np.random.default_rng(3), 3, ease=0.5)
-    own = path._own_clock(np.linspace(path.start, path.end, 2000))
-    assert (np.diff(own) >= -1e-12).all()
-    np.testing.assert_allclose(own[[0, -1]], [winding.start, winding.end], atol=1e-12)
+    clock = path._knot_clock(np.linspace(path.start, path.end, 2000))
+    assert (np.diff(clock) >= -1e-12).all()
+    np.testing.assert_allclose(clock[[0, -1]], [winding.start, winding.end], atol=1e-12)
 
 
 def test_wrong_content_is_refused(winding: Path) -> None:

@@ -9,7 +9,7 @@ import torch
 
 from sigmaslam.geometry.camera import CameraModel
 from sigmaslam.synthetic.rendering.facets import Facets, join
-from sigmaslam.synthetic.rendering.renderer import Renderer, Views
+from sigmaslam.synthetic.rendering.renderer import RenderedViews, Renderer
 from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel, Tube
 from sigmaslam.synthetic.rendering.visibility import Eye
 from sigmaslam.synthetic.scene import Body, Lights, Material, Scene, Texture
@@ -26,7 +26,7 @@ def renderer() -> Renderer:
     return Renderer(small_scene())
 
 
-def render(renderer: Renderer, camera: CameraModel, *views: tuple[np.ndarray, float]) -> Views:
+def render(renderer: Renderer, camera: CameraModel, *views: tuple[np.ndarray, float]) -> RenderedViews:
     return renderer.render(Eye(camera), np.stack([T for T, _ in views]), np.array([time for _, time in views]))
 
 

@@ -45,7 +45,7 @@ def test_no_two_pairs_and_no_two_scenes_share_their_random_numbers(monkeypatch: 
     named, default_rng = [], np.random.default_rng
     monkeypatch.setattr(np.random, "default_rng", lambda name=None: named.append(name) or default_rng(name))
     monkeypatch.setattr(ScenePairs, "_views", lambda self, scene: [None] * 4)
-    monkeypatch.setattr(ScenePairs, "_shared", lambda self, a, b: 1.0)
+    monkeypatch.setattr(ScenePairs, "_overlap", lambda self, a, b: 1.0)
     monkeypatch.setattr(ScenePairs, "_photograph", lambda self, views, rng, sensor: None)
     for seed in range(3):
         for index in range(40):

@@ -13,7 +13,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from sigmaslam.geometry.camera import CameraModel
-from sigmaslam.synthetic.choices import MOTIONS
+from sigmaslam.synthetic.render_choices import MOTIONS
 from sigmaslam.synthetic.rendering.renderer import Renderer
 from sigmaslam.synthetic.rendering.visibility import Eye
 from sigmaslam.synthetic.scene import Scene, Texture

@@ -7,7 +7,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from sigmaslam.geometry.camera import CameraModel
-from sigmaslam.synthetic.motion import trajectories
+from sigmaslam.synthetic.motion import random_motions
 from sigmaslam.synthetic.rendering.renderer import Renderer
 from sigmaslam.synthetic.rendering.visibility import Eye
 from sigmaslam.synthetic.scene import Scene
@@ -123,7 +123,7 @@ def test_motions_do_what_they_say(domain: str):
 def test_a_real_drive_is_followed(real_data: FilePath):
     profile = real_data / "kitti_gt_trajectories" / "05.txt"
     path = street.generate(np.random.default_rng(0), Wish(DURATION, profile=profile, textures=1)).path
-    real = trajectories.drive_profile(profile, DURATION, np.random.default_rng(0))
+    real = random_motions.drive_profile(profile, DURATION, np.random.default_rng(0))
     times = np.linspace(0, DURATION, 50)
     ours, theirs = path.poses(times), real.poses(times)
     assert ours[:, :2] == pytest.approx(theirs[:, :2])

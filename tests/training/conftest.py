@@ -6,7 +6,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from sigmaslam.models.network import FeatureNetwork
+from sigmaslam.models.feature_network import FeatureNetwork
 from sigmaslam.training.features.recipes import TrainingConfig
 from tests.support.tiny_runs import make_small
 

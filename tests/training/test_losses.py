@@ -7,7 +7,7 @@ from scipy import stats
 from torch import Tensor
 from torch.nn import functional
 
-from sigmaslam.models.network import FeatureNetwork
+from sigmaslam.models.feature_network import FeatureNetwork
 from sigmaslam.training.features import step
 from sigmaslam.training.features.losses import MatchLoss, match_loss, place_loss
 from sigmaslam.training.features.step import _zoom, pair_loss

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from sigmaslam.models.network import FeatureNetwork
+from sigmaslam.models.feature_network import FeatureNetwork
 from sigmaslam.training.features import pictures
 from sigmaslam.training.features.pictures import draw_sample
 from sigmaslam.training.features.stream import open_stream

@@ -13,7 +13,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.frontend.nearest_neighbours import Putative
 from sigmaslam.frontend.scorer_inputs import NEIGHBOURS, nearest_matches
 from sigmaslam.frontend.types import Features
-from sigmaslam.models.scorer import MatchScorer
+from sigmaslam.models.scorer_network import MatchScorer
 from sigmaslam.training import steps
 from sigmaslam.training.matching import scorer_training as scorer_training
 from sigmaslam.training.matching.match_sets import MatchSet

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sigmaslam.errors import InputError
-from sigmaslam.synthetic import pairs
+from sigmaslam.synthetic import homography_pairs
 from sigmaslam.training.choices import MIXES
 from sigmaslam.training.features import stream
 from sigmaslam.training.features.stream import MixedPairs, PairDataset, open_stream, pair_loader
@@ -15,7 +15,7 @@ from sigmaslam.training.features.stream import MixedPairs, PairDataset, open_str
 
 @pytest.fixture(autouse=True)
 def small_textures(monkeypatch):
-    monkeypatch.setattr(pairs, "_TEXTURE_SIZE", 128)
+    monkeypatch.setattr(homography_pairs, "_TEXTURE_SIZE", 128)
 
 
 def test_batches_do_not_depend_on_where_the_loader_begins():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from sigmaslam.models.network import FeatureNetwork
+from sigmaslam.models.feature_network import FeatureNetwork
 from sigmaslam.training.choices import MIXES
 from sigmaslam.training.features import validation
 from sigmaslam.training.features.validation import PairMatches, held_out_sources, match_pair, matching_accuracy

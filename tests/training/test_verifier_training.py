@@ -12,8 +12,8 @@ from sigmaslam.errors import InputError
 from sigmaslam.evaluation.metrics.calibration import calibration_error
 from sigmaslam.frontend.nearest_neighbours import Putative
 from sigmaslam.frontend.types import Features
-from sigmaslam.models.scorer import MatchScorer
-from sigmaslam.models.verifier import VERIFIER_COLUMNS, MatchVerifier
+from sigmaslam.models.scorer_network import MatchScorer
+from sigmaslam.models.verifier_network import VERIFIER_COLUMNS, MatchVerifier
 from sigmaslam.synthetic.rendering.textures import dead_leaves
 from sigmaslam.training.matching import verifier_training as verifier_training
 from sigmaslam.training.matching.match_sets import MatchSet, PairRecord

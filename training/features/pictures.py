@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from sigmaslam.frontend.image_pair import draw_lines
-from sigmaslam.models.network import FeatureNetwork
+from sigmaslam.models.feature_network import FeatureNetwork
 from sigmaslam.training.features.stream import Pair
 from sigmaslam.training.features.validation import match_pair
 

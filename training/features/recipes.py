@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sigmaslam.errors import InputError
 from sigmaslam.inference.onnx_graph import shipped_weights
-from sigmaslam.models.network import DESCRIPTOR_SIZE, STRIDE, STRIDES
+from sigmaslam.models.feature_network import DESCRIPTOR_SIZE, STRIDE, STRIDES
 from sigmaslam.training.choices import MIXES
 
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from sigmaslam.models.detector import to_cells
-from sigmaslam.models.network import FeatureMaps, FeatureNetwork, sample_map
+from sigmaslam.models.feature_network import FeatureMaps, FeatureNetwork, sample_map
 from sigmaslam.training.features.losses import PairLoss, match_loss, place_loss
 
 # A keypoint has a partner if one was found this near to its true place in image 1, pixels.

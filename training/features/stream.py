@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader, Dataset, Subset
 
 from sigmaslam.errors import InputError
 from sigmaslam.models.detector import detect, to_cells
-from sigmaslam.synthetic.pairs import HomographyPairs
+from sigmaslam.synthetic.homography_pairs import HomographyPairs
 from sigmaslam.synthetic.rendering.textures import KINDS
 from sigmaslam.synthetic.scene_pairs import ScenePairs
 from sigmaslam.training.choices import MIXES

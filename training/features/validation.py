@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from sigmaslam.models.extractor import FeatureExtractor
-from sigmaslam.models.network import FeatureNetwork
+from sigmaslam.models.feature_network import FeatureNetwork
 from sigmaslam.training.choices import MIXES
 from sigmaslam.training.features.stream import Pair, open_stream
 

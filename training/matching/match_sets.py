@@ -17,7 +17,7 @@ from sigmaslam.frontend.classical import OrbDetector, SiftDetector
 from sigmaslam.frontend.learned import LearnedDetector
 from sigmaslam.frontend.nearest_neighbours import Putative, nearest_anywhere, nearest_in_ellipses, nearest_in_rows
 from sigmaslam.frontend.types import Features
-from sigmaslam.synthetic.pairs import HomographyPairs
+from sigmaslam.synthetic.homography_pairs import HomographyPairs
 from sigmaslam.synthetic.rendering.textures import KINDS
 from sigmaslam.synthetic.scene_pairs import ScenePairs
 from sigmaslam.training.features.stream import PairStream, prepare_worker, take_turn

@@ -13,7 +13,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 
 from sigmaslam.evaluation.metrics.calibration import RIGHT
 from sigmaslam.frontend.scorer_inputs import NEIGHBOURS, nearest_matches, side_information
-from sigmaslam.models.scorer import SIDE_CHANNELS, MatchScorer
+from sigmaslam.models.scorer_network import SIDE_CHANNELS, MatchScorer
 from sigmaslam.training.matching.match_sets import MatchSet
 from sigmaslam.training.steps import train_steps
 

@@ -25,8 +25,8 @@ from sigmaslam.evaluation.metrics.calibration import (
     spearman,
 )
 from sigmaslam.files import atomic_path, atomic_write_text, make_folder
-from sigmaslam.models.scorer import MatchScorer
-from sigmaslam.models.verifier import MatchVerifier
+from sigmaslam.models.scorer_network import MatchScorer
+from sigmaslam.models.verifier_network import MatchVerifier
 from sigmaslam.progress import open_progress
 from sigmaslam.training.card import describe_origin
 from sigmaslam.training.devices import describe_processor

@@ -21,8 +21,8 @@ from sigmaslam.frontend.match_confidence import LEAST_LOGIT
 from sigmaslam.frontend.patch_evidence import examine_patches
 from sigmaslam.frontend.types import Refinement
 from sigmaslam.frontend.verifier_inputs import describe_matches
-from sigmaslam.models.scorer import MatchScorer
-from sigmaslam.models.verifier import MatchVerifier
+from sigmaslam.models.scorer_network import MatchScorer
+from sigmaslam.models.verifier_network import MatchVerifier
 from sigmaslam.training.matching.match_sets import MatchSet, PairRecord
 from sigmaslam.training.matching.scorer_training import score_set
 from sigmaslam.training.steps import train_steps

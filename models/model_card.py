@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sigmaslam.errors import InputError
-from sigmaslam.models.network import DESCRIPTOR_SIZE
+from sigmaslam.models.feature_network import DESCRIPTOR_SIZE
 
 _CARD_FIELDS = (
     *("config", "metrics_on_held_out_renders", "parameters", "data", "command", "commit", "seed"),

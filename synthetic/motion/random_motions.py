@@ -37,7 +37,7 @@ from sigmaslam.synthetic.motion.paths import (
 )
 
 __all__ = [
-    "Box",
+    "FreeSpace",
     "Path",
     "at_rest",
     "closed_loop",
@@ -59,7 +59,7 @@ _GRAVITY = 9.81
 _DEGREE = np.pi / 180
 
 
-class Box(NamedTuple):
+class FreeSpace(NamedTuple):
     """Free space, upright.
 
     Attributes:
@@ -71,7 +71,7 @@ class Box(NamedTuple):
     half: tuple[float, float, float]
 
 
-def hand_held(rng: np.random.Generator, duration: float, box: Box) -> Path:
+def hand_held(rng: np.random.Generator, duration: float, box: FreeSpace) -> Path:
     """A camera that is carried by a walking person, who looks all around.
 
     Walks at 0.3-0.8 m/s, slower where the way turns back, with the bounce and sway of steps, up to 40 deg/s, with
@@ -108,7 +108,7 @@ def hand_held(rng: np.random.Generator, duration: float, box: Box) -> Path:
     return path_through(t[inside], position[inside], view_rotations(*angles[inside].T))
 
 
-def drone(rng: np.random.Generator, duration: float, box: Box) -> Path:
+def drone(rng: np.random.Generator, duration: float, box: FreeSpace) -> Path:
     """A camera that is fixed to a drone: up to 2-3 m/s and 4 m/s^2, banks with its acceleration, turns at 45-90 deg/s.
 
     Args:
@@ -332,7 +332,7 @@ def pure_rotation(rng: np.random.Generator, duration: float, position: tuple[flo
     return path_through(t[inside], fixed[inside], view_rotations(*angles[inside].T))
 
 
-def closed_loop(rng: np.random.Generator, duration: float, box: Box) -> Path:
+def closed_loop(rng: np.random.Generator, duration: float, box: FreeSpace) -> Path:
     """A camera that looks ahead on a round course and ends at its start, with the same pose and velocity.
 
     Args:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -12,44 +11,39 @@ from torch import Tensor
 from sigmaslam.filters.linalg.square_roots import cholesky, identity, log_diagonal, solve_lower, square, triangularise
 
 
-class Noise(Protocol):
-    """What the filters ask of a covariance R (..., m, m)."""
+class Noise(ABC):
+    """A covariance R (..., m, m). What is not overridden works with its root, a full triangle."""
 
-    @property
-    def size(self) -> int:
-        """m."""
-        ...
-
+    @abstractmethod
     def covariance(self) -> Tensor:
         """R, (..., m, m)."""
-        ...
-
-    def variance(self) -> Tensor:
-        """Diagonal of R, (..., m)."""
-        ...
-
-    def factor(self) -> Tensor:
-        """Lower triangular root of R, (..., m, m)."""
-        ...
-
-    def triangularised(self, pieces: Sequence[Tensor]) -> Tensor:
-        """Lower root (..., m, m) of the covariance of R plus that of other deviations, pieces (..., m, c_i)."""
-        ...
-
-    def whitened(self, columns: Tensor) -> Tensor:
-        """R^-1/2 columns, (..., m, c)."""
-        ...
-
-    def log_determinant(self) -> Tensor:
-        """log |R|, (...,)."""
-        ...
 
     def masked(self, mask: Tensor) -> Noise:
         """The noise with unit variance, and no correlation, where mask (..., m) is False."""
-        ...
+        return Dense(_masked(self.covariance(), mask))
+
+    @abstractmethod
+    def variance(self) -> Tensor:
+        """Diagonal of R, (..., m)."""
+
+    def log_determinant(self) -> Tensor:
+        """log |R|, (...,)."""
+        return log_diagonal(self.factor())
+
+    @abstractmethod
+    def factor(self) -> Tensor:
+        """Lower triangular root of R, (..., m, m)."""
+
+    def triangularised(self, pieces: Sequence[Tensor]) -> Tensor:
+        """Lower root (..., m, m) of the covariance of R plus that of other deviations, pieces (..., m, c_i)."""
+        return triangularise([*pieces, self.factor()])
+
+    def whitened(self, columns: Tensor) -> Tensor:
+        """R^-1/2 columns, (..., m, c)."""
+        return solve_lower(self.factor(), columns, regular=True)
 
 
-class Diagonal:
+class Diagonal(Noise):
     """Independent components."""
 
     def __init__(self, variance: Tensor) -> None:
@@ -57,11 +51,6 @@ class Diagonal:
         if variance.ndim < 1:
             raise ValueError("variances (..., m) expected, got a scalar")
         self._variance = variance
-
-    @property
-    def size(self) -> int:
-        """m."""
-        return self._variance.shape[-1]
 
     def covariance(self) -> Tensor:
         """R, (..., m, m)."""
@@ -92,73 +81,42 @@ class Diagonal:
         return Diagonal(torch.where(mask, self._variance, 1.0))
 
 
-class BlockDiagonal:
+class BlockDiagonal(Noise):
     """Independent blocks, such as one 2x2 or 3x3 covariance for each point."""
 
     def __init__(self, blocks: Tensor) -> None:
         """Takes the blocks (..., b, k, k); component i k + j of the measurement is component j of block i."""
         if blocks.ndim < 3 or blocks.shape[-1] != blocks.shape[-2]:
             raise ValueError(f"blocks (..., b, k, k) expected, got {tuple(blocks.shape)}")
-        self.blocks = blocks
-
-    @property
-    def size(self) -> int:
-        """m = b k."""
-        return self.blocks.shape[-3] * self.blocks.shape[-1]
+        self._blocks = Dense(blocks)
+        self._shape = blocks.shape[-3], blocks.shape[-1]
 
     def covariance(self) -> Tensor:
         """R, (..., m, m)."""
-        return _block_diagonal(self.blocks)
+        return _block_diagonal(self._blocks.covariance())
 
     def variance(self) -> Tensor:
         """Diagonal of R, (..., m)."""
-        return torch.diagonal(self.blocks, dim1=-2, dim2=-1).flatten(-2)
+        return self._blocks.variance().flatten(-2)
 
     def factor(self) -> Tensor:
         """Lower triangular root of R, (..., m, m)."""
-        return _block_diagonal(_flagged(*cholesky(self.blocks)))
-
-    def triangularised(self, pieces: Sequence[Tensor]) -> Tensor:
-        """Lower root of R and more deviations."""
-        return triangularise([*pieces, self.factor()])
+        return _block_diagonal(self._blocks.factor())
 
     def whitened(self, columns: Tensor) -> Tensor:
         """R^-1/2 columns, (..., m, c), block by block."""
-        count, size = self.blocks.shape[-3], self.blocks.shape[-1]
-        factor = _flagged(*cholesky(self.blocks))
-        return solve_lower(factor, columns.unflatten(-2, (count, size)), regular=True).flatten(-3, -2)
+        return self._blocks.whitened(columns.unflatten(-2, self._shape)).flatten(-3, -2)
 
     def log_determinant(self) -> Tensor:
         """log |R|, (...,)."""
-        return log_diagonal(_flagged(*cholesky(self.blocks))).sum(dim=-1)
+        return self._blocks.log_determinant().sum(dim=-1)
 
     def masked(self, mask: Tensor) -> BlockDiagonal:
         """Unit variance and no correlation where mask (..., m) is False."""
-        count, size = self.blocks.shape[-3], self.blocks.shape[-1]
-        return BlockDiagonal(_masked(self.blocks, mask.unflatten(-1, (count, size))))
+        return BlockDiagonal(_masked(self._blocks.covariance(), mask.unflatten(-1, self._shape)))
 
 
-class _Correlated(ABC):
-    """A covariance whose root is a full triangle."""
-
-    @abstractmethod
-    def factor(self) -> Tensor:
-        """Lower triangular root of R, (..., m, m)."""
-
-    def triangularised(self, pieces: Sequence[Tensor]) -> Tensor:
-        """Lower root of R and more deviations."""
-        return triangularise([*pieces, self.factor()])
-
-    def whitened(self, columns: Tensor) -> Tensor:
-        """R^-1/2 columns, (..., m, c)."""
-        return solve_lower(self.factor(), columns, regular=True)
-
-    def log_determinant(self) -> Tensor:
-        """log |R|, (...,)."""
-        return log_diagonal(self.factor())
-
-
-class Dense(_Correlated):
+class Dense(Noise):
     """Any covariance."""
 
     def __init__(self, covariance: Tensor) -> None:
@@ -166,11 +124,6 @@ class Dense(_Correlated):
         if covariance.ndim < 2 or covariance.shape[-1] != covariance.shape[-2]:
             raise ValueError(f"a covariance (..., m, m) expected, got {tuple(covariance.shape)}")
         self._covariance = covariance
-
-    @property
-    def size(self) -> int:
-        """m."""
-        return self._covariance.shape[-1]
 
     def covariance(self) -> Tensor:
         """R, (..., m, m)."""
@@ -181,25 +134,17 @@ class Dense(_Correlated):
         return torch.diagonal(self._covariance, dim1=-2, dim2=-1)
 
     def factor(self) -> Tensor:
-        """Lower triangular root of R, (..., m, m)."""
-        return _flagged(*cholesky(self._covariance))
-
-    def masked(self, mask: Tensor) -> Dense:
-        """Unit variance and no correlation where mask (..., m) is False."""
-        return Dense(_masked(self._covariance, mask))
+        """Lower triangular root of R, (..., m, m); NaN where R is not positive semidefinite."""
+        factor, healthy = cholesky(self._covariance)
+        return factor if healthy is None else torch.where(healthy[..., None, None], factor, torch.nan)
 
 
-class Rooted(_Correlated):
+class Rooted(Noise):
     """A covariance by its lower triangular root."""
 
     def __init__(self, root: Tensor) -> None:
         """Takes the root (..., m, m)."""
         self._root = root
-
-    @property
-    def size(self) -> int:
-        """m."""
-        return self._root.shape[-1]
 
     def covariance(self) -> Tensor:
         """R, (..., m, m)."""
@@ -213,19 +158,10 @@ class Rooted(_Correlated):
         """Root of R, (..., m, m)."""
         return self._root
 
-    def masked(self, mask: Tensor) -> Dense:
-        """Unit variance and no correlation where mask (..., m) is False."""
-        return Dense(self.covariance()).masked(mask)
-
 
 def as_noise(noise: Noise | Tensor) -> Noise:
     """A tensor is taken for a dense covariance (..., m, m)."""
     return Dense(noise) if isinstance(noise, Tensor) else noise
-
-
-def _flagged(matrix: Tensor, healthy: Tensor | None) -> Tensor:
-    """Matrices (..., r, c) with NaN in those that are not healthy, so that no result passes for one."""
-    return matrix if healthy is None else torch.where(healthy[..., None, None], matrix, torch.nan)
 
 
 def _masked(covariance: Tensor, mask: Tensor) -> Tensor:
@@ -234,6 +170,6 @@ def _masked(covariance: Tensor, mask: Tensor) -> Tensor:
 
 
 def _block_diagonal(blocks: Tensor) -> Tensor:
-    apart = identity(blocks.shape[-3], blocks)[:, None, :, None]
-    spread = apart * blocks.unsqueeze(-2)
+    on_diagonal = identity(blocks.shape[-3], blocks)[:, None, :, None]
+    spread = on_diagonal * blocks.unsqueeze(-2)
     return spread.flatten(-4, -3).flatten(-2, -1)

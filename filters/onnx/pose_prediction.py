@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from sigmaslam.filters.linalg.semidefinite import cholesky
-from sigmaslam.filters.onnx.se3 import adjoint_se3, exp_se3, invert_se3, log_se3
+from sigmaslam.filters.onnx.exportable_se3 import adjoint_se3, exp_se3, invert_se3, log_se3
 from sigmaslam.filters.onnx.unscented import covariance_of, sigma_offsets
 
 POSE = slice(0, 6)

@@ -19,15 +19,15 @@ from torch import Tensor, nn
 
 from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.files import atomic_path, atomic_write_text, make_folder
-from sigmaslam.filters.onnx.constant_velocity import STATE_SIZE, Predict
-from sigmaslam.filters.onnx.se3 import exp_se3
-from sigmaslam.filters.onnx.stereo_window import Transfer
+from sigmaslam.filters.onnx.exportable_se3 import exp_se3
+from sigmaslam.filters.onnx.pose_prediction import STATE_SIZE, Predict
+from sigmaslam.filters.onnx.stereo_window import StereoTransfer
 from sigmaslam.inference.onnx_graph import OnnxGraph
-from sigmaslam.models.card import card_page, read_card, scoring_page
 from sigmaslam.models.extractor import EXTRACTOR_SIZE_MULTIPLE, FeatureExtractor
-from sigmaslam.models.network import DESCRIPTOR_SIZE, STRIDE, FeatureNetwork
-from sigmaslam.models.scorer import NEIGHBOURS, SIDE_CHANNELS, MatchScorer, ScoredMatches
-from sigmaslam.models.verifier import VERIFIER_COLUMNS, MatchCovariance, MatchVerifier
+from sigmaslam.models.feature_network import DESCRIPTOR_SIZE, STRIDE, FeatureNetwork
+from sigmaslam.models.model_card import card_page, read_card, scoring_page
+from sigmaslam.models.scorer_network import NEIGHBOURS, SIDE_CHANNELS, MatchScorer, ScoredMatches
+from sigmaslam.models.verifier_network import VERIFIER_COLUMNS, MatchCovariance, MatchVerifier
 from sigmaslam.synthetic.rendering.textures import dead_leaves
 
 _OPSET = 20
@@ -215,7 +215,7 @@ def _filter_graphs() -> dict[str, _Graph]:
             (fixed,) * 5,
         ),
         "stereo_transfer": _Graph(
-            Transfer(),
+            StereoTransfer(),
             _transfer_example(0, 5, 40),
             _transfer_example(1, 3, 17),
             ["relative", "spread", "pair", "calibration", "intrinsics", "landmarks", "landmark_spread"],
@@ -274,10 +274,10 @@ def _export(
         program.save(path, external_data=False)
         strip_origins(path)
         feed = {name: np.asarray(value) for name, value in zip(graph.inputs, graph.checked, strict=True)}
-        found = OnnxGraph(path)(feed)
+        actual = OnnxGraph(path)(feed)
         with torch.no_grad():
             expected = [value.numpy() for value in graph.module(*graph.checked)]
-        difference = (compare or _relative_difference)(found, expected)
+        difference = (compare or _relative_difference)(actual, expected)
         if not difference <= tolerance:
             raise SigmaSlamError(
                 f"{out.name} differs from torch by {difference:.2e}, more than {tolerance:.0e}: not written"
@@ -296,24 +296,24 @@ def strip_origins(path: Path) -> None:
     onnx.save(model, path)
 
 
-def _relative_difference(found: list[np.ndarray], expected: list[np.ndarray]) -> float:
+def _relative_difference(actual: list[np.ndarray], expected: list[np.ndarray]) -> float:
     """Largest difference over all outputs, relative to an output's largest value where that exceeds 1."""
     return max(
-        float(np.abs(a - b).max() / max(1.0, float(np.abs(b).max()))) for a, b in zip(found, expected, strict=True)
+        float(np.abs(a - b).max() / max(1.0, float(np.abs(b).max()))) for a, b in zip(actual, expected, strict=True)
     )
 
 
-def _feature_difference(found: list[np.ndarray], expected: list[np.ndarray]) -> float:
+def _feature_difference(actual: list[np.ndarray], expected: list[np.ndarray]) -> float:
     """Largest difference of common keypoints, their scores, descriptors and sigmas; infinite if over 2 % are missing.
 
     Round-off may swap two keypoints of nearly equal score, so they are paired by place.
     """
     count = int((expected[1] > 0).sum())
-    distance = np.linalg.norm(expected[0][:count, None] - found[0][None, :count], axis=2)
+    distance = np.linalg.norm(expected[0][:count, None] - actual[0][None, :count], axis=2)
     nearest = distance.argmin(axis=1)
     common = distance[np.arange(count), nearest] < 1.0
     if common.mean() < 0.98:
         return float("inf")
     return max(
-        float(np.abs(a[nearest[common]] - b[:count][common]).max()) for a, b in zip(found, expected, strict=True)
+        float(np.abs(a[nearest[common]] - b[:count][common]).max()) for a, b in zip(actual, expected, strict=True)
     )

@@ -20,8 +20,8 @@ _GROWTH = 0.03
 # Only the nearest neighbours make hypotheses; all vote.
 _HYPOTHESES = 8
 # Nearer neighbours say nothing of rotation and scale, pixels.
-_LEAST_DISTANCE = 2.0
-_LEAST_ZOOM = 0.2
+_MIN_DISTANCE = 2.0
+_MIN_ZOOM = 0.2
 
 
 class MatchScorer(nn.Module):
@@ -66,7 +66,7 @@ class MatchScorer(nn.Module):
         inner, outer = u1 * u0 + v1 * v0, v1 * u0 - u1 * v0
         real, imaginary = inner / square0.clamp_min(1.0), outer / square0.clamp_min(1.0)
         zoom2 = real * real + imaginary * imaginary
-        sound = ((square0 > _LEAST_DISTANCE**2) & (zoom2 > _LEAST_ZOOM**2) & (zoom2 < _LEAST_ZOOM**-2)).to(side.dtype)
+        sound = ((square0 > _MIN_DISTANCE**2) & (zoom2 > _MIN_ZOOM**2) & (zoom2 < _MIN_ZOOM**-2)).to(side.dtype)
         # Squared distance |d1_k - z_j d0_k|^2 of neighbour k (fourth axis) from where hypothesis j (third) has it.
         growth = 1.0 / (1.0 + _GROWTH**2 * square1)
         of_hypothesis = torch.stack([torch.ones_like(real), zoom2, -2.0 * real, -2.0 * imaginary], dim=3)

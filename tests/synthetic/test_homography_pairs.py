@@ -2,8 +2,8 @@ import cv2
 import numpy as np
 import pytest
 
-from sigmaslam.synthetic import pairs
-from sigmaslam.synthetic.pairs import HomographyPair, HomographyPairs
+from sigmaslam.synthetic import homography_pairs
+from sigmaslam.synthetic.homography_pairs import HomographyPair, HomographyPairs
 from sigmaslam.synthetic.rendering import bank
 from sigmaslam.synthetic.rendering.textures import paint
 
@@ -11,7 +11,7 @@ from sigmaslam.synthetic.rendering.textures import paint
 @pytest.fixture(autouse=True)
 def small_textures(monkeypatch):
     """A twelfth of the leaves' area: what is tested does not depend on the size of the texture."""
-    monkeypatch.setattr(pairs, "_TEXTURE_SIZE", 128)
+    monkeypatch.setattr(homography_pairs, "_TEXTURE_SIZE", 128)
 
 
 def assert_equal(a: HomographyPair, b: HomographyPair) -> None:
@@ -75,8 +75,8 @@ def test_images_are_what_a_camera_gives():
 
 def test_homography_carries_image_0_onto_image_1(monkeypatch):
     """Without sensor and occlusion the two views agree, but for resampling; a pixel's shift would show."""
-    monkeypatch.setattr(pairs, "_sense", lambda image, rng: image)
-    monkeypatch.setattr(pairs, "_occlude", lambda image, foreign, rng: (image, np.zeros(image.shape, bool)))
+    monkeypatch.setattr(homography_pairs, "_sense", lambda image, rng: image)
+    monkeypatch.setattr(homography_pairs, "_occlude", lambda image, foreign, rng: (image, np.zeros(image.shape, bool)))
     # A smooth texture, so that resampling twice costs little.
     monkeypatch.setattr(bank, "paint", lambda *arguments: cv2.GaussianBlur(paint(*arguments), (0, 0), 3.0))
     stream, compared = HomographyPairs(1, size=128), 0
@@ -114,7 +114,7 @@ def test_what_the_camera_sees_agrees_where_there_is_texture():
 
 
 def test_some_second_views_are_occluded_and_no_first_one(monkeypatch):
-    monkeypatch.setattr(pairs, "_sense", lambda image, rng: image)
+    monkeypatch.setattr(homography_pairs, "_sense", lambda image, rng: image)
     monkeypatch.setattr(bank, "paint", lambda kind, size, seed: np.full((size, size), 40 + seed % 160, np.uint8))
     stream = HomographyPairs(0, size=64)
     views = [(pair.image0.std(), pair.image1.std()) for pair in map(stream.pair, range(80))]

@@ -7,9 +7,9 @@ import pytest
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.se3 import rotation_log
 from sigmaslam.geometry.trajectory import read_kitti
-from sigmaslam.synthetic.motion.trajectories import (
+from sigmaslam.synthetic.motion.random_motions import (
     CAMERA_HEIGHT,
-    Box,
+    FreeSpace,
     Path,
     closed_loop,
     drive,
@@ -25,8 +25,8 @@ from sigmaslam.synthetic.motion.trajectories import (
 
 Generator = Callable[[np.random.Generator], Path]
 
-ROOM = Box((1.0, -2.0, 1.5), (1.6, 1.1, 0.25))
-HALL = Box((0.0, 0.0, 3.0), (6.0, 5.0, 2.0))
+ROOM = FreeSpace((1.0, -2.0, 1.5), (1.6, 1.1, 0.25))
+HALL = FreeSpace((0.0, 0.0, 3.0), (6.0, 5.0, 2.0))
 BEND = np.linspace(0, 1, 20)
 TUBE = np.stack([0.2 * BEND, 0.04 * np.sin(4 * BEND), 0.05 * np.cos(5 * BEND)], axis=-1)
 RADIUS = 0.012
@@ -81,7 +81,7 @@ def test_the_same_seed_gives_the_same_path(name: str) -> None:
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("half", [(1.6, 1.1, 0.25), (0.4, 0.3, 0.02), (20.0, 15.0, 0.2)])
 def test_hand_held_and_drone_stay_in_their_box(half: tuple[float, float, float], seed: int) -> None:
-    box = Box((1.0, -2.0, 1.5), half)
+    box = FreeSpace((1.0, -2.0, 1.5), half)
     for path in (hand_held(np.random.default_rng(seed), 15, box), drone(np.random.default_rng(seed), 15, box)):
         T, _, _ = motion(path, 0.02)
         assert (np.abs(T[:, :3, 3] - box.centre) <= box.half).all()
@@ -90,7 +90,7 @@ def test_hand_held_and_drone_stay_in_their_box(half: tuple[float, float, float],
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_person_walks_at_walking_speed_with_the_camera_upright(seed: int) -> None:
-    T, velocity, _ = motion(hand_held(np.random.default_rng(seed), 30, Box((0, 0, 1.5), (4, 3, 0.2))))
+    T, velocity, _ = motion(hand_held(np.random.default_rng(seed), 30, FreeSpace((0, 0, 1.5), (4, 3, 0.2))))
     speed = np.linalg.norm(velocity, axis=1)
     assert 0.3 < np.median(speed) < 0.8
     assert (speed > 0.3).mean() > 0.8
@@ -225,6 +225,6 @@ def test_stops_hold_a_walk_still() -> None:
 
 def test_a_path_without_room_or_time_is_refused() -> None:
     with pytest.raises(InputError, match="room to move"):
-        hand_held(np.random.default_rng(0), 10, Box((0, 0, 0), (0.01, 0.01, 0.01)))
+        hand_held(np.random.default_rng(0), 10, FreeSpace((0, 0, 0), (0.01, 0.01, 0.01)))
     with pytest.raises(InputError, match="duration"):
         drone(np.random.default_rng(0), 0.0, HALL)

@@ -12,7 +12,7 @@ from sigmaslam.synthetic.rendering.visibility import Sight
 from sigmaslam.synthetic.simulation import Studio
 from sigmaslam.synthetic.truth import arrive
 
-_MOST_VIEWS = 200
+_MAX_VIEWS = 200
 _FRAMES_A_VIEW = 5  # new landmarks are taken in every so many frames ...
 _CELLS = (10, 14)  # ... one in each cell of this raster of the left image
 _STREAM = 101
@@ -36,7 +36,7 @@ class Landmarks:
 def choose_landmarks(studio: Studio) -> Landmarks:
     """Points seen from along the path, spread over the image; the same for every process."""
     simulation = studio.simulation
-    count = int(np.clip(simulation.frames // _FRAMES_A_VIEW, 1, _MOST_VIEWS))
+    count = int(np.clip(simulation.frames // _FRAMES_A_VIEW, 1, _MAX_VIEWS))
     frames = np.unique(np.linspace(0, simulation.frames - 1, count).round().astype(int))
     rng = np.random.default_rng((simulation.seed, _STREAM))
     eye = studio.left

@@ -9,7 +9,7 @@ VERIFIER_COLUMNS = 14
 """Of `sigmaslam.frontend.verifier_inputs.describe_matches`."""
 _WIDTH = 48
 # Of log sigma, pixels.
-_LEAST_LOG_SIGMA, _MOST_LOG_SIGMA = -4.0, 2.5
+_MIN_LOG_SIGMA, _MAX_LOG_SIGMA = -4.0, 2.5
 
 
 class MatchVerifier(nn.Module):
@@ -43,10 +43,10 @@ class MatchVerifier(nn.Module):
         Args:
             columns: (M, 14) of `sigmaslam.frontend.verifier_inputs.describe_matches`.
         """
-        found = self.layers((columns - self.mean) / self.spread)
+        outputs = self.layers((columns - self.mean) / self.spread)
         theory = 0.5 * (columns[:, 1:2] - columns[:, 4:6])
-        log_sigma = (found[:, 1:] + theory).clamp(_LEAST_LOG_SIGMA, _MOST_LOG_SIGMA)
-        return self.logit_scale * found[:, 0] + self.logit_shift, log_sigma + torch.log(self.sigma_scale)
+        log_sigma = (outputs[:, 1:] + theory).clamp(_MIN_LOG_SIGMA, _MAX_LOG_SIGMA)
+        return self.logit_scale * outputs[:, 0] + self.logit_shift, log_sigma + torch.log(self.sigma_scale)
 
 
 class MatchCovariance(nn.Module):

@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from sigmaslam.models.detector import to_cells
-from sigmaslam.models.network import (
+from sigmaslam.models.feature_network import (
     DESCRIPTOR_SIZE,
     SIZE_MULTIPLE,
     FeatureMaps,

@@ -9,8 +9,10 @@ from safetensors.torch import save_file
 
 from sigmaslam.errors import InputError
 from sigmaslam.inference.onnx_graph import OnnxGraph, shipped_weights
-from sigmaslam.models import export
-from sigmaslam.models.export import (
+from sigmaslam.models import onnx_export
+from sigmaslam.models.extractor import FeatureExtractor
+from sigmaslam.models.feature_network import FeatureNetwork
+from sigmaslam.models.onnx_export import (
     export_features,
     export_filter,
     export_scoring,
@@ -18,11 +20,9 @@ from sigmaslam.models.export import (
     load_scorer,
     load_verifier,
 )
-from sigmaslam.models.extractor import FeatureExtractor
-from sigmaslam.models.network import FeatureNetwork
-from sigmaslam.models.scorer import MatchScorer
+from sigmaslam.models.scorer_network import MatchScorer
 from sigmaslam.models.torch_runtime import TorchFeatures, filter_module, scoring_module
-from sigmaslam.models.verifier import MatchVerifier
+from sigmaslam.models.verifier_network import MatchVerifier
 from sigmaslam.synthetic.rendering.textures import dead_leaves
 
 FILTERS = ("pose_predict", "stereo_transfer")
@@ -98,12 +98,13 @@ def test_shipped_filter_equals_torch(name):
 def assert_filter_graphs_equal_torch(folder: Path, names: tuple[str, ...] = FILTERS) -> None:
     """On states and numbers of pairs and measurements that the export neither traced nor checked."""
     examples = {
-        "pose_predict": [export._predict_example(seed) for seed in (5, 6)],
+        "pose_predict": [onnx_export._predict_example(seed) for seed in (5, 6)],
         "stereo_transfer": [
-            export._transfer_example(seed, pairs, count) for seed, pairs, count in ((5, 1, 1), (6, 1, 211), (7, 36, 2))
+            onnx_export._transfer_example(seed, pairs, count)
+            for seed, pairs, count in ((5, 1, 1), (6, 1, 211), (7, 36, 2))
         ],
     }
-    inputs = {name: graph.inputs for name, graph in export._filter_graphs().items()}
+    inputs = {name: graph.inputs for name, graph in onnx_export._filter_graphs().items()}
     for name in names:
         for example in examples[name]:
             feed = {key: value.numpy() for key, value in zip(inputs[name], example, strict=True)}
@@ -117,8 +118,8 @@ def test_shipped_scorer_and_verifier_equal_torch(name):
     """On numbers of matches that the export neither traced (300) nor checked (77)."""
     graph, twin = OnnxGraph(shipped(f"{name}.onnx")), scoring_module(name)
     shipped(f"{name}.safetensors")
-    inputs = export._scoring_graphs(MatchScorer(), MatchVerifier())[name].inputs
-    example = {"scorer": export._matches_example, "verifier": export._columns_example}[name]
+    inputs = onnx_export._scoring_graphs(MatchScorer(), MatchVerifier())[name].inputs
+    example = {"scorer": onnx_export._matches_example, "verifier": onnx_export._columns_example}[name]
     for seed, count in ((5, 1), (6, 13), (7, 1500)):
         given = {key: value.numpy() for key, value in zip(inputs, example(seed, count), strict=True)}
         for a, b in zip(graph(given), twin(given), strict=True):
@@ -222,11 +223,11 @@ def test_an_output_that_is_off_shows_in_the_difference(output):
     rng = np.random.default_rng(0)
     expected = [100 * rng.random((20, 2)), rng.random(20), rng.random((20, 8)), rng.random(20)]
     swapped = [np.concatenate([values[1::-1], values[2:]]) for values in expected]
-    assert export._feature_difference(swapped, expected) == 0.0
+    assert onnx_export._feature_difference(swapped, expected) == 0.0
     found = [values.copy() for values in swapped]
     found[output][7] += 2e-3
-    assert export._feature_difference(found, expected) == pytest.approx(2e-3)
-    assert export._feature_difference([values[:15] for values in expected], expected) == np.inf
+    assert onnx_export._feature_difference(found, expected) == pytest.approx(2e-3)
+    assert onnx_export._feature_difference([values[:15] for values in expected], expected) == np.inf
 
 
 def test_a_broken_graph_is_refused(tmp_path):
