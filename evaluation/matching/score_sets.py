@@ -3,32 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 
 from sigmaslam.evaluation.matching.extractors import MAX_KEYPOINTS, Extractor, remembering
 from sigmaslam.evaluation.matching.pairs import ImagePair
 from sigmaslam.evaluation.matching.scores import Features, match_judged, score_pair, score_points, summarize
-from sigmaslam.evaluation.matching.sets import load_set
 
 Scores = dict[str, dict[str, float]]
 """By set, then by name of the score; shares and areas in [0, 1], numbers of matches a pair."""
 
 _COUNTS = ("correct_3", "matches", "steps_good", "steps", "inliers")
-
-
-def score(extractor: Extractor, sets: Sequence[str], data: Path) -> Scores:
-    """Scores of an extractor.
-
-    Args:
-        extractor: image to keypoints and descriptors.
-        sets: names from SELECTION and FINAL.
-        data: folder of the real data sets.
-    Raises:
-        InputError: a set is unknown or missing.
-    """
-    return {name: score_pairs(extractor, load_set(name, data)) for name in sets}
 
 
 def score_pairs(
@@ -88,7 +73,7 @@ def format_scores(results: Mapping[str, Scores]) -> str:
     """Markdown tables, one a set with a row for each extractor; shares and areas in percent.
 
     Args:
-        results: by name of the extractor what `score` gave.
+        results: by name of the extractor, as `compare` gives them.
     """
     lines = []
     for name in dict.fromkeys(name for scores in results.values() for name in scores):
