@@ -29,7 +29,7 @@ class Scale:
 
 
 @dataclass(frozen=True, slots=True)
-class Result:
+class ConsistencyResult:
     """One method on one sequence; NaN where there is nothing to judge.
 
     Attributes:
@@ -69,13 +69,13 @@ class Result:
     point_gross: float
 
 
-Results: TypeAlias = Mapping[Scale, Mapping[str, Sequence[Result]]]
+Results: TypeAlias = Mapping[Scale, Mapping[str, Sequence[ConsistencyResult]]]
 """By scale and method, in the order of seeds."""
 
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """A range for one number; `name` is an attribute of `Result`."""
+    """A range for one number; `name` is an attribute of `ConsistencyResult`."""
 
     label: str
     name: str
@@ -180,7 +180,7 @@ def _goals(results: Results) -> Iterator[str]:
     yield "Missed: " + "; ".join(missed) + "." if missed else "All goals are met."
 
 
-def _tables(methods: Mapping[str, Sequence[Result]]) -> Iterator[str]:
+def _tables(methods: Mapping[str, Sequence[ConsistencyResult]]) -> Iterator[str]:
     ours = next(iter(methods.values()))
     yield from header(*_POSE_HEADER, numbers_from=1)
     for method, found in methods.items():
@@ -216,7 +216,7 @@ def _tables(methods: Mapping[str, Sequence[Result]]) -> Iterator[str]:
         yield row(method, *cells)
 
 
-def _cell(found: Sequence[Result], value: Callable[[Result], float], form: str = ".2f") -> str:
+def _cell(found: Sequence[ConsistencyResult], value: Callable[[ConsistencyResult], float], form: str = ".2f") -> str:
     return _spread(*mean_with_error([value(result) for result in found]), form)
 
 

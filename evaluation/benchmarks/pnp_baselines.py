@@ -7,15 +7,22 @@ settings are common ones, the same for every sequence.
 
 from __future__ import annotations
 
+import csv
+import time
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 import cv2
 import numpy as np
 
+from sigmaslam.files import make_folder
 from sigmaslam.geometry.camera import RectifiedStereo, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import rotation_exp, se3_adjoint, se3_inverse, se3_log, skew
+from sigmaslam.geometry.trajectory import Trajectory, write_tum
+from sigmaslam.readers import StereoSequence
+from sigmaslam.runs.report import COLUMNS
 
 _KEYPOINTS = 1500  # as many as the tracker asks for
 _PIXEL_SIGMA = 1.0
@@ -200,6 +207,31 @@ class PnpOdometry:
         return OdometryStep(
             se3_inverse(T) @ self._pose @ T, adjoint @ self._covariance @ adjoint.T, status, matches, inliers
         )
+
+
+def track_with_pnp(sequence: StereoSequence, out: Path, matcher: str) -> None:
+    """Tracks a sequence; leaves trajectory.tum, covariance.npy and frames.csv in the new folder `out`.
+
+    Args:
+        sequence: opened by `open_sequence`.
+        out: run folder.
+        matcher: "sift" or "klt".
+    """
+    make_folder(out)
+    odometry = PnpOdometry(sequence.camera, matcher)
+    timestamps, steps = [], []
+    with (out / "frames.csv").open("w", newline="", encoding="utf-8") as table:
+        rows = csv.DictWriter(table, ["status", *COLUMNS, "ms_step"])
+        rows.writeheader()
+        for frame in sequence.frames():
+            began = time.perf_counter()
+            step = odometry.step(frame.left, frame.right)
+            row = {"status": step.status, "timestamp": frame.timestamp, "matches": step.matches}
+            rows.writerow(row | {"inliers": step.inliers, "ms_step": 1e3 * (time.perf_counter() - began)})
+            timestamps.append(frame.timestamp)
+            steps.append(step)
+    write_tum(out / "trajectory.tum", Trajectory(np.array(timestamps), np.stack([s.T_world_camera for s in steps])))
+    np.save(out / "covariance.npy", np.stack([step.covariance for step in steps]))
 
 
 @dataclass(frozen=True, slots=True)
