@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.metrics.trajectories import (
+from sigmaslam.evaluation.metrics.trajectory_errors import (
     AbsoluteError,
     KittiErrors,
     PoseNees,

@@ -52,7 +52,7 @@ _GROSS = 5.0  # sigmas
 
 
 @dataclass(frozen=True, slots=True)
-class _Job:
+class _ConsistencyTrials:
     """One sequence, with all methods."""
 
     cache: TrialCache
@@ -88,7 +88,7 @@ def write_consistency(
     make_folder(runs)
     cache = TrialCache(runs, hash_code(Path(__file__)))
     # All scales of a seed before the next one: what is there when it is stopped is balanced.
-    jobs = [_Job(cache, scale, _FIRST_SEED + k) for k in range(seeds) for scale in SCALES]
+    jobs = [_ConsistencyTrials(cache, scale, _FIRST_SEED + k) for k in range(seeds) for scale in SCALES]
     missing = [job for job in jobs if any(job.read(method) is None for method in METHODS)]
     note(f"{len(jobs) - len(missing)} of {len(jobs)} sequences are there")
     context = multiprocessing.get_context("spawn")
@@ -115,7 +115,7 @@ def _start_worker() -> None:
     torch.set_num_threads(1)
 
 
-def _work(job: _Job) -> str:
+def _work(job: _ConsistencyTrials) -> str:
     """Renders and tracks what is missing of one sequence; says how long both took."""
     try:
         return _make(job)
@@ -123,7 +123,7 @@ def _work(job: _Job) -> str:
         os._exit(130)  # or this process would begin with the next sequence
 
 
-def _make(job: _Job) -> str:
+def _make(job: _ConsistencyTrials) -> str:
     began = time.perf_counter()
     source = render(job.cache.folder, job.recipe, 1)
     rendered = time.perf_counter()

@@ -93,7 +93,7 @@ class WatchedSequence(StereoSequence):
 
 
 @dataclass(frozen=True, slots=True)
-class _Truth:
+class _LapTruth:
     """The lap's own poses, and how the repeats go on with them."""
 
     lap: Trajectory
@@ -130,7 +130,7 @@ def write_endurance(
         source = render(renders or Path(scratch), recipe, default_workers())
         note(f"the lap is in {source}")
         lap = open_sequence(source)
-        truth = _Truth(read_trajectory(source / "poses.txt"), recipe.frames)
+        truth = _LapTruth(read_trajectory(source / "poses.txt"), recipe.frames)
 
         # Ten remembered keyframes are all recent ones, of which none makes a loop.
         without = Path(scratch) / "without"
@@ -161,7 +161,7 @@ def write_endurance(
 def _measure(
     run: TrialResult,
     sequence: WatchedSequence,
-    truth: _Truth,
+    truth: _LapTruth,
     block: int,
     asked: int,
     seconds: float,
@@ -208,7 +208,7 @@ def _measure(
     )
 
 
-def _errors(run: TrialResult, truth: _Truth) -> np.ndarray:
+def _errors(run: TrialResult, truth: _LapTruth) -> np.ndarray:
     """(N,) distance between every position and the true one, in the world of the first frame, metres."""
     poses = run.trajectory.poses
     return np.asarray(np.linalg.norm(poses[:, :3, 3] - truth.poses(len(poses))[:, :3, 3], axis=1))

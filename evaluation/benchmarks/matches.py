@@ -10,17 +10,17 @@ import cv2
 import torch
 
 from sigmaslam.evaluation.benchmarks.page import header, machine, row, write_page
+from sigmaslam.evaluation.matching.dynamic_scenes import SHARES, MoverJudgement, judge_movers
+from sigmaslam.evaluation.matching.image_pairs import ImagePair, Motion, SameRows
 from sigmaslam.evaluation.matching.judgement import (
     HomographyJudgement,
     RowJudgement,
     judge_homographies,
     judge_rows,
 )
-from sigmaslam.evaluation.matching.movers import SHARES, MoverJudgement, judge_movers
-from sigmaslam.evaluation.matching.pairs import ImagePair, Motion, SameRows
 from sigmaslam.evaluation.matching.rejection import KEYPOINTS, compare_rejection
+from sigmaslam.evaluation.matching.relative_pose import compare_starts
 from sigmaslam.evaluation.matching.sets import check_sets, load_set
-from sigmaslam.evaluation.matching.start import compare_starts
 from sigmaslam.frontend.match_confidence import MatchJudge
 from sigmaslam.training.matching.match_sets import DETECTORS
 

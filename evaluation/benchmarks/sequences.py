@@ -61,7 +61,7 @@ METHODS = (*_TRIED, "bundle")
 
 
 @dataclass(frozen=True, slots=True)
-class _Job:
+class _BenchmarkSequence:
     """A sequence; `exact` says that its truth is."""
 
     name: str
@@ -124,7 +124,7 @@ def run_sequences(
     with ExitStack() as stack:
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         demo = stack.enter_context(as_file(files("sigmaslam.synthetic") / "demo"))
-        jobs = [_Job("demo (rendered)", demo, demo / "poses.txt", True)] if "demo" in wanted else []
+        jobs = [_BenchmarkSequence("demo (rendered)", demo, demo / "poses.txt", True)] if "demo" in wanted else []
         for preset in RENDERED:
             if preset in wanted:
                 try:
@@ -133,7 +133,11 @@ def run_sequences(
                     reason = f"{error.name} is not installed: pip install 'sigmaslam[train]'"
                     yield Omission(f"{preset} (rendered)", "", reason)
         if data is not None:
-            jobs += [_Job(name, data / name, data / name / truth, False) for name, truth in REAL if name in wanted]
+            jobs += [
+                _BenchmarkSequence(name, data / name, data / name / truth, False)
+                for name, truth in REAL
+                if name in wanted
+            ]
         for number, job in enumerate(jobs):
             runs = scratch / str(number)
             for method in METHODS:
@@ -154,7 +158,7 @@ def _check_names(kind: str, names: Sequence[str], known: Sequence[str]) -> None:
             raise InputError(f"{kind} {name!r} is unknown; choose of {', '.join(known)}")
 
 
-def _render(preset: str, folder: Path, note: Callable[[str], None]) -> _Job:
+def _render(preset: str, folder: Path, note: Callable[[str], None]) -> _BenchmarkSequence:
     """Renders a sequence; frames that are there are kept."""
     from sigmaslam.evaluation.benchmarks.consistency import OFFSET, SCALES
     from sigmaslam.synthetic.render_sequence import default_workers
@@ -165,10 +169,10 @@ def _render(preset: str, folder: Path, note: Callable[[str], None]) -> _Job:
     began = time.perf_counter()
     out = render(folder, recipe, default_workers())
     note(f"{preset} rendered in {time.perf_counter() - began:.0f} s")
-    return _Job(f"{preset} (rendered, disparities {OFFSET} px too large)", out, out / "poses.txt", True)
+    return _BenchmarkSequence(f"{preset} (rendered, disparities {OFFSET} px too large)", out, out / "poses.txt", True)
 
 
-def _run(job: _Job, method: str, runs: Path) -> SequenceResult | Omission:
+def _run(job: _BenchmarkSequence, method: str, runs: Path) -> SequenceResult | Omission:
     if method == "bundle":
         return _adjust(job, runs)
     trial = Trial(job.source, job.truth, _TRIED[method]).run(runs / method)
@@ -176,7 +180,7 @@ def _run(job: _Job, method: str, runs: Path) -> SequenceResult | Omission:
     return SequenceResult(job.name, method, trial, nees)
 
 
-def _adjust(job: _Job, runs: Path) -> SequenceResult | Omission:
+def _adjust(job: _BenchmarkSequence, runs: Path) -> SequenceResult | Omission:
     """Bundle adjustment of the tracks of ours."""
     run, out = runs / "ours", runs / "bundle"
     if not run.is_dir():

@@ -17,7 +17,7 @@ import numpy as np
 
 from sigmaslam.evaluation.benchmarks.page import machine, table, write_page
 from sigmaslam.evaluation.filters import work as filter_work
-from sigmaslam.evaluation.filters.peers import Peer, available, single_thread_environment
+from sigmaslam.evaluation.filters.peer_filters import Peer, available, single_thread_environment
 from sigmaslam.evaluation.filters.work import BatchedWork, StereoWork
 from sigmaslam.progress import open_progress
 

@@ -9,11 +9,11 @@ from pathlib import Path
 
 from sigmaslam.errors import FrameError, InputError
 from sigmaslam.evaluation.matching.extractors import CLASSICAL, Extractor, load_extractor, remembering
-from sigmaslam.evaluation.matching.pairs import ImagePair
+from sigmaslam.evaluation.matching.image_pairs import ImagePair
+from sigmaslam.evaluation.matching.klt_tracks import KLT, TRACKED_KEYPOINTS, score_klt
 from sigmaslam.evaluation.matching.score_sets import Scores, score_pairs, score_refined
 from sigmaslam.evaluation.matching.sets import REFINED, STEPS, TRACKS, check_sets, load_set, load_steps, load_tracks
 from sigmaslam.evaluation.matching.stereo import score_steps
-from sigmaslam.evaluation.matching.tracks import KLT, TRACKED_KEYPOINTS, score_klt
 
 # Follows the name of an extractor in the row of what `sigmaslam match` makes of its features.
 _REFINED = " + sigmaslam match"

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.matching.peers import PeerExtractor, read_signature
+from sigmaslam.evaluation.matching.peer_extractors import PeerExtractor, read_signature
 from sigmaslam.frontend.classical import OrbDetector, SiftDetector
 from sigmaslam.frontend.learned import Graph, extract
 from sigmaslam.frontend.types import Features

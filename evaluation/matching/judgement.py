@@ -9,8 +9,8 @@ import numpy as np
 
 from sigmaslam.estimation.chi_square import CHI_SQUARE_95_OF_2
 from sigmaslam.estimation.mahalanobis import squared_mahalanobis
-from sigmaslam.evaluation.matching.pairs import Homography, ImagePair, SameRows
-from sigmaslam.evaluation.metrics.calibration import (
+from sigmaslam.evaluation.matching.image_pairs import Homography, ImagePair, SameRows
+from sigmaslam.evaluation.metrics.probability_calibration import (
     RIGHT,
     auroc,
     average_precision,

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.matching.pairs import Disparity, Homography, ImagePair, Motion, resize
+from sigmaslam.evaluation.matching.image_pairs import Disparity, Homography, ImagePair, Motion, resize
 from sigmaslam.geometry.se3 import se3_inverse
 from sigmaslam.readers.images import read_grey as read_grey  # also imported from here
 from sigmaslam.readers.images import read_image

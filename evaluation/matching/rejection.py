@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from kornia.feature.adalam.adalam import AdalamFilter
 
-from sigmaslam.evaluation.matching.pairs import ImagePair, Motion
+from sigmaslam.evaluation.matching.image_pairs import ImagePair, Motion
 from sigmaslam.evaluation.matching.scores import essential_by_magsac
 from sigmaslam.frontend.classical import SiftDetector
 from sigmaslam.frontend.match_confidence import MatchJudge

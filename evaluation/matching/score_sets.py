@@ -7,8 +7,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from sigmaslam.evaluation.matching.extractors import MAX_KEYPOINTS, Extractor, remembering
-from sigmaslam.evaluation.matching.pairs import ImagePair
-from sigmaslam.evaluation.matching.scores import Features, match_judged, score_pair, score_points, summarize
+from sigmaslam.evaluation.matching.image_pairs import ImagePair
+from sigmaslam.evaluation.matching.scores import (
+    KeypointsAndDescriptors,
+    match_judged,
+    score_pair,
+    score_points,
+    summarize,
+)
 
 Scores = dict[str, dict[str, float]]
 """By set, then by name of the score; shares and areas in [0, 1], numbers of matches a pair."""
@@ -49,7 +55,7 @@ def score_refined(extractor: Extractor, pairs: Sequence[ImagePair]) -> dict[str,
 def _limited(extractor: Extractor, max_keypoints: int) -> Extractor:
     """The extractor, asked once for an image, which must not give more keypoints than everyone may."""
 
-    def extract(image: np.ndarray) -> Features:
+    def extract(image: np.ndarray) -> KeypointsAndDescriptors:
         features = extractor(image)
         if len(features[0]) > max_keypoints:
             raise ValueError(f"the extractor gave {len(features[0])} keypoints: at most {max_keypoints} are compared")

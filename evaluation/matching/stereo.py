@@ -9,7 +9,12 @@ import cv2
 import numpy as np
 
 from sigmaslam.evaluation.matching.extractors import Extractor, remembering
-from sigmaslam.evaluation.matching.scores import Features, match_judged, match_rows_refined, mutual_nearest
+from sigmaslam.evaluation.matching.scores import (
+    KeypointsAndDescriptors,
+    match_judged,
+    match_rows_refined,
+    mutual_nearest,
+)
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import rotation_log
 
@@ -74,7 +79,11 @@ def is_good(T_1_0: np.ndarray, truth: np.ndarray) -> bool:
 
 
 def estimate_step(
-    step: StereoStep, left0: Features, right0: Features, left1: Features, judged: bool = False
+    step: StereoStep,
+    left0: KeypointsAndDescriptors,
+    right0: KeypointsAndDescriptors,
+    left1: KeypointsAndDescriptors,
+    judged: bool = False,
 ) -> tuple[np.ndarray, int] | None:
     """Pose by stereo triangulation, mutual nearest neighbours in the next left image, P3P and refinement.
 

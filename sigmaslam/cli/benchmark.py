@@ -97,7 +97,7 @@ def _matches(out: Path, command: str, *, data: Path | None) -> str:
 
 @_registered
 def _noise(out: Path, command: str, *, data: Path | None, runs: Path | None) -> str:
-    from sigmaslam.evaluation.benchmarks.noise import write_noise
+    from sigmaslam.evaluation.benchmarks.match_noise import write_noise
     from sigmaslam.synthetic.render_sequence import default_workers
 
     folder = _need_runs(runs, "noise", "renders")

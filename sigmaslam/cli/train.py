@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from sigmaslam.cli.extras import need_train_extra
-from sigmaslam.training.choices import MIXES, RECIPE_NAMES
+from sigmaslam.training.mixes import MIXES, RECIPE_NAMES
 
 # mypy reads the members of an enum from literals alone.
 Data = StrEnum("Data", list(MIXES))  # type: ignore[misc]

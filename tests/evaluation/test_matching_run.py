@@ -10,11 +10,11 @@ import pytest
 
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.matching import compare, comparison, format_scores, load_extractor, score_pairs
-from sigmaslam.evaluation.matching.pairs import Homography, ImagePair, SameRows
-from sigmaslam.evaluation.matching.peers import read_signature
+from sigmaslam.evaluation.matching.image_pairs import Homography, ImagePair, SameRows
+from sigmaslam.evaluation.matching.peer_extractors import read_signature
 from sigmaslam.evaluation.matching.score_sets import score_refined
 from sigmaslam.evaluation.matching.scores import score_points, summarize
-from sigmaslam.evaluation.matching.sequences import sequence_pairs, sequence_steps
+from sigmaslam.evaluation.matching.sequence_pairs import sequence_pairs, sequence_steps
 from sigmaslam.evaluation.matching.sets import ALL, REFINED, SELECTION, STEPS, TRACKS
 from sigmaslam.frontend.image_pair import match_features
 from sigmaslam.frontend.match_confidence import MatchJudge

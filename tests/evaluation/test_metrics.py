@@ -7,7 +7,7 @@ from evo.core import sync as evo_sync
 from evo.core.trajectory import PoseTrajectory3D
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.metrics.trajectories import (
+from sigmaslam.evaluation.metrics.trajectory_errors import (
     absolute_trajectory_error,
     align,
     align_umeyama,

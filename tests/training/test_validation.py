@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from sigmaslam.models.network import FeatureNetwork
-from sigmaslam.training.choices import MIXES
 from sigmaslam.training.features import validation
 from sigmaslam.training.features.validation import PairMatches, held_out_sources, match_pair, matching_accuracy
+from sigmaslam.training.mixes import MIXES
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sigmaslam.errors import InputError
 from sigmaslam.inference.onnx_graph import shipped_weights
-from sigmaslam.training.choices import MIXES
+from sigmaslam.training.mixes import MIXES
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,7 +16,7 @@ class TrainingConfig:
 
     Attributes:
         steps: optimiser steps.
-        data: what the pairs are made of, a key of `choices.MIXES`.
+        data: what the pairs are made of, a key of `mixes.MIXES`.
         batch_size: pairs a step, of all processes together.
         size: side of the training images, pixels.
         points: keypoints per image in the loss.

@@ -16,7 +16,7 @@ from sigmaslam.models.detector import detect, to_cells
 from sigmaslam.synthetic.pairs import HomographyPairs
 from sigmaslam.synthetic.rendering.textures import KINDS
 from sigmaslam.synthetic.scene_pairs import ScenePairs
-from sigmaslam.training.choices import MIXES
+from sigmaslam.training.mixes import MIXES
 
 # image0 (1, H, W), image1 (1, H, W), keypoints0 (N, 2), places1 (N, 2), visible (N,), keypoints1 (2 N, 2)
 TrainingPair = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]

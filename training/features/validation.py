@@ -11,8 +11,8 @@ from torch import Tensor
 
 from sigmaslam.models.extractor import FeatureExtractor
 from sigmaslam.models.network import FeatureNetwork
-from sigmaslam.training.choices import MIXES
 from sigmaslam.training.features.stream import Pair, open_stream
+from sigmaslam.training.mixes import MIXES
 
 _PAIRS = 48
 _KEYPOINTS = 256

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from sigmaslam.evaluation.metrics.calibration import RIGHT
+from sigmaslam.evaluation.metrics.probability_calibration import RIGHT
 from sigmaslam.frontend.scorer_inputs import NEIGHBOURS, nearest_matches, side_information
 from sigmaslam.models.scorer import SIDE_CHANNELS, MatchScorer
 from sigmaslam.training.matching.match_sets import MatchSet
-from sigmaslam.training.steps import train_steps
+from sigmaslam.training.small_loop import train_steps
 
 LEARNING_RATE = 3e-3
 SETS_A_STEP = 8

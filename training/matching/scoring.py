@@ -16,7 +16,7 @@ from safetensors.torch import save_file
 
 from sigmaslam.errors import InputError
 from sigmaslam.estimation.chi_square import CHI_SQUARE_68_OF_2, CHI_SQUARE_95_OF_2
-from sigmaslam.evaluation.metrics.calibration import (
+from sigmaslam.evaluation.metrics.probability_calibration import (
     RIGHT,
     auroc,
     average_precision,
@@ -28,12 +28,12 @@ from sigmaslam.files import atomic_path, atomic_write_text, make_folder
 from sigmaslam.models.scorer import MatchScorer
 from sigmaslam.models.verifier import MatchVerifier
 from sigmaslam.progress import open_progress
-from sigmaslam.training.card import describe_origin
 from sigmaslam.training.devices import describe_processor
 from sigmaslam.training.features.validation import held_out_seed
 from sigmaslam.training.matching.match_sets import PairRecord, load_record, record_path, write_records
 from sigmaslam.training.matching.scorer_training import make_sample, score_set, train_scorer
 from sigmaslam.training.matching.verifier_training import VerifierRows, calibrate, collect_rows, train_verifier
+from sigmaslam.training.run_card import describe_origin
 
 SCORER_NAME, VERIFIER_NAME, CARD_NAME = "scorer.safetensors", "verifier.safetensors", "matching.json"
 _CONFIG_NAME, _SECONDS_NAME = "config.json", "seconds.txt"

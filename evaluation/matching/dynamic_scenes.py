@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from sigmaslam.evaluation.metrics.calibration import RIGHT
+from sigmaslam.evaluation.metrics.probability_calibration import RIGHT
 from sigmaslam.frontend.image_pair import match_features
 from sigmaslam.frontend.match_confidence import MatchJudge
 from sigmaslam.frontend.types import Features
@@ -110,7 +110,7 @@ def judge_movers(detect: Callable[[np.ndarray], Features], judge: MatchJudge, se
 
 
 @dataclass(frozen=True, slots=True)
-class _Truth:
+class _TrueMotion:
     """Of M pixels of the first view: where they are in the second, whether they moved on their own, depths, motion."""
 
     places: np.ndarray
@@ -120,7 +120,7 @@ class _Truth:
     T_1_0: np.ndarray
 
 
-def _look_up(pair: ScenePair, points0: np.ndarray) -> _Truth:
+def _look_up(pair: ScenePair, points0: np.ndarray) -> _TrueMotion:
     sight0, sight1 = pair.views0.sight, pair.views1.sight
     T_1_0 = sight1.T_view_mover[0, 0] @ torch.linalg.inv(sight0.T_view_mover[0, 0])
     places, visible = pair.transfer(points0)
@@ -137,4 +137,4 @@ def _look_up(pair: ScenePair, points0: np.ndarray) -> _Truth:
     moved, depth0, depth1 = np.zeros(len(points0), bool), np.ones(len(points0)), np.ones(len(points0))
     moved[rows] = np.linalg.norm(static_places - places[rows], axis=1) > _MOVED
     depth0[rows], depth1[rows] = in_view0[2].numpy(), in_view1[2].numpy()
-    return _Truth(np.where(visible[:, None], places, np.inf), moved, depth0, depth1, T_1_0.numpy())
+    return _TrueMotion(np.where(visible[:, None], places, np.inf), moved, depth0, depth1, T_1_0.numpy())

@@ -97,7 +97,7 @@ def single_thread_environment() -> dict[str, str]:
 
 
 @dataclass(frozen=True, slots=True)
-class _Problem:
+class _PeerProblem:
     """A work as models of the form model(xp, states (..., n), inputs), with the inputs of each filter.
 
     In a batch every array but the noises has a leading dimension B; a single filter has none.
@@ -124,7 +124,7 @@ class _Problem:
         return (np.stack(means), np.stack(covariances)) if self.batched else (means[0], covariances[0])
 
 
-def _problem(work: Work) -> _Problem:
+def _problem(work: Work) -> _PeerProblem:
     if isinstance(work, LinearWork):
         raise TypeError("LinearWork is for Kalman filters: no unscented filter here takes it")
     no_inputs = np.empty((len(work.mean), 0))
@@ -143,7 +143,7 @@ def _problem(work: Work) -> _Problem:
     if isinstance(work, LocalisationWork):
         measure, measure_inputs = _range_and_relative_bearing, np.column_stack([work.landmark, measurement[:, 1]])
         measurement = measurement * np.array([1.0, 0.0])
-    return _Problem(
+    return _PeerProblem(
         not isinstance(work, StereoWork),
         work.mean,
         work.covariance,
@@ -295,7 +295,7 @@ def stone_soup(work: Work, dtype: str = "float64") -> Step:
     problem = _problem(work)
     process_noise, measurement_noise = CovarianceMatrix(work.process_noise), CovarianceMatrix(work.measurement_noise)
 
-    class Motion(GaussianModel, TransitionModel):
+    class Transition(GaussianModel, TransitionModel):
         inputs: Any = Property()
 
         @property
@@ -330,7 +330,7 @@ def stone_soup(work: Work, dtype: str = "float64") -> Step:
                 StateVector(mean),
                 CovarianceMatrix(covariance),
                 Detection(StateVector(measurement), measurement_model=sensor),
-                UnscentedKalmanPredictor(Motion(inputs=transition_inputs), **cubature),
+                UnscentedKalmanPredictor(Transition(inputs=transition_inputs), **cubature),
                 UnscentedKalmanUpdater(None, **cubature),
             )
         )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sigmaslam.evaluation.matching.pairs import ImagePair, Motion
+from sigmaslam.evaluation.matching.image_pairs import ImagePair, Motion
 from sigmaslam.evaluation.matching.scores import pose_by_magsac, pose_errors_deg
 from sigmaslam.frontend.image_pair import Matches, match_features
 from sigmaslam.frontend.match_confidence import MatchJudge
