@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from sigmaslam.evaluation.benchmarks.page import header, machine, row
+from sigmaslam.evaluation.benchmarks.page import header, opening, row
 from sigmaslam.evaluation.metrics.map_consistency import mean_with_error, ratio_with_error, root_mean_square_with_error
 
 
@@ -120,9 +120,7 @@ def format_page(results: Results, offset: float, frames: int, first_seed: int, c
     """The page; the first method of each scale is the one that goals are for."""
     seeds = max(len(of_method) for of_scale in results.values() for of_method in of_scale.values())
     lines = [
-        "# Is it as sure as it says?",
-        "",
-        f"Made by `{command}` on {machine()}. {seeds} rendered sequences a scale",
+        *opening("Is it as sure as it says?", command, f". {seeds} rendered sequences a scale"),
         f"(seeds {first_seed} to {first_seed + seeds - 1}, used for nothing else), {frames} frames each, exact truth.",
         f"All disparities are {offset} px larger than the calibration says, and nobody tells the tracker. Images are",
         "reduced so that this can be afforded: "

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sigmaslam.evaluation.benchmarks.page import machine, table
+from sigmaslam.evaluation.benchmarks.page import opening, table
 
 # What is asked for.
 _MEMORY, _TIME, _LOOP = 5.0, 10.0, 0.2
@@ -80,9 +80,7 @@ def format_endurance(endurance: Endurance, command: str) -> str:
     """The run as a Markdown page."""
     words = _WORDS.format(lap_frames=endurance.lap_frames, length=endurance.lap_length)
     lines = [
-        "# Endurance",
-        "",
-        f"Made by `{command}` on {machine()}, in {endurance.seconds / 60:.0f} minutes.",
+        *opening("Endurance", command, f", in {endurance.seconds / 60:.0f} minutes."),
         "",
         words,
     ]

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.benchmarks.page import header, machine, row, write_page
+from sigmaslam.evaluation.benchmarks.page import header, opening, row, write_page
 from sigmaslam.evaluation.filters.speed import Contender, Timing, time_interleaved
 from sigmaslam.evaluation.matching import check_sets, compare, format_scores, load_extractor
 from sigmaslam.evaluation.matching.extractors import CLASSICAL, MAX_KEYPOINTS
@@ -186,9 +186,7 @@ def _loading_time(name: str) -> float | None:
 def _introduction(command: str, rounds: int) -> list[str]:
     versions = ", ".join(f"{name} {version(name)}" for name in ("onnxruntime", "opencv-python-headless", "numpy"))
     return [
-        "# Features",
-        "",
-        f"Made by `{command}` on {machine()}. {versions}.",
+        *opening("Features", command, f". {versions}."),
         "",
         f"- *ms*: from an 8-bit {_WIDTH}x{_HEIGHT} image to at most {MAX_KEYPOINTS:,} keypoints with descriptors; CPU",
         f"  time on one thread, extractors in turn, {rounds} rounds; the ratio with its lowest and highest round.",

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmaslam.evaluation.benchmarks.page import header, machine, row, write_page
+from sigmaslam.evaluation.benchmarks.page import header, opening, row, write_page
 from sigmaslam.evaluation.benchmarks.sequences import REAL
 from sigmaslam.evaluation.trial import Trial, render
 from sigmaslam.readers import open_sequence
@@ -108,9 +108,7 @@ def _page(
     results: dict[str, tuple[NoiseResult, NoiseResult]],
 ) -> str:
     lines = [
-        "# Every match its own covariance, or one for all",
-        "",
-        f"Made by `{command}` on {machine()}. The tracker with the",
+        *opening("Every match its own covariance, or one for all", command, ". The tracker with the"),
         "learned features; only R and the landmarks' disparity sigma differ. NEES and NIS per degree of freedom, 1 is",
         "right; NEES says something on renders alone, whose truth is exact.",
         "",

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import torch
 
-from sigmaslam.evaluation.benchmarks.page import header, machine, row, write_page
+from sigmaslam.evaluation.benchmarks.page import header, opening, row, write_page
 from sigmaslam.evaluation.matching.dynamic_scenes import SHARES, MoverJudgement, judge_movers
 from sigmaslam.evaluation.matching.image_pairs import ImagePair, Motion, SameRows
 from sigmaslam.evaluation.matching.judgement import (
@@ -58,9 +58,7 @@ def write_matches(path: Path, data: Path, command: str, note: Callable[[str], No
 
 def _introduction(command: str) -> list[str]:
     return [
-        "# Matches: do probability and covariance hold?",
-        "",
-        f"Made by `{command}` on {machine()}, one thread, in one run. Nothing was",
+        *opening("Matches: do probability and covariance hold?", command, ", one thread, in one run. Nothing was"),
         "trained or tuned on these images. Shares in percent unless they are called sigma, AUROC or correlation.",
         "",
     ]

@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sigmaslam.evaluation.benchmarks.page import machine, table
+from sigmaslam.evaluation.benchmarks.page import opening, table
 from sigmaslam.evaluation.trial import TrialResult
 from sigmaslam.runs.report import FrameTable
 
@@ -94,7 +94,7 @@ def method_label(method: str) -> str:
 
 def format_results(results: Sequence[SequenceResult | Omission], command: str, complete: bool = True) -> str:
     """The results as a Markdown page."""
-    lines = ["# Results", "", f"Made by `{command}` on {machine()}.", _WORDS.format(threads=cv2.getNumThreads())]
+    lines = [*opening("Results", command, "."), _WORDS.format(threads=cv2.getNumThreads())]
     if not complete:
         lines += ["**Stopped before the end: what is missing was not run.**", ""]
     for missing in results:

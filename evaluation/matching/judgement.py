@@ -10,14 +10,8 @@ import numpy as np
 from sigmaslam.estimation.chi_square import CHI_SQUARE_95_OF_2
 from sigmaslam.estimation.mahalanobis import squared_mahalanobis
 from sigmaslam.evaluation.matching.image_pairs import Homography, ImagePair, SameRows
-from sigmaslam.evaluation.metrics.probability_calibration import (
-    RIGHT,
-    auroc,
-    average_precision,
-    best_half,
-    calibration_error,
-    spearman,
-)
+from sigmaslam.evaluation.metrics import probability_calibration as calibration
+from sigmaslam.evaluation.metrics.probability_calibration import RIGHT
 from sigmaslam.frontend.affine_alignment import refine_by_neighbours
 from sigmaslam.frontend.descriptor import match_stereo
 from sigmaslam.frontend.match_confidence import LEAST_LOGIT, MatchJudge
@@ -82,7 +76,7 @@ def judge_homographies(pairs: Sequence[ImagePair], detect: Detect, judge: MatchJ
         logit = judge.score(putative, features0, features1)
         ratio = (1.0 - putative.similarity) / np.maximum(1.0 - putative.second0, 1e-6)
         mutual = putative.mutual
-        precisions = [average_precision(score, near) for score in (10.0 * mutual - ratio, logit)]
+        precisions = [calibration.average_precision(score, near) for score in (10.0 * mutual - ratio, logit)]
         # Everything is asked of the same matches, also of those the verifier does not get to see.
         seen = np.flatnonzero(mutual & (logit > LEAST_LOGIT))
         weight = 1.0 / (1.0 + np.exp(-logit[seen].astype(np.float64)))
@@ -95,9 +89,9 @@ def judge_homographies(pairs: Sequence[ImagePair], detect: Detect, judge: MatchJ
         ranked.append(
             (
                 *precisions,
-                auroc(-ratio[mutual], near[mutual]),
-                auroc(logit[mutual], near[mutual]),
-                auroc(probability[mutual], right[mutual]),
+                calibration.auroc(-ratio[mutual], near[mutual]),
+                calibration.auroc(logit[mutual], near[mutual]),
+                calibration.auroc(probability[mutual], right[mutual]),
             )
         )
         good = right[seen]
@@ -113,10 +107,10 @@ def judge_homographies(pairs: Sequence[ImagePair], detect: Detect, judge: MatchJ
         ratio_auroc,
         scorer_auroc,
         final_auroc,
-        calibration_error(probability, right),
-        spearman(before, length),
-        spearman(size, length),
-        best_half(size, length),
+        calibration.calibration_error(probability, right),
+        calibration.spearman(before, length),
+        calibration.spearman(size, length),
+        calibration.best_half(size, length),
         float((squared_mahalanobis(error, covariance.astype(np.float64)) < CHI_SQUARE_95_OF_2).mean()),
         float(np.median(length)),
     )
@@ -179,7 +173,7 @@ def judge_rows(pairs: Sequence[ImagePair], detect: Detect, judge: MatchJudge) ->
         _share_within(mended, sigma, 2.0),
         _share_within(mended, _CONSTANT_SIGMA, 1.0),
         _share_within(mended, _CONSTANT_SIGMA, 2.0),
-        spearman(sigma, np.abs(mended)),
+        calibration.spearman(sigma, np.abs(mended)),
         float(np.median(np.abs(mended))),
         float(np.median(sigma)),
         float(np.median(error)),

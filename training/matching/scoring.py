@@ -16,14 +16,8 @@ from safetensors.torch import save_file
 
 from sigmaslam.errors import InputError
 from sigmaslam.estimation.chi_square import CHI_SQUARE_68_OF_2, CHI_SQUARE_95_OF_2
-from sigmaslam.evaluation.metrics.probability_calibration import (
-    RIGHT,
-    auroc,
-    average_precision,
-    best_half,
-    calibration_error,
-    spearman,
-)
+from sigmaslam.evaluation.metrics import probability_calibration as calibration
+from sigmaslam.evaluation.metrics.probability_calibration import RIGHT
 from sigmaslam.files import atomic_path, atomic_write_text, make_folder
 from sigmaslam.models.scorer import MatchScorer
 from sigmaslam.models.verifier import MatchVerifier
@@ -167,7 +161,8 @@ def _scorer_metrics(scorer: MatchScorer, paths: list[Path]) -> dict[str, float]:
             accepted = logit > 0
             f1 = 2.0 * (right & accepted).sum() / (right.sum() + accepted.sum())
             baseline = 10.0 * side[:, 3] - side[:, 4]
-            values = average_precision(logit, right), average_precision(baseline, right), auroc(logit, right), f1
+            precisions = [calibration.average_precision(score, right) for score in (logit, baseline)]
+            values = *precisions, calibration.auroc(logit, right), f1
             found.setdefault(kind, []).append(values)
     names = ("average_precision", "mutual_ratio_average_precision", "auroc", "f1")
     return {
@@ -185,10 +180,10 @@ def _verifier_metrics(verifier: MatchVerifier, rows: VerifierRows) -> dict[str, 
     square = ((error / sigma) ** 2).sum(axis=1)
     length, size = np.linalg.norm(error, axis=1), np.linalg.norm(sigma, axis=1)
     return {
-        "verified_auroc": auroc(logit, right),
-        "expected_calibration_error": calibration_error(1.0 / (1.0 + np.exp(-logit)), right),
-        "spearman_sigma_error": spearman(size, length),
-        "best_half_rms": best_half(size, length),
+        "verified_auroc": calibration.auroc(logit, right),
+        "expected_calibration_error": calibration.calibration_error(1.0 / (1.0 + np.exp(-logit)), right),
+        "spearman_sigma_error": calibration.spearman(size, length),
+        "best_half_rms": calibration.best_half(size, length),
         "inside_95_ellipse": float((square < CHI_SQUARE_95_OF_2).mean()),
         "inside_68_ellipse": float((square < CHI_SQUARE_68_OF_2).mean()),
     }
