@@ -181,41 +181,41 @@ def _goals(results: Results) -> Iterator[str]:
 def _tables(methods: Mapping[str, Sequence[ConsistencyResult]]) -> Iterator[str]:
     ours = next(iter(methods.values()))
     yield from header(*_POSE_HEADER, numbers_from=1)
-    for method, found in methods.items():
-        ate = [result.ate for result in found]
+    for method, trials in methods.items():
+        ate = [result.ate for result in trials]
         cells = [
-            _cell(found, lambda r: r.nees),
-            _cell(found, lambda r: r.nees_last),
-            _cell(found, lambda r: 100 * r.inside, ".0f"),
-            _cell(found, lambda r: r.nis),
-            _cell(found, lambda r: 1e3 * r.ate, ".3g"),
-            _cell(found, lambda r: 100 * r.ate / r.path_length, ".3f"),
-            "" if found is ours else _spread(*ratio_with_error(ate, [result.ate for result in ours]), ".2f"),
-            _cell(found, lambda r: r.offset_error, "+.3f"),
-            _spread(*root_mean_square_with_error([result.offset_z for result in found]), ".2f"),
-            f"{sum(result.lost for result in found)}",
-            f"{np.mean([r.filter_ms for r in found]):.0f} / {np.mean([r.total_ms for r in found]):.0f}",
+            _cell(trials, lambda r: r.nees),
+            _cell(trials, lambda r: r.nees_last),
+            _cell(trials, lambda r: 100 * r.inside, ".0f"),
+            _cell(trials, lambda r: r.nis),
+            _cell(trials, lambda r: 1e3 * r.ate, ".3g"),
+            _cell(trials, lambda r: 100 * r.ate / r.path_length, ".3f"),
+            "" if trials is ours else _spread(*ratio_with_error(ate, [result.ate for result in ours]), ".2f"),
+            _cell(trials, lambda r: r.offset_error, "+.3f"),
+            _spread(*root_mean_square_with_error([result.offset_z for result in trials]), ".2f"),
+            f"{sum(result.lost for result in trials)}",
+            f"{np.mean([r.filter_ms for r in trials]):.0f} / {np.mean([r.total_ms for r in trials]):.0f}",
         ]
         yield row(method, *cells)
     yield ""
     yield "Map points:"
     yield ""
     yield from header(*_MAP_HEADER, numbers_from=1)
-    for method, found in methods.items():
-        points, edges = (sum(getattr(result, name) for result in found) for name in ("points", "edges"))
+    for method, trials in methods.items():
+        points, edges = (sum(getattr(result, name) for result in trials) for name in ("points", "edges"))
         cells = [
-            f"{points / len(found):.0f}",
+            f"{points / len(trials):.0f}",
             f"{100 * edges / max(points + edges, 1):.1f} %",
-            _cell(found, lambda r: r.point_nees),
-            _cell(found, lambda r: r.point_median),
-            _cell(found, lambda r: 100 * r.point_inside, ".0f"),
-            _cell(found, lambda r: 100 * r.point_gross, ".1f") + " %",
+            _cell(trials, lambda r: r.point_nees),
+            _cell(trials, lambda r: r.point_median),
+            _cell(trials, lambda r: 100 * r.point_inside, ".0f"),
+            _cell(trials, lambda r: 100 * r.point_gross, ".1f") + " %",
         ]
         yield row(method, *cells)
 
 
-def _cell(found: Sequence[ConsistencyResult], value: Callable[[ConsistencyResult], float], form: str = ".2f") -> str:
-    return _spread(*mean_with_error([value(result) for result in found]), form)
+def _cell(trials: Sequence[ConsistencyResult], value: Callable[[ConsistencyResult], float], form: str = ".2f") -> str:
+    return _spread(*mean_with_error([value(result) for result in trials]), form)
 
 
 def _spread(value: float, error: float, form: str) -> str:

@@ -173,16 +173,16 @@ def _measure(
     errors = _errors(run, truth)
     blocks = []
     for number, megabytes in enumerate(sequence.megabytes):
-        own = slice(number * block, (number + 1) * block)
-        low, middle, high = np.percentile(totals[own], [10, 50, 90])
+        rows = slice(number * block, (number + 1) * block)
+        low, middle, high = np.percentile(totals[rows], [10, 50, 90])
         blocks.append(
             Block(
                 (number + 1) * block,
                 megabytes,
                 sequence.cpu_ms[number],
                 (float(low), float(middle), float(high)),
-                float(keyframes[own].mean()),
-                int((~tracked[own]).sum()) - (number == 0),
+                float(keyframes[rows].mean()),
+                int((~tracked[rows]).sum()) - (number == 0),
             )
         )
     laps = [

@@ -101,12 +101,14 @@ def measure_costs(names: Sequence[str], rounds: int) -> list[Cost]:
         image = photograph_like((_HEIGHT, _WIDTH))
         extractors = {name: load_extractor(name) for name in names}
         _use_one_torch_thread()
-        found = {name: extractor(image)[0] for name, extractor in extractors.items()}
+        keypoints = {name: extractor(image)[0] for name, extractor in extractors.items()}
         contenders = [Contender(name, partial(extractor, image)) for name, extractor in extractors.items()]
         timings = time_interleaved(contenders, rounds)
     finally:
         cv2.setNumThreads(threads)
-    return [Cost(name, timings[name], _loading_time(name), count_parameters(name), len(found[name])) for name in names]
+    return [
+        Cost(name, timings[name], _loading_time(name), count_parameters(name), len(keypoints[name])) for name in names
+    ]
 
 
 def _use_one_torch_thread() -> None:

@@ -117,8 +117,8 @@ def _page(
         "",
         *header("sigma of places / disparity, px", "ATE, geometric mean, mm", "NEES, geometric mean"),
     ]
-    for constant, found in tuning.items():
-        ate, nees = (_geometric_mean([getattr(each, name) for each in found]) for name in ("ate", "nees"))
+    for constant, trials in tuning.items():
+        ate, nees = (_geometric_mean([getattr(each, name) for each in trials]) for name in ("ate", "nees"))
         mark = " (chosen)" if constant == chosen else ""
         lines.append(f"| {constant[0]} / {constant[1]}{mark} | {1e3 * ate:.2f} | {nees:.2f} |")
     lines += [

@@ -81,8 +81,8 @@ def _homographies(data: Path, judge: MatchJudge) -> list[str]:
     for name in _HOMOGRAPHIES:
         pairs = load_set(name, data)
         for kind, make in DETECTORS.items():
-            found = judge_homographies(pairs, make(_PHOTOGRAPH_KEYPOINTS), judge)
-            lines.append(row(name, kind, *(f"{value:.3f}" for value in astuple(found))))
+            measured = judge_homographies(pairs, make(_PHOTOGRAPH_KEYPOINTS), judge)
+            lines.append(row(name, kind, *(f"{value:.3f}" for value in astuple(measured))))
     return [*lines, ""]
 
 
@@ -100,8 +100,8 @@ def _rows(data: Path, judge: MatchJudge) -> list[str]:
     for name in _STEREO:
         pairs = [pair for pair in load_set(name, data) if isinstance(pair.truth, SameRows)]
         for kind, make in DETECTORS.items():
-            found = judge_rows(pairs, make(_STEREO_KEYPOINTS), judge)
-            matches, *shares, correlation, median, sigma, bias = astuple(found)
+            measured = judge_rows(pairs, make(_STEREO_KEYPOINTS), judge)
+            matches, *shares, correlation, median, sigma, bias = astuple(measured)
             cells = [f"{matches:.0f}", *(f"{100 * share:.1f}" for share in shares), f"{correlation:.2f}"]
             lines.append(row(name, kind, *cells, f"{median:.3f}", f"{sigma:.3f}", f"{bias:+.3f}"))
     return [*lines, ""]
@@ -120,8 +120,8 @@ def _rejection(data: Path, judge: MatchJudge) -> list[str]:
     ]
     for name, pairs in _motions(data):
         for thinned in (False, True):
-            share, found = compare_rejection(pairs, judge, thinned)
-            for contender, reached in found.items():
+            share, measured = compare_rejection(pairs, judge, thinned)
+            for contender, reached in measured.items():
                 shares = (f"{100 * value:.1f}" for value in (reached.f1, reached.precision, reached.recall))
                 lines.append(
                     row(
@@ -162,7 +162,7 @@ def _motions(data: Path) -> list[tuple[str, list[ImagePair]]]:
 
 
 def _movers(data: Path, judge: MatchJudge) -> list[str]:
-    found = judge_movers(DETECTORS["learned"](_PHOTOGRAPH_KEYPOINTS), judge, _MOVER_SEED, _MOVER_PAIRS)
+    measured = judge_movers(DETECTORS["learned"](_PHOTOGRAPH_KEYPOINTS), judge, _MOVER_SEED, _MOVER_PAIRS)
     low, high = (f"{100 * share:.0f}" for share in SHARES)
     return [
         "## Rendered scenes with half of the matches on moving things",
@@ -172,6 +172,6 @@ def _movers(data: Path, judge: MatchJudge) -> list[str]:
         "what is accepted that lies on the static scene:",
         "",
         *header(*(field.name.replace("_", " ") for field in fields(MoverJudgement))),
-        row(str(found.pairs), *(f"{100 * value:.1f}" for value in astuple(found)[1:])),
+        row(str(measured.pairs), *(f"{100 * value:.1f}" for value in astuple(measured)[1:])),
         "",
     ]

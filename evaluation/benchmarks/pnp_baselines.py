@@ -29,11 +29,11 @@ _PIXEL_SIGMA = 1.0
 _RATIO = 0.8
 _ROW_TOLERANCE = 2.0
 # Nearer to zero a disparity says nothing about depth, and with the landmark taken as known nothing tells the pose so.
-_LEAST_DISPARITY = 1.0
+_MIN_DISPARITY = 1.0
 _FORWARD_BACKWARD = 1.0
 _REPROJECTION = 2.0
 _RANSAC_ROUNDS, _CONFIDENCE = 500, 0.999
-_LEAST_INLIERS = 15
+_MIN_INLIERS = 15
 # A new keyframe when inliers fall below this share of those that the first view after the keyframe had.
 _KEYFRAME_RATIO = 0.6
 
@@ -96,7 +96,7 @@ def pose_from_points(points: np.ndarray, pixels: np.ndarray, camera: RectifiedSt
     Returns:
         None when fewer than 15 points agree.
     """
-    if len(points) < _LEAST_INLIERS:
+    if len(points) < _MIN_INLIERS:
         return None
     points, pixels = points.astype(np.float64), pixels.astype(np.float64)
     # With flags for P3P the pose of all inliers would come from EPnP, which on far points is off by tens of pixels.
@@ -115,7 +115,7 @@ def pose_from_points(points: np.ndarray, pixels: np.ndarray, camera: RectifiedSt
     inliers = np.zeros(len(points), bool)
     inliers[index.ravel()] = True
     for last in (False, True):
-        if inliers.sum() < _LEAST_INLIERS:
+        if inliers.sum() < _MIN_INLIERS:
             return None
         turn, shift = cv2.solvePnPRefineLM(points[inliers], pixels[inliers], camera.matrix, None, turn, shift)
         if not last:
@@ -257,7 +257,7 @@ class SiftMatcher:
         """Triangulates the keyframe."""
         pixels, descriptors = self._detect(view.right)
         shift = view.pixels[:, None] - pixels
-        near = (np.abs(shift[..., 1]) <= _ROW_TOLERANCE) & (shift[..., 0] >= _LEAST_DISPARITY)
+        near = (np.abs(shift[..., 1]) <= _ROW_TOLERANCE) & (shift[..., 0] >= _MIN_DISPARITY)
         left, right = self._match(view.descriptors, descriptors, near)
         self._points = _triangulate(view.pixels[left], pixels[right], self._camera)
         self._descriptors = view.descriptors[left]
@@ -309,7 +309,7 @@ class KltMatcher:
         pixels = np.zeros((0, 2), np.float32) if corners is None else corners.reshape(-1, 2)
         places, found = _follow(left, right, pixels)
         shift = pixels - places
-        found &= (np.abs(shift[:, 1]) <= _ROW_TOLERANCE) & (shift[:, 0] >= _LEAST_DISPARITY)
+        found &= (np.abs(shift[:, 1]) <= _ROW_TOLERANCE) & (shift[:, 0] >= _MIN_DISPARITY)
         self._points = _triangulate(pixels[found], places[found], self._camera)
         self._pixels, self._image = pixels[found], left
 

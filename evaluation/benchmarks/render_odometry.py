@@ -191,12 +191,12 @@ def row_noise(u: np.ndarray, v: np.ndarray, difference: np.ndarray) -> float:
     x, y = ((values - values.mean()) / max(float(values.std()), 1e-9) for values in (u, v))
     terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
     kept = np.ones(len(x), dtype=bool)
-    rest = difference
+    residual = difference
     for _ in range(_FITS):
         solution, *_ = np.linalg.lstsq(terms[kept], difference[kept], rcond=None)
-        rest = np.abs(difference - terms @ solution)
-        kept = rest <= 4.0 * np.median(rest)
-    return float(np.median(rest))
+        residual = np.abs(difference - terms @ solution)
+        kept = residual <= 4.0 * np.median(residual)
+    return float(np.median(residual))
 
 
 def _match_eyes(sequence: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -152,10 +152,10 @@ def run_sequences(
                     note(f"{label}, ATE {ate_cell(result)} m, {total_cell(result)} ms")
 
 
-def _check_names(kind: str, names: Sequence[str], known: Sequence[str]) -> None:
+def _check_names(kind: str, names: Sequence[str], choices: Sequence[str]) -> None:
     for name in names:
-        if name not in known:
-            raise InputError(f"{kind} {name!r} is unknown; choose of {', '.join(known)}")
+        if name not in choices:
+            raise InputError(f"{kind} {name!r} is unknown; choose of {', '.join(choices)}")
 
 
 def _render(preset: str, folder: Path, note: Callable[[str], None]) -> _BenchmarkSequence:

@@ -101,12 +101,14 @@ def format_results(results: Sequence[SequenceResult | Omission], command: str, c
         if isinstance(missing, Omission) and not missing.method:
             lines += [f"{missing.sequence} is left out: {missing.reason}", ""]
     for sequence in dict.fromkeys(result.sequence for result in results if isinstance(result, SequenceResult)):
-        found = [result for result in results if isinstance(result, SequenceResult) and result.sequence == sequence]
-        lines += [f"## {sequence}", "", *table(_COLUMNS, (_row(result) for result in found)), ""]
+        of_sequence = [
+            result for result in results if isinstance(result, SequenceResult) and result.sequence == sequence
+        ]
+        lines += [f"## {sequence}", "", *table(_COLUMNS, (_row(result) for result in of_sequence)), ""]
         for missing in results:
             if isinstance(missing, Omission) and missing.method and missing.sequence == sequence:
                 lines += [f"The row *{_LABELS[missing.method]}* is left out: {missing.reason}", ""]
-        staged = [each for each in found if each.trial.frames and "filter" in each.trial.frames.milliseconds]
+        staged = [each for each in of_sequence if each.trial.frames and "filter" in each.trial.frames.milliseconds]
         if staged:
             lines += [*table(_STAGE_COLUMNS, map(_stage_row, staged)), ""]
     return "\n".join(lines)

@@ -77,11 +77,11 @@ def _compare_tracks(
     for label in (*names, KLT):
         start = time.perf_counter()
         try:
-            found = _score_tracks(label, tracks)
+            scores = _score_tracks(label, tracks)
         except FrameError as error:
             note(f"{TRACKS}: left out {label}: {error}")
             continue
-        results.setdefault(label, {})[TRACKS] = found
+        results.setdefault(label, {})[TRACKS] = scores
         note(f"{TRACKS}: {label}, {len(tracks)} pairs in {time.perf_counter() - start:.1f} s")
 
 

@@ -26,7 +26,7 @@ _SIZE = 384
 _DOMAINS = ("street", "room", "drone")
 # A thing that moves by less in the image cannot be told from the scene.
 _MOVED = 3.0
-_LEAST_MATCHES = 60
+_MIN_MATCHES = 60
 # Of the virtual stereo pair, in depths of the median point, and the noise of its disparities, pixels.
 _BASELINE, _DISPARITY_NOISE = 0.05, 0.3
 
@@ -63,7 +63,7 @@ def judge_movers(detect: Callable[[np.ndarray], Features], judge: MatchJudge, se
     """
     stream = ScenePairs(seed, _SIZE, _DOMAINS, most_moved=0.5)
     counts = np.zeros((4, 2))
-    found, right_poses = 0, 0
+    pair_count, right_poses = 0, 0
     for index in range(tried):
         pair = stream.pair(index)
         image0, image1 = (np.round(255.0 * image).astype(np.uint8) for image in (pair.image0, pair.image1))
@@ -73,9 +73,9 @@ def judge_movers(detect: Callable[[np.ndarray], Features], judge: MatchJudge, se
         right = np.linalg.norm(matches.keypoints1 - truth.places, axis=1) < RIGHT
         static = right & ~truth.moved
         share = 1.0 - static.sum() / max(right.sum(), 1)
-        if right.sum() < _LEAST_MATCHES or not SHARES[0] <= share <= SHARES[1]:
+        if right.sum() < _MIN_MATCHES or not SHARES[0] <= share <= SHARES[1]:
             continue
-        found += 1
+        pair_count += 1
         camera0, camera1 = pair.views0.sight.eye.camera, pair.views1.sight.eye.camera
         # As if both had been taken by the first camera: the centres are the same.
         centre, zoom = np.array([camera0.cx, camera0.cy]), camera0.fx / camera1.fx
@@ -106,7 +106,9 @@ def judge_movers(detect: Callable[[np.ndarray], Features], judge: MatchJudge, se
     still, matched, epipolar_share, stereo_share = (
         float(share) for share in counts[:, 0] / np.maximum(counts[:, 1], 1.0)
     )
-    return MoverJudgement(found, 1.0 - still, matched, epipolar_share, stereo_share, right_poses / max(found, 1))
+    return MoverJudgement(
+        pair_count, 1.0 - still, matched, epipolar_share, stereo_share, right_poses / max(pair_count, 1)
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -158,11 +158,11 @@ def judge_rows(pairs: Sequence[ImagePair], detect: Detect, judge: MatchJudge) ->
     for pair in pairs:
         assert isinstance(pair.truth, SameRows)
         features0, features1 = detect(pair.image0), detect(pair.image1)
-        found = match_stereo(judge, pair.image0, pair.image1, features0, features1)
-        points = features0.keypoints[found.index0].astype(np.float64)
+        matches = match_stereo(judge, pair.image0, pair.image1, features0, features1)
+        points = features0.keypoints[matches.index0].astype(np.float64)
         height, width = pair.image0.shape
         place = (points - (0.5 * width, 0.5 * height)) / (0.5 * width)
-        rows.append(np.column_stack([found.places[:, 1] - points[:, 1], np.sqrt(found.covariance[:, 1, 1]), place]))
+        rows.append(np.column_stack([matches.places[:, 1] - points[:, 1], np.sqrt(matches.covariance[:, 1, 1]), place]))
     error, sigma, u, v = np.concatenate(rows).T
     mended = error - _rectification(error, u, v)
     return RowJudgement(

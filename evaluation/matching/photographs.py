@@ -65,15 +65,15 @@ def find_occluded(disparity: np.ndarray) -> np.ndarray:
         (H, W) bool.
     """
     height, width = disparity.shape
-    known = np.isfinite(disparity)
-    v, u = np.nonzero(known)
-    target = np.round(u - disparity[known]).astype(int)
+    valid = np.isfinite(disparity)
+    v, u = np.nonzero(valid)
+    target = np.round(u - disparity[valid]).astype(int)
     inside = (target >= 0) & (target < width)
     nearest = np.zeros((height, width))
-    np.maximum.at(nearest, (v[inside], target[inside]), disparity[known][inside])
+    np.maximum.at(nearest, (v[inside], target[inside]), disparity[valid][inside])
     occluded = np.zeros(disparity.shape, bool)
     occluded[v[~inside], u[~inside]] = True
-    hidden = nearest[v[inside], target[inside]] > disparity[known][inside] + 1.0
+    hidden = nearest[v[inside], target[inside]] > disparity[valid][inside] + 1.0
     occluded[v[inside], u[inside]] = hidden
     return occluded
 

@@ -64,9 +64,9 @@ def _limited(extractor: Extractor, max_keypoints: int) -> Extractor:
     return remembering(extract)
 
 
-def _summarize_parts(pairs: Sequence[ImagePair], found: Sequence[dict[str, float]]) -> dict[str, float]:
+def _summarize_parts(pairs: Sequence[ImagePair], pair_scores: Sequence[dict[str, float]]) -> dict[str, float]:
     parts: dict[tuple[str, type], list[dict[str, float]]] = {}
-    for pair, scores in zip(pairs, found, strict=True):
+    for pair, scores in zip(pairs, pair_scores, strict=True):
         parts.setdefault((pair.part, type(pair.truth)), []).append(scores)
     return {
         f"{part}_{name}" if part else name: value

@@ -22,8 +22,8 @@ GOOD_POSITION = 0.05
 """Metres."""
 GOOD_ROTATION_DEG = 1.0
 # Points of less disparity are too far for a pose; pixels.
-_LEAST_DISPARITY = 1.0
-_LEAST_POINTS = 6
+_MIN_DISPARITY = 1.0
+_MIN_POINTS = 6
 _INLIER_THRESHOLD = 2.0
 _ITERATIONS = 2000
 _CONFIDENCE = 0.9999
@@ -97,7 +97,7 @@ def estimate_step(
     index, places = match_rows_refined(step.left0, step.right0, left0, right0)
     keypoints = left0[0][index].astype(np.float64)
     disparity = keypoints[:, 0] - places[:, 0]
-    near = (disparity >= _LEAST_DISPARITY) & (np.abs(keypoints[:, 1] - places[:, 1]) < 1.0)
+    near = (disparity >= _MIN_DISPARITY) & (np.abs(keypoints[:, 1] - places[:, 1]) < 1.0)
     points = step.camera.triangulate(np.column_stack([keypoints, disparity])[near])
     kept = index[near]
     if not judged:
@@ -109,7 +109,7 @@ def estimate_step(
 
 def _solve_pnp(points: np.ndarray, pixels: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, int] | None:
     """Pose that takes (N, 3) points to where (N, 2) pixels see them, and the number of points that agree."""
-    if len(points) < _LEAST_POINTS:
+    if len(points) < _MIN_POINTS:
         return None
     cv2.setRNGSeed(0)
     found, rotation, translation, inliers = cv2.solvePnPRansac(
@@ -122,7 +122,7 @@ def _solve_pnp(points: np.ndarray, pixels: np.ndarray, K: np.ndarray) -> tuple[n
         reprojectionError=_INLIER_THRESHOLD,
         confidence=_CONFIDENCE,
     )
-    if not found or len(inliers) < _LEAST_POINTS:
+    if not found or len(inliers) < _MIN_POINTS:
         return None
     index = inliers.ravel()
     rotation, translation = cv2.solvePnPRefineLM(points[index], pixels[index], K, None, rotation, translation)

@@ -94,8 +94,8 @@ class MixedPairs:
 
     def pair(self, index: int) -> Pair:
         """The pair of that index, the same whenever it is asked for."""
-        source, own = take_turn(self._turns, index)
-        return self._streams[source].pair(own)
+        source, source_index = take_turn(self._turns, index)
+        return self._streams[source].pair(source_index)
 
 
 class PairDataset(Dataset[TrainingPair]):

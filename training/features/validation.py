@@ -69,13 +69,13 @@ def matching_accuracy(
         of the pairs of one source.
     """
     streams = [open_stream(source, seed, size) for source in sources]
-    found: list[dict[str, float]] = []
+    pair_metrics: list[dict[str, float]] = []
     for index in range(pairs):
         pair = streams[index % len(streams)].pair(index // len(streams))
-        found.append(match_pair(network, pair).metrics())
-    overall = {name: sum(each[name] for each in found) / pairs for name in found[0]}
+        pair_metrics.append(match_pair(network, pair).metrics())
+    overall = {name: sum(each[name] for each in pair_metrics) / pairs for name in pair_metrics[0]}
     for turn, source in enumerate(sources[:pairs]):
-        of_source = found[turn :: len(sources)]
+        of_source = pair_metrics[turn :: len(sources)]
         overall[f"mma_3_{source}"] = sum(each["mma_3"] for each in of_source) / len(of_source)
     return overall
 
@@ -89,8 +89,8 @@ def match_pair(network: FeatureNetwork, pair: Pair) -> PairMatches:
     device = next(network.parameters()).device
 
     def extract(image: np.ndarray) -> tuple[Tensor, Tensor]:
-        found = extractor(torch.from_numpy(image)[None, None].to(device), torch.tensor(_KEYPOINTS))
-        keypoints, scores, descriptors, _ = (values.cpu() for values in found)
+        features = extractor(torch.from_numpy(image)[None, None].to(device), torch.tensor(_KEYPOINTS))
+        keypoints, scores, descriptors, _ = (values.cpu() for values in features)
         return keypoints[scores > 0], descriptors[scores > 0]
 
     (keypoints0, descriptors0), (keypoints1, descriptors1) = extract(pair.image0), extract(pair.image1)

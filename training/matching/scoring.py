@@ -84,7 +84,7 @@ def train_scoring(out: Path, config: ScoringConfig, workers: int) -> dict[str, A
             )
         ]
         clock.seconds()
-        sets = [found for record in _records(folders[0]) for found in record.sets.values()]
+        sets = [match_set for record in _records(folders[0]) for match_set in record.sets.values()]
         told = _open_bar(progress, "training the scorer", config.steps)
         scorer = train_scorer(sets, config.steps, config.seed, out / _SCORER_CHECKPOINT, told)
         clock.seconds()
@@ -150,7 +150,7 @@ def _collect(progress: Progress, paths: list[Path], scorer: MatchScorer) -> Veri
 
 def _scorer_metrics(scorer: MatchScorer, paths: list[Path]) -> dict[str, float]:
     """Means over the sets of one kind that have at least 8 right and 8 wrong matches."""
-    found: dict[str, list[tuple[float, ...]]] = {}
+    by_kind: dict[str, list[tuple[float, ...]]] = {}
     for record in _records(paths):
         for kind, of_kind in record.sets.items():
             _, _, side, _, error = make_sample(of_kind)
@@ -163,11 +163,11 @@ def _scorer_metrics(scorer: MatchScorer, paths: list[Path]) -> dict[str, float]:
             baseline = 10.0 * side[:, 3] - side[:, 4]
             precisions = [calibration.average_precision(score, right) for score in (logit, baseline)]
             values = *precisions, calibration.auroc(logit, right), f1
-            found.setdefault(kind, []).append(values)
+            by_kind.setdefault(kind, []).append(values)
     names = ("average_precision", "mutual_ratio_average_precision", "auroc", "f1")
     return {
         f"{kind}_{name}": float(np.mean([each[k] for each in values]))
-        for kind, values in found.items()
+        for kind, values in by_kind.items()
         for k, name in enumerate(names)
     }
 
