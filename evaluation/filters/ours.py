@@ -9,6 +9,7 @@ from typing import Any, TypeAlias
 import torch
 from torch import Tensor
 
+from sigmaslam import filters
 from sigmaslam.evaluation.filters.work import (
     LandmarkWork,
     LinearWork,
@@ -21,22 +22,8 @@ from sigmaslam.evaluation.filters.work import (
     project_stereo,
     range_and_bearing,
 )
-from sigmaslam.filters import (
-    BayesFilter,
-    Diagonal,
-    Gaussian,
-    KalmanFilter,
-    LinearMeasurement,
-    LinearMotion,
-    MeasurementModel,
-    MotionModel,
-    UnscentedKalmanFilter,
-    compile_step,
-    stack,
-    wrap_angle,
-)
 
-Step: TypeAlias = Callable[[], Gaussian]
+Step: TypeAlias = Callable[[], filters.Gaussian]
 
 # The models' arithmetic with vectors in batch-last memory.
 _TORCH: Any = SimpleNamespace(
@@ -44,7 +31,7 @@ _TORCH: Any = SimpleNamespace(
     sin=torch.sin,
     hypot=torch.hypot,
     arctan2=torch.arctan2,
-    stack=lambda components, _: stack(components),
+    stack=lambda components, _: filters.stack(components),
 )
 
 
@@ -64,59 +51,60 @@ def make(work: Work, dtype: str = "float64", compiled: bool = False, device: str
 
     # One linearisation, as the peers do; failures are flagged, not raised, where a look at the flag would break a
     # compiled step in two.
-    bayes: BayesFilter
+    bayes: filters.BayesFilter
     policy: Any = "hold" if compiled else "raise"
     if isinstance(work, LinearWork):
-        bayes = KalmanFilter(on_failure=policy)
+        bayes = filters.KalmanFilter(on_failure=policy)
     else:
-        bayes = UnscentedKalmanFilter(iterations=1, on_failure=policy)
+        bayes = filters.UnscentedKalmanFilter(iterations=1, on_failure=policy)
     motion, measurement, motion_inputs, measurement_inputs = _models(work, tensor)
-    prior = Gaussian(tensor(work.mean), tensor(work.covariance))
+    prior = filters.Gaussian(tensor(work.mean), tensor(work.covariance))
     value = tensor(work.measurement)
     if numbers is torch.float32:  # goes on with square roots: start with one
-        prior = Gaussian(prior.mean, factor=prior.factor, factor_is_lower=True)
+        prior = filters.Gaussian(prior.mean, factor=prior.factor, factor_is_lower=True)
     inputs = [*motion_inputs, value, *measurement_inputs]
     if prior.batch_shape:
         prior = prior.batch_last()
-        inputs = [stack(given.unbind(-1)) for given in inputs]
+        inputs = [filters.stack(given.unbind(-1)) for given in inputs]
 
     def step(mean: Tensor, held: Tensor, *inputs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         by_root = prior.is_square_root
-        belief = Gaussian(mean, factor=held, factor_is_lower=True) if by_root else Gaussian(mean, held)
+        belief = filters.Gaussian(mean, factor=held, factor_is_lower=True) if by_root else filters.Gaussian(mean, held)
         controls, seen = inputs[: len(motion_inputs)], inputs[len(motion_inputs) :]
         predicted = bayes.predict(belief, motion, *controls).belief
         result = bayes.update(predicted, measurement, *seen)
         return result.belief.mean, result.belief.held, result.healthy
 
-    run = compile_step(step) if compiled else step
+    run = filters.compile_step(step) if compiled else step
 
-    def one() -> Gaussian:
+    def one() -> filters.Gaussian:
         with torch.inference_mode():
             mean, held, _ = run(prior.mean, prior.held, *inputs)
-        return Gaussian(mean, factor=held) if prior.is_square_root else Gaussian(mean, held)
+        return filters.Gaussian(mean, factor=held) if prior.is_square_root else filters.Gaussian(mean, held)
 
     return one
 
 
 def _models(work: Work, tensor: Callable[[Any], Tensor]) -> tuple[Any, Any, list[Tensor], list[Tensor]]:
     """Motion, measurement, and the inputs of both."""
-    Q, R = tensor(work.process_noise), Diagonal(tensor(work.measurement_noise.diagonal()))
+    Q, R = tensor(work.process_noise), filters.Diagonal(tensor(work.measurement_noise.diagonal()))
     if isinstance(work, StereoWork):
         points = tensor(work.points)
-        see = MeasurementModel(lambda states: project_stereo(torch, states, points), R)
-        return LinearMotion(tensor(work.transition), Q), see, [], []
+        see = filters.MeasurementModel(lambda states: project_stereo(torch, states, points), R)
+        return filters.LinearMotion(tensor(work.transition), Q), see, [], []
     if isinstance(work, LinearWork):
-        return LinearMotion(tensor(work.transition), Q), LinearMeasurement(tensor(work.observation), R), [], []
-    noise = Diagonal(tensor(work.process_noise.diagonal()))
+        measurement = filters.LinearMeasurement(tensor(work.observation), R)
+        return filters.LinearMotion(tensor(work.transition), Q), measurement, [], []
+    noise = filters.Diagonal(tensor(work.process_noise.diagonal()))
     if isinstance(work, LandmarkWork):
-        stay = LinearMotion(torch.eye(3, dtype=Q.dtype, device=Q.device), noise)
-        return stay, MeasurementModel(lambda states: project_landmark(_TORCH, states), R), [], []
-    unicycle = MotionModel(lambda states, control: drive(_TORCH, states, control), noise)
+        stay = filters.LinearMotion(torch.eye(3, dtype=Q.dtype, device=Q.device), noise)
+        return stay, filters.MeasurementModel(lambda states: project_landmark(_TORCH, states), R), [], []
+    unicycle = filters.MotionModel(lambda states, control: drive(_TORCH, states, control), noise)
     if isinstance(work, PositionWork):
-        fix = LinearMeasurement(torch.eye(3, dtype=Q.dtype, device=Q.device)[:2], R)
+        fix = filters.LinearMeasurement(torch.eye(3, dtype=Q.dtype, device=Q.device)[:2], R)
         return unicycle, fix, [tensor(work.control)], []
     assert isinstance(work, LocalisationWork)
-    see = MeasurementModel(
+    see = filters.MeasurementModel(
         lambda states, landmark: range_and_bearing(_TORCH, states, landmark), R, _range_and_bearing_difference
     )
     return unicycle, see, [tensor(work.control)], [tensor(work.landmark)]
@@ -124,4 +112,4 @@ def _models(work: Work, tensor: Callable[[Any], Tensor]) -> tuple[Any, Any, list
 
 def _range_and_bearing_difference(measured: Tensor, predicted: Tensor) -> Tensor:
     difference = measured - predicted
-    return stack([difference[..., 0], wrap_angle(difference[..., 1])])
+    return filters.stack([difference[..., 0], filters.wrap_angle(difference[..., 1])])

@@ -18,9 +18,8 @@ from sigmaslam.evaluation.matching.scores import (
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import rotation_log
 
-GOOD_POSITION = 0.05
-"""Metres."""
-GOOD_ROTATION_DEG = 1.0
+# A pose within these of the truth is good, metres and degrees.
+GOOD_POSITION, GOOD_ROTATION_DEG = 0.05, 1.0
 # Points of less disparity are too far for a pose; pixels.
 _MIN_DISPARITY = 1.0
 _MIN_POINTS = 6

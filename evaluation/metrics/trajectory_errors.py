@@ -13,6 +13,8 @@ from sigmaslam.geometry.se3 import rotation_log, se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory
 
 Alignment = Literal["se3", "origin"]
+# Seconds that the timestamps of an estimated and a true pose may differ.
+MAX_DIFFERENCE = 0.02
 
 KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 """Segment lengths of the KITTI benchmark, metres."""
@@ -20,8 +22,6 @@ SHORT_LENGTHS = (10.0, 20.0, 30.0, 40.0, 50.0)
 """Segment lengths for paths too short for the benchmark's, metres."""
 KITTI_STEP = 10
 """Frames between the starts of segments in the KITTI benchmark."""
-MAX_DIFFERENCE = 0.02
-"""Seconds that the timestamps of an estimated and a true pose may differ."""
 SHORT_PATH = 200.0
 """Below this path length, metres, segments start at every frame."""
 
