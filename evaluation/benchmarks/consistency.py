@@ -30,7 +30,7 @@ from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam.synthetic.render_sequence import SCENE_NAME
 from sigmaslam.synthetic.simulation import Recipe, Simulation, Studio
 
-# All three are written rectified, so that the injected offset is one of disparities, exactly.
+# The images of all three are rectified, so that the injected offset shifts all disparities alike.
 SCALES = (
     Scale("driving", "street", 576, 176),
     Scale("indoors", "room", 360, 270),
@@ -87,7 +87,7 @@ def write_consistency(
     """
     make_folder(runs)
     cache = TrialCache(runs, hash_code(Path(__file__)))
-    # All scales of a seed before the next one: what is there when it is stopped is balanced.
+    # Run all scales of a seed before the next seed: an interrupted benchmark is balanced.
     jobs = [_ConsistencyTrials(cache, scale, _FIRST_SEED + k) for k in range(seeds) for scale in SCALES]
     missing = [job for job in jobs if any(job.read(method) is None for method in METHODS)]
     note(f"{len(jobs) - len(missing)} of {len(jobs)} sequences are there")

@@ -132,7 +132,7 @@ def write_endurance(
         lap = open_sequence(source)
         truth = _LapTruth(read_trajectory(source / "poses.txt"), recipe.frames)
 
-        # Ten remembered keyframes are all recent ones, of which none makes a loop.
+        # With ten keyframes in memory all are recent and none closes a loop.
         without = Path(scratch) / "without"
         some = min(frames, recipe.frames + _BEYOND)
         without_loops = partial(track_sequence, config=TrackerConfig(max_keyframes=10), tracks=True)

@@ -9,7 +9,7 @@ import numpy as np
 
 from sigmaslam.evaluation.benchmarks.page import opening, table
 
-# What is asked for.
+# Limits of growth of memory and time and of the loop error, percent.
 _MEMORY, _TIME, _LOOP = 5.0, 10.0, 0.2
 _WORDS = """\
 One lap through a rendered room ({lap_frames} frames, {length:.1f} m), whose end is its beginning, tracked over and over
@@ -112,7 +112,7 @@ def _verdicts(endurance: Endurance) -> list[str]:
     lines = ["| goal | found | |", "| --- | --- | --- |"]
     blocks = endurance.blocks
     if len(blocks) > 2:
-        # The memory of places fills in the first blocks.
+        # The keyframe memory fills up during the first blocks.
         first = blocks[1]
         growth = 100.0 * max(block.megabytes / first.megabytes - 1.0 for block in blocks[2:])
         lines.append(

@@ -249,7 +249,7 @@ def repeatability(image: np.ndarray, H: np.ndarray) -> float:
     mapped = mapped[_inside(there, mapped)][:wanted]
     if len(mapped) == 0:
         return float("nan")
-    # What is found just outside the area serves too, or corners that move a little there would be lost.
+    # Keep corners just outside the area, or those that move across its border are lost.
     near = cv2.dilate(there, np.ones((5, 5), np.uint8))
     matched = places1[_inside(near, places1)]
     matched = matched[np.cumsum(_inside(there, matched)) <= wanted]

@@ -28,13 +28,13 @@ _KEYPOINTS = 1500  # as many as the tracker asks for
 _PIXEL_SIGMA = 1.0
 _RATIO = 0.8
 _ROW_TOLERANCE = 2.0
-# Nearer to zero a disparity says nothing about depth, and with the landmark taken as known nothing tells the pose so.
+# Smaller disparities, in pixels, carry no depth, and the pose takes landmarks as exact.
 _MIN_DISPARITY = 1.0
 _FORWARD_BACKWARD = 1.0
 _REPROJECTION = 2.0
 _RANSAC_ROUNDS, _CONFIDENCE = 500, 0.999
 _MIN_INLIERS = 15
-# A new keyframe when inliers fall below this share of those that the first view after the keyframe had.
+# Insert a keyframe when the inliers fall below this share of those of the first view after the last keyframe.
 _KEYFRAME_RATIO = 0.6
 
 
@@ -143,7 +143,7 @@ class PnpOdometry:
         self._matcher: Matcher = SiftMatcher(self._camera) if matcher == "sift" else KltMatcher(self._camera)
         self._T_rectified_left = np.eye(4)
         self._T_rectified_left[:3, :3] = self._rectifier.R_rectified_left
-        # Of the rectified left eye, the world being the first of them.
+        # Pose of the rectified left camera; the world is its first frame.
         self._key_pose, self._key_covariance = np.eye(4), np.zeros((6, 6))
         self._pose, self._covariance = np.eye(4), np.zeros((6, 6))
         self._step = np.eye(4)

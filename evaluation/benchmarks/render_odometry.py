@@ -83,7 +83,7 @@ class Drive:
     tracked: float
 
 
-# What is compared, and whether it must agree within LIMIT; the rest only explains.
+# Attribute, title, format, and whether the ratio must be within LIMIT.
 _ROWS: tuple[tuple[str, str, str, bool], ...] = (
     ("inliers", "inliers a frame", ".0f", True),
     ("stereo_matches", "stereo matches of raw SIFT", ".0f", True),
@@ -174,7 +174,7 @@ def format_odometry(real: Drive, renders: Sequence[Drive]) -> list[str]:
             off.append(f"{title} (x{ratio:.2f})")
         cells = [title, *(format(value, form) for value in (truth, *values)), f"{ratio:.2f}"]
         lines.append(row(*cells, ("yes" if alike else "**no**") if required else ""))
-    # Around zero a ratio says nothing.
+    # The offset is near zero, where a ratio is undefined.
     cells = ["disparity offset px", *(f"{drive.offset:+.2f}" for drive in (real, *renders))]
     lines.append(row(*cells, "", ""))
     verdict = f"Off by more than a factor of {LIMIT:g}: {', '.join(off)}." if off else "Every one is within the limit."

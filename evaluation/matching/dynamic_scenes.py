@@ -24,10 +24,10 @@ SHARES = (0.35, 0.5)
 """Between these are the shares of right matches on moving things: beyond a half the scene may be the lesser body."""
 _SIZE = 384
 _DOMAINS = ("street", "room", "drone")
-# A thing that moves by less in the image cannot be told from the scene.
+# Image motion below this, in pixels, does not count as independent motion.
 _MOVED = 3.0
 _MIN_MATCHES = 60
-# Of the virtual stereo pair, in depths of the median point, and the noise of its disparities, pixels.
+# Baseline of the virtual stereo pair, in median depths, and noise of its disparities, in pixels.
 _BASELINE, _DISPARITY_NOISE = 0.05, 0.3
 
 
@@ -77,7 +77,7 @@ def judge_movers(detect: Callable[[np.ndarray], Features], judge: MatchJudge, se
             continue
         pair_count += 1
         camera0, camera1 = pair.views0.sight.eye.camera, pair.views1.sight.eye.camera
-        # As if both had been taken by the first camera: the centres are the same.
+        # Map both views to the intrinsics of the first camera; the principal points are equal.
         centre, zoom = np.array([camera0.cx, camera0.cy]), camera0.fx / camera1.fx
         points1 = (matches.keypoints1 - centre) * zoom + centre
         covariance = zoom**2 * matches.covariance

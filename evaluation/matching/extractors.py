@@ -77,7 +77,7 @@ def load_extractor(name: str, max_keypoints: int = MAX_KEYPOINTS) -> Extractor:
 
 def remembering(extractor: Extractor) -> Extractor:
     """The same extractor, which is asked only once for the features of an array."""
-    # With the arrays themselves, so that their ids stay apart.
+    # The cache holds the arrays, so that no two of them share an id.
     features: dict[int, tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]] = {}
 
     def extract(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

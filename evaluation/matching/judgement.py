@@ -19,7 +19,7 @@ from sigmaslam.frontend.nearest_neighbours import nearest_anywhere
 from sigmaslam.frontend.types import Features
 
 _CONSTANT_SIGMA = 0.3
-# Scale of the robust fit of what is left of a rectification, pixels, and its iterations.
+# Scale, in pixels, and iterations of the robust fit of the rectification error.
 _RECTIFICATION_SCALE, _RECTIFICATION_FITS = 0.3, 20
 
 Detect = Callable[[np.ndarray], Features]
@@ -77,7 +77,7 @@ def judge_homographies(pairs: Sequence[ImagePair], detect: Detect, judge: MatchJ
         ratio = (1.0 - putative.similarity) / np.maximum(1.0 - putative.second0, 1e-6)
         mutual = putative.mutual
         precisions = [calibration.average_precision(score, near) for score in (10.0 * mutual - ratio, logit)]
-        # Everything is asked of the same matches, also of those the verifier does not get to see.
+        # Score the same matches before and after verification, also those that the verifier does not see.
         seen = np.flatnonzero(mutual & (logit > LEAST_LOGIT))
         weight = 1.0 / (1.0 + np.exp(-logit[seen].astype(np.float64)))
         refinement = refine_by_neighbours(pair.image0, pair.image1, points0[seen], points1[seen], weight)

@@ -140,7 +140,7 @@ def _random_warp(rng: np.random.Generator, size: tuple[int, int], strength: floa
 def _view(photograph: np.ndarray, H: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """The photograph, mirrored at its borders, through a homography and a camera of its own."""
     height, width = photograph.shape
-    # Drawn at twice the size and averaged: a smaller scale must not alias.
+    # Draw at twice the size and average, so that a smaller scale does not alias.
     double = np.array([[2.0, 0.0, 0.5], [0.0, 2.0, 0.5], [0.0, 0.0, 1.0]])
     large = cv2.warpPerspective(
         photograph, double @ H, (2 * width, 2 * height), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101

@@ -122,7 +122,7 @@ def _thin(task: _Task, rng: np.random.Generator) -> _Task:
     wrong, right = np.flatnonzero(~task.right), np.flatnonzero(task.right)
     kept = min(len(right), round(len(wrong) * _THINNED / (1.0 - _THINNED)))
     rows = np.sort(np.concatenate([wrong, rng.permutation(right)[:kept]]))
-    # The matches are those of all keypoints of image 0, in their order: the others never were.
+    # Row k of the matches belongs to keypoint k of image 0: drop both together.
     features0 = task.features0.select(rows)
     putative = nearest_anywhere(features0.descriptors, task.features1.descriptors)
     return _Task(task.pair, features0, task.features1, task.frames0[rows], task.frames1, putative, task.right[rows])

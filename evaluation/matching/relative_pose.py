@@ -16,9 +16,9 @@ from sigmaslam.frontend.nearest_neighbours import nearest_anywhere
 from sigmaslam.frontend.types import Features
 from sigmaslam.two_view.epipolar import estimate_epipolar_pose
 
-# With less translation its direction means nothing, metres.
+# Below this length, in metres, the direction of a translation is undefined.
 _MIN_TRANSLATION = 0.02
-# Ours sees less probable matches too: its weights leave them out.
+# Our estimator also takes improbable matches: its weights suppress them.
 _MIN_PROBABILITY = 0.05
 _ROUNDS = 5
 
@@ -63,7 +63,7 @@ def compare_starts(
         points1 = features1.keypoints[mutual.index1].astype(np.float64)
         matches = match_features(judge, pair.image0, pair.image1, features0, features1, _MIN_PROBABILITY)
         contenders = _contenders(points0, points1, matches, truth.K)
-        # In turn, so that a busy moment of the machine hits everyone.
+        # Interleave the contenders, so that a busy moment of the machine hits all of them.
         times = np.full((_ROUNDS, len(contenders)), np.inf)
         for turn in range(_ROUNDS):
             for column, (name, estimate) in enumerate(contenders.items()):

@@ -17,7 +17,7 @@ from sigmaslam.geometry.se3 import rotation_log
 
 CORNER_THRESHOLDS = (1, 3, 5)
 POSE_THRESHOLDS = (1, 5, 10)
-# Keypoints nearer to the border of the other image than this need not be seen again.
+# Repeatability ignores keypoints within this many pixels of the border of the other image.
 _BORDER = 8
 # The robust estimators of everyone. OpenCV's USAC has its own generator: the same matches give the same answer. Its
 # MAGSAC leaves some homographies of our photographs pixels off where least squares on the same inliers is right to a

@@ -20,12 +20,10 @@ from sigmaslam.geometry.se3 import rotation_log
 
 # A pose within these of the truth is good, metres and degrees.
 GOOD_POSITION, GOOD_ROTATION_DEG = 0.05, 1.0
-# Points of less disparity are too far for a pose; pixels.
+# Points below this disparity, in pixels, are too far for a pose.
 _MIN_DISPARITY = 1.0
 _MIN_POINTS = 6
-_INLIER_THRESHOLD = 2.0
-_ITERATIONS = 2000
-_CONFIDENCE = 0.9999
+_INLIER_THRESHOLD, _ITERATIONS, _CONFIDENCE = 2.0, 2000, 0.9999  # of RANSAC
 
 
 @dataclass(frozen=True, slots=True)

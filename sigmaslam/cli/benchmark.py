@@ -199,7 +199,7 @@ def benchmark(
     run = _BENCHMARKS[name.value]
     served = [option for option in values if option in inspect.signature(run).parameters]
     for option in values:
-        # What is not typed is a default, or SIGMASLAM_DATA, which is there for all.
+        # Refuse typed options alone: defaults and SIGMASLAM_DATA exist for every benchmark.
         source = context.get_parameter_source(option)
         if option not in served and source is not None and source.name == "COMMANDLINE":
             raise InputError(f"--{option} is not an option of the benchmark {name.value}: leave it out")

@@ -18,7 +18,7 @@ _PAIRS = 48
 _KEYPOINTS = 256
 _SEED_OFFSET = 1_000_003
 _SOURCES = ("leaves", "patterns", "scenes")
-# Seen by runs that learn from it alone: elsewhere it is part of the scenes.
+# Sources that validate only the runs which train on them.
 _SPECIAL_SOURCES = ("endoscopy",)
 
 

@@ -37,7 +37,7 @@ _TURNS = ("planes", "scenes", "stereo", "scenes", "turned planes", "video")
 _ROW_TOLERANCE = 2.0
 _DISPARITY = (-2.0, 0.25 * SIZE)
 _ELLIPSE_SIGMA = (1.0, 25.0)
-# Where the truth is not known a prediction is about as far off as a moving thing goes, pixels.
+# Standard deviation, in pixels, of a prediction whose true place is unknown.
 _FOREIGN = 40.0
 _POLL = 0.5  # seconds
 _PUTATIVE = ("index0", "index1", "similarity", "second0", "second1")
