@@ -24,7 +24,7 @@ FORBIDDEN = {
 }
 
 # Tables of names that the command line offers, and their packages: they import nothing.
-NAMES = {f"sigmaslam.{layer}{module}" for layer in ("training", "synthetic") for module in ("", ".choices")}
+NAMES = {f"sigmaslam.{name}" for name in ("training", "training.mixes", "synthetic", "synthetic.choices")}
 # The runtime from the ground up: a folder imports only from floors below its own.
 FLOORS = (
     ("errors", "table"),
