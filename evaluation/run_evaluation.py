@@ -12,7 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.metrics.trajectories import (
+from sigmaslam.evaluation.metrics.trajectory_errors import (
+    MAX_DIFFERENCE,
     AbsoluteError,
     KittiErrors,
     PoseNees,
@@ -107,8 +108,6 @@ def evaluate_run(
     *,
     lengths: Sequence[float] | None = None,
     step: int | None = None,
-    delta: int = 1,
-    max_difference: float = 0.02,
     plot: bool = True,
 ) -> Evaluation:
     """Compare a run folder or a trajectory file with the truth.
@@ -124,8 +123,6 @@ def evaluate_run(
             or a TUM or KITTI file.
         truth: TUM, KITTI, or EuRoC ground truth.
         lengths, step: segments of the KITTI errors (see `kitti_errors`).
-        delta: frames in a step of the relative error.
-        max_difference: seconds that paired timestamps may differ.
         plot: write `evaluation.png` into the run folder or beside the trajectory.
     Raises:
         InputError: a file is missing or wrong, or the timestamps do not meet.
@@ -136,19 +133,17 @@ def evaluate_run(
     if is_run and not estimate_path.is_file():
         raise InputError(f"{run_or_trajectory}: holds no trajectory.tum; give a folder written by `sigmaslam track`")
     estimate, true, association = _same_clock(estimate_path, truth)
-    if association == "time at 10 Hz":
-        max_difference = min(max_difference, 1e-3)
-    estimate_index, _ = associate(estimate, true, max_difference)
-    if association == "time at 10 Hz" and len(estimate_index) < len(estimate):
+    paired, _ = associate(estimate, true, 1e-3 if association == "time at 10 Hz" else MAX_DIFFERENCE)
+    if association == "time at 10 Hz" and len(paired) < len(estimate):
         raise InputError(
             f"{truth}: a KITTI file without times.txt beside it is taken as 10 Hz, but only "
-            f"{len(estimate_index)} of the {len(estimate)} poses of {estimate_path} have such times: put the "
+            f"{len(paired)} of the {len(estimate)} poses of {estimate_path} have such times: put the "
             "times.txt of the images beside the pose file"
         )
     if is_run and _follows_object(run_or_trajectory):
-        true = _of_followed_frame(estimate, true, max_difference)
+        true = _of_followed_frame(estimate, true)
     covariance = _read_covariance(run_or_trajectory / "covariance.npy", len(estimate)) if is_run else None
-    matched_estimate, matched_truth = synchronise(estimate, true, max_difference)
+    matched_estimate, matched_truth = synchronise(estimate, true)
     evaluation = Evaluation(
         estimate_path=estimate_path,
         truth_path=truth,
@@ -157,15 +152,15 @@ def evaluate_run(
         frames=_frame_count(run_or_trajectory if is_run else None, estimate, true, len(matched_estimate)),
         path_length=matched_truth.path_length,
         estimate_path_length=matched_estimate.path_length,
-        ate=absolute_trajectory_error(estimate, true, "se3", max_difference),
-        ate_origin=absolute_trajectory_error(estimate, true, "origin", max_difference),
-        rpe=relative_pose_error(estimate, true, delta, max_difference),
-        kitti=kitti_errors(estimate, true, lengths, step, max_difference),
-        nees=pose_nees(estimate, true, covariance, max_difference) if covariance is not None else None,
+        ate=absolute_trajectory_error(estimate, true, "se3"),
+        ate_origin=absolute_trajectory_error(estimate, true, "origin"),
+        rpe=relative_pose_error(estimate, true),
+        kitti=kitti_errors(estimate, true, lengths, step),
+        nees=pose_nees(estimate, true, covariance) if covariance is not None else None,
         figure_path=estimate_path.parent / "evaluation.png" if plot else None,
     )
     if evaluation.figure_path:
-        figure = draw_evaluation(evaluation, estimate, true, covariance, max_difference)
+        figure = draw_evaluation(evaluation, estimate, true, covariance)
         save_png(figure, evaluation.figure_path)
     return evaluation
 
@@ -222,7 +217,6 @@ def draw_evaluation(
     estimate: Trajectory,
     truth: Trajectory,
     covariance: np.ndarray | None = None,
-    max_difference: float = 0.02,
 ) -> Figure:
     """View from above, height, errors over time with 3 sigma, and segment errors.
 
@@ -230,11 +224,10 @@ def draw_evaluation(
         evaluation: of these trajectories.
         estimate, truth: trajectories in one clock.
         covariance: (N, 6, 6) of the estimate, body frame, translation first.
-        max_difference: seconds that paired timestamps may differ.
     """
     figure = Figure(figsize=(11, 11), layout="constrained")
     grid = figure.add_gridspec(3, 2, height_ratios=(1.5, 1, 1))
-    matched_estimate, matched_truth = synchronise(estimate, truth, max_difference)
+    matched_estimate, matched_truth = synchronise(estimate, truth)
     aligned = align(matched_estimate, matched_truth, "se3")
     seconds = matched_estimate.timestamps - matched_estimate.timestamps[0]
 
@@ -249,7 +242,7 @@ def draw_evaluation(
     side.set_title("Third axis, best alignment", fontsize=10)
     side.legend(fontsize=8)
 
-    errors = pose_errors(estimate, truth, max_difference)
+    errors = pose_errors(estimate, truth)
     units = ((slice(0, 3), 1.0, "position error [m]"), (slice(3, 6), 180 / math.pi, "rotation error [deg]"))
     panels = [above, side]
     for column, (part, unit, label) in enumerate(units):
@@ -316,12 +309,12 @@ def _follows_object(run: Path) -> bool:
         return False
 
 
-def _of_followed_frame(estimate: Trajectory, truth: Trajectory, max_difference: float) -> Trajectory:
+def _of_followed_frame(estimate: Trajectory, truth: Trajectory) -> Trajectory:
     """The truth of the frame on the body that the run follows; the truth may be of another frame on the body.
 
     The two frames are taken as the first pair of poses has them to each other. The fixed frame is the camera's in both.
     """
-    estimate_index, truth_index = associate(estimate, truth, max_difference)
+    estimate_index, truth_index = associate(estimate, truth)
     first = se3_inverse(truth.poses[truth_index[0]]) @ estimate.poses[estimate_index[0]]
     return Trajectory(truth.timestamps, truth.poses @ first)
 

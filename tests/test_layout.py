@@ -24,7 +24,7 @@ FORBIDDEN = {
 }
 
 # Tables of names that the command line offers, and their packages: they import nothing.
-NAMES = {f"sigmaslam.{name}" for name in ("training", "training.choices", "synthetic", "synthetic.render_choices")}
+NAMES = {f"sigmaslam.{name}" for name in ("training", "training.mixes", "synthetic", "synthetic.render_choices")}
 # The runtime from the ground up: a folder imports only from floors below its own.
 FLOORS = (
     ("errors", "table"),

@@ -14,8 +14,8 @@ from torch.nn.parallel import DistributedDataParallel
 
 from sigmaslam.errors import InputError
 from sigmaslam.models.feature_network import FeatureMaps, FeatureNetwork
+from sigmaslam.training.features.batch_loss import pair_loss
 from sigmaslam.training.features.losses import PairLoss
-from sigmaslam.training.features.step import pair_loss
 from sigmaslam.training.features.stream import TrainingPair
 
 

@@ -2,41 +2,35 @@
 
 from __future__ import annotations
 
-import hashlib
-import inspect
 import json
 import multiprocessing
 import os
-import shutil
-import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import redirect_stderr
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
 
-from sigmaslam.errors import InputError
-from sigmaslam.evaluation.benchmarks.consistency_page import Result, Results, Scale, format_page
+from sigmaslam.evaluation.benchmarks.consistency_page import ConsistencyResult, Results, Scale, format_page
 from sigmaslam.evaluation.benchmarks.page import write_page
 from sigmaslam.evaluation.metrics import map_consistency as consistency
-from sigmaslam.evaluation.run_evaluation import evaluate_run
-from sigmaslam.files import atomic_write_text, make_folder
+from sigmaslam.evaluation.trial import Trial, TrialCache, hash_code, render
+from sigmaslam.files import make_folder
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.trajectory import read_trajectory
-from sigmaslam.inference.onnx_graph import shipped_weights
 from sigmaslam.readers import open_sequence
-from sigmaslam.runs.report import read_frames
 from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.tracker import TrackerConfig
-from sigmaslam.synthetic.render_sequence import SCENE_NAME, write_sequence
+from sigmaslam.synthetic.render_sequence import SCENE_NAME
 from sigmaslam.synthetic.simulation import Recipe, Simulation, Studio
 
-# All three are written rectified, so that the injected offset is one of disparities, exactly.
+# The images of all three are rectified, so that the injected offset shifts all disparities alike.
 SCALES = (
     Scale("driving", "street", 576, 176),
     Scale("indoors", "room", 360, 270),
@@ -58,22 +52,22 @@ _GROSS = 5.0  # sigmas
 
 
 @dataclass(frozen=True, slots=True)
-class _Job:
+class _ConsistencyTrials:
     """One sequence, with all methods."""
 
-    runs: Path
+    cache: TrialCache
     scale: Scale
     seed: int
-    code: str
 
     @property
     def recipe(self) -> Recipe:
         scale = self.scale
         return Recipe(scale.preset, FRAMES, self.seed, disparity_offset=OFFSET, width=scale.width, height=scale.height)
 
-    @property
-    def source(self) -> Path:
-        return self.runs / f"{self.scale.preset}{self.seed}"
+    def read(self, method: str) -> ConsistencyResult | None:
+        """The result that is kept, unless it is of something else."""
+        figures = self.cache.read(self.recipe, method, METHODS[method])
+        return None if figures is None else ConsistencyResult(**figures)
 
 
 def write_consistency(
@@ -92,10 +86,10 @@ def write_consistency(
         note: is told of progress.
     """
     make_folder(runs)
-    code = _code_hash()
-    # All scales of a seed before the next one: what is there when it is stopped is balanced.
-    jobs = [_Job(runs, scale, _FIRST_SEED + k, code) for k in range(seeds) for scale in SCALES]
-    missing = [job for job in jobs if any(_read_result(job, method) is None for method in METHODS)]
+    cache = TrialCache(runs, hash_code(Path(__file__)))
+    # Run all scales of a seed before the next seed: an interrupted benchmark is balanced.
+    jobs = [_ConsistencyTrials(cache, scale, _FIRST_SEED + k) for k in range(seeds) for scale in SCALES]
+    missing = [job for job in jobs if any(job.read(method) is None for method in METHODS)]
     note(f"{len(jobs) - len(missing)} of {len(jobs)} sequences are there")
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(workers, max(len(missing), 1)), context, _start_worker) as pool:
@@ -108,7 +102,7 @@ def write_consistency(
             raise
     results: Results = {
         scale: {
-            method: [result for job in jobs if job.scale == scale and (result := _read_result(job, method))]
+            method: [result for job in jobs if job.scale == scale and (result := job.read(method))]
             for method in METHODS
         }
         for scale in SCALES
@@ -121,7 +115,7 @@ def _start_worker() -> None:
     torch.set_num_threads(1)
 
 
-def _work(job: _Job) -> str:
+def _work(job: _ConsistencyTrials) -> str:
     """Renders and tracks what is missing of one sequence; says how long both took."""
     try:
         return _make(job)
@@ -129,32 +123,16 @@ def _work(job: _Job) -> str:
         os._exit(130)  # or this process would begin with the next sequence
 
 
-def _make(job: _Job) -> str:
+def _make(job: _ConsistencyTrials) -> str:
     began = time.perf_counter()
-    _render(job)
+    source = render(job.cache.folder, job.recipe, 1)
     rendered = time.perf_counter()
-    scene = _open_scene(job.source)
-    count = 0
-    for method, config in METHODS.items():
-        if _read_result(job, method) is None:
-            result = _track(job, config, scene)
-            content = {"made_from": _made_from(job, config), "result": asdict(result)}
-            atomic_write_text(_result_path(job, method), json.dumps(content, indent=1) + "\n")
-            count += 1
+    scene = _open_scene(source)
+    missing = [method for method in METHODS if job.read(method) is None]
+    for method in missing:
+        job.cache.write(job.recipe, method, METHODS[method], asdict(_track(source, METHODS[method], scene)))
     tracked = time.perf_counter()
-    return f"{job.source.name}, rendered in {rendered - began:.0f} s, {count} methods in {tracked - rendered:.0f} s"
-
-
-def _render(job: _Job) -> None:
-    """Frames that are there are kept."""
-    was_there = job.source.exists()
-    try:
-        write_sequence(job.source, job.recipe, "sparse")
-    except BaseException:
-        # Stopped before the scene was written it could not be gone on with.
-        if not was_there and not (job.source / SCENE_NAME).is_file():
-            shutil.rmtree(job.source, ignore_errors=True)
-        raise
+    return f"{source.name}, rendered in {rendered - began:.0f} s, {len(missing)} methods in {tracked - rendered:.0f} s"
 
 
 def _open_scene(source: Path) -> Studio:
@@ -178,20 +156,14 @@ def depths_around(studio: Studio, frame: int, pixels: np.ndarray) -> np.ndarray:
         return np.asarray((1.0 / inverse).numpy().reshape(-1, 3, 3))
 
 
-def _track(job: _Job, config: TrackerConfig, scene: Studio) -> Result:
-    truth = job.source / "poses.txt"
-    sequence = open_sequence(job.source)
-    with tempfile.TemporaryDirectory() as scratch, Path(os.devnull).open("w") as nowhere:
-        run = Path(scratch) / "run"
-        with redirect_stderr(nowhere):
-            track_sequence(sequence, run, config=config)
-        evaluation = evaluate_run(run, truth, plot=False)
-        frames = read_frames(run / "frames.csv")
-        with np.load(run / "map.npz") as content:
-            point_map = dict(content)
+def _track(source: Path, config: TrackerConfig, scene: Studio) -> ConsistencyResult:
+    truth = source / "poses.txt"
+    sequence = open_sequence(source)
+    with Path(os.devnull).open("w") as nowhere, redirect_stderr(nowhere):
+        trial = Trial(sequence, truth, partial(track_sequence, config=config)).run()
+    evaluation, tracked, point_map = trial.evaluation, trial.tracked, trial.point_map
     assert evaluation.nees is not None
-    tracked = np.array(frames.status) == "tracking"
-    columns = frames.columns
+    columns = trial.table.columns
     offset, sigma = columns["disparity_offset"][-1], columns["disparity_offset_sigma"][-1]
     true = read_trajectory(truth)
     hosts = np.abs(point_map["timestamps"][:, None] - true.timestamps).argmin(axis=1)
@@ -206,7 +178,7 @@ def _track(job: _Job, config: TrackerConfig, scene: Studio) -> Result:
     per_frame = evaluation.nees.per_frame
     some, dof = len(nees) > 0, columns["dof"][tracked].sum()
     nan = float("nan")
-    return Result(
+    return ConsistencyResult(
         nees=evaluation.nees.mean,
         nees_last=float(per_frame[-1]) if len(per_frame) else nan,
         inside=consistency.coverage(per_frame, 6),
@@ -216,8 +188,8 @@ def _track(job: _Job, config: TrackerConfig, scene: Studio) -> Result:
         offset_error=float(offset - OFFSET),
         offset_z=float((offset - OFFSET) / sigma) if sigma > 0 else nan,
         lost=int((~tracked[1:]).sum()),
-        filter_ms=float(np.median(frames.milliseconds["filter"])),
-        total_ms=float(np.median(frames.total_milliseconds)),
+        filter_ms=float(np.median(trial.table.milliseconds["filter"])),
+        total_ms=float(np.median(trial.table.total_milliseconds)),
         points=int(clear.sum()),
         edges=int((~clear).sum()),
         point_nees=float(nees.mean()) if some else nan,
@@ -225,38 +197,3 @@ def _track(job: _Job, config: TrackerConfig, scene: Studio) -> Result:
         point_inside=consistency.coverage(nees, 3),
         point_gross=float((3.0 * nees > _GROSS**2).mean()) if some else nan,
     )
-
-
-def _result_path(job: _Job, method: str) -> Path:
-    slug = "".join(letter if letter.isalnum() else "_" for letter in method)
-    return job.runs / f"{job.source.name}-{slug}.json"
-
-
-def _made_from(job: _Job, config: TrackerConfig) -> dict[str, object]:
-    return {"recipe": asdict(job.recipe), "configuration": asdict(config), "code": job.code}
-
-
-def _read_result(job: _Job, method: str) -> Result | None:
-    """The result that is kept, unless it is of something else."""
-    path = _result_path(job, method)
-    if not path.is_file():
-        return None
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise InputError(f"{path} is no result of this benchmark ({error}): remove it") from error
-    asked = json.loads(json.dumps(_made_from(job, METHODS[method])))
-    return Result(**content["result"]) if content.get("made_from") == asked else None
-
-
-def _code_hash() -> str:
-    """Of everything between the images and a result: the tracker, its graphs, and this benchmark."""
-    package = Path(inspect.getfile(TrackerConfig)).parent
-    sources = list(package.glob("*.py"))
-    sources += [path for folder in ("frontend", "readers") for path in (package / folder).glob("*.py")]
-    sources += shipped_weights("features.onnx").parent.glob("*.onnx")
-    sources += [Path(__file__), Path(consistency.__file__), Path(consistency.__file__).with_name("metrics.py")]
-    digest = hashlib.sha256()
-    for path in sorted(sources, key=lambda path: path.name):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()

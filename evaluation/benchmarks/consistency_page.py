@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from sigmaslam.evaluation.benchmarks.page import header, machine, row
+from sigmaslam.evaluation.benchmarks.page import header, opening, row
 from sigmaslam.evaluation.metrics.map_consistency import mean_with_error, ratio_with_error, root_mean_square_with_error
 
 
@@ -29,7 +29,7 @@ class Scale:
 
 
 @dataclass(frozen=True, slots=True)
-class Result:
+class ConsistencyResult:
     """One method on one sequence; NaN where there is nothing to judge.
 
     Attributes:
@@ -69,13 +69,13 @@ class Result:
     point_gross: float
 
 
-Results: TypeAlias = Mapping[Scale, Mapping[str, Sequence[Result]]]
+Results: TypeAlias = Mapping[Scale, Mapping[str, Sequence[ConsistencyResult]]]
 """By scale and method, in the order of seeds."""
 
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """A range for one number; `name` is an attribute of `Result`."""
+    """A range for one number; `name` is an attribute of `ConsistencyResult`."""
 
     label: str
     name: str
@@ -120,9 +120,7 @@ def format_page(results: Results, offset: float, frames: int, first_seed: int, c
     """The page; the first method of each scale is the one that goals are for."""
     seeds = max(len(of_method) for of_scale in results.values() for of_method in of_scale.values())
     lines = [
-        "# Is it as sure as it says?",
-        "",
-        f"Made by `{command}` on {machine()}. {seeds} rendered sequences a scale",
+        *opening("Is it as sure as it says?", command, f". {seeds} rendered sequences a scale"),
         f"(seeds {first_seed} to {first_seed + seeds - 1}, used for nothing else), {frames} frames each, exact truth.",
         f"All disparities are {offset} px larger than the calibration says, and nobody tells the tracker. Images are",
         "reduced so that this can be afforded: "
@@ -180,44 +178,44 @@ def _goals(results: Results) -> Iterator[str]:
     yield "Missed: " + "; ".join(missed) + "." if missed else "All goals are met."
 
 
-def _tables(methods: Mapping[str, Sequence[Result]]) -> Iterator[str]:
+def _tables(methods: Mapping[str, Sequence[ConsistencyResult]]) -> Iterator[str]:
     ours = next(iter(methods.values()))
     yield from header(*_POSE_HEADER, numbers_from=1)
-    for method, found in methods.items():
-        ate = [result.ate for result in found]
+    for method, trials in methods.items():
+        ate = [result.ate for result in trials]
         cells = [
-            _cell(found, lambda r: r.nees),
-            _cell(found, lambda r: r.nees_last),
-            _cell(found, lambda r: 100 * r.inside, ".0f"),
-            _cell(found, lambda r: r.nis),
-            _cell(found, lambda r: 1e3 * r.ate, ".3g"),
-            _cell(found, lambda r: 100 * r.ate / r.path_length, ".3f"),
-            "" if found is ours else _spread(*ratio_with_error(ate, [result.ate for result in ours]), ".2f"),
-            _cell(found, lambda r: r.offset_error, "+.3f"),
-            _spread(*root_mean_square_with_error([result.offset_z for result in found]), ".2f"),
-            f"{sum(result.lost for result in found)}",
-            f"{np.mean([r.filter_ms for r in found]):.0f} / {np.mean([r.total_ms for r in found]):.0f}",
+            _cell(trials, lambda r: r.nees),
+            _cell(trials, lambda r: r.nees_last),
+            _cell(trials, lambda r: 100 * r.inside, ".0f"),
+            _cell(trials, lambda r: r.nis),
+            _cell(trials, lambda r: 1e3 * r.ate, ".3g"),
+            _cell(trials, lambda r: 100 * r.ate / r.path_length, ".3f"),
+            "" if trials is ours else _spread(*ratio_with_error(ate, [result.ate for result in ours]), ".2f"),
+            _cell(trials, lambda r: r.offset_error, "+.3f"),
+            _spread(*root_mean_square_with_error([result.offset_z for result in trials]), ".2f"),
+            f"{sum(result.lost for result in trials)}",
+            f"{np.mean([r.filter_ms for r in trials]):.0f} / {np.mean([r.total_ms for r in trials]):.0f}",
         ]
         yield row(method, *cells)
     yield ""
     yield "Map points:"
     yield ""
     yield from header(*_MAP_HEADER, numbers_from=1)
-    for method, found in methods.items():
-        points, edges = (sum(getattr(result, name) for result in found) for name in ("points", "edges"))
+    for method, trials in methods.items():
+        points, edges = (sum(getattr(result, name) for result in trials) for name in ("points", "edges"))
         cells = [
-            f"{points / len(found):.0f}",
+            f"{points / len(trials):.0f}",
             f"{100 * edges / max(points + edges, 1):.1f} %",
-            _cell(found, lambda r: r.point_nees),
-            _cell(found, lambda r: r.point_median),
-            _cell(found, lambda r: 100 * r.point_inside, ".0f"),
-            _cell(found, lambda r: 100 * r.point_gross, ".1f") + " %",
+            _cell(trials, lambda r: r.point_nees),
+            _cell(trials, lambda r: r.point_median),
+            _cell(trials, lambda r: 100 * r.point_inside, ".0f"),
+            _cell(trials, lambda r: 100 * r.point_gross, ".1f") + " %",
         ]
         yield row(method, *cells)
 
 
-def _cell(found: Sequence[Result], value: Callable[[Result], float], form: str = ".2f") -> str:
-    return _spread(*mean_with_error([value(result) for result in found]), form)
+def _cell(trials: Sequence[ConsistencyResult], value: Callable[[ConsistencyResult], float], form: str = ".2f") -> str:
+    return _spread(*mean_with_error([value(result) for result in trials]), form)
 
 
 def _spread(value: float, error: float, form: str) -> str:

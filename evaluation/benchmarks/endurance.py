@@ -6,6 +6,7 @@ import tempfile
 import time
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +15,14 @@ from sigmaslam.bundle_adjustment.track_file import TRACKS_NAME
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.benchmarks.endurance_page import Block, Endurance, Lap, format_endurance
 from sigmaslam.evaluation.benchmarks.page import write_page
+from sigmaslam.evaluation.trial import Trial, TrialResult, read_trial, render
 from sigmaslam.geometry.se3 import se3_inverse
 from sigmaslam.geometry.trajectory import Trajectory, read_trajectory
 from sigmaslam.readers import StereoFrame, StereoSequence, open_sequence
 from sigmaslam.readers.images import RawPair
-from sigmaslam.runs.report import read_frames
 from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.tracker import TrackerConfig
-from sigmaslam.synthetic.render_sequence import default_workers, write_sequence
+from sigmaslam.synthetic.render_sequence import default_workers
 from sigmaslam.synthetic.simulation import Recipe
 
 LAP = Recipe("room", 400, 3000, "loop", width=320, height=240)
@@ -92,7 +93,7 @@ class WatchedSequence(StereoSequence):
 
 
 @dataclass(frozen=True, slots=True)
-class _Truth:
+class _LapTruth:
     """The lap's own poses, and how the repeats go on with them."""
 
     lap: Trajectory
@@ -126,66 +127,62 @@ def write_endurance(
         block: frames that are told of together.
     """
     with tempfile.TemporaryDirectory() as scratch:
-        source = (renders or Path(scratch)) / f"{recipe.preset}{recipe.seed}"
-        write_sequence(source, recipe, "sparse", default_workers())
+        source = render(renders or Path(scratch), recipe, default_workers())
         note(f"the lap is in {source}")
         lap = open_sequence(source)
-        truth = _Truth(read_trajectory(source / "poses.txt"), recipe.frames)
+        truth = _LapTruth(read_trajectory(source / "poses.txt"), recipe.frames)
 
-        # Ten remembered keyframes are all recent ones, of which none makes a loop.
+        # With ten keyframes in memory all are recent and none closes a loop.
         without = Path(scratch) / "without"
         some = min(frames, recipe.frames + _BEYOND)
-        track_sequence(
-            WatchedSequence(RepeatedPairs(lap, some), lap, block),
-            without,
-            config=TrackerConfig(max_keyframes=10),
-            tracks=True,
-        )
+        without_loops = partial(track_sequence, config=TrackerConfig(max_keyframes=10), tracks=True)
+        open_run = Trial(WatchedSequence(RepeatedPairs(lap, some), lap, block), None, without_loops).run(without)
         with np.load(without / TRACKS_NAME) as tracks:
             names = ("frame", "landmark", "measurement", "covariance")
             tracks_bytes = sum(tracks[name].nbytes for name in names) / some
-        open_errors = _errors(without, truth)
+        open_errors = _errors(open_run, truth)
         note("tracked without loops")
 
         run = Path(scratch) / "run"
         sequence = WatchedSequence(RepeatedPairs(lap, frames), lap, block)
         began = time.perf_counter()
         try:
-            track_sequence(sequence, run)
+            Trial(sequence, None).run(run)
         finally:
             if (run / "trajectory.tum").exists():
                 seconds = time.perf_counter() - began
-                endurance = _measure(run, sequence, truth, block, frames, seconds, open_errors, tracks_bytes)
+                endurance = _measure(
+                    read_trial(run, None), sequence, truth, block, frames, seconds, open_errors, tracks_bytes
+                )
                 page = write_page(path, format_endurance(endurance, command))
     return page
 
 
 def _measure(
-    run: Path,
+    run: TrialResult,
     sequence: WatchedSequence,
-    truth: _Truth,
+    truth: _LapTruth,
     block: int,
     asked: int,
     seconds: float,
     open_errors: np.ndarray,
     tracks_bytes: float,
 ) -> Endurance:
-    table = read_frames(run / "frames.csv")
-    totals, tracked = table.total_milliseconds, np.array(table.status) == "tracking"
-    keyframes = table.milliseconds["map"] > 5.0
+    totals, tracked = run.table.total_milliseconds, run.tracked
+    keyframes = run.table.milliseconds["map"] > 5.0
     errors = _errors(run, truth)
     blocks = []
     for number, megabytes in enumerate(sequence.megabytes):
-        own = slice(number * block, (number + 1) * block)
-        low, middle, high = np.percentile(totals[own], [10, 50, 90])
+        rows = slice(number * block, (number + 1) * block)
+        low, middle, high = np.percentile(totals[rows], [10, 50, 90])
         blocks.append(
             Block(
                 (number + 1) * block,
                 megabytes,
                 sequence.cpu_ms[number],
                 (float(low), float(middle), float(high)),
-                float(keyframes[own].mean()),
-                int((~tracked[own]).sum()) - (number == 0),
+                float(keyframes[rows].mean()),
+                int((~tracked[rows]).sum()) - (number == 0),
             )
         )
     laps = [
@@ -196,8 +193,6 @@ def _measure(
         )
         for end in range(truth.frames, len(errors) + 1, truth.frames)
     ]
-    with np.load(run / "map.npz") as content:
-        points = len(content["points"])
     return Endurance(
         asked,
         len(errors),
@@ -208,14 +203,14 @@ def _measure(
         laps,
         errors,
         open_errors,
-        points,
+        len(run.point_map["points"]),
         tracks_bytes,
     )
 
 
-def _errors(run: Path, truth: _Truth) -> np.ndarray:
+def _errors(run: TrialResult, truth: _LapTruth) -> np.ndarray:
     """(N,) distance between every position and the true one, in the world of the first frame, metres."""
-    poses = read_trajectory(run / "trajectory.tum").poses
+    poses = run.trajectory.poses
     return np.asarray(np.linalg.norm(poses[:, :3, 3] - truth.poses(len(poses))[:, :3, 3], axis=1))
 
 

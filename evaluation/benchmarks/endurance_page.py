@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sigmaslam.evaluation.benchmarks.page import machine, table
+from sigmaslam.evaluation.benchmarks.page import opening, table
 
-# What is asked for.
+# Limits of growth of memory and time and of the loop error, percent.
 _MEMORY, _TIME, _LOOP = 5.0, 10.0, 0.2
 _WORDS = """\
 One lap through a rendered room ({lap_frames} frames, {length:.1f} m), whose end is its beginning, tracked over and over
@@ -80,9 +80,7 @@ def format_endurance(endurance: Endurance, command: str) -> str:
     """The run as a Markdown page."""
     words = _WORDS.format(lap_frames=endurance.lap_frames, length=endurance.lap_length)
     lines = [
-        "# Endurance",
-        "",
-        f"Made by `{command}` on {machine()}, in {endurance.seconds / 60:.0f} minutes.",
+        *opening("Endurance", command, f", in {endurance.seconds / 60:.0f} minutes."),
         "",
         words,
     ]
@@ -114,7 +112,7 @@ def _verdicts(endurance: Endurance) -> list[str]:
     lines = ["| goal | found | |", "| --- | --- | --- |"]
     blocks = endurance.blocks
     if len(blocks) > 2:
-        # The memory of places fills in the first blocks.
+        # The keyframe memory fills up during the first blocks.
         first = blocks[1]
         growth = 100.0 * max(block.megabytes / first.megabytes - 1.0 for block in blocks[2:])
         lines.append(

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.benchmarks.page import header, machine, row, write_page
+from sigmaslam.evaluation.benchmarks.page import header, opening, row, write_page
 from sigmaslam.evaluation.filters.speed import Contender, Timing, time_interleaved
 from sigmaslam.evaluation.matching import check_sets, compare, format_scores, load_extractor
 from sigmaslam.evaluation.matching.extractors import CLASSICAL, MAX_KEYPOINTS
@@ -101,12 +101,14 @@ def measure_costs(names: Sequence[str], rounds: int) -> list[Cost]:
         image = photograph_like((_HEIGHT, _WIDTH))
         extractors = {name: load_extractor(name) for name in names}
         _use_one_torch_thread()
-        found = {name: extractor(image)[0] for name, extractor in extractors.items()}
+        keypoints = {name: extractor(image)[0] for name, extractor in extractors.items()}
         contenders = [Contender(name, partial(extractor, image)) for name, extractor in extractors.items()]
         timings = time_interleaved(contenders, rounds)
     finally:
         cv2.setNumThreads(threads)
-    return [Cost(name, timings[name], _loading_time(name), count_parameters(name), len(found[name])) for name in names]
+    return [
+        Cost(name, timings[name], _loading_time(name), count_parameters(name), len(keypoints[name])) for name in names
+    ]
 
 
 def _use_one_torch_thread() -> None:
@@ -186,9 +188,7 @@ def _loading_time(name: str) -> float | None:
 def _introduction(command: str, rounds: int) -> list[str]:
     versions = ", ".join(f"{name} {version(name)}" for name in ("onnxruntime", "opencv-python-headless", "numpy"))
     return [
-        "# Features",
-        "",
-        f"Made by `{command}` on {machine()}. {versions}.",
+        *opening("Features", command, f". {versions}."),
         "",
         f"- *ms*: from an 8-bit {_WIDTH}x{_HEIGHT} image to at most {MAX_KEYPOINTS:,} keypoints with descriptors; CPU",
         f"  time on one thread, extractors in turn, {rounds} rounds; the ratio with its lowest and highest round.",

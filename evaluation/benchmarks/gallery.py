@@ -40,9 +40,9 @@ def sheet(frame: Frame) -> np.ndarray:
     left = cv2.cvtColor(frame.left, cv2.COLOR_GRAY2BGR)
     # Red: hidden or out of sight in the next left image; blue: in the right image; violet: in both.
     hidden = left // 2
-    known = np.isfinite(frame.depth)
-    hidden[known & ~frame.flow_visible, 2] = 230
-    hidden[known & ~frame.stereo_visible, 0] = 230
+    valid = np.isfinite(frame.depth)
+    hidden[valid & ~frame.flow_visible, 2] = 230
+    hidden[valid & ~frame.stereo_visible, 0] = 230
     pictures = [
         (left, "left"),
         (cv2.cvtColor(frame.right, cv2.COLOR_GRAY2BGR), "right"),
@@ -63,21 +63,21 @@ def sheet(frame: Frame) -> np.ndarray:
 
 def _depth(depth: np.ndarray) -> np.ndarray:
     """Inverse depth in colour, near is bright; black where there is nothing."""
-    known = np.isfinite(depth)
-    inverse = np.where(known, 1.0 / np.where(known, depth, 1.0), 0.0)
-    low, high = np.percentile(inverse[known], [1, 99])
+    valid = np.isfinite(depth)
+    inverse = np.where(valid, 1.0 / np.where(valid, depth, 1.0), 0.0)
+    low, high = np.percentile(inverse[valid], [1, 99])
     grey = np.clip((inverse - low) / max(high - low, 1e-9), 0, 1)
-    return np.where(known[..., None], cv2.applyColorMap((255 * grey).astype(np.uint8), cv2.COLORMAP_INFERNO), 0)
+    return np.where(valid[..., None], cv2.applyColorMap((255 * grey).astype(np.uint8), cv2.COLORMAP_INFERNO), 0)
 
 
 def _flow(flow: np.ndarray) -> np.ndarray:
     """Direction as hue, length as saturation up to its 95 % quantile."""
-    known = np.isfinite(flow).all(axis=-1)
-    u, v = np.moveaxis(np.where(known[..., None], flow, 0.0).astype(np.float32), -1, 0)
+    valid = np.isfinite(flow).all(axis=-1)
+    u, v = np.moveaxis(np.where(valid[..., None], flow, 0.0).astype(np.float32), -1, 0)
     length, angle = cv2.cartToPolar(u, v, angleInDegrees=True)
-    reach = max(float(np.percentile(length[known], 95)), 1e-6)
+    reach = max(float(np.percentile(length[valid], 95)), 1e-6)
     share = np.clip(length / reach, 0, 1)
-    hsv = np.stack([angle / 2, 255 * share, np.where(known, 255, 0)], axis=-1).astype(np.uint8)
+    hsv = np.stack([angle / 2, 255 * share, np.where(valid, 255, 0)], axis=-1).astype(np.uint8)
     return np.asarray(cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR))
 
 

@@ -249,13 +249,13 @@ def repeatability(image: np.ndarray, H: np.ndarray) -> float:
     mapped = mapped[_inside(there, mapped)][:wanted]
     if len(mapped) == 0:
         return float("nan")
-    # What is found just outside the area serves too, or corners that move a little there would be lost.
+    # Keep corners just outside the area, or those that move across its border are lost.
     near = cv2.dilate(there, np.ones((5, 5), np.uint8))
-    found = places1[_inside(near, places1)]
-    found = found[np.cumsum(_inside(there, found)) <= wanted]
-    if len(found) == 0:
+    matched = places1[_inside(near, places1)]
+    matched = matched[np.cumsum(_inside(there, matched)) <= wanted]
+    if len(matched) == 0:
         return 0.0
-    distance = np.linalg.norm(mapped[:, None] - found[None], axis=2).min(axis=1)
+    distance = np.linalg.norm(mapped[:, None] - matched[None], axis=2).min(axis=1)
     return float((distance < 1.0).mean())
 
 

@@ -9,18 +9,18 @@ from pathlib import Path
 import cv2
 import torch
 
-from sigmaslam.evaluation.benchmarks.page import header, machine, row, write_page
+from sigmaslam.evaluation.benchmarks.page import header, opening, row, write_page
+from sigmaslam.evaluation.matching.dynamic_scenes import SHARES, MoverJudgement, judge_movers
+from sigmaslam.evaluation.matching.image_pairs import ImagePair, Motion, SameRows
 from sigmaslam.evaluation.matching.judgement import (
     HomographyJudgement,
     RowJudgement,
     judge_homographies,
     judge_rows,
 )
-from sigmaslam.evaluation.matching.movers import SHARES, MoverJudgement, judge_movers
-from sigmaslam.evaluation.matching.pairs import ImagePair, Motion, SameRows
 from sigmaslam.evaluation.matching.rejection import KEYPOINTS, compare_rejection
+from sigmaslam.evaluation.matching.relative_pose import compare_starts
 from sigmaslam.evaluation.matching.sets import check_sets, load_set
-from sigmaslam.evaluation.matching.start import compare_starts
 from sigmaslam.frontend.match_confidence import MatchJudge
 from sigmaslam.training.matching.match_sets import DETECTORS
 
@@ -58,9 +58,7 @@ def write_matches(path: Path, data: Path, command: str, note: Callable[[str], No
 
 def _introduction(command: str) -> list[str]:
     return [
-        "# Matches: do probability and covariance hold?",
-        "",
-        f"Made by `{command}` on {machine()}, one thread, in one run. Nothing was",
+        *opening("Matches: do probability and covariance hold?", command, ", one thread, in one run. Nothing was"),
         "trained or tuned on these images. Shares in percent unless they are called sigma, AUROC or correlation.",
         "",
     ]
@@ -83,8 +81,8 @@ def _homographies(data: Path, judge: MatchJudge) -> list[str]:
     for name in _HOMOGRAPHIES:
         pairs = load_set(name, data)
         for kind, make in DETECTORS.items():
-            found = judge_homographies(pairs, make(_PHOTOGRAPH_KEYPOINTS), judge)
-            lines.append(row(name, kind, *(f"{value:.3f}" for value in astuple(found))))
+            measured = judge_homographies(pairs, make(_PHOTOGRAPH_KEYPOINTS), judge)
+            lines.append(row(name, kind, *(f"{value:.3f}" for value in astuple(measured))))
     return [*lines, ""]
 
 
@@ -102,8 +100,8 @@ def _rows(data: Path, judge: MatchJudge) -> list[str]:
     for name in _STEREO:
         pairs = [pair for pair in load_set(name, data) if isinstance(pair.truth, SameRows)]
         for kind, make in DETECTORS.items():
-            found = judge_rows(pairs, make(_STEREO_KEYPOINTS), judge)
-            matches, *shares, correlation, median, sigma, bias = astuple(found)
+            measured = judge_rows(pairs, make(_STEREO_KEYPOINTS), judge)
+            matches, *shares, correlation, median, sigma, bias = astuple(measured)
             cells = [f"{matches:.0f}", *(f"{100 * share:.1f}" for share in shares), f"{correlation:.2f}"]
             lines.append(row(name, kind, *cells, f"{median:.3f}", f"{sigma:.3f}", f"{bias:+.3f}"))
     return [*lines, ""]
@@ -122,8 +120,8 @@ def _rejection(data: Path, judge: MatchJudge) -> list[str]:
     ]
     for name, pairs in _motions(data):
         for thinned in (False, True):
-            share, found = compare_rejection(pairs, judge, thinned)
-            for contender, reached in found.items():
+            share, measured = compare_rejection(pairs, judge, thinned)
+            for contender, reached in measured.items():
                 shares = (f"{100 * value:.1f}" for value in (reached.f1, reached.precision, reached.recall))
                 lines.append(
                     row(
@@ -164,7 +162,7 @@ def _motions(data: Path) -> list[tuple[str, list[ImagePair]]]:
 
 
 def _movers(data: Path, judge: MatchJudge) -> list[str]:
-    found = judge_movers(DETECTORS["learned"](_PHOTOGRAPH_KEYPOINTS), judge, _MOVER_SEED, _MOVER_PAIRS)
+    measured = judge_movers(DETECTORS["learned"](_PHOTOGRAPH_KEYPOINTS), judge, _MOVER_SEED, _MOVER_PAIRS)
     low, high = (f"{100 * share:.0f}" for share in SHARES)
     return [
         "## Rendered scenes with half of the matches on moving things",
@@ -174,6 +172,6 @@ def _movers(data: Path, judge: MatchJudge) -> list[str]:
         "what is accepted that lies on the static scene:",
         "",
         *header(*(field.name.replace("_", " ") for field in fields(MoverJudgement))),
-        row(str(found.pairs), *(f"{100 * value:.1f}" for value in astuple(found)[1:])),
+        row(str(measured.pairs), *(f"{100 * value:.1f}" for value in astuple(measured)[1:])),
         "",
     ]

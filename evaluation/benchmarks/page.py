@@ -21,6 +21,18 @@ def write_page(path: Path, page: str) -> str:
     return page
 
 
+def opening(title: str, command: str, text: str, place: str = "") -> list[str]:
+    """The first lines of a page: its title, what it was made by and where.
+
+    Args:
+        title: of the page.
+        command: that makes the page.
+        text: what follows the machine, with its punctuation; its further lines come after it.
+        place: the machine, if it is described otherwise than by `machine`.
+    """
+    return [f"# {title}", "", f"Made by `{command}` on {place or machine()}{text}"]
+
+
 def machine() -> str:
     """Kind of processor, and its cores."""
     return f"{platform.machine()}, {os.cpu_count()} cores"

@@ -7,27 +7,34 @@ settings are common ones, the same for every sequence.
 
 from __future__ import annotations
 
+import csv
+import time
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 import cv2
 import numpy as np
 
+from sigmaslam.files import make_folder
 from sigmaslam.geometry.camera import RectifiedStereo, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import rotation_exp, se3_adjoint, se3_inverse, se3_log, skew
+from sigmaslam.geometry.trajectory import Trajectory, write_tum
+from sigmaslam.readers import StereoSequence
+from sigmaslam.runs.report import COLUMNS
 
 _KEYPOINTS = 1500  # as many as the tracker asks for
 _PIXEL_SIGMA = 1.0
 _RATIO = 0.8
 _ROW_TOLERANCE = 2.0
-# Nearer to zero a disparity says nothing about depth, and with the landmark taken as known nothing tells the pose so.
-_LEAST_DISPARITY = 1.0
+# Smaller disparities, in pixels, carry no depth, and the pose takes landmarks as exact.
+_MIN_DISPARITY = 1.0
 _FORWARD_BACKWARD = 1.0
 _REPROJECTION = 2.0
 _RANSAC_ROUNDS, _CONFIDENCE = 500, 0.999
-_LEAST_INLIERS = 15
-# A new keyframe when inliers fall below this share of those that the first view after the keyframe had.
+_MIN_INLIERS = 15
+# Insert a keyframe when the inliers fall below this share of those of the first view after the last keyframe.
 _KEYFRAME_RATIO = 0.6
 
 
@@ -89,7 +96,7 @@ def pose_from_points(points: np.ndarray, pixels: np.ndarray, camera: RectifiedSt
     Returns:
         None when fewer than 15 points agree.
     """
-    if len(points) < _LEAST_INLIERS:
+    if len(points) < _MIN_INLIERS:
         return None
     points, pixels = points.astype(np.float64), pixels.astype(np.float64)
     # With flags for P3P the pose of all inliers would come from EPnP, which on far points is off by tens of pixels.
@@ -108,7 +115,7 @@ def pose_from_points(points: np.ndarray, pixels: np.ndarray, camera: RectifiedSt
     inliers = np.zeros(len(points), bool)
     inliers[index.ravel()] = True
     for last in (False, True):
-        if inliers.sum() < _LEAST_INLIERS:
+        if inliers.sum() < _MIN_INLIERS:
             return None
         turn, shift = cv2.solvePnPRefineLM(points[inliers], pixels[inliers], camera.matrix, None, turn, shift)
         if not last:
@@ -136,7 +143,7 @@ class PnpOdometry:
         self._matcher: Matcher = SiftMatcher(self._camera) if matcher == "sift" else KltMatcher(self._camera)
         self._T_rectified_left = np.eye(4)
         self._T_rectified_left[:3, :3] = self._rectifier.R_rectified_left
-        # Of the rectified left eye, the world being the first of them.
+        # Pose of the rectified left camera; the world is its first frame.
         self._key_pose, self._key_covariance = np.eye(4), np.zeros((6, 6))
         self._pose, self._covariance = np.eye(4), np.zeros((6, 6))
         self._step = np.eye(4)
@@ -202,6 +209,31 @@ class PnpOdometry:
         )
 
 
+def track_with_pnp(sequence: StereoSequence, out: Path, matcher: str) -> None:
+    """Tracks a sequence; leaves trajectory.tum, covariance.npy and frames.csv in the new folder `out`.
+
+    Args:
+        sequence: opened by `open_sequence`.
+        out: run folder.
+        matcher: "sift" or "klt".
+    """
+    make_folder(out)
+    odometry = PnpOdometry(sequence.camera, matcher)
+    timestamps, steps = [], []
+    with (out / "frames.csv").open("w", newline="", encoding="utf-8") as table:
+        rows = csv.DictWriter(table, ["status", *COLUMNS, "ms_step"])
+        rows.writeheader()
+        for frame in sequence.frames():
+            began = time.perf_counter()
+            step = odometry.step(frame.left, frame.right)
+            row = {"status": step.status, "timestamp": frame.timestamp, "matches": step.matches}
+            rows.writerow(row | {"inliers": step.inliers, "ms_step": 1e3 * (time.perf_counter() - began)})
+            timestamps.append(frame.timestamp)
+            steps.append(step)
+    write_tum(out / "trajectory.tum", Trajectory(np.array(timestamps), np.stack([s.T_world_camera for s in steps])))
+    np.save(out / "covariance.npy", np.stack([step.covariance for step in steps]))
+
+
 @dataclass(frozen=True, slots=True)
 class _SiftView:
     right: np.ndarray
@@ -225,7 +257,7 @@ class SiftMatcher:
         """Triangulates the keyframe."""
         pixels, descriptors = self._detect(view.right)
         shift = view.pixels[:, None] - pixels
-        near = (np.abs(shift[..., 1]) <= _ROW_TOLERANCE) & (shift[..., 0] >= _LEAST_DISPARITY)
+        near = (np.abs(shift[..., 1]) <= _ROW_TOLERANCE) & (shift[..., 0] >= _MIN_DISPARITY)
         left, right = self._match(view.descriptors, descriptors, near)
         self._points = _triangulate(view.pixels[left], pixels[right], self._camera)
         self._descriptors = view.descriptors[left]
@@ -277,7 +309,7 @@ class KltMatcher:
         pixels = np.zeros((0, 2), np.float32) if corners is None else corners.reshape(-1, 2)
         places, found = _follow(left, right, pixels)
         shift = pixels - places
-        found &= (np.abs(shift[:, 1]) <= _ROW_TOLERANCE) & (shift[:, 0] >= _LEAST_DISPARITY)
+        found &= (np.abs(shift[:, 1]) <= _ROW_TOLERANCE) & (shift[:, 0] >= _MIN_DISPARITY)
         self._points = _triangulate(pixels[found], places[found], self._camera)
         self._pixels, self._image = pixels[found], left
 

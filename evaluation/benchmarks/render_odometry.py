@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -13,12 +13,11 @@ import numpy as np
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.benchmarks.page import row
 from sigmaslam.evaluation.matching.scores import mutual_nearest
-from sigmaslam.evaluation.run_evaluation import evaluate_run
+from sigmaslam.evaluation.trial import Trial, render
 from sigmaslam.frontend.classical import SiftDetector
 from sigmaslam.geometry.se3 import rotation_log
 from sigmaslam.geometry.trajectory import read_trajectory
 from sigmaslam.readers import open_sequence
-from sigmaslam.runs.report import read_frames
 from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.tracker import TrackerConfig
 
@@ -84,7 +83,7 @@ class Drive:
     tracked: float
 
 
-# What is compared, and whether it must agree within LIMIT; the rest only explains.
+# Attribute, title, format, and whether the ratio must be within LIMIT.
 _ROWS: tuple[tuple[str, str, str, bool], ...] = (
     ("inliers", "inliers a frame", ".0f", True),
     ("stereo_matches", "stereo matches of raw SIFT", ".0f", True),
@@ -113,38 +112,28 @@ def render_drives(folder: Path, data: Path, note: Callable[[str], None] = lambda
         data: folder of the real data sets.
         note: told what is being done.
     """
-    from sigmaslam.synthetic.render_sequence import default_workers, write_sequence
+    from sigmaslam.synthetic.render_sequence import default_workers
     from sigmaslam.synthetic.simulation import Recipe
 
     drives = []
     for seed in SEEDS:
-        drive = folder / f"street{seed}"
         recipe = Recipe("street", FRAMES, seed, width=WIDTH, height=HEIGHT, profile=str(data / PROFILE))
-        name = drive.name
 
-        def done(count: int, name: str = name) -> None:
-            note(f"rendering {name}: {count} of {FRAMES} frames")
+        def done(count: int, seed: int = seed) -> None:
+            note(f"rendering street{seed}: {count} of {FRAMES} frames")
 
-        write_sequence(drive, recipe, "sparse", default_workers(), done=done)
-        drives.append(drive)
+        drives.append(render(folder, recipe, default_workers(), done))
     return drives
 
 
 def follow(name: str, sequence: Path, truth: Path) -> Drive:
     """Tracks a sequence with SIFT and compares it with the truth."""
-    with tempfile.TemporaryDirectory() as scratch:
-        run = Path(scratch) / "run"
-        track_sequence(open_sequence(sequence), run, "sift")
-        evaluation = evaluate_run(run, truth, lengths=_LENGTHS, step=1, plot=False)
-        frames = read_frames(run / "frames.csv")
-        positions = read_trajectory(run / "trajectory.tum").positions
-    tracked = np.array(frames.status) == "tracking"
+    result = Trial(sequence, truth, partial(track_sequence, frontend="sift")).run(lengths=_LENGTHS, step=1)
+    evaluation, tracked, columns = result.evaluation, result.tracked, result.table.columns
     if not tracked.any():
         raise InputError(f"{sequence}: SIFT tracked none of its frames, there is nothing to compare")
-    columns = frames.columns
-    steps = evaluation.matched - 1
-    step = evaluation.path_length / steps
-    lengths = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    step = evaluation.path_length / (evaluation.matched - 1)
+    lengths = np.linalg.norm(np.diff(result.trajectory.positions, axis=0), axis=1)
     bend = lengths[1:-1] - 0.5 * (lengths[:-2] + lengths[2:])
     counts, rows = _match_eyes(sequence)
     return Drive(
@@ -159,13 +148,13 @@ def follow(name: str, sequence: Path, truth: Path) -> Drive:
         disparity=float(np.median(rows[:, 2])),
         inliers=float(np.median(columns["inliers"][tracked])),
         inlier_share=float(np.median(columns["inliers"][tracked] / np.maximum(columns["matches"][tracked], 1))),
-        nis=float(np.median(columns["nis"][tracked] / columns["dof"][tracked])),
+        nis=float(np.median(result.nis)),
         t_rel=evaluation.kitti.mean_translation_percent,
         r_rel=evaluation.kitti.mean_rotation_deg_per_100m,
         step_error=100 * evaluation.rpe.translation_median / step,
         roughness=100 * float(np.median(np.abs(bend))) / step,
         offset=float(columns["disparity_offset"][-1]),
-        tracked=float(tracked.sum() / max(len(frames) - 1, 1)),
+        tracked=float(tracked.sum() / max(len(tracked) - 1, 1)),
     )
 
 
@@ -185,7 +174,7 @@ def format_odometry(real: Drive, renders: Sequence[Drive]) -> list[str]:
             off.append(f"{title} (x{ratio:.2f})")
         cells = [title, *(format(value, form) for value in (truth, *values)), f"{ratio:.2f}"]
         lines.append(row(*cells, ("yes" if alike else "**no**") if required else ""))
-    # Around zero a ratio says nothing.
+    # The offset is near zero, where a ratio is undefined.
     cells = ["disparity offset px", *(f"{drive.offset:+.2f}" for drive in (real, *renders))]
     lines.append(row(*cells, "", ""))
     verdict = f"Off by more than a factor of {LIMIT:g}: {', '.join(off)}." if off else "Every one is within the limit."
@@ -202,12 +191,12 @@ def row_noise(u: np.ndarray, v: np.ndarray, difference: np.ndarray) -> float:
     x, y = ((values - values.mean()) / max(float(values.std()), 1e-9) for values in (u, v))
     terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
     kept = np.ones(len(x), dtype=bool)
-    rest = difference
+    residual = difference
     for _ in range(_FITS):
         solution, *_ = np.linalg.lstsq(terms[kept], difference[kept], rcond=None)
-        rest = np.abs(difference - terms @ solution)
-        kept = rest <= 4.0 * np.median(rest)
-    return float(np.median(rest))
+        residual = np.abs(difference - terms @ solution)
+        kept = residual <= 4.0 * np.median(residual)
+    return float(np.median(residual))
 
 
 def _match_eyes(sequence: Path) -> tuple[np.ndarray, np.ndarray]:

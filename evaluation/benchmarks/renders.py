@@ -21,7 +21,7 @@ from sigmaslam.evaluation.benchmarks import image_statistics as statistics
 from sigmaslam.evaluation.benchmarks import render_odometry as odometry
 from sigmaslam.evaluation.benchmarks import render_speed as speed
 from sigmaslam.evaluation.benchmarks.image_statistics import ImageSet
-from sigmaslam.evaluation.benchmarks.page import row, write_page
+from sigmaslam.evaluation.benchmarks.page import opening, row, write_page
 from sigmaslam.evaluation.matching.photographs import read_grey
 from sigmaslam.plot_style import BLACK, GREY, SERIES, style_axes
 from sigmaslam.readers import open_sequence
@@ -98,9 +98,7 @@ def write_renders(
         sets = summarize_all(data, drives)
     save_png(draw(sets), figure)
     lines = [
-        "# Renders beside real images",
-        "",
-        f"Made by `{command}` on {machine}.",
+        *opening("Renders beside real images", command, ".", machine),
         "",
         *_statistics_section(sets, figure),
         *_odometry_section(real, renders),

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from importlib.resources import as_file, files
 from pathlib import Path
 
@@ -16,20 +17,17 @@ from sigmaslam.bundle_adjustment.refine_run import refine_run
 from sigmaslam.bundle_adjustment.track_file import TRACKS_NAME
 from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.evaluation.benchmarks.page import write_page
-from sigmaslam.evaluation.benchmarks.pnp_baselines import PnpOdometry
+from sigmaslam.evaluation.benchmarks.pnp_baselines import track_with_pnp
 from sigmaslam.evaluation.benchmarks.sequences_page import (
-    LeftOut,
-    Result,
+    Omission,
+    SequenceResult,
     ate_cell,
     format_results,
     method_label,
     total_cell,
 )
-from sigmaslam.evaluation.run_evaluation import Evaluation, evaluate_run
-from sigmaslam.files import make_folder
-from sigmaslam.geometry.trajectory import Trajectory, read_tum, write_tum
+from sigmaslam.evaluation.trial import Method, Trial, TrialResult, read_trial, render
 from sigmaslam.readers import open_sequence
-from sigmaslam.runs.report import COLUMNS, FrameTable, read_frames
 from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.tracker import TrackerConfig
 
@@ -47,20 +45,23 @@ SEQUENCES = ("demo", *RENDERED, *(name for name, _ in REAL))
 FRAMES = 40
 _SEED = 2000  # seeds below 1000 were looked at while the tracker was made; consistency counts from there
 
-_TRACKED = {
-    "ours": ("learned", TrackerConfig()),
-    "ekf": ("learned", TrackerConfig(linearisation="extended", iterations=1)),
-    "sift": ("sift", TrackerConfig()),
-    "orb": ("orb", TrackerConfig()),
-    "klt": ("klt", TrackerConfig()),
+track_ours = partial(track_sequence, tracks=True)
+"""What `sigmaslam track --tracks` does."""
+_TRIED: dict[str, Method] = {
+    "ours": track_ours,
+    "ekf": partial(track_sequence, config=TrackerConfig(linearisation="extended", iterations=1)),
+    "sift": partial(track_sequence, frontend="sift"),
+    "orb": partial(track_sequence, frontend="orb"),
+    "klt": partial(track_sequence, frontend="klt"),
+    "sift-pnp": partial(track_with_pnp, matcher="sift"),
+    "klt-pnp": partial(track_with_pnp, matcher="klt"),
 }
-_PNP = {"sift-pnp": "sift", "klt-pnp": "klt"}
-METHODS = (*_TRACKED, *_PNP, "bundle")
+METHODS = (*_TRIED, "bundle")
 """In the order of the page; the bundle adjustment takes the tracks of the first."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Job:
+class _BenchmarkSequence:
     """A sequence; `exact` says that its truth is."""
 
     name: str
@@ -92,7 +93,7 @@ def write_results(
     Raises:
         InputError: a name is unknown, or `data` does not hold the sequences.
     """
-    results: list[Result | LeftOut] = []
+    results: list[SequenceResult | Omission] = []
     try:
         for result in run_sequences(data, methods, sequences, renders, note):
             results.append(result)
@@ -109,7 +110,7 @@ def run_sequences(
     sequences: Sequence[str] | None = None,
     renders: Path | None = None,
     note: Callable[[str], None] = lambda text: None,
-) -> Iterator[Result | LeftOut]:
+) -> Iterator[SequenceResult | Omission]:
     """Runs and evaluates everything, one at a time; see `write_results`."""
     _check_names("method", methods, METHODS)
     _check_names("sequence", sequences or (), SEQUENCES)
@@ -123,16 +124,20 @@ def run_sequences(
     with ExitStack() as stack:
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         demo = stack.enter_context(as_file(files("sigmaslam.synthetic") / "demo"))
-        jobs = [_Job("demo (rendered)", demo, demo / "poses.txt", True)] if "demo" in wanted else []
+        jobs = [_BenchmarkSequence("demo (rendered)", demo, demo / "poses.txt", True)] if "demo" in wanted else []
         for preset in RENDERED:
             if preset in wanted:
                 try:
                     jobs.append(_render(preset, renders or scratch / "renders", note))
                 except ImportError as error:
                     reason = f"{error.name} is not installed: pip install 'sigmaslam[train]'"
-                    yield LeftOut(f"{preset} (rendered)", "", reason)
+                    yield Omission(f"{preset} (rendered)", "", reason)
         if data is not None:
-            jobs += [_Job(name, data / name, data / name / truth, False) for name, truth in REAL if name in wanted]
+            jobs += [
+                _BenchmarkSequence(name, data / name, data / name / truth, False)
+                for name, truth in REAL
+                if name in wanted
+            ]
         for number, job in enumerate(jobs):
             runs = scratch / str(number)
             for method in METHODS:
@@ -141,94 +146,60 @@ def run_sequences(
                 result = _run(job, method, runs)
                 yield result
                 label = f"{job.name}: {method_label(method)}"
-                if isinstance(result, LeftOut):
+                if isinstance(result, Omission):
                     note(f"{label} is left out: {result.reason}")
                 else:
                     note(f"{label}, ATE {ate_cell(result)} m, {total_cell(result)} ms")
 
 
-def follow_with_pnp(source: Path, matcher: str, out: Path) -> FrameTable:
-    """Runs a baseline on a sequence; leaves trajectory.tum and covariance.npy in the new folder `out`."""
-    sequence = open_sequence(source)
-    odometry = PnpOdometry(sequence.camera, matcher)
-    steps, timestamps, milliseconds = [], [], []
-    for frame in sequence.frames():
-        began = time.perf_counter()
-        steps.append(odometry.step(frame.left, frame.right))
-        milliseconds.append(1e3 * (time.perf_counter() - began))
-        timestamps.append(frame.timestamp)
-    make_folder(out)
-    trajectory = Trajectory(np.array(timestamps), np.stack([step.T_world_camera for step in steps]))
-    write_tum(out / "trajectory.tum", trajectory)
-    np.save(out / "covariance.npy", np.stack([step.covariance for step in steps]))
-    columns = {name: np.full(len(steps), np.nan) for name in COLUMNS}
-    columns["timestamp"] = trajectory.timestamps
-    columns["matches"] = np.array([step.matches for step in steps], dtype=float)
-    columns["inliers"] = np.array([step.inliers for step in steps], dtype=float)
-    return FrameTable([step.status for step in steps], columns, {"step": np.array(milliseconds)})
-
-
-def _check_names(kind: str, names: Sequence[str], known: Sequence[str]) -> None:
+def _check_names(kind: str, names: Sequence[str], choices: Sequence[str]) -> None:
     for name in names:
-        if name not in known:
-            raise InputError(f"{kind} {name!r} is unknown; choose of {', '.join(known)}")
+        if name not in choices:
+            raise InputError(f"{kind} {name!r} is unknown; choose of {', '.join(choices)}")
 
 
-def _render(preset: str, folder: Path, note: Callable[[str], None]) -> _Job:
-    """Renders a sequence, or finds it there."""
+def _render(preset: str, folder: Path, note: Callable[[str], None]) -> _BenchmarkSequence:
+    """Renders a sequence; frames that are there are kept."""
     from sigmaslam.evaluation.benchmarks.consistency import OFFSET, SCALES
-    from sigmaslam.synthetic.render_sequence import default_workers, write_sequence
+    from sigmaslam.synthetic.render_sequence import default_workers
     from sigmaslam.synthetic.simulation import Recipe
 
     (scale,) = (scale for scale in SCALES if scale.preset == preset)
     recipe = Recipe(preset, FRAMES, _SEED, disparity_offset=OFFSET, width=scale.width, height=scale.height)
-    out = folder / f"{preset}{_SEED}"
     began = time.perf_counter()
-    write_sequence(out, recipe, "sparse", default_workers())
+    out = render(folder, recipe, default_workers())
     note(f"{preset} rendered in {time.perf_counter() - began:.0f} s")
-    return _Job(f"{preset} (rendered, disparities {OFFSET} px too large)", out, out / "poses.txt", True)
+    return _BenchmarkSequence(f"{preset} (rendered, disparities {OFFSET} px too large)", out, out / "poses.txt", True)
 
 
-def _run(job: _Job, method: str, runs: Path) -> Result | LeftOut:
-    run = runs / method
-    if method in _PNP:
-        frames = follow_with_pnp(job.source, _PNP[method], run)
-    elif method in _TRACKED:
-        _track(job, method, run)
-        frames = read_frames(run / "frames.csv")
-    else:
+def _run(job: _BenchmarkSequence, method: str, runs: Path) -> SequenceResult | Omission:
+    if method == "bundle":
         return _adjust(job, runs)
-    evaluation = evaluate_run(run, job.truth, plot=False)
-    nees = evaluation.nees.mean if job.exact and evaluation.nees else np.nan
-    return Result(job.name, method, evaluation, nees, frames)
+    trial = Trial(job.source, job.truth, _TRIED[method]).run(runs / method)
+    nees = trial.evaluation.nees.mean if job.exact and trial.evaluation.nees else np.nan
+    return SequenceResult(job.name, method, trial, nees)
 
 
-def _track(job: _Job, method: str, run: Path) -> None:
-    frontend, config = _TRACKED[method]
-    track_sequence(open_sequence(job.source), run, frontend, config=config, tracks=method == "ours")
-
-
-def _adjust(job: _Job, runs: Path) -> Result | LeftOut:
+def _adjust(job: _BenchmarkSequence, runs: Path) -> SequenceResult | Omission:
     """Bundle adjustment of the tracks of ours."""
     run, out = runs / "ours", runs / "bundle"
     if not run.is_dir():
-        _track(job, "ours", run)
+        track_ours(open_sequence(job.source), run)
     try:
         refined = refine_run(run, out)
     except SigmaSlamError as error:
         # No GTSAM, or nothing to adjust: a camera at rest has one keyframe.
-        return LeftOut(job.name, "bundle", str(error))
-    evaluation = evaluate_run(out, job.truth, plot=False)
-    nees = _keyframe_nees(evaluation, run, out) if job.exact else np.nan
-    return Result(job.name, "bundle", evaluation, nees, None, refined)
+        return Omission(job.name, "bundle", str(error))
+    trial = read_trial(out, job.truth)
+    return SequenceResult(job.name, "bundle", trial, _keyframe_nees(trial, run) if job.exact else np.nan, refined)
 
 
-def _keyframe_nees(evaluation: Evaluation, run: Path, out: Path) -> float:
+def _keyframe_nees(adjusted_trial: TrialResult, run: Path) -> float:
     """Of the keyframes alone: the others have the covariance of the keyframe before."""
     with np.load(run / TRACKS_NAME) as tracks:
         keyframes = np.unique(tracks["frame"])
-    times = read_tum(out / "trajectory.tum").timestamps[keyframes]
-    nees = evaluation.nees
+    times = adjusted_trial.trajectory.timestamps[keyframes]
+    nees = adjusted_trial.evaluation.nees
     if nees is None:
         return float("nan")
     adjusted = np.isin(nees.timestamps, times)

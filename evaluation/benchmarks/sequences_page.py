@@ -9,8 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sigmaslam.evaluation.benchmarks.page import machine, table
-from sigmaslam.evaluation.run_evaluation import Evaluation
+from sigmaslam.evaluation.benchmarks.page import opening, table
+from sigmaslam.evaluation.trial import TrialResult
 from sigmaslam.runs.report import FrameTable
 
 _LABELS = {
@@ -60,28 +60,26 @@ on one machine; times are wall milliseconds. No setting of any method differs be
 
 
 @dataclass(frozen=True, slots=True)
-class Result:
+class SequenceResult:
     """One method on one sequence.
 
     Attributes:
         sequence: name.
         method: key.
-        evaluation: against the truth.
+        trial: run and evaluation; the bundle adjustment has no table of frames.
         nees: mean per degree of freedom; NaN where the truth is not exact.
-        frames: every frame; None for the bundle adjustment.
         refined: what refine.json says; None but for the bundle adjustment.
     """
 
     sequence: str
     method: str
-    evaluation: Evaluation
+    trial: TrialResult
     nees: float
-    frames: FrameTable | None
     refined: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class LeftOut:
+class Omission:
     """What could not be run, and why; without a method the whole sequence."""
 
     sequence: str
@@ -94,43 +92,45 @@ def method_label(method: str) -> str:
     return _LABELS[method]
 
 
-def format_results(results: Sequence[Result | LeftOut], command: str, complete: bool = True) -> str:
+def format_results(results: Sequence[SequenceResult | Omission], command: str, complete: bool = True) -> str:
     """The results as a Markdown page."""
-    lines = ["# Results", "", f"Made by `{command}` on {machine()}.", _WORDS.format(threads=cv2.getNumThreads())]
+    lines = [*opening("Results", command, "."), _WORDS.format(threads=cv2.getNumThreads())]
     if not complete:
         lines += ["**Stopped before the end: what is missing was not run.**", ""]
     for missing in results:
-        if isinstance(missing, LeftOut) and not missing.method:
+        if isinstance(missing, Omission) and not missing.method:
             lines += [f"{missing.sequence} is left out: {missing.reason}", ""]
-    for sequence in dict.fromkeys(result.sequence for result in results if isinstance(result, Result)):
-        found = [result for result in results if isinstance(result, Result) and result.sequence == sequence]
-        lines += [f"## {sequence}", "", *table(_COLUMNS, (_row(result) for result in found)), ""]
+    for sequence in dict.fromkeys(result.sequence for result in results if isinstance(result, SequenceResult)):
+        of_sequence = [
+            result for result in results if isinstance(result, SequenceResult) and result.sequence == sequence
+        ]
+        lines += [f"## {sequence}", "", *table(_COLUMNS, (_row(result) for result in of_sequence)), ""]
         for missing in results:
-            if isinstance(missing, LeftOut) and missing.method and missing.sequence == sequence:
+            if isinstance(missing, Omission) and missing.method and missing.sequence == sequence:
                 lines += [f"The row *{_LABELS[missing.method]}* is left out: {missing.reason}", ""]
-        staged = [(each.method, each.frames) for each in found if each.frames and "filter" in each.frames.milliseconds]
+        staged = [each for each in of_sequence if each.trial.frames and "filter" in each.trial.frames.milliseconds]
         if staged:
-            lines += [*table(_STAGE_COLUMNS, (_stage_row(method, frames) for method, frames in staged)), ""]
+            lines += [*table(_STAGE_COLUMNS, map(_stage_row, staged)), ""]
     return "\n".join(lines)
 
 
-def ate_cell(result: Result) -> str:
+def ate_cell(result: SequenceResult) -> str:
     """Metres; more digits inside a body."""
-    rmse = result.evaluation.ate.rmse
+    rmse = result.trial.evaluation.ate.rmse
     return f"{rmse:.4f}" if rmse >= 1e-3 else f"{rmse:.6f}"
 
 
-def total_cell(result: Result) -> str:
+def total_cell(result: SequenceResult) -> str:
     """Milliseconds a frame, and their spread where there is one."""
-    if result.frames is None:
+    if result.trial.frames is None:
         seconds, share = _seconds_adjusting(result)
         return f"{share:.0f} (whole: {seconds:.1f} s)"
-    low, middle, high = np.percentile(_totals(result.frames), [10, 50, 90])
+    low, middle, high = np.percentile(_totals(result.trial.frames), [10, 50, 90])
     return f"{middle:.0f} ({low:.0f} - {high:.0f})"
 
 
-def _row(result: Result) -> list[str]:
-    evaluation, frames, refined = result.evaluation, result.frames, result.refined
+def _row(result: SequenceResult) -> list[str]:
+    evaluation, frames, refined = result.trial.evaluation, result.trial.frames, result.refined
     translations, rotations = evaluation.rpe.translations, evaluation.rpe.rotations_deg
     ends_tracked, nis = np.ones(len(translations), bool), np.nan
     if frames is not None:
@@ -165,11 +165,11 @@ def _row(result: Result) -> list[str]:
     ]
 
 
-def _stage_row(method: str, frames: FrameTable) -> list[str]:
-    tracked = np.array(frames.status) == "tracking"
+def _stage_row(result: SequenceResult) -> list[str]:
+    frames, tracked = result.trial.table, result.trial.tracked
     inliers = float(np.median(frames.columns["inliers"][tracked])) if tracked.any() else np.nan
     stages = (f"{np.nanmedian(frames.milliseconds[stage]):.1f}" for stage in _STAGES)
-    return [_LABELS[method], _number(inliers, ".0f"), *stages]
+    return [_LABELS[result.method], _number(inliers, ".0f"), *stages]
 
 
 def _totals(frames: FrameTable) -> np.ndarray:
@@ -178,7 +178,7 @@ def _totals(frames: FrameTable) -> np.ndarray:
     return np.asarray(np.nansum(stages, axis=0)[np.isfinite(stages).any(axis=0)])
 
 
-def _seconds_adjusting(result: Result) -> tuple[float, float]:
+def _seconds_adjusting(result: SequenceResult) -> tuple[float, float]:
     """Of the whole optimisation, and milliseconds a frame."""
     assert result.refined is not None
     seconds = float(result.refined["seconds_adjust"])

@@ -36,14 +36,14 @@ from sigmaslam.filters.systems import differential_drive
 from sigmaslam.plot_style import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION, style_axes
 from sigmaslam.runs.figures import save_png
 
-# Independent groups of runs or samples, from whose scatter the intervals come.
+# Number of independent groups of runs or samples; their scatter gives the intervals.
 _GROUPS = 20
 _STEPS, _TIME_STEP, _SPEED = 50, 0.2, 1.0
 _SPEED_SIGMA = 0.2
 _SPREADS = (0.1, 0.3, 0.6)
 _SHOWN = 0.6
 _SAMPLES = 50_000
-# A relative change that nobody would notice, however sure it is.
+# Relative changes below this are negligible, whatever their significance.
 _TOO_SMALL = 1e-3
 _COMPARISON_COLUMNS = (
     "scenario",

@@ -93,12 +93,8 @@ def _models(work: Work, tensor: Callable[[Any], Tensor]) -> tuple[Any, Any, list
         see = filters.MeasurementModel(lambda states: project_stereo(torch, states, points), R)
         return filters.LinearMotion(tensor(work.transition), Q), see, [], []
     if isinstance(work, LinearWork):
-        return (
-            filters.LinearMotion(tensor(work.transition), Q),
-            filters.LinearMeasurement(tensor(work.observation), R),
-            [],
-            [],
-        )
+        measurement = filters.LinearMeasurement(tensor(work.observation), R)
+        return filters.LinearMotion(tensor(work.transition), Q), measurement, [], []
     noise = filters.Diagonal(tensor(work.process_noise.diagonal()))
     if isinstance(work, LandmarkWork):
         stay = filters.LinearMotion(torch.eye(3, dtype=Q.dtype, device=Q.device), noise)

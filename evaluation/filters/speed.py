@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmaslam.evaluation.benchmarks.page import machine, table, write_page
+from sigmaslam.evaluation.benchmarks.page import opening, table, write_page
 from sigmaslam.evaluation.filters import work as filter_work
-from sigmaslam.evaluation.filters.peers import Peer, available, single_thread_environment
+from sigmaslam.evaluation.filters.peer_filters import Peer, available, single_thread_environment
 from sigmaslam.evaluation.filters.work import BatchedWork, StereoWork
 from sigmaslam.progress import open_progress
 
@@ -119,9 +119,7 @@ def format_page(rounds: int, compiled: bool, command: str) -> str:
     peers = available()
     versions = ", ".join(f"{name} {_version(name)}" for name in _PACKAGES)
     lines = [
-        "# Speed of the filters",
-        "",
-        f"Made by `{command}` on {machine()}, one",
+        *opening("Speed of the filters", command, ", one"),
         f"thread; process CPU time, contenders in turn, {rounds} rounds. {versions}.",
         "",
         "Work: one prediction and one update of an unscented filter with the cubature set, one linearisation, sigma",

@@ -2,9 +2,9 @@
 
 from sigmaslam.evaluation.matching.comparison import compare, read_scores
 from sigmaslam.evaluation.matching.extractors import Extractor, LearnedExtractor, load_extractor
-from sigmaslam.evaluation.matching.pairs import ImagePair
-from sigmaslam.evaluation.matching.peers import PeerExtractor
-from sigmaslam.evaluation.matching.score_sets import format_scores, score, score_pairs
+from sigmaslam.evaluation.matching.image_pairs import ImagePair
+from sigmaslam.evaluation.matching.peer_extractors import PeerExtractor
+from sigmaslam.evaluation.matching.score_sets import format_scores, score_pairs
 from sigmaslam.evaluation.matching.sets import FINAL, SELECTION, check_sets, load_set
 
 __all__ = [
@@ -20,6 +20,5 @@ __all__ = [
     "load_extractor",
     "load_set",
     "read_scores",
-    "score",
     "score_pairs",
 ]

@@ -9,11 +9,11 @@ from pathlib import Path
 
 from sigmaslam.errors import FrameError, InputError
 from sigmaslam.evaluation.matching.extractors import CLASSICAL, Extractor, load_extractor, remembering
-from sigmaslam.evaluation.matching.pairs import ImagePair
+from sigmaslam.evaluation.matching.image_pairs import ImagePair
+from sigmaslam.evaluation.matching.klt_tracks import KLT, TRACKED_KEYPOINTS, score_klt
 from sigmaslam.evaluation.matching.score_sets import Scores, score_pairs, score_refined
 from sigmaslam.evaluation.matching.sets import REFINED, STEPS, TRACKS, check_sets, load_set, load_steps, load_tracks
 from sigmaslam.evaluation.matching.stereo import score_steps
-from sigmaslam.evaluation.matching.tracks import KLT, TRACKED_KEYPOINTS, score_klt
 
 # Follows the name of an extractor in the row of what `sigmaslam match` makes of its features.
 _REFINED = " + sigmaslam match"
@@ -77,11 +77,11 @@ def _compare_tracks(
     for label in (*names, KLT):
         start = time.perf_counter()
         try:
-            found = _score_tracks(label, tracks)
+            scores = _score_tracks(label, tracks)
         except FrameError as error:
             note(f"{TRACKS}: left out {label}: {error}")
             continue
-        results.setdefault(label, {})[TRACKS] = found
+        results.setdefault(label, {})[TRACKS] = scores
         note(f"{TRACKS}: {label}, {len(tracks)} pairs in {time.perf_counter() - start:.1f} s")
 
 

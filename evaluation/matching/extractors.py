@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.matching.peers import PeerExtractor, read_signature
+from sigmaslam.evaluation.matching.peer_extractors import PeerExtractor, read_signature
 from sigmaslam.frontend.classical import OrbDetector, SiftDetector
 from sigmaslam.frontend.learned import Graph, extract
 from sigmaslam.frontend.types import Features
@@ -47,8 +47,8 @@ class LearnedExtractor:
 
     def __call__(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Keypoints and descriptors of an (H, W) uint8 image."""
-        found = extract(self._graph, image, self._max_keypoints)
-        return found.keypoints, found.descriptors
+        features = extract(self._graph, image, self._max_keypoints)
+        return features.keypoints, features.descriptors
 
 
 def load_extractor(name: str, max_keypoints: int = MAX_KEYPOINTS) -> Extractor:
@@ -77,13 +77,13 @@ def load_extractor(name: str, max_keypoints: int = MAX_KEYPOINTS) -> Extractor:
 
 def remembering(extractor: Extractor) -> Extractor:
     """The same extractor, which is asked only once for the features of an array."""
-    # With the arrays themselves, so that their ids stay apart.
-    found: dict[int, tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]] = {}
+    # The cache holds the arrays, so that no two of them share an id.
+    features: dict[int, tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]] = {}
 
     def extract(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        if id(image) not in found:
-            found[id(image)] = image, extractor(image)
-        return found[id(image)][1]
+        if id(image) not in features:
+            features[id(image)] = image, extractor(image)
+        return features[id(image)][1]
 
     return extract
 

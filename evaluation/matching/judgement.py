@@ -9,15 +9,9 @@ import numpy as np
 
 from sigmaslam.estimation.chi_square import CHI_SQUARE_95_OF_2
 from sigmaslam.estimation.mahalanobis import squared_mahalanobis
-from sigmaslam.evaluation.matching.pairs import Homography, ImagePair, SameRows
-from sigmaslam.evaluation.metrics.calibration import (
-    RIGHT,
-    auroc,
-    average_precision,
-    best_half,
-    calibration_error,
-    spearman,
-)
+from sigmaslam.evaluation.matching.image_pairs import Homography, ImagePair, SameRows
+from sigmaslam.evaluation.metrics import probability_calibration as calibration
+from sigmaslam.evaluation.metrics.probability_calibration import RIGHT
 from sigmaslam.frontend.affine_alignment import refine_by_neighbours
 from sigmaslam.frontend.descriptor import match_stereo
 from sigmaslam.frontend.match_confidence import LEAST_LOGIT, MatchJudge
@@ -25,7 +19,7 @@ from sigmaslam.frontend.nearest_neighbours import nearest_anywhere
 from sigmaslam.frontend.types import Features
 
 _CONSTANT_SIGMA = 0.3
-# Scale of the robust fit of what is left of a rectification, pixels, and its iterations.
+# Scale, in pixels, and iterations of the robust fit of the rectification error.
 _RECTIFICATION_SCALE, _RECTIFICATION_FITS = 0.3, 20
 
 Detect = Callable[[np.ndarray], Features]
@@ -82,8 +76,8 @@ def judge_homographies(pairs: Sequence[ImagePair], detect: Detect, judge: MatchJ
         logit = judge.score(putative, features0, features1)
         ratio = (1.0 - putative.similarity) / np.maximum(1.0 - putative.second0, 1e-6)
         mutual = putative.mutual
-        precisions = [average_precision(score, near) for score in (10.0 * mutual - ratio, logit)]
-        # Everything is asked of the same matches, also of those the verifier does not get to see.
+        precisions = [calibration.average_precision(score, near) for score in (10.0 * mutual - ratio, logit)]
+        # Score the same matches before and after verification, also those that the verifier does not see.
         seen = np.flatnonzero(mutual & (logit > LEAST_LOGIT))
         weight = 1.0 / (1.0 + np.exp(-logit[seen].astype(np.float64)))
         refinement = refine_by_neighbours(pair.image0, pair.image1, points0[seen], points1[seen], weight)
@@ -95,9 +89,9 @@ def judge_homographies(pairs: Sequence[ImagePair], detect: Detect, judge: MatchJ
         ranked.append(
             (
                 *precisions,
-                auroc(-ratio[mutual], near[mutual]),
-                auroc(logit[mutual], near[mutual]),
-                auroc(probability[mutual], right[mutual]),
+                calibration.auroc(-ratio[mutual], near[mutual]),
+                calibration.auroc(logit[mutual], near[mutual]),
+                calibration.auroc(probability[mutual], right[mutual]),
             )
         )
         good = right[seen]
@@ -113,10 +107,10 @@ def judge_homographies(pairs: Sequence[ImagePair], detect: Detect, judge: MatchJ
         ratio_auroc,
         scorer_auroc,
         final_auroc,
-        calibration_error(probability, right),
-        spearman(before, length),
-        spearman(size, length),
-        best_half(size, length),
+        calibration.calibration_error(probability, right),
+        calibration.spearman(before, length),
+        calibration.spearman(size, length),
+        calibration.best_half(size, length),
         float((squared_mahalanobis(error, covariance.astype(np.float64)) < CHI_SQUARE_95_OF_2).mean()),
         float(np.median(length)),
     )
@@ -164,11 +158,11 @@ def judge_rows(pairs: Sequence[ImagePair], detect: Detect, judge: MatchJudge) ->
     for pair in pairs:
         assert isinstance(pair.truth, SameRows)
         features0, features1 = detect(pair.image0), detect(pair.image1)
-        found = match_stereo(judge, pair.image0, pair.image1, features0, features1)
-        points = features0.keypoints[found.index0].astype(np.float64)
+        matches = match_stereo(judge, pair.image0, pair.image1, features0, features1)
+        points = features0.keypoints[matches.index0].astype(np.float64)
         height, width = pair.image0.shape
         place = (points - (0.5 * width, 0.5 * height)) / (0.5 * width)
-        rows.append(np.column_stack([found.places[:, 1] - points[:, 1], np.sqrt(found.covariance[:, 1, 1]), place]))
+        rows.append(np.column_stack([matches.places[:, 1] - points[:, 1], np.sqrt(matches.covariance[:, 1, 1]), place]))
     error, sigma, u, v = np.concatenate(rows).T
     mended = error - _rectification(error, u, v)
     return RowJudgement(
@@ -179,7 +173,7 @@ def judge_rows(pairs: Sequence[ImagePair], detect: Detect, judge: MatchJudge) ->
         _share_within(mended, sigma, 2.0),
         _share_within(mended, _CONSTANT_SIGMA, 1.0),
         _share_within(mended, _CONSTANT_SIGMA, 2.0),
-        spearman(sigma, np.abs(mended)),
+        calibration.spearman(sigma, np.abs(mended)),
         float(np.median(np.abs(mended))),
         float(np.median(sigma)),
         float(np.median(error)),

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.matching.pairs import Disparity, Homography, ImagePair, Motion, resize
+from sigmaslam.evaluation.matching.image_pairs import Disparity, Homography, ImagePair, Motion, resize
 from sigmaslam.geometry.se3 import se3_inverse
 from sigmaslam.readers.images import read_grey as read_grey  # also imported from here
 from sigmaslam.readers.images import read_image
@@ -65,15 +65,15 @@ def find_occluded(disparity: np.ndarray) -> np.ndarray:
         (H, W) bool.
     """
     height, width = disparity.shape
-    known = np.isfinite(disparity)
-    v, u = np.nonzero(known)
-    target = np.round(u - disparity[known]).astype(int)
+    valid = np.isfinite(disparity)
+    v, u = np.nonzero(valid)
+    target = np.round(u - disparity[valid]).astype(int)
     inside = (target >= 0) & (target < width)
     nearest = np.zeros((height, width))
-    np.maximum.at(nearest, (v[inside], target[inside]), disparity[known][inside])
+    np.maximum.at(nearest, (v[inside], target[inside]), disparity[valid][inside])
     occluded = np.zeros(disparity.shape, bool)
     occluded[v[~inside], u[~inside]] = True
-    hidden = nearest[v[inside], target[inside]] > disparity[known][inside] + 1.0
+    hidden = nearest[v[inside], target[inside]] > disparity[valid][inside] + 1.0
     occluded[v[inside], u[inside]] = hidden
     return occluded
 
@@ -140,7 +140,7 @@ def _random_warp(rng: np.random.Generator, size: tuple[int, int], strength: floa
 def _view(photograph: np.ndarray, H: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """The photograph, mirrored at its borders, through a homography and a camera of its own."""
     height, width = photograph.shape
-    # Drawn at twice the size and averaged: a smaller scale must not alias.
+    # Draw at twice the size and average, so that a smaller scale does not alias.
     double = np.array([[2.0, 0.0, 0.5], [0.0, 2.0, 0.5], [0.0, 0.0, 1.0]])
     large = cv2.warpPerspective(
         photograph, double @ H, (2 * width, 2 * height), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from kornia.feature.adalam.adalam import AdalamFilter
 
-from sigmaslam.evaluation.matching.pairs import ImagePair, Motion
+from sigmaslam.evaluation.matching.image_pairs import ImagePair, Motion
 from sigmaslam.evaluation.matching.scores import essential_by_magsac
 from sigmaslam.frontend.classical import SiftDetector
 from sigmaslam.frontend.match_confidence import MatchJudge
@@ -76,7 +76,7 @@ def compare_rejection(
         "AdaLAM (kornia)": _adalam,
         "MAGSAC": _magsac,
     }
-    found: dict[str, list[tuple[float, ...]]] = {name: [] for name in contenders}
+    outcomes: dict[str, list[tuple[float, ...]]] = {name: [] for name in contenders}
     shares = []
     for number, pair in enumerate(pairs):
         task = _make_task(pair)
@@ -89,9 +89,9 @@ def compare_rejection(
             elapsed = 1e3 * (time.perf_counter() - begin)
             both = float((accepted & task.right).sum())
             precision, recall = both / max(accepted.sum(), 1), both / max(task.right.sum(), 1)
-            found[name].append((2 * both / max(accepted.sum() + task.right.sum(), 1), precision, recall, elapsed))
+            outcomes[name].append((2 * both / max(accepted.sum() + task.right.sum(), 1), precision, recall, elapsed))
     results = {}
-    for name, values in found.items():
+    for name, values in outcomes.items():
         f1, precision, recall, milliseconds = np.array(values).T
         results[name] = Rejection(
             float(f1.mean()), float(precision.mean()), float(recall.mean()), float(np.median(milliseconds))
@@ -122,7 +122,7 @@ def _thin(task: _Task, rng: np.random.Generator) -> _Task:
     wrong, right = np.flatnonzero(~task.right), np.flatnonzero(task.right)
     kept = min(len(right), round(len(wrong) * _THINNED / (1.0 - _THINNED)))
     rows = np.sort(np.concatenate([wrong, rng.permutation(right)[:kept]]))
-    # The matches are those of all keypoints of image 0, in their order: the others never were.
+    # Row k of the matches belongs to keypoint k of image 0: drop both together.
     features0 = task.features0.select(rows)
     putative = nearest_anywhere(features0.descriptors, task.features1.descriptors)
     return _Task(task.pair, features0, task.features1, task.frames0[rows], task.frames1, putative, task.right[rows])
@@ -138,15 +138,15 @@ def _magsac(task: _Task) -> np.ndarray:
         features.keypoints[index].astype(np.float64)
         for features, index in ((task.features0, task.putative.index0), (task.features1, task.putative.index1))
     )
-    found = essential_by_magsac(points0, points1, task.pair.truth.K)
-    return np.zeros(len(points0), bool) if found is None else found[1].ravel() > 0
+    essential = essential_by_magsac(points0, points1, task.pair.truth.K)
+    return np.zeros(len(points0), bool) if essential is None else essential[1].ravel() > 0
 
 
 def _adalam(task: _Task) -> np.ndarray:
     putative = task.putative
     distance = np.maximum(2.0 - 2.0 * putative.similarity, 0.0)
     ratio = distance / np.maximum(2.0 - 2.0 * putative.second0, 1e-3)
-    found = AdalamFilter().filter_matches(
+    filtered = AdalamFilter().filter_matches(
         torch.from_numpy(task.features0.keypoints),
         torch.from_numpy(task.features1.keypoints),
         torch.from_numpy(putative.index1),
@@ -160,5 +160,5 @@ def _adalam(task: _Task) -> np.ndarray:
         s2=torch.from_numpy(task.frames1[:, 0]).float(),
     )
     accepted = np.zeros(len(putative.index0), bool)
-    accepted[np.asarray(found)[:, 0]] = True
+    accepted[np.asarray(filtered)[:, 0]] = True
     return accepted

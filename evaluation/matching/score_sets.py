@@ -3,32 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 
 from sigmaslam.evaluation.matching.extractors import MAX_KEYPOINTS, Extractor, remembering
-from sigmaslam.evaluation.matching.pairs import ImagePair
-from sigmaslam.evaluation.matching.scores import Features, match_judged, score_pair, score_points, summarize
-from sigmaslam.evaluation.matching.sets import load_set
+from sigmaslam.evaluation.matching.image_pairs import ImagePair
+from sigmaslam.evaluation.matching.scores import (
+    KeypointsAndDescriptors,
+    match_judged,
+    score_pair,
+    score_points,
+    summarize,
+)
 
 Scores = dict[str, dict[str, float]]
 """By set, then by name of the score; shares and areas in [0, 1], numbers of matches a pair."""
 
 _COUNTS = ("correct_3", "matches", "steps_good", "steps", "inliers")
-
-
-def score(extractor: Extractor, sets: Sequence[str], data: Path) -> Scores:
-    """Scores of an extractor.
-
-    Args:
-        extractor: image to keypoints and descriptors.
-        sets: names from SELECTION and FINAL.
-        data: folder of the real data sets.
-    Raises:
-        InputError: a set is unknown or missing.
-    """
-    return {name: score_pairs(extractor, load_set(name, data)) for name in sets}
 
 
 def score_pairs(
@@ -64,7 +55,7 @@ def score_refined(extractor: Extractor, pairs: Sequence[ImagePair]) -> dict[str,
 def _limited(extractor: Extractor, max_keypoints: int) -> Extractor:
     """The extractor, asked once for an image, which must not give more keypoints than everyone may."""
 
-    def extract(image: np.ndarray) -> Features:
+    def extract(image: np.ndarray) -> KeypointsAndDescriptors:
         features = extractor(image)
         if len(features[0]) > max_keypoints:
             raise ValueError(f"the extractor gave {len(features[0])} keypoints: at most {max_keypoints} are compared")
@@ -73,9 +64,9 @@ def _limited(extractor: Extractor, max_keypoints: int) -> Extractor:
     return remembering(extract)
 
 
-def _summarize_parts(pairs: Sequence[ImagePair], found: Sequence[dict[str, float]]) -> dict[str, float]:
+def _summarize_parts(pairs: Sequence[ImagePair], pair_scores: Sequence[dict[str, float]]) -> dict[str, float]:
     parts: dict[tuple[str, type], list[dict[str, float]]] = {}
-    for pair, scores in zip(pairs, found, strict=True):
+    for pair, scores in zip(pairs, pair_scores, strict=True):
         parts.setdefault((pair.part, type(pair.truth)), []).append(scores)
     return {
         f"{part}_{name}" if part else name: value
@@ -88,7 +79,7 @@ def format_scores(results: Mapping[str, Scores]) -> str:
     """Markdown tables, one a set with a row for each extractor; shares and areas in percent.
 
     Args:
-        results: by name of the extractor what `score` gave.
+        results: by name of the extractor, as `compare` gives them.
     """
     lines = []
     for name in dict.fromkeys(name for scores in results.values() for name in scores):

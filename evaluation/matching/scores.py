@@ -8,16 +8,16 @@ from functools import cache
 import cv2
 import numpy as np
 
-from sigmaslam import frontend
-from sigmaslam.evaluation.matching.pairs import Disparity, Homography, ImagePair, Motion, SameRows
+from sigmaslam.evaluation.matching.image_pairs import Disparity, Homography, ImagePair, Motion, SameRows
 from sigmaslam.frontend.descriptor import match_stereo
 from sigmaslam.frontend.image_pair import Matches, match_features
 from sigmaslam.frontend.match_confidence import MatchJudge
+from sigmaslam.frontend.types import Features
 from sigmaslam.geometry.se3 import rotation_log
 
 CORNER_THRESHOLDS = (1, 3, 5)
 POSE_THRESHOLDS = (1, 5, 10)
-# Keypoints nearer to the border of the other image than this need not be seen again.
+# Repeatability ignores keypoints within this many pixels of the border of the other image.
 _BORDER = 8
 # The robust estimators of everyone. OpenCV's USAC has its own generator: the same matches give the same answer. Its
 # MAGSAC leaves some homographies of our photographs pixels off where least squares on the same inliers is right to a
@@ -28,7 +28,7 @@ _CONFIDENCE = 0.9999
 _ITERATIONS = 10_000
 _CORNER_ERROR, _POLISHED_ERROR, _POSE_ERROR = "corner_error", "polished_corner_error", "pose_error_deg"
 
-Features = tuple[np.ndarray, np.ndarray]
+KeypointsAndDescriptors = tuple[np.ndarray, np.ndarray]
 
 
 def mutual_nearest(descriptors0: np.ndarray, descriptors1: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -49,7 +49,7 @@ def mutual_nearest(descriptors0: np.ndarray, descriptors1: np.ndarray) -> tuple[
 
 
 def match_rows_refined(
-    left: np.ndarray, right: np.ndarray, features_left: Features, features_right: Features
+    left: np.ndarray, right: np.ndarray, features_left: KeypointsAndDescriptors, features_right: KeypointsAndDescriptors
 ) -> tuple[np.ndarray, np.ndarray]:
     """Stereo matches of a rectified pair as the tracker makes them (`match_stereo`).
 
@@ -64,7 +64,9 @@ def match_rows_refined(
     return found.index0, found.places
 
 
-def score_pair(pair: ImagePair, features0: Features, features1: Features) -> dict[str, float]:
+def score_pair(
+    pair: ImagePair, features0: KeypointsAndDescriptors, features1: KeypointsAndDescriptors
+) -> dict[str, float]:
     """What the features of both images achieve on this pair.
 
     Args:
@@ -244,11 +246,11 @@ def summarize(pairs: Sequence[dict[str, float]]) -> dict[str, float]:
     return summary
 
 
-def without_sigma(features: Features) -> frontend.Features:
+def without_sigma(features: KeypointsAndDescriptors) -> Features:
     """What the judge takes; everyone's scores and sigmas are taken to be the same, as not all extractors give them."""
     keypoints, descriptors = features
     alike = np.ones(len(keypoints), np.float32)
-    return frontend.Features(keypoints, _unit(descriptors), alike, alike)
+    return Features(keypoints, _unit(descriptors), alike, alike)
 
 
 @cache
@@ -256,7 +258,9 @@ def _judge() -> MatchJudge:
     return MatchJudge()
 
 
-def match_judged(image0: np.ndarray, image1: np.ndarray, features0: Features, features1: Features) -> Matches:
+def match_judged(
+    image0: np.ndarray, image1: np.ndarray, features0: KeypointsAndDescriptors, features1: KeypointsAndDescriptors
+) -> Matches:
     """What `sigmaslam match` makes of anyone's keypoints and descriptors if all have the same score and sigma."""
     return match_features(_judge(), image0, image1, without_sigma(features0), without_sigma(features1))
 

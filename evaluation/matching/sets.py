@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.matching import photographs, sequences
-from sigmaslam.evaluation.matching.pairs import ImagePair, Motion
+from sigmaslam.evaluation.matching import photographs, sequence_pairs
+from sigmaslam.evaluation.matching.image_pairs import ImagePair, Motion
 from sigmaslam.evaluation.matching.stereo import StereoStep
 
 SELECTION = ("set12", "middlebury")
@@ -26,8 +26,8 @@ _SETS: dict[str, tuple[str, Callable[[Path], list[ImagePair]]]] = {
     "boat": ("homography_boat", photographs.boat),
     "churchill": ("homography_hpatches_churchill", photographs.churchill),
     "fountain": ("strecha_fountain_P11", photographs.fountain),
-    "kitti": ("kitti_raw_0926_0039_a", sequences.kitti),
-    "euroc": ("euroc_v1_01_keyframes_a", sequences.euroc),
+    "kitti": ("kitti_raw_0926_0039_a", sequence_pairs.kitti),
+    "euroc": ("euroc_v1_01_keyframes_a", sequence_pairs.euroc),
 }
 
 
@@ -68,7 +68,7 @@ def load_tracks(data: Path) -> list[ImagePair]:
 
 def load_steps(data: Path) -> list[StereoStep]:
     """The steps between keyframes of the set euroc."""
-    return sequences.euroc_steps(_folder(data, _SETS["euroc"][0]))
+    return sequence_pairs.euroc_steps(_folder(data, _SETS["euroc"][0]))
 
 
 def _folder(data: Path, name: str) -> Path:

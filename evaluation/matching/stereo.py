@@ -9,19 +9,21 @@ import cv2
 import numpy as np
 
 from sigmaslam.evaluation.matching.extractors import Extractor, remembering
-from sigmaslam.evaluation.matching.scores import Features, match_judged, match_rows_refined, mutual_nearest
+from sigmaslam.evaluation.matching.scores import (
+    KeypointsAndDescriptors,
+    match_judged,
+    match_rows_refined,
+    mutual_nearest,
+)
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import rotation_log
 
-GOOD_POSITION = 0.05
-"""Metres."""
-GOOD_ROTATION_DEG = 1.0
-# Points of less disparity are too far for a pose; pixels.
-_LEAST_DISPARITY = 1.0
-_LEAST_POINTS = 6
-_INLIER_THRESHOLD = 2.0
-_ITERATIONS = 2000
-_CONFIDENCE = 0.9999
+# A pose within these of the truth is good, metres and degrees.
+GOOD_POSITION, GOOD_ROTATION_DEG = 0.05, 1.0
+# Points below this disparity, in pixels, are too far for a pose.
+_MIN_DISPARITY = 1.0
+_MIN_POINTS = 6
+_INLIER_THRESHOLD, _ITERATIONS, _CONFIDENCE = 2.0, 2000, 0.9999  # of RANSAC
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +76,11 @@ def is_good(T_1_0: np.ndarray, truth: np.ndarray) -> bool:
 
 
 def estimate_step(
-    step: StereoStep, left0: Features, right0: Features, left1: Features, judged: bool = False
+    step: StereoStep,
+    left0: KeypointsAndDescriptors,
+    right0: KeypointsAndDescriptors,
+    left1: KeypointsAndDescriptors,
+    judged: bool = False,
 ) -> tuple[np.ndarray, int] | None:
     """Pose by stereo triangulation, mutual nearest neighbours in the next left image, P3P and refinement.
 
@@ -88,7 +94,7 @@ def estimate_step(
     index, places = match_rows_refined(step.left0, step.right0, left0, right0)
     keypoints = left0[0][index].astype(np.float64)
     disparity = keypoints[:, 0] - places[:, 0]
-    near = (disparity >= _LEAST_DISPARITY) & (np.abs(keypoints[:, 1] - places[:, 1]) < 1.0)
+    near = (disparity >= _MIN_DISPARITY) & (np.abs(keypoints[:, 1] - places[:, 1]) < 1.0)
     points = step.camera.triangulate(np.column_stack([keypoints, disparity])[near])
     kept = index[near]
     if not judged:
@@ -100,7 +106,7 @@ def estimate_step(
 
 def _solve_pnp(points: np.ndarray, pixels: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, int] | None:
     """Pose that takes (N, 3) points to where (N, 2) pixels see them, and the number of points that agree."""
-    if len(points) < _LEAST_POINTS:
+    if len(points) < _MIN_POINTS:
         return None
     cv2.setRNGSeed(0)
     found, rotation, translation, inliers = cv2.solvePnPRansac(
@@ -113,7 +119,7 @@ def _solve_pnp(points: np.ndarray, pixels: np.ndarray, K: np.ndarray) -> tuple[n
         reprojectionError=_INLIER_THRESHOLD,
         confidence=_CONFIDENCE,
     )
-    if not found or len(inliers) < _LEAST_POINTS:
+    if not found or len(inliers) < _MIN_POINTS:
         return None
     index = inliers.ravel()
     rotation, translation = cv2.solvePnPRefineLM(points[index], pixels[index], K, None, rotation, translation)

@@ -29,11 +29,11 @@ def mean_with_error(values: Sequence[float] | np.ndarray) -> tuple[float, float]
 
     The error of a single value is NaN.
     """
-    known = np.asarray(values, dtype=np.float64)
-    known = known[~np.isnan(known)]
-    if len(known) < 2:
-        return (float(known[0]) if len(known) else float("nan")), float("nan")
-    return float(known.mean()), float(known.std(ddof=1) / np.sqrt(len(known)))
+    valid = np.asarray(values, dtype=np.float64)
+    valid = valid[~np.isnan(valid)]
+    if len(valid) < 2:
+        return (float(valid[0]) if len(valid) else float("nan")), float("nan")
+    return float(valid.mean()), float(valid.std(ddof=1) / np.sqrt(len(valid)))
 
 
 def root_mean_square_with_error(values: Sequence[float] | np.ndarray) -> tuple[float, float]:

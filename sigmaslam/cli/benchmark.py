@@ -89,15 +89,6 @@ def _features(
 
 
 @_registered
-def _ablations(out: Path, command: str, *, data: Path | None, runs: Path | None, steps: int, seeds: int | None) -> str:
-    from sigmaslam.evaluation.benchmarks.ablations import write_ablations
-
-    folder, seeds = _need_runs(runs, "ablations", "training runs"), seeds or 3
-    command += f" --runs {folder} --steps {steps} --seeds {seeds}"
-    return write_ablations(out, folder, _need_data(data), seeds, steps, command, _note)
-
-
-@_registered
 def _matches(out: Path, command: str, *, data: Path | None) -> str:
     from sigmaslam.evaluation.benchmarks.matches import write_matches
 
@@ -106,7 +97,7 @@ def _matches(out: Path, command: str, *, data: Path | None) -> str:
 
 @_registered
 def _noise(out: Path, command: str, *, data: Path | None, runs: Path | None) -> str:
-    from sigmaslam.evaluation.benchmarks.noise import write_noise
+    from sigmaslam.evaluation.benchmarks.match_noise import write_noise
     from sigmaslam.synthetic.render_sequence import default_workers
 
     folder = _need_runs(runs, "noise", "renders")
@@ -115,11 +106,11 @@ def _noise(out: Path, command: str, *, data: Path | None, runs: Path | None) -> 
 
 
 @_registered
-def _consistency(out: Path, command: str, *, runs: Path | None, seeds: int | None) -> str:
+def _consistency(out: Path, command: str, *, runs: Path | None, seeds: int) -> str:
     from sigmaslam.evaluation.benchmarks.consistency import write_consistency
     from sigmaslam.synthetic.render_sequence import default_workers
 
-    folder, seeds = _need_runs(runs, "consistency", "renders and results"), seeds or 30
+    folder = _need_runs(runs, "consistency", "renders and results")
     command += f" --runs {folder.name} --seeds {seeds}"
     return write_consistency(out, folder, seeds, default_workers(), command, _note)
 
@@ -172,19 +163,11 @@ def benchmark(
     runs: Annotated[
         Path | None,
         typer.Option(
-            help="ablations, noise, consistency, sequences, endurance: folder of the training runs or renders; what is "
-            "there is used again. sequences, endurance: a temporary one without it."
+            help="noise, consistency, sequences, endurance: folder of the renders; what is there is used again. "
+            "sequences, endurance: a temporary one without it."
         ),
     ] = None,
-    steps: Annotated[int, typer.Option(min=1, help="ablations: optimiser steps a run.")] = 250,
-    seeds: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            help="ablations: runs of each variant; consistency: sequences a scale.",
-            show_default="3, consistency 30",
-        ),
-    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="consistency: sequences a scale.")] = 30,
     frames: Annotated[int, typer.Option(min=1, help="endurance: frames to track.")] = 10_000,
     weights: Annotated[
         list[Path] | None,
@@ -210,14 +193,13 @@ def benchmark(
     covariance hold, beside AdaLAM and MAGSAC. noise: the tracker with these covariances beside one constant.
     consistency: whether poses and map are as sure as they say, on 90 rendered sequences (an hour). endurance: memory,
     time and error over 10,000 frames of a lap over and over (ten minutes to render, then a quarter of an hour).
-    ablations: what each part of the features gains, by short training runs (an hour). All but the first need the extra
-    'train'.
+    All but the first need the extra 'train'.
     """
     values = {option: value for option, value in locals().items() if option not in ("context", "name", "out")}
     run = _BENCHMARKS[name.value]
     served = [option for option in values if option in inspect.signature(run).parameters]
     for option in values:
-        # What is not typed is a default, or SIGMASLAM_DATA, which is there for all.
+        # Refuse typed options alone: defaults and SIGMASLAM_DATA exist for every benchmark.
         source = context.get_parameter_source(option)
         if option not in served and source is not None and source.name == "COMMANDLINE":
             raise InputError(f"--{option} is not an option of the benchmark {name.value}: leave it out")

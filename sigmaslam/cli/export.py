@@ -26,9 +26,9 @@ def export(
     need_train_extra()
     from sigmaslam.evaluation.matching import read_scores
     from sigmaslam.models.onnx_export import export_all, export_scoring
-    from sigmaslam.training.card import CARD_NAME
     from sigmaslam.training.features.loop import WEIGHTS_NAME
     from sigmaslam.training.matching.scoring import SCORER_NAME
+    from sigmaslam.training.run_card import CARD_NAME
 
     if (run / SCORER_NAME).is_file():
         if scores is not None:

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from sigmaslam.cli.extras import need_train_extra
-from sigmaslam.training.choices import MIXES, RECIPE_NAMES
+from sigmaslam.training.mixes import MIXES, RECIPE_NAMES
 
 # mypy reads the members of an enum from literals alone.
 Data = StrEnum("Data", list(MIXES))  # type: ignore[misc]
@@ -47,7 +47,7 @@ def train(
     from sigmaslam.training.features.recipes import choose_config, starting_weights
 
     config = choose_config(recipe.value, steps, None if data is None else data.value, seed)
-    # What a resumed run began with is written in its checkpoint.
+    # The checkpoint of a resumed run names its starting weights.
     weights = start if resume else starting_weights(recipe.value, start)
     card = run_training(out, config, workers, resume, recipe.value, weights, device)
     if leads():

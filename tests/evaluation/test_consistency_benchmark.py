@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from sigmaslam.evaluation.benchmarks.consistency import depths_around
-from sigmaslam.evaluation.benchmarks.consistency_page import Result, Scale, format_page
+from sigmaslam.evaluation.benchmarks.consistency_page import ConsistencyResult, Scale, format_page
 from sigmaslam.evaluation.metrics.map_consistency import (
     coverage,
     depth_edges,
@@ -22,7 +22,7 @@ from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.synthetic.simulation import Recipe, Studio, simulate
 
 CAMERA = RectifiedStereo(fx=100.0, fy=100.0, cx=31.5, cy=23.5, baseline=0.1, width=64, height=48)
-GOOD = Result(
+GOOD = ConsistencyResult(
     nees=1.0,
     nees_last=1.0,
     inside=0.95,

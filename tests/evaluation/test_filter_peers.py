@@ -7,9 +7,9 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from sigmaslam.evaluation.filters import peers as filter_peers
+from sigmaslam.evaluation.filters import peer_filters as filter_peers
 from sigmaslam.evaluation.filters import work as filter_work
-from sigmaslam.evaluation.filters.peers import PEERS, Peer
+from sigmaslam.evaluation.filters.peer_filters import PEERS, Peer
 from sigmaslam.evaluation.filters.work import Belief, StereoWork, Work
 
 WORKS: tuple[Work, ...] = (

@@ -1,6 +1,5 @@
-"""Scores of whole sets, their table, and the command."""
+"""Scores of whole sets, and their table."""
 
-import json
 from collections.abc import Iterator
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -11,12 +10,11 @@ import pytest
 
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.matching import compare, comparison, format_scores, load_extractor, score_pairs
-from sigmaslam.evaluation.matching.__main__ import main
-from sigmaslam.evaluation.matching.pairs import Homography, ImagePair, SameRows
-from sigmaslam.evaluation.matching.peers import read_signature
+from sigmaslam.evaluation.matching.image_pairs import Homography, ImagePair, SameRows
+from sigmaslam.evaluation.matching.peer_extractors import read_signature
 from sigmaslam.evaluation.matching.score_sets import score_refined
 from sigmaslam.evaluation.matching.scores import score_points, summarize
-from sigmaslam.evaluation.matching.sequences import sequence_pairs, sequence_steps
+from sigmaslam.evaluation.matching.sequence_pairs import sequence_pairs, sequence_steps
 from sigmaslam.evaluation.matching.sets import ALL, REFINED, SELECTION, STEPS, TRACKS
 from sigmaslam.frontend.image_pair import match_features
 from sigmaslam.frontend.match_confidence import MatchJudge
@@ -158,19 +156,13 @@ def test_a_score_that_others_do_not_have_is_left_open():
     assert "| klt | - | 100 |" in page
 
 
-def test_the_command_prints_json_of_all_extractors(
-    real_data: Path, weights: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def test_all_extractors_are_scored_and_progress_is_told(real_data: Path, weights: Path):
     graph = str(weights / "features.onnx")
-    monkeypatch.setenv("SIGMASLAM_DATA", str(real_data))
-    monkeypatch.setattr("sys.argv", ["matching", "--weights", graph, "--sets", "middlebury", "--json"])
-    main()
-    printed = capsys.readouterr()
-    found = json.loads(printed.out)
-    names = ["sift", "orb", graph]
+    names, notes = ["sift", "orb", graph], []
+    found = compare(names, ["middlebury"], real_data, notes.append)
     assert sorted(found) == sorted([*names, *(f"{name} + sigmaslam match" for name in names)])
     assert found[graph]["middlebury"]["mma_3"] > 0.5
-    assert f"middlebury: {graph}, 2 pairs" in printed.err
+    assert any(note.startswith(f"middlebury: {graph}, 2 pairs") for note in notes)
 
 
 def test_klt_has_a_row_among_the_tracks_alone(monkeypatch: pytest.MonkeyPatch, demo_sequence: Path):
@@ -223,25 +215,3 @@ def test_a_set_that_cannot_be_scored_is_refused_before_anything_is(real_data: Pa
     with pytest.raises(InputError, match="does not hold homography_boat"):
         compare(["orb"], ["middlebury", "boat"], middlebury_alone, notes.append)
     assert not notes
-
-
-def test_the_command_says_what_is_missing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    monkeypatch.setenv("SIGMASLAM_DATA", str(tmp_path))
-    monkeypatch.setattr("sys.argv", ["matching"])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    assert stopped.value.code == 2
-    assert "does not hold denoising" in capsys.readouterr().err
-
-
-def test_without_a_folder_of_data_the_command_does_not_look_in_the_current_one(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    monkeypatch.setenv("SIGMASLAM_DATA", "")
-    monkeypatch.setattr("sys.argv", ["matching"])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    assert stopped.value.code == 2
-    assert "set SIGMASLAM_DATA" in capsys.readouterr().err

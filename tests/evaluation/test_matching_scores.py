@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sigmaslam.evaluation.matching.pairs import Disparity, Homography, ImagePair, Motion, SameRows, Truth
+from sigmaslam.evaluation.matching.image_pairs import Disparity, Homography, ImagePair, Motion, SameRows, Truth
 from sigmaslam.evaluation.matching.scores import (
     area_under_curve,
     corner_error,

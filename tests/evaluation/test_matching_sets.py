@@ -8,9 +8,9 @@ import pytest
 
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.matching import FINAL, SELECTION, load_extractor, load_set, score_pairs
-from sigmaslam.evaluation.matching.pairs import Disparity, Homography, Motion, resize
+from sigmaslam.evaluation.matching.image_pairs import Disparity, Homography, Motion, resize
 from sigmaslam.evaluation.matching.photographs import find_occluded, middlebury, warped_pair
-from sigmaslam.evaluation.matching.sequences import sequence_pairs
+from sigmaslam.evaluation.matching.sequence_pairs import sequence_pairs
 from sigmaslam.readers import open_sequence
 from sigmaslam.synthetic.rendering.textures import dead_leaves
 

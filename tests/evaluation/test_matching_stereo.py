@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from sigmaslam.evaluation.matching import load_extractor, score_pairs
-from sigmaslam.evaluation.matching.pairs import Homography, ImagePair, Motion, SameRows
+from sigmaslam.evaluation.matching.image_pairs import Homography, ImagePair, Motion, SameRows
+from sigmaslam.evaluation.matching.klt_tracks import TRACKED_KEYPOINTS, follow_corners, score_klt
 from sigmaslam.evaluation.matching.scores import match_rows_refined, score_pair
-from sigmaslam.evaluation.matching.sequences import sequence_pairs, sequence_steps
+from sigmaslam.evaluation.matching.sequence_pairs import sequence_pairs, sequence_steps
 from sigmaslam.evaluation.matching.stereo import StereoStep, estimate_step, is_good, score_steps
-from sigmaslam.evaluation.matching.tracks import TRACKED_KEYPOINTS, follow_corners, score_klt
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import rotation_exp, se3_exp
 from sigmaslam.readers import open_sequence

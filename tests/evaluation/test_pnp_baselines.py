@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sigmaslam.evaluation.benchmarks.pnp_baselines import PnpOdometry, pose_from_points
-from sigmaslam.evaluation.metrics.trajectories import absolute_trajectory_error
+from sigmaslam.evaluation.metrics.trajectory_errors import absolute_trajectory_error
 from sigmaslam.geometry.camera import CameraModel, RectifiedStereo, StereoCamera
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory, read_trajectory

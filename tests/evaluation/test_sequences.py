@@ -50,7 +50,7 @@ def test_every_method_has_its_row(tmp_path: Path):
 def test_without_gtsam_the_bundle_adjustment_is_left_out_with_a_note(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "gtsam", None)
     # Tracks that are there already, so that nothing is tracked.
-    monkeypatch.setattr(sequences, "_track", lambda job, method, run: run.mkdir(parents=True))
+    monkeypatch.setattr(sequences, "track_ours", lambda sequence, run: run.mkdir(parents=True))
     text = write_results(tmp_path / "results.md", None, "the command", ("klt-pnp", "bundle"), ["demo"])
     assert _rows(text, "bundle") == []
     assert "*bundle adjustment* is left out: gtsam is not installed" in text
@@ -61,7 +61,7 @@ def test_without_torch_the_renders_are_left_out_with_a_note(tmp_path: Path, monk
     def fail(*_: object) -> None:
         raise ImportError(name="torch")
 
-    monkeypatch.setattr(sequences, "_render", fail)
+    monkeypatch.setattr(sequences, "render", fail)
     text = write_results(tmp_path / "results.md", None, "the command", ("klt-pnp",), ["demo", "street"])
     assert "street (rendered) is left out: torch is not installed" in text
     assert len(_rows(text, "klt-pnp")) == 1
@@ -71,7 +71,8 @@ def test_what_was_found_is_written_when_it_is_stopped(tmp_path: Path, monkeypatc
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(sequences, "_adjust", interrupt)
+    monkeypatch.setattr(sequences, "refine_run", interrupt)
+    monkeypatch.setattr(sequences, "track_ours", lambda sequence, run: run.mkdir(parents=True))
     page = tmp_path / "results.md"
     with pytest.raises(KeyboardInterrupt):
         write_results(page, None, "the command", ("klt-pnp", "bundle"), ["demo"])

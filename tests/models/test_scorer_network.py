@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from sigmaslam.evaluation.metrics.calibration import auroc
+from sigmaslam.evaluation.metrics.probability_calibration import auroc
 from sigmaslam.frontend.scorer_inputs import nearest_matches
 from sigmaslam.models.scorer_network import SIDE_CHANNELS, MatchScorer, ScoredMatches
 

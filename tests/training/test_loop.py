@@ -15,11 +15,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from sigmaslam.errors import InputError
 from sigmaslam.models.onnx_export import load_network
 from sigmaslam.training import devices
-from sigmaslam.training.card import CARD_NAME
 from sigmaslam.training.features.checkpoint import CHECKPOINT_NAME
 from sigmaslam.training.features.loop import WEIGHTS_NAME, train
 from sigmaslam.training.features.recipes import TrainingConfig
 from sigmaslam.training.journal import Journal
+from sigmaslam.training.run_card import CARD_NAME
 from tests.support.tiny_runs import make_small
 
 pytestmark = pytest.mark.usefixtures("small")

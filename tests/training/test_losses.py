@@ -8,9 +8,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from sigmaslam.models.feature_network import FeatureNetwork
-from sigmaslam.training.features import step
+from sigmaslam.training.features import batch_loss
+from sigmaslam.training.features.batch_loss import _zoom, pair_loss
 from sigmaslam.training.features.losses import MatchLoss, match_loss, place_loss
-from sigmaslam.training.features.step import _zoom, pair_loss
 from sigmaslam.training.features.stream import NOWHERE
 
 
@@ -144,7 +144,7 @@ def test_every_partner_teaches_quality_whether_it_is_a_distractor_or_not():
         return match_loss(*arguments)
 
     with pytest.MonkeyPatch.context() as context:
-        context.setattr(step, "match_loss", spy)
+        context.setattr(batch_loss, "match_loss", spy)
         pair_loss(network, image, image, corners, corners, visible, found, torch.Generator().manual_seed(5))
     assert asked["repeated"].all()
 

@@ -14,7 +14,7 @@ from sigmaslam.frontend.nearest_neighbours import Putative
 from sigmaslam.frontend.scorer_inputs import NEIGHBOURS, nearest_matches
 from sigmaslam.frontend.types import Features
 from sigmaslam.models.scorer_network import MatchScorer
-from sigmaslam.training import steps
+from sigmaslam.training import small_loop
 from sigmaslam.training.matching import scorer_training as scorer_training
 from sigmaslam.training.matching.match_sets import MatchSet
 from sigmaslam.training.matching.scorer_training import (
@@ -256,7 +256,7 @@ def assert_same_weights(a: MatchScorer, b: MatchScorer) -> None:
 def test_a_run_that_was_stopped_ends_bit_for_bit_as_one_that_was_not(
     sets: list[MatchSet], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(steps, "SAVE_EVERY", 2)
+    monkeypatch.setattr(small_loop, "SAVE_EVERY", 2)
     whole = train(sets, tmp_path / "whole.safetensors")
     stopped = tmp_path / "stopped.safetensors"
     with pytest.raises(KeyboardInterrupt):

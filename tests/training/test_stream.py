@@ -8,9 +8,9 @@ import torch
 
 from sigmaslam.errors import InputError
 from sigmaslam.synthetic import homography_pairs
-from sigmaslam.training.choices import MIXES
 from sigmaslam.training.features import stream
 from sigmaslam.training.features.stream import MixedPairs, PairDataset, open_stream, pair_loader
+from sigmaslam.training.mixes import MIXES
 
 
 @pytest.fixture(autouse=True)

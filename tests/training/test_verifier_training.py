@@ -9,7 +9,7 @@ from scipy import stats
 from torch import Tensor
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.metrics.calibration import calibration_error
+from sigmaslam.evaluation.metrics.probability_calibration import calibration_error
 from sigmaslam.frontend.nearest_neighbours import Putative
 from sigmaslam.frontend.types import Features
 from sigmaslam.models.scorer_network import MatchScorer

@@ -74,9 +74,7 @@ def begin(config: TrainingConfig, recipe: str | None, start: Path | None, place:
         InputError: the weights of `start` are missing or of another network.
     """
     torch.manual_seed(config.seed)
-    size, stride = config.descriptor_size, config.stride
-    network = FeatureNetwork(size, stride) if start is None else _load_start(start, size, stride)
-    network = place_network(network, place)
+    network = place_network(FeatureNetwork() if start is None else _load_start(start), place)
     optimizer = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
     # The rate rises for a tenth of the steps; a rise of one step, that of ten steps, is a division by zero in torch.
     rising = 0.1 if config.steps < 3 else max(0.1, 2 / config.steps)
@@ -126,9 +124,9 @@ def resume_checkpoint(
     return state
 
 
-def _load_start(path: Path, descriptor_size: int, stride: int) -> FeatureNetwork:
+def _load_start(path: Path) -> FeatureNetwork:
     try:
-        return load_network(path, descriptor_size, stride)
+        return load_network(path)
     except InputError as error:
         advice = "give weights that fit with --from, or train from nothing with --recipe full"
         raise InputError(f"{error}\nThe run was to start from these: {advice}") from error

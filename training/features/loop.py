@@ -15,8 +15,6 @@ from torch.utils.data import DataLoader
 
 from sigmaslam.files import atomic_path, atomic_write_text, make_folder
 from sigmaslam.progress import open_progress
-from sigmaslam.training.card import CARD_NAME, describe_origin, make_card
-from sigmaslam.training.choices import MIXES
 from sigmaslam.training.devices import Workplace, loss_module, open_workplace, to_device
 from sigmaslam.training.features.checkpoint import (
     CHECKPOINT_NAME,
@@ -33,6 +31,8 @@ from sigmaslam.training.features.stream import TrainingPair, open_stream, pair_l
 from sigmaslam.training.features.validation import held_out_seed, held_out_sources, matching_accuracy
 from sigmaslam.training.interruption import Interruption
 from sigmaslam.training.journal import Journal
+from sigmaslam.training.mixes import MIXES
+from sigmaslam.training.run_card import CARD_NAME, describe_origin, make_card
 
 WEIGHTS_NAME = "features.safetensors"
 _LOG_EVERY = 50

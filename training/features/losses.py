@@ -75,7 +75,7 @@ def match_loss(
         best_backward = similarity[:, :, :count].argmax(dim=1) == rows
         right = best_forward & best_backward & visible
         target = (right & repeated).to(similarity.dtype)
-    # A point that left the image tells nothing about how good it is.
+    # A point that leaves the image has no label for its quality.
     quality = (functional.binary_cross_entropy_with_logits(quality0, target, reduction="none") * weight).sum() / total
     return MatchLoss(descriptor, quality, right.to(similarity.dtype).sum() / total)
 

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from sigmaslam.errors import InputError
 from sigmaslam.inference.onnx_graph import shipped_weights
-from sigmaslam.models.feature_network import DESCRIPTOR_SIZE, STRIDE, STRIDES
-from sigmaslam.training.choices import MIXES
+from sigmaslam.training.mixes import MIXES
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,7 +16,7 @@ class TrainingConfig:
 
     Attributes:
         steps: optimiser steps.
-        data: what the pairs are made of, a key of `choices.MIXES`.
+        data: what the pairs are made of, a key of `mixes.MIXES`.
         batch_size: pairs a step, of all processes together.
         size: side of the training images, pixels.
         points: keypoints per image in the loss.
@@ -27,7 +26,6 @@ class TrainingConfig:
         seed: of the data, the initial weights and the sampling.
         validate_every: in steps, and at the end; 0: never.
         checkpoint_every: in steps.
-        descriptor_size, stride: of the network, as `FeatureNetwork` takes them.
     """
 
     steps: int = 3400
@@ -42,8 +40,6 @@ class TrainingConfig:
     seed: int = 0
     validate_every: int = 1700
     checkpoint_every: int = 250
-    descriptor_size: int = DESCRIPTOR_SIZE
-    stride: int = STRIDE
 
 
 RECIPES = {
@@ -85,13 +81,11 @@ def check_config(config: TrainingConfig) -> None:
     """
     if config.data not in MIXES:
         raise InputError(f"data {config.data!r} is unknown; choose one of {', '.join(MIXES)}")
-    for name in ("steps", "batch_size", "points", "checkpoint_every", "descriptor_size"):
+    for name in ("steps", "batch_size", "points", "checkpoint_every"):
         if getattr(config, name) < 1:
             raise InputError(f"{name} {getattr(config, name)} is too small: give 1 or more")
     if config.validate_every < 0:
         raise InputError(f"validate_every {config.validate_every} is negative: give steps, or 0 for never")
-    if config.stride not in STRIDES:
-        raise InputError(f"stride {config.stride} is unknown; choose one of {', '.join(map(str, STRIDES))}")
     if 8 * config.points > config.size**2:
         raise InputError(f"points {config.points} are too many for {config.size}x{config.size} pixels: give less")
     if config.size < 64 or config.size % 32:

@@ -16,7 +16,7 @@ from sigmaslam.models.detector import detect, to_cells
 from sigmaslam.synthetic.homography_pairs import HomographyPairs
 from sigmaslam.synthetic.rendering.textures import KINDS
 from sigmaslam.synthetic.scene_pairs import ScenePairs
-from sigmaslam.training.choices import MIXES
+from sigmaslam.training.mixes import MIXES
 
 # image0 (1, H, W), image1 (1, H, W), keypoints0 (N, 2), places1 (N, 2), visible (N,), keypoints1 (2 N, 2)
 TrainingPair = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
@@ -53,7 +53,7 @@ def open_stream(source: str, seed: int, size: int) -> PairStream:
     'scenes', 'endoscopy' (scenes inside a body), 'patterns' (every texture but leaves), a texture's kind under
     homographies, or 'turned leaves', which are warped further: by up to 90 degrees and e^1 between the views.
     """
-    # Of its own, or two sources with textures of one kind would show the same ones.
+    # Derive a seed for each source: sources with the same kind of texture must show different ones.
     seed = int(np.random.SeedSequence((seed, *source.encode())).generate_state(1)[0])
     if source == "scenes":
         return ScenePairs(seed, size)
@@ -94,8 +94,8 @@ class MixedPairs:
 
     def pair(self, index: int) -> Pair:
         """The pair of that index, the same whenever it is asked for."""
-        source, own = take_turn(self._turns, index)
-        return self._streams[source].pair(own)
+        source, source_index = take_turn(self._turns, index)
+        return self._streams[source].pair(source_index)
 
 
 class PairDataset(Dataset[TrainingPair]):
@@ -124,7 +124,7 @@ class PairDataset(Dataset[TrainingPair]):
         index = self._first + item
         pair = self._pairs.pair(index)
         rng = np.random.default_rng((self._seed, 2, index))
-        # A random choice, so that weak ones are learned too; of image 1 all, or partners would be missing.
+        # Choose keypoints of image 0 at random, to learn weak ones too, and keep all of image 1, to keep the partners.
         keypoints0 = rng.permutation(self._strongest(pair.image0))[: self._keypoints]
         filling = rng.uniform(0, self._size - 1, (self._keypoints - len(keypoints0), 2))
         keypoints0 = np.concatenate([keypoints0, filling]).astype(np.float32)

@@ -11,14 +11,14 @@ from torch import Tensor
 
 from sigmaslam.models.extractor import FeatureExtractor
 from sigmaslam.models.feature_network import FeatureNetwork
-from sigmaslam.training.choices import MIXES
 from sigmaslam.training.features.stream import Pair, open_stream
+from sigmaslam.training.mixes import MIXES
 
 _PAIRS = 48
 _KEYPOINTS = 256
 _SEED_OFFSET = 1_000_003
 _SOURCES = ("leaves", "patterns", "scenes")
-# Seen by runs that learn from it alone: elsewhere it is part of the scenes.
+# Sources that validate only the runs which train on them.
 _SPECIAL_SOURCES = ("endoscopy",)
 
 
@@ -69,13 +69,13 @@ def matching_accuracy(
         of the pairs of one source.
     """
     streams = [open_stream(source, seed, size) for source in sources]
-    found: list[dict[str, float]] = []
+    pair_metrics: list[dict[str, float]] = []
     for index in range(pairs):
         pair = streams[index % len(streams)].pair(index // len(streams))
-        found.append(match_pair(network, pair).metrics())
-    overall = {name: sum(each[name] for each in found) / pairs for name in found[0]}
+        pair_metrics.append(match_pair(network, pair).metrics())
+    overall = {name: sum(each[name] for each in pair_metrics) / pairs for name in pair_metrics[0]}
     for turn, source in enumerate(sources[:pairs]):
-        of_source = found[turn :: len(sources)]
+        of_source = pair_metrics[turn :: len(sources)]
         overall[f"mma_3_{source}"] = sum(each["mma_3"] for each in of_source) / len(of_source)
     return overall
 
@@ -89,8 +89,8 @@ def match_pair(network: FeatureNetwork, pair: Pair) -> PairMatches:
     device = next(network.parameters()).device
 
     def extract(image: np.ndarray) -> tuple[Tensor, Tensor]:
-        found = extractor(torch.from_numpy(image)[None, None].to(device), torch.tensor(_KEYPOINTS))
-        keypoints, scores, descriptors, _ = (values.cpu() for values in found)
+        features = extractor(torch.from_numpy(image)[None, None].to(device), torch.tensor(_KEYPOINTS))
+        keypoints, scores, descriptors, _ = (values.cpu() for values in features)
         return keypoints[scores > 0], descriptors[scores > 0]
 
     (keypoints0, descriptors0), (keypoints1, descriptors1) = extract(pair.image0), extract(pair.image1)

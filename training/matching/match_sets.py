@@ -31,13 +31,13 @@ SIZE = 384
 """Side of the square images, pixels."""
 # Keypoints an image, drawn evenly in the logarithm: those of 0.3 to 2.5 thousand in an image of 640 x 480 pixels.
 _KEYPOINTS = (150, 1200)
-_LEAST_MATCHES = 24
+_MIN_MATCHES = 24
 # In turn; "anywhere" is as between two photographs, "rows" as in a stereo pair, "ellipses" as with a prediction.
 _TURNS = ("planes", "scenes", "stereo", "scenes", "turned planes", "video")
 _ROW_TOLERANCE = 2.0
 _DISPARITY = (-2.0, 0.25 * SIZE)
 _ELLIPSE_SIGMA = (1.0, 25.0)
-# Where the truth is not known a prediction is about as far off as a moving thing goes, pixels.
+# Standard deviation, in pixels, of a prediction whose true place is unknown.
 _FOREIGN = 40.0
 _POLL = 0.5  # seconds
 _PUTATIVE = ("index0", "index1", "similarity", "second0", "second1")
@@ -89,8 +89,8 @@ class MatchSets:
 
     def record(self, index: int) -> PairRecord:
         """The record of that index, the same whenever it is asked for."""
-        source, own = take_turn(_TURNS, index)
-        pair = self._streams[source].pair(own)
+        source, source_index = take_turn(_TURNS, index)
+        pair = self._streams[source].pair(source_index)
         rng = np.random.default_rng((self._seed, 3, index))
         image0, image1 = (np.round(255.0 * image).astype(np.uint8) for image in (pair.image0, pair.image1))
         count = int(np.exp(rng.uniform(*np.log(_KEYPOINTS))))
@@ -101,7 +101,7 @@ class MatchSets:
             features0, features1 = detect(image0), detect(image1)
             places, visible = pair.transfer(features0.keypoints.astype(np.float64))
             putative = _match(source, guided, features0, features1, places, rng)
-            if len(putative.index0) >= _LEAST_MATCHES:
+            if len(putative.index0) >= _MIN_MATCHES:
                 shown = np.where(visible[:, None], places, np.inf)[putative.index0]
                 sets[kind] = MatchSet(source, _bare(features0), _bare(features1), putative, shown)
         return PairRecord(image0, image1, sets)
@@ -120,8 +120,8 @@ def _match(
         return nearest_in_rows(features0.keypoints, features1.keypoints, *descriptors, _ROW_TOLERANCE, _DISPARITY)
     if guided and source in ("scenes", "video"):
         sigma = np.exp(rng.uniform(*np.log(_ELLIPSE_SIGMA)))
-        known = (np.abs(places) < 4 * SIZE).all(axis=1)
-        predicted = np.where(known[:, None], places, features0.keypoints + rng.normal(0.0, _FOREIGN, places.shape))
+        valid = (np.abs(places) < 4 * SIZE).all(axis=1)
+        predicted = np.where(valid[:, None], places, features0.keypoints + rng.normal(0.0, _FOREIGN, places.shape))
         predicted = predicted + sigma * rng.standard_normal(2)
         covariance = np.tile(sigma**2 * np.eye(2), (len(predicted), 1, 1))
         return nearest_in_ellipses(predicted, covariance, features1.keypoints, *descriptors)
@@ -136,13 +136,13 @@ def _bare(features: Features) -> Features:
 def save_record(path: Path, record: PairRecord) -> None:
     """Writes a record as .npz."""
     arrays = {"image0": record.image0, "image1": record.image1}
-    for kind, found in record.sets.items():
-        arrays |= {f"{kind}.source": np.array(found.source), f"{kind}.places": found.places}
+    for kind, match_set in record.sets.items():
+        arrays |= {f"{kind}.source": np.array(match_set.source), f"{kind}.places": match_set.places}
         for name in ("keypoints", "scores", "sigma"):
-            arrays[f"{kind}.{name}0"] = getattr(found.features0, name)
-            arrays[f"{kind}.{name}1"] = getattr(found.features1, name)
+            arrays[f"{kind}.{name}0"] = getattr(match_set.features0, name)
+            arrays[f"{kind}.{name}1"] = getattr(match_set.features1, name)
         for name in _PUTATIVE:
-            arrays[f"{kind}.{name}"] = getattr(found.putative, name)
+            arrays[f"{kind}.{name}"] = getattr(match_set.putative, name)
     with atomic_path(path) as temporary:
         np.savez(temporary, allow_pickle=False, **arrays)
 

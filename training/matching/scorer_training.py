@@ -11,15 +11,15 @@ import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from sigmaslam.evaluation.metrics.calibration import RIGHT
+from sigmaslam.evaluation.metrics.probability_calibration import RIGHT
 from sigmaslam.frontend.scorer_inputs import NEIGHBOURS, nearest_matches, side_information
 from sigmaslam.models.scorer_network import SIDE_CHANNELS, MatchScorer
 from sigmaslam.training.matching.match_sets import MatchSet
-from sigmaslam.training.steps import train_steps
+from sigmaslam.training.small_loop import train_steps
 
 LEARNING_RATE = 3e-3
 SETS_A_STEP = 8
-_MOST_MATCHES = 512
+_MAX_MATCHES = 512
 # Weight of the round before the first, of those in between, and of the last.
 _ROUND_WEIGHTS = (0.2, 0.4, 1.0)
 
@@ -27,31 +27,31 @@ _ROUND_WEIGHTS = (0.2, 0.4, 1.0)
 Sample = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
-def make_sample(found: MatchSet, rows: np.ndarray | None = None) -> Sample:
+def make_sample(match_set: MatchSet, rows: np.ndarray | None = None) -> Sample:
     """What the scorer sees of a set as the run time would show it, and the error of each match.
 
     Args:
-        found: the set.
+        match_set: the set.
         rows: only these of its matches.
     """
-    rows = np.arange(len(found.places)) if rows is None else rows
-    putative = found.putative.select(rows)
-    points0, points1 = found.features0.keypoints[putative.index0], found.features1.keypoints[putative.index1]
-    side = side_information(putative, found.features0, found.features1)
-    error = np.linalg.norm(points1 - found.places[rows], axis=1)
+    rows = np.arange(len(match_set.places)) if rows is None else rows
+    putative = match_set.putative.select(rows)
+    points0, points1 = match_set.features0.keypoints[putative.index0], match_set.features1.keypoints[putative.index1]
+    side = side_information(putative, match_set.features0, match_set.features1)
+    error = np.linalg.norm(points1 - match_set.places[rows], axis=1)
     return points0, points1, side, nearest_matches(points0, putative.mutual), error
 
 
-def vary_sample(found: MatchSet, rng: np.random.Generator) -> Sample:
+def vary_sample(match_set: MatchSet, rng: np.random.Generator) -> Sample:
     """A sample of at most 512 matches, with images turned or mirrored alike, and parts of what is known left out.
 
     What one kind of features says of itself another does not, or says otherwise: the scorer must not rely on it.
     """
-    count = min(len(found.places), _MOST_MATCHES)
+    count = min(len(match_set.places), _MAX_MATCHES)
     if rng.random() < 0.5:
         count = max(24, int(count * rng.uniform(0.3, 1.0)))
-    rows = np.sort(rng.choice(len(found.places), min(count, len(found.places)), replace=False))
-    points0, points1, side, near, error = make_sample(found, rows)
+    rows = np.sort(rng.choice(len(match_set.places), min(count, len(match_set.places)), replace=False))
+    points0, points1, side, near, error = make_sample(match_set, rows)
     if rng.random() < 0.25:
         side[:, 6:8] = 0.5
     if rng.random() < 0.25:
@@ -100,10 +100,10 @@ def scorer_loss(logits: Tensor, weight: Tensor, error: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def score_set(scorer: MatchScorer, found: MatchSet) -> np.ndarray:
+def score_set(scorer: MatchScorer, match_set: MatchSet) -> np.ndarray:
     """(M,) logits of all matches of a set."""
     scorer.eval()
-    return np.asarray(scorer(*collate([make_sample(found)])[:5])[-1, 0].numpy())
+    return np.asarray(scorer(*collate([make_sample(match_set)])[:5])[-1, 0].numpy())
 
 
 def train_scorer(
@@ -134,7 +134,7 @@ def train_scorer(
             yield scorer_loss(scorer(*inputs, weight), weight, error)
 
     made_of = {"steps": steps, "seed": seed, "sets": len(sets)}
-    train_steps(scorer, optimizer, schedule, steps, losses, checkpoint, made_of, note, most_gradient=1.0)
+    train_steps(scorer, optimizer, schedule, steps, losses, checkpoint, made_of, note, max_gradient=1.0)
     return scorer
 
 

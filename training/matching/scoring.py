@@ -16,24 +16,18 @@ from safetensors.torch import save_file
 
 from sigmaslam.errors import InputError
 from sigmaslam.estimation.chi_square import CHI_SQUARE_68_OF_2, CHI_SQUARE_95_OF_2
-from sigmaslam.evaluation.metrics.calibration import (
-    RIGHT,
-    auroc,
-    average_precision,
-    best_half,
-    calibration_error,
-    spearman,
-)
+from sigmaslam.evaluation.metrics import probability_calibration as calibration
+from sigmaslam.evaluation.metrics.probability_calibration import RIGHT
 from sigmaslam.files import atomic_path, atomic_write_text, make_folder
 from sigmaslam.models.scorer_network import MatchScorer
 from sigmaslam.models.verifier_network import MatchVerifier
 from sigmaslam.progress import open_progress
-from sigmaslam.training.card import describe_origin
 from sigmaslam.training.devices import describe_processor
 from sigmaslam.training.features.validation import held_out_seed
 from sigmaslam.training.matching.match_sets import PairRecord, load_record, record_path, write_records
 from sigmaslam.training.matching.scorer_training import make_sample, score_set, train_scorer
 from sigmaslam.training.matching.verifier_training import VerifierRows, calibrate, collect_rows, train_verifier
+from sigmaslam.training.run_card import describe_origin
 
 SCORER_NAME, VERIFIER_NAME, CARD_NAME = "scorer.safetensors", "verifier.safetensors", "matching.json"
 _CONFIG_NAME, _SECONDS_NAME = "config.json", "seconds.txt"
@@ -90,7 +84,7 @@ def train_scoring(out: Path, config: ScoringConfig, workers: int) -> dict[str, A
             )
         ]
         clock.seconds()
-        sets = [found for record in _records(folders[0]) for found in record.sets.values()]
+        sets = [match_set for record in _records(folders[0]) for match_set in record.sets.values()]
         told = _open_bar(progress, "training the scorer", config.steps)
         scorer = train_scorer(sets, config.steps, config.seed, out / _SCORER_CHECKPOINT, told)
         clock.seconds()
@@ -156,7 +150,7 @@ def _collect(progress: Progress, paths: list[Path], scorer: MatchScorer) -> Veri
 
 def _scorer_metrics(scorer: MatchScorer, paths: list[Path]) -> dict[str, float]:
     """Means over the sets of one kind that have at least 8 right and 8 wrong matches."""
-    found: dict[str, list[tuple[float, ...]]] = {}
+    by_kind: dict[str, list[tuple[float, ...]]] = {}
     for record in _records(paths):
         for kind, of_kind in record.sets.items():
             _, _, side, _, error = make_sample(of_kind)
@@ -167,12 +161,13 @@ def _scorer_metrics(scorer: MatchScorer, paths: list[Path]) -> dict[str, float]:
             accepted = logit > 0
             f1 = 2.0 * (right & accepted).sum() / (right.sum() + accepted.sum())
             baseline = 10.0 * side[:, 3] - side[:, 4]
-            values = average_precision(logit, right), average_precision(baseline, right), auroc(logit, right), f1
-            found.setdefault(kind, []).append(values)
+            precisions = [calibration.average_precision(score, right) for score in (logit, baseline)]
+            values = *precisions, calibration.auroc(logit, right), f1
+            by_kind.setdefault(kind, []).append(values)
     names = ("average_precision", "mutual_ratio_average_precision", "auroc", "f1")
     return {
         f"{kind}_{name}": float(np.mean([each[k] for each in values]))
-        for kind, values in found.items()
+        for kind, values in by_kind.items()
         for k, name in enumerate(names)
     }
 
@@ -185,10 +180,10 @@ def _verifier_metrics(verifier: MatchVerifier, rows: VerifierRows) -> dict[str, 
     square = ((error / sigma) ** 2).sum(axis=1)
     length, size = np.linalg.norm(error, axis=1), np.linalg.norm(sigma, axis=1)
     return {
-        "verified_auroc": auroc(logit, right),
-        "expected_calibration_error": calibration_error(1.0 / (1.0 + np.exp(-logit)), right),
-        "spearman_sigma_error": spearman(size, length),
-        "best_half_rms": best_half(size, length),
+        "verified_auroc": calibration.auroc(logit, right),
+        "expected_calibration_error": calibration.calibration_error(1.0 / (1.0 + np.exp(-logit)), right),
+        "spearman_sigma_error": calibration.spearman(size, length),
+        "best_half_rms": calibration.best_half(size, length),
         "inside_95_ellipse": float((square < CHI_SQUARE_95_OF_2).mean()),
         "inside_68_ellipse": float((square < CHI_SQUARE_68_OF_2).mean()),
     }

@@ -14,7 +14,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 
 from sigmaslam.errors import SigmaSlamError
 from sigmaslam.estimation.chi_square import NORMAL_WITHIN_2
-from sigmaslam.evaluation.metrics.calibration import RIGHT
+from sigmaslam.evaluation.metrics.probability_calibration import RIGHT
 from sigmaslam.frontend.affine_alignment import refine_by_neighbours
 from sigmaslam.frontend.lucas_kanade import refine
 from sigmaslam.frontend.match_confidence import LEAST_LOGIT
@@ -25,7 +25,7 @@ from sigmaslam.models.scorer_network import MatchScorer
 from sigmaslam.models.verifier_network import MatchVerifier
 from sigmaslam.training.matching.match_sets import MatchSet, PairRecord
 from sigmaslam.training.matching.scorer_training import score_set
-from sigmaslam.training.steps import train_steps
+from sigmaslam.training.small_loop import train_steps
 
 _LEARNING_RATE = 3e-3
 _BATCH = 4096

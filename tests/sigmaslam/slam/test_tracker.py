@@ -8,7 +8,7 @@ import pytest
 
 from sigmaslam import StereoTracker, open_sequence
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.metrics.trajectories import absolute_trajectory_error, kitti_errors
+from sigmaslam.evaluation.metrics.trajectory_errors import absolute_trajectory_error, kitti_errors
 from sigmaslam.geometry.se3 import se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory, read_kitti
 from sigmaslam.readers import StereoFrame

@@ -78,8 +78,8 @@ class PeerExtractor:
         Raises:
             FrameError: the image is larger than the graph takes.
         """
-        found = self._graph({self._input: self._pad(image)})
-        named = dict(zip(self._graph.outputs, found, strict=True))
+        outputs = self._graph({self._input: self._pad(image)})
+        named = dict(zip(self._graph.outputs, outputs, strict=True))
         keypoints, scores, descriptors = recognise_outputs(named, self._path, self._outputs)
         inside = (keypoints[:, 0] <= image.shape[1] - 1) & (keypoints[:, 1] <= image.shape[0] - 1)
         kept = np.flatnonzero((scores > 0) & inside)
@@ -104,24 +104,24 @@ class PeerExtractor:
 
 
 def recognise_outputs(
-    found: Mapping[str, np.ndarray], path: Path, shapes: Mapping[str, Shape] | None = None
+    outputs: Mapping[str, np.ndarray], path: Path, shapes: Mapping[str, Shape] | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Keypoints (N, 2), scores (N,) and descriptors (N, C) as float32.
 
     Args:
-        found: arrays by name of the output.
+        outputs: arrays by name of the output.
         path: of the graph, for the message.
         shapes: of the outputs as the graph declares them, for the message; those found without it.
     Raises:
         InputError: names and shapes do not tell which is which.
     """
-    keypoints = _find(found, "keypoints", (-1, 2))
+    keypoints = _find(outputs, "keypoints", (-1, 2))
     if keypoints is not None:
         count = len(keypoints)
-        scores, descriptors = _find(found, "scores", (count,)), _find(found, "descriptors", (count, -1))
+        scores, descriptors = _find(outputs, "scores", (count,)), _find(outputs, "descriptors", (count, -1))
         if scores is not None and descriptors is not None:
             return keypoints.astype(np.float32), scores.astype(np.float32), descriptors.astype(np.float32)
-    declared = shapes or {name: array.shape for name, array in found.items()}
+    declared = shapes or {name: array.shape for name, array in outputs.items()}
     raise InputError(
         f"{path} cannot be understood: its outputs are {_list(declared)}; keypoints (N, 2), scores (N,) and "
         "descriptors (N, C) are wanted, by these names or these shapes"
@@ -149,20 +149,20 @@ def _image_input(path: Path, signature: Signature) -> tuple[str, int, tuple[int 
     return name, 3 if shape[1] == 3 else 1, (height, width)
 
 
-def _find(found: Mapping[str, np.ndarray], kind: str, shape: tuple[int, ...]) -> np.ndarray | None:
+def _find(outputs: Mapping[str, np.ndarray], kind: str, shape: tuple[int, ...]) -> np.ndarray | None:
     """The output of a name that says so, or else the only one of that shape, without a leading 1.
 
     Args:
-        found: arrays by name.
+        outputs: arrays by name.
         kind: of `_NAMES`.
         shape: -1 for any length, of descriptors but 2, which is that of keypoints.
     """
     fitting = {}
-    for name, array in found.items():
+    for name, array in outputs.items():
         bare = array[0] if array.ndim == len(shape) + 1 and len(array) == 1 else array
         if bare.ndim == len(shape) and all(n in (-1, m) for n, m in zip(shape, bare.shape, strict=True)):
             fitting[name] = bare
-    named = [name for name in found if name.lower() in _NAMES[kind]]
+    named = [name for name in outputs if name.lower() in _NAMES[kind]]
     if named:
         return fitting.get(named[0])
     candidates = [array for array in fitting.values() if kind != "descriptors" or array.shape[1] != 2]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from sigmaslam.evaluation.metrics.calibration import RIGHT
+from sigmaslam.evaluation.metrics.probability_calibration import RIGHT
 from sigmaslam.frontend.image_pair import match_features
 from sigmaslam.frontend.match_confidence import MatchJudge
 from sigmaslam.frontend.types import Features
@@ -24,10 +24,10 @@ SHARES = (0.35, 0.5)
 """Between these are the shares of right matches on moving things: beyond a half the scene may be the lesser body."""
 _SIZE = 384
 _DOMAINS = ("street", "room", "drone")
-# A thing that moves by less in the image cannot be told from the scene.
+# Image motion below this, in pixels, does not count as independent motion.
 _MOVED = 3.0
-_LEAST_MATCHES = 60
-# Of the virtual stereo pair, in depths of the median point, and the noise of its disparities, pixels.
+_MIN_MATCHES = 60
+# Baseline of the virtual stereo pair, in median depths, and noise of its disparities, in pixels.
 _BASELINE, _DISPARITY_NOISE = 0.05, 0.3
 
 
@@ -63,7 +63,7 @@ def judge_movers(detect: Callable[[np.ndarray], Features], judge: MatchJudge, se
     """
     stream = ScenePairs(seed, _SIZE, _DOMAINS, max_moving_share=0.5)
     counts = np.zeros((4, 2))
-    found, right_poses = 0, 0
+    pair_count, right_poses = 0, 0
     for index in range(tried):
         pair = stream.pair(index)
         image0, image1 = (np.round(255.0 * image).astype(np.uint8) for image in (pair.image0, pair.image1))
@@ -73,11 +73,11 @@ def judge_movers(detect: Callable[[np.ndarray], Features], judge: MatchJudge, se
         right = np.linalg.norm(matches.keypoints1 - truth.places, axis=1) < RIGHT
         static = right & ~truth.moved
         share = 1.0 - static.sum() / max(right.sum(), 1)
-        if right.sum() < _LEAST_MATCHES or not SHARES[0] <= share <= SHARES[1]:
+        if right.sum() < _MIN_MATCHES or not SHARES[0] <= share <= SHARES[1]:
             continue
-        found += 1
+        pair_count += 1
         camera0, camera1 = pair.views0.sight.eye.camera, pair.views1.sight.eye.camera
-        # As if both had been taken by the first camera: the centres are the same.
+        # Map both views to the intrinsics of the first camera; the principal points are equal.
         centre, zoom = np.array([camera0.cx, camera0.cy]), camera0.fx / camera1.fx
         points1 = (matches.keypoints1 - centre) * zoom + centre
         covariance = zoom**2 * matches.covariance
@@ -106,11 +106,13 @@ def judge_movers(detect: Callable[[np.ndarray], Features], judge: MatchJudge, se
     still, matched, epipolar_share, stereo_share = (
         float(share) for share in counts[:, 0] / np.maximum(counts[:, 1], 1.0)
     )
-    return MoverJudgement(found, 1.0 - still, matched, epipolar_share, stereo_share, right_poses / max(found, 1))
+    return MoverJudgement(
+        pair_count, 1.0 - still, matched, epipolar_share, stereo_share, right_poses / max(pair_count, 1)
+    )
 
 
 @dataclass(frozen=True, slots=True)
-class _Truth:
+class _TrueMotion:
     """Of M pixels of the first view: where they are in the second, whether they moved on their own, depths, motion."""
 
     places: np.ndarray
@@ -120,7 +122,7 @@ class _Truth:
     T_1_0: np.ndarray
 
 
-def _look_up(pair: ScenePair, points0: np.ndarray) -> _Truth:
+def _look_up(pair: ScenePair, points0: np.ndarray) -> _TrueMotion:
     sight0, sight1 = pair.views0.sight, pair.views1.sight
     T_1_0 = sight1.T_view_mover[0, 0] @ torch.linalg.inv(sight0.T_view_mover[0, 0])
     places, visible = pair.transfer(points0)
@@ -137,4 +139,4 @@ def _look_up(pair: ScenePair, points0: np.ndarray) -> _Truth:
     moved, depth0, depth1 = np.zeros(len(points0), bool), np.ones(len(points0)), np.ones(len(points0))
     moved[rows] = np.linalg.norm(static_places - places[rows], axis=1) > _MOVED
     depth0[rows], depth1[rows] = in_view0[2].numpy(), in_view1[2].numpy()
-    return _Truth(np.where(visible[:, None], places, np.inf), moved, depth0, depth1, T_1_0.numpy())
+    return _TrueMotion(np.where(visible[:, None], places, np.inf), moved, depth0, depth1, T_1_0.numpy())

@@ -26,7 +26,7 @@ def train_steps(
     checkpoint: Path,
     made_of: dict[str, Any],
     note: Callable[[int, str], None],
-    most_gradient: float = float("inf"),
+    max_gradient: float = float("inf"),
 ) -> None:
     """Takes the steps, or those that the checkpoint lacks; the network is left in evaluation mode.
 
@@ -37,7 +37,7 @@ def train_steps(
         checkpoint: file for the state, every 250 steps, at the end and when the run is stopped.
         made_of: what the training is made of, as JSON holds it.
         note: is told of every step and the loss.
-        most_gradient: longer gradients are cut to this norm.
+        max_gradient: longer gradients are cut to this norm.
     Raises:
         InputError: the checkpoint cannot be read, or is of a training made of something else.
         KeyboardInterrupt: the run was stopped; it goes on from the checkpoint.
@@ -61,8 +61,8 @@ def train_steps(
                     loss = next(coming)
                     optimizer.zero_grad(set_to_none=True)
                     loss.backward()
-                    if most_gradient < float("inf"):
-                        nn.utils.clip_grad_norm_(network.parameters(), most_gradient)
+                    if max_gradient < float("inf"):
+                        nn.utils.clip_grad_norm_(network.parameters(), max_gradient)
                     optimizer.step()
                     schedule.step()
                     step += 1

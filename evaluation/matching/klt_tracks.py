@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sigmaslam.evaluation.matching.pairs import ImagePair, Motion
+from sigmaslam.evaluation.matching.image_pairs import ImagePair, Motion
 from sigmaslam.frontend.klt import KltFrontend
 from sigmaslam.frontend.types import KeypointSearch
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sigmaslam.evaluation.matching.pairs import ImagePair, Motion
+from sigmaslam.evaluation.matching.image_pairs import ImagePair, Motion
 from sigmaslam.evaluation.matching.scores import pose_by_magsac, pose_errors_deg
 from sigmaslam.frontend.image_pair import Matches, match_features
 from sigmaslam.frontend.match_confidence import MatchJudge
@@ -16,10 +16,10 @@ from sigmaslam.frontend.nearest_neighbours import nearest_anywhere
 from sigmaslam.frontend.types import Features
 from sigmaslam.two_view.epipolar import estimate_epipolar_pose
 
-# With less translation its direction means nothing, metres.
-_LEAST_TRANSLATION = 0.02
-# Ours sees less probable matches too: its weights leave them out.
-_LEAST_PROBABILITY = 0.05
+# Below this length, in metres, the direction of a translation is undefined.
+_MIN_TRANSLATION = 0.02
+# Our estimator also takes improbable matches: its weights suppress them.
+_MIN_PROBABILITY = 0.05
 _ROUNDS = 5
 
 _Pose = tuple[np.ndarray, np.ndarray] | None
@@ -51,19 +51,19 @@ def compare_starts(
         detect: image to features.
         judge: of the matches.
     """
-    found: dict[str, list[tuple[float, float, float]]] = {}
+    measured: dict[str, list[tuple[float, float, float]]] = {}
     for pair in pairs:
         truth = pair.truth
-        if not isinstance(truth, Motion) or np.linalg.norm(truth.T_1_0[:3, 3]) < _LEAST_TRANSLATION:
+        if not isinstance(truth, Motion) or np.linalg.norm(truth.T_1_0[:3, 3]) < _MIN_TRANSLATION:
             continue
         features0, features1 = detect(pair.image0), detect(pair.image1)
         putative = nearest_anywhere(features0.descriptors, features1.descriptors)
         mutual = putative.select(putative.mutual)
         points0 = features0.keypoints[mutual.index0].astype(np.float64)
         points1 = features1.keypoints[mutual.index1].astype(np.float64)
-        matches = match_features(judge, pair.image0, pair.image1, features0, features1, _LEAST_PROBABILITY)
+        matches = match_features(judge, pair.image0, pair.image1, features0, features1, _MIN_PROBABILITY)
         contenders = _contenders(points0, points1, matches, truth.K)
-        # In turn, so that a busy moment of the machine hits everyone.
+        # Interleave the contenders, so that a busy moment of the machine hits all of them.
         times = np.full((_ROUNDS, len(contenders)), np.inf)
         for turn in range(_ROUNDS):
             for column, (name, estimate) in enumerate(contenders.items()):
@@ -71,10 +71,10 @@ def compare_starts(
                 pose = estimate()
                 times[turn, column] = 1e3 * (time.perf_counter() - begin)
                 if turn == 0:
-                    found.setdefault(name, []).append((*_errors(pose, truth.T_1_0), 0.0))
+                    measured.setdefault(name, []).append((*_errors(pose, truth.T_1_0), 0.0))
         for column, name in enumerate(contenders):
-            found[name][-1] = (*found[name][-1][:2], float(times[:, column].min()))
-    return {name: _summary(np.array(values)) for name, values in found.items()}
+            measured[name][-1] = (*measured[name][-1][:2], float(times[:, column].min()))
+    return {name: _summary(np.array(values)) for name, values in measured.items()}
 
 
 def _contenders(

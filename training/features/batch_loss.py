@@ -44,7 +44,7 @@ def pair_loss(
     batch, count = keypoints0.shape[:2]
     size = image0.shape[-1]
     visible = visible & ((places1 >= _MARGIN) & (places1 <= size - 1 - _MARGIN)).all(dim=-1)
-    # By matrix products it would be off by a tenth of a pixel.
+    # Matrix products would err by a tenth of a pixel.
     distance = torch.cdist(places1, keypoints1, compute_mode="donot_use_mm_for_euclid_dist")
     nearest, partner = distance.min(dim=2)
     distractors = keypoints1[:, ::2]

@@ -8,9 +8,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from sigmaslam.training.choices import MIXES
 from sigmaslam.training.devices import Workplace, describe_hardware
 from sigmaslam.training.features.checkpoint import TrainingState
+from sigmaslam.training.mixes import MIXES
 
 CARD_NAME = "features.json"
 _LIMITS = [

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib.resources import as_file, files
 from pathlib import Path
 
 import numpy as np
 
-from sigmaslam.evaluation.benchmarks.page import header, machine, row, write_page
+from sigmaslam.evaluation.benchmarks.page import header, opening, row, write_page
 from sigmaslam.evaluation.benchmarks.sequences import REAL
-from sigmaslam.evaluation.run_evaluation import evaluate_run
+from sigmaslam.evaluation.trial import Trial, render
 from sigmaslam.readers import open_sequence
-from sigmaslam.runs.report import read_frames
 from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.tracker import TrackerConfig
-from sigmaslam.synthetic.render_sequence import write_sequence
 from sigmaslam.synthetic.simulation import Recipe
 
 CONSTANTS = ((0.15, 0.2), (0.2, 0.3), (0.3, 0.4), (0.5, 0.6))
@@ -68,12 +66,11 @@ def write_noise(
     renders: dict[int, dict[str, tuple[Path, Path]]] = {}
     for seed in (_TUNING_SEED, _TEST_SEED):
         for preset in _PRESETS:
-            name = f"{preset}{seed}"
-            note(f"rendering {name}")
-            write_sequence(runs / name, Recipe(preset, _FRAMES, seed), "sparse", workers)
-            truth = runs / name / _EUROC_TRUTH
-            truth = truth if truth.is_file() else runs / name / "poses.txt"
-            renders.setdefault(seed, {})[name] = (runs / name, truth)
+            note(f"rendering {preset}{seed}")
+            source = render(runs, Recipe(preset, _FRAMES, seed), workers)
+            truth = source / _EUROC_TRUTH
+            truth = truth if truth.is_file() else source / "poses.txt"
+            renders.setdefault(seed, {})[source.name] = (source, truth)
     note(f"tuning {len(CONSTANTS)} constants")
     tuning = {
         constant: [_track(source, truth, constant) for source, truth in renders[_TUNING_SEED].values()]
@@ -91,21 +88,16 @@ def write_noise(
 
 
 def _track(source: Path, truth: Path, constant: tuple[float, float] | None) -> NoiseResult:
-    with tempfile.TemporaryDirectory() as scratch:
-        run = Path(scratch) / "run"
-        track_sequence(open_sequence(source), run, config=TrackerConfig(constant_sigma=constant))
-        evaluation = evaluate_run(run, truth, plot=False)
-        frames = read_frames(run / "frames.csv")
-    tracked = np.array(frames.status) == "tracking"
-    columns = frames.columns
+    result = Trial(source, truth, partial(track_sequence, config=TrackerConfig(constant_sigma=constant))).run()
+    evaluation = result.evaluation
     assert evaluation.nees is not None
     return NoiseResult(
         evaluation.ate.rmse,
         float(np.median(evaluation.rpe.translations)),
         evaluation.nees.mean,
-        float(np.median(columns["nis"][tracked] / columns["dof"][tracked])) if tracked.any() else float("nan"),
-        int(tracked.sum()),
-        len(frames) - 1,
+        float(np.median(result.nis)) if len(result.nis) else float("nan"),
+        int(result.tracked.sum()),
+        len(result.table) - 1,
     )
 
 
@@ -116,9 +108,7 @@ def _page(
     results: dict[str, tuple[NoiseResult, NoiseResult]],
 ) -> str:
     lines = [
-        "# Every match its own covariance, or one for all",
-        "",
-        f"Made by `{command}` on {machine()}. The tracker with the",
+        *opening("Every match its own covariance, or one for all", command, ". The tracker with the"),
         "learned features; only R and the landmarks' disparity sigma differ. NEES and NIS per degree of freedom, 1 is",
         "right; NEES says something on renders alone, whose truth is exact.",
         "",
@@ -127,8 +117,8 @@ def _page(
         "",
         *header("sigma of places / disparity, px", "ATE, geometric mean, mm", "NEES, geometric mean"),
     ]
-    for constant, found in tuning.items():
-        ate, nees = (_geometric_mean([getattr(each, name) for each in found]) for name in ("ate", "nees"))
+    for constant, trials in tuning.items():
+        ate, nees = (_geometric_mean([getattr(each, name) for each in trials]) for name in ("ate", "nees"))
         mark = " (chosen)" if constant == chosen else ""
         lines.append(f"| {constant[0]} / {constant[1]}{mark} | {1e3 * ate:.2f} | {nees:.2f} |")
     lines += [

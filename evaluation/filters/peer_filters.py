@@ -20,13 +20,31 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmaslam.evaluation.filters import work as filter_work
+from sigmaslam.evaluation.filters.work import (
+    BASELINE,
+    FOCAL_LENGTH,
+    PRINCIPAL_POINT,
+    TIME_STEP,
+    Array,
+    LandmarkWork,
+    LinearWork,
+    LocalisationWork,
+    PositionWork,
+    StereoWork,
+    Work,
+    advance,
+    drive,
+    project_landmark,
+    project_stereo,
+    range_and_bearing,
+    wrap,
+)
 
 Step: TypeAlias = Callable[[], tuple[NDArray[Any], NDArray[Any]]]
 Model: TypeAlias = Callable[[Any, Any, Any], Any]
 
-_BATCHED = (filter_work.LocalisationWork, filter_work.PositionWork, filter_work.LandmarkWork)
-_UNSCENTED = (filter_work.StereoWork, *_BATCHED)
+_BATCHED = (LocalisationWork, PositionWork, LandmarkWork)
+_UNSCENTED = (StereoWork, *_BATCHED)
 
 
 class Maker(Protocol):
@@ -79,58 +97,54 @@ def single_thread_environment() -> dict[str, str]:
 
 
 @dataclass(frozen=True, slots=True)
-class _Problem:
+class _PeerProblem:
     """A work as models of the form model(xp, states (..., n), inputs), with the inputs of each filter.
 
     In a batch every array but the noises has a leading dimension B; a single filter has none.
     """
 
     batched: bool
-    mean: filter_work.Array
-    covariance: filter_work.Array
-    process_noise: filter_work.Array
-    measurement: filter_work.Array
-    measurement_noise: filter_work.Array
+    mean: Array
+    covariance: Array
+    process_noise: Array
+    measurement: Array
+    measurement_noise: Array
     transition: Model
-    transition_inputs: filter_work.Array
+    transition_inputs: Array
     measure: Model
-    measure_inputs: filter_work.Array
+    measure_inputs: Array
 
-    def filters(
-        self,
-    ) -> list[tuple[filter_work.Array, filter_work.Array, filter_work.Array, filter_work.Array, filter_work.Array]]:
+    def filters(self) -> list[tuple[Array, Array, Array, Array, Array]]:
         """Mean, covariance, measurement, and the inputs of transition and measurement, of each filter."""
         arrays = (self.mean, self.covariance, self.measurement, self.transition_inputs, self.measure_inputs)
         return list(zip(*arrays, strict=True)) if self.batched else [arrays]
 
-    def collect(
-        self, means: list[filter_work.Array], covariances: list[filter_work.Array]
-    ) -> tuple[filter_work.Array, filter_work.Array]:
+    def collect(self, means: list[Array], covariances: list[Array]) -> tuple[Array, Array]:
         """Results of `filters`, in the shapes of the work."""
         return (np.stack(means), np.stack(covariances)) if self.batched else (means[0], covariances[0])
 
 
-def _problem(work: filter_work.Work) -> _Problem:
-    if isinstance(work, filter_work.LinearWork):
+def _problem(work: Work) -> _PeerProblem:
+    if isinstance(work, LinearWork):
         raise TypeError("LinearWork is for Kalman filters: no unscented filter here takes it")
     no_inputs = np.empty((len(work.mean), 0))
     measurement = work.measurement
-    transition: Model = filter_work.drive
+    transition: Model = drive
     measure: Model = _position
     measure_inputs = no_inputs
-    if isinstance(work, filter_work.StereoWork):
+    if isinstance(work, StereoWork):
         transition, transition_inputs = _advance, work.transition
-        measure, measure_inputs = filter_work.project_stereo, work.points
-    elif isinstance(work, filter_work.LandmarkWork):
+        measure, measure_inputs = project_stereo, work.points
+    elif isinstance(work, LandmarkWork):
         transition, transition_inputs = _stay, no_inputs
         measure = _project_landmark
     else:
         transition_inputs = work.control
-    if isinstance(work, filter_work.LocalisationWork):
+    if isinstance(work, LocalisationWork):
         measure, measure_inputs = _range_and_relative_bearing, np.column_stack([work.landmark, measurement[:, 1]])
         measurement = measurement * np.array([1.0, 0.0])
-    return _Problem(
-        not isinstance(work, filter_work.StereoWork),
+    return _PeerProblem(
+        not isinstance(work, StereoWork),
         work.mean,
         work.covariance,
         work.process_noise,
@@ -148,7 +162,7 @@ def _stay(xp: Any, states: Any, inputs: Any) -> Any:
 
 
 def _advance(xp: Any, states: Any, inputs: Any) -> Any:
-    return filter_work.advance(states, inputs)
+    return advance(states, inputs)
 
 
 def _position(xp: Any, states: Any, inputs: Any) -> Any:
@@ -156,23 +170,23 @@ def _position(xp: Any, states: Any, inputs: Any) -> Any:
 
 
 def _project_landmark(xp: Any, states: Any, inputs: Any) -> Any:
-    return filter_work.project_landmark(xp, states)
+    return project_landmark(xp, states)
 
 
 def _range_and_relative_bearing(xp: Any, states: Any, inputs: Any) -> Any:
     """Range and the bearing minus the measured one; inputs (..., 3) are the landmark and the measured bearing."""
-    measured = filter_work.range_and_bearing(xp, states, inputs[..., :2])
-    return xp.stack([measured[..., 0], filter_work.wrap(measured[..., 1] - inputs[..., 2])], -1)
+    measured = range_and_bearing(xp, states, inputs[..., :2])
+    return xp.stack([measured[..., 0], wrap(measured[..., 1] - inputs[..., 2])], -1)
 
 
-def filterpy(work: filter_work.Work, dtype: str = "float64") -> Step:
+def filterpy(work: Work, dtype: str = "float64") -> Step:
     """filterpy's UnscentedKalmanFilter with Merwe's points, or its KalmanFilter for linear work.
 
     Version 2.0 draws new sigma points at the end of predict(), so its result is that of the reference. Its
     CubatureKalmanFilter measures with the propagated points, which lack the process noise, and is not used.
     """
     _check_dtype(dtype, "float64")
-    if isinstance(work, filter_work.LinearWork):
+    if isinstance(work, LinearWork):
         return _filterpy_linear(work)
     from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
@@ -190,7 +204,7 @@ def filterpy(work: filter_work.Work, dtype: str = "float64") -> Step:
     unscented.Q, unscented.R = problem.process_noise, problem.measurement_noise
     filters = problem.filters()
 
-    def step() -> tuple[filter_work.Array, filter_work.Array]:
+    def step() -> tuple[Array, Array]:
         means, covariances = [], []
         for mean, covariance, measurement, transition_inputs, measure_inputs in filters:
             unscented.x, unscented.P = mean, covariance
@@ -203,7 +217,7 @@ def filterpy(work: filter_work.Work, dtype: str = "float64") -> Step:
     return step
 
 
-def _filterpy_linear(work: filter_work.LinearWork) -> Step:
+def _filterpy_linear(work: LinearWork) -> Step:
     from filterpy.kalman import KalmanFilter
 
     kalman = KalmanFilter(dim_x=4, dim_z=2)
@@ -214,7 +228,7 @@ def _filterpy_linear(work: filter_work.LinearWork) -> Step:
         work.measurement_noise,
     )
 
-    def step() -> tuple[filter_work.Array, filter_work.Array]:
+    def step() -> tuple[Array, Array]:
         means, covariances = [], []
         for mean, covariance, measurement in zip(work.mean, work.covariance, work.measurement, strict=True):
             kalman.x, kalman.P = mean, covariance
@@ -227,46 +241,40 @@ def _filterpy_linear(work: filter_work.LinearWork) -> Step:
     return step
 
 
-def _one_point(model: Model) -> Callable[[filter_work.Array, filter_work.Array], filter_work.Array]:
+def _one_point(model: Model) -> Callable[[Array, Array], Array]:
     """The model of one sigma point, as filterpy calls it.
 
     For a handful of numbers `math` is ten times quicker than numpy, and a user of filterpy would take it.
     """
-    single: dict[Model, Callable[[filter_work.Array, filter_work.Array], filter_work.Array]] = {
-        filter_work.drive: _drive_one,
+    single: dict[Model, Callable[[Array, Array], Array]] = {
+        drive: _drive_one,
         _range_and_relative_bearing: _range_and_relative_bearing_one,
         _project_landmark: _project_landmark_one,
     }
     return single.get(model, partial(model, np))
 
 
-def _drive_one(state: filter_work.Array, control: filter_work.Array) -> filter_work.Array:
+def _drive_one(state: Array, control: Array) -> Array:
     x, y, theta = state.tolist()
     speed, turn_rate = control.tolist()
-    step = speed * filter_work.TIME_STEP
-    return np.array([x + step * math.cos(theta), y + step * math.sin(theta), theta + turn_rate * filter_work.TIME_STEP])
+    step = speed * TIME_STEP
+    return np.array([x + step * math.cos(theta), y + step * math.sin(theta), theta + turn_rate * TIME_STEP])
 
 
-def _range_and_relative_bearing_one(state: filter_work.Array, inputs: filter_work.Array) -> filter_work.Array:
+def _range_and_relative_bearing_one(state: Array, inputs: Array) -> Array:
     x, y, theta = state.tolist()
     landmark_x, landmark_y, measured = inputs.tolist()
     dx, dy = landmark_x - x, landmark_y - y
-    return np.array([math.hypot(dx, dy), filter_work.wrap(math.atan2(dy, dx) - theta - measured)])
+    return np.array([math.hypot(dx, dy), wrap(math.atan2(dy, dx) - theta - measured)])
 
 
-def _project_landmark_one(state: filter_work.Array, inputs: filter_work.Array) -> filter_work.Array:
+def _project_landmark_one(state: Array, inputs: Array) -> Array:
     x, y, z = state.tolist()
-    scale = filter_work.FOCAL_LENGTH / z
-    return np.array(
-        [
-            scale * x + filter_work.PRINCIPAL_POINT[0],
-            scale * y + filter_work.PRINCIPAL_POINT[1],
-            scale * filter_work.BASELINE,
-        ]
-    )
+    scale = FOCAL_LENGTH / z
+    return np.array([scale * x + PRINCIPAL_POINT[0], scale * y + PRINCIPAL_POINT[1], scale * BASELINE])
 
 
-def stone_soup(work: filter_work.Work, dtype: str = "float64") -> Step:
+def stone_soup(work: Work, dtype: str = "float64") -> Step:
     """Stone Soup's UnscentedKalmanPredictor and Updater with models of our own, which see all sigma points at once.
 
     Its predict() and predict_measurement() remember their last 128 results by the identity of the state, so that every
@@ -287,7 +295,7 @@ def stone_soup(work: filter_work.Work, dtype: str = "float64") -> Step:
     problem = _problem(work)
     process_noise, measurement_noise = CovarianceMatrix(work.process_noise), CovarianceMatrix(work.measurement_noise)
 
-    class Motion(GaussianModel, TransitionModel):
+    class Transition(GaussianModel, TransitionModel):
         inputs: Any = Property()
 
         @property
@@ -322,12 +330,12 @@ def stone_soup(work: filter_work.Work, dtype: str = "float64") -> Step:
                 StateVector(mean),
                 CovarianceMatrix(covariance),
                 Detection(StateVector(measurement), measurement_model=sensor),
-                UnscentedKalmanPredictor(Motion(inputs=transition_inputs), **cubature),
+                UnscentedKalmanPredictor(Transition(inputs=transition_inputs), **cubature),
                 UnscentedKalmanUpdater(None, **cubature),
             )
         )
 
-    def step() -> tuple[filter_work.Array, filter_work.Array]:
+    def step() -> tuple[Array, Array]:
         means, covariances = [], []
         for mean, covariance, detection, predictor, updater in filters:
             prediction = predictor.predict(GaussianState(mean, covariance))
@@ -339,7 +347,7 @@ def stone_soup(work: filter_work.Work, dtype: str = "float64") -> Step:
     return step
 
 
-def dynamax(work: filter_work.Work, dtype: str = "float64") -> Step:
+def dynamax(work: Work, dtype: str = "float64") -> Step:
     """The two halves of dynamax's unscented filter, compiled by jax.jit, and by jax.vmap over a batch.
 
     Its public unscented_kalman_filter() takes a whole sequence and works in the order update, predict: one step from a
@@ -406,7 +414,7 @@ def dynamax(work: filter_work.Work, dtype: str = "float64") -> Step:
     return step
 
 
-def pypose(work: filter_work.Work, dtype: str = "float64", repaired: bool = True) -> Step:
+def pypose(work: Work, dtype: str = "float64", repaired: bool = True) -> Step:
     """PyPose's UKF, batched, with kappa = 0, as it is or with its two faults repaired.
 
     As it is, it takes the rows of the lower Cholesky factor for offsets, and pairs the deviations of the propagated
@@ -480,13 +488,13 @@ def pypose(work: filter_work.Work, dtype: str = "float64", repaired: bool = True
     return step
 
 
-def torch_kf(work: filter_work.LinearWork, dtype: str = "float64") -> Step:
+def torch_kf(work: LinearWork, dtype: str = "float64") -> Step:
     """torch-kf's KalmanFilter, batched, as its README has it."""
     _check_dtype(dtype, "float64", "float32")
     import torch
     from torch_kf import GaussianState, KalmanFilter
 
-    def tensor(array: filter_work.Array) -> torch.Tensor:
+    def tensor(array: Array) -> torch.Tensor:
         return torch.tensor(array, dtype=getattr(torch, dtype))
 
     kalman = KalmanFilter(
@@ -506,7 +514,7 @@ def torch_kf(work: filter_work.LinearWork, dtype: str = "float64") -> Step:
     return step
 
 
-def torch_linalg(work: filter_work.Work, dtype: str = "float64") -> Step:
+def torch_linalg(work: Work, dtype: str = "float64") -> Step:
     """No library: the batched filter that a person writes with torch.linalg, batch first and without unrolling."""
     _check_dtype(dtype, "float64", "float32")
     import torch
@@ -565,10 +573,10 @@ _DOUBLE = ("float64",)
 _BOTH = ("float64", "float32")
 
 PEERS = (
-    Peer("filterpy", ("filterpy",), (*_UNSCENTED, filter_work.LinearWork), _DOUBLE, filterpy, batched=False),
+    Peer("filterpy", ("filterpy",), (*_UNSCENTED, LinearWork), _DOUBLE, filterpy, batched=False),
     Peer("Stone Soup", ("stonesoup",), _UNSCENTED, _DOUBLE, stone_soup, batched=False),
     Peer("dynamax", ("dynamax", "jax"), _UNSCENTED, _BOTH, dynamax, batched=True),
     Peer("PyPose, repaired", ("pypose", "torch"), _UNSCENTED, _BOTH, pypose, batched=True),
     Peer("torch.linalg batched", ("torch",), _BATCHED, _BOTH, torch_linalg, batched=True),
-    Peer("torch-kf", ("torch_kf", "torch"), (filter_work.LinearWork,), _BOTH, torch_kf, batched=True),
+    Peer("torch-kf", ("torch_kf", "torch"), (LinearWork,), _BOTH, torch_kf, batched=True),
 )

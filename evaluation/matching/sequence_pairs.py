@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmaslam.evaluation.matching.pairs import ImagePair, Motion, SameRows, resize
+from sigmaslam.evaluation.matching.image_pairs import ImagePair, Motion, SameRows, resize
 from sigmaslam.evaluation.matching.stereo import StereoStep
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.rectification import StereoRectifier

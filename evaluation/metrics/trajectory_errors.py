@@ -12,7 +12,9 @@ from sigmaslam.estimation.mahalanobis import squared_mahalanobis
 from sigmaslam.geometry.se3 import rotation_log, se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory
 
-Alignment = Literal["se3", "sim3", "origin", "none"]
+Alignment = Literal["se3", "origin"]
+# Seconds that the timestamps of an estimated and a true pose may differ.
+MAX_DIFFERENCE = 0.02
 
 KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 """Segment lengths of the KITTI benchmark, metres."""
@@ -119,7 +121,9 @@ class PoseNees:
     per_frame: np.ndarray
 
 
-def associate(estimate: Trajectory, truth: Trajectory, max_difference: float = 0.02) -> tuple[np.ndarray, np.ndarray]:
+def associate(
+    estimate: Trajectory, truth: Trajectory, max_difference: float = MAX_DIFFERENCE
+) -> tuple[np.ndarray, np.ndarray]:
     """Pair each estimated pose with the true pose nearest in time; each pose is used once at most.
 
     Args:
@@ -155,42 +159,33 @@ def associate(estimate: Trajectory, truth: Trajectory, max_difference: float = 0
     )
 
 
-def synchronise(estimate: Trajectory, truth: Trajectory, max_difference: float = 0.02) -> tuple[Trajectory, Trajectory]:
+def synchronise(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, Trajectory]:
     """The associated poses of both, of equal length; see `associate`."""
-    estimate_index, truth_index = associate(estimate, truth, max_difference)
+    estimate_index, truth_index = associate(estimate, truth)
     return estimate.subset(estimate_index), truth.subset(truth_index)
 
 
-def align_umeyama(
-    estimate_positions: np.ndarray, truth_positions: np.ndarray, with_scale: bool = False
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Rotation R, translation t and scale s that minimise the sum of |s R estimate + t - truth|^2.
+def align_umeyama(estimate_positions: np.ndarray, truth_positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation R and translation t that minimise the sum of |R estimate + t - truth|^2.
 
     Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 1991.
     Where positions are on a line or in one place, one of the many best rotations is given.
 
     Args:
         estimate_positions, truth_positions: (N, 3) metres.
-        with_scale: estimate the scale too; else it is 1.
     Returns:
-        R (3, 3), t (3,) and s.
+        R (3, 3) and t (3,).
     Raises:
-        ValueError: the arrays differ in shape, or the scale is asked for and all positions are one.
+        ValueError: the arrays differ in shape.
     """
     if estimate_positions.shape != truth_positions.shape or estimate_positions.shape[-1:] != (3,):
         raise ValueError(f"positions must both be (N, 3); got {estimate_positions.shape} and {truth_positions.shape}")
     estimate_mean, truth_mean = estimate_positions.mean(axis=0), truth_positions.mean(axis=0)
     estimate_centred, truth_centred = estimate_positions - estimate_mean, truth_positions - truth_mean
-    u, singular_values, vt = np.linalg.svd(truth_centred.T @ estimate_centred / len(truth_positions))
+    u, _, vt = np.linalg.svd(truth_centred.T @ estimate_centred / len(truth_positions))
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     R = (u * sign) @ vt
-    scale = 1.0
-    if with_scale:
-        variance = np.mean(np.sum(estimate_centred**2, axis=1))
-        if variance == 0:
-            raise ValueError("all estimated positions are the same, so they have no scale")
-        scale = float(singular_values @ sign / variance)
-    return R, truth_mean - scale * R @ estimate_mean, scale
+    return R, truth_mean - R @ estimate_mean
 
 
 def align(estimate: Trajectory, truth: Trajectory, alignment: Alignment = "se3") -> Trajectory:
@@ -198,27 +193,22 @@ def align(estimate: Trajectory, truth: Trajectory, alignment: Alignment = "se3")
 
     Args:
         estimate, truth: N poses each.
-        alignment: "se3" the best rigid motion of the positions, "sim3" with scale, "origin" the motion that
-            makes the first poses equal, "none" leaves the estimate as it is.
+        alignment: "se3" the best rigid motion of the positions, "origin" the motion that makes the first poses equal.
     Raises:
         ValueError: the lengths differ.
     """
     if len(estimate) != len(truth):
         raise ValueError(f"{len(estimate)} estimated and {len(truth)} true poses: synchronise them first")
-    if alignment == "none":
-        return estimate
     if alignment == "origin":
         return Trajectory(estimate.timestamps, truth.poses[0] @ se3_inverse(estimate.poses[0]) @ estimate.poses)
-    R, t, scale = align_umeyama(estimate.positions, truth.positions, with_scale=alignment == "sim3")
+    R, t = align_umeyama(estimate.positions, truth.positions)
     poses = estimate.poses.copy()
     poses[:, :3, :3] = R @ estimate.rotations
-    poses[:, :3, 3] = scale * estimate.positions @ R.T + t
+    poses[:, :3, 3] = estimate.positions @ R.T + t
     return Trajectory(estimate.timestamps, poses)
 
 
-def absolute_trajectory_error(
-    estimate: Trajectory, truth: Trajectory, alignment: Alignment = "se3", max_difference: float = 0.02
-) -> AbsoluteError:
+def absolute_trajectory_error(estimate: Trajectory, truth: Trajectory, alignment: Alignment = "se3") -> AbsoluteError:
     """Absolute trajectory error over the frames that both have.
 
     On a straight path the rotation about the path, and hence rotation_rmse_deg, is undetermined by "se3".
@@ -226,7 +216,7 @@ def absolute_trajectory_error(
     Raises:
         InputError: no timestamps agree.
     """
-    estimate, truth = synchronise(estimate, truth, max_difference)
+    estimate, truth = synchronise(estimate, truth)
     aligned = align(estimate, truth, alignment)
     distance = np.linalg.norm(aligned.positions - truth.positions, axis=1)
     angle = _angles_deg(np.swapaxes(truth.rotations, 1, 2) @ aligned.rotations)
@@ -240,9 +230,7 @@ def absolute_trajectory_error(
     )
 
 
-def relative_pose_error(
-    estimate: Trajectory, truth: Trajectory, delta: int = 1, max_difference: float = 0.02
-) -> RelativeError:
+def relative_pose_error(estimate: Trajectory, truth: Trajectory, delta: int = 1) -> RelativeError:
     """Error of the motion over every step of `delta` associated frames (overlapping steps).
 
     Where the estimate misses frames, the step over the gap is longer.
@@ -252,7 +240,7 @@ def relative_pose_error(
     """
     if delta < 1:
         raise ValueError(f"delta must be at least 1 frame, not {delta}")
-    estimate, truth = synchronise(estimate, truth, max_difference)
+    estimate, truth = synchronise(estimate, truth)
     if len(estimate) <= delta:
         raise InputError(
             f"{len(estimate)} frames of estimate and truth agree in time, and a step of {delta} needs "
@@ -278,7 +266,6 @@ def kitti_errors(
     truth: Trajectory,
     lengths: Sequence[float] | None = None,
     step: int | None = None,
-    max_difference: float = 0.02,
 ) -> KittiErrors:
     """Segment errors of the KITTI odometry development kit (evaluate_odometry.cpp).
 
@@ -294,7 +281,7 @@ def kitti_errors(
     Raises:
         InputError: no timestamps agree.
     """
-    estimate, truth = synchronise(estimate, truth, max_difference)
+    estimate, truth = synchronise(estimate, truth)
     distances = truth.distances
     if lengths is None:
         lengths = SHORT_LENGTHS if distances[-1] < KITTI_LENGTHS[0] else KITTI_LENGTHS
@@ -322,13 +309,13 @@ def kitti_errors(
     )
 
 
-def pose_errors(estimate: Trajectory, truth: Trajectory, max_difference: float = 0.02) -> PoseErrors:
+def pose_errors(estimate: Trajectory, truth: Trajectory) -> PoseErrors:
     """Errors log(T_estimate^-1 T_truth), both relative to their first associated pose.
 
     Raises:
         InputError: no timestamps agree.
     """
-    estimate_index, truth_index = associate(estimate, truth, max_difference)
+    estimate_index, truth_index = associate(estimate, truth)
     estimated, true = estimate.poses[estimate_index], truth.poses[truth_index]
     first = np.zeros(1, dtype=np.int64)
     every = np.arange(len(estimated))
@@ -336,9 +323,7 @@ def pose_errors(estimate: Trajectory, truth: Trajectory, max_difference: float =
     return PoseErrors(estimate.timestamps[estimate_index], errors, estimate_index)
 
 
-def pose_nees(
-    estimate: Trajectory, truth: Trajectory, covariance: np.ndarray, max_difference: float = 0.02
-) -> PoseNees:
+def pose_nees(estimate: Trajectory, truth: Trajectory, covariance: np.ndarray) -> PoseNees:
     """NEES of poses relative to the first, per degree of freedom.
 
     The first associated frame, whose error is zero by construction, and frames with a singular or non-finite
@@ -353,7 +338,7 @@ def pose_nees(
     """
     if covariance.shape != (len(estimate), 6, 6):
         raise ValueError(f"covariance must be ({len(estimate)}, 6, 6), one a pose; got {covariance.shape}")
-    result = pose_errors(estimate, truth, max_difference)
+    result = pose_errors(estimate, truth)
     used = is_regular(covariance[result.index])
     used[0] = False
     errors, P = result.errors[used], covariance[result.index[used]]

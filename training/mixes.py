@@ -8,7 +8,6 @@ MIXES: dict[str, tuple[str, ...]] = {
     "patterns": ("patterns",),
     "scenes": ("scenes",),
     "mix": ("leaves", "scenes", "leaves", "scenes", "leaves"),
-    "blend": ("leaves", "leaves", "leaves", "scenes"),
     "turned": ("turned leaves", "leaves", "turned leaves", "scenes"),
     "endoscope": ("endoscopy", "leaves", "endoscopy", "leaves"),
 }
