@@ -6,7 +6,7 @@ import tempfile
 from enum import StrEnum
 from importlib.resources import as_file, files
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -16,6 +16,9 @@ from sigmaslam.frontend import FRONTENDS
 from sigmaslam.inference.onnx_graph import BACKENDS
 from sigmaslam.readers import StereoSequence, open_cameras, open_sequence
 from sigmaslam.readers.open import FORMATS
+
+if TYPE_CHECKING:
+    from sigmaslam.slam.config import TrackerConfig
 
 # mypy reads the members of an enum from literals alone.
 Frontend = StrEnum("Frontend", FRONTENDS)  # type: ignore[misc]
@@ -57,6 +60,9 @@ def track(
         Backend,
         typer.Option(help="What runs network and filter; torch needs 'train'."),
     ] = Backend["onnx"],
+    config: Annotated[
+        Path | None, typer.Option(help="YAML of tracker settings, `name: value` (names: sigmaslam.TrackerConfig).")
+    ] = None,
     map: Annotated[
         Path | None,
         typer.Option(help="map.npz of an earlier run with the same camera and front-end: poses are in its world."),
@@ -101,9 +107,10 @@ def track(
         need_train_extra()
     if track_object is not None and (map is not None or tracks):
         raise InputError("--map and --tracks are of a moving camera's world: leave them out with --track-object")
+    settings = None if config is None else _read_config(config, track_object is not None)
     sequence = _open_input(source, format, calibration, camera, seconds, (topic_left, topic_right))
     try:
-        summary = _track(sequence, out, frontend, backend, map, tracks, track_object, location)
+        summary = _track(sequence, out, frontend, backend, settings, map, tracks, track_object, location)
     except KeyboardInterrupt:
         if (out / "run.json").exists():
             typer.echo(f"Stopped; what was tracked until then is in {out}")
@@ -138,11 +145,19 @@ def _open_input(
     return open_cameras(camera, calibration, seconds)
 
 
+def _read_config(path: Path, track_object: bool) -> TrackerConfig:
+    from sigmaslam.slam.config import read_config
+    from sigmaslam.slam.object_tracker import OBJECT_CONFIG
+
+    return read_config(path, OBJECT_CONFIG if track_object else None)
+
+
 def _track(
     sequence: StereoSequence,
     out: Path,
     frontend: Frontend,
     backend: Backend,
+    config: TrackerConfig | None = None,
     map_path: Path | None = None,
     tracks: bool = False,
     track_object: str | None = None,
@@ -156,6 +171,7 @@ def _track(
         out,
         frontend.value,
         backend.value,
+        config,
         map_path=map_path,
         tracks=tracks,
         track_object=track_object,

@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sigmaslam.errors import InputError
+
+LINEARISATIONS = ("unscented", "extended")
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,3 +71,46 @@ class TrackerConfig:
     keyframe_ratio: float = 0.65
     search_limit: float = 25.0
     lost_seconds: float = 0.5
+
+
+def read_config(path: Path, base: TrackerConfig | None = None) -> TrackerConfig:
+    """Settings of a YAML file, `name: value` line by line; those that it does not name stay as in `base`.
+
+    Raises:
+        InputError: the file cannot be read, names no setting, or gives a value of the wrong kind.
+    """
+    base = base or TrackerConfig()
+    try:
+        entries = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise InputError(f"{path}: settings that cannot be read: {' '.join(str(error).split())}") from None
+    if not isinstance(entries, dict):
+        raise InputError(f"{path}: expected lines like `keyframe_ratio: 0.75`, found {type(entries).__name__}")
+    known = {field.name: getattr(base, field.name) for field in fields(base)}
+    for name, value in entries.items():
+        if name not in known:
+            raise InputError(f"{path}: there is no setting '{name}': choose among {', '.join(known)}")
+        entries[name] = _checked(f"{path}: {name}", value, known[name])
+    return replace(base, **entries)
+
+
+def _checked(place: str, value: Any, default: Any) -> Any:
+    """The value in the kind of the default one."""
+    if default is None:
+        if isinstance(value, list) and len(value) == 2 and all(_is_positive(each) for each in value):
+            return float(value[0]), float(value[1])
+        raise InputError(f"{place}: expected two positive numbers in a list, found {value!r}")
+    if isinstance(default, str):
+        if value in LINEARISATIONS:
+            return value
+        raise InputError(f"{place}: expected one of {', '.join(LINEARISATIONS)}, found {value!r}")
+    if isinstance(default, int) and isinstance(value, int) and _is_positive(value):
+        return value
+    if isinstance(default, float) and (value == 0 or _is_positive(value)) and not isinstance(value, bool):
+        return float(value)
+    kind = "a whole number above zero" if isinstance(default, int) else "a number, zero or more"
+    raise InputError(f"{place}: expected {kind}, found {value!r}")
+
+
+def _is_positive(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < float("inf")
