@@ -8,6 +8,7 @@ import numpy as np
 
 from sigmaslam.evaluation.matching.pairs import ImagePair, Motion
 from sigmaslam.frontend.klt import KltFrontend
+from sigmaslam.frontend.types import KeypointSearch
 
 KLT = "klt"
 TRACKED_KEYPOINTS = 2048
@@ -41,5 +42,5 @@ def follow_corners(image0: np.ndarray, image1: np.ndarray) -> tuple[np.ndarray, 
     klt = KltFrontend(TRACKED_KEYPOINTS)
     key, view = klt.observe(image0, image0), klt.observe(image1, image1)
     points = key.features.keypoints
-    tracks = klt.match(key, np.arange(len(points)), view, points.astype(np.float64), None)
+    tracks = klt.match(KeypointSearch.anywhere(key, np.arange(len(points))), view)
     return points[tracks.key_index].astype(np.float64), tracks.points

@@ -33,17 +33,17 @@ _ROBUST_SCALES = (6.0, 4.0, 3.0)
 _GATED = 3
 
 
+@dataclass(frozen=True, slots=True)
 class FrameUpdate:
     """Predicts what a frame sees of a window's landmarks, and estimates its pose; changes nothing.
 
-    Args:
+    Attributes:
         window: whose posterior is the prior.
         iterations: linearisations with a robust loss.
     """
 
-    def __init__(self, window: KeyframeWindow, iterations: int) -> None:
-        self._window = window
-        self._iterations = iterations
+    window: KeyframeWindow
+    iterations: int
 
     def predict(
         self, rows: np.ndarray, pose: np.ndarray, step_covariance: np.ndarray, reference: int = -1
@@ -58,7 +58,7 @@ class FrameUpdate:
         Returns:
             (u, v, disparity) (K, 3), its covariance without the measurement's noise (K, 3, 3), in front (K,) bool.
         """
-        state = self._window.posterior
+        state = self.window.posterior
         covariance = append_moved(matrix_root(state.covariance), pose_slice(reference % len(state)), step_covariance)
         covariance = covariance @ covariance.T
         moved, common = np.zeros((len(rows), LANDMARK_SIZE)), np.zeros((len(rows), 3, 2))
@@ -93,7 +93,7 @@ class FrameUpdate:
         Returns:
             None where too few views agree.
         """
-        window = self._window
+        window = self.window
         last, frame = pose_slice(len(window) - 1), pose_slice(len(window))
         factor = append_moved(matrix_root(window.posterior.covariance), last, step_covariance)
         prior = factor @ factor.T
@@ -108,7 +108,7 @@ class FrameUpdate:
         # draw the pose towards no motion.
         moved = np.zeros((len(views), LANDMARK_SIZE))
 
-        for iteration in range(self._iterations):
+        for iteration in range(self.iterations):
             update = self._linearised(views, pose, offset, spread, moved, 1.0)
             if update.usable.sum() < min_inliers:
                 return None
@@ -185,7 +185,7 @@ class FrameUpdate:
     def _landmark_step(self, views: LandmarkViews, update: _LinearisedViews, step: np.ndarray) -> np.ndarray:
         """(M, 6) how far the landmarks move when the state moves by a step."""
         after = update.residual - update.by_state @ step
-        cross = self._window.landmarks.covariance[views.landmark] @ update.by_landmark.transpose(0, 2, 1)
+        cross = self.window.landmarks.covariance[views.landmark] @ update.by_landmark.transpose(0, 2, 1)
         return np.asarray((cross @ (update.precision @ after[..., None]))[..., 0])
 
     def _linearise(
@@ -201,7 +201,7 @@ class FrameUpdate:
 
         The landmarks follow the state, and lie `moved` (M, 6) from there.
         """
-        window, state = self._window, self._window.posterior
+        window, state = self.window, self.window.posterior
         size = len(state.covariance)
         poses = np.concatenate([state.poses, pose[None]])
         poses = se3_exp(offset[CALIBRATION_SIZE:].reshape(-1, 6)) @ poses
@@ -222,7 +222,7 @@ class FrameUpdate:
         self, rows: np.ndarray, linear: Linearisation, noise: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Noise with that of the landmarks, and derivatives by the state with those through the landmarks."""
-        landmarks, size = self._window.landmarks, len(self._window.posterior.covariance)
+        landmarks, size = self.window.landmarks, len(self.window.posterior.covariance)
         by_state = linear.by_state.copy()
         by_state[:, :, :size] += linear.by_landmark @ landmarks.dependence[rows]
         through = project_covariance(linear.by_landmark, landmarks.covariance[rows])

@@ -11,7 +11,7 @@ from sigmaslam.frontend.lucas_kanade import refine
 from sigmaslam.frontend.match_confidence import LEAST_LOGIT, MatchJudge
 from sigmaslam.frontend.nearest_neighbours import Putative, nearest_anywhere, nearest_in_ellipses, nearest_in_rows
 from sigmaslam.frontend.plane_alignment import refine_in_rows, refine_on_planes
-from sigmaslam.frontend.types import Features, PatchMaps, Refinement, StereoView, TemporalMatches
+from sigmaslam.frontend.types import Features, KeypointSearch, Refinement, StereoView, TemporalMatches
 
 _ROW_TOLERANCE = 2.0
 # A little below zero, so that points at infinity survive a disparity offset.
@@ -134,22 +134,15 @@ class DescriptorFrontend:
         sigma[found.index0] = np.sqrt(found.covariance[:, 0, 0])
         return StereoView(left, right, features, disparity, sigma)
 
-    def match(
-        self,
-        key: StereoView,
-        index: np.ndarray,
-        view: StereoView,
-        predicted: np.ndarray,
-        covariance: np.ndarray | None,
-        maps: PatchMaps | None = None,
-    ) -> TemporalMatches:
+    def match(self, search: KeypointSearch, view: StereoView) -> TemporalMatches:
         """Mutual nearest neighbours within the ellipses of the prediction, or anywhere."""
-        wanted = key.features.select(index)
+        key, maps, covariance = search.key, search.maps, search.covariance
+        wanted = key.features.select(search.index)
         descriptors = wanted.descriptors, view.features.descriptors
         putative = (
             nearest_anywhere(*descriptors)
             if covariance is None
-            else nearest_in_ellipses(predicted, covariance, view.features.keypoints, *descriptors)
+            else nearest_in_ellipses(search.predicted, covariance, view.features.keypoints, *descriptors)
         )
 
         def refined(points0: np.ndarray, points1: np.ndarray, index0: np.ndarray, _: np.ndarray) -> Refinement:
@@ -160,7 +153,7 @@ class DescriptorFrontend:
         found = judge_refined(self._judge, key.left, view.left, wanted, view.features, putative, refined)
         found = found.select(found.probability >= _LEAST_PROBABILITY)
         return TemporalMatches(
-            index[found.index0],
+            search.index[found.index0],
             found.places,
             view.disparity[found.index1],
             found.covariance.astype(np.float64),

@@ -7,7 +7,7 @@ import numpy as np
 
 from sigmaslam.frontend.lucas_kanade import lucas_kanade
 from sigmaslam.frontend.nearest_neighbours import within_ellipses
-from sigmaslam.frontend.types import Features, PatchMaps, StereoView, TemporalMatches
+from sigmaslam.frontend.types import Features, KeypointSearch, StereoView, TemporalMatches
 
 _WINDOW = 15
 _LEVELS = 4
@@ -43,24 +43,16 @@ class KltFrontend:
         disparity = _disparity(left, right, keypoints)
         return StereoView(left, right, features, disparity, np.where(np.isfinite(disparity), _DISPARITY_SIGMA, np.nan))
 
-    def match(
-        self,
-        key: StereoView,
-        index: np.ndarray,
-        view: StereoView,
-        predicted: np.ndarray,
-        covariance: np.ndarray | None,
-        maps: PatchMaps | None = None,
-    ) -> TemporalMatches:
+    def match(self, search: KeypointSearch, view: StereoView) -> TemporalMatches:
         """Corners of the keyframe followed into the current left image, then into the right one; no patch is warped."""
-        points = key.features.keypoints[index]
-        places, found = _follow(key.left, view.left, points, predicted)
-        if covariance is not None:
-            found &= within_ellipses(places - predicted, covariance)
+        points = search.key.features.keypoints[search.index]
+        places, found = _follow(search.key.left, view.left, points, search.predicted)
+        if search.covariance is not None:
+            found &= within_ellipses(places - search.predicted, search.covariance)
         places = places[found]
         disparity = _disparity(view.left, view.right, places)
         return TemporalMatches(
-            index[found],
+            search.index[found],
             places,
             disparity,
             np.tile(_SIGMA**2 * np.eye(2), (len(places), 1, 1)),

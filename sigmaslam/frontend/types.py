@@ -85,6 +85,31 @@ class PatchMaps(Table):
 
 
 @dataclass(frozen=True, slots=True)
+class KeypointSearch:
+    """Keypoints of a keyframe that are to be found in another view.
+
+    Attributes:
+        key: the keyframe.
+        index: (K,) which of its keypoints.
+        predicted: (K, 2) where they are expected, pixels.
+        covariance: (K, 2, 2) of that, pixels squared: only the 99 % ellipse is searched; None: the prediction is worth
+            little.
+        maps: of the K patches, by which they are warped before they are compared.
+    """
+
+    key: StereoView
+    index: np.ndarray
+    predicted: np.ndarray
+    covariance: np.ndarray | None = None
+    maps: PatchMaps | None = None
+
+    @classmethod
+    def anywhere(cls, key: StereoView, index: np.ndarray) -> KeypointSearch:
+        """Keypoints that may be anywhere in the view."""
+        return cls(key, index, key.features.keypoints[index].astype(np.float64))
+
+
+@dataclass(frozen=True, slots=True)
 class TemporalMatches(Table):
     """Where keypoints of a keyframe are in the current view.
 
@@ -138,24 +163,6 @@ class Frontend(Protocol):
         """Detects keypoints in a rectified pair and finds their disparity."""
         ...
 
-    def match(
-        self,
-        key: StereoView,
-        index: np.ndarray,
-        view: StereoView,
-        predicted: np.ndarray,
-        covariance: np.ndarray | None,
-        maps: PatchMaps | None = None,
-    ) -> TemporalMatches:
-        """Finds keypoints of a keyframe in the current view.
-
-        Args:
-            key: the keyframe.
-            index: (K,) which of its keypoints are wanted.
-            view: the current view.
-            predicted: (K, 2) where the filter expects them, pixels.
-            covariance: (K, 2, 2) of that, pixels squared: only the 99 % ellipse is searched; None: the prediction is
-                worth little.
-            maps: of the K patches, by which they are warped before they are compared.
-        """
+    def match(self, search: KeypointSearch, view: StereoView) -> TemporalMatches:
+        """Finds keypoints of a keyframe in the current view."""
         ...

@@ -13,7 +13,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
-from sigmaslam.frontend import Frontend, StereoView, TemporalMatches
+from sigmaslam.frontend import Frontend, KeypointSearch, StereoView, TemporalMatches
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import se3_inverse
 from sigmaslam.slam.config import TrackerConfig
@@ -153,8 +153,7 @@ class BodyAdmission:
         first, min_inliers = self._first, self._config.min_inliers
         assert first is not None
         index = np.flatnonzero(np.isfinite(first.disparity))
-        keypoints = first.features.keypoints[index].astype(np.float64)
-        matches = self._frontend.match(first, index, view, keypoints, None)
+        matches = self._frontend.match(KeypointSearch.anywhere(first, index), view)
         rows = matches.key_index
         before = first.measured(rows)
         moved = self._has_moved(before, first.disparity_sigma[rows], matches)
@@ -199,7 +198,7 @@ class BodyAdmission:
             if not len(rows) or not len(index):
                 continue
             near = np.tile((0.5 * _STILL) ** 2 * np.eye(2), (len(rows), 1, 1))
-            matches = self._frontend.match(earlier, rows, view, before[:, :2], near)
+            matches = self._frontend.match(KeypointSearch(earlier, rows, before[:, :2], near), view)
             drift = np.linalg.norm(matches.points - earlier.measured(matches.key_index)[:, :2], axis=1)
             there = matches.points[drift < _STILL]
             if len(there):

@@ -9,7 +9,7 @@ import numpy as np
 from sigmaslam.estimation.frame_update import FrameUpdate
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
-from sigmaslam.frontend import Frontend, StereoView
+from sigmaslam.frontend import Frontend, KeypointSearch, StereoView
 from sigmaslam.frontend.plane_alignment import plane_maps
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import se3_inverse
@@ -51,10 +51,11 @@ class GuidedMatches:
         )
 
 
+@dataclass(frozen=True, slots=True)
 class GuidedMatcher:
     """Active search: finds landmarks within the innovation ellipse of their prediction, keyframe by keyframe.
 
-    Args:
+    Attributes:
         camera: the rectified pair.
         frontend: matches features.
         window: whose landmarks are searched for.
@@ -63,21 +64,12 @@ class GuidedMatcher:
         config: settings.
     """
 
-    def __init__(
-        self,
-        camera: RectifiedStereo,
-        frontend: Frontend,
-        window: KeyframeWindow,
-        update: FrameUpdate,
-        noise: MeasurementNoise,
-        config: TrackerConfig,
-    ) -> None:
-        self._camera = camera
-        self._frontend = frontend
-        self._window = window
-        self._update = update
-        self._noise = noise
-        self._config = config
+    camera: RectifiedStereo
+    frontend: Frontend
+    window: KeyframeWindow
+    update: FrameUpdate
+    noise: MeasurementNoise
+    config: TrackerConfig
 
     def match_guided(
         self,
@@ -98,16 +90,16 @@ class GuidedMatcher:
             reference: the last one by default.
             alone: the view is too far from the keyframes' to share errors with them.
         """
-        landmarks = self._window.landmarks
-        rows = np.flatnonzero(landmarks.misses < self._config.max_misses)
+        landmarks = self.window.landmarks
+        rows = np.flatnonzero(landmarks.misses < self.config.max_misses)
         if not len(rows):
             return GuidedMatches.empty()
-        predicted, S, in_front = self._update.predict(rows, pose, covariance, reference)
+        predicted, S, in_front = self.update.predict(rows, pose, covariance, reference)
         S = S[:, :2, :2] + np.eye(2)
         inside = in_front & self._in_image(predicted)
-        inside &= np.linalg.eigvalsh(S)[:, 1] < self._config.search_limit**2
+        inside &= np.linalg.eigvalsh(S)[:, 1] < self.config.search_limit**2
         rows, predicted, S = rows[inside], predicted[inside], S[inside]
-        T_view_key = se3_inverse(pose) @ self._window.posterior.poses
+        T_view_key = se3_inverse(pose) @ self.window.posterior.poses
         parts = []
         for anchor, key in enumerate(keyframes):
             chosen = np.flatnonzero(landmarks.anchor[rows] == anchor)
@@ -116,20 +108,21 @@ class GuidedMatcher:
             feature = landmarks.feature[rows[chosen]]
             maps = None
             if key.slope is not None:
-                measured = self._window.true_disparity(landmarks.estimate[rows[chosen]])
-                maps = plane_maps(self._camera, measured, key.slope[feature], T_view_key[anchor])
-            matches = self._frontend.match(key, feature, view, predicted[chosen, :2], S[chosen], maps)
+                measured = self.window.true_disparity(landmarks.estimate[rows[chosen]])
+                maps = plane_maps(self.camera, measured, key.slope[feature], T_view_key[anchor])
+            search = KeypointSearch(key, feature, predicted[chosen, :2], S[chosen], maps)
+            matches = self.frontend.match(search, view)
             # Features of a keyframe ascend with the rows of its landmarks.
             place = np.searchsorted(feature, matches.key_index)
-            noise, common = self._noise.of_matches(matches), np.zeros((len(place), 3, 2))
-            if alone and anchor != reference % len(keyframes) and len(place) < self._config.min_inliers:
+            noise, common = self.noise.of_matches(matches), np.zeros((len(place), 3, 2))
+            if alone and anchor != reference % len(keyframes) and len(place) < self.config.min_inliers:
                 continue  # a few that agree by chance would connect keyframes that hardly see each other
             if not alone:
-                noise, common = self._noise.split(noise)
+                noise, common = self.noise.split(noise)
             views = LandmarkViews(rows[chosen][place], matches.measured, noise, common)
             parts.append(GuidedMatches(views, matches.probability, rows[chosen]))
         return GuidedMatches.concatenate(parts)
 
     def _in_image(self, predicted: np.ndarray) -> np.ndarray:
         u, v = predicted[:, 0], predicted[:, 1]
-        return np.asarray((u >= 0) & (v >= 0) & (u < self._camera.width) & (v < self._camera.height))
+        return np.asarray((u >= 0) & (v >= 0) & (u < self.camera.width) & (v < self.camera.height))

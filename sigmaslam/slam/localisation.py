@@ -51,10 +51,11 @@ class Prediction:
         return cls(key @ motion.step, turn_covariance(key, motion.step_covariance))
 
 
+@dataclass(frozen=True, slots=True)
 class Localiser:
     """Matches a view with the landmarks of the window and estimates its pose.
 
-    Args:
+    Attributes:
         window: of keyframes.
         update: estimates poses against it.
         guided: finds landmarks near a prediction.
@@ -62,19 +63,11 @@ class Localiser:
         config: settings.
     """
 
-    def __init__(
-        self,
-        window: KeyframeWindow,
-        update: FrameUpdate,
-        guided: GuidedMatcher,
-        unguided: UnguidedMatcher,
-        config: TrackerConfig,
-    ) -> None:
-        self._window = window
-        self._update = update
-        self._guided = guided
-        self._unguided = unguided
-        self._config = config
+    window: KeyframeWindow
+    update: FrameUpdate
+    guided: GuidedMatcher
+    unguided: UnguidedMatcher
+    config: TrackerConfig
 
     def localise(
         self, view: StereoView, keyframes: list[StereoView], prediction: Prediction, guided: bool, clock: Stopwatch
@@ -90,7 +83,7 @@ class Localiser:
         """
         matches, fit = GuidedMatches.empty(), None
         if guided:
-            matches = self._guided.match_guided(view, keyframes, prediction.pose, prediction.covariance)
+            matches = self.guided.match_guided(view, keyframes, prediction.pose, prediction.covariance)
             clock.lap("match")
             fit = self._fit_near(matches, prediction)
             clock.lap("filter")
@@ -98,7 +91,7 @@ class Localiser:
             other_matches, other = self._localise_anywhere(view, keyframes, prediction, clock)
             if fit is None or (other is not None and other.nis_per_dof < fit.nis_per_dof):
                 matches, fit = other_matches, other
-        min_inliers = _DOUBTFUL_INLIERS * self._config.min_inliers
+        min_inliers = _DOUBTFUL_INLIERS * self.config.min_inliers
         if fit is not None and fit.nis_before_scaling > _DOUBTFUL_NIS and fit.count < min_inliers:
             return matches, None  # chance agreement of a few
         return matches, fit
@@ -106,19 +99,19 @@ class Localiser:
     def _fit_near(self, matches: GuidedMatches, prediction: Prediction) -> FrameFit | None:
         """Update from the prediction; most of what was found near it must agree."""
         pose, covariance = prediction.pose, prediction.covariance
-        count, min_inliers = len(matches.probability), self._config.min_inliers
+        count, min_inliers = len(matches.probability), self.config.min_inliers
         if count < min_inliers:
             return None
-        fit = self._update.fit(matches.views, pose, covariance, min_inliers)
+        fit = self.update.fit(matches.views, pose, covariance, min_inliers)
         if fit is None or fit.prior_cost > CHI_SQUARE_9999_OF_6:
             # The camera has jumped, and all matches with it; or something moves that gives most of them, and those that
             # stand still agree with a pose close to the prediction: that one is tried first.
-            expected = np.flatnonzero(self._update.agrees(matches.views, pose, covariance))
+            expected = np.flatnonzero(self.update.agrees(matches.views, pose, covariance))
             min_steady = _DOUBTFUL_INLIERS * min_inliers
-            steady = self._update.fit(matches.views.select(expected), pose, 0.01 * covariance, min_steady)
+            steady = self.update.fit(matches.views.select(expected), pose, 0.01 * covariance, min_steady)
             if steady is not None:
                 expected = expected[steady.inliers]
-                steady = self._update.fit(matches.views.select(expected), pose, covariance, min_steady)
+                steady = self.update.fit(matches.views.select(expected), pose, covariance, min_steady)
             if steady is not None and steady.count >= _MIN_SHARE * count:
                 inliers = np.zeros(count, bool)
                 inliers[expected] = steady.inliers
@@ -131,17 +124,17 @@ class Localiser:
         """Without a prediction: the pose relative to one of the last keyframes, then landmarks near there."""
         matches = GuidedMatches.empty()
         for back in range(1, min(_LAST_KEYFRAMES, len(keyframes)) + 1):
-            relative = self._unguided.relative_pose_to(keyframes[-back], view)
+            relative = self.unguided.relative_pose_to(keyframes[-back], view)
             clock.lap("match")
             if relative is None:
                 continue
-            start = self._window.posterior.poses[-back] @ relative.T_key_camera
-            margin = np.diag(np.repeat([_MARGIN * self._window.depth, _MARGIN], 3) ** 2)
+            start = self.window.posterior.poses[-back] @ relative.T_key_camera
+            margin = np.diag(np.repeat([_MARGIN * self.window.depth, _MARGIN], 3) ** 2)
             uncertain = turn_covariance(start, relative.covariance + margin)
-            matches = self._guided.match_guided(view, keyframes, start, uncertain, -back, alone=True)
+            matches = self.guided.match_guided(view, keyframes, start, uncertain, -back, alone=True)
             clock.lap("match")
-            fit = self._update.fit(
-                matches.views, prediction.pose, prediction.covariance, self._config.min_inliers, start, relative.scale
+            fit = self.update.fit(
+                matches.views, prediction.pose, prediction.covariance, self.config.min_inliers, start, relative.scale
             )
             clock.lap("filter")
             if fit is not None and fit.count >= _MIN_SHARE * len(matches.probability):

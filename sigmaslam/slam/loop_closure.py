@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,42 +24,42 @@ _RECENT, _LOOP_COSINE = 10, 0.5
 _REACH_SIGMAS = 3.0
 
 
+@dataclass(frozen=True, slots=True)
 class LoopCloser:
     """Constrains the newest keyframe to one that left the window long ago.
 
-    Args:
+    Attributes:
         window: owns the poses.
         keyframes: of the window and its past.
         matcher: finds keyframes in views.
     """
 
-    def __init__(self, window: KeyframeWindow, keyframes: Keyframes, matcher: UnguidedMatcher) -> None:
-        self._window = window
-        self._keyframes = keyframes
-        self._matcher = matcher
+    window: KeyframeWindow
+    keyframes: Keyframes
+    matcher: UnguidedMatcher
 
     def close(self) -> None:
         """Closes a loop where the newest keyframe sees what one of long ago saw."""
-        view = self._keyframes.active[-1].view
+        view = self.keyframes.active[-1].view
         for keyframe in retrieve(view, 1, self._revisited()):
-            relative = self._matcher.relative_pose_to(keyframe.view, view)
+            relative = self.matcher.relative_pose_to(keyframe.view, view)
             if relative is None:
                 continue
-            pose = self._keyframes.pose(keyframe) @ relative.T_key_camera
+            pose = self.keyframes.pose(keyframe) @ relative.T_key_camera
             covariance = turn_covariance(pose, relative.covariance)
-            index = self._keyframes.index(keyframe.id)
-            if self._window.add_loop_constraint(index, relative.T_key_camera, covariance):
+            index = self.keyframes.index(keyframe.id)
+            if self.window.add_loop_constraint(index, relative.T_key_camera, covariance):
                 _LOGGER.info("loop closed with the keyframe of %.3f s", keyframe.timestamp)
 
     def _revisited(self) -> list[Keyframe]:
         """Keyframes that left the window long ago and should see what its newest one sees."""
-        state = self._window.posterior
+        state = self.window.posterior
         pose, place = state.poses[-1], pose_slice(len(state) - 1)
         sigma = np.sqrt(np.trace(se3_body(pose, state.covariance[place, place])[:3, :3]))
-        reach = self._window.depth + _REACH_SIGMAS * sigma
+        reach = self.window.depth + _REACH_SIGMAS * sigma
 
         def is_near(keyframe: Keyframe) -> bool:
-            between = se3_inverse(pose) @ self._keyframes.pose(keyframe)
+            between = se3_inverse(pose) @ self.keyframes.pose(keyframe)
             return bool(np.linalg.norm(between[:3, 3]) < reach and between[2, 2] > _LOOP_COSINE)
 
-        return [keyframe for keyframe in self._keyframes.left_long_ago(_RECENT) if is_near(keyframe)]
+        return [keyframe for keyframe in self.keyframes.left_long_ago(_RECENT) if is_near(keyframe)]

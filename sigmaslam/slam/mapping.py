@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -45,10 +45,11 @@ class KeyframeTracks(Table):
     covariance: np.ndarray
 
 
+@dataclass(slots=True)
 class Mapper:
     """Makes views keyframes of the window.
 
-    Args:
+    Attributes:
         camera: the rectified pair.
         window: takes keyframes and landmarks.
         keyframes: of the window.
@@ -58,24 +59,14 @@ class Mapper:
         config: settings.
     """
 
-    def __init__(
-        self,
-        camera: RectifiedStereo,
-        window: KeyframeWindow,
-        keyframes: Keyframes,
-        motion: MotionFilter,
-        noise: MeasurementNoise,
-        admission: LandmarkAdmission,
-        config: TrackerConfig,
-    ) -> None:
-        self._camera = camera
-        self._window = window
-        self._keyframes = keyframes
-        self._motion = motion
-        self._noise = noise
-        self._admission = admission
-        self._config = config
-        self._landmarks_in_keyframe = 0
+    camera: RectifiedStereo
+    window: KeyframeWindow
+    keyframes: Keyframes
+    motion: MotionFilter
+    noise: MeasurementNoise
+    admission: LandmarkAdmission
+    config: TrackerConfig
+    _landmarks_in_keyframe: int = field(default=0, init=False)
 
     def insert_if_due(
         self,
@@ -96,10 +87,10 @@ class Mapper:
         """
         # A scale beyond the NIS is that of blur: such a keyframe would spoil what comes after it.
         blurred = fit.inflation > fit.nis_before_scaling > _SCATTERED
-        if fit.count >= self._config.keyframe_ratio * self._landmarks_in_keyframe or blurred:
+        if fit.count >= self.config.keyframe_ratio * self._landmarks_in_keyframe or blurred:
             return None
-        admitted = view.only(self._admission.admit(view, fit.pose, self._window))
-        if not admitted.has_stereo(self._admission.min_points, self._config.min_inliers):
+        admitted = view.only(self.admission.admit(view, fit.pose, self.window))
+        if not admitted.has_stereo(self.admission.min_points, self.config.min_inliers):
             return None
         views = matches.views.select(fit.inliers).inflated(fit.inflation)
         return self.insert(admitted, timestamp, fit.pose, *expected, views)
@@ -127,16 +118,16 @@ class Mapper:
         Returns:
             What the keyframe saw, known landmarks before new ones.
         """
-        window, keyframes = self._window, self._keyframes
+        window, keyframes = self.window, self.keyframes
         views = LandmarkViews.empty() if views is None else views
-        if len(window) == self._config.window:
+        if len(window) == self.config.window:
             views = views.renumber(keyframes.marginalise_oldest())
         if len(window):
             step_covariance = turn_covariance(window.posterior.poses[-1], step_covariance)
         since = timestamp - keyframes.active[-1].timestamp if keyframes.active else 0.0
-        walk = np.array([self._config.offset_walk**2 * since, 0.0, 0.0])
+        walk = np.array([self.config.offset_walk**2 * since, 0.0, 0.0])
         median = max(float(np.nanmedian(view.disparity)), _MIN_DISPARITY)
-        depth = self._camera.fx * self._camera.baseline / median
+        depth = self.camera.fx * self.camera.baseline / median
         window.add_keyframe(pose, step, step_covariance, walk, depth, origin)
         view = replace(view, slope=disparity_slopes(view.features.keypoints, view.disparity))
         keyframes.append(view, timestamp)
@@ -144,7 +135,7 @@ class Mapper:
         self._add_landmarks(view, views)
         seen = LandmarkViews.concatenate([views, window.landmarks.anchor_views(len(window) - 1)])
         window.solve()
-        self._motion.start_keyframe()
+        self.motion.start_keyframe()
         self._landmarks_in_keyframe = len(seen)
         return KeyframeTracks(window.landmarks.id[seen.landmark], seen.measurement, seen.covariance)
 
@@ -153,7 +144,7 @@ class Mapper:
         assert view.slope is not None
         index = np.flatnonzero(np.isfinite(view.disparity))
         taken = views.measurement[:, :2]
-        index = index[select_apart(view.features.select(index), taken, self._config.spacing, view.left.shape)]
+        index = index[select_apart(view.features.select(index), taken, self.config.spacing, view.left.shape)]
         measured = view.measured(index)
         disparity_range = patch_disparity_range(view.left, view.right, measured, view.slope[index])
-        self._window.add_landmarks(index, measured, self._noise.of_keypoints(view, index), disparity_range)
+        self.window.add_landmarks(index, measured, self.noise.of_keypoints(view, index), disparity_range)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,10 +26,11 @@ _LOGGER = logging.getLogger(__name__)
 _MIN_STEREO_SHARE = 0.25
 
 
+@dataclass(frozen=True, slots=True)
 class Recovery:
     """Makes views keyframes that see no known landmark.
 
-    Args:
+    Attributes:
         course: of the tracker; changed.
         window, keyframes: of the tracker.
         motion: forgets its velocity.
@@ -37,62 +39,52 @@ class Recovery:
         config: settings.
     """
 
-    def __init__(
-        self,
-        course: Course,
-        window: KeyframeWindow,
-        keyframes: Keyframes,
-        motion: MotionFilter,
-        mapper: Mapper,
-        admission: LandmarkAdmission,
-        config: TrackerConfig,
-    ) -> None:
-        self._course = course
-        self._window = window
-        self._keyframes = keyframes
-        self._motion = motion
-        self._mapper = mapper
-        self._admission = admission
-        self._config = config
+    course: Course
+    window: KeyframeWindow
+    keyframes: Keyframes
+    motion: MotionFilter
+    mapper: Mapper
+    admission: LandmarkAdmission
+    config: TrackerConfig
 
     def start_or_recover(self, view: StereoView, timestamp: float) -> KeyframeTracks | None:
         """Without a pose: starts, or waits for a while and goes on with the uncertainty of the prediction."""
-        course = self._course
-        enough = view.has_stereo(self._admission.min_points, self._config.min_inliers)
+        course = self.course
+        enough = view.has_stereo(self.admission.min_points, self.config.min_inliers)
         if course.phase is Phase.WAITING_IN_MAP or not enough:
             return None
         if course.phase is Phase.WAITING:
             seen_by_both = np.isfinite(view.disparity).mean()
             return self._start(view, timestamp) if seen_by_both >= _MIN_STEREO_SHARE else None
         since = timestamp - course.tracked_at
-        if since <= self._config.lost_seconds or not self._admission.restarts_anywhere:
+        if since <= self.config.lost_seconds or not self.admission.restarts_anywhere:
             return None
         _LOGGER.warning("tracking starts anew at %.3f s, %.2f s after the last pose", timestamp, since)
         if course.has_moved:
             course.resume(timestamp)
         course.tracked_at = timestamp
-        pose = Prediction.of(self._window, self._motion).pose
-        return self._insert(view, timestamp, pose, self._motion.step, self._motion.step_covariance)
+        pose = Prediction.of(self.window, self.motion).pose
+        return self._insert(view, timestamp, pose, self.motion.step, self.motion.step_covariance)
 
     def resume(self, found: Relocalisation, timestamp: float) -> KeyframeTracks:
         """Goes on from where a lost view was found."""
-        self._course.resume(timestamp)
+        self.course.resume(timestamp)
         covariance = turn_covariance(found.pose, found.covariance)
         return self._insert(found.view, timestamp, found.pose, found.pose, covariance, found.origin)
 
     def begin_again(self, first: StereoView, timestamp: float) -> None:
         """Starts again from the first view, now with other landmarks, and predicts the current frame from there."""
-        course, started_at, had_moved = self._course, self._course.started_at, self._course.has_moved
-        self._keyframes.restart()
+        course, started_at, had_moved = self.course, self.course.started_at, self.course.has_moved
+        self.keyframes.restart()
         self._start(first, started_at)
         if had_moved:
             course.resume(started_at)
-        self._motion.predict(timestamp - started_at, densities(self._config, self._window.depth))
+        self.motion.predict(timestamp - started_at, densities(self.config, self.window.depth))
 
     def _start(self, view: StereoView, timestamp: float) -> KeyframeTracks:
         """Makes the view the first keyframe, and its camera the world."""
-        self._course.start(timestamp)
-        view = view.only(self._admission.admit(view, np.eye(4), self._window))
+        self.course.start(timestamp)
+        view = view.only(self.admission.admit(view, np.eye(4), self.window))
         return self._insert(view, timestamp, np.eye(4), np.eye(4), np.zeros((6, 6)))
 
     def _insert(
@@ -104,6 +96,6 @@ class Recovery:
         step_covariance: np.ndarray,
         origin: int | None = None,
     ) -> KeyframeTracks:
-        tracks = self._mapper.insert(view, timestamp, pose, step, step_covariance, None, origin)
-        self._motion.forget_twist(initial_twist_sigma(self._config, self._window.depth))
+        tracks = self.mapper.insert(view, timestamp, pose, step, step_covariance, None, origin)
+        self.motion.forget_twist(initial_twist_sigma(self.config, self.window.depth))
         return tracks

@@ -35,10 +35,11 @@ class Relocalisation:
     origin: int
 
 
+@dataclass(frozen=True, slots=True)
 class Relocaliser:
     """Finds views among remembered keyframes.
 
-    Args:
+    Attributes:
         window: emptied where a view is found.
         keyframes: of the window and its past.
         matcher: finds keyframes in views.
@@ -46,33 +47,25 @@ class Relocaliser:
         min_inliers: fewer are no pose.
     """
 
-    def __init__(
-        self,
-        window: KeyframeWindow,
-        keyframes: Keyframes,
-        matcher: UnguidedMatcher,
-        admission: LandmarkAdmission,
-        min_inliers: int,
-    ) -> None:
-        self._window = window
-        self._keyframes = keyframes
-        self._matcher = matcher
-        self._admission = admission
-        self._min_inliers = min_inliers
+    window: KeyframeWindow
+    keyframes: Keyframes
+    matcher: UnguidedMatcher
+    admission: LandmarkAdmission
+    min_inliers: int
 
     def relocalise(self, view: StereoView) -> Relocalisation | None:
         """Finds the view and moves all keyframes of the window to the past; None, and no change, if it is nowhere."""
-        min_points = self._admission.min_points
-        if not view.has_stereo(min_points, self._min_inliers):
+        min_points = self.admission.min_points
+        if not view.has_stereo(min_points, self.min_inliers):
             return None
-        keyframes = self._keyframes
+        keyframes = self.keyframes
         for keyframe in retrieve(view, _RETRIEVED, keyframes.remembered):
-            relative = self._matcher.relative_pose_to(keyframe.view, view)
+            relative = self.matcher.relative_pose_to(keyframe.view, view)
             if relative is None:
                 continue
             pose = nearest_rigid(keyframes.pose(keyframe) @ relative.T_key_camera)
-            admitted = view.only(self._admission.admit(view, pose, self._window))
-            if not admitted.has_stereo(min_points, self._min_inliers):
+            admitted = view.only(self.admission.admit(view, pose, self.window))
+            if not admitted.has_stereo(min_points, self.min_inliers):
                 continue
             while keyframes.active:
                 keyframes.marginalise_oldest(spare=keyframe)

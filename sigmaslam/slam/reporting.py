@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from sigmaslam.estimation.constant_velocity import MotionFilter
@@ -19,21 +21,19 @@ from sigmaslam.slam.phase import Course, Phase
 _ANYWHERE = 1e6
 
 
+@dataclass(frozen=True, slots=True)
 class Reporter:
     """Makes estimates of frames.
 
-    Args:
+    Attributes:
         T_rectified_left: (4, 4) takes points of the left camera into the rectified one.
         window, motion, course: of the tracker.
     """
 
-    def __init__(
-        self, T_rectified_left: np.ndarray, window: KeyframeWindow, motion: MotionFilter, course: Course
-    ) -> None:
-        self._T_rectified_left = T_rectified_left
-        self._window = window
-        self._motion = motion
-        self._course = course
+    T_rectified_left: np.ndarray
+    window: KeyframeWindow
+    motion: MotionFilter
+    course: Course
 
     def report(
         self,
@@ -45,28 +45,28 @@ class Reporter:
         milliseconds: dict[str, float],
     ) -> Estimate:
         """What is known after a frame; without a fit by the prediction, without a keyframe nothing."""
-        state = self._window.posterior
+        state = self.window.posterior
         calibration, spread = state.calibration, state.covariance[CALIBRATION, CALIBRATION]
         if fit is not None:
             pose, absolute, relative = fit.pose, fit.covariance, fit.relative
             calibration, spread = fit.calibration, fit.calibration_covariance
         elif len(state):
-            prediction = Prediction.of(self._window, self._motion)
+            prediction = Prediction.of(self.window, self.motion)
             last = pose_slice(len(state) - 1)
             pose, relative = prediction.pose, prediction.covariance
             absolute = state.covariance[last, last] + relative
         else:
             pose = np.eye(4)
-            relative = absolute = (_ANYWHERE if self._course.phase is Phase.WAITING_IN_MAP else 0.0) * np.eye(6)
+            relative = absolute = (_ANYWHERE if self.course.phase is Phase.WAITING_IN_MAP else 0.0) * np.eye(6)
         # The filter knows the rectified camera; users know the left camera of their calibration.
-        T_left_rectified = se3_inverse(self._T_rectified_left)
+        T_left_rectified = se3_inverse(self.T_rectified_left)
         adjoint = se3_adjoint(T_left_rectified) @ se3_adjoint(se3_inverse(pose))
         belief = 1.0 - np.sqrt(max(np.linalg.eigvalsh(turn_covariance(se3_inverse(pose), relative))[-1], 0.0))
         covariance = adjoint @ absolute @ adjoint.T
         frame_covariance = adjoint @ relative @ adjoint.T if fit is not None else np.zeros((6, 6))
         return Estimate(
             timestamp=timestamp,
-            T_world_camera=T_left_rectified @ pose @ self._T_rectified_left,
+            T_world_camera=T_left_rectified @ pose @ self.T_rectified_left,
             covariance=0.5 * (covariance + covariance.T),
             status=status,
             belief=float(np.clip(belief, 0.0, 1.0)),

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
-from sigmaslam.frontend import Frontend, StereoView
+from sigmaslam.frontend import Frontend, KeypointSearch, StereoView
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.measurement_noise import MeasurementNoise
@@ -18,10 +20,11 @@ from sigmaslam.two_view.stereo_pose import RelativePose, estimate_relative_pose
 _MIN_SHARE, _FEW_AGREE = 0.5, 3
 
 
+@dataclass(frozen=True, slots=True)
 class UnguidedMatcher:
     """Finds keyframes in views, wherever they are.
 
-    Args:
+    Attributes:
         camera: the rectified pair.
         frontend: matches features.
         window: whose calibration corrects the disparities.
@@ -29,34 +32,26 @@ class UnguidedMatcher:
         config: settings.
     """
 
-    def __init__(
-        self,
-        camera: RectifiedStereo,
-        frontend: Frontend,
-        window: KeyframeWindow,
-        noise: MeasurementNoise,
-        config: TrackerConfig,
-    ) -> None:
-        self._camera = camera
-        self._frontend = frontend
-        self._window = window
-        self._noise = noise
-        self._config = config
+    camera: RectifiedStereo
+    frontend: Frontend
+    window: KeyframeWindow
+    noise: MeasurementNoise
+    config: TrackerConfig
 
     def relative_pose_to(self, key: StereoView, view: StereoView) -> RelativePose | None:
         """Pose of a view relative to a keyframe by all of its stereo features; None where too few agree."""
         index = np.flatnonzero(np.isfinite(key.disparity))
-        if len(index) < self._config.min_inliers:
+        if len(index) < self.config.min_inliers:
             return None
-        matches = self._frontend.match(key, index, view, key.features.keypoints[index].astype(np.float64), None)
+        matches = self.frontend.match(KeypointSearch.anywhere(key, index), view)
         rows = matches.key_index
-        place = np.full(len(rows), self._config.keyframe_sigma)
+        place = np.full(len(rows), self.config.keyframe_sigma)
         relative = estimate_relative_pose(
-            self._camera,
-            self._window.true_disparity(key.measured(rows)),
+            self.camera,
+            self.window.true_disparity(key.measured(rows)),
             np.column_stack([place, place, key.disparity_sigma[rows]]),
-            self._window.true_disparity(matches.measured),
-            self._noise.of_matches(matches),
+            self.window.true_disparity(matches.measured),
+            self.noise.of_matches(matches),
             matches.probability,
         )
         if relative is None:
@@ -64,4 +59,4 @@ class UnguidedMatcher:
         # Each by its probability: many doubtful ones are few.
         agreeing = float(matches.probability[relative.inliers].sum())
         fair = agreeing >= _MIN_SHARE * matches.probability.sum()
-        return relative if agreeing >= self._config.min_inliers * (1 if fair else _FEW_AGREE) else None
+        return relative if agreeing >= self.config.min_inliers * (1 if fair else _FEW_AGREE) else None

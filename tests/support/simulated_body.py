@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sigmaslam.frontend.types import PatchMaps, StereoView, TemporalMatches
+from sigmaslam.frontend.types import KeypointSearch, StereoView, TemporalMatches
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
 from sigmaslam.slam.object_tracker import ObjectEstimate, ObjectTracker
 from tests.support.quantiles import chi_square_quantile, squared_sigmas
@@ -48,26 +48,18 @@ class SimulatedBody:
         self.seen[frame] = seen
         return self._errors.view(left, right, truth, seen)
 
-    def match(
-        self,
-        key: StereoView,
-        index: np.ndarray,
-        view: StereoView,
-        predicted: np.ndarray,
-        covariance: np.ndarray | None,
-        maps: PatchMaps | None = None,
-    ) -> TemporalMatches:
+    def match(self, search: KeypointSearch, view: StereoView) -> TemporalMatches:
         """The points that both see, within the ellipses where there are any."""
         frame = frame_of(view.left)
-        wanted, seen = self.seen[frame_of(key.left)][index], self.seen[frame]
+        wanted, seen = self.seen[frame_of(search.key.left)][search.index], self.seen[frame]
         truth, _ = self._project(frame)
         places = truth[wanted, :2] + self._errors.place * self._random.standard_normal((len(wanted), 2))
         both = np.isin(wanted, seen)
-        if covariance is not None:
-            apart = places - predicted
-            both &= np.einsum("ki,kij,kj->k", apart, np.linalg.inv(covariance), apart) < _ELLIPSE
+        if search.covariance is not None:
+            apart = places - search.predicted
+            both &= np.einsum("ki,kij,kj->k", apart, np.linalg.inv(search.covariance), apart) < _ELLIPSE
         disparity = view.disparity[np.searchsorted(seen, wanted[both])]
-        return self._errors.matches(index[both], places[both], disparity)
+        return self._errors.matches(search.index[both], places[both], disparity)
 
     def _project(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """(u, v, disparity) of all points without noise, and which are in view."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sigmaslam.frontend.types import PatchMaps, StereoView, TemporalMatches
+from sigmaslam.frontend.types import KeypointSearch, StereoView, TemporalMatches
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse
 from sigmaslam.slam.tracker import Estimate, StereoTracker
 from tests.support.estimates import squared_error
@@ -98,31 +98,23 @@ class SimulatedFrontend:
         self._seen[frame] = seen
         return self._errors.view(left, right, truth, seen)
 
-    def match(
-        self,
-        key: StereoView,
-        index: np.ndarray,
-        view: StereoView,
-        predicted: np.ndarray,
-        covariance: np.ndarray | None,
-        maps: PatchMaps | None = None,
-    ) -> TemporalMatches:
+    def match(self, search: KeypointSearch, view: StereoView) -> TemporalMatches:
         """The points that both see, wherever they were predicted."""
         frame = frame_of(view.left)
-        wanted, seen = self._seen[frame_of(key.left)][index], self._seen[frame]
+        wanted, seen = self._seen[frame_of(search.key.left)][search.index], self._seen[frame]
         both = np.isin(wanted, seen)
         points, count = wanted[both], int(both.sum())
         truth, _ = self._project(frame)
         # Of a keyframe's points in all views alike, and of this view alone.
         common = self._place_errors.setdefault(
-            frame_of(key.left), self._random.standard_normal((len(self._points), 2))
+            frame_of(search.key.left), self._random.standard_normal((len(self._points), 2))
         )[points]
         own = self._random.standard_normal((count, 2))
         error = np.sqrt(self._shared_place) * common + np.sqrt(1.0 - self._shared_place) * own
         places = truth[points, :2] + self._errors.place * error
         wrong = self._random.random(count) < self._outliers
         places[wrong] += self._random.uniform(-20, 20, (int(wrong.sum()), 2))
-        return self._errors.matches(index[both], places, view.disparity[np.searchsorted(seen, points)])
+        return self._errors.matches(search.index[both], places, view.disparity[np.searchsorted(seen, points)])
 
     def _path(self, frames: int) -> np.ndarray:
         """Poses of a camera whose velocity wanders about the typical one."""

@@ -12,6 +12,7 @@ from sigmaslam.frontend.classical import OrbDetector, SiftDetector
 from sigmaslam.frontend.learned import LearnedDetector
 from sigmaslam.frontend.lucas_kanade import lucas_kanade, refine
 from sigmaslam.frontend.nearest_neighbours import Putative, nearest_anywhere, nearest_in_ellipses, nearest_in_rows
+from sigmaslam.frontend.types import KeypointSearch
 from sigmaslam.inference import onnx_graph as session
 from sigmaslam.readers import open_sequence
 from sigmaslam.synthetic.simulation import Simulation, Studio
@@ -306,7 +307,7 @@ def test_matches_of_the_demo_follow_the_true_motion(demo, name):
     seen = rays * at(demo["depth"][0], points)[:, None] @ demo["T_4_0"][:3, :3].T + demo["T_4_0"][:3, 3]
     truth = (seen / seen[:, 2:] @ demo["K"].T)[:, :2]
     predicted = truth + np.random.default_rng(0).normal(0, 2.0, truth.shape)
-    found = method.match(key, index, view, predicted, ellipses(np.full(len(index), 12.0)))
+    found = method.match(KeypointSearch(key, index, predicted, ellipses(np.full(len(index), 12.0))), view)
     assert len(np.unique(found.key_index)) == len(found.key_index) > 50
     assert set(found.key_index) <= set(index)
     asymmetry = np.abs(found.covariance[:, 0, 1] - found.covariance[:, 1, 0])
@@ -328,7 +329,7 @@ def test_without_a_covariance_the_prediction_does_not_matter(demo, name):
     key, view = (method.observe(*images) for images in demo["images"])
     index = np.flatnonzero(np.isfinite(key.disparity))
     somewhere = np.random.default_rng(0).uniform(0, 320, (len(index), 2))
-    found, again = (method.match(key, index, view, places, None) for places in (somewhere, somewhere[::-1]))
+    found, again = (method.match(KeypointSearch(key, index, places), view) for places in (somewhere, somewhere[::-1]))
     assert len(found.key_index) > 50
     np.testing.assert_array_equal(found.key_index, again.key_index)
     np.testing.assert_array_equal(found.points, again.points)
@@ -341,7 +342,7 @@ def test_a_black_image_has_no_features(name):
     view = method.observe(black, black)
     assert len(view.features.keypoints) == len(view.disparity) == len(view.disparity_sigma) == 0
     for covariance in (np.zeros((0, 2, 2)), None):
-        nothing = method.match(view, np.zeros(0, np.int64), view, np.zeros((0, 2)), covariance)
+        nothing = method.match(KeypointSearch(view, np.zeros(0, np.int64), np.zeros((0, 2)), covariance), view)
         assert nothing.points.shape == (0, 2)
         assert nothing.covariance.shape == (0, 2, 2)
 
@@ -353,7 +354,7 @@ def test_a_textured_keyframe_finds_nothing_in_a_black_view(demo, name):
     empty: StereoView = method.observe(black, black)
     index = np.arange(min(20, len(key.disparity)))
     for covariance in (ellipses(np.full(len(index), 20.0)), None):
-        found = method.match(key, index, empty, key.features.keypoints[index], covariance)
+        found = method.match(KeypointSearch(key, index, key.features.keypoints[index], covariance), empty)
         assert len(found.points) == 0
 
 

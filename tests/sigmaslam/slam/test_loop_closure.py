@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from sigmaslam.frontend.types import PatchMaps, StereoView, TemporalMatches
+from sigmaslam.frontend.types import KeypointSearch, StereoView, TemporalMatches
 from sigmaslam.geometry.se3 import nearest_rigid, se3_exp, se3_inverse, se3_log
 from sigmaslam.slam.tracker import StereoTracker
 from tests.support.quantiles import chi_square_median, squared_sigmas
@@ -34,23 +34,15 @@ class LapFrontend(SimulatedFrontend):
         super().__init__(SCALE, seed, FRAMES, 100, offset=OFFSET)
         self._loops = loops
 
-    def match(
-        self,
-        key: StereoView,
-        index: np.ndarray,
-        view: StereoView,
-        predicted: np.ndarray,
-        covariance: np.ndarray | None,
-        maps: PatchMaps | None = None,
-    ) -> TemporalMatches:
+    def match(self, search: KeypointSearch, view: StereoView) -> TemporalMatches:
         # Drawn whatever is made of it, so that the noise is that of the other runs.
-        found = super().match(key, index, view, predicted, covariance, maps)
+        found = super().match(search, view)
         frame = frame_of(view.left)
-        if covariance is not None or self._loops == "right" or frame - frame_of(key.left) < LONG_AGO:
+        if search.covariance is not None or self._loops == "right" or frame - frame_of(search.key.left) < LONG_AGO:
             return found
         if self._loops == "none":
             return found.select(np.zeros(0, np.int64))
-        points = self._seen[frame_of(key.left)][found.key_index]
+        points = self._seen[frame_of(search.key.left)][found.key_index]
         aside = self.poses[frame] @ se3_exp(np.array([5.0, 0, 0, 0, 0, 0]))
         seen = self._project_from(aside)[0][points]
         return replace(found, points=seen[:, :2], disparity=seen[:, 2])
