@@ -27,9 +27,9 @@ from sigmaslam.evaluation.metrics import map_consistency as consistency
 from sigmaslam.evaluation.run_evaluation import evaluate_run
 from sigmaslam.files import atomic_write_text, make_folder
 from sigmaslam.geometry.rectification import StereoRectifier
-from sigmaslam.geometry.trajectory import read_trajectory
 from sigmaslam.inference.onnx_graph import shipped_weights
 from sigmaslam.readers import open_sequence
+from sigmaslam.readers.trajectory_files import read_trajectory
 from sigmaslam.runs.report import read_frames
 from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.tracker import TrackerConfig

@@ -27,8 +27,9 @@ from sigmaslam.evaluation.benchmarks.sequences_page import (
 )
 from sigmaslam.evaluation.run_evaluation import Evaluation, evaluate_run
 from sigmaslam.files import make_folder
-from sigmaslam.geometry.trajectory import Trajectory, read_tum, write_tum
+from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import open_sequence
+from sigmaslam.readers.trajectory_files import read_tum, write_tum
 from sigmaslam.runs.report import COLUMNS, FrameTable, read_frames
 from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.tracker import TrackerConfig

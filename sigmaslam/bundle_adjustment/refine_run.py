@@ -19,7 +19,8 @@ from sigmaslam.bundle_adjustment.track_file import TRACKS_NAME, read_tracks
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder, make_folder
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
-from sigmaslam.geometry.trajectory import Trajectory, check_covariances, read_tum, write_kitti, write_tum
+from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.readers.trajectory_files import check_covariances, read_tum, write_kitti, write_tum
 from sigmaslam.runs.run_folder import write_ply
 from sigmaslam.slam.point_map import PointMap
 

@@ -1,15 +1,14 @@
 """Cameras: interior orientation (9.28)-(9.30), the stereo pair, and the rectified pair of (9.34)."""
 
 import os
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Literal, Self, cast, get_args
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
-import yaml
 
-from sigmaslam.errors import CalibrationError, InputError
+from sigmaslam.errors import CalibrationError
+from sigmaslam.geometry.checked_yaml import CalibrationYaml
 
 DistortionModel = Literal["none", "radtan", "equidistant"]
 
@@ -69,34 +68,6 @@ class CameraModel:
                 f"distortion has {len(self.distortion)} coefficients; model {self.distortion_model!r} "
                 f"takes {' or '.join(map(str, counts))}"
             )
-
-    @classmethod
-    def from_chapter(
-        cls,
-        alpha_u: float,
-        alpha_v: float,
-        shear: float,
-        scale_difference: float,
-        u0: float,
-        v0: float,
-        *,
-        width: int,
-        height: int,
-        distortion_model: DistortionModel = "none",
-        distortion: tuple[float, ...] = (),
-    ) -> Self:
-        """Camera with the chapter's K, (9.29): skew = shear alpha_v, fy = alpha_v (1 + scale_difference)."""
-        return cls(
-            width=width,
-            height=height,
-            fx=alpha_u,
-            fy=alpha_v * (1.0 + scale_difference),
-            cx=u0,
-            cy=v0,
-            skew=shear * alpha_v,
-            distortion_model=distortion_model,
-            distortion=distortion,
-        )
 
     @property
     def matrix(self) -> np.ndarray:
@@ -313,29 +284,8 @@ class StereoCamera:
         except CalibrationError as error:
             raise content.error(str(error)) from None
 
-    def to_yaml(self, path: str | os.PathLike[str]) -> None:
-        """Write the form that `from_yaml` reads, exactly; the file appears whole or not at all.
 
-        Raises:
-            InputError: the file cannot be written.
-        """
-        content = {
-            "left": _camera_to_yaml(self.left),
-            "right": _camera_to_yaml(self.right),
-            "T_left_right": self.T_left_right.tolist(),
-        }
-        text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=200)
-        target = Path(path)
-        partial = target.with_name(f".{target.name}.{os.getpid()}")
-        try:
-            partial.write_text(text, encoding="utf-8")
-            partial.replace(target)
-        except OSError as error:
-            partial.unlink(missing_ok=True)
-            raise InputError(f"{path}: cannot write the calibration: {error.strerror}") from None
-
-
-def _camera_from_yaml(section: "CalibrationYaml") -> CameraModel:
+def _camera_from_yaml(section: CalibrationYaml) -> CameraModel:
     required = ("fx", "fy", "cx", "cy")
     section.reject_unknown(("width", "height", *required, "skew", "distortion_model", "distortion"))
     values: dict[str, Any] = {key: section.integer(key) for key in ("width", "height")}
@@ -347,15 +297,6 @@ def _camera_from_yaml(section: "CalibrationYaml") -> CameraModel:
         return CameraModel(**values)
     except CalibrationError as error:
         raise section.error(str(error)) from None
-
-
-def _camera_to_yaml(camera: CameraModel) -> dict[str, Any]:
-    values: dict[str, Any] = {"width": int(camera.width), "height": int(camera.height)}
-    values |= {key: float(getattr(camera, key)) for key in ("fx", "fy", "cx", "cy", "skew")}
-    return values | {
-        "distortion_model": camera.distortion_model,
-        "distortion": [float(value) for value in camera.distortion],
-    }
 
 
 @dataclass(frozen=True, slots=True)
@@ -418,98 +359,3 @@ class RectifiedStereo:
             )
         Z = self.fx * self.baseline / disparity
         return np.stack([(uvd[..., 0] - self.cx) * Z / self.fx, (uvd[..., 1] - self.cy) * Z / self.fy, Z], axis=-1)
-
-
-_REQUIRED: Any = object()
-
-
-class CalibrationYaml:
-    """A YAML calibration file whose getters raise errors that name file, key and what was expected."""
-
-    def __init__(self, path: Path, entries: dict[str, Any], prefix: str = "") -> None:
-        self.path = path
-        self.entries = entries
-        self.prefix = prefix
-
-    @classmethod
-    def read(cls, path: str | os.PathLike[str]) -> Self:
-        """Read a file; OpenCV's '%YAML:1.0' first line, which is no YAML, is skipped."""
-        path = Path(path)
-        try:
-            text = path.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise CalibrationError(f"{path}: cannot read the calibration: {error}") from None
-        first, _, rest = text.partition("\n")
-        if first.startswith("%YAML:"):
-            text = "\n" + rest
-        try:
-            entries = yaml.safe_load(text)
-        except yaml.YAMLError as error:
-            raise CalibrationError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
-        if not isinstance(entries, dict):
-            raise CalibrationError(f"{path}: expected keys with values, found {type(entries).__name__}")
-        return cls(path, entries)
-
-    def error(self, message: str) -> CalibrationError:
-        """The error to raise about this section."""
-        return CalibrationError(f"{self.path}: {self.prefix.rstrip('.') + ': ' if self.prefix else ''}{message}")
-
-    def section(self, key: str) -> "CalibrationYaml":
-        """The mapping under a key."""
-        entries = self._get(key, "a mapping")
-        if not isinstance(entries, dict):
-            raise self._wrong(key, "a mapping", entries)
-        return CalibrationYaml(self.path, entries, f"{self.prefix}{key}.")
-
-    def text(self, key: str, default: str = _REQUIRED) -> str:
-        """A word."""
-        value = self._get(key, "a word", default)
-        # YAML reads a bare `none` as a string, but `null` and `~` as None.
-        return "none" if value is None else str(value)
-
-    def number(self, key: str, default: float = _REQUIRED) -> float:
-        """A finite number."""
-        return float(self.numbers(key, (), default))
-
-    def integer(self, key: str) -> int:
-        """A whole number."""
-        value = self.number(key)
-        if value != int(value):
-            raise self._wrong(key, "a whole number", value)
-        return int(value)
-
-    def numbers(self, key: str, shape: tuple[int | None, ...], default: Any = _REQUIRED) -> np.ndarray:
-        """A float64 array of nested lists; None in `shape` stands for any length."""
-        size = "x".join("any" if n is None else str(n) for n in shape)
-        expected = "a number" if not shape else "a list of numbers" if size == "any" else f"{size} numbers in lists"
-        value = self._get(key, expected, default)
-        try:
-            # Through str: YAML 1.1 reads 1e-5 as text; booleans are no numbers.
-            array = np.array(value, dtype=str) if value != [] else np.zeros(0, dtype=str)
-            numbers = array.astype(np.float64)
-        except ValueError:
-            raise self._wrong(key, expected, value) from None
-        fits = numbers.ndim == len(shape) and all(
-            n is None or n == m for n, m in zip(shape, numbers.shape, strict=True)
-        )
-        if not fits or not np.all(np.isfinite(numbers)):
-            found = "x".join(map(str, numbers.shape)) or "one number"
-            raise self._wrong(key, expected, value, f" (size {found})")
-        return cast(np.ndarray, numbers)
-
-    def reject_unknown(self, known: Collection[str]) -> None:
-        """Refuse keys that nobody would read, as a misspelt optional key would pass unseen."""
-        unknown = [str(key) for key in self.entries if key not in known]
-        if unknown:
-            raise self.error(f"unknown key {', '.join(unknown)}; known are {', '.join(known)}")
-
-    def _get(self, key: str, expected: str, default: Any = _REQUIRED) -> Any:
-        if key in self.entries:
-            return self.entries[key]
-        if default is not _REQUIRED:
-            return default
-        raise CalibrationError(f"{self.path}: key '{self.prefix}{key}' is missing; expected {expected}")
-
-    def _wrong(self, key: str, expected: str, value: Any, detail: str = "") -> CalibrationError:
-        shown = str(value) if len(str(value)) <= 80 else str(value)[:77] + "..."
-        return CalibrationError(f"{self.path}: key '{self.prefix}{key}' must be {expected}, got {shown}{detail}")

@@ -17,8 +17,9 @@ from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text
-from sigmaslam.geometry.trajectory import Trajectory, read_tum
+from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.plot_style import BLUE, GREEN, GREY, PURPLE, SERIES, VERMILLION, style_axes
+from sigmaslam.readers.trajectory_files import read_tum
 from sigmaslam.runs.figures import plot_trajectory, to_svg
 
 COLUMNS = (

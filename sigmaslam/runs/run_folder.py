@@ -19,8 +19,9 @@ import numpy as np
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder
 from sigmaslam.geometry.camera import StereoCamera
-from sigmaslam.geometry.trajectory import Trajectory, write_kitti, write_tum
+from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.inference.onnx_graph import shipped_weights
+from sigmaslam.readers.trajectory_files import write_kitti, write_tum
 from sigmaslam.runs.report import COLUMNS, write_report
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.slam.mapping import KeyframeTracks

@@ -12,9 +12,9 @@ from typing import Any
 from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.fusion.location_filter import LocationFilter
 from sigmaslam.fusion.readings import Locations
-from sigmaslam.geometry.trajectory import write_tum
 from sigmaslam.progress import open_progress
 from sigmaslam.readers import StereoFrame, StereoSequence
+from sigmaslam.readers.trajectory_files import write_tum
 from sigmaslam.runs.run_folder import RunWriter, describe_camera
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.estimate import Estimate

@@ -19,7 +19,8 @@ from sigmaslam.evaluation.metrics.trajectories import (
     synchronise,
 )
 from sigmaslam.geometry.se3 import rotation_exp, se3_adjoint, se3_exp, se3_inverse
-from sigmaslam.geometry.trajectory import Trajectory, read_kitti
+from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.readers.trajectory_files import read_kitti
 
 
 @pytest.fixture(scope="module")
