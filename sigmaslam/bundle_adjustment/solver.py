@@ -7,14 +7,13 @@ found on the profile: where the gradient of the cost by the offset, everything e
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from sigmaslam.bundle_adjustment.gtsam_bridge import load_gtsam, swap_tangent
-from sigmaslam.bundle_adjustment.pose_graph import PoseEdge, connected_parts
 from sigmaslam.bundle_adjustment.structure import HUBER, Observations, offset_gradient, whitened_residuals
 from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log, turn_covariance
@@ -45,6 +44,22 @@ class Solution:
     offset: float
     graph: Any
     values: Any
+
+
+@dataclass(frozen=True, slots=True)
+class Bridge:
+    """The tracker's motion between two keyframes, where the tracks break off.
+
+    Attributes:
+        i, j: the keyframes.
+        T_i_j: (4, 4) takes j to i, metres.
+        covariance: (6, 6) of x in T_i_j exp(x), x = (translation, rotation).
+    """
+
+    i: int
+    j: int
+    T_i_j: np.ndarray
+    covariance: np.ndarray
 
 
 class Solver:
@@ -163,7 +178,7 @@ class Solver:
                 "the tracks do not fix every keyframe and landmark, so there is no covariance: track with more features"
             ) from error
 
-    def bridges(self, kept: np.ndarray) -> list[PoseEdge]:
+    def bridges(self, kept: np.ndarray) -> list[Bridge]:
         """Where the tracks break off: the tracker's motion from the keyframe before, so that all are connected."""
         landmark, keyframe = self._observations.landmark[kept], self._observations.keyframe[kept]
         order = np.lexsort([keyframe, landmark])
@@ -175,7 +190,7 @@ class Solver:
         label = connected_parts(len(self._tracked), map(tuple, pairs[shared >= _LEAST_SHARED].tolist()))
         return [self._motion(j) for j in np.unique(label)[1:].tolist()]
 
-    def _motion(self, j: int) -> PoseEdge:
+    def _motion(self, j: int) -> Bridge:
         """The tracker's motion from keyframe j - 1 to j, as uncertain as its covariance has grown."""
         motion = se3_inverse(self._tracked[j - 1]) @ self._tracked[j]
         growth = self._covariances[j] - turn_covariance(se3_inverse(motion), self._covariances[j - 1])
@@ -190,7 +205,7 @@ class Solver:
         whitened = np.linalg.solve(root, np.linalg.solve(root, growth).T)
         size, axes = np.linalg.eigh(0.5 * (whitened + whitened.T))
         factor = root @ axes * np.sqrt(np.maximum(size, 0.01))
-        return PoseEdge(j - 1, j, motion, factor @ factor.T)
+        return Bridge(j - 1, j, motion, factor @ factor.T)
 
     def _graph(self, kept: np.ndarray, offset: float, robust: bool) -> Any:
         gtsam, observations, first = self._gtsam, self._observations, self._first_pose_key
@@ -226,3 +241,19 @@ class Solver:
             noise = gtsam.noiseModel.Gaussian.Covariance(swap_tangent(bridge.covariance))
             graph.add(gtsam.BetweenFactorPose3(first + bridge.i, first + bridge.j, gtsam.Pose3(bridge.T_i_j), noise))
         return graph
+
+
+def connected_parts(count: int, pairs: Iterable[tuple[int, int]]) -> np.ndarray:
+    """The lowest member of each one's part, (count,), where pairs are connected."""
+    parent = list(range(count))
+
+    def root(member: int) -> int:
+        while parent[member] != member:
+            parent[member] = parent[parent[member]]
+            member = parent[member]
+        return member
+
+    for i, j in pairs:
+        low, high = sorted((root(i), root(j)))
+        parent[high] = low
+    return np.array([root(member) for member in range(count)])
