@@ -322,6 +322,16 @@ class RectifiedStereo:
         """K of both eyes, (3, 3) float64."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
+    @property
+    def focal_baseline(self) -> float:
+        """fx times the baseline: disparity times depth, pixels metres."""
+        return self.fx * self.baseline
+
+    def rays(self, pixels: np.ndarray) -> np.ndarray:
+        """Rays (..., 3) of unit depth in the left camera frame through pixels (..., 2)."""
+        u, v = pixels[..., 0], pixels[..., 1]
+        return np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones(u.shape)], axis=-1)
+
     def project(self, points: np.ndarray) -> np.ndarray:
         """Pixels of points, the inverse of `triangulate`.
 
@@ -334,7 +344,7 @@ class RectifiedStereo:
         points = np.asarray(points)
         X, Y, Z = points[..., 0], points[..., 1], points[..., 2]
         u, v = self.fx * X / Z + self.cx, self.fy * Y / Z + self.cy
-        return np.stack([u, v, self.fx * self.baseline / Z], axis=-1)
+        return np.stack([u, v, self.focal_baseline / Z], axis=-1)
 
     def triangulate(self, uvd: np.ndarray) -> np.ndarray:
         """Points from a rectified pair, eq. (9.34).
@@ -357,5 +367,5 @@ class RectifiedStereo:
                 f"{np.count_nonzero(wrong)} of {disparity.size} disparities are not positive; the first is "
                 f"{disparity[first]} at index {first if len(first) != 1 else first[0]}; drop those points"
             )
-        Z = self.fx * self.baseline / disparity
+        Z = self.focal_baseline / disparity
         return np.stack([(uvd[..., 0] - self.cx) * Z / self.fx, (uvd[..., 1] - self.cy) * Z / self.fy, Z], axis=-1)

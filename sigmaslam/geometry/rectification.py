@@ -136,8 +136,8 @@ def _inner_rectangle(model: CameraModel, R: np.ndarray) -> np.ndarray:
 
 def _source_pixels(model: CameraModel, view: RectifiedStereo, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """For each rectified pixel, (H, W) float32 u and v of its place in the original image."""
-    u, v = np.meshgrid(np.arange(view.width), np.arange(view.height))
-    rays = np.stack([(u - view.cx) / view.fx, (v - view.cy) / view.fy, np.ones(u.shape)], axis=-1) @ R
+    grid = np.stack(np.meshgrid(np.arange(view.width), np.arange(view.height)), axis=-1)
+    rays = view.rays(grid) @ R
     pixels = np.where(rays[..., 2:] > 0, model.project(rays), -1.0).astype(np.float32)
     return np.ascontiguousarray(pixels[..., 0]), np.ascontiguousarray(pixels[..., 1])
 

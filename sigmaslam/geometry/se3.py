@@ -103,6 +103,11 @@ def se3_inverse(T: np.ndarray) -> np.ndarray:
     return inverse
 
 
+def transform_points(T: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Points (..., 3) in the frame that T (4, 4) takes them to."""
+    return np.asarray(points @ T[:3, :3].T + T[:3, 3])
+
+
 def nearest_rigid(T: np.ndarray) -> np.ndarray:
     """Rigid transforms whose rotations have lost digits, made orthonormal again; (..., 4, 4) -> (..., 4, 4).
 

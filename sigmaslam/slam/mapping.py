@@ -127,7 +127,7 @@ class Mapper:
         since = timestamp - keyframes.active[-1].timestamp if keyframes.active else 0.0
         walk = np.array([self.config.offset_walk**2 * since, 0.0, 0.0])
         median = max(float(np.nanmedian(view.disparity)), _MIN_DISPARITY)
-        depth = self.camera.fx * self.camera.baseline / median
+        depth = self.camera.focal_baseline / median
         window.add_keyframe(pose, step, step_covariance, walk, depth, origin)
         view = replace(view, slope=disparity_slopes(view.features.keypoints, view.disparity))
         keyframes.append(view, timestamp)

@@ -297,6 +297,13 @@ def test_triangulate_inverts_project_and_equals_two_pinholes():
     np.testing.assert_allclose(left[..., 1], right[..., 1])
 
 
+def test_rays_times_depth_are_the_points():
+    points = points_in_view().reshape(50, 10, 3)
+    uvd = STEREO.project(points)
+    depth = STEREO.focal_baseline / uvd[..., 2:]
+    np.testing.assert_allclose(depth * STEREO.rays(uvd[..., :2]), points, rtol=1e-12, atol=1e-12)
+
+
 def test_disparities_that_are_not_positive_are_counted():
     uvd = np.ones((2, 3, 3))
     uvd[0, 2, 2], uvd[1, 0, 2], uvd[1, 1, 2] = 0.0, -1.0, np.nan
