@@ -12,7 +12,7 @@ from sigmaslam import frontend
 from sigmaslam.evaluation.matching.pairs import Disparity, Homography, ImagePair, Motion, SameRows
 from sigmaslam.frontend.descriptor import match_stereo
 from sigmaslam.frontend.image_pair import Matches, match_features
-from sigmaslam.frontend.match_confidence import MatchJudge
+from sigmaslam.frontend.match_confidence import ConfidenceEstimator
 from sigmaslam.geometry.se3 import rotation_log
 
 CORNER_THRESHOLDS = (1, 3, 5)
@@ -252,8 +252,8 @@ def without_sigma(features: Features) -> frontend.Features:
 
 
 @cache
-def _judge() -> MatchJudge:
-    return MatchJudge()
+def _judge() -> ConfidenceEstimator:
+    return ConfidenceEstimator()
 
 
 def match_judged(image0: np.ndarray, image1: np.ndarray, features0: Features, features1: Features) -> Matches:

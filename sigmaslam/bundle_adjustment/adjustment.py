@@ -24,7 +24,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 
 # Fewer that agree are no solution.
-_LEAST_SHARE = 0.5
+_MIN_SHARE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,12 +34,12 @@ class RefineConfig:
     Attributes:
         offset_sigma: prior of the disparity offset about zero, pixels; wide, as rectifications of real data are off by
             up to a pixel.
-        least_significance: landmarks whose inverse depth is not this many standard deviations above zero are left
+        min_significance: landmarks whose inverse depth is not this many standard deviations above zero are left
             out: points in Euclidean coordinates cannot be at infinity.
     """
 
     offset_sigma: float = 1.0
-    least_significance: float = 3.0
+    min_significance: float = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +127,7 @@ def adjust(
         structure = fit_structure(observations, kept | (repeated & lost[observations.landmark]), at, offset)
         return structure, repeated & ~(structure.significance >= least)[observations.landmark]
 
-    least = config.least_significance
+    least = config.min_significance
     structure, far = fit(repeated, tracked, offset)
     kept = choose(observations, repeated, structure, tracked, offset, least, gated=False)
     if not kept.any():
@@ -142,7 +142,7 @@ def adjust(
         structure, far = fit(kept, solution.poses, offset)
         agreeing = choose(observations, repeated, structure, solution.poses, offset, least, gated=True)
         near = int((repeated & ~far).sum())
-        if agreeing.sum() < max(_LEAST_SHARE * near, 1):
+        if agreeing.sum() < max(_MIN_SHARE * near, 1):
             raise InputError(
                 f"{agreeing.sum()} of {near} observations agree on where things are: too few. Are trajectory and "
                 "tracks of the same run?"

@@ -20,7 +20,7 @@ from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log, turn_covarianc
 
 # Metres and radians: holds the first keyframe in place.
 _FIXED = 1e-8
-_MOST_ITERATIONS = 50
+_MAX_ITERATIONS = 50
 # Half the sum of squares: when an iteration gains less, no state is further than 0.001 standard deviations off.
 _CONVERGED = 1e-6
 # With Huber's loss only a place to judge outliers from is looked for; its last digits come slowly.
@@ -28,9 +28,9 @@ _NEARLY_CONVERGED = 1e-4  # of the cost
 # Pixels: the step by which the offset's curvature is measured.
 _PROBE = 0.05
 _OFFSET_CONVERGED = 1e-2  # standard deviations
-_MOST_OFFSET_STEPS = 10
+_MAX_OFFSET_STEPS = 10
 # Keyframes that share fewer landmarks count as apart.
-_LEAST_SHARED = 10
+_MIN_SHARED = 10
 # Of (u, v, disparity), rows (u_left, u_right, v): GTSAM's order.
 _STEREO_FROM_DISPARITY = np.array([[1.0, 0, 0], [1, 0, -1], [0, 1, 0]])
 
@@ -114,7 +114,7 @@ class Solver:
         optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, gtsam.LevenbergMarquardtParams())
         self.solves += 1
         cost = optimiser.error()
-        for _ in range(_MOST_ITERATIONS):
+        for _ in range(_MAX_ITERATIONS):
             optimiser.iterate()
             self.iterations += 1
             gain, cost = cost - optimiser.error(), optimiser.error()
@@ -152,7 +152,7 @@ class Solver:
         curvature = max((gradient(probe) - slope) / _PROBE, prior_sigma**-2)
         by_offset = se3_log(se3_inverse(solution.poses) @ probe.poses) / _PROBE
         points_by_offset = (probe.points - solution.points) / _PROBE
-        for _ in range(_MOST_OFFSET_STEPS):
+        for _ in range(_MAX_OFFSET_STEPS):
             step = -slope / curvature
             if abs(step) * math.sqrt(curvature) < _OFFSET_CONVERGED:
                 break
@@ -187,7 +187,7 @@ class Solver:
         # From each view of a landmark to the next one.
         steps = np.column_stack([keyframe[:-1], keyframe[1:]])[same]
         pairs, shared = np.unique(steps, axis=0, return_counts=True)
-        label = connected_parts(len(self._tracked), map(tuple, pairs[shared >= _LEAST_SHARED].tolist()))
+        label = connected_parts(len(self._tracked), map(tuple, pairs[shared >= _MIN_SHARED].tolist()))
         return [self._motion(j) for j in np.unique(label)[1:].tolist()]
 
     def _motion(self, j: int) -> Bridge:

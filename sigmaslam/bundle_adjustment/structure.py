@@ -173,16 +173,16 @@ def choose(
     structure: Structure,
     poses: np.ndarray,
     offset: float,
-    least_significance: float,
+    min_significance: float,
     gated: bool,
 ) -> np.ndarray:
     """Which observations (O,) of those `among` them to use.
 
-    Left out are landmarks whose inverse depth is not `least_significance` standard deviations above zero, observations
+    Left out are landmarks whose inverse depth is not `min_significance` standard deviations above zero, observations
     from which the point is behind, those beyond the 99.9 % quantile of chi-square (where `gated`), and then landmarks
     that fewer than two keyframes observe.
     """
-    far = ~(structure.significance >= least_significance)
+    far = ~(structure.significance >= min_significance)
     points = np.where(far[:, None], 0.0, structure.points)
     residuals, in_front = whitened_residuals(observations, poses, points, offset)
     kept = among & in_front & ~far[observations.landmark]

@@ -33,7 +33,7 @@ def plot_trajectory(
     axes: Axes,
     trajectories: Mapping[str, Trajectory],
     points: np.ndarray | None = None,
-    most_points: int = 3000,
+    max_points: int = 3000,
 ) -> tuple[int, int, int]:
     """Draw trajectories from above, with equal scales and a mark where each begins.
 
@@ -41,7 +41,7 @@ def plot_trajectory(
         axes: where to draw.
         trajectories: by label; the first tells the plane of the view.
         points: (M, 3) map points, metres; an even selection of them is drawn, rasterised.
-        most_points: how many at most.
+        max_points: how many at most.
     Returns:
         The axes of the view (see `view_axes`).
     """
@@ -57,7 +57,7 @@ def plot_trajectory(
         low = np.minimum(low, np.maximum(np.percentile(points, 2, axis=0), low - reach))
         high = np.maximum(high, np.minimum(np.percentile(points, 98, axis=0), high + reach))
         points = points[((points >= low) & (points <= high)).all(axis=1)]
-        shown = points[:: max(1, -(-len(points) // most_points))]
+        shown = points[:: max(1, -(-len(points) // max_points))]
         axes.plot(*shown.T, color=GREY, marker=".", ms=1.6, mew=0, ls="", rasterized=True, label="map points", zorder=1)
     for number, (label, trajectory) in enumerate(trajectories.items()):
         colour = SERIES[number % len(SERIES)]

@@ -36,11 +36,11 @@ COLUMNS = (
 STATUSES = ("starting", "tracking", "lost", "relocalised", "skipped")
 STATUS_COLOURS = {"lost": VERMILLION, "relocalised": PURPLE, "skipped": GREY}
 
-MOST_VERTICES = 1000
+MAX_VERTICES = 1000
 """Frames above which lines become pictures inside the SVG, to keep the report small."""
-MOST_COLUMNS = 250
+MAX_COLUMNS = 250
 """Steps across filled areas; of more frames the means, or every so many, are drawn."""
-MOST_CONFIGURATION = 20_000
+MAX_CONFIGURATION = 20_000
 """Characters of run.json that are shown."""
 
 
@@ -120,8 +120,8 @@ def write_report(run_dir: str | Path) -> Path:
     points = _read_points(run_dir / "map.npz")
     run = _read_run(run_dir / "run.json")
     configuration = json.dumps(run, indent=2, ensure_ascii=False)
-    if len(configuration) > MOST_CONFIGURATION:
-        configuration = configuration[:MOST_CONFIGURATION] + "\n… (run.json has more)"
+    if len(configuration) > MAX_CONFIGURATION:
+        configuration = configuration[:MAX_CONFIGURATION] + "\n… (run.json has more)"
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("sigmaslam.runs", "templates"), autoescape=True, undefined=jinja2.StrictUndefined
     )
@@ -255,7 +255,7 @@ def _figures(trajectory: Trajectory, frames: FrameTable, points: np.ndarray | No
 
 
 def _line(axes: Axes, frames: FrameTable, values: np.ndarray, label: str, colour: str, **style: Any) -> None:
-    rasterised = len(frames) > MOST_VERTICES
+    rasterised = len(frames) > MAX_VERTICES
     axes.plot(frames.seconds, values, color=colour, label=label, rasterized=rasterised, **{"lw": 1.2, **style})
 
 
@@ -274,7 +274,7 @@ def _draw_nis(axes: Axes, frames: FrameTable) -> bool:
     if not np.isfinite(ratio).any():
         return False
     # Wilson and Hilferty: (chi2 / dof)^(1/3) is nearly normal.
-    every = -(-len(frames) // MOST_COLUMNS)
+    every = -(-len(frames) // MAX_COLUMNS)
     dof = frames.columns["dof"][::every]
     dof = np.where(dof > 0, dof, np.nan)
     spread = np.sqrt(2 / (9 * dof))
@@ -301,7 +301,7 @@ def _draw_offset(axes: Axes, frames: FrameTable) -> bool:
         alpha=0.25,
         lw=0,
         label="2 sigma",
-        rasterized=len(frames) > MOST_VERTICES,
+        rasterized=len(frames) > MAX_VERTICES,
     )
     _line(axes, frames, offset, "offset", BLUE)
     axes.axhline(0.0, color=GREY, lw=1)
@@ -323,7 +323,7 @@ def _draw_milliseconds(axes: Axes, frames: FrameTable) -> bool:
         return False
     seconds = frames.seconds[measured]
     stages = np.nan_to_num(np.array([values[measured] for values in frames.milliseconds.values()]))
-    every = -(-len(seconds) // MOST_COLUMNS)
+    every = -(-len(seconds) // MAX_COLUMNS)
     starts = np.arange(0, len(seconds), every)
     means = np.add.reduceat(stages, starts, axis=1) / np.diff(np.append(starts, len(seconds)))
     colours = [SERIES[number % len(SERIES)] for number in range(len(means))]

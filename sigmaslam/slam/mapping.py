@@ -11,7 +11,7 @@ from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
 from sigmaslam.frontend import StereoView
-from sigmaslam.frontend.feature_spacing import select_apart
+from sigmaslam.frontend.feature_spacing import select_spaced
 from sigmaslam.frontend.patch_disparity_range import patch_disparity_range
 from sigmaslam.frontend.plane_alignment import disparity_slopes
 from sigmaslam.geometry.camera import RectifiedStereo
@@ -144,7 +144,7 @@ class Mapper:
         assert view.slope is not None
         index = np.flatnonzero(np.isfinite(view.disparity))
         taken = views.measurement[:, :2]
-        index = index[select_apart(view.features.select(index), taken, self.config.spacing, view.left.shape)]
+        index = index[select_spaced(view.features.select(index), taken, self.config.spacing, view.left.shape)]
         measured = view.measured(index)
         disparity_range = patch_disparity_range(view.left, view.right, measured, view.slope[index])
         self.window.add_landmarks(index, measured, self.noise.of_keypoints(view, index), disparity_range)
