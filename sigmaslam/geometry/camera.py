@@ -14,9 +14,9 @@ DistortionModel = Literal["none", "radtan", "equidistant"]
 
 COEFFICIENT_COUNTS: dict[str, tuple[int, ...]] = {"none": (0,), "radtan": (4, 5, 8), "equidistant": (4,)}
 
-# How far a rotation may be from orthonormal: files carry six or seven digits.
+# Rotations may deviate so much from orthonormal, as files have six or seven digits.
 ORTHONORMAL_TOLERANCE = 1e-4
-# A pair counts as rectified when rows agree to about 0.01 px: angles in rad, offsets relative to baseline.
+# A pair counts as rectified when rows agree to about 0.01 px. Angles are in radians, offsets relative to the baseline.
 RECTIFIED_ANGLE = 1e-5
 RECTIFIED_OFFSET = 1e-4
 
@@ -60,8 +60,8 @@ class CameraModel:
         if self.fx <= 0 or self.fy <= 0:
             raise CalibrationError(f"focal lengths must be positive pixels, got fx={self.fx}, fy={self.fy}")
         if self.distortion_model not in COEFFICIENT_COUNTS:
-            known = ", ".join(get_args(DistortionModel))
-            raise CalibrationError(f"distortion_model is {self.distortion_model!r}; use one of {known}")
+            names = ", ".join(get_args(DistortionModel))
+            raise CalibrationError(f"distortion_model is {self.distortion_model!r}; use one of {names}")
         counts = COEFFICIENT_COUNTS[self.distortion_model]
         if len(self.distortion) not in counts:
             raise CalibrationError(
@@ -78,8 +78,8 @@ class CameraModel:
         """Pixels of points in the camera frame.
 
         Args:
-            points: (..., 3) metres. Only Z > 0 has a meaning; nothing is checked, so that whole clouds can be
-                projected and masked afterwards.
+            points: (..., 3) metres. Only points with Z > 0 have a meaning. This is not checked, so that whole clouds
+                can be projected and masked afterwards.
 
         Returns:
             (..., 2) pixels (u, v), in the floating type of `points`.
@@ -97,8 +97,8 @@ class CameraModel:
             pixels: (..., 2) pixels (u, v).
 
         Returns:
-            (..., 3) points with Z = 1 in the camera frame, in the floating type of `pixels`; NaN where no
-            ray in front of the camera has this pixel (beyond the fold of the distortion, or 90 degrees).
+            (..., 3) points with Z = 1 in the camera frame, in the floating type of `pixels`; NaN for pixels that no
+            ray in front of the camera has (beyond the fold of the distortion, or 90 degrees).
         """
         pixels, dtype = _as_float64(pixels, 2, "pixels")
         y = (pixels[..., 1] - self.cy) / self.fy
@@ -115,7 +115,7 @@ class CameraModel:
             radius = np.hypot(X, Y)
             theta = np.arctan2(radius, Z)
             theta_d, _ = _equidistant_polynomial(theta, self.distortion)
-            # On the axis the ratio is 0 / 0; its limit is 1 / Z.
+            # The ratio is 0 / 0 on the axis; its limit is 1 / Z.
             scale = np.where(radius > 0, theta_d / radius, 1.0 / Z)
             return X * scale, Y * scale
         x, y = X / Z, Y / Z
@@ -166,9 +166,9 @@ def _undistort_radtan(
                 break
         x_now, y_now, (a, b, d) = _distort_radtan(x, y, coefficients)
         residual = np.hypot(x_now - x_distorted, y_now - y_distorted)
-        # Both eigenvalues positive: not beyond the fold, where the image runs backwards.
-        found = (residual < _NEWTON_RESIDUAL) & (a * d - b * b > 0) & (a + d > 0)
-    return np.where(found, x, np.nan), np.where(found, y, np.nan)
+        # Both eigenvalues of the Jacobian are positive up to the fold, beyond which the image is mirrored.
+        valid = (residual < _NEWTON_RESIDUAL) & (a * d - b * b > 0) & (a + d > 0)
+    return np.where(valid, x, np.nan), np.where(valid, y, np.nan)
 
 
 def _equidistant_polynomial(theta: np.ndarray, coefficients: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
@@ -191,9 +191,9 @@ def _undistort_equidistant(
             if not np.any(np.abs(value - theta_d) > 1e-15):
                 break
         value, slope = _equidistant_polynomial(theta, coefficients)
-        found = (np.abs(value - theta_d) < _NEWTON_RESIDUAL) & (slope > 0) & (theta >= 0) & (theta < np.pi / 2)
+        valid = (np.abs(value - theta_d) < _NEWTON_RESIDUAL) & (slope > 0) & (theta >= 0) & (theta < np.pi / 2)
         scale = np.where(theta_d > 0, np.tan(theta) / theta_d, 1.0)
-    scale = np.where(found, scale, np.nan)
+    scale = np.where(valid, scale, np.nan)
     return x_distorted * scale, y_distorted * scale
 
 
@@ -248,7 +248,7 @@ class StereoCamera:
 
     @property
     def is_rectified(self) -> bool:
-        """Whether the images can be used as they are: equal K, undistorted, parallel, pure x baseline."""
+        """Whether the images need no rectification: equal K, no distortion, parallel axes, a baseline along x."""
         left, right = self.left, self.right
         if left.distortion_model != "none" or right.distortion_model != "none" or left.skew or right.skew:
             return False

@@ -29,9 +29,9 @@ class CalibrationYaml:
             text = path.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
             raise CalibrationError(f"{path}: cannot read the calibration: {error}") from None
-        first, _, rest = text.partition("\n")
+        first, _, body = text.partition("\n")
         if first.startswith("%YAML:"):
-            text = "\n" + rest
+            text = "\n" + body
         try:
             entries = yaml.safe_load(text)
         except yaml.YAMLError as error:
@@ -54,7 +54,7 @@ class CalibrationYaml:
     def text(self, key: str, default: str = _REQUIRED) -> str:
         """A word."""
         value = self._get(key, "a word", default)
-        # YAML reads a bare `none` as a string, but `null` and `~` as None.
+        # YAML reads a bare `none` as a string, and `null` and `~` as None.
         return "none" if value is None else str(value)
 
     def number(self, key: str, default: float = _REQUIRED) -> float:
@@ -74,7 +74,7 @@ class CalibrationYaml:
         expected = "a number" if not shape else "a list of numbers" if size == "any" else f"{size} numbers in lists"
         value = self._get(key, expected, default)
         try:
-            # Through str: YAML 1.1 reads 1e-5 as text; booleans are no numbers.
+            # The conversion goes through str, as YAML 1.1 reads 1e-5 as text and booleans are no numbers.
             array = np.array(value, dtype=str) if value != [] else np.zeros(0, dtype=str)
             numbers = array.astype(np.float64)
         except ValueError:
@@ -83,12 +83,12 @@ class CalibrationYaml:
             n is None or n == m for n, m in zip(shape, numbers.shape, strict=True)
         )
         if not fits or not np.all(np.isfinite(numbers)):
-            found = "x".join(map(str, numbers.shape)) or "one number"
-            raise self._wrong(key, expected, value, f" (size {found})")
+            actual = "x".join(map(str, numbers.shape)) or "one number"
+            raise self._wrong(key, expected, value, f" (size {actual})")
         return cast(np.ndarray, numbers)
 
     def reject_unknown(self, known: Collection[str]) -> None:
-        """Refuse keys that nobody would read, as a misspelt optional key would pass unseen."""
+        """Refuse unknown keys, as a misspelt optional key would be ignored."""
         unknown = [str(key) for key in self.entries if key not in known]
         if unknown:
             raise self.error(f"unknown key {', '.join(unknown)}; known are {', '.join(known)}")

@@ -20,7 +20,7 @@ KITTI_FRAME_RATE = 10.0
 
 
 def trajectory_format(path: str | Path) -> TrajectoryFormat:
-    """Tell the format from the first line that is not a comment.
+    """The format, from the first line that is not a comment.
 
     Commas make it EuRoC, eight columns TUM, twelve KITTI.
 
@@ -44,7 +44,7 @@ def trajectory_format(path: str | Path) -> TrajectoryFormat:
 
 
 def read_trajectory(path: str | Path) -> Trajectory:
-    """Read a trajectory in any of the three forms, which is told from its content.
+    """Read a trajectory in any of the three forms, which its content determines.
 
     Raises:
         InputError: the file cannot be read or a line is wrong (the message names file, line and value).
@@ -58,11 +58,11 @@ def read_trajectory(path: str | Path) -> Trajectory:
 
 
 def check_covariances(loaded: object, path: Path, count: int) -> np.ndarray:
-    """What numpy loaded from a covariance.npy, if it is one of as many poses as the trajectory beside it.
+    """The covariances of a covariance.npy, checked against the number of poses in the trajectory beside it.
 
     Args:
-        loaded: the content.
-        path: for the message.
+        loaded: content of the file.
+        path: of the file.
         count: poses of trajectory.tum.
     Returns:
         (count, 6, 6) float64.
@@ -174,7 +174,7 @@ def read_euroc_truth(path: str | Path) -> Trajectory:
     """
     path = Path(path)
     rows, numbers = _numbers(path, columns=None, form="EuRoC: timestamp, p (3), q (4), ...", separator=",")
-    # No position is as large as a time in nanoseconds.
+    # A second column as large as a time in nanoseconds is a time stamp, no position.
     first = 2 if rows.shape[1] > 1 and abs(rows[0, 1]) > 1e15 else 1
     if rows.shape[1] < first + 7:
         raise InputError(

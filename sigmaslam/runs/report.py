@@ -37,11 +37,11 @@ STATUSES = ("starting", "tracking", "lost", "relocalised", "skipped")
 STATUS_COLOURS = {"lost": VERMILLION, "relocalised": PURPLE, "skipped": GREY}
 
 MAX_VERTICES = 1000
-"""Frames above which lines become pictures inside the SVG, to keep the report small."""
+"""With more frames, lines become pictures inside the SVG, which keeps the report small."""
 MAX_COLUMNS = 250
-"""Steps across filled areas; of more frames the means, or every so many, are drawn."""
+"""Filled areas have at most so many steps; with more frames they show means, or a subset."""
 MAX_CONFIGURATION = 20_000
-"""Characters of run.json that are shown."""
+"""The report shows at most so many characters of run.json."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class FrameTable:
     Attributes:
         status: one of `STATUSES` for each of N frames.
         columns: by name of `COLUMNS`, (N,) float64; NaN where the field is empty.
-        milliseconds: by stage ("read", "features", ...), (N,) float64; NaN where empty.
+        milliseconds: by stage ("read", "features", ...), (N,) float64; NaN where the field is empty.
     """
 
     status: list[str]
@@ -107,7 +107,7 @@ def read_frames(path: Path) -> FrameTable:
 def write_report(run_dir: str | Path) -> Path:
     """Write `report.html` from the files of a run folder.
 
-    Reads trajectory.tum and frames.csv, and map.npz and run.json where they are.
+    Reads trajectory.tum and frames.csv, and map.npz and run.json if they exist.
 
     Returns:
         The path of the report.
@@ -157,7 +157,7 @@ def _column(path: Path, rows: list[dict[str, str]], name: str) -> np.ndarray:
 
 
 def _read_points(path: Path) -> np.ndarray | None:
-    """Map points (M, 3), or None where the run has no map."""
+    """Map points (M, 3), or None if the run has no map."""
     if not path.is_file():
         return None
     try:
@@ -183,7 +183,7 @@ def _read_run(path: Path) -> dict[str, Any]:
 def _facts(trajectory: Trajectory, frames: FrameTable, points: np.ndarray | None) -> list[tuple[str, str]]:
     """Label and value of the summary."""
     total = frames.total_milliseconds
-    # The first frame pays for loading; the median frame is what a user waits for.
+    # The median is robust against the first frame, which includes the time of loading.
     speed = _median(total)
     ratio = _median(_nis_per_dof(frames))
     facts = [
@@ -215,7 +215,7 @@ def _nis_per_dof(frames: FrameTable) -> np.ndarray:
 
 
 def _figures(trajectory: Trajectory, frames: FrameTable, points: np.ndarray | None) -> list[tuple[str, str, Markup]]:
-    """Title, caption and SVG of each figure; what is in no frame has none."""
+    """Title, caption and SVG of each figure that has data."""
     figures = []
     if len(trajectory):
         figure = Figure(figsize=(8, 5.5), layout="constrained")
@@ -273,7 +273,7 @@ def _draw_nis(axes: Axes, frames: FrameTable) -> bool:
     ratio = np.where(ratio > 0, ratio, np.nan)
     if not np.isfinite(ratio).any():
         return False
-    # Wilson and Hilferty: (chi2 / dof)^(1/3) is nearly normal.
+    # (chi2 / dof)^(1/3) is nearly normal (Wilson and Hilferty).
     every = -(-len(frames) // MAX_COLUMNS)
     dof = frames.columns["dof"][::every]
     dof = np.where(dof > 0, dof, np.nan)
@@ -335,7 +335,7 @@ def _draw_milliseconds(axes: Axes, frames: FrameTable) -> bool:
 
 
 def _mark_statuses(axes: Axes, frames: FrameTable) -> None:
-    """Shade the frames that were not tracked."""
+    """Shades the frames that were not tracked."""
     seconds = frames.seconds
     half = 0.5 * float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.5
     first = 0

@@ -18,7 +18,7 @@ from sigmaslam.cli import app
 from sigmaslam.errors import CalibrationError, InputError
 from sigmaslam.readers import StereoFrame, open_cameras
 from sigmaslam.readers import live as camera_module
-from sigmaslam.readers.capture import JUDGED_PAIRS, StereoCapture, open_capture
+from sigmaslam.readers.capture import SYNCHRONY_PAIRS, StereoCapture, open_capture
 from sigmaslam.readers.live import LivePairs, LiveSequence
 from sigmaslam.readers.trajectory_files import read_tum
 from sigmaslam.runs.track import track_sequence
@@ -214,7 +214,7 @@ def median_difference(frames: list[StereoFrame]) -> float:
 @pytest.mark.parametrize(("late", "warned"), [(0.007, True), (0.001, False)])
 def test_eyes_that_are_not_taken_together_are_warned_about(caplog, late: float, warned: bool):
     left, right = FakeCamera(driver="V4L2", period=0.016), FakeCamera(driver="V4L2", period=0.016, late=late)
-    list(islice(live(left, right).frames(), JUDGED_PAIRS + 10))
+    list(islice(live(left, right).frames(), SYNCHRONY_PAIRS + 10))
     assert ("camera 0 and camera 1: left and right are taken 7 ms apart" in caplog.text) == warned
 
 
@@ -223,7 +223,7 @@ def test_grabbing_that_takes_long_is_warned_about(caplog, monkeypatch: pytest.Mo
     right = FakeCamera()
     monkeypatch.setattr(right, "grab", lambda: time.sleep(0.008) is None)
     capture = StereoCapture([FakeCamera(), right], ["camera 0", "camera 1"])
-    for index in range(JUDGED_PAIRS):
+    for index in range(SYNCHRONY_PAIRS):
         capture.take(index)
     assert "camera 0 and camera 1: left and right are taken" in caplog.text
 
