@@ -28,14 +28,9 @@ from sigmaslam.evaluation.metrics.trajectory_errors import (
     synchronise,
 )
 from sigmaslam.geometry.se3 import se3_inverse
-from sigmaslam.geometry.trajectory import (
-    Trajectory,
-    check_covariances,
-    kitti_times_path,
-    read_trajectory,
-    trajectory_format,
-)
+from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.plot_style import BLUE, VERMILLION, style_axes
+from sigmaslam.readers.trajectory_files import check_covariances, kitti_times_path, read_trajectory, trajectory_format
 from sigmaslam.runs.figures import AXIS_NAMES, plot_trajectory, save_png
 
 

@@ -17,9 +17,10 @@ from sigmaslam import errors
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.run_evaluation import Evaluation, evaluate_run
 from sigmaslam.files import atomic_write_text
-from sigmaslam.geometry.trajectory import Trajectory, read_trajectory
+from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.inference.onnx_graph import shipped_weights
 from sigmaslam.readers import StereoSequence, open_sequence
+from sigmaslam.readers.trajectory_files import read_trajectory
 from sigmaslam.runs.report import FrameTable, read_frames
 from sigmaslam.runs.track import track_sequence
 

@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from sigmaslam.files import atomic_write_text
 from sigmaslam.geometry.camera import CameraModel
-from sigmaslam.geometry.trajectory import Trajectory, write_kitti
+from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.readers.trajectory_files import write_kitti
 from sigmaslam.synthetic.simulation import Simulation
 
 _FIRST_STAMP = 1_600_000_000_000_000_000  # nanoseconds; EuRoC's stamps count from 1970

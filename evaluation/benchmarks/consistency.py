@@ -23,8 +23,8 @@ from sigmaslam.evaluation.metrics import map_consistency as consistency
 from sigmaslam.evaluation.trial import Trial, TrialCache, hash_code, render
 from sigmaslam.files import make_folder
 from sigmaslam.geometry.rectification import StereoRectifier
-from sigmaslam.geometry.trajectory import read_trajectory
 from sigmaslam.readers import open_sequence
+from sigmaslam.readers.trajectory_files import read_trajectory
 from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam.synthetic.render_sequence import SCENE_NAME

@@ -17,9 +17,10 @@ from sigmaslam.evaluation.benchmarks.endurance_page import Block, Endurance, Lap
 from sigmaslam.evaluation.benchmarks.page import write_page
 from sigmaslam.evaluation.trial import Trial, TrialResult, read_trial, render
 from sigmaslam.geometry.se3 import se3_inverse
-from sigmaslam.geometry.trajectory import Trajectory, read_trajectory
+from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import StereoFrame, StereoSequence, open_sequence
 from sigmaslam.readers.images import RawPair
+from sigmaslam.readers.trajectory_files import read_trajectory
 from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam.synthetic.render_sequence import default_workers

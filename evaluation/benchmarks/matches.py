@@ -21,7 +21,7 @@ from sigmaslam.evaluation.matching.judgement import (
 from sigmaslam.evaluation.matching.rejection import KEYPOINTS, compare_rejection
 from sigmaslam.evaluation.matching.relative_pose import compare_starts
 from sigmaslam.evaluation.matching.sets import check_sets, load_set
-from sigmaslam.frontend.match_confidence import MatchJudge
+from sigmaslam.frontend.match_confidence import ConfidenceEstimator
 from sigmaslam.training.matching.match_sets import DETECTORS
 
 _HOMOGRAPHIES, _STEREO = ("set12", "boat", "churchill"), ("kitti", "euroc")
@@ -45,7 +45,7 @@ def write_matches(path: Path, data: Path, command: str, note: Callable[[str], No
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
     try:
-        judge = MatchJudge()
+        judge = ConfidenceEstimator()
         lines = _introduction(command)
         for part in (_homographies, _rows, _rejection, _starts, _movers):
             note(part.__name__.strip("_"))
@@ -64,7 +64,7 @@ def _introduction(command: str) -> list[str]:
     ]
 
 
-def _homographies(data: Path, judge: MatchJudge) -> list[str]:
+def _homographies(data: Path, judge: ConfidenceEstimator) -> list[str]:
     lines = [
         "## Real homographies",
         "",
@@ -86,7 +86,7 @@ def _homographies(data: Path, judge: MatchJudge) -> list[str]:
     return [*lines, ""]
 
 
-def _rows(data: Path, judge: MatchJudge) -> list[str]:
+def _rows(data: Path, judge: ConfidenceEstimator) -> list[str]:
     lines = [
         "## Rows of real stereo pairs",
         "",
@@ -107,7 +107,7 @@ def _rows(data: Path, judge: MatchJudge) -> list[str]:
     return [*lines, ""]
 
 
-def _rejection(data: Path, judge: MatchJudge) -> list[str]:
+def _rejection(data: Path, judge: ConfidenceEstimator) -> list[str]:
     lines = [
         "## Right from wrong among SIFT's nearest neighbours",
         "",
@@ -135,7 +135,7 @@ def _rejection(data: Path, judge: MatchJudge) -> list[str]:
     return [*lines, ""]
 
 
-def _starts(data: Path, judge: MatchJudge) -> list[str]:
+def _starts(data: Path, judge: ConfidenceEstimator) -> list[str]:
     lines = [
         "## Relative pose without a prediction",
         "",
@@ -161,7 +161,7 @@ def _motions(data: Path) -> list[tuple[str, list[ImagePair]]]:
     ]
 
 
-def _movers(data: Path, judge: MatchJudge) -> list[str]:
+def _movers(data: Path, judge: ConfidenceEstimator) -> list[str]:
     measured = judge_movers(DETECTORS["learned"](_PHOTOGRAPH_KEYPOINTS), judge, _MOVER_SEED, _MOVER_PAIRS)
     low, high = (f"{100 * share:.0f}" for share in SHARES)
     return [

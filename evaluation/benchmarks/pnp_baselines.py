@@ -20,8 +20,9 @@ from sigmaslam.files import make_folder
 from sigmaslam.geometry.camera import RectifiedStereo, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import rotation_exp, se3_adjoint, se3_inverse, se3_log, skew
-from sigmaslam.geometry.trajectory import Trajectory, write_tum
+from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import StereoSequence
+from sigmaslam.readers.trajectory_files import write_tum
 from sigmaslam.runs.report import COLUMNS
 
 _KEYPOINTS = 1500  # as many as the tracker asks for

@@ -16,8 +16,8 @@ from sigmaslam.evaluation.matching.scores import mutual_nearest
 from sigmaslam.evaluation.trial import Trial, render
 from sigmaslam.frontend.classical import SiftDetector
 from sigmaslam.geometry.se3 import rotation_log
-from sigmaslam.geometry.trajectory import read_trajectory
 from sigmaslam.readers import open_sequence
+from sigmaslam.readers.trajectory_files import read_trajectory
 from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.tracker import TrackerConfig
 

@@ -10,7 +10,7 @@ import torch
 
 from sigmaslam.evaluation.metrics.probability_calibration import RIGHT
 from sigmaslam.frontend.image_pair import match_features
-from sigmaslam.frontend.match_confidence import MatchJudge
+from sigmaslam.frontend.match_confidence import ConfidenceEstimator
 from sigmaslam.frontend.types import Features
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import rotation_log
@@ -52,7 +52,9 @@ class MoverJudgement:
     poses_right: float
 
 
-def judge_movers(detect: Callable[[np.ndarray], Features], judge: MatchJudge, seed: int, tried: int) -> MoverJudgement:
+def judge_movers(
+    detect: Callable[[np.ndarray], Features], judge: ConfidenceEstimator, seed: int, tried: int
+) -> MoverJudgement:
     """Looks for such pairs among `tried` rendered ones and matches them.
 
     Args:

@@ -14,7 +14,7 @@ from sigmaslam.evaluation.metrics import probability_calibration as calibration
 from sigmaslam.evaluation.metrics.probability_calibration import RIGHT
 from sigmaslam.frontend.affine_alignment import refine_by_neighbours
 from sigmaslam.frontend.descriptor import match_stereo
-from sigmaslam.frontend.match_confidence import LEAST_LOGIT, MatchJudge
+from sigmaslam.frontend.match_confidence import MIN_LOGIT, ConfidenceEstimator
 from sigmaslam.frontend.nearest_neighbours import nearest_anywhere
 from sigmaslam.frontend.types import Features
 
@@ -55,7 +55,7 @@ class HomographyJudgement:
     median: float
 
 
-def judge_homographies(pairs: Sequence[ImagePair], detect: Detect, judge: MatchJudge) -> HomographyJudgement:
+def judge_homographies(pairs: Sequence[ImagePair], detect: Detect, judge: ConfidenceEstimator) -> HomographyJudgement:
     """Judges the matches of pairs whose homography is known.
 
     Args:
@@ -78,7 +78,7 @@ def judge_homographies(pairs: Sequence[ImagePair], detect: Detect, judge: MatchJ
         mutual = putative.mutual
         precisions = [calibration.average_precision(score, near) for score in (10.0 * mutual - ratio, logit)]
         # Score the same matches before and after verification, also those that the verifier does not see.
-        seen = np.flatnonzero(mutual & (logit > LEAST_LOGIT))
+        seen = np.flatnonzero(mutual & (logit > MIN_LOGIT))
         weight = 1.0 / (1.0 + np.exp(-logit[seen].astype(np.float64)))
         refinement = refine_by_neighbours(pair.image0, pair.image1, points0[seen], points1[seen], weight)
         sigma = features0.sigma[putative.index0[seen]], features1.sigma[putative.index1[seen]]
@@ -143,7 +143,7 @@ class RowJudgement:
     bias: float
 
 
-def judge_rows(pairs: Sequence[ImagePair], detect: Detect, judge: MatchJudge) -> RowJudgement:
+def judge_rows(pairs: Sequence[ImagePair], detect: Detect, judge: ConfidenceEstimator) -> RowJudgement:
     """Judges the stereo matches that the tracker would use by the difference of their rows, which should be zero.
 
     What is left of the rectification is common to all pairs of a set: a polynomial of second degree in the place, as a

@@ -14,7 +14,7 @@ from kornia.feature.adalam.adalam import AdalamFilter
 from sigmaslam.evaluation.matching.image_pairs import ImagePair, Motion
 from sigmaslam.evaluation.matching.scores import essential_by_magsac
 from sigmaslam.frontend.classical import SiftDetector
-from sigmaslam.frontend.match_confidence import MatchJudge
+from sigmaslam.frontend.match_confidence import ConfidenceEstimator
 from sigmaslam.frontend.nearest_neighbours import Putative, nearest_anywhere
 from sigmaslam.frontend.types import Features
 
@@ -59,7 +59,7 @@ class Rejection:
 
 
 def compare_rejection(
-    pairs: Sequence[ImagePair], judge: MatchJudge, thinned: bool
+    pairs: Sequence[ImagePair], judge: ConfidenceEstimator, thinned: bool
 ) -> tuple[float, dict[str, Rejection]]:
     """Everyone on the pairs with a known motion.
 

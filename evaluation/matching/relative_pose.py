@@ -11,7 +11,7 @@ import numpy as np
 from sigmaslam.evaluation.matching.image_pairs import ImagePair, Motion
 from sigmaslam.evaluation.matching.scores import pose_by_magsac, pose_errors_deg
 from sigmaslam.frontend.image_pair import Matches, match_features
-from sigmaslam.frontend.match_confidence import MatchJudge
+from sigmaslam.frontend.match_confidence import ConfidenceEstimator
 from sigmaslam.frontend.nearest_neighbours import nearest_anywhere
 from sigmaslam.frontend.types import Features
 from sigmaslam.two_view.epipolar import estimate_epipolar_pose
@@ -42,7 +42,7 @@ class StartScore:
 
 
 def compare_starts(
-    pairs: Sequence[ImagePair], detect: Callable[[np.ndarray], Features], judge: MatchJudge
+    pairs: Sequence[ImagePair], detect: Callable[[np.ndarray], Features], judge: ConfidenceEstimator
 ) -> dict[str, StartScore]:
     """Everyone on the pairs with a known motion that is more than a turn.
 

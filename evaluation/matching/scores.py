@@ -11,7 +11,7 @@ import numpy as np
 from sigmaslam.evaluation.matching.image_pairs import Disparity, Homography, ImagePair, Motion, SameRows
 from sigmaslam.frontend.descriptor import match_stereo
 from sigmaslam.frontend.image_pair import Matches, match_features
-from sigmaslam.frontend.match_confidence import MatchJudge
+from sigmaslam.frontend.match_confidence import ConfidenceEstimator
 from sigmaslam.frontend.types import Features
 from sigmaslam.geometry.se3 import rotation_log
 
@@ -254,8 +254,8 @@ def without_sigma(features: KeypointsAndDescriptors) -> Features:
 
 
 @cache
-def _judge() -> MatchJudge:
-    return MatchJudge()
+def _judge() -> ConfidenceEstimator:
+    return ConfidenceEstimator()
 
 
 def match_judged(

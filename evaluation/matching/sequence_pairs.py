@@ -14,8 +14,8 @@ from sigmaslam.evaluation.matching.stereo import StereoStep
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import se3_inverse
-from sigmaslam.geometry.trajectory import read_trajectory
 from sigmaslam.readers import StereoSequence, open_sequence
+from sigmaslam.readers.trajectory_files import read_trajectory
 
 _KITTI_STEP = 6
 

@@ -23,8 +23,8 @@ from sigmaslam.bundle_adjustment.track_file import Tracks
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 
-# Fewer that agree are no solution.
-_LEAST_SHARE = 0.5
+# A smaller share of inliers is no solution.
+_MIN_SHARE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,36 +34,36 @@ class RefineConfig:
     Attributes:
         offset_sigma: prior of the disparity offset about zero, pixels; wide, as rectifications of real data are off by
             up to a pixel.
-        least_significance: landmarks whose inverse depth is not this many standard deviations above zero are left
-            out: points in Euclidean coordinates cannot be at infinity.
+        min_significance: landmarks whose inverse depth is fewer standard deviations above zero are not used, as
+            Euclidean coordinates have no points at infinity.
     """
 
     offset_sigma: float = 1.0
-    least_significance: float = 3.0
+    min_significance: float = 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class Adjustment:
-    """What the adjustment found.
+    """Result of the adjustment.
 
     Attributes:
         frames: (K,) rows of the keyframes in the trajectory.
         poses: (K, 4, 4) T_world_camera of the left camera.
-        covariances: (K, 6, 6) of these in the camera's own frame, (translation, rotation), given the first pose.
+        covariances: (K, 6, 6) of the poses in the camera's frame, (translation, rotation), given the first pose.
         points: (L, 3) landmarks in the world, metres.
         point_covariances: (L, 3, 3) given poses and offset.
         point_views: (L,) observations of each landmark in use.
         disparity_offset, disparity_offset_sigma: pixels.
-        observations: how many are in use.
-        outliers: how many were found wrong.
-        far_landmarks: left out because they cannot be told from infinity.
-        bridges: gaps in the tracks that are spanned by the tracker's own motion.
+        observations: number in use.
+        outliers: number of rejected observations.
+        far_landmarks: number of landmarks that are not used because they may be at infinity.
+        bridges: number of gaps in the tracks that the tracker's motion spans.
         dof: degrees of freedom of the residuals.
         cost_before, cost_after: sum of squared whitened residuals of the observations in use, per degree of freedom,
-            at the tracker's poses and offset with the points that fit these best, and now.
+            at the tracker's poses and offset with the points that fit these best, and at the solution.
         iterations: Levenberg-Marquardt steps of all solves.
-        solves: how many times the graph was solved.
-        converged: False when a solve ran out of iterations, or the offset out of steps.
+        solves: number of solves of the graph.
+        converged: False when a solve or the search for the offset reached its limit of iterations.
     """
 
     frames: np.ndarray
@@ -95,15 +95,15 @@ def adjust(
 ) -> Adjustment:
     """Bundle adjustment of a run's tracks.
 
-    First with Huber's loss; then observations beyond the 99.9 % quantile are left out and the others weighted as
-    their covariances say, twice, the second time with the offset.
+    The first solve uses Huber's loss. Two more follow without it: each rejects the observations beyond the 99.9 %
+    quantile and weights the others by their covariances. The last one also estimates the offset.
 
     Args:
         tracks: the observations.
         poses: (N, 4, 4) T_world_camera of all frames, as tracked.
-        covariances: (N, 6, 6) of these; only the growth over gaps in the tracks is used.
+        covariances: (N, 6, 6) of the poses; only their growth over gaps in the tracks is used.
         config: settings.
-        tell: is told what goes on.
+        tell: receives messages on the progress.
     Raises:
         InputError: gtsam is not installed, there is nothing to adjust, or the tracks do not fix all poses.
     """
@@ -121,15 +121,18 @@ def adjust(
     repeated = seen_again(observations, np.ones(len(observations), bool))
 
     def fit(kept: np.ndarray, at: np.ndarray, offset: float) -> tuple[Structure, np.ndarray]:
-        """Points by themselves, with every view where none was kept, and which of the repeated views are far."""
-        tell("points by themselves")
-        lost = np.bincount(observations.landmark[kept], minlength=len(observations.host)) == 0
-        structure = fit_structure(observations, kept | (repeated & lost[observations.landmark]), at, offset)
-        return structure, repeated & ~(structure.significance >= least)[observations.landmark]
+        """Points at fixed poses, and which repeated observations are of far landmarks.
 
-    least = config.least_significance
+        Landmarks without a kept observation use all of theirs.
+        """
+        tell("points by themselves")
+        unused = np.bincount(observations.landmark[kept], minlength=len(observations.host)) == 0
+        structure = fit_structure(observations, kept | (repeated & unused[observations.landmark]), at, offset)
+        return structure, repeated & ~(structure.significance >= min_significance)[observations.landmark]
+
+    min_significance = config.min_significance
     structure, far = fit(repeated, tracked, offset)
-    kept = choose(observations, repeated, structure, tracked, offset, least, gated=False)
+    kept = choose(observations, repeated, structure, tracked, offset, min_significance, gated=False)
     if not kept.any():
         raise InputError(
             f"none of {len(structure.points)} landmarks is seen by two keyframes and near enough to have a depth: "
@@ -137,35 +140,37 @@ def adjust(
         )
     solution = solver.solve(kept, tracked, structure.points, offset, robust=True)
 
-    def judge() -> tuple[np.ndarray, Structure]:
-        """Which observations agree with the solution, those left out before included, and points that fit it."""
+    def select_inliers() -> tuple[np.ndarray, Structure]:
+        """Inliers of the solution among all repeated observations, and points that fit it."""
         structure, far = fit(kept, solution.poses, offset)
-        agreeing = choose(observations, repeated, structure, solution.poses, offset, least, gated=True)
+        inliers = choose(observations, repeated, structure, solution.poses, offset, min_significance, gated=True)
         near = int((repeated & ~far).sum())
-        if agreeing.sum() < max(_LEAST_SHARE * near, 1):
+        if inliers.sum() < max(_MIN_SHARE * near, 1):
             raise InputError(
-                f"{agreeing.sum()} of {near} observations agree on where things are: too few. Are trajectory and "
+                f"{inliers.sum()} of {near} observations agree on where things are: too few. Are trajectory and "
                 "tracks of the same run?"
             )
-        return agreeing, structure
+        return inliers, structure
 
-    kept, structure = judge()
+    kept, structure = select_inliers()
     solution = solver.solve(kept, solution.poses, structure.points, offset)
-    kept, structure = judge()
+    kept, structure = select_inliers()
     while True:
         solution, curvature, by_offset = solver.solve_with_offset(
             kept, solution.poses, structure.points, solution.offset, config.offset_sigma
         )
-        # Some may have run away to infinity since. Half of the limit, or those at the limit would come and go.
+        # Reject landmarks that have moved to infinity. The limit is halved, or those near it would come and go.
         structure, far = fit(kept, solution.poses, solution.offset)
-        near = choose(observations, kept, structure, solution.poses, solution.offset, 0.5 * least, gated=False)
+        near = choose(
+            observations, kept, structure, solution.poses, solution.offset, 0.5 * min_significance, gated=False
+        )
         if np.array_equal(near, kept):
             break
         kept = near
 
     sigma = 1.0 / math.sqrt(curvature)
     covariance = solver.pose_covariances(solution)
-    # The offset is not in the graph: what its uncertainty does to the poses.
+    # The offset is not a state of the graph: its uncertainty adds to that of the poses.
     covariance += sigma**2 * by_offset[:, :, None] * by_offset[:, None, :]
     covariance[0] = 0.0
     used = np.unique(observations.landmark[kept])

@@ -1,4 +1,4 @@
-"""GTSAM as this package uses it: an optional extra, imported where it is needed, with its rotation-first tangents."""
+"""Access to GTSAM, an optional extra that is imported on use, and its order of tangents, rotation first."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from sigmaslam.errors import InputError
 
-# Ours is (translation, rotation), GTSAM's (rotation, translation): the same swap leads there and back.
+# Tangents are (translation, rotation) here and (rotation, translation) in GTSAM. The swap is its own inverse.
 _SWAP = np.array([3, 4, 5, 0, 1, 2])
 
 

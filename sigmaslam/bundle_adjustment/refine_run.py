@@ -19,7 +19,8 @@ from sigmaslam.bundle_adjustment.track_file import TRACKS_NAME, read_tracks
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder, make_folder
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
-from sigmaslam.geometry.trajectory import Trajectory, check_covariances, read_tum, write_kitti, write_tum
+from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.readers.trajectory_files import check_covariances, read_tum, write_kitti, write_tum
 from sigmaslam.runs.run_folder import write_ply
 from sigmaslam.slam.point_map import PointMap
 
@@ -33,9 +34,9 @@ def refine_run(
         run: folder of `sigmaslam track --tracks`.
         out: folder, new or empty.
         config: settings.
-        tell: is told what goes on.
+        tell: receives messages on the progress.
     Returns:
-        What refine.json holds.
+        The content of refine.json.
     Raises:
         InputError: gtsam is not installed, a file of the run is missing or wrong, or `out` holds something.
     """
@@ -86,7 +87,7 @@ def refine_run(
 
 
 def spread_corrections(trajectory: Trajectory, frames: np.ndarray, poses: np.ndarray) -> Trajectory:
-    """All frames, each moved like the keyframes before and after it, in between by time on SE(3).
+    """All frames, each corrected like the keyframes before and after it, interpolated in time on SE(3).
 
     Args:
         trajectory: N frames as tracked.
@@ -98,7 +99,7 @@ def spread_corrections(trajectory: Trajectory, frames: np.ndarray, poses: np.nda
     after = np.minimum(before + 1, len(frames) - 1)
     since = trajectory.timestamps - trajectory.timestamps[frames[before]]
     interval = trajectory.timestamps[frames[after]] - trajectory.timestamps[frames[before]]
-    # Nothing to go by before the first keyframe and after the last.
+    # Frames before the first keyframe or after the last have only one neighbour.
     share = np.where(interval > 0, since / np.where(interval > 0, interval, 1.0), 0.0).clip(0.0, 1.0)
     change = se3_log(se3_inverse(corrections[before]) @ corrections[after])
     refined = corrections[before] @ se3_exp(share[:, None] * change) @ trajectory.poses
@@ -107,7 +108,7 @@ def spread_corrections(trajectory: Trajectory, frames: np.ndarray, poses: np.nda
 
 
 def keyframe_before(frames: np.ndarray, count: int) -> np.ndarray:
-    """For each of `count` frames the last keyframe (0 to K - 1) up to it, or the first where there is none."""
+    """Index (0 to K - 1) of the last keyframe up to each of `count` frames; the first one if there is none."""
     return np.maximum(np.searchsorted(frames, np.arange(count), side="right") - 1, 0)
 
 
@@ -118,7 +119,8 @@ def _write(out: Path, trajectory: Trajectory, adjustment: Adjustment) -> None:
     with atomic_path(out / "covariance.npy") as path:
         np.save(path, adjustment.covariances[keyframe_before(adjustment.frames, len(trajectory))])
     count = len(adjustment.points)
-    unknown = np.full((count, 3), np.nan)  # which keyframe saw a point first, and where, is not passed on
+    # The adjustment does not keep the keyframe and the pixel that first saw a point.
+    unknown = np.full((count, 3), np.nan)
     point_map = PointMap(
         adjustment.points, adjustment.point_covariances, adjustment.point_views, unknown[:, 0], unknown[:, 1:]
     )

@@ -1,38 +1,38 @@
 """Keyframes, landmarks and the disparity offset by GTSAM.
 
-GTSAM solves for keyframes and landmarks with the offset held. The offset, which its stereo factor does not know, is
-found on the profile: where the gradient of the cost by the offset, everything else being optimal, is zero.
+GTSAM solves for keyframes and landmarks at a fixed offset, which its stereo factor does not model. The offset minimises
+the profile of the cost, in which everything else is optimal: there the gradient by the offset is zero.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from sigmaslam.bundle_adjustment.gtsam_bridge import load_gtsam, swap_tangent
-from sigmaslam.bundle_adjustment.pose_graph import PoseEdge, connected_parts
 from sigmaslam.bundle_adjustment.structure import HUBER, Observations, offset_gradient, whitened_residuals
 from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log, turn_covariance
 
-# Metres and radians: holds the first keyframe in place.
+# This standard deviation, metres and radians, fixes the first keyframe.
 _FIXED = 1e-8
-_MOST_ITERATIONS = 50
-# Half the sum of squares: when an iteration gains less, no state is further than 0.001 standard deviations off.
+_MAX_ITERATIONS = 50
+# An iteration that reduces half the sum of squares by less leaves every state within 0.001 standard deviations.
 _CONVERGED = 1e-6
-# With Huber's loss only a place to judge outliers from is looked for; its last digits come slowly.
-_NEARLY_CONVERGED = 1e-4  # of the cost
-# Pixels: the step by which the offset's curvature is measured.
+# The solution with Huber's loss only serves to reject outliers. It stops at this share of the cost.
+_NEARLY_CONVERGED = 1e-4
+# This step, pixels, measures the curvature of the profile by a difference.
 _PROBE = 0.05
-_OFFSET_CONVERGED = 1e-2  # standard deviations
-_MOST_OFFSET_STEPS = 10
-# Keyframes that share fewer landmarks count as apart.
-_LEAST_SHARED = 10
-# Of (u, v, disparity), rows (u_left, u_right, v): GTSAM's order.
+# The search for the offset stops at a step of so many standard deviations.
+_OFFSET_CONVERGED = 1e-2
+_MAX_OFFSET_STEPS = 10
+# Keyframes that share fewer landmarks are not connected.
+_MIN_SHARED = 10
+# This matrix takes (u, v, disparity) to (u_left, u_right, v), GTSAM's order.
 _STEREO_FROM_DISPARITY = np.array([[1.0, 0, 0], [1, 0, -1], [0, 1, 0]])
 
 
@@ -47,14 +47,30 @@ class Solution:
     values: Any
 
 
+@dataclass(frozen=True, slots=True)
+class Bridge:
+    """The tracker's motion between two keyframes, where the tracks break off.
+
+    Attributes:
+        i, j: the keyframes.
+        T_i_j: (4, 4) takes j to i, metres.
+        covariance: (6, 6) of x in T_i_j exp(x), x = (translation, rotation).
+    """
+
+    i: int
+    j: int
+    T_i_j: np.ndarray
+    covariance: np.ndarray
+
+
 class Solver:
     """Builds and solves the graphs of one set of tracks.
 
     Args:
-        observations: all of them.
+        observations: of all keyframes.
         tracked: (K, 4, 4) T_world_camera of the rectified camera, as tracked.
-        covariances: (K, 6, 6) of these.
-        tell: is told what goes on.
+        covariances: (K, 6, 6) of the tracked poses.
+        tell: receives messages on the progress.
     Raises:
         InputError: gtsam is not installed.
     """
@@ -84,9 +100,9 @@ class Solver:
 
         Args:
             kept: (O,) bool, the observations to use.
-            poses, points: where to start from.
+            poses, points: start of the iteration.
             offset: pixels.
-            robust: Huber's loss, and no more digits than it takes to tell outliers.
+            robust: use Huber's loss and stop early, which suffices to reject outliers.
         """
         gtsam = self._gtsam
         graph = self._graph(kept, offset, robust)
@@ -99,7 +115,7 @@ class Solver:
         optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, gtsam.LevenbergMarquardtParams())
         self.solves += 1
         cost = optimiser.error()
-        for _ in range(_MOST_ITERATIONS):
+        for _ in range(_MAX_ITERATIONS):
             optimiser.iterate()
             self.iterations += 1
             gain, cost = cost - optimiser.error(), optimiser.error()
@@ -107,7 +123,7 @@ class Solver:
             if gain <= (_NEARLY_CONVERGED * cost if robust else _CONVERGED):
                 break
         else:
-            # Huber's is no more than a place to start from.
+            # The solution with Huber's loss is only a start and need not converge.
             self.converged &= robust
         values = optimiser.values()
         points = points.copy()
@@ -133,18 +149,18 @@ class Solver:
         solution = self.solve(kept, poses, points, offset)
         probe = self.solve(kept, solution.poses, solution.points, solution.offset + _PROBE)
         slope = gradient(solution)
-        # Never flatter than the prior.
+        # The prior is the lower bound of the curvature.
         curvature = max((gradient(probe) - slope) / _PROBE, prior_sigma**-2)
         by_offset = se3_log(se3_inverse(solution.poses) @ probe.poses) / _PROBE
         points_by_offset = (probe.points - solution.points) / _PROBE
-        for _ in range(_MOST_OFFSET_STEPS):
+        for _ in range(_MAX_OFFSET_STEPS):
             step = -slope / curvature
             if abs(step) * math.sqrt(curvature) < _OFFSET_CONVERGED:
                 break
             poses, points = solution.poses @ se3_exp(step * by_offset), solution.points + step * points_by_offset
             solution = self.solve(kept, poses, points, solution.offset + step)
             before, slope = slope, gradient(solution)
-            # Close by, the difference is that of rounding.
+            # The difference over a short step is dominated by rounding.
             if abs(step) > 0.1 * _PROBE:
                 curvature = max((slope - before) / step, prior_sigma**-2)
         else:
@@ -163,20 +179,20 @@ class Solver:
                 "the tracks do not fix every keyframe and landmark, so there is no covariance: track with more features"
             ) from error
 
-    def bridges(self, kept: np.ndarray) -> list[PoseEdge]:
-        """Where the tracks break off: the tracker's motion from the keyframe before, so that all are connected."""
+    def bridges(self, kept: np.ndarray) -> list[Bridge]:
+        """The tracker's motion from the keyframe before each gap in the tracks, so that all keyframes are connected."""
         landmark, keyframe = self._observations.landmark[kept], self._observations.keyframe[kept]
         order = np.lexsort([keyframe, landmark])
         landmark, keyframe = landmark[order], keyframe[order]
         same = landmark[1:] == landmark[:-1]
-        # From each view of a landmark to the next one.
+        # Each row is a pair of successive keyframes that observe one landmark.
         steps = np.column_stack([keyframe[:-1], keyframe[1:]])[same]
         pairs, shared = np.unique(steps, axis=0, return_counts=True)
-        label = connected_parts(len(self._tracked), map(tuple, pairs[shared >= _LEAST_SHARED].tolist()))
+        label = connected_parts(len(self._tracked), map(tuple, pairs[shared >= _MIN_SHARED].tolist()))
         return [self._motion(j) for j in np.unique(label)[1:].tolist()]
 
-    def _motion(self, j: int) -> PoseEdge:
-        """The tracker's motion from keyframe j - 1 to j, as uncertain as its covariance has grown."""
+    def _motion(self, j: int) -> Bridge:
+        """The tracker's motion from keyframe j - 1 to j, with the growth of its covariance."""
         motion = se3_inverse(self._tracked[j - 1]) @ self._tracked[j]
         growth = self._covariances[j] - turn_covariance(se3_inverse(motion), self._covariances[j - 1])
         try:
@@ -186,11 +202,11 @@ class Solver:
                 f"the tracks break off before keyframe {j}, and the covariance there is not positive definite, so the "
                 "gap cannot be bridged: track again"
             ) from None
-        # A filter may have shrunk it in some directions: a hundredth is the least.
+        # A filter may have reduced the covariance in some directions: the growth is at least a hundredth of it.
         whitened = np.linalg.solve(root, np.linalg.solve(root, growth).T)
         size, axes = np.linalg.eigh(0.5 * (whitened + whitened.T))
         factor = root @ axes * np.sqrt(np.maximum(size, 0.01))
-        return PoseEdge(j - 1, j, motion, factor @ factor.T)
+        return Bridge(j - 1, j, motion, factor @ factor.T)
 
     def _graph(self, kept: np.ndarray, offset: float, robust: bool) -> Any:
         gtsam, observations, first = self._gtsam, self._observations, self._first_pose_key
@@ -213,7 +229,7 @@ class Solver:
             noise = gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
             if robust:
                 noise = gtsam.noiseModel.Robust.Create(huber, noise)
-            # The last two: no exception, and no message, where a point is behind the camera.
+            # The last two arguments suppress exception and message for points behind the camera.
             if stereo:
                 measured = gtsam.StereoPoint2(u, u - (disparity - offset), v)
                 graph.add(gtsam.GenericStereoFactor3D(measured, noise, pose, key, stereo_camera, False, False))
@@ -226,3 +242,19 @@ class Solver:
             noise = gtsam.noiseModel.Gaussian.Covariance(swap_tangent(bridge.covariance))
             graph.add(gtsam.BetweenFactorPose3(first + bridge.i, first + bridge.j, gtsam.Pose3(bridge.T_i_j), noise))
         return graph
+
+
+def connected_parts(count: int, pairs: Iterable[tuple[int, int]]) -> np.ndarray:
+    """Connected components of a graph: the lowest member of each node's component, (count,)."""
+    parent = list(range(count))
+
+    def root(member: int) -> int:
+        while parent[member] != member:
+            parent[member] = parent[parent[member]]
+            member = parent[member]
+        return member
+
+    for i, j in pairs:
+        low, high = sorted((root(i), root(j)))
+        parent[high] = low
+    return np.array([root(member) for member in range(count)])

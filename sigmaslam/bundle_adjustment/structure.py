@@ -1,4 +1,4 @@
-"""Observations and landmarks with the poses held fixed: residuals, the best points, and which of them to use."""
+"""Observations and landmarks at fixed poses: residuals, the best points, and the selection of inliers."""
 
 from __future__ import annotations
 
@@ -18,14 +18,13 @@ _NEWTON_PIXELS = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class Observations:
-    """Observations of landmarks by keyframes, both counted from 0.
+    """Observations of landmarks by keyframes, both numbered from 0.
 
     Attributes:
         keyframe, landmark: (O,) int64.
-        measurement: (O, 3) (u, v, disparity), pixels; 0 for a disparity that is not known.
-        whitening: (O, 3, 3) upper triangular W with W^T W the inverse of the covariance; zero for a disparity that
-            is not known.
-        stereo: (O,) bool, the disparity is known.
+        measurement: (O, 3) (u, v, disparity), pixels; a missing disparity is 0.
+        whitening: (O, 3, 3) upper triangular W with W^T W the inverse of the covariance; zero for a missing disparity.
+        stereo: (O,) bool, whether there is a disparity.
         host: (L,) the first observation of each landmark.
         intrinsics: (5,) fx, fy, cx, cy, baseline.
     """
@@ -47,7 +46,7 @@ class Structure:
     """Landmarks that fit their observations best, poses fixed.
 
     Attributes:
-        points: (L, 3) in the world, metres; not finite where the landmark is at infinity or behind its host.
+        points: (L, 3) in the world, metres; not finite for landmarks at infinity or behind their host.
         significance: (L,) inverse depth in units of its standard deviation.
     """
 
@@ -56,7 +55,7 @@ class Structure:
 
 
 def collect(tracks: Tracks) -> tuple[Observations, np.ndarray]:
-    """The observations by keyframes and landmarks counted from 0, and the frames (K,) of the keyframes."""
+    """The observations with keyframes and landmarks numbered from 0, and the frames (K,) of the keyframes."""
     frames, keyframe = np.unique(tracks.frame, return_inverse=True)
     _, host, landmark = np.unique(tracks.landmark, return_index=True, return_inverse=True)
     stereo = ~np.isnan(tracks.measurement[:, 2])
@@ -74,7 +73,7 @@ def collect(tracks: Tracks) -> tuple[Observations, np.ndarray]:
 def whitened_residuals(
     observations: Observations, poses: np.ndarray, points: np.ndarray, offset: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (O, 3), predicted less measured, and which observations (O,) have their point in front.
+    """Residuals (O, 3), predicted minus measured, and whether the point is in front of the camera, (O,) bool.
 
     Args:
         observations: O of them.
@@ -96,11 +95,11 @@ def offset_gradient(observations: Observations, residuals: np.ndarray) -> float:
 def point_covariances(
     observations: Observations, kept: np.ndarray, poses: np.ndarray, points: np.ndarray
 ) -> np.ndarray:
-    """Covariances (L, 3, 3) of points in the world, given poses and offset; NaN for those that are not seen.
+    """Covariances (L, 3, 3) of points in the world, given poses and offset; NaN for points without observations.
 
     Args:
         observations: O of them.
-        kept: (O,) bool, which ones count.
+        kept: (O,) bool, the observations to use.
         poses, points: as for `whitened_residuals`.
     """
     seen, _ = _in_camera(observations, poses, points)
@@ -115,14 +114,15 @@ def point_covariances(
 
 
 def fit_structure(observations: Observations, kept: np.ndarray, poses: np.ndarray, offset: float) -> Structure:
-    """Each landmark by Gauss-Newton with Huber's loss, as (u, v, disparity) in its host: infinity is no special place.
+    """Each landmark by Gauss-Newton with Huber's loss, as (u, v, disparity) in its host, where infinity is regular.
 
     Args:
         observations: O of them.
-        kept: (O,) bool, which ones count.
+        kept: (O,) bool, the observations to use.
         poses, offset: as for `whitened_residuals`.
     """
-    fx, fy, cx, cy, baseline = observations.intrinsics
+    fx, fy, _, _, baseline = observations.intrinsics
+    focal_baseline = fx * baseline
     landmark, host = observations.landmark, observations.host
     T_world_host = poses[observations.keyframe[host]]
     T_camera_host = (se3_inverse(poses)[observations.keyframe] @ T_world_host[landmark])[:, :3]
@@ -130,9 +130,9 @@ def fit_structure(observations: Observations, kept: np.ndarray, poses: np.ndarra
     weight = kept.astype(np.float64)
     information = np.zeros((len(host), 3, 3))
     for _ in range(_NEWTON_STEPS):
-        rays = np.column_stack([(place[:, 0] - cx) / fx, (place[:, 1] - cy) / fy, np.ones(len(place))])
-        inverse_depth = place[:, 2] / (fx * baseline)
-        # The point seen from each camera, times its inverse depth in the host.
+        rays = _rays(observations.intrinsics, place)
+        inverse_depth = place[:, 2] / focal_baseline
+        # Points in the frame of each camera are scaled by their inverse depth in the host.
         seen = np.einsum("oij,oj->oi", T_camera_host[:, :, :3], rays[landmark])
         seen += T_camera_host[:, :, 3] * inverse_depth[landmark, None]
         in_front = seen[:, 2] > 0
@@ -140,11 +140,12 @@ def fit_structure(observations: Observations, kept: np.ndarray, poses: np.ndarra
         predicted, by_seen = _project(observations.intrinsics, seen, inverse_depth[landmark])
         predicted[:, 2] += offset
         by_place = np.stack(
-            [T_camera_host[:, :, 0] / fx, T_camera_host[:, :, 1] / fy, T_camera_host[:, :, 3] / (fx * baseline)],
+            [T_camera_host[:, :, 0] / fx, T_camera_host[:, :, 1] / fy, T_camera_host[:, :, 3] / focal_baseline],
             axis=-1,
         )
         jacobian = by_seen @ by_place
-        jacobian[:, 2, 2] += 1.0 / seen[:, 2]  # inverse depth is in the disparity itself too
+        # The disparity depends on the inverse depth directly, too.
+        jacobian[:, 2, 2] += 1.0 / seen[:, 2]
         jacobian = observations.whitening @ jacobian
         residual = _apply(observations.whitening, observations.measurement - predicted)
         length = np.linalg.norm(residual, axis=1)
@@ -161,8 +162,8 @@ def fit_structure(observations: Observations, kept: np.ndarray, poses: np.ndarra
     regular = _is_regular(information)
     sigma = np.full(len(host), np.inf)
     sigma[regular] = np.sqrt(np.linalg.inv(information[regular])[:, 2, 2])
-    depth = np.where(place[:, 2] > 0, fx * baseline / np.where(place[:, 2] > 0, place[:, 2], 1.0), np.nan)
-    rays = np.column_stack([(place[:, 0] - cx) / fx, (place[:, 1] - cy) / fy, np.ones(len(place))])
+    depth = np.where(place[:, 2] > 0, focal_baseline / np.where(place[:, 2] > 0, place[:, 2], 1.0), np.nan)
+    rays = _rays(observations.intrinsics, place)
     points = np.einsum("lij,lj->li", T_world_host[:, :3, :3], rays * depth[:, None]) + T_world_host[:, :3, 3]
     return Structure(points, place[:, 2] / sigma)
 
@@ -173,16 +174,16 @@ def choose(
     structure: Structure,
     poses: np.ndarray,
     offset: float,
-    least_significance: float,
+    min_significance: float,
     gated: bool,
 ) -> np.ndarray:
-    """Which observations (O,) of those `among` them to use.
+    """Selects the observations (O,) bool to use of those in the mask `among`.
 
-    Left out are landmarks whose inverse depth is not `least_significance` standard deviations above zero, observations
-    from which the point is behind, those beyond the 99.9 % quantile of chi-square (where `gated`), and then landmarks
-    that fewer than two keyframes observe.
+    Rejects landmarks whose inverse depth is less than `min_significance` standard deviations above zero, observations
+    with the point behind the camera, observations beyond the 99.9 % quantile of chi-square (if `gated`), and finally
+    landmarks that fewer than two keyframes observe.
     """
-    far = ~(structure.significance >= least_significance)
+    far = ~(structure.significance >= min_significance)
     points = np.where(far[:, None], 0.0, structure.points)
     residuals, in_front = whitened_residuals(observations, poses, points, offset)
     kept = among & in_front & ~far[observations.landmark]
@@ -192,25 +193,31 @@ def choose(
 
 
 def seen_again(observations: Observations, kept: np.ndarray) -> np.ndarray:
-    """Which of the `kept` observations (O,) are of landmarks that two keyframes or more observe."""
+    """The `kept` observations (O,) of landmarks that two keyframes or more observe."""
     pairs = np.unique(np.column_stack([observations.landmark, observations.keyframe])[kept], axis=0)
     views = np.bincount(pairs[:, 0], minlength=len(observations.host))
     return np.asarray(kept & (views[observations.landmark] >= 2))
 
 
 def _first_guess(observations: Observations, offset: float) -> np.ndarray:
-    """(u, v, disparity) of each landmark in its host; an unknown disparity from the other views, or one pixel."""
+    """(u, v, disparity) of each landmark in its host; a missing disparity is the mean of the other views', or 1 px."""
     stereo, landmark, count = observations.stereo, observations.landmark, len(observations.host)
     place = observations.measurement[observations.host].copy()
-    known = np.bincount(landmark[stereo], minlength=count)
+    views = np.bincount(landmark[stereo], minlength=count)
     total = np.bincount(landmark[stereo], observations.measurement[stereo, 2], minlength=count)
-    mean = np.where(known > 0, total / np.maximum(known, 1), offset + 1.0)
+    mean = np.where(views > 0, total / np.maximum(views, 1), offset + 1.0)
     place[:, 2] = np.where(stereo[observations.host], place[:, 2], mean) - offset
     return place
 
 
+def _rays(intrinsics: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Rays (L, 3) of unit depth through pixels (L, 2 or more)."""
+    fx, fy, cx, cy, _ = intrinsics
+    return np.column_stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(len(pixels))])
+
+
 def _in_camera(observations: Observations, poses: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points (O, 3) as the cameras see them, and whether they are in front; those that are not are at (0, 0, 1)."""
+    """Points (O, 3) in the cameras' frames, and whether they are in front; points behind are set to (0, 0, 1)."""
     T = se3_inverse(poses)[observations.keyframe]
     seen = np.einsum("oij,oj->oi", T[:, :3, :3], points[observations.landmark]) + T[:, :3, 3]
     in_front = seen[:, 2] > 0
@@ -219,7 +226,7 @@ def _in_camera(observations: Observations, poses: np.ndarray, points: np.ndarray
 
 
 def _project(intrinsics: np.ndarray, seen: np.ndarray, scale: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-    """(u, v, disparity) of points (O, 3) that are multiplied by `scale`, and the derivative (O, 3, 3) by the points."""
+    """(u, v, disparity) of points (O, 3) multiplied by `scale`, and the derivative (O, 3, 3) by the points."""
     fx, fy, cx, cy, baseline = intrinsics
     X, Y, Z = seen.T
     disparity = fx * baseline * scale / Z
@@ -240,7 +247,7 @@ def _sum_by_landmark(observations: Observations, values: np.ndarray) -> np.ndarr
 
 
 def _is_regular(information: np.ndarray) -> np.ndarray:
-    """Which matrices (L, 3, 3) can be inverted, whatever the units."""
+    """Whether matrices (L, 3, 3) can be inverted, independent of the units."""
     diagonal = np.diagonal(information, axis1=1, axis2=2)
     positive = (diagonal > 0).all(axis=1) & np.isfinite(information).all(axis=(1, 2))
     scale = np.sqrt(np.where(positive[:, None], diagonal, 1.0))

@@ -1,4 +1,4 @@
-"""The observations that a run leaves in tracks.npz."""
+"""Observations of a run: the file tracks.npz."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ TRACKS_NAME = "tracks.npz"
 
 @dataclass(frozen=True, slots=True)
 class Tracks:
-    """Landmarks as keyframes observed them, with the rectified pair that they were observed by.
+    """Observations of landmarks by keyframes, and the rectified pair that made them.
 
     Attributes:
         frame: (O,) int64, row of the observing keyframe in the trajectory.
-        landmark: (O,) int64, any numbers; the first observation in this order is the landmark's host.
+        landmark: (O,) int64, any numbers; the first observation of a landmark in this order is its host.
         measurement: (O, 3) (u, v, disparity) in the rectified left image, pixels; disparity may be NaN.
-        covariance: (O, 3, 3) pixels squared; what belongs to a disparity of NaN has no meaning.
+        covariance: (O, 3, 3) pixels squared; row and column of a disparity of NaN have no meaning.
         intrinsics: (5,) fx, fy, cx, cy in pixels and the baseline in metres.
         R_rectified_left: (3, 3) takes left-camera to rectified coordinates; both have the same centre.
-        disparity_offset: (2,) measured minus true disparity as the tracker saw it last, and its sigma, pixels.
+        disparity_offset: (2,) the tracker's last estimate of measured minus true disparity, and its sigma, pixels.
     """
 
     frame: np.ndarray
@@ -40,7 +40,7 @@ class Tracks:
         return len(self.frame)
 
 
-# None stands for the number of observations.
+# None is the number of observations.
 _SHAPES: dict[str, tuple[int | None, ...]] = {
     "frame": (None,),
     "landmark": (None,),
@@ -60,7 +60,7 @@ def read_tracks(path: Path, frames: int) -> Tracks:
         path: the file.
         frames: poses in the trajectory of the same run.
     Raises:
-        InputError: there is no such file, it is cut off, or what it holds is wrong (the message says where).
+        InputError: there is no such file, it is truncated, or its content is wrong (the message says where).
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file; {_MEND.replace(' again', '')} to make a run with the observations")
@@ -117,8 +117,8 @@ def _check(path: Path, tracks: Tracks, frames: int) -> None:
 
 def without_disparity(measurement: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Covariances (O, 3, 3) in which a disparity of NaN has unit variance and no correlation."""
-    unknown = np.isnan(measurement[:, 2])
+    missing = np.isnan(measurement[:, 2])
     result = covariance.copy()
-    result[unknown, 2, :] = result[unknown, :, 2] = 0.0
-    result[unknown, 2, 2] = 1.0
+    result[missing, 2, :] = result[missing, :, 2] = 0.0
+    result[missing, 2, 2] = 1.0
     return result

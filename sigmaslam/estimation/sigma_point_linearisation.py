@@ -45,7 +45,7 @@ class ViewLineariser:
     """
 
     def __init__(self, camera: RectifiedStereo, backend: str, unscented: bool) -> None:
-        self._intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.fx * camera.baseline])
+        self._intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.focal_baseline])
         self._transfer = load_step("stereo_transfer", backend)
         self._unscented = unscented
 

@@ -7,7 +7,7 @@ from sigmaslam.frontend.classical import OrbDetector, SiftDetector
 from sigmaslam.frontend.descriptor import DescriptorFrontend
 from sigmaslam.frontend.klt import KltFrontend
 from sigmaslam.frontend.learned import LearnedDetector
-from sigmaslam.frontend.match_confidence import MatchJudge
+from sigmaslam.frontend.match_confidence import ConfidenceEstimator
 from sigmaslam.frontend.types import Frontend
 
 FRONTENDS = ("learned", "sift", "orb", "klt")
@@ -24,11 +24,11 @@ def build_frontend(name: str, max_keypoints: int, backend: str = "onnx") -> Fron
         InputError: there is no front-end of that name.
     """
     if name == "learned":
-        return DescriptorFrontend(name, LearnedDetector(max_keypoints, backend), MatchJudge(backend))
+        return DescriptorFrontend(name, LearnedDetector(max_keypoints, backend), ConfidenceEstimator(backend))
     if name == "sift":
-        return DescriptorFrontend(name, SiftDetector(max_keypoints), MatchJudge(backend))
+        return DescriptorFrontend(name, SiftDetector(max_keypoints), ConfidenceEstimator(backend))
     if name == "orb":
-        return DescriptorFrontend(name, OrbDetector(max_keypoints), MatchJudge(backend))
+        return DescriptorFrontend(name, OrbDetector(max_keypoints), ConfidenceEstimator(backend))
     if name == "klt":
         return KltFrontend(max_keypoints)
     raise InputError(f"there is no front-end '{name}': choose one of {', '.join(FRONTENDS)}")

@@ -9,8 +9,8 @@ import numpy as np
 
 from sigmaslam.frontend.types import Features
 
-# Standard deviation of a keypoint's place over the diameter that OpenCV gives it: half a pixel of its octave for ORB's
-# patches of 31 pixels, less for SIFT, which interpolates.
+# Standard deviation of a keypoint's place, relative to the diameter from OpenCV. It is half a pixel of the octave for
+# ORB's patches of 31 pixels, and less for SIFT, which interpolates.
 _SIFT_SIGMA = 0.1
 _ORB_SIGMA = 0.5 / 31
 
@@ -49,7 +49,7 @@ def _features(keypoints: Sequence[cv2.KeyPoint], descriptors: np.ndarray, sigma_
     places = np.array([keypoint.pt for keypoint in keypoints], np.float32)
     scores = np.array([keypoint.response for keypoint in keypoints], np.float32)
     sigma = sigma_per_size * np.array([keypoint.size for keypoint in keypoints], np.float32)
-    # OpenCV may return the same place twice with two orientations: the first stays, matches must be one to one.
+    # OpenCV may return one place with two orientations. Only the first is used, as matches must be one to one.
     _, first = np.unique(places, axis=0, return_index=True)
     order = first[np.argsort(-scores[first], kind="stable")]
     return Features(places[order], descriptors[order], scores[order], sigma[order])

@@ -1,4 +1,4 @@
-"""Front-end for keypoints with descriptors, learned or classical: detect, match, refine, judge."""
+"""Front-end for keypoints with descriptors, learned or classical: detect, match, refine, estimate confidence."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sigmaslam.frontend.lucas_kanade import refine
-from sigmaslam.frontend.match_confidence import LEAST_LOGIT, MatchJudge
+from sigmaslam.frontend.match_confidence import MIN_LOGIT, ConfidenceEstimator
 from sigmaslam.frontend.nearest_neighbours import Putative, nearest_anywhere, nearest_in_ellipses, nearest_in_rows
 from sigmaslam.frontend.plane_alignment import refine_in_rows, refine_on_planes
 from sigmaslam.frontend.types import Features, KeypointSearch, Refinement, StereoView, TemporalMatches
@@ -25,7 +25,7 @@ Detector = Callable[[np.ndarray], Features]
 
 
 @dataclass(frozen=True, slots=True)
-class JudgedMatches:
+class RefinedMatches:
     """One-to-one matches of two images, refined.
 
     Attributes:
@@ -41,9 +41,9 @@ class JudgedMatches:
     probability: np.ndarray
     covariance: np.ndarray
 
-    def select(self, index: np.ndarray) -> JudgedMatches:
+    def select(self, index: np.ndarray) -> RefinedMatches:
         """The matches of that index or mask."""
-        return JudgedMatches(
+        return RefinedMatches(
             self.index0[index], self.index1[index], self.places[index], self.probability[index], self.covariance[index]
         )
 
@@ -52,41 +52,45 @@ Refine = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Refinement]
 """From keypoints (M, 2), (M, 2) of two images, the index (M,) of the first ones, and the scorer's logit (M,)."""
 
 
-def judge_refined(
-    judge: MatchJudge,
+def refine_with_confidence(
+    estimator: ConfidenceEstimator,
     image0: np.ndarray,
     image1: np.ndarray,
     features0: Features,
     features1: Features,
     putative: Putative,
     refined: Refine,
-) -> JudgedMatches:
-    """The mutual matches that the scorer does not refuse, refined and judged.
+) -> RefinedMatches:
+    """The mutual matches that the scorer does not refuse, refined, with their confidence.
 
     Args:
-        judge: of the matches.
+        estimator: of the matches.
         image0, image1: (H, W) uint8.
         features0, features1: of these.
         putative: nearest neighbours among them.
         refined: moves them to where the patches agree.
     """
-    logit = judge.score(putative, features0, features1)
-    kept = putative.mutual & (logit > LEAST_LOGIT)
+    logit = estimator.score(putative, features0, features1)
+    kept = putative.mutual & (logit > MIN_LOGIT)
     index0, index1, logit = putative.index0[kept], putative.index1[kept], logit[kept]
     points0 = features0.keypoints[index0]
     refinement = refined(points0, features1.keypoints[index1], index0, logit)
     sigma = features0.sigma[index0], features1.sigma[index1]
-    probability, covariance = judge.verify(image0, image1, points0, logit, refinement, sigma)
-    return JudgedMatches(index0, index1, refinement.places, probability, covariance)
+    probability, covariance = estimator.verify(image0, image1, points0, logit, refinement, sigma)
+    return RefinedMatches(index0, index1, refinement.places, probability, covariance)
 
 
 def match_stereo(
-    judge: MatchJudge, left: np.ndarray, right: np.ndarray, features_left: Features, features_right: Features
-) -> JudgedMatches:
+    estimator: ConfidenceEstimator,
+    left: np.ndarray,
+    right: np.ndarray,
+    features_left: Features,
+    features_right: Features,
+) -> RefinedMatches:
     """Stereo matches of a rectified pair: descriptors within a band of rows, then alignment.
 
     Args:
-        judge: of the matches.
+        estimator: of the matches.
         left, right: (H, W) uint8.
         features_left, features_right: of these images.
     """
@@ -98,8 +102,8 @@ def match_stereo(
         _ROW_TOLERANCE,
         (_LEAST_DISPARITY, _MOST_DISPARITY * left.shape[1]),
     )
-    found = judge_refined(
-        judge,
+    found = refine_with_confidence(
+        estimator,
         left,
         right,
         features_left,
@@ -117,18 +121,18 @@ class DescriptorFrontend:
     Args:
         name: for reports.
         detect: image (H, W) uint8 to features.
-        judge: of the matches.
+        estimator: of the matches.
     """
 
-    def __init__(self, name: str, detect: Detector, judge: MatchJudge) -> None:
+    def __init__(self, name: str, detect: Detector, estimator: ConfidenceEstimator) -> None:
         self.name = name
         self._detect = detect
-        self._judge = judge
+        self._estimator = estimator
 
     def observe(self, left: np.ndarray, right: np.ndarray) -> StereoView:
         """Features of both images, matched along the rows."""
         features = self._detect(left)
-        found = match_stereo(self._judge, left, right, features, self._detect(right))
+        found = match_stereo(self._estimator, left, right, features, self._detect(right))
         disparity, sigma = np.full((2, len(features.keypoints)), np.nan)
         disparity[found.index0] = features.keypoints[found.index0, 0] - found.places[:, 0]
         sigma[found.index0] = np.sqrt(found.covariance[:, 0, 0])
@@ -150,7 +154,7 @@ class DescriptorFrontend:
                 return refine_on_planes(key.left, view.left, points0, points1, maps.select(index0))
             return refine(key.left, view.left, points0, points1)
 
-        found = judge_refined(self._judge, key.left, view.left, wanted, view.features, putative, refined)
+        found = refine_with_confidence(self._estimator, key.left, view.left, wanted, view.features, putative, refined)
         found = found.select(found.probability >= _LEAST_PROBABILITY)
         return TemporalMatches(
             search.index[found.index0],

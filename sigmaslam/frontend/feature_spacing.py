@@ -1,4 +1,4 @@
-"""Features that keep their distance: what lies closer has the same errors, because patches overlap."""
+"""Selection of features at a minimum distance, as overlapping patches have correlated errors."""
 
 from __future__ import annotations
 
@@ -8,15 +8,17 @@ import numpy as np
 from sigmaslam.frontend import Features
 
 
-def select_apart(features: Features, taken: np.ndarray, spacing: float, shape: tuple[int, ...]) -> np.ndarray:
-    """Ascending indices of features that are `spacing` from places taken (K, 2) and from each other, best first."""
+def select_spaced(
+    features: Features, occupied_places: np.ndarray, spacing: float, shape: tuple[int, ...]
+) -> np.ndarray:
+    """Ascending indices of features at least `spacing` from occupied places (K, 2) and from each other, best first."""
     occupied = np.zeros(shape, np.uint8)
     radius = round(spacing)
 
     def occupy(place: np.ndarray) -> None:
         cv2.circle(occupied, (round(float(place[0])), round(float(place[1]))), radius, 1, -1)
 
-    for place in taken:
+    for place in occupied_places:
         occupy(place)
     height, width = shape
     kept = []

@@ -14,19 +14,19 @@ from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path, atomic_write_bytes
 from sigmaslam.frontend.affine_alignment import refine_by_neighbours
 from sigmaslam.frontend.classical import OrbDetector, SiftDetector
-from sigmaslam.frontend.descriptor import judge_refined
+from sigmaslam.frontend.descriptor import refine_with_confidence
 from sigmaslam.frontend.learned import LearnedDetector
-from sigmaslam.frontend.match_confidence import MatchJudge
+from sigmaslam.frontend.match_confidence import ConfidenceEstimator
 from sigmaslam.frontend.nearest_neighbours import nearest_anywhere
 from sigmaslam.frontend.types import Features
 from sigmaslam.readers.images import read_grey
 
 DETECTORS = {"learned": LearnedDetector, "sift": SiftDetector, "orb": OrbDetector}
-# What is less probable is left out by default.
-LEAST_PROBABILITY = 0.5
-_LEAST_SIDE = 96
-_LEAST_KEYPOINTS = 4
-_MOST_LINES = 200
+# Matches with a smaller probability are dropped by default.
+MIN_PROBABILITY = 0.5
+_MIN_SIDE = 96
+_MIN_KEYPOINTS = 4
+_MAX_LINES = 200
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class Matches:
         probability: (M,) float32, that keypoints1 is within 3 px of the true place of keypoints0 in image 1; calibrated
             on renders: of matches near 0.8 about 80 per cent are right.
         covariance: (M, 2, 2) float32, pixels squared, of keypoints1 minus that true place, if the match is right.
-        index0, index1: (M,) which keypoints of either image they are, from the best score down.
+        index0, index1: (M,) indices of the keypoints in either image, ordered by falling score.
     """
 
     keypoints0: np.ndarray
@@ -59,7 +59,7 @@ def match_images(
     image1: np.ndarray,
     frontend: str = "learned",
     max_keypoints: int = 1024,
-    min_probability: float = LEAST_PROBABILITY,
+    min_probability: float = MIN_PROBABILITY,
 ) -> Matches:
     """Matches between two images of one scene.
 
@@ -67,34 +67,34 @@ def match_images(
         image0, image1: (H, W) uint8 grey, of any two sizes from 96 pixels.
         frontend: "learned", "sift" or "orb".
         max_keypoints: most an image, from 4; the time and memory of matching grow with its square.
-        min_probability: matches with less are left out; 0 keeps every mutual nearest neighbour that is not hopeless.
+        min_probability: of a match; 0 keeps every mutual nearest neighbour that the scorer does not refuse.
     Raises:
         InputError: an image has another shape or type or is too small, or an option is out of range.
     """
     detect = _detector(frontend, max_keypoints)
     _check_probability(min_probability)
     features0, features1 = detect(_checked(image0, "image0")), detect(_checked(image1, "image1"))
-    return match_features(MatchJudge(), image0, image1, features0, features1, min_probability)
+    return match_features(ConfidenceEstimator(), image0, image1, features0, features1, min_probability)
 
 
 def match_features(
-    judge: MatchJudge,
+    estimator: ConfidenceEstimator,
     image0: np.ndarray,
     image1: np.ndarray,
     features0: Features,
     features1: Features,
-    min_probability: float = LEAST_PROBABILITY,
+    min_probability: float = MIN_PROBABILITY,
 ) -> Matches:
-    """Mutual nearest neighbours among all keypoints, moved to where the patches, warped as the neighbours say, agree.
+    """Mutual nearest neighbours among all keypoints, refined by aligning patches that the neighbours' map warps.
 
     Args:
-        judge: of the matches.
+        estimator: of the matches.
         image0, image1: (H, W) uint8.
         features0, features1: of these.
         min_probability: as `match_images` takes it.
     """
-    found = judge_refined(
-        judge,
+    matches = refine_with_confidence(
+        estimator,
         image0,
         image1,
         features0,
@@ -102,10 +102,11 @@ def match_features(
         nearest_anywhere(features0.descriptors, features1.descriptors),
         lambda points0, points1, _, logit: refine_by_neighbours(image0, image1, points0, points1, logit),
     )
-    order = np.argsort(-found.probability, kind="stable")
-    order = order[found.probability[order] >= min_probability]
-    keypoints, places = features0.keypoints[found.index0], found.places.astype(np.float32)
-    return Matches(keypoints, places, found.probability, found.covariance, found.index0, found.index1).select(order)
+    order = np.argsort(-matches.probability, kind="stable")
+    order = order[matches.probability[order] >= min_probability]
+    keypoints, places = features0.keypoints[matches.index0], matches.places.astype(np.float32)
+    columns = keypoints, places, matches.probability, matches.covariance, matches.index0, matches.index1
+    return Matches(*columns).select(order)
 
 
 def match_files(
@@ -114,10 +115,10 @@ def match_files(
     out: Path,
     frontend: str,
     max_keypoints: int,
-    min_probability: float = LEAST_PROBABILITY,
+    min_probability: float = MIN_PROBABILITY,
     picture: Path | None = None,
 ) -> str:
-    """Matches two image files, writes the fields of `Matches` as .npz and perhaps a picture; returns a summary.
+    """Matches two image files and writes the fields of `Matches` as .npz and optionally a picture; returns a summary.
 
     Raises:
         InputError: a file cannot be read or written, an image is too small, or an option is out of range.
@@ -129,12 +130,12 @@ def match_files(
         raise InputError(f"--picture {picture} would overwrite an image that is to be matched: choose another name")
     detect = _detector(frontend, max_keypoints)
     _check_probability(min_probability)
-    judge = MatchJudge()
+    estimator = ConfidenceEstimator()
     image0, image1 = (_checked(read_grey(path), str(path)) for path in (path0, path1))
     start = time.perf_counter()
     features0, features1 = detect(image0), detect(image1)
     detected = time.perf_counter()
-    matches = match_features(judge, image0, image1, features0, features1, min_probability)
+    matches = match_features(estimator, image0, image1, features0, features1, min_probability)
     end = time.perf_counter()
     with atomic_path(out) as temporary:
         np.savez_compressed(temporary, **asdict(matches))
@@ -143,24 +144,24 @@ def match_files(
     counts = f"{len(features0.keypoints)} and {len(features1.keypoints)} keypoints"
     count = len(matches.probability)
     sigma = np.sqrt(0.5 * np.trace(matches.covariance, axis1=1, axis2=2))
-    found = (
+    summary = (
         f"{count} matches, {matches.probability.sum():.0f} expected to be right, median sigma {np.median(sigma):.2f} px"
         if count
         else ""
     )
     milliseconds = f"features {1e3 * (detected - start):.0f} ms, matching {1e3 * (end - detected):.0f} ms"
-    return f"{counts}, {found or 'no matches'}; {milliseconds}"
+    return f"{counts}, {summary or 'no matches'}; {milliseconds}"
 
 
 def draw_matches(image0: np.ndarray, image1: np.ndarray, matches: Matches) -> np.ndarray:
     """Both images (H, W) uint8 side by side, lines from purple (probability 0) to yellow (1); (H, W, 3) BGR.
 
-    Of many matches 200 are drawn, evenly chosen from the first to the last.
+    At most 200 matches are drawn, evenly chosen from the first to the last.
     """
     palette = cv2.applyColorMap(np.arange(256, dtype=np.uint8), cv2.COLORMAP_VIRIDIS).reshape(256, 3).tolist()
     count = len(matches.probability)
-    # The most probable last: their lines lie on top.
-    rows = np.linspace(count - 1, 0, min(count, _MOST_LINES)).round().astype(int)
+    # The most probable matches are drawn last, so that their lines lie on top.
+    rows = np.linspace(count - 1, 0, min(count, _MAX_LINES)).round().astype(int)
     colours = [palette[round(255.0 * float(probability))] for probability in matches.probability[rows]]
     return draw_lines(image0, image1, matches.keypoints0[rows], matches.keypoints1[rows], colours)
 
@@ -185,8 +186,8 @@ def draw_lines(
 def _detector(frontend: str, max_keypoints: int) -> Callable[[np.ndarray], Features]:
     if frontend not in DETECTORS:
         raise InputError(f"there is no front-end '{frontend}' for two images: choose one of {', '.join(DETECTORS)}")
-    if max_keypoints < _LEAST_KEYPOINTS:
-        raise InputError(f"--max-keypoints is {max_keypoints}: give at least {_LEAST_KEYPOINTS}")
+    if max_keypoints < _MIN_KEYPOINTS:
+        raise InputError(f"--max-keypoints is {max_keypoints}: give at least {_MIN_KEYPOINTS}")
     return DETECTORS[frontend](max_keypoints)
 
 
@@ -199,6 +200,6 @@ def _checked(image: np.ndarray, name: str) -> np.ndarray:
     if image.ndim != 2 or image.dtype != np.uint8:
         raise InputError(f"{name} is {image.dtype} of shape {image.shape}: give a grey (H, W) uint8 image")
     height, width = image.shape
-    if min(height, width) < _LEAST_SIDE:
-        raise InputError(f"{name} is {width}x{height} pixels: give one of at least {_LEAST_SIDE} on each side")
+    if min(height, width) < _MIN_SIDE:
+        raise InputError(f"{name} is {width}x{height} pixels: give one of at least {_MIN_SIDE} on each side")
     return image

@@ -32,8 +32,8 @@ class KltFrontend:
     def observe(self, left: np.ndarray, right: np.ndarray) -> StereoView:
         """Corners of the left image, followed into the right one."""
         distance = max(5.0, 0.5 * np.sqrt(left.size / self._max_keypoints))
-        found = cv2.goodFeaturesToTrack(left, self._max_keypoints, 0.003, distance, blockSize=5)
-        keypoints = np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
+        corners = cv2.goodFeaturesToTrack(left, self._max_keypoints, 0.003, distance, blockSize=5)
+        keypoints = np.zeros((0, 2), np.float32) if corners is None else corners.reshape(-1, 2)
         features = Features(
             keypoints,
             np.zeros((len(keypoints), 0), np.float32),
@@ -46,13 +46,13 @@ class KltFrontend:
     def match(self, search: KeypointSearch, view: StereoView) -> TemporalMatches:
         """Corners of the keyframe followed into the current left image, then into the right one; no patch is warped."""
         points = search.key.features.keypoints[search.index]
-        places, found = _follow(search.key.left, view.left, points, search.predicted)
+        places, tracked = _follow(search.key.left, view.left, points, search.predicted)
         if search.covariance is not None:
-            found &= within_ellipses(places - search.predicted, search.covariance)
-        places = places[found]
+            tracked &= within_ellipses(places - search.predicted, search.covariance)
+        places = places[tracked]
         disparity = _disparity(view.left, view.right, places)
         return TemporalMatches(
-            search.index[found],
+            search.index[tracked],
             places,
             disparity,
             np.tile(_SIGMA**2 * np.eye(2), (len(places), 1, 1)),
@@ -64,16 +64,16 @@ class KltFrontend:
 def _follow(
     image0: np.ndarray, image1: np.ndarray, points0: np.ndarray, guess1: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Places in image 1 and whether the way back ends where it began."""
+    """Places in image 1, and whether tracking back from them returns to the starting points."""
     height, width = image1.shape
     guess1 = np.clip(guess1, 0, (width - 1, height - 1))
-    places, found = lucas_kanade(image0, image1, points0, guess1, _WINDOW, _LEVELS)
+    places, converged = lucas_kanade(image0, image1, points0, guess1, _WINDOW, _LEVELS)
     back, returned = lucas_kanade(image1, image0, places, points0, _WINDOW, 1)
-    return places, found & returned & (np.linalg.norm(back - points0, axis=1) <= _FORWARD_BACKWARD)
+    return places, converged & returned & (np.linalg.norm(back - points0, axis=1) <= _FORWARD_BACKWARD)
 
 
 def _disparity(left: np.ndarray, right: np.ndarray, points: np.ndarray) -> np.ndarray:
-    places, found = _follow(left, right, points, points)
+    places, tracked = _follow(left, right, points, points)
     disparity = points[:, 0] - places[:, 0]
-    level = found & (np.abs(places[:, 1] - points[:, 1]) <= _ROW_TOLERANCE) & (disparity > -2.0)
+    level = tracked & (np.abs(places[:, 1] - points[:, 1]) <= _ROW_TOLERANCE) & (disparity > -2.0)
     return np.where(level, disparity, np.nan)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-# FLANN_INDEX_KDTREE_SINGLE and unlimited checks: exact.
+# FLANN_INDEX_KDTREE_SINGLE with unlimited checks is exact.
 _TREE: dict[str, bool | int | float | str] = {"algorithm": 4, "leaf_max_size": 10}
 _SEARCH: dict[str, bool | int | float | str] = {"checks": -1}
 
@@ -19,5 +19,5 @@ def nearest_points(points: np.ndarray, queries: np.ndarray, count: int) -> np.nd
     if len(queries) == 0:
         return np.zeros((0, count), np.int64)
     index = cv2.flann.Index(np.ascontiguousarray(points, np.float32), _TREE)
-    found, _ = index.knnSearch(np.ascontiguousarray(queries, np.float32), count, params=_SEARCH)
-    return np.asarray(found, np.int64)
+    nearest, _ = index.knnSearch(np.ascontiguousarray(queries, np.float32), count, params=_SEARCH)
+    return np.asarray(nearest, np.int64)

@@ -11,11 +11,11 @@ from sigmaslam.frontend.types import Features
 from sigmaslam.inference.onnx_graph import OnnxGraph, shipped_weights
 
 Graph = Callable[[Mapping[str, np.ndarray]], list[np.ndarray]]
-"""What runs the network: an `OnnxGraph`, or the same network in torch."""
+"""A network as a function: an `OnnxGraph`, or the same network in torch."""
 
 _SIZE_MULTIPLE = 32
 _BORDER = 8
-# The graph describes twice as many candidates, and one in four comes from an image of a quarter of the pixels.
+# The graph describes twice as many candidates; one in four comes from an image with a quarter of the pixels.
 _PIXELS_PER_KEYPOINT = 8
 
 
@@ -43,13 +43,13 @@ class LearnedDetector:
 
 
 def extract(graph: Graph, image: np.ndarray, max_keypoints: int) -> Features:
-    """Features of an (H, W) uint8 image by a graph that is called as the exported one is.
+    """Features of an (H, W) uint8 image by a graph with the inputs and outputs of the exported one.
 
     Args:
         graph: takes {"image": (1, 1, H, W) float32 in [0, 1], "count": N} and returns keypoints (N, 2), scores (N,),
             best first, descriptors (N, C) and sigma (N,).
         image: of any size from 96 pixels.
-        max_keypoints: how many are wanted; small images give fewer.
+        max_keypoints: upper limit; small images give fewer.
     """
     height, width = image.shape
     bottom, right = -height % _SIZE_MULTIPLE, -width % _SIZE_MULTIPLE
@@ -57,7 +57,7 @@ def extract(graph: Graph, image: np.ndarray, max_keypoints: int) -> Features:
     count = np.array(min(max_keypoints, padded.size // _PIXELS_PER_KEYPOINT), np.int64)
     feed = {"image": padded[None, None].astype(np.float32) / 255.0, "count": count}
     keypoints, scores, descriptors, sigma = graph(feed)
-    # The padding has no corners of its own, but its seam may.
+    # The padding contains no corners, but its seam may.
     inside = (keypoints[:, 0] < width - _BORDER) & (keypoints[:, 1] < height - _BORDER)
     kept = np.flatnonzero((scores > 0) & inside)
     return Features(keypoints[kept], descriptors[kept], scores[kept], sigma[kept])

@@ -13,14 +13,14 @@ from sigmaslam.frontend.types import Features, Refinement
 from sigmaslam.frontend.verifier_inputs import describe_matches
 from sigmaslam.inference.onnx_graph import OnnxGraph, shipped_weights
 
-LEAST_LOGIT = -4.0
-"""Matches with less from the scorer are not worth a look at their patches; the verifier has seen none of them."""
+MIN_LOGIT = -4.0
+"""Matches with a smaller logit from the scorer are dropped; the verifier was trained without them."""
 
 _Graph = Callable[[Mapping[str, np.ndarray]], list[np.ndarray]]
 
 
-class MatchJudge:
-    """Says how likely a match is right, and how far off it may be.
+class ConfidenceEstimator:
+    """Estimates the probability that a match is right, and the covariance of its error.
 
     Args:
         backend: "onnx", or "torch" (needs the extra `train`).
@@ -37,7 +37,7 @@ class MatchJudge:
             self._verifier = OnnxGraph(shipped_weights("verifier.onnx"))
 
     def score(self, putative: Putative, features0: Features, features1: Features) -> np.ndarray:
-        """(M,) logit that each match is right, from its neighbours and its margins; no image is looked at.
+        """Logit (M,) that each match is right, from its neighbours and its margins, without the images.
 
         Args:
             putative: nearest neighbours, mutual or not, of one pair of images.

@@ -1,4 +1,4 @@
-"""Nearest neighbours among unit descriptors, looked for only where geometry allows them."""
+"""Nearest neighbours among unit descriptors, restricted to where geometry allows them."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import numpy as np
 
 from sigmaslam.estimation.chi_square import CHI_SQUARE_99_OF_2
 
-# Similarity of what is not there; no two unit vectors are less alike than -1.
-_NOTHING = -1.0
-# Gathering the descriptors of a pair costs about as much as multiplying so many.
+# A missing neighbour has this similarity, the smallest that two unit vectors can have.
+_NO_SIMILARITY = -1.0
+# From this share of all pairs on, the product of all descriptors is faster than gathering those of the pairs.
 _DENSE_FROM = 1 / 8
 
 
 @dataclass(frozen=True, slots=True)
 class Putative:
-    """For keypoints of image 0 their nearest neighbour in image 1, right or wrong.
+    """Putative matches: keypoints of image 0 with their nearest neighbours in image 1, right or wrong.
 
     Attributes:
         index0, index1: (M,) keypoints of either image; each of image 0 at most once.
@@ -33,7 +33,7 @@ class Putative:
 
     @property
     def mutual(self) -> np.ndarray:
-        """(M,) bool: neither has a better partner, so that these are one to one; exact ties are no match."""
+        """(M,) bool: neither keypoint has a better partner. Mutual matches are one to one; exact ties do not match."""
         return np.asarray((self.similarity > self.second0) & (self.similarity > self.second1))
 
     def distinct(self, ratio: float) -> np.ndarray:
@@ -49,17 +49,17 @@ class Putative:
 
 
 def nearest_anywhere(descriptors0: np.ndarray, descriptors1: np.ndarray) -> Putative:
-    """Among all keypoints of two images, whose descriptors (N, D), (M, D) are of unit length."""
+    """Nearest neighbours among all keypoints of two images with descriptors (N, D), (M, D) of unit length."""
     if len(descriptors0) == 0 or len(descriptors1) == 0:
         return _none()
     similarity = descriptors0 @ descriptors1.T
     rows, columns = np.arange(len(descriptors0)), np.arange(len(descriptors1))
     index1, index0 = similarity.argmax(axis=1), similarity.argmax(axis=0)
     best1, best0 = similarity[rows, index1], similarity[index0, columns]
-    similarity[rows, index1] = _NOTHING
+    similarity[rows, index1] = _NO_SIMILARITY
     second = similarity.max(axis=1)
     similarity[rows, index1] = best1
-    similarity[index0, columns] = _NOTHING
+    similarity[index0, columns] = _NO_SIMILARITY
     runner_up = similarity.max(axis=0)
     other = np.where(index0[index1] == rows, runner_up[index1], best0[index1])
     return Putative(rows, index1, best1, second, other)
@@ -73,7 +73,7 @@ def nearest_in_rows(
     row_tolerance: float,
     disparity_range: tuple[float, float],
 ) -> Putative:
-    """Along the rows of a rectified pair.
+    """Nearest neighbours along the rows of a rectified pair.
 
     Args:
         left, right: (N, 2), (M, 2) keypoints.
@@ -94,18 +94,18 @@ def nearest_in_ellipses(
     descriptors0: np.ndarray,
     descriptors1: np.ndarray,
 ) -> Putative:
-    """Within the 99 % ellipse about a predicted place.
+    """Nearest neighbours within the 99 % ellipses about predicted places.
 
     Args:
         predicted: (N, 2) expected pixel coordinates in image 1.
-        covariance: (N, 2, 2) of that, pixels squared, positive definite.
+        covariance: (N, 2, 2) of the prediction, pixels squared, positive definite.
         keypoints: (M, 2) of image 1.
         descriptors0, descriptors1: (N, D), (M, D) of unit length.
     """
-    reach = np.sqrt(CHI_SQUARE_99_OF_2 * covariance[:, 1, 1])
-    first, second = _pairs_in_band(predicted[:, 1], reach, keypoints[:, 1])
+    half_height = np.sqrt(CHI_SQUARE_99_OF_2 * covariance[:, 1, 1])
+    first, second = _pairs_in_band(predicted[:, 1], half_height, keypoints[:, 1])
     offset = keypoints[second] - predicted[first]
-    # Rows and columns of the ellipse's box first: most pairs of a band are far away.
+    # The bounding box of the ellipse goes first: most pairs of a band are far outside.
     close = np.abs(offset[:, 0]) <= np.sqrt(CHI_SQUARE_99_OF_2 * covariance[:, 0, 0])[first]
     first, second, offset = first[close], second[close], offset[close]
     inside = within_ellipses(offset, covariance[first])
@@ -119,12 +119,12 @@ def within_ellipses(offset: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     return np.asarray(vv * u * u - 2.0 * uv * u * v + uu * v * v <= CHI_SQUARE_99_OF_2 * (uu * vv - uv * uv))
 
 
-def _pairs_in_band(row0: np.ndarray, reach: np.ndarray, row1: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Index pairs (K,), (K,) with |row1 - row0| <= reach (N,), in order of the first."""
+def _pairs_in_band(row0: np.ndarray, tolerance: np.ndarray, row1: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Index pairs (K,), (K,) with |row1 - row0| <= tolerance (N,), in order of the first."""
     order = np.argsort(row1, kind="stable")
     rows = row1[order]
-    begin = np.searchsorted(rows, row0 - reach, "left")
-    count = np.maximum(np.searchsorted(rows, row0 + reach, "right") - begin, 0)
+    begin = np.searchsorted(rows, row0 - tolerance, "left")
+    count = np.maximum(np.searchsorted(rows, row0 + tolerance, "right") - begin, 0)
     first = np.repeat(np.arange(len(row0)), count)
     within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
     return first, order[np.repeat(begin, count) + within]
@@ -149,15 +149,15 @@ def _nearest(descriptors0: np.ndarray, descriptors1: np.ndarray, first: np.ndarr
 
 def _two_best(values: np.ndarray, group: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """By group the largest value, its place (-1: the group is empty) and the second largest."""
-    best = np.full(groups, _NOTHING, values.dtype)
+    best = np.full(groups, _NO_SIMILARITY, values.dtype)
     np.maximum.at(best, group, values)
     place = np.full(groups, -1, np.int64)
     winners = np.flatnonzero(values == best[group])
     place[group[winners]] = winners
-    struck = values.copy()
-    struck[place[place >= 0]] = _NOTHING
-    second = np.full(groups, _NOTHING, values.dtype)
-    np.maximum.at(second, group, struck)
+    others = values.copy()
+    others[place[place >= 0]] = _NO_SIMILARITY
+    second = np.full(groups, _NO_SIMILARITY, values.dtype)
+    np.maximum.at(second, group, others)
     return best, place, second
 
 

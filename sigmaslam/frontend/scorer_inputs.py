@@ -1,4 +1,4 @@
-"""What the match scorer is told of putative matches: side information, and who is near whom."""
+"""Inputs of the match scorer: side information of putative matches, and their neighbours."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from sigmaslam.frontend.nearest_neighbours import Putative
 from sigmaslam.frontend.types import Features
 
 NEIGHBOURS = 12
-# With fewer mutual matches everyone is asked.
-_LEAST_ANCHORS = 32
-_MOST_LOG_SIGMA = 2.0
+# With fewer mutual matches all matches may be neighbours.
+_MIN_ANCHORS = 32
+_MAX_LOG_SIGMA = 2.0
 
 
 def side_information(putative: Putative, features0: Features, features1: Features) -> np.ndarray:
-    """What a matcher knows of its matches, in numbers that mean the same for every kind of features.
+    """Columns of similarities, scores and sigmas that have the same meaning for every kind of features.
 
-    Similarities count by their rank in the set or as a ratio of distances, detector scores by their rank in the image.
+    Similarities enter as their rank in the set or as a ratio of distances, detector scores as their rank in the image.
 
     Args:
         putative: the matches.
@@ -43,13 +43,13 @@ def side_information(putative: Putative, features0: Features, features1: Feature
         np.minimum(ratios[1], 2.0),
         _rank(features0.scores)[putative.index0],
         _rank(features1.scores)[putative.index1],
-        np.clip(quotient, -_MOST_LOG_SIGMA, _MOST_LOG_SIGMA),
+        np.clip(quotient, -_MAX_LOG_SIGMA, _MAX_LOG_SIGMA),
     ]
     return np.stack(columns, axis=1).astype(np.float32)
 
 
 def nearest_matches(points0: np.ndarray, mutual: np.ndarray) -> np.ndarray:
-    """Neighbours in image 0 of every match, among the mutual ones, which are right more often.
+    """Neighbours of every match in image 0, among the mutual matches, which are right more often.
 
     Args:
         points0: (M, 2) float32 matched keypoints of image 0.
@@ -58,14 +58,14 @@ def nearest_matches(points0: np.ndarray, mutual: np.ndarray) -> np.ndarray:
         (M, 12) int64, nearest first; the match itself where there are too few.
     """
     anchors = np.flatnonzero(mutual)
-    if len(anchors) < _LEAST_ANCHORS:
+    if len(anchors) < _MIN_ANCHORS:
         anchors = np.arange(len(points0))
     rows = np.arange(len(points0))[:, None]
     if len(anchors) < 2:
         return np.tile(rows, (1, NEIGHBOURS))
-    wanted = min(NEIGHBOURS + 1, len(anchors))
-    near = anchors[nearest_points(points0[anchors], points0, wanted)]
-    # Itself goes last, so that the first twelve are others wherever there are as many.
+    count = min(NEIGHBOURS + 1, len(anchors))
+    near = anchors[nearest_points(points0[anchors], points0, count)]
+    # The match itself goes last, so that the first twelve are other matches if there are enough.
     order = np.argsort(near == rows, axis=1, kind="stable")
     near = np.take_along_axis(near, order, axis=1)[:, :NEIGHBOURS]
     missing = NEIGHBOURS - near.shape[1]
@@ -73,6 +73,6 @@ def nearest_matches(points0: np.ndarray, mutual: np.ndarray) -> np.ndarray:
 
 
 def _rank(values: np.ndarray) -> np.ndarray:
-    """Share of the others below each, equal ones counting half."""
+    """Share of the values below each value; equal values count half."""
     _, group, counts = np.unique(values, return_inverse=True, return_counts=True)
     return np.asarray((np.cumsum(counts) - 0.5 * counts)[group] / max(len(values), 1))

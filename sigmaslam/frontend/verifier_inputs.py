@@ -1,4 +1,4 @@
-"""What the match verifier is told of refined matches."""
+"""Inputs of the match verifier: columns that describe refined matches."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import numpy as np
 from sigmaslam.frontend.patch_evidence import Evidence
 from sigmaslam.frontend.types import Refinement
 
-_MOST_LOGIT = 8.0
-_MOST_DISTANCE = 50.0
+_MAX_LOGIT = 8.0
+_MAX_DISTANCE = 50.0
 
 
 def describe_matches(
@@ -19,7 +19,7 @@ def describe_matches(
     Args:
         logit: (M,) of the scorer.
         evidence: of the patches at the refined places.
-        refinement: how they came there.
+        refinement: of the matches.
         sigma0, sigma1: (M,) of the keypoints of either image, pixels.
     Returns:
         (M, 14) float32: logit / 4; logs of half the squared difference of the patches, of both contrasts and both
@@ -30,7 +30,7 @@ def describe_matches(
     distance = np.zeros(len(logit)) if refinement.distance is None else refinement.distance
     return np.column_stack(
         [
-            np.clip(logit, -_MOST_LOGIT, _MOST_LOGIT) / 4.0,
+            np.clip(logit, -_MAX_LOGIT, _MAX_LOGIT) / 4.0,
             np.log(0.5 * (1.0 - evidence.correlation) + 1e-3),
             np.log(evidence.contrast0),
             np.log(evidence.contrast1),
@@ -41,6 +41,6 @@ def describe_matches(
             np.log(sigma0 * evidence.zoom + 0.05),
             np.log(sigma1 + 0.05),
             np.log(evidence.spacing),
-            np.log1p(np.minimum(distance, _MOST_DISTANCE)),
+            np.log1p(np.minimum(distance, _MAX_DISTANCE)),
         ]
     ).astype(np.float32)

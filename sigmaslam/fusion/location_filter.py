@@ -1,13 +1,14 @@
 """A location sensor fused with the tracker's poses, loosely: the sensor's world and its mount are states.
 
-The tracker's error is taken as a random walk in its world whose steps are what its covariance grows by, so that errors
-of successive poses are correlated as drift is, and one reading says something of all poses that follow; and, besides, a
-part of what each frame's matches add, of which a reading says something for that frame alone. What is not modelled: how
-far the motion between two frames is from the constant velocity that gives the pose at the time of a reading.
+The error of the tracker's pose has two parts. The drift is a random walk in the tracker's world, whose steps have the
+covariance by which that of the pose grows: errors of successive poses are correlated, and one reading corrects all
+later poses. The frame error is a share of the covariance that each frame's matches add, and a reading corrects it for
+that frame alone. The pose at the time of a reading is interpolated with constant velocity between two frames; the error
+of this interpolation is not modelled.
 
-Nothing can be fused until readings and poses show how the two worlds lie to each other (`find_worlds`). That is solved
-anew with each reading, by all of them, until the rotation is known well enough to be linear; from there a reading is
-one unscented update of 24 error states: drift, the sensor's world, its mount, the frame's own error.
+Fusion begins when readings and poses determine the transformation between the two worlds (`find_worlds`). The solution
+uses all readings and is repeated with each new one until the rotation is accurate enough to be linear. From then on
+each reading is one unscented update of 24 error states: drift, the sensor's world, its mount, the frame error.
 """
 
 from __future__ import annotations
@@ -21,43 +22,45 @@ from sigmaslam.estimation.chi_square import CHI_SQUARE_999
 from sigmaslam.estimation.gaussian import matrix_root, renew_part
 from sigmaslam.fusion.readings import Locations
 from sigmaslam.fusion.sensor_model import (
-    OFFSET,
-    OWN,
+    DRIFT,
+    FRAME_ERROR,
+    MODEL_SIZE,
     SENSOR_WORLD,
-    SIZE,
-    WHOLE,
-    Pairs,
-    State,
+    STATE_SIZE,
+    FusionState,
+    PosedReadings,
+    SensorModel,
     find_worlds,
+    reading_jacobian,
     residuals,
-    slopes,
 )
 from sigmaslam.geometry.se3 import nearest_rigid, se3_body, se3_exp, se3_inverse, se3_log, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.slam.estimate import Estimate
 
-# Share of a frame's own covariance that the next one does not share: their matches are mostly of the same landmarks.
-# At 0 a precise sensor turns single frames' errors into drift (a rendered room, 4.1 mm alone: 6.5 mm, NEES 3.9; at 0.5
+# This share of a frame's covariance is independent of the next frame's, as both match mostly the same landmarks. At 0 a
+# precise sensor turns errors of single frames into drift (a rendered room, 4.1 mm alone: 6.5 mm, NEES 3.9; at 0.5
 # 3.8 mm and 1.4, at 1 4.0 mm and 1.5).
-_FRESH = 0.5
-# Where the variance of the tracker's position or rotation falls below this share, a loop or a map has corrected it.
-_CORRECTED = 0.5
-# All readings are solved for at once until the rotation between the worlds is known to so many radians, one sigma: at
-# 0.15 the square of the error times a lever of a metre is a centimetre that no linear update knows of.
-_LINEAR_TURN = 0.03
-# And until there are so many of them.
-_MOST_KEPT = 60
+_INDEPENDENT_SHARE = 0.5
+# A loop or a map has corrected the tracker if the variance of position or rotation falls below this share.
+_CORRECTED_SHARE = 0.5
+# One solution uses all readings until the rotation between the worlds has this standard deviation, radians. At 0.15 the
+# square of the error times a lever of a metre is a centimetre, which a linear update misses.
+_LINEAR_ROTATION_SIGMA = 0.03
+# The solution for all readings uses at most so many of them.
+_MAX_READINGS = 60
+_TRANSLATION_AND_ROTATION = (slice(0, 3), slice(3, 6))
 
 
 @dataclass(slots=True)
 class LocationSummary:
-    """What became of the readings.
+    """Counts of the readings by their use.
 
     Attributes:
-        used: readings that were fused, or served to find the sensor's world.
-        weakened: of these, those that disagreed by more than 99.9 % of right ones do; they count less.
+        used: readings that were fused, or served to solve for the sensor's world.
+        weakened: used readings beyond the 99.9 % quantile, which count less.
         unused: readings before the first frame, after a loss, or while the tracker had no pose.
-        ready: time stamp from which poses are fused; None: the motion never showed how the worlds lie to each other.
+        ready: time stamp from which poses are fused; None if the motion never determined the sensor's world.
     """
 
     used: int = 0
@@ -67,17 +70,32 @@ class LocationSummary:
 
 
 @dataclass(frozen=True, slots=True)
-class _Known:
-    """The filter: its state, None before the worlds are known; and (6, 6) how far the tracker's error has walked."""
+class _Belief:
+    """State of the filter, None before the worlds are solved for, and covariance (6, 6) of the tracker's drift."""
 
-    state: State | None
-    walked: np.ndarray
+    state: FusionState | None
+    drift_covariance: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
+class _TrackedPose:
+    """The tracker's pose at the time of a reading.
+
+    Attributes:
+        pose: (4, 4) between the last two frames.
+        share: of the time from the earlier frame to the last one, in [0, 1].
+        frame_covariance: (6, 6) of the error of a frame alone, perturbed from the left in the world.
+    """
+
+    pose: np.ndarray
+    share: float
+    frame_covariance: np.ndarray
 
 
 class LocationFilter:
-    """Improves the tracker's estimates, frame by frame, by the readings until then.
+    """Improves the tracker's estimates frame by frame with the readings until then.
 
-    Poses stay in the tracker's world. Before the worlds are known to each other they are returned as they are.
+    Poses stay in the tracker's world. They are returned unchanged before the sensor's world is solved for.
 
     Example:
         location = LocationFilter(read_locations(path))
@@ -90,29 +108,34 @@ class LocationFilter:
 
     def __init__(self, readings: Locations, on_object: bool = False) -> None:
         self.summary = LocationSummary()
-        # About the first reading: coordinates of a country's grid would cost digits.
+        # Positions are relative to the first reading: coordinates of a national grid would cost digits.
         self._origin = readings.positions[0]
         self._readings = replace(readings, positions=readings.positions - self._origin)
         self._on_object = on_object
         self._next = 0
-        self._known = self._sure = _Known(None, np.zeros((6, 6)))
+        self._belief = self._belief_when_tracked = _Belief(None, np.zeros((6, 6)))
         self._last: Estimate | None = None
         self._was_tracked = True
-        self._pairs: list[tuple[int, np.ndarray, np.ndarray, np.ndarray]] = []
+        # Readings for the solution of the worlds: row, pose, and the covariances of drift and frame error.
+        self._unsolved: list[tuple[int, np.ndarray, np.ndarray, np.ndarray]] = []
         self._trajectory: list[tuple[float, np.ndarray]] = []
 
     @property
     def T_sensor_world(self) -> np.ndarray | None:  # noqa: N802
-        """(4, 4) takes our world, the first left camera, into the sensor's; None: not known yet."""
-        return None if self._known.state is None else self._moved_back(self._known.state.model.A)
+        """(4, 4) takes the tracker's world, the first left camera, into the sensor's; None before it is solved for."""
+        if self._belief.state is None:
+            return None
+        T = self._belief.state.model.A.copy()
+        T[:3, 3] += self._origin
+        return T
 
     @property
     def T_sensor_world_covariance(self) -> np.ndarray | None:  # noqa: N802
-        """(6, 6) of that, perturbed from the right (in our world), translation before rotation."""
-        return None if self._known.state is None else self._known.state.covariance[SENSOR_WORLD, SENSOR_WORLD]
+        """(6, 6) of T_sensor_world, perturbed from the right (in the tracker's world), translation before rotation."""
+        return None if self._belief.state is None else self._belief.state.covariance[SENSOR_WORLD, SENSOR_WORLD]
 
     def trajectory(self) -> Trajectory | None:
-        """All poses until now in the sensor's world, by the last estimate of it; None: it is not known."""
+        """All poses until now in the sensor's world, by its last estimate; None before it is solved for."""
         if self.T_sensor_world is None:
             return None
         poses = np.stack([pose for _, pose in self._trajectory])
@@ -120,89 +143,95 @@ class LocationFilter:
         return Trajectory(times, self.T_sensor_world @ (se3_inverse(poses) if self._on_object else poses))
 
     def fuse(self, estimate: Estimate) -> Estimate:
-        """The estimate with what readings until its time stamp say.
+        """The estimate, corrected by the readings until its time stamp.
 
         Raises:
-            InputError: at the first frame, where all readings are of an earlier time.
+            InputError: at the first frame, if all readings are earlier.
         """
         if self._last is None:
             self._check_times(estimate.timestamp)
-        # Without a first pose the tracker's world is where it is: no error.
+        # Before its first pose the tracker counts as tracked: its world has no error yet.
         tracked = estimate.status != "lost"
-        found_again = tracked and not self._was_tracked
-        if found_again:
-            # The tracker's error is that of before the loss, and not what it walked off to meanwhile.
-            self._known = self._sure
-        self._allow_correction(estimate)
-        growth = self._growth(estimate)
-        own = turn_covariance(estimate.T_world_camera, _FRESH * estimate.frame_covariance)
-        self._begin(own)
+        relocalised = tracked and not self._was_tracked
+        if relocalised:
+            # The tracker's error is that of before the loss; the drift since then does not count.
+            self._belief = self._belief_when_tracked
+        self._reset_corrected_drift(estimate)
+        growth = self._drift_growth(estimate)
+        frame_covariance = turn_covariance(estimate.T_world_camera, _INDEPENDENT_SHARE * estimate.frame_covariance)
+        self._renew_frame_error(frame_covariance)
         before, done = self._last, 0.0
-        for row in self._due(estimate.timestamp):
-            usable = tracked or self._known.state is not None
-            if before is None or found_again or not usable or self._readings.timestamps[row] < before.timestamp:
+        for row in self._due_readings(estimate.timestamp):
+            usable = tracked or self._belief.state is not None
+            if before is None or relocalised or not usable or self._readings.timestamps[row] < before.timestamp:
                 self.summary.unused += 1
                 continue
             share = (self._readings.timestamps[row] - before.timestamp) / (estimate.timestamp - before.timestamp)
-            self._walk((share - done) * growth)
+            self._grow_drift((share - done) * growth)
             done = share
             step = se3_log(se3_inverse(before.T_world_camera) @ estimate.T_world_camera)
             pose = before.T_world_camera @ se3_exp(share * step)
-            self._take(row, pose, own, share, float(estimate.timestamp))
-        self._walk((1.0 - done) * growth)
+            self._fuse_reading(row, _TrackedPose(pose, share, frame_covariance), float(estimate.timestamp))
+        self._grow_drift((1.0 - done) * growth)
         if tracked:
-            self._sure = self._known
+            self._belief_when_tracked = self._belief
         self._last, self._was_tracked = estimate, tracked
-        result = self._fused(estimate)
+        result = self._correct(estimate)
         self._trajectory.append((result.timestamp, result.T_world_camera))
         return result
 
     # ---- the tracker's error
 
-    def _growth(self, estimate: Estimate) -> np.ndarray:
-        """(6, 6) what the covariance of the tracker's drift has grown by, in the world, perturbed from the left."""
-        values, vectors = np.linalg.eigh(_drift(estimate) - self._known.walked)
+    def _drift_growth(self, estimate: Estimate) -> np.ndarray:
+        """(6, 6) growth of the covariance of the tracker's drift, in the world, perturbed from the left."""
+        values, vectors = np.linalg.eigh(_world_drift_covariance(estimate) - self._belief.drift_covariance)
         return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
-    def _begin(self, own: np.ndarray) -> None:
-        """Another frame, whose own error, of covariance (6, 6), has nothing to do with that of the one before."""
-        state = self._known.state
+    def _renew_frame_error(self, frame_covariance: np.ndarray) -> None:
+        """A new frame: its frame error, of covariance (6, 6), is independent of the one before."""
+        state = self._belief.state
         if state is not None:
-            covariance = renew_part(state.covariance, OWN, own)
-            self._known = replace(self._known, state=replace(state, own=np.zeros(6), covariance=covariance))
+            covariance = renew_part(state.covariance, FRAME_ERROR, frame_covariance)
+            state = replace(state, frame_error=np.zeros(6), covariance=covariance)
+            self._belief = replace(self._belief, state=state)
 
-    def _walk(self, growth: np.ndarray) -> None:
-        state = self._known.state
+    def _grow_drift(self, growth: np.ndarray) -> None:
+        state = self._belief.state
         if state is not None:
             covariance = state.covariance.copy()
-            covariance[OFFSET, OFFSET] += growth
+            covariance[DRIFT, DRIFT] += growth
             state = replace(state, covariance=covariance)
-        self._known = _Known(state, self._known.walked + growth)
+        self._belief = _Belief(state, self._belief.drift_covariance + growth)
 
-    def _allow_correction(self, estimate: Estimate) -> None:
-        """Where the tracker has corrected itself, its error is another one, as large as it says."""
-        now = se3_body(estimate.T_world_camera, self._known.walked), _drifted(estimate)
-        ratios = [np.trace(now[1][part, part]) / max(np.trace(now[0][part, part]), 1e-300) for part in _PARTS]
-        if estimate.status != "relocalised" and min(ratios) > _CORRECTED:
+    def _reset_corrected_drift(self, estimate: Estimate) -> None:
+        """After a correction by the tracker itself, the drift is a new error with the covariance that it claims."""
+        before = se3_body(estimate.T_world_camera, self._belief.drift_covariance)
+        now = _drift_covariance(estimate)
+        ratios = [
+            np.trace(now[part, part]) / max(np.trace(before[part, part]), 1e-300) for part in _TRANSLATION_AND_ROTATION
+        ]
+        if estimate.status != "relocalised" and min(ratios) > _CORRECTED_SHARE:
             return
-        self._pairs.clear()  # their errors no longer have in common what earlier ones had
-        walked, state = _drift(estimate), self._known.state
+        # The drift of these readings is not a part of the drift from now on.
+        self._unsolved.clear()
+        drift_covariance, state = _world_drift_covariance(estimate), self._belief.state
         if state is not None:
-            covariance = renew_part(state.covariance, OFFSET, walked)
-            state = replace(state, offset=np.zeros(6), covariance=covariance)
-        self._known = _Known(state, walked)
+            covariance = renew_part(state.covariance, DRIFT, drift_covariance)
+            state = replace(state, drift=np.zeros(6), covariance=covariance)
+        self._belief = _Belief(state, drift_covariance)
 
-    def _fused(self, estimate: Estimate) -> Estimate:
-        state = self._known.state
+    def _correct(self, estimate: Estimate) -> Estimate:
+        """The estimate with drift and frame error taken out."""
+        state = self._belief.state
         if state is None:
             return estimate
-        pose = nearest_rigid(se3_exp(state.offset + state.own) @ estimate.T_world_camera)
-        both = np.eye(WHOLE)[OFFSET] + np.eye(WHOLE)[OWN]
+        pose = nearest_rigid(se3_exp(state.drift + state.frame_error) @ estimate.T_world_camera)
+        both = np.eye(STATE_SIZE)[DRIFT] + np.eye(STATE_SIZE)[FRAME_ERROR]
         return replace(
             estimate,
             T_world_camera=pose,
             covariance=se3_body(pose, both @ state.covariance @ both.T),
-            frame_covariance=se3_body(pose, state.covariance[OWN, OWN]),
+            frame_covariance=se3_body(pose, state.covariance[FRAME_ERROR, FRAME_ERROR]),
         )
 
     # ---- readings
@@ -215,90 +244,89 @@ class LocationFilter:
                 f"{first:.6f} s; give both in the same clock"
             )
 
-    def _due(self, until: float) -> range:
-        """Rows of the readings up to that time that were not asked for yet."""
+    def _due_readings(self, until: float) -> range:
+        """Rows of the readings since the last call, up to that time."""
         begin, self._next = self._next, int(np.searchsorted(self._readings.timestamps, until, side="right"))
         return range(begin, self._next)
 
-    def _take(self, row: int, pose: np.ndarray, own: np.ndarray, share: float, timestamp: float) -> None:
-        """A reading of a pose that is, to a share, the last frame's and else the one's before."""
+    def _fuse_reading(self, row: int, tracked: _TrackedPose, timestamp: float) -> None:
+        """Updates the state by a reading, or solves for the worlds while their rotation is not linear."""
         self.summary.used += 1
-        if self._known.state is not None and not self._pairs:
-            self._update(self._known.state, row, pose, own, share)
+        if self._belief.state is not None and not self._unsolved:
+            self._update(self._belief.state, row, tracked)
             return
-        self._pairs.append((row, pose, self._known.walked, (share**2 + (1.0 - share) ** 2) * own))
-        rows = [kept for kept, *_ in self._pairs]
-        readings = self._readings
-        _, poses, walked, fresh = zip(*self._pairs, strict=True)
-        pairs = Pairs(
-            np.stack(poses),
-            np.stack(walked),
-            np.stack(fresh),
-            readings.positions[rows],
-            None if readings.rotations is None else readings.rotations[rows],
-            readings.covariances[rows],
+        share = tracked.share
+        frame_covariance = (share**2 + (1.0 - share) ** 2) * tracked.frame_covariance
+        self._unsolved.append((row, tracked.pose, self._belief.drift_covariance, frame_covariance))
+        state = find_worlds(
+            self._posed_readings(), self._belief.drift_covariance, self._on_object, self._solved_model()
         )
-        before = self._known.state
-        known = None if before is None else before.model
-        state = find_worlds(pairs, self._known.walked, self._on_object, known)
-        self._known = _Known(state, self._known.walked)
-        self._begin(own)
-        full = len(self._pairs) >= _MOST_KEPT
+        self._belief = _Belief(state, self._belief.drift_covariance)
+        self._renew_frame_error(tracked.frame_covariance)
+        full = len(self._unsolved) >= _MAX_READINGS
         if state is not None:
             self.summary.ready = timestamp if self.summary.ready is None else self.summary.ready
-            if full or state.turn_sigma < _LINEAR_TURN:
-                self._pairs.clear()
+            if full or state.rotation_sigma < _LINEAR_ROTATION_SIGMA:
+                self._unsolved.clear()
         elif full:
-            self._pairs = self._pairs[::2]
+            self._unsolved = self._unsolved[::2]
 
-    def _update(self, state: State, row: int, pose: np.ndarray, own: np.ndarray, share: float) -> None:
-        """Unscented update by a reading of the tracker's pose at its time."""
-        readings = self._readings
+    def _solved_model(self) -> SensorModel | None:
+        return None if self._belief.state is None else self._belief.state.model
+
+    def _posed_readings(self) -> PosedReadings:
+        """The readings for the solution of the worlds."""
+        rows, poses, drift, frame_error = zip(*self._unsolved, strict=True)
+        readings, index = self._readings, list(rows)
+        return PosedReadings(
+            np.stack(poses),
+            np.stack(drift),
+            np.stack(frame_error),
+            readings.positions[index],
+            None if readings.rotations is None else readings.rotations[index],
+            readings.covariances[index],
+        )
+
+    def _update(self, state: FusionState, row: int, tracked: _TrackedPose) -> None:
+        """Unscented update by a reading."""
+        readings, pose, share = self._readings, tracked.pose, tracked.share
         rotation = None if readings.rotations is None else readings.rotations[row]
-        root = np.sqrt(WHOLE) * matrix_root(state.covariance)
+        root = np.sqrt(STATE_SIZE) * matrix_root(state.covariance)
         points = np.concatenate([root.T, -root.T])
-        shifted = points[:, :SIZE].copy()
-        shifted[:, OFFSET] += state.offset + share * (points[:, OWN] + state.own)
-        rest = residuals(state.model.expect(pose, shifted), readings.positions[row], rotation)
-        innovation = rest.mean(axis=0)
-        apart = (innovation - rest) / np.sqrt(len(points))
-        cross = points.T @ apart / np.sqrt(len(points))
-        by_offset = slopes(state.model, pose, readings.positions[row], rotation)[:, OFFSET]
-        predicted = apart.T @ apart
-        noise = readings.covariances[row] + (1.0 - share) ** 2 * by_offset @ own @ by_offset.T
+        errors = points[:, :MODEL_SIZE].copy()
+        errors[:, DRIFT] += state.drift + share * (points[:, FRAME_ERROR] + state.frame_error)
+        residual = residuals(state.model.expect(pose, errors), readings.positions[row], rotation)
+        innovation = residual.mean(axis=0)
+        deviation = (innovation - residual) / np.sqrt(len(points))
+        cross = points.T @ deviation / np.sqrt(len(points))
+        by_drift = reading_jacobian(state.model, pose, readings.positions[row], rotation)[:, DRIFT]
+        predicted = deviation.T @ deviation
+        # The error of the earlier frame is not a state: it counts as noise.
+        noise = readings.covariances[row] + (1.0 - share) ** 2 * by_drift @ tracked.frame_covariance @ by_drift.T
         squared = float(innovation @ np.linalg.solve(predicted + noise, innovation))
-        gate = CHI_SQUARE_999[len(innovation)]  # a reading beyond is weakened until it is there
+        # A reading beyond the gate is weakened until it lies on the gate.
+        gate = CHI_SQUARE_999[len(innovation)]
         if squared > gate:
             self.summary.weakened += 1
             noise = noise + (squared / gate - 1.0) * (predicted + noise)
         gain = np.linalg.solve(predicted + noise, cross.T).T
         step = gain @ innovation
         covariance = state.covariance - gain @ cross.T
-        self._known = replace(
-            self._known,
-            state=State(
-                state.model.moved(step[:SIZE]),
-                state.offset + step[OFFSET],
-                state.own + step[OWN],
-                0.5 * (covariance + covariance.T),
-            ),
+        state = FusionState(
+            state.model.corrected(step[:MODEL_SIZE]),
+            state.drift + step[DRIFT],
+            state.frame_error + step[FRAME_ERROR],
+            0.5 * (covariance + covariance.T),
         )
-
-    def _moved_back(self, A: np.ndarray) -> np.ndarray:
-        moved = A.copy()
-        moved[:3, 3] += self._origin
-        return moved
+        self._belief = replace(self._belief, state=state)
 
 
-_PARTS = (slice(0, 3), slice(3, 6))
-
-
-def _drift(estimate: Estimate) -> np.ndarray:
-    """(6, 6) covariance of what the tracker has drifted by, perturbed from the left in the world."""
-    covariance = turn_covariance(estimate.T_world_camera, _drifted(estimate))
+def _world_drift_covariance(estimate: Estimate) -> np.ndarray:
+    """(6, 6) covariance of the tracker's drift, perturbed from the left in the world."""
+    covariance = turn_covariance(estimate.T_world_camera, _drift_covariance(estimate))
     return np.asarray(0.5 * (covariance + covariance.T))
 
 
-def _drifted(estimate: Estimate) -> np.ndarray:
-    """The same in the camera's frame."""
-    return estimate.covariance - _FRESH * estimate.frame_covariance
+def _drift_covariance(estimate: Estimate) -> np.ndarray:
+    """(6, 6) covariance of the tracker's drift in the camera's frame."""
+    return estimate.covariance - _INDEPENDENT_SHARE * estimate.frame_covariance

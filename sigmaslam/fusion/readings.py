@@ -14,11 +14,11 @@ from sigmaslam.geometry.se3 import quaternion_to_matrix
 
 _POSITION = ("timestamp", "x", "y", "z")
 _QUATERNION = ("qx", "qy", "qz", "qw")
-_SPHERE = ("sigma_position",)
-_AXES = ("sigma_x", "sigma_y", "sigma_z")
-_TRIANGLE = ("cxx", "cxy", "cxz", "cyy", "cyz", "czz")
-_TURN = "sigma_rotation"
-# A quaternion's length may be so much off one: files have few digits.
+_ONE_SIGMA = ("sigma_position",)
+_AXIS_SIGMAS = ("sigma_x", "sigma_y", "sigma_z")
+_MATRIX = ("cxx", "cxy", "cxz", "cyy", "cyz", "czz")
+_ROTATION_SIGMA = "sigma_rotation"
+# The length of a quaternion may differ from 1 by so much, as files have few digits.
 _LENGTH_TOLERANCE = 0.01
 
 
@@ -31,7 +31,7 @@ class Locations:
         positions: (N, 3) metres.
         rotations: (N, 3, 3) of the sensor's axes in its world; None from a sensor of positions.
         covariances: (N, m, m) metres and radians squared: position along the axes of the sensor's world, m = 3; with
-            rotations m = 6, the rotation about the sensor's own axes.
+            rotations m = 6, the rotation about the axes of the sensor.
         source: the file.
     """
 
@@ -51,7 +51,7 @@ def read_locations(path: Path) -> Locations:
     Its first line names the columns, in any order: timestamp (seconds, in the clock of the images), x, y, z (metres);
     for poses also qx, qy, qz, qw. The covariance of the position is sigma_position, or sigma_x, sigma_y, sigma_z
     (metres), or cxx, cxy, cxz, cyy, cyz, czz (metres squared); that of the rotation is sigma_rotation (radians, about
-    any axis). Other columns are left alone.
+    any axis). Other columns are ignored.
 
     Raises:
         InputError: a column is missing or a value is wrong; the message gives file, line and value.
@@ -68,10 +68,10 @@ def read_locations(path: Path) -> Locations:
     if len(rows) < 2:
         raise InputError(f"{path}: holds no readings; its first line names the columns, each further line is a reading")
     names = [cell.strip().lstrip("#").strip() for cell in rows[0][1]]
-    wanted = _columns(path, names)
-    table = np.array([_numbers(path, number, row, names, wanted) for number, row in rows[1:]])
+    columns = _columns(path, names)
+    table = np.array([_numbers(path, number, row, names, columns) for number, row in rows[1:]])
     lines = [number for number, _ in rows[1:]]
-    value = dict(zip(wanted, table.T, strict=True))
+    value = dict(zip(columns, table.T, strict=True))
     for k in np.flatnonzero(np.diff(value["timestamp"]) <= 0)[:1]:
         raise InputError(
             f"{path}, line {lines[k + 1]}: timestamp {float(value['timestamp'][k + 1])!r} does not come after "
@@ -81,10 +81,10 @@ def read_locations(path: Path) -> Locations:
     rotations = None
     if _QUATERNION[0] in value:
         rotations = _rotations(path, lines, np.column_stack([value[name] for name in _QUATERNION]))
-        _check_sigma(path, lines, _TURN, value[_TURN])
+        _check_sigma(path, lines, _ROTATION_SIGMA, value[_ROTATION_SIGMA])
         grown = np.zeros((len(table), 6, 6))
         grown[:, :3, :3] = covariances
-        grown[:, 3:, 3:] = value[_TURN][:, None, None] ** 2 * np.eye(3)
+        grown[:, 3:, 3:] = value[_ROTATION_SIGMA][:, None, None] ** 2 * np.eye(3)
         covariances = grown
     positions = np.column_stack([value[name] for name in _POSITION[1:]])
     return Locations(value["timestamp"], positions, rotations, covariances, path)
@@ -101,25 +101,25 @@ def _columns(path: Path, names: list[str]) -> list[str]:
             )
         return list(some)
 
-    wanted = need(_POSITION)
-    spreads = [some for some in (_SPHERE, _AXES, _TRIANGLE) if some[0] in names]
+    columns = need(_POSITION)
+    spreads = [some for some in (_ONE_SIGMA, _AXIS_SIGMAS, _MATRIX) if some[0] in names]
     if len(spreads) != 1:
         raise InputError(
             f"{path}, line 1: the covariance of the position must be given once, there are {', '.join(names)}; give "
-            f"the column {_SPHERE[0]}, or {', '.join(_AXES)}, or {', '.join(_TRIANGLE)}"
+            f"the column {_ONE_SIGMA[0]}, or {', '.join(_AXIS_SIGMAS)}, or {', '.join(_MATRIX)}"
         )
-    wanted += need(spreads[0])
+    columns += need(spreads[0])
     if any(name in names for name in _QUATERNION):
-        wanted += need((*_QUATERNION, _TURN))
-    return wanted
+        columns += need((*_QUATERNION, _ROTATION_SIGMA))
+    return columns
 
 
-def _numbers(path: Path, line: int, row: list[str], names: list[str], wanted: list[str]) -> list[float]:
+def _numbers(path: Path, line: int, row: list[str], names: list[str], columns: list[str]) -> list[float]:
     if len(row) != len(names):
         raise InputError(f"{path}, line {line}: {len(row)} values for {len(names)} columns; mend or remove the line")
     cells = dict(zip(names, row, strict=True))
     values = []
-    for name in wanted:
+    for name in columns:
         try:
             number = float(cells[name])
         except ValueError:
@@ -136,17 +136,17 @@ def _check_sigma(path: Path, lines: list[int], name: str, sigma: np.ndarray) -> 
 
 
 def _position_covariances(path: Path, lines: list[int], value: dict[str, np.ndarray]) -> np.ndarray:
-    if _TRIANGLE[0] in value:
-        xx, xy, xz, yy, yz, zz = (value[name] for name in _TRIANGLE)
+    if _MATRIX[0] in value:
+        xx, xy, xz, yy, yz, zz = (value[name] for name in _MATRIX)
         rows = [np.stack(row, axis=-1) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))]
         covariances = np.stack(rows, axis=-2)
         for k in np.flatnonzero(np.linalg.eigvalsh(covariances)[:, 0] <= 0)[:1]:
             raise InputError(
-                f"{path}, line {lines[k]}: {', '.join(_TRIANGLE)} are no covariance, an eigenvalue is not larger than "
+                f"{path}, line {lines[k]}: {', '.join(_MATRIX)} are no covariance, an eigenvalue is not larger than "
                 "zero; give variances and covariances in metres squared"
             )
         return covariances
-    names = _AXES if _AXES[0] in value else _SPHERE * 3
+    names = _AXIS_SIGMAS if _AXIS_SIGMAS[0] in value else _ONE_SIGMA * 3
     for name in names:
         _check_sigma(path, lines, name, value[name])
     sigma = np.column_stack([value[name] for name in names])

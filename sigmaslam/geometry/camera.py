@@ -1,23 +1,22 @@
 """Cameras: interior orientation (9.28)-(9.30), the stereo pair, and the rectified pair of (9.34)."""
 
 import os
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Literal, Self, cast, get_args
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
-import yaml
 
-from sigmaslam.errors import CalibrationError, InputError
+from sigmaslam.errors import CalibrationError
+from sigmaslam.geometry.checked_yaml import CalibrationYaml
 
 DistortionModel = Literal["none", "radtan", "equidistant"]
 
 COEFFICIENT_COUNTS: dict[str, tuple[int, ...]] = {"none": (0,), "radtan": (4, 5, 8), "equidistant": (4,)}
 
-# How far a rotation may be from orthonormal: files carry six or seven digits.
+# Rotations may deviate so much from orthonormal, as files have six or seven digits.
 ORTHONORMAL_TOLERANCE = 1e-4
-# A pair counts as rectified when rows agree to about 0.01 px: angles in rad, offsets relative to baseline.
+# A pair counts as rectified when rows agree to about 0.01 px. Angles are in radians, offsets relative to the baseline.
 RECTIFIED_ANGLE = 1e-5
 RECTIFIED_OFFSET = 1e-4
 
@@ -61,42 +60,14 @@ class CameraModel:
         if self.fx <= 0 or self.fy <= 0:
             raise CalibrationError(f"focal lengths must be positive pixels, got fx={self.fx}, fy={self.fy}")
         if self.distortion_model not in COEFFICIENT_COUNTS:
-            known = ", ".join(get_args(DistortionModel))
-            raise CalibrationError(f"distortion_model is {self.distortion_model!r}; use one of {known}")
+            names = ", ".join(get_args(DistortionModel))
+            raise CalibrationError(f"distortion_model is {self.distortion_model!r}; use one of {names}")
         counts = COEFFICIENT_COUNTS[self.distortion_model]
         if len(self.distortion) not in counts:
             raise CalibrationError(
                 f"distortion has {len(self.distortion)} coefficients; model {self.distortion_model!r} "
                 f"takes {' or '.join(map(str, counts))}"
             )
-
-    @classmethod
-    def from_chapter(
-        cls,
-        alpha_u: float,
-        alpha_v: float,
-        shear: float,
-        scale_difference: float,
-        u0: float,
-        v0: float,
-        *,
-        width: int,
-        height: int,
-        distortion_model: DistortionModel = "none",
-        distortion: tuple[float, ...] = (),
-    ) -> Self:
-        """Camera with the chapter's K, (9.29): skew = shear alpha_v, fy = alpha_v (1 + scale_difference)."""
-        return cls(
-            width=width,
-            height=height,
-            fx=alpha_u,
-            fy=alpha_v * (1.0 + scale_difference),
-            cx=u0,
-            cy=v0,
-            skew=shear * alpha_v,
-            distortion_model=distortion_model,
-            distortion=distortion,
-        )
 
     @property
     def matrix(self) -> np.ndarray:
@@ -107,8 +78,8 @@ class CameraModel:
         """Pixels of points in the camera frame.
 
         Args:
-            points: (..., 3) metres. Only Z > 0 has a meaning; nothing is checked, so that whole clouds can be
-                projected and masked afterwards.
+            points: (..., 3) metres. Only points with Z > 0 have a meaning. This is not checked, so that whole clouds
+                can be projected and masked afterwards.
 
         Returns:
             (..., 2) pixels (u, v), in the floating type of `points`.
@@ -126,8 +97,8 @@ class CameraModel:
             pixels: (..., 2) pixels (u, v).
 
         Returns:
-            (..., 3) points with Z = 1 in the camera frame, in the floating type of `pixels`; NaN where no
-            ray in front of the camera has this pixel (beyond the fold of the distortion, or 90 degrees).
+            (..., 3) points with Z = 1 in the camera frame, in the floating type of `pixels`; NaN for pixels that no
+            ray in front of the camera has (beyond the fold of the distortion, or 90 degrees).
         """
         pixels, dtype = _as_float64(pixels, 2, "pixels")
         y = (pixels[..., 1] - self.cy) / self.fy
@@ -144,7 +115,7 @@ class CameraModel:
             radius = np.hypot(X, Y)
             theta = np.arctan2(radius, Z)
             theta_d, _ = _equidistant_polynomial(theta, self.distortion)
-            # On the axis the ratio is 0 / 0; its limit is 1 / Z.
+            # The ratio is 0 / 0 on the axis; its limit is 1 / Z.
             scale = np.where(radius > 0, theta_d / radius, 1.0 / Z)
             return X * scale, Y * scale
         x, y = X / Z, Y / Z
@@ -195,9 +166,9 @@ def _undistort_radtan(
                 break
         x_now, y_now, (a, b, d) = _distort_radtan(x, y, coefficients)
         residual = np.hypot(x_now - x_distorted, y_now - y_distorted)
-        # Both eigenvalues positive: not beyond the fold, where the image runs backwards.
-        found = (residual < _NEWTON_RESIDUAL) & (a * d - b * b > 0) & (a + d > 0)
-    return np.where(found, x, np.nan), np.where(found, y, np.nan)
+        # Both eigenvalues of the Jacobian are positive up to the fold, beyond which the image is mirrored.
+        valid = (residual < _NEWTON_RESIDUAL) & (a * d - b * b > 0) & (a + d > 0)
+    return np.where(valid, x, np.nan), np.where(valid, y, np.nan)
 
 
 def _equidistant_polynomial(theta: np.ndarray, coefficients: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
@@ -220,9 +191,9 @@ def _undistort_equidistant(
             if not np.any(np.abs(value - theta_d) > 1e-15):
                 break
         value, slope = _equidistant_polynomial(theta, coefficients)
-        found = (np.abs(value - theta_d) < _NEWTON_RESIDUAL) & (slope > 0) & (theta >= 0) & (theta < np.pi / 2)
+        valid = (np.abs(value - theta_d) < _NEWTON_RESIDUAL) & (slope > 0) & (theta >= 0) & (theta < np.pi / 2)
         scale = np.where(theta_d > 0, np.tan(theta) / theta_d, 1.0)
-    scale = np.where(found, scale, np.nan)
+    scale = np.where(valid, scale, np.nan)
     return x_distorted * scale, y_distorted * scale
 
 
@@ -277,7 +248,7 @@ class StereoCamera:
 
     @property
     def is_rectified(self) -> bool:
-        """Whether the images can be used as they are: equal K, undistorted, parallel, pure x baseline."""
+        """Whether the images need no rectification: equal K, no distortion, parallel axes, a baseline along x."""
         left, right = self.left, self.right
         if left.distortion_model != "none" or right.distortion_model != "none" or left.skew or right.skew:
             return False
@@ -313,29 +284,8 @@ class StereoCamera:
         except CalibrationError as error:
             raise content.error(str(error)) from None
 
-    def to_yaml(self, path: str | os.PathLike[str]) -> None:
-        """Write the form that `from_yaml` reads, exactly; the file appears whole or not at all.
 
-        Raises:
-            InputError: the file cannot be written.
-        """
-        content = {
-            "left": _camera_to_yaml(self.left),
-            "right": _camera_to_yaml(self.right),
-            "T_left_right": self.T_left_right.tolist(),
-        }
-        text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=200)
-        target = Path(path)
-        partial = target.with_name(f".{target.name}.{os.getpid()}")
-        try:
-            partial.write_text(text, encoding="utf-8")
-            partial.replace(target)
-        except OSError as error:
-            partial.unlink(missing_ok=True)
-            raise InputError(f"{path}: cannot write the calibration: {error.strerror}") from None
-
-
-def _camera_from_yaml(section: "CalibrationYaml") -> CameraModel:
+def _camera_from_yaml(section: CalibrationYaml) -> CameraModel:
     required = ("fx", "fy", "cx", "cy")
     section.reject_unknown(("width", "height", *required, "skew", "distortion_model", "distortion"))
     values: dict[str, Any] = {key: section.integer(key) for key in ("width", "height")}
@@ -347,15 +297,6 @@ def _camera_from_yaml(section: "CalibrationYaml") -> CameraModel:
         return CameraModel(**values)
     except CalibrationError as error:
         raise section.error(str(error)) from None
-
-
-def _camera_to_yaml(camera: CameraModel) -> dict[str, Any]:
-    values: dict[str, Any] = {"width": int(camera.width), "height": int(camera.height)}
-    values |= {key: float(getattr(camera, key)) for key in ("fx", "fy", "cx", "cy", "skew")}
-    return values | {
-        "distortion_model": camera.distortion_model,
-        "distortion": [float(value) for value in camera.distortion],
-    }
 
 
 @dataclass(frozen=True, slots=True)
@@ -381,6 +322,16 @@ class RectifiedStereo:
         """K of both eyes, (3, 3) float64."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
+    @property
+    def focal_baseline(self) -> float:
+        """fx times the baseline: disparity times depth, pixels metres."""
+        return self.fx * self.baseline
+
+    def rays(self, pixels: np.ndarray) -> np.ndarray:
+        """Rays (..., 3) of unit depth in the left camera frame through pixels (..., 2)."""
+        u, v = pixels[..., 0], pixels[..., 1]
+        return np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones(u.shape)], axis=-1)
+
     def project(self, points: np.ndarray) -> np.ndarray:
         """Pixels of points, the inverse of `triangulate`.
 
@@ -393,7 +344,7 @@ class RectifiedStereo:
         points = np.asarray(points)
         X, Y, Z = points[..., 0], points[..., 1], points[..., 2]
         u, v = self.fx * X / Z + self.cx, self.fy * Y / Z + self.cy
-        return np.stack([u, v, self.fx * self.baseline / Z], axis=-1)
+        return np.stack([u, v, self.focal_baseline / Z], axis=-1)
 
     def triangulate(self, uvd: np.ndarray) -> np.ndarray:
         """Points from a rectified pair, eq. (9.34).
@@ -416,100 +367,5 @@ class RectifiedStereo:
                 f"{np.count_nonzero(wrong)} of {disparity.size} disparities are not positive; the first is "
                 f"{disparity[first]} at index {first if len(first) != 1 else first[0]}; drop those points"
             )
-        Z = self.fx * self.baseline / disparity
+        Z = self.focal_baseline / disparity
         return np.stack([(uvd[..., 0] - self.cx) * Z / self.fx, (uvd[..., 1] - self.cy) * Z / self.fy, Z], axis=-1)
-
-
-_REQUIRED: Any = object()
-
-
-class CalibrationYaml:
-    """A YAML calibration file whose getters raise errors that name file, key and what was expected."""
-
-    def __init__(self, path: Path, entries: dict[str, Any], prefix: str = "") -> None:
-        self.path = path
-        self.entries = entries
-        self.prefix = prefix
-
-    @classmethod
-    def read(cls, path: str | os.PathLike[str]) -> Self:
-        """Read a file; OpenCV's '%YAML:1.0' first line, which is no YAML, is skipped."""
-        path = Path(path)
-        try:
-            text = path.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise CalibrationError(f"{path}: cannot read the calibration: {error}") from None
-        first, _, rest = text.partition("\n")
-        if first.startswith("%YAML:"):
-            text = "\n" + rest
-        try:
-            entries = yaml.safe_load(text)
-        except yaml.YAMLError as error:
-            raise CalibrationError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
-        if not isinstance(entries, dict):
-            raise CalibrationError(f"{path}: expected keys with values, found {type(entries).__name__}")
-        return cls(path, entries)
-
-    def error(self, message: str) -> CalibrationError:
-        """The error to raise about this section."""
-        return CalibrationError(f"{self.path}: {self.prefix.rstrip('.') + ': ' if self.prefix else ''}{message}")
-
-    def section(self, key: str) -> "CalibrationYaml":
-        """The mapping under a key."""
-        entries = self._get(key, "a mapping")
-        if not isinstance(entries, dict):
-            raise self._wrong(key, "a mapping", entries)
-        return CalibrationYaml(self.path, entries, f"{self.prefix}{key}.")
-
-    def text(self, key: str, default: str = _REQUIRED) -> str:
-        """A word."""
-        value = self._get(key, "a word", default)
-        # YAML reads a bare `none` as a string, but `null` and `~` as None.
-        return "none" if value is None else str(value)
-
-    def number(self, key: str, default: float = _REQUIRED) -> float:
-        """A finite number."""
-        return float(self.numbers(key, (), default))
-
-    def integer(self, key: str) -> int:
-        """A whole number."""
-        value = self.number(key)
-        if value != int(value):
-            raise self._wrong(key, "a whole number", value)
-        return int(value)
-
-    def numbers(self, key: str, shape: tuple[int | None, ...], default: Any = _REQUIRED) -> np.ndarray:
-        """A float64 array of nested lists; None in `shape` stands for any length."""
-        size = "x".join("any" if n is None else str(n) for n in shape)
-        expected = "a number" if not shape else "a list of numbers" if size == "any" else f"{size} numbers in lists"
-        value = self._get(key, expected, default)
-        try:
-            # Through str: YAML 1.1 reads 1e-5 as text; booleans are no numbers.
-            array = np.array(value, dtype=str) if value != [] else np.zeros(0, dtype=str)
-            numbers = array.astype(np.float64)
-        except ValueError:
-            raise self._wrong(key, expected, value) from None
-        fits = numbers.ndim == len(shape) and all(
-            n is None or n == m for n, m in zip(shape, numbers.shape, strict=True)
-        )
-        if not fits or not np.all(np.isfinite(numbers)):
-            found = "x".join(map(str, numbers.shape)) or "one number"
-            raise self._wrong(key, expected, value, f" (size {found})")
-        return cast(np.ndarray, numbers)
-
-    def reject_unknown(self, known: Collection[str]) -> None:
-        """Refuse keys that nobody would read, as a misspelt optional key would pass unseen."""
-        unknown = [str(key) for key in self.entries if key not in known]
-        if unknown:
-            raise self.error(f"unknown key {', '.join(unknown)}; known are {', '.join(known)}")
-
-    def _get(self, key: str, expected: str, default: Any = _REQUIRED) -> Any:
-        if key in self.entries:
-            return self.entries[key]
-        if default is not _REQUIRED:
-            return default
-        raise CalibrationError(f"{self.path}: key '{self.prefix}{key}' is missing; expected {expected}")
-
-    def _wrong(self, key: str, expected: str, value: Any, detail: str = "") -> CalibrationError:
-        shown = str(value) if len(str(value)) <= 80 else str(value)[:77] + "..."
-        return CalibrationError(f"{self.path}: key '{self.prefix}{key}' must be {expected}, got {shown}{detail}")

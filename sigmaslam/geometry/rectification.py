@@ -6,9 +6,9 @@ import numpy as np
 from sigmaslam.errors import CalibrationError, FrameError
 from sigmaslam.geometry.camera import CameraModel, RectifiedStereo, StereoCamera
 
-# Rays further than 60 degrees from the axis are left out: a fisheye image would be stretched without limit.
+# The rectified image ends at 60 degrees from the axis, as a fisheye image would be stretched without limit.
 MAX_TANGENT = float(np.tan(np.radians(60.0)))
-# Rectified pixels whose source is nearer to the image border than this, in pixels, are not valid.
+# A rectified pixel is valid if its source is at least so many pixels from the image border.
 VALID_MARGIN = 3
 _BORDER_SAMPLES = 200
 
@@ -79,7 +79,7 @@ def _parallel_rotations(camera: StereoCamera) -> tuple[np.ndarray, np.ndarray]:
     """Rotations from each eye to its rectified frame, as in cv2.stereoRectify."""
     R_left_right, position = camera.T_left_right[:3, :3], camera.T_left_right[:3, 3]
     half, _ = cv2.Rodrigues(0.5 * cv2.Rodrigues(R_left_right)[0])
-    # In the frame half-way between the eyes; the left one reaches it by half^T, the right one by half.
+    # The baseline is in the frame half-way between the eyes: half^T takes the left eye to it, half the right one.
     baseline = half.T @ position
     axis = np.cross(baseline, [1.0, 0.0, 0.0])
     length = np.linalg.norm(axis)
@@ -126,7 +126,7 @@ def _inner_rectangle(model: CameraModel, R: np.ndarray) -> np.ndarray:
     bounds = np.array([-MAX_TANGENT, -MAX_TANGENT, MAX_TANGENT, MAX_TANGENT])
     for side, pixels in enumerate(sides):
         rays = model.unproject(pixels) @ R.T
-        # A border pixel without a ray in front of the camera lies beyond the limit anyhow.
+        # Border pixels without a ray in front of the camera are beyond the limit.
         rays = rays[rays[:, 2] > 0]
         edge = rays[:, side % 2] / rays[:, 2]
         if len(edge):
@@ -136,8 +136,8 @@ def _inner_rectangle(model: CameraModel, R: np.ndarray) -> np.ndarray:
 
 def _source_pixels(model: CameraModel, view: RectifiedStereo, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """For each rectified pixel, (H, W) float32 u and v of its place in the original image."""
-    u, v = np.meshgrid(np.arange(view.width), np.arange(view.height))
-    rays = np.stack([(u - view.cx) / view.fx, (v - view.cy) / view.fy, np.ones(u.shape)], axis=-1) @ R
+    grid = np.stack(np.meshgrid(np.arange(view.width), np.arange(view.height)), axis=-1)
+    rays = view.rays(grid) @ R
     pixels = np.where(rays[..., 2:] > 0, model.project(rays), -1.0).astype(np.float32)
     return np.ascontiguousarray(pixels[..., 0]), np.ascontiguousarray(pixels[..., 1])
 

@@ -103,15 +103,20 @@ def se3_inverse(T: np.ndarray) -> np.ndarray:
     return inverse
 
 
-def nearest_rigid(T: np.ndarray) -> np.ndarray:
-    """Rigid transforms whose rotations have lost digits, made orthonormal again; (..., 4, 4) -> (..., 4, 4).
+def transform_points(T: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Points (..., 3) in the frame that T (4, 4) takes them to."""
+    return np.asarray(points @ T[:3, :3].T + T[:3, 3])
 
-    An inverse by transposition doubles what a rotation is off by: products of poses and inverses, one frame after the
-    other, need this or leave the group within a hundred frames.
+
+def nearest_rigid(T: np.ndarray) -> np.ndarray:
+    """Rigid transforms with orthonormal rotations next to those of T; (..., 4, 4) -> (..., 4, 4).
+
+    An inverse by transposition doubles the error of a rotation. Without this, products of poses and inverses over
+    successive frames leave the group within a hundred frames.
     """
-    mended = np.array(T, dtype=np.float64)
-    mended[..., :3, :3] = nearest_rotation(mended[..., :3, :3])
-    return mended
+    rigid = np.array(T, dtype=np.float64)
+    rigid[..., :3, :3] = nearest_rotation(rigid[..., :3, :3])
+    return rigid
 
 
 def se3_adjoint(T: np.ndarray) -> np.ndarray:
@@ -132,7 +137,7 @@ def se3_adjoint(T: np.ndarray) -> np.ndarray:
 
 
 def turn_covariance(T: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Covariances of tangent vectors seen from elsewhere: of `se3_adjoint(T) @ x`.
+    """Covariances of tangent vectors in another frame: of `se3_adjoint(T) @ x`.
 
     Args:
         T: (..., 4, 4) rigid transforms.
@@ -145,7 +150,7 @@ def turn_covariance(T: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 def se3_body(T: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Covariance (6, 6) of a pose in its own frame, from that of its perturbation from the left."""
+    """Covariance (6, 6) of a pose in the body frame, from that of its perturbation from the left."""
     spread = turn_covariance(se3_inverse(T), covariance)
     return np.asarray(0.5 * (spread + spread.T))
 

@@ -1,4 +1,4 @@
-"""ONNX Runtime sessions as this project needs them: one place for options and for the shipped graphs."""
+"""ONNX Runtime sessions: their options, and the shipped graphs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import onnxruntime
 
 from sigmaslam.errors import InputError
 
-# This fusion moves a constant factor into a float32 attribute of the product, also when the product is float64: the
+# This fusion moves a constant factor into a float32 attribute of the product, even if the product is float64. The
 # covariances of the filter would be wrong in the eighth digit.
 _DISABLED = ["MatMulScaleFusion"]
 BACKENDS = ("onnx", "torch")
@@ -33,7 +33,7 @@ class OnnxGraph:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
         options.inter_op_num_threads = 1
-        # Several sessions take turns: one that spins while it waits halves the speed of the others.
+        # Several sessions take turns. A session that spins while it waits halves the speed of the others.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         options.log_severity_level = 3
         try:
@@ -46,8 +46,8 @@ class OnnxGraph:
 
     def __call__(self, feed: Mapping[str, np.ndarray]) -> list[np.ndarray]:
         """Outputs in the order of the graph."""
-        found: list[np.ndarray] = self._session.run(None, dict(feed))
-        return found
+        outputs: list[np.ndarray] = self._session.run(None, dict(feed))
+        return outputs
 
 
 def shipped_weights(name: str) -> Path:
@@ -57,7 +57,7 @@ def shipped_weights(name: str) -> Path:
 
 
 def load_step(name: str, backend: str) -> Callable[[Mapping[str, np.ndarray]], list[np.ndarray]]:
-    """A step of the filter by the name of its graph; one of `BACKENDS`: "torch" is its twin."""
+    """A step of the filter by the name of its graph, with one of `BACKENDS`; "torch" is the same step in torch."""
     if backend == "torch":
         from sigmaslam.models.torch_runtime import filter_module
 

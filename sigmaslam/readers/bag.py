@@ -31,7 +31,7 @@ Topics = tuple[str | None, str | None]
 
 LOOKED_FOR = "a ROS bag *.bag, *.mcap or *.db3, or a folder with metadata.yaml"
 _SUFFIXES = (".bag", ".mcap", ".db3")
-# Words in a topic's name that tell the eye.
+# These words in a topic's name identify the eye.
 _EYES = tuple(re.compile(rf"(?<![a-z])({words})(?![a-z0-9])") for words in ("left|cam0|infra1", "right|cam1|infra2"))
 
 
@@ -96,7 +96,7 @@ class BagReader:
 
 @contextmanager
 def open_reader(path: Path) -> Iterator[BagReader]:
-    """Open a bag; whatever rosbags finds wrong with it becomes an InputError.
+    """Open a bag; every error of rosbags becomes an InputError.
 
     Raises:
         InputError: rosbags is not installed, or the bag cannot be read.
@@ -109,7 +109,7 @@ def open_reader(path: Path) -> Iterator[BagReader]:
             f"{path}: a ROS bag, and {error.name} is not installed: pip install 'sigmaslam[bag]'"
         ) from error
     try:
-        # The image messages are alike in all versions of ROS 2; the bag's other types are not looked at.
+        # All versions of ROS 2 have the same image messages; other types are not read.
         if path.suffix == ".bag":
             reader: Any = rosbag1.Reader(path)
             deserialize: Any = get_typestore(Stores.ROS1_NOETIC).deserialize_ros1
@@ -130,19 +130,19 @@ def open_reader(path: Path) -> Iterator[BagReader]:
 def _choose_topics(bag: BagReader, topics: Topics) -> tuple[str, str]:
     images = [topic for topic, (kind, _) in bag.topics.items() if kind in (IMAGE, COMPRESSED_IMAGE)]
     chosen: list[str] = []
-    for eye, name, own, other in zip(("left", "right"), topics, _EYES, _EYES[::-1], strict=True):
+    for eye, name, words, others in zip(("left", "right"), topics, _EYES, _EYES[::-1], strict=True):
         if name is not None:
-            found = [topic for topic in images if topic.strip("/") == name.strip("/")]
+            matching = [topic for topic in images if topic.strip("/") == name.strip("/")]
             problem = f"no image topic {name}"
         else:
-            found = [topic for topic in images if own.search(topic.lower()) and not other.search(topic.lower())]
-            problem = f"{len(found) or 'no'} image topics are {eye} by their name"
-        if len(found) != 1:
+            matching = [topic for topic in images if words.search(topic.lower()) and not others.search(topic.lower())]
+            problem = f"{len(matching) or 'no'} image topics are {eye} by their name"
+        if len(matching) != 1:
             raise InputError(
                 f"{bag.path}: {problem}; choose with --topic-left and --topic-right; image topics and their number "
                 f"of messages:{bag.list_topics(IMAGE, COMPRESSED_IMAGE)}"
             )
-        chosen += found
+        chosen += matching
     if chosen[0] == chosen[1]:
         raise InputError(f"{bag.path}: {chosen[0]} is given for both eyes")
     return chosen[0], chosen[1]
@@ -187,7 +187,7 @@ class BagPairs:
         self._topics = topics
         with open_reader(path) as bag, closing(bag.messages(topics)) as messages:
             self.length: int | None = min(bag.topics[topic][1] for topic in topics)
-            # Drivers that know no time leave the headers at zero.
+            # Drivers without a clock leave the stamps of the headers at zero.
             self._by_recording = all(stamp_ns(message) == 0 for _, _, message in islice(messages, 4))
         if self._by_recording:
             logger.warning("%s: images have no time stamps; the times of recording are used", path)
@@ -227,7 +227,7 @@ class BagPairs:
             yield self._topics.index(topic), Stamped(recorded if self._by_recording else stamp_ns(message), message)
 
     def _pair(self, index: int, left: Stamped[Any], right: Stamped[Any]) -> RawPair | SkippedFrame:
-        # Division of Python integers is rounded once; 19 digits are more than a float holds.
+        # A float does not hold 19 digits; dividing Python integers rounds only once.
         names = [
             f"{topic} at {_seconds(image.stamp):.6f} s"
             for topic, image in zip(self._topics, (left, right), strict=True)

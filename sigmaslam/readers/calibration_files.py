@@ -1,4 +1,4 @@
-"""Calibration files of any of the known forms: ours, and KITTI's two."""
+"""Calibration files in three forms: the project's YAML, and KITTI's two."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ GREY_PAIR = (0, 1)
 
 
 def read_calibration(path: Path, image_size: ImageSize, cameras: tuple[int, int] = GREY_PAIR) -> StereoCamera:
-    """Read our YAML form, or one of KITTI's text forms.
+    """Read the project's YAML form, or one of KITTI's text forms.
 
     Args:
         path: `*.yaml` / `*.yml` for `StereoCamera.from_yaml`, anything else for `read_kitti_calibration`.

@@ -17,16 +17,17 @@ from sigmaslam.readers.video import split_halves, to_grey
 
 logger = logging.getLogger(__name__)
 
-# Whether left and right are taken together is judged by the median of so many pairs.
-JUDGED_PAIRS = 30
+# The median over so many pairs tells whether left and right are synchronised.
+SYNCHRONY_PAIRS = 30
 _DEFAULT_RATE_HZ = 30.0
-# OpenCV asks V4L2 for so many buffers.
+# OpenCV requests so many buffers from V4L2.
 _BUFFERS = 4
-_OLDEST_S = 10.0
+# A driver's time stamp that is older does not come from the monotonic clock.
+_MAX_AGE_S = 10.0
 
 
 class Capture(Protocol):
-    """What is used of cv2.VideoCapture."""
+    """The methods of cv2.VideoCapture that the readers use."""
 
     def grab(self) -> bool:
         """Wait for the next image and take it."""
@@ -38,14 +39,14 @@ class Capture(Protocol):
         """A property."""
 
     def getBackendName(self) -> str:  # noqa: N802
-        """What drives the camera."""
+        """Name of the camera's driver."""
 
     def release(self) -> None:
         """Give the camera back."""
 
 
 class PlayedVideo:
-    """A video file as a camera: after the first image, `grab` waits until the next one is due."""
+    """A video file played as a camera: after the first image, `grab` waits until the next one is due."""
 
     def __init__(self, capture: Capture) -> None:
         self._capture = capture
@@ -78,7 +79,7 @@ def open_capture(device: str, size: tuple[int, int] | None = None) -> Capture:
     Raises:
         InputError: OpenCV cannot open it.
     """
-    # By number, as by name OpenCV tries other things first; /dev/v4l/by-id/* are links to /dev/video*.
+    # A number opens the camera directly; for a name OpenCV tries other backends first. /dev/v4l/by-id/* are links.
     number = re.fullmatch(r"(?:/dev/video)?(\d+)", device if device.isdecimal() else str(Path(device).resolve()))
     capture = cv2.VideoCapture(int(number[1])) if number else cv2.VideoCapture(device)
     if not capture.isOpened():
@@ -95,7 +96,7 @@ def open_capture(device: str, size: tuple[int, int] | None = None) -> Capture:
 
 
 def rate_hz(capture: Capture) -> float:
-    """Images a second as the camera or file says, else 30."""
+    """Images per second that the camera or file reports, else 30."""
     rate = capture.get(cv2.CAP_PROP_FPS)
     return rate if 1.0 <= rate <= 1000.0 else _DEFAULT_RATE_HZ
 
@@ -123,9 +124,9 @@ class StereoCapture:
         self._spreads: list[float] = []
 
     def take(self, index: int) -> RawPair | None:
-        """The next pair, or None where a camera fails; its timestamp is on the monotonic clock.
+        """The next pair, or None when a camera fails; its timestamp is on the monotonic clock.
 
-        That is the driver's time of the left image where it tells one (V4L2), else the time when it was there.
+        The timestamp is the driver's for the left image (V4L2), else the time at which the image arrived.
 
         Raises:
             InputError: an image with both eyes has an odd width.
@@ -141,7 +142,7 @@ class StereoCapture:
                 return None
             images.append(to_grey(image))
         if len(images) == 2:
-            self._judge(abs(times[1] - times[0]))
+            self._check_synchrony(abs(times[1] - times[0]))
             return RawPair(index, times[0], images[0], images[1], *self._names)
         name = self._names[0]
         left, right = split_halves(images[0], name)
@@ -153,7 +154,7 @@ class StereoCapture:
             capture.release()
 
     def _grab_both(self) -> list[float] | None:
-        """When the images of each eye were taken."""
+        """Time stamps of the images of each eye, or None when a camera fails."""
         times = []
         for eye in range(len(self._captures)):
             moment = self._grab(eye)
@@ -161,7 +162,7 @@ class StereoCapture:
                 return None
             times.append(moment)
         for _ in range(_BUFFERS):
-            # A driver's buffer may hold images that are older than the other eye's by a frame or more.
+            # The image in a driver's buffer may be older than the other eye's by a frame or more.
             if not self._driver_clock or max(times) - min(times) < self.period / 2:
                 break
             older = times.index(min(times))
@@ -179,21 +180,22 @@ class StereoCapture:
         now = time.monotonic()
         if self._driver_clock:
             moment = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
-            if now - _OLDEST_S < moment <= now:
+            if now - _MAX_AGE_S < moment <= now:
                 return moment
-            self._driver_clock = False  # this driver has another clock, or none
+            # The driver has another clock, or none.
+            self._driver_clock = False
         return now
 
-    def _judge(self, spread: float) -> None:
-        if self.played or len(self._spreads) == JUDGED_PAIRS:
+    def _check_synchrony(self, spread: float) -> None:
+        if self.played or len(self._spreads) == SYNCHRONY_PAIRS:
             return
         self._spreads.append(spread)
         median = float(np.median(self._spreads))
-        if len(self._spreads) == JUDGED_PAIRS and 1e9 * median > STAMP_TOLERANCE_NS:
+        if len(self._spreads) == SYNCHRONY_PAIRS and 1e9 * median > STAMP_TOLERANCE_NS:
             logger.warning(
                 "%s: left and right are taken %.0f ms apart (median of %d pairs): move slowly, or use cameras with a "
                 "common trigger",
                 " and ".join(self._names),
                 1e3 * median,
-                JUDGED_PAIRS,
+                SYNCHRONY_PAIRS,
             )

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from sigmaslam.errors import CalibrationError, InputError
-from sigmaslam.geometry.camera import CalibrationYaml, CameraModel, DistortionModel, StereoCamera
+from sigmaslam.geometry.camera import CameraModel, DistortionModel, StereoCamera
+from sigmaslam.geometry.checked_yaml import CalibrationYaml
 from sigmaslam.readers.calibration_files import read_calibration
 from sigmaslam.readers.images import ImagePairs
 from sigmaslam.readers.kitti import common_size

@@ -15,7 +15,7 @@ logger = logging.getLogger(__name__)
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"})
 
-# So many pairs in a row may fail before the sequence is given up.
+# Reading stops after more failed pairs in a row.
 MAX_FAILURES = 20
 
 
@@ -76,7 +76,7 @@ def decode_image(content: bytes, name: str) -> np.ndarray:
     """
     if not content:
         raise FrameError(f"{name}: file is empty (0 bytes)")
-    # OpenCV 4 fills the rest of a truncated JPEG with grey; its end marker must come after its last scan.
+    # OpenCV 4 fills the missing part of a truncated JPEG with grey. A whole one ends with a marker after its last scan.
     if content[:2] == b"\xff\xd8" and content.rfind(b"\xff\xd9") < content.rfind(b"\xff\xda"):
         raise FrameError(f"{name}: JPEG is truncated")
     try:

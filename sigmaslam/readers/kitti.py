@@ -8,7 +8,7 @@ from sigmaslam.readers.images import ImagePairs, RawPair
 from sigmaslam.readers.pairing import default_times, frame_numbers, pair_by_name, read_times
 from sigmaslam.readers.stereo_sequence import StereoSequence
 
-# Left folder, right folder and KITTI's numbers of their cameras; grey before colour.
+# Each row has the left folder, the right folder and KITTI's numbers of their cameras. Grey goes before colour.
 LAYOUTS = (
     ("image_0", "image_1", (0, 1)),
     ("image_00/data", "image_01/data", (0, 1)),
@@ -74,7 +74,7 @@ def _timestamps(folder: Path, left_folder: Path, files: list[tuple[Path, Path]])
 
 
 def _find_calibration(folder: Path) -> Path:
-    # KITTI raw keeps one calibration per day, beside the drives.
+    # KITTI raw has one calibration per day, beside the drives.
     candidates = (
         folder / "calib.txt",
         folder / "calib_cam_to_cam.txt",

@@ -1,4 +1,4 @@
-"""Live cameras as a sequence: the latest pair wins, those nobody was ready for are dropped."""
+"""Live cameras as a sequence: the consumer gets the latest pair, pairs that it misses are dropped."""
 
 import logging
 import threading
@@ -19,9 +19,9 @@ from sigmaslam.readers.stereo_sequence import StereoFrame, StereoSequence
 logger = logging.getLogger(__name__)
 
 SIDE_BY_SIDE = "side-by-side:"
-# What waited in the drivers' buffers while the tracker was made is old; for so long images are thrown away.
+# Images in the drivers' buffers are old when the tracker is ready: images of the first half second are dropped.
 SETTLE_S = 0.5
-# Without a pair for so long the run ends.
+# The run ends after so long without a pair.
 STALL_S = 10.0
 _RETRY_S = 0.01
 _JOIN_S = 2.0
@@ -69,27 +69,27 @@ class LiveSequence(StereoSequence):
 
     @property
     def dropped(self) -> int:
-        """Pairs that came while nobody was ready for them."""
+        """Number of pairs that the consumer missed."""
         return self._live.dropped
 
     def _items(self) -> Generator[StereoFrame | SkippedFrame, None, None]:
-        # Not read ahead: what waits in a queue gets old.
+        # Live pairs are not read ahead: they would age in the queue.
         return self._convert()
 
 
 class LivePairs:
-    """The latest pair, each time it is asked for, as a source of pairs; timestamps begin at 0 with the first.
+    """A source of pairs that yields the latest pair; timestamps begin at 0 with the first.
 
-    A thread takes pairs all the time, so that no driver holds old ones.
+    A thread takes pairs continuously, so that the drivers' buffers hold no old ones.
 
     Args:
-        capture: the cameras; they are given back when the iteration ends.
+        capture: the cameras; they are released when the iteration ends.
         name: for messages.
         seconds: ends the iteration after so long.
 
     Attributes:
-        timestamps, length: None; nobody knows.
-        dropped: pairs of the iteration that came while nobody was ready for them.
+        timestamps, length: None, as the future is unknown.
+        dropped: number of pairs that the consumer missed.
     """
 
     def __init__(self, capture: StereoCapture, name: str, seconds: float | None = None) -> None:
@@ -101,7 +101,7 @@ class LivePairs:
         self._seconds = seconds
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
-        # Guards what follows: where the thread puts a pair and the iteration takes it.
+        # The condition guards the three fields below, through which the thread passes pairs to the iteration.
         self._changed = threading.Condition()
         self._latest: RawPair | None = None
         self._ended = False
@@ -159,7 +159,7 @@ class LivePairs:
         raise InputError(f"{what} no more images: unplugged? The run ends here")
 
     def _take_all(self) -> None:
-        """What the thread does."""
+        """Takes pairs in the thread until the iteration stops or the cameras fail."""
         settled = time.monotonic() + (0.0 if self._capture.played else SETTLE_S)
         patience = 0 if self._capture.played else MAX_FAILURES
         index, failures = 0, 0

@@ -1,4 +1,4 @@
-"""The one door to all readers."""
+"""Opens a stereo sequence of any format."""
 
 import os
 from collections.abc import Callable
@@ -23,12 +23,12 @@ def open_sequence(
     calibration: str | os.PathLike[str] | None = None,
     topics: bag.Topics = (None, None),
 ) -> StereoSequence:
-    """Open a stereo sequence and check all of it that can be checked before reading.
+    """Open a stereo sequence; everything that needs no reading of images is checked at once.
 
     Args:
         path: a folder (KITTI, EuRoC, plain, or with two videos), a side-by-side video or a ROS bag.
         format: one of `FORMATS`; 'auto' tries them in that order.
-        calibration: replaces the calibration that the format keeps: our YAML form (`StereoCamera.from_yaml`)
+        calibration: replaces the calibration of the format: YAML (`StereoCamera.from_yaml`)
             or KITTI's calib.txt or calib_cam_to_cam.txt.
         topics: left and right image topic of a bag; None finds the only one whose name tells the eye.
 
@@ -43,14 +43,14 @@ def open_sequence(
         raise InputError(f"{path}: no such file or folder")
     if format == "auto":
         format = _detect(path)
-    own_calibration = None if calibration is None else Path(calibration)
+    calibration_path = None if calibration is None else Path(calibration)
     if format == "bag":
-        return bag.open_bag(path, own_calibration, topics)
+        return bag.open_bag(path, calibration_path, topics)
     if topics != (None, None):
         raise InputError(f"{path}: topics are given, and the format is {format!r}; only bags have topics")
     if format != "video" and not path.is_dir():
         raise InputError(f"{path}: a file; format {format!r} needs a folder")
-    return _OPENERS[format](path, own_calibration)
+    return _OPENERS[format](path, calibration_path)
 
 
 def _detect(path: Path) -> str:

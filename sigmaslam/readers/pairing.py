@@ -1,4 +1,4 @@
-"""Which left image belongs to which right image, and when it was taken."""
+"""Pairs of left and right images, and their time stamps."""
 
 import logging
 import re
@@ -18,10 +18,10 @@ logger = logging.getLogger(__name__)
 
 DEFAULT_RATE_HZ = 10.0
 STAMP_TOLERANCE_NS = 5_000_000
-# Nanoseconds since 1970 have 19 digits; 16 leave room for clocks that start elsewhere.
+# Nanoseconds since 1970 have 19 digits; 16 also admit clocks with another origin.
 STAMP_DIGITS = 16
 
-# So many images of one eye wait for the other eye's before they count as alone.
+# At most so many images of one eye wait for a partner.
 MAX_WAITING = 50
 
 Key = tuple[int, ...] | str
@@ -120,13 +120,13 @@ def pair_by_stamp(
     if unpaired:
         logger.warning("%s: %d images without a partner within 5 ms are left out", source, unpaired)
     pairs = [(left[int(left_stamps[i])], right[int(right_stamps[to_right[i]])]) for i in chosen]
-    # Division of Python integers is rounded once; 19 digits are more than a float holds.
+    # A float does not hold 19 digits; dividing Python integers rounds only once.
     return pairs, [int(left_stamps[i]) / 1_000_000_000 for i in chosen]
 
 
 @dataclass(frozen=True, slots=True)
 class Stamped(Generic[T]):
-    """Something with the time at which it was taken, nanoseconds."""
+    """An item with its time stamp, nanoseconds."""
 
     stamp: int
     item: T
@@ -157,19 +157,19 @@ def pair_streams(images: Iterable[tuple[int, Stamped[T]]]) -> Iterator[tuple[Sta
 def _settle(
     waiting: tuple[deque[Stamped[T]], deque[Stamped[T]]], ended: bool
 ) -> Iterator[tuple[Stamped[T] | None, Stamped[T] | None]]:
-    """Decides about the heads of both queues while what follows them is known, or will not come."""
+    """Pairs or discards the heads of both queues as long as their successors are there, or the streams have ended."""
     left, right = waiting
     while left or right:
         if not ended and max(len(left), len(right)) <= MAX_WAITING and min(len(left), len(right)) < 2:
             return
         if left and right:
-            apart = abs(left[0].stamp - right[0].stamp)
-            left_alone = len(left) > 1 and abs(left[1].stamp - right[0].stamp) < apart
-            right_alone = len(right) > 1 and abs(left[0].stamp - right[1].stamp) < apart
-            if apart <= STAMP_TOLERANCE_NS and not left_alone and not right_alone:
+            difference = abs(left[0].stamp - right[0].stamp)
+            left_alone = len(left) > 1 and abs(left[1].stamp - right[0].stamp) < difference
+            right_alone = len(right) > 1 and abs(left[0].stamp - right[1].stamp) < difference
+            if difference <= STAMP_TOLERANCE_NS and not left_alone and not right_alone:
                 yield left.popleft(), right.popleft()
                 continue
-            left_alone = left_alone if apart <= STAMP_TOLERANCE_NS else left[0].stamp < right[0].stamp
+            left_alone = left_alone if difference <= STAMP_TOLERANCE_NS else left[0].stamp < right[0].stamp
         else:
             left_alone = bool(left)
         yield (left.popleft(), None) if left_alone else (None, right.popleft())
@@ -219,7 +219,7 @@ def _seconds(text: str) -> float:
     date, _, clock = text.partition(" ")
     if not clock:
         return float(text)
-    # Nine decimals, which datetime does not read.
+    # datetime cannot read nine decimals.
     whole, _, decimals = clock.partition(".")
     return datetime.fromisoformat(f"{date} {whole}+00:00").timestamp() + float(f"0.{decimals or 0}")
 

@@ -19,7 +19,7 @@ IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 
-# Bytes a value, channels, and what makes it grey or BGR.
+# Each encoding has its bytes per value, its channels, and the conversion to grey or BGR.
 _ENCODINGS: dict[str, tuple[int, int, int | None]] = {
     "mono8": (1, 1, None),
     "8UC1": (1, 1, None),
@@ -119,12 +119,12 @@ def stereo_from_infos(
             for info, P, name in zip((left, right), (P_left, P_right), info_topics, strict=True)
         ]
     else:
-        turns = np.broadcast_to(np.eye(4), (2, 4, 4)).copy()
+        rotations = np.broadcast_to(np.eye(4), (2, 4, 4)).copy()
         models = []
-        for turn, info, name in zip(turns, (left, right), info_topics, strict=True):
-            turn[:3, :3] = _matrix(info, "r", (3, 3), name)
+        for rotation, info, name in zip(rotations, (left, right), info_topics, strict=True):
+            rotation[:3, :3] = _matrix(info, "r", (3, 3), name)
             models.append(_model(info, _matrix(info, "k", (3, 3), name), name, True))
-        T_left_right = turns[0].T @ T_left_right @ turns[1]
+        T_left_right = rotations[0].T @ T_left_right @ rotations[1]
     try:
         return StereoCamera(models[0], models[1], T_left_right)
     except CalibrationError as error:
@@ -162,7 +162,7 @@ def _lens(info: Any, name: str) -> tuple[DistortionModel, tuple[float, ...]]:
         model = "none"
     if model == "none":
         return "none", ()
-    # OpenCV's thin prism and tilt, which are nearly always zero, come after the eight of the rational model.
+    # The eight coefficients of the rational model precede thin prism and tilt, which are nearly always zero.
     while len(distortion) > 8 and distortion[-1] == 0.0:
         distortion.pop()
     return model, tuple(distortion)

@@ -39,7 +39,7 @@ class StereoFrame:
 
 
 class PairSource(Protocol):
-    """What a reader gives: pairs in order, those that cannot be read as SkippedFrame."""
+    """Pairs of a reader in order; pairs that cannot be read are SkippedFrame."""
 
     timestamps: list[float] | None
     length: int | None
@@ -58,8 +58,8 @@ class StereoSequence:
         camera: calibration of the images as stored.
         source: the file or folder, or the name of a camera.
         format: 'kitti', 'euroc', 'folder', 'video', 'bag' or 'camera'.
-        timestamps: seconds, one per pair, or None where they are only known on reading (videos).
-        length: number of pairs, or None where the file does not say.
+        timestamps: seconds, one per pair, or None if only reading gives them (videos).
+        length: number of pairs, or None if the file does not give it.
         skipped: the pairs that the latest run of `frames` could not use.
 
     Raises:
@@ -86,7 +86,7 @@ class StereoSequence:
                 raise CalibrationError(
                     f"{name}: {eye} {mismatch}; give the calibration made at the size of these images"
                 )
-            # Fixes the scale of 16-bit images before the first run, so that every run gives the same pixels.
+            # The first image sets the scale of 16-bit images, so that every run gives the same pixels.
             try:
                 self._grey.convert(image, name)
             except FrameError as error:
@@ -94,7 +94,7 @@ class StereoSequence:
 
     @property
     def dropped(self) -> int:
-        """Pairs of a live camera that came while nobody was ready for them; 0 for recordings."""
+        """Number of pairs of a live camera that the consumer missed; 0 for recordings."""
         return 0
 
     def frames(self) -> Generator[StereoFrame, None, None]:

@@ -19,7 +19,7 @@ from sigmaslam.readers.stereo_sequence import StereoSequence
 
 logger = logging.getLogger(__name__)
 
-# What sits beside videos and is none: images, calibrations, notes.
+# Files beside videos with these suffixes are no videos: images, calibrations, notes.
 _NOT_VIDEO = IMAGE_SUFFIXES | {
     "",
     ".yaml",
@@ -39,14 +39,14 @@ _CLOCK_PROBE = 3
 
 def find_videos(folder: Path) -> tuple[Path, Path] | None:
     """The files left.* and right.* of a folder, if both are there."""
-    found = []
+    chosen = []
     for eye in ("left", "right"):
         files = sorted(folder.glob(f"{eye}.*"))
         videos = [path for path in files if path.is_file() and path.suffix.lower() not in _NOT_VIDEO]
         if not videos:
             return None
-        found.append(videos[0])
-    return found[0], found[1]
+        chosen.append(videos[0])
+    return chosen[0], chosen[1]
 
 
 def beside_calibration(folder: Path, calibration: Path | None, image_size: ImageSize) -> StereoCamera:
@@ -182,7 +182,7 @@ def split_halves(image: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def to_grey(image: np.ndarray) -> np.ndarray:
-    """Grey of what OpenCV captures: it gives BGR for grey videos too, so a warning about colour would say nothing."""
+    """Grey image of a captured one; OpenCV gives BGR for grey videos, too, so there is no warning about colour."""
     return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
 
 

@@ -23,7 +23,7 @@ def view_axes(positions: np.ndarray) -> tuple[int, int, int]:
     For a camera that drives with z forward and y down these are x, z and y.
     """
     extent = np.ptp(positions, axis=0) if len(positions) else np.zeros(3)
-    # Of equal extents the height is y, the axis that points down in a level camera.
+    # For equal extents the height is y, the axis that points down in a level camera.
     height = min((1, 2, 0), key=lambda axis: float(extent[axis]))
     horizontal, vertical = (axis for axis in range(3) if axis != height)
     return horizontal, vertical, height
@@ -33,15 +33,15 @@ def plot_trajectory(
     axes: Axes,
     trajectories: Mapping[str, Trajectory],
     points: np.ndarray | None = None,
-    most_points: int = 3000,
+    max_points: int = 3000,
 ) -> tuple[int, int, int]:
     """Draw trajectories from above, with equal scales and a mark where each begins.
 
     Args:
         axes: where to draw.
-        trajectories: by label; the first tells the plane of the view.
+        trajectories: by label; the first determines the plane of the view.
         points: (M, 3) map points, metres; an even selection of them is drawn, rasterised.
-        most_points: how many at most.
+        max_points: upper limit of the drawn map points.
     Returns:
         The axes of the view (see `view_axes`).
     """
@@ -52,12 +52,12 @@ def plot_trajectory(
     if points is not None and len(points):
         points = points[np.isfinite(points).all(axis=1)][:, plane]
     if points is not None and len(points):
-        # Far points are the least certain ones: they may not decide the scale of the view.
-        reach = max(0.5 * float(np.max(high - low)), 5.0)
-        low = np.minimum(low, np.maximum(np.percentile(points, 2, axis=0), low - reach))
-        high = np.maximum(high, np.minimum(np.percentile(points, 98, axis=0), high + reach))
+        # Far points are the least certain ones, so the margin limits their effect on the scale of the view.
+        margin = max(0.5 * float(np.max(high - low)), 5.0)
+        low = np.minimum(low, np.maximum(np.percentile(points, 2, axis=0), low - margin))
+        high = np.maximum(high, np.minimum(np.percentile(points, 98, axis=0), high + margin))
         points = points[((points >= low) & (points <= high)).all(axis=1)]
-        shown = points[:: max(1, -(-len(points) // most_points))]
+        shown = points[:: max(1, -(-len(points) // max_points))]
         axes.plot(*shown.T, color=GREY, marker=".", ms=1.6, mew=0, ls="", rasterized=True, label="map points", zorder=1)
     for number, (label, trajectory) in enumerate(trajectories.items()):
         colour = SERIES[number % len(SERIES)]
@@ -84,7 +84,7 @@ def to_svg(figure: Figure, name: str, dots_per_inch: int = 100) -> str:
 
     Args:
         figure: what to draw; rasterised artists become a PNG inside.
-        name: differs from figure to figure of one page, so that their identifiers do.
+        name: unique among the figures of one page, as it makes their identifiers unique.
         dots_per_inch: of rasterised artists.
     """
     target = io.StringIO()
@@ -94,8 +94,8 @@ def to_svg(figure: Figure, name: str, dots_per_inch: int = 100) -> str:
         )
     text = target.getvalue()
     text = text[text.index("<svg") :]
-    # A hundredth of a point is more than a screen shows; matplotlib writes six digits.
+    # Matplotlib writes six digits; a screen does not resolve a hundredth of a point.
     text = re.sub(r' (?:d|x|y)="[^"]*"', lambda attribute: re.sub(r"(\.\d\d)\d+", r"\1", attribute[0]), text)
-    # Matplotlib numbers every group alike in each figure; only what is referred to needs a name.
+    # Matplotlib repeats the names of groups in each figure. Only groups with references need one.
     used = set(re.findall(r'(?:href="#|url\(#)([^")]+)', text))
     return re.sub(r' id="([^"]*)"', lambda match: match[0] if match[1] in used else "", text)

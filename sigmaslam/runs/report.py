@@ -17,8 +17,9 @@ from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text
-from sigmaslam.geometry.trajectory import Trajectory, read_tum
+from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.plot_style import BLUE, GREEN, GREY, PURPLE, SERIES, VERMILLION, style_axes
+from sigmaslam.readers.trajectory_files import read_tum
 from sigmaslam.runs.figures import plot_trajectory, to_svg
 
 COLUMNS = (
@@ -35,12 +36,12 @@ COLUMNS = (
 STATUSES = ("starting", "tracking", "lost", "relocalised", "skipped")
 STATUS_COLOURS = {"lost": VERMILLION, "relocalised": PURPLE, "skipped": GREY}
 
-MOST_VERTICES = 1000
-"""Frames above which lines become pictures inside the SVG, to keep the report small."""
-MOST_COLUMNS = 250
-"""Steps across filled areas; of more frames the means, or every so many, are drawn."""
-MOST_CONFIGURATION = 20_000
-"""Characters of run.json that are shown."""
+MAX_VERTICES = 1000
+"""With more frames, lines become pictures inside the SVG, which keeps the report small."""
+MAX_COLUMNS = 250
+"""Filled areas have at most so many steps; with more frames they show means, or a subset."""
+MAX_CONFIGURATION = 20_000
+"""The report shows at most so many characters of run.json."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +51,7 @@ class FrameTable:
     Attributes:
         status: one of `STATUSES` for each of N frames.
         columns: by name of `COLUMNS`, (N,) float64; NaN where the field is empty.
-        milliseconds: by stage ("read", "features", ...), (N,) float64; NaN where empty.
+        milliseconds: by stage ("read", "features", ...), (N,) float64; NaN where the field is empty.
     """
 
     status: list[str]
@@ -106,7 +107,7 @@ def read_frames(path: Path) -> FrameTable:
 def write_report(run_dir: str | Path) -> Path:
     """Write `report.html` from the files of a run folder.
 
-    Reads trajectory.tum and frames.csv, and map.npz and run.json where they are.
+    Reads trajectory.tum and frames.csv, and map.npz and run.json if they exist.
 
     Returns:
         The path of the report.
@@ -119,8 +120,8 @@ def write_report(run_dir: str | Path) -> Path:
     points = _read_points(run_dir / "map.npz")
     run = _read_run(run_dir / "run.json")
     configuration = json.dumps(run, indent=2, ensure_ascii=False)
-    if len(configuration) > MOST_CONFIGURATION:
-        configuration = configuration[:MOST_CONFIGURATION] + "\n… (run.json has more)"
+    if len(configuration) > MAX_CONFIGURATION:
+        configuration = configuration[:MAX_CONFIGURATION] + "\n… (run.json has more)"
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("sigmaslam.runs", "templates"), autoescape=True, undefined=jinja2.StrictUndefined
     )
@@ -156,7 +157,7 @@ def _column(path: Path, rows: list[dict[str, str]], name: str) -> np.ndarray:
 
 
 def _read_points(path: Path) -> np.ndarray | None:
-    """Map points (M, 3), or None where the run has no map."""
+    """Map points (M, 3), or None if the run has no map."""
     if not path.is_file():
         return None
     try:
@@ -182,7 +183,7 @@ def _read_run(path: Path) -> dict[str, Any]:
 def _facts(trajectory: Trajectory, frames: FrameTable, points: np.ndarray | None) -> list[tuple[str, str]]:
     """Label and value of the summary."""
     total = frames.total_milliseconds
-    # The first frame pays for loading; the median frame is what a user waits for.
+    # The median is robust against the first frame, which includes the time of loading.
     speed = _median(total)
     ratio = _median(_nis_per_dof(frames))
     facts = [
@@ -214,7 +215,7 @@ def _nis_per_dof(frames: FrameTable) -> np.ndarray:
 
 
 def _figures(trajectory: Trajectory, frames: FrameTable, points: np.ndarray | None) -> list[tuple[str, str, Markup]]:
-    """Title, caption and SVG of each figure; what is in no frame has none."""
+    """Title, caption and SVG of each figure that has data."""
     figures = []
     if len(trajectory):
         figure = Figure(figsize=(8, 5.5), layout="constrained")
@@ -254,7 +255,7 @@ def _figures(trajectory: Trajectory, frames: FrameTable, points: np.ndarray | No
 
 
 def _line(axes: Axes, frames: FrameTable, values: np.ndarray, label: str, colour: str, **style: Any) -> None:
-    rasterised = len(frames) > MOST_VERTICES
+    rasterised = len(frames) > MAX_VERTICES
     axes.plot(frames.seconds, values, color=colour, label=label, rasterized=rasterised, **{"lw": 1.2, **style})
 
 
@@ -272,8 +273,8 @@ def _draw_nis(axes: Axes, frames: FrameTable) -> bool:
     ratio = np.where(ratio > 0, ratio, np.nan)
     if not np.isfinite(ratio).any():
         return False
-    # Wilson and Hilferty: (chi2 / dof)^(1/3) is nearly normal.
-    every = -(-len(frames) // MOST_COLUMNS)
+    # (chi2 / dof)^(1/3) is nearly normal (Wilson and Hilferty).
+    every = -(-len(frames) // MAX_COLUMNS)
     dof = frames.columns["dof"][::every]
     dof = np.where(dof > 0, dof, np.nan)
     spread = np.sqrt(2 / (9 * dof))
@@ -300,7 +301,7 @@ def _draw_offset(axes: Axes, frames: FrameTable) -> bool:
         alpha=0.25,
         lw=0,
         label="2 sigma",
-        rasterized=len(frames) > MOST_VERTICES,
+        rasterized=len(frames) > MAX_VERTICES,
     )
     _line(axes, frames, offset, "offset", BLUE)
     axes.axhline(0.0, color=GREY, lw=1)
@@ -322,7 +323,7 @@ def _draw_milliseconds(axes: Axes, frames: FrameTable) -> bool:
         return False
     seconds = frames.seconds[measured]
     stages = np.nan_to_num(np.array([values[measured] for values in frames.milliseconds.values()]))
-    every = -(-len(seconds) // MOST_COLUMNS)
+    every = -(-len(seconds) // MAX_COLUMNS)
     starts = np.arange(0, len(seconds), every)
     means = np.add.reduceat(stages, starts, axis=1) / np.diff(np.append(starts, len(seconds)))
     colours = [SERIES[number % len(SERIES)] for number in range(len(means))]
@@ -334,7 +335,7 @@ def _draw_milliseconds(axes: Axes, frames: FrameTable) -> bool:
 
 
 def _mark_statuses(axes: Axes, frames: FrameTable) -> None:
-    """Shade the frames that were not tracked."""
+    """Shades the frames that were not tracked."""
     seconds = frames.seconds
     half = 0.5 * float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.5
     first = 0

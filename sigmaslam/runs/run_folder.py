@@ -1,4 +1,4 @@
-"""What a run leaves on disk: rows as soon as they are known, the rest when the run ends, however it ends."""
+"""Files of a run: rows of frames are written at once, the other files when the run ends, however it ends."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ import numpy as np
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder
 from sigmaslam.geometry.camera import StereoCamera
-from sigmaslam.geometry.trajectory import Trajectory, write_kitti, write_tum
+from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.inference.onnx_graph import shipped_weights
+from sigmaslam.readers.trajectory_files import write_kitti, write_tum
 from sigmaslam.runs.report import COLUMNS, write_report
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.slam.mapping import KeyframeTracks
@@ -36,7 +37,7 @@ class RunWriter:
 
     Args:
         out: folder to make; it must not exist, or be empty.
-        rectified: what `StereoTracker.describe_rectified` says, to write tracks.npz as well.
+        rectified: result of `StereoTracker.describe_rectified`, to write tracks.npz as well.
     Raises:
         InputError: the folder holds something, or cannot be made.
     """
@@ -51,10 +52,10 @@ class RunWriter:
         self._out = out
         self._rows = csv.writer(self._table)
         self._rows.writerow(_COLUMNS)
-        # Time stamp, pose and covariance of each frame, on disk: memory does not grow with a run.
+        # Time stamp, pose and covariance of each frame go to disk, so that memory does not grow with the run.
         self._poses = tempfile.TemporaryFile()  # noqa: SIM115
         self._statuses: Counter[str] = Counter()
-        self._inliers = array("i")  # of the frames that have any
+        self._inliers = array("i")  # positive counts alone
         self._calibration: CalibrationEstimate | None = None
         self._skipped = 0
         self._rectified = rectified
@@ -104,8 +105,8 @@ class RunWriter:
 
         Args:
             point_map: the landmarks.
-            keyframes: arrays by name by which a later run finds its place in the map.
-            run: what run.json says beside versions, weights and the summary.
+            keyframes: arrays by name, with which a later run relocalises in the map.
+            run: entries of run.json beside versions, weights and the summary.
         Returns:
             The summary.
         """
@@ -160,7 +161,7 @@ class RunWriter:
 
 
 def calibration_verdict(calibration: CalibrationEstimate) -> str:
-    """What the estimated disparity offset means, in words."""
+    """The estimated disparity offset in words."""
     offset, sigma = calibration.disparity_offset, calibration.disparity_offset_sigma
     figure = f"{offset:+.2f} ± {sigma:.2f} px"
     if sigma > 0.2:

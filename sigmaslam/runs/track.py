@@ -12,9 +12,9 @@ from typing import Any
 from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.fusion.location_filter import LocationFilter
 from sigmaslam.fusion.readings import Locations
-from sigmaslam.geometry.trajectory import write_tum
 from sigmaslam.progress import open_progress
 from sigmaslam.readers import StereoFrame, StereoSequence
+from sigmaslam.readers.trajectory_files import write_tum
 from sigmaslam.runs.run_folder import RunWriter, describe_camera
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.estimate import Estimate
@@ -42,14 +42,14 @@ def track_sequence(
         sequence: opened by `sigmaslam.readers.open_sequence` or `open_cameras`.
         out: run folder, new or empty.
         frontend, backend, config: of `StereoTracker`.
-        map_path: map.npz of an earlier run, whose world the poses are given in.
-        tracks: write tracks.npz, too: what keyframes saw, for `sigmaslam refine`.
+        map_path: map.npz of an earlier run; poses are in its world.
+        tracks: write tracks.npz, too, the observations of keyframes for `sigmaslam refine`.
         track_object: box or mask, see `read_region`: the camera is at rest and follows one body. Poses are then
             T_camera_object, their covariances in the body's frame, and the map that of the body in its own frame.
-        locations: of a sensor on what moves, camera or body, to fuse; writes trajectory_location.tum, too: the poses
-            in the sensor's world.
+        locations: readings to fuse of a sensor on the moving camera or body; writes trajectory_location.tum, too, the
+            poses in the sensor's world.
     Returns:
-        The summary that run.json holds; with `locations` what became of them, too, under `location`.
+        The summary in run.json; with `locations` also the counts of the readings, under `location`.
     Raises:
         InputError: the folder is not empty, an argument is wrong, or the sequence breaks off; what was computed is on
             disk then.
@@ -67,7 +67,7 @@ def track_sequence(
     writer = RunWriter(out, rectified)
     ended = "complete"
     try:
-        # However this ends, cameras are given back before the results are written.
+        # Cameras are released before the results are written, even after an error.
         with closing(sequence.frames()) as frames:
             _track(sequence, frames, tracker, writer, location)
     except KeyboardInterrupt:
@@ -112,14 +112,14 @@ def _build_tracker(
 
 
 def _describe_object(tracker: Tracker, track_object: str | None) -> dict[str, Any]:
-    """What run.json says of a followed body: its region, and where its frame is in the first left camera's."""
+    """Entries of run.json for a followed body: its region, and the origin of its frame in the first left camera's."""
     if not isinstance(tracker, ObjectTracker):
         return {}
     return {"object": {"region": track_object, "origin": tracker.origin.tolist()}}
 
 
 def _describe_location(location: LocationFilter | None) -> dict[str, Any]:
-    """What run.json says of a location sensor: what became of its readings, and how its world lies to ours."""
+    """Entries of run.json for a location sensor: counts of the readings, and the pose of its world."""
     if location is None:
         return {}
     T, covariance = location.T_sensor_world, location.T_sensor_world_covariance
@@ -141,22 +141,22 @@ def _track(
 ) -> None:
     with open_progress() as progress:
         task = progress.add_task("frames", total=sequence.length, note="")
-        noted, done = 0, 0
+        reported, done = 0, 0
         began = since = time.perf_counter()
         for frame in frames:
             read_ms = 1e3 * (time.perf_counter() - since)
-            # Frames that could not be read come to light with the next one that could.
-            for skipped in sequence.skipped[noted:]:
+            # The sequence reports skipped frames together with the next readable one.
+            for skipped in sequence.skipped[reported:]:
                 writer.add_skipped(skipped.timestamp)
-            noted = len(sequence.skipped)
+            reported = len(sequence.skipped)
             estimate = tracker.step(frame.left, frame.right, frame.timestamp)
             if location is not None:
                 estimate = estimate.map_camera(location.fuse)
             writer.add(estimate.camera, estimate.pose, estimate.pose_covariance, read_ms)
             done += 1
             since = time.perf_counter()
-            progress.update(task, completed=done + noted, note=_note(estimate.camera, done / (since - began)))
-        for skipped in sequence.skipped[noted:]:
+            progress.update(task, completed=done + reported, note=_note(estimate.camera, done / (since - began)))
+        for skipped in sequence.skipped[reported:]:
             writer.add_skipped(skipped.timestamp)
         progress.update(task, completed=done + len(sequence.skipped))
 

@@ -15,7 +15,7 @@ from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
 from sigmaslam.frontend import Frontend, KeypointSearch, StereoView, TemporalMatches
 from sigmaslam.geometry.camera import RectifiedStereo
-from sigmaslam.geometry.se3 import se3_inverse
+from sigmaslam.geometry.se3 import se3_inverse, transform_points
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.object_region import BodyShape, inner_half, pixels_in
 from sigmaslam.slam.unguided_matching import UnguidedMatcher
@@ -81,7 +81,7 @@ class BodyAdmission:
         points = camera.triangulate(self._first.measured(np.isfinite(self._first.disparity)))
         depth, size = float(np.median(points[:, 2])), float(np.linalg.norm(np.std(points, axis=0)))
         aside = _UNSEEN * depth / camera.fx
-        far = _UNSEEN * depth**2 / (camera.fx * camera.baseline)
+        far = _UNSEEN * depth**2 / camera.focal_baseline
         return np.asarray(np.diag([aside, aside, far, aside / size, aside / size, aside / size]) ** 2)
 
     def admit(self, view: StereoView, pose: np.ndarray, window: KeyframeWindow) -> np.ndarray:
@@ -208,6 +208,6 @@ class BodyAdmission:
 
     def _carried(self, uvd: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(u, v, disparity) (K, 3) of points moved by T (4, 4), and which are in front of the camera, (K,) bool."""
-        points = self._camera.triangulate(uvd) @ T[:3, :3].T + T[:3, 3]
+        points = transform_points(T, self._camera.triangulate(uvd))
         in_front = points[:, 2] > 1e-6
         return self._camera.project(np.where(in_front[:, None], points, [0.0, 0.0, 1.0])), in_front

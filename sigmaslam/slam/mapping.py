@@ -11,7 +11,7 @@ from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
 from sigmaslam.frontend import StereoView
-from sigmaslam.frontend.feature_spacing import select_apart
+from sigmaslam.frontend.feature_spacing import select_spaced
 from sigmaslam.frontend.patch_disparity_range import patch_disparity_range
 from sigmaslam.frontend.plane_alignment import disparity_slopes
 from sigmaslam.geometry.camera import RectifiedStereo
@@ -127,7 +127,7 @@ class Mapper:
         since = timestamp - keyframes.active[-1].timestamp if keyframes.active else 0.0
         walk = np.array([self.config.offset_walk**2 * since, 0.0, 0.0])
         median = max(float(np.nanmedian(view.disparity)), _MIN_DISPARITY)
-        depth = self.camera.fx * self.camera.baseline / median
+        depth = self.camera.focal_baseline / median
         window.add_keyframe(pose, step, step_covariance, walk, depth, origin)
         view = replace(view, slope=disparity_slopes(view.features.keypoints, view.disparity))
         keyframes.append(view, timestamp)
@@ -144,7 +144,7 @@ class Mapper:
         assert view.slope is not None
         index = np.flatnonzero(np.isfinite(view.disparity))
         taken = views.measurement[:, :2]
-        index = index[select_apart(view.features.select(index), taken, self.config.spacing, view.left.shape)]
+        index = index[select_spaced(view.features.select(index), taken, self.config.spacing, view.left.shape)]
         measured = view.measured(index)
         disparity_range = patch_disparity_range(view.left, view.right, measured, view.slope[index])
         self.window.add_landmarks(index, measured, self.noise.of_keypoints(view, index), disparity_range)

@@ -10,7 +10,7 @@ import numpy as np
 
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.camera import RectifiedStereo
-from sigmaslam.geometry.se3 import se3_inverse
+from sigmaslam.geometry.se3 import se3_inverse, transform_points
 
 _NUMBER = r"\s*([-+]?[0-9]*\.?[0-9]+)\s*"
 _BOX = re.compile(",".join([_NUMBER] * 4))
@@ -116,8 +116,7 @@ class BodyShape:
             uvd: (N, 3) left pixel and disparity.
         """
         points = self.points()
-        T = se3_inverse(pose)
-        seen = points @ T[:3, :3].T + T[:3, 3]
+        seen = transform_points(se3_inverse(pose), points)
         seen = seen[seen[:, 2] > 1e-6]
         if len(seen) < _LEAST_POINTS:
             return np.zeros(len(uvd), bool)
@@ -128,6 +127,6 @@ class BodyShape:
         margin = max(_LEAST_MARGIN, _MARGIN * float(np.sqrt(cv2.contourArea(hull))))
         inside = [cv2.pointPolygonTest(hull, (float(x), float(y)), True) >= -margin for x, y in uvd[:, :2]]
         slack = _DEPTH_SLACK * float(np.ptp(points, axis=0).max()) + _LEAST_DEPTH_SLACK * float(np.median(seen[:, 2]))
-        focal = camera.fx * camera.baseline
+        focal = camera.focal_baseline
         least, most = focal / (seen[:, 2].max() + slack), focal / max(seen[:, 2].min() - slack, 1e-6)
         return np.array(inside, bool).reshape(-1) & (uvd[:, 2] >= least) & (uvd[:, 2] <= most)

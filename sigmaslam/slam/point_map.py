@@ -11,7 +11,7 @@ from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.marginalised_poses import PastPoses, past_slice, point_lever
 from sigmaslam.estimation.state_layout import LANDMARK_SIZE, MODELLED, pose_slice
 from sigmaslam.geometry.camera import RectifiedStereo
-from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
+from sigmaslam.geometry.se3 import se3_inverse, transform_points, turn_covariance
 from sigmaslam.table import Table
 
 # A keypoint may lie on either end of what its patch shows: standard deviation of its disparity, over that range.
@@ -48,7 +48,7 @@ class PointMap(Table):
     def transform(self, T: np.ndarray) -> PointMap:
         """The map in another world, T (4, 4) takes this one there."""
         R = T[:3, :3]
-        return replace(self, points=self.points @ R.T + T[:3, 3], covariances=R @ self.covariances @ R.T)
+        return replace(self, points=transform_points(T, self.points), covariances=R @ self.covariances @ R.T)
 
 
 def hand_over_points(points: PointMap, past: PastPoses, leaving: int, heir: int) -> PointMap:

@@ -1,4 +1,4 @@
-"""Relative pose of two calibrated views from judged matches: the 5-point method, then least squares by covariance."""
+"""Relative pose of two calibrated views from matches: the 5-point method, then least squares by covariance."""
 
 from __future__ import annotations
 
@@ -9,22 +9,23 @@ import numpy as np
 
 from sigmaslam.geometry.se3 import skew
 
-_LEAST_MATCHES = 8
-_LEAST_PROBABILITY = 0.5
-# Of the sampling stage, pixels and iterations: few matches are wrong by then.
+_MIN_MATCHES = 8
+_MIN_PROBABILITY = 0.5
+# The sampling consensus accepts this epipolar distance, pixels, and draws this many samples. Few matches are wrong.
 _THRESHOLD = 1.0
 _SAMPLES = 500
+# Gauss-Newton stops after so many steps, or when no component of a step is larger than this, radians.
 _ITERATIONS = 12
-_CONVERGED = 1e-5  # radians
-# About so many matches say which side of the cameras the scene is on, and whether it is a plane.
-_ASKED = 100
-# A homography that so many matches follow within this distance, pixels, may be that of a plane; with less translation,
-# in distances of the plane, it is that of a turn.
-_PLANE_SHARE, _PLANE_THRESHOLD, _LEAST_PARALLAX = 0.8, 2.0, 1e-3
-# Scale of the robust loss and bound of an inlier, in standard deviations of the epipolar distance.
+_CONVERGED = 1e-5
+# About this many matches choose among the poses of an essential matrix, and test for a plane.
+_SUBSET = 100
+# A homography may be that of a plane if this share of the matches follow it within this distance, pixels. If the
+# translation is smaller, relative to the distance of the plane, the homography is that of a rotation.
+_PLANE_SHARE, _PLANE_THRESHOLD, _MIN_PARALLAX = 0.8, 2.0, 1e-3
+# The scale of the robust loss and the bound of an inlier count in standard deviations of the epipolar distance.
 _ROBUST = 2.0
 _INLIER = 3.0
-# What a place in image 0 is uncertain by, pixels.
+# Keypoints in image 0 have this standard deviation, pixels.
 _SIGMA0 = 0.1
 
 
@@ -36,7 +37,7 @@ class EpipolarPose:
         R: (3, 3) rotation, takes directions of camera 0 to camera 1.
         direction: (3,) unit vector, translation of the points of camera 0 in camera 1.
         inliers: (M,) bool, probable matches within three standard deviations of their epipolar lines whose rays meet
-            before both cameras, or are parallel within their errors.
+            in front of both cameras, or are parallel within their errors.
     """
 
     R: np.ndarray
@@ -47,10 +48,10 @@ class EpipolarPose:
 def estimate_epipolar_pose(
     K: np.ndarray, points0: np.ndarray, points1: np.ndarray, probability: np.ndarray, covariance: np.ndarray
 ) -> EpipolarPose | None:
-    """Pose that the matches agree on, each by its probability and covariance.
+    """Pose that the matches agree on, each weighted by its probability and covariance.
 
-    The 5-point method in a sampling consensus over the probable matches begins (9.5.1); iterated least squares of the
-    epipolar distance over its standard deviation, with Geman and McClure's loss, follow.
+    The 5-point method in a sampling consensus over the probable matches gives the first pose (9.5.1). Iterated least
+    squares of the epipolar distance over its standard deviation, with Geman and McClure's loss, refine it.
 
     Args:
         K: (3, 3) intrinsics of both images.
@@ -58,10 +59,10 @@ def estimate_epipolar_pose(
         probability: (M,) of the matches.
         covariance: (M, 2, 2) of points1, pixels squared.
     Returns:
-        None with fewer than 8 probable matches, or where no pose is found.
+        The pose; None with fewer than 8 probable matches, or if the 5-point method fails.
     """
-    probable = np.flatnonzero(probability >= _LEAST_PROBABILITY)
-    if len(probable) < _LEAST_MATCHES:
+    probable = np.flatnonzero(probability >= _MIN_PROBABILITY)
+    if len(probable) < _MIN_MATCHES:
         return None
     points0, points1 = points0.astype(np.float64), points1.astype(np.float64)
     essential, mask = cv2.findEssentialMat(
@@ -73,30 +74,30 @@ def estimate_epipolar_pose(
         threshold=_THRESHOLD,
         maxIters=_SAMPLES,
     )
-    # OpenCV gives None where it finds nothing, against its own type hints.
+    # OpenCV returns None on failure, although its type hints exclude None.
     if np.shape(essential) != (3, 3):
         return None
     K_inverse = np.linalg.inv(K)
     rays0, rays1 = (np.c_[points, np.ones(len(points))] @ K_inverse.T for points in (points0, points1))
     agreeing = probable[mask.ravel() > 0]
-    # Covariances in the units of the rays.
+    # The covariances are in the units of the rays.
     J = K_inverse[:2, :2]
-    views = _Views(rays0, rays1, _SIGMA0**2 * J @ J.T, J @ covariance.astype(np.float64) @ J.T)
-    some = agreeing[:: max(1, len(agreeing) // _ASKED)]
-    begins = [_most_in_front(essential, rays0[some], rays1[some])]
-    begins += _poses_of_plane(K, points0[some], points1[some])
+    rays = _MatchedRays(rays0, rays1, _SIGMA0**2 * J @ J.T, J @ covariance.astype(np.float64) @ J.T)
+    subset = agreeing[:: max(1, len(agreeing) // _SUBSET)]
+    starts = [_pose_of_essential(essential, rays0[subset], rays1[subset])]
+    starts += _poses_of_plane(K, points0[subset], points1[subset])
     best: EpipolarPose | None = None
-    for begin in begins:
-        R, direction = _polish(views, probability, *begin)
-        near = (np.abs(views.whitened(R, direction)[0]) < _INLIER) & (probability >= _LEAST_PROBABILITY)
-        pose = EpipolarPose(R, direction, near & views.in_front(R, direction))
+    for start in starts:
+        R, direction = _refine_pose(rays, probability, *start)
+        near = (np.abs(rays.whitened(R, direction)[0]) < _INLIER) & (probability >= _MIN_PROBABILITY)
+        pose = EpipolarPose(R, direction, near & rays.in_front(R, direction))
         if best is None or pose.inliers.sum() > best.inliers.sum():
             best = pose
     return best
 
 
 @dataclass(frozen=True, slots=True)
-class _Views:
+class _MatchedRays:
     """Rays (M, 3) of the matches with third component 1, and the covariance of the other two: (2, 2) and (M, 2, 2)."""
 
     rays0: np.ndarray
@@ -105,7 +106,7 @@ class _Views:
     spread1: np.ndarray
 
     def whitened(self, R: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Epipolar residual over its standard deviation to first order (Sampson), and that, both (M,)."""
+        """Epipolar residual over its standard deviation to first order (Sampson), and that deviation, both (M,)."""
         E = skew(direction) @ R
         by1, by0 = self.rays0 @ E.T, self.rays1 @ E
         a, b, c, d = by1[:, 0], by1[:, 1], by0[:, 0], by0[:, 1]
@@ -116,25 +117,25 @@ class _Views:
         return (self.rays1 * by1).sum(axis=1) / sigma, sigma
 
     def in_front(self, R: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """(M,) bool, whether the rays meet before both cameras, or are parallel within their errors."""
-        before, parallax = _depths_positive(self.rays0, self.rays1, R, direction)
+        """(M,) bool, whether the rays meet in front of both cameras, or are parallel within their errors."""
+        in_front, parallax = _depths_positive(self.rays0, self.rays1, R, direction)
         variance = np.trace(self.spread1, axis1=1, axis2=2) + np.trace(self.spread0)
-        return np.asarray(before | (parallax < _INLIER**2 * variance))
+        return np.asarray(in_front | (parallax < _INLIER**2 * variance))
 
 
-def _most_in_front(essential: np.ndarray, rays0: np.ndarray, rays1: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of the four poses of an essential matrix the one that puts most points in front of both cameras."""
+def _pose_of_essential(essential: np.ndarray, rays0: np.ndarray, rays1: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The one of the four poses of an essential matrix that puts most points in front of both cameras."""
     Ra, Rb, direction = cv2.decomposeEssentialMat(essential)
     poses = [(R, sign * direction.ravel()) for R in (Ra, Rb) for sign in (1.0, -1.0)]
     return max(poses, key=lambda pose: int(_depths_positive(rays0, rays1, *pose)[0].sum()))
 
 
 def _poses_of_plane(K: np.ndarray, points0: np.ndarray, points1: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Where one homography explains the matches (M, 2), (M, 2), the poses that a plane leaves, else none.
+    """Poses that a plane allows, if one homography explains the matches (M, 2), (M, 2); else none.
 
-    Of a plane two poses explain the matches, and the 5-point method gives either.
+    Two poses explain the matches of a plane, and the 5-point method gives either.
     """
-    if len(points0) < _LEAST_MATCHES:
+    if len(points0) < _MIN_MATCHES:
         return []
     H, mask = cv2.findHomography(points0, points1, cv2.USAC_FAST, _PLANE_THRESHOLD, maxIters=_SAMPLES)
     if np.shape(H) != (3, 3) or mask.mean() < _PLANE_SHARE:
@@ -144,21 +145,21 @@ def _poses_of_plane(K: np.ndarray, points0: np.ndarray, points1: np.ndarray) -> 
     return [
         (np.asarray(R), translation.ravel() / length)
         for R, translation, length in zip(rotations, translations, lengths, strict=True)
-        if length > _LEAST_PARALLAX
+        if length > _MIN_PARALLAX
     ]
 
 
-def _polish(
-    views: _Views, probability: np.ndarray, R: np.ndarray, direction: np.ndarray
+def _refine_pose(
+    rays: _MatchedRays, probability: np.ndarray, R: np.ndarray, direction: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss-Newton over the five degrees of freedom, with iterated weights."""
+    """Gauss-Newton over the five degrees of freedom, with a robust loss."""
     for _ in range(_ITERATIONS):
-        residual, sigma = views.whitened(R, direction)
-        turned = views.rays0 @ R.T
-        inner = (views.rays1 * turned).sum(axis=1)
-        by_rotation = (turned @ direction)[:, None] * views.rays1 - inner[:, None] * direction
+        residual, sigma = rays.whitened(R, direction)
+        turned = rays.rays0 @ R.T
+        inner = (rays.rays1 * turned).sum(axis=1)
+        by_rotation = (turned @ direction)[:, None] * rays.rays1 - inner[:, None] * direction
         tangent = np.linalg.svd(direction[None])[2][1:].T
-        by_direction = _cross(turned, views.rays1) @ tangent
+        by_direction = _cross(turned, rays.rays1) @ tangent
         J = np.concatenate([by_rotation, by_direction], axis=1) / sigma[:, None]
         weighted = J * (probability / (1.0 + (residual / _ROBUST) ** 2) ** 2)[:, None]
         normal = weighted.T @ J
@@ -174,16 +175,16 @@ def _polish(
 def _depths_positive(
     rays0: np.ndarray, rays1: np.ndarray, R: np.ndarray, direction: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Whether the rays meet before both cameras, and the squared sine of their angle times their lengths, both (M,)."""
+    """Whether rays meet in front of both cameras, and (sine of their angle times their lengths) squared, both (M,)."""
     turned = rays0 @ R.T
-    # Depth z0 from rays1 x (z0 R rays0 + t) = 0, and likewise z1.
+    # The depth z0 follows from rays1 x (z0 R rays0 + t) = 0, and z1 likewise.
     normal = _cross(rays1, turned)
-    before = (_cross(rays1, direction) * normal).sum(axis=1) < 0
-    before &= (_cross(turned, direction) * normal).sum(axis=1) < 0
-    return before, (normal * normal).sum(axis=1)
+    in_front = (_cross(rays1, direction) * normal).sum(axis=1) < 0
+    in_front &= (_cross(turned, direction) * normal).sum(axis=1) < 0
+    return in_front, (normal * normal).sum(axis=1)
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Cross products (M, 3) of (M, 3) and (M, 3) or (3,): numpy's own takes five times as long for few."""
+    """Cross products (M, 3) of (M, 3) and (M, 3) or (3,); np.cross takes five times as long for few rows."""
     (a0, a1, a2), (b0, b1, b2) = a.T, b.T
     return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=1)

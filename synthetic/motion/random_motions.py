@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.se3 import rotation_exp
-from sigmaslam.geometry.trajectory import read_kitti
+from sigmaslam.readers.trajectory_files import read_kitti
 from sigmaslam.synthetic.geometry import arc_length
 from sigmaslam.synthetic.motion.paths import (
     KNOT_INTERVAL,

@@ -8,7 +8,8 @@ import pytest
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.run_evaluation import evaluate_run, format_evaluation
 from sigmaslam.geometry.se3 import se3_adjoint, se3_exp, se3_inverse
-from sigmaslam.geometry.trajectory import Trajectory, read_kitti, read_trajectory, write_kitti, write_tum
+from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.readers.trajectory_files import read_kitti, read_trajectory, write_kitti, write_tum
 
 
 def make_run(folder: Path, truth: Trajectory, seed: int = 0) -> None:

@@ -18,7 +18,8 @@ from sigmaslam.evaluation.metrics.trajectory_errors import (
     synchronise,
 )
 from sigmaslam.geometry.se3 import rotation_exp, se3_adjoint, se3_exp, se3_inverse
-from sigmaslam.geometry.trajectory import Trajectory, read_kitti
+from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.readers.trajectory_files import read_kitti
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from sigmaslam.geometry.trajectory import read_kitti
 from sigmaslam.readers import open_sequence
+from sigmaslam.readers.trajectory_files import read_kitti
 from sigmaslam.slam.tracker import Estimate, StereoTracker
 from tests.support.estimates import Demo, track
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from sigmaslam.bundle_adjustment.track_file import Tracks
 from sigmaslam.geometry.se3 import rotation_exp, se3_exp, se3_inverse
-from sigmaslam.geometry.trajectory import Trajectory, write_tum
+from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.readers.trajectory_files import write_tum
 
 INTRINSICS = np.array([400.0, 410.0, 320.0, 240.0, 0.2])
 WIDTH, HEIGHT = 640, 480

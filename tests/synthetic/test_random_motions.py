@@ -6,7 +6,7 @@ import pytest
 
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.se3 import rotation_log
-from sigmaslam.geometry.trajectory import read_kitti
+from sigmaslam.readers.trajectory_files import read_kitti
 from sigmaslam.synthetic.motion.random_motions import (
     CAMERA_HEIGHT,
     FreeSpace,

@@ -17,7 +17,7 @@ from sigmaslam.estimation.chi_square import NORMAL_WITHIN_2
 from sigmaslam.evaluation.metrics.probability_calibration import RIGHT
 from sigmaslam.frontend.affine_alignment import refine_by_neighbours
 from sigmaslam.frontend.lucas_kanade import refine
-from sigmaslam.frontend.match_confidence import LEAST_LOGIT
+from sigmaslam.frontend.match_confidence import MIN_LOGIT
 from sigmaslam.frontend.patch_evidence import examine_patches
 from sigmaslam.frontend.types import Refinement
 from sigmaslam.frontend.verifier_inputs import describe_matches
@@ -73,7 +73,7 @@ def collect_rows(records: Iterable[PairRecord], scorer: MatchScorer, note: Calla
     for number, record in enumerate(records):
         for found in record.sets.values():
             logit = score_set(scorer, found)
-            kept = found.putative.mutual & (logit > LEAST_LOGIT)
+            kept = found.putative.mutual & (logit > MIN_LOGIT)
             for mapped, sources in ((False, _SHIFTED), (True, _MAPPED)):
                 if found.source in sources and kept.any():
                     parts.append(_rows_of(record, found, logit, kept, mapped, number))

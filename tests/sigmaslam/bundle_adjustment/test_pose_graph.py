@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sigmaslam.bundle_adjustment.pose_graph import PoseEdge, connected_parts, optimise_pose_graph
+from sigmaslam.bundle_adjustment.solver import connected_parts
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.se3 import se3_adjoint, se3_exp, se3_inverse, se3_log
+from tests.support.pose_graph import PoseEdge, optimise_pose_graph
 from tests.support.quantiles import squared_sigmas
 
 STEP_SIGMA = np.array([0.02, 0.02, 0.02, 0.003, 0.003, 0.003])

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sigmaslam.geometry.trajectory import read_tum
+from sigmaslam.readers.trajectory_files import read_tum
 from tests.support.commands import Finished, assert_refused, command_line, environment, run_here, run_process
 
 FRAMES = 8

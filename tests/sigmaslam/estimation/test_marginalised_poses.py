@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sigmaslam.bundle_adjustment.pose_graph import PoseEdge, optimise_pose_graph
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.marginalised_poses import PastPoses
 from sigmaslam.estimation.state_layout import pose_slice
@@ -24,6 +23,7 @@ from tests.support.dense_window import (
     unsolved,
     world,
 )
+from tests.support.pose_graph import PoseEdge, optimise_pose_graph
 
 STEP_SIGMA = 1e-3 * np.array([0.02, 0.02, 0.02, 0.003, 0.003, 0.003])
 LOOP_SIGMA = STEP_SIGMA / 2

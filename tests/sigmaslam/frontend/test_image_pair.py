@@ -13,7 +13,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.frontend.classical import OrbDetector, SiftDetector
 from sigmaslam.frontend.image_pair import draw_matches, match_features
 from sigmaslam.frontend.learned import LearnedDetector
-from sigmaslam.frontend.match_confidence import LEAST_LOGIT, MatchJudge
+from sigmaslam.frontend.match_confidence import MIN_LOGIT, ConfidenceEstimator
 from sigmaslam.frontend.nearest_neighbours import nearest_anywhere
 from sigmaslam.frontend.types import Features
 from sigmaslam.inference.onnx_graph import shipped_weights
@@ -55,8 +55,8 @@ def features(frontend: str, pair: Pair) -> tuple[Features, Features]:
 
 
 @pytest.fixture(scope="module")
-def judge() -> MatchJudge:
-    return MatchJudge()
+def estimator() -> ConfidenceEstimator:
+    return ConfidenceEstimator()
 
 
 @pytest.fixture(scope="module")
@@ -153,22 +153,22 @@ def test_covariances_are_positive_and_not_too_sure_of_right_matches(either: Matc
 
 
 def test_of_any_probability_all_mutual_neighbours_are_matches_but_hopeless_ones(
-    judge: MatchJudge, features: tuple[Features, Features], everything: Matches
+    estimator: ConfidenceEstimator, features: tuple[Features, Features], everything: Matches
 ):
     found, expected = set(pairs(everything)), set(mutual(features))
     assert found <= expected
     putative = nearest_anywhere(features[0].descriptors, features[1].descriptors)
-    hopeless = judge.score(putative, *features) <= LEAST_LOGIT
+    hopeless = estimator.score(putative, *features) <= MIN_LOGIT
     index = zip(putative.index0[hopeless].tolist(), putative.index1[hopeless].tolist(), strict=True)
     assert expected - found == expected & set(index)
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
 def test_of_a_least_probability_the_matches_are_the_first_of_all(
-    judge: MatchJudge, pair: Pair, features: tuple[Features, Features], everything: Matches, share: float
+    estimator: ConfidenceEstimator, pair: Pair, features: tuple[Features, Features], everything: Matches, share: float
 ):
     least = float(np.quantile(everything.probability, share))
-    found = match_features(judge, *pair, *features, min_probability=least)
+    found = match_features(estimator, *pair, *features, min_probability=least)
     expected = everything.select(everything.probability >= least)
     assert 0 < len(found.probability) < len(everything.probability)
     for name in FIELDS:
@@ -201,14 +201,14 @@ def test_refinement_moves_places_a_little_and_changes_nothing_else(
 
 
 def test_matches_whose_patches_do_not_fit_are_less_probable_and_less_exact(
-    judge: MatchJudge, pair: Pair, features: tuple[Features, Features], everything: Matches
+    estimator: ConfidenceEstimator, pair: Pair, features: tuple[Features, Features], everything: Matches
 ):
     """Half of the second image is repainted, the features stay where they are, which is right to a few pixels."""
     image0, image1 = pair
     middle = image1.shape[1] // 2
     repainted = image1.copy()
     repainted[:, :middle] = np.random.default_rng(0).integers(0, 255, repainted.shape, np.uint8)[:, :middle]
-    found = match_features(judge, image0, repainted, *features, min_probability=0.0)
+    found = match_features(estimator, image0, repainted, *features, min_probability=0.0)
     row_of = {each: row for row, each in enumerate(pairs(found))}
     again = found.select(np.array([row_of[each] for each in pairs(everything)]))
     u = features[1].keypoints[everything.index1, 0]
@@ -240,32 +240,32 @@ def alike(keypoints0: np.ndarray, keypoints1: np.ndarray) -> tuple[Features, Fea
     return first, second
 
 
-def test_wrong_matches_among_right_ones_are_dropped(judge: MatchJudge, pair: Pair):
+def test_wrong_matches_among_right_ones_are_dropped(estimator: ConfidenceEstimator, pair: Pair):
     rng = np.random.default_rng(6)
     keypoints0 = rng.uniform((120, 80), (400, 300), (400, 2))
     keypoints1 = warped(keypoints0)
     wrong = rng.random(400) < 0.3
     keypoints1[wrong] = rng.uniform((20, 20), (480, 360), (int(wrong.sum()), 2))
-    found = np.isin(np.arange(400), match_features(judge, *pair, *alike(keypoints0, keypoints1)).index0)
+    found = np.isin(np.arange(400), match_features(estimator, *pair, *alike(keypoints0, keypoints1)).index0)
     assert found[~wrong].mean() > 0.97
     assert found[wrong].mean() < 0.1
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])
-def test_fewer_than_four_matches_stay_where_they_are(judge: MatchJudge, pair: Pair, count: int):
+def test_fewer_than_four_matches_stay_where_they_are(estimator: ConfidenceEstimator, pair: Pair, count: int):
     """No neighbours say how their patches are turned."""
     places = np.random.default_rng(0).uniform(150, 300, (count, 2))
     features = alike(places, warped(places) + 0.5)
-    found = match_features(judge, *pair, *features, min_probability=0.0)
+    found = match_features(estimator, *pair, *features, min_probability=0.0)
     assert [getattr(found, name).shape[1:] for name in FIELDS] == [shape[1:] for shape in SHAPES_OF_NONE]
     assert set(pairs(found)) <= set(mutual(features))
     np.testing.assert_array_equal(found.keypoints1, features[1].keypoints[found.index1])
 
 
-def test_matching_leaves_its_input(judge: MatchJudge, pair: Pair, features: tuple[Features, Features]):
+def test_matching_leaves_its_input(estimator: ConfidenceEstimator, pair: Pair, features: tuple[Features, Features]):
     given = [*pair, *(getattr(each, name) for each in features for name in ("keypoints", "descriptors", "sigma"))]
     before = [array.copy() for array in given]
-    match_features(judge, *pair, *features)
+    match_features(estimator, *pair, *features)
     for array, copy in zip(given, before, strict=True):
         np.testing.assert_array_equal(array, copy)
 

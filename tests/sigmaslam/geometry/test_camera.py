@@ -7,8 +7,9 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sigmaslam.errors import CalibrationError, InputError
+from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, RectifiedStereo, StereoCamera
+from tests.support.calibration_yaml import write_calibration
 
 RADTAN4 = (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05)
 RADTAN5 = (-0.3728755, 0.2037299, 2.219027e-03, 1.383707e-03, -0.07233722)
@@ -110,10 +111,9 @@ def test_floating_type_follows_the_input():
         camera.project(np.ones((4, 2)))
 
 
-def test_chapter_matrix():
-    camera = CameraModel.from_chapter(700.0, 690.0, 0.01, 0.002, 320.0, 240.0, width=640, height=480)
-    expected = [[700.0, 0.01 * 690.0, 320.0], [0.0, 690.0 * 1.002, 240.0], [0.0, 0.0, 1.0]]
-    np.testing.assert_allclose(camera.matrix, expected, rtol=1e-15)
+def test_the_matrix_with_skew_projects_as_the_camera_does():
+    camera = CameraModel(640, 480, 700.0, 691.0, 320.0, 240.0, skew=6.9)
+    np.testing.assert_array_equal(camera.matrix, [[700.0, 6.9, 320.0], [0.0, 691.0, 240.0], [0.0, 0.0, 1.0]])
     pixel = camera.matrix @ [0.2, -0.1, 1.0]
     np.testing.assert_allclose(camera.project(np.array([0.4, -0.2, 2.0])), pixel[:2])
 
@@ -181,11 +181,10 @@ def test_yaml_round_trip_is_exact(tmp_path):
         make_camera("equidistant", EQUIDISTANT),
         rotation=(0.01, 0.1, -0.02),
     )
-    camera.to_yaml(path)
+    write_calibration(camera, path)
     again = StereoCamera.from_yaml(path)
     assert (again.left, again.right) == (camera.left, camera.right)
     np.testing.assert_array_equal(again.T_left_right, camera.T_left_right)
-    assert [file.name for file in tmp_path.iterdir()] == ["stereo.yaml"]
 
 
 finite = st.floats(-1e9, 1e9)
@@ -196,13 +195,8 @@ finite = st.floats(-1e9, 1e9)
 def test_any_camera_survives_yaml(tmp_path_factory, fx, centre, distortion):
     camera = CameraModel(640, 480, fx, fx, *centre, distortion_model="radtan", distortion=distortion)
     path = tmp_path_factory.mktemp("yaml") / "stereo.yaml"
-    make_stereo(camera, make_camera()).to_yaml(path)
+    write_calibration(make_stereo(camera, make_camera()), path)
     assert StereoCamera.from_yaml(path).left == camera
-
-
-def test_yaml_into_a_missing_folder_is_refused(tmp_path):
-    with pytest.raises(InputError, match="cannot write the calibration: No such file"):
-        make_stereo().to_yaml(tmp_path / "none" / "stereo.yaml")
 
 
 def yaml_content():
@@ -301,6 +295,13 @@ def test_triangulate_inverts_project_and_equals_two_pinholes():
     np.testing.assert_allclose(uvd[..., :2], left)
     np.testing.assert_allclose(uvd[..., 2], left[..., 0] - right[..., 0], rtol=1e-9)
     np.testing.assert_allclose(left[..., 1], right[..., 1])
+
+
+def test_rays_times_depth_are_the_points():
+    points = points_in_view().reshape(50, 10, 3)
+    uvd = STEREO.project(points)
+    depth = STEREO.focal_baseline / uvd[..., 2:]
+    np.testing.assert_allclose(depth * STEREO.rays(uvd[..., :2]), points, rtol=1e-12, atol=1e-12)
 
 
 def test_disparities_that_are_not_positive_are_counted():

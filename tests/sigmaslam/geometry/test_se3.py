@@ -104,6 +104,13 @@ def test_se3_inverse_undoes():
     np.testing.assert_allclose(rotation.se3_inverse(T) @ T, np.tile(np.eye(4), (60, 1, 1)), atol=1e-14)
 
 
+def test_transformed_points_are_those_of_homogeneous_coordinates():
+    generator = np.random.default_rng(6)
+    T, points = rotation.se3_exp(generator.normal(size=6)), generator.normal(size=(5, 4, 3))
+    homogeneous = np.concatenate([points, np.ones((5, 4, 1))], axis=-1)
+    np.testing.assert_allclose(rotation.transform_points(T, points), (homogeneous @ T.T)[..., :3], atol=1e-14)
+
+
 def test_adjoint_moves_a_tangent_through_a_transform():
     tangents = _tangents()
     T, small = rotation.se3_exp(tangents), 0.1 * np.roll(tangents, 7, axis=0)

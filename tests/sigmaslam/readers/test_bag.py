@@ -15,10 +15,10 @@ from sigmaslam.cli import app
 from sigmaslam.errors import CalibrationError, InputError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
-from sigmaslam.geometry.trajectory import read_tum
 from sigmaslam.readers import open_sequence
 from sigmaslam.readers.pairing import MAX_WAITING, Stamped, pair_streams
 from sigmaslam.readers.ros_messages import image_array
+from sigmaslam.readers.trajectory_files import read_tum
 
 START = 1_700_000_000_123_456_789
 STEP = 50_000_000

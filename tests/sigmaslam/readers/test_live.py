@@ -16,12 +16,13 @@ from typer.testing import CliRunner
 
 from sigmaslam.cli import app
 from sigmaslam.errors import CalibrationError, InputError
-from sigmaslam.geometry.trajectory import read_tum
 from sigmaslam.readers import StereoFrame, open_cameras
 from sigmaslam.readers import live as camera_module
-from sigmaslam.readers.capture import JUDGED_PAIRS, StereoCapture, open_capture
+from sigmaslam.readers.capture import SYNCHRONY_PAIRS, StereoCapture, open_capture
 from sigmaslam.readers.live import LivePairs, LiveSequence
+from sigmaslam.readers.trajectory_files import read_tum
 from sigmaslam.runs.track import track_sequence
+from tests.support.calibration_yaml import write_calibration
 from tests.support.commands import command_line, environment, run_process
 from tests.support.simulated_stereo import parallel_camera
 from tests.support.videos import write_video
@@ -213,7 +214,7 @@ def median_difference(frames: list[StereoFrame]) -> float:
 @pytest.mark.parametrize(("late", "warned"), [(0.007, True), (0.001, False)])
 def test_eyes_that_are_not_taken_together_are_warned_about(caplog, late: float, warned: bool):
     left, right = FakeCamera(driver="V4L2", period=0.016), FakeCamera(driver="V4L2", period=0.016, late=late)
-    list(islice(live(left, right).frames(), JUDGED_PAIRS + 10))
+    list(islice(live(left, right).frames(), SYNCHRONY_PAIRS + 10))
     assert ("camera 0 and camera 1: left and right are taken 7 ms apart" in caplog.text) == warned
 
 
@@ -222,7 +223,7 @@ def test_grabbing_that_takes_long_is_warned_about(caplog, monkeypatch: pytest.Mo
     right = FakeCamera()
     monkeypatch.setattr(right, "grab", lambda: time.sleep(0.008) is None)
     capture = StereoCapture([FakeCamera(), right], ["camera 0", "camera 1"])
-    for index in range(JUDGED_PAIRS):
+    for index in range(SYNCHRONY_PAIRS):
         capture.take(index)
     assert "camera 0 and camera 1: left and right are taken" in caplog.text
 
@@ -261,7 +262,7 @@ def videos(tmp_path: Path) -> Path:
     for eye, name in enumerate(("left", "right")):
         write_video(tmp_path / f"{name}.avi", [shade(index, eye) for index in range(20)], RATE_HZ)
     write_video(tmp_path / "both.avi", [np.hstack([shade(index, 0), shade(index, 1)]) for index in range(20)], RATE_HZ)
-    CAMERA.to_yaml(tmp_path / "stereo.yaml")
+    write_calibration(CAMERA, tmp_path / "stereo.yaml")
     return tmp_path
 
 
@@ -291,7 +292,7 @@ def test_a_camera_that_cannot_be_opened_is_named(device: str):
 
 
 def test_sizes_that_do_not_fit_are_refused(videos: Path):
-    parallel_camera(128, 96, 50.0, 0.1).to_yaml(videos / "large.yaml")
+    write_calibration(parallel_camera(128, 96, 50.0, 0.1), videos / "large.yaml")
     with pytest.raises(CalibrationError, match=r"left image is 64x48, the calibration is for 128x96"):
         open_cameras(f"side-by-side:{videos}/both.avi", videos / "large.yaml")
     wide = write_video(videos / "wide.avi", [shade(index, 1, 80) for index in range(3)], RATE_HZ)

@@ -11,6 +11,7 @@ from sigmaslam.errors import CalibrationError, InputError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.readers import StereoFrame, open_sequence
 from sigmaslam.readers.stereo_sequence import READ_AHEAD, read_ahead
+from tests.support.calibration_yaml import write_calibration
 from tests.support.videos import write_video
 
 WIDTH, HEIGHT = 64, 48
@@ -36,7 +37,7 @@ def make_folder(root, count=6, left="left", right="right", name="{:06d}.png", ca
         for index in range(count):
             assert cv2.imwrite(str(root / folder / name.format(index)), picture(index, eye, **options))
     if calibration:
-        stereo_camera().to_yaml(root / "calibration.yaml")
+        write_calibration(stereo_camera(), root / "calibration.yaml")
     return root
 
 
@@ -378,7 +379,7 @@ def test_empty_image_folder(tmp_path):
 def test_calibration_of_another_size_names_both(tmp_path):
     make_folder(tmp_path)
     other = tmp_path / "other.yaml"
-    stereo_camera(128, 96).to_yaml(other)
+    write_calibration(stereo_camera(128, 96), other)
     with pytest.raises(CalibrationError, match="left image is 64x48, the calibration is for 128x96"):
         open_sequence(tmp_path, calibration=other)
 
@@ -397,7 +398,7 @@ def test_calibration_of_any_form_overrides(tmp_path):
     yaml_file = tmp_path / "own.yaml"
     T = np.eye(4)
     T[0, 3] = 0.7
-    StereoCamera(stereo_camera().left, stereo_camera().right, T).to_yaml(yaml_file)
+    write_calibration(StereoCamera(stereo_camera().left, stereo_camera().right, T), yaml_file)
     assert open_sequence(tmp_path / "kitti", calibration=yaml_file).camera.baseline == pytest.approx(0.7)
 
 
@@ -603,7 +604,7 @@ def check_video_frames(frames: list[StereoFrame], count):
 def test_two_videos(tmp_path, format):
     for eye, name in enumerate(("left.avi", "right.avi")):
         write_video(tmp_path / name, [smooth(index, eye) for index in range(7)], RATE_HZ)
-    stereo_camera().to_yaml(tmp_path / "calibration.yaml")
+    write_calibration(stereo_camera(), tmp_path / "calibration.yaml")
     sequence, frames = read_all(tmp_path, format=format)
     assert (sequence.format, sequence.length, sequence.timestamps) == ("video", 7, None)
     check_video_frames(frames, 7)
@@ -615,11 +616,11 @@ def test_side_by_side_video(tmp_path):
     with pytest.raises(CalibrationError, match="no calibration"):
         open_sequence(path)
     calibration = tmp_path / "elsewhere.yaml"
-    stereo_camera().to_yaml(calibration)
+    write_calibration(stereo_camera(), calibration)
     sequence, frames = read_all(path, calibration=calibration)
     assert (sequence.format, sequence.source, sequence.length) == ("video", path, 7)
     check_video_frames(frames, 7)
-    stereo_camera(128, 48).to_yaml(calibration)
+    write_calibration(stereo_camera(128, 48), calibration)
     with pytest.raises(CalibrationError, match=r"left half\): left image is 64x48, the calibration is for 128x48"):
         open_sequence(path, calibration=calibration)
 

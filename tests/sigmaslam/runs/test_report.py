@@ -7,7 +7,8 @@ import pytest
 
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.se3 import rotation_exp
-from sigmaslam.geometry.trajectory import Trajectory, write_tum
+from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.readers.trajectory_files import write_tum
 from sigmaslam.runs.report import read_frames, write_report
 
 STAGES = ("read", "features", "match", "filter", "map")

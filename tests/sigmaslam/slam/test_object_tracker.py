@@ -12,8 +12,9 @@ from sigmaslam.cli import app
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.run_evaluation import evaluate_run
 from sigmaslam.geometry.se3 import se3_inverse
-from sigmaslam.geometry.trajectory import Trajectory, read_kitti, write_kitti
+from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import open_sequence
+from sigmaslam.readers.trajectory_files import read_kitti, write_kitti
 from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.object_region import read_region
 from tests.support.quantiles import WITHIN_3_SIGMA

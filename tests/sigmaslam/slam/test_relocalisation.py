@@ -12,7 +12,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.estimation.marginalised_poses import PastPoses
 from sigmaslam.frontend import Features, StereoView
 from sigmaslam.geometry.camera import RectifiedStereo
-from sigmaslam.geometry.trajectory import read_kitti
+from sigmaslam.readers.trajectory_files import read_kitti
 from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.keyframe import Keyframe
 from sigmaslam.slam.keyframes import Keyframes

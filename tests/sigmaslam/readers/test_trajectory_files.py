@@ -10,8 +10,8 @@ from hypothesis.extra.numpy import arrays
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path
 from sigmaslam.geometry.se3 import rotation_exp, se3_exp
-from sigmaslam.geometry.trajectory import (
-    Trajectory,
+from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.readers.trajectory_files import (
     read_euroc_truth,
     read_kitti,
     read_trajectory,

@@ -1,14 +1,15 @@
-"""Pose graphs: keyframes tied by relative poses, some of which (loops) may be wrong. Needs the extra `graph`."""
+"""Pose graphs by GTSAM, the reference for what the window and its marginalised poses must agree with."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from sigmaslam.bundle_adjustment.gtsam_bridge import load_gtsam, swap_tangent
+from sigmaslam.bundle_adjustment.solver import connected_parts
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 
 # Metres and radians: holds the first pose in place. What is not known of it is added to the result.
@@ -137,19 +138,3 @@ def _check(poses: np.ndarray, edges: Sequence[PoseEdge]) -> None:
             f"{len(loose)} of {count} poses, the first is {loose[0]}, are not connected to pose 0 by edges that are "
             "not doubtful: add the edge to the pose before, with a large covariance if need be"
         )
-
-
-def connected_parts(count: int, pairs: Iterable[tuple[int, int]]) -> np.ndarray:
-    """The lowest member of each one's part, (count,), where pairs are connected."""
-    parent = list(range(count))
-
-    def root(member: int) -> int:
-        while parent[member] != member:
-            parent[member] = parent[parent[member]]
-            member = parent[member]
-        return member
-
-    for i, j in pairs:
-        low, high = sorted((root(i), root(j)))
-        parent[high] = low
-    return np.array([root(member) for member in range(count)])

@@ -1,0 +1,105 @@
+"""YAML calibration files whose values are checked as they are read."""
+
+import os
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any, Self, cast
+
+import numpy as np
+import yaml
+
+from sigmaslam.errors import CalibrationError
+
+_REQUIRED: Any = object()
+
+
+class CalibrationYaml:
+    """A YAML calibration file whose getters raise errors that name file, key and what was expected."""
+
+    def __init__(self, path: Path, entries: dict[str, Any], prefix: str = "") -> None:
+        self.path = path
+        self.entries = entries
+        self.prefix = prefix
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> Self:
+        """Read a file; OpenCV's '%YAML:1.0' first line, which is no YAML, is skipped."""
+        path = Path(path)
+        try:
+            text = path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise CalibrationError(f"{path}: cannot read the calibration: {error}") from None
+        first, _, body = text.partition("\n")
+        if first.startswith("%YAML:"):
+            text = "\n" + body
+        try:
+            entries = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise CalibrationError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
+        if not isinstance(entries, dict):
+            raise CalibrationError(f"{path}: expected keys with values, found {type(entries).__name__}")
+        return cls(path, entries)
+
+    def error(self, message: str) -> CalibrationError:
+        """The error to raise about this section."""
+        return CalibrationError(f"{self.path}: {self.prefix.rstrip('.') + ': ' if self.prefix else ''}{message}")
+
+    def section(self, key: str) -> "CalibrationYaml":
+        """The mapping under a key."""
+        entries = self._get(key, "a mapping")
+        if not isinstance(entries, dict):
+            raise self._wrong(key, "a mapping", entries)
+        return CalibrationYaml(self.path, entries, f"{self.prefix}{key}.")
+
+    def text(self, key: str, default: str = _REQUIRED) -> str:
+        """A word."""
+        value = self._get(key, "a word", default)
+        # YAML reads a bare `none` as a string, and `null` and `~` as None.
+        return "none" if value is None else str(value)
+
+    def number(self, key: str, default: float = _REQUIRED) -> float:
+        """A finite number."""
+        return float(self.numbers(key, (), default))
+
+    def integer(self, key: str) -> int:
+        """A whole number."""
+        value = self.number(key)
+        if value != int(value):
+            raise self._wrong(key, "a whole number", value)
+        return int(value)
+
+    def numbers(self, key: str, shape: tuple[int | None, ...], default: Any = _REQUIRED) -> np.ndarray:
+        """A float64 array of nested lists; None in `shape` stands for any length."""
+        size = "x".join("any" if n is None else str(n) for n in shape)
+        expected = "a number" if not shape else "a list of numbers" if size == "any" else f"{size} numbers in lists"
+        value = self._get(key, expected, default)
+        try:
+            # The conversion goes through str, as YAML 1.1 reads 1e-5 as text and booleans are no numbers.
+            array = np.array(value, dtype=str) if value != [] else np.zeros(0, dtype=str)
+            numbers = array.astype(np.float64)
+        except ValueError:
+            raise self._wrong(key, expected, value) from None
+        fits = numbers.ndim == len(shape) and all(
+            n is None or n == m for n, m in zip(shape, numbers.shape, strict=True)
+        )
+        if not fits or not np.all(np.isfinite(numbers)):
+            actual = "x".join(map(str, numbers.shape)) or "one number"
+            raise self._wrong(key, expected, value, f" (size {actual})")
+        return cast(np.ndarray, numbers)
+
+    def reject_unknown(self, known: Collection[str]) -> None:
+        """Refuse unknown keys, as a misspelt optional key would be ignored."""
+        unknown = [str(key) for key in self.entries if key not in known]
+        if unknown:
+            raise self.error(f"unknown key {', '.join(unknown)}; known are {', '.join(known)}")
+
+    def _get(self, key: str, expected: str, default: Any = _REQUIRED) -> Any:
+        if key in self.entries:
+            return self.entries[key]
+        if default is not _REQUIRED:
+            return default
+        raise CalibrationError(f"{self.path}: key '{self.prefix}{key}' is missing; expected {expected}")
+
+    def _wrong(self, key: str, expected: str, value: Any, detail: str = "") -> CalibrationError:
+        shown = str(value) if len(str(value)) <= 80 else str(value)[:77] + "..."
+        return CalibrationError(f"{self.path}: key '{self.prefix}{key}' must be {expected}, got {shown}{detail}")

@@ -1,0 +1,277 @@
+"""Trajectory files: TUM, KITTI and the ground truth of EuRoC."""
+
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from sigmaslam.errors import InputError
+from sigmaslam.files import atomic_write_text
+from sigmaslam.geometry.checked_yaml import CalibrationYaml
+from sigmaslam.geometry.se3 import matrix_to_quaternion, nearest_rotation, quaternion_to_matrix
+from sigmaslam.geometry.trajectory import Trajectory
+
+TrajectoryFormat = Literal["tum", "kitti", "euroc"]
+
+KITTI_FRAME_RATE = 10.0
+"""Frames per second of KITTI, used where a pose file has no times.txt."""
+
+
+def trajectory_format(path: str | Path) -> TrajectoryFormat:
+    """The format, from the first line that is not a comment.
+
+    Commas make it EuRoC, eight columns TUM, twelve KITTI.
+
+    Raises:
+        InputError: the file cannot be read, is empty, or has another number of columns.
+    """
+    path = Path(path)
+    for number, line in _lines(path):
+        if "," in line:
+            return "euroc"
+        columns = len(line.split())
+        if columns == 8:
+            return "tum"
+        if columns == 12:
+            return "kitti"
+        raise InputError(
+            f"{path}: line {number} has {columns} columns; a trajectory has 8 (TUM: t x y z qx qy qz qw), "
+            "12 (KITTI: 3x4 matrix by rows), or commas (EuRoC ground truth)"
+        )
+    raise InputError(f"{path}: holds no poses; give a trajectory in TUM, KITTI or EuRoC form")
+
+
+def read_trajectory(path: str | Path) -> Trajectory:
+    """Read a trajectory in any of the three forms, which its content determines.
+
+    Raises:
+        InputError: the file cannot be read or a line is wrong (the message names file, line and value).
+    """
+    readers: dict[TrajectoryFormat, Callable[[str | Path], Trajectory]] = {
+        "tum": read_tum,
+        "kitti": read_kitti,
+        "euroc": read_euroc_truth,
+    }
+    return readers[trajectory_format(path)](path)
+
+
+def check_covariances(loaded: object, path: Path, count: int) -> np.ndarray:
+    """The covariances of a covariance.npy, checked against the number of poses in the trajectory beside it.
+
+    Args:
+        loaded: content of the file.
+        path: of the file.
+        count: poses of trajectory.tum.
+    Returns:
+        (count, 6, 6) float64.
+    Raises:
+        InputError: it has another shape, or is an archive.
+    """
+    if not isinstance(loaded, np.ndarray) or loaded.shape != (count, 6, 6):
+        shape = getattr(loaded, "shape", "an archive")
+        raise InputError(
+            f"{path}: is {shape}, but trajectory.tum beside it has {count} poses and needs ({count}, 6, 6): "
+            "both must come from the same run"
+        )
+    return np.asarray(loaded, dtype=np.float64)
+
+
+def read_tum(path: str | Path) -> Trajectory:
+    """Read rows of `t x y z qx qy qz qw` (seconds, metres, T_world_camera); `#` starts a comment.
+
+    Raises:
+        InputError: the file cannot be read or a line is wrong.
+    """
+    path = Path(path)
+    rows, numbers = _numbers(path, columns=8, form="TUM: t x y z qx qy qz qw")
+    _check_increasing(path, rows[:, 0], numbers)
+    return Trajectory(rows[:, 0], _poses(path, rows[:, 1:4], rows[:, 4:8], numbers))
+
+
+def write_tum(path: str | Path, trajectory: Trajectory) -> None:
+    """Write `t x y z qx qy qz qw` rows; nothing is left behind if it fails.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    rows = np.column_stack([trajectory.positions, matrix_to_quaternion(trajectory.rotations)])
+    lines = [
+        f"{timestamp:.9f} " + " ".join(f"{value:.12f}" for value in row) + "\n"
+        for timestamp, row in zip(trajectory.timestamps, rows, strict=True)
+    ]
+    atomic_write_text(path, "".join(lines))
+
+
+def kitti_times_path(path: str | Path) -> Path | None:
+    """The times.txt beside a KITTI pose file, or None where there is none."""
+    times = Path(path).parent / "times.txt"
+    return times if times.is_file() else None
+
+
+def read_kitti(path: str | Path, times_path: str | Path | None = None) -> Trajectory:
+    """Read rows of 3x4 matrices T_world_camera (12 columns).
+
+    The rotations, which KITTI writes with seven digits, are made orthonormal.
+
+    Args:
+        path: the pose file.
+        times_path: one timestamp in seconds a row; by default times.txt beside the pose file, and 10 Hz from
+            zero where there is none.
+    Raises:
+        InputError: a file cannot be read, a line is wrong, or there are not as many times as poses.
+    """
+    path = Path(path)
+    rows, numbers = _numbers(path, columns=12, form="KITTI: 3x4 matrix by rows")
+    matrices = rows.reshape(-1, 3, 4)
+    rotations = nearest_rotation(matrices[:, :, :3])
+    deviation = np.abs(rotations - matrices[:, :, :3]).max(axis=(1, 2))
+    wrong = np.flatnonzero(deviation > 1e-3)
+    if len(wrong):
+        raise InputError(
+            f"{path}: line {numbers[wrong[0]]} holds no rotation matrix (off by {deviation[wrong[0]]:.3g}): "
+            "each row must be the upper 3x4 part of T_world_camera, by rows"
+        )
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = rotations
+    poses[:, :3, 3] = matrices[:, :, 3]
+
+    times = Path(times_path) if times_path is not None else kitti_times_path(path)
+    if times is None:
+        return Trajectory(np.arange(len(rows)) / KITTI_FRAME_RATE, poses)
+    stamps, stamp_numbers = _numbers(times, columns=1, form="one time in seconds")
+    if len(stamps) != len(rows):
+        raise InputError(
+            f"{path}: {len(rows)} poses, but {times} has {len(stamps)} times: give the times of these poses, "
+            "or move the file away to assume 10 Hz"
+        )
+    _check_increasing(times, stamps[:, 0], stamp_numbers)
+    return Trajectory(stamps[:, 0], poses)
+
+
+def write_kitti(path: str | Path, trajectory: Trajectory, times_path: str | Path | None = None) -> None:
+    """Write rows of 3x4 matrices and, where `times_path` is given, the timestamps in seconds.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    rows = trajectory.poses[:, :3, :].reshape(-1, 12)
+    atomic_write_text(path, "".join(" ".join(f"{value:.12e}" for value in row) + "\n" for row in rows))
+    if times_path is not None:
+        atomic_write_text(times_path, "".join(f"{t:.9f}\n" for t in trajectory.timestamps))
+
+
+def read_euroc_truth(path: str | Path) -> Trajectory:
+    """Read EuRoC ground truth and turn its body poses into poses of camera 0.
+
+    Two forms are known: `timestamp_ns, p (3), q as w x y z, ...` (state_groundtruth_estimate0/data.csv) and
+    the same with a second timestamp after the first. T_BS is taken from `cam0/sensor.yaml` or
+    `cam0_sensor.yaml` in the folder of the file or one of the two above it.
+
+    Raises:
+        InputError: the file cannot be read, a line is wrong, or T_BS is not found.
+    """
+    path = Path(path)
+    rows, numbers = _numbers(path, columns=None, form="EuRoC: timestamp, p (3), q (4), ...", separator=",")
+    # A second column as large as a time in nanoseconds is a time stamp, no position.
+    first = 2 if rows.shape[1] > 1 and abs(rows[0, 1]) > 1e15 else 1
+    if rows.shape[1] < first + 7:
+        raise InputError(
+            f"{path}: line {numbers[0]} has {rows.shape[1]} columns; EuRoC ground truth has at least "
+            f"{first + 7}: timestamp in ns, p_x, p_y, p_z, q_w, q_x, q_y, q_z"
+        )
+    timestamps = rows[:, 0] / 1e9
+    _check_increasing(path, timestamps, numbers)
+    quaternions = rows[:, [first + 4, first + 5, first + 6, first + 3]]
+    T_world_body = _poses(path, rows[:, first : first + 3], quaternions, numbers)
+    return Trajectory(timestamps, T_world_body @ _camera_in_body(path))
+
+
+def _camera_in_body(truth: Path) -> np.ndarray:
+    """T_body_camera (4, 4) of camera 0 from the sensor file near the ground truth."""
+    folders = [truth.resolve().parent, *list(truth.resolve().parents)[1:3]]
+    candidates = [folder / name for folder in folders for name in ("cam0/sensor.yaml", "cam0_sensor.yaml")]
+    sensor = next((candidate for candidate in candidates if candidate.is_file()), None)
+    if sensor is None:
+        raise InputError(
+            f"{truth}: EuRoC truth is of the body, and no cam0/sensor.yaml or cam0_sensor.yaml with T_BS is "
+            f"in {folders[0]} or the two folders above: put it there, or convert the truth to TUM form"
+        )
+    entries = CalibrationYaml.read(sensor).entries
+    try:
+        T_body_camera = np.array(entries["T_BS"]["data"], dtype=np.float64).reshape(4, 4)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{sensor}: T_BS: data must be a list of 16 numbers by rows ({error})") from error
+    T_body_camera[:3, :3] = nearest_rotation(T_body_camera[:3, :3])
+    return T_body_camera
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Lines that are neither empty nor comments, each with its number from 1."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file; check the path") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not text; give a trajectory in TUM, KITTI or EuRoC form") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); give a readable file") from error
+    for number, line in enumerate(text.splitlines(), start=1):
+        stripped = line.strip()
+        if stripped and not stripped.startswith("#"):
+            yield number, stripped
+
+
+def _numbers(path: Path, columns: int | None, form: str, separator: str | None = None) -> tuple[np.ndarray, list[int]]:
+    """All rows as (N, columns) float64 and their line numbers; None takes the columns of the first row."""
+    rows: list[list[float]] = []
+    numbers: list[int] = []
+    for number, line in _lines(path):
+        fields = line.split(separator)
+        columns = len(fields) if columns is None else columns
+        if len(fields) != columns:
+            raise InputError(f"{path}: line {number} has {len(fields)} columns, not {columns} ({form})")
+        row = []
+        for field in fields:
+            try:
+                value = float(field)
+            except ValueError:
+                value = math.nan
+            if not math.isfinite(value):
+                raise InputError(
+                    f"{path}: line {number}: {field.strip()!r} is not a finite number ({form}); "
+                    "correct or remove the line"
+                )
+            row.append(value)
+        rows.append(row)
+        numbers.append(number)
+    if not rows:
+        raise InputError(f"{path}: holds no rows; expected {form}")
+    return np.array(rows, dtype=np.float64), numbers
+
+
+def _check_increasing(path: Path, timestamps: np.ndarray, numbers: list[int]) -> None:
+    late = np.flatnonzero(np.diff(timestamps) <= 0)
+    if len(late):
+        k = late[0] + 1
+        raise InputError(
+            f"{path}: line {numbers[k]}: time {timestamps[k]:.9f} s does not follow "
+            f"{timestamps[k - 1]:.9f} s; sort the rows by time and remove repeated ones"
+        )
+
+
+def _poses(path: Path, positions: np.ndarray, quaternions: np.ndarray, numbers: list[int]) -> np.ndarray:
+    """Poses (N, 4, 4) of positions (N, 3) and quaternions (N, 4) in x, y, z, w that must be unit."""
+    length = np.linalg.norm(quaternions, axis=1)
+    wrong = np.flatnonzero(np.abs(length - 1) > 1e-2)
+    if len(wrong):
+        k = wrong[0]
+        raise InputError(
+            f"{path}: line {numbers[k]}: the quaternion has length {length[k]:.4g}, not 1; "
+            "check the order of the columns"
+        )
+    poses = np.tile(np.eye(4), (len(positions), 1, 1))
+    poses[:, :3, :3] = quaternion_to_matrix(quaternions)
+    poses[:, :3, 3] = positions
+    return poses
