@@ -45,6 +45,29 @@ class KeyframeTracks(Table):
     covariance: np.ndarray
 
 
+@dataclass(frozen=True, slots=True)
+class NewKeyframe:
+    """A view that becomes a keyframe.
+
+    Attributes:
+        view: with disparities where landmarks may be.
+        timestamp: seconds.
+        pose: (4, 4) estimate of T_world_camera.
+        step: (4, 4) T_last_new as expected without its images; of the first keyframe T_world_camera.
+        step_covariance: (6, 6) of that, perturbed from the left in the last keyframe.
+        views: of the window's landmarks.
+        origin: of the first one, the past pose relative to which `step_covariance` is.
+    """
+
+    view: StereoView
+    timestamp: float
+    pose: np.ndarray
+    step: np.ndarray
+    step_covariance: np.ndarray
+    views: LandmarkViews = field(default_factory=LandmarkViews.empty)
+    origin: int | None = None
+
+
 @dataclass(slots=True)
 class Mapper:
     """Makes views keyframes of the window.
@@ -93,44 +116,27 @@ class Mapper:
         if not admitted.has_stereo(self.admission.min_points, self.config.min_inliers):
             return None
         views = matches.views.select(fit.inliers).inflated(fit.inflation)
-        return self.insert(admitted, timestamp, fit.pose, *expected, views)
+        return self.insert(NewKeyframe(admitted, timestamp, fit.pose, *expected, views))
 
-    def insert(
-        self,
-        view: StereoView,
-        timestamp: float,
-        pose: np.ndarray,
-        step: np.ndarray,
-        step_covariance: np.ndarray,
-        views: LandmarkViews | None = None,
-        origin: int | None = None,
-    ) -> KeyframeTracks:
-        """Makes a view a keyframe: it sees `views` of known landmarks, and whatever else it has in stereo is new.
+    def insert(self, new: NewKeyframe) -> KeyframeTracks:
+        """Makes a view a keyframe: what it has in stereo beside the views of known landmarks is new.
 
-        Args:
-            view: with disparities where landmarks may be.
-            timestamp: seconds.
-            pose: (4, 4) estimate of T_world_camera.
-            step: (4, 4) T_last_new as expected without its images; of the first keyframe T_world_camera.
-            step_covariance: (6, 6) of that, perturbed from the left in the last keyframe.
-            views: of the window's landmarks.
-            origin: of the first one, the past pose relative to which `step_covariance` is.
         Returns:
             What the keyframe saw, known landmarks before new ones.
         """
-        window, keyframes = self.window, self.keyframes
-        views = LandmarkViews.empty() if views is None else views
+        window, keyframes, views = self.window, self.keyframes, new.views
         if len(window) == self.config.window:
             views = views.renumber(keyframes.marginalise_oldest())
+        step_covariance = new.step_covariance
         if len(window):
             step_covariance = turn_covariance(window.posterior.poses[-1], step_covariance)
-        since = timestamp - keyframes.active[-1].timestamp if keyframes.active else 0.0
+        since = new.timestamp - keyframes.active[-1].timestamp if keyframes.active else 0.0
         walk = np.array([self.config.offset_walk**2 * since, 0.0, 0.0])
-        median = max(float(np.nanmedian(view.disparity)), _MIN_DISPARITY)
-        depth = self.camera.focal_baseline / median
-        window.add_keyframe(pose, step, step_covariance, walk, depth, origin)
-        view = replace(view, slope=disparity_slopes(view.features.keypoints, view.disparity))
-        keyframes.append(view, timestamp)
+        disparity = max(float(np.nanmedian(new.view.disparity)), _MIN_DISPARITY)
+        depth = self.camera.focal_baseline / disparity
+        window.add_keyframe(new.pose, new.step, step_covariance, walk, depth, new.origin)
+        view = replace(new.view, slope=disparity_slopes(new.view.features.keypoints, new.view.disparity))
+        keyframes.append(view, new.timestamp)
         window.add_views(views)
         self._add_landmarks(view, views)
         seen = LandmarkViews.concatenate([views, window.landmarks.anchor_views(len(window) - 1)])

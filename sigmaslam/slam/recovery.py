@@ -15,7 +15,7 @@ from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.keyframes import Keyframes
 from sigmaslam.slam.landmark_admission import LandmarkAdmission
 from sigmaslam.slam.localisation import Prediction
-from sigmaslam.slam.mapping import KeyframeTracks, Mapper
+from sigmaslam.slam.mapping import KeyframeTracks, Mapper, NewKeyframe
 from sigmaslam.slam.motion_prior import densities, initial_twist_sigma
 from sigmaslam.slam.phase import Course, Phase
 from sigmaslam.slam.relocalisation import Relocalisation
@@ -64,13 +64,14 @@ class Recovery:
             course.resume(timestamp)
         course.tracked_at = timestamp
         pose = Prediction.of(self.window, self.motion).pose
-        return self._insert(view, timestamp, pose, self.motion.step, self.motion.step_covariance)
+        return self._insert(NewKeyframe(view, timestamp, pose, self.motion.step, self.motion.step_covariance))
 
     def resume(self, found: Relocalisation, timestamp: float) -> KeyframeTracks:
         """Goes on from where a lost view was found."""
         self.course.resume(timestamp)
         covariance = turn_covariance(found.pose, found.covariance)
-        return self._insert(found.view, timestamp, found.pose, found.pose, covariance, found.origin)
+        new = NewKeyframe(found.view, timestamp, found.pose, found.pose, covariance, origin=found.origin)
+        return self._insert(new)
 
     def begin_again(self, first: StereoView, timestamp: float) -> None:
         """Starts again from the first view, now with other landmarks, and predicts the current frame from there."""
@@ -85,17 +86,10 @@ class Recovery:
         """Makes the view the first keyframe, and its camera the world."""
         self.course.start(timestamp)
         view = view.only(self.admission.admit(view, np.eye(4), self.window))
-        return self._insert(view, timestamp, np.eye(4), np.eye(4), np.zeros((6, 6)))
+        return self._insert(NewKeyframe(view, timestamp, np.eye(4), np.eye(4), np.zeros((6, 6))))
 
-    def _insert(
-        self,
-        view: StereoView,
-        timestamp: float,
-        pose: np.ndarray,
-        step: np.ndarray,
-        step_covariance: np.ndarray,
-        origin: int | None = None,
-    ) -> KeyframeTracks:
-        tracks = self.mapper.insert(view, timestamp, pose, step, step_covariance, None, origin)
+    def _insert(self, new: NewKeyframe) -> KeyframeTracks:
+        """Makes a view a keyframe that sees no known landmark; its velocity is unknown."""
+        tracks = self.mapper.insert(new)
         self.motion.forget_twist(initial_twist_sigma(self.config, self.window.depth))
         return tracks

@@ -129,25 +129,18 @@ def test_errors_are_as_large_as_the_covariance_says_after_a_loop():
     assert 0.75 < np.mean(ratios) < 1.25
 
 
+def arrays_of(window: KeyframeWindow) -> list[np.ndarray]:
+    state = window.posterior
+    return [state.poses, state.covariance, state.past.poses, state.past.covariance, state.past.cross]
+
+
 def test_a_wrong_loop_is_refused_and_changes_nothing():
     truth, steps = drive(0)
     window, edge = follow(steps), loop(truth, 1, 0)
-    before = [
-        window.posterior.poses,
-        window.posterior.covariance,
-        window.posterior.past.poses,
-        window.posterior.past.covariance,
-        window.posterior.past.cross,
-    ]
+    before = arrays_of(window)
     wrong = replace(edge, T_i_j=edge.T_i_j @ se3_exp(np.array([0.003, 0, -0.002, 0, 0.0005, 0])))
     assert not close(window, wrong)
-    after = [
-        window.posterior.poses,
-        window.posterior.covariance,
-        window.posterior.past.poses,
-        window.posterior.past.covariance,
-        window.posterior.past.cross,
-    ]
+    after = arrays_of(window)
     for old, new in zip(before, after, strict=True):
         np.testing.assert_array_equal(old, new)
 
