@@ -9,6 +9,7 @@ import numpy as np
 from sigmaslam.estimation.landmark_table import LandmarkTable
 from sigmaslam.estimation.robust import student_weight, whiten
 from sigmaslam.estimation.sigma_point_linearisation import Linearisation
+from sigmaslam.estimation.small_triangular import solve_lower
 from sigmaslam.estimation.state_layout import LANDMARK_SIZE, MODELLED
 
 
@@ -68,7 +69,7 @@ def eliminate_landmarks(
     landmark_information = sums[:, :, :LANDMARK_SIZE] + np.eye(LANDMARK_SIZE) * precision[:, None, :]
     vector = sums[:, :, -1] + departure * precision
     lower = np.linalg.cholesky(landmark_information)
-    reduced = np.linalg.solve(lower, np.concatenate([sums[:, :, LANDMARK_SIZE:-1], vector[..., None]], axis=2))
+    reduced = solve_lower(lower, np.concatenate([sums[:, :, LANDMARK_SIZE:-1], vector[..., None]], axis=2))
     tall, flat = by_state.reshape(-1, size), reduced[:, :, :size].reshape(-1, size)
     information = tall.T @ tall - flat.T @ flat
     right = tall.T @ residuals.ravel() - flat.T @ reduced[:, :, -1].ravel()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999, CHI_SQUARE_MEDIAN
+from sigmaslam.estimation.small_triangular import solve_lower
 
 # A disparity that is not there: its variance, pixels squared.
 UNKNOWN_VARIANCE = 1e12
@@ -57,7 +58,7 @@ def common_scale(squared: np.ndarray, components: np.ndarray) -> float:
 
 def whiten(stacked: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Rows (3 M, k) of stacked (M, 3, k) in units of the noise (M, 3, 3)."""
-    return np.asarray(np.linalg.solve(np.linalg.cholesky(noise), stacked).reshape(-1, stacked.shape[2]))
+    return np.asarray(solve_lower(np.linalg.cholesky(noise), stacked).reshape(-1, stacked.shape[2]))
 
 
 def student_weight(squared: np.ndarray, components: np.ndarray, freedom: float = STUDENT_FREEDOM) -> np.ndarray:
