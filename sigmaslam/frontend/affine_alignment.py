@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sigmaslam.frontend.image_smoothing import smoothed
 from sigmaslam.frontend.knn import nearest_points
-from sigmaslam.frontend.patch_evidence import sample_patches
+from sigmaslam.frontend.patch_kernels import align
 from sigmaslam.frontend.types import Refinement
 
 _NEIGHBOURS = 24
@@ -22,10 +21,9 @@ _PRIOR = 1.0
 _RADIUS = 7
 _ITERATIONS = 6
 _TAPER = 0.6
-_LEAST_CORRELATION = 0.5
-_LONGEST_STEP = 1.0
-# Of a plane seen from elsewhere: no part of a patch is nearer than this share of its centre's distance.
-_LEAST_DEPTH = 0.2
+_MIN_CORRELATION = 0.5
+# Between the images around a match.
+_MAX_ZOOM = 5.0
 
 
 def local_maps(points0: np.ndarray, points1: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -94,24 +92,18 @@ def align_patches(
         np.isfinite(A).all(axis=(1, 2)), np.linalg.det(np.nan_to_num(A, posinf=0.0, neginf=0.0)), 0.0
     )
     zoom = np.sqrt(np.maximum(determinant, 0.0))
-    usable = (zoom > 0.2) & (zoom < 5.0) & _inside(image0, points0) & _inside(image1, points1)
+    usable = (zoom > 1.0 / _MAX_ZOOM) & (zoom < _MAX_ZOOM) & _inside(image0, points0) & _inside(image1, points1)
+    rows = np.flatnonzero(usable)
     # The finer image is smoothed as much as the coarser one's pixels do, in steps of half an octave.
-    half_octaves = np.round(2.0 * np.log2(np.clip(zoom, 0.2, 5.0))).astype(int)
-    for step in np.unique(half_octaves[usable]):
-        rows = np.flatnonzero((half_octaves == step) & usable)
-        ratio = 2.0 ** (0.5 * step)
-        spacing = max(1.0, ratio)
-        smooth0, smooth1 = smoothed(image0, max(1.0, 1.0 / ratio)), smoothed(image1, spacing)
-        side = np.arange(-radius, radius + 1, dtype=np.float32)
-        grid = np.float32(spacing) * np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
-        offsets = grid @ np.linalg.inv(A[rows]).transpose(0, 2, 1)
-        if tilt is not None:
-            offsets /= np.maximum(1.0 - offsets @ tilt[rows][..., None], _LEAST_DEPTH)
-        template = sample_patches(smooth0, points0[rows, None] + offsets)
-        window = np.exp(-0.5 * (grid**2).sum(axis=1) / np.float32(taper * spacing * radius) ** 2)
-        places[rows], moved[rows] = _align(
-            template, grid, window / window.sum(), smooth1, places[rows], spacing, reach * spacing, iterations
-        )
+    half_octaves = np.round(2.0 * np.log2(zoom[rows])).astype(int)
+    back = np.linalg.inv(A[rows])
+    tilts = np.zeros((len(rows), 2)) if tilt is None else tilt[rows]
+    found = align(image0, image1, points0[rows], places[rows], back, tilts, half_octaves, radius, iterations, taper)
+    shift, correlation = found[:, :2], found[:, 2]
+    spacing = np.maximum(1.0, 2.0 ** (0.5 * half_octaves))
+    fits = (correlation > _MIN_CORRELATION) & (np.linalg.norm(shift, axis=1) <= reach * spacing)
+    places[rows[fits]] += shift[fits]
+    moved[rows[fits]] = True
     return places, moved
 
 
@@ -133,46 +125,3 @@ def refine_by_neighbours(
 
 def _inside(image: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.asarray(((points >= 0) & (points <= (image.shape[1] - 1, image.shape[0] - 1))).all(axis=1))
-
-
-def _align(
-    template: np.ndarray,
-    grid: np.ndarray,
-    window: np.ndarray,
-    image1: np.ndarray,
-    points1: np.ndarray,
-    spacing: float,
-    reach: float,
-    iterations: int,
-) -> tuple[np.ndarray, np.ndarray]:
-    """As `align_patches`, for matches of one zoom.
-
-    Args:
-        template: (M, K) patches of image 0, warped and sampled at offsets `grid` (K, 2), `spacing` apart, of image 1.
-        window: (K,) weights of the samples, of sum 1.
-        image1: (H, W) float32, smoothed.
-        points1, reach, iterations: as there.
-    """
-    count = round(len(grid) ** 0.5)
-    template = _normalised(template, window)
-    square = template.reshape(-1, count, count)
-    along_v, along_u = np.gradient(square, np.float32(spacing), axis=(1, 2))
-    gradient = np.stack([along_u, along_v], axis=1).reshape(len(template), 2, -1)
-    weighted = gradient * window
-    normal = weighted @ gradient.transpose(0, 2, 1) + np.float32(1e-6) * np.eye(2, dtype=np.float32)
-    towards = np.linalg.inv(normal) @ weighted
-    shift = np.zeros_like(points1)
-    for _ in range(iterations):
-        error = _normalised(sample_patches(image1, (points1 + shift)[:, None] + grid), window) - template
-        step = (towards @ error[..., None])[..., 0]
-        length = np.linalg.norm(step, axis=1, keepdims=True)
-        shift -= step * np.minimum(1.0, _LONGEST_STEP * spacing / np.maximum(length, 1e-9))
-    final = _normalised(sample_patches(image1, (points1 + shift)[:, None] + grid), window)
-    moved = ((final * template) @ window > _LEAST_CORRELATION) & (np.linalg.norm(shift, axis=1) <= reach)
-    return np.where(moved[:, None], points1 + shift, points1), moved
-
-
-def _normalised(patches: np.ndarray, window: np.ndarray) -> np.ndarray:
-    """Patches (M, K) of weighted mean 0 and variance 1."""
-    centred = patches - (patches @ window)[:, None]
-    return np.asarray(centred / np.sqrt((centred * centred) @ window + np.float32(1e-2))[:, None])

@@ -11,7 +11,7 @@ import numpy as np
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.state_layout import pose_slice
 from sigmaslam.frontend import StereoView
-from sigmaslam.frontend.image_smoothing import sharpness
+from sigmaslam.frontend.image_sharpness import sharpness
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.slam.keyframe import Keyframe
 from sigmaslam.slam.map_file import pack_keyframes, read_keyframes

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sigmaslam.frontend.affine_alignment import align_patches
-from sigmaslam.frontend.image_smoothing import sharpness, smoothed
+from sigmaslam.frontend.image_sharpness import sharpness
 from sigmaslam.frontend.lucas_kanade import refine
 from sigmaslam.frontend.plane_alignment import disparity_slopes, plane_maps, refine_in_rows, refine_on_planes
 from sigmaslam.frontend.types import PatchMaps
@@ -168,28 +168,7 @@ def test_what_moves_alike_is_not_misplaced_alike_between_pixels(shift):
     assert np.abs((places - points1)[moved].mean(axis=0)).max() < 0.006
 
 
-# Smoothed images
-
-
-@pytest.mark.parametrize("factor", [1.0, 1.5])
-def test_an_image_is_smoothed_once_on_pixels_and_between_them(factor):
-    image = digitised(textured(), 3)
-    found = smoothed(image, factor)
-    assert smoothed(image, factor) is found
-    reach = 2 * int(np.ceil(4.0 * 0.7 * factor)) + 1
-    expected = cv2.GaussianBlur(image.astype(np.float32), (reach, reach), 0.7 * factor)
-    np.testing.assert_allclose(found[::2, ::2], expected, atol=1e-3)
-
-
-def test_waves_are_smoothed_by_what_a_gaussian_leaves_of_them_wherever_they_are_sampled():
-    """Of five pixels to the wave, and of eight across."""
-    omega = 2.0 * np.pi / np.array([5.0, 8.0])
-    v, u = np.mgrid[:80, :100] / 2.0
-    wave = 100.0 * np.exp(-0.5 * (0.7 * omega) ** 2).prod() * np.sin(omega[0] * u) * np.sin(omega[1] * v)
-    image = 128.0 + 100.0 * np.sin(omega[0] * u) * np.sin(omega[1] * v)
-    found = smoothed(np.rint(image[::2, ::2]).astype(np.uint8))
-    inner = slice(12, -12), slice(12, -12)
-    assert np.abs(found[inner] - 128.0 - wave[inner]).max() < 0.6
+# Sharpness
 
 
 @pytest.mark.parametrize(("kernel", "least", "most"), [((11, 1), 0.4, 0.8), ((5, 5), 0.2, 0.6), ((1, 1), 1.0, 1.0)])
@@ -199,14 +178,3 @@ def test_blur_is_less_sharp_and_darkness_is_not(kernel, least, most):
     assert least <= sharpness(cv2.blur(image, kernel)) / whole <= most
     assert sharpness((0.5 * image + 20.0).astype(np.uint8)) == pytest.approx(whole, rel=0.02)
     assert sharpness(np.full_like(image, 7)) == 0.0
-
-
-def test_another_image_in_its_place_is_another_image():
-    """Of 100 images at few addresses: one that is gone leaves its address to the next."""
-    addresses = set()
-    for level in range(100):
-        image = np.full((120, 160), level, np.uint8)
-        assert smoothed(image).mean() == pytest.approx(level, rel=1e-5)
-        addresses.add(id(image))
-        del image
-    assert len(addresses) < 50

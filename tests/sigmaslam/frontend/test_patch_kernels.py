@@ -1,0 +1,119 @@
+"""Patches sampled, aligned and compared: compiled kernels against their NumPy twin, both against what is known."""
+
+from __future__ import annotations
+
+import logging
+
+import cv2
+import numpy as np
+import pytest
+
+from sigmaslam.frontend import patch_kernels
+from sigmaslam.frontend.patch_kernels import align_reference, examine_reference, sample
+
+WIDTH, HEIGHT = 160, 120
+Matches = tuple[np.ndarray, ...]
+
+
+@pytest.fixture(scope="module")
+def kernels():
+    """The compiled module."""
+    return pytest.importorskip("sigmaslam.frontend._kernels", reason="installed without a compiler")
+
+
+@pytest.fixture(scope="module")
+def images() -> tuple[np.ndarray, np.ndarray]:
+    """Texture at all scales, and the same a fraction of a pixel on."""
+    rng = np.random.default_rng(0)
+    noise = sum(
+        cv2.resize(rng.normal(size=(HEIGHT // k + 2, WIDTH // k + 2)) * k, (WIDTH + 8, HEIGHT + 8), interpolation=2)
+        for k in (2, 4, 8, 16)
+    )
+    grey = cv2.normalize(noise, None, 0, 255, cv2.NORM_MINMAX)
+    shifted = cv2.warpAffine(grey, np.array([[1.0, 0.0, -0.4], [0.0, 1.0, 0.3]]), (WIDTH + 8, HEIGHT + 8))
+    cut = slice(4, 4 + HEIGHT), slice(4, 4 + WIDTH)
+    return tuple(np.rint(each[cut]).astype(np.uint8) for each in (grey, shifted))
+
+
+def matches(count: int = 200, zoom: float = 1.2, seed: int = 1) -> Matches:
+    """Places in both images, some at the border, with maps that turn, scale and tilt."""
+    rng = np.random.default_rng(seed)
+    points0 = rng.uniform(0, [WIDTH - 1, HEIGHT - 1], (count, 2))
+    points1 = np.clip(points0 + rng.normal(0, 0.5, (count, 2)), 0, [WIDTH - 1, HEIGHT - 1])
+    A = np.eye(2) + 0.05 * rng.normal(size=(count, 2, 2))
+    A *= (zoom ** rng.uniform(-1, 1, count))[:, None, None]
+    half_octaves = np.round(np.log2(np.linalg.det(A))).astype(np.int32)
+    return points0, points1, np.linalg.inv(A), 0.003 * rng.normal(size=(count, 2)), half_octaves
+
+
+@pytest.mark.parametrize("half_octaves", [0, 1, 3])
+def test_samples_on_pixels_are_those_of_a_gaussian_blur(images, half_octaves: int):
+    sigma = 0.7 * 2 ** (0.5 * half_octaves)
+    reach = 2 * int(np.ceil(4.0 * sigma)) + 1
+    expected = cv2.GaussianBlur(images[0].astype(np.float32), (reach, reach), sigma, borderType=cv2.BORDER_REPLICATE)
+    v, u = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
+    found = sample(images[0], np.stack([u, v], axis=-1), half_octaves)
+    np.testing.assert_allclose(found, expected, atol=0.02)
+
+
+def test_waves_are_what_a_gaussian_leaves_of_them_wherever_they_are_sampled():
+    """Of five pixels to the wave, and of eight across."""
+    omega = 2.0 * np.pi / np.array([5.0, 8.0])
+    v, u = np.mgrid[:60, :80].astype(np.float64)
+    image = np.rint(128.0 + 100.0 * np.sin(omega[0] * u) * np.sin(omega[1] * v)).astype(np.uint8)
+    places = np.random.default_rng(0).uniform(8, [70, 50], (50, 20, 2))
+    waves = np.sin(omega * places).prod(axis=-1) * np.exp(-0.5 * (0.7 * omega) ** 2).prod()
+    assert np.abs(sample(image, places) - 128.0 - 100.0 * waves).max() < 0.6
+
+
+@pytest.mark.parametrize(("radius", "taper", "zoom"), [(5, 1.0, 1.0), (5, 1.0, 1.5), (7, 0.6, 4.5)])
+def test_compiled_alignment_equals_its_twin(kernels, images, radius: int, taper: float, zoom: float):
+    given = matches(zoom=zoom)
+    found = kernels.align(*images, *given, 2 * radius + 1, 3, taper * radius)
+    expected = align_reference(*images, *given, radius, 3, taper)
+    np.testing.assert_allclose(found[:, 2], expected[:, 2], atol=1e-4)
+    # Where patches fit; a step from a patch without texture may be anything.
+    good = expected[:, 2] > 0.5
+    assert good.sum() > 80
+    assert np.abs(found - expected)[good].max() < 2e-3
+    assert np.median(np.abs(found - expected)[good]) < 1e-5
+
+
+@pytest.mark.parametrize("zoom", [1.0, 4.5])
+def test_compiled_evidence_equals_its_twin(kernels, images, zoom: float):
+    points0, points1, back, _, half_octaves = matches(zoom=zoom)
+    found = kernels.examine(*images, points0, points1, back, half_octaves, 11, 3.0, 1.0)
+    expected = examine_reference(*images, points0, points1, back, half_octaves, 5, 0.6, 1.0)
+    np.testing.assert_allclose(found, expected, rtol=2e-4, atol=2e-5)
+
+
+def test_every_run_gives_the_same_bits(kernels, images):
+    first, again = (kernels.align(*images, *matches(), 11, 3, 5.0) for _ in range(2))
+    assert first.tobytes() == again.tobytes()
+
+
+def test_patches_find_the_shift_of_the_image(images):
+    points = np.random.default_rng(2).uniform(12, [WIDTH - 12, HEIGHT - 12], (100, 2))
+    same, flat = np.tile(np.eye(2), (100, 1, 1)), np.zeros((100, 2))
+    found = patch_kernels.align(*images, points, points, same, flat, np.zeros(100, int), 5, 3, 1.0)
+    assert np.abs(np.median(found[:, :2], axis=0) - [-0.4, 0.3]).max() < 0.02
+    assert np.median(found[:, 2]) > 0.95
+
+
+def test_without_a_compiler_the_twin_serves_and_says_so_once(images, monkeypatch, caplog):
+    monkeypatch.setattr(patch_kernels, "_kernels", None)
+    patch_kernels._tell_slow.cache_clear()
+    with caplog.at_level(logging.WARNING):
+        found = [patch_kernels.align(*images, *matches(20), 5, 3, 1.0) for _ in range(2)]
+    np.testing.assert_array_equal(found[0], align_reference(*images, *matches(20), 5, 3, 1.0))
+    assert [record.message for record in caplog.records if "C++ compiler" in record.message] != []
+    assert len(caplog.records) == 1
+
+
+@pytest.mark.parametrize("side", [4, 17])
+def test_patches_of_other_sizes_are_refused(kernels, images, side: int):
+    with pytest.raises(ValueError, match="samples a side"):
+        kernels.align(*images, *matches(5), side, 3, 5.0)
+    points0, *others = matches(5)
+    with pytest.raises(ValueError, match="a row for each match"):
+        kernels.align(*images, points0[:4], *others, 11, 3, 5.0)
