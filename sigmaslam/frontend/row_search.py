@@ -1,0 +1,93 @@
+"""Where keypoints of the left image are in the right one of a rectified pair: patches of edges, searched along the row.
+
+Edges are compared at half the resolution, there and back; whole pixels of that are found, which alignment refines.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from sigmaslam.frontend.patch_kernels import compiled
+
+# The patches, pixels of half the resolution: rows above and below, columns before and from the keypoint on.
+_ABOVE, _TALL, _BEFORE, _BROAD = 5, 11, 8, 16
+# The best place must have less than this share of the difference of the second best one.
+_MAX_RATIO = 0.9
+# Disparities that count as neighbours of the best one, and by how many the way back may miss.
+_NEIGHBOURS, _MAX_MISS = 2, 1
+_NOWHERE = -1000
+
+
+def search_rows(
+    left: np.ndarray, right: np.ndarray, keypoints: np.ndarray, lowest: float, highest: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Finds keypoints in the right image.
+
+    Args:
+        left, right: (H, W) uint8, a rectified pair.
+        keypoints: (N, 2) of the left image, pixels.
+        lowest, highest: disparities to search between, pixels.
+    Returns:
+        (M,) which keypoints were found, and (M, 2) float64 where, to two pixels along the row.
+    """
+    edges = _edges(left), _edges(right)
+    places = np.rint(0.5 * keypoints - 0.25).astype(np.int32)
+    bounds = int(np.floor(0.5 * lowest)), int(0.5 * highest)
+    kernels = compiled()
+    search = search_reference if kernels is None else kernels.search_rows
+    disparity = search(*edges, places, *bounds, _MAX_RATIO)
+    index = np.flatnonzero(disparity != _NOWHERE)
+    found = keypoints[index].astype(np.float64)
+    found[:, 0] -= 2.0 * disparity[index]
+    return index, found
+
+
+def search_reference(
+    left: np.ndarray, right: np.ndarray, places: np.ndarray, lowest: int, highest: int, ratio: float
+) -> np.ndarray:
+    """The search in NumPy.
+
+    Args:
+        left, right: (H, W) uint8.
+        places: (N, 2) pixels of the left image, whole numbers.
+        lowest, highest: disparities to search between.
+        ratio: the best difference must be smaller than this share of the second best.
+    Returns:
+        (N,) disparity, or -1000 where none is found.
+    """
+    disparities = np.arange(lowest, highest + 1)
+    there = _differences(left, right, places, -disparities)
+    best = there.argmin(axis=1)
+    apart = np.abs(disparities[None] - disparities[best][:, None]) > _NEIGHBOURS
+    second = np.where(apart, there, np.inf).min(axis=1)
+    cost = there[np.arange(len(places)), best]
+    found = np.isfinite(cost) & np.isfinite(second) & (cost <= np.float32(ratio) * second)
+    seen = places - np.column_stack([disparities[best], np.zeros(len(places), int)])
+    back = _differences(right, left, np.where(found[:, None], seen, places), disparities).argmin(axis=1)
+    found &= np.abs(disparities[back] - disparities[best]) <= _MAX_MISS
+    return np.where(found, disparities[best], _NOWHERE)
+
+
+def _differences(image0: np.ndarray, image1: np.ndarray, places: np.ndarray, shifts: np.ndarray) -> np.ndarray:
+    """(N, S) sums of absolute differences of patches of image 0 and those shifted along the row in image 1."""
+    height, width = image0.shape
+    dv, du = np.mgrid[-_ABOVE : _TALL - _ABOVE, -_BEFORE : _BROAD - _BEFORE]
+    u, v = places[:, 0, None, None], places[:, 1, None, None]
+    rows = np.clip(v + dv, 0, height - 1)
+    wanted = image0[rows, np.clip(u + du, 0, width - 1)].astype(np.int32)
+    tall = (places[:, 1] >= _ABOVE) & (places[:, 1] + _TALL - _ABOVE <= height)
+    sums = np.full((len(places), len(shifts)), np.inf)
+    inside0 = tall & (places[:, 0] >= _BEFORE) & (places[:, 0] + _BROAD - _BEFORE <= width)
+    for k, shift in enumerate(shifts):
+        column = places[:, 0] + shift
+        inside = inside0 & (column >= _BEFORE) & (column + _BROAD - _BEFORE <= width)
+        patch = image1[rows, np.clip(u + shift + du, 0, width - 1)]
+        sums[inside, k] = np.abs(wanted - patch).sum(axis=(1, 2))[inside]
+    return sums
+
+
+def _edges(image: np.ndarray) -> np.ndarray:
+    """Horizontal derivative at half the resolution, (H / 2, W / 2) uint8 about 128."""
+    half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    return cv2.convertScaleAbs(cv2.Sobel(half, cv2.CV_16S, 1, 0), alpha=0.5, beta=128.0)
