@@ -21,7 +21,7 @@ from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.inference.onnx_graph import shipped_weights
 from sigmaslam.readers import StereoSequence, open_sequence
 from sigmaslam.readers.trajectory_files import read_trajectory
-from sigmaslam.runs.report import FrameTable, read_frames
+from sigmaslam.runs.frame_table import FrameTable, read_frames
 from sigmaslam.runs.track import track_sequence
 
 if TYPE_CHECKING:

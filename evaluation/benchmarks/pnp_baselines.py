@@ -23,7 +23,7 @@ from sigmaslam.geometry.se3 import rotation_exp, se3_adjoint, se3_inverse, se3_l
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import StereoSequence
 from sigmaslam.readers.trajectory_files import write_tum
-from sigmaslam.runs.report import COLUMNS
+from sigmaslam.runs.frame_table import COLUMNS
 
 _KEYPOINTS = 1500  # as many as the tracker asks for
 _PIXEL_SIGMA = 1.0

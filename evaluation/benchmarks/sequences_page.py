@@ -11,7 +11,7 @@ import numpy as np
 
 from sigmaslam.evaluation.benchmarks.page import opening, table
 from sigmaslam.evaluation.trial import TrialResult
-from sigmaslam.runs.report import FrameTable
+from sigmaslam.runs.frame_table import FrameTable
 
 _LABELS = {
     "ours": "ours",

@@ -1,10 +1,7 @@
 """The report of a run: one HTML file without links to anything outside it."""
 
-import csv
 import json
-import re
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,19 +18,8 @@ from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.plot_style import BLUE, GREEN, GREY, PURPLE, SERIES, VERMILLION, style_axes
 from sigmaslam.readers.trajectory_files import read_tum
 from sigmaslam.runs.figures import plot_trajectory, to_svg
+from sigmaslam.runs.frame_table import STATUSES, FrameTable, read_frames
 
-COLUMNS = (
-    "timestamp",
-    "matches",
-    "inliers",
-    "nis",
-    "dof",
-    "belief",
-    "disparity_offset",
-    "disparity_offset_sigma",
-)
-"""Columns of numbers that frames.csv must have, next to `status` and any number of `ms_...`."""
-STATUSES = ("starting", "tracking", "lost", "relocalised", "skipped")
 STATUS_COLOURS = {"lost": VERMILLION, "relocalised": PURPLE, "skipped": GREY}
 
 MAX_VERTICES = 1000
@@ -42,66 +28,6 @@ MAX_COLUMNS = 250
 """Filled areas have at most so many steps; with more frames they show means, or a subset."""
 MAX_CONFIGURATION = 20_000
 """The report shows at most so many characters of run.json."""
-
-
-@dataclass(frozen=True, slots=True)
-class FrameTable:
-    """The rows of frames.csv.
-
-    Attributes:
-        status: one of `STATUSES` for each of N frames.
-        columns: by name of `COLUMNS`, (N,) float64; NaN where the field is empty.
-        milliseconds: by stage ("read", "features", ...), (N,) float64; NaN where the field is empty.
-    """
-
-    status: list[str]
-    columns: dict[str, np.ndarray]
-    milliseconds: dict[str, np.ndarray]
-
-    def __len__(self) -> int:
-        return len(self.status)
-
-    @property
-    def seconds(self) -> np.ndarray:
-        """(N,) time since the first frame."""
-        timestamps = self.columns["timestamp"]
-        return np.asarray(timestamps - timestamps[0])
-
-    @property
-    def total_milliseconds(self) -> np.ndarray:
-        """(N,) time spent on each frame; NaN where no stage has a time."""
-        stages = np.array(list(self.milliseconds.values())).reshape(-1, len(self))
-        measured = np.isfinite(stages).any(axis=0)
-        return np.where(measured, np.nansum(stages, axis=0), np.nan)
-
-
-def read_frames(path: Path) -> FrameTable:
-    """Read frames.csv.
-
-    Raises:
-        InputError: the file is missing or empty, a column is missing, or a field is no number or no status.
-    """
-    try:
-        with path.open(newline="", encoding="utf-8") as stream:
-            reader = csv.DictReader(stream)
-            names = reader.fieldnames or []
-            rows = list(reader)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: cannot be read ({error}); give a folder written by `sigmaslam track`") from error
-    missing = [name for name in (*COLUMNS, "status") if name not in names]
-    if missing:
-        raise InputError(f"{path}: has no column {', '.join(missing)}; run `sigmaslam track` again")
-    if not rows:
-        raise InputError(f"{path}: holds no frames; run `sigmaslam track` again")
-    for number, row in enumerate(rows, start=2):
-        if row["status"] not in STATUSES:
-            raise InputError(f"{path}: line {number}: status {row['status']!r} is none of {', '.join(STATUSES)}")
-    stages = [name for name in names if re.fullmatch(r"ms_[a-z0-9_]+", name)]
-    return FrameTable(
-        status=[row["status"] for row in rows],
-        columns={name: _column(path, rows, name) for name in COLUMNS},
-        milliseconds={name.removeprefix("ms_"): _column(path, rows, name) for name in stages},
-    )
 
 
 def write_report(run_dir: str | Path) -> Path:
@@ -137,23 +63,6 @@ def write_report(run_dir: str | Path) -> Path:
     path = run_dir / "report.html"
     atomic_write_text(path, text)
     return path
-
-
-def _column(path: Path, rows: list[dict[str, str]], name: str) -> np.ndarray:
-    values = np.full(len(rows), np.nan)
-    for index, row in enumerate(rows):
-        field = (row[name] or "").strip()
-        if not field:
-            if name == "timestamp":
-                raise InputError(f"{path}: line {index + 2}: has no timestamp; every frame needs one")
-            continue
-        try:
-            values[index] = float(field)
-        except ValueError as error:
-            raise InputError(
-                f"{path}: line {index + 2}: {name} is {field!r}, not a number; leave it empty if unknown"
-            ) from error
-    return values
 
 
 def _read_points(path: Path) -> np.ndarray | None:

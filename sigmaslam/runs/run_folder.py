@@ -22,7 +22,7 @@ from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.inference.onnx_graph import shipped_weights
 from sigmaslam.readers.trajectory_files import write_kitti, write_tum
-from sigmaslam.runs.report import COLUMNS, write_report
+from sigmaslam.runs.frame_table import COLUMNS
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.slam.mapping import KeyframeTracks
 from sigmaslam.slam.point_map import PointMap
@@ -129,6 +129,8 @@ class RunWriter:
             np.savez_compressed(path, **points, **keyframes)
         write_ply(self._out / "map.ply", point_map)
         self._write_tracks()
+        from sigmaslam.runs.report import write_report  # draws: not needed before the run has ended
+
         write_report(self._out)
         return summary
 

@@ -9,7 +9,8 @@ from sigmaslam.errors import InputError
 from sigmaslam.geometry.se3 import rotation_exp
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import write_tum
-from sigmaslam.runs.report import read_frames, write_report
+from sigmaslam.runs.frame_table import read_frames
+from sigmaslam.runs.report import write_report
 
 STAGES = ("read", "features", "match", "filter", "map")
 HEADER = (

@@ -1,0 +1,102 @@
+"""The table of frames that a run folder holds: frames.csv."""
+
+from __future__ import annotations
+
+import csv
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sigmaslam.errors import InputError
+
+COLUMNS = (
+    "timestamp",
+    "matches",
+    "inliers",
+    "nis",
+    "dof",
+    "belief",
+    "disparity_offset",
+    "disparity_offset_sigma",
+)
+"""Columns of numbers that frames.csv must have, next to `status` and any number of `ms_...`."""
+STATUSES = ("starting", "tracking", "lost", "relocalised", "skipped")
+
+
+@dataclass(frozen=True, slots=True)
+class FrameTable:
+    """The rows of frames.csv.
+
+    Attributes:
+        status: one of `STATUSES` for each of N frames.
+        columns: by name of `COLUMNS`, (N,) float64; NaN where the field is empty.
+        milliseconds: by stage ("read", "features", ...), (N,) float64; NaN where the field is empty.
+    """
+
+    status: list[str]
+    columns: dict[str, np.ndarray]
+    milliseconds: dict[str, np.ndarray]
+
+    def __len__(self) -> int:
+        return len(self.status)
+
+    @property
+    def seconds(self) -> np.ndarray:
+        """(N,) time since the first frame."""
+        timestamps = self.columns["timestamp"]
+        return np.asarray(timestamps - timestamps[0])
+
+    @property
+    def total_milliseconds(self) -> np.ndarray:
+        """(N,) time spent on each frame; NaN where no stage has a time."""
+        stages = np.array(list(self.milliseconds.values())).reshape(-1, len(self))
+        measured = np.isfinite(stages).any(axis=0)
+        return np.where(measured, np.nansum(stages, axis=0), np.nan)
+
+
+def read_frames(path: Path) -> FrameTable:
+    """Read frames.csv.
+
+    Raises:
+        InputError: the file is missing or empty, a column is missing, or a field is no number or no status.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8") as stream:
+            reader = csv.DictReader(stream)
+            names = reader.fieldnames or []
+            rows = list(reader)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: cannot be read ({error}); give a folder written by `sigmaslam track`") from error
+    missing = [name for name in (*COLUMNS, "status") if name not in names]
+    if missing:
+        raise InputError(f"{path}: has no column {', '.join(missing)}; run `sigmaslam track` again")
+    if not rows:
+        raise InputError(f"{path}: holds no frames; run `sigmaslam track` again")
+    for number, row in enumerate(rows, start=2):
+        if row["status"] not in STATUSES:
+            raise InputError(f"{path}: line {number}: status {row['status']!r} is none of {', '.join(STATUSES)}")
+    stages = [name for name in names if re.fullmatch(r"ms_[a-z0-9_]+", name)]
+    return FrameTable(
+        status=[row["status"] for row in rows],
+        columns={name: _column(path, rows, name) for name in COLUMNS},
+        milliseconds={name.removeprefix("ms_"): _column(path, rows, name) for name in stages},
+    )
+
+
+def _column(path: Path, rows: list[dict[str, str]], name: str) -> np.ndarray:
+    values = np.full(len(rows), np.nan)
+    for index, row in enumerate(rows):
+        field = (row[name] or "").strip()
+        if not field:
+            if name == "timestamp":
+                raise InputError(f"{path}: line {index + 2}: has no timestamp; every frame needs one")
+            continue
+        try:
+            values[index] = float(field)
+        except ValueError as error:
+            raise InputError(
+                f"{path}: line {index + 2}: {name} is {field!r}, not a number; leave it empty if unknown"
+            ) from error
+    return values
