@@ -1,6 +1,7 @@
 """Where keypoints of the left image are in the right one of a rectified pair: patches of edges, searched along the row.
 
-Edges are compared at half the resolution, there and back; whole pixels of that are found, which alignment refines.
+Edges are compared, those of large images at half the resolution, there and back; whole pixels are found, which
+alignment refines.
 """
 
 from __future__ import annotations
@@ -10,7 +11,9 @@ import numpy as np
 
 from sigmaslam.frontend.patch_kernels import compiled
 
-# The patches, pixels of half the resolution: rows above and below, columns before and from the keypoint on.
+# Images from this width on are searched at half the resolution.
+_HALVED_FROM = 640
+# The patches, pixels: rows above the keypoint and in all, columns before it and in all.
 _ABOVE, _TALL, _BEFORE, _BROAD = 5, 11, 8, 16
 # The best place must have less than this share of the difference of the second best one.
 _MAX_RATIO = 0.9
@@ -29,17 +32,18 @@ def search_rows(
         keypoints: (N, 2) of the left image, pixels.
         lowest, highest: disparities to search between, pixels.
     Returns:
-        (M,) which keypoints were found, and (M, 2) float64 where, to two pixels along the row.
+        (M,) which keypoints were found, and (M, 2) float64 where, to a pixel or two along the row.
     """
-    edges = _edges(left), _edges(right)
-    places = np.rint(0.5 * keypoints - 0.25).astype(np.int32)
-    bounds = int(np.floor(0.5 * lowest)), int(0.5 * highest)
+    scale = 2 if left.shape[1] >= _HALVED_FROM else 1
+    edges = _edges(left, scale), _edges(right, scale)
+    places = np.rint((keypoints + 0.5) / scale - 0.5).astype(np.int32)
+    bounds = int(np.floor(lowest / scale)), int(highest / scale)
     kernels = compiled()
     search = search_reference if kernels is None else kernels.search_rows
     disparity = search(*edges, places, *bounds, _MAX_RATIO)
     index = np.flatnonzero(disparity != _NOWHERE)
     found = keypoints[index].astype(np.float64)
-    found[:, 0] -= 2.0 * disparity[index]
+    found[:, 0] -= float(scale) * disparity[index]
     return index, found
 
 
@@ -87,7 +91,8 @@ def _differences(image0: np.ndarray, image1: np.ndarray, places: np.ndarray, shi
     return sums
 
 
-def _edges(image: np.ndarray) -> np.ndarray:
-    """Horizontal derivative at half the resolution, (H / 2, W / 2) uint8 about 128."""
-    half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    return cv2.convertScaleAbs(cv2.Sobel(half, cv2.CV_16S, 1, 0), alpha=0.5, beta=128.0)
+def _edges(image: np.ndarray, scale: int) -> np.ndarray:
+    """Horizontal derivative of an image shrunk by a whole factor, (H / scale, W / scale) uint8 about 128."""
+    if scale > 1:
+        image = cv2.resize(image, None, fx=1.0 / scale, fy=1.0 / scale, interpolation=cv2.INTER_AREA)
+    return cv2.convertScaleAbs(cv2.Sobel(image, cv2.CV_16S, 1, 0), alpha=0.5, beta=128.0)
