@@ -10,7 +10,10 @@ export SIGMASLAM_DATA := $(abspath ../shared/data)
 endif
 endif
 
-.PHONY: demo test test-slow lint clean
+# What an installation is made of: when one of these changes, it is made again.
+BUILD := pyproject.toml setup.py requirements.lock sigmaslam/frontend/kernels.cpp
+
+.PHONY: demo test test-slow lint wheel clean
 
 demo: $(VENV)/.runtime
 	$(VENV)/bin/sigmaslam demo
@@ -27,6 +30,15 @@ lint: $(VENV)/.dev
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
 
+# A wheel with compiled kernels, and the demo run from it in an environment of its own.
+wheel: $(VENV)/bin/python
+	rm -rf dist build
+	$(VENV)/bin/python -m pip wheel --quiet --no-deps --wheel-dir dist .
+	$(PYTHON) -m venv build/check
+	build/check/bin/python -m pip install --quiet $(INSTALL_FLAGS) dist/*.whl
+	cd build && check/bin/python -c "import sigmaslam.frontend._kernels"
+	cd build && check/bin/sigmaslam demo
+
 clean:
 	rm -rf $(VENV) build dist *.egg-info
 
@@ -34,10 +46,10 @@ $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 
 # The runtime alone: no torch.
-$(VENV)/.runtime: pyproject.toml requirements.lock | $(VENV)/bin/python
+$(VENV)/.runtime: $(BUILD) | $(VENV)/bin/python
 	$(VENV)/bin/python -m pip install --quiet $(INSTALL_FLAGS) --editable .
 	touch $@
 
-$(VENV)/.dev: pyproject.toml requirements.lock | $(VENV)/bin/python
+$(VENV)/.dev: $(BUILD) | $(VENV)/bin/python
 	$(VENV)/bin/python -m pip install --quiet $(INSTALL_FLAGS) --editable ".[dev]"
 	touch $@ $(VENV)/.runtime
