@@ -18,8 +18,8 @@ def weighted_update(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Posterior mean and covariance from derivatives with residuals (3 M, n + 1) about `offset`, weighted (M,)."""
     rows = whitened * np.sqrt(np.repeat(weight, 3))[:, None]
-    by, rest = rows[:, :-1], rows[:, -1]
-    information, vector = by.T @ by, by.T @ rest
+    by_state, residual = rows[:, :-1], rows[:, -1]
+    information, vector = by_state.T @ by_state, by_state.T @ residual
     return condition(factor, information, vector + information @ offset)
 
 
@@ -44,11 +44,11 @@ def append_moved(factor: np.ndarray, part: slice, step_covariance: np.ndarray) -
     return grown
 
 
-def renew_part(covariance: np.ndarray, part: slice, own: np.ndarray) -> np.ndarray:
-    """The covariance with one part of the state known anew, by itself."""
+def renew_part(covariance: np.ndarray, part: slice, renewal: np.ndarray) -> np.ndarray:
+    """The covariance with one part of the state replaced by an independent one of covariance `renewal`."""
     renewed = covariance.copy()
     renewed[part, :] = renewed[:, part] = 0.0
-    renewed[part, part] = own
+    renewed[part, part] = renewal
     return renewed
 
 

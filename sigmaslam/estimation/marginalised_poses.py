@@ -40,11 +40,11 @@ class PastPoses:
 
     def relative(self, index: int) -> np.ndarray:
         """(K, 6, 6) covariance of the pose `index` relative to each."""
-        own = past_slice(index)
+        place = past_slice(index)
         blocks = self.covariance.reshape(len(self), 6, len(self), 6)
         each = blocks[np.arange(len(self)), :, np.arange(len(self))]
         across = blocks[:, :, index]
-        return np.asarray(each + self.covariance[own, own] - across - across.transpose(0, 2, 1))
+        return np.asarray(each + self.covariance[place, place] - across - across.transpose(0, 2, 1))
 
     def closest(self, index: int) -> int:
         """The other pose relative to which the place of this one is known best."""
@@ -55,9 +55,9 @@ class PastPoses:
 
     def relative_to(self, window: np.ndarray, index: int) -> np.ndarray:
         """(6, 6) covariance of the window's last pose relative to the pose `index`; window (n, n) is its covariance."""
-        own, last = past_slice(index), slice(len(window) - 6, len(window))
-        across = self.cross[own, last]
-        return np.asarray(window[last, last] + self.covariance[own, own] - across - across.T)
+        place, last = past_slice(index), slice(len(window) - 6, len(window))
+        across = self.cross[place, last]
+        return np.asarray(window[last, last] + self.covariance[place, place] - across - across.T)
 
     def grow(
         self, window: np.ndarray, step_covariance: np.ndarray, walk: np.ndarray, origin: int | None
@@ -79,9 +79,9 @@ class PastPoses:
             last = slice(size - 6, size)
             grown[size:, :size], grown[size:, size:], across = window[last], window[last, last], self.cross[:, last]
         elif origin is not None:
-            own = past_slice(origin)
-            grown[size:, :size], grown[size:, size:] = self.cross[own], self.covariance[own, own]
-            across = self.covariance[:, own]
+            place = past_slice(origin)
+            grown[size:, :size], grown[size:, size:] = self.cross[place], self.covariance[place, place]
+            across = self.covariance[:, place]
         grown[:size, size:] = grown[size:, :size].T
         grown[size:, size:] += step_covariance
         return grown, replace(self, cross=np.concatenate([self.cross, across], axis=1))

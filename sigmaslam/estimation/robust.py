@@ -15,7 +15,7 @@ STUDENT_FREEDOM = 2.0
 # What so many agree on is no matter of a few outliers.
 _NEARLY_ALL = 0.95
 # Right matches are not worse than three times the standard deviation that they claim, all together.
-_MOST_SCALE = 9.0
+_MAX_SCALE = 9.0
 
 
 def mask_missing(residual: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -53,7 +53,7 @@ def common_scale(squared: np.ndarray, components: np.ndarray) -> float:
         return 1.0
     factor = float(np.median(ratio))
     agreeing = float((squared <= factor * CHI_SQUARE_999[components]).mean())
-    return factor if factor <= _MOST_SCALE and agreeing >= _NEARLY_ALL else 1.0
+    return factor if factor <= _MAX_SCALE and agreeing >= _NEARLY_ALL else 1.0
 
 
 def whiten(stacked: np.ndarray, noise: np.ndarray) -> np.ndarray:

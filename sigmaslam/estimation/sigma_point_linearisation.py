@@ -12,9 +12,9 @@ from sigmaslam.geometry.se3 import se3_adjoint, se3_inverse
 from sigmaslam.inference.onnx_graph import load_step
 
 # Least spread of sigma points: share of the scene's depth, radians, pixels; with it alone slopes are derivatives.
-_LEAST_SPREAD = 1e-6
+_MIN_SPREAD = 1e-6
 # Largest standard deviation that sigma points are drawn from: share of the scene's depth and radians.
-_MOST_SPREAD = 0.05
+_MAX_SPREAD = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,11 +87,11 @@ class ViewLineariser:
             chain[k, :6, pose_slice(from_)] = adjoint[k]
             chain[k, :6, pose_slice(to)] -= adjoint[k]
         chain[:, 6:, CALIBRATION] = np.eye(3)
-        floor = np.diag(np.r_[np.full(3, depth), np.ones(6)] * _LEAST_SPREAD) ** 2
+        floor = np.diag(np.r_[np.full(3, depth), np.ones(6)] * _MIN_SPREAD) ** 2
         joint = chain @ covariance @ chain.transpose(0, 2, 1) if self._unscented else np.zeros((len(pairs), 9, 9))
         spread = np.linalg.cholesky(_limited(0.5 * (joint + joint.transpose(0, 2, 1)), depth) + floor)
         own = landmark_covariance[:, :MODELLED, :MODELLED] * float(self._unscented)
-        landmark_spread = np.linalg.cholesky(own + _LEAST_SPREAD**2 * np.eye(MODELLED))
+        landmark_spread = np.linalg.cholesky(own + _MIN_SPREAD**2 * np.eye(MODELLED))
         mean, slopes, nonlinearity, in_front = self._transfer(
             {
                 "relative": relative,
@@ -113,4 +113,4 @@ def _limited(covariance: np.ndarray, depth: float) -> np.ndarray:
     """Covariances (k, 9, 9) of relative poses and calibration, shrunk where sigma points would leave the scene."""
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     worst = np.maximum(variance[:, :3].max(axis=1) / depth**2, variance[:, 3:6].max(axis=1))
-    return covariance * np.minimum(1.0, _MOST_SPREAD**2 / np.maximum(worst, 1e-300))[:, None, None]
+    return covariance * np.minimum(1.0, _MAX_SPREAD**2 / np.maximum(worst, 1e-300))[:, None, None]

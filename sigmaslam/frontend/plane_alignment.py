@@ -28,7 +28,7 @@ _ROUGH, _STEEP = 0.2, 0.5
 _FIRST_SCALE, _LAST_SCALE = 8.0, 2.0
 _FITS = 5
 # Of what is seen from elsewhere, over its depth in the keyframe.
-_LEAST_DEPTH = 1e-3
+_MIN_DEPTH = 1e-3
 
 
 def disparity_slopes(points: np.ndarray, disparity: np.ndarray) -> np.ndarray:
@@ -73,7 +73,7 @@ def plane_maps(camera: RectifiedStereo, measured: np.ndarray, slope: np.ndarray,
     # A point of inverse depth rho on a ray r is seen along R r + rho t, and rho is linear in the pixels of a plane.
     seen = ray @ rotation.T + measured[:, 2:] * nearness
     by_pixel = (rotation[:, :2] / focal) + nearness[:, None] * slope[:, None, :]
-    depth = np.maximum(seen[:, 2:], _LEAST_DEPTH)
+    depth = np.maximum(seen[:, 2:], _MIN_DEPTH)
     tilt = by_pixel[:, 2] / depth
     A = focal[:, None] * (by_pixel[:, :2] / depth[..., None] - (seen[:, :2] / depth)[..., None] * tilt[:, None, :])
     return PatchMaps(A, tilt)

@@ -11,7 +11,7 @@ from sigmaslam.table import Table
 
 # Of a pair with the eyes swapped, more than this share of the disparities is negative by more than a pixel, which no
 # disparity offset explains.
-_MOST_NEGATIVE = 0.1
+_MAX_NEGATIVE = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,7 @@ class StereoView:
         False with fewer than `min_to_judge` disparities.
         """
         known = self.disparity[np.isfinite(self.disparity)]
-        return len(known) >= min_to_judge and float((known < -1.0).mean()) > _MOST_NEGATIVE
+        return len(known) >= min_to_judge and float((known < -1.0).mean()) > _MAX_NEGATIVE
 
 
 @dataclass(frozen=True, slots=True)

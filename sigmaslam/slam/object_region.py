@@ -17,10 +17,10 @@ _BOX = re.compile(",".join([_NUMBER] * 4))
 # Points further from the middle of a body than so many median distances are not taken for its outline.
 _FARTHEST = 4.0
 # What borders on the known outline may be the body's, too: it turns. Share of the outline's size, and pixels at least.
-_MARGIN, _LEAST_MARGIN = 0.1, 8.0
+_MARGIN, _MIN_MARGIN = 0.1, 8.0
 # A body is so much deeper than its known points, as a share of their size, and of their distance at least.
-_DEPTH_SLACK, _LEAST_DEPTH_SLACK = 0.25, 0.03
-_LEAST_POINTS = 3
+_DEPTH_SLACK, _MIN_DEPTH_SLACK = 0.25, 0.03
+_MIN_POINTS = 3
 
 
 def read_region(text: str, width: int, height: int) -> np.ndarray:
@@ -101,7 +101,7 @@ class BodyShape:
     def points(self) -> np.ndarray:
         """(M, 3) in the body's frame, without those far off."""
         every = np.array(list(self._points.values())).reshape(-1, 3)
-        if len(every) < _LEAST_POINTS:
+        if len(every) < _MIN_POINTS:
             return every
         away = np.linalg.norm(every - np.median(every, axis=0), axis=1)
         return np.asarray(every[away <= _FARTHEST * np.median(away)])
@@ -118,15 +118,15 @@ class BodyShape:
         points = self.points()
         seen = transform_points(se3_inverse(pose), points)
         seen = seen[seen[:, 2] > 1e-6]
-        if len(seen) < _LEAST_POINTS:
+        if len(seen) < _MIN_POINTS:
             return np.zeros(len(uvd), bool)
         camera = self._camera
         u = camera.fx * seen[:, 0] / seen[:, 2] + camera.cx
         v = camera.fy * seen[:, 1] / seen[:, 2] + camera.cy
         hull = cv2.convexHull(np.column_stack([u, v]).astype(np.float32))
-        margin = max(_LEAST_MARGIN, _MARGIN * float(np.sqrt(cv2.contourArea(hull))))
+        margin = max(_MIN_MARGIN, _MARGIN * float(np.sqrt(cv2.contourArea(hull))))
         inside = [cv2.pointPolygonTest(hull, (float(x), float(y)), True) >= -margin for x, y in uvd[:, :2]]
-        slack = _DEPTH_SLACK * float(np.ptp(points, axis=0).max()) + _LEAST_DEPTH_SLACK * float(np.median(seen[:, 2]))
+        slack = _DEPTH_SLACK * float(np.ptp(points, axis=0).max()) + _MIN_DEPTH_SLACK * float(np.median(seen[:, 2]))
         focal = camera.focal_baseline
-        least, most = focal / (seen[:, 2].max() + slack), focal / max(seen[:, 2].min() - slack, 1e-6)
-        return np.array(inside, bool).reshape(-1) & (uvd[:, 2] >= least) & (uvd[:, 2] <= most)
+        lowest, highest = focal / (seen[:, 2].max() + slack), focal / max(seen[:, 2].min() - slack, 1e-6)
+        return np.array(inside, bool).reshape(-1) & (uvd[:, 2] >= lowest) & (uvd[:, 2] <= highest)
