@@ -15,11 +15,11 @@ from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.gaussian import append_moved, matrix_root, project_covariance, replace_part, weighted_update
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
+from sigmaslam.estimation.mahalanobis import squared_mahalanobis
 from sigmaslam.estimation.robust import (
     UNKNOWN_VARIANCE,
     common_scale,
     mask_missing,
-    squared_lengths,
     student_weight,
     whiten,
 )
@@ -70,7 +70,7 @@ class FrameUpdate:
         """(M,) bool: which views agree with a predicted pose (99.9 %), the arguments as of `fit`."""
         predicted, S, in_front = self.predict(views.landmark, pose, step_covariance)
         residual, covariance = mask_missing(views.measurement - predicted, S + views.covariance)
-        return np.asarray(in_front & (squared_lengths(residual, covariance) <= CHI_SQUARE_999[views.components]))
+        return np.asarray(in_front & (squared_mahalanobis(residual, covariance) <= CHI_SQUARE_999[views.components]))
 
     def fit(
         self,
@@ -116,7 +116,7 @@ class FrameUpdate:
             if iteration == 0 and start is None:
                 # About what the prior expects.
                 innovation_covariance = update.noise + project_covariance(update.by_state, prior)
-                squared = squared_lengths(update.residual, innovation_covariance)
+                squared = squared_mahalanobis(update.residual, innovation_covariance)
             whitened = update.whitened()
             for limit in _ROBUST_SCALES:
                 weight = update.usable / (1.0 + squared / (scale * limit**2)) ** 2

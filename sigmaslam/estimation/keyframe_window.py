@@ -20,8 +20,9 @@ from sigmaslam.estimation.chi_square import CHI_SQUARE_999, CHI_SQUARE_9999_OF_6
 from sigmaslam.estimation.gaussian import condition, matrix_root
 from sigmaslam.estimation.landmark_elimination import Elimination, eliminate_landmarks
 from sigmaslam.estimation.landmark_table import KeyframeViews, LandmarkTable, LandmarkViews
+from sigmaslam.estimation.mahalanobis import squared_mahalanobis
 from sigmaslam.estimation.marginalised_poses import PastPoses, point_lever
-from sigmaslam.estimation.robust import STUDENT_FREEDOM, UNKNOWN_VARIANCE, mask_missing, squared_lengths
+from sigmaslam.estimation.robust import STUDENT_FREEDOM, UNKNOWN_VARIANCE, mask_missing
 from sigmaslam.estimation.sigma_point_linearisation import Linearisation, ViewLineariser
 from sigmaslam.estimation.state_layout import CALIBRATION_SIZE, LANDMARK_SIZE, MODELLED, pose_slice
 from sigmaslam.estimation.window_state import WindowState
@@ -229,7 +230,7 @@ def _eliminate(window: KeyframeWindow, observations: KeyframeViews) -> tuple[np.
 def _agree(window: KeyframeWindow, observations: KeyframeViews) -> np.ndarray:
     """(O,) bool: which views fit the posterior (99.9 %)."""
     linear, residual, noise, components = _linearise(window, observations)
-    return np.asarray(linear.in_front & (squared_lengths(residual, noise) <= CHI_SQUARE_999[components]))
+    return np.asarray(linear.in_front & (squared_mahalanobis(residual, noise) <= CHI_SQUARE_999[components]))
 
 
 def _linearise(

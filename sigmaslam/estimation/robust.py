@@ -29,11 +29,6 @@ def mask_missing(residual: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, n
     return residual, noise
 
 
-def squared_lengths(residual: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """(M,) squared Mahalanobis lengths of residuals (M, 3)."""
-    return np.einsum("mi,mi->m", residual, np.linalg.solve(covariance, residual[..., None])[..., 0])
-
-
 def common_scale(squared: np.ndarray, components: np.ndarray) -> float:
     """Factor, 1 or more, by which all variances together are too small: of a blurred image, say.
 

@@ -13,6 +13,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
+from sigmaslam.estimation.mahalanobis import squared_mahalanobis
 from sigmaslam.frontend import Frontend, KeypointSearch, StereoView, TemporalMatches
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import se3_inverse, transform_points
@@ -182,8 +183,7 @@ class BodyAdmission:
         noise[:, :2, :2] = matches.covariance + self._config.keyframe_sigma**2 * np.eye(2)
         noise[:, 2, 2] = np.where(known, disparity_sigma**2 + np.nan_to_num(matches.disparity_sigma) ** 2, 1.0)
         motion[~known, 2] = 0.0
-        squared = np.einsum("mi,mi->m", motion, np.linalg.solve(noise, motion[..., None])[..., 0])
-        return np.asarray(squared > CHI_SQUARE_999[2 + known])
+        return np.asarray(squared_mahalanobis(motion, noise) > CHI_SQUARE_999[2 + known])
 
     def _stands_still(self, view: StereoView, index: np.ndarray, pose: np.ndarray) -> np.ndarray:
         """Which of these features are where background was in an earlier view; (K,) bool."""
