@@ -11,19 +11,15 @@ from sigmaslam.frontend.lucas_kanade import refine
 from sigmaslam.frontend.match_confidence import MIN_LOGIT, ConfidenceEstimator
 from sigmaslam.frontend.nearest_neighbours import Putative, nearest_anywhere, nearest_in_ellipses, nearest_in_rows
 from sigmaslam.frontend.plane_alignment import refine_in_rows, refine_on_planes
-from sigmaslam.frontend.row_search import search_rows
 from sigmaslam.frontend.types import Features, KeypointSearch, Refinement, StereoView, TemporalMatches
 
 _ROW_TOLERANCE = 2.0
 # A little below zero, so that points at infinity survive a disparity offset.
-_MIN_DISPARITY = -2.0
+_LEAST_DISPARITY = -2.0
 # Share of the image width that disparity may reach.
-_MAX_DISPARITY = 0.25
-# What the verifier is told in place of the scorer's logit, which needs descriptors of both images: what the scorer
-# gives right stereo matches of renders, in the median.
-_ROW_LOGIT = 6.0
+_MOST_DISPARITY = 0.25
 # What is more likely wrong than right is left out.
-_MIN_PROBABILITY = 0.5
+_LEAST_PROBABILITY = 0.5
 
 Detector = Callable[[np.ndarray], Features]
 
@@ -104,7 +100,7 @@ def match_stereo(
         features_left.descriptors,
         features_right.descriptors,
         _ROW_TOLERANCE,
-        (_MIN_DISPARITY, _MAX_DISPARITY * left.shape[1]),
+        (_LEAST_DISPARITY, _MOST_DISPARITY * left.shape[1]),
     )
     found = refine_with_confidence(
         estimator,
@@ -116,7 +112,7 @@ def match_stereo(
         lambda points0, points1, *_: refine_in_rows(left, right, points0, points1),
     )
     level = np.abs(found.places[:, 1] - features_left.keypoints[found.index0, 1]) <= _ROW_TOLERANCE
-    return found.select(level & (found.probability >= _MIN_PROBABILITY))
+    return found.select(level & (found.probability >= _LEAST_PROBABILITY))
 
 
 class DescriptorFrontend:
@@ -134,20 +130,12 @@ class DescriptorFrontend:
         self._estimator = estimator
 
     def observe(self, left: np.ndarray, right: np.ndarray) -> StereoView:
-        """Features of the left image, searched for along the rows of the right one."""
+        """Features of both images, matched along the rows."""
         features = self._detect(left)
+        found = match_stereo(self._estimator, left, right, features, self._detect(right))
         disparity, sigma = np.full((2, len(features.keypoints)), np.nan)
-        index, start = search_rows(left, right, features.keypoints, _MIN_DISPARITY, _MAX_DISPARITY * left.shape[1])
-        keypoints, keypoint_sigma = features.keypoints[index].astype(np.float64), features.sigma[index]
-        refined = refine_in_rows(left, right, keypoints, start)
-        logit = np.full(len(index), _ROW_LOGIT, np.float32)
-        sigmas = keypoint_sigma, keypoint_sigma
-        probability, covariance = self._estimator.verify(left, right, keypoints, logit, refined, sigmas)
-        level = np.abs(refined.places[:, 1] - keypoints[:, 1]) <= _ROW_TOLERANCE
-        right_ones = refined.moved & level & (probability >= _MIN_PROBABILITY)
-        index = index[right_ones]
-        disparity[index] = keypoints[right_ones, 0] - refined.places[right_ones, 0]
-        sigma[index] = np.sqrt(covariance[right_ones, 0, 0])
+        disparity[found.index0] = features.keypoints[found.index0, 0] - found.places[:, 0]
+        sigma[found.index0] = np.sqrt(found.covariance[:, 0, 0])
         return StereoView(left, right, features, disparity, sigma)
 
     def match(self, search: KeypointSearch, view: StereoView) -> TemporalMatches:
@@ -167,7 +155,7 @@ class DescriptorFrontend:
             return refine(key.left, view.left, points0, points1)
 
         found = refine_with_confidence(self._estimator, key.left, view.left, wanted, view.features, putative, refined)
-        found = found.select(found.probability >= _MIN_PROBABILITY)
+        found = found.select(found.probability >= _LEAST_PROBABILITY)
         return TemporalMatches(
             search.index[found.index0],
             found.places,
