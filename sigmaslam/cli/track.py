@@ -105,8 +105,6 @@ def track(
     """Track a stereo sequence, recorded or live: trajectory, covariance, map and report."""
     if backend.value == "torch":
         need_train_extra()
-    if track_object is not None and (map is not None or tracks):
-        raise InputError("--map and --tracks are of a moving camera's world: leave them out with --track-object")
     settings = None if config is None else _read_config(config, track_object is not None)
     sequence = _open_input(source, format, calibration, camera, seconds, (topic_left, topic_right))
     try:

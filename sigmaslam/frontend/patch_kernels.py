@@ -36,13 +36,6 @@ _FLAT, _RIDGE = np.float32(1e-2), np.float32(1e-6)
 _CHUNK = 128
 
 
-def compiled() -> ModuleType | None:
-    """The compiled kernels; None, said once, where there are none."""
-    if _kernels is None:
-        _tell_slow()
-    return _kernels
-
-
 def align(
     image0: np.ndarray,
     image1: np.ndarray,
@@ -69,10 +62,10 @@ def align(
     Returns:
         (M, 3) float64: shift of the place in image 1, pixels, and the correlation of the patches there.
     """
-    kernels = compiled()
-    if kernels is None:
+    if _kernels is None:
+        _tell_slow()
         return align_reference(image0, image1, points0, points1, back, tilt, half_octaves, radius, iterations, taper)
-    found: np.ndarray = kernels.align(
+    found: np.ndarray = _kernels.align(
         image0, image1, points0, points1, back, tilt, half_octaves, 2 * radius + 1, iterations, taper * radius
     )
     return found
@@ -95,10 +88,10 @@ def examine(
         (M, 6) float64: correlation, variance of either patch, and uu, uv, vv: mean products of the gradients of both
         normalised patches' mean, by samples.
     """
-    kernels = compiled()
-    if kernels is None:
+    if _kernels is None:
+        _tell_slow()
         return examine_reference(image0, image1, points0, points1, back, half_octaves, radius, taper, flat)
-    found: np.ndarray = kernels.examine(
+    found: np.ndarray = _kernels.examine(
         image0, image1, points0, points1, back, half_octaves, 2 * radius + 1, taper * radius, flat
     )
     return found

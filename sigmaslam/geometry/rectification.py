@@ -51,6 +51,13 @@ class StereoRectifier:
         )
         self.valid_mask = _valid_mask(left, *self._maps[0])
 
+    @property
+    def T_rectified_left(self) -> np.ndarray:  # noqa: N802
+        """(4, 4) takes points of the left camera into the rectified one: both eyes turn about their centres."""
+        T = np.eye(4)
+        T[:3, :3] = self.R_rectified_left
+        return T
+
     def rectify(self, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rectified images, bilinear; the very same arrays if the camera is rectified already.
 

@@ -56,7 +56,7 @@ def track_sequence(
         KeyboardInterrupt: passed on after the partial results are written.
     """
     if track_object is not None and (map_path is not None or tracks):
-        raise InputError("a map and tracks are of a moving camera's world: leave them out where a body is tracked")
+        raise InputError("--map and --tracks are of a moving camera's world: leave them out with --track-object")
     tracker = _build_tracker(sequence, frontend, backend, config, track_object)
     location = None if locations is None else LocationFilter(locations, track_object is not None)
     rectified = None

@@ -103,9 +103,7 @@ class ObjectTracker:
     ) -> None:
         self.config = config = config or OBJECT_CONFIG
         rectifier = StereoRectifier(camera)
-        T_rectified_left = np.eye(4)
-        T_rectified_left[:3, :3] = rectifier.R_rectified_left
-        self._T_left_rectified = se3_inverse(T_rectified_left)
+        self._T_left_rectified = se3_inverse(rectifier.T_rectified_left)
         if isinstance(frontend, str):
             frontend = build_frontend(frontend, config.max_keypoints, backend)
         raw = region.astype(np.uint8) * 255

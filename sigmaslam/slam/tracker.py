@@ -64,8 +64,7 @@ class StereoTracker:
         self.config = config = config or TrackerConfig()
         self._rectifier = StereoRectifier(camera)
         self._camera = rectified = self._rectifier.rectified
-        self._T_rectified_left = np.eye(4)
-        self._T_rectified_left[:3, :3] = self._rectifier.R_rectified_left
+        self._T_rectified_left = self._rectifier.T_rectified_left
         if isinstance(frontend, str):
             frontend = build_frontend(frontend, config.max_keypoints, backend)
         self._frontend = frontend
@@ -137,7 +136,7 @@ class StereoTracker:
         """The rectified pair that tracks are measured in: intrinsics (5,), R_rectified_left (3, 3)."""
         camera = self._camera
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.baseline])
-        return {"intrinsics": intrinsics, "R_rectified_left": self._T_rectified_left[:3, :3]}
+        return {"intrinsics": intrinsics, "R_rectified_left": self._rectifier.R_rectified_left}
 
     def pack_keyframes(self) -> dict[str, Any]:
         """Keyframes by which a later run finds its place in the map, as arrays by name."""
