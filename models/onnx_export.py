@@ -27,7 +27,7 @@ from sigmaslam.models.extractor import EXTRACTOR_SIZE_MULTIPLE, FeatureExtractor
 from sigmaslam.models.feature_network import DESCRIPTOR_SIZE, STRIDE, FeatureNetwork
 from sigmaslam.models.model_card import card_page, read_card, scoring_page
 from sigmaslam.models.scorer_network import NEIGHBOURS, SIDE_CHANNELS, MatchScorer, ScoredMatches
-from sigmaslam.models.verifier_network import VERIFIER_COLUMNS, MatchCovariance, MatchVerifier
+from sigmaslam.models.verifier_network import PLACE_COLUMNS, VERIFIER_COLUMNS, MatchCovariance, MatchVerifier
 from sigmaslam.synthetic.rendering.textures import dead_leaves
 
 _OPSET = 20
@@ -67,23 +67,27 @@ def load_scorer(weights: Path) -> MatchScorer:
     return _load(MatchScorer(), weights)
 
 
-def load_verifier(weights: Path) -> MatchVerifier:
-    """The match verifier with trained weights; raises as `load_network` does."""
-    return _load(MatchVerifier(), weights)
+def load_verifier(weights: Path, columns: int = VERIFIER_COLUMNS) -> MatchVerifier:
+    """A match verifier of so many columns with trained weights; raises as `load_network` does."""
+    return _load(MatchVerifier(columns), weights)
 
 
 def export_scoring(run: Path, out: Path) -> dict[str, float]:
     """Graphs, weights and card of a run of `sigmaslam train-scorer`, into one folder.
 
     Args:
-        run: folder with scorer.safetensors, verifier.safetensors and matching.json.
+        run: folder with scorer.safetensors, verifier.safetensors, place_verifier.safetensors and matching.json.
         out: folder.
     Returns:
         Largest differences of the graphs from torch.
     """
     content = read_card(run / "matching.json")
     make_folder(out)
-    graphs = _scoring_graphs(load_scorer(run / "scorer.safetensors"), load_verifier(run / "verifier.safetensors"))
+    graphs = _scoring_graphs(
+        load_scorer(run / "scorer.safetensors"),
+        load_verifier(run / "verifier.safetensors"),
+        load_verifier(run / "place_verifier.safetensors", PLACE_COLUMNS),
+    )
     differences = {name: _export(graph, out / f"{name}.onnx", _FEATURE_TOLERANCE) for name, graph in graphs.items()}
     content["onnx_minus_torch"] = differences
     for name in graphs:
@@ -157,7 +161,7 @@ def _load(module: _Module, weights: Path) -> _Module:
     return module.eval()
 
 
-def _scoring_graphs(scorer: MatchScorer, verifier: MatchVerifier) -> dict[str, _Graph]:
+def _scoring_graphs(scorer: MatchScorer, verifier: MatchVerifier, place_verifier: MatchVerifier) -> dict[str, _Graph]:
     free = {0: torch.export.Dim("matches", min=1, max=100_000)}
     return {
         "scorer": _Graph(
@@ -168,15 +172,20 @@ def _scoring_graphs(scorer: MatchScorer, verifier: MatchVerifier) -> dict[str, _
             ["logit"],
             (free,) * 4,
         ),
-        "verifier": _Graph(
-            MatchCovariance(verifier),
-            _columns_example(0, 300),
-            _columns_example(1, 77),
-            ["columns", "axes"],
-            ["probability", "covariance"],
-            (free,) * 2,
-        ),
+        "verifier": _verifier_graph(verifier, VERIFIER_COLUMNS),
+        "place_verifier": _verifier_graph(place_verifier, PLACE_COLUMNS),
     }
+
+
+def _verifier_graph(verifier: MatchVerifier, columns: int) -> _Graph:
+    return _Graph(
+        MatchCovariance(verifier),
+        _columns_example(0, 300, columns),
+        _columns_example(1, 77, columns),
+        ["columns", "axes"],
+        ["probability", "covariance"],
+        ({0: torch.export.Dim("matches", min=1, max=100_000)},) * 2,
+    )
 
 
 def _matches_example(seed: int, count: int) -> tuple[Tensor, ...]:
@@ -187,11 +196,11 @@ def _matches_example(seed: int, count: int) -> tuple[Tensor, ...]:
     return points0, points1, torch.rand(count, SIDE_CHANNELS, generator=generator), near
 
 
-def _columns_example(seed: int, count: int) -> tuple[Tensor, ...]:
+def _columns_example(seed: int, count: int, columns: int) -> tuple[Tensor, ...]:
     generator = torch.Generator().manual_seed(seed)
     angle = torch.pi * torch.rand(count, generator=generator)
     axes = torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()], dim=1).reshape(count, 2, 2)
-    return torch.randn(count, VERIFIER_COLUMNS, generator=generator), axes
+    return torch.randn(count, columns, generator=generator), axes
 
 
 def _noisy_texture(rng: np.random.Generator, shape: tuple[int, int]) -> Tensor:

@@ -15,7 +15,7 @@ from sigmaslam.inference.onnx_graph import shipped_weights
 from sigmaslam.models.extractor import FeatureExtractor
 from sigmaslam.models.onnx_export import load_network, load_scorer, load_verifier
 from sigmaslam.models.scorer_network import ScoredMatches
-from sigmaslam.models.verifier_network import MatchCovariance
+from sigmaslam.models.verifier_network import PLACE_COLUMNS, VERIFIER_COLUMNS, MatchCovariance
 
 
 class TorchModule:
@@ -39,11 +39,12 @@ class TorchFeatures(TorchModule):
 
 
 def scoring_module(name: str) -> TorchModule:
-    """scorer or verifier."""
+    """scorer, verifier or place_verifier."""
     weights = shipped_weights(f"{name}.safetensors")
-    return TorchModule(
-        ScoredMatches(load_scorer(weights)) if name == "scorer" else MatchCovariance(load_verifier(weights))
-    )
+    if name == "scorer":
+        return TorchModule(ScoredMatches(load_scorer(weights)))
+    columns = PLACE_COLUMNS if name == "place_verifier" else VERIFIER_COLUMNS
+    return TorchModule(MatchCovariance(load_verifier(weights, columns)))
 
 
 def filter_module(name: str) -> TorchModule:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-VERIFIER_COLUMNS = 14
-"""Of `sigmaslam.frontend.verifier_inputs.describe_matches`."""
+VERIFIER_COLUMNS, PLACE_COLUMNS = 14, 11
+"""Of `sigmaslam.frontend.verifier_inputs`: `describe_matches`, `describe_places`."""
 _WIDTH = 48
 # Of log sigma, pixels.
 _MIN_LOG_SIGMA, _MAX_LOG_SIGMA = -4.0, 2.5
@@ -17,6 +17,9 @@ class MatchVerifier(nn.Module):
 
     It learns by how much the error exceeds what theory says of an alignment: variance of the difference of the patches
     over their squared gradient, along each of the patch's axes.
+
+    Args:
+        columns: that describe a match: `VERIFIER_COLUMNS` or `PLACE_COLUMNS`; the first six mean the same in both.
     """
 
     mean: Tensor
@@ -25,23 +28,23 @@ class MatchVerifier(nn.Module):
     logit_shift: Tensor
     sigma_scale: Tensor
 
-    def __init__(self) -> None:
+    def __init__(self, columns: int = VERIFIER_COLUMNS) -> None:
         super().__init__()
-        self.register_buffer("mean", torch.zeros(VERIFIER_COLUMNS))
-        self.register_buffer("spread", torch.ones(VERIFIER_COLUMNS))
+        self.register_buffer("mean", torch.zeros(columns))
+        self.register_buffer("spread", torch.ones(columns))
         # Fitted after training, on held-out renders.
         self.register_buffer("logit_scale", torch.ones(()))
         self.register_buffer("logit_shift", torch.zeros(()))
         self.register_buffer("sigma_scale", torch.ones(()))
         self.layers = nn.Sequential(
-            nn.Linear(VERIFIER_COLUMNS, _WIDTH), nn.ReLU(), nn.Linear(_WIDTH, _WIDTH), nn.ReLU(), nn.Linear(_WIDTH, 3)
+            nn.Linear(columns, _WIDTH), nn.ReLU(), nn.Linear(_WIDTH, _WIDTH), nn.ReLU(), nn.Linear(_WIDTH, 3)
         )
 
     def forward(self, columns: Tensor) -> tuple[Tensor, Tensor]:
         """Logit that the match is right, (M,), and log sigma along the patch's axes, (M, 2), pixels of image 1.
 
         Args:
-            columns: (M, 14) of `sigmaslam.frontend.verifier_inputs.describe_matches`.
+            columns: (M, C) of `sigmaslam.frontend.verifier_inputs`.
         """
         outputs = self.layers((columns - self.mean) / self.spread)
         theory = 0.5 * (columns[:, 1:2] - columns[:, 4:6])
@@ -57,7 +60,7 @@ class MatchCovariance(nn.Module):
         self.verifier = verifier
 
     def forward(self, columns: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
-        """Probability (M,) and covariance (M, 2, 2) in pixels squared, from (M, 14) columns and (M, 2, 2) axes."""
+        """Probability (M,) and covariance (M, 2, 2) in pixels squared, from (M, C) columns and (M, 2, 2) axes."""
         logit, log_sigma = self.verifier(columns)
         variance = torch.exp(2.0 * log_sigma)
         covariance = (axes * variance.unsqueeze(1)) @ axes.transpose(1, 2)

@@ -6,6 +6,8 @@ scaled they do not; here each patch is first warped by the affine map that the n
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from sigmaslam.frontend.knn import nearest_points
@@ -24,6 +26,20 @@ _TAPER = 0.6
 _MIN_CORRELATION = 0.5
 # Between the images around a match.
 _MAX_ZOOM = 5.0
+
+
+class AlignedPatches(NamedTuple):
+    """Patches of image 0 in image 1.
+
+    Attributes:
+        places: (M, 2) float64, unchanged where the patches do not fit or the way is too far.
+        moved: (M,) bool.
+        correlation: (M,) of the patches where the alignment ended; 0 where there was none.
+    """
+
+    places: np.ndarray
+    moved: np.ndarray
+    correlation: np.ndarray
 
 
 def local_maps(points0: np.ndarray, points1: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -68,7 +84,7 @@ def align_patches(
     radius: int = _RADIUS,
     iterations: int = _ITERATIONS,
     taper: float = _TAPER,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> AlignedPatches:
     """Places in image 1 where the patches around points of image 0, warped by their maps, fit best.
 
     Inverse compositional Lucas-Kanade (Baker & Matthews 2004) over a shift, with gain and offset of the grey values
@@ -83,8 +99,6 @@ def align_patches(
         radius: of the patches, pixels of the coarser image.
         iterations: Gauss-Newton steps.
         taper: standard deviation of the patches' Gaussian window, radii.
-    Returns:
-        (M, 2) float64 places, unchanged where the patches do not fit or the way is too far, and (M,) bool moved.
     """
     places, moved = points1.astype(np.float64), np.zeros(len(points1), bool)
     # No opaque surface shows its mirror image: a negative determinant is as bad as none.
@@ -104,7 +118,9 @@ def align_patches(
     fits = (correlation > _MIN_CORRELATION) & (np.linalg.norm(shift, axis=1) <= reach * spacing)
     places[rows[fits]] += shift[fits]
     moved[rows[fits]] = True
-    return places, moved
+    agreement = np.zeros(len(points1))
+    agreement[rows] = correlation
+    return AlignedPatches(places, moved, agreement)
 
 
 def refine_by_neighbours(
@@ -119,8 +135,8 @@ def refine_by_neighbours(
     """
     points0, points1 = points0.astype(np.float64), points1.astype(np.float64)
     A, distance = local_maps(points0, points1, 1.0 / (1.0 + np.exp(-logit.astype(np.float64))))
-    places, moved = align_patches(image0, image1, points0, points1, A)
-    return Refinement(points1, places, moved, A, distance)
+    aligned = align_patches(image0, image1, points0, points1, A)
+    return Refinement(points1, aligned.places, aligned.moved, A, distance)
 
 
 def _inside(image: np.ndarray, points: np.ndarray) -> np.ndarray:

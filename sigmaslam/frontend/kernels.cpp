@@ -6,10 +6,16 @@
 #include <pybind11/pybind11.h>
 
 #include <algorithm>
+#include <climits>
 #include <cmath>
 #include <cstdint>
+#include <cstdlib>
 #include <stdexcept>
 #include <vector>
+
+#if defined(__SSE2__)
+#include <emmintrin.h>
+#endif
 
 namespace py = pybind11;
 using Grey = py::array_t<uint8_t, py::array::c_style | py::array::forcecast>;
@@ -37,6 +43,8 @@ constexpr int MOST_OCTAVES = 6;  // half octaves of smoothing, 0 to 5
 constexpr int MOST_TAPS = 32;
 constexpr int MOST_EXTENT = 128;  // pixels that a patch reaches over
 constexpr float FLAT = 1e-2f, RIDGE = 1e-6f, NEAREST = 0.2f;
+
+constexpr int NOWHERE = -1000;   // a disparity that was not found
 
 struct Image {
     const uint8_t* pixels;
@@ -334,6 +342,55 @@ CLONES void examine_one(const Image& image0, const Image& image1, const double* 
     out[5] = dot(product, along_v, side);
 }
 
+constexpr int ABOVE = 5, TALL = 11, BEFORE = 8, BROAD = 16;  // of the patches that are searched for along rows
+
+// Sum of absolute differences of two patches, exact in whole numbers on any processor.
+INLINE int sum_differences(const uint8_t* a, const uint8_t* b, int width) {
+#if defined(__SSE2__)
+    __m128i sums = _mm_setzero_si128();
+    for (int r = 0; r < TALL; ++r) {
+        const __m128i row_a = _mm_loadu_si128(reinterpret_cast<const __m128i*>(a + r * width));
+        const __m128i row_b = _mm_loadu_si128(reinterpret_cast<const __m128i*>(b + r * width));
+        sums = _mm_add_epi64(sums, _mm_sad_epu8(row_a, row_b));
+    }
+    return _mm_cvtsi128_si32(sums) + _mm_extract_epi16(sums, 4);
+#else
+    int sum = 0;
+    for (int r = 0; r < TALL; ++r)
+        for (int c = 0; c < BROAD; ++c) sum += std::abs(a[r * width + c] - b[r * width + c]);
+    return sum;
+#endif
+}
+
+CLONES int search_row(const Image& left, const Image& right, int u, int v, int lowest, int highest, float ratio) {
+    const int width = left.width;
+    if (u < BEFORE || u + BROAD - BEFORE > width || v < ABOVE || v + TALL - ABOVE > left.height) return NOWHERE;
+    const uint8_t* wanted = left.pixels + static_cast<size_t>(v - ABOVE) * width + u - BEFORE;
+    const uint8_t* row = right.pixels + static_cast<size_t>(v - ABOVE) * width - BEFORE;
+    const int first = std::max(lowest, u + BROAD - BEFORE - width), last = std::min(highest, u - BEFORE);
+    int best = INT_MAX, disparity = NOWHERE, second = INT_MAX;
+    std::vector<int> costs(std::max(last - first + 1, 0));
+    for (int d = first; d <= last; ++d) {
+        const int cost = costs[d - first] = sum_differences(wanted, row + u - d, width);
+        if (cost < best) best = cost, disparity = d;
+    }
+    for (int d = first; d <= last; ++d)
+        if (std::abs(d - disparity) > 2) second = std::min(second, costs[d - first]);
+    if (disparity == NOWHERE || second == INT_MAX || static_cast<float>(best) > ratio * static_cast<float>(second)) return NOWHERE;
+    // And back.
+    const uint8_t* found = row + u - disparity;
+    const uint8_t* line = left.pixels + static_cast<size_t>(v - ABOVE) * width - BEFORE;
+    int back = NOWHERE;
+    best = INT_MAX;
+    for (int d = lowest; d <= highest; ++d) {
+        const int there = u - disparity + d;
+        if (there < BEFORE || there + BROAD - BEFORE > width) continue;
+        const int cost = sum_differences(found, line + there, width);
+        if (cost < best) best = cost, back = d;
+    }
+    return std::abs(back - disparity) <= 1 ? disparity : NOWHERE;
+}
+
 Image view(const Grey& image) {
     if (image.ndim() != 2) throw std::invalid_argument("an image must be (H, W)");
     return {image.data(), static_cast<int>(image.shape(0)), static_cast<int>(image.shape(1))};
@@ -386,10 +443,27 @@ py::array_t<double> examine(const Grey& grey0, const Grey& grey1, const Reals& p
     return result;
 }
 
+// (M,) disparities.
+py::array_t<int32_t> search_rows(const Grey& grey_left, const Grey& grey_right, const Steps& places, int lowest,
+                                 int highest, float ratio) {
+    const Image left = view(grey_left), right = view(grey_right);
+    if (left.width != right.width || left.height != right.height)
+        throw std::invalid_argument("both images must be of one size");
+    const py::ssize_t count = places.size() / 2;
+    py::array_t<int32_t> result(count);
+    int32_t* out = result.mutable_data();
+    const int32_t* at = places.data();
+    py::gil_scoped_release release;
+    for (py::ssize_t k = 0; k < count; ++k)
+        out[k] = search_row(left, right, at[2 * k], at[2 * k + 1], lowest, highest, ratio);
+    return result;
+}
+
 }  // namespace
 
 PYBIND11_MODULE(_kernels, module) {
     module.doc() = "Compiled patch alignment and evidence; sigmaslam.frontend.patch_kernels is the reference.";
     module.def("align", &align);
     module.def("examine", &examine);
+    module.def("search_rows", &search_rows);
 }

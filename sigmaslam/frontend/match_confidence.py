@@ -6,11 +6,12 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from sigmaslam.frontend.followed_patches import compare_with_neighbours
 from sigmaslam.frontend.nearest_neighbours import Putative
-from sigmaslam.frontend.patch_evidence import examine_patches
+from sigmaslam.frontend.patch_evidence import Evidence, examine_patches
 from sigmaslam.frontend.scorer_inputs import nearest_matches, side_information
 from sigmaslam.frontend.types import Features, Refinement
-from sigmaslam.frontend.verifier_inputs import describe_matches
+from sigmaslam.frontend.verifier_inputs import describe_matches, describe_places
 from sigmaslam.inference.onnx_graph import OnnxGraph, shipped_weights
 
 MIN_LOGIT = -4.0
@@ -32,9 +33,11 @@ class ConfidenceEstimator:
 
             self._scorer: _Graph = scoring_module("scorer")
             self._verifier: _Graph = scoring_module("verifier")
+            self._place_verifier: _Graph = scoring_module("place_verifier")
         else:
             self._scorer = OnnxGraph(shipped_weights("scorer.onnx"))
             self._verifier = OnnxGraph(shipped_weights("verifier.onnx"))
+            self._place_verifier = OnnxGraph(shipped_weights("place_verifier.onnx"))
 
     def score(self, putative: Putative, features0: Features, features1: Features) -> np.ndarray:
         """Logit (M,) that each match is right, from its neighbours and its margins, without the images.
@@ -80,4 +83,21 @@ class ConfidenceEstimator:
         evidence = examine_patches(image0, image1, points0, refinement.places, refinement.A)
         columns = describe_matches(logit, evidence, refinement, *sigma)
         probability, covariance = self._verifier({"columns": columns, "axes": evidence.axes.astype(np.float32)})
+        return probability, covariance
+
+    def verify_places(
+        self, places: np.ndarray, predicted: np.ndarray, evidence: Evidence, sigma0: np.ndarray, temporal: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Probability (M,) and covariance (M, 2, 2) as of `verify`, of places found without features of image 1.
+
+        Args:
+            places, predicted: (M, 2) in image 1, pixels; of places along rows the prediction is the keypoint itself.
+            evidence: of the patches at the places.
+            sigma0: (M,) of the keypoints of image 0, pixels.
+            temporal: the images were taken one after the other, not by both eyes.
+        """
+        if len(places) == 0:
+            return np.zeros(0, np.float32), np.zeros((0, 2, 2), np.float32)
+        columns = describe_places(*compare_with_neighbours(places, predicted), evidence, sigma0, temporal)
+        probability, covariance = self._place_verifier({"columns": columns, "axes": evidence.axes.astype(np.float32)})
         return probability, covariance

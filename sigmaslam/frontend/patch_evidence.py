@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sigmaslam.frontend.patch_kernels import examine
+from sigmaslam.table import Table
 
 # Of a patch in samples, and of its Gaussian window in radii.
 _RADIUS, _TAPER = 5, 0.6
@@ -16,7 +17,7 @@ _MIN_VARIANCE = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Evidence:
+class Evidence(Table):
     """Of each match, from patches of 11 x 11 samples, a pixel of the coarser image apart.
 
     Attributes:

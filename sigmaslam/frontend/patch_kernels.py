@@ -62,10 +62,10 @@ def align(
     Returns:
         (M, 3) float64: shift of the place in image 1, pixels, and the correlation of the patches there.
     """
-    if _kernels is None:
-        _tell_slow()
+    kernels = compiled()
+    if kernels is None:
         return align_reference(image0, image1, points0, points1, back, tilt, half_octaves, radius, iterations, taper)
-    found: np.ndarray = _kernels.align(
+    found: np.ndarray = kernels.align(
         image0, image1, points0, points1, back, tilt, half_octaves, 2 * radius + 1, iterations, taper * radius
     )
     return found
@@ -88,13 +88,20 @@ def examine(
         (M, 6) float64: correlation, variance of either patch, and uu, uv, vv: mean products of the gradients of both
         normalised patches' mean, by samples.
     """
-    if _kernels is None:
-        _tell_slow()
+    kernels = compiled()
+    if kernels is None:
         return examine_reference(image0, image1, points0, points1, back, half_octaves, radius, taper, flat)
-    found: np.ndarray = _kernels.examine(
+    found: np.ndarray = kernels.examine(
         image0, image1, points0, points1, back, half_octaves, 2 * radius + 1, taper * radius, flat
     )
     return found
+
+
+def compiled() -> ModuleType | None:
+    """The compiled functions, or None where NumPy must do, which is said once."""
+    if _kernels is None:
+        _tell_slow()
+    return _kernels
 
 
 # ---- the reference

@@ -21,6 +21,8 @@ _RADIUS = 5
 _ITERATIONS = 3
 # A window that hardly falls off: with less of a patch a still image drifts by its noise.
 _TAPER = 1.0
+# Longest move of a shifted patch, pixels.
+_REACH = 2.0
 _NEIGHBOURS = 16
 # Of a disparity about the plane through its neighbours, and of a slope beforehand: standard deviations, pixels, 1.
 _ROUGH, _STEEP = 0.2, 0.5
@@ -92,12 +94,19 @@ def refine_on_planes(
     return _align(image0, image1, points0, refine(image0, image1, points0, points1), maps)
 
 
-def refine_in_rows(left: np.ndarray, right: np.ndarray, points0: np.ndarray, points1: np.ndarray) -> Refinement:
+def refine_in_rows(
+    left: np.ndarray, right: np.ndarray, points0: np.ndarray, points1: np.ndarray, reach: float = _REACH
+) -> Refinement:
     """The same for the eyes of a rectified pair: how surfaces slope is known from the disparities themselves.
 
     The maps are near the identity and not handed on: the verifier judges such pairs as if they were shifted only.
+
+    Args:
+        left, right: (H, W) uint8.
+        points0, points1: (M, 2) matched pixels.
+        reach: longest move, pixels.
     """
-    shifted = refine(left, right, points0, points1)
+    shifted = refine(left, right, points0, points1, reach=reach)
     slope = disparity_slopes(points0, points0[:, 0] - shifted.places[:, 0])
     # The right eye sees u - disparity.
     A = np.tile(np.eye(2), (len(slope), 1, 1))
@@ -109,7 +118,7 @@ def _align(
     image0: np.ndarray, image1: np.ndarray, points0: np.ndarray, shifted: Refinement, maps: PatchMaps
 ) -> Refinement:
     """From where patches that are only shifted agree to where the warped ones do."""
-    places, moved = align_patches(
+    aligned = align_patches(
         image0,
         image1,
         points0.astype(np.float64),
@@ -120,4 +129,4 @@ def _align(
         iterations=_ITERATIONS,
         taper=_TAPER,
     )
-    return Refinement(shifted.start, places, moved | shifted.moved, maps.A)
+    return Refinement(shifted.start, aligned.places, aligned.moved | shifted.moved, maps.A)

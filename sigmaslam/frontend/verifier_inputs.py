@@ -26,15 +26,12 @@ def describe_matches(
         sharpnesses; moves along both axes; whether refined, whether by the neighbours' map; logs of both sigmas and
         of the spacing; distance from the neighbours' map.
     """
-    shift = np.einsum("mji,mj->mi", evidence.axes, refinement.places - refinement.start) / evidence.spacing[:, None]
+    shift = _along_axes(evidence, refinement.places - refinement.start)
     distance = np.zeros(len(logit)) if refinement.distance is None else refinement.distance
     return np.column_stack(
         [
             np.clip(logit, -_MAX_LOGIT, _MAX_LOGIT) / 4.0,
-            np.log(0.5 * (1.0 - evidence.correlation) + 1e-3),
-            np.log(evidence.contrast0),
-            np.log(evidence.contrast1),
-            np.log(evidence.sharpness + 1e-3),
+            *_appearance(evidence),
             np.log1p(np.abs(shift)),
             refinement.moved,
             np.full(len(logit), refinement.A is not None),
@@ -44,3 +41,44 @@ def describe_matches(
             np.log1p(np.minimum(distance, _MAX_DISTANCE)),
         ]
     ).astype(np.float32)
+
+
+def describe_places(
+    departure: np.ndarray, spread: np.ndarray, evidence: Evidence, sigma0: np.ndarray, temporal: bool
+) -> np.ndarray:
+    """The columns that the verifier of places takes, which were found without features of image 1.
+
+    Args:
+        departure: (M, 2) from where the neighbours would have each place, pixels; `compare_with_neighbours`.
+        spread: (M,) of the neighbours' own departures.
+        evidence: of the patches at the places.
+        sigma0: (M,) of the keypoints of image 0, pixels.
+        temporal: the images were taken one after the other, not by both eyes.
+    Returns:
+        (M, 11) float32: log of the spread; logs of half the squared difference of the patches, of both contrasts and
+        both sharpnesses; departures along both axes; whether temporal; logs of sigma and of the spacing.
+    """
+    return np.column_stack(
+        [
+            np.log(spread + 0.1),
+            *_appearance(evidence),
+            np.log1p(np.minimum(np.abs(_along_axes(evidence, departure)), _MAX_DISTANCE)),
+            np.full(len(spread), temporal),
+            np.log(sigma0 * evidence.zoom + 0.05),
+            np.log(evidence.spacing),
+        ]
+    ).astype(np.float32)
+
+
+def _appearance(evidence: Evidence) -> tuple[np.ndarray, ...]:
+    return (
+        np.log(0.5 * (1.0 - evidence.correlation) + 1e-3),
+        np.log(evidence.contrast0),
+        np.log(evidence.contrast1),
+        np.log(evidence.sharpness + 1e-3),
+    )
+
+
+def _along_axes(evidence: Evidence, offset: np.ndarray) -> np.ndarray:
+    """(M, 2) offsets (M, 2) in pixels of image 1 along the patches' axes, in samples."""
+    return np.asarray(np.einsum("mji,mj->mi", evidence.axes, offset) / evidence.spacing[:, None])

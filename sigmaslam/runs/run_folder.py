@@ -29,7 +29,14 @@ from sigmaslam.slam.point_map import PointMap
 
 STAGES = ("read", "features", "match", "filter", "map")
 _COLUMNS = (COLUMNS[0], "status", *COLUMNS[1:], *(f"ms_{stage}" for stage in STAGES))
-_GRAPHS = ("features.onnx", "scorer.onnx", "verifier.onnx", "pose_predict.onnx", "stereo_transfer.onnx")
+_GRAPHS = (
+    "features.onnx",
+    "scorer.onnx",
+    "verifier.onnx",
+    "place_verifier.onnx",
+    "pose_predict.onnx",
+    "stereo_transfer.onnx",
+)
 
 
 class RunWriter:

@@ -110,7 +110,7 @@ def test_calibrated_ellipses_hold_what_they_promise(factor: float):
     assert float(verifier.sigma_scale) == pytest.approx(factor, rel=0.03)
     held_out = known_rows(untrained(), 20_000, factor, 1.0, 0.0, seed=2)
     with torch.no_grad():
-        _, log_sigma = verifier(torch.from_numpy(held_out.columns))
+        _, log_sigma = verifier(torch.from_numpy(held_out.inputs))
     square = ((held_out.error / np.exp(log_sigma.numpy())) ** 2).sum(axis=1)[held_out.right]
     assert (square < CHI_SQUARE_95).mean() == pytest.approx(0.95, abs=0.01)
 
@@ -131,7 +131,7 @@ def test_calibrated_probabilities_are_the_shares_of_right_matches(scale: float, 
 
     def expected_error() -> float:
         with torch.no_grad():
-            logit, _ = verifier(torch.from_numpy(held_out.columns))
+            logit, _ = verifier(torch.from_numpy(held_out.inputs))
         return calibration_error(torch.sigmoid(logit).numpy(), held_out.right)
 
     before = expected_error()
@@ -233,7 +233,7 @@ def test_the_same_seed_trains_the_same_weights(tmp_path: Path):
     )
     assert_same_weights(first, second)
     assert not torch.equal(first.layers[0].weight, other.layers[0].weight)
-    torch.testing.assert_close(first.mean, torch.from_numpy(rows.columns.mean(axis=0)), rtol=0, atol=1e-5)
+    torch.testing.assert_close(first.mean, torch.from_numpy(rows.inputs.mean(axis=0)), rtol=0, atol=1e-5)
 
 
 # Rows
@@ -268,10 +268,10 @@ def test_mutual_matches_are_refined_as_at_run_time(source: str, times: int, mapp
     done: list[int] = []
     rows = collect_rows([shifted_record(source), shifted_record(source, 1)], MatchScorer(), done.append)
     assert done == [1, 2]
-    assert rows.columns.shape == (2 * 50 * times, VERIFIER_COLUMNS)
-    assert np.unique(rows.columns[:, 9]).tolist() == mapped
+    assert rows.inputs.shape == (2 * 50 * times, VERIFIER_COLUMNS)
+    assert np.unique(rows.inputs[:, 9]).tolist() == mapped
     assert np.bincount(rows.pair).tolist() == [50 * times, 50 * times]
-    assert np.isfinite(rows.columns).all()
+    assert np.isfinite(rows.inputs).all()
     assert np.isfinite(rows.error).all()
 
 
@@ -301,4 +301,4 @@ def test_selected_rows_stay_together():
     part = rows.select(rows.right)
     assert part.right.all()
     assert 0 < len(part.pair) == rows.right.sum() < 50
-    np.testing.assert_array_equal(part.columns, rows.columns[rows.right])
+    np.testing.assert_array_equal(part.inputs, rows.inputs[rows.right])

@@ -40,6 +40,7 @@ _ELLIPSE_SIGMA = (1.0, 25.0)
 # Standard deviation, in pixels, of a prediction whose true place is unknown.
 _FOREIGN = 40.0
 _POLL = 0.5  # seconds
+_OWN = ("source", "expected", "visible")
 _PUTATIVE = ("index0", "index1", "similarity", "second0", "second1")
 
 
@@ -51,14 +52,21 @@ class MatchSet:
         source: one of the turns, for reports.
         features0, features1: of the images, without descriptors.
         putative: for every keypoint of image 0 that has a candidate.
-        places: (M, 2) true places in image 1 of the keypoints of image 0, infinite where they are not seen there.
+        expected: (N, 2) where the geometry has each keypoint of image 0 in image 1, also if it is hidden there.
+        visible: (N,) bool, whether it is seen there.
     """
 
     source: str
     features0: Features
     features1: Features
     putative: Putative
-    places: np.ndarray
+    expected: np.ndarray
+    visible: np.ndarray
+
+    @property
+    def places(self) -> np.ndarray:
+        """(M, 2) true places of the putative matches in image 1, infinite where they are not seen there."""
+        return np.where(self.visible[:, None], self.expected, np.inf)[self.putative.index0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,8 +110,7 @@ class MatchSets:
             places, visible = pair.transfer(features0.keypoints.astype(np.float64))
             putative = _match(source, guided, features0, features1, places, rng)
             if len(putative.index0) >= _MIN_MATCHES:
-                shown = np.where(visible[:, None], places, np.inf)[putative.index0]
-                sets[kind] = MatchSet(source, _bare(features0), _bare(features1), putative, shown)
+                sets[kind] = MatchSet(source, _bare(features0), _bare(features1), putative, places, visible)
         return PairRecord(image0, image1, sets)
 
 
@@ -137,7 +144,7 @@ def save_record(path: Path, record: PairRecord) -> None:
     """Writes a record as .npz."""
     arrays = {"image0": record.image0, "image1": record.image1}
     for kind, match_set in record.sets.items():
-        arrays |= {f"{kind}.source": np.array(match_set.source), f"{kind}.places": match_set.places}
+        arrays |= {f"{kind}.{name}": np.array(getattr(match_set, name)) for name in _OWN}
         for name in ("keypoints", "scores", "sigma"):
             arrays[f"{kind}.{name}0"] = getattr(match_set.features0, name)
             arrays[f"{kind}.{name}1"] = getattr(match_set.features1, name)
@@ -160,7 +167,8 @@ def load_record(path: Path) -> PairRecord:
                 keypoints, scores, sigma = (of_kind[f"{name}{k}"] for name in ("keypoints", "scores", "sigma"))
                 features.append(Features(keypoints, np.zeros((len(keypoints), 0), np.float32), scores, sigma))
             putative = Putative(*(of_kind[name] for name in _PUTATIVE))
-            sets[kind] = MatchSet(str(of_kind["source"]), features[0], features[1], putative, of_kind["places"])
+            source, expected, visible = str(of_kind["source"]), of_kind["expected"], of_kind["visible"]
+            sets[kind] = MatchSet(source, features[0], features[1], putative, expected, visible)
         return PairRecord(arrays["image0"], arrays["image1"], sets)
 
 

@@ -25,13 +25,15 @@ from sigmaslam.progress import open_progress
 from sigmaslam.training.devices import describe_processor
 from sigmaslam.training.features.validation import held_out_seed
 from sigmaslam.training.matching.match_sets import PairRecord, load_record, record_path, write_records
+from sigmaslam.training.matching.place_rows import collect_place_rows
 from sigmaslam.training.matching.scorer_training import make_sample, score_set, train_scorer
 from sigmaslam.training.matching.verifier_training import VerifierRows, calibrate, collect_rows, train_verifier
 from sigmaslam.training.run_card import describe_origin
 
 SCORER_NAME, VERIFIER_NAME, CARD_NAME = "scorer.safetensors", "verifier.safetensors", "matching.json"
+PLACE_VERIFIER_NAME = "place_verifier.safetensors"
 _CONFIG_NAME, _SECONDS_NAME = "config.json", "seconds.txt"
-_SCORER_CHECKPOINT, _VERIFIER_CHECKPOINT = "scorer_checkpoint.safetensors", "verifier_checkpoint.safetensors"
+_SCORER_CHECKPOINT = "scorer_checkpoint.safetensors"
 _HELD_OUT_SHARE = 0.1
 _SHOW_EVERY = 20
 _LIMITS = [
@@ -48,7 +50,7 @@ class ScoringConfig:
     Attributes:
         pairs: rendered pairs to learn from; a tenth as many others calibrate and measure.
         steps: of the scorer's optimiser, 8 sets each.
-        verifier_steps: of the verifier's, 4,096 matches each.
+        verifier_steps: of that of either verifier, 4,096 matches each.
         seed: of everything.
     """
 
@@ -59,7 +61,7 @@ class ScoringConfig:
 
 
 def train_scoring(out: Path, config: ScoringConfig, workers: int) -> dict[str, Any]:
-    """Makes scorer.safetensors, verifier.safetensors and matching.json in `out`; returns the card.
+    """Makes the weights of scorer and both verifiers, and matching.json, in `out`; returns the card.
 
     What an interrupted run of the same configuration left there is used.
 
@@ -88,15 +90,21 @@ def train_scoring(out: Path, config: ScoringConfig, workers: int) -> dict[str, A
         told = _open_bar(progress, "training the scorer", config.steps)
         scorer = train_scorer(sets, config.steps, config.seed, out / _SCORER_CHECKPOINT, told)
         clock.seconds()
-        rows, held_out = (_collect(progress, folder, scorer) for folder in folders)
-        told = _open_bar(progress, "training the verifier", config.verifier_steps)
-        verifier = train_verifier(rows, config.verifier_steps, config.seed, out / _VERIFIER_CHECKPOINT, told)
-    # Pairs in turn calibrate and measure.
-    calibrate(verifier, held_out.select(held_out.pair % 2 == 0))
-    metrics = _scorer_metrics(scorer, folders[1]) | _verifier_metrics(verifier, held_out.select(held_out.pair % 2 == 1))
-    card = _make_card(origin, config, scorer, verifier, metrics, clock.seconds())
-    _save(out / SCORER_NAME, scorer)
-    _save(out / VERIFIER_NAME, verifier)
+        metrics = _scorer_metrics(scorer, folders[1])
+        rows = [
+            _collect(progress, folder, lambda records, note: collect_rows(records, scorer, note)) for folder in folders
+        ]
+        verifier = _train_verifier(progress, out / VERIFIER_NAME, config, rows, metrics, "")
+        seed = config.seed
+        rows = [
+            _collect(progress, folder, lambda records, note: collect_place_rows(records, seed, note))
+            for folder in folders
+        ]
+        place_verifier = _train_verifier(progress, out / PLACE_VERIFIER_NAME, config, rows, metrics, "place_")
+    networks = {"scorer": scorer, "verifier": verifier, "place_verifier": place_verifier}
+    card = _make_card(origin, config, networks, metrics, clock.seconds())
+    for name, network in zip((SCORER_NAME, VERIFIER_NAME, PLACE_VERIFIER_NAME), networks.values(), strict=True):
+        _save(out / name, network)
     atomic_write_text(out / CARD_NAME, json.dumps(card, indent=2) + "\n")
     return card
 
@@ -143,9 +151,34 @@ def _records(paths: list[Path]) -> Iterator[PairRecord]:
     return (load_record(path) for path in paths)
 
 
-def _collect(progress: Progress, paths: list[Path], scorer: MatchScorer) -> VerifierRows:
+def _collect(
+    progress: Progress,
+    paths: list[Path],
+    collect: Callable[[Iterator[PairRecord], Callable[[int], None]], VerifierRows],
+) -> VerifierRows:
     task = progress.add_task("refining matches", total=len(paths), note="")
-    return collect_rows(_records(paths), scorer, lambda done: progress.update(task, completed=done))
+    return collect(_records(paths), lambda done: progress.update(task, completed=done))
+
+
+def _train_verifier(
+    progress: Progress,
+    weights: Path,
+    config: ScoringConfig,
+    rows: list[VerifierRows],
+    metrics: dict[str, float],
+    prefix: str,
+) -> MatchVerifier:
+    """A verifier of the rows of pairs and of held-out ones; its figures are added to the metrics."""
+    learnt, held_out = rows
+    name = weights.stem.replace("_", " ")
+    told = _open_bar(progress, f"training the {name}", config.verifier_steps)
+    checkpoint = weights.with_name(f"{weights.stem}_checkpoint.safetensors")
+    verifier = train_verifier(learnt, config.verifier_steps, config.seed, checkpoint, told)
+    # Pairs in turn calibrate and measure.
+    calibrate(verifier, held_out.select(held_out.pair % 2 == 0))
+    figures = _verifier_metrics(verifier, held_out.select(held_out.pair % 2 == 1))
+    metrics |= {f"{prefix}{key}": value for key, value in figures.items()}
+    return verifier
 
 
 def _scorer_metrics(scorer: MatchScorer, paths: list[Path]) -> dict[str, float]:
@@ -174,7 +207,7 @@ def _scorer_metrics(scorer: MatchScorer, paths: list[Path]) -> dict[str, float]:
 
 def _verifier_metrics(verifier: MatchVerifier, rows: VerifierRows) -> dict[str, float]:
     with torch.no_grad():
-        logit, log_sigma = (values.numpy() for values in verifier(torch.from_numpy(rows.columns)))
+        logit, log_sigma = (values.numpy() for values in verifier(torch.from_numpy(rows.inputs)))
     right = rows.right
     sigma, error = np.exp(log_sigma[right]), rows.error[right]
     square = ((error / sigma) ** 2).sum(axis=1)
@@ -192,8 +225,7 @@ def _verifier_metrics(verifier: MatchVerifier, rows: VerifierRows) -> dict[str, 
 def _make_card(
     origin: dict[str, str],
     config: ScoringConfig,
-    scorer: MatchScorer,
-    verifier: MatchVerifier,
+    networks: dict[str, torch.nn.Module],
     metrics: dict[str, float],
     seconds: float,
 ) -> dict[str, Any]:
@@ -203,10 +235,7 @@ def _make_card(
         **origin,
         "duration_s": round(seconds, 1),
         "hardware": describe_processor(),
-        "parameters": {
-            name: sum(p.numel() for p in module.parameters())
-            for name, module in (("scorer", scorer), ("verifier", verifier))
-        },
+        "parameters": {name: sum(p.numel() for p in network.parameters()) for name, network in networks.items()},
         "data": "renders alone, no photograph: planes, scenes, stereo pairs, video; our features, SIFT and ORB",
         "limits": _LIMITS,
         "metrics_on_held_out_renders": {name: round(value, 4) for name, value in metrics.items()},

@@ -18,11 +18,12 @@ from sigmaslam.evaluation.metrics.probability_calibration import RIGHT
 from sigmaslam.frontend.affine_alignment import refine_by_neighbours
 from sigmaslam.frontend.lucas_kanade import refine
 from sigmaslam.frontend.match_confidence import MIN_LOGIT
-from sigmaslam.frontend.patch_evidence import examine_patches
+from sigmaslam.frontend.patch_evidence import Evidence, examine_patches
 from sigmaslam.frontend.types import Refinement
 from sigmaslam.frontend.verifier_inputs import describe_matches
 from sigmaslam.models.scorer_network import MatchScorer
 from sigmaslam.models.verifier_network import MatchVerifier
+from sigmaslam.table import Table
 from sigmaslam.training.matching.match_sets import MatchSet, PairRecord
 from sigmaslam.training.matching.scorer_training import score_set
 from sigmaslam.training.small_loop import train_steps
@@ -38,16 +39,16 @@ _FAR = 1e3
 
 
 @dataclass(frozen=True, slots=True)
-class VerifierRows:
+class VerifierRows(Table):
     """Refined matches of many pairs.
 
     Attributes:
-        columns: (M, 14) as the verifier takes them.
+        inputs: (M, C) as the verifier takes them.
         error: (M, 2) of the refined place along the patch's axes, pixels; very large where there is no truth.
         pair: (M,) which pair each is of.
     """
 
-    columns: np.ndarray
+    inputs: np.ndarray
     error: np.ndarray
     pair: np.ndarray
 
@@ -55,10 +56,6 @@ class VerifierRows:
     def right(self) -> np.ndarray:
         """(M,) bool, within 3 px of the truth."""
         return np.asarray(np.linalg.norm(self.error, axis=1) < RIGHT)
-
-    def select(self, index: np.ndarray) -> VerifierRows:
-        """The rows of that index or mask."""
-        return VerifierRows(self.columns[index], self.error[index], self.pair[index])
 
 
 def collect_rows(records: Iterable[PairRecord], scorer: MatchScorer, note: Callable[[int], None]) -> VerifierRows:
@@ -80,13 +77,12 @@ def collect_rows(records: Iterable[PairRecord], scorer: MatchScorer, note: Calla
         note(number + 1)
     if not parts:
         raise SigmaSlamError("the scorer finds no match likely in any pair: train it longer, or on more pairs")
-    columns, error, pair = (np.concatenate([part[k] for part in parts]) for k in range(3))
-    return VerifierRows(columns, error, pair)
+    return VerifierRows.concatenate(parts)
 
 
 def _rows_of(
     record: PairRecord, found: MatchSet, logit: np.ndarray, kept: np.ndarray, mapped: bool, number: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> VerifierRows:
     putative = found.putative.select(kept)
     points0 = found.features0.keypoints[putative.index0].astype(np.float64)
     points1 = found.features1.keypoints[putative.index1].astype(np.float64)
@@ -98,9 +94,15 @@ def _rows_of(
     evidence = examine_patches(record.image0, record.image1, points0, refinement.places, refinement.A)
     sigma0, sigma1 = found.features0.sigma[putative.index0], found.features1.sigma[putative.index1]
     columns = describe_matches(logit[kept], evidence, refinement, sigma0, sigma1)
-    error = np.nan_to_num(refinement.places - found.places[kept], nan=_FAR, posinf=_FAR, neginf=-_FAR)
+    error = error_along_axes(evidence, refinement.places, found.places[kept])
+    return VerifierRows(columns, error, np.full(len(columns), number))
+
+
+def error_along_axes(evidence: Evidence, places: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """(M, 2) float32 places less true ones along the patches' axes, pixels; very large where the truth is infinite."""
+    error = np.nan_to_num(places - truth, nan=_FAR, posinf=_FAR, neginf=-_FAR)
     along_axes = np.einsum("mji,mj->mi", evidence.axes, np.clip(error, -_FAR, _FAR))
-    return columns, along_axes.astype(np.float32), np.full(len(columns), number)
+    return np.asarray(along_axes, np.float32)
 
 
 def verifier_loss(logit: Tensor, log_sigma: Tensor, error: Tensor) -> Tensor:
@@ -128,8 +130,8 @@ def train_verifier(
         InputError, KeyboardInterrupt: as there.
     """
     torch.manual_seed(seed)
-    verifier = MatchVerifier()
-    columns, error = torch.from_numpy(rows.columns), torch.from_numpy(rows.error)
+    verifier = MatchVerifier(rows.inputs.shape[1])
+    columns, error = torch.from_numpy(rows.inputs), torch.from_numpy(rows.error)
     verifier.mean.copy_(columns.mean(dim=0))
     verifier.spread.copy_(columns.std(dim=0) + 1e-3)
     optimizer = torch.optim.AdamW(verifier.parameters(), _LEARNING_RATE, weight_decay=1e-4)
@@ -155,7 +157,7 @@ def calibrate(verifier: MatchVerifier, rows: VerifierRows) -> None:
     matches lie within two sigma, along either axis, as of a normal error.
     """
     with torch.no_grad():
-        logit, log_sigma = verifier(torch.from_numpy(rows.columns))
+        logit, log_sigma = verifier(torch.from_numpy(rows.inputs))
     right = torch.from_numpy(rows.right)
     scale, shift = torch.ones((), requires_grad=True), torch.zeros((), requires_grad=True)
     optimizer = torch.optim.LBFGS([scale, shift], max_iter=100, line_search_fn="strong_wolfe")

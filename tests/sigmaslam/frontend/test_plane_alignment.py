@@ -151,8 +151,8 @@ def test_no_tilt_is_a_tilt_of_zero():
     image0, image1 = digitised(texture, 1), digitised(warped(texture, H), 2)
     points0, points1 = corners(image0, H)
     maps = maps_of(H, points0)
-    plain, _ = align_patches(image0, image1, points0, points1 + 0.5, maps.A)
-    tilted, _ = align_patches(image0, image1, points0, points1 + 0.5, maps.A, np.zeros((len(points0), 2)))
+    plain, _, _ = align_patches(image0, image1, points0, points1 + 0.5, maps.A)
+    tilted, _, _ = align_patches(image0, image1, points0, points1 + 0.5, maps.A, np.zeros((len(points0), 2)))
     np.testing.assert_array_equal(plain, tilted)
 
 
@@ -163,7 +163,7 @@ def test_what_moves_alike_is_not_misplaced_alike_between_pixels(shift):
     H[0, 2] = shift
     image0, image1 = digitised(textured(), 1), digitised(warped(textured(), H), 2)
     points0, points1 = corners(image0, H)
-    places, moved = align_patches(image0, image1, points0, points1 + 0.3, np.tile(np.eye(2), (len(points0), 1, 1)))
+    places, moved, _ = align_patches(image0, image1, points0, points1 + 0.3, np.tile(np.eye(2), (len(points0), 1, 1)))
     assert moved.mean() > 0.95
     assert np.abs((places - points1)[moved].mean(axis=0)).max() < 0.006
 

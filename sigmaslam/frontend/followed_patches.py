@@ -1,0 +1,135 @@
+"""Patches of one image found in another one without features: from a start, else from where their neighbours went."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from sigmaslam.frontend.affine_alignment import AlignedPatches, align_patches
+from sigmaslam.frontend.knn import nearest_points
+from sigmaslam.frontend.nearest_neighbours import within_ellipses
+from sigmaslam.frontend.types import PatchMaps
+from sigmaslam.table import Table
+
+# Patches in samples, Gauss-Newton steps, and the window's standard deviation in radii.
+_RADIUS, _ITERATIONS, _TAPER = 5, 5, 1.0
+# A patch that agrees less than this where it was followed to is searched for again, first in images so much smaller.
+_MIN_AGREEMENT = 0.9
+_SCALES = (4, 2)
+# A prediction is corrected by so many neighbours, where there are enough.
+_CORRECTING, _MIN_CORRECTING = 7, 8
+# Neighbours that a found place is compared with.
+_COMPARED = 12
+
+
+@dataclass(frozen=True, slots=True)
+class PatchTargets(Table):
+    """Patches of one image that are wanted in another one.
+
+    Attributes:
+        points: (K, 2) float64 their centres, pixels.
+        maps: how they change.
+        predicted: (K, 2) where they are expected, pixels of the other image.
+        covariance: (K, 2, 2) of that, pixels squared; only its 99 % ellipse counts.
+        start: (K, 2) where they were followed to; NaN where that is not known.
+        corrected: (K, 2) where they are expected by what their neighbours were followed to.
+    """
+
+    points: np.ndarray
+    maps: PatchMaps
+    predicted: np.ndarray
+    covariance: np.ndarray
+    start: np.ndarray
+    corrected: np.ndarray
+
+
+def correct_by_neighbours(predicted: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """(K, 2) predictions moved by what the seven nearest starts are off, in the median.
+
+    Args:
+        predicted: (K, 2) pixels.
+        start: (K, 2) where patches were followed to; NaN where that is not known.
+    """
+    known = np.flatnonzero(np.isfinite(start[:, 0]))
+    if len(known) < _MIN_CORRECTING:
+        return predicted
+    near = known[nearest_points(predicted[known], predicted, min(_CORRECTING, len(known)))]
+    return np.asarray(predicted + np.median(start[near] - predicted[near], axis=1))
+
+
+def find_patches(image0: np.ndarray, image1: np.ndarray, targets: PatchTargets) -> tuple[np.ndarray, np.ndarray]:
+    """Aligns patches, from their starts or, where there is none or it fits badly, from coarse to fine.
+
+    Args:
+        image0, image1: (H, W) uint8.
+        targets: the patches of image 0.
+    Returns:
+        (K, 2) places in image 1 and (K,) bool, whether the patch was found there within its ellipse.
+    """
+    followed = np.isfinite(targets.start[:, 0])
+    start = np.where(followed[:, None], targets.start, targets.corrected)
+    first = _align(image0, image1, targets.points, targets.maps, start)
+    places, found = first.places, first.moved & within_ellipses(first.places - targets.predicted, targets.covariance)
+    again = np.flatnonzero(~found | ~followed | (first.correlation < _MIN_AGREEMENT))
+    if len(again):
+        wanted = targets.select(again)
+        start = _coarse_to_fine(image0, image1, wanted)
+        second = _align(image0, image1, wanted.points, wanted.maps, start)
+        better = second.moved & within_ellipses(second.places - wanted.predicted, wanted.covariance)
+        better &= ~found[again] | (second.correlation > first.correlation[again])
+        places[again[better]] = second.places[better]
+        found[again[better]] = True
+    return places, found
+
+
+def compare_with_neighbours(places: np.ndarray, predicted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How found places depart from their prediction, beside how their neighbours do.
+
+    Args:
+        places, predicted: (M, 2) pixels.
+    Returns:
+        (M, 2) departure less the median of the twelve nearest others, and (M,) the median distance of theirs from
+        that; zero where there are no others.
+    """
+    count = min(_COMPARED + 1, len(places))
+    if count < 2:
+        return np.zeros((len(places), 2)), np.zeros(len(places))
+    near = nearest_points(places, places, count)[:, 1:]
+    departure = places - predicted
+    usual = np.median(departure[near], axis=1)
+    spread = np.median(np.linalg.norm(departure[near] - usual[:, None], axis=2), axis=1)
+    return departure - usual, spread
+
+
+def _align(
+    image0: np.ndarray, image1: np.ndarray, points: np.ndarray, maps: PatchMaps, start: np.ndarray
+) -> AlignedPatches:
+    return align_patches(
+        image0,
+        image1,
+        points,
+        start,
+        maps.A,
+        maps.tilt,
+        radius=_RADIUS,
+        iterations=_ITERATIONS,
+        taper=_TAPER,
+    )
+
+
+def _coarse_to_fine(image0: np.ndarray, image1: np.ndarray, targets: PatchTargets) -> np.ndarray:
+    """(K, 2) places by alignment at a quarter and half of the size, from where the neighbours went."""
+    places = targets.corrected
+    for scale in _SCALES:
+        maps = PatchMaps(targets.maps.A, targets.maps.tilt * scale)
+        points, start = ((pixels + 0.5) / scale - 0.5 for pixels in (targets.points, places))
+        aligned = _align(_shrink(image0, scale), _shrink(image1, scale), points, maps, start)
+        places = np.where(aligned.moved[:, None], (aligned.places + 0.5) * scale - 0.5, places)
+    return places
+
+
+def _shrink(image: np.ndarray, scale: int) -> np.ndarray:
+    height, width = image.shape
+    return cv2.resize(image, (width // scale, height // scale), interpolation=cv2.INTER_AREA)
