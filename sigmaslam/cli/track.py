@@ -101,6 +101,17 @@ def track(
             "[,sigma_rotation]; any rate, any world (docs/object.md)."
         ),
     ] = None,
+    realtime: Annotated[
+        bool,
+        typer.Option(
+            "--realtime",
+            help="Play a recording at its time stamps, as a camera would: always the newest frame is tracked, those "
+            "that come meanwhile are dropped. Cameras always do.",
+        ),
+    ] = False,
+    threads: Annotated[
+        int, typer.Option(min=1, help="Threads of the network and of OpenCV; from 2 on keyframes are foreseen.")
+    ] = 2,
 ) -> None:
     """Track a stereo sequence, recorded or live: trajectory, covariance, map and report."""
     if backend.value == "torch":
@@ -108,7 +119,9 @@ def track(
     settings = None if config is None else _read_config(config, track_object is not None)
     sequence = _open_input(source, format, calibration, camera, seconds, (topic_left, topic_right))
     try:
-        summary = _track(sequence, out, frontend, backend, settings, map, tracks, track_object, location)
+        summary = _track(
+            sequence, out, frontend, backend, settings, map, tracks, track_object, location, realtime, threads
+        )
     except KeyboardInterrupt:
         if (out / "run.json").exists():
             typer.echo(f"Stopped; what was tracked until then is in {out}")
@@ -117,7 +130,7 @@ def track(
         f"{summary['tracking']} of {summary['frames']} frames tracked, {summary['lost']} lost, "
         f"{summary['skipped']} skipped; {summary['median_inliers']:.0f} inliers in the median frame, "
         f"{summary['map_points']} map points.\n{summary['calibration_verdict']}\n"
-        f"{_location_verdict(summary)}Report: {out / 'report.html'}"
+        f"{_location_verdict(summary)}{_real_time_verdict(summary)}Report: {out / 'report.html'}"
     )
 
 
@@ -160,10 +173,15 @@ def _track(
     tracks: bool = False,
     track_object: str | None = None,
     location: Path | None = None,
+    realtime: bool = False,
+    threads: int = 2,
 ) -> dict[str, Any]:
+    import cv2
+
     from sigmaslam.fusion.readings import read_locations
     from sigmaslam.runs.track import track_sequence
 
+    cv2.setNumThreads(threads)
     return track_sequence(
         sequence,
         out,
@@ -174,6 +192,8 @@ def _track(
         tracks=tracks,
         track_object=track_object,
         locations=None if location is None else read_locations(location),
+        real_time=realtime,
+        threads=threads,
     )
 
 
@@ -191,3 +211,12 @@ def _location_verdict(summary: dict[str, Any]) -> str:
         f"Location sensor: {used} readings used ({weakened} disagreed and count less), {unused} not; poses are fused "
         f"from {ready:.3f} s on.\n"
     )
+
+
+def _real_time_verdict(summary: dict[str, Any]) -> str:
+    """A line about dropped frames and latency; empty where frames were tracked as fast as they could be."""
+    if "real_time" not in summary:
+        return ""
+    latency = summary["real_time"]["latency_ms"]
+    figures = ", ".join(f"{name} {value:.0f}" for name, value in latency.items())
+    return f"In real time: {summary['real_time']['dropped']} frames dropped; latency in ms: {figures}.\n"

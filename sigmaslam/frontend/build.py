@@ -13,18 +13,19 @@ from sigmaslam.frontend.types import Frontend
 FRONTENDS = ("learned", "sift", "orb", "klt")
 
 
-def build_frontend(name: str, max_keypoints: int, backend: str = "onnx") -> Frontend:
+def build_frontend(name: str, max_keypoints: int, backend: str = "onnx", threads: int = 2) -> Frontend:
     """The front-end of that name.
 
     Args:
         name: one of FRONTENDS.
         max_keypoints: per image.
         backend: "onnx" or "torch", of the networks.
+        threads: of the feature network.
     Raises:
         InputError: there is no front-end of that name.
     """
     if name == "learned":
-        return DescriptorFrontend(name, LearnedDetector(max_keypoints, backend), ConfidenceEstimator(backend))
+        return DescriptorFrontend(name, LearnedDetector(max_keypoints, backend, threads), ConfidenceEstimator(backend))
     if name == "sift":
         return DescriptorFrontend(name, SiftDetector(max_keypoints), ConfidenceEstimator(backend))
     if name == "orb":

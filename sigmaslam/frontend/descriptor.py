@@ -7,11 +7,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sigmaslam.frontend.followed_patches import PatchTargets, correct_by_neighbours, find_patches, shrink
 from sigmaslam.frontend.lucas_kanade import refine
 from sigmaslam.frontend.match_confidence import MIN_LOGIT, ConfidenceEstimator
-from sigmaslam.frontend.nearest_neighbours import Putative, nearest_anywhere, nearest_in_ellipses, nearest_in_rows
+from sigmaslam.frontend.nearest_neighbours import (
+    Putative,
+    nearest_anywhere,
+    nearest_in_ellipses,
+    nearest_in_rows,
+    within_ellipses,
+)
+from sigmaslam.frontend.patch_evidence import Evidence, examine_patches
 from sigmaslam.frontend.plane_alignment import refine_in_rows, refine_on_planes
+from sigmaslam.frontend.row_search import align_in_rows, search_rows
 from sigmaslam.frontend.types import Features, KeypointSearch, Refinement, StereoView, TemporalMatches
+from sigmaslam.table import Table
 
 _ROW_TOLERANCE = 2.0
 # A little below zero, so that points at infinity survive a disparity offset.
@@ -20,6 +30,10 @@ _LEAST_DISPARITY = -2.0
 _MOST_DISPARITY = 0.25
 # What is more likely wrong than right is left out.
 _LEAST_PROBABILITY = 0.5
+# How far alignment may move a disparity that was searched for, and one that was predicted, pixels.
+_REACH_NEW, _REACH_FOLLOWED = 2.0, 3.0
+# Pixels from anywhere.
+_NOWHERE = 1e6
 
 Detector = Callable[[np.ndarray], Features]
 
@@ -130,13 +144,16 @@ class DescriptorFrontend:
         self._estimator = estimator
 
     def observe(self, left: np.ndarray, right: np.ndarray) -> StereoView:
-        """Features of both images, matched along the rows."""
+        """Features of the left image, searched for along the rows of the right one."""
         features = self._detect(left)
-        found = match_stereo(self._estimator, left, right, features, self._detect(right))
+        index, start = search_rows(left, right, features.keypoints)
+        points = features.keypoints[index].astype(np.float64)
+        found, values, sigmas = self._disparities(left, right, points, start, points, features.sigma[index], _REACH_NEW)
+        behind = values < _LEAST_DISPARITY
         disparity, sigma = np.full((2, len(features.keypoints)), np.nan)
-        disparity[found.index0] = features.keypoints[found.index0, 0] - found.places[:, 0]
-        sigma[found.index0] = np.sqrt(found.covariance[:, 0, 0])
-        return StereoView(left, right, features, disparity, sigma)
+        index = index[found[~behind]]
+        disparity[index], sigma[index] = values[~behind], sigmas[~behind]
+        return StereoView(left, right, features, disparity, sigma, behind=int(behind.sum()), small=shrink(left))
 
     def match(self, search: KeypointSearch, view: StereoView) -> TemporalMatches:
         """Mutual nearest neighbours within the ellipses of the prediction, or anywhere."""
@@ -164,3 +181,108 @@ class DescriptorFrontend:
             view.disparity_sigma[found.index1],
             found.probability,
         )
+
+    def follow(
+        self, searches: list[KeypointSearch], starts: list[np.ndarray], left: np.ndarray, right: np.ndarray
+    ) -> list[TemporalMatches]:
+        """Patches aligned to where they were followed, or to where their neighbours went."""
+        if not searches:
+            return []
+        starts = [_inside(search, start) for search, start in zip(searches, starts, strict=True)]
+        corrected = correct_by_neighbours(
+            np.concatenate([search.predicted for search in searches]), np.concatenate(starts)
+        )
+        ends = np.cumsum([len(start) for start in starts])
+        small = shrink(left)
+        parts = zip(searches, starts, np.split(corrected, ends[:-1]), strict=True)
+        found = _FollowedPatches.concatenate([_find(number, *part, left, small) for number, part in enumerate(parts)])
+        verified = self._estimator.verify_places(
+            found.places, found.predicted, found.evidence, found.sigma0, temporal=True
+        )
+        likely = verified[0] >= _LEAST_PROBABILITY
+        found, probability, covariance = found.select(likely), verified[0][likely], verified[1][likely]
+        start = found.places - np.column_stack([found.expected_disparity, np.zeros(len(found))])
+        index, *measured = self._disparities(left, right, found.places, start, start, found.sigma0, _REACH_FOLLOWED)
+        disparity, sigma = np.full((2, len(found)), np.nan)
+        disparity[index], sigma[index] = measured
+        covariance = covariance.astype(np.float64)
+        matches = TemporalMatches(found.key_index, found.places, disparity, covariance, sigma, probability)
+        return [matches.select(found.search == number) for number in range(len(searches))]
+
+    def _disparities(
+        self,
+        left: np.ndarray,
+        right: np.ndarray,
+        points: np.ndarray,
+        start: np.ndarray,
+        predicted: np.ndarray,
+        sigma0: np.ndarray,
+        reach: float,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Which of the points (M, 2) are found in the right image from a start, their disparities and sigmas."""
+        places, there = align_in_rows(left, right, points, start, reach)
+        index = np.flatnonzero(there)
+        points, places, predicted = points[index], places[index], predicted[index]
+        evidence = examine_patches(left, right, points, places)
+        judged = self._estimator.verify_places(places, predicted, evidence, sigma0[index], temporal=False)
+        likely = np.flatnonzero(judged[0] >= _LEAST_PROBABILITY)
+        disparity = points[likely, 0] - places[likely, 0]
+        return index[likely], disparity, np.sqrt(judged[1][likely, 0, 0].astype(np.float64))
+
+
+@dataclass(frozen=True, slots=True)
+class _FollowedPatches(Table):
+    """Keypoints of keyframes in an image, before they are verified.
+
+    Attributes:
+        search: (M,) number of the keyframe's search.
+        key_index: (M,) index into the keyframe's features.
+        predicted: (M, 2) where they were expected, pixels.
+        expected_disparity: (M,) pixels.
+        sigma0: (M,) of the keypoints, pixels.
+        places: (M, 2) where they were found.
+        evidence: of the patches there.
+    """
+
+    search: np.ndarray
+    key_index: np.ndarray
+    predicted: np.ndarray
+    expected_disparity: np.ndarray
+    sigma0: np.ndarray
+    places: np.ndarray
+    evidence: Evidence
+
+
+def _inside(search: KeypointSearch, start: np.ndarray) -> np.ndarray:
+    """The starts (K, 2) that lie in the ellipses of their predictions; NaN for the others."""
+    assert search.covariance is not None
+    offset = np.nan_to_num(start - search.predicted, nan=_NOWHERE)
+    return np.where(within_ellipses(offset, search.covariance)[:, None], start, np.nan)
+
+
+def _find(
+    number: int,
+    search: KeypointSearch,
+    start: np.ndarray,
+    corrected: np.ndarray,
+    left: np.ndarray,
+    small: tuple[np.ndarray, ...],
+) -> _FollowedPatches:
+    """The keypoints of a keyframe that are found in an image."""
+    key, maps, covariance, disparity = search.key, search.maps, search.covariance, search.disparity
+    if maps is None or covariance is None or disparity is None:
+        raise ValueError("keypoints are followed with a prediction of their places, patches and disparities")
+    points = key.features.keypoints[search.index].astype(np.float64)
+    targets = PatchTargets(points, maps, search.predicted, covariance, start, corrected)
+    places, found = find_patches(key.left, left, key.small, small, targets)
+    rows = np.flatnonzero(found)
+    index, places = search.index[rows], places[rows]
+    return _FollowedPatches(
+        np.full(len(rows), number),
+        index,
+        search.predicted[rows],
+        disparity[rows],
+        key.features.sigma[index],
+        places,
+        examine_patches(key.left, left, points[rows], places, maps.A[rows]),
+    )

@@ -59,11 +59,26 @@ def correct_by_neighbours(predicted: np.ndarray, start: np.ndarray) -> np.ndarra
     return np.asarray(predicted + np.median(start[near] - predicted[near], axis=1))
 
 
-def find_patches(image0: np.ndarray, image1: np.ndarray, targets: PatchTargets) -> tuple[np.ndarray, np.ndarray]:
+def shrink(image: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The (H, W) uint8 image at a quarter and half of the size, as `find_patches` takes it."""
+    height, width = image.shape
+    return tuple(
+        cv2.resize(image, (width // scale, height // scale), interpolation=cv2.INTER_AREA) for scale in _SCALES
+    )
+
+
+def find_patches(
+    image0: np.ndarray,
+    image1: np.ndarray,
+    small0: tuple[np.ndarray, ...],
+    small1: tuple[np.ndarray, ...],
+    targets: PatchTargets,
+) -> tuple[np.ndarray, np.ndarray]:
     """Aligns patches, from their starts or, where there is none or it fits badly, from coarse to fine.
 
     Args:
         image0, image1: (H, W) uint8.
+        small0, small1: the same, shrunk by `shrink`.
         targets: the patches of image 0.
     Returns:
         (K, 2) places in image 1 and (K,) bool, whether the patch was found there within its ellipse.
@@ -75,7 +90,7 @@ def find_patches(image0: np.ndarray, image1: np.ndarray, targets: PatchTargets) 
     again = np.flatnonzero(~found | ~followed | (first.correlation < _MIN_AGREEMENT))
     if len(again):
         wanted = targets.select(again)
-        start = _coarse_to_fine(image0, image1, wanted)
+        start = _coarse_to_fine(small0, small1, wanted)
         second = _align(image0, image1, wanted.points, wanted.maps, start)
         better = second.moved & within_ellipses(second.places - wanted.predicted, wanted.covariance)
         better &= ~found[again] | (second.correlation > first.correlation[again])
@@ -119,17 +134,14 @@ def _align(
     )
 
 
-def _coarse_to_fine(image0: np.ndarray, image1: np.ndarray, targets: PatchTargets) -> np.ndarray:
+def _coarse_to_fine(
+    small0: tuple[np.ndarray, ...], small1: tuple[np.ndarray, ...], targets: PatchTargets
+) -> np.ndarray:
     """(K, 2) places by alignment at a quarter and half of the size, from where the neighbours went."""
     places = targets.corrected
-    for scale in _SCALES:
+    for scale, image0, image1 in zip(_SCALES, small0, small1, strict=True):
         maps = PatchMaps(targets.maps.A, targets.maps.tilt * scale)
         points, start = ((pixels + 0.5) / scale - 0.5 for pixels in (targets.points, places))
-        aligned = _align(_shrink(image0, scale), _shrink(image1, scale), points, maps, start)
+        aligned = _align(image0, image1, points, maps, start)
         places = np.where(aligned.moved[:, None], (aligned.places + 0.5) * scale - 0.5, places)
     return places
-
-
-def _shrink(image: np.ndarray, scale: int) -> np.ndarray:
-    height, width = image.shape
-    return cv2.resize(image, (width // scale, height // scale), interpolation=cv2.INTER_AREA)

@@ -45,20 +45,34 @@ class KltFrontend:
 
     def match(self, search: KeypointSearch, view: StereoView) -> TemporalMatches:
         """Corners of the keyframe followed into the current left image, then into the right one; no patch is warped."""
-        points = search.key.features.keypoints[search.index]
-        places, tracked = _follow(search.key.left, view.left, points, search.predicted)
-        if search.covariance is not None:
-            tracked &= within_ellipses(places - search.predicted, search.covariance)
-        places = places[tracked]
-        disparity = _disparity(view.left, view.right, places)
-        return TemporalMatches(
-            search.index[tracked],
-            places,
-            disparity,
-            np.tile(_SIGMA**2 * np.eye(2), (len(places), 1, 1)),
-            np.where(np.isfinite(disparity), _DISPARITY_SIGMA, np.nan),
-            np.ones(len(places)),
-        )
+        return _match(search, search.predicted, view.left, view.right)
+
+    def follow(
+        self, searches: list[KeypointSearch], starts: list[np.ndarray], left: np.ndarray, right: np.ndarray
+    ) -> list[TemporalMatches]:
+        """The same from where optical flow took the corners."""
+        return [
+            _match(search, np.where(np.isfinite(start), start, search.predicted), left, right)
+            for search, start in zip(searches, starts, strict=True)
+        ]
+
+
+def _match(search: KeypointSearch, start: np.ndarray, left: np.ndarray, right: np.ndarray) -> TemporalMatches:
+    """Corners of a keyframe in a pair, from a start (K, 2)."""
+    points = search.key.features.keypoints[search.index]
+    places, tracked = _follow(search.key.left, left, points, start)
+    if search.covariance is not None:
+        tracked &= within_ellipses(places - search.predicted, search.covariance)
+    places = places[tracked]
+    disparity = _disparity(left, right, places)
+    return TemporalMatches(
+        search.index[tracked],
+        places,
+        disparity,
+        np.tile(_SIGMA**2 * np.eye(2), (len(places), 1, 1)),
+        np.where(np.isfinite(disparity), _DISPARITY_SIGMA, np.nan),
+        np.ones(len(places)),
+    )
 
 
 def _follow(

@@ -10,6 +10,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from sigmaslam.frontend.types import StereoView
+
 # All below at half the resolution, which is five times as fast and nearly as good.
 # Of the patches that are aligned, 11 pixels wide, with what is smoothed into them.
 _RADIUS = 3
@@ -22,33 +24,12 @@ _UNIQUE, _SPECKLE = 10, 50
 _LEAST, _BEYOND = -4, 16
 
 
-def patch_disparity_range(left: np.ndarray, right: np.ndarray, measured: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """Range of the disparities within each keypoint's patch, the slope of its surface taken off; (K,) pixels.
-
-    Args:
-        left, right: (H, W) uint8, a rectified pair.
-        measured: (K, 3) (u, v, disparity) of the keypoints.
-        slope: (K, 2) gradients of the disparity there, as of `disparity_slopes`.
-    Returns:
-        Zero where nothing is known around a keypoint.
-    """
-    if not len(measured):
-        return np.zeros(0)
-    halves = [cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for image in (left, right)]
-    dense = _dense_disparity(halves[0], halves[1], 0.5 * float(measured[:, 2].max()))
-    height, width = dense.shape
-    dv, du = np.mgrid[-_RADIUS : _RADIUS + 1, -_RADIUS : _RADIUS + 1]
-    u, v = np.round(0.5 * measured[:, :2] - 0.25).astype(int).T[..., None, None]
-    u, v = np.clip(u + du, 0, width - 1), np.clip(v + dv, 0, height - 1)
-    tilted = slope[:, 0, None, None] * u + slope[:, 1, None, None] * v
-    untilted = (dense[v, u] - tilted).reshape(len(measured), -1)
-    known = np.isfinite(untilted)
-    most, least = np.where(known, untilted, -np.inf).max(axis=1), np.where(known, untilted, np.inf).min(axis=1)
-    return np.where(known.any(axis=1), 2.0 * (most - least), 0.0)
-
-
-def _dense_disparity(left: np.ndarray, right: np.ndarray, largest: float) -> np.ndarray:
-    """(H, W) disparities in pixels by semi-global matching, NaN where there is none."""
+def dense_disparity(view: StereoView) -> np.ndarray:
+    """(H / 2, W / 2) disparities in pixels of half the left image by semi-global matching, NaN where there is none."""
+    largest = 0.5 * float(np.max(view.disparity, initial=0.0, where=np.isfinite(view.disparity)))
+    halves = [
+        cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for image in (view.left, view.right)
+    ]
     levels = 16 * int(np.ceil((largest + _BEYOND - _LEAST) / 16))
     matcher = cv2.StereoSGBM.create(
         minDisparity=_LEAST,
@@ -62,6 +43,29 @@ def _dense_disparity(left: np.ndarray, right: np.ndarray, largest: float) -> np.
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )
     # It gives none to columns that the whole range of disparities would leave.
-    wide = [cv2.copyMakeBorder(image, 0, 0, levels, 0, cv2.BORDER_REPLICATE) for image in (left, right)]
+    wide = [cv2.copyMakeBorder(image, 0, 0, levels, 0, cv2.BORDER_REPLICATE) for image in halves]
     sixteenths = matcher.compute(*wide)[:, levels:]
     return np.where(sixteenths >= 16 * _LEAST, sixteenths / 16.0, np.nan)
+
+
+def patch_disparity_range(dense: np.ndarray, measured: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """Range of the disparities within each keypoint's patch, the slope of its surface taken off; (K,) pixels.
+
+    Args:
+        dense: (H / 2, W / 2) as `dense_disparity` gives it.
+        measured: (K, 3) (u, v, disparity) of the keypoints.
+        slope: (K, 2) gradients of the disparity there, as of `disparity_slopes`.
+    Returns:
+        Zero where nothing is known around a keypoint.
+    """
+    if not len(measured):
+        return np.zeros(0)
+    height, width = dense.shape
+    dv, du = np.mgrid[-_RADIUS : _RADIUS + 1, -_RADIUS : _RADIUS + 1]
+    u, v = np.round(0.5 * measured[:, :2] - 0.25).astype(int).T[..., None, None]
+    u, v = np.clip(u + du, 0, width - 1), np.clip(v + dv, 0, height - 1)
+    tilted = slope[:, 0, None, None] * u + slope[:, 1, None, None] * v
+    untilted = (dense[v, u] - tilted).reshape(len(measured), -1)
+    known = np.isfinite(untilted)
+    most, least = np.where(known, untilted, -np.inf).max(axis=1), np.where(known, untilted, np.inf).min(axis=1)
+    return np.where(known.any(axis=1), 2.0 * (most - least), 0.0)

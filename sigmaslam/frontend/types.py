@@ -41,6 +41,9 @@ class StereoView:
         disparity: (N,) float64 in pixels, NaN where the keypoint was not found in the right image.
         disparity_sigma: (N,) its standard deviation, NaN likewise.
         slope: (N, 2) gradient of the disparity around each keypoint, zero where unknown; of keyframes, None of others.
+        behind: keypoints that were found in the right image where only the eyes swapped would have them, far behind
+            infinity; they have no disparity.
+        small: the left image in smaller sizes, where the front-end needs them to follow its keypoints.
     """
 
     left: np.ndarray
@@ -49,6 +52,8 @@ class StereoView:
     disparity: np.ndarray
     disparity_sigma: np.ndarray
     slope: np.ndarray | None = None
+    behind: int = 0
+    small: tuple[np.ndarray, ...] = ()
 
     def measured(self, index: np.ndarray) -> np.ndarray:
         """(K, 3) float64 (u, v, disparity) of the features of that index or mask."""
@@ -68,7 +73,8 @@ class StereoView:
         False with fewer than `min_to_judge` disparities.
         """
         known = self.disparity[np.isfinite(self.disparity)]
-        return len(known) >= min_to_judge and float((known < -1.0).mean()) > _MAX_NEGATIVE
+        count, negative = len(known) + self.behind, int((known < -1.0).sum()) + self.behind
+        return count >= min_to_judge and negative > _MAX_NEGATIVE * count
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +101,7 @@ class KeypointSearch:
         covariance: (K, 2, 2) of that, pixels squared: only the 99 % ellipse is searched; None: the prediction is worth
             little.
         maps: of the K patches, by which they are warped before they are compared.
+        disparity: (K,) expected in the view, pixels.
     """
 
     key: StereoView
@@ -102,6 +109,7 @@ class KeypointSearch:
     predicted: np.ndarray
     covariance: np.ndarray | None = None
     maps: PatchMaps | None = None
+    disparity: np.ndarray | None = None
 
     @classmethod
     def anywhere(cls, key: StereoView, index: np.ndarray) -> KeypointSearch:
@@ -165,4 +173,16 @@ class Frontend(Protocol):
 
     def match(self, search: KeypointSearch, view: StereoView) -> TemporalMatches:
         """Finds keypoints of a keyframe in the current view."""
+        ...
+
+    def follow(
+        self, searches: list[KeypointSearch], starts: list[np.ndarray], left: np.ndarray, right: np.ndarray
+    ) -> list[TemporalMatches]:
+        """Finds keypoints of keyframes in a pair of which no features are known.
+
+        Args:
+            searches: by keyframe, with a prediction and its covariance, maps and disparities.
+            starts: (K, 2) of each, where optical flow took the keypoints; NaN where that is not known.
+            left, right: (H, W) uint8, the rectified pair.
+        """
         ...

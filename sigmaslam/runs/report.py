@@ -54,7 +54,7 @@ def write_report(run_dir: str | Path) -> Path:
     summary = run.get("summary")
     text = environment.get_template("report.html").render(
         name=run_dir.resolve().name,
-        facts=_facts(trajectory, frames, points),
+        facts=[*_facts(trajectory, frames, points), *_real_time_facts(run)],
         statuses=[(status, frames.status.count(status)) for status in STATUSES],
         verdict=summary.get("calibration_verdict") if isinstance(summary, dict) else None,
         figures=_figures(trajectory, frames, points),
@@ -107,6 +107,15 @@ def _facts(trajectory: Trajectory, frames: FrameTable, points: np.ndarray | None
     if points is not None:
         facts.append(("map points", f"{len(points)}"))
     return facts
+
+
+def _real_time_facts(run: dict[str, Any]) -> list[tuple[str, str]]:
+    """Label and value of what a run in real time adds to the summary."""
+    timing = run.get("real_time")
+    if not isinstance(timing, dict):
+        return []
+    latency = ", ".join(f"{name} {value:.0f}" for name, value in timing["latency_ms"].items())
+    return [("dropped", f"{timing['dropped']}"), ("latency", f"{latency} ms")]
 
 
 def _median(values: np.ndarray) -> float | None:

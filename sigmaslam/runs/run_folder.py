@@ -27,7 +27,7 @@ from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.slam.mapping import KeyframeTracks
 from sigmaslam.slam.point_map import PointMap
 
-STAGES = ("read", "features", "match", "filter", "map")
+STAGES = ("read", "rectify", "features", "match", "filter", "map")
 _COLUMNS = (COLUMNS[0], "status", *COLUMNS[1:], *(f"ms_{stage}" for stage in STAGES))
 _GRAPHS = (
     "features.onnx",

@@ -15,6 +15,7 @@ from sigmaslam.fusion.readings import Locations
 from sigmaslam.progress import open_progress
 from sigmaslam.readers import StereoFrame, StereoSequence
 from sigmaslam.readers.trajectory_files import write_tum
+from sigmaslam.runs.real_time import Latency, RealTimePlayer, describe_real_time
 from sigmaslam.runs.run_folder import RunWriter, describe_camera
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.estimate import Estimate
@@ -35,21 +36,25 @@ def track_sequence(
     tracks: bool = False,
     track_object: str | None = None,
     locations: Locations | None = None,
+    real_time: bool = False,
+    threads: int = 2,
 ) -> dict[str, Any]:
     """Tracks a sequence and writes the run folder; partial results are kept when it is stopped or fails.
 
     Args:
         sequence: opened by `sigmaslam.readers.open_sequence` or `open_cameras`.
         out: run folder, new or empty.
-        frontend, backend, config: of `StereoTracker`.
+        frontend, backend, config, threads: of `StereoTracker`.
         map_path: map.npz of an earlier run; poses are in its world.
         tracks: write tracks.npz, too, the observations of keyframes for `sigmaslam refine`.
         track_object: box or mask, see `read_region`: the camera is at rest and follows one body. Poses are then
             T_camera_object, their covariances in the body's frame, and the map that of the body in its own frame.
         locations: readings to fuse of a sensor on the moving camera or body; writes trajectory_location.tum, too, the
             poses in the sensor's world.
+        real_time: play a recording at its time stamps; frames are dropped when tracking falls behind.
     Returns:
-        The summary in run.json; with `locations` also the counts of the readings, under `location`.
+        The summary in run.json; with `locations` also the counts of the readings, under `location`, and in real time
+        what was dropped and the latency, under `real_time`.
     Raises:
         InputError: the folder is not empty, an argument is wrong, or the sequence breaks off; what was computed is on
             disk then.
@@ -57,7 +62,7 @@ def track_sequence(
     """
     if track_object is not None and (map_path is not None or tracks):
         raise InputError("--map and --tracks are of a moving camera's world: leave them out with --track-object")
-    tracker = _build_tracker(sequence, frontend, backend, config, track_object)
+    tracker = _build_tracker(sequence, frontend, backend, config, track_object, threads)
     location = None if locations is None else LocationFilter(locations, track_object is not None)
     rectified = None
     if isinstance(tracker, StereoTracker):
@@ -65,11 +70,12 @@ def track_sequence(
             tracker.load_map(map_path)
         rectified = tracker.describe_rectified() if tracks else None
     writer = RunWriter(out, rectified)
+    timing = _Timing(sequence, real_time)
     ended = "complete"
     try:
         # Cameras are released before the results are written, even after an error.
         with closing(sequence.frames()) as frames:
-            _track(sequence, frames, tracker, writer, location)
+            _track(sequence, timing.play(frames), tracker, writer, location, timing)
     except KeyboardInterrupt:
         ended = "interrupted"
         raise
@@ -89,7 +95,8 @@ def track_sequence(
                 "frontend": frontend,
                 "backend": backend,
                 "ended": ended,
-                "dropped": sequence.dropped,
+                "dropped": timing.dropped,
+                **timing.describe(),
                 "configuration": asdict(tracker.config),
                 "calibration": describe_camera(sequence.camera),
                 **_describe_object(tracker, track_object),
@@ -99,16 +106,56 @@ def track_sequence(
         trajectory = None if location is None else location.trajectory()
         if trajectory is not None:
             write_tum(out / "trajectory_location.tum", trajectory)
+    summary = {**summary, **timing.describe()}
     return summary if location is None else {**summary, "location": asdict(location.summary)}
 
 
+class _Timing:
+    """Whether frames come in real time, from cameras or played, and how long their poses take."""
+
+    def __init__(self, sequence: StereoSequence, real_time: bool) -> None:
+        self._sequence = sequence
+        self._live = sequence.format == "camera"
+        self._latency = Latency() if self._live or real_time else None
+        self._player: RealTimePlayer | None = None
+
+    @property
+    def dropped(self) -> int:
+        """Frames that came while others were tracked."""
+        return self._sequence.dropped if self._player is None else self._player.dropped
+
+    def play(self, frames: Iterator[StereoFrame]) -> Iterator[StereoFrame]:
+        """The frames as they come; cameras give them in real time anyway."""
+        if self._latency is not None and not self._live:
+            self._player = RealTimePlayer(frames, self._latency)
+            frames = self._player.play()
+        for frame in frames:
+            if self._latency is not None:
+                self._latency.start(frame.timestamp)
+            yield frame
+
+    def note(self, timestamp: float) -> None:
+        """The pose of that frame is known."""
+        if self._latency is not None:
+            self._latency.note(timestamp)
+
+    def describe(self) -> dict[str, Any]:
+        """Entries of run.json."""
+        return {} if self._latency is None else describe_real_time(self._latency, self.dropped)
+
+
 def _build_tracker(
-    sequence: StereoSequence, frontend: str, backend: str, config: TrackerConfig | None, track_object: str | None
+    sequence: StereoSequence,
+    frontend: str,
+    backend: str,
+    config: TrackerConfig | None,
+    track_object: str | None,
+    threads: int,
 ) -> Tracker:
     if track_object is None:
-        return StereoTracker(sequence.camera, frontend, backend, config)
+        return StereoTracker(sequence.camera, frontend, backend, config, threads=threads)
     region = read_region(track_object, sequence.camera.left.width, sequence.camera.left.height)
-    return ObjectTracker(sequence.camera, region, frontend, backend, config)
+    return ObjectTracker(sequence.camera, region, frontend, backend, config, threads)
 
 
 def _describe_object(tracker: Tracker, track_object: str | None) -> dict[str, Any]:
@@ -138,6 +185,7 @@ def _track(
     tracker: Tracker,
     writer: RunWriter,
     location: LocationFilter | None,
+    timing: _Timing,
 ) -> None:
     with open_progress() as progress:
         task = progress.add_task("frames", total=sequence.length, note="")
@@ -150,15 +198,18 @@ def _track(
                 writer.add_skipped(skipped.timestamp)
             reported = len(sequence.skipped)
             estimate = tracker.step(frame.left, frame.right, frame.timestamp)
+            timing.note(frame.timestamp)
             if location is not None:
                 estimate = estimate.map_camera(location.fuse)
             writer.add(estimate.camera, estimate.pose, estimate.pose_covariance, read_ms)
             done += 1
             since = time.perf_counter()
-            progress.update(task, completed=done + reported, note=_note(estimate.camera, done / (since - began)))
+            progress.update(
+                task, completed=done + reported + timing.dropped, note=_note(estimate.camera, done / (since - began))
+            )
         for skipped in sequence.skipped[reported:]:
             writer.add_skipped(skipped.timestamp)
-        progress.update(task, completed=done + len(sequence.skipped))
+        progress.update(task, completed=done + len(sequence.skipped) + timing.dropped)
 
 
 def _note(estimate: Estimate, rate: float) -> str:

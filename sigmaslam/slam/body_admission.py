@@ -18,6 +18,7 @@ from sigmaslam.frontend import Frontend, KeypointSearch, StereoView, TemporalMat
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import se3_inverse, transform_points
 from sigmaslam.slam.config import TrackerConfig
+from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.object_region import BodyShape, inner_half, pixels_in
 from sigmaslam.slam.unguided_matching import UnguidedMatcher
 
@@ -123,11 +124,11 @@ class BodyAdmission:
         points = self._camera.triangulate(uvd[sure])
         self._shape.add(landmarks.id[rows], (anchor[:, :3, :3] @ points[..., None])[..., 0] + anchor[:, :3, 3])
 
-    def begin_again(self, view: StereoView, matcher: UnguidedMatcher) -> StereoView | None:
+    def begin_again(self, frame: Frame, matcher: UnguidedMatcher) -> StereoView | None:
         """The first view with what has moved since, once that is enough to give a pose; None while all is at rest."""
         if self.separated:
             return None
-        body = self._moving_part(view, matcher)
+        body = self._moving_part(frame.view, matcher)
         if body is not None:
             self._first, self.separated = body, True
         return body

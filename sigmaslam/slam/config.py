@@ -68,7 +68,7 @@ class TrackerConfig:
     max_keyframes: int = 60
     max_misses: int = 3
     min_inliers: int = 15
-    keyframe_ratio: float = 0.65
+    keyframe_ratio: float = 0.75
     search_limit: float = 25.0
     lost_seconds: float = 0.5
 

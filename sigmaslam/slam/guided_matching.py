@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from sigmaslam.estimation.frame_update import FrameUpdate
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
-from sigmaslam.frontend import Frontend, KeypointSearch, StereoView
+from sigmaslam.frontend import Frontend, KeypointSearch, StereoView, TemporalMatches
 from sigmaslam.frontend.plane_alignment import plane_maps
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import se3_inverse
@@ -90,17 +91,60 @@ class GuidedMatcher:
             reference: the last one by default.
             alone: the view is too far from the keyframes' to share errors with them.
         """
+        parts, count = [], self.config.min_inliers
+        for anchor, rows, search in self._searches(keyframes, pose, covariance, reference):
+            matches = self.frontend.match(search, view)
+            if alone and anchor != reference % len(keyframes) and len(matches) < count:
+                continue  # a few that agree by chance would connect keyframes that hardly see each other
+            parts.append(self._measured(rows, search, matches, alone))
+        return GuidedMatches.concatenate(parts)
+
+    def follow(
+        self,
+        left: np.ndarray,
+        right: np.ndarray,
+        keyframes: list[StereoView],
+        pose: np.ndarray,
+        covariance: np.ndarray,
+        carry: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
+    ) -> GuidedMatches:
+        """Finds landmarks likewise in a pair without features.
+
+        Args:
+            left, right: (H, W) uint8, rectified.
+            keyframes, pose, covariance: as of `match_guided`.
+            carry: from the left image, ids (K,) and predicted places (K, 2) of landmarks to where optical flow takes
+                them, NaN where it does not.
+        """
+        searches = [(rows, search) for _, rows, search in self._searches(keyframes, pose, covariance, -1)]
+        if not searches:
+            return GuidedMatches.empty()
+        rows = np.concatenate([each for each, _ in searches])
+        start = carry(
+            left, self.window.landmarks.id[rows], np.concatenate([search.predicted for _, search in searches])
+        )
+        starts = np.split(start, np.cumsum([len(each) for each, _ in searches])[:-1])
+        found = self.frontend.follow([search for _, search in searches], starts, left, right)
+        parts = [
+            self._measured(rows, search, matches, alone=False)
+            for (rows, search), matches in zip(searches, found, strict=True)
+        ]
+        return GuidedMatches.concatenate(parts)
+
+    def _searches(
+        self, keyframes: list[StereoView], pose: np.ndarray, covariance: np.ndarray, reference: int
+    ) -> Iterator[tuple[int, np.ndarray, KeypointSearch]]:
+        """For each keyframe of which enough landmarks are in view: its number, their rows, and what is searched for."""
         landmarks = self.window.landmarks
         rows = np.flatnonzero(landmarks.misses < self.config.max_misses)
         if not len(rows):
-            return GuidedMatches.empty()
+            return
         predicted, S, in_front = self.update.predict(rows, pose, covariance, reference)
         S = S[:, :2, :2] + np.eye(2)
         inside = in_front & self._in_image(predicted)
         inside &= np.linalg.eigvalsh(S)[:, 1] < self.config.search_limit**2
         rows, predicted, S = rows[inside], predicted[inside], S[inside]
         T_view_key = se3_inverse(pose) @ self.window.posterior.poses
-        parts = []
         for anchor, key in enumerate(keyframes):
             chosen = np.flatnonzero(landmarks.anchor[rows] == anchor)
             if len(chosen) < _MIN_LANDMARKS:
@@ -110,18 +154,19 @@ class GuidedMatcher:
             if key.slope is not None:
                 measured = self.window.true_disparity(landmarks.estimate[rows[chosen]])
                 maps = plane_maps(self.camera, measured, key.slope[feature], T_view_key[anchor])
-            search = KeypointSearch(key, feature, predicted[chosen, :2], S[chosen], maps)
-            matches = self.frontend.match(search, view)
-            # Features of a keyframe ascend with the rows of its landmarks.
-            place = np.searchsorted(feature, matches.key_index)
-            noise, common = self.noise.of_matches(matches), np.zeros((len(place), 3, 2))
-            if alone and anchor != reference % len(keyframes) and len(place) < self.config.min_inliers:
-                continue  # a few that agree by chance would connect keyframes that hardly see each other
-            if not alone:
-                noise, common = self.noise.split(noise)
-            views = LandmarkViews(rows[chosen][place], matches.measured, noise, common)
-            parts.append(GuidedMatches(views, matches.probability, rows[chosen]))
-        return GuidedMatches.concatenate(parts)
+            places = predicted[chosen]
+            yield anchor, rows[chosen], KeypointSearch(key, feature, places[:, :2], S[chosen], maps, places[:, 2])
+
+    def _measured(
+        self, rows: np.ndarray, search: KeypointSearch, matches: TemporalMatches, alone: bool
+    ) -> GuidedMatches:
+        """Matches of one keyframe as views of landmarks."""
+        # Features of a keyframe ascend with the rows of its landmarks.
+        place = np.searchsorted(search.index, matches.key_index)
+        noise, common = self.noise.of_matches(matches), np.zeros((len(place), 3, 2))
+        if not alone:
+            noise, common = self.noise.split(noise)
+        return GuidedMatches(LandmarkViews(rows[place], matches.measured, noise, common), matches.probability, rows)
 
     def _in_image(self, predicted: np.ndarray) -> np.ndarray:
         u, v = predicted[:, 0], predicted[:, 1]

@@ -30,5 +30,5 @@ class Keyframe:
 
     def leave_window(self, points: PointMap) -> Keyframe:
         """The keyframe as it is remembered, with the points (in its frame) that leave with it."""
-        view = replace(self.view, right=np.zeros((0, 0), np.uint8))
+        view = replace(self.view, right=np.zeros((0, 0), np.uint8), small=())
         return replace(self, view=view, points=points)

@@ -72,9 +72,9 @@ class Keyframes:
         self.active.append(Keyframe(self._next_id, timestamp, view, sharpness(view.left)))
         self._next_id += 1
 
-    def blur(self, view: StereoView) -> float:
-        """How many times as sharp as the view the sharpest keyframe is; 1 where what is seen may be the reason."""
-        here, sharpest = sharpness(view.left), max(keyframe.sharpness for keyframe in self.active)
+    def blur(self, left: np.ndarray) -> float:
+        """How many times as sharp as an image the sharpest keyframe is; 1 where what is seen may be the reason."""
+        here, sharpest = sharpness(left), max(keyframe.sharpness for keyframe in self.active)
         return sharpest / max(here, _MIN_SHARPNESS * sharpest) if here < _BLURRED * sharpest else 1.0
 
     def marginalise_oldest(self, spare: Keyframe | None = None) -> np.ndarray:

@@ -9,6 +9,7 @@ import numpy as np
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
 from sigmaslam.frontend import StereoView
+from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.unguided_matching import UnguidedMatcher
 
 
@@ -31,7 +32,7 @@ class LandmarkAdmission(Protocol):
         """Takes note of the views that agree with a frame's pose."""
         ...
 
-    def begin_again(self, view: StereoView, matcher: UnguidedMatcher) -> StereoView | None:
+    def begin_again(self, frame: Frame, matcher: UnguidedMatcher) -> StereoView | None:
         """The first view with what has been admitted wrongly left out, to start from it again; None: go on."""
         ...
 
@@ -55,6 +56,6 @@ class AdmitAll:
     def confirm(self, views: LandmarkViews, window: KeyframeWindow) -> None:
         """Nothing to note."""
 
-    def begin_again(self, view: StereoView, matcher: UnguidedMatcher) -> StereoView | None:
+    def begin_again(self, frame: Frame, matcher: UnguidedMatcher) -> StereoView | None:
         """Never."""
         return None

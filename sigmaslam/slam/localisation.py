@@ -14,7 +14,10 @@ from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.frontend import StereoView
 from sigmaslam.geometry.se3 import turn_covariance
 from sigmaslam.slam.config import TrackerConfig
+from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.guided_matching import GuidedMatcher, GuidedMatches
+from sigmaslam.slam.keyframe import Keyframe
+from sigmaslam.slam.landmark_following import LandmarkFollower
 from sigmaslam.slam.stopwatch import Stopwatch
 from sigmaslam.slam.unguided_matching import UnguidedMatcher
 
@@ -59,6 +62,7 @@ class Localiser:
         window: of keyframes.
         update: estimates poses against it.
         guided: finds landmarks near a prediction.
+        follower: finds them without features.
         unguided: finds keyframes anywhere.
         config: settings.
     """
@@ -66,8 +70,28 @@ class Localiser:
     window: KeyframeWindow
     update: FrameUpdate
     guided: GuidedMatcher
+    follower: LandmarkFollower
     unguided: UnguidedMatcher
     config: TrackerConfig
+
+    def follow(
+        self, frame: Frame, keyframes: list[Keyframe], prediction: Prediction, clock: Stopwatch
+    ) -> tuple[GuidedMatches, FrameFit] | None:
+        """Matches and pose of a frame without features; None where that is doubtful.
+
+        Args:
+            frame: the current one.
+            keyframes: of the window.
+            prediction: of its pose.
+            clock: takes the time of the stages `match` and `filter`.
+        """
+        matches = self.follower.follow(frame, keyframes, prediction.pose, prediction.covariance)
+        clock.lap("match")
+        fit = self._fit_near(matches, prediction)
+        clock.lap("filter")
+        if fit is None or fit.nis_per_dof > _DOUBTFUL_NIS or self.follower.has_fallen(matches, fit.inliers):
+            return None
+        return matches, fit
 
     def localise(
         self, view: StereoView, keyframes: list[StereoView], prediction: Prediction, guided: bool, clock: Stopwatch

@@ -12,11 +12,12 @@ from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
 from sigmaslam.frontend import StereoView
 from sigmaslam.frontend.feature_spacing import select_spaced
-from sigmaslam.frontend.patch_disparity_range import patch_disparity_range
+from sigmaslam.frontend.patch_disparity_range import dense_disparity, patch_disparity_range
 from sigmaslam.frontend.plane_alignment import disparity_slopes
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import turn_covariance
 from sigmaslam.slam.config import TrackerConfig
+from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.keyframes import Keyframes
 from sigmaslam.slam.landmark_admission import LandmarkAdmission
@@ -26,6 +27,8 @@ from sigmaslam.table import Table
 # A blurred view whose matches scatter by so many times the variance that they claim is no keyframe. A sharp one is: no
 # keyframes at all for 20 frames lost the KITTI drive.
 _SCATTERED = 1.6
+# How fast the landmarks that a frame loses follow those of the last one.
+_LOSS_ADAPTATION = 0.5
 # The scene is no farther away than where its disparity is this, pixels.
 _MIN_DISPARITY = 0.5
 
@@ -57,6 +60,7 @@ class NewKeyframe:
         step_covariance: (6, 6) of that, perturbed from the left in the last keyframe.
         views: of the window's landmarks.
         origin: of the first one, the past pose relative to which `step_covariance` is.
+        dense: as of `dense_disparity`; made here where there is none.
     """
 
     view: StereoView
@@ -66,6 +70,7 @@ class NewKeyframe:
     step_covariance: np.ndarray
     views: LandmarkViews = field(default_factory=LandmarkViews.empty)
     origin: int | None = None
+    dense: np.ndarray | None = None
 
 
 @dataclass(slots=True)
@@ -90,33 +95,43 @@ class Mapper:
     admission: LandmarkAdmission
     config: TrackerConfig
     _landmarks_in_keyframe: int = field(default=0, init=False)
+    _last_count: int = field(default=0, init=False)
+    _loss: float = field(default=0.0, init=False)
+
+    @property
+    def keyframe_is_near(self) -> bool:
+        """The next frame will probably be a keyframe, if it loses as many landmarks as the last ones."""
+        return self._last_count - self._loss < self.config.keyframe_ratio * self._landmarks_in_keyframe
 
     def insert_if_due(
         self,
-        view: StereoView,
+        frame: Frame,
         timestamp: float,
         fit: FrameFit,
         matches: GuidedMatches,
         expected: tuple[np.ndarray, np.ndarray],
     ) -> KeyframeTracks | None:
-        """Makes a tracked view a keyframe when the landmarks of the last one fade, and the view can replace it.
+        """Makes a tracked frame a keyframe when the landmarks of the last one fade, and the frame can replace it.
 
         Args:
-            view: the tracked view.
+            frame: the tracked one.
             timestamp: seconds.
             fit: its pose.
             matches: with the window's landmarks.
             expected: step (4, 4) from the last keyframe without its images, and its covariance (6, 6).
         """
+        self._loss += _LOSS_ADAPTATION * (self._last_count - fit.count - self._loss)
+        self._last_count = fit.count
         # A scale beyond the NIS is that of blur: such a keyframe would spoil what comes after it.
         blurred = fit.inflation > fit.nis_before_scaling > _SCATTERED
         if fit.count >= self.config.keyframe_ratio * self._landmarks_in_keyframe or blurred:
             return None
+        view = frame.view
         admitted = view.only(self.admission.admit(view, fit.pose, self.window))
         if not admitted.has_stereo(self.admission.min_points, self.config.min_inliers):
             return None
         views = matches.views.select(fit.inliers).inflated(fit.inflation)
-        return self.insert(NewKeyframe(admitted, timestamp, fit.pose, *expected, views))
+        return self.insert(NewKeyframe(admitted, timestamp, fit.pose, *expected, views, dense=frame.dense))
 
     def insert(self, new: NewKeyframe) -> KeyframeTracks:
         """Makes a view a keyframe: what it has in stereo beside the views of known landmarks is new.
@@ -138,19 +153,19 @@ class Mapper:
         view = replace(new.view, slope=disparity_slopes(new.view.features.keypoints, new.view.disparity))
         keyframes.append(view, new.timestamp)
         window.add_views(views)
-        self._add_landmarks(view, views)
+        self._add_landmarks(view, views, dense_disparity(view) if new.dense is None else new.dense)
         seen = LandmarkViews.concatenate([views, window.landmarks.anchor_views(len(window) - 1)])
         window.solve()
         self.motion.start_keyframe()
-        self._landmarks_in_keyframe = len(seen)
+        self._landmarks_in_keyframe = self._last_count = len(seen)
         return KeyframeTracks(window.landmarks.id[seen.landmark], seen.measurement, seen.covariance)
 
-    def _add_landmarks(self, view: StereoView, views: LandmarkViews) -> None:
+    def _add_landmarks(self, view: StereoView, views: LandmarkViews, dense: np.ndarray) -> None:
         """Makes landmarks of the stereo points that no landmark has been found at."""
         assert view.slope is not None
         index = np.flatnonzero(np.isfinite(view.disparity))
         taken = views.measurement[:, :2]
         index = index[select_spaced(view.features.select(index), taken, self.config.spacing, view.left.shape)]
         measured = view.measured(index)
-        disparity_range = patch_disparity_range(view.left, view.right, measured, view.slope[index])
+        disparity_range = patch_disparity_range(dense, measured, view.slope[index])
         self.window.add_landmarks(index, measured, self.noise.of_keypoints(view, index), disparity_range)

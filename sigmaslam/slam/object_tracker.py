@@ -89,7 +89,7 @@ class ObjectTracker:
     Args:
         camera: calibration of the raw images.
         region: (H, W) bool, where the body is in the first raw left image; background inside does little harm.
-        frontend, backend: of `StereoTracker`.
+        frontend, backend, threads: of `StereoTracker`.
         config: likewise; by default `OBJECT_CONFIG`, with more acceleration.
     """
 
@@ -100,16 +100,17 @@ class ObjectTracker:
         frontend: Frontend | str = "learned",
         backend: str = "onnx",
         config: TrackerConfig | None = None,
+        threads: int = 2,
     ) -> None:
         self.config = config = config or OBJECT_CONFIG
         rectifier = StereoRectifier(camera)
         self._T_left_rectified = se3_inverse(rectifier.T_rectified_left)
         if isinstance(frontend, str):
-            frontend = build_frontend(frontend, config.max_keypoints, backend)
+            frontend = build_frontend(frontend, config.max_keypoints, backend, threads)
         raw = region.astype(np.uint8) * 255
         rectified_region = rectifier.rectify(raw, raw)[0] > 127
         self._body = BodyAdmission(rectifier.rectified, rectified_region, frontend, config)
-        self._tracker = StereoTracker(camera, frontend, backend, config, self._body)
+        self._tracker = StereoTracker(camera, frontend, backend, config, self._body, threads)
 
     @property
     def origin(self) -> np.ndarray:

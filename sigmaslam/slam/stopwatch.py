@@ -9,7 +9,7 @@ class Stopwatch:
     """Adds up wall time by stage."""
 
     def __init__(self) -> None:
-        self.milliseconds = dict.fromkeys(("features", "match", "filter", "map"), 0.0)
+        self.milliseconds = dict.fromkeys(("rectify", "features", "match", "filter", "map"), 0.0)
         self._since = time.perf_counter()
 
     def lap(self, stage: str) -> None:

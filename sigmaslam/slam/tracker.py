@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -13,18 +14,20 @@ from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.frame_update import FrameUpdate
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.sigma_point_linearisation import ViewLineariser
-from sigmaslam.frontend import Frontend, StereoView, build_frontend
+from sigmaslam.frontend import Frontend, build_frontend
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
+from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.guided_matching import GuidedMatcher, GuidedMatches
 from sigmaslam.slam.keyframes import Keyframes
 from sigmaslam.slam.landmark_admission import AdmitAll, LandmarkAdmission
+from sigmaslam.slam.landmark_following import LandmarkFollower
 from sigmaslam.slam.localisation import Localiser, Prediction
 from sigmaslam.slam.loop_closure import LoopCloser
-from sigmaslam.slam.mapping import Mapper
+from sigmaslam.slam.mapping import KeyframeTracks, Mapper
 from sigmaslam.slam.measurement_noise import MeasurementNoise
 from sigmaslam.slam.motion_prior import densities
 from sigmaslam.slam.phase import Course, Phase
@@ -51,6 +54,8 @@ class StereoTracker:
         backend: "onnx", or "torch" (needs the extra `train`).
         config: settings.
         admission: what may become a landmark; by default everything.
+        threads: of the network; with more than one the features of a keyframe that is foreseen are made beside the
+            tracking of its frame. The results are the same whether it was foreseen or not.
     """
 
     def __init__(
@@ -60,14 +65,16 @@ class StereoTracker:
         backend: str = "onnx",
         config: TrackerConfig | None = None,
         admission: LandmarkAdmission | None = None,
+        threads: int = 2,
     ) -> None:
         self.config = config = config or TrackerConfig()
         self._rectifier = StereoRectifier(camera)
         self._camera = rectified = self._rectifier.rectified
         self._T_rectified_left = self._rectifier.T_rectified_left
         if isinstance(frontend, str):
-            frontend = build_frontend(frontend, config.max_keypoints, backend)
+            frontend = build_frontend(frontend, config.max_keypoints, backend, threads)
         self._frontend = frontend
+        self._beside = ThreadPoolExecutor(1, "keyframe") if threads > 1 else None
         self._admission = admission = admission or AdmitAll(config.min_inliers)
         lineariser = ViewLineariser(rectified, backend, config.linearisation == "unscented")
         calibration_sigma = np.array([config.offset_sigma, config.turn_sigma, config.turn_sigma])
@@ -79,7 +86,8 @@ class StereoTracker:
         update = FrameUpdate(window, config.iterations)
         guided = GuidedMatcher(rectified, frontend, window, update, noise, config)
         self._unguided = unguided = UnguidedMatcher(rectified, frontend, window, noise, config)
-        self._localiser = Localiser(window, update, guided, unguided, config)
+        self._follower = follower = LandmarkFollower(guided)
+        self._localiser = Localiser(window, update, guided, follower, unguided, config)
         self._mapper = Mapper(rectified, window, keyframes, motion, noise, admission, config)
         self._loops = LoopCloser(window, keyframes, unguided)
         self._relocaliser = Relocaliser(window, keyframes, unguided, admission, config.min_inliers)
@@ -107,21 +115,22 @@ class StereoTracker:
         """
         self._check_time(timestamp)
         clock = Stopwatch()
-        view = self._frontend.observe(*self._rectifier.rectify(left, right))
-        clock.lap("features")
+        frame = Frame(*self._rectifier.rectify(left, right), self._frontend)
+        clock.lap("rectify")
         self._predict(timestamp)
-        matches, fit = self._localise(view, timestamp, clock)
+        matches, fit = self._localise(frame, timestamp, clock)
         if fit is not None:
             status = "tracking"
             expected = self._motion.step, self._motion.step_covariance
-            fit = self._correct(fit, matches, view, timestamp)
-            tracks = self._mapper.insert_if_due(view, timestamp, fit, matches, expected)
-        elif (found := self._relocaliser.relocalise(view)) is not None:
+            fit = self._correct(fit, matches, frame, timestamp)
+            tracks = self._mapper.insert_if_due(frame, timestamp, fit, matches, expected)
+        elif (found := self._relocaliser.relocalise(frame.view)) is not None:
             status = "relocalised"
             tracks = self._recovery.resume(found, timestamp)
         else:
             status = "lost" if self._course.has_moved else "starting"
-            tracks = self._recovery.start_or_recover(view, timestamp)
+            tracks = self._recovery.start_or_recover(frame.view, timestamp)
+        self._remember(frame, matches, fit, tracks)
         if tracks is not None:
             self._loops.close()
         clock.lap("map")
@@ -157,23 +166,33 @@ class StereoTracker:
             seconds = timestamp - self._course.timestamp
             self._motion.predict(seconds, densities(self.config, self._window.depth))
 
-    def _localise(self, view: StereoView, timestamp: float, clock: Stopwatch) -> tuple[GuidedMatches, FrameFit | None]:
+    def _localise(self, frame: Frame, timestamp: float, clock: Stopwatch) -> tuple[GuidedMatches, FrameFit | None]:
         """Matches with the window's landmarks, and the pose if enough of them agree."""
-        if self._course.is_waiting or view.is_swapped(self.config.min_inliers):
+        if self._course.is_waiting:
             return GuidedMatches.empty(), None
-        first = self._admission.begin_again(view, self._unguided)
+        first = self._admission.begin_again(frame, self._unguided)
         if first is not None:
             self._recovery.begin_again(first, timestamp)
-        keyframes = [keyframe.view for keyframe in self._keyframes.active]
         prediction = Prediction.of(self._window, self._motion)
         guided = self._course.phase is Phase.TRACKING
+        if guided:
+            if self._beside is not None and self._mapper.keyframe_is_near:
+                frame.foresee(self._beside)
+            followed = self._localiser.follow(frame, self._keyframes.active, prediction, clock)
+            if followed is not None:
+                return followed
+        view = frame.view
+        clock.lap("features")
+        if view.is_swapped(self.config.min_inliers):
+            return GuidedMatches.empty(), None
+        keyframes = [keyframe.view for keyframe in self._keyframes.active]
         return self._localiser.localise(view, keyframes, prediction, guided, clock)
 
-    def _correct(self, fit: FrameFit, matches: GuidedMatches, view: StereoView, timestamp: float) -> FrameFit:
-        """Takes a pose over, less certain where the view is blurred."""
+    def _correct(self, fit: FrameFit, matches: GuidedMatches, frame: Frame, timestamp: float) -> FrameFit:
+        """Takes a pose over, less certain where the frame is blurred."""
         # Patches that are blurred are misplaced alike, along the blur and towards where they were expected: many of
         # them say no more than a few.
-        fit = fit.inflated(max(fit.nis_before_scaling, 1.0) * self._keyframes.blur(view))
+        fit = fit.inflated(max(fit.nis_before_scaling, 1.0) * self._keyframes.blur(frame.left))
         seen = matches.views.select(fit.inliers)
         self._admission.confirm(seen, self._window)
         self._window.count_sightings(matches.searched, seen.landmark)
@@ -182,3 +201,15 @@ class StereoTracker:
         self._noise.adapt(fit.nis_per_dof)
         self._course.track(timestamp)
         return fit
+
+    def _remember(
+        self, frame: Frame, matches: GuidedMatches, fit: FrameFit | None, tracks: KeyframeTracks | None
+    ) -> None:
+        """Takes note of where landmarks are in the frame, so that the next one can be followed."""
+        if tracks is not None:
+            self._follower.remember(frame.left, tracks.landmark_id, tracks.measurement[:, :2])
+        elif fit is not None:
+            seen = matches.views.select(fit.inliers)
+            self._follower.remember(frame.left, self._window.landmarks.id[seen.landmark], seen.measurement[:, :2])
+        else:
+            self._follower.forget()

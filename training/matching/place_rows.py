@@ -12,6 +12,7 @@ from sigmaslam.frontend.followed_patches import (
     compare_with_neighbours,
     correct_by_neighbours,
     find_patches,
+    shrink,
 )
 from sigmaslam.frontend.lucas_kanade import lucas_kanade
 from sigmaslam.frontend.nearest_neighbours import within_ellipses
@@ -92,7 +93,8 @@ def _followed(
     A = A @ (np.eye(2) + _MAP_ERROR * rng.standard_normal((len(points), 2, 2)))
     maps = PatchMaps(A, np.zeros_like(points))
     targets = PatchTargets(points, maps, predicted, covariance, start, correct_by_neighbours(predicted, start))
-    places, there = find_patches(*pair, targets)
+    small0, small1 = (shrink(image) for image in pair)
+    places, there = find_patches(*pair, small0, small1, targets)
     kept = usable[there]
     return _describe(pair, points[there], places[there], predicted[there], A[there], found, kept, truth)
 

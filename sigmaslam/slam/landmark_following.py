@@ -1,0 +1,88 @@
+"""Landmarks followed from frame to frame, without features of the frame."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sigmaslam.frontend.lucas_kanade import lucas_kanade
+from sigmaslam.slam.frame import Frame
+from sigmaslam.slam.guided_matching import GuidedMatcher, GuidedMatches
+from sigmaslam.slam.keyframe import Keyframe
+
+# Of optical flow from the last frame: side of the patch, and levels above the image itself.
+_WINDOW, _LEVELS = 15, 3
+# With a smaller share of the landmarks found, or of those seen by both eyes, than so much of the usual one, something
+# has happened that following cannot judge.
+_FALLEN = 0.6
+_MIN_SHARE = 0.3
+# How fast the usual shares follow those of a frame.
+_ADAPTATION = 0.2
+
+
+class LandmarkFollower:
+    """Remembers where landmarks were in the last frame, and finds them in the next one.
+
+    Args:
+        guided: predicts where they are.
+    """
+
+    def __init__(self, guided: GuidedMatcher) -> None:
+        self._guided = guided
+        self.forget()
+
+    def forget(self) -> None:
+        """There is no last frame with a pose."""
+        self._left: np.ndarray | None = None
+        self._usual: np.ndarray | None = None
+
+    def remember(self, left: np.ndarray, landmark_id: np.ndarray, places: np.ndarray) -> None:
+        """Takes the frame that has been tracked.
+
+        Args:
+            left: (H, W) uint8.
+            landmark_id: (M,) of the landmarks that were seen.
+            places: (M, 2) pixels.
+        """
+        order = np.argsort(landmark_id)
+        self._left, self._id, self._places = left, landmark_id[order], places[order]
+
+    def follow(
+        self, frame: Frame, keyframes: list[Keyframe], pose: np.ndarray, covariance: np.ndarray
+    ) -> GuidedMatches:
+        """Finds the window's landmarks by optical flow from the last frame, aligned to their keyframes' patches.
+
+        Args:
+            frame: the current one.
+            keyframes: of the window.
+            pose, covariance: predicted, as of `GuidedMatcher.match_guided`.
+        """
+        views = [keyframe.view for keyframe in keyframes]
+        return self._guided.follow(frame.left, frame.right, views, pose, covariance, self._carry)
+
+    def has_fallen(self, matches: GuidedMatches, inliers: np.ndarray) -> bool:
+        """Whether suddenly less is found than usual: of the landmarks, or of their disparities.
+
+        Args:
+            matches: as `follow` gives them.
+            inliers: (M,) bool, those that agree with the pose.
+        """
+        stereo = np.isfinite(matches.views.measurement[inliers, 2])
+        shares = np.array([inliers.sum() / max(len(matches.searched), 1), stereo.mean() if len(stereo) else 0.0])
+        usual = shares if self._usual is None else self._usual
+        if shares[0] < _MIN_SHARE or (shares < _FALLEN * usual).any():
+            return True
+        self._usual = usual + _ADAPTATION * (shares - usual)
+        return False
+
+    def _carry(self, left: np.ndarray, landmark_id: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+        """(K, 2) where optical flow takes landmarks; NaN for those that the last frame did not see."""
+        start = np.full(predicted.shape, np.nan)
+        if self._left is None or not len(self._id):
+            return start
+        at = np.minimum(np.searchsorted(self._id, landmark_id), len(self._id) - 1)
+        rows = np.flatnonzero(self._id[at] == landmark_id)
+        height, width = left.shape
+        guess = np.clip(predicted[rows], 0, (width - 1, height - 1))
+        places, found = lucas_kanade(self._left, left, self._places[at[rows]], guess, _WINDOW, _LEVELS)
+        start[rows[found]] = places[found]
+        return start
