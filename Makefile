@@ -11,7 +11,7 @@ endif
 endif
 
 # What an installation is made of: when one of these changes, it is made again.
-BUILD := pyproject.toml setup.py requirements.lock sigmaslam/frontend/kernels.cpp
+BUILD := pyproject.toml setup.py requirements.lock sigmaslam/frontend/kernels.cpp sigmaslam/frontend/kernels.inc
 
 .PHONY: demo test test-slow lint wheel clean
 

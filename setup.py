@@ -7,8 +7,9 @@ from setuptools import Extension, setup
 KERNELS = Extension(
     "sigmaslam.frontend._kernels",
     ["sigmaslam/frontend/kernels.cpp"],
+    depends=["sigmaslam/frontend/kernels.inc"],
     include_dirs=[pybind11.get_include()],
-    extra_compile_args=["-O3", "-std=c++17", "-ffp-contract=off", "-fvisibility=hidden", "-g0"],
+    extra_compile_args=["-O3", "-std=c++17", "-ffp-contract=off", "-fvisibility=hidden", "-Wno-psabi", "-g0"],
     language="c++",
     optional=True,  # without a compiler the NumPy twin serves
 )
