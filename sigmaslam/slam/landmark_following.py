@@ -28,12 +28,17 @@ class LandmarkFollower:
 
     def __init__(self, guided: GuidedMatcher) -> None:
         self._guided = guided
-        self.forget()
+        self._left: np.ndarray | None = None
+        self._usual: np.ndarray | None = None
+
+    @property
+    def is_ready(self) -> bool:
+        """There is a last frame with a pose."""
+        return self._left is not None
 
     def forget(self) -> None:
         """There is no last frame with a pose."""
-        self._left: np.ndarray | None = None
-        self._usual: np.ndarray | None = None
+        self._left = None
 
     def remember(self, left: np.ndarray, landmark_id: np.ndarray, places: np.ndarray) -> None:
         """Takes the frame that has been tracked.

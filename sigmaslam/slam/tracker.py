@@ -175,7 +175,7 @@ class StereoTracker:
             self._recovery.begin_again(first, timestamp)
         prediction = Prediction.of(self._window, self._motion)
         guided = self._course.phase is Phase.TRACKING
-        if guided:
+        if guided and self._follower.is_ready:
             if self._beside is not None and self._mapper.keyframe_is_near:
                 frame.foresee(self._beside)
             followed = self._localiser.follow(frame, self._keyframes.active, prediction, clock)
