@@ -33,7 +33,7 @@ def test_a_shifted_image_is_found_at_its_shift(pair):
     shifted = np.roll(left, -12, axis=1)
     corners = cv2.goodFeaturesToTrack(left, 300, 0.01, 5.0).reshape(-1, 2)
     inner = corners[(corners[:, 0] > 40) & (corners[:, 0] < left.shape[1] - 40)]
-    index, places = search_rows(left, shifted, inner, -2.0, 80.0)
+    index, places = search_rows(left, shifted, inner)
     assert len(index) > 0.8 * len(inner[(inner[:, 1] > 12) & (inner[:, 1] < left.shape[0] - 12)])
     disparity = inner[index, 0] - places[:, 0]
     assert (np.abs(disparity - 12.0) <= 2.0).mean() > 0.97
@@ -45,6 +45,6 @@ def test_nothing_is_found_where_there_is_no_texture_or_none_alike(pair):
     noise = np.random.default_rng(1).integers(0, 256, left.shape).astype(np.uint8)
     corners = cv2.goodFeaturesToTrack(left, 300, 0.01, 5.0).reshape(-1, 2)
     for other in (np.full_like(left, 90), noise):
-        index, _ = search_rows(left, other, corners, -2.0, 80.0)
+        index, _ = search_rows(left, other, corners)
         assert len(index) < 0.1 * len(corners)
-    assert len(search_rows(*pair, np.zeros((0, 2), np.float32), -2.0, 80.0)[0]) == 0
+    assert len(search_rows(*pair, np.zeros((0, 2), np.float32))[0]) == 0
