@@ -1,5 +1,6 @@
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,10 +23,19 @@ from sigmaslam.models.onnx_export import (
 )
 from sigmaslam.models.scorer_network import MatchScorer
 from sigmaslam.models.torch_runtime import TorchFeatures, filter_module, scoring_module
-from sigmaslam.models.verifier_network import MatchVerifier
+from sigmaslam.models.verifier_network import PLACE_COLUMNS, VERIFIER_COLUMNS, MatchVerifier
 from sigmaslam.synthetic.rendering.textures import dead_leaves
 
 FILTERS = ("pose_predict", "stereo_transfer")
+
+
+def untrained_networks() -> dict[str, torch.nn.Module]:
+    """What judges matches, by name."""
+    return {
+        "scorer": MatchScorer(),
+        "verifier": MatchVerifier(VERIFIER_COLUMNS),
+        "place_verifier": MatchVerifier(PLACE_COLUMNS),
+    }
 
 
 def shipped(name: str) -> Path:
@@ -113,13 +123,17 @@ def assert_filter_graphs_equal_torch(folder: Path, names: tuple[str, ...] = FILT
                 np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9, err_msg=name)
 
 
-@pytest.mark.parametrize("name", ["scorer", "verifier"])
-def test_shipped_scorer_and_verifier_equal_torch(name):
+@pytest.mark.parametrize("name", ["scorer", "verifier", "place_verifier"])
+def test_shipped_scorer_and_verifiers_equal_torch(name):
     """On numbers of matches that the export neither traced (300) nor checked (77)."""
     graph, twin = OnnxGraph(shipped(f"{name}.onnx")), scoring_module(name)
     shipped(f"{name}.safetensors")
-    inputs = onnx_export._scoring_graphs(MatchScorer(), MatchVerifier())[name].inputs
-    example = {"scorer": onnx_export._matches_example, "verifier": onnx_export._columns_example}[name]
+    inputs = onnx_export._scoring_graphs(*untrained_networks().values())[name].inputs
+    example = {
+        "scorer": onnx_export._matches_example,
+        "verifier": partial(onnx_export._columns_example, columns=VERIFIER_COLUMNS),
+        "place_verifier": partial(onnx_export._columns_example, columns=PLACE_COLUMNS),
+    }[name]
     for seed, count in ((5, 1), (6, 13), (7, 1500)):
         given = {key: value.numpy() for key, value in zip(inputs, example(seed, count), strict=True)}
         for a, b in zip(graph(given), twin(given), strict=True):
@@ -128,11 +142,11 @@ def test_shipped_scorer_and_verifier_equal_torch(name):
 
 
 @pytest.mark.slow
-def test_scorer_and_verifier_of_a_run_are_exported_with_their_card(tmp_path):
+def test_scorer_and_verifiers_of_a_run_are_exported_with_their_card(tmp_path):
     run, out = tmp_path / "run", tmp_path / "out"
     run.mkdir()
     torch.manual_seed(0)
-    networks = {"scorer": MatchScorer(), "verifier": MatchVerifier()}
+    networks = untrained_networks()
     for name, network in networks.items():
         save_file({k: v.contiguous() for k, v in network.state_dict().items()}, run / f"{name}.safetensors")
     shutil.copy(shipped("matching.json"), run)
@@ -205,7 +219,9 @@ def test_a_file_that_holds_no_weights_is_refused(tmp_path, content):
         load_network(path)
 
 
-@pytest.mark.parametrize("load", [load_network, load_scorer, load_verifier])
+@pytest.mark.parametrize(
+    "load", [load_network, load_scorer, load_verifier, partial(load_verifier, columns=PLACE_COLUMNS)]
+)
 def test_missing_weights_are_named(load):
     with pytest.raises(InputError, match=r"nowhere\.safetensors does not exist"):
         load(Path("nowhere.safetensors"))

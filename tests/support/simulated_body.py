@@ -61,6 +61,13 @@ class SimulatedBody:
         disparity = view.disparity[np.searchsorted(seen, wanted[both])]
         return self._errors.matches(search.index[both], places[both], disparity)
 
+    def follow(
+        self, searches: list[KeypointSearch], starts: list[np.ndarray], left: np.ndarray, right: np.ndarray
+    ) -> list[TemporalMatches]:
+        """The same as `match` finds in the pair observed."""
+        view = self.observe(left, right)
+        return [self.match(search, view) for search in searches]
+
     def _project(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """(u, v, disparity) of all points without noise, and which are in view."""
         T = self.poses[frame]

@@ -116,6 +116,13 @@ class SimulatedFrontend:
         places[wrong] += self._random.uniform(-20, 20, (int(wrong.sum()), 2))
         return self._errors.matches(search.index[both], places, view.disparity[np.searchsorted(seen, points)])
 
+    def follow(
+        self, searches: list[KeypointSearch], starts: list[np.ndarray], left: np.ndarray, right: np.ndarray
+    ) -> list[TemporalMatches]:
+        """The same as `match` finds in the pair observed."""
+        view = self.observe(left, right)
+        return [self.match(search, view) for search in searches]
+
     def _path(self, frames: int) -> np.ndarray:
         """Poses of a camera whose velocity wanders about the typical one."""
         scale = self._scale

@@ -39,7 +39,7 @@ def stereo() -> PairRecord:
 
 
 def arrays_of(found: MatchSet) -> dict[str, np.ndarray]:
-    named = {"places": found.places}
+    named = {name: getattr(found, name) for name in ("places", "expected", "visible")}
     for name in ("features0", "features1", "putative"):
         part = getattr(found, name)
         named |= {f"{name}.{field.name}": getattr(part, field.name) for field in fields(part)}

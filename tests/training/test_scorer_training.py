@@ -1,6 +1,7 @@
 """The match scorer's batches, loss and training on sets made here."""
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -50,15 +51,14 @@ def match_set(count: int, seed: int = 0) -> MatchSet:
     )
     index0 = np.arange(count)
     similarity, *others = np.sort(rng.random((3, count), np.float32), axis=0)[::-1]
-    return MatchSet(
-        "planes", *both, Putative(index0, np.argsort(order)[index0], similarity, *others), keypoints0[:count]
-    )
+    putative = Putative(index0, np.argsort(order)[index0], similarity, *others)
+    return MatchSet("planes", *both, putative, keypoints0, np.ones(2 * count, bool))
 
 
 def without_truth(found: MatchSet, rows: slice) -> MatchSet:
-    places = found.places.copy()
-    places[rows] = np.inf
-    return MatchSet(found.source, found.features0, found.features1, found.putative, places)
+    visible = found.visible.copy()
+    visible[rows] = False
+    return replace(found, visible=visible)
 
 
 def layout_of(sample: Sample, found: MatchSet) -> tuple[tuple[float, float, bool], np.ndarray]:
@@ -95,7 +95,7 @@ def test_a_sample_has_the_points_of_its_matches_and_their_errors():
 def test_a_part_of_a_set_is_as_if_the_others_had_not_been_found():
     found, rows = match_set(60), np.arange(3, 60, 2)
     sample = make_sample(found, rows)
-    alone = MatchSet(found.source, found.features0, found.features1, found.putative.select(rows), found.places[rows])
+    alone = replace(found, putative=found.putative.select(rows))
     for a, b in zip(sample, make_sample(alone), strict=True):
         np.testing.assert_array_equal(a, b)
 

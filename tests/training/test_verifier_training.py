@@ -247,7 +247,7 @@ def shifted_record(source: str, seed: int = 0) -> PairRecord:
     keypoints0 = rng.uniform(30.0, 150.0, (60, 2)).astype(np.float32)
     keypoints1 = (keypoints0 + SHIFT + rng.normal(0.0, 0.4, (60, 2))).astype(np.float32)
     places = keypoints0.astype(np.float64) + SHIFT
-    places[:6] = np.inf
+    visible = np.arange(60) >= 6
     features0, features1 = (
         Features(points, np.zeros((60, 0), np.float32), rng.random(60, np.float32), np.ones(60, np.float32))
         for points in (keypoints0, keypoints1)
@@ -256,7 +256,7 @@ def shifted_record(source: str, seed: int = 0) -> PairRecord:
     similarity, second = np.full(60, 0.9, np.float32), rng.uniform(0.0, 0.8, 60).astype(np.float32)
     second[-10:] = 0.95
     putative = Putative(index, index, similarity, second, second)
-    return PairRecord(image0, image1, {"sift": MatchSet(source, features0, features1, putative, places)})
+    return PairRecord(image0, image1, {"sift": MatchSet(source, features0, features1, putative, places, visible)})
 
 
 @pytest.mark.parametrize(

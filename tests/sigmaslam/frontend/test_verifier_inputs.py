@@ -1,11 +1,11 @@
-"""What the match verifier is told: values counted by hand, and finite ones whatever the patches are."""
+"""What the verifiers are told: values counted by hand, and finite ones whatever the patches are."""
 
 import numpy as np
 import pytest
 
 from sigmaslam.frontend.patch_evidence import Evidence, examine_patches
 from sigmaslam.frontend.types import Refinement
-from sigmaslam.frontend.verifier_inputs import describe_matches
+from sigmaslam.frontend.verifier_inputs import describe_matches, describe_places
 
 COUNT = 5
 LOGIT, CORRELATION, CONTRAST0, CONTRAST1, SHARPNESS, SHIFT, MOVED, MAPPED = 0, 1, 2, 3, [4, 5], [6, 7], 8, 9
@@ -105,24 +105,92 @@ def test_no_contrast_no_edges_and_no_sigma_are_finite():
     assert np.isfinite(columns(flat, sigma=(0.0, 0.0))).all()
 
 
-@pytest.mark.parametrize("images", ["flat", "one of them flat", "the same", "saturated"])
-def test_columns_of_degenerate_images_are_finite(images: str):
-    rng = np.random.default_rng(1)
-    noise = rng.integers(0, 256, (60, 60), np.uint8)
+def degenerate(images: str) -> tuple[np.ndarray, np.ndarray]:
+    noise = np.random.default_rng(1).integers(0, 256, (60, 60), np.uint8)
     flat, saturated = np.full_like(noise, 90), np.where(noise > 127, 255, 0).astype(np.uint8)
-    image0, image1 = {
+    pairs = {
         "flat": (flat, flat),
         "one of them flat": (noise, flat),
         "the same": (noise, noise),
         "saturated": (saturated, 255 - saturated),
-    }[images]
+    }
+    return pairs[images]
+
+
+@pytest.mark.parametrize("images", ["flat", "one of them flat", "the same", "saturated"])
+def test_columns_of_degenerate_images_are_finite(images: str):
     moved = refinement()
     found = describe_matches(
-        rng.standard_normal(COUNT),
-        examine_patches(image0, image1, moved.start, moved.places),
+        np.random.default_rng(1).standard_normal(COUNT),
+        examine_patches(*degenerate(images), moved.start, moved.places),
         moved,
         np.ones(COUNT),
         np.ones(COUNT),
     )
     assert np.isfinite(found).all()
     assert found.shape == (COUNT, 14)
+
+
+# Places
+
+
+PLACE_SPREAD, PLACE_DEPARTURE, TEMPORAL, PLACE_SIGMA, PLACE_SPACING = 0, [6, 7], 8, 9, 10
+
+
+def place_columns(
+    departure: np.ndarray | None = None, spread: float = 0.4, sigma: float = 0.5, temporal: bool = True
+) -> np.ndarray:
+    departure = np.zeros((COUNT, 2)) if departure is None else departure
+    return describe_places(departure, np.full(COUNT, spread), evidence(), np.full(COUNT, sigma), temporal)
+
+
+def test_a_place_is_eleven_float32_numbers():
+    found = place_columns()
+    assert found.shape == (COUNT, 11)
+    assert found.dtype == np.float32
+    none = np.zeros(0)
+    nothing = Evidence(none, none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)), none, none)
+    assert describe_places(np.zeros((0, 2)), none, nothing, none, False).shape == (0, 11)
+
+
+@pytest.mark.parametrize(
+    ("column", "expected"),
+    [
+        (PLACE_SPREAD, np.log(0.5)),
+        (CORRELATION, np.log(0.101)),
+        (CONTRAST0, np.log(20.0)),
+        (CONTRAST1, np.log(30.0)),
+        (SHARPNESS, np.log([0.301, 0.011])),
+        (PLACE_DEPARTURE, 0.0),
+        (TEMPORAL, 1.0),
+        (PLACE_SIGMA, np.log(2.0 * 0.5 + 0.05)),
+        (PLACE_SPACING, np.log(2.0)),
+    ],
+)
+def test_columns_of_places_have_the_values_counted_by_hand(column: int | list[int], expected: float | list[float]):
+    found = place_columns()[:, column]
+    np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), rtol=1e-5, atol=1e-6)
+
+
+def test_departures_are_counted_along_the_axes_in_samples_and_far_is_far_enough():
+    axes = evidence().axes[0]
+    departure = np.outer([3.0, -3.0, 0.0, 1e6, 2.0], axes[:, 0]) + np.outer([0.0, 0.0, 1.0, 0.0, -4.0], axes[:, 1])
+    found = np.expm1(place_columns(departure)[:, PLACE_DEPARTURE])
+    expected = np.array([[3, 0], [3, 0], [0, 1], [100, 0], [2, 4]]) / 2.0
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-4)
+
+
+def test_places_of_the_other_eye_are_told_from_those_of_another_time():
+    assert (place_columns(temporal=False)[:, TEMPORAL] == 0.0).all()
+    assert (np.delete(place_columns(temporal=False) == place_columns(), TEMPORAL, axis=1)).all()
+
+
+@pytest.mark.parametrize("images", ["flat", "one of them flat", "the same", "saturated"])
+def test_columns_of_places_in_degenerate_images_are_finite(images: str):
+    rng = np.random.default_rng(1)
+    points, places = rng.uniform(-5, 65, (2, COUNT, 2))
+    found = describe_places(
+        places - points, np.zeros(COUNT), examine_patches(*degenerate(images), points, places), np.zeros(COUNT), True
+    )
+    assert np.isfinite(found).all()
+    assert found.shape == (COUNT, 11)

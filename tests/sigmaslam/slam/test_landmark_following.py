@@ -1,0 +1,265 @@
+"""Landmarks followed without features, and frames whose features are made when asked for, or beside the tracking."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sigmaslam import StereoTracker
+from sigmaslam.estimation.landmark_table import LandmarkViews
+from sigmaslam.frontend import Frontend, KeypointSearch, StereoView, TemporalMatches, build_frontend
+from sigmaslam.frontend.patch_disparity_range import dense_disparity
+from sigmaslam.slam.config import TrackerConfig
+from sigmaslam.slam.frame import Frame
+from sigmaslam.slam.guided_matching import GuidedMatches
+from sigmaslam.slam.landmark_following import LandmarkFollower
+from sigmaslam.slam.mapping import Mapper
+from tests.support.estimates import Demo, statuses, track
+
+SEARCHED = 200
+# So that there are some keyframes within few frames: every second one of the demo, and keyframes sooner.
+OFTEN, EVERY, FRAMES = TrackerConfig(keyframe_ratio=0.95), 2, 15
+
+
+class CarryingOnly:
+    """In place of a `GuidedMatcher`: notes where landmarks are carried to.
+
+    Args:
+        landmark_id, predicted: (K,), (K, 2) of the landmarks that are searched for.
+    """
+
+    def __init__(self, landmark_id: np.ndarray, predicted: np.ndarray) -> None:
+        self._landmark_id, self._predicted = landmark_id, predicted
+        self.start = np.zeros((0, 2))
+
+    def follow(
+        self,
+        left: np.ndarray,
+        right: np.ndarray,
+        keyframes: list[StereoView],
+        pose: np.ndarray,
+        covariance: np.ndarray,
+        carry: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
+    ) -> GuidedMatches:
+        self.start = carry(left, self._landmark_id, self._predicted)
+        return GuidedMatches.empty()
+
+
+class CountingFrontend:
+    """Another front-end, and how often it observed."""
+
+    def __init__(self, frontend: Frontend) -> None:
+        self._frontend = frontend
+        self.name = frontend.name
+        self.observed = 0
+
+    def observe(self, left: np.ndarray, right: np.ndarray) -> StereoView:
+        self.observed += 1
+        return self._frontend.observe(left, right)
+
+    def match(self, search: KeypointSearch, view: StereoView) -> TemporalMatches:
+        return self._frontend.match(search, view)
+
+    def follow(
+        self, searches: list[KeypointSearch], starts: list[np.ndarray], left: np.ndarray, right: np.ndarray
+    ) -> list[TemporalMatches]:
+        return self._frontend.follow(searches, starts, left, right)
+
+
+@pytest.fixture(scope="module")
+def learned() -> Frontend:
+    return build_frontend("learned", 1000, threads=1)
+
+
+# Less than usual
+
+
+def found(share: float, stereo: float = 1.0) -> tuple[GuidedMatches, np.ndarray]:
+    """Matches with that share of the landmarks, a few of them outliers, and that share of inliers with a disparity."""
+    inliers = round(share * SEARCHED)
+    measurement = np.zeros((inliers + 5, 3))
+    measurement[round(stereo * inliers) :, 2] = np.nan
+    rows, count = np.arange(SEARCHED), inliers + 5
+    views = LandmarkViews(np.arange(count), measurement, np.zeros((count, 3, 3)), np.zeros((count, 3, 2)))
+    return GuidedMatches(views, np.ones(count), rows), np.arange(count) < inliers
+
+
+@pytest.fixture
+def follower(learned: Frontend) -> LandmarkFollower:
+    return LandmarkFollower(CarryingOnly(np.zeros(0, np.int64), np.zeros((0, 2))))
+
+
+def test_a_sudden_fall_of_what_is_found_is_told_and_does_not_become_usual(follower: LandmarkFollower):
+    """Below 0.6 of what is usual."""
+    for _ in range(3):
+        assert not follower.has_fallen(*found(0.8))
+    assert not follower.has_fallen(*found(0.5))
+    for _ in range(20):
+        assert follower.has_fallen(*found(0.4))
+    assert not follower.has_fallen(*found(0.8))
+
+
+def test_a_sudden_fall_of_the_disparities_is_told(follower: LandmarkFollower):
+    for _ in range(3):
+        assert not follower.has_fallen(*found(0.8, stereo=0.9))
+    assert follower.has_fallen(*found(0.8, stereo=0.5))
+    assert not follower.has_fallen(*found(0.8, stereo=0.6))
+
+
+def test_a_gradual_fall_is_usual_until_too_little_is_left(follower: LandmarkFollower):
+    """By one part in thirty a frame, down to 0.3 of the landmarks."""
+    shares = 0.9 * 0.967 ** np.arange(60)
+    fallen = [follower.has_fallen(*found(share, stereo=share)) for share in shares]
+    np.testing.assert_array_equal(fallen, np.round(shares * SEARCHED) / SEARCHED < 0.3)
+
+
+def test_what_is_usual_is_forgotten_with_the_last_frame(follower: LandmarkFollower):
+    follower.has_fallen(*found(0.9))
+    assert follower.has_fallen(*found(0.4))
+    follower.forget()
+    assert not follower.has_fallen(*found(0.4))
+
+
+def test_nothing_found_is_a_fall_even_in_the_first_frame(follower: LandmarkFollower):
+    assert follower.has_fallen(*found(0.0))
+    assert follower.has_fallen(GuidedMatches.empty(), np.zeros(0, bool))
+
+
+# Where landmarks are carried to
+
+
+def test_landmarks_of_the_last_frame_are_carried_along_with_their_image(demo: Demo, learned: Frontend):
+    """In any order; others are nowhere, as all are once the frame is forgotten, and only the last frame counts."""
+    left = demo[1][10].left
+    shift = np.array([3, -2])
+    places = learned.observe(left, left).features.keypoints[:300].astype(np.float64)
+    places = places[((places > 25) & (places < np.array(left.shape[::-1]) - 25)).all(axis=1)]
+    rng = np.random.default_rng(0)
+    landmark_id = rng.permutation(5000)[: len(places)]
+    searched = rng.permutation(len(places))
+    unknown = np.arange(5000, 5020)
+    guided = CarryingOnly(
+        np.concatenate([landmark_id[searched], unknown]), np.concatenate([places[searched], places[:20]])
+    )
+    follower = LandmarkFollower(guided)
+    moved = np.roll(left, shift[::-1], axis=(0, 1))
+
+    def carried() -> np.ndarray:
+        follower.follow(Frame(moved, moved, learned), [], np.eye(4), np.eye(6))
+        return guided.start
+
+    assert np.isnan(carried()).all()
+    follower.remember(np.zeros_like(left), landmark_id, places + 50.0)
+    follower.remember(left, landmark_id, places)
+    start = carried()
+    assert np.isfinite(start[:-20]).mean() > 0.95
+    error = np.linalg.norm(start[:-20] - places[searched] - shift, axis=1)
+    assert np.nanmax(error) < 0.1
+    assert np.isnan(start[-20:]).all()
+    follower.forget()
+    assert np.isnan(carried()).all()
+
+
+def test_a_frame_without_landmarks_carries_none(learned: Frontend):
+    guided = CarryingOnly(np.arange(5), np.full((5, 2), 40.0))
+    follower = LandmarkFollower(guided)
+    blank = np.zeros((96, 96), np.uint8)
+    follower.remember(blank, np.zeros(0, np.int64), np.zeros((0, 2)))
+    follower.follow(Frame(blank, blank, learned), [], np.eye(4), np.eye(6))
+    assert np.isnan(guided.start).all()
+
+
+# Frames
+
+
+def arrays_of(view: StereoView) -> dict[str, Any]:
+    features = {name: getattr(view.features, name) for name in ("keypoints", "descriptors", "scores", "sigma")}
+    own = {name: getattr(view, name) for name in ("left", "right", "disparity", "disparity_sigma", "slope", "behind")}
+    return features | own | {f"small {number}": image for number, image in enumerate(view.small)}
+
+
+def test_the_view_of_a_frame_is_made_once_and_only_if_it_is_asked_for(demo: Demo, learned: Frontend):
+    frame, frontend = demo[1][5], CountingFrontend(learned)
+    lazy = Frame(frame.left, frame.right, frontend)
+    assert frontend.observed == 0
+    assert lazy.view is lazy.view
+    assert lazy.dense is lazy.dense
+    assert frontend.observed == 1
+    np.testing.assert_array_equal(lazy.dense, dense_disparity(lazy.view))
+    other = Frame(frame.left, frame.right, frontend)
+    assert other.dense.shape == (frame.left.shape[0] // 2, frame.left.shape[1] // 2)
+    assert other.view is other.view
+    assert frontend.observed == 2
+
+
+def test_a_view_that_was_foreseen_is_the_same_to_the_bit_and_made_once(demo: Demo, learned: Frontend):
+    frontend = CountingFrontend(learned)
+    with ThreadPoolExecutor(1) as beside:
+        for frame in demo[1][5:8]:
+            plain, foreseen = (Frame(frame.left, frame.right, frontend) for _ in range(2))
+            foreseen.foresee(beside)
+            expected = arrays_of(plain.view)
+            for name, array in arrays_of(foreseen.view).items():
+                np.testing.assert_array_equal(array, expected[name], err_msg=name)
+            np.testing.assert_array_equal(foreseen.dense, plain.dense)
+            assert foreseen.view is foreseen.view
+    assert frontend.observed == 6
+
+
+def test_what_goes_wrong_beside_the_tracking_is_raised_where_the_view_is_asked_for(demo: Demo, learned: Frontend):
+    class Broken(CountingFrontend):
+        def observe(self, left: np.ndarray, right: np.ndarray) -> StereoView:
+            raise MemoryError("as if")
+
+    frame = Frame(demo[1][0].left, demo[1][0].right, Broken(learned))
+    with ThreadPoolExecutor(1) as beside:
+        frame.foresee(beside)
+        with pytest.raises(MemoryError, match="as if"):
+            _ = frame.view
+
+
+# The tracker
+
+
+def test_poses_do_not_depend_on_which_keyframes_are_foreseen(demo: Demo, monkeypatch: pytest.MonkeyPatch):
+    """To the bit, with as many threads of the network: all frames foreseen against none."""
+    camera, frames, _ = demo
+    runs, foreseen = [], []
+    foresee = Frame.foresee
+    monkeypatch.setattr(Frame, "foresee", lambda frame, executor: (foreseen.append(frame), foresee(frame, executor)))
+    for near in (True, False):
+        monkeypatch.setattr(Mapper, "keyframe_is_near", property(lambda mapper, near=near: near))
+        runs.append(track(StereoTracker(camera, config=OFTEN, threads=2), frames[::EVERY][:FRAMES]))
+        assert len(foreseen) == FRAMES - 2  # the first two have no prediction
+    assert statuses(runs[0]) == ["starting"] + ["tracking"] * (FRAMES - 1)
+    assert sum(estimate.tracks is not None for estimate in runs[0]) >= 3
+    for a, b in zip(*runs, strict=True):
+        assert a.status == b.status
+        np.testing.assert_array_equal(a.T_world_camera, b.T_world_camera)
+        np.testing.assert_array_equal(a.covariance, b.covariance)
+        assert (a.tracks is None) == (b.tracks is None)
+        if a.tracks is not None and b.tracks is not None:
+            np.testing.assert_array_equal(a.tracks.measurement, b.tracks.measurement)
+            np.testing.assert_array_equal(a.tracks.covariance, b.tracks.covariance)
+
+
+def test_one_thread_foresees_nothing(demo: Demo, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(Mapper, "keyframe_is_near", property(lambda mapper: True))
+    monkeypatch.setattr(Frame, "foresee", lambda *arguments: pytest.fail("foreseen with one thread"))
+    track(StereoTracker(demo[0], threads=1), demo[1][:4])
+
+
+def test_features_are_made_of_keyframes_only_once_the_camera_has_started(demo: Demo, learned: Frontend):
+    camera, frames, _ = demo
+    frontend = CountingFrontend(learned)
+    tracker = StereoTracker(camera, frontend, config=OFTEN, threads=1)
+    started = track(tracker, frames[: 2 * EVERY : EVERY])
+    assert frontend.observed == len(started) == 2
+    estimates = track(tracker, frames[2 * EVERY :: EVERY][: FRAMES - 2])
+    keyframes = sum(estimate.tracks is not None for estimate in estimates)
+    assert frontend.observed == len(started) + keyframes
+    assert 2 <= keyframes < 0.5 * len(estimates)
