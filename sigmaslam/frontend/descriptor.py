@@ -21,6 +21,7 @@ from sigmaslam.frontend.patch_evidence import Evidence, examine_patches
 from sigmaslam.frontend.plane_alignment import refine_in_rows, refine_on_planes
 from sigmaslam.frontend.row_search import align_in_rows, search_rows
 from sigmaslam.frontend.types import Features, KeypointSearch, Refinement, StereoView, TemporalMatches
+from sigmaslam.frontend.verifier_inputs import PlaceSearch
 from sigmaslam.table import Table
 
 _ROW_TOLERANCE = 2.0
@@ -123,7 +124,7 @@ def match_stereo(
         features_left,
         features_right,
         putative,
-        lambda points0, points1, *_: refine_in_rows(left, right, points0, points1),
+        lambda points0, points1, *_: refine_in_rows(left, right, points0, points1)[0],
     )
     level = np.abs(found.places[:, 1] - features_left.keypoints[found.index0, 1]) <= _ROW_TOLERANCE
     return found.select(level & (found.probability >= _LEAST_PROBABILITY))
@@ -148,7 +149,9 @@ class DescriptorFrontend:
         features = self._detect(left)
         index, start = search_rows(left, right, features.keypoints)
         points = features.keypoints[index].astype(np.float64)
-        found, values, sigmas = self._disparities(left, right, points, start, points, features.sigma[index], _REACH_NEW)
+        found, values, sigmas = self._disparities(
+            left, right, points, start, features.sigma[index], PlaceSearch.ALONG_ROWS
+        )
         behind = values < _LEAST_DISPARITY
         disparity, sigma = np.full((2, len(features.keypoints)), np.nan)
         index = index[found[~behind]]
@@ -197,12 +200,14 @@ class DescriptorFrontend:
         parts = zip(searches, starts, np.split(corrected, ends[:-1]), strict=True)
         found = _FollowedPatches.concatenate([_find(number, *part, left, small) for number, part in enumerate(parts)])
         verified = self._estimator.verify_places(
-            found.places, found.predicted, found.evidence, found.sigma0, temporal=True
+            found.places, found.predicted, found.evidence, found.sigma0, PlaceSearch.IN_TIME
         )
         likely = verified[0] >= _LEAST_PROBABILITY
         found, probability, covariance = found.select(likely), verified[0][likely], verified[1][likely]
         start = found.places - np.column_stack([found.expected_disparity, np.zeros(len(found))])
-        index, *measured = self._disparities(left, right, found.places, start, start, found.sigma0, _REACH_FOLLOWED)
+        index, *measured = self._disparities(
+            left, right, found.places, start, found.sigma0, PlaceSearch.PREDICTED_ALONG_ROWS
+        )
         disparity, sigma = np.full((2, len(found)), np.nan)
         disparity[index], sigma[index] = measured
         covariance = covariance.astype(np.float64)
@@ -215,16 +220,18 @@ class DescriptorFrontend:
         right: np.ndarray,
         points: np.ndarray,
         start: np.ndarray,
-        predicted: np.ndarray,
         sigma0: np.ndarray,
-        reach: float,
+        search: PlaceSearch,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Which of the points (M, 2) are found in the right image from a start, their disparities and sigmas."""
-        places, there = align_in_rows(left, right, points, start, reach)
+        is_predicted = search is PlaceSearch.PREDICTED_ALONG_ROWS
+        reach = _REACH_FOLLOWED if is_predicted else _REACH_NEW
+        places, there, slope = align_in_rows(left, right, points, start, reach)
         index = np.flatnonzero(there)
-        points, places, predicted = points[index], places[index], predicted[index]
+        points, places = points[index], places[index]
         evidence = examine_patches(left, right, points, places)
-        judged = self._estimator.verify_places(places, predicted, evidence, sigma0[index], temporal=False)
+        predicted, slopes = (start[index], None) if is_predicted else (points, slope[index])
+        judged = self._estimator.verify_places(places, predicted, evidence, sigma0[index], search, slopes)
         likely = np.flatnonzero(judged[0] >= _LEAST_PROBABILITY)
         disparity = points[likely, 0] - places[likely, 0]
         return index[likely], disparity, np.sqrt(judged[1][likely, 0, 0].astype(np.float64))

@@ -99,11 +99,15 @@ def find_patches(
     return places, found
 
 
-def compare_with_neighbours(places: np.ndarray, predicted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def compare_with_neighbours(
+    places: np.ndarray, predicted: np.ndarray, slope: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """How found places depart from their prediction, beside how their neighbours do.
 
     Args:
         places, predicted: (M, 2) pixels.
+        slope: (M, 2) by how much a disparity, the departure along the row, grows with either coordinate of the
+            prediction; by default not at all.
     Returns:
         (M, 2) departure less the median of the twelve nearest others, and (M,) the median distance of theirs from
         that; zero where there are no others.
@@ -113,8 +117,12 @@ def compare_with_neighbours(places: np.ndarray, predicted: np.ndarray) -> tuple[
         return np.zeros((len(places), 2)), np.zeros(len(places))
     near = nearest_points(places, places, count)[:, 1:]
     departure = places - predicted
-    usual = np.median(departure[near], axis=1)
-    spread = np.median(np.linalg.norm(departure[near] - usual[:, None], axis=2), axis=1)
+    neighbours = departure[near]
+    if slope is not None:
+        apart = predicted[near] - predicted[:, None]
+        neighbours[..., 0] += np.einsum("mkj,mj->mk", apart, slope)
+    usual = np.median(neighbours, axis=1)
+    spread = np.median(np.linalg.norm(neighbours - usual[:, None], axis=2), axis=1)
     return departure - usual, spread
 
 

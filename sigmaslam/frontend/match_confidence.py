@@ -11,7 +11,7 @@ from sigmaslam.frontend.nearest_neighbours import Putative
 from sigmaslam.frontend.patch_evidence import Evidence, examine_patches
 from sigmaslam.frontend.scorer_inputs import nearest_matches, side_information
 from sigmaslam.frontend.types import Features, Refinement
-from sigmaslam.frontend.verifier_inputs import describe_matches, describe_places
+from sigmaslam.frontend.verifier_inputs import PlaceSearch, describe_matches, describe_places
 from sigmaslam.inference.onnx_graph import OnnxGraph, shipped_weights
 
 MIN_LOGIT = -4.0
@@ -86,7 +86,13 @@ class ConfidenceEstimator:
         return probability, covariance
 
     def verify_places(
-        self, places: np.ndarray, predicted: np.ndarray, evidence: Evidence, sigma0: np.ndarray, temporal: bool
+        self,
+        places: np.ndarray,
+        predicted: np.ndarray,
+        evidence: Evidence,
+        sigma0: np.ndarray,
+        search: PlaceSearch,
+        slope: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Probability (M,) and covariance (M, 2, 2) as of `verify`, of places found without features of image 1.
 
@@ -94,10 +100,11 @@ class ConfidenceEstimator:
             places, predicted: (M, 2) in image 1, pixels; of places along rows the prediction is the keypoint itself.
             evidence: of the patches at the places.
             sigma0: (M,) of the keypoints of image 0, pixels.
-            temporal: the images were taken one after the other, not by both eyes.
+            search: how the places were found.
+            slope: (M, 2) of the disparities, where they were not predicted.
         """
         if len(places) == 0:
             return np.zeros(0, np.float32), np.zeros((0, 2, 2), np.float32)
-        columns = describe_places(*compare_with_neighbours(places, predicted), evidence, sigma0, temporal)
+        columns = describe_places(*compare_with_neighbours(places, predicted, slope), evidence, sigma0, search)
         probability, covariance = self._place_verifier({"columns": columns, "axes": evidence.axes.astype(np.float32)})
         return probability, covariance

@@ -96,7 +96,7 @@ def refine_on_planes(
 
 def refine_in_rows(
     left: np.ndarray, right: np.ndarray, points0: np.ndarray, points1: np.ndarray, reach: float = _REACH
-) -> Refinement:
+) -> tuple[Refinement, np.ndarray]:
     """The same for the eyes of a rectified pair: how surfaces slope is known from the disparities themselves.
 
     The maps are near the identity and not handed on: the verifier judges such pairs as if they were shifted only.
@@ -105,13 +105,15 @@ def refine_in_rows(
         left, right: (H, W) uint8.
         points0, points1: (M, 2) matched pixels.
         reach: longest move, pixels.
+    Returns:
+        The refined matches, and the slopes (M, 2) as of `disparity_slopes`.
     """
     shifted = refine(left, right, points0, points1, reach=reach)
     slope = disparity_slopes(points0, points0[:, 0] - shifted.places[:, 0])
     # The right eye sees u - disparity.
     A = np.tile(np.eye(2), (len(slope), 1, 1))
     A[:, 0] -= slope
-    return replace(_align(left, right, points0, shifted, PatchMaps(A, np.zeros_like(slope))), A=None)
+    return replace(_align(left, right, points0, shifted, PatchMaps(A, np.zeros_like(slope))), A=None), slope
 
 
 def _align(

@@ -51,7 +51,7 @@ def search_rows(left: np.ndarray, right: np.ndarray, keypoints: np.ndarray) -> t
 
 def align_in_rows(
     left: np.ndarray, right: np.ndarray, points: np.ndarray, start: np.ndarray, reach: float
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Exact places of points of the left image in the right one.
 
     Args:
@@ -59,10 +59,12 @@ def align_in_rows(
         points, start: (M, 2) float64 in the left image, and about where they are in the right one, pixels.
         reach: longest move, pixels.
     Returns:
-        (M, 2) float64 places and (M,) bool, whether the patches could be aligned, and near the row.
+        (M, 2) float64 places; (M,) bool, whether the patches could be aligned, and near the row; and the slopes (M, 2)
+        as of `disparity_slopes`.
     """
-    refined = refine_in_rows(left, right, points, start, reach)
-    return refined.places, refined.moved & (np.abs(refined.places[:, 1] - points[:, 1]) <= _ROW_TOLERANCE)
+    refined, slope = refine_in_rows(left, right, points, start, reach)
+    level = np.abs(refined.places[:, 1] - points[:, 1]) <= _ROW_TOLERANCE
+    return refined.places, refined.moved & level, slope
 
 
 def search_reference(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from enum import Enum, auto
+
 import numpy as np
 
 from sigmaslam.frontend.patch_evidence import Evidence
@@ -9,6 +11,14 @@ from sigmaslam.frontend.types import Refinement
 
 _MAX_LOGIT = 8.0
 _MAX_DISTANCE = 50.0
+
+
+class PlaceSearch(Enum):
+    """How places were found without features of image 1."""
+
+    IN_TIME = auto()  # near a prediction, in a later image
+    ALONG_ROWS = auto()  # in the other eye, anywhere along the row
+    PREDICTED_ALONG_ROWS = auto()  # in the other eye, near a predicted disparity
 
 
 def describe_matches(
@@ -44,7 +54,7 @@ def describe_matches(
 
 
 def describe_places(
-    departure: np.ndarray, spread: np.ndarray, evidence: Evidence, sigma0: np.ndarray, temporal: bool
+    departure: np.ndarray, spread: np.ndarray, evidence: Evidence, sigma0: np.ndarray, search: PlaceSearch
 ) -> np.ndarray:
     """The columns that the verifier of places takes, which were found without features of image 1.
 
@@ -53,17 +63,19 @@ def describe_places(
         spread: (M,) of the neighbours' own departures.
         evidence: of the patches at the places.
         sigma0: (M,) of the keypoints of image 0, pixels.
-        temporal: the images were taken one after the other, not by both eyes.
+        search: how the places were found.
     Returns:
-        (M, 11) float32: log of the spread; logs of half the squared difference of the patches, of both contrasts and
-        both sharpnesses; departures along both axes; whether temporal; logs of sigma and of the spacing.
+        (M, 12) float32: log of the spread; logs of half the squared difference of the patches, of both contrasts and
+        both sharpnesses; departures along both axes; whether in time, whether predicted; logs of sigma and of the
+        spacing.
     """
     return np.column_stack(
         [
             np.log(spread + 0.1),
             *_appearance(evidence),
             np.log1p(np.minimum(np.abs(_along_axes(evidence, departure)), _MAX_DISTANCE)),
-            np.full(len(spread), temporal),
+            np.full(len(spread), search is PlaceSearch.IN_TIME),
+            np.full(len(spread), search is not PlaceSearch.ALONG_ROWS),
             np.log(sigma0 * evidence.zoom + 0.05),
             np.log(evidence.spacing),
         ]

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
+from sigmaslam.errors import SigmaSlamError
 from sigmaslam.frontend.affine_alignment import local_maps
 from sigmaslam.frontend.followed_patches import (
     PatchTargets,
@@ -19,7 +20,7 @@ from sigmaslam.frontend.nearest_neighbours import within_ellipses
 from sigmaslam.frontend.patch_evidence import examine_patches
 from sigmaslam.frontend.row_search import align_in_rows, search_rows
 from sigmaslam.frontend.types import PatchMaps
-from sigmaslam.frontend.verifier_inputs import describe_places
+from sigmaslam.frontend.verifier_inputs import PlaceSearch, describe_places
 from sigmaslam.training.matching.match_sets import MatchSet, PairRecord
 from sigmaslam.training.matching.verifier_training import VerifierRows, error_along_axes
 
@@ -32,7 +33,7 @@ _CARRIED, _DRIFT, _FORGOTTEN = 0.3, 2.0, 0.1
 # Relative error of the patches' maps.
 _MAP_ERROR = 0.03
 # Pairs whose second image shows another place.
-_FOREIGN = 0.06
+_FOREIGN = 0.15
 _LK_WINDOW, _LK_LEVELS = 15, 3
 # Of predicted disparities, pixels, drawn evenly in the logarithm.
 _DISPARITY_SIGMAS = (0.1, 1.5)
@@ -67,6 +68,8 @@ def collect_place_rows(records: Iterable[PairRecord], seed: int, note: Callable[
                 if len(columns) >= _MIN_ROWS:
                     parts.append(VerifierRows(columns, error, np.full(len(columns), number)))
         note(number + 1)
+    if not parts:
+        raise SigmaSlamError("no keypoint is found again in any pair: train on more pairs")
     return VerifierRows.concatenate(parts)
 
 
@@ -96,7 +99,9 @@ def _followed(
     small0, small1 = (shrink(image) for image in pair)
     places, there = find_patches(*pair, small0, small1, targets)
     kept = usable[there]
-    return _describe(pair, points[there], places[there], predicted[there], A[there], found, kept, truth)
+    return _describe(
+        pair, points[there], places[there], predicted[there], A[there], found, kept, truth, PlaceSearch.IN_TIME
+    )
 
 
 def _starts(
@@ -120,9 +125,11 @@ def _along_rows(pair: _Pair, found: MatchSet, truth: np.ndarray) -> tuple[np.nda
     """Columns and errors of keypoints searched for along the rows of a stereo pair."""
     index, start = search_rows(*pair, found.features0.keypoints)
     points = found.features0.keypoints[index].astype(np.float64)
-    places, there = align_in_rows(*pair, points, start, _REACH_NEW)
+    places, there, slope = align_in_rows(*pair, points, start, _REACH_NEW)
     points = points[there]
-    return _describe(pair, points, places[there], points, None, found, index[there], truth)
+    return _describe(
+        pair, points, places[there], points, None, found, index[there], truth, PlaceSearch.ALONG_ROWS, slope[there]
+    )
 
 
 def _followed_along_rows(
@@ -138,8 +145,18 @@ def _followed_along_rows(
     )
     usable = np.flatnonzero((start[:, 0] >= 0) & (start[:, 0] < pair[1].shape[1]))
     points, start = points[usable], start[usable]
-    places, there = align_in_rows(*pair, points, start, _REACH_FOLLOWED)
-    return _describe(pair, points[there], places[there], start[there], None, found, usable[there], truth)
+    places, there, _ = align_in_rows(*pair, points, start, _REACH_FOLLOWED)
+    return _describe(
+        pair,
+        points[there],
+        places[there],
+        start[there],
+        None,
+        found,
+        usable[there],
+        truth,
+        PlaceSearch.PREDICTED_ALONG_ROWS,
+    )
 
 
 def _describe(
@@ -151,9 +168,11 @@ def _describe(
     found: MatchSet,
     index: np.ndarray,
     truth: np.ndarray,
+    search: PlaceSearch,
+    slope: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Columns and errors of places of the keypoints of that index."""
     evidence = examine_patches(*pair, points, places, A)
     sigma = found.features0.sigma[index]
-    columns = describe_places(*compare_with_neighbours(places, predicted), evidence, sigma, A is not None)
+    columns = describe_places(*compare_with_neighbours(places, predicted, slope), evidence, sigma, search)
     return columns, error_along_axes(evidence, places, truth[index])
