@@ -54,10 +54,12 @@ class RealTimePlayer:
 
     Attributes:
         dropped: frames that were still waiting when a newer one had come.
+        waited: seconds until the last frame came.
     """
 
     def __init__(self, frames: Iterator[StereoFrame], latency: Latency) -> None:
         self.dropped = 0
+        self.waited = 0.0
         self._frames = frames
         self._latency = latency
 
@@ -66,7 +68,8 @@ class RealTimePlayer:
         waiting = next(self._frames, None)
         while waiting is not None:
             self._latency.start(waiting.timestamp)
-            time.sleep(max(-self._latency.age(waiting.timestamp), 0.0))
+            self.waited = max(-self._latency.age(waiting.timestamp), 0.0)
+            time.sleep(self.waited)
             coming = next(self._frames, None)
             while coming is not None and self._latency.age(coming.timestamp) >= 0.0:
                 self.dropped += 1

@@ -124,6 +124,11 @@ class _Timing:
         """Frames that came while others were tracked."""
         return self._sequence.dropped if self._player is None else self._player.dropped
 
+    @property
+    def waited(self) -> float:
+        """Seconds until the last frame came, when it was the tracker that was early."""
+        return 0.0 if self._player is None else self._player.waited
+
     def play(self, frames: Iterator[StereoFrame]) -> Iterator[StereoFrame]:
         """The frames as they come; cameras give them in real time anyway."""
         if self._latency is not None and not self._live:
@@ -192,11 +197,11 @@ def _track(
         reported, done = 0, 0
         began = since = time.perf_counter()
         for frame in frames:
-            read_ms = 1e3 * (time.perf_counter() - since)
-            # The sequence reports skipped frames together with the next readable one.
-            for skipped in sequence.skipped[reported:]:
-                writer.add_skipped(skipped.timestamp)
-            reported = len(sequence.skipped)
+            read_ms = 1e3 * (time.perf_counter() - since - timing.waited)
+            # Skipped frames are reported together with a later readable one.
+            while reported < len(sequence.skipped) and sequence.skipped[reported].timestamp < frame.timestamp:
+                writer.add_skipped(sequence.skipped[reported].timestamp)
+                reported += 1
             estimate = tracker.step(frame.left, frame.right, frame.timestamp)
             timing.note(frame.timestamp)
             if location is not None:

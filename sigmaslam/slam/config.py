@@ -35,7 +35,8 @@ class TrackerConfig:
         linearisation: "unscented" or "extended".
         iterations: linearisations in a frame's update.
         window: keyframes that are estimated jointly.
-        spacing: landmarks are at least so far apart, pixels; what lies closer has the same errors (patches overlap).
+        spacing: landmarks are at least so far apart in images of 640 x 480 pixels and larger ones, pixels; in smaller
+            ones less, down to two thirds. What lies closer has the same errors (patches overlap).
         shared_disparity: share of the variance of a landmark's disparities that is the same in all views.
         shared_place: share of the variance of its places, relative to the keyframe's, that is the same in all views.
         max_points: of the map; when there are twice as many, the least confirmed half goes.
@@ -61,7 +62,7 @@ class TrackerConfig:
     linearisation: str = "unscented"
     iterations: int = 2
     window: int = 6
-    spacing: float = 8.0
+    spacing: float = 12.0
     shared_disparity: float = 0.8
     shared_place: float = 0.6
     max_points: int = 100_000

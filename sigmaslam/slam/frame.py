@@ -30,6 +30,11 @@ class Frame:
         """Begins to make all that a keyframe needs; the same as without."""
         self._foreseen = executor.submit(self._make)
 
+    def finish(self) -> None:
+        """What has been foreseen and not yet begun is not needed."""
+        if self._foreseen is not None:
+            self._foreseen.cancel()
+
     @property
     def view(self) -> StereoView:
         """The pair with its features and their disparities."""

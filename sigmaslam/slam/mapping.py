@@ -27,6 +27,8 @@ from sigmaslam.table import Table
 # A blurred view whose matches scatter by so many times the variance that they claim is no keyframe. A sharp one is: no
 # keyframes at all for 20 frames lost the KITTI drive.
 _SCATTERED = 1.6
+# Images of fewer pixels have landmarks closer together than the setting says, down to this share of it.
+_FULL_SPACING_FROM, _LEAST_SPACING = 640 * 480, 2 / 3
 # How fast the landmarks that a frame loses follow those of the last one.
 _LOSS_ADAPTATION = 0.5
 # The scene is no farther away than where its disparity is this, pixels.
@@ -165,7 +167,9 @@ class Mapper:
         assert view.slope is not None
         index = np.flatnonzero(np.isfinite(view.disparity))
         taken = views.measurement[:, :2]
-        index = index[select_spaced(view.features.select(index), taken, self.config.spacing, view.left.shape)]
+        scale = np.clip(np.sqrt(view.left.size / _FULL_SPACING_FROM), _LEAST_SPACING, 1.0)
+        spacing = float(scale) * self.config.spacing
+        index = index[select_spaced(view.features.select(index), taken, spacing, view.left.shape)]
         measured = view.measured(index)
         disparity_range = patch_disparity_range(dense, measured, view.slope[index])
         self.window.add_landmarks(index, measured, self.noise.of_keypoints(view, index), disparity_range)

@@ -131,6 +131,7 @@ class StereoTracker:
             status = "lost" if self._course.has_moved else "starting"
             tracks = self._recovery.start_or_recover(frame.view, timestamp)
         self._remember(frame, matches, fit, tracks)
+        frame.finish()
         if tracks is not None:
             self._loops.close()
         clock.lap("map")

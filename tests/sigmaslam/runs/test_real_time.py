@@ -178,7 +178,6 @@ def test_a_recording_that_is_not_played_drops_nothing_and_tells_no_latency(demo_
     assert "real_time" not in summary
 
 
-@pytest.mark.xfail(strict=True, raises=AssertionError, reason="the player reads one frame ahead of the one tracked")
 @pytest.mark.usefixtures("clock", "without_report")
 def test_a_frame_that_cannot_be_read_has_its_row_where_its_time_is(demo_sequence: Path, tmp_path: Path):
     """As it has in a run that is not in real time."""
