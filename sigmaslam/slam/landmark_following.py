@@ -74,10 +74,9 @@ class LandmarkFollower:
         stereo = np.isfinite(matches.views.measurement[inliers, 2])
         shares = np.array([inliers.sum() / max(len(matches.searched), 1), stereo.mean() if len(stereo) else 0.0])
         usual = shares if self._usual is None else self._usual
-        if shares[0] < _MIN_SHARE or (shares < _FALLEN * usual).any():
-            return True
+        # Also after a fall, so that what stays so becomes usual.
         self._usual = usual + _ADAPTATION * (shares - usual)
-        return False
+        return bool(shares[0] < _MIN_SHARE or (shares < _FALLEN * usual).any())
 
     def _carry(self, left: np.ndarray, landmark_id: np.ndarray, predicted: np.ndarray) -> np.ndarray:
         """(K, 2) where optical flow takes landmarks; NaN for those that the last frame did not see."""

@@ -100,11 +100,11 @@ def test_of_a_pair_of_another_place_all_that_is_found_is_wrong(source: str, monk
 
 
 def test_so_many_pairs_are_foreign():
-    """About one in seventeen."""
+    """About one in seven."""
     records = [record("scenes")] * 60
     rows = collect(records)
     foreign = np.array([far(rows)[rows.pair == number].all() for number in range(60)])
-    assert 1 <= foreign.sum() <= 9
+    assert 3 <= foreign.sum() <= 17
 
 
 @pytest.mark.usefixtures("no_foreign_pairs")

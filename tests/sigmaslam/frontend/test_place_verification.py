@@ -11,6 +11,7 @@ from sigmaslam.frontend.lucas_kanade import lucas_kanade
 from sigmaslam.frontend.match_confidence import ConfidenceEstimator
 from sigmaslam.frontend.patch_evidence import examine_patches
 from sigmaslam.frontend.types import PatchMaps
+from sigmaslam.frontend.verifier_inputs import PlaceSearch
 from tests.support.estimates import Demo
 
 # Of predictions, pixels: keypoints are expected where they were.
@@ -178,6 +179,6 @@ def test_places_beside_the_true_ones_are_improbable(carried: Carried):
     places = matched.points + np.where(wrong[:, None], aside, 0.0)
     evidence = examine_patches(key.left, view.left, points, places)
     sigma0 = key.features.sigma[matched.key_index]
-    probability, _ = ConfidenceEstimator().verify_places(places, points, evidence, sigma0, temporal=True)
+    probability, _ = ConfidenceEstimator().verify_places(places, points, evidence, sigma0, PlaceSearch.IN_TIME)
     assert (probability[~wrong] > 0.5).mean() > 0.97
     assert (probability[wrong] > 0.5).mean() < 0.03

@@ -5,7 +5,7 @@ import pytest
 
 from sigmaslam.frontend.patch_evidence import Evidence, examine_patches
 from sigmaslam.frontend.types import Refinement
-from sigmaslam.frontend.verifier_inputs import describe_matches, describe_places
+from sigmaslam.frontend.verifier_inputs import PlaceSearch, describe_matches, describe_places
 
 COUNT = 5
 LOGIT, CORRELATION, CONTRAST0, CONTRAST1, SHARPNESS, SHIFT, MOVED, MAPPED = 0, 1, 2, 3, [4, 5], [6, 7], 8, 9
@@ -134,23 +134,26 @@ def test_columns_of_degenerate_images_are_finite(images: str):
 # Places
 
 
-PLACE_SPREAD, PLACE_DEPARTURE, TEMPORAL, PLACE_SIGMA, PLACE_SPACING = 0, [6, 7], 8, 9, 10
+PLACE_SPREAD, PLACE_DEPARTURE, TEMPORAL, PREDICTED, PLACE_SIGMA, PLACE_SPACING = 0, [6, 7], 8, 9, 10, 11
 
 
 def place_columns(
-    departure: np.ndarray | None = None, spread: float = 0.4, sigma: float = 0.5, temporal: bool = True
+    departure: np.ndarray | None = None,
+    spread: float = 0.4,
+    sigma: float = 0.5,
+    search: PlaceSearch = PlaceSearch.IN_TIME,
 ) -> np.ndarray:
     departure = np.zeros((COUNT, 2)) if departure is None else departure
-    return describe_places(departure, np.full(COUNT, spread), evidence(), np.full(COUNT, sigma), temporal)
+    return describe_places(departure, np.full(COUNT, spread), evidence(), np.full(COUNT, sigma), search)
 
 
-def test_a_place_is_eleven_float32_numbers():
+def test_a_place_is_twelve_float32_numbers():
     found = place_columns()
-    assert found.shape == (COUNT, 11)
+    assert found.shape == (COUNT, 12)
     assert found.dtype == np.float32
     none = np.zeros(0)
     nothing = Evidence(none, none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)), none, none)
-    assert describe_places(np.zeros((0, 2)), none, nothing, none, False).shape == (0, 11)
+    assert describe_places(np.zeros((0, 2)), none, nothing, none, PlaceSearch.ALONG_ROWS).shape == (0, 12)
 
 
 @pytest.mark.parametrize(
@@ -163,6 +166,7 @@ def test_a_place_is_eleven_float32_numbers():
         (SHARPNESS, np.log([0.301, 0.011])),
         (PLACE_DEPARTURE, 0.0),
         (TEMPORAL, 1.0),
+        (PREDICTED, 1.0),
         (PLACE_SIGMA, np.log(2.0 * 0.5 + 0.05)),
         (PLACE_SPACING, np.log(2.0)),
     ],
@@ -181,16 +185,18 @@ def test_departures_are_counted_along_the_axes_in_samples_and_far_is_far_enough(
 
 
 def test_places_of_the_other_eye_are_told_from_those_of_another_time():
-    assert (place_columns(temporal=False)[:, TEMPORAL] == 0.0).all()
-    assert (np.delete(place_columns(temporal=False) == place_columns(), TEMPORAL, axis=1)).all()
+    in_time, along_rows, predicted = (place_columns(search=search) for search in PlaceSearch)
+    told = [TEMPORAL, PREDICTED]
+    for found, expected in ((in_time, (1.0, 1.0)), (along_rows, (0.0, 0.0)), (predicted, (0.0, 1.0))):
+        np.testing.assert_array_equal(found[:, told], np.broadcast_to(expected, (COUNT, 2)))
+        np.testing.assert_array_equal(np.delete(found, told, axis=1), np.delete(in_time, told, axis=1))
 
 
 @pytest.mark.parametrize("images", ["flat", "one of them flat", "the same", "saturated"])
 def test_columns_of_places_in_degenerate_images_are_finite(images: str):
     rng = np.random.default_rng(1)
     points, places = rng.uniform(-5, 65, (2, COUNT, 2))
-    found = describe_places(
-        places - points, np.zeros(COUNT), examine_patches(*degenerate(images), points, places), np.zeros(COUNT), True
-    )
+    found_evidence = examine_patches(*degenerate(images), points, places)
+    found = describe_places(places - points, np.zeros(COUNT), found_evidence, np.zeros(COUNT), PlaceSearch.IN_TIME)
     assert np.isfinite(found).all()
-    assert found.shape == (COUNT, 11)
+    assert found.shape == (COUNT, 12)

@@ -93,13 +93,12 @@ def follower(learned: Frontend) -> LandmarkFollower:
     return LandmarkFollower(CarryingOnly(np.zeros(0, np.int64), np.zeros((0, 2))))
 
 
-def test_a_sudden_fall_of_what_is_found_is_told_and_does_not_become_usual(follower: LandmarkFollower):
+def test_a_sudden_fall_of_what_is_found_is_told(follower: LandmarkFollower):
     """Below 0.6 of what is usual."""
     for _ in range(3):
         assert not follower.has_fallen(*found(0.8))
     assert not follower.has_fallen(*found(0.5))
-    for _ in range(20):
-        assert follower.has_fallen(*found(0.4))
+    assert follower.has_fallen(*found(0.4))
     assert not follower.has_fallen(*found(0.8))
 
 
@@ -117,11 +116,16 @@ def test_a_gradual_fall_is_usual_until_too_little_is_left(follower: LandmarkFoll
     np.testing.assert_array_equal(fallen, np.round(shares * SEARCHED) / SEARCHED < 0.3)
 
 
-def test_what_is_usual_is_forgotten_with_the_last_frame(follower: LandmarkFollower):
+def test_what_stays_fallen_becomes_usual(follower: LandmarkFollower):
     follower.has_fallen(*found(0.9))
     assert follower.has_fallen(*found(0.4))
+    assert [follower.has_fallen(*found(0.4)) for _ in range(10)][-1] is False
+
+
+def test_what_is_usual_is_remembered_over_a_lost_frame(follower: LandmarkFollower):
+    follower.has_fallen(*found(0.9))
     follower.forget()
-    assert not follower.has_fallen(*found(0.4))
+    assert follower.has_fallen(*found(0.4))
 
 
 def test_nothing_found_is_a_fall_even_in_the_first_frame(follower: LandmarkFollower):
