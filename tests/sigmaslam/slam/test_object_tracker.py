@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from sigmaslam.cli import app
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.run_evaluation import evaluate_run
+from sigmaslam.evaluation.run_evaluation import Evaluation, evaluate_run
 from sigmaslam.geometry.se3 import se3_inverse
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import open_sequence
@@ -172,34 +172,65 @@ def test_the_command_line_refuses_a_wrong_region_before_it_writes(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("without_report")
 def test_a_rendered_tool_is_followed_and_a_sensor_on_it_takes_drift_away(tmp_path: Path):
-    """`sigmaslam render tool --frames 75 --seed 1` with the box of docs/object.md; a sensor at 10 Hz."""
+    """`sigmaslam render tool --frames 75 --seed 1` with the box of docs/object.md; a sensor at 10 Hz, 0.12 mm.
+
+    Means of five draws: noise of one grey level in 5 % of the pixels moves the rotation between 0.2 and 0.3 degrees.
+    """
     pytest.importorskip("torch")
     from sigmaslam.synthetic.render_sequence import write_sequence
     from sigmaslam.synthetic.simulation import Recipe, simulate
 
     folder, recipe = tmp_path / "tool", Recipe("tool", 75, 1)
     write_sequence(folder, recipe, "sparse", workers=2)
-    sequence = open_sequence(folder, "kitti")
-    summary = track_sequence(sequence, tmp_path / "alone", track_object=BOX)
-    assert summary["lost"] == 0
-    alone = evaluate_run(tmp_path / "alone", folder / "poses_object.txt", plot=False)
-    assert alone.path_length > 0.1
-    assert alone.ate.rmse < 0.002
-    assert alone.nees is not None
-    assert alone.nees.mean < 4
-    # Better than the sensor (0.29 degrees), which has little to add to it.
-    assert alone.ate_origin.rotation_rmse_deg < 0.25
-
     simulation = simulate(recipe)
     body = simulation.scene.bodies[int(np.flatnonzero(simulation.scene.moving)[0])]
     times = np.arange(0.017, simulation.times[-1], 0.1)  # not those of the frames
     camera = simulation.path.poses(np.zeros(1))[0]
-    readings = sense(np.stack([se3_inverse(camera) @ body.pose(time) for time in times]), times, 0, 2e-4, 5e-3)
-    summary = track_sequence(sequence, tmp_path / "fused", track_object=BOX, locations=readings)
-    assert summary["location"]["ready"] is not None
-    fused = evaluate_run(tmp_path / "fused", folder / "poses_object.txt", plot=False)
-    assert fused.ate_origin.rmse < 0.8 * alone.ate_origin.rmse
-    assert fused.ate_origin.rotation_rmse_deg < alone.ate_origin.rotation_rmse_deg
-    assert fused.nees is not None
-    assert 0.5 < fused.nees.mean < 2.0
+    truth = np.stack([se3_inverse(camera) @ body.pose(time) for time in times])
+
+    alone, fused = [], []
+    for draw in range(5):
+        add_noise(folder, draw)
+        sequence = open_sequence(folder, "kitti")
+        out = tmp_path / f"alone{draw}", tmp_path / f"fused{draw}"
+        assert track_sequence(sequence, out[0], track_object=BOX)["lost"] == 0
+        readings = sense(truth, times, draw, 7e-5, 5e-3)
+        summary = track_sequence(sequence, out[1], track_object=BOX, locations=readings)
+        assert summary["location"]["ready"] is not None
+        for run, results in zip(out, (alone, fused), strict=True):
+            results.append(evaluate_run(run, folder / "poses_object.txt", plot=False))
+
+    assert alone[0].path_length > 0.1
+    assert max(each.ate.rmse for each in alone) < 0.002
+    assert nees(alone) < 4
+    # Better than the sensor (0.29 degrees), which has little to add to it.
+    assert turned(alone) < 0.25
+    assert displaced(fused) < 0.8 * displaced(alone)
+    assert turned(fused) < turned(alone)
+    assert 0.5 < nees(fused) < 2.0
+
+
+def add_noise(folder: Path, draw: int) -> None:
+    """One grey level, up or down, in 5 % of the pixels of all images; none in the first draw."""
+    rng = np.random.default_rng(draw)
+    for path in sorted(folder.glob("image_*/*.png")) if draw else []:
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).astype(int)
+        noise = rng.choice([-1, 0, 1], image.shape, p=[0.025, 0.95, 0.025])
+        cv2.imwrite(str(path), np.clip(image + noise, 0, 255).astype(np.uint8))
+
+
+def turned(results: list[Evaluation]) -> float:
+    """Mean rotation error of several runs, degrees."""
+    return float(np.mean([each.ate_origin.rotation_rmse_deg for each in results]))
+
+
+def displaced(results: list[Evaluation]) -> float:
+    """Mean position error of several runs, metres."""
+    return float(np.mean([each.ate_origin.rmse for each in results]))
+
+
+def nees(results: list[Evaluation]) -> float:
+    """Mean NEES per degree of freedom of several runs."""
+    return float(np.mean([each.nees.mean for each in results if each.nees is not None]))
