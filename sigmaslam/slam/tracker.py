@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from threadpoolctl import ThreadpoolController
 
 from sigmaslam.errors import InputError
 from sigmaslam.estimation.constant_velocity import MotionFilter
@@ -74,6 +75,7 @@ class StereoTracker:
         if isinstance(frontend, str):
             frontend = build_frontend(frontend, config.max_keypoints, backend, threads)
         self._frontend = frontend
+        self._blas = ThreadpoolController()
         self._beside = ThreadPoolExecutor(1, "keyframe") if threads > 1 else None
         self._admission = admission = admission or AdmitAll(config.min_inliers)
         lineariser = ViewLineariser(rectified, backend, config.linearisation == "unscented")
@@ -114,6 +116,11 @@ class StereoTracker:
             FrameError: an image has the wrong type or size.
         """
         self._check_time(timestamp)
+        # The matrices are small: threads of BLAS would wait for each other for longer than they compute.
+        with self._blas.limit(limits=1, user_api="blas"):
+            return self._step(left, right, timestamp)
+
+    def _step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> Estimate:
         clock = Stopwatch()
         frame = Frame(*self._rectifier.rectify(left, right), self._frontend)
         clock.lap("rectify")
