@@ -32,8 +32,9 @@ _WORDS = """\
 Every method runs in a process of its own, once held on one core and once on two; every library has as many threads. The
 methods take turns, {rounds}. Figures are medians over the rounds, with the lowest and highest round in brackets.
 
-- *CPU ms*: CPU time of a frame, of all threads of the process. *Wall ms*: time until its pose is there. Medians over
-  the frames but the first {warm_up}; *p95*: 95 % of the frames take less. Images are decoded before.
+- *CPU ms*: CPU time of all threads of the process from one frame to the next. *Wall ms*: time until the pose of a frame
+  is there. Medians over the frames but the first {warm_up}; *p95*: 95 % of the frames take less. Images are decoded
+  before, and reading them is not counted.
 - *times cuVSLAM's*: ratio of the CPU times of the same round.
 - *frames/s*: frames by the sum of their wall times, two threads.
 - *peak MiB*: largest resident memory of the process, two threads, with Python and all libraries.
@@ -41,9 +42,9 @@ methods take turns, {rounds}. Figures are medians over the rounds, with the lowe
 - *tracked*: frames with a pose. *ATE*: root mean square error of their positions after the best rigid alignment.
 - *ours*: learned features; *ours with*: other features under the same filter. *KLT + PnP*, *SIFT + PnP*: from OpenCV
   alone (`evaluation/benchmarks/pnp_baselines.py`).
-- *cuVSLAM*: on the CPU, by the package dim-odom. *ORB-SLAM3*: by the package pyorbslam3; the CPU time of its mapping
-  threads counts while a frame is tracked. Both are given rectified images: to rectify is in the time of the others, not
-  in theirs. ORB-SLAM3 is under the GPL: a peer of the development, no part of SigmaSLAM.
+- *cuVSLAM*: on the CPU, by the package dim-odom. *ORB-SLAM3*: by the package pyorbslam3, the threads of its
+  mapping included. Both are given rectified images: to rectify is in the time of the others, not in theirs. ORB-SLAM3
+  is under the GPL: a peer of the development, no part of SigmaSLAM.
 """
 
 

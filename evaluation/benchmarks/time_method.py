@@ -13,7 +13,7 @@ import resource
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -58,7 +58,7 @@ class MethodTiming:
     """What a method took for N frames after the warm-up, and the poses of all that it tracked.
 
     Attributes:
-        cpu_ms: (N,) CPU time of a frame, of all threads of the process.
+        cpu_ms: (N,) CPU time of all threads of the process from one frame to the next, without the reading of pairs.
         wall_ms: (N,).
         stages_ms: (N,) wall time by stage; empty but for ours.
         keyframe: (N,) whether the frame became a keyframe; False but for ours.
@@ -143,31 +143,33 @@ def run_job(job: TimingJob, started: float) -> MethodTiming:
     _hold_on_cores(job.threads)
     pairs = open_pairs(Path(job.pairs))
     method = _open(job, pairs)
-    steps: list[tuple[_Step, float, float]] = []
+    steps, walls, own, others = [], [], [], []
     first_pose = float("nan")
     for index, timestamp in enumerate(pairs.timestamps):
         left, right = pairs.read(index, method.rectified)
-        cpu, wall = time.process_time(), time.perf_counter()
+        others.append(_other_threads())
+        cpu, wall = time.thread_time(), time.perf_counter()
         step = method.step(left, right, timestamp)
-        cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
+        own.append(time.thread_time() - cpu)
+        walls.append(time.perf_counter() - wall)
         if index and step.pose is not None and np.isnan(first_pose):
             first_pose = time.time() - started
-        steps.append((step, 1e3 * cpu, 1e3 * wall))
+        steps.append(step)
+    # Threads in the background go on while the next pair is read.
+    cpus = np.array(own) + np.diff([*others, _other_threads()])
     peak = _peak_mib()
     method.close()
-    tracked = [(time, step.pose) for time, (step, _, _) in zip(pairs.timestamps, steps, strict=True)]
     counted = steps[WARM_UP:]
+    tracked = [(time, step.pose) for time, step in zip(pairs.timestamps, steps, strict=True) if step.pose is not None]
     return MethodTiming(
-        cpu_ms=[round(cpu, 3) for _, cpu, _ in counted],
-        wall_ms=[round(wall, 3) for _, _, wall in counted],
-        stages_ms={
-            stage: [round(step.stages_ms[stage], 3) for step, _, _ in counted] for stage in steps[-1][0].stages_ms
-        },
-        keyframe=[step.keyframe for step, _, _ in counted],
-        landmarks=[step.landmarks for step, _, _ in counted],
+        cpu_ms=_milliseconds(cpus[WARM_UP:]),
+        wall_ms=_milliseconds(walls[WARM_UP:]),
+        stages_ms={stage: [step.stages_ms[stage] for step in counted] for stage in steps[-1].stages_ms},
+        keyframe=[step.keyframe for step in counted],
+        landmarks=[step.landmarks for step in counted],
         frames=len(steps),
-        timestamps=[time for time, pose in tracked if pose is not None],
-        poses=[pose.tolist() for _, pose in tracked if pose is not None],
+        timestamps=[time for time, _ in tracked],
+        poses=[pose.tolist() for _, pose in tracked],
         first_pose_s=first_pose,
         peak_mib=peak,
         version=method.version,
@@ -230,18 +232,28 @@ class _Peer:
             peer = CuvslamPeer(pairs.rectified)
         else:
             peer = OrbSlamPeer(pairs.rectified, 1.0 / float(np.median(np.diff(pairs.timestamps))))
-        self.version, self._step, self.close = peer.version, peer.step, peer.close
+        self._peer, self.version = peer, peer.version
 
     def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> _Step:
-        return _Step(self._step(left, right, timestamp))
+        return _Step(self._peer.step(left, right, timestamp))
 
-    close: Callable[[], None]
+    def close(self) -> None:
+        self._peer.close()
 
 
 def _hold_on_cores(count: int) -> None:
     """Keeps this process on the first cores that it may use, where the system can."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:count])
+
+
+def _other_threads() -> float:
+    """CPU seconds so far of all threads but this one."""
+    return time.process_time() - time.thread_time()
+
+
+def _milliseconds(seconds: Iterable[float]) -> list[float]:
+    return [round(1e3 * float(each), 3) for each in seconds]
 
 
 def _peak_mib() -> float:
