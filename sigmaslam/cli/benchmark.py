@@ -17,6 +17,8 @@ from sigmaslam.errors import InputError
 # Each runs one benchmark and returns its page. It is given where the page goes, the command that the page names, and,
 # as keywords of their names, the options that it serves.
 _BENCHMARKS: dict[str, Callable[..., str]] = {}
+# They leave out what needs the extra `train`.
+_WITHOUT_TRAIN = ("sequences", "runtime")
 
 
 def _registered(function: Callable[..., str]) -> Callable[..., str]:
@@ -116,10 +118,41 @@ def _consistency(out: Path, command: str, *, runs: Path | None, seeds: int) -> s
 
 
 @_registered
-def _endurance(out: Path, command: str, *, runs: Path | None, frames: int) -> str:
+def _endurance(out: Path, command: str, *, runs: Path | None, frames: int | None) -> str:
     from sigmaslam.evaluation.benchmarks.endurance import write_endurance
 
+    frames = frames or 10_000
     return write_endurance(out, frames, f"{command} --frames {frames}", runs, _note)
+
+
+@_registered
+def _runtime(
+    out: Path,
+    command: str,
+    *,
+    data: Path | None,
+    method: list[str] | None,
+    sequence: list[str] | None,
+    rounds: int | None,
+    runs: Path | None,
+    frames: int | None,
+) -> str:
+    from sigmaslam.evaluation.benchmarks.runtime import FRAMES, ROUNDS, SEQUENCES, write_runtime
+    from sigmaslam.evaluation.benchmarks.time_method import METHODS
+
+    command += _repeated("method", method) + _repeated("sequence", sequence)
+    command += (f" --rounds {rounds}" if rounds else "") + (f" --frames {frames}" if frames else "")
+    return write_runtime(
+        out,
+        data,
+        command,
+        method or METHODS,
+        sequence or SEQUENCES,
+        rounds or ROUNDS,
+        frames or FRAMES,
+        runs,
+        _note,
+    )
 
 
 # mypy reads the members of an enum from literals alone.
@@ -140,14 +173,16 @@ def benchmark(
     method: Annotated[
         list[str] | None,
         typer.Option(
-            help="sequences: ours, ekf, sift, orb, klt, sift-pnp, klt-pnp, bundle; may be given more than once.",
+            help="sequences: ours, ekf, sift, orb, klt, sift-pnp, klt-pnp, bundle; runtime: ours, sift, orb, klt, "
+            "klt-pnp, sift-pnp, cuvslam, orbslam3; may be given more than once.",
             show_default="all",
         ),
     ] = None,
     sequence: Annotated[
         list[str] | None,
         typer.Option(
-            help="sequences: demo, street, room, organ, or a folder of the data; may be given more than once.",
+            help="sequences: demo, street, room, organ, or a folder of the data; runtime: room, demo, or a folder of "
+            "the data; may be given more than once.",
             show_default="all",
         ),
     ] = None,
@@ -155,20 +190,25 @@ def benchmark(
         int | None,
         typer.Option(
             min=1,
-            help="filters, features: rounds in which every contender is timed.",
-            show_default="7, features 15",
+            help="filters, features, runtime: rounds in which every contender is timed.",
+            show_default="7, features 15, runtime 3",
         ),
     ] = None,
     eager: Annotated[bool, typer.Option("--eager", help="filters: leave out what takes minutes to compile.")] = False,
     runs: Annotated[
         Path | None,
         typer.Option(
-            help="noise, consistency, sequences, endurance: folder of the renders; what is there is used again. "
-            "sequences, endurance: a temporary one without it."
+            help="noise, consistency, sequences, endurance, runtime: folder of the renders; what is there is used "
+            "again. sequences, endurance, runtime: a temporary one without it."
         ),
     ] = None,
     seeds: Annotated[int, typer.Option(min=1, help="consistency: sequences a scale.")] = 30,
-    frames: Annotated[int, typer.Option(min=1, help="endurance: frames to track.")] = 10_000,
+    frames: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="endurance: frames to track; runtime: of each sequence.", show_default="10000, runtime 60"
+        ),
+    ] = None,
     weights: Annotated[
         list[Path] | None,
         typer.Option(
@@ -193,7 +233,8 @@ def benchmark(
     covariance hold, beside AdaLAM and MAGSAC. noise: the tracker with these covariances beside one constant.
     consistency: whether poses and map are as sure as they say, on 90 rendered sequences (an hour). endurance: memory,
     time and error over 10,000 frames of a lap over and over (ten minutes to render, then a quarter of an hour).
-    All but the first need the extra 'train'.
+    runtime: CPU and wall time, memory and start-up beside OpenCV's odometry, cuVSLAM and ORB-SLAM3 (extra 'peers').
+    All but sequences and runtime need the extra 'train'.
     """
     values = {option: value for option, value in locals().items() if option not in ("context", "name", "out")}
     run = _BENCHMARKS[name.value]
@@ -203,7 +244,7 @@ def benchmark(
         source = context.get_parameter_source(option)
         if option not in served and source is not None and source.name == "COMMANDLINE":
             raise InputError(f"--{option} is not an option of the benchmark {name.value}: leave it out")
-    if name.value != "sequences":
+    if name.value not in _WITHOUT_TRAIN:
         need_train_extra()
     typer.echo(run(out, f"sigmaslam benchmark {name.value} --out {out}", **{each: values[each] for each in served}))
 
