@@ -102,16 +102,13 @@ class KeyframeWindow:
         """Takes what the last keyframe sees of landmarks of earlier ones."""
         self._observations = self._observations.append(len(self) - 1, views)
 
-    def add_landmarks(
-        self, feature: np.ndarray, measured: np.ndarray, variance: np.ndarray, disparity_range: np.ndarray | None = None
-    ) -> None:
+    def add_landmarks(self, feature: np.ndarray, measured: np.ndarray, variance: np.ndarray) -> None:
         """Adds landmarks that the last keyframe sees first.
 
         Args:
             feature: (K,) index among the keyframe's features.
             measured: (K, 3) (u, v, disparity).
             variance: (K, 4) of these, and of what the disparities are off by in all views alike.
-            disparity_range: (K,) around them, pixels; zero by default.
         """
         count = len(feature)
         size = len(self.posterior.covariance)
@@ -127,7 +124,7 @@ class KeyframeWindow:
             np.ones(count, np.int64),
             np.zeros(count, np.int64),
             self._next_id + np.arange(count),
-            np.zeros(count) if disparity_range is None else disparity_range,
+            np.zeros(count),
         )
         self._next_id += count
         self.landmarks = LandmarkTable.concatenate([self.landmarks, new])

@@ -88,7 +88,8 @@ class LandmarkTable(Table):
         views: (L,) how many keyframes and frames have confirmed it.
         misses: (L,) frames in a row in which it was looked for and not found.
         id: (L,) number that no other landmark of the run has.
-        disparity_range: (L,) range of the disparities around them, pixels, as of `patch_disparity_range`; for the map.
+        disparity_range: (L,) range of the disparities around them, pixels, as of `patch_disparity_range`; for the map,
+            zero until it is made.
     """
 
     anchor: np.ndarray

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,9 @@ from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.state_layout import pose_slice
 from sigmaslam.frontend import StereoView
 from sigmaslam.frontend.image_sharpness import sharpness
+from sigmaslam.frontend.patch_disparity_range import dense_disparity
 from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam.slam.deferred import Deferred
 from sigmaslam.slam.keyframe import Keyframe
 from sigmaslam.slam.map_file import pack_keyframes, read_keyframes
 from sigmaslam.slam.place_recognition import closest_pair
@@ -40,14 +43,18 @@ class Keyframes:
         window: owns the poses.
         max_keyframes: more than so many that left the window are not remembered.
         max_points: of the map; when there are twice as many, the least confirmed half goes.
+        executor: makes what only the map needs beside the tracking, if there is one.
 
     Attributes:
         active: keyframes of the window, in its order.
         remembered: keyframes that left it, in the order of its past.
     """
 
-    def __init__(self, window: KeyframeWindow, max_keyframes: int, max_points: int) -> None:
+    def __init__(
+        self, window: KeyframeWindow, max_keyframes: int, max_points: int, executor: Executor | None = None
+    ) -> None:
         self._window = window
+        self._executor = executor
         self._max_keyframes = max(max_keyframes, 1)
         self._max_points = max_points
         self._next_id = self._first_id = 0
@@ -69,7 +76,10 @@ class Keyframes:
 
     def append(self, view: StereoView, timestamp: float) -> None:
         """Takes the newest keyframe of the window."""
-        self.active.append(Keyframe(self._next_id, timestamp, view, sharpness(view.left)))
+        dense = Deferred(lambda: dense_disparity(view))
+        if self._executor is not None:
+            dense.begin(self._executor)
+        self.active.append(Keyframe(self._next_id, timestamp, view, sharpness(view.left), dense))
         self._next_id += 1
 
     def blur(self, left: np.ndarray) -> float:
@@ -85,6 +95,7 @@ class Keyframes:
         Returns:
             New row of each landmark, as of `KeyframeWindow.marginalise_oldest`.
         """
+        self.active[0].measure_surfaces(self._window.landmarks, 0)
         points = anchor_points(self._window, 0, _times(self.active))
         new_row = self._window.marginalise_oldest()
         self._remember(self.active.pop(0).leave_window(points), spare)
@@ -98,6 +109,8 @@ class Keyframes:
 
     def map(self) -> PointMap:
         """All landmarks so far that were seen at least three times, in the world of the window."""
+        for anchor, keyframe in enumerate(self.active):
+            keyframe.measure_surfaces(self._window.landmarks, anchor)
         past = points_in_world([keyframe.points for keyframe in self.remembered], self._window.posterior.past)
         return merge_maps([past, window_points(self._window, _times(self.active))])
 

@@ -12,7 +12,6 @@ from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
 from sigmaslam.frontend import StereoView
 from sigmaslam.frontend.feature_spacing import select_spaced
-from sigmaslam.frontend.patch_disparity_range import dense_disparity, patch_disparity_range
 from sigmaslam.frontend.plane_alignment import disparity_slopes
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import turn_covariance
@@ -62,7 +61,6 @@ class NewKeyframe:
         step_covariance: (6, 6) of that, perturbed from the left in the last keyframe.
         views: of the window's landmarks.
         origin: of the first one, the past pose relative to which `step_covariance` is.
-        dense: as of `dense_disparity`; made here where there is none.
     """
 
     view: StereoView
@@ -72,7 +70,6 @@ class NewKeyframe:
     step_covariance: np.ndarray
     views: LandmarkViews = field(default_factory=LandmarkViews.empty)
     origin: int | None = None
-    dense: np.ndarray | None = None
 
 
 @dataclass(slots=True)
@@ -133,7 +130,7 @@ class Mapper:
         if not admitted.has_stereo(self.admission.min_points, self.config.min_inliers):
             return None
         views = matches.views.select(fit.inliers).inflated(fit.inflation)
-        return self.insert(NewKeyframe(admitted, timestamp, fit.pose, *expected, views, dense=frame.dense))
+        return self.insert(NewKeyframe(admitted, timestamp, fit.pose, *expected, views))
 
     def insert(self, new: NewKeyframe) -> KeyframeTracks:
         """Makes a view a keyframe: what it has in stereo beside the views of known landmarks is new.
@@ -155,21 +152,19 @@ class Mapper:
         view = replace(new.view, slope=disparity_slopes(new.view.features.keypoints, new.view.disparity))
         keyframes.append(view, new.timestamp)
         window.add_views(views)
-        self._add_landmarks(view, views, dense_disparity(view) if new.dense is None else new.dense)
+        self._add_landmarks(view, views)
         seen = LandmarkViews.concatenate([views, window.landmarks.anchor_views(len(window) - 1)])
         window.solve()
         self.motion.start_keyframe()
         self._landmarks_in_keyframe = self._last_count = len(seen)
         return KeyframeTracks(window.landmarks.id[seen.landmark], seen.measurement, seen.covariance)
 
-    def _add_landmarks(self, view: StereoView, views: LandmarkViews, dense: np.ndarray) -> None:
+    def _add_landmarks(self, view: StereoView, views: LandmarkViews) -> None:
         """Makes landmarks of the stereo points that no landmark has been found at."""
-        assert view.slope is not None
         index = np.flatnonzero(np.isfinite(view.disparity))
         taken = views.measurement[:, :2]
         scale = np.clip(np.sqrt(view.left.size / _FULL_SPACING_FROM), _LEAST_SPACING, 1.0)
         spacing = float(scale) * self.config.spacing
         index = index[select_spaced(view.features.select(index), taken, spacing, view.left.shape)]
         measured = view.measured(index)
-        disparity_range = patch_disparity_range(dense, measured, view.slope[index])
-        self.window.add_landmarks(index, measured, self.noise.of_keypoints(view, index), disparity_range)
+        self.window.add_landmarks(index, measured, self.noise.of_keypoints(view, index))

@@ -84,7 +84,7 @@ class StereoTracker:
         self._noise = noise = MeasurementNoise(config)
         self._motion = motion = MotionFilter(backend)
         self._course = course = Course()
-        self._keyframes = keyframes = Keyframes(window, config.max_keyframes, config.max_points)
+        self._keyframes = keyframes = Keyframes(window, config.max_keyframes, config.max_points, self._beside)
         update = FrameUpdate(window, config.iterations)
         guided = GuidedMatcher(rectified, frontend, window, update, noise, config)
         self._unguided = unguided = UnguidedMatcher(rectified, frontend, window, noise, config)
