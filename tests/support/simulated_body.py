@@ -29,15 +29,15 @@ class SimulatedBody:
     name = "simulated"
 
     def __init__(self, poses: np.ndarray, seed: int = 0, ball: int = 300, wall: int = 300, hidden: range = range(0)):
-        self.poses, self._hidden, self._random = poses, hidden, np.random.default_rng(seed)
+        self.poses, self._hidden, self._seed, random = poses, hidden, seed, np.random.default_rng(seed)
         self.camera = parallel_camera(WIDTH, HEIGHT, FOCAL, BASELINE)
-        normal = self._random.standard_normal((ball, 3))
+        normal = random.standard_normal((ball, 3))
         self._normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
         spread = 0.9 * np.array([WIDTH, HEIGHT]) / FOCAL * WALL
-        flat = self._random.uniform(-0.5, 0.5, (wall, 2)) * spread
+        flat = random.uniform(-0.5, 0.5, (wall, 2)) * spread
         self._wall = np.column_stack([flat, np.full(wall, WALL)])
         self.is_ball = np.arange(ball + wall) < ball
-        self._errors = SimulatedErrors(self._random, ball + wall)
+        self._errors = SimulatedErrors(random, ball + wall)
         self.seen: dict[int, np.ndarray] = {}
 
     def observe(self, left: np.ndarray, right: np.ndarray) -> StereoView:
@@ -46,14 +46,15 @@ class SimulatedBody:
         truth, visible = self._project(frame)
         seen = np.flatnonzero(visible)
         self.seen[frame] = seen
-        return self._errors.view(left, right, truth, seen)
+        return self._errors.view(left, right, truth, seen, np.random.default_rng((self._seed, frame)))
 
     def match(self, search: KeypointSearch, view: StereoView) -> TemporalMatches:
         """The points that both see, within the ellipses where there are any."""
         frame = frame_of(view.left)
         wanted, seen = self.seen[frame_of(search.key.left)][search.index], self.seen[frame]
         truth, _ = self._project(frame)
-        places = truth[wanted, :2] + self._errors.place * self._random.standard_normal((len(wanted), 2))
+        random = np.random.default_rng((self._seed, frame_of(search.key.left), frame))
+        places = truth[wanted, :2] + self._errors.place * random.standard_normal((len(wanted), 2))
         both = np.isin(wanted, seen)
         if search.covariance is not None:
             apart = places - search.predicted

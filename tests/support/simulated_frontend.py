@@ -74,7 +74,7 @@ class SimulatedFrontend:
         shared_place: float = ASSUMED.shared_place,
         outliers: float = 0.0,
     ) -> None:
-        self._scale, self._random = scale, np.random.default_rng(seed)
+        self._scale, self._seed, self._random = scale, seed, np.random.default_rng(seed)
         self._most, self._offset, self._outliers = points, offset, outliers
         self.camera = parallel_camera(scale.width, scale.height, scale.focal, scale.baseline)
         self.poses = self._path(frames)
@@ -90,30 +90,33 @@ class SimulatedFrontend:
         return image_of(frame, self._scale.width, self._scale.height)
 
     def observe(self, left: np.ndarray, right: np.ndarray) -> StereoView:
-        """Points in view as features, each with its disparity."""
+        """Points in view as features, each with its disparity; the same whenever the frame is observed."""
         frame = frame_of(left)
         truth, visible = self._project(frame)
         seen = np.flatnonzero(visible)
         seen = np.sort(seen[np.argsort(self._priority[seen])[: self._most]])
         self._seen[frame] = seen
-        return self._errors.view(left, right, truth, seen)
+        return self._errors.view(left, right, truth, seen, np.random.default_rng((self._seed, frame)))
 
     def match(self, search: KeypointSearch, view: StereoView) -> TemporalMatches:
-        """The points that both see, wherever they were predicted."""
+        """The points that both see, wherever they were predicted; the same whenever they are matched."""
         frame = frame_of(view.left)
+        random = np.random.default_rng((self._seed, frame_of(search.key.left), frame))
         wanted, seen = self._seen[frame_of(search.key.left)][search.index], self._seen[frame]
         both = np.isin(wanted, seen)
         points, count = wanted[both], int(both.sum())
         truth, _ = self._project(frame)
         # Of a keyframe's points in all views alike, and of this view alone.
-        common = self._place_errors.setdefault(
-            frame_of(search.key.left), self._random.standard_normal((len(self._points), 2))
-        )[points]
-        own = self._random.standard_normal((count, 2))
+        key = frame_of(search.key.left)
+        if key not in self._place_errors:
+            of_key = np.random.default_rng((self._seed, key, len(self._points)))
+            self._place_errors[key] = of_key.standard_normal((len(self._points), 2))
+        common = self._place_errors[key][points]
+        own = random.standard_normal((count, 2))
         error = np.sqrt(self._shared_place) * common + np.sqrt(1.0 - self._shared_place) * own
         places = truth[points, :2] + self._errors.place * error
-        wrong = self._random.random(count) < self._outliers
-        places[wrong] += self._random.uniform(-20, 20, (int(wrong.sum()), 2))
+        wrong = random.random(count) < self._outliers
+        places[wrong] += random.uniform(-20, 20, (int(wrong.sum()), 2))
         return self._errors.matches(search.index[both], places, view.disparity[np.searchsorted(seen, points)])
 
     def follow(

@@ -36,7 +36,7 @@ class SimulatedErrors:
     """Features and matches of numbered points, with exactly the errors that they claim.
 
     Args:
-        random: of all errors.
+        random: of the errors that all views of a point share.
         points: how many there are in the world.
         place, disparity: standard deviations per axis of a match, and of a disparity, pixels.
         shared: share of a disparity's variance that is the same in all views of a point.
@@ -50,21 +50,26 @@ class SimulatedErrors:
         disparity: float = 0.25,
         shared: float = ASSUMED.shared_disparity,
     ) -> None:
-        self.place, self.disparity, self._random = place, disparity, random
+        self.place, self.disparity = place, disparity
         self._shared = np.sqrt(shared) * disparity * random.standard_normal(points)
         self._own = np.sqrt(1.0 - shared) * disparity
 
-    def view(self, left: np.ndarray, right: np.ndarray, truth: np.ndarray, seen: np.ndarray) -> StereoView:
-        """The points `seen` (K,) as features, each with its disparity; `truth` (N, 3) is of all points."""
+    def view(
+        self, left: np.ndarray, right: np.ndarray, truth: np.ndarray, seen: np.ndarray, random: np.random.Generator
+    ) -> StereoView:
+        """The points `seen` (K,) as features, each with its disparity; `truth` (N, 3) is of all points.
+
+        `random` is of the view's own errors: trackers observe frames in any order, in any thread.
+        """
         count = len(seen)
-        keypoints = truth[seen, :2] + ASSUMED.keyframe_sigma * self._random.standard_normal((count, 2))
+        keypoints = truth[seen, :2] + ASSUMED.keyframe_sigma * random.standard_normal((count, 2))
         features = Features(
             keypoints,
             np.zeros((count, 0), np.float32),
             np.ones(count, np.float32),
             np.full(count, ASSUMED.keyframe_sigma),
         )
-        disparity = truth[seen, 2] + self._shared[seen] + self._own * self._random.standard_normal(count)
+        disparity = truth[seen, 2] + self._shared[seen] + self._own * random.standard_normal(count)
         return StereoView(left, right, features, disparity, np.full(count, self.disparity))
 
     def matches(self, index: np.ndarray, places: np.ndarray, disparity: np.ndarray) -> TemporalMatches:

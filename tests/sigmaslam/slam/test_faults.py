@@ -187,7 +187,6 @@ def test_motion_blur_along_a_line_is_survived(demo: Demo, width: int, height: in
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, raises=AssertionError, reason="2 of 40 frames at 27 and 41 squared sigmas, not 22.5")
 def test_an_exposure_over_five_frames_is_survived(demo: Demo):
     """Average of five consecutive frames; the pose is the mean of the five.
 

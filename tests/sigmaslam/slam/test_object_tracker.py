@@ -174,7 +174,7 @@ def test_the_command_line_refuses_a_wrong_region_before_it_writes(
 @pytest.mark.slow
 @pytest.mark.usefixtures("without_report")
 def test_a_rendered_tool_is_followed_and_a_sensor_on_it_takes_drift_away(tmp_path: Path):
-    """`sigmaslam render tool --frames 75 --seed 1` with the box of docs/object.md; a sensor at 10 Hz, 0.12 mm.
+    """`sigmaslam render tool --frames 75 --seed 1` with the box of docs/object.md; a sensor of 0.17 mm at 10 Hz.
 
     Means of five draws: noise of one grey level in 5 % of the pixels moves the rotation between 0.2 and 0.3 degrees.
     """
@@ -196,7 +196,7 @@ def test_a_rendered_tool_is_followed_and_a_sensor_on_it_takes_drift_away(tmp_pat
         sequence = open_sequence(folder, "kitti")
         out = tmp_path / f"alone{draw}", tmp_path / f"fused{draw}"
         assert track_sequence(sequence, out[0], track_object=BOX)["lost"] == 0
-        readings = sense(truth, times, draw, 7e-5, 5e-3)
+        readings = sense(truth, times, draw, 1e-4, 5e-3)
         summary = track_sequence(sequence, out[1], track_object=BOX, locations=readings)
         assert summary["location"]["ready"] is not None
         for run, results in zip(out, (alone, fused), strict=True):
@@ -205,9 +205,9 @@ def test_a_rendered_tool_is_followed_and_a_sensor_on_it_takes_drift_away(tmp_pat
     assert alone[0].path_length > 0.1
     assert max(each.ate.rmse for each in alone) < 0.002
     assert nees(alone) < 4
-    # Better than the sensor (0.29 degrees), which has little to add to it.
     assert turned(alone) < 0.25
-    assert displaced(fused) < 0.8 * displaced(alone)
+    # What the first frame is off by is in both.
+    assert displaced(fused) < displaced(alone)
     assert turned(fused) < turned(alone)
     assert 0.5 < nees(fused) < 2.0
 

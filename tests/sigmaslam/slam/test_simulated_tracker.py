@@ -67,8 +67,9 @@ def test_rotations_stay_orthonormal(frames: int):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", SCALES)
-def test_coverage_over_thirty_worlds(kind: str):
-    runs = [simulate(kind, 1000 + seed, 40) for seed in range(30)]
+def test_coverage_over_sixty_worlds(kind: str):
+    """Of thirty, the share inside 95 % scatters between 0.87 and 0.93."""
+    runs = [simulate(kind, first + seed, 40) for first in (1000, 3000) for seed in range(30)]
     for run in runs:
         assert_always_tracking(run)
     nees = np.array([run.nees for run in runs])
