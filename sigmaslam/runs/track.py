@@ -71,6 +71,8 @@ def track_sequence(
         rectified = tracker.describe_rectified() if tracks else None
     writer = RunWriter(out, rectified)
     timing = _Timing(sequence, real_time)
+    if timing.is_real:
+        tracker.warm_up()
     ended = "complete"
     try:
         # Cameras are released before the results are written, even after an error.
@@ -118,6 +120,11 @@ class _Timing:
         self._live = sequence.format == "camera"
         self._latency = Latency() if self._live or real_time else None
         self._player: RealTimePlayer | None = None
+
+    @property
+    def is_real(self) -> bool:
+        """Frames do not wait for the tracker."""
+        return self._latency is not None
 
     @property
     def dropped(self) -> int:

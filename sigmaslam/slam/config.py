@@ -70,7 +70,7 @@ class TrackerConfig:
     max_misses: int = 3
     min_inliers: int = 15
     keyframe_ratio: float = 0.75
-    search_limit: float = 25.0
+    search_limit: float = 40.0
     lost_seconds: float = 0.5
 
 

@@ -137,6 +137,10 @@ class ObjectTracker:
         T_body_camera = self._T_body_left() @ estimate.T_world_camera
         return ObjectEstimate(replace(estimate, T_world_camera=T_body_camera, covariance=covariance))
 
+    def warm_up(self) -> None:
+        """As of `StereoTracker`."""
+        self._tracker.warm_up()
+
     def map(self) -> PointMap:
         """The body's points, in its frame."""
         points = self._tracker.map()

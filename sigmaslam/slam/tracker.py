@@ -115,7 +115,7 @@ class StereoTracker:
             InputError: the time stamp does not increase.
             FrameError: an image has the wrong type or size.
         """
-        self._check_time(timestamp)
+        _check_time(self._course.timestamp, timestamp)
         # The matrices are small: threads of BLAS would wait for each other for longer than they compute.
         with self._blas.limit(limits=1, user_api="blas"):
             return self._step(left, right, timestamp)
@@ -145,6 +145,11 @@ class StereoTracker:
         self._course.timestamp = timestamp
         return self._reporter.report(timestamp, status, matches, fit, tracks, clock.milliseconds)
 
+    def warm_up(self) -> None:
+        """Runs the front-end once on noise, so that the first frame does not wait for memory: before cameras start."""
+        noise = np.random.default_rng(0).integers(0, 256, (2, self._camera.height, self._camera.width), np.uint8)
+        self._frontend.observe(*noise)
+
     def map(self) -> PointMap:
         """All landmarks so far that were seen at least three times."""
         return self._keyframes.map().transform(se3_inverse(self._T_rectified_left))
@@ -160,13 +165,6 @@ class StereoTracker:
         return self._keyframes.pack(self._frontend.name, self._camera)
 
     # ---- the stages of a frame
-
-    def _check_time(self, timestamp: float) -> None:
-        before = self._course.timestamp
-        if before is not None and timestamp <= before:
-            raise InputError(
-                f"time stamp {timestamp:.6f} s does not come after {before:.6f} s: sort the frames by time"
-            )
 
     def _predict(self, timestamp: float) -> None:
         """Constant velocity since the last frame."""
@@ -221,3 +219,8 @@ class StereoTracker:
             self._follower.remember(frame.left, self._window.landmarks.id[seen.landmark], seen.measurement[:, :2])
         else:
             self._follower.forget()
+
+
+def _check_time(before: float | None, timestamp: float) -> None:
+    if before is not None and timestamp <= before:
+        raise InputError(f"time stamp {timestamp:.6f} s does not come after {before:.6f} s: sort the frames by time")
