@@ -63,7 +63,7 @@ Keypoints (blobs of two scales, ranked by a learned quality), {DESCRIPTOR_SIZE}-
 
 
 def scoring_page(card: dict[str, Any]) -> str:
-    """The card of scorer and verifier for people, in Markdown."""
+    """The card of the scorer and both verifiers for people, in Markdown."""
     sections = [
         _table("setting", "", card["config"]),
         _table("held-out renders", "", card["metrics_on_held_out_renders"]),
@@ -71,9 +71,10 @@ def scoring_page(card: dict[str, Any]) -> str:
         _graphs_section(card),
     ]
     counts = card["parameters"]
-    return f"""# Model card: match scorer and verifier
+    return f"""# Model card: match scorer and verifiers
 
-Probability that a match is right, and covariance of its place; {counts["scorer"]} and {counts["verifier"]} parameters.
+Probability that a match is right, and covariance of its place: scorer, {counts["scorer"]} parameters, verifier of matches,
+{counts["verifier"]}, and of places found without features, {counts["place_verifier"]} (figures `place_`).
 
 - Data: {card["data"]}.
 - Command: `{card["command"]}`, commit {card["commit"]}, seed {card["seed"]}.

@@ -130,7 +130,8 @@ class OrbSlamPeer:
             vocabulary = pyorbslam3.vocabulary_path(download=False)
         except FileNotFoundError as error:
             raise MissingPeerError(
-                f"{error}: call `pyorbslam3.vocabulary_path()` once, which downloads it, or set PYORBSLAM3_VOCAB"
+                "its vocabulary is not here: call `pyorbslam3.vocabulary_path()` once, which downloads it, or set "
+                "PYORBSLAM3_VOCAB to an ORBvoc.txt"
             ) from error
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "settings.yaml"
