@@ -73,8 +73,8 @@ def scoring_page(card: dict[str, Any]) -> str:
     counts = card["parameters"]
     return f"""# Model card: match scorer and verifiers
 
-Probability that a match is right, and covariance of its place: scorer, {counts["scorer"]} parameters, verifier of matches,
-{counts["verifier"]}, and of places found without features, {counts["place_verifier"]} (figures `place_`).
+Probability that a match is right, and covariance of its place: scorer, {counts["scorer"]} parameters; verifiers of
+matches, {counts["verifier"]}, and of places found without features, {counts["place_verifier"]} (figures `place_`).
 
 - Data: {card["data"]}.
 - Command: `{card["command"]}`, commit {card["commit"]}, seed {card["seed"]}.

@@ -66,12 +66,6 @@ class FrameUpdate:
         noise, by_state = self._through_landmarks(rows, linear, np.zeros((len(rows), 3, 3)))
         return linear.mean, noise + project_covariance(by_state, covariance), linear.in_front
 
-    def agrees(self, views: LandmarkViews, pose: np.ndarray, step_covariance: np.ndarray) -> np.ndarray:
-        """(M,) bool: which views agree with a predicted pose (99.9 %), the arguments as of `fit`."""
-        predicted, S, in_front = self.predict(views.landmark, pose, step_covariance)
-        residual, covariance = mask_missing(views.measurement - predicted, S + views.covariance)
-        return np.asarray(in_front & (squared_mahalanobis(residual, covariance) <= CHI_SQUARE_999[views.components]))
-
     def fit(
         self,
         views: LandmarkViews,

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from sigmaslam.estimation.chi_square import CHI_SQUARE_9999_OF_6
 from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.frame_update import FrameUpdate
@@ -127,19 +126,6 @@ class Localiser:
         if count < min_inliers:
             return None
         fit = self.update.fit(matches.views, pose, covariance, min_inliers)
-        if fit is None or fit.prior_cost > CHI_SQUARE_9999_OF_6:
-            # The camera has jumped, and all matches with it; or something moves that gives most of them, and those that
-            # stand still agree with a pose close to the prediction: that one is tried first.
-            expected = np.flatnonzero(self.update.agrees(matches.views, pose, covariance))
-            min_steady = _DOUBTFUL_INLIERS * min_inliers
-            steady = self.update.fit(matches.views.select(expected), pose, 0.01 * covariance, min_steady)
-            if steady is not None:
-                expected = expected[steady.inliers]
-                steady = self.update.fit(matches.views.select(expected), pose, covariance, min_steady)
-            if steady is not None and steady.count >= _MIN_SHARE * count:
-                inliers = np.zeros(count, bool)
-                inliers[expected] = steady.inliers
-                fit = replace(steady, inliers=inliers)
         return fit if fit is not None and fit.count >= _MIN_SHARE * count else None
 
     def _localise_anywhere(
