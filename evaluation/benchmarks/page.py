@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
+from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text
 
 _MARK = "<!-- notes -->"
+
+T = TypeVar("T")
 
 
 def write_page(path: Path, page: str) -> str:
@@ -52,3 +56,29 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 def row(*cells: str) -> str:
     """A line of a table."""
     return "| " + " | ".join(cells) + " |"
+
+
+def write_results_page(path: Path, results: Iterable[T], form: Callable[[list[T], bool], str]) -> str:
+    """Writes the page of results that come one by one and returns it; also, of those there are, when it is stopped.
+
+    Args:
+        path: Markdown page, as of `write_page`.
+        results: as they are found.
+        form: the page of results, and whether they are all.
+    """
+    found: list[T] = []
+    try:
+        for result in results:
+            found.append(result)
+    except BaseException:
+        if found:
+            write_page(path, form(found, False))
+        raise
+    return write_page(path, form(found, True))
+
+
+def check_names(kind: str, names: Sequence[str], choices: Sequence[str]) -> None:
+    """InputError where one of the names is not among the choices."""
+    for name in names:
+        if name not in choices:
+            raise InputError(f"{kind} {name!r} is unknown; choose of {', '.join(choices)}")

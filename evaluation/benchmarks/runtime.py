@@ -16,7 +16,7 @@ import numpy as np
 
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.benchmarks.decoded_pairs import DecodedPairs, write_pairs
-from sigmaslam.evaluation.benchmarks.page import write_page
+from sigmaslam.evaluation.benchmarks.page import check_names, write_results_page
 from sigmaslam.evaluation.benchmarks.runtime_page import (
     LANDMARKS,
     SEQUENCE,
@@ -97,15 +97,8 @@ def write_runtime(
     Raises:
         InputError: a name is unknown, or there are too few frames.
     """
-    results: list[TimedRun | Omission] = []
-    try:
-        for result in time_everything(data, methods, sequences, rounds, frames, renders, note):
-            results.append(result)
-    except BaseException:
-        if results:
-            write_page(path, format_runtime(results, command, rounds, complete=False))
-        raise
-    return write_page(path, format_runtime(results, command, rounds))
+    results = time_everything(data, methods, sequences, rounds, frames, renders, note)
+    return write_results_page(path, results, lambda found, complete: format_runtime(found, command, rounds, complete))
 
 
 def time_everything(
@@ -118,8 +111,8 @@ def time_everything(
     note: Callable[[str], None] = lambda text: None,
 ) -> Iterator[TimedRun | Omission]:
     """Times everything, one process at a time; see `write_runtime`."""
-    _check_names("method", methods, METHODS)
-    _check_names("sequence", sequences, (*SEQUENCES, _DEMO))
+    check_names("method", methods, METHODS)
+    check_names("sequence", sequences, (*SEQUENCES, _DEMO))
     if frames <= WARM_UP + 1:
         raise InputError(f"--frames is {frames}: give at least {WARM_UP + 2}, the first {WARM_UP} are not counted")
     methods = [method for method in METHODS if method in methods]
@@ -141,12 +134,6 @@ def time_everything(
         if first is not None:
             yield from _take_turns(_vary_size(*first, methods, scratch), rounds, missing, note)
             yield from _take_turns(_vary_landmarks(*first, methods), rounds, missing, note)
-
-
-def _check_names(kind: str, names: Sequence[str], choices: Sequence[str]) -> None:
-    for name in names:
-        if name not in choices:
-            raise InputError(f"{kind} {name!r} is unknown; choose of {', '.join(choices)}")
 
 
 def _find(

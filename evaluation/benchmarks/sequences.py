@@ -16,7 +16,7 @@ import numpy as np
 from sigmaslam.bundle_adjustment.refine_run import refine_run
 from sigmaslam.bundle_adjustment.track_file import TRACKS_NAME
 from sigmaslam.errors import InputError, SigmaSlamError
-from sigmaslam.evaluation.benchmarks.page import write_page
+from sigmaslam.evaluation.benchmarks.page import check_names, write_results_page
 from sigmaslam.evaluation.benchmarks.pnp_baselines import track_with_pnp
 from sigmaslam.evaluation.benchmarks.sequences_page import (
     Omission,
@@ -93,15 +93,8 @@ def write_results(
     Raises:
         InputError: a name is unknown, or `data` does not hold the sequences.
     """
-    results: list[SequenceResult | Omission] = []
-    try:
-        for result in run_sequences(data, methods, sequences, renders, note):
-            results.append(result)
-    except BaseException:
-        if results:
-            write_page(path, format_results(results, command, complete=False))
-        raise
-    return write_page(path, format_results(results, command))
+    results = run_sequences(data, methods, sequences, renders, note)
+    return write_results_page(path, results, lambda found, complete: format_results(found, command, complete))
 
 
 def run_sequences(
@@ -112,8 +105,8 @@ def run_sequences(
     note: Callable[[str], None] = lambda text: None,
 ) -> Iterator[SequenceResult | Omission]:
     """Runs and evaluates everything, one at a time; see `write_results`."""
-    _check_names("method", methods, METHODS)
-    _check_names("sequence", sequences or (), SEQUENCES)
+    check_names("method", methods, METHODS)
+    check_names("sequence", sequences or (), SEQUENCES)
     wanted = sequences or [name for name in SEQUENCES if data is not None or name not in dict(REAL)]
     real = [name for name in wanted if name in dict(REAL)]
     missing = [name for name in real if data is None or not (data / name).is_dir()]
@@ -150,12 +143,6 @@ def run_sequences(
                     note(f"{label} is left out: {result.reason}")
                 else:
                     note(f"{label}, ATE {ate_cell(result)} m, {total_cell(result)} ms")
-
-
-def _check_names(kind: str, names: Sequence[str], choices: Sequence[str]) -> None:
-    for name in names:
-        if name not in choices:
-            raise InputError(f"{kind} {name!r} is unknown; choose of {', '.join(choices)}")
 
 
 def _render(preset: str, folder: Path, note: Callable[[str], None]) -> _BenchmarkSequence:

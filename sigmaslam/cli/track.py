@@ -217,6 +217,7 @@ def _real_time_verdict(summary: dict[str, Any]) -> str:
     """A line about dropped frames and latency; empty where frames were tracked as fast as they could be."""
     if "real_time" not in summary:
         return ""
-    latency = summary["real_time"]["latency_ms"]
-    figures = ", ".join(f"{name} {value:.0f}" for name, value in latency.items())
+    from sigmaslam.runs.real_time import format_latency
+
+    figures = format_latency(summary["real_time"]["latency_ms"])
     return f"In real time: {summary['real_time']['dropped']} frames dropped; latency in ms: {figures}.\n"

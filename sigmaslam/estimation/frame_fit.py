@@ -19,7 +19,6 @@ class FrameFit:
         inliers: (M,) bool, the views that agree.
         nis, dof: of the inliers.
         noise_scale: what the variances of all views are multiplied by in the posterior, 1 or more, as they scatter.
-        prior_cost: squared sigmas by which it departs from what was known before.
         inflation: by what `relative` was multiplied for errors that all views share.
     """
 
@@ -32,7 +31,6 @@ class FrameFit:
     nis: float
     dof: int
     noise_scale: float
-    prior_cost: float
     inflation: float = 1.0
 
     @property

@@ -152,7 +152,6 @@ class FrameUpdate:
             prior_cost + float(update.squared[inliers].sum()),
             int(components[inliers].sum()),
             noise_scale,
-            prior_cost,
         )
 
     # ---- the equations

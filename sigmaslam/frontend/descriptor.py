@@ -19,20 +19,22 @@ from sigmaslam.frontend.nearest_neighbours import (
 )
 from sigmaslam.frontend.patch_evidence import Evidence, examine_patches
 from sigmaslam.frontend.plane_alignment import refine_in_rows, refine_on_planes
-from sigmaslam.frontend.row_search import align_in_rows, search_rows
+from sigmaslam.frontend.row_search import (
+    MAX_DISPARITY,
+    REACH_PREDICTED,
+    REACH_SEARCHED,
+    ROW_TOLERANCE,
+    align_in_rows,
+    search_rows,
+)
 from sigmaslam.frontend.types import Features, KeypointSearch, Refinement, StereoView, TemporalMatches
 from sigmaslam.frontend.verifier_inputs import PlaceSearch
 from sigmaslam.table import Table
 
-_ROW_TOLERANCE = 2.0
 # A little below zero, so that points at infinity survive a disparity offset.
 _LEAST_DISPARITY = -2.0
-# Share of the image width that disparity may reach.
-_MOST_DISPARITY = 0.25
 # What is more likely wrong than right is left out.
 _LEAST_PROBABILITY = 0.5
-# How far alignment may move a disparity that was searched for, and one that was predicted, pixels.
-_REACH_NEW, _REACH_FOLLOWED = 2.0, 3.0
 # Pixels from anywhere.
 _NOWHERE = 1e6
 
@@ -114,8 +116,8 @@ def match_stereo(
         features_right.keypoints,
         features_left.descriptors,
         features_right.descriptors,
-        _ROW_TOLERANCE,
-        (_LEAST_DISPARITY, _MOST_DISPARITY * left.shape[1]),
+        ROW_TOLERANCE,
+        (_LEAST_DISPARITY, MAX_DISPARITY * left.shape[1]),
     )
     found = refine_with_confidence(
         estimator,
@@ -126,7 +128,7 @@ def match_stereo(
         putative,
         lambda points0, points1, *_: refine_in_rows(left, right, points0, points1)[0],
     )
-    level = np.abs(found.places[:, 1] - features_left.keypoints[found.index0, 1]) <= _ROW_TOLERANCE
+    level = np.abs(found.places[:, 1] - features_left.keypoints[found.index0, 1]) <= ROW_TOLERANCE
     return found.select(level & (found.probability >= _LEAST_PROBABILITY))
 
 
@@ -225,7 +227,7 @@ class DescriptorFrontend:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Which of the points (M, 2) are found in the right image from a start, their disparities and sigmas."""
         is_predicted = search is PlaceSearch.PREDICTED_ALONG_ROWS
-        reach = _REACH_FOLLOWED if is_predicted else _REACH_NEW
+        reach = REACH_PREDICTED if is_predicted else REACH_SEARCHED
         places, there, slope = align_in_rows(left, right, points, start, reach)
         index = np.flatnonzero(there)
         points, places = points[index], places[index]

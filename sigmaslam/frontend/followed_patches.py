@@ -13,6 +13,8 @@ from sigmaslam.frontend.nearest_neighbours import within_ellipses
 from sigmaslam.frontend.types import PatchMaps
 from sigmaslam.table import Table
 
+FLOW_WINDOW, FLOW_LEVELS = 15, 3
+"""Of the optical flow that gives starts: side of its patches, pixels, and levels above the image itself."""
 # Patches in samples, Gauss-Newton steps, and the window's standard deviation in radii.
 _RADIUS, _ITERATIONS, _TAPER = 5, 5, 1.0
 # A patch that agrees less than this where it was followed to is searched for again, first in images so much smaller.

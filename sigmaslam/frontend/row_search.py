@@ -14,8 +14,8 @@ from sigmaslam.frontend.plane_alignment import refine_in_rows
 
 # Images from this width on are searched at half the resolution.
 _HALVED_FROM = 640
-# Share of the image width that disparity may reach.
-_MAX_DISPARITY = 0.25
+MAX_DISPARITY = 0.25
+"""Share of the image width that disparity may reach."""
 # The patches, pixels: rows above the keypoint and in all, columns before it and in all.
 _ABOVE, _TALL, _BEFORE, _BROAD = 5, 11, 8, 16
 # The best place must have less than this share of the difference of the second best one.
@@ -23,8 +23,10 @@ _MAX_RATIO = 0.9
 # Disparities that count as neighbours of the best one, and by how many the way back may miss.
 _NEIGHBOURS, _MAX_MISS = 2, 1
 _NOWHERE = -1000
-# Rows that the eyes of a rectified pair may be off by, pixels.
-_ROW_TOLERANCE = 2.0
+ROW_TOLERANCE = 2.0
+"""Rows that the eyes of a rectified pair may be off by, pixels."""
+REACH_SEARCHED, REACH_PREDICTED = 2.0, 3.0
+"""How far alignment may move a disparity that was searched for, and one that was predicted, pixels."""
 
 
 def search_rows(left: np.ndarray, right: np.ndarray, keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -39,7 +41,7 @@ def search_rows(left: np.ndarray, right: np.ndarray, keypoints: np.ndarray) -> t
     scale = 2 if left.shape[1] >= _HALVED_FROM else 1
     edges = _edges(left, scale), _edges(right, scale)
     places = np.rint((keypoints + 0.5) / scale - 0.5).astype(np.int32)
-    most = int(_MAX_DISPARITY * left.shape[1] / scale)
+    most = int(MAX_DISPARITY * left.shape[1] / scale)
     kernels = compiled()
     search = search_reference if kernels is None else kernels.search_rows
     disparity = search(*edges, places, -most, most, _MAX_RATIO)
@@ -63,7 +65,7 @@ def align_in_rows(
         as of `disparity_slopes`.
     """
     refined, slope = refine_in_rows(left, right, points, start, reach)
-    level = np.abs(refined.places[:, 1] - points[:, 1]) <= _ROW_TOLERANCE
+    level = np.abs(refined.places[:, 1] - points[:, 1]) <= ROW_TOLERANCE
     return refined.places, refined.moved & level, slope
 
 

@@ -78,6 +78,11 @@ class RealTimePlayer:
             waiting = coming
 
 
+def format_latency(latency_ms: dict[str, float]) -> str:
+    """Percentiles as `Latency.describe` gives them, in words."""
+    return ", ".join(f"{name} {value:.0f}" for name, value in latency_ms.items())
+
+
 def describe_real_time(latency: Latency, dropped: int) -> dict[str, Any]:
     """Entry of run.json."""
     return {"real_time": {"policy": POLICY, "dropped": dropped, "latency_ms": latency.describe()}}

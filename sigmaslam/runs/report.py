@@ -19,6 +19,7 @@ from sigmaslam.plot_style import BLUE, GREEN, GREY, PURPLE, SERIES, VERMILLION, 
 from sigmaslam.readers.trajectory_files import read_tum
 from sigmaslam.runs.figures import plot_trajectory, to_svg
 from sigmaslam.runs.frame_table import STATUSES, FrameTable, read_frames
+from sigmaslam.runs.real_time import format_latency
 
 STATUS_COLOURS = {"lost": VERMILLION, "relocalised": PURPLE, "skipped": GREY}
 
@@ -114,8 +115,7 @@ def _real_time_facts(run: dict[str, Any]) -> list[tuple[str, str]]:
     timing = run.get("real_time")
     if not isinstance(timing, dict):
         return []
-    latency = ", ".join(f"{name} {value:.0f}" for name, value in timing["latency_ms"].items())
-    return [("dropped", f"{timing['dropped']}"), ("latency", f"{latency} ms")]
+    return [("dropped", f"{timing['dropped']}"), ("latency", f"{format_latency(timing['latency_ms'])} ms")]
 
 
 def _median(values: np.ndarray) -> float | None:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from sigmaslam.frontend.followed_patches import FLOW_LEVELS, FLOW_WINDOW
 from sigmaslam.frontend.lucas_kanade import lucas_kanade
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.guided_matching import GuidedMatcher, GuidedMatches
 from sigmaslam.slam.keyframe import Keyframe
 
-# Of optical flow from the last frame: side of the patch, and levels above the image itself.
-_WINDOW, _LEVELS = 15, 3
 # With a smaller share of the landmarks found, or of those seen by both eyes, than so much of the usual one, something
 # has happened that following cannot judge.
 _FALLEN = 0.6
@@ -87,6 +86,6 @@ class LandmarkFollower:
         rows = np.flatnonzero(self._id[at] == landmark_id)
         height, width = left.shape
         guess = np.clip(predicted[rows], 0, (width - 1, height - 1))
-        places, found = lucas_kanade(self._left, left, self._places[at[rows]], guess, _WINDOW, _LEVELS)
+        places, found = lucas_kanade(self._left, left, self._places[at[rows]], guess, FLOW_WINDOW, FLOW_LEVELS)
         start[rows[found]] = places[found]
         return start

@@ -9,6 +9,8 @@ import numpy as np
 from sigmaslam.errors import SigmaSlamError
 from sigmaslam.frontend.affine_alignment import local_maps
 from sigmaslam.frontend.followed_patches import (
+    FLOW_LEVELS,
+    FLOW_WINDOW,
     PatchTargets,
     compare_with_neighbours,
     correct_by_neighbours,
@@ -18,7 +20,7 @@ from sigmaslam.frontend.followed_patches import (
 from sigmaslam.frontend.lucas_kanade import lucas_kanade
 from sigmaslam.frontend.nearest_neighbours import within_ellipses
 from sigmaslam.frontend.patch_evidence import examine_patches
-from sigmaslam.frontend.row_search import align_in_rows, search_rows
+from sigmaslam.frontend.row_search import REACH_PREDICTED, REACH_SEARCHED, align_in_rows, search_rows
 from sigmaslam.frontend.types import PatchMaps
 from sigmaslam.frontend.verifier_inputs import PlaceSearch, describe_places
 from sigmaslam.training.matching.match_sets import MatchSet, PairRecord
@@ -34,10 +36,8 @@ _CARRIED, _DRIFT, _FORGOTTEN = 0.3, 2.0, 0.1
 _MAP_ERROR = 0.03
 # Pairs whose second image shows another place.
 _FOREIGN = 0.15
-_LK_WINDOW, _LK_LEVELS = 15, 3
 # Of predicted disparities, pixels, drawn evenly in the logarithm.
 _DISPARITY_SIGMAS = (0.1, 1.5)
-_REACH_NEW, _REACH_FOLLOWED = 2.0, 3.0
 _MIN_ROWS = 16
 
 
@@ -114,7 +114,7 @@ def _starts(
 ) -> np.ndarray:
     """Where keypoints were followed to: by Lucas-Kanade over the whole way, or carried on from a frame before."""
     if rng.random() < 0.5:
-        places, found = lucas_kanade(*pair, points, predicted, _LK_WINDOW, _LK_LEVELS)
+        places, found = lucas_kanade(*pair, points, predicted, FLOW_WINDOW, FLOW_LEVELS)
     else:
         noise = np.where(visible, _CARRIED, _DRIFT)[:, None] * rng.standard_normal(points.shape)
         places, found = expected + noise, rng.random(len(points)) > _FORGOTTEN
@@ -125,7 +125,7 @@ def _along_rows(pair: _Pair, found: MatchSet, truth: np.ndarray) -> tuple[np.nda
     """Columns and errors of keypoints searched for along the rows of a stereo pair."""
     index, start = search_rows(*pair, found.features0.keypoints)
     points = found.features0.keypoints[index].astype(np.float64)
-    places, there, slope = align_in_rows(*pair, points, start, _REACH_NEW)
+    places, there, slope = align_in_rows(*pair, points, start, REACH_SEARCHED)
     points = points[there]
     return _describe(
         pair, points, places[there], points, None, found, index[there], truth, PlaceSearch.ALONG_ROWS, slope[there]
@@ -145,7 +145,7 @@ def _followed_along_rows(
     )
     usable = np.flatnonzero((start[:, 0] >= 0) & (start[:, 0] < pair[1].shape[1]))
     points, start = points[usable], start[usable]
-    places, there, _ = align_in_rows(*pair, points, start, _REACH_FOLLOWED)
+    places, there, _ = align_in_rows(*pair, points, start, REACH_PREDICTED)
     return _describe(
         pair,
         points[there],
