@@ -15,7 +15,9 @@ class FrameFit:
         pose: (4, 4) T_world_camera.
         relative: (6, 6) covariance of the pose relative to the last keyframe, perturbed from the left in the world.
         covariance: (6, 6) of the pose, likewise.
-        calibration, calibration_covariance: (3,), (3, 3) as this frame adds to it.
+        calibration, calibration_covariance: (12,), (12, 12) as this frame adds to it.
+        common: (6, 12) how considered errors of the calibration, of variance one, enter that of the pose, which the
+            covariances above do not contain.
         inliers: (M,) bool, the views that agree.
         nis, dof: of the inliers.
         noise_scale: what the variances of all views are multiplied by in the posterior, 1 or more, as they scatter.
@@ -27,6 +29,7 @@ class FrameFit:
     covariance: np.ndarray
     calibration: np.ndarray
     calibration_covariance: np.ndarray
+    common: np.ndarray
     inliers: np.ndarray
     nis: float
     dof: int

@@ -134,11 +134,16 @@ class FrameUpdate:
             if update.usable.sum() < min_inliers or inliers.sum() < min_inliers:
                 return None
             weight = inliers * student_weight(update.squared, components, window.student_freedom)
-            solution, spread = weighted_update(factor, update.whitened(), offset, weight)
+            whitened = update.whitened()
+            solution, spread = weighted_update(factor, whitened, offset, weight)
+            rows = whitened[:, :-1] * np.sqrt(np.repeat(weight, 3))[:, None]
             offset, moved = solution, self._landmark_step(views, update, solution - offset)
         inliers = inliers & agree
         if inliers.sum() < min_inliers:
             return None
+        common = window.posterior.common
+        common = np.concatenate([common, common[last]])
+        common = common - spread @ (rows.T @ (rows @ common))
         standard = np.linalg.lstsq(factor, offset, rcond=1e-12)[0]
         prior_cost = float(standard @ standard)
         cross = spread[frame, last]
@@ -148,6 +153,7 @@ class FrameUpdate:
             spread[frame, frame],
             window.posterior.calibration + offset[CALIBRATION],
             spread[CALIBRATION, CALIBRATION],
+            common[frame],
             inliers,
             prior_cost + float(update.squared[inliers].sum()),
             int(components[inliers].sum()),

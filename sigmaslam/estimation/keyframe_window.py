@@ -16,6 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sigmaslam.estimation.calibration_errors import CalibrationPrior, measured_errors
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999, CHI_SQUARE_9999_OF_6
 from sigmaslam.estimation.gaussian import condition, matrix_root
 from sigmaslam.estimation.landmark_elimination import Elimination, eliminate_landmarks
@@ -34,7 +35,7 @@ class KeyframeWindow:
 
     Args:
         camera: the rectified pair.
-        calibration_sigma: (3,) prior of the calibration, pixels; zero switches a state off.
+        calibration: prior of its errors.
         lineariser: of views of landmarks.
         student_freedom: degrees of freedom of the errors' Student-t; infinite: Gaussian.
 
@@ -43,19 +44,21 @@ class KeyframeWindow:
         posterior: what is known with them.
         landmarks: estimated with the posterior.
         depth: of the scene that the last keyframe sees, metres.
+        calibration: prior of the errors of the calibration.
     """
 
     def __init__(
         self,
         camera: RectifiedStereo,
-        calibration_sigma: np.ndarray,
+        calibration: CalibrationPrior,
         lineariser: ViewLineariser,
         student_freedom: float = STUDENT_FREEDOM,
     ) -> None:
         self.camera = camera
         self.lineariser = lineariser
         self.student_freedom = student_freedom
-        self.prior = self.posterior = WindowState.initial(calibration_sigma)
+        self.calibration = calibration
+        self.prior = self.posterior = WindowState.initial(calibration)
         self.landmarks = LandmarkTable.empty(CALIBRATION_SIZE)
         self.depth = 1.0
         self._observations = KeyframeViews()
@@ -88,7 +91,7 @@ class KeyframeWindow:
             pose: (4, 4) estimate of T_world_camera.
             step: (4, 4) T_last_new as it was expected without its images; of the first one T_world_camera.
             step_covariance: (6, 6) of that, perturbed from the left in the world.
-            walk: (3,) variances by which the calibration may have moved since the last keyframe.
+            walk: (12,) variances by which the calibration may have moved since the last keyframe.
             depth: of the scene that it sees, metres.
             origin: of the first one, the past pose relative to which `step_covariance` is; the world by default.
         """
@@ -144,12 +147,13 @@ class KeyframeWindow:
             vector = vector + information @ offset
             state, covariance = condition(factor, information, vector)
             step = state - offset
-            self.posterior = self.posterior.moved(step, covariance)
+            common = self.prior.common_given(covariance, information)
+            self.posterior = self.posterior.moved(step, covariance, common)
             rows = elimination.landmark
             self.landmarks.estimate[rows] += elimination.step + elimination.dependence @ step
             self.landmarks.covariance[rows] = elimination.covariance
             self.landmarks.dependence[rows] = elimination.dependence
-        past = self.prior.past.given(self.prior.covariance, information, vector)
+        past = self.prior.past.given(self.prior.covariance, self.prior.common, information, vector)
         self.posterior = replace(self.posterior, past=past)
         agree = _agree(self, self._observations)
         if not agree.all():
@@ -166,7 +170,7 @@ class KeyframeWindow:
             False, and nothing is changed, where it contradicts what is known, or says less than is known already.
         """
         posterior = self.posterior
-        known = posterior.past.relative_to(posterior.covariance, index)
+        known = posterior.past.relative_to(posterior.covariance, posterior.common, index)
         # What the old keyframe was measured with is the same in all its matches: they must not be counted without end.
         lever = point_lever(posterior.poses[-1:, :3, 3])[0]
         if np.trace(lever @ known @ lever.T) < np.trace(lever @ covariance @ lever.T):
@@ -204,13 +208,11 @@ class KeyframeWindow:
         """Forgets a pose that left the window."""
         self.prior, self.posterior = self.prior.forget(index), self.posterior.forget(index)
 
-    def true_disparity(self, measured: np.ndarray) -> np.ndarray:
-        """(u, v, disparity) (K, 3) without what the calibration adds, and of landmarks (K, 6) their own errors."""
-        x = (measured[:, 0] - measured[:, 2] - self.camera.cx) / self.camera.fx
-        y = (measured[:, 1] - self.camera.cy) / self.camera.fy
-        constant, yaw, pitch = self.posterior.calibration
-        bias = measured[:, 3:MODELLED].sum(axis=1) + constant + yaw * x * x + pitch * x * y
-        return np.column_stack([measured[:, :2], measured[:, 2] - bias])
+    def as_calibrated(self, measured: np.ndarray) -> np.ndarray:
+        """(u, v, disparity) (K, 3) without errors of the calibration, and of landmarks (K, 6) their own errors."""
+        uvd = measured[:, :3] - measured_errors(self.camera, measured[:, :3]) @ self.posterior.calibration
+        uvd[:, 2] -= measured[:, 3:MODELLED].sum(axis=1)
+        return np.asarray(uvd)
 
 
 # ---- the equations

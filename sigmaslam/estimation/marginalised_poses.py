@@ -22,29 +22,37 @@ class PastPoses:
 
     Attributes:
         poses: (K, 4, 4) T_world_keyframe.
-        covariance: (6 K, 6 K) of them, perturbed from the left in the world.
+        covariance: (6 K, 6 K) of them, perturbed from the left in the world, as far as it comes from matches and motion.
         cross: (6 K, n) covariance with the window's state.
+        common: (6 K, 12) how considered errors of the calibration, of variance one, enter their errors.
     """
 
     poses: np.ndarray
     covariance: np.ndarray
     cross: np.ndarray
+    common: np.ndarray
 
     @classmethod
     def empty(cls) -> PastPoses:
         """None, beside a window without keyframes."""
-        return cls(np.zeros((0, 4, 4)), np.zeros((0, 0)), np.zeros((0, CALIBRATION_SIZE)))
+        none = np.zeros((0, CALIBRATION_SIZE))
+        return cls(np.zeros((0, 4, 4)), np.zeros((0, 0)), none, none)
+
+    @property
+    def whole_covariance(self) -> np.ndarray:
+        """(6 K, 6 K) with the part of the considered errors."""
+        return np.asarray(self.covariance + self.common @ self.common.T)
 
     def __len__(self) -> int:
         return len(self.poses)
 
     def relative(self, index: int) -> np.ndarray:
-        """(K, 6, 6) covariance of the pose `index` relative to each."""
-        place = past_slice(index)
-        blocks = self.covariance.reshape(len(self), 6, len(self), 6)
+        """(K, 6, 6) covariance of the pose `index` relative to each, with the part of the considered errors."""
+        place, whole = past_slice(index), self.whole_covariance
+        blocks = whole.reshape(len(self), 6, len(self), 6)
         each = blocks[np.arange(len(self)), :, np.arange(len(self))]
         across = blocks[:, :, index]
-        return np.asarray(each + self.covariance[place, place] - across - across.transpose(0, 2, 1))
+        return np.asarray(each + whole[place, place] - across - across.transpose(0, 2, 1))
 
     def closest(self, index: int) -> int:
         """The other pose relative to which the place of this one is known best."""
@@ -53,11 +61,18 @@ class PastPoses:
         doubt[index] = np.inf
         return int(doubt.argmin())
 
-    def relative_to(self, window: np.ndarray, index: int) -> np.ndarray:
-        """(6, 6) covariance of the window's last pose relative to the pose `index`; window (n, n) is its covariance."""
+    def relative_to(self, window: np.ndarray, common: np.ndarray, index: int) -> np.ndarray:
+        """(6, 6) covariance of the window's last pose relative to the pose `index`, with the considered errors' part.
+
+        Args:
+            window, common: (n, n), (n, 12) of its state.
+            index: of the past pose.
+        """
         place, last = past_slice(index), slice(len(window) - 6, len(window))
-        across = self.cross[place, last]
-        return np.asarray(window[last, last] + self.covariance[place, place] - across - across.T)
+        across, apart = self.cross[place, last], common[last] - self.common[place]
+        return np.asarray(
+            window[last, last] + self.covariance[place, place] - across - across.T + apart @ apart.T
+        )
 
     def grow(
         self, window: np.ndarray, step_covariance: np.ndarray, walk: np.ndarray, origin: int | None
@@ -67,7 +82,7 @@ class PastPoses:
         Args:
             window: (n, n) covariance before.
             step_covariance: (6, 6) of the new pose relative to the last one.
-            walk: (3,) variances that the calibration gains.
+            walk: (12,) variances that the calibration gains.
             origin: the pose of these that takes the place of the last one, where the window has none.
         """
         size = len(window)
@@ -87,17 +102,17 @@ class PastPoses:
         return grown, replace(self, cross=np.concatenate([self.cross, across], axis=1))
 
     def add_loop_constraint(
-        self, window: np.ndarray, index: int, difference: np.ndarray, covariance: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, PastPoses]:
+        self, window: np.ndarray, common: np.ndarray, index: int, difference: np.ndarray, covariance: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, PastPoses]:
         """Posterior when the window's last pose has been measured relative to the pose `index`.
 
         Args:
-            window: (n, n) covariance of its state before.
+            window, common: (n, n), (n, 12) of its state before.
             index: of the old pose.
             difference: (6,) by which the two should move against each other.
             covariance: (6, 6) of that.
         Returns:
-            (n,) step of the window's state, its covariance (n, n), and these.
+            (n,) step of the window's state, its covariance (n, n) and `common` (n, 12), and these.
         """
         old, last = past_slice(index), slice(len(window) - 6, len(window))
         # Covariances of the states with the difference that is measured: the last pose less the old one.
@@ -107,34 +122,42 @@ class PastPoses:
         gain = np.linalg.lstsq(innovation, by_window.T, rcond=1e-12)[0].T
         past_gain = np.linalg.lstsq(innovation, by_past.T, rcond=1e-12)[0].T
         root = matrix_root(window - gain @ by_window.T)
+        apart = common[last] - self.common[old]
         past = self.moved(
-            past_gain @ difference, self.covariance - past_gain @ by_past.T, self.cross - past_gain @ by_window.T
+            past_gain @ difference,
+            self.covariance - past_gain @ by_past.T,
+            self.cross - past_gain @ by_window.T,
+            self.common - past_gain @ apart,
         )
-        return gain @ difference, root @ root.T, past
+        return gain @ difference, root @ root.T, common - gain @ apart, past
 
     def drop(self, index: int) -> PastPoses:
         """Those but one."""
         rest = np.delete(np.arange(6 * len(self)), past_slice(index))
-        return PastPoses(np.delete(self.poses, index, axis=0), self.covariance[np.ix_(rest, rest)], self.cross[rest])
+        poses = np.delete(self.poses, index, axis=0)
+        return PastPoses(poses, self.covariance[np.ix_(rest, rest)], self.cross[rest], self.common[rest])
 
-    def append(self, pose: np.ndarray, window: np.ndarray, place: slice) -> PastPoses:
-        """These and a pose of the window, which stays there; window (n, n) is its covariance."""
+    def append(self, pose: np.ndarray, window: np.ndarray, common: np.ndarray, place: slice) -> PastPoses:
+        """These and a pose of the window, which stays there; window (n, n) and common (n, 12) are of its state."""
         across = self.cross[:, place]
         covariance = np.block([[self.covariance, across], [across.T, window[place, place]]])
         return PastPoses(
-            np.concatenate([self.poses, pose[None]]), covariance, np.concatenate([self.cross, window[place]])
+            np.concatenate([self.poses, pose[None]]),
+            covariance,
+            np.concatenate([self.cross, window[place]]),
+            np.concatenate([self.common, common[place]]),
         )
 
-    def moved(self, step: np.ndarray, covariance: np.ndarray, cross: np.ndarray) -> PastPoses:
-        """The poses moved by (6 K,), with another covariance."""
+    def moved(self, step: np.ndarray, covariance: np.ndarray, cross: np.ndarray, common: np.ndarray) -> PastPoses:
+        """The poses moved by (6 K,), with other errors."""
         poses = nearest_rigid(se3_exp(step.reshape(-1, 6)) @ self.poses)
-        return PastPoses(poses, 0.5 * (covariance + covariance.T), cross)
+        return PastPoses(poses, 0.5 * (covariance + covariance.T), cross, common)
 
-    def given(self, window: np.ndarray, information: np.ndarray, vector: np.ndarray) -> PastPoses:
+    def given(self, window: np.ndarray, common: np.ndarray, information: np.ndarray, vector: np.ndarray) -> PastPoses:
         """Their posterior when something is learned about the window.
 
         Args:
-            window: (n, n) covariance of its state before.
+            window, common: (n, n), (n, 12) of its state before.
             information, vector: (n, n), (n,) of what is learned: a factor exp(-x^T information x / 2 + vector^T x).
         """
         if not len(self):
@@ -143,10 +166,12 @@ class PastPoses:
         lower = np.linalg.cholesky(np.eye(len(factor.T)) + factor.T @ information @ factor)
         reduced = np.linalg.solve(lower, factor.T)
         half = np.linalg.solve(lower, factor.T @ information @ self.cross.T)
+        cross = self.cross - half.T @ reduced
         return self.moved(
-            self.cross @ vector - half.T @ (reduced @ vector),
+            cross @ vector,
             self.covariance - self.cross @ information @ self.cross.T + half.T @ half,
-            self.cross - half.T @ reduced,
+            cross,
+            self.common - cross @ (information @ common),
         )
 
 

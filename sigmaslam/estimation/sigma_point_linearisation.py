@@ -6,7 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sigmaslam.estimation.state_layout import CALIBRATION, LANDMARK_SIZE, MODELLED, pose_slice
+from sigmaslam.estimation.calibration_errors import measured_errors
+from sigmaslam.estimation.state_layout import (
+    CALIBRATION,
+    CALIBRATION_MODELLED,
+    LANDMARK_SIZE,
+    MODELLED,
+    pose_slice,
+)
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import se3_adjoint, se3_inverse
 from sigmaslam.inference.onnx_graph import load_step
@@ -45,6 +52,7 @@ class ViewLineariser:
     """
 
     def __init__(self, camera: RectifiedStereo, backend: str, unscented: bool) -> None:
+        self._camera = camera
         self._intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.focal_baseline])
         self._transfer = load_step("stereo_transfer", backend)
         self._unscented = unscented
@@ -65,7 +73,7 @@ class ViewLineariser:
 
         Args:
             poses: (K, 4, 4) T_world_camera.
-            calibration: (3,).
+            calibration: (12,) its errors.
             covariance: (n, n) of calibration and poses, which sigma points are drawn from.
             landmarks, landmark_covariance: (M, 6), (M, 6, 6) in their anchor keyframes.
             anchor, view: (M,) which of the poses a landmark is anchored to, and which sees it.
@@ -86,7 +94,7 @@ class ViewLineariser:
         for k, (from_, to) in enumerate(zip(anchors, sights, strict=True)):
             chain[k, :6, pose_slice(from_)] = adjoint[k]
             chain[k, :6, pose_slice(to)] -= adjoint[k]
-        chain[:, 6:, CALIBRATION] = np.eye(3)
+        chain[:, 6:, :CALIBRATION_MODELLED] = np.eye(CALIBRATION_MODELLED)
         floor = np.diag(np.r_[np.full(3, depth), np.ones(6)] * _MIN_SPREAD) ** 2
         joint = chain @ covariance @ chain.transpose(0, 2, 1) if self._unscented else np.zeros((len(pairs), 9, 9))
         spread = np.linalg.cholesky(_limited(0.5 * (joint + joint.transpose(0, 2, 1)), depth) + floor)
@@ -97,7 +105,7 @@ class ViewLineariser:
                 "relative": relative,
                 "spread": spread,
                 "pair": pair,
-                "calibration": calibration,
+                "calibration": calibration[:CALIBRATION_MODELLED],
                 "intrinsics": self._intrinsics,
                 "landmarks": landmarks[:, :MODELLED],
                 "landmark_spread": landmark_spread,
@@ -105,6 +113,11 @@ class ViewLineariser:
         )
         by_state = slopes[:, :, :9] @ (np.linalg.inv(spread) @ chain)[pair]
         by_landmark = np.concatenate([slopes[:, :, 9:] @ np.linalg.inv(landmark_spread), common], axis=2)
+        # A pair that is off sees each point as the calibrated pair sees another one, in the anchor and in the view.
+        in_anchor, in_view = (measured_errors(self._camera, uvd) for uvd in (landmarks[:, :3], mean))
+        by_error = (in_view - by_landmark[:, :, :3] @ in_anchor)[:, :, CALIBRATION_MODELLED:]
+        by_state[:, :, CALIBRATION_MODELLED : CALIBRATION.stop] = by_error
+        mean = mean + by_error @ calibration[CALIBRATION_MODELLED:]
         mean = mean + (common @ landmarks[:, MODELLED:, None])[..., 0]
         return Linearisation(mean, by_state, by_landmark, nonlinearity, in_front > 0.5)
 

@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sigmaslam.estimation.calibration_errors import CalibrationPrior
 from sigmaslam.estimation.gaussian import condition, matrix_root
-from sigmaslam.estimation.marginalised_poses import PastPoses
+from sigmaslam.estimation.marginalised_poses import PastPoses, past_slice
 from sigmaslam.estimation.state_layout import CALIBRATION, CALIBRATION_SIZE, pose_slice
 from sigmaslam.geometry.se3 import nearest_rigid, se3_exp, se3_inverse, se3_log
 
@@ -17,41 +18,53 @@ class WindowState:
     """Mean and covariance of calibration and poses, which are perturbed from the left in the world.
 
     Attributes:
-        calibration: (3,) disparity offset, and what yaw and pitch of the right camera add to disparities, pixels.
+        calibration: (12,) errors of the calibration, see `calibration_errors.ERRORS`.
         poses: (K, 4, 4) T_world_keyframe, the oldest first.
-        covariance: (3 + 6 K, 3 + 6 K) of both.
+        covariance: (12 + 6 K, 12 + 6 K) of both, as far as it comes from matches and motion.
+        common: (12 + 6 K, 12) how considered errors of the calibration, of variance one, enter the errors of both.
         past: marginalised poses, jointly Gaussian with the state.
     """
 
     calibration: np.ndarray
     poses: np.ndarray
     covariance: np.ndarray
+    common: np.ndarray
     past: PastPoses
 
     @classmethod
-    def initial(cls, calibration_sigma: np.ndarray) -> WindowState:
-        """No poses; a calibration error of mean zero with standard deviations (3,), pixels."""
-        covariance = np.diag(calibration_sigma.astype(float) ** 2)
-        return cls(np.zeros(CALIBRATION_SIZE), np.zeros((0, 4, 4)), covariance, PastPoses.empty())
+    def initial(cls, calibration: CalibrationPrior) -> WindowState:
+        """No poses; calibration errors of mean zero."""
+        covariance, common = calibration.estimated_covariance, calibration.considered_factor
+        return cls(np.zeros(CALIBRATION_SIZE), np.zeros((0, 4, 4)), covariance, common, PastPoses.empty())
 
     def __len__(self) -> int:
         return len(self.poses)
+
+    @property
+    def whole_covariance(self) -> np.ndarray:
+        """(n, n) covariance with the part of the considered errors."""
+        return np.asarray(self.covariance + self.common @ self.common.T)
 
     def minus(self, other: WindowState) -> np.ndarray:
         """(n,) error-state difference of two means."""
         poses = se3_log(self.poses @ se3_inverse(other.poses)).ravel()
         return np.r_[self.calibration - other.calibration, poses]
 
-    def moved(self, step: np.ndarray, covariance: np.ndarray) -> WindowState:
-        """The means moved by an error-state step (n,), with another covariance; marginalised poses stay."""
+    def moved(self, step: np.ndarray, covariance: np.ndarray, common: np.ndarray) -> WindowState:
+        """The means moved by an error-state step (n,), with other errors; marginalised poses stay."""
         poses = nearest_rigid(se3_exp(step[CALIBRATION_SIZE:].reshape(-1, 6)) @ self.poses)
-        return replace(self, calibration=self.calibration + step[CALIBRATION], poses=poses, covariance=covariance)
+        calibration = self.calibration + step[CALIBRATION]
+        return replace(self, calibration=calibration, poses=poses, covariance=covariance, common=common)
 
     def given(self, information: np.ndarray, vector: np.ndarray) -> WindowState:
         """Posterior when exp(-x^T information x / 2 + vector^T x) is learned about the error state x."""
-        past = self.past.given(self.covariance, information, vector)
+        past = self.past.given(self.covariance, self.common, information, vector)
         step, covariance = condition(matrix_root(self.covariance), information, vector)
-        return replace(self.moved(step, covariance), past=past)
+        return replace(self.moved(step, covariance, self.common_given(covariance, information)), past=past)
+
+    def common_given(self, covariance: np.ndarray, information: np.ndarray) -> np.ndarray:
+        """(n, 12) `common` after an update with that information and that posterior covariance, by its gain."""
+        return np.asarray(self.common - covariance @ (information @ self.common))
 
     def grow(
         self, pose: np.ndarray, step_covariance: np.ndarray, walk: np.ndarray, origin: int | None = None
@@ -61,23 +74,31 @@ class WindowState:
         Args:
             pose: (4, 4) mean of T_world_keyframe.
             step_covariance: (6, 6) of it relative to the last keyframe, perturbed from the left in the world.
-            walk: (3,) variances by which the calibration may have moved since.
+            walk: (12,) variances by which the calibration may have moved since.
             origin: in an empty window, the marginalised pose that takes the place of the last keyframe; the world by
                 default.
         """
         covariance, past = self.past.grow(self.covariance, step_covariance, walk, origin)
         poses = np.concatenate([self.poses, nearest_rigid(pose)[None]])
-        return replace(self, poses=poses, covariance=covariance, past=past)
+        common = np.zeros((6, CALIBRATION_SIZE))
+        if len(self):
+            common = self.common[-6:]
+        elif origin is not None:
+            common = self.past.common[past_slice(origin)]
+        return replace(
+            self, poses=poses, covariance=covariance, common=np.concatenate([self.common, common]), past=past
+        )
 
     def marginalise_oldest(self) -> WindowState:
         """Moves the oldest pose to the past."""
         oldest = pose_slice(0)
         remaining = np.r_[0:CALIBRATION_SIZE, oldest.stop : len(self.covariance)]
-        past = self.past.append(self.poses[0], self.covariance, oldest)
+        past = self.past.append(self.poses[0], self.covariance, self.common, oldest)
         return replace(
             self,
             poses=self.poses[1:],
             covariance=self.covariance[np.ix_(remaining, remaining)],
+            common=self.common[remaining],
             past=replace(past, cross=past.cross[:, remaining]),
         )
 
@@ -90,8 +111,10 @@ class WindowState:
             covariance: (6, 6) of that, perturbed from the left in the world.
         """
         difference = self.loop_difference(index, T_past_last)
-        step, posterior, past = self.past.add_loop_constraint(self.covariance, index, difference, covariance)
-        return replace(self.moved(step, posterior), past=past)
+        step, posterior, common, past = self.past.add_loop_constraint(
+            self.covariance, self.common, index, difference, covariance
+        )
+        return replace(self.moved(step, posterior, common), past=past)
 
     def loop_difference(self, index: int, T_past_last: np.ndarray) -> np.ndarray:
         """(6,) by which the last pose must move in the world to agree with a measurement from a marginalised one."""
@@ -103,5 +126,5 @@ class WindowState:
 
     def without_poses(self) -> WindowState:
         """What is known of the calibration alone."""
-        covariance = self.covariance[CALIBRATION, CALIBRATION]
-        return WindowState(self.calibration, np.zeros((0, 4, 4)), covariance, PastPoses.empty())
+        covariance, common = self.covariance[CALIBRATION, CALIBRATION], self.common[CALIBRATION]
+        return WindowState(self.calibration, np.zeros((0, 4, 4)), covariance, common, PastPoses.empty())

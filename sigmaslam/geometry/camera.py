@@ -8,6 +8,7 @@ from typing import Any, Literal, Self, get_args
 import numpy as np
 
 from sigmaslam.errors import CalibrationError
+from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.geometry.checked_yaml import CalibrationYaml
 
 DistortionModel = Literal["none", "radtan", "equidistant"]
@@ -205,6 +206,7 @@ class StereoCamera:
         left, right: the two cameras.
         T_left_right: (4, 4) float64, read-only; maps right-camera points into the left frame, metres. Its
             translation is the position of the right camera in the left frame.
+        sigmas: how well all this is known.
 
     Raises:
         CalibrationError: T_left_right is no rigid transformation, or the right camera is not to the right.
@@ -213,6 +215,7 @@ class StereoCamera:
     left: CameraModel
     right: CameraModel
     T_left_right: np.ndarray
+    sigmas: CalibrationSigmas = CalibrationSigmas()
 
     def __post_init__(self) -> None:
         T = np.array(self.T_left_right, dtype=np.float64)
@@ -272,6 +275,7 @@ class StereoCamera:
                    distortion: [-0.283, 0.0740, 0.0002, 0.00002]}   # optional, []
             right: {...}
             T_left_right: [[1, 0, 0, 0.11], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+            sigmas: {focal: 0.003}                 # optional, see `CalibrationSigmas`; 0: without errors
 
         Raises:
             CalibrationError: the file cannot be read, a key is missing or wrong; names file, key and value.
@@ -280,7 +284,7 @@ class StereoCamera:
         left, right = (_camera_from_yaml(content.section(eye)) for eye in ("left", "right"))
         T_left_right = content.numbers("T_left_right", (4, 4))
         try:
-            return cls(left, right, T_left_right)
+            return cls(left, right, T_left_right, CalibrationSigmas.from_yaml(content))
         except CalibrationError as error:
             raise content.error(str(error)) from None
 

@@ -101,7 +101,7 @@ class BodyAdmission:
             return usable & pixels_in(self._region, view.features.keypoints)
         index = np.flatnonzero(usable)
         # The shape is that of measured disparities but for what they are off by.
-        index = index[self._shape.holds(pose, window.true_disparity(view.measured(index)))]
+        index = index[self._shape.holds(pose, window.as_calibrated(view.measured(index)))]
         index = index[~self._stands_still(view, index, pose)]
         self._references = [self._references[0], *self._references[1:][-_REFERENCES + 1 :], (view, pose)]
         admitted = np.zeros(len(view.disparity), bool)
@@ -117,7 +117,7 @@ class BodyAdmission:
             self._shape.add(landmarks.id, self._camera.triangulate(landmarks.measured[:, :3]))
         rows = views.landmark
         away = np.linalg.norm(views.measurement[:, :2] - landmarks.measured[rows, :2], axis=1)
-        uvd = window.true_disparity(landmarks.estimate[rows])
+        uvd = window.as_calibrated(landmarks.estimate[rows])
         sure = (away > _MOVED) & (uvd[:, 2] > _MIN_DISPARITY)
         rows = rows[sure]
         anchor = poses[landmarks.anchor[rows]]

@@ -30,8 +30,6 @@ class TrackerConfig:
         start_turn: of the angular velocity, rad/s.
         offset_sigma: prior of the disparity offset, pixels.
         offset_walk: its random walk, pixels per root second.
-        turn_sigma: prior of what a turn of the right camera (yaw, pitch) does to disparities at unit normalised
-            coordinates, pixels; zero switches these states off.
         linearisation: "unscented" or "extended".
         iterations: linearisations in a frame's update.
         window: keyframes that are estimated jointly.
@@ -58,7 +56,6 @@ class TrackerConfig:
     start_turn: float = 1.0
     offset_sigma: float = 0.5
     offset_walk: float = 0.02
-    turn_sigma: float = 0.0
     linearisation: str = "unscented"
     iterations: int = 2
     window: int = 6

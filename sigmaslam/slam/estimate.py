@@ -39,6 +39,8 @@ class Estimate:
         nis, dof: normalised innovation squared and its degrees of freedom; 0 without an update.
         calibration: of the stereo pair.
         milliseconds: wall time by stage.
+        matching_covariance: (6, 6) the part of the covariance that comes from matches and motion; the rest comes from
+            errors of the calibration.
         frame_covariance: (6, 6) the part of the covariance that the frame's matches add to that of its keyframe; zero
             without them.
         tracks: what the frame saw, where it became a keyframe.
@@ -55,6 +57,7 @@ class Estimate:
     dof: int
     calibration: CalibrationEstimate
     milliseconds: dict[str, float] = field(default_factory=dict)
+    matching_covariance: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
     frame_covariance: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
     tracks: KeyframeTracks | None = None
 

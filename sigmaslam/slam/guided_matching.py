@@ -152,7 +152,7 @@ class GuidedMatcher:
             feature = landmarks.feature[rows[chosen]]
             maps = None
             if key.slope is not None:
-                measured = self.window.true_disparity(landmarks.estimate[rows[chosen]])
+                measured = self.window.as_calibrated(landmarks.estimate[rows[chosen]])
                 maps = plane_maps(self.camera, measured, key.slope[feature], T_view_key[anchor])
             places = predicted[chosen]
             yield anchor, rows[chosen], KeypointSearch(key, feature, places[:, :2], S[chosen], maps, places[:, 2])

@@ -131,7 +131,7 @@ class Keyframes:
         state = self._window.posterior
         past = state.past
         for k, pose in enumerate(state.poses):
-            past = past.append(pose, state.covariance, pose_slice(k))
+            past = past.append(pose, state.covariance, state.common, pose_slice(k))
         return pack_keyframes([*self.remembered, *self.active], past, frontend, camera)
 
     def _remember(self, keyframe: Keyframe, spare: Keyframe | None = None) -> None:

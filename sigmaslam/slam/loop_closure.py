@@ -55,7 +55,7 @@ class LoopCloser:
         """Keyframes that left the window long ago and should see what its newest one sees."""
         state = self.window.posterior
         pose, place = state.poses[-1], pose_slice(len(state) - 1)
-        sigma = np.sqrt(np.trace(se3_body(pose, state.covariance[place, place])[:3, :3]))
+        sigma = np.sqrt(np.trace(se3_body(pose, state.whole_covariance[place, place])[:3, :3]))
         reach = self.window.depth + _REACH_SIGMAS * sigma
 
         def is_near(keyframe: Keyframe) -> bool:

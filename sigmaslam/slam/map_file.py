@@ -30,7 +30,7 @@ def pack_keyframes(
     views = [keyframe.view for keyframe in keyframes]
     arrays: dict[str, Any] = {
         "poses": past.poses,
-        "covariance": past.covariance,
+        "covariance": past.whole_covariance,
         "timestamps": np.array([keyframe.timestamp for keyframe in keyframes]),
         "images": np.stack([view.left for view in views]),
         "counts": np.array([len(view.disparity) for view in views]),
@@ -90,7 +90,8 @@ def read_keyframes(path: Path, frontend: str, camera: RectifiedStereo) -> tuple[
         )
         keyframes.append(Keyframe(k, float(arrays[_PREFIX + "timestamps"][k]), view))
     joint = arrays[_PREFIX + "covariance"]
-    return keyframes, PastPoses(arrays[_PREFIX + "poses"], joint, np.zeros((len(joint), CALIBRATION_SIZE)))
+    none = np.zeros((len(joint), CALIBRATION_SIZE))
+    return keyframes, PastPoses(arrays[_PREFIX + "poses"], joint, none, none)
 
 
 def _intrinsics(camera: RectifiedStereo) -> np.ndarray:

@@ -10,6 +10,7 @@ from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
+from sigmaslam.estimation.state_layout import CALIBRATION_SIZE
 from sigmaslam.frontend import StereoView
 from sigmaslam.frontend.feature_spacing import select_spaced
 from sigmaslam.frontend.plane_alignment import disparity_slopes
@@ -145,7 +146,8 @@ class Mapper:
         if len(window):
             step_covariance = turn_covariance(window.posterior.poses[-1], step_covariance)
         since = new.timestamp - keyframes.active[-1].timestamp if keyframes.active else 0.0
-        walk = np.array([self.config.offset_walk**2 * since, 0.0, 0.0])
+        walk = np.zeros(CALIBRATION_SIZE)
+        walk[0] = self.config.offset_walk**2 * since
         disparity = max(float(np.nanmedian(new.view.disparity)), _MIN_DISPARITY)
         depth = self.camera.focal_baseline / disparity
         window.add_keyframe(new.pose, new.step, step_covariance, walk, depth, new.origin)

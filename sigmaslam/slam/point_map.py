@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sigmaslam.estimation.calibration_errors import measured_errors
 from sigmaslam.estimation.gaussian import project_covariance
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.marginalised_poses import PastPoses, past_slice, point_lever
-from sigmaslam.estimation.state_layout import LANDMARK_SIZE, MODELLED, pose_slice
+from sigmaslam.estimation.state_layout import CALIBRATION, LANDMARK_SIZE, MODELLED, pose_slice
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import se3_inverse, transform_points, turn_covariance
 from sigmaslam.table import Table
@@ -71,7 +72,7 @@ def points_in_world(parts: list[PointMap], past: PastPoses) -> PointMap:
     for index, part in enumerate(parts):
         place = past_slice(index)
         points = part.transform(past.poses[index])
-        spread = project_covariance(point_lever(points.points), past.covariance[place, place])
+        spread = project_covariance(point_lever(points.points), past.whole_covariance[place, place])
         whole.append(replace(points, covariances=points.covariances + spread))
     return merge_maps(whole)
 
@@ -109,7 +110,7 @@ def _triangulate(
 ) -> PointMap:
     """Points in the world; their covariances with that of the anchor's pose, or given it."""
     landmarks, state = window.landmarks, window.posterior
-    uvd = window.true_disparity(landmarks.estimate)
+    uvd = window.as_calibrated(landmarks.estimate)
     kept = chosen & (landmarks.views >= min_views) & (uvd[:, 2] > _MIN_DISPARITY)
     uvd, landmarks = uvd[kept], landmarks.select(kept)
     if not len(landmarks):
@@ -121,14 +122,14 @@ def _triangulate(
     by_landmark = np.concatenate([by_disparity, -by_disparity[:, :, 2:], unmoved], axis=2)
     points = (R @ points[..., None])[..., 0] + state.poses[landmarks.anchor, :3, 3]
     by_state = by_landmark @ landmarks.dependence
-    by_state[:, :, 0] -= by_disparity[:, :, 2]
+    by_state[:, :, CALIBRATION] -= by_disparity @ measured_errors(window.camera, landmarks.estimate[:, :3])
     # Landmarks depend on poses relative to the anchor alone: without its lever this is what remains given its pose.
     if absolute:
         lever = point_lever(points)
         for anchor in np.unique(landmarks.anchor):
             rows = landmarks.anchor == anchor
             by_state[rows, :, pose_slice(anchor)] += lever[rows]
-    covariances = by_state @ state.covariance @ by_state.transpose(0, 2, 1)
+    covariances = by_state @ state.whole_covariance @ by_state.transpose(0, 2, 1)
     covariances += by_landmark @ landmarks.covariance @ by_landmark.transpose(0, 2, 1)
     by_surface = _EITHER_SURFACE * landmarks.disparity_range[:, None, None] * by_disparity[:, :, 2:]
     covariances += by_surface @ by_surface.transpose(0, 2, 1)

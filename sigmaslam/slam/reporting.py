@@ -9,7 +9,7 @@ import numpy as np
 from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
-from sigmaslam.estimation.state_layout import CALIBRATION, pose_slice
+from sigmaslam.estimation.state_layout import CALIBRATION, CALIBRATION_SIZE, pose_slice
 from sigmaslam.geometry.se3 import se3_adjoint, se3_inverse, turn_covariance
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.slam.guided_matching import GuidedMatches
@@ -47,14 +47,15 @@ class Reporter:
         """What is known after a frame; without a fit by the prediction, without a keyframe nothing."""
         state = self.window.posterior
         calibration, spread = state.calibration, state.covariance[CALIBRATION, CALIBRATION]
+        by_error = np.zeros((6, CALIBRATION_SIZE))
         if fit is not None:
             pose, absolute, relative = fit.pose, fit.covariance, fit.relative
-            calibration, spread = fit.calibration, fit.calibration_covariance
+            calibration, spread, by_error = fit.calibration, fit.calibration_covariance, fit.common
         elif len(state):
             prediction = Prediction.of(self.window, self.motion)
             last = pose_slice(len(state) - 1)
             pose, relative = prediction.pose, prediction.covariance
-            absolute = state.covariance[last, last] + relative
+            absolute, by_error = state.covariance[last, last] + relative, state.common[last]
         else:
             pose = np.eye(4)
             relative = absolute = (_ANYWHERE if self.course.phase is Phase.WAITING_IN_MAP else 0.0) * np.eye(6)
@@ -62,12 +63,14 @@ class Reporter:
         T_left_rectified = se3_inverse(self.T_rectified_left)
         adjoint = se3_adjoint(T_left_rectified) @ se3_adjoint(se3_inverse(pose))
         belief = 1.0 - np.sqrt(max(np.linalg.eigvalsh(turn_covariance(se3_inverse(pose), relative))[-1], 0.0))
-        covariance = adjoint @ absolute @ adjoint.T
+        matching = adjoint @ absolute @ adjoint.T
+        covariance = matching + (adjoint @ by_error) @ (adjoint @ by_error).T
         frame_covariance = adjoint @ relative @ adjoint.T if fit is not None else np.zeros((6, 6))
         return Estimate(
             timestamp=timestamp,
             T_world_camera=T_left_rectified @ pose @ self.T_rectified_left,
             covariance=0.5 * (covariance + covariance.T),
+            matching_covariance=0.5 * (matching + matching.T),
             status=status,
             belief=float(np.clip(belief, 0.0, 1.0)),
             matches=len(matches.probability),

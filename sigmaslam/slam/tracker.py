@@ -10,6 +10,7 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from sigmaslam.errors import InputError
+from sigmaslam.estimation.calibration_errors import CalibrationPrior
 from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.frame_update import FrameUpdate
@@ -79,8 +80,8 @@ class StereoTracker:
         self._beside = ThreadPoolExecutor(1, "keyframe") if threads > 1 else None
         self._admission = admission = admission or AdmitAll(config.min_inliers)
         lineariser = ViewLineariser(rectified, backend, config.linearisation == "unscented")
-        calibration_sigma = np.array([config.offset_sigma, config.turn_sigma, config.turn_sigma])
-        self._window = window = KeyframeWindow(rectified, calibration_sigma, lineariser)
+        prior = CalibrationPrior.of(rectified, camera.sigmas, config.offset_sigma)
+        self._window = window = KeyframeWindow(rectified, prior, lineariser)
         self._noise = noise = MeasurementNoise(config)
         self._motion = motion = MotionFilter(backend)
         self._course = course = Course()

@@ -48,9 +48,9 @@ class UnguidedMatcher:
         place = np.full(len(rows), self.config.keyframe_sigma)
         relative = estimate_relative_pose(
             self.camera,
-            self.window.true_disparity(key.measured(rows)),
+            self.window.as_calibrated(key.measured(rows)),
             np.column_stack([place, place, key.disparity_sigma[rows]]),
-            self.window.true_disparity(matches.measured),
+            self.window.as_calibrated(matches.measured),
             self.noise.of_matches(matches),
             matches.probability,
         )

@@ -181,7 +181,7 @@ def test_a_turned_right_camera_is_taken_out_of_the_disparity():
     biased = window_of(truth + np.array([0, 0, 1]) * (0.3 + 2 * x * x - x * y)[:, None])
     biased.posterior = replace(biased.posterior, calibration=calibration)
     # To first order: the bias is taken at the measured disparity.
-    np.testing.assert_allclose(biased.true_disparity(biased.landmarks.measured), truth, atol=0.02)
+    np.testing.assert_allclose(biased.as_calibrated(biased.landmarks.measured), truth, atol=0.02)
 
 
 def test_merged_maps_hold_all_points():

@@ -1,0 +1,90 @@
+"""What errors of a stereo calibration do to the measurements of a rectified pair.
+
+The disparity offset is estimated. The others are consider parameters (Schmidt 1966; Tapley, Schutz and Born 2004, chapter
+6): images hardly tell them from motion, so they are not moved, and poses are estimated as if they were zero; but what
+they do to every pose and map point is carried along, and is part of their covariance. With the gains of Schmidt's filter,
+which trusts views less for them, the KITTI drive was three times worse: every window made up a calibration of its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
+from sigmaslam.geometry.camera import RectifiedStereo
+
+ERRORS = (
+    "offset",  # disparity, everywhere
+    "yaw",  # of the right camera: disparity, with x^2
+    "pitch",  # of the right camera: disparity, with x y
+    "roll",  # of the right camera: disparity, with y
+    "zoom",  # of the right camera against the left one: disparity, with x
+    "bend",  # disparity, with y^2
+    "lenses",  # their difference: disparity, with x r^2
+    "focal",  # of both: places along their rays, and disparity, relative
+    "centre_u",  # principal point of both: places
+    "centre_v",
+    "lens",  # of both: places, with r^3 along their rays
+    "baseline",  # disparity, relative
+)
+"""In the order of the state. `focal` and `baseline` are relative; the others are pixels, at unit normalised coordinates."""
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationPrior:
+    """What is known of the errors of a calibration before any image; their mean is zero.
+
+    Attributes:
+        sigma: (12,) standard deviations, in the units and order of `ERRORS`.
+        estimated: (12,) bool, those that images may move; the others are considered.
+    """
+
+    sigma: np.ndarray
+    estimated: np.ndarray
+
+    @property
+    def estimated_covariance(self) -> np.ndarray:
+        """(12, 12) of those that are estimated, zero for the others."""
+        return np.diag(np.where(self.estimated, self.sigma, 0.0) ** 2)
+
+    @property
+    def considered_factor(self) -> np.ndarray:
+        """(12, 12) factor of the covariance of those that are considered, zero for the others."""
+        return np.diag(np.where(self.estimated, 0.0, self.sigma))
+
+    @classmethod
+    def of(cls, camera: RectifiedStereo, sigmas: CalibrationSigmas, offset_sigma: float) -> CalibrationPrior:
+        """Of a pair whose disparity offset alone is estimated; its standard deviation is in pixels."""
+        turn, lens = camera.fx * sigmas.rotation, camera.fx * sigmas.distortion
+        centre = camera.fx * sigmas.principal_point
+        in_disparity = (offset_sigma, turn, turn, turn, lens, lens, lens)
+        return cls.independent(
+            np.array([*in_disparity, sigmas.focal, centre, centre, lens, sigmas.baseline]), "offset"
+        )
+
+    @classmethod
+    def independent(cls, sigma: np.ndarray, *estimated: str) -> CalibrationPrior:
+        """Independent errors with standard deviations (12,); `estimated` are names of `ERRORS`."""
+        return cls(np.asarray(sigma, float), np.isin(ERRORS, estimated))
+
+
+def measured_errors(camera: RectifiedStereo, uvd: np.ndarray) -> np.ndarray:
+    """(M, 3, 12) by how much each error, of size one, changes what is measured of points, to first order.
+
+    Args:
+        camera: as calibrated.
+        uvd: (M, 3) (u, v, disparity).
+    """
+    u, v, disparity = uvd.T
+    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+    x_right, squared = x - disparity / camera.fx, x * x + y * y
+    errors = np.zeros((len(uvd), 3, len(ERRORS)))
+    in_disparity = (np.ones_like(x), x_right * x_right, x_right * y, y, x, y * y, x * squared)
+    errors[:, 2, : len(in_disparity)] = np.stack(in_disparity, axis=1)
+    errors[:, 0, 7], errors[:, 1, 7], errors[:, 2, 7] = camera.fx * x, camera.fy * y, disparity
+    errors[:, 0, 8] = errors[:, 1, 9] = 1.0
+    errors[:, 0, 10], errors[:, 1, 10] = x * squared, y * squared
+    errors[:, 2, 11] = disparity
+    return errors
