@@ -101,7 +101,7 @@ def read_frame_pairs(path: Path, count: int) -> FramePairs:
     if shapes != ((rows,), (rows,), (rows,), (rows, 4, 4), (rows, 6, 6)):
         raise InputError(f"{path}: its arrays are {', '.join(map(str, shapes))}, which do not go together; {mend}")
     frames = np.concatenate([pairs.earlier, pairs.later])
-    if rows and not (0 <= frames.min() and frames.max() < count):
+    if rows and not (frames.min() >= 0 and frames.max() < count):
         raise InputError(
             f"{path}: has frame {frames.max()}, but trajectory.tum beside it has {count} poses: "
             "both must come from the same run"
