@@ -61,8 +61,11 @@ class SpanConsistency:
 
     @property
     def truth_rules(self) -> bool:
-        """The truth is no better than the estimate: more than half of the covariances is the truth's."""
-        return self.truth_share > 0.5
+        """The truth is no better than the estimate: it makes more than half of the covariances, and of what is seen.
+
+        An estimate that is too sure of itself leaves nearly all of the covariances to the truth; its errors tell.
+        """
+        return self.truth_share > 0.5 * max(1.0, self.mean_nees)
 
 
 def truth_covariance(position_sigma: float, rotation_sigma_deg: float) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -143,17 +144,29 @@ def test_a_noisy_truth_counts_by_its_sigmas():
 
 
 def test_half_of_the_covariance_is_where_the_truth_begins_to_rule():
+    """Of errors that are no larger than both say: here none."""
     truth = winding_path()
     pairs = pairs_of(truth, {"10 m": 10})
+    pairs = replace(pairs, pose=se3_inverse(truth.poses[pairs.earlier]) @ truth.poses[pairs.later])
     own = np.tile(np.diag(SIGMA**2), (COUNT, 1, 1))
     for factor, rules in ((0.9, False), (1.1, True)):
         of_truth = factor * own
         relative = se3_inverse(truth.poses[pairs.earlier]) @ truth.poses[pairs.later]
         whole = relative_truth_covariance(relative, of_truth[pairs.earlier], of_truth[pairs.later])
-        pairs = FramePairs(pairs.span, pairs.earlier, pairs.later, pairs.pose, whole / factor)
+        pairs = replace(pairs, covariance=whole / factor)
         (span,) = relative_consistency(pairs, truth, truth, of_truth)
         assert span.truth_share == pytest.approx(factor / (1.0 + factor), rel=1e-6)
         assert span.truth_rules == rules
+
+
+def test_an_estimate_that_is_too_sure_does_not_make_the_truth_rule():
+    """Errors of ten sigmas of the truth are the estimate's, whatever it claims."""
+    truth = winding_path()
+    of_truth = np.tile(0.01 * np.diag(SIGMA**2), (COUNT, 1, 1))
+    (span,) = relative_consistency(pairs_of(truth, {"1 m": 1}, claimed=1e-4), truth, truth, of_truth)
+    assert span.truth_share > 0.9
+    assert span.mean_nees > 10
+    assert not span.truth_rules
 
 
 # ---- the file, and the run folder
