@@ -12,6 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sigmaslam.errors import InputError
+from sigmaslam.evaluation.metrics.map_consistency import coverage
+from sigmaslam.evaluation.metrics.relative_consistency import SpanConsistency, relative_consistency, truth_covariance
 from sigmaslam.evaluation.metrics.trajectory_errors import (
     MAX_DIFFERENCE,
     AbsoluteError,
@@ -27,11 +29,13 @@ from sigmaslam.evaluation.metrics.trajectory_errors import (
     relative_pose_error,
     synchronise,
 )
-from sigmaslam.geometry.se3 import se3_inverse
+from sigmaslam.evaluation.relative_summary import draw_relative, format_relative, span_to_dict
+from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.plot_style import BLUE, VERMILLION, style_axes
 from sigmaslam.readers.trajectory_files import check_covariances, kitti_times_path, read_trajectory, trajectory_format
 from sigmaslam.runs.figures import AXIS_NAMES, plot_trajectory, save_png
+from sigmaslam.runs.relative_pose_file import RELATIVE_POSES_NAME, read_frame_pairs
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +53,7 @@ class Evaluation:
         rpe: error of the motion from frame to frame.
         kitti: segment errors.
         nees: of poses relative to the first; None where there is no covariance.
+        relative: consistency of poses relative to earlier ones, by span; None where the run does not say.
         figure_path: the plots; None where none were asked for.
     """
 
@@ -64,6 +69,7 @@ class Evaluation:
     rpe: RelativeError
     kitti: KittiErrors
     nees: PoseNees | None
+    relative: tuple[SpanConsistency, ...] | None
     figure_path: Path | None
 
     @property
@@ -76,7 +82,8 @@ class Evaluation:
         rpe, nees = asdict(self.rpe), asdict(self.nees) if self.nees else None
         del rpe["translations"], rpe["rotations_deg"]
         if nees:
-            nees["count"] = len(nees.pop("per_frame"))
+            per_frame = nees.pop("per_frame")
+            nees |= {"count": len(per_frame), "inside": coverage(per_frame, 6)}
             del nees["timestamps"]
         result = {
             "estimate": str(self.estimate_path),
@@ -92,6 +99,7 @@ class Evaluation:
             "rpe": rpe,
             "kitti": asdict(self.kitti),
             "nees": nees,
+            "relative": None if self.relative is None else [span_to_dict(span) for span in self.relative],
             "figure": str(self.figure_path) if self.figure_path else None,
         }
         return {key: _plain(value) for key, value in result.items()}
@@ -104,6 +112,8 @@ def evaluate_run(
     lengths: Sequence[float] | None = None,
     step: int | None = None,
     plot: bool = True,
+    truth_sigma_position: float | None = None,
+    truth_sigma_rotation: float | None = None,
 ) -> Evaluation:
     """Compare a run folder or a trajectory file with the truth.
 
@@ -115,10 +125,13 @@ def evaluate_run(
 
     Args:
         run_or_trajectory: a folder with `trajectory.tum` (and `covariance.npy`, (N, 6, 6) in the body frame),
-            or a TUM or KITTI file.
+            or a TUM or KITTI file. Poses relative to earlier ones are judged where it holds `relative_poses.npz`.
         truth: TUM, KITTI, or EuRoC ground truth.
         lengths, step: segments of the KITTI errors (see `kitti_errors`).
         plot: write `evaluation.png` into the run folder or beside the trajectory.
+        truth_sigma_position, truth_sigma_rotation: standard deviations of each true pose, of each coordinate (metres)
+            and about each axis (degrees), for the poses relative to earlier ones; where one alone is given the other is
+            zero.
     Raises:
         InputError: a file is missing or wrong, or the timestamps do not meet.
     """
@@ -135,7 +148,10 @@ def evaluate_run(
             f"{len(paired)} of the {len(estimate)} poses of {estimate_path} have such times: put the "
             "times.txt of the images beside the pose file"
         )
-    if is_run and _follows_object(run_or_trajectory):
+    follows_object = is_run and _follows_object(run_or_trajectory)
+    sigmas = truth_sigma_position, truth_sigma_rotation
+    relative = _judge_relative_poses(run_or_trajectory, estimate, true, sigmas, follows_object) if is_run else None
+    if follows_object:
         true = _of_followed_frame(estimate, true)
     covariance = _read_covariance(run_or_trajectory / "covariance.npy", len(estimate)) if is_run else None
     matched_estimate, matched_truth = synchronise(estimate, true)
@@ -152,6 +168,7 @@ def evaluate_run(
         rpe=relative_pose_error(estimate, true),
         kitti=kitti_errors(estimate, true, lengths, step),
         nees=pose_nees(estimate, true, covariance) if covariance is not None else None,
+        relative=relative,
         figure_path=estimate_path.parent / "evaluation.png" if plot else None,
     )
     if evaluation.figure_path:
@@ -202,9 +219,10 @@ def format_evaluation(evaluation: Evaluation) -> str:
         lines += [
             "",
             f"NEES per degree of freedom (1 is right, more is overconfident): {e.nees.mean:.2f}; translation "
-            f"{e.nees.mean_translation:.2f}, rotation {e.nees.mean_rotation:.2f}, median {e.nees.median:.2f}",
+            f"{e.nees.mean_translation:.2f}, rotation {e.nees.mean_rotation:.2f}, median {e.nees.median:.2f}; "
+            f"inside 95 %: {100 * coverage(e.nees.per_frame, 6):.0f} %",
         ]
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, "", *format_relative(e.relative)]) + "\n"
 
 
 def draw_evaluation(
@@ -220,8 +238,10 @@ def draw_evaluation(
         estimate, truth: trajectories in one clock.
         covariance: (N, 6, 6) of the estimate, body frame, translation first.
     """
-    figure = Figure(figsize=(11, 11), layout="constrained")
-    grid = figure.add_gridspec(3, 2, height_ratios=(1.5, 1, 1))
+    spans = evaluation.relative or ()
+    rows = (1.5, 1, 1, 1) if spans else (1.5, 1, 1)
+    figure = Figure(figsize=(11, 2.0 + 2.6 * sum(rows) - 0.1), layout="constrained")
+    grid = figure.add_gridspec(len(rows), 2, height_ratios=rows)
     matched_estimate, matched_truth = synchronise(estimate, truth)
     aligned = align(matched_estimate, matched_truth, "se3")
     seconds = matched_estimate.timestamps - matched_estimate.timestamps[0]
@@ -264,6 +284,9 @@ def draw_evaluation(
         _draw_segments(panel, kitti.lengths, by_length, mean)
         panel.set(xlabel="segment length [m]", ylabel=label)
         panels.append(panel)
+    if spans:
+        panels += [figure.add_subplot(grid[3, 0]), figure.add_subplot(grid[3, 1])]
+        draw_relative(panels[-2], panels[-1], spans)
     for panel in panels:
         style_axes(panel)
     return figure
@@ -281,6 +304,27 @@ def _draw_segments(panel: Axes, lengths: np.ndarray, by_length: np.ndarray, mean
     panel.set_xticks(lengths)
     panel.set_ylim(0, 1.2 * max(float(np.max(by_length)), 1e-9))
     panel.legend(fontsize=8, loc="best")
+
+
+def _judge_relative_poses(
+    run: Path,
+    estimate: Trajectory,
+    truth: Trajectory,
+    sigmas: tuple[float | None, float | None],
+    follows_object: bool,
+) -> tuple[SpanConsistency, ...] | None:
+    """Consistency of the camera's poses relative to earlier ones; of a followed body's run in the body's frame."""
+    path = run / RELATIVE_POSES_NAME
+    if not path.is_file():
+        return None
+    pairs = read_frame_pairs(path, len(estimate))
+    covariances = None
+    if any(sigma is not None for sigma in sigmas):
+        covariances = np.tile(truth_covariance(sigmas[0] or 0.0, sigmas[1] or 0.0), (len(truth), 1, 1))
+    if follows_object:
+        covariances = covariances if covariances is None else turn_covariance(truth.poses, covariances)
+        truth = Trajectory(truth.timestamps, se3_inverse(truth.poses))
+    return relative_consistency(pairs, estimate, truth, covariances)
 
 
 def _same_clock(estimate_path: Path, truth_path: Path) -> tuple[Trajectory, Trajectory, str]:
@@ -340,6 +384,8 @@ def _plain(value: Any) -> Any:
     """Arrays as lists, and None for NaN, which JSON does not know."""
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
     if isinstance(value, np.ndarray):
         return [_plain(item) for item in value.tolist()]
     if isinstance(value, float) and not math.isfinite(value):

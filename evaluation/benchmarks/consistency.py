@@ -196,4 +196,5 @@ def _track(source: Path, config: TrackerConfig, scene: Studio) -> ConsistencyRes
         point_median=float(np.median(nees)) if some else nan,
         point_inside=consistency.coverage(nees, 3),
         point_gross=float((3.0 * nees > _GROSS**2).mean()) if some else nan,
+        relative={span.span: (span.mean_nees, span.inside) for span in evaluation.relative or ()},
     )

@@ -10,6 +10,7 @@ import numpy as np
 
 from sigmaslam.evaluation.benchmarks.page import header, opening, row
 from sigmaslam.evaluation.metrics.map_consistency import mean_with_error, ratio_with_error, root_mean_square_with_error
+from sigmaslam.slam.relative_poses import SPANS
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +49,8 @@ class ConsistencyResult:
         point_nees, point_median: of points per degree of freedom, mean and median.
         point_inside: share inside the 95 % ellipsoid.
         point_gross: share beyond 5 sigma.
+        relative: of poses relative to earlier ones, by the name of the span: mean NEES per degree of freedom, and share
+            of pairs inside the 95 % ellipsoid.
     """
 
     nees: float
@@ -67,6 +70,7 @@ class ConsistencyResult:
     point_median: float
     point_inside: float
     point_gross: float
+    relative: Mapping[str, Sequence[float]]
 
 
 Results: TypeAlias = Mapping[Scale, Mapping[str, Sequence[ConsistencyResult]]]
@@ -149,6 +153,8 @@ _NOTES = [
     "",
     "- *NEES* of poses: of T_estimate^-1 T_truth, 6 dof, relative to the first frame; over all frames after the first,",
     "  lost ones too.",
+    "- *NEES* and *inside* of poses relative to earlier ones: of T_i_j as known at frame j; i is a keyframe",
+    "  about so far back on the path, or in time; over all pairs of a sequence.",
     "- *ATE*: root mean square position error after the best rigid alignment. *ATE over ours*: geometric mean of the",
     "  quotient on the same sequence.",
     "- *offset z rms*: root mean square of (estimated - true) / sigma at the last frame; 1 is right.",
@@ -197,6 +203,7 @@ def _tables(methods: Mapping[str, Sequence[ConsistencyResult]]) -> Iterator[str]
             f"{np.mean([r.filter_ms for r in trials]):.0f} / {np.mean([r.total_ms for r in trials]):.0f}",
         ]
         yield row(method, *cells)
+    yield from _relative_table(methods)
     yield ""
     yield "Map points:"
     yield ""
@@ -211,6 +218,25 @@ def _tables(methods: Mapping[str, Sequence[ConsistencyResult]]) -> Iterator[str]
             _cell(trials, lambda r: 100 * r.point_inside, ".0f"),
             _cell(trials, lambda r: 100 * r.point_gross, ".1f") + " %",
         ]
+        yield row(method, *cells)
+
+
+def _relative_table(methods: Mapping[str, Sequence[ConsistencyResult]]) -> Iterator[str]:
+    """Poses relative to earlier ones, over the spans that a scale has."""
+    results = [result for trials in methods.values() for result in trials]
+    spans = [span for span in SPANS if any(span in result.relative for result in results)]
+    if not spans:
+        return
+    yield ""
+    yield "Poses relative to earlier ones:"
+    yield ""
+    yield from header("method", *(f"{what} {span}" for span in spans for what in ("NEES", "inside")), numbers_from=1)
+    for method, trials in methods.items():
+        cells = []
+        for span in spans:
+            figures = [result.relative[span] for result in trials if span in result.relative]
+            cells.append(_spread(*mean_with_error([nees for nees, _ in figures]), ".2f"))
+            cells.append(_spread(*mean_with_error([100 * inside for _, inside in figures]), ".0f"))
         yield row(method, *cells)
 
 

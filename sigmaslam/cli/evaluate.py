@@ -12,13 +12,25 @@ import typer
 def evaluate(
     run: Annotated[Path, typer.Argument(metavar="RUN_OR_TRAJECTORY", help="Run folder, or a TUM or KITTI file.")],
     truth: Annotated[Path, typer.Option(help="Ground truth: TUM, KITTI (with times.txt beside it) or EuRoC csv.")],
+    truth_sigma_position: Annotated[
+        float | None, typer.Option(metavar="M", min=0.0, help="Of each coordinate of the true positions, metres.")
+    ] = None,
+    truth_sigma_rotation: Annotated[
+        float | None, typer.Option(metavar="DEG", min=0.0, help="Of the true rotations about each axis, degrees.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
     """Compare a trajectory with the truth: ATE, RPE, KITTI t_rel and r_rel, NEES; draws evaluation.png.
+
+    Poses of a run are also judged relative to earlier ones, 1, 10, 50, 100 m or 1, 5, 20 s back. Say how good the truth
+    is with --truth-sigma-position and --truth-sigma-rotation: it counts there, and you see where it is no better than
+    the estimate.
 
     Of a run with --track-object the truth is T_camera_object of any frame that is fixed to the body.
     """
     from sigmaslam.evaluation.run_evaluation import evaluate_run, format_evaluation
 
-    evaluation = evaluate_run(run, truth)
+    evaluation = evaluate_run(
+        run, truth, truth_sigma_position=truth_sigma_position, truth_sigma_rotation=truth_sigma_rotation
+    )
     typer.echo(json.dumps(evaluation.to_dict(), indent=2) if as_json else format_evaluation(evaluation))

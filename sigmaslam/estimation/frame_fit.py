@@ -8,16 +8,35 @@ import numpy as np
 
 
 @dataclass(frozen=True, slots=True)
+class FramePosterior:
+    """Window and frame as the frame's views have them together; n is the window's error state, the frame stands behind.
+
+    Attributes:
+        step: (n + 6,) from the window's posterior and the predicted pose.
+        covariance: (n + 6, n + 6) of both, as far as it comes from matches and motion.
+        common: (n + 6, 12) how considered errors of the calibration, of variance one, enter the errors of both.
+        information: (n + 6, n + 6) of the views alone.
+        score: (n + 6,) slope of the views' log-likelihood at the posterior mean.
+    """
+
+    step: np.ndarray
+    covariance: np.ndarray
+    common: np.ndarray
+    information: np.ndarray
+    score: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
 class FrameFit:
     """Posterior of a frame's pose together with the window.
 
     Attributes:
         pose: (4, 4) T_world_camera.
-        relative: (6, 6) covariance of the pose relative to the last keyframe, perturbed from the left in the world.
+        relative: (6, 6) covariance of the pose relative to the last keyframe, perturbed from the left in the world, as
+            far as it comes from matches and motion.
         covariance: (6, 6) of the pose, likewise.
         calibration, calibration_covariance: (12,), (12, 12) as this frame adds to it.
-        common: (6, 12) how considered errors of the calibration, of variance one, enter that of the pose, which the
-            covariances above do not contain.
+        joint: of the window and the frame, without `inflation`.
         inliers: (M,) bool, the views that agree.
         nis, dof: of the inliers.
         noise_scale: what the variances of all views are multiplied by in the posterior, 1 or more, as they scatter.
@@ -29,7 +48,7 @@ class FrameFit:
     covariance: np.ndarray
     calibration: np.ndarray
     calibration_covariance: np.ndarray
-    common: np.ndarray
+    joint: FramePosterior
     inliers: np.ndarray
     nis: float
     dof: int

@@ -11,8 +11,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999
-from sigmaslam.estimation.frame_fit import FrameFit
-from sigmaslam.estimation.gaussian import append_moved, matrix_root, project_covariance, replace_part, weighted_update
+from sigmaslam.estimation.frame_fit import FrameFit, FramePosterior
+from sigmaslam.estimation.gaussian import (
+    append_moved,
+    condition,
+    matrix_root,
+    project_covariance,
+    replace_part,
+    weighted_information,
+)
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
 from sigmaslam.estimation.mahalanobis import squared_mahalanobis
@@ -114,7 +121,7 @@ class FrameUpdate:
             whitened = update.whitened()
             for limit in _ROBUST_SCALES:
                 weight = update.usable / (1.0 + squared / (scale * limit**2)) ** 2
-                solution, spread = weighted_update(factor, whitened, offset, weight)
+                solution, spread = condition(factor, *weighted_information(whitened, offset, weight))
                 after = update.residual - update.by_state @ (solution - offset)
                 squared = np.einsum("mi,mij,mj->m", after, update.precision, after)
             offset, moved = solution, self._landmark_step(views, update, solution - offset)
@@ -134,16 +141,15 @@ class FrameUpdate:
             if update.usable.sum() < min_inliers or inliers.sum() < min_inliers:
                 return None
             weight = inliers * student_weight(update.squared, components, window.student_freedom)
-            whitened = update.whitened()
-            solution, spread = weighted_update(factor, whitened, offset, weight)
-            rows = whitened[:, :-1] * np.sqrt(np.repeat(weight, 3))[:, None]
+            information, vector = weighted_information(update.whitened(), offset, weight)
+            solution, spread = condition(factor, information, vector)
             offset, moved = solution, self._landmark_step(views, update, solution - offset)
         inliers = inliers & agree
         if inliers.sum() < min_inliers:
             return None
         common = window.posterior.common
         common = np.concatenate([common, common[last]])
-        common = common - spread @ (rows.T @ (rows @ common))
+        common = common - spread @ (information @ common)
         standard = np.linalg.lstsq(factor, offset, rcond=1e-12)[0]
         prior_cost = float(standard @ standard)
         cross = spread[frame, last]
@@ -153,7 +159,7 @@ class FrameUpdate:
             spread[frame, frame],
             window.posterior.calibration + offset[CALIBRATION],
             spread[CALIBRATION, CALIBRATION],
-            common[frame],
+            FramePosterior(offset, spread, common, information, vector - information @ offset),
             inliers,
             prior_cost + float(update.squared[inliers].sum()),
             int(components[inliers].sum()),

@@ -13,14 +13,12 @@ def condition(factor: np.ndarray, information: np.ndarray, vector: np.ndarray) -
     return reduced.T @ (reduced @ vector), reduced.T @ reduced
 
 
-def weighted_update(
-    factor: np.ndarray, whitened: np.ndarray, offset: np.ndarray, weight: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Posterior mean and covariance from derivatives with residuals (3 M, n + 1) about `offset`, weighted (M,)."""
+def weighted_information(whitened: np.ndarray, offset: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What `condition` takes, from derivatives with residuals (3 M, n + 1) about `offset`, weighted (M,)."""
     rows = whitened * np.sqrt(np.repeat(weight, 3))[:, None]
     by_state, residual = rows[:, :-1], rows[:, -1]
-    information, vector = by_state.T @ by_state, by_state.T @ residual
-    return condition(factor, information, vector + information @ offset)
+    information = by_state.T @ by_state
+    return information, by_state.T @ residual + information @ offset
 
 
 def matrix_root(covariance: np.ndarray) -> np.ndarray:

@@ -23,6 +23,7 @@ from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.inference.onnx_graph import shipped_weights
 from sigmaslam.readers.trajectory_files import write_kitti, write_tum
 from sigmaslam.runs.frame_table import COLUMNS
+from sigmaslam.runs.relative_pose_file import RelativePoseWriter
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.slam.mapping import KeyframeTracks
 from sigmaslam.slam.point_map import PointMap
@@ -61,6 +62,7 @@ class RunWriter:
         self._rows.writerow(_COLUMNS)
         # Time stamp, pose and covariance of each frame go to disk, so that memory does not grow with the run.
         self._poses = tempfile.TemporaryFile()  # noqa: SIM115
+        self._relative_poses = RelativePoseWriter()
         self._statuses: Counter[str] = Counter()
         self._inliers = array("i")  # positive counts alone
         self._calibration: CalibrationEstimate | None = None
@@ -94,6 +96,7 @@ class RunWriter:
         self._table.flush()
         row = np.r_[estimate.timestamp, pose.ravel(), covariance.ravel()]
         self._poses.write(row.astype(np.float64).tobytes())
+        self._relative_poses.add(self._statuses.total(), estimate.relative_poses)
         self._statuses[estimate.status] += 1
         if estimate.inliers:
             self._inliers.append(estimate.inliers)
@@ -108,7 +111,7 @@ class RunWriter:
         self._skipped += 1
 
     def finish(self, point_map: PointMap, keyframes: dict[str, Any], run: dict[str, Any]) -> dict[str, Any]:
-        """Writes trajectory, covariance, map, run.json and report.html.
+        """Writes trajectory, covariance, relative poses, map, run.json and report.html.
 
         Args:
             point_map: the landmarks.
@@ -131,6 +134,7 @@ class RunWriter:
         write_kitti(self._out / "trajectory.kitti", trajectory, self._out / "times.txt")
         with atomic_path(self._out / "covariance.npy") as path:
             np.save(path, rows[:, 17:].reshape(-1, 6, 6))
+        self._relative_poses.finish(self._out, trajectory.timestamps)
         with atomic_path(self._out / "map.npz") as path:
             points = {name: getattr(point_map, name) for name in PointMap.__slots__}
             np.savez_compressed(path, **points, **keyframes)

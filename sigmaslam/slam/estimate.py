@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sigmaslam.slam.mapping import KeyframeTracks
+from sigmaslam.slam.relative_poses import RelativePoses
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +45,7 @@ class Estimate:
         frame_covariance: (6, 6) the part of the covariance that the frame's matches add to that of its keyframe; zero
             without them.
         tracks: what the frame saw, where it became a keyframe.
+        relative_poses: relative to keyframes some way and some time back.
     """
 
     timestamp: float
@@ -60,6 +62,7 @@ class Estimate:
     matching_covariance: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
     frame_covariance: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
     tracks: KeyframeTracks | None = None
+    relative_poses: RelativePoses = field(default_factory=RelativePoses.empty)
 
     @property
     def camera(self) -> Estimate:

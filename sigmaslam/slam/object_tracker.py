@@ -21,6 +21,7 @@ from sigmaslam.slam.body_admission import BodyAdmission
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.estimate import Estimate
 from sigmaslam.slam.point_map import PointMap
+from sigmaslam.slam.relative_poses import RelativePoses
 from sigmaslam.slam.tracker import StereoTracker
 
 # Hands move things faster than cameras are carried.
@@ -129,13 +130,15 @@ class ObjectTracker:
                 "the first frame has too few points that both eyes see: start where the images are good, "
                 "and check the calibration"
             )
-        covariance = estimate.covariance
+        covariance, relative_poses = estimate.covariance, estimate.relative_poses
         if not self._body.separated and estimate.status != "starting":
             # In the body's frame, whose axes are the camera's still; from there into the left camera's.
             T_left_body = self._T_left_rectified @ self._body.T_camera_body
             covariance = covariance + turn_covariance(T_left_body, self._body.unseen_motion())
+            relative_poses = RelativePoses.empty()  # the body may have moved unseen
         T_body_camera = self._T_body_left() @ estimate.T_world_camera
-        return ObjectEstimate(replace(estimate, T_world_camera=T_body_camera, covariance=covariance))
+        changes = {"T_world_camera": T_body_camera, "covariance": covariance, "relative_poses": relative_poses}
+        return ObjectEstimate(replace(estimate, **changes))
 
     def warm_up(self) -> None:
         """As of `StereoTracker`."""

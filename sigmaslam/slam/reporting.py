@@ -16,6 +16,7 @@ from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.localisation import Prediction
 from sigmaslam.slam.mapping import KeyframeTracks
 from sigmaslam.slam.phase import Course, Phase
+from sigmaslam.slam.relative_poses import RelativePoseReporter
 
 # Variance of a pose that is not known at all, m^2 and rad^2.
 _ANYWHERE = 1e6
@@ -28,12 +29,14 @@ class Reporter:
     Attributes:
         T_rectified_left: (4, 4) takes points of the left camera into the rectified one.
         window, motion, course: of the tracker.
+        relative_poses: relates frames to keyframes.
     """
 
     T_rectified_left: np.ndarray
     window: KeyframeWindow
     motion: MotionFilter
     course: Course
+    relative_poses: RelativePoseReporter
 
     def report(
         self,
@@ -50,7 +53,7 @@ class Reporter:
         by_error = np.zeros((6, CALIBRATION_SIZE))
         if fit is not None:
             pose, absolute, relative = fit.pose, fit.covariance, fit.relative
-            calibration, spread, by_error = fit.calibration, fit.calibration_covariance, fit.common
+            calibration, spread, by_error = fit.calibration, fit.calibration_covariance, fit.joint.common[-6:]
         elif len(state):
             prediction = Prediction.of(self.window, self.motion)
             last = pose_slice(len(state) - 1)
@@ -81,4 +84,6 @@ class Reporter:
             milliseconds=milliseconds,
             frame_covariance=0.5 * (frame_covariance + frame_covariance.T),
             tracks=tracks,
+            # A keyframe is the window's by now, which has learned from it.
+            relative_poses=self.relative_poses.report(timestamp, fit if tracks is None else None),
         )

@@ -35,6 +35,7 @@ from sigmaslam.slam.motion_prior import densities
 from sigmaslam.slam.phase import Course, Phase
 from sigmaslam.slam.point_map import PointMap
 from sigmaslam.slam.recovery import Recovery
+from sigmaslam.slam.relative_poses import RelativePoseReporter
 from sigmaslam.slam.relocalisation import Relocaliser
 from sigmaslam.slam.reporting import Reporter
 from sigmaslam.slam.stopwatch import Stopwatch
@@ -95,7 +96,8 @@ class StereoTracker:
         self._loops = LoopCloser(window, keyframes, unguided)
         self._relocaliser = Relocaliser(window, keyframes, unguided, admission, config.min_inliers)
         self._recovery = Recovery(course, window, keyframes, motion, self._mapper, admission, config)
-        self._reporter = Reporter(self._T_rectified_left, window, motion, course)
+        relative_poses = RelativePoseReporter(self._T_rectified_left, window, keyframes, motion)
+        self._reporter = Reporter(self._T_rectified_left, window, motion, course, relative_poses)
 
     def load_map(self, path: Path) -> None:
         """Takes the world of a map that `sigmaslam track` has written; tracking starts where a view is found in it.

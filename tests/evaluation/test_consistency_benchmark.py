@@ -40,6 +40,7 @@ GOOD = ConsistencyResult(
     point_median=0.79,
     point_inside=0.95,
     point_gross=0.0,
+    relative={"1 m": (1.1, 0.94), "1 s": (0.9, 0.96)},
 )
 
 
@@ -112,7 +113,7 @@ def test_depths_around_pixels_are_those_of_the_image():
 
 
 def test_the_page_names_the_goals_that_are_missed():
-    bad = replace(GOOD, nees=2.4, nis=0.5)
+    bad = replace(GOOD, nees=2.4, nis=0.5, relative={"1 s": (1.5, 0.8)})
     results = {
         Scale("driving", "street", 64, 48): {"ours": [GOOD, GOOD], "EKF": [bad, bad]},
         Scale("endoscope", "organ", 64, 48): {"ours": [bad, bad], "EKF": [GOOD, GOOD]},
@@ -123,6 +124,9 @@ def test_the_page_names_the_goals_that_are_missed():
     assert "seeds 1000 to 1001" in page
     assert "`the command`" in page
     rows = [line for line in page.splitlines() if line.startswith("| EKF |")]
-    assert len(rows) == 4
+    assert len(rows) == 6
+    assert "| method | NEES 1 m | inside 1 m | NEES 1 s | inside 1 s |" in page
+    assert "| EKF | - | - | 1.50 ± 0.00 | 80 ± 0 |" in rows
+    assert "| EKF | 1.10 ± 0.00 | 94 ± 0 | 0.90 ± 0.00 | 96 ± 0 |" in rows
     widths = {line.count("|") for line in page.splitlines() if line.startswith(("| EKF |", "| ours |"))}
-    assert widths == {8, 13}
+    assert widths == {6, 8, 13}

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from sigmaslam.readers.trajectory_files import read_tum
+from sigmaslam.runs.relative_pose_file import read_frame_pairs
 from tests.support.commands import Finished, assert_refused, command_line, environment, run_here, run_process
 
 FRAMES = 8
@@ -59,6 +60,8 @@ def test_track_writes_every_output_and_evaluate_reads_them(whole_sequence: Path,
     assert covariance.shape == (FRAMES, 6, 6)
     assert (np.linalg.eigvalsh(covariance[1:]) > 0).all()
     assert len(rows(out)) == FRAMES
+    pairs = read_frame_pairs(out / "relative_poses.npz", FRAMES)
+    assert (pairs.earlier < pairs.later).all()
     with np.load(out / "map.npz") as archive:
         assert len(archive["points"]) == len(archive["covariances"]) == len(archive["observations"]) > 50
         vertices = len(archive["points"])

@@ -10,9 +10,10 @@ import pytest
 
 from sigmaslam.frontend.types import KeypointSearch, StereoView, TemporalMatches
 from sigmaslam.geometry.se3 import nearest_rigid, se3_exp, se3_inverse, se3_log
+from sigmaslam.slam.relative_poses import SPANS
 from sigmaslam.slam.tracker import StereoTracker
 from tests.support.quantiles import chi_square_median, squared_sigmas
-from tests.support.simulated_frontend import SCALES, SimulatedFrontend, frame_of, run_simulated
+from tests.support.simulated_frontend import SCALES, SimulatedFrontend, SimulatedRun, frame_of, run_simulated
 
 LAP, FRAMES = 180, 220
 SCALE = SCALES["driving"]
@@ -62,6 +63,8 @@ class Lap:
         keyframe_error, keyframe_nees: means.
         point_error, point_nees: medians, the latter over what it should be.
         end_error: metres, mean of the frames after the lap.
+        relative_error, relative_nees: of frames after the lap relative to keyframes 100 m back, means; metres.
+        reported_error: the same of the poses that were reported at the time of both.
         poses: (K, 4, 4) remembered.
     """
 
@@ -70,6 +73,9 @@ class Lap:
     point_error: float
     point_nees: float
     end_error: float
+    relative_error: float
+    relative_nees: float
+    reported_error: float
     poses: np.ndarray
 
 
@@ -99,8 +105,25 @@ def drive(seed: int, loops: str = "right") -> Lap:
         point_error,
         point_nees,
         float(np.mean(end)),
+        *_relative_to_the_lap(run),
         poses,
     )
+
+
+def _relative_to_the_lap(run: SimulatedRun) -> tuple[float, float, float]:
+    """Mean error and NEES of relative poses after the lap, and error of what had been reported."""
+    error, nees, reported = [], [], []
+    for now in range(LAP + 20, FRAMES):
+        relative = run.estimates[now].relative_poses
+        for row in np.flatnonzero(relative.span == SPANS.index("100 m")):
+            frame = round(relative.timestamp[row] / SCALE.interval)
+            true = se3_inverse(run.poses[frame]) @ run.poses[now]
+            off = se3_log(se3_inverse(relative.pose[row]) @ true)
+            before = se3_inverse(run.estimates[frame].T_world_camera) @ run.estimates[now].T_world_camera
+            error.append(np.linalg.norm(off[:3]))
+            nees.append(squared_sigmas(off, relative.covariance[row]) / 6)
+            reported.append(np.linalg.norm(before[:3, 3] - true[:3, 3]))
+    return float(np.mean(error)), float(np.mean(nees)), float(np.mean(reported))
 
 
 def _points(tracker: StereoTracker, frontend: LapFrontend) -> tuple[float, float]:
@@ -141,6 +164,9 @@ def test_a_loop_corrects_keyframes_and_points_of_the_way_round(monkeypatch: pyte
     # Five laps, each with errors that all its keyframes share: the mean scatters by a third.
     assert 0.4 < np.mean([lap.keyframe_nees for lap in after]) < 2.0
     assert 0.4 < np.mean([lap.point_nees for lap in after]) < 2.0
+    assert 0.4 < np.mean([lap.relative_nees for lap in after]) < 2.0
+    # The keyframe's pose is the corrected one, not what was reported before the loop.
+    assert np.mean([lap.relative_error for lap in after]) < 0.9 * np.mean([lap.reported_error for lap in after])
 
 
 @pytest.mark.slow

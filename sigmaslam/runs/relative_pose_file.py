@@ -1,0 +1,109 @@
+"""relative_poses.npz of a run: poses of frames relative to earlier ones, with the covariance between the two."""
+
+from __future__ import annotations
+
+import tempfile
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sigmaslam.errors import InputError
+from sigmaslam.files import atomic_path
+from sigmaslam.slam.relative_poses import SPANS, RelativePoses
+from sigmaslam.table import Table
+
+RELATIVE_POSES_NAME = "relative_poses.npz"
+# Numbers of a row on disk: frame, span, time stamp of the earlier frame, pose, covariance.
+_WIDTH = 3 + 16 + 36
+
+
+@dataclass(frozen=True, slots=True)
+class FramePairs(Table):
+    """Poses of frames relative to earlier ones.
+
+    Attributes:
+        span: (M,) name of the distance or the time between the two, as of `SPANS`.
+        earlier, later: (M,) their rows in trajectory.tum.
+        pose: (M, 4, 4) T_earlier_later of the left camera, as it was known at the later frame.
+        covariance: (M, 6, 6) of it in the later camera's frame, translation (metres) before rotation (radians).
+    """
+
+    span: np.ndarray
+    earlier: np.ndarray
+    later: np.ndarray
+    pose: np.ndarray
+    covariance: np.ndarray
+
+
+class RelativePoseWriter:
+    """Collects relative poses on disk, so that memory does not grow with the run."""
+
+    def __init__(self) -> None:
+        self._rows = tempfile.TemporaryFile()  # noqa: SIM115
+
+    def add(self, frame: int, relative: RelativePoses) -> None:
+        """Takes those of a frame, by its row in trajectory.tum."""
+        count = len(relative)
+        columns = (
+            np.full(count, frame),
+            relative.span,
+            relative.timestamp,
+            relative.pose.reshape(count, 16),
+            relative.covariance.reshape(count, 36),
+        )
+        self._rows.write(np.column_stack(columns).astype(np.float64).tobytes())
+
+    def finish(self, folder: Path, timestamps: np.ndarray) -> None:
+        """Writes relative_poses.npz.
+
+        Args:
+            folder: of the run.
+            timestamps: (N,) of all frames, seconds, as they were tracked.
+        """
+        self._rows.seek(0)
+        rows = np.frombuffer(self._rows.read()).reshape(-1, _WIDTH)
+        self._rows.close()
+        pairs = FramePairs(
+            np.array(SPANS)[rows[:, 1].astype(np.int64)],
+            np.searchsorted(timestamps, rows[:, 2]),
+            rows[:, 0].astype(np.int64),
+            rows[:, 3:19].reshape(-1, 4, 4),
+            rows[:, 19:].reshape(-1, 6, 6),
+        )
+        write_frame_pairs(folder / RELATIVE_POSES_NAME, pairs)
+
+
+def write_frame_pairs(path: Path, pairs: FramePairs) -> None:
+    """Writes the columns as arrays by name."""
+    with atomic_path(path) as temporary:
+        np.savez_compressed(temporary, **{name: getattr(pairs, name) for name in FramePairs.__slots__})
+
+
+def read_frame_pairs(path: Path, count: int) -> FramePairs:
+    """The content of a relative_poses.npz.
+
+    Args:
+        path: of the file.
+        count: poses of trajectory.tum beside it.
+    Raises:
+        InputError: it is no such file, or of another run.
+    """
+    mend = "run `sigmaslam track` again"
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            pairs = FramePairs(*(archive[name] for name in FramePairs.__slots__))
+    except (OSError, ValueError, EOFError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path}: holds no relative poses ({error}); {mend}") from error
+    rows = len(pairs.span)
+    shapes = tuple(column.shape for column in pairs.columns())
+    if shapes != ((rows,), (rows,), (rows,), (rows, 4, 4), (rows, 6, 6)):
+        raise InputError(f"{path}: its arrays are {', '.join(map(str, shapes))}, which do not go together; {mend}")
+    frames = np.concatenate([pairs.earlier, pairs.later])
+    if rows and not (frames.min() >= 0 and frames.max() < count):
+        raise InputError(
+            f"{path}: has frame {frames.max()}, but trajectory.tum beside it has {count} poses: "
+            "both must come from the same run"
+        )
+    return pairs
