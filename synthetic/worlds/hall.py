@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from sigmaslam.synthetic.geometry import rigid_motion
 from sigmaslam.synthetic.motion import random_motions
 from sigmaslam.synthetic.motion.paths import Path, at_rest, with_stops
+from sigmaslam.synthetic.motion.shaken import shaken
 from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel
 from sigmaslam.synthetic.scene import Body, Scene
 from sigmaslam.synthetic.worlds.episode import Episode, Wish, daylight
@@ -19,6 +20,7 @@ from sigmaslam.synthetic.worlds.street_furniture import person
 
 _CLEARANCE = 0.7
 """Metres around the camera's way that stay free."""
+_SHAKE = 0.08  # metres that a shaken camera leaves its way
 _FREE_FOR_MOVERS = 0.8  # more of it where bodies fly about in front of the camera
 _TEXTURES = {"leaves": 2, "plaster": 1, "bricks": 2, "glyphs": 1, "wood": 1, "noise": 1, "cells": 1, "asphalt": 1,
              "facade": 1, "checker": 1, "strokes": 1}  # fmt: skip
@@ -339,6 +341,10 @@ def _flight(rng: np.random.Generator, wish: Wish, size: np.ndarray, clearance: f
         return random_motions.pure_rotation(rng, wish.duration, centre)
     if wish.motion == "loop":
         return random_motions.closed_loop(rng, wish.duration, box)
+    if wish.motion == "shaken":
+        # At a third of the speed, so that the shaking is most of the flow.
+        inner = random_motions.FreeSpace(box.centre, (box.half[0] - _SHAKE, box.half[1] - _SHAKE, box.half[2] - _SHAKE))
+        return shaken(rng, random_motions.drone(rng, wish.duration / 3, inner), wish.duration, _SHAKE)
     if wish.motion == "stops":
         ease = min(1.5, wish.duration / 6)
         return with_stops(random_motions.drone(rng, max(wish.duration - 1.0 - ease, 3 * ease), box), rng, 1, ease)

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from sigmaslam.synthetic.motion.paths import Path, at_rest, with_stops
 from sigmaslam.synthetic.motion.random_motions import FreeSpace, closed_loop, hand_held, pure_rotation
+from sigmaslam.synthetic.motion.shaken import shaken
 from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel, Shape
 from sigmaslam.synthetic.scene import Body, Lights, Material, Scene, Texture
 from sigmaslam.synthetic.worlds.episode import Episode, Wish
@@ -17,6 +18,7 @@ from sigmaslam.synthetic.worlds.part_models import Model, Part, follow
 CLEARANCE = 0.3
 """Metres between the camera and any surface, at least."""
 
+_SHAKE = 0.05  # metres that a shaken camera leaves its way
 _DEPTH = 0.8  # metres off the walls that belong to furniture
 
 # Tile in metres on small things and contrast of each kind: boards of 5-25 cm, tiles of 10-30 cm on floors and walls.
@@ -64,6 +66,10 @@ def _carry(rng: np.random.Generator, wish: Wish, free: FreeSpace) -> Path:
         return pure_rotation(rng, wish.duration, _triple(free.centre + rng.uniform(-0.8, 0.8, 3) * free.half))
     if wish.motion == "rest":
         return at_rest(hand_held(rng, wish.duration, free).poses(0.5 * wish.duration), wish.duration)
+    if wish.motion == "shaken":
+        reach = min(_SHAKE, 0.4 * min(free.half))
+        inner = FreeSpace(free.centre, _triple(np.array(free.half) - reach))
+        return shaken(rng, hand_held(rng, 0.5 * wish.duration, inner), wish.duration, reach)
     if wish.motion == "stops":
         moving = 0.75 * wish.duration
         return with_stops(hand_held(rng, moving, free), rng, 1 + int(wish.duration / 8), min(1.0, 0.5 * moving))
