@@ -18,7 +18,12 @@ _ROLLING, _ROLL_SWING = (15.0, 40.0), (1.5, 4.0)
 _TILT = 12.0  # degrees rms by which the swings lean from the horizontal
 
 
-def shaken(rng: np.random.Generator, slow: Path, duration: float, reach: float) -> Path:
+def slowed(path: Path, duration: float) -> Path:
+    """The same way without stops, passed within that many seconds."""
+    return Path(path.times * (duration / path.times[-1]), path.positions, path.rotations)
+
+
+def shaken(rng: np.random.Generator, slow: Path, reach: float) -> Path:
     """A slow path, shaken.
 
     The camera swings to and fro about an axis that wanders around its vertical one. The peaks of the rate and the ends
@@ -27,13 +32,12 @@ def shaken(rng: np.random.Generator, slow: Path, duration: float, reach: float) 
 
     Args:
         rng: source of all randomness.
-        slow: where the camera goes but for the shaking; it is played from its start to its end within `duration`.
-        duration: seconds.
+        slow: where the camera goes but for the shaking; from 0 on.
         reach: metres that the position leaves the slow path along each axis, at most; in bands of 1 to 2.5 Hz.
     """
-    clock, inside = padded_clock(duration)
+    clock, inside = padded_clock(slow.end)
     t = clock[inside]
-    T = slow.poses(slow.start + (slow.end - slow.start) * t / duration)
+    T = slow.poses(t)
     swing, roll = _swings(rng, t, _SWING, _TURNING), _swings(rng, t, _ROLL_SWING, _ROLLING)
     lean = _DEGREE * _TILT * noise(rng, t, 1, 0.1, 0.4)[:, 0]
     turn = np.stack([swing * np.sin(lean), swing * np.cos(lean), roll], axis=-1)

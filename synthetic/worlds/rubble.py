@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from sigmaslam.synthetic.geometry import rigid_motion
 from sigmaslam.synthetic.motion.paths import Path, at_rest, with_stops
 from sigmaslam.synthetic.motion.random_motions import FreeSpace, closed_loop, hand_held, pure_rotation
-from sigmaslam.synthetic.motion.shaken import shaken
+from sigmaslam.synthetic.motion.shaken import shaken, slowed
 from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Panel, Sheet
 from sigmaslam.synthetic.scene import Body, Scene
 from sigmaslam.synthetic.worlds.episode import Episode, Wish, daylight
@@ -34,7 +34,8 @@ _TEXTURES = {"leaves": 2, "plaster": 1, "bricks": 2, "glyphs": 1, "wood": 2, "no
 
 def generate(rng: np.random.Generator, wish: Wish) -> Episode:
     """Heaps, leaning planks, posts and nets 1-4 m around a short way, between the walls of houses that stand."""
-    path = _way(rng, wish)
+    way = _way(rng, wish)
+    path = shaken(rng, way, _SHAKE) if wish.motion == "shaken" else way
     site = _Site(rng, _palette(rng, wish), path, CLEARANCE + _FREE_FOR_MOVERS * (wish.movers > 0))
     site.build()
     bodies = site.bodies
@@ -42,7 +43,7 @@ def generate(rng: np.random.Generator, wish: Wish) -> Episode:
         makers = (site.swinging_plank, lambda: person(rng, site.palette), site.heap)
         models = [makers[int(rng.integers(3))]() for _ in range(1 + int(wish.movers > 0.15))]
         share = min(1.3 * wish.movers, 0.55)  # some of it will be behind what rests
-        bodies += follow(rng, path, wish.duration, share, [centred(model) for model in models], (0.6, 1.3))
+        bodies += follow(rng, way, wish.duration, share, [centred(model) for model in models], (0.6, 1.3))
     # Hazy: the sun is as strong as the sky, and shadows are not black.
     lights = replace(daylight(rng, 30, (0.3, 0.6)), ambient=float(rng.uniform(0.35, 0.5)))
     return Episode(Scene(tuple(bodies), tuple(site.palette.materials), lights, sky=float(rng.uniform(0.6, 1.0))), path)
@@ -182,6 +183,7 @@ class _Site:
 
 
 def _way(rng: np.random.Generator, wish: Wish) -> Path:
+    """The camera's path but for the shaking."""
     free = FreeSpace((0.0, 0.0, _EYES), (1.2, 0.9, 0.25))
     if wish.motion == "loop":
         return closed_loop(rng, wish.duration, free)
@@ -193,7 +195,7 @@ def _way(rng: np.random.Generator, wish: Wish) -> Path:
         moving = 0.75 * wish.duration
         return with_stops(hand_held(rng, moving, free), rng, 1 + int(wish.duration / 8), min(1.0, 0.5 * moving))
     if wish.motion == "shaken":
-        return shaken(rng, hand_held(rng, 0.5 * wish.duration, free), wish.duration, _SHAKE)
+        return slowed(hand_held(rng, 0.5 * wish.duration, free), wish.duration)
     return hand_held(rng, wish.duration, free)
 
 
