@@ -160,12 +160,12 @@ def _goals(ours: Sequence[ShakeResult]) -> Iterator[str]:
         count = sum(len(getattr(result, name)) for result in ours)
         of = sum(result.tracking for result in ours)
         if count:
-            missed.append(f"{count} frames are wrong {label}")
+            missed.append(f"frames wrong {label} ({count})")
         yield row(f"frames called `tracking`, wrong {label}", "0", f"{count} of {of}" + ", **missed**" * (count > 0))
     median = float(np.median([result.percent for result in ours]))
     holds = median <= MOST_ATE
     if not holds:
-        missed.append(f"the median ATE is {median:.2f} %")
+        missed.append(f"median ATE ({median:.2f} %)")
     yield row("ATE, % of path, median", f"{MOST_ATE:g}", f"{median:.2f}" + ("" if holds else ", **missed**"))
     yield ""
     yield "Missed: " + "; ".join(missed) + "." if missed else "All goals are met."
