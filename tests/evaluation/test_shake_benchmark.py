@@ -157,7 +157,7 @@ def test_a_method_that_is_right_has_no_wrong_frame_and_one_that_jumps_has(shaken
 def test_the_page_says_which_frames_are_wrong_and_what_is_missed():
     wrong = replace(GOOD, ate=0.02, wrong_step=[3, 4], wrong_second=[22], wrong_start=[22, 23, 24])
     page = format_page({"ours": {STILL: GOOD, MOVING: wrong}, "KLT + PnP": {STILL: wrong, MOVING: GOOD}}, 60, 1000, "c")
-    assert "Missed: frames wrong over a frame (2); frames wrong over 1 s (1); frames wrong since the start (3); " in page
+    assert "Missed: frames wrong over a frame (2); frames wrong over 1 s (1); frames wrong since the start (3)" in page
     assert "median ATE (1.20 %)." in page
     assert "2 of 118, **missed**" in page
     assert "- room1001: 3, 4; 22" in page
