@@ -44,6 +44,8 @@ _CODE = (
     "two_view",
 )
 
+_EUROC_TRUTH = Path("mav0") / "state_groundtruth_estimate0" / "data.csv"
+
 Method = Callable[[StereoSequence, Path], object]
 """Writes what it makes of a sequence into a new run folder: `track_sequence`, or another one with its arguments."""
 
@@ -152,6 +154,12 @@ def render(folder: Path, recipe: Recipe, workers: int, done: Callable[[int], Non
             shutil.rmtree(source, ignore_errors=True)
         raise
     return source
+
+
+def rendered_truth(source: Path) -> Path:
+    """The file of the true poses in a rendered folder, of either layout."""
+    truth = source / _EUROC_TRUTH
+    return truth if truth.is_file() else source / "poses.txt"
 
 
 @dataclass(frozen=True, slots=True)

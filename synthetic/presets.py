@@ -11,7 +11,7 @@ import numpy as np
 from sigmaslam.geometry.camera import CameraModel, DistortionModel
 from sigmaslam.synthetic.camera.rig import Miscalibration, Rig, loose_rig, parallel_rig
 from sigmaslam.synthetic.camera.sensor import Sensor
-from sigmaslam.synthetic.worlds import colon, hall, organ, room, street, tool
+from sigmaslam.synthetic.worlds import colon, hall, organ, room, rubble, street, tool
 from sigmaslam.synthetic.worlds.episode import Episode, Wish
 
 Layout = Literal["kitti", "euroc"]
@@ -59,6 +59,7 @@ PRESETS = {
     "colon": Preset(colon.generate, 640, 480, 350.0, 0.005, 25.0, "euroc", "equidistant", (-0.012, 0.004, -0.002, 0.0)),
     "organ": Preset(organ.generate, 640, 512, 520.0, 0.0045, 25.0),
     "tool": Preset(tool.generate, 640, 512, 520.0, 0.005, 25.0),
+    "rubble": Preset(rubble.generate, 640, 480, 460.0, 0.11, 20.0),
 }
 
 # Sensors by name: what comes after the light has reached the lens.
@@ -75,6 +76,8 @@ SENSORS = {
         gamma=0.6,
         jpeg_quality=60,
     ),
+    # A camera that opens its shutter for half of the time because there is little light.
+    "slow": Sensor(blur=0.5, vignetting=0.15, shutter=0.5, photons_at_white=10500.0, read_noise=0.4),
 }
 # Largest logs of the common gain and of the quotient of the two cameras' gains.
-EXPOSURES = {"ideal": (0.0, 0.0), "normal": (0.06, 0.06), "harsh": (0.4, 0.25)}
+EXPOSURES = {"ideal": (0.0, 0.0), "normal": (0.06, 0.06), "harsh": (0.4, 0.25), "slow": (0.06, 0.06)}

@@ -14,7 +14,7 @@ from sigmaslam.synthetic.camera.rig import Miscalibration, Rig
 from sigmaslam.synthetic.camera.sensor import Sensor, expose, exposure_gains
 from sigmaslam.synthetic.motion.paths import Path
 from sigmaslam.synthetic.presets import EXPOSURES, PRESETS, SENSORS, Layout
-from sigmaslam.synthetic.render_choices import MOTIONS
+from sigmaslam.synthetic.render_choices import CARRIED, MOTIONS
 from sigmaslam.synthetic.rendering.renderer import RenderedViews, Renderer
 from sigmaslam.synthetic.rendering.visibility import Eye
 from sigmaslam.synthetic.scene import Scene
@@ -73,6 +73,11 @@ class Recipe:
             raise InputError(f"movers is {self.movers}; give a share of the image from 0 to 0.5")
         if min(self.width or 16, self.height or 16) < 16:
             raise InputError(f"the image size {self.width}x{self.height} is too small; give at least 16x16")
+        if self.motion == "shaken" and self.preset not in CARRIED:
+            raise InputError(
+                f"the motion shaken goes with {', '.join(CARRIED)}, whose camera is carried by hand or "
+                f"flies, not with {self.preset}"
+            )
         if self.profile is not None and self.preset != "street":
             raise InputError(f"a profile of real motion goes with the preset street, not with {self.preset}")
 

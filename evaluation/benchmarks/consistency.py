@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import redirect_stderr
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 
 from sigmaslam.evaluation.benchmarks.consistency_page import ConsistencyResult, Results, Scale, format_page
 from sigmaslam.evaluation.benchmarks.page import write_page
+from sigmaslam.evaluation.benchmarks.trial_pool import run_trials
 from sigmaslam.evaluation.metrics import map_consistency as consistency
 from sigmaslam.evaluation.trial import Trial, TrialCache, hash_code, render
 from sigmaslam.files import make_folder
@@ -90,16 +88,7 @@ def write_consistency(
     # Run all scales of a seed before the next seed: an interrupted benchmark is balanced.
     jobs = [_ConsistencyTrials(cache, scale, _FIRST_SEED + k) for k in range(seeds) for scale in SCALES]
     missing = [job for job in jobs if any(job.read(method) is None for method in METHODS)]
-    note(f"{len(jobs) - len(missing)} of {len(jobs)} sequences are there")
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, max(len(missing), 1)), context, _start_worker) as pool:
-        try:
-            futures = [pool.submit(_work, job) for job in missing]
-            for count, future in enumerate(as_completed(futures), start=1):
-                note(f"{count} of {len(missing)}: {future.result()}")
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+    run_trials(_make, missing, len(jobs), workers, note)
     results: Results = {
         scale: {
             method: [result for job in jobs if job.scale == scale and (result := job.read(method))]
@@ -110,20 +99,8 @@ def write_consistency(
     return write_page(path, format_page(results, OFFSET, FRAMES, _FIRST_SEED, command))
 
 
-def _start_worker() -> None:
-    cv2.setNumThreads(1)
-    torch.set_num_threads(1)
-
-
-def _work(job: _ConsistencyTrials) -> str:
-    """Renders and tracks what is missing of one sequence; says how long both took."""
-    try:
-        return _make(job)
-    except KeyboardInterrupt:
-        os._exit(130)  # or this process would begin with the next sequence
-
-
 def _make(job: _ConsistencyTrials) -> str:
+    """Renders and tracks what is missing of one sequence; says how long both took."""
     began = time.perf_counter()
     source = render(job.cache.folder, job.recipe, 1)
     rendered = time.perf_counter()

@@ -12,7 +12,7 @@ import numpy as np
 
 from sigmaslam.evaluation.benchmarks.page import header, opening, row, write_page
 from sigmaslam.evaluation.benchmarks.sequences import REAL
-from sigmaslam.evaluation.trial import Trial, render
+from sigmaslam.evaluation.trial import Trial, render, rendered_truth
 from sigmaslam.readers import open_sequence
 from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.tracker import TrackerConfig
@@ -23,7 +23,6 @@ CONSTANTS = ((0.15, 0.2), (0.2, 0.3), (0.3, 0.4), (0.5, 0.6))
 _PRESETS = ("street", "room", "drone")
 _TUNING_SEED, _TEST_SEED = 101, 102
 _FRAMES = 40
-_EUROC_TRUTH = Path("mav0") / "state_groundtruth_estimate0" / "data.csv"
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,9 +67,7 @@ def write_noise(
         for preset in _PRESETS:
             note(f"rendering {preset}{seed}")
             source = render(runs, Recipe(preset, _FRAMES, seed), workers)
-            truth = source / _EUROC_TRUTH
-            truth = truth if truth.is_file() else source / "poses.txt"
-            renders.setdefault(seed, {})[source.name] = (source, truth)
+            renders.setdefault(seed, {})[source.name] = (source, rendered_truth(source))
     note(f"tuning {len(CONSTANTS)} constants")
     tuning = {
         constant: [_track(source, truth, constant) for source, truth in renders[_TUNING_SEED].values()]

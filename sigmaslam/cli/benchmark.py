@@ -108,13 +108,22 @@ def _noise(out: Path, command: str, *, data: Path | None, runs: Path | None) -> 
 
 
 @_registered
-def _consistency(out: Path, command: str, *, runs: Path | None, seeds: int) -> str:
+def _consistency(out: Path, command: str, *, runs: Path | None, seeds: int | None) -> str:
     from sigmaslam.evaluation.benchmarks.consistency import write_consistency
     from sigmaslam.synthetic.render_sequence import default_workers
 
-    folder = _need_runs(runs, "consistency", "renders and results")
+    folder, seeds = _need_runs(runs, "consistency", "renders and results"), seeds or 30
     command += f" --runs {folder.name} --seeds {seeds}"
     return write_consistency(out, folder, seeds, default_workers(), command, _note)
+
+
+@_registered
+def _shake(out: Path, command: str, *, runs: Path | None, seeds: int | None) -> str:
+    from sigmaslam.evaluation.benchmarks.shake import write_shake
+    from sigmaslam.synthetic.render_sequence import default_workers
+
+    folder, seeds = _need_runs(runs, "shake", "renders and results"), seeds or 20
+    return write_shake(out, folder, seeds, default_workers(), f"{command} --runs {folder.name} --seeds {seeds}", _note)
 
 
 @_registered
@@ -198,11 +207,14 @@ def benchmark(
     runs: Annotated[
         Path | None,
         typer.Option(
-            help="noise, consistency, sequences, endurance, runtime: folder of the renders; what is there is used "
-            "again. sequences, endurance, runtime: a temporary one without it."
+            help="noise, consistency, shake, sequences, endurance, runtime: folder of the renders; what is there is "
+            "used again. sequences, endurance, runtime: a temporary one without it."
         ),
     ] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="consistency: sequences a scale.")] = 30,
+    seeds: Annotated[
+        int | None,
+        typer.Option(min=1, help="consistency: sequences a scale; shake: sequences.", show_default="30, shake 20"),
+    ] = None,
     frames: Annotated[
         int | None,
         typer.Option(
@@ -231,7 +243,8 @@ def benchmark(
     are installed. claims: EKF against UKF by Monte Carlo. renders: how fast, and how like real images. features: time
     and scores of the features beside SIFT, ORB and other people's. matches: whether their probability and
     covariance hold, beside AdaLAM and MAGSAC. noise: the tracker with these covariances beside one constant.
-    consistency: whether poses and map are as sure as they say, on 90 rendered sequences (an hour). endurance: memory,
+    consistency: whether poses and map are as sure as they say, on 90 rendered sequences (an hour). shake: whether
+    frames of a shaken camera with a slow shutter are right when they are called tracked. endurance: memory,
     time and error over 10,000 frames of a lap over and over (ten minutes to render, then a quarter of an hour).
     runtime: CPU and wall time, memory and start-up beside OpenCV's odometry, cuVSLAM and ORB-SLAM3 (extra 'peers').
     All but sequences and runtime need the extra 'train'.

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from sigmaslam.synthetic.geometry import rigid_motion
 from sigmaslam.synthetic.motion import random_motions
 from sigmaslam.synthetic.motion.paths import Path, at_rest, with_stops
+from sigmaslam.synthetic.motion.shaken import shaken, slowed
 from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel
 from sigmaslam.synthetic.scene import Body, Scene
 from sigmaslam.synthetic.worlds.episode import Episode, Wish, daylight
@@ -19,6 +20,7 @@ from sigmaslam.synthetic.worlds.street_furniture import person
 
 _CLEARANCE = 0.7
 """Metres around the camera's way that stay free."""
+_SHAKE = 0.08  # metres that a shaken camera leaves its way
 _FREE_FOR_MOVERS = 0.8  # more of it where bodies fly about in front of the camera
 _TEXTURES = {"leaves": 2, "plaster": 1, "bricks": 2, "glyphs": 1, "wood": 1, "noise": 1, "cells": 1, "asphalt": 1,
              "facade": 1, "checker": 1, "strokes": 1}  # fmt: skip
@@ -29,14 +31,15 @@ def generate(rng: np.random.Generator, wish: Wish) -> Episode:
     outdoors = bool(rng.random() < 0.25)
     size = np.array([rng.uniform(12, 30), rng.uniform(12, 22), rng.uniform(5.5, 9.0)])
     clearance = _CLEARANCE + _FREE_FOR_MOVERS * (wish.movers > 0)
-    path = _flight(rng, wish, size, clearance)
+    way = _flight(rng, wish, size, clearance)
+    path = shaken(rng, way, _SHAKE) if wish.motion == "shaken" else way
     hall = Hall(rng, wish, size, path, clearance, outdoors)
     hall.build()
     bodies = hall.bodies
     if wish.movers > 0:
         makers = (hall.load, hall.flying_machine, hall.crates)
         models = [makers[int(rng.integers(3))]() for _ in range(1 + int(rng.random() < 0.6) + int(wish.movers > 0.2))]
-        bodies += follow(rng, path, wish.duration, wish.movers, [centred(m) for m in models], (0.6, 1.4))
+        bodies += follow(rng, way, wish.duration, wish.movers, [centred(m) for m in models], (0.6, 1.4))
     lights = daylight(rng, 25, (0.6, 1.2))
     return Episode(Scene(tuple(bodies), tuple(hall.palette.materials), lights, sky=float(rng.uniform(0.8, 2.2))), path)
 
@@ -326,7 +329,7 @@ class Hall:
 
 
 def _flight(rng: np.random.Generator, wish: Wish, size: np.ndarray, clearance: float) -> Path:
-    """The camera's path, off the walls, the floor and what hangs under the ceiling."""
+    """The camera's path but for the shaking, off the walls, the floor and what hangs under the ceiling."""
     half = np.minimum(size[:2] / 2 - clearance - 0.9, rng.uniform(3.0, 7.0))
     low, high = 0.35 + clearance, size[2] - 1.2 - clearance
     middle = rng.uniform(-1, 1, 2) * (size[:2] / 2 - clearance - 0.9 - half)
@@ -339,6 +342,10 @@ def _flight(rng: np.random.Generator, wish: Wish, size: np.ndarray, clearance: f
         return random_motions.pure_rotation(rng, wish.duration, centre)
     if wish.motion == "loop":
         return random_motions.closed_loop(rng, wish.duration, box)
+    if wish.motion == "shaken":
+        # At a third of the speed, so that the shaking is most of the flow.
+        inner = random_motions.FreeSpace(box.centre, (box.half[0] - _SHAKE, box.half[1] - _SHAKE, box.half[2] - _SHAKE))
+        return slowed(random_motions.drone(rng, wish.duration / 3, inner), wish.duration)
     if wish.motion == "stops":
         ease = min(1.5, wish.duration / 6)
         return with_stops(random_motions.drone(rng, max(wish.duration - 1.0 - ease, 3 * ease), box), rng, 1, ease)

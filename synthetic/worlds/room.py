@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from sigmaslam.synthetic.motion.paths import Path, at_rest, with_stops
 from sigmaslam.synthetic.motion.random_motions import FreeSpace, closed_loop, hand_held, pure_rotation
+from sigmaslam.synthetic.motion.shaken import shaken, slowed
 from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel, Shape
 from sigmaslam.synthetic.scene import Body, Lights, Material, Scene, Texture
 from sigmaslam.synthetic.worlds.episode import Episode, Wish
@@ -17,6 +18,7 @@ from sigmaslam.synthetic.worlds.part_models import Model, Part, follow
 CLEARANCE = 0.3
 """Metres between the camera and any surface, at least."""
 
+_SHAKE = 0.05  # metres that a shaken camera leaves its way
 _DEPTH = 0.8  # metres off the walls that belong to furniture
 
 # Tile in metres on small things and contrast of each kind: boards of 5-25 cm, tiles of 10-30 cm on floors and walls.
@@ -49,21 +51,26 @@ def generate(rng: np.random.Generator, wish: Wish) -> Episode:
     _fill_middle(furniture, size, free)
     direction = _triple(rng.uniform((-0.8, -0.8, 0.7), (0.8, 0.8, 1.2)))
     lights = Lights(rng.uniform(0.2, 0.45), rng.uniform(0.3, 0.9), direction, shadows=bool(rng.random() < 0.85))
-    path = _carry(rng, wish, free)
+    way = _carry(rng, wish, free)
+    path = shaken(rng, way, _SHAKE) if wish.motion == "shaken" else way
     if wish.movers > 0:
         models = [_passer_by(furniture) for _ in range(1 if wish.movers < 0.15 else int(rng.integers(1, 4)))]
         share = min(1.2 * wish.movers, 0.55)  # some of it will be behind furniture
-        furniture.bodies += follow(rng, path, wish.duration, share, models, (0.7, 2.2))
+        furniture.bodies += follow(rng, way, wish.duration, share, models, (0.7, 2.2))
     return Episode(Scene(tuple(furniture.bodies), tuple(furniture.materials), lights), path)
 
 
 def _carry(rng: np.random.Generator, wish: Wish, free: FreeSpace) -> Path:
+    """The camera's path but for the shaking."""
     if wish.motion == "loop":
         return closed_loop(rng, wish.duration, free)
     if wish.motion == "rotation":
         return pure_rotation(rng, wish.duration, _triple(free.centre + rng.uniform(-0.8, 0.8, 3) * free.half))
     if wish.motion == "rest":
         return at_rest(hand_held(rng, wish.duration, free).poses(0.5 * wish.duration), wish.duration)
+    if wish.motion == "shaken":
+        inner = FreeSpace(free.centre, _triple(np.array(free.half) - _SHAKE))
+        return slowed(hand_held(rng, 0.5 * wish.duration, inner), wish.duration)
     if wish.motion == "stops":
         moving = 0.75 * wish.duration
         return with_stops(hand_held(rng, moving, free), rng, 1 + int(wish.duration / 8), min(1.0, 0.5 * moving))

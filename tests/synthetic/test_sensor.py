@@ -62,7 +62,9 @@ def test_read_noise_is_normal_and_white(rng: np.random.Generator) -> None:
     assert np.abs(np.mean(noise[1:] * noise[:-1])) < 1.0
 
 
-@pytest.mark.parametrize(("flow", "shutter"), [((12.0, 0.0), 0.5), ((6.0, 8.0), 0.8), ((0.0, 9.0), 1.0)])
+@pytest.mark.parametrize(
+    ("flow", "shutter"), [((12.0, 0.0), 0.5), ((6.0, 8.0), 0.8), ((0.0, 9.0), 1.0), ((50.0, 0.0), 0.5)]
+)
 def test_motion_blur_is_as_long_as_flow_times_shutter(
     flow: tuple[float, float], shutter: float, rng: np.random.Generator
 ) -> None:
@@ -78,6 +80,18 @@ def test_motion_blur_is_as_long_as_flow_times_shutter(
             # A uniform line of length L has variance L^2 / 12; bilinear sampling adds up to 1/4.
             variance = (flow[axis] * shutter) ** 2 / 12
             assert -0.15 < spread(photograph, axis) ** 2 - variance < 0.3
+
+
+@pytest.mark.parametrize("length", [25, 32])
+def test_a_long_blur_has_no_gaps(length: int, rng: np.random.Generator) -> None:
+    point = np.zeros((21, 81), np.float32)
+    point[10, 40] = 0.75 * length
+    field = np.zeros((21, 81, 2)) + [2.0 * length, 0.0]
+    field[0, 0] = 0.0  # or the field would be constant
+    line = expose(point, replace(QUIET, shutter=0.5), rng, flow=field)[10].astype(float)
+    first = 40 - (length - 3) // 2
+    np.testing.assert_allclose(line[first : first + length - 3], 0.75 * 255, rtol=0.1)
+    assert line[: first - 3].max() == line[first + length + 1 :].max() == 0
 
 
 def test_constant_flow_gives_what_the_general_way_gives(texture: np.ndarray, rng: np.random.Generator) -> None:

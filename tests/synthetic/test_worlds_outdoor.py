@@ -11,10 +11,10 @@ from sigmaslam.synthetic.motion import random_motions
 from sigmaslam.synthetic.rendering.renderer import Renderer
 from sigmaslam.synthetic.rendering.visibility import Eye
 from sigmaslam.synthetic.scene import Scene
-from sigmaslam.synthetic.worlds import hall, street
+from sigmaslam.synthetic.worlds import hall, rubble, street
 from sigmaslam.synthetic.worlds.episode import Episode, Wish
 
-DOMAINS = {"street": street.generate, "hall": hall.generate}
+DOMAINS = {"street": street.generate, "hall": hall.generate, "rubble": rubble.generate}
 DURATION, SHARE = 4.0, 0.2
 # 70 degrees across, 4 : 3, as shares are meant.
 EYE = Eye(CameraModel(80, 60, 57.1, 57.1, 39.5, 29.5))
@@ -80,7 +80,7 @@ def test_movers_cover_about_the_wished_share(shown: tuple[str, Episode, Renderer
 def test_the_lane_is_free_and_the_camera_is_1_65_m_above_it(shown: tuple[str, Episode, Renderer]):
     domain, episode, renderer = shown
     if domain != "street":
-        pytest.skip("the hall has no lane")
+        pytest.skip("there is no lane")
     times = np.linspace(0, DURATION, 400)
     way = episode.path.poses(times)[:, :3, 3]
     still = (renderer.surfaces.mover == 0).numpy()

@@ -217,4 +217,6 @@ def test_an_option_that_the_benchmark_does_not_serve_is_refused(tmp_path: Path):
     page = tmp_path / "page.md"
     assert_refused(run_here("benchmark", "claims", "--out", page, "--rounds", "3"), "--rounds", "claims")
     assert_refused(run_here("benchmark", "sequences", "--out", page, "--eager"), "--eager", "sequences")
+    assert_refused(run_here("benchmark", "shake", "--out", page, "--frames", "3"), "--frames", "shake")
+    assert_refused(run_here("benchmark", "shake", "--out", page, "--seeds", "3"), "shake", "--runs")
     assert not page.exists()
