@@ -57,6 +57,10 @@ class MotionFilter:
         )
         self._covariance = 0.5 * (covariance + covariance.T)
 
+    def widen(self, factor: float) -> None:
+        """The prediction is off by more than it claims: all its variances are so many times as large."""
+        self._covariance = factor * self._covariance
+
     def correct(self, step: np.ndarray, covariance: np.ndarray) -> None:
         """Takes over the posterior of the pose, perturbed from the left in the keyframe, which knew the prediction."""
         P = self._covariance

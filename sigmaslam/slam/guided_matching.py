@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sigmaslam.estimation.chi_square import CHI_SQUARE_MEDIAN
 from sigmaslam.estimation.frame_update import FrameUpdate
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
+from sigmaslam.estimation.mahalanobis import squared_mahalanobis
 from sigmaslam.frontend import Frontend, KeypointSearch, StereoView, TemporalMatches
 from sigmaslam.frontend.plane_alignment import plane_maps
 from sigmaslam.geometry.camera import RectifiedStereo
@@ -107,29 +109,40 @@ class GuidedMatcher:
         pose: np.ndarray,
         covariance: np.ndarray,
         carry: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
-    ) -> GuidedMatches:
+    ) -> tuple[GuidedMatches, float]:
         """Finds landmarks likewise in a pair without features.
+
+        Before anything is gated, optical flow tells by how much the prediction is off: a camera that is shaken turns
+        back within a few frames, which no constant velocity foresees. Where the flow departs further than predicted,
+        landmarks are searched for in ellipses that much wider.
 
         Args:
             left, right: (H, W) uint8, rectified.
             keyframes, pose, covariance: as of `match_guided`.
             carry: from the left image, ids (K,) and predicted places (K, 2) of landmarks to where optical flow takes
                 them, NaN where it does not.
+        Returns:
+            The matches, and by what the prediction's variances are to be multiplied, 1 or more.
         """
         searches = [(rows, search) for _, rows, search in self._searches(keyframes, pose, covariance, -1)]
         if not searches:
-            return GuidedMatches.empty()
+            return GuidedMatches.empty(), 1.0
         rows = np.concatenate([each for each, _ in searches])
         start = carry(
             left, self.window.landmarks.id[rows], np.concatenate([search.predicted for _, search in searches])
         )
+        excess = _excess(
+            start - np.concatenate([search.predicted for _, search in searches]),
+            np.concatenate([search.covariance for _, search in searches]),
+        )
+        searches = [(each, replace(search, covariance=excess * search.covariance)) for each, search in searches]
         starts = np.split(start, np.cumsum([len(each) for each, _ in searches])[:-1])
         found = self.frontend.follow([search for _, search in searches], starts, left, right)
         parts = [
             self._measured(rows, search, matches, alone=False)
             for (rows, search), matches in zip(searches, found, strict=True)
         ]
-        return GuidedMatches.concatenate(parts)
+        return GuidedMatches.concatenate(parts), excess
 
     def _searches(
         self, keyframes: list[StereoView], pose: np.ndarray, covariance: np.ndarray, reference: int
@@ -171,3 +184,12 @@ class GuidedMatcher:
     def _in_image(self, predicted: np.ndarray) -> np.ndarray:
         u, v = predicted[:, 0], predicted[:, 1]
         return np.asarray((u >= 0) & (v >= 0) & (u < self.camera.width) & (v < self.camera.height))
+
+
+def _excess(departure: np.ndarray, covariance: np.ndarray) -> float:
+    """By what covariances (K, 2, 2) are too small for departures (K, 2), NaN where unknown, in the median; 1 or more."""
+    known = np.isfinite(departure[:, 0])
+    if known.sum() < _MIN_LANDMARKS:
+        return 1.0
+    squared = squared_mahalanobis(departure[known], covariance[known])
+    return max(1.0, float(np.median(squared)) / CHI_SQUARE_MEDIAN[2])

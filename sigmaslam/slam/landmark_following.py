@@ -52,13 +52,15 @@ class LandmarkFollower:
 
     def follow(
         self, frame: Frame, keyframes: list[Keyframe], pose: np.ndarray, covariance: np.ndarray
-    ) -> GuidedMatches:
+    ) -> tuple[GuidedMatches, float]:
         """Finds the window's landmarks by optical flow from the last frame, aligned to their keyframes' patches.
 
         Args:
             frame: the current one.
             keyframes: of the window.
             pose, covariance: predicted, as of `GuidedMatcher.match_guided`.
+        Returns:
+            As of `GuidedMatcher.follow`.
         """
         views = [keyframe.view for keyframe in keyframes]
         return self._guided.follow(frame.left, frame.right, views, pose, covariance, self._carry)

@@ -59,6 +59,7 @@ class Localiser:
 
     Attributes:
         window: of keyframes.
+        motion: predicts; is widened where images say at once that it is off.
         update: estimates poses against it.
         guided: finds landmarks near a prediction.
         follower: finds them without features.
@@ -67,6 +68,7 @@ class Localiser:
     """
 
     window: KeyframeWindow
+    motion: MotionFilter
     update: FrameUpdate
     guided: GuidedMatcher
     follower: LandmarkFollower
@@ -84,7 +86,10 @@ class Localiser:
             prediction: of its pose.
             clock: takes the time of the stages `match` and `filter`.
         """
-        matches = self.follower.follow(frame, keyframes, prediction.pose, prediction.covariance)
+        matches, excess = self.follower.follow(frame, keyframes, prediction.pose, prediction.covariance)
+        if excess > 1.0:
+            self.motion.widen(excess)
+            prediction = Prediction.of(self.window, self.motion)
         clock.lap("match")
         fit = self._fit_near(matches, prediction)
         clock.lap("filter")

@@ -91,7 +91,7 @@ class StereoTracker:
         guided = GuidedMatcher(rectified, frontend, window, update, noise, config)
         self._unguided = unguided = UnguidedMatcher(rectified, frontend, window, noise, config)
         self._follower = follower = LandmarkFollower(guided)
-        self._localiser = Localiser(window, update, guided, follower, unguided, config)
+        self._localiser = Localiser(window, motion, update, guided, follower, unguided, config)
         self._mapper = Mapper(rectified, window, keyframes, motion, noise, admission, config)
         self._loops = LoopCloser(window, keyframes, unguided)
         self._relocaliser = Relocaliser(window, keyframes, unguided, admission, config.min_inliers)
@@ -190,6 +190,7 @@ class StereoTracker:
             followed = self._localiser.follow(frame, self._keyframes.active, prediction, clock)
             if followed is not None:
                 return followed
+            prediction = Prediction.of(self._window, self._motion)
         view = frame.view
         clock.lap("features")
         if view.is_swapped(self.config.min_inliers):
