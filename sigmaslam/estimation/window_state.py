@@ -37,6 +37,14 @@ class WindowState:
     def __len__(self) -> int:
         return len(self.poses)
 
+    @property
+    def all_poses(self) -> PastPoses:
+        """The marginalised poses, and behind them those of the window."""
+        past = self.past
+        for k, pose in enumerate(self.poses):
+            past = past.append(pose, self.covariance, pose_slice(k))
+        return past
+
     def minus(self, other: WindowState) -> np.ndarray:
         """(n,) error-state difference of two means."""
         poses = se3_log(self.poses @ se3_inverse(other.poses)).ravel()
