@@ -141,7 +141,7 @@ class RunWriter:
             np.save(path, rows[:, 17:].reshape(-1, 6, 6))
         if final is not None:
             # A frame whose pose was not written, as the run was stopped in it, is in neither trajectory.
-            write_tum(self._out / FINAL_TRAJECTORY, final[0].subset(slice(len(rows))))
+            write_tum(self._out / FINAL_TRAJECTORY, final[0].subset(np.arange(len(rows))))
             with atomic_path(self._out / FINAL_COVARIANCE) as path:
                 np.save(path, final[1][: len(rows)])
         with atomic_path(self._out / "map.npz") as path:

@@ -127,7 +127,9 @@ class StereoTracker:
         clock = Stopwatch()
         frame = Frame(*self._rectifier.rectify(left, right), self._frontend)
         clock.lap("rectify")
-        self._predict(timestamp)
+        if self._course.timestamp is not None:
+            # Constant velocity since the last frame.
+            self._motion.predict(timestamp - self._course.timestamp, densities(self.config, self._window.depth))
         matches, fit = self._localise(frame, timestamp, clock)
         predicted = filtered = self._motion.state
         if fit is not None:
@@ -176,12 +178,6 @@ class StereoTracker:
         return self._keyframes.pack(self._frontend.name, self._camera)
 
     # ---- the stages of a frame
-
-    def _predict(self, timestamp: float) -> None:
-        """Constant velocity since the last frame."""
-        if self._course.timestamp is not None:
-            seconds = timestamp - self._course.timestamp
-            self._motion.predict(seconds, densities(self.config, self._window.depth))
 
     def _localise(self, frame: Frame, timestamp: float, clock: Stopwatch) -> tuple[GuidedMatches, FrameFit | None]:
         """Matches with the window's landmarks, and the pose if enough of them agree."""
