@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sigmaslam.estimation.constant_velocity import MotionState
-from sigmaslam.estimation.gaussian import regression
+from sigmaslam.estimation.gaussian import matrix_root, regression
 from sigmaslam.geometry.se3 import nearest_rigid, se3_adjoint, se3_exp, se3_inverse, se3_log, skew
 
 
@@ -26,27 +26,41 @@ class MotionLink:
     filtered: MotionState
 
 
-def smooth_motion(chain: list[MotionLink]) -> list[MotionState]:
-    """States of successive frames that hang at one keyframe, each given all of them.
+@dataclass(frozen=True, slots=True)
+class SmoothedMotion:
+    """Successive frames that hang at one keyframe, each given all of them.
 
-    The backward pass of Rauch, Tung and Striebel (1965), with the error state of the filter.
+    Attributes:
+        step: (N, 4, 4) T_keyframe_camera.
+        covariance: (N, 6, 6) of it, perturbed from the left in the keyframe.
+    """
+
+    step: np.ndarray
+    covariance: np.ndarray
+
+
+def smooth_motion(chain: list[MotionLink]) -> SmoothedMotion:
+    """The backward pass of Rauch, Tung and Striebel (1965), with the error state of the filter.
+
+    Args:
+        chain: frames in the order of time.
     """
     if not chain:
-        return []
-    smoothed = [chain[-1].filtered]
+        return SmoothedMotion(np.zeros((0, 4, 4)), np.zeros((0, 6, 6)))
+    states = [chain[-1].filtered]
     for link, later in zip(chain[-2::-1], chain[:0:-1], strict=True):
-        here, predicted, after = link.filtered, later.predicted, smoothed[-1]
+        here, predicted, after = link.filtered, later.predicted, states[-1]
         slope = _transition(here, later.timestamp - link.timestamp)
         gain = regression(here.covariance @ slope.T, predicted.covariance)
-        change = np.r_[se3_log(after.step @ se3_inverse(predicted.step)), after.twist - predicted.twist]
-        move = gain @ change
-        covariance = here.covariance + gain @ (after.covariance - predicted.covariance) @ gain.T
-        smoothed.append(
-            MotionState(
-                nearest_rigid(se3_exp(move[:6]) @ here.step), here.twist + move[6:], 0.5 * (covariance + covariance.T)
-            )
-        )
-    return smoothed[::-1]
+        move = gain @ np.r_[se3_log(after.step @ se3_inverse(predicted.step)), after.twist - predicted.twist]
+        # Of a motion that is hardly known, predicted by sigma points, the difference may be negative somewhere.
+        root = matrix_root(here.covariance + gain @ (after.covariance - predicted.covariance) @ gain.T)
+        step = nearest_rigid(se3_exp(move[:6]) @ here.step)
+        states.append(MotionState(step, here.twist + move[6:], root @ root.T))
+    states.reverse()
+    return SmoothedMotion(
+        np.array([state.step for state in states]), np.array([state.covariance[:6, :6] for state in states])
+    )
 
 
 def _transition(state: MotionState, seconds: float) -> np.ndarray:

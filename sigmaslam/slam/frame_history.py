@@ -16,7 +16,7 @@ from sigmaslam.estimation.constant_velocity import MotionState
 from sigmaslam.estimation.gaussian import regression
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.marginalised_poses import PastPoses, past_slice
-from sigmaslam.estimation.motion_smoothing import MotionLink, smooth_motion
+from sigmaslam.estimation.motion_smoothing import MotionLink, SmoothedMotion, smooth_motion
 from sigmaslam.geometry.se3 import nearest_rigid, se3_adjoint, se3_exp, se3_inverse, se3_log, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.slam.estimate import Estimate
@@ -44,12 +44,9 @@ class HangingFrames(Table):
         return cls(nearest_rigid(step), spread.astype(np.float32), share.astype(np.float32))
 
     @classmethod
-    def hanging(cls, states: list[MotionState], share: np.ndarray | None = None) -> HangingFrames:
-        """Frames of a motion since the first keyframe, with scalar shares (N,); by default they take none."""
-        step = np.array([state.step for state in states]).reshape(-1, 4, 4)
-        spread = np.array([state.covariance[:6, :6] for state in states]).reshape(-1, 6, 6)
-        weight = np.zeros(len(states)) if share is None else share
-        return cls.of(step, spread, weight[:, None, None] * np.eye(6))
+    def at_first(cls, motion: SmoothedMotion) -> HangingFrames:
+        """Frames that take no share of what the second keyframe is corrected by."""
+        return cls.of(motion.step, motion.covariance, np.zeros_like(motion.covariance))
 
     def corrected(self, correction: np.ndarray) -> HangingFrames:
         """The frames when the second keyframe is moved by (6,), perturbed from the left in the first one."""
@@ -138,7 +135,7 @@ class FrameHistory:
                 self._settled.append((estimate.T_world_camera[None], estimate.covariance[None]))
                 return
             self._chain, self._began = [active[0].id], active[0].timestamp
-            self._intervals = [_Interval(HangingFrames.hanging([]), np.eye(4))]
+            self._intervals = [_Interval(HangingFrames.at_first(smooth_motion([])), np.eye(4))]
         link = MotionLink(estimate.timestamp, predicted, filtered)
         if active[0].timestamp == estimate.timestamp and active[0].id == self._chain[-1]:
             self._links = [_at_keyframe(estimate.timestamp)]
@@ -166,15 +163,18 @@ class FrameHistory:
 
     def _close(self, link: MotionLink, id: int) -> None:
         """A frame became a keyframe: those since the last one are smoothed, and hang between the two from now on."""
-        motion = [*self._links, link]
-        end = link.filtered
-        elapsed = np.array([each.timestamp for each in self._links]) - self._began
-        sizes = np.array([np.trace(each.filtered.covariance[:3, :3]) for each in self._links])
-        # What two frames' errors have in common is that of the landmarks, which grows with the way from the keyframe.
+        chain, end = [*self._links, link], link.filtered
+        motion = smooth_motion(chain)
+        # What errors of two frames have in common is that of the landmarks, which grows with the way from the keyframe.
         # An error that is much larger at the end is the end's own.
-        whole = np.trace(end.covariance[:3, :3])
-        share = np.minimum(elapsed / (link.timestamp - self._began), sizes / whole if whole > 0 else 1.0)
-        frames = HangingFrames.hanging(smooth_motion(motion)[:-1], share)
+        elapsed = np.array([each.timestamp for each in chain]) - self._began
+        size = np.array([np.trace(each.filtered.covariance[:3, :3]) for each in chain])
+        share = np.minimum(elapsed / elapsed[-1], size / max(size[-1], np.finfo(float).tiny))[:, None, None]
+        spread = motion.covariance
+        if end is link.predicted:
+            # A keyframe that was not tracked: how far the prediction is off there says how far it was on the way.
+            spread = (1.0 - share) * spread
+        frames = HangingFrames.of(motion.step[:-1], spread[:-1], share[:-1] * np.eye(6))
         self._chain.append(id)
         self._intervals.append(_Interval(frames, end.step))
         self._links, self._began = [_at_keyframe(link.timestamp)], link.timestamp
@@ -244,7 +244,7 @@ class FrameHistory:
         for first, last, interval in zip([places[0], *places], places, self._intervals, strict=False):
             step = se3_inverse(keyframes.poses[first]) @ keyframes.poses[last]
             parts.append(interval.settled(step).frames.between(first, last, keyframes))
-        newest = HangingFrames.hanging(smooth_motion(self._links))
+        newest = HangingFrames.at_first(smooth_motion(self._links))
         parts.append(newest.between(places[-1], places[-1], keyframes))
         return [self._in_left_camera(*part) for part in parts]
 
