@@ -163,20 +163,16 @@ class FrameHistory:
 
     def _close(self, link: MotionLink, id: int) -> None:
         """A frame became a keyframe: those since the last one are smoothed, and hang between the two from now on."""
-        chain, end = [*self._links, link], link.filtered
+        chain = [*self._links, link]
         motion = smooth_motion(chain)
         # What errors of two frames have in common is that of the landmarks, which grows with the way from the keyframe.
         # An error that is much larger at the end is the end's own.
         elapsed = np.array([each.timestamp for each in chain]) - self._began
         size = np.array([np.trace(each.filtered.covariance[:3, :3]) for each in chain])
         share = np.minimum(elapsed / elapsed[-1], size / max(size[-1], np.finfo(float).tiny))[:, None, None]
-        spread = motion.covariance
-        if end is link.predicted:
-            # A keyframe that was not tracked: how far the prediction is off there says how far it was on the way.
-            spread = (1.0 - share) * spread
-        frames = HangingFrames.of(motion.step[:-1], spread[:-1], share[:-1] * np.eye(6))
+        frames = HangingFrames.of(motion.step[:-1], motion.covariance[:-1], share[:-1] * np.eye(6))
         self._chain.append(id)
-        self._intervals.append(_Interval(frames, end.step))
+        self._intervals.append(_Interval(frames, link.filtered.step))
         self._links, self._began = [_at_keyframe(link.timestamp)], link.timestamp
 
     def _forget(self, id: int, ids: list[int]) -> None:

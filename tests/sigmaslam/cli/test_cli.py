@@ -112,7 +112,8 @@ def test_a_sequence_that_breaks_off_leaves_what_was_computed(short_sequence: Pat
     result = run_here("track", short_sequence, "--out", out)
     assert_refused(result, "time")
     if out.exists():  # a reader may refuse the file before the first frame
-        assert len(read_tum(out / "trajectory.tum")) == 5
+        assert len(read_tum(out / "trajectory.tum")) == len(read_tum(out / "trajectory_final.tum")) == 5
+        assert np.load(out / "covariance_final.npy").shape == (5, 6, 6)
 
 
 def test_a_calibration_with_a_missing_key_or_wrong_size_is_refused(short_sequence: Path, tmp_path: Path):
