@@ -40,10 +40,13 @@ class WindowState:
     @property
     def all_poses(self) -> PastPoses:
         """The marginalised poses, and behind them those of the window."""
-        past = self.past
-        for k, pose in enumerate(self.poses):
-            past = past.append(pose, self.covariance, pose_slice(k))
-        return past
+        past, own = self.past, self.covariance[CALIBRATION_SIZE:]
+        across = past.cross[:, CALIBRATION_SIZE:]
+        return PastPoses(
+            np.concatenate([past.poses, self.poses]),
+            np.block([[past.covariance, across], [across.T, own[:, CALIBRATION_SIZE:]]]),
+            np.concatenate([past.cross, own]),
+        )
 
     def minus(self, other: WindowState) -> np.ndarray:
         """(n,) error-state difference of two means."""

@@ -125,7 +125,6 @@ class FrameHistory:
             predicted: motion since the last keyframe before it, without its images.
             filtered: the same with them, or again without where they gave no pose.
         """
-        self._timestamps.append(estimate.timestamp)
         active = self._keyframes.active
         ids = [keyframe.id for keyframe in (*self._keyframes.remembered, *active)]
         if self._chain and not set(self._ids) & set(ids):
@@ -133,6 +132,7 @@ class FrameHistory:
         if not self._chain:
             if not active:
                 self._settled.append((estimate.T_world_camera[None], estimate.covariance[None]))
+                self._timestamps.append(estimate.timestamp)
                 return
             self._chain, self._began = [active[0].id], active[0].timestamp
             self._intervals = [_Interval(HangingFrames.at_first(smooth_motion([])), np.eye(4))]
@@ -146,6 +146,7 @@ class FrameHistory:
         for gone in [each for each in self._chain if each not in ids]:
             self._forget(gone, ids)
         self._ids, self._state = ids, self._window.posterior
+        self._timestamps.append(estimate.timestamp)
 
     def final(self) -> tuple[Trajectory, np.ndarray]:
         """All frames as they are known now.

@@ -176,6 +176,9 @@ def test_ctrl_c_leaves_a_usable_run(demo_sequence: Path, tmp_path: Path):
     count = len(read_tum(out / "trajectory.tum"))
     assert 3 <= count < 40
     assert len(np.load(out / "covariance.npy")) == count == len(rows(out))
+    final = read_tum(out / "trajectory_final.tum")
+    np.testing.assert_array_equal(final.timestamps, read_tum(out / "trajectory.tum").timestamps)
+    assert np.load(out / "covariance_final.npy").shape == (count, 6, 6)
 
 
 def test_the_runtime_imports_without_torch_or_kornia(demo_sequence: Path):
