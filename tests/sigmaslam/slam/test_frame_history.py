@@ -172,7 +172,7 @@ class Walk:
         last = window.posterior.poses[-1] if len(window) else np.eye(4)
         step = STEP if len(window) else np.eye(4)
         spread = turn_covariance(last, SPREAD) if len(window) else np.zeros((6, 6))
-        window.add_keyframe(last @ step, step, spread, np.zeros(3), 1.0)
+        window.add_keyframe(last @ step, step, spread, np.zeros(CALIBRATION_SIZE), 1.0)
         self.keyframes.append(empty_view(), float(self.count))
 
 
