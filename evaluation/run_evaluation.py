@@ -36,6 +36,17 @@ from sigmaslam.plot_style import BLUE, VERMILLION, style_axes
 from sigmaslam.readers.trajectory_files import check_covariances, kitti_times_path, read_trajectory, trajectory_format
 from sigmaslam.runs.figures import AXIS_NAMES, plot_trajectory, save_png
 from sigmaslam.runs.relative_pose_file import RELATIVE_POSES_NAME, read_frame_pairs
+from sigmaslam.runs.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY
+
+
+@dataclass(frozen=True, slots=True)
+class FinalErrors:
+    """Errors of the same frames after the fact, of `trajectory_final.tum`; attributes as of `Evaluation`."""
+
+    ate: AbsoluteError
+    ate_origin: AbsoluteError
+    rpe: RelativeError
+    nees: PoseNees | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +66,7 @@ class Evaluation:
         nees: of poses relative to the first; None where there is no covariance.
         relative: consistency of poses relative to earlier ones, by span; None where the run does not say.
         figure_path: the plots; None where none were asked for.
+        final: of the trajectory after the fact; None where there is none.
     """
 
     estimate_path: Path
@@ -71,6 +83,7 @@ class Evaluation:
     nees: PoseNees | None
     relative: tuple[SpanConsistency, ...] | None
     figure_path: Path | None
+    final: FinalErrors | None = None
 
     @property
     def coverage(self) -> float:
@@ -79,12 +92,6 @@ class Evaluation:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, texts and lists for JSON; None stands for what could not be computed."""
-        rpe, nees = asdict(self.rpe), asdict(self.nees) if self.nees else None
-        del rpe["translations"], rpe["rotations_deg"]
-        if nees:
-            per_frame = nees.pop("per_frame")
-            nees |= {"count": len(per_frame), "inside": coverage(per_frame, 6)}
-            del nees["timestamps"]
         result = {
             "estimate": str(self.estimate_path),
             "truth": str(self.truth_path),
@@ -94,13 +101,11 @@ class Evaluation:
             "coverage": self.coverage,
             "path_length": self.path_length,
             "estimate_path_length": self.estimate_path_length,
-            "ate": asdict(self.ate),
-            "ate_origin": asdict(self.ate_origin),
-            "rpe": rpe,
+            **_errors_to_dict(self),
             "kitti": asdict(self.kitti),
-            "nees": nees,
             "relative": None if self.relative is None else [span_to_dict(span) for span in self.relative],
             "figure": str(self.figure_path) if self.figure_path else None,
+            "final": None if self.final is None else _errors_to_dict(self.final),
         }
         return {key: _plain(value) for key, value in result.items()}
 
@@ -124,8 +129,9 @@ def evaluate_run(
     of the truth at the estimate's rate, and never more than there are true poses.
 
     Args:
-        run_or_trajectory: a folder with `trajectory.tum` (and `covariance.npy`, (N, 6, 6) in the body frame),
-            or a TUM or KITTI file. Poses relative to earlier ones are judged where it holds `relative_poses.npz`.
+        run_or_trajectory: a folder with `trajectory.tum` (and `covariance.npy`, (N, 6, 6) in the body frame;
+            `trajectory_final.tum` and its covariance are evaluated beside them), or a TUM or KITTI file. Poses
+            relative to earlier ones are judged where it holds `relative_poses.npz`.
         truth: TUM, KITTI, or EuRoC ground truth.
         lengths, step: segments of the KITTI errors (see `kitti_errors`).
         plot: write `evaluation.png` into the run folder or beside the trajectory.
@@ -170,6 +176,7 @@ def evaluate_run(
         nees=pose_nees(estimate, true, covariance) if covariance is not None else None,
         relative=relative,
         figure_path=estimate_path.parent / "evaluation.png" if plot else None,
+        final=_evaluate_final(run_or_trajectory, estimate, true) if is_run else None,
     )
     if evaluation.figure_path:
         figure = draw_evaluation(evaluation, estimate, true, covariance)
@@ -187,18 +194,9 @@ def format_evaluation(evaluation: Evaluation) -> str:
         f"path      {e.path_length:.2f} m true, {e.estimate_path_length:.2f} m estimated",
         "",
         f"{'':<24}{'rmse [m]':>11}{'mean [m]':>11}{'median [m]':>12}{'max [m]':>11}{'rotation [deg]':>16}",
+        *_error_rows(e),
+        "",
     ]
-    for name, ate in (("ATE, best alignment", e.ate), ("ATE, first pose", e.ate_origin)):
-        lines.append(
-            f"{name:<24}{ate.rmse:>11.4f}{ate.mean:>11.4f}{ate.median:>12.4f}{ate.maximum:>11.4f}"
-            f"{ate.rotation_rmse_deg:>16.4f}"
-        )
-    name = f"RPE, {e.rpe.delta} frame" + ("s" if e.rpe.delta > 1 else "")
-    lines.append(
-        f"{name:<24}{e.rpe.translation_rmse:>11.4f}{e.rpe.translations.mean():>11.4f}"
-        f"{e.rpe.translation_median:>12.4f}{e.rpe.translations.max():>11.4f}{e.rpe.rotation_rmse_deg:>16.4f}"
-    )
-    lines.append("")
     if len(e.kitti.lengths):
         lines.append(f"{'KITTI segments':<24}{'count':>11}{'t_rel [%]':>11}{'r_rel [deg/100 m]':>19}")
         k = e.kitti
@@ -211,17 +209,10 @@ def format_evaluation(evaluation: Evaluation) -> str:
         )
     else:
         lines.append("KITTI segments: none, the path is shorter than a segment")
-    if e.nees is None:
-        lines += ["", "NEES: no covariance"]
-    elif len(e.nees.per_frame) == 0:
-        lines += ["", "NEES: no frame has a regular covariance"]
-    else:
-        lines += [
-            "",
-            f"NEES per degree of freedom (1 is right, more is overconfident): {e.nees.mean:.2f}; translation "
-            f"{e.nees.mean_translation:.2f}, rotation {e.nees.mean_rotation:.2f}, median {e.nees.median:.2f}; "
-            f"inside 95 %: {100 * coverage(e.nees.per_frame, 6):.0f} %",
-        ]
+    lines += ["", _nees_line(e.nees)]
+    if e.final is not None:
+        lines += ["", "After the fact, with loops and smoothing (trajectory_final.tum):", *_error_rows(e.final)]
+        lines.append(_nees_line(e.final.nees))
     return "\n".join([*lines, "", *format_relative(e.relative)]) + "\n"
 
 
@@ -325,6 +316,66 @@ def _judge_relative_poses(
         covariances = covariances if covariances is None else turn_covariance(truth.poses, covariances)
         truth = Trajectory(truth.timestamps, se3_inverse(truth.poses))
     return relative_consistency(pairs, estimate, truth, covariances)
+
+
+def _error_rows(errors: Evaluation | FinalErrors) -> list[str]:
+    """ATE and RPE, a line each."""
+    rows = [
+        f"{name:<24}{ate.rmse:>11.4f}{ate.mean:>11.4f}{ate.median:>12.4f}{ate.maximum:>11.4f}"
+        f"{ate.rotation_rmse_deg:>16.4f}"
+        for name, ate in (("ATE, best alignment", errors.ate), ("ATE, first pose", errors.ate_origin))
+    ]
+    rpe = errors.rpe
+    name = f"RPE, {rpe.delta} frame" + ("s" if rpe.delta > 1 else "")
+    return [
+        *rows,
+        f"{name:<24}{rpe.translation_rmse:>11.4f}{rpe.translations.mean():>11.4f}"
+        f"{rpe.translation_median:>12.4f}{rpe.translations.max():>11.4f}{rpe.rotation_rmse_deg:>16.4f}",
+    ]
+
+
+def _nees_line(nees: PoseNees | None) -> str:
+    if nees is None:
+        return "NEES: no covariance"
+    if len(nees.per_frame) == 0:
+        return "NEES: no frame has a regular covariance"
+    return (
+        f"NEES per degree of freedom (1 is right, more is overconfident): {nees.mean:.2f}; translation "
+        f"{nees.mean_translation:.2f}, rotation {nees.mean_rotation:.2f}, median {nees.median:.2f}; "
+        f"inside 95 %: {100 * coverage(nees.per_frame, 6):.0f} %"
+    )
+
+
+def _errors_to_dict(errors: Evaluation | FinalErrors) -> dict[str, Any]:
+    """ATE, RPE without its steps, and NEES with the number of its frames in their place."""
+    rpe, nees = asdict(errors.rpe), asdict(errors.nees) if errors.nees else None
+    del rpe["translations"], rpe["rotations_deg"]
+    if nees:
+        per_frame = nees.pop("per_frame")
+        nees |= {"count": len(per_frame), "inside": coverage(per_frame, 6)}
+        del nees["timestamps"]
+    return {"ate": asdict(errors.ate), "ate_origin": asdict(errors.ate_origin), "rpe": rpe, "nees": nees}
+
+
+def _evaluate_final(run: Path, estimate: Trajectory, truth: Trajectory) -> FinalErrors | None:
+    """The errors after the fact, of a run that has them; the trajectories are in the clock of the truth."""
+    path = run / FINAL_TRAJECTORY
+    if not path.is_file():
+        return None
+    final = read_trajectory(path)
+    if len(final) != len(estimate):
+        raise InputError(
+            f"{path}: has {len(final)} poses, but trajectory.tum beside it {len(estimate)}: both must come from the "
+            "same run"
+        )
+    final = Trajectory(estimate.timestamps, final.poses)
+    covariance = _read_covariance(run / FINAL_COVARIANCE, len(final))
+    return FinalErrors(
+        absolute_trajectory_error(final, truth, "se3"),
+        absolute_trajectory_error(final, truth, "origin"),
+        relative_pose_error(final, truth),
+        None if covariance is None else pose_nees(final, truth, covariance),
+    )
 
 
 def _same_clock(estimate_path: Path, truth_path: Path) -> tuple[Trajectory, Trajectory, str]:

@@ -21,7 +21,7 @@ from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder, ma
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import check_covariances, read_tum, write_kitti, write_tum
-from sigmaslam.runs.run_folder import write_ply
+from sigmaslam.runs.run_folder import FINAL_TRAJECTORY, write_ply
 from sigmaslam.slam.point_map import PointMap
 
 
@@ -31,7 +31,7 @@ def refine_run(
     """Bundle adjustment of the tracks of a run; writes trajectory, covariance, map and refine.json.
 
     Args:
-        run: folder of `sigmaslam track --tracks`.
+        run: folder of `sigmaslam track --tracks`; the adjustment begins at its `trajectory_final.tum` if there is one.
         out: folder, new or empty.
         config: settings.
         tell: receives messages on the progress.
@@ -46,7 +46,7 @@ def refine_run(
     if not (run / "trajectory.tum").is_file():
         raise InputError(f"{run}: holds no trajectory.tum; give a folder written by `sigmaslam track --tracks`")
     check_new_folder(out)
-    trajectory = read_tum(run / "trajectory.tum")
+    trajectory = _read_trajectory(run)
     tracks = read_tracks(run / TRACKS_NAME, len(trajectory))
     covariances = _read_covariances(run / "covariance.npy", len(trajectory))
     make_folder(out)
@@ -129,6 +129,20 @@ def _write(out: Path, trajectory: Trajectory, adjustment: Adjustment) -> None:
             path, points=point_map.points, covariances=point_map.covariances, observations=point_map.observations
         )
     write_ply(out / "map.ply", point_map)
+
+
+def _read_trajectory(run: Path) -> Trajectory:
+    """Where the adjustment begins: the frames after the fact, of a run that has them."""
+    said = read_tum(run / "trajectory.tum")
+    if not (run / FINAL_TRAJECTORY).is_file():
+        return said
+    final = read_tum(run / FINAL_TRAJECTORY)
+    if not np.array_equal(final.timestamps, said.timestamps):
+        raise InputError(
+            f"{run / FINAL_TRAJECTORY}: has {len(final)} poses at other times than the {len(said)} of trajectory.tum: "
+            "both must come from the same run"
+        )
+    return final
 
 
 def _read_covariances(path: Path, count: int) -> np.ndarray:

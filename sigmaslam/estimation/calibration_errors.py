@@ -1,9 +1,9 @@
 """What errors of a stereo calibration do to the measurements of a rectified pair.
 
-The disparity offset is estimated. The others are consider parameters (Schmidt 1966; Tapley, Schutz and Born 2004, chapter
-6): images hardly tell them from motion, so they are not moved, and poses are estimated as if they were zero; but what
-they do to every pose and map point is carried along, and is part of their covariance. With the gains of Schmidt's filter,
-which trusts views less for them, the KITTI drive was three times worse: every window made up a calibration of its own.
+The disparity offset is estimated. The others are consider parameters (Schmidt 1966; Tapley, Schutz and Born 2004,
+chapter 6): images hardly tell them from motion, so they are not moved, and poses are estimated as if they were zero;
+but what they do to every pose and map point is carried along, and is part of their covariance. With the gains of
+Schmidt's filter, which trusts views less for them, every window makes up a calibration of its own.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ ERRORS = (
     "lens",  # of both: places, with r^3 along their rays
     "baseline",  # disparity, relative
 )
-"""In the order of the state. `focal` and `baseline` are relative; the others are pixels, at unit normalised coordinates."""
+"""In the order of the state. `focal` and `baseline` are relative, the others pixels at unit normalised coordinates."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,9 +60,7 @@ class CalibrationPrior:
         turn, lens = camera.fx * sigmas.rotation, camera.fx * sigmas.distortion
         centre = camera.fx * sigmas.principal_point
         in_disparity = (offset_sigma, turn, turn, turn, lens, lens, lens)
-        return cls.independent(
-            np.array([*in_disparity, sigmas.focal, centre, centre, lens, sigmas.baseline]), "offset"
-        )
+        return cls.independent(np.array([*in_disparity, sigmas.focal, centre, centre, lens, sigmas.baseline]), "offset")
 
     @classmethod
     def independent(cls, sigma: np.ndarray, *estimated: str) -> CalibrationPrior:

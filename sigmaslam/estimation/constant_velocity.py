@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from sigmaslam.geometry.se3 import nearest_rigid, se3_inverse, se3_log
@@ -9,6 +11,21 @@ from sigmaslam.inference.onnx_graph import load_step
 
 # Order of the graph's error state, see sigmaslam.filters.onnx.pose_prediction.
 _POSE, _TWIST, _STATE_SIZE = slice(0, 6), slice(6, 12), 12
+
+
+@dataclass(frozen=True, slots=True)
+class MotionState:
+    """Pose since the last keyframe, and twist, at one moment.
+
+    Attributes:
+        step: (4, 4) T_keyframe_camera.
+        twist: (6,) velocity of the camera in its own frame, m/s and rad/s.
+        covariance: (12, 12) of both; the step is perturbed from the left in the keyframe.
+    """
+
+    step: np.ndarray
+    twist: np.ndarray
+    covariance: np.ndarray
 
 
 class MotionFilter:
@@ -27,6 +44,11 @@ class MotionFilter:
         self.step = np.eye(4)
         self.twist = np.zeros(6)
         self._covariance = np.zeros((_STATE_SIZE, _STATE_SIZE))
+
+    @property
+    def state(self) -> MotionState:
+        """What is known now."""
+        return MotionState(self.step.copy(), self.twist.copy(), self._covariance.copy())
 
     @property
     def step_covariance(self) -> np.ndarray:

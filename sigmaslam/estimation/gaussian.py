@@ -56,3 +56,11 @@ def replace_part(covariance: np.ndarray, part: slice, other: slice) -> np.ndarra
     replaced[part, :], replaced[:, part] = replaced[other, :], replaced[:, other]
     replaced[part, part] = replaced[other, other]
     return replaced
+
+
+def regression(cross: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """cross covariance^-1 (n, k), with the pseudo-inverse in units of the standard deviations where it is singular."""
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    sigma = np.where(sigma > 0.0, sigma, 1.0)
+    correlation = covariance / np.outer(sigma, sigma)
+    return np.asarray((cross / sigma) @ np.linalg.pinv(correlation, rcond=1e-12, hermitian=True) / sigma)

@@ -13,7 +13,7 @@ import numpy as np
 
 from sigmaslam.estimation.gaussian import matrix_root
 from sigmaslam.estimation.state_layout import CALIBRATION_SIZE
-from sigmaslam.geometry.se3 import nearest_rigid, se3_exp, skew
+from sigmaslam.geometry.se3 import nearest_rigid, se3_adjoint, se3_exp, se3_inverse, skew
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +22,8 @@ class PastPoses:
 
     Attributes:
         poses: (K, 4, 4) T_world_keyframe.
-        covariance: (6 K, 6 K) of them, perturbed from the left in the world, as far as it comes from matches and motion.
+        covariance: (6 K, 6 K) of them, perturbed from the left in the world, as far as it comes from matches and
+            motion.
         cross: (6 K, n) covariance with the window's state.
         common: (6 K, 12) how considered errors of the calibration, of variance one, enter their errors.
     """
@@ -54,12 +55,20 @@ class PastPoses:
         across = blocks[:, :, index]
         return np.asarray(each + whole[place, place] - across - across.transpose(0, 2, 1))
 
-    def closest(self, index: int) -> int:
-        """The other pose relative to which the place of this one is known best."""
+    def closest(self, index: int, others: list[int] | None = None) -> int:
+        """Of the other poses (of all by default) the one relative to which the place of this one is known best."""
         lever = point_lever(self.poses[index, :3, 3][None])[0]
         doubt = np.trace(lever @ self.relative(index) @ lever.T, axis1=1, axis2=2)
-        doubt[index] = np.inf
-        return int(doubt.argmin())
+        candidates = np.array([k for k in (range(len(self)) if others is None else others) if k != index])
+        return int(candidates[doubt[candidates].argmin()])
+
+    def relative_to_first(self, indices: list[int]) -> np.ndarray:
+        """(6 M, 6 M) covariance of M poses relative to the first of M + 1 indices, perturbed from the left in it."""
+        rows = np.concatenate([np.arange(6 * index, 6 * index + 6) for index in indices])
+        adjoint = se3_adjoint(se3_inverse(self.poses[indices[0]]))
+        by_first = np.tile(-adjoint, (len(indices) - 1, 1))
+        slope = np.concatenate([by_first, np.kron(np.eye(len(indices) - 1), adjoint)], axis=1)
+        return np.asarray(slope @ self.covariance[np.ix_(rows, rows)] @ slope.T)
 
     def relative_to(self, window: np.ndarray, common: np.ndarray, index: int) -> np.ndarray:
         """(6, 6) covariance of the window's last pose relative to the pose `index`, with the considered errors' part.
@@ -70,9 +79,7 @@ class PastPoses:
         """
         place, last = past_slice(index), slice(len(window) - 6, len(window))
         across, apart = self.cross[place, last], common[last] - self.common[place]
-        return np.asarray(
-            window[last, last] + self.covariance[place, place] - across - across.T + apart @ apart.T
-        )
+        return np.asarray(window[last, last] + self.covariance[place, place] - across - across.T + apart @ apart.T)
 
     def grow(
         self, window: np.ndarray, step_covariance: np.ndarray, walk: np.ndarray, origin: int | None

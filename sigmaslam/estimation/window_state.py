@@ -45,6 +45,18 @@ class WindowState:
         """(n, n) covariance with the part of the considered errors."""
         return np.asarray(self.covariance + self.common @ self.common.T)
 
+    @property
+    def all_poses(self) -> PastPoses:
+        """The marginalised poses, and behind them those of the window."""
+        past, own = self.past, self.covariance[CALIBRATION_SIZE:]
+        across = past.cross[:, CALIBRATION_SIZE:]
+        return PastPoses(
+            np.concatenate([past.poses, self.poses]),
+            np.block([[past.covariance, across], [across.T, own[:, CALIBRATION_SIZE:]]]),
+            np.concatenate([past.cross, own]),
+            np.concatenate([past.common, self.common[CALIBRATION_SIZE:]]),
+        )
+
     def minus(self, other: WindowState) -> np.ndarray:
         """(n,) error-state difference of two means."""
         poses = se3_log(self.poses @ se3_inverse(other.poses)).ravel()

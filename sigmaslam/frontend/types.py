@@ -116,6 +116,10 @@ class KeypointSearch:
         """Keypoints that may be anywhere in the view."""
         return cls(key, index, key.features.keypoints[index].astype(np.float64))
 
+    def widened(self, factor: float) -> KeypointSearch:
+        """The same search, of predictions with so many times the covariance."""
+        return self if self.covariance is None else replace(self, covariance=factor * self.covariance)
+
 
 @dataclass(frozen=True, slots=True)
 class TemporalMatches(Table):

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, Self, get_args
 
 import numpy as np
@@ -215,7 +215,7 @@ class StereoCamera:
     left: CameraModel
     right: CameraModel
     T_left_right: np.ndarray
-    sigmas: CalibrationSigmas = CalibrationSigmas()
+    sigmas: CalibrationSigmas = field(default_factory=CalibrationSigmas)
 
     def __post_init__(self) -> None:
         T = np.array(self.T_left_right, dtype=np.float64)

@@ -20,6 +20,7 @@ from sigmaslam.readers.trajectory_files import read_tum
 from sigmaslam.runs.figures import plot_trajectory, to_svg
 from sigmaslam.runs.frame_table import STATUSES, FrameTable, read_frames
 from sigmaslam.runs.real_time import format_latency
+from sigmaslam.runs.run_folder import FINAL_TRAJECTORY
 
 STATUS_COLOURS = {"lost": VERMILLION, "relocalised": PURPLE, "skipped": GREY}
 
@@ -34,7 +35,7 @@ MAX_CONFIGURATION = 20_000
 def write_report(run_dir: str | Path) -> Path:
     """Write `report.html` from the files of a run folder.
 
-    Reads trajectory.tum and frames.csv, and map.npz and run.json if they exist.
+    Reads trajectory.tum and frames.csv, and trajectory_final.tum, map.npz and run.json if they exist.
 
     Returns:
         The path of the report.
@@ -58,12 +59,17 @@ def write_report(run_dir: str | Path) -> Path:
         facts=[*_facts(trajectory, frames, points), *_real_time_facts(run)],
         statuses=[(status, frames.status.count(status)) for status in STATUSES],
         verdict=summary.get("calibration_verdict") if isinstance(summary, dict) else None,
-        figures=_figures(trajectory, frames, points),
+        figures=_figures(trajectory, _read_final(run_dir / FINAL_TRAJECTORY), frames, points),
         configuration=configuration if run else None,
     )
     path = run_dir / "report.html"
     atomic_write_text(path, text)
     return path
+
+
+def _read_final(path: Path) -> dict[str, Trajectory]:
+    """The trajectory after the fact by its label, if the run has one."""
+    return {"after the fact": read_tum(path)} if path.is_file() else {}
 
 
 def _read_points(path: Path) -> np.ndarray | None:
@@ -132,12 +138,14 @@ def _nis_per_dof(frames: FrameTable) -> np.ndarray:
     return np.where(dof > 0, nis / np.where(dof > 0, dof, 1.0), np.nan)
 
 
-def _figures(trajectory: Trajectory, frames: FrameTable, points: np.ndarray | None) -> list[tuple[str, str, Markup]]:
+def _figures(
+    trajectory: Trajectory, final: dict[str, Trajectory], frames: FrameTable, points: np.ndarray | None
+) -> list[tuple[str, str, Markup]]:
     """Title, caption and SVG of each figure that has data."""
     figures = []
     if len(trajectory):
         figure = Figure(figsize=(8, 5.5), layout="constrained")
-        plot_trajectory(figure.add_subplot(), {"trajectory": trajectory}, points)
+        plot_trajectory(figure.add_subplot(), {"trajectory": trajectory, **final}, points)
         caption = "From above; the dot marks the start."
         if points is not None and len(points):
             caption += f" An even selection of the {len(points)} map points; far ones are cut off."

@@ -28,6 +28,7 @@ from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.slam.mapping import KeyframeTracks
 from sigmaslam.slam.point_map import PointMap
 
+FINAL_TRAJECTORY, FINAL_COVARIANCE = "trajectory_final.tum", "covariance_final.npy"
 STAGES = ("read", "rectify", "features", "match", "filter", "map")
 _COLUMNS = (COLUMNS[0], "status", *COLUMNS[1:], *(f"ms_{stage}" for stage in STAGES))
 _GRAPHS = (
@@ -110,13 +111,20 @@ class RunWriter:
         self._table.flush()
         self._skipped += 1
 
-    def finish(self, point_map: PointMap, keyframes: dict[str, Any], run: dict[str, Any]) -> dict[str, Any]:
+    def finish(
+        self,
+        point_map: PointMap,
+        keyframes: dict[str, Any],
+        run: dict[str, Any],
+        final: tuple[Trajectory, np.ndarray] | None = None,
+    ) -> dict[str, Any]:
         """Writes trajectory, covariance, relative poses, map, run.json and report.html.
 
         Args:
             point_map: the landmarks.
             keyframes: arrays by name, with which a later run relocalises in the map.
             run: entries of run.json beside versions, weights and the summary.
+            final: the frames as they are known now, with covariances; they are written beside those said at once.
         Returns:
             The summary.
         """
@@ -135,6 +143,11 @@ class RunWriter:
         with atomic_path(self._out / "covariance.npy") as path:
             np.save(path, rows[:, 17:].reshape(-1, 6, 6))
         self._relative_poses.finish(self._out, trajectory.timestamps)
+        if final is not None:
+            # A frame whose pose was not written, as the run was stopped in it, is in neither trajectory.
+            write_tum(self._out / FINAL_TRAJECTORY, final[0].subset(np.arange(len(rows))))
+            with atomic_path(self._out / FINAL_COVARIANCE) as path:
+                np.save(path, final[1][: len(rows)])
         with atomic_path(self._out / "map.npz") as path:
             points = {name: getattr(point_map, name) for name in PointMap.__slots__}
             np.savez_compressed(path, **points, **keyframes)

@@ -104,6 +104,8 @@ def track_sequence(
                 **_describe_object(tracker, track_object),
                 **_describe_location(location),
             },
+            # A sensor's readings correct poses as they come, not after the fact.
+            tracker.final_trajectory() if location is None else None,
         )
         trajectory = None if location is None else location.trajectory()
         if trajectory is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -128,14 +128,11 @@ class GuidedMatcher:
         if not searches:
             return GuidedMatches.empty(), 1.0
         rows = np.concatenate([each for each, _ in searches])
-        start = carry(
-            left, self.window.landmarks.id[rows], np.concatenate([search.predicted for _, search in searches])
-        )
-        excess = _excess(
-            start - np.concatenate([search.predicted for _, search in searches]),
-            np.concatenate([search.covariance for _, search in searches]),
-        )
-        searches = [(each, replace(search, covariance=excess * search.covariance)) for each, search in searches]
+        predicted = np.concatenate([search.predicted for _, search in searches])
+        start = carry(left, self.window.landmarks.id[rows], predicted)
+        covariances = [search.covariance for _, search in searches if search.covariance is not None]
+        excess = _excess(start - predicted, np.concatenate(covariances))
+        searches = [(each, search.widened(excess)) for each, search in searches]
         starts = np.split(start, np.cumsum([len(each) for each, _ in searches])[:-1])
         found = self.frontend.follow([search for _, search in searches], starts, left, right)
         parts = [
@@ -187,7 +184,7 @@ class GuidedMatcher:
 
 
 def _excess(departure: np.ndarray, covariance: np.ndarray) -> float:
-    """By what covariances (K, 2, 2) are too small for departures (K, 2), NaN where unknown, in the median; 1 or more."""
+    """By what covariances (K, 2, 2) are too small for departures (K, 2), in the median; 1 or more. NaN: unknown."""
     known = np.isfinite(departure[:, 0])
     if known.sum() < _MIN_LANDMARKS:
         return 1.0

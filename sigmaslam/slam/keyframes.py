@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
-from sigmaslam.estimation.state_layout import pose_slice
 from sigmaslam.frontend import StereoView
 from sigmaslam.frontend.image_sharpness import sharpness
 from sigmaslam.frontend.patch_disparity_range import dense_disparity
@@ -128,11 +127,7 @@ class Keyframes:
 
     def pack(self, frontend: str, camera: RectifiedStereo) -> dict[str, Any]:
         """All of them as arrays by name, by which a later run finds its place in the map."""
-        state = self._window.posterior
-        past = state.past
-        for k, pose in enumerate(state.poses):
-            past = past.append(pose, state.covariance, state.common, pose_slice(k))
-        return pack_keyframes([*self.remembered, *self.active], past, frontend, camera)
+        return pack_keyframes([*self.remembered, *self.active], self._window.posterior.all_poses, frontend, camera)
 
     def _remember(self, keyframe: Keyframe, spare: Keyframe | None = None) -> None:
         """Takes a keyframe of the window's past, and forgets a superfluous one for it, but not the one to spare."""

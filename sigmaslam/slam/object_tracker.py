@@ -17,6 +17,7 @@ from sigmaslam.frontend import Frontend, build_frontend
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
+from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.slam.body_admission import BodyAdmission
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.estimate import Estimate
@@ -112,6 +113,8 @@ class ObjectTracker:
         rectified_region = rectifier.rectify(raw, raw)[0] > 127
         self._body = BodyAdmission(rectifier.rectified, rectified_region, frontend, config)
         self._tracker = StereoTracker(camera, frontend, backend, config, self._body, threads)
+        # What each frame before the body moved on its own adds to its covariance.
+        self._unseen_motion: list[np.ndarray] = []
 
     @property
     def origin(self) -> np.ndarray:
@@ -131,14 +134,28 @@ class ObjectTracker:
                 "and check the calibration"
             )
         covariance, relative_poses = estimate.covariance, estimate.relative_poses
-        if not self._body.separated and estimate.status != "starting":
+        if not self._body.separated:
             # In the body's frame, whose axes are the camera's still; from there into the left camera's.
             T_left_body = self._T_left_rectified @ self._body.T_camera_body
-            covariance = covariance + turn_covariance(T_left_body, self._body.unseen_motion())
-            relative_poses = RelativePoses.empty()  # the body may have moved unseen
+            starting = estimate.status == "starting"
+            unseen = np.zeros((6, 6)) if starting else turn_covariance(T_left_body, self._body.unseen_motion())
+            covariance = covariance + unseen
+            self._unseen_motion.append(unseen)
+            if not starting:
+                relative_poses = RelativePoses.empty()  # the body may have moved unseen
         T_body_camera = self._T_body_left() @ estimate.T_world_camera
         changes = {"T_world_camera": T_body_camera, "covariance": covariance, "relative_poses": relative_poses}
         return ObjectEstimate(replace(estimate, **changes))
+
+    def final_trajectory(self) -> tuple[Trajectory, np.ndarray]:
+        """T_camera_object of all frames as it is known now, with covariances (N, 6, 6) in the body's own frame."""
+        camera, covariances = self._tracker.final_trajectory()
+        for covariance, unseen in zip(covariances, self._unseen_motion, strict=False):
+            covariance += unseen
+        T_body_camera = self._T_body_left() @ camera.poses
+        turned = turn_covariance(T_body_camera, covariances)
+        poses = se3_inverse(T_body_camera)
+        return Trajectory(camera.timestamps, poses), 0.5 * (turned + turned.transpose(0, 2, 1))
 
     def warm_up(self) -> None:
         """As of `StereoTracker`."""

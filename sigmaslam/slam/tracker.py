@@ -20,9 +20,11 @@ from sigmaslam.frontend import Frontend, build_frontend
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
+from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.slam.frame import Frame
+from sigmaslam.slam.frame_history import FrameHistory
 from sigmaslam.slam.guided_matching import GuidedMatcher, GuidedMatches
 from sigmaslam.slam.keyframes import Keyframes
 from sigmaslam.slam.landmark_admission import AdmitAll, LandmarkAdmission
@@ -98,6 +100,7 @@ class StereoTracker:
         self._recovery = Recovery(course, window, keyframes, motion, self._mapper, admission, config)
         relative_poses = RelativePoseReporter(self._T_rectified_left, window, keyframes, motion)
         self._reporter = Reporter(self._T_rectified_left, window, motion, course, relative_poses)
+        self._history = FrameHistory(window, keyframes, self._T_rectified_left)
 
     def load_map(self, path: Path) -> None:
         """Takes the world of a map that `sigmaslam track` has written; tracking starts where a view is found in it.
@@ -127,12 +130,16 @@ class StereoTracker:
         clock = Stopwatch()
         frame = Frame(*self._rectifier.rectify(left, right), self._frontend)
         clock.lap("rectify")
-        self._predict(timestamp)
+        if self._course.timestamp is not None:
+            # Constant velocity since the last frame.
+            self._motion.predict(timestamp - self._course.timestamp, densities(self.config, self._window.depth))
         matches, fit = self._localise(frame, timestamp, clock)
+        predicted = filtered = self._motion.state
         if fit is not None:
             status = "tracking"
             expected = self._motion.step, self._motion.step_covariance
             fit = self._correct(fit, matches, frame, timestamp)
+            filtered = self._motion.state
             tracks = self._mapper.insert_if_due(frame, timestamp, fit, matches, expected)
         elif (found := self._relocaliser.relocalise(frame.view)) is not None:
             status = "relocalised"
@@ -146,7 +153,9 @@ class StereoTracker:
             self._loops.close()
         clock.lap("map")
         self._course.timestamp = timestamp
-        return self._reporter.report(timestamp, status, matches, fit, tracks, clock.milliseconds)
+        estimate = self._reporter.report(timestamp, status, matches, fit, tracks, clock.milliseconds)
+        self._history.append(estimate, predicted, filtered)
+        return estimate
 
     def warm_up(self) -> None:
         """Runs the front-end once on noise, so that the first frame does not wait for memory: before cameras start."""
@@ -156,6 +165,10 @@ class StereoTracker:
     def map(self) -> PointMap:
         """All landmarks so far that were seen at least three times."""
         return self._keyframes.map().transform(se3_inverse(self._T_rectified_left))
+
+    def final_trajectory(self) -> tuple[Trajectory, np.ndarray]:
+        """All frames so far as they are known now, with covariances (N, 6, 6) in the camera's own frame."""
+        return self._history.final()
 
     def describe_rectified(self) -> dict[str, Any]:
         """The rectified pair that tracks are measured in: intrinsics (5,), R_rectified_left (3, 3)."""
@@ -168,12 +181,6 @@ class StereoTracker:
         return self._keyframes.pack(self._frontend.name, self._camera)
 
     # ---- the stages of a frame
-
-    def _predict(self, timestamp: float) -> None:
-        """Constant velocity since the last frame."""
-        if self._course.timestamp is not None:
-            seconds = timestamp - self._course.timestamp
-            self._motion.predict(seconds, densities(self.config, self._window.depth))
 
     def _localise(self, frame: Frame, timestamp: float, clock: Stopwatch) -> tuple[GuidedMatches, FrameFit | None]:
         """Matches with the window's landmarks, and the pose if enough of them agree."""

@@ -68,6 +68,37 @@ def test_dictionary_is_json_and_table_shows_the_same(drive):
     assert max(map(len, table.splitlines()[2:])) <= 160
 
 
+def test_a_trajectory_after_the_fact_is_evaluated_beside(drive):
+    run, truth = drive
+    without = evaluate_run(run, truth, plot=False)
+    assert without.final is None
+    assert without.to_dict()["final"] is None
+    assert "After the fact" not in format_evaluation(without)
+    live, true = read_trajectory(run / "trajectory.tum"), read_trajectory(truth)
+    write_tum(run / "trajectory_final.tum", Trajectory(live.timestamps, true.poses))
+    evaluation = evaluate_run(run, truth, plot=False)
+    assert evaluation.ate.rmse == without.ate.rmse
+    assert evaluation.final is not None
+    assert evaluation.final.ate.rmse == pytest.approx(0, abs=1e-6)
+    assert evaluation.final.nees is None
+    np.save(run / "covariance_final.npy", np.tile(1e-4 * np.eye(6), (186, 1, 1)))
+    evaluation = evaluate_run(run, truth, plot=False)
+    content = json.loads(json.dumps(evaluation.to_dict(), allow_nan=False))["final"]
+    assert content["nees"]["count"] == 185
+    assert content["nees"]["mean"] == pytest.approx(0, abs=1e-3)
+    assert set(content) == {"ate", "ate_origin", "rpe", "nees"}
+    table = format_evaluation(evaluation)
+    assert f"{without.ate.rmse:.4f}" in table.partition("After the fact")[0]
+    assert "0.0000" in table.partition("After the fact")[2]
+
+
+def test_a_trajectory_after_the_fact_of_another_run_is_refused(drive):
+    run, truth = drive
+    write_tum(run / "trajectory_final.tum", read_trajectory(run / "trajectory.tum").subset(np.arange(20)))
+    with pytest.raises(InputError, match=r"trajectory_final.tum: has 20 poses, .* 186: both must"):
+        evaluate_run(run, truth, plot=False)
+
+
 def test_missing_frames_lower_the_coverage(drive):
     run, truth = drive
     full = read_trajectory(run / "trajectory.tum")

@@ -1,6 +1,7 @@
 """Bundle adjustment: exact data, consistency, outliers, other routes to the same optimum, files."""
 
 import json
+import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -226,6 +227,19 @@ def test_two_runs_are_equal_to_the_bit(run_folder: Path, tmp_path: Path):
         refine_run(run_folder, tmp_path / name)
     for name in ("trajectory.tum", "trajectory.kitti", "covariance.npy", "map.ply"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
+
+
+def test_the_adjustment_begins_at_the_trajectory_after_the_fact(run_folder: Path, tmp_path: Path):
+    run = tmp_path / "run"
+    shutil.copytree(run_folder, run)
+    said = refine_run(run, tmp_path / "said")
+    shutil.copy(tmp_path / "said" / "trajectory.tum", run / "trajectory_final.tum")
+    begun = refine_run(run, tmp_path / "final")
+    assert begun["cost_per_dof_before"] < said["cost_per_dof_before"]
+    assert begun["cost_per_dof_after"] == pytest.approx(said["cost_per_dof_after"], rel=0.02)
+    write_tum(run / "trajectory_final.tum", read_tum(run / "trajectory.tum").subset(np.arange(5)))
+    with pytest.raises(InputError, match=r"trajectory_final.tum: has 5 poses at other times than the 35"):
+        refine_run(run, tmp_path / "refused")
 
 
 def spoil(change: Callable[[dict[str, np.ndarray]], None]) -> Callable[[Path], None]:

@@ -115,7 +115,8 @@ def test_a_sequence_that_breaks_off_leaves_what_was_computed(short_sequence: Pat
     result = run_here("track", short_sequence, "--out", out)
     assert_refused(result, "time")
     if out.exists():  # a reader may refuse the file before the first frame
-        assert len(read_tum(out / "trajectory.tum")) == 5
+        assert len(read_tum(out / "trajectory.tum")) == len(read_tum(out / "trajectory_final.tum")) == 5
+        assert np.load(out / "covariance_final.npy").shape == (5, 6, 6)
 
 
 def test_a_calibration_with_a_missing_key_or_wrong_size_is_refused(short_sequence: Path, tmp_path: Path):
@@ -178,6 +179,9 @@ def test_ctrl_c_leaves_a_usable_run(demo_sequence: Path, tmp_path: Path):
     count = len(read_tum(out / "trajectory.tum"))
     assert 3 <= count < 40
     assert len(np.load(out / "covariance.npy")) == count == len(rows(out))
+    final = read_tum(out / "trajectory_final.tum")
+    np.testing.assert_array_equal(final.timestamps, read_tum(out / "trajectory.tum").timestamps)
+    assert np.load(out / "covariance_final.npy").shape == (count, 6, 6)
 
 
 def test_the_runtime_imports_without_torch_or_kornia(demo_sequence: Path):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from sigmaslam.estimation.marginalised_poses import PastPoses
 from sigmaslam.estimation.window_state import WindowState
-from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
+from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log, turn_covariance
 
 POSES, PAST = 3, 2
 LOOP_SIGMA = 1e-5 * np.array([1.0, 2.0, 3.0, 0.5, 0.4, 0.3])
@@ -120,3 +120,25 @@ def test_of_a_state_without_poses_the_calibration_remains():
     assert len(alone) == len(alone.past) == 0
     np.testing.assert_array_equal(alone.covariance, state.covariance[:3, :3])
     np.testing.assert_array_equal(alone.calibration, state.calibration)
+
+
+def test_all_poses_are_the_marginalised_ones_before_those_of_the_window():
+    """As if the window were marginalised pose by pose, but that it keeps them."""
+    state = random_state(0)
+    together, one_by_one = state.all_poses, state
+    for _ in range(POSES):
+        one_by_one = one_by_one.marginalise_oldest()
+    np.testing.assert_array_equal(together.poses, one_by_one.past.poses)
+    np.testing.assert_array_equal(together.covariance, one_by_one.past.covariance)
+    np.testing.assert_array_equal(together.cross[:, :3], one_by_one.past.cross)
+
+
+def test_covariances_relative_to_a_pose_are_those_of_the_differences():
+    poses = random_state(1).all_poses
+    joint = poses.relative_to_first([1, 3, 0])
+    back = se3_inverse(poses.poses[1])
+    for k, index in enumerate((3, 0)):
+        block = slice(6 * k, 6 * k + 6)
+        np.testing.assert_allclose(joint[block, block], turn_covariance(back, poses.relative(index)[1]), atol=1e-18)
+    np.testing.assert_allclose(joint, joint.T, atol=1e-18)
+    assert np.linalg.eigvalsh(joint)[0] > -1e-18

@@ -223,4 +223,5 @@ def test_the_command_line_fuses_and_says_what_became_of_the_readings(demo_sequen
     assert "Location sensor: 19 readings used" in result.output
     # The first is of the first frame, before there is a motion.
     assert len(read_tum(run / "trajectory_location.tum")) == len(truth)
+    assert not (run / "trajectory_final.tum").exists()  # it would lack the readings
     assert evaluate_run(run, demo_sequence / "poses.txt", plot=False).ate_origin.rmse < 0.02

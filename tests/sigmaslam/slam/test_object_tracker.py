@@ -1,6 +1,7 @@
 """A camera at rest follows one body: a simulated ball before a wall, a rendered tool, and a scene that is the body."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,7 +12,7 @@ from typer.testing import CliRunner
 from sigmaslam.cli import app
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.run_evaluation import Evaluation, evaluate_run
-from sigmaslam.geometry.se3 import se3_inverse
+from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import open_sequence
 from sigmaslam.readers.trajectory_files import read_kitti, write_kitti
@@ -93,6 +94,25 @@ def test_the_body_is_followed_and_its_covariance_is_right(grown: float, wall: in
     nees = nees_of(errors, estimates)
     assert nees.max() < NEES_999
     assert 0.3 < nees[rest + 5 :].mean() < 1.8
+    final, covariances = tracker.final_trajectory()
+    known = [
+        replace(e, camera=replace(e.camera, T_world_camera=se3_inverse(T), covariance=turn_covariance(T, P)))
+        for e, T, P in zip(estimates, final.poses, covariances, strict=True)
+    ]
+    np.testing.assert_allclose(known[2].object_covariance, covariances[2], atol=1e-12)
+    final_errors = errors_of(body, known)
+    # Before it moves it is smoothed alone, and not known better than what might have been overlooked.
+    before = slice(1, max(rest - 1, 1))
+    said = np.array([e.T_camera_object for e in estimates])[before]
+    np.testing.assert_allclose(final.poses[before], said, atol=1e-4)
+    sizes = [
+        np.trace(each[before, :3, :3], axis1=1, axis2=2)
+        for each in (covariances, np.array([e.object_covariance for e in estimates]))
+    ]
+    assert ((0.5 * sizes[1] < sizes[0]) & (sizes[0] < 1.01 * sizes[1])).all()
+    moving = slice(rest + 5, None)
+    assert np.mean(final_errors[moving, :3] ** 2) < 1.1 * np.mean(errors[moving, :3] ** 2)
+    assert 0.3 < nees_of(final_errors, known)[moving].mean() < 1.8
     # The wall is 0.25 m and more behind the ball's visible side.
     points = tracker.map().points + tracker.origin - body.poses[0][:3, 3]
     assert len(points) > 40

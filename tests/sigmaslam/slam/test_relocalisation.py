@@ -12,6 +12,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.estimation.marginalised_poses import PastPoses
 from sigmaslam.frontend import Features, StereoView
 from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam.geometry.se3 import se3_inverse, se3_log
 from sigmaslam.readers.trajectory_files import read_kitti
 from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.keyframe import Keyframe
@@ -21,7 +22,7 @@ from sigmaslam.slam.place_recognition import retrieve
 from sigmaslam.slam.tracker import TrackerConfig
 from tests.support.dense_window import make_window
 from tests.support.estimates import Demo, error_of, mirrored, squared_error
-from tests.support.quantiles import WITHIN_3_SIGMA
+from tests.support.quantiles import WITHIN_3_SIGMA, squared_sigmas
 
 CAMERA = RectifiedStereo(fx=200.0, fy=201.0, cx=32.0, cy=24.0, baseline=0.1, width=64, height=48)
 
@@ -257,6 +258,10 @@ def test_poses_are_in_the_world_of_the_map(demo: Demo, demo_run: Path):
         assert estimate.status == ("relocalised" if k == 10 else "tracking")
         assert np.linalg.norm(error_of(estimate, truth[k])[:3]) < 0.01
         assert squared_error(estimate, truth[k]) < WITHIN_3_SIGMA
+    final, covariances = tracker.final_trajectory()
+    errors = se3_log(se3_inverse(final.poses) @ truth[10:16])
+    assert np.linalg.norm(errors[:, :3], axis=1).max() < 0.01
+    assert squared_sigmas(errors, covariances).max() < WITHIN_3_SIGMA
 
 
 @pytest.mark.slow
@@ -281,6 +286,12 @@ def test_a_view_that_is_nowhere_in_the_map_has_no_pose(demo: Demo, demo_run: Pat
         assert estimate.belief == 0.0
     estimate = tracker.step(frames[5].left, frames[5].right, 0.3)
     assert estimate.status == "relocalised"
+    final, covariances = tracker.final_trajectory()
+    assert len(final) == 5
+    np.testing.assert_array_equal(final.poses[:4], [np.eye(4)] * 4)
+    assert np.linalg.eigvalsh(covariances[:4]).min() > 1e5
+    np.testing.assert_allclose(final.poses[4], estimate.T_world_camera, atol=1e-9)
+    np.testing.assert_allclose(covariances[4], estimate.covariance, atol=1e-9)
 
 
 def test_tracks_begin_with_their_hosts_and_are_read_by_refine(demo_run: Path):
