@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sigmaslam.estimation.chi_square import CHI_SQUARE_MEDIAN
 from sigmaslam.estimation.frame_update import FrameUpdate
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
@@ -19,6 +18,12 @@ from sigmaslam.geometry.se3 import se3_inverse
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.measurement_noise import MeasurementNoise
 
+# A landmark that so many views have confirmed stands still: something that moves is a landmark for a frame, too.
+_CONFIRMED = 2
+# The prediction holds where so many of them are where it says: the others may be covered by what moves. The quantile of
+# the chi-square distribution with two degrees of freedom is that of an exponential one.
+_RIGHT = 0.3
+_CHI_SQUARE_RIGHT = -2.0 * np.log1p(-_RIGHT)
 # A keyframe of which fewer landmarks are in view is not searched for.
 _MIN_LANDMARKS = 8
 
@@ -131,7 +136,8 @@ class GuidedMatcher:
         predicted = np.concatenate([search.predicted for _, search in searches])
         start = carry(left, self.window.landmarks.id[rows], predicted)
         covariances = [search.covariance for _, search in searches if search.covariance is not None]
-        excess = _excess(start - predicted, np.concatenate(covariances))
+        confirmed = self.window.landmarks.views[rows] >= _CONFIRMED
+        excess = _excess((start - predicted)[confirmed], np.concatenate(covariances)[confirmed])
         searches = [(each, search.widened(excess)) for each, search in searches]
         starts = np.split(start, np.cumsum([len(each) for each, _ in searches])[:-1])
         found = self.frontend.follow([search for _, search in searches], starts, left, right)
@@ -184,9 +190,9 @@ class GuidedMatcher:
 
 
 def _excess(departure: np.ndarray, covariance: np.ndarray) -> float:
-    """By what covariances (K, 2, 2) are too small for departures (K, 2), in the median; 1 or more. NaN: unknown."""
+    """By what covariances (K, 2, 2) are too small for the smaller departures (K, 2), 1 or more; NaN: unknown."""
     known = np.isfinite(departure[:, 0])
     if known.sum() < _MIN_LANDMARKS:
         return 1.0
     squared = squared_mahalanobis(departure[known], covariance[known])
-    return max(1.0, float(np.median(squared)) / CHI_SQUARE_MEDIAN[2])
+    return max(1.0, float(np.quantile(squared, _RIGHT)) / _CHI_SQUARE_RIGHT)
