@@ -8,17 +8,20 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
+from sigmaslam.estimation.calibration_errors import ERRORS, CalibrationPrior
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.frame_update import FrameUpdate
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
 from sigmaslam.estimation.sigma_point_linearisation import ViewLineariser
+from sigmaslam.estimation.state_layout import CALIBRATION_SIZE
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
 
 CAMERA = RectifiedStereo(fx=400.0, fy=410.0, cx=319.5, cy=239.5, baseline=0.2, width=640, height=480)
-# Standard deviations of the prior and of the noise.
+# Standard deviations of the prior and of the noise; of the calibration offset, yaw and pitch are estimated.
 CALIBRATION_SIGMA = np.array([0.5, 0.3, 0.3])
+ESTIMATED = ERRORS[:3]
 FIRST_SIGMA = np.repeat([0.02, 0.01], 3)
 STEP_SIGMA = np.repeat([0.05, 0.02], 3)
 HOST_SIGMA = np.array([0.1, 0.1, 0.15, 0.25])
@@ -102,17 +105,29 @@ def world(seed: int = 0, scale: float = 1.0, count: int = 12, hosts: int = KEYFR
 
 
 def make_window(
-    calibration_sigma: np.ndarray, linearisation: str = "extended", camera: RectifiedStereo = CAMERA
+    calibration_sigma: np.ndarray,
+    linearisation: str = "extended",
+    camera: RectifiedStereo = CAMERA,
+    considered_sigma: np.ndarray | None = None,
 ) -> KeyframeWindow:
-    """An empty window of Gaussian errors: least squares alone, where there are weights for longer tails."""
+    """An empty window of Gaussian errors: least squares alone, where there are weights for longer tails.
+
+    Args:
+        calibration_sigma: (3,) of the errors that are estimated.
+        linearisation: "extended" or "unscented".
+        camera: the rectified pair.
+        considered_sigma: (9,) of those that are considered; none by default.
+    """
     lineariser = ViewLineariser(camera, "onnx", linearisation == "unscented")
-    return KeyframeWindow(camera, calibration_sigma, lineariser, student_freedom=GAUSSIAN)
+    others = np.zeros(len(ERRORS) - len(ESTIMATED)) if considered_sigma is None else considered_sigma
+    prior = CalibrationPrior.independent(np.r_[calibration_sigma, others], *ESTIMATED)
+    return KeyframeWindow(camera, prior, lineariser, student_freedom=GAUSSIAN)
 
 
 def add_keyframe(window: KeyframeWindow, given: World, k: int, views: LandmarkViews, hosted: bool = True) -> None:
     sigma = given.scale * (STEP_SIGMA if k else FIRST_SIGMA)
     pose = window.posterior.poses[-1] @ STEP if k else given.expected[0]
-    window.add_keyframe(pose, STEP if k else given.expected[0], np.diag(sigma**2), np.zeros(3), DEPTH)
+    window.add_keyframe(pose, STEP if k else given.expected[0], np.diag(sigma**2), np.zeros(CALIBRATION_SIZE), DEPTH)
     window.add_views(views)
     own = np.flatnonzero(given.host == k) if hosted else np.zeros(0, np.int64)
     variance = np.tile((given.scale * HOST_SIGMA) ** 2, (len(own), 1))
@@ -239,6 +254,12 @@ class Dense:
         return np.asarray(np.linalg.inv(self.information())[: self.size, : self.size])
 
 
+def without_considered(matrix: np.ndarray) -> np.ndarray:
+    """A covariance or information of a window's state without the rows and columns of the considered errors."""
+    kept = np.r_[0 : len(ESTIMATED), CALIBRATION_SIZE : len(matrix)]
+    return np.asarray(matrix[np.ix_(kept, kept)])
+
+
 def eliminate(information: np.ndarray, kept: np.ndarray) -> np.ndarray:
     """Schur's complement: the information about what is kept."""
     gone = np.setdiff1d(np.arange(len(information)), kept)
@@ -258,6 +279,7 @@ def assert_same_state(
     """Estimates and covariances of the poses from `first` on, in standard deviations."""
     chosen = np.r_[0:3, 3 + 6 * first : dense.size]
     expected = dense.covariance()[np.ix_(chosen, chosen)]
-    difference = np.r_[calibration - dense.at[:3], se3_log(poses @ se3_inverse(dense.poses[first:])).ravel()]
+    covariance = without_considered(covariance)
+    difference = np.r_[calibration[:3] - dense.at[:3], se3_log(poses @ se3_inverse(dense.poses[first:])).ravel()]
     assert np.abs(difference / np.sqrt(np.diag(expected))).max() < tolerance
     assert in_sigmas(covariance, expected) < tolerance
