@@ -79,6 +79,11 @@ class Estimate:
         """(6, 6) of `pose` in its own frame."""
         return self.covariance
 
+    @property
+    def pose_matching_covariance(self) -> np.ndarray:
+        """(6, 6) the part of `pose_covariance` that comes from matches and motion."""
+        return self.matching_covariance
+
     def map_camera(self, change: Callable[[Estimate], Estimate]) -> Estimate:
         """The result with another camera estimate."""
         return change(self)

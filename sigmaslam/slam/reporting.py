@@ -49,11 +49,12 @@ class Reporter:
     ) -> Estimate:
         """What is known after a frame; without a fit by the prediction, without a keyframe nothing."""
         state = self.window.posterior
-        calibration, spread = state.calibration, state.covariance[CALIBRATION, CALIBRATION]
+        calibration, spread = state.calibration, state.whole_covariance[CALIBRATION, CALIBRATION]
         by_error = np.zeros((6, CALIBRATION_SIZE))
         if fit is not None:
             pose, absolute, relative = fit.pose, fit.covariance, fit.relative
-            calibration, spread, by_error = fit.calibration, fit.calibration_covariance, fit.joint.common[-6:]
+            by_error, on_calibration = fit.joint.common[-6:], fit.joint.common[CALIBRATION]
+            calibration, spread = fit.calibration, fit.calibration_covariance + on_calibration @ on_calibration.T
         elif len(state):
             prediction = Prediction.of(self.window, self.motion)
             last = pose_slice(len(state) - 1)
