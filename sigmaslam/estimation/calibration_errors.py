@@ -8,7 +8,7 @@ Schmidt's filter, which trusts views less for them, every window makes up a cali
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -43,6 +43,12 @@ class CalibrationPrior:
 
     sigma: np.ndarray
     estimated: np.ndarray
+
+    def considering(self, index: int) -> CalibrationPrior:
+        """The same with one error more that is considered."""
+        estimated = self.estimated.copy()
+        estimated[index] = False
+        return replace(self, estimated=estimated)
 
     @property
     def estimated_covariance(self) -> np.ndarray:

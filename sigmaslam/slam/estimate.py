@@ -18,10 +18,13 @@ class CalibrationEstimate:
     Attributes:
         disparity_offset: measured minus true disparity, pixels.
         disparity_offset_sigma: its standard deviation, pixels.
+        refused_offset: what the images made of it where no such calibration could be so far off, pixels; it is not
+            estimated any more then. Zero otherwise.
     """
 
     disparity_offset: float
     disparity_offset_sigma: float
+    refused_offset: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -81,7 +81,9 @@ class Reporter:
             inliers=fit.count if fit is not None else 0,
             nis=fit.nis if fit is not None else 0.0,
             dof=fit.dof if fit is not None else 0,
-            calibration=CalibrationEstimate(float(calibration[0]), float(np.sqrt(max(spread[0, 0], 0.0)))),
+            calibration=CalibrationEstimate(
+                float(calibration[0]), float(np.sqrt(max(spread[0, 0], 0.0))), float(self.window.refused[0])
+            ),
             milliseconds=milliseconds,
             frame_covariance=0.5 * (frame_covariance + frame_covariance.T),
             tracks=tracks,
