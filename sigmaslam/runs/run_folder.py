@@ -196,7 +196,8 @@ def calibration_verdict(calibration: CalibrationEstimate) -> str:
     if calibration.refused_offset:
         return (
             f"The images ask for a disparity offset of {calibration.refused_offset:+.1f} px, which is more than "
-            "calibrations are off by: nothing was corrected. A lens, the baseline or the right camera is wrong: calibrate again."
+            "calibrations are off by: nothing was corrected. A lens, the baseline or the right camera is wrong: "
+            "calibrate again."
         )
     if sigma > 0.2:
         return (
