@@ -1,4 +1,4 @@
-"""Whether poses and map are as sure as they say: the tracker on renders with exact truth, many seeds, five filters, two calibrations."""
+"""Whether poses and map are as sure as they say: on renders with exact truth, many seeds, five filters."""
 
 from __future__ import annotations
 
@@ -142,8 +142,8 @@ def _track(source: Path, method: str, seed: int, scene: Studio) -> ConsistencyRe
     # The others are given what is right but for the offset, which is estimated.
     sequence, config = open_rendered(source), METHODS[method]
     if method == _DRAWN:
-        camera = replace(sequence.camera, sigmas=CalibrationSigmas())
-        sequence.camera = draw_calibration(camera, np.random.default_rng(seed))
+        uncertain = replace(sequence.camera, sigmas=CalibrationSigmas())
+        sequence.camera = draw_calibration(uncertain, np.random.default_rng(seed))
     with Path(os.devnull).open("w") as nowhere, redirect_stderr(nowhere):
         trial = Trial(sequence, truth, partial(track_sequence, config=config)).run()
     evaluation, tracked, point_map = trial.evaluation, trial.tracked, trial.point_map
