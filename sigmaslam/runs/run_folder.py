@@ -186,6 +186,7 @@ class RunWriter:
             "median_inliers": float(np.median(self._inliers)) if self._inliers else 0.0,
             "map_points": len(point_map.points),
             "calibration_verdict": calibration_verdict(last) if last else "No frame was read.",
+            "calibration_errors": {name: list(each) for name, each in last.errors.items()} if last else {},
         }
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sigmaslam.estimation.calibration_errors import ERRORS
 from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
@@ -81,12 +82,17 @@ class Reporter:
             inliers=fit.count if fit is not None else 0,
             nis=fit.nis if fit is not None else 0.0,
             dof=fit.dof if fit is not None else 0,
-            calibration=CalibrationEstimate(
-                float(calibration[0]), float(np.sqrt(max(spread[0, 0], 0.0))), float(self.window.refused[0])
-            ),
+            calibration=self._describe_calibration(calibration, spread),
             milliseconds=milliseconds,
             frame_covariance=0.5 * (frame_covariance + frame_covariance.T),
             tracks=tracks,
             # A keyframe is the window's by now, which has learned from it.
             relative_poses=self.relative_poses.report(timestamp, fit if tracks is None else None),
         )
+
+    def _describe_calibration(self, errors: np.ndarray, covariance: np.ndarray) -> CalibrationEstimate:
+        """What is known of errors (12,) with covariance (12, 12)."""
+        sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        chosen = [k for k in np.flatnonzero(self.window.calibration.estimated).tolist() if k]
+        others = {ERRORS[k]: (float(errors[k]), float(sigma[k])) for k in chosen}
+        return CalibrationEstimate(float(errors[0]), float(sigma[0]), float(self.window.refused[0]), others)
