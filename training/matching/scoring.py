@@ -37,7 +37,6 @@ PLACE_VERIFIER_NAME = "place_verifier.safetensors"
 _CONFIG_NAME, _SECONDS_NAME = "config.json", "seconds.txt"
 _SCORER_CHECKPOINT = "scorer_checkpoint.safetensors"
 _HELD_OUT_SHARE, _LEAST_HELD_OUT = 0.1, 36
-_MAX_THREADS = 4
 # On the card on their own beside the mean over all sources.
 _REPORTED = ("forward", "repeated")
 _REPORTED_METRICS = ("expected_calibration_error", "within_1_sigma", "within_2_sigma")
@@ -74,8 +73,7 @@ def train_scoring(out: Path, config: ScoringConfig, workers: int) -> dict[str, A
     Args:
         out: run folder.
         config: of the run.
-        workers: processes that make pairs and refine their matches, and threads that train; with other threads the
-            last bits of the weights differ.
+        workers: processes that make pairs and refine their matches; the training itself takes one core.
     Raises:
         InputError: the folder holds a run of another configuration, or something else.
     """
@@ -83,7 +81,7 @@ def train_scoring(out: Path, config: ScoringConfig, workers: int) -> dict[str, A
     # Before the run: the tree may move on while it lasts.
     origin = describe_origin([out])
     clock = _Clock(out / _SECONDS_NAME)
-    torch.set_num_threads(min(workers, _MAX_THREADS))
+    torch.set_num_threads(1)
     with open_progress() as progress:
         folders = [
             _make_records(progress, out / name, seed, count, workers)
