@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sigmaslam.evaluation.matching.image_pairs import ImagePair, Motion
+from sigmaslam.evaluation.matching.stereo import StereoStep
 from sigmaslam.evaluation.metrics import probability_calibration as calibration
 from sigmaslam.evaluation.metrics.probability_calibration import RIGHT
+from sigmaslam.frontend.descriptor import match_stereo
 from sigmaslam.frontend.image_pair import match_features
 from sigmaslam.frontend.match_confidence import ConfidenceEstimator
 from sigmaslam.frontend.types import Features
@@ -19,6 +20,8 @@ from sigmaslam.synthetic.scene_pairs import ScenePair
 EDGES = (0.0, 0.2, 0.5, 0.8, 0.95, 1.0)
 """Of the probabilities whose shares of right matches are told."""
 _LIKELY = 0.5
+# Stereo matches that give a depth: their probability, and disparity in pixels.
+_SURE, _LEAST_DISPARITY = 0.9, 0.5
 
 Detect = Callable[[np.ndarray], Features]
 
@@ -29,9 +32,9 @@ class MeasuredMatches:
 
     Attributes:
         probability: (M,).
-        error: (M,) distance from the true place or, where only the motion is known, line, pixels.
-        deviation: (M, 2) errors along the axes of the covariance over their standard deviations; None where only a
-            line is known.
+        error: (M,) distance from the true place, pixels.
+        deviation: (M, 2) errors along the axes of the covariance over their standard deviations; None where the truth
+            is too coarse for that.
     """
 
     probability: np.ndarray
@@ -88,9 +91,12 @@ def judge_probability(measured: MeasuredMatches) -> ProbabilityJudgement:
     )
 
 
-def measure_motions(pairs: Sequence[ImagePair], detect: Detect, judge: ConfidenceEstimator) -> MeasuredMatches:
-    """Matches of pairs whose motion is known, by their distances from the epipolar lines."""
-    return _join(_of_motion(pair, detect, judge) for pair in pairs)
+def measure_steps(steps: Sequence[StereoStep], detect: Detect, judge: ConfidenceEstimator) -> MeasuredMatches:
+    """Matches of pairs whose motion is known, of the keypoints that stereo gives a depth.
+
+    The distance from the epipolar line would not do: where a camera advances most wrong matches lie near it too.
+    """
+    return _join(_of_step(step, detect, judge) for step in steps)
 
 
 def measure_renders(
@@ -100,12 +106,21 @@ def measure_renders(
     return _join(_of_render(pair, detect, judge) for pair in pairs)
 
 
-def _of_motion(pair: ImagePair, detect: Detect, judge: ConfidenceEstimator) -> MeasuredMatches:
-    if not isinstance(pair.truth, Motion):
-        raise ValueError(f"pair {pair.name}: its motion is not known")
-    matches = match_features(judge, pair.image0, pair.image1, detect(pair.image0), detect(pair.image1), 0.0)
-    points0, points1 = (points.astype(np.float64) for points in (matches.keypoints0, matches.keypoints1))
-    return MeasuredMatches(matches.probability, pair.truth.epipolar_distance(points0, points1), None)
+def _of_step(step: StereoStep, detect: Detect, judge: ConfidenceEstimator) -> MeasuredMatches:
+    left, right, later = detect(step.left0), detect(step.right0), detect(step.left1)
+    eyes = match_stereo(judge, step.left0, step.right0, left, right)
+    eyes = eyes.select(eyes.probability >= _SURE)
+    disparity = np.full(len(left.keypoints), np.nan)
+    disparity[eyes.index0] = left.keypoints[eyes.index0, 0] - eyes.places[:, 0]
+    matches = match_features(judge, step.left0, step.left1, left, later, 0.0)
+    matches = matches.select(np.nan_to_num(disparity[matches.index0]) > _LEAST_DISPARITY)
+    points = step.camera.triangulate(np.column_stack([matches.keypoints0, disparity[matches.index0]]))
+    seen = points @ step.T_1_0[:3, :3].T + step.T_1_0[:3, 3]
+    in_front = seen[:, 2] > 0
+    places = np.full((len(seen), 2), np.inf)
+    places[in_front] = step.camera.project(seen[in_front])[:, :2]
+    error = np.linalg.norm(matches.keypoints1 - places, axis=1)
+    return MeasuredMatches(matches.probability, error, None)
 
 
 def _of_render(pair: ScenePair | HomographyPair, detect: Detect, judge: ConfidenceEstimator) -> MeasuredMatches:

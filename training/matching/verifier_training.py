@@ -113,7 +113,9 @@ def _refinements(record: PairRecord, found: MatchSet, rng: np.random.Generator) 
 def predicted_maps(points: np.ndarray, expected: np.ndarray, rng: np.random.Generator) -> PatchMaps:
     """Maps of (M, 2) points by where (M, 2) their neighbours truly are, off as those of a prediction are."""
     A, _ = local_maps(points, expected, np.ones(len(points)))
-    return PatchMaps(A @ (np.eye(2) + _MAP_ERROR * rng.standard_normal((len(points), 2, 2))), np.zeros_like(points))
+    off = np.eye(2) + _MAP_ERROR * rng.standard_normal((len(points), 2, 2))
+    # Of too few points there is no map, which is infinite.
+    return PatchMaps(A @ off if np.isfinite(A).all() else A, np.zeros_like(points))
 
 
 def _rows_of(
