@@ -9,8 +9,6 @@ from torch import Tensor, nn
 
 SIDE_CHANNELS = 9
 """Of `sigmaslam.frontend.scorer_inputs.side_information`."""
-# Of these the ratios of distances to both runners-up.
-_RATIOS = slice(4, 6)
 NEIGHBOURS = 12
 """Of `sigmaslam.frontend.scorer_inputs.nearest_matches`."""
 _WIDTH = 32
@@ -33,8 +31,7 @@ class MatchScorer(nn.Module):
     far as they agree with it, each by how much it is trusted; what the best similarity and all of them together got
     is what a match learns of its surroundings in a round. Trust begins with what the matcher knows. Beside its
     surroundings a match sees the whole set through its trust-weighted mean and spread (context normalisation, Yi et
-    al. 2018), its share of trusted matches, and how distinct these are: where structure repeats itself neighbours agree
-    on a wrong period as well.
+    al. 2018).
     """
 
     def __init__(self, rounds: int = _ROUNDS) -> None:
@@ -44,7 +41,7 @@ class MatchScorer(nn.Module):
         self.first_trust = nn.Linear(_WIDTH, 1)
         self.local = nn.ModuleList(_layers(_WIDTH + votes + 1, _WIDTH, _WIDTH) for _ in range(rounds))
         self.context = nn.ModuleList(_layers(_WIDTH + 4, _WIDTH, _WIDTH) for _ in range(rounds))
-        self.overall = nn.ModuleList(nn.Linear(4, _WIDTH) for _ in range(rounds))
+        self.overall = nn.ModuleList(nn.Linear(2, _WIDTH) for _ in range(rounds))
         self.trust = nn.ModuleList(_layers(_WIDTH, _WIDTH, 1) for _ in range(rounds))
 
     def forward(self, points0: Tensor, points1: Tensor, side: Tensor, near: Tensor, weight: Tensor) -> Tensor:
@@ -98,8 +95,7 @@ class MatchScorer(nn.Module):
             mean = (importance * seen).sum(dim=1, keepdim=True)
             spread = ((importance * (seen - mean) ** 2).sum(dim=1, keepdim=True) + 1e-3).sqrt()
             size = weight.sum(dim=1, keepdim=True).unsqueeze(2).clamp_min(1.0)
-            distinct = (importance * side[:, :, _RATIOS]).sum(dim=1, keepdim=True)
-            set_wide = overall(torch.cat([total / size, torch.log(size) / 7.0, distinct], dim=2))
+            set_wide = overall(torch.cat([total / size, torch.log(size) / 7.0], dim=2))
             hidden = hidden + 0.5 * (seen - mean) / spread + set_wide
             logit = trust(hidden).squeeze(2)
             logits.append(logit)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-VERIFIER_COLUMNS, PLACE_COLUMNS = 18, 12
+VERIFIER_COLUMNS, PLACE_COLUMNS = 14, 12
 """Of `sigmaslam.frontend.verifier_inputs`: `describe_matches`, `describe_places`."""
 _WIDTH = 48
 # Of log sigma, pixels.

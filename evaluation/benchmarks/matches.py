@@ -32,13 +32,15 @@ from sigmaslam.frontend.match_confidence import ConfidenceEstimator
 from sigmaslam.synthetic.homography_pairs import HomographyPair
 from sigmaslam.synthetic.repeated_pairs import RepeatedPairs
 from sigmaslam.synthetic.scene_pairs import ScenePair, ScenePairs
-from sigmaslam.training.matching.match_sets import DETECTORS, FORWARD_DOMAINS, SIZE
+from sigmaslam.training.matching.match_sets import DETECTORS, SIZE
 
 _HOMOGRAPHIES, _STEREO = ("set12", "boat", "churchill"), ("kitti", "euroc")
 _PHOTOGRAPH_KEYPOINTS, _STEREO_KEYPOINTS = 1024, 1500
 _MOVER_SEED, _MOVER_PAIRS = 2_000_003, 320
 _RENDER_SEED, _RENDER_PAIRS = 2_000_005, 64
 _RENDERED = range(_RENDER_PAIRS)
+# Worlds in which cameras advance.
+_FORWARD_DOMAINS = ("street", "street", "drone", "room")
 
 
 def write_matches(path: Path, data: Path, command: str, note: Callable[[str], None] = lambda text: None) -> str:
@@ -134,7 +136,7 @@ def _probability(data: Path, judge: ConfidenceEstimator) -> list[str]:
         *header("set", "features", "matches", *bins, "ece", "precision", "lost", "within 1", "within 2"),
     ]
     renders: dict[str, Sequence[ScenePair | HomographyPair]] = {
-        "renders, forward": list(map(ScenePairs(_RENDER_SEED, SIZE, FORWARD_DOMAINS, forward=True).pair, _RENDERED)),
+        "renders, forward": list(map(ScenePairs(_RENDER_SEED, SIZE, _FORWARD_DOMAINS, forward=True).pair, _RENDERED)),
         "renders, repeated": list(map(RepeatedPairs(_RENDER_SEED, SIZE).pair, _RENDERED)),
     }
     gaps = {f"kitti gap {gap}": load_advances(data, gap) for gap in (1, 3)}

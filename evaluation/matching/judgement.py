@@ -81,9 +81,7 @@ def judge_homographies(pairs: Sequence[ImagePair], detect: Detect, judge: Confid
         seen = np.flatnonzero(mutual & (logit > MIN_LOGIT))
         refinement = refine_by_neighbours(pair.image0, pair.image1, points0[seen], points1[seen], logit[seen])
         sigma = features0.sigma[putative.index0[seen]], features1.sigma[putative.index1[seen]]
-        verified, covariance = judge.verify(
-            pair.image0, pair.image1, points0[seen], putative.select(seen), logit[seen], refinement, sigma
-        )
+        verified, covariance = judge.verify(pair.image0, pair.image1, points0[seen], logit[seen], refinement, sigma)
         probability, error = np.zeros(len(logit)), points1 - places
         probability[seen], error[seen] = verified, refinement.places - places[seen]
         right = np.linalg.norm(error, axis=1) < RIGHT

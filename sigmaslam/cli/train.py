@@ -57,12 +57,12 @@ def train(
 def train_scorer(
     out: Annotated[Path, typer.Option(help="Folder for pairs, checkpoint, weights and card; new, or left to go on.")],
     pairs: Annotated[int, typer.Option(min=16, help="Rendered pairs to learn from; a tenth more to calibrate on.")] = (
-        2700
+        2400
     ),
-    steps: Annotated[int, typer.Option(min=10, help="Optimiser steps of the scorer, 8 sets of matches each.")] = 4000,
-    verifier_steps: Annotated[int, typer.Option(min=10, help="Of the verifier, 4,096 matches each.")] = 6000,
+    steps: Annotated[int, typer.Option(min=1, help="Optimiser steps of the scorer, 8 sets of matches each.")] = 4000,
+    verifier_steps: Annotated[int, typer.Option(min=1, help="Of the verifier, 4,096 matches each.")] = 6000,
     seed: Annotated[int, typer.Option(min=0, help="Seed of pairs, weights and order.")] = 0,
-    workers: Annotated[int, typer.Option(min=1, help="Processes that render pairs and refine matches.")] = 2,
+    workers: Annotated[int, typer.Option(min=1, help="Processes that render pairs.")] = 2,
 ) -> None:
     """Train what gives matches their probability and covariance, on renders alone (needs the extra 'train').
 

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-# Shares of a normal distribution within one and two standard deviations.
-NORMAL_WITHIN_1 = 0.6826894921370859
+# Share of a normal distribution within two standard deviations.
 NORMAL_WITHIN_2 = 0.9544997361036416
 # 68, 95 and 99 % with 2 degrees of freedom.
 CHI_SQUARE_68_OF_2 = 2.27886856637673

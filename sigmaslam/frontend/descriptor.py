@@ -89,12 +89,11 @@ def refine_with_confidence(
     """
     logit = estimator.score(putative, features0, features1)
     kept = putative.mutual & (logit > MIN_LOGIT)
-    putative, logit = putative.select(kept), logit[kept]
-    index0, index1 = putative.index0, putative.index1
+    index0, index1, logit = putative.index0[kept], putative.index1[kept], logit[kept]
     points0 = features0.keypoints[index0]
     refinement = refined(points0, features1.keypoints[index1], index0, logit)
     sigma = features0.sigma[index0], features1.sigma[index1]
-    probability, covariance = estimator.verify(image0, image1, points0, putative, logit, refinement, sigma)
+    probability, covariance = estimator.verify(image0, image1, points0, logit, refinement, sigma)
     return RefinedMatches(index0, index1, refinement.places, probability, covariance)
 
 

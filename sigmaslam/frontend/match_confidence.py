@@ -9,7 +9,7 @@ import numpy as np
 from sigmaslam.frontend.followed_patches import compare_with_neighbours
 from sigmaslam.frontend.nearest_neighbours import Putative
 from sigmaslam.frontend.patch_evidence import Evidence, examine_patches
-from sigmaslam.frontend.scorer_inputs import distance_ratios, nearest_matches, side_information
+from sigmaslam.frontend.scorer_inputs import nearest_matches, side_information
 from sigmaslam.frontend.types import Features, Refinement
 from sigmaslam.frontend.verifier_inputs import PlaceSearch, describe_matches, describe_places
 from sigmaslam.inference.onnx_graph import OnnxGraph, shipped_weights
@@ -65,7 +65,6 @@ class ConfidenceEstimator:
         image0: np.ndarray,
         image1: np.ndarray,
         points0: np.ndarray,
-        putative: Putative,
         logit: np.ndarray,
         refinement: Refinement,
         sigma: tuple[np.ndarray, np.ndarray],
@@ -75,7 +74,6 @@ class ConfidenceEstimator:
         Args:
             image0, image1: (H, W) uint8.
             points0: (M, 2) in image 0.
-            putative: the matches, all of the pair that are to be verified.
             logit: (M,) as `score` gives it.
             refinement: of their places in image 1.
             sigma: (M,) of the detected keypoints in either image, pixels.
@@ -83,7 +81,7 @@ class ConfidenceEstimator:
         if len(points0) == 0:
             return np.zeros(0, np.float32), np.zeros((0, 2, 2), np.float32)
         evidence = examine_patches(image0, image1, points0, refinement.places, refinement.A)
-        columns = describe_matches(logit, distance_ratios(putative), evidence, refinement, *sigma)
+        columns = describe_matches(logit, evidence, refinement, *sigma)
         probability, covariance = self._verifier({"columns": columns, "axes": evidence.axes.astype(np.float32)})
         return probability, covariance
 

@@ -28,6 +28,10 @@ def side_information(putative: Putative, features0: Features, features1: Feature
         quotient of the keypoints' sigmas.
     """
     similarity = putative.similarity
+    distance = np.maximum(1.0 - similarity, 0.0) + 1e-4
+    ratios = [
+        np.sqrt(distance / (np.maximum(1.0 - other, 0.0) + 1e-4)) for other in (putative.second0, putative.second1)
+    ]
     sigma0, sigma1 = features0.sigma[putative.index0], features1.sigma[putative.index1]
     quotient = np.log(np.maximum(sigma1, 1e-6) / np.maximum(sigma0, 1e-6))
     columns = [
@@ -35,19 +39,13 @@ def side_information(putative: Putative, features0: Features, features1: Feature
         _rank(similarity - putative.second0),
         _rank(similarity - putative.second1),
         putative.mutual,
-        *distance_ratios(putative).T,
+        np.minimum(ratios[0], 2.0),
+        np.minimum(ratios[1], 2.0),
         _rank(features0.scores)[putative.index0],
         _rank(features1.scores)[putative.index1],
         np.clip(quotient, -_MAX_LOG_SIGMA, _MAX_LOG_SIGMA),
     ]
     return np.stack(columns, axis=1).astype(np.float32)
-
-
-def distance_ratios(putative: Putative) -> np.ndarray:
-    """(M, 2) distances of the descriptors over those of the runners-up in image 1 and in image 0, at most 2."""
-    distance = np.maximum(1.0 - putative.similarity, 0.0) + 1e-4
-    others = np.maximum(1.0 - np.stack([putative.second0, putative.second1], axis=1), 0.0) + 1e-4
-    return np.asarray(np.minimum(np.sqrt(distance[:, None] / others), 2.0))
 
 
 def nearest_matches(points0: np.ndarray, mutual: np.ndarray) -> np.ndarray:

@@ -11,8 +11,6 @@ from sigmaslam.frontend.types import Refinement
 
 _MAX_LOGIT = 8.0
 _MAX_DISTANCE = 50.0
-# In all, where there are no matches.
-_LEAST_TRUST = 1e-9
 
 
 class PlaceSearch(Enum):
@@ -24,36 +22,26 @@ class PlaceSearch(Enum):
 
 
 def describe_matches(
-    logit: np.ndarray,
-    ratios: np.ndarray,
-    evidence: Evidence,
-    refinement: Refinement,
-    sigma0: np.ndarray,
-    sigma1: np.ndarray,
+    logit: np.ndarray, evidence: Evidence, refinement: Refinement, sigma0: np.ndarray, sigma1: np.ndarray
 ) -> np.ndarray:
     """The columns that the verifier takes.
 
     Args:
-        logit: (M,) of the scorer, of all matches of a pair of images that are to be verified.
-        ratios: (M, 2) of distances to both runners-up, as of `distance_ratios`.
+        logit: (M,) of the scorer.
         evidence: of the patches at the refined places.
         refinement: of the matches.
         sigma0, sigma1: (M,) of the keypoints of either image, pixels.
     Returns:
-        (M, 18) float32: logit / 4; logs of half the squared difference of the patches, of both contrasts and both
+        (M, 14) float32: logit / 4; logs of half the squared difference of the patches, of both contrasts and both
         sharpnesses; moves along both axes; whether refined, whether by the neighbours' map; logs of both sigmas and
-        of the spacing; distance from the neighbours' map; both ratios; and, the same for all, the share of the matches
-        that the scorer expects to be right, and the mean of these of the log of the difference of the patches.
+        of the spacing; distance from the neighbours' map.
     """
-    logit = np.clip(np.asarray(logit, np.float64), -_MAX_LOGIT, _MAX_LOGIT)
-    trust = 1.0 / (1.0 + np.exp(-logit))
-    appearance = _appearance(evidence)
     shift = _along_axes(evidence, refinement.places - refinement.start)
     distance = np.zeros(len(logit)) if refinement.distance is None else refinement.distance
     return np.column_stack(
         [
-            logit / 4.0,
-            *appearance,
+            np.clip(logit, -_MAX_LOGIT, _MAX_LOGIT) / 4.0,
+            *_appearance(evidence),
             np.log1p(np.abs(shift)),
             refinement.moved,
             np.full(len(logit), refinement.A is not None),
@@ -61,9 +49,6 @@ def describe_matches(
             np.log(sigma1 + 0.05),
             np.log(evidence.spacing),
             np.log1p(np.minimum(distance, _MAX_DISTANCE)),
-            ratios,
-            np.full(len(logit), trust.sum() / max(len(logit), 1)),
-            np.full(len(logit), trust @ appearance[0] / max(trust.sum(), _LEAST_TRUST)),
         ]
     ).astype(np.float32)
 

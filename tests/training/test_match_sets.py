@@ -17,11 +17,10 @@ from sigmaslam.training.matching.match_sets import (
     load_record,
     record_path,
     save_record,
-    source_of,
     write_records,
 )
 
-PLANES, SCENES, STEREO, VIDEO = 0, 1, 3, 16
+PLANES, STEREO, SCENES, VIDEO = 0, 2, 3, 5
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +101,7 @@ def test_there_are_right_and_wrong_matches_and_mutual_ones_are_right_more_often(
         right, mutual = errors(found) < 3.0, found.putative.mutual
         assert right.sum() >= 8, kind
         assert (~right).sum() >= 8, kind
-        assert right[mutual].mean() > 1.5 * right[~mutual].mean(), kind
+        assert right[mutual].mean() > 2.0 * right[~mutual].mean(), kind
 
 
 def test_right_matches_are_about_as_near_as_keypoints_are_exact(video: PairRecord):
@@ -132,21 +131,17 @@ def test_sources_take_turns_and_see_neighbouring_pairs(monkeypatch: pytest.Monke
 
     sets = MatchSets(0)
     monkeypatch.setattr(sets, "_streams", {name: Recorder(name) for name in sets._streams})
-    for index in range(18):
+    for index in range(12):
         with pytest.raises(LookupError):
             sets.record(index)
-    assert asked[:9] == [
+    assert asked[:6] == [
         ("planes", 0),
         ("scenes", 0),
-        ("forward", 0),
         ("stereo", 0),
         ("scenes", 1),
         ("turned planes", 0),
-        ("forward", 1),
         ("video", 0),
-        ("repeated", 0),
     ]
-    assert [name for name, _ in asked] == [source_of(index) for index in range(18)]
     assert [own for name, own in asked if name == "scenes"] == [0, 1, 2, 3]
     assert [own for name, own in asked if name == "stereo"] == [0, 1]
 

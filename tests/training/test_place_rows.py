@@ -14,6 +14,7 @@ from sigmaslam.models.verifier_network import PLACE_COLUMNS
 from sigmaslam.synthetic.rendering.textures import dead_leaves
 from sigmaslam.training.matching import place_rows
 from sigmaslam.training.matching.match_sets import MatchSet, PairRecord
+from sigmaslam.training.matching.place_rows import collect_place_rows
 from sigmaslam.training.matching.verifier_training import VerifierRows
 
 COUNT, HIDDEN, SIDE, MARGIN = 200, 50, 300, 20
@@ -43,9 +44,7 @@ def record(source: str, seed: int = 0, kinds: tuple[str, ...] = ("sift",)) -> Pa
 
 
 def collect(records: list[PairRecord], seed: int = 0) -> VerifierRows:
-    return VerifierRows.concatenate(
-        [rows for number, each in enumerate(records) for rows in place_rows.place_rows(each, number, seed)]
-    )
+    return collect_place_rows(records, seed, lambda done: None)
 
 
 def far(rows: VerifierRows) -> np.ndarray:
@@ -73,7 +72,9 @@ def test_errors_are_small_where_keypoints_are_seen_and_very_large_where_they_are
 @pytest.mark.parametrize(("source", "times"), [("stereo", 2), ("scenes", 1), ("planes", 1)])
 def test_keypoints_are_searched_for_along_rows_and_from_predictions_or_followed(source: str, times: int):
     """Eyes are told from times by a column; most keypoints are found."""
-    rows = collect([record(source), record(source, 1, ("sift", "orb"))])
+    done: list[int] = []
+    rows = collect_place_rows([record(source), record(source, 1, ("sift", "orb"))], 0, done.append)
+    assert done == [1, 2]
     assert rows.inputs.shape == (len(rows.pair), PLACE_COLUMNS)
     assert rows.inputs.dtype == rows.error.dtype == np.float32
     assert np.isfinite(rows.inputs).all()

@@ -19,7 +19,6 @@ from sigmaslam.frontend.nearest_neighbours import Putative, nearest_anywhere, ne
 from sigmaslam.frontend.types import Features
 from sigmaslam.synthetic.homography_pairs import HomographyPairs
 from sigmaslam.synthetic.rendering.textures import KINDS
-from sigmaslam.synthetic.repeated_pairs import RepeatedPairs
 from sigmaslam.synthetic.scene_pairs import ScenePairs
 from sigmaslam.training.features.stream import PairStream, prepare_worker, take_turn
 
@@ -33,20 +32,8 @@ SIZE = 384
 # Keypoints an image, drawn evenly in the logarithm: those of 0.3 to 2.5 thousand in an image of 640 x 480 pixels.
 _KEYPOINTS = (150, 1200)
 _MIN_MATCHES = 24
-# In turn. Forward motion counts as much as any other motion in a scene: most cameras on wheels or wings do little else.
-_TURNS = (
-    "planes",
-    "scenes",
-    "forward",
-    "stereo",
-    "scenes",
-    "turned planes",
-    "forward",
-    "video",
-    "repeated",
-)
-FORWARD_DOMAINS = ("street", "street", "drone", "room")
-"""Worlds in which cameras advance."""
+# In turn; "anywhere" is as between two photographs, "rows" as in a stereo pair, "ellipses" as with a prediction.
+_TURNS = ("planes", "scenes", "stereo", "scenes", "turned planes", "video")
 _ROW_TOLERANCE = 2.0
 _DISPARITY = (-2.0, 0.25 * SIZE)
 _ELLIPSE_SIGMA = (1.0, 25.0)
@@ -106,8 +93,6 @@ class MatchSets:
             "scenes": ScenePairs(seed, SIZE),
             "video": HomographyPairs(seed + 2, SIZE, ("leaves",), (0.1, 0.2)),
             "stereo": ScenePairs(seed + 1, SIZE, stereo=True),
-            "forward": ScenePairs(seed + 2, SIZE, FORWARD_DOMAINS, forward=True),
-            "repeated": RepeatedPairs(seed + 3, SIZE),
         }
 
     def record(self, index: int) -> PairRecord:
@@ -129,11 +114,6 @@ class MatchSets:
         return PairRecord(image0, image1, sets)
 
 
-def source_of(index: int) -> str:
-    """The turn that the record of that index is of."""
-    return take_turn(_TURNS, index)[0]
-
-
 def _match(
     source: str,
     guided: bool,
@@ -145,7 +125,7 @@ def _match(
     descriptors = features0.descriptors, features1.descriptors
     if source == "stereo":
         return nearest_in_rows(features0.keypoints, features1.keypoints, *descriptors, _ROW_TOLERANCE, _DISPARITY)
-    if guided and source in ("scenes", "forward", "video"):
+    if guided and source in ("scenes", "video"):
         sigma = np.exp(rng.uniform(*np.log(_ELLIPSE_SIGMA)))
         valid = (np.abs(places) < 4 * SIZE).all(axis=1)
         predicted = np.where(valid[:, None], places, features0.keypoints + rng.normal(0.0, _FOREIGN, places.shape))

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+
 import numpy as np
 
+from sigmaslam.errors import SigmaSlamError
+from sigmaslam.frontend.affine_alignment import local_maps
 from sigmaslam.frontend.followed_patches import (
     FLOW_LEVELS,
     FLOW_WINDOW,
@@ -17,9 +21,10 @@ from sigmaslam.frontend.lucas_kanade import lucas_kanade
 from sigmaslam.frontend.nearest_neighbours import within_ellipses
 from sigmaslam.frontend.patch_evidence import examine_patches
 from sigmaslam.frontend.row_search import REACH_PREDICTED, REACH_SEARCHED, align_in_rows, search_rows
+from sigmaslam.frontend.types import PatchMaps
 from sigmaslam.frontend.verifier_inputs import PlaceSearch, describe_places
 from sigmaslam.training.matching.match_sets import MatchSet, PairRecord
-from sigmaslam.training.matching.verifier_training import VerifierRows, error_along_axes, predicted_maps
+from sigmaslam.training.matching.verifier_training import VerifierRows, error_along_axes
 
 # Of predictions, pixels: what all are off by, drawn evenly in the logarithm, and what they claim beside it.
 _SIGMAS, _OWN_SIGMA = (0.5, 15.0), 1.0
@@ -27,6 +32,8 @@ _SIGMAS, _OWN_SIGMA = (0.5, 15.0), 1.0
 _STRETCH, _WRONG_DEPTH = 0.01, 0.1
 # Places of the last frame carried on are off by so much; hidden ones drift away from where they were.
 _CARRIED, _DRIFT, _FORGOTTEN = 0.3, 2.0, 0.1
+# Relative error of the patches' maps.
+_MAP_ERROR = 0.03
 # Pairs whose second image shows another place.
 _FOREIGN = 0.15
 # Of predicted disparities, pixels, drawn evenly in the logarithm.
@@ -34,34 +41,36 @@ _DISPARITY_SIGMAS = (0.1, 1.5)
 _MIN_ROWS = 16
 
 
-def place_rows(record: PairRecord, number: int, seed: int) -> list[VerifierRows]:
-    """The keypoints of a record, found as the run time does without features of the second image.
+def collect_place_rows(records: Iterable[PairRecord], seed: int, note: Callable[[int], None]) -> VerifierRows:
+    """Finds the keypoints of all records as the run time does without features of the second image.
 
     Args:
-        record: the pair with its sets.
-        number: of the pair.
+        records: pairs with their sets.
         seed: of predictions and starts.
+        note: is told how many records are done.
     """
     parts = []
-    rng = np.random.default_rng((seed, 5, number))
-    for found in record.sets.values():
-        image1, truth = record.image1, np.where(found.visible[:, None], found.expected, np.inf)
-        if rng.random() < _FOREIGN:
-            image1, truth = (
-                np.roll(image1, [side // 2 for side in image1.shape], (0, 1)),
-                np.full_like(truth, np.inf),
-            )
-        pair = record.image0, image1
-        if found.source == "stereo":
-            drawn = [_along_rows(pair, found, truth), _followed_along_rows(pair, found, truth, rng)]
-        else:
-            drawn = [_followed(pair, found, truth, rng)]
-        parts += [
-            VerifierRows(columns, error, np.full(len(columns), number))
-            for columns, error in drawn
-            if len(columns) >= _MIN_ROWS
-        ]
-    return parts
+    for number, record in enumerate(records):
+        rng = np.random.default_rng((seed, 5, number))
+        for found in record.sets.values():
+            image1, truth = record.image1, np.where(found.visible[:, None], found.expected, np.inf)
+            if rng.random() < _FOREIGN:
+                image1, truth = (
+                    np.roll(image1, [side // 2 for side in image1.shape], (0, 1)),
+                    np.full_like(truth, np.inf),
+                )
+            pair = record.image0, image1
+            if found.source == "stereo":
+                drawn = [_along_rows(pair, found, truth), _followed_along_rows(pair, found, truth, rng)]
+            else:
+                drawn = [_followed(pair, found, truth, rng)]
+            for columns, error in drawn:
+                if len(columns) >= _MIN_ROWS:
+                    parts.append(VerifierRows(columns, error, np.full(len(columns), number)))
+        note(number + 1)
+    if not parts:
+        raise SigmaSlamError("no keypoint is found again in any pair: train on more pairs")
+    return VerifierRows.concatenate(parts)
 
 
 _Pair = tuple[np.ndarray, np.ndarray]
@@ -83,13 +92,15 @@ def _followed(
     covariance = np.tile((sigma**2 + _OWN_SIGMA**2) * np.eye(2), (len(points), 1, 1))
     start = _starts(pair, points, predicted, expected, found.visible[usable], rng)
     start[~within_ellipses(np.nan_to_num(start, nan=1e6) - predicted, covariance)] = np.nan
-    maps = predicted_maps(points, expected, rng)
+    A, _ = local_maps(points, expected, np.ones(len(points)))
+    A = A @ (np.eye(2) + _MAP_ERROR * rng.standard_normal((len(points), 2, 2)))
+    maps = PatchMaps(A, np.zeros_like(points))
     targets = PatchTargets(points, maps, predicted, covariance, start, correct_by_neighbours(predicted, start))
     small0, small1 = (shrink(image) for image in pair)
     places, there = find_patches(*pair, small0, small1, targets)
     kept = usable[there]
     return _describe(
-        pair, points[there], places[there], predicted[there], maps.A[there], found, kept, truth, PlaceSearch.IN_TIME
+        pair, points[there], places[there], predicted[there], A[there], found, kept, truth, PlaceSearch.IN_TIME
     )
 
 

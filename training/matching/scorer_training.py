@@ -20,8 +20,6 @@ from sigmaslam.training.small_loop import train_steps
 LEARNING_RATE = 3e-3
 SETS_A_STEP = 8
 _MAX_MATCHES = 512
-# Share of the steps in which the rate of learning rises, and the fewest steps.
-_RISE, _MIN_RISE = 0.05, 2
 # Weight of the round before the first, of those in between, and of the last.
 _ROUND_WEIGHTS = (0.2, 0.4, 1.0)
 
@@ -126,9 +124,7 @@ def train_scorer(
     torch.manual_seed(seed)
     scorer = MatchScorer()
     optimizer = torch.optim.AdamW(scorer.parameters(), LEARNING_RATE, weight_decay=1e-4)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimizer, LEARNING_RATE, total_steps=steps, pct_start=max(_RISE, _MIN_RISE / steps)
-    )
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, LEARNING_RATE, total_steps=steps, pct_start=0.05)
 
     def losses(done: int) -> Iterator[Tensor]:
         order = islice(_endless_order(len(sets), seed), done * SETS_A_STEP, None)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -12,15 +12,14 @@ import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from sigmaslam.estimation.chi_square import NORMAL_WITHIN_1, NORMAL_WITHIN_2
+from sigmaslam.errors import SigmaSlamError
+from sigmaslam.estimation.chi_square import NORMAL_WITHIN_2
 from sigmaslam.evaluation.metrics.probability_calibration import RIGHT
-from sigmaslam.frontend.affine_alignment import local_maps, refine_by_neighbours
+from sigmaslam.frontend.affine_alignment import refine_by_neighbours
 from sigmaslam.frontend.lucas_kanade import refine
 from sigmaslam.frontend.match_confidence import MIN_LOGIT
 from sigmaslam.frontend.patch_evidence import Evidence, examine_patches
-from sigmaslam.frontend.plane_alignment import refine_in_rows, refine_on_planes
-from sigmaslam.frontend.scorer_inputs import distance_ratios
-from sigmaslam.frontend.types import PatchMaps, Refinement
+from sigmaslam.frontend.types import Refinement
 from sigmaslam.frontend.verifier_inputs import describe_matches
 from sigmaslam.models.scorer_network import MatchScorer
 from sigmaslam.models.verifier_network import MatchVerifier
@@ -33,18 +32,9 @@ _LEARNING_RATE = 3e-3
 _BATCH = 4096
 # Degrees of freedom of Student's t: few near-misses among the right matches must not widen the sigma of all.
 _FREEDOM = 20.0
-# How matches of either source are refined at run time: shifted, as planes along the rows or by a prediction, or by the
-# maps of their neighbours. Pairs whose images differ by more than a shift are refined by these alone.
-_SHIFTED = ("scenes", "forward", "video", "repeated")
-_IN_ROWS = ("stereo",)
-_ON_PLANES = ("scenes", "forward", "video")
-_MAPPED = ("planes", "turned planes", "scenes", "forward", "video", "repeated")
-# Relative error of the maps that a prediction gives.
-_MAP_ERROR = 0.03
-# Scale of sigma: tried from half to twice that which is right at two sigma. As the errors have longer tails than a
-# normal one no scale is right at one and at two sigma; what each may miss is what is promised of it.
-_SCALES = np.geomspace(0.5, 2.0, 1001)
-_MAY_MISS_1, _MAY_MISS_2 = 0.05, 0.03
+# Pairs whose images differ by more than a shift are refined by the neighbours' maps alone.
+_SHIFTED = ("stereo", "scenes", "video")
+_MAPPED = ("planes", "turned planes", "scenes", "video")
 _FAR = 1e3
 
 
@@ -68,66 +58,42 @@ class VerifierRows(Table):
         return np.asarray(np.linalg.norm(self.error, axis=1) < RIGHT)
 
 
-def match_rows(record: PairRecord, number: int, scorer: MatchScorer, seed: int) -> list[VerifierRows]:
-    """The matches of a record, refined in all the ways in which the run time refines such pairs.
+def collect_rows(records: Iterable[PairRecord], scorer: MatchScorer, note: Callable[[int], None]) -> VerifierRows:
+    """Refines the matches of all records as the run time does.
 
     Args:
-        record: the pair with its sets.
-        number: of the pair.
+        records: pairs with their sets.
         scorer: trained.
-        seed: of the maps' errors.
+        note: is told how many records are done.
     """
     parts = []
-    rng = np.random.default_rng((seed, 6, number))
-    for found in record.sets.values():
-        logit = score_set(scorer, found)
-        kept = found.putative.mutual & (logit > MIN_LOGIT)
-        if kept.any():
-            parts += [
-                _rows_of(record, found, logit, kept, refine_as, number)
-                for refine_as in _refinements(record, found, rng)
-            ]
-    return parts
-
-
-_Refine = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Refinement]
-# From points (M, 2), (M, 2) of both images, logit (M,), and true places (M, 2), also of hidden points.
-
-
-def _refinements(record: PairRecord, found: MatchSet, rng: np.random.Generator) -> list[_Refine]:
-    images = record.image0, record.image1
-    ways: list[tuple[tuple[str, ...], _Refine]] = [
-        (_SHIFTED, lambda points0, points1, *_: refine(*images, points0, points1)),
-        (_IN_ROWS, lambda points0, points1, *_: refine_in_rows(*images, points0, points1)[0]),
-        (
-            _ON_PLANES,
-            lambda points0, points1, _, expected: refine_on_planes(
-                *images, points0, points1, predicted_maps(points0, expected, rng)
-            ),
-        ),
-        (_MAPPED, lambda points0, points1, logit, _: refine_by_neighbours(*images, points0, points1, logit)),
-    ]
-    return [way for sources, way in ways if found.source in sources]
-
-
-def predicted_maps(points: np.ndarray, expected: np.ndarray, rng: np.random.Generator) -> PatchMaps:
-    """Maps of (M, 2) points by where (M, 2) their neighbours truly are, off as those of a prediction are."""
-    A, _ = local_maps(points, expected, np.ones(len(points)))
-    off = np.eye(2) + _MAP_ERROR * rng.standard_normal((len(points), 2, 2))
-    # Of too few points there is no map, which is infinite.
-    return PatchMaps(A @ off if np.isfinite(A).all() else A, np.zeros_like(points))
+    for number, record in enumerate(records):
+        for found in record.sets.values():
+            logit = score_set(scorer, found)
+            kept = found.putative.mutual & (logit > MIN_LOGIT)
+            for mapped, sources in ((False, _SHIFTED), (True, _MAPPED)):
+                if found.source in sources and kept.any():
+                    parts.append(_rows_of(record, found, logit, kept, mapped, number))
+        note(number + 1)
+    if not parts:
+        raise SigmaSlamError("the scorer finds no match likely in any pair: train it longer, or on more pairs")
+    return VerifierRows.concatenate(parts)
 
 
 def _rows_of(
-    record: PairRecord, found: MatchSet, logit: np.ndarray, kept: np.ndarray, refine_as: _Refine, number: int
+    record: PairRecord, found: MatchSet, logit: np.ndarray, kept: np.ndarray, mapped: bool, number: int
 ) -> VerifierRows:
     putative = found.putative.select(kept)
     points0 = found.features0.keypoints[putative.index0].astype(np.float64)
     points1 = found.features1.keypoints[putative.index1].astype(np.float64)
-    refinement = refine_as(points0, points1, logit[kept], found.expected[putative.index0])
+    refinement: Refinement
+    if mapped:
+        refinement = refine_by_neighbours(record.image0, record.image1, points0, points1, logit[kept])
+    else:
+        refinement = refine(record.image0, record.image1, points0, points1)
     evidence = examine_patches(record.image0, record.image1, points0, refinement.places, refinement.A)
     sigma0, sigma1 = found.features0.sigma[putative.index0], found.features1.sigma[putative.index1]
-    columns = describe_matches(logit[kept], distance_ratios(putative), evidence, refinement, sigma0, sigma1)
+    columns = describe_matches(logit[kept], evidence, refinement, sigma0, sigma1)
     error = error_along_axes(evidence, refinement.places, found.places[kept])
     return VerifierRows(columns, error, np.full(len(columns), number))
 
@@ -187,8 +153,8 @@ def train_verifier(
 def calibrate(verifier: MatchVerifier, rows: VerifierRows) -> None:
     """Fits the numbers that turn what it learned into probabilities and sigmas that hold, on held-out pairs.
 
-    Scale and shift of the logit by likelihood (Platt 1999); the scale of sigma such that about as many errors of right
-    matches lie within one and within two sigma, along either axis, as of a normal error.
+    Scale and shift of the logit by likelihood (Platt 1999); the scale of sigma such that as many errors of right
+    matches lie within two sigma, along either axis, as of a normal error.
     """
     with torch.no_grad():
         logit, log_sigma = verifier(torch.from_numpy(rows.inputs))
@@ -207,13 +173,4 @@ def calibrate(verifier: MatchVerifier, rows: VerifierRows) -> None:
     with torch.no_grad():
         verifier.logit_shift.copy_(scale * verifier.logit_shift + shift)
         verifier.logit_scale.copy_(scale * verifier.logit_scale)
-        verifier.sigma_scale.mul_(_fit_scale(deviation.double().numpy()))
-
-
-def _fit_scale(deviation: np.ndarray) -> float:
-    """What sigmas are to be multiplied by, from the errors (N,) over them, without sign."""
-    ordered = np.sort(deviation)
-    scales = _SCALES * np.quantile(ordered, NORMAL_WITHIN_2) / 2.0
-    within_1, within_2 = (np.searchsorted(ordered, sigmas * scales) / len(ordered) for sigmas in (1.0, 2.0))
-    missed = ((within_1 - NORMAL_WITHIN_1) / _MAY_MISS_1) ** 2 + ((within_2 - NORMAL_WITHIN_2) / _MAY_MISS_2) ** 2
-    return float(scales[missed.argmin()])
+        verifier.sigma_scale.mul_(torch.quantile(deviation, NORMAL_WITHIN_2) / 2.0)

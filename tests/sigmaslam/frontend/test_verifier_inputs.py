@@ -9,8 +9,7 @@ from sigmaslam.frontend.verifier_inputs import PlaceSearch, describe_matches, de
 
 COUNT = 5
 LOGIT, CORRELATION, CONTRAST0, CONTRAST1, SHARPNESS, SHIFT, MOVED, MAPPED = 0, 1, 2, 3, [4, 5], [6, 7], 8, 9
-SIGMA0, SIGMA1, SPACING, DISTANCE, RATIOS, SHARE, USUAL = 10, 11, 12, 13, [14, 15], 16, 17
-RATIO = (0.5, 0.9)
+SIGMA0, SIGMA1, SPACING, DISTANCE = 10, 11, 12, 13
 
 
 def evidence(**changed: np.ndarray) -> Evidence:
@@ -42,22 +41,18 @@ def columns(
     sigma: tuple[float, float] = (0.5, 0.7),
 ) -> np.ndarray:
     return describe_matches(
-        np.full(COUNT, logit),
-        np.tile(RATIO, (COUNT, 1)),
-        of or evidence(),
-        moved or refinement(),
-        *(np.full(COUNT, each) for each in sigma),
+        np.full(COUNT, logit), of or evidence(), moved or refinement(), *(np.full(COUNT, each) for each in sigma)
     )
 
 
-def test_a_match_is_eighteen_float32_numbers():
+def test_a_match_is_fourteen_float32_numbers():
     found = columns()
-    assert found.shape == (COUNT, 18)
+    assert found.shape == (COUNT, 14)
     assert found.dtype == np.float32
     none = np.zeros(0)
     nothing = Evidence(none, none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)), none, none)
     nowhere = Refinement(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, bool))
-    assert describe_matches(none, np.zeros((0, 2)), nothing, nowhere, none, none).shape == (0, 18)
+    assert describe_matches(none, nothing, nowhere, none, none).shape == (0, 14)
 
 
 @pytest.mark.parametrize(
@@ -75,9 +70,6 @@ def test_a_match_is_eighteen_float32_numbers():
         (SIGMA1, np.log(0.75)),
         (SPACING, np.log(2.0)),
         (DISTANCE, 0.0),
-        (RATIOS, RATIO),
-        (SHARE, 1.0 / (1.0 + np.exp(-1.0))),
-        (USUAL, np.log(0.101)),
     ],
 )
 def test_columns_have_the_values_counted_by_hand(column: int | list[int], expected: float | list[float]):
@@ -101,23 +93,6 @@ def test_the_neighbours_map_is_told_and_far_is_far_enough():
 @pytest.mark.parametrize(("logit", "expected"), [(3.0, 0.75), (1e6, 2.0), (-np.inf, -2.0)])
 def test_a_logit_beyond_reason_is_bounded(logit: float, expected: float):
     np.testing.assert_allclose(columns(logit=logit)[:, LOGIT], expected)
-
-
-def test_a_match_is_told_how_the_set_is_that_it_is_of():
-    """Of which half is hopeless and half is sure; what the hopeless ones look like does not count."""
-    correlation = np.array([0.9, 0.5, 0.9, 0.5])
-    some = {field: getattr(evidence(), field)[:4] for field in Evidence.__slots__} | {"correlation": correlation}
-    moved = refinement()
-    found = describe_matches(
-        np.array([50.0, -50.0, 50.0, -50.0]),
-        np.ones((4, 2)),
-        Evidence(**some),
-        Refinement(moved.start[:4], moved.places[:4], moved.moved[:4]),
-        np.ones(4),
-        np.ones(4),
-    )
-    np.testing.assert_allclose(found[:, SHARE], 0.5, atol=1e-6)
-    np.testing.assert_allclose(found[:, USUAL], np.log(0.051), atol=2e-3)
 
 
 @pytest.mark.parametrize("correlation", [1.0, 1.0 + 1e-6, -1.0, 0.0])
@@ -147,14 +122,13 @@ def test_columns_of_degenerate_images_are_finite(images: str):
     moved = refinement()
     found = describe_matches(
         np.random.default_rng(1).standard_normal(COUNT),
-        np.ones((COUNT, 2)),
         examine_patches(*degenerate(images), moved.start, moved.places),
         moved,
         np.ones(COUNT),
         np.ones(COUNT),
     )
     assert np.isfinite(found).all()
-    assert found.shape == (COUNT, 18)
+    assert found.shape == (COUNT, 14)
 
 
 # Places
