@@ -71,6 +71,7 @@ class Reporter:
         matching = adjoint @ absolute @ adjoint.T
         covariance = matching + (adjoint @ by_error) @ (adjoint @ by_error).T
         frame_covariance = adjoint @ relative @ adjoint.T if fit is not None else np.zeros((6, 6))
+        covariance, matching = _within_half_turn(covariance), _within_half_turn(matching)
         return Estimate(
             timestamp=timestamp,
             T_world_camera=T_left_rectified @ pose @ self.T_rectified_left,
@@ -96,3 +97,12 @@ class Reporter:
         chosen = [k for k in np.flatnonzero(self.window.calibration.estimated).tolist() if k]
         others = {ERRORS[k]: (float(errors[k]), float(sigma[k])) for k in chosen}
         return CalibrationEstimate(float(errors[0]), float(sigma[0]), float(self.window.refused[0]), others)
+
+
+def _within_half_turn(covariance: np.ndarray) -> np.ndarray:
+    """A covariance (6, 6) whose rotation is less certain than half a turn, as one that knows no more than nothing."""
+    sigma = np.sqrt(max(float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]), 0.0))
+    if sigma < np.pi:
+        return covariance
+    scale = np.repeat([1.0, np.pi / sigma], 3)
+    return np.asarray(scale[:, None] * covariance * scale)
