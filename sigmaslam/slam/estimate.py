@@ -38,6 +38,8 @@ class Estimate:
         timestamp: seconds.
         T_world_camera: (4, 4) pose of the left camera; the world is the first left camera.
         covariance: (6, 6) of that pose in the camera's own frame, translation (metres) before rotation (radians).
+        matching_covariance: (6, 6) the part of the covariance that comes from matches and motion; the rest comes from
+            errors of the calibration.
         status: "starting", "tracking", "lost", or "relocalised": found again among keyframes that had left the window,
             or in the map.
         belief: 1 - sqrt of the largest eigenvalue of the covariance of the pose relative to the keyframe (metres and
@@ -46,8 +48,6 @@ class Estimate:
         nis, dof: normalised innovation squared and its degrees of freedom; 0 without an update.
         calibration: of the stereo pair.
         milliseconds: wall time by stage.
-        matching_covariance: (6, 6) the part of the covariance that comes from matches and motion; the rest comes from
-            errors of the calibration.
         frame_covariance: (6, 6) the part of the covariance that the frame's matches add to that of its keyframe; zero
             without them.
         tracks: what the frame saw, where it became a keyframe.
@@ -57,6 +57,7 @@ class Estimate:
     timestamp: float
     T_world_camera: np.ndarray
     covariance: np.ndarray
+    matching_covariance: np.ndarray
     status: str
     belief: float
     matches: int
@@ -65,7 +66,6 @@ class Estimate:
     dof: int
     calibration: CalibrationEstimate
     milliseconds: dict[str, float] = field(default_factory=dict)
-    matching_covariance: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
     frame_covariance: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
     tracks: KeyframeTracks | None = None
     relative_poses: RelativePoses = field(default_factory=RelativePoses.empty)
