@@ -63,7 +63,10 @@ class PastPoses:
         return int(candidates[doubt[candidates].argmin()])
 
     def relative_to_first(self, indices: list[int]) -> np.ndarray:
-        """(6 M, 6 M) covariance of M poses relative to the first of M + 1 indices, perturbed from the left in it."""
+        """(6 M, 6 M) covariance of M poses relative to the first of M + 1 indices, perturbed from the left in it.
+
+        As far as it comes from matches and motion.
+        """
         rows = np.concatenate([np.arange(6 * index, 6 * index + 6) for index in indices])
         adjoint = se3_adjoint(se3_inverse(self.poses[indices[0]]))
         by_first = np.tile(-adjoint, (len(indices) - 1, 1))

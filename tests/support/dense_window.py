@@ -22,6 +22,8 @@ CAMERA = RectifiedStereo(fx=400.0, fy=410.0, cx=319.5, cy=239.5, baseline=0.2, w
 # Standard deviations of the prior and of the noise; of the calibration offset, yaw and pitch are estimated.
 CALIBRATION_SIGMA = np.array([0.5, 0.3, 0.3])
 ESTIMATED = ERRORS[:3]
+CONSIDERED = slice(len(ESTIMATED), CALIBRATION_SIZE)
+NO_WALK = np.zeros(CALIBRATION_SIZE)
 FIRST_SIGMA = np.repeat([0.02, 0.01], 3)
 STEP_SIGMA = np.repeat([0.05, 0.02], 3)
 HOST_SIGMA = np.array([0.1, 0.1, 0.15, 0.25])
@@ -127,7 +129,7 @@ def make_window(
 def add_keyframe(window: KeyframeWindow, given: World, k: int, views: LandmarkViews, hosted: bool = True) -> None:
     sigma = given.scale * (STEP_SIGMA if k else FIRST_SIGMA)
     pose = window.posterior.poses[-1] @ STEP if k else given.expected[0]
-    window.add_keyframe(pose, STEP if k else given.expected[0], np.diag(sigma**2), np.zeros(CALIBRATION_SIZE), DEPTH)
+    window.add_keyframe(pose, STEP if k else given.expected[0], np.diag(sigma**2), NO_WALK, DEPTH)
     window.add_views(views)
     own = np.flatnonzero(given.host == k) if hosted else np.zeros(0, np.int64)
     variance = np.tile((given.scale * HOST_SIGMA) ** 2, (len(own), 1))
@@ -252,6 +254,11 @@ class Dense:
     def covariance(self) -> np.ndarray:
         """Of calibration and poses."""
         return np.asarray(np.linalg.inv(self.information())[: self.size, : self.size])
+
+
+def dense_slice(pose: int) -> slice:
+    """Where a pose stands among the dense unknowns."""
+    return slice(len(ESTIMATED) + 6 * pose, len(ESTIMATED) + 6 * pose + 6)
 
 
 def without_considered(matrix: np.ndarray) -> np.ndarray:
