@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sigmaslam.estimation.marginalised_poses import PastPoses
+from sigmaslam.estimation.relative_covariance import relative_to_first
 from sigmaslam.estimation.state_layout import CALIBRATION, CALIBRATION_SIZE, pose_slice
 from sigmaslam.estimation.window_state import WindowState
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log, turn_covariance
@@ -203,7 +204,7 @@ def test_covariances_relative_to_a_pose_are_those_of_the_differences():
     """As far as they come from matches and motion."""
     poses = random_state(1).all_poses
     poses = replace(poses, common=np.zeros_like(poses.common))
-    joint = poses.relative_to_first([1, 3, 0])
+    joint = relative_to_first(poses, [1, 3, 0])
     back = se3_inverse(poses.poses[1])
     for k, index in enumerate((3, 0)):
         block = slice(6 * k, 6 * k + 6)
