@@ -14,7 +14,7 @@ def condition(factor: np.ndarray, information: np.ndarray, vector: np.ndarray) -
 
 
 def condition_common(common: np.ndarray, covariance: np.ndarray, information: np.ndarray) -> np.ndarray:
-    """How errors that are considered, not estimated, enter a state after it was conditioned: by the gain of `condition`.
+    """How considered errors, which are not estimated, enter a state that was conditioned: by the gain of `condition`.
 
     Args:
         common: (n, m) how they entered before.

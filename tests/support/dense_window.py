@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import least_squares
 
-from sigmaslam.estimation.calibration_errors import ERRORS, CalibrationPrior
+from sigmaslam.estimation.calibration_errors import ERRORS, CalibrationPrior, measured_errors
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.frame_update import FrameUpdate
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
@@ -106,6 +106,17 @@ def world(seed: int = 0, scale: float = 1.0, count: int = 12, hosts: int = KEYFR
     return World(scale, np.array(expected), poses, calibration, host, landmarks, measured, views)
 
 
+def by_pair_with(given: World, errors: np.ndarray) -> World:
+    """The same world seen by a pair with errors (12,) of its calibration, beside those that the world has anyway."""
+
+    def off(uvd: np.ndarray) -> np.ndarray:
+        return np.asarray(uvd + measured_errors(CAMERA, uvd) @ errors)
+
+    measured = np.c_[off(given.measured[:, :3]), given.measured[:, 3:]]
+    views = [replace(views, measurement=off(views.measurement)) for views in given.views]
+    return replace(given, measured=measured, views=views)
+
+
 def make_window(
     calibration_sigma: np.ndarray,
     linearisation: str = "extended",
@@ -136,9 +147,11 @@ def add_keyframe(window: KeyframeWindow, given: World, k: int, views: LandmarkVi
     window.add_landmarks(own, given.measured[own, :3], variance)
 
 
-def unsolved(given: World, linearisation: str = "extended", order: int = 1) -> KeyframeWindow:
+def unsolved(
+    given: World, linearisation: str = "extended", order: int = 1, considered_sigma: np.ndarray | None = None
+) -> KeyframeWindow:
     """The keyframes and their views; order -1 hands them over from the last to the first."""
-    window = make_window(given.scale * CALIBRATION_SIGMA, linearisation)
+    window = make_window(given.scale * CALIBRATION_SIGMA, linearisation, considered_sigma=considered_sigma)
     for k in range(KEYFRAMES):
         add_keyframe(window, given, k, given.views[k].select(np.arange(len(given.views[k]))[::order]))
     return window

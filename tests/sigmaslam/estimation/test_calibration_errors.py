@@ -104,7 +104,7 @@ def test_the_prior_of_a_pair_is_in_pixels_where_its_errors_are():
         ("baseline", ("baseline",), 1.0),
     ):
         prior = CalibrationPrior.of(CAMERA, replace(CalibrationSigmas.none(), **{name: 0.01}), offset)
-        expected = {each: 0.01 * scale for each in errors} | {"offset": offset}
+        expected = dict.fromkeys(errors, 0.01 * scale) | {"offset": offset}
         np.testing.assert_allclose(prior.sigma, [expected.get(each, 0.0) for each in ERRORS])
 
 
