@@ -21,15 +21,18 @@ ERRORS = (
     "pitch",  # of the right camera: disparity, with x y
     "roll",  # of the right camera: disparity, with y
     "zoom",  # of the right camera against the left one: disparity, with x
-    "bend",  # disparity, with y^2
-    "lenses",  # their difference: disparity, with x r^2
+    "bend",  # of the right lens, which sits aside: disparity, with y^2
+    "lenses",  # of the right lens against the left one: disparity, with x r^2
     "focal",  # of both: places along their rays, and disparity, relative
     "centre_u",  # principal point of both: places
     "centre_v",
-    "lens",  # of both: places, with r^3 along their rays
+    "lens",  # of both: places, with r^3 along their rays, and disparity
     "baseline",  # disparity, relative
 )
-"""In the order of the state. `focal` and `baseline` are relative, the others pixels at unit normalised coordinates."""
+"""In the order of the state. `focal` and `baseline` are relative, the others pixels at unit normalised coordinates.
+
+What is the right camera's alone depends on the place in the right image.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,12 +96,14 @@ def measured_errors(camera: RectifiedStereo, uvd: np.ndarray) -> np.ndarray:
     """
     u, v, disparity = uvd.T
     x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
-    x_right, squared = x - disparity / camera.fx, x * x + y * y
+    x_right = x - disparity / camera.fx
+    squared, squared_right = x * x + y * y, x_right * x_right + y * y
     errors = np.zeros((len(uvd), 3, len(ERRORS)))
-    in_disparity = (np.ones_like(x), x_right * x_right, x_right * y, y, x, y * y, x * squared)
+    in_disparity = (np.ones_like(x), x_right * x_right, x_right * y, y, x_right, y * y, x_right * squared_right)
     errors[:, 2, : len(in_disparity)] = np.stack(in_disparity, axis=1)
     errors[:, 0, 7], errors[:, 1, 7], errors[:, 2, 7] = camera.fx * x, camera.fy * y, disparity
     errors[:, 0, 8] = errors[:, 1, 9] = 1.0
-    errors[:, 0, 10], errors[:, 1, 10] = x * squared, y * squared
+    errors[:, 0, 10], errors[:, 1, 10] = x * squared, camera.fy / camera.fx * y * squared
+    errors[:, 2, 10] = x * squared - x_right * squared_right
     errors[:, 2, 11] = disparity
     return errors

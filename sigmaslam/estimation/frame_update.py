@@ -15,6 +15,7 @@ from sigmaslam.estimation.frame_fit import FrameFit, FramePosterior
 from sigmaslam.estimation.gaussian import (
     append_moved,
     condition,
+    condition_common,
     matrix_root,
     project_covariance,
     replace_part,
@@ -148,8 +149,7 @@ class FrameUpdate:
         if inliers.sum() < min_inliers:
             return None
         common = window.posterior.common
-        common = np.concatenate([common, common[last]])
-        common = common - spread @ (information @ common)
+        common = condition_common(np.concatenate([common, common[last]]), spread, information)
         standard = np.linalg.lstsq(factor, offset, rcond=1e-12)[0]
         prior_cost = float(standard @ standard)
         cross = spread[frame, last]

@@ -13,6 +13,17 @@ def condition(factor: np.ndarray, information: np.ndarray, vector: np.ndarray) -
     return reduced.T @ (reduced @ vector), reduced.T @ reduced
 
 
+def condition_common(common: np.ndarray, covariance: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """How considered errors, which are not estimated, enter a state that was conditioned: by the gain of `condition`.
+
+    Args:
+        common: (n, m) how they entered before.
+        covariance: (n, n) posterior, from `condition`.
+        information: (n, n) of what was learned.
+    """
+    return np.asarray(common - covariance @ (information @ common))
+
+
 def weighted_information(whitened: np.ndarray, offset: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """What `condition` takes, from derivatives with residuals (3 M, n + 1) about `offset`, weighted (M,)."""
     rows = whitened * np.sqrt(np.repeat(weight, 3))[:, None]

@@ -18,7 +18,7 @@ import numpy as np
 
 from sigmaslam.estimation.calibration_errors import CalibrationPrior, measured_errors
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999, CHI_SQUARE_9999_OF_6
-from sigmaslam.estimation.gaussian import condition, matrix_root
+from sigmaslam.estimation.gaussian import condition, condition_common, matrix_root
 from sigmaslam.estimation.landmark_elimination import Elimination, eliminate_landmarks
 from sigmaslam.estimation.landmark_table import KeyframeViews, LandmarkTable, LandmarkViews
 from sigmaslam.estimation.mahalanobis import squared_mahalanobis
@@ -26,7 +26,7 @@ from sigmaslam.estimation.marginalised_poses import PastPoses, point_lever
 from sigmaslam.estimation.robust import STUDENT_FREEDOM, UNKNOWN_VARIANCE, mask_missing
 from sigmaslam.estimation.sigma_point_linearisation import Linearisation, ViewLineariser
 from sigmaslam.estimation.state_layout import CALIBRATION_SIZE, LANDMARK_SIZE, MODELLED, pose_slice
-from sigmaslam.estimation.window_state import WindowState
+from sigmaslam.estimation.window_state import WindowState, loop_difference
 from sigmaslam.geometry.camera import RectifiedStereo
 
 # An error of the calibration beyond so many standard deviations of its prior is not believed.
@@ -153,7 +153,7 @@ class KeyframeWindow:
             vector = vector + information @ offset
             state, covariance = condition(factor, information, vector)
             step = state - offset
-            common = self.prior.common_given(covariance, information)
+            common = condition_common(self.prior.common, covariance, information)
             self.posterior = self.posterior.moved(step, covariance, common)
             rows = elimination.landmark
             self.landmarks.estimate[rows] += elimination.step + elimination.dependence @ step
@@ -198,7 +198,7 @@ class KeyframeWindow:
         lever = point_lever(posterior.poses[-1:, :3, 3])[0]
         if np.trace(lever @ known @ lever.T) < np.trace(lever @ covariance @ lever.T):
             return False
-        difference = posterior.loop_difference(index, T_past_last)
+        difference = loop_difference(posterior, index, T_past_last)
         squared = difference @ np.linalg.lstsq(known + covariance, difference, rcond=1e-12)[0]
         if squared > CHI_SQUARE_9999_OF_6:
             return False

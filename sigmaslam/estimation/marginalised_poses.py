@@ -13,7 +13,7 @@ import numpy as np
 
 from sigmaslam.estimation.gaussian import matrix_root
 from sigmaslam.estimation.state_layout import CALIBRATION_SIZE
-from sigmaslam.geometry.se3 import nearest_rigid, se3_adjoint, se3_exp, se3_inverse, skew
+from sigmaslam.geometry.se3 import nearest_rigid, se3_exp, skew
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,14 +61,6 @@ class PastPoses:
         doubt = np.trace(lever @ self.relative(index) @ lever.T, axis1=1, axis2=2)
         candidates = np.array([k for k in (range(len(self)) if others is None else others) if k != index])
         return int(candidates[doubt[candidates].argmin()])
-
-    def relative_to_first(self, indices: list[int]) -> np.ndarray:
-        """(6 M, 6 M) covariance of M poses relative to the first of M + 1 indices, perturbed from the left in it."""
-        rows = np.concatenate([np.arange(6 * index, 6 * index + 6) for index in indices])
-        adjoint = se3_adjoint(se3_inverse(self.poses[indices[0]]))
-        by_first = np.tile(-adjoint, (len(indices) - 1, 1))
-        slope = np.concatenate([by_first, np.kron(np.eye(len(indices) - 1), adjoint)], axis=1)
-        return np.asarray(slope @ self.covariance[np.ix_(rows, rows)] @ slope.T)
 
     def relative_to(self, window: np.ndarray, common: np.ndarray, index: int) -> np.ndarray:
         """(6, 6) covariance of the window's last pose relative to the pose `index`, with the considered errors' part.

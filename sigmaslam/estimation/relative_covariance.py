@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from sigmaslam.estimation.frame_fit import FramePosterior
-from sigmaslam.estimation.marginalised_poses import past_slice
+from sigmaslam.estimation.marginalised_poses import PastPoses, past_slice
 from sigmaslam.estimation.state_layout import CALIBRATION_SIZE, pose_slice
 from sigmaslam.estimation.window_state import WindowState
-from sigmaslam.geometry.se3 import se3_exp
+from sigmaslam.geometry.se3 import se3_adjoint, se3_exp, se3_inverse
 
 
 def last_relative_to(state: WindowState, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -58,6 +58,18 @@ def frame_relative_to(state: WindowState, frame: FramePosterior, index: np.ndarr
     across = posterior[:, :, size:]
     poses = se3_exp(frame.step[last] + prior @ frame.score) @ earlier.poses
     return poses, own + spread[size:, size:] - across - across.transpose(0, 2, 1) + apart @ apart.transpose(0, 2, 1)
+
+
+def relative_to_first(poses: PastPoses, indices: list[int]) -> np.ndarray:
+    """(6 M, 6 M) covariance of M poses relative to the first of M + 1 indices, perturbed from the left in it.
+
+    As far as it comes from matches and motion.
+    """
+    rows = np.concatenate([np.arange(6 * index, 6 * index + 6) for index in indices])
+    adjoint = se3_adjoint(se3_inverse(poses.poses[indices[0]]))
+    by_first = np.tile(-adjoint, (len(indices) - 1, 1))
+    slope = np.concatenate([by_first, np.kron(np.eye(len(indices) - 1), adjoint)], axis=1)
+    return np.asarray(slope @ poses.covariance[np.ix_(rows, rows)] @ slope.T)
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sigmaslam.estimation.calibration_errors import CalibrationPrior
-from sigmaslam.estimation.gaussian import condition, matrix_root
+from sigmaslam.estimation.gaussian import condition, condition_common, matrix_root
 from sigmaslam.estimation.marginalised_poses import PastPoses, past_slice
 from sigmaslam.estimation.state_layout import CALIBRATION, CALIBRATION_SIZE, pose_slice
 from sigmaslam.geometry.se3 import nearest_rigid, se3_exp, se3_inverse, se3_log
@@ -72,11 +72,8 @@ class WindowState:
         """Posterior when exp(-x^T information x / 2 + vector^T x) is learned about the error state x."""
         past = self.past.given(self.covariance, self.common, information, vector)
         step, covariance = condition(matrix_root(self.covariance), information, vector)
-        return replace(self.moved(step, covariance, self.common_given(covariance, information)), past=past)
-
-    def common_given(self, covariance: np.ndarray, information: np.ndarray) -> np.ndarray:
-        """(n, 12) `common` after an update with that information and that posterior covariance, by its gain."""
-        return np.asarray(self.common - covariance @ (information @ self.common))
+        common = condition_common(self.common, covariance, information)
+        return replace(self.moved(step, covariance, common), past=past)
 
     def without_estimate(self, index: int, sigma: float) -> WindowState:
         """As if an estimated error of the calibration had been considered from the start: it is zero, give or take.
@@ -147,15 +144,11 @@ class WindowState:
             T_past_last: (4, 4) the last pose relative to it, as measured.
             covariance: (6, 6) of that, perturbed from the left in the world.
         """
-        difference = self.loop_difference(index, T_past_last)
+        difference = loop_difference(self, index, T_past_last)
         step, posterior, common, past = self.past.add_loop_constraint(
             self.covariance, self.common, index, difference, covariance
         )
         return replace(self.moved(step, posterior, common), past=past)
-
-    def loop_difference(self, index: int, T_past_last: np.ndarray) -> np.ndarray:
-        """(6,) by which the last pose must move in the world to agree with a measurement from a marginalised one."""
-        return np.asarray(se3_log(self.past.poses[index] @ T_past_last @ se3_inverse(self.poses[-1])))
 
     def forget(self, index: int) -> WindowState:
         """Drops a marginalised pose."""
@@ -165,3 +158,8 @@ class WindowState:
         """What is known of the calibration alone."""
         covariance, common = self.covariance[CALIBRATION, CALIBRATION], self.common[CALIBRATION]
         return WindowState(self.calibration, np.zeros((0, 4, 4)), covariance, common, PastPoses.empty())
+
+
+def loop_difference(state: WindowState, index: int, T_past_last: np.ndarray) -> np.ndarray:
+    """(6,) by which the last pose must move in the world to agree with a measurement from a marginalised one."""
+    return np.asarray(se3_log(state.past.poses[index] @ T_past_last @ se3_inverse(state.poses[-1])))

@@ -45,8 +45,11 @@ class CalibrationSigmas:
         if "sigmas" not in content.entries:
             return cls()
         if not isinstance(content.entries["sigmas"], dict):
-            if content.number("sigmas") != 0.0:
-                raise content.error("sigmas: expected 0, or a mapping such as {focal: 0.003, baseline: 0.001}")
+            value = content.number("sigmas")
+            if value != 0.0:
+                raise content.error(
+                    f"sigmas is {value:g}: give 0, or a mapping such as {{focal: 0.003, baseline: 0.001}}"
+                )
             return cls.none()
         section, default = content.section("sigmas"), asdict(cls())
         section.reject_unknown(tuple(default))

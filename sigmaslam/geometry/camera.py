@@ -282,9 +282,9 @@ class StereoCamera:
         """
         content = CalibrationYaml.read(path)
         left, right = (_camera_from_yaml(content.section(eye)) for eye in ("left", "right"))
-        T_left_right = content.numbers("T_left_right", (4, 4))
+        T_left_right, sigmas = content.numbers("T_left_right", (4, 4)), CalibrationSigmas.from_yaml(content)
         try:
-            return cls(left, right, T_left_right, CalibrationSigmas.from_yaml(content))
+            return cls(left, right, T_left_right, sigmas)
         except CalibrationError as error:
             raise content.error(str(error)) from None
 

@@ -17,6 +17,7 @@ from sigmaslam.estimation.gaussian import regression
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.marginalised_poses import PastPoses, past_slice
 from sigmaslam.estimation.motion_smoothing import MotionLink, SmoothedMotion, smooth_motion
+from sigmaslam.estimation.relative_covariance import relative_to_first
 from sigmaslam.geometry.se3 import nearest_rigid, se3_adjoint, se3_exp, se3_inverse, se3_log, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.slam.estimate import Estimate
@@ -200,7 +201,7 @@ class FrameHistory:
         next_one = index.get(following)
         if next_one is not None:
             after = after.settled(se3_inverse(keyframes.poses[own]) @ keyframes.poses[next_one])
-        residual = keyframes.relative_to_first([heir, own])
+        residual = relative_to_first(keyframes, [heir, own])
         if not place:
             first = self._ids[heir]
             lead, rest = before.frames.handed_over(step, residual), after.frames.handed_over(step, residual)
@@ -215,7 +216,7 @@ class FrameHistory:
         # What a correction of the next keyframe relative to the heir says of the one that is forgotten.
         by_next = np.zeros((6, 6))
         if next_one is not None:
-            joint = keyframes.relative_to_first([heir, own, next_one])
+            joint = relative_to_first(keyframes, [heir, own, next_one])
             by_next = regression(joint[:6, 6:], joint[6:, 6:])
             residual = residual - by_next @ joint[6:, :6]
         frames = before.settled(step).frames

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import least_squares
 
-from sigmaslam.estimation.calibration_errors import ERRORS, CalibrationPrior
+from sigmaslam.estimation.calibration_errors import ERRORS, CalibrationPrior, measured_errors
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.frame_update import FrameUpdate
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
@@ -22,6 +22,8 @@ CAMERA = RectifiedStereo(fx=400.0, fy=410.0, cx=319.5, cy=239.5, baseline=0.2, w
 # Standard deviations of the prior and of the noise; of the calibration offset, yaw and pitch are estimated.
 CALIBRATION_SIGMA = np.array([0.5, 0.3, 0.3])
 ESTIMATED = ERRORS[:3]
+CONSIDERED = slice(len(ESTIMATED), CALIBRATION_SIZE)
+NO_WALK = np.zeros(CALIBRATION_SIZE)
 FIRST_SIGMA = np.repeat([0.02, 0.01], 3)
 STEP_SIGMA = np.repeat([0.05, 0.02], 3)
 HOST_SIGMA = np.array([0.1, 0.1, 0.15, 0.25])
@@ -104,6 +106,17 @@ def world(seed: int = 0, scale: float = 1.0, count: int = 12, hosts: int = KEYFR
     return World(scale, np.array(expected), poses, calibration, host, landmarks, measured, views)
 
 
+def by_pair_with(given: World, errors: np.ndarray) -> World:
+    """The same world seen by a pair with errors (12,) of its calibration, beside those that the world has anyway."""
+
+    def off(uvd: np.ndarray) -> np.ndarray:
+        return np.asarray(uvd + measured_errors(CAMERA, uvd) @ errors)
+
+    measured = np.c_[off(given.measured[:, :3]), given.measured[:, 3:]]
+    views = [replace(views, measurement=off(views.measurement)) for views in given.views]
+    return replace(given, measured=measured, views=views)
+
+
 def make_window(
     calibration_sigma: np.ndarray,
     linearisation: str = "extended",
@@ -127,16 +140,18 @@ def make_window(
 def add_keyframe(window: KeyframeWindow, given: World, k: int, views: LandmarkViews, hosted: bool = True) -> None:
     sigma = given.scale * (STEP_SIGMA if k else FIRST_SIGMA)
     pose = window.posterior.poses[-1] @ STEP if k else given.expected[0]
-    window.add_keyframe(pose, STEP if k else given.expected[0], np.diag(sigma**2), np.zeros(CALIBRATION_SIZE), DEPTH)
+    window.add_keyframe(pose, STEP if k else given.expected[0], np.diag(sigma**2), NO_WALK, DEPTH)
     window.add_views(views)
     own = np.flatnonzero(given.host == k) if hosted else np.zeros(0, np.int64)
     variance = np.tile((given.scale * HOST_SIGMA) ** 2, (len(own), 1))
     window.add_landmarks(own, given.measured[own, :3], variance)
 
 
-def unsolved(given: World, linearisation: str = "extended", order: int = 1) -> KeyframeWindow:
+def unsolved(
+    given: World, linearisation: str = "extended", order: int = 1, considered_sigma: np.ndarray | None = None
+) -> KeyframeWindow:
     """The keyframes and their views; order -1 hands them over from the last to the first."""
-    window = make_window(given.scale * CALIBRATION_SIGMA, linearisation)
+    window = make_window(given.scale * CALIBRATION_SIGMA, linearisation, considered_sigma=considered_sigma)
     for k in range(KEYFRAMES):
         add_keyframe(window, given, k, given.views[k].select(np.arange(len(given.views[k]))[::order]))
     return window
@@ -252,6 +267,11 @@ class Dense:
     def covariance(self) -> np.ndarray:
         """Of calibration and poses."""
         return np.asarray(np.linalg.inv(self.information())[: self.size, : self.size])
+
+
+def dense_slice(pose: int) -> slice:
+    """Where a pose stands among the dense unknowns."""
+    return slice(len(ESTIMATED) + 6 * pose, len(ESTIMATED) + 6 * pose + 6)
 
 
 def without_considered(matrix: np.ndarray) -> np.ndarray:

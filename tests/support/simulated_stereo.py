@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sigmaslam.frontend.types import Features, StereoView, TemporalMatches
+from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.slam.tracker import TrackerConfig
 
@@ -13,11 +14,11 @@ ASSUMED = TrackerConfig()
 
 
 def parallel_camera(width: int, height: int, focal: float, baseline: float) -> StereoCamera:
-    """Two equal eyes without distortion, side by side."""
+    """Two equal eyes without distortion, side by side; of the calibration the disparity offset alone may be wrong."""
     eye = CameraModel(width, height, focal, focal, 0.5 * width, 0.5 * height)
     to_right = np.eye(4)
     to_right[0, 3] = baseline
-    return StereoCamera(eye, eye, to_right)
+    return StereoCamera(eye, eye, to_right, CalibrationSigmas.none())
 
 
 def image_of(frame: int, width: int, height: int) -> np.ndarray:

@@ -187,7 +187,12 @@ def test_ctrl_c_leaves_a_usable_run(demo_sequence: Path, tmp_path: Path):
 def test_the_runtime_imports_without_torch_or_kornia(demo_sequence: Path):
     """The whole path but training runs where only the runtime is installed."""
     script = (
-        "import sys; sys.modules.update(torch=None, kornia=None, onnx=None, onnxscript=None, safetensors=None)\n"
+        "import sys\n"
+        "class Absent:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.partition('.')[0] in ('torch', 'kornia', 'onnx', 'onnxscript', 'safetensors'):\n"
+        "            raise ModuleNotFoundError(name)\n"
+        "sys.meta_path.insert(0, Absent())\n"
         "import sigmaslam.cli, sigmaslam.evaluation.run_evaluation\n"
         "from sigmaslam import StereoTracker, open_sequence\n"
         f"sequence = open_sequence({str(demo_sequence)!r})\n"

@@ -10,21 +10,24 @@ from scipy.stats import chi2
 
 from sigmaslam.estimation.frame_update import FrameUpdate
 from sigmaslam.estimation.landmark_table import LandmarkViews
-from sigmaslam.estimation.state_layout import CALIBRATION, pose_slice
+from sigmaslam.estimation.state_layout import CALIBRATION, CALIBRATION_SIZE, pose_slice
 from sigmaslam.geometry.se3 import se3_inverse, se3_log
 from tests.support.dense_window import (
     CALIBRATION_SIGMA,
+    CONSIDERED,
     DEPTH,
     FIRST_SIGMA,
     HOST_SIGMA,
     ITERATIONS,
     KEYFRAMES,
     NARROW,
+    NO_WALK,
     STEP,
     STEP_SIGMA,
     Dense,
     add_keyframe,
     assert_same_state,
+    dense_slice,
     eliminate,
     fit,
     in_sigmas,
@@ -32,6 +35,7 @@ from tests.support.dense_window import (
     project,
     solved,
     unsolved,
+    without_considered,
     world,
 )
 
@@ -76,8 +80,9 @@ def test_without_views_the_prior_stays():
     given = world(0)
     nothing = given.views[0]
     window = solved(replace(given, views=[nothing] * 4))
-    expected = np.zeros((21, 21))
-    expected[CALIBRATION, CALIBRATION] = np.diag(CALIBRATION_SIGMA**2)
+    size = CALIBRATION_SIZE + 6 * KEYFRAMES
+    expected = np.zeros((size, size))
+    expected[CALIBRATION, CALIBRATION] = np.diag(np.pad(CALIBRATION_SIGMA**2, (0, CALIBRATION_SIZE - 3)))
     for a in range(KEYFRAMES):
         for b in range(KEYFRAMES):
             common = FIRST_SIGMA**2 + min(a, b) * STEP_SIGMA**2
@@ -96,7 +101,7 @@ def test_views_say_nothing_about_where_the_whole_window_is(linearisation: str):
     window = make_window(CALIBRATION_SIGMA, linearisation)
     for k in range(KEYFRAMES):
         sigma = STEP_SIGMA if k else np.zeros(6)
-        window.add_keyframe(given.expected[k], STEP if k else np.eye(4), np.diag(sigma**2), np.zeros(3), DEPTH)
+        window.add_keyframe(given.expected[k], STEP if k else np.eye(4), np.diag(sigma**2), NO_WALK, DEPTH)
         window.add_views(given.views[k])
         own = np.flatnonzero(given.host == k)
         window.add_landmarks(own, given.measured[own, :3], np.tile(HOST_SIGMA**2, (len(own), 1)))
@@ -110,7 +115,7 @@ def test_a_common_uncertainty_of_all_poses_is_not_seen_in_the_views():
     """A metre and a tenth of a radian that host and frame have in common leave the prediction certain."""
     window = make_window(np.zeros(3), "unscented")
     given = world(0)
-    window.add_keyframe(STEP, STEP, np.diag(np.repeat([1.0, 0.1], 3) ** 2), np.zeros(3), DEPTH)
+    window.add_keyframe(STEP, STEP, np.diag(np.repeat([1.0, 0.1], 3) ** 2), NO_WALK, DEPTH)
     window.add_landmarks(np.arange(12), given.measured[:, :3], np.full((12, 4), 1e-8))
     _, covariance, in_front = FrameUpdate(window, ITERATIONS).predict(np.arange(12), STEP @ STEP, np.zeros((6, 6)))
     assert in_front.all()
@@ -161,7 +166,7 @@ def test_views_that_do_not_fit_are_forgotten():
     broken = unsolved(replace(given, views=[*views[:2], replace(views[2], measurement=wrong), views[3]]))
     clean = solved(replace(given, views=[*views[:2], views[2].select(right), views[3]]))
     broken.solve()
-    sigma = np.sqrt(np.diag(clean.posterior.covariance)[3:])
+    sigma = np.sqrt(np.diag(clean.posterior.covariance)[CALIBRATION_SIZE:])
     assert np.abs(se3_log(broken.posterior.poses @ se3_inverse(clean.posterior.poses)).ravel() / sigma).max() > 0.2
     broken.solve(8)
     np.testing.assert_allclose(broken.posterior.poses, clean.posterior.poses, atol=1e-8)
@@ -180,14 +185,16 @@ def test_a_frame_equals_one_more_pose_in_dense_least_squares(scale: float, toler
         assert found.inliers.all()
         before, dense = Dense(given, KEYFRAMES).solve(), Dense(given, KEYFRAMES + 1).solve()
         covariance = dense.covariance()
-        frame, last = pose_slice(KEYFRAMES), pose_slice(KEYFRAMES - 1)
+        frame, last, calibration = dense_slice(KEYFRAMES), dense_slice(KEYFRAMES - 1), slice(0, 3)
         relative = np.zeros((6, dense.size))
         relative[:, frame], relative[:, last] = np.eye(6), -np.eye(6)
         sigma = np.sqrt(np.diag(covariance))
-        error = np.r_[found.calibration - dense.at[:3], se3_log(found.pose @ se3_inverse(dense.poses[-1]))]
+        error = np.r_[found.calibration[:3] - dense.at[:3], se3_log(found.pose @ se3_inverse(dense.poses[-1]))]
         assert np.abs(error / sigma[np.r_[0:3, frame]]).max() < tolerance
         assert in_sigmas(found.covariance, covariance[frame, frame]) < tolerance
-        assert in_sigmas(found.calibration_covariance, covariance[CALIBRATION, CALIBRATION]) < tolerance
+        calibration_covariance = without_considered(found.calibration_covariance)
+        assert in_sigmas(calibration_covariance, covariance[calibration, calibration]) < tolerance
+        np.testing.assert_allclose(found.calibration[CONSIDERED], 0.0, atol=1e-12)
         assert in_sigmas(found.relative, relative @ covariance @ relative.T) < tolerance
         assert found.nis == pytest.approx(dense.cost - before.cost, rel=tolerance)
         assert found.dof == np.isfinite(given.views[-1].measurement).sum()
@@ -276,12 +283,12 @@ def test_errors_are_as_large_as_the_covariance_says(linearisation: str):
         error = se3_log(given.poses[-1] @ se3_inverse(found.pose))
         frame += error @ np.linalg.solve(found.covariance, error)
         error = np.r_[
-            given.calibration - window.posterior.calibration,
+            given.calibration - window.posterior.calibration[:3],
             se3_log(given.poses[:KEYFRAMES] @ se3_inverse(window.posterior.poses)).ravel(),
         ]
-        state += error @ np.linalg.solve(window.posterior.covariance, error)
-        error = given.calibration - found.calibration
-        calibration += error @ np.linalg.solve(found.calibration_covariance, error)
+        state += error @ np.linalg.solve(without_considered(window.posterior.covariance), error)
+        error = given.calibration - found.calibration[:3]
+        calibration += error @ np.linalg.solve(without_considered(found.calibration_covariance), error)
         nis, dof = nis + found.nis, dof + found.dof
     for total, freedom in ((frame, 6 * worlds), (state, 21 * worlds), (calibration, 3 * worlds), (nis, dof)):
         low, high = chi2.ppf([0.0005, 0.9995], freedom)
@@ -301,9 +308,9 @@ def test_what_a_retired_keyframe_leaves_is_the_dense_marginal():
         window.marginalise_oldest()
         assert len(window.landmarks) == 0
         window.solve()
-        assert in_sigmas(window.posterior.covariance, expected) < tolerance
+        assert in_sigmas(without_considered(window.posterior.covariance), expected) < tolerance
         error = np.r_[
-            window.posterior.calibration - dense.at[:3],
+            window.posterior.calibration[:3] - dense.at[:3],
             se3_log(window.posterior.poses @ se3_inverse(dense.poses[1:])).ravel(),
         ]
         assert np.abs(error / np.sqrt(np.diag(expected))).max() < tolerance
@@ -313,15 +320,15 @@ def test_what_a_retired_keyframe_leaves_is_the_dense_marginal():
 def test_a_retired_keyframe_changes_nothing_of_what_is_known_of_the_rest(linearisation: str):
     given = world(1, 0.1, count=30)
     window = solved(given, linearisation)
-    rest = np.r_[0:3, 9:21]
-    poses, covariance = window.posterior.poses[1:].copy(), window.posterior.covariance[np.ix_(rest, rest)].copy()
+    rest = np.r_[0:3, dense_slice(1).start : dense_slice(KEYFRAMES).start]
+    poses, covariance = window.posterior.poses[1:], without_considered(window.posterior.covariance)[np.ix_(rest, rest)]
     gone = int((given.host == 0).sum())
     number = window.marginalise_oldest()
     np.testing.assert_array_equal(number, np.where(given.host == 0, -1, np.arange(len(given.host)) - gone))
     np.testing.assert_array_equal(window.landmarks.anchor, given.host[given.host > 0] - 1)
     np.testing.assert_array_equal(window.landmarks.id, np.flatnonzero(given.host > 0))
     window.solve(4)
-    assert in_sigmas(window.posterior.covariance, covariance) < 1e-3
+    assert in_sigmas(without_considered(window.posterior.covariance), covariance) < 1e-3
     error = se3_log(window.posterior.poses @ se3_inverse(poses)).ravel()
     assert np.abs(error / np.sqrt(np.diag(covariance)[3:])).max() < 1e-3
 
@@ -352,7 +359,7 @@ def test_a_long_chain_of_windows_stays_rigid():
             window.marginalise_oldest()
         first = not len(window)
         pose = np.eye(4) if first else window.posterior.poses[-1] @ STEP
-        window.add_keyframe(pose, np.eye(4) if first else STEP, np.diag(STEP_SIGMA**2), np.zeros(3), DEPTH)
+        window.add_keyframe(pose, np.eye(4) if first else STEP, np.diag(STEP_SIGMA**2), NO_WALK, DEPTH)
         if k:
             window.add_views(seen)
         window.add_landmarks(rows, given.landmarks[:, :3], np.tile(HOST_SIGMA**2, (30, 1)))

@@ -9,7 +9,7 @@ import pytest
 
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.marginalised_poses import PastPoses
-from sigmaslam.estimation.state_layout import pose_slice
+from sigmaslam.estimation.state_layout import CALIBRATION, CALIBRATION_SIZE, pose_slice
 from sigmaslam.geometry.se3 import se3_body, se3_exp, se3_inverse, se3_log, turn_covariance
 from sigmaslam.slam.point_map import PointMap, hand_over_points, merge_maps, most_confirmed, points_in_world
 from tests.support.dense_window import (
@@ -17,10 +17,13 @@ from tests.support.dense_window import (
     DEPTH,
     KEYFRAMES,
     NARROW,
+    NO_WALK,
     Dense,
+    dense_slice,
     in_sigmas,
     make_window,
     unsolved,
+    without_considered,
     world,
 )
 from tests.support.pose_graph import PoseEdge, optimise_pose_graph
@@ -31,12 +34,12 @@ COUNT = 12
 
 
 def joint(window: KeyframeWindow) -> np.ndarray:
-    """Covariance of calibration, past poses, and poses of the window."""
+    """Covariance of the estimated calibration, past poses, and poses of the window."""
     past = window.posterior.past
     whole = np.block([[window.posterior.covariance, past.cross.T], [past.cross, past.covariance]])
     size = len(window.posterior.covariance)
-    order = np.r_[0:3, size : len(whole), 3:size]
-    return whole[np.ix_(order, order)]
+    order = np.r_[CALIBRATION, size : len(whole), CALIBRATION_SIZE:size]
+    return without_considered(whole[np.ix_(order, order)])
 
 
 def drive(seed: int) -> tuple[np.ndarray, list[PoseEdge]]:
@@ -54,12 +57,12 @@ def drive(seed: int) -> tuple[np.ndarray, list[PoseEdge]]:
 def follow(steps: list[PoseEdge], kept: int = 3) -> KeyframeWindow:
     """A window that knows the steps alone."""
     window = make_window(CALIBRATION_SIGMA)
-    window.add_keyframe(np.eye(4), np.eye(4), np.zeros((6, 6)), np.zeros(3), DEPTH)
+    window.add_keyframe(np.eye(4), np.eye(4), np.zeros((6, 6)), NO_WALK, DEPTH)
     for step in steps:
         if len(window) == kept:
             window.marginalise_oldest()
         pose = window.posterior.poses[-1] @ step.T_i_j
-        window.add_keyframe(pose, step.T_i_j, turn_covariance(pose, step.covariance), np.zeros(3), DEPTH)
+        window.add_keyframe(pose, step.T_i_j, turn_covariance(pose, step.covariance), NO_WALK, DEPTH)
         window.solve()
     return window
 
@@ -86,7 +89,7 @@ def test_past_and_window_together_are_the_dense_solution(seed: int):
     dense = Dense(given, KEYFRAMES).solve()
     assert in_sigmas(joint(window), dense.covariance()) < 1e-3
     error = se3_log(window.posterior.past.poses[0] @ se3_inverse(dense.poses[0]))
-    assert np.abs(error / np.sqrt(np.diag(dense.covariance())[3:9])).max() < 1e-3
+    assert np.abs(error / np.sqrt(np.diag(dense.covariance())[dense_slice(0)])).max() < 1e-3
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -172,7 +175,7 @@ def test_a_new_start_from_a_past_pose_knows_what_it_has_in_common_with_it():
     while len(window):
         window.marginalise_oldest()
     pose, match = window.posterior.past.poses[4] @ steps[0].T_i_j, np.diag(LOOP_SIGMA**2)
-    window.add_keyframe(pose, pose, match, np.zeros(3), DEPTH, 4)
+    window.add_keyframe(pose, pose, match, NO_WALK, DEPTH, 4)
     window.solve()
     own, last = slice(24, 30), pose_slice(0)
     across = window.posterior.past.cross[own, last]
@@ -188,7 +191,8 @@ def chained(count: int) -> PastPoses:
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, 2, 3] = np.arange(count)
     blocks = np.minimum.outer(np.arange(count), np.arange(count))
-    return PastPoses(poses, np.kron(blocks, 1e-4 * np.eye(6)), np.zeros((6 * count, 3)))
+    none = np.zeros((6 * count, CALIBRATION_SIZE))
+    return PastPoses(poses, np.kron(blocks, 1e-4 * np.eye(6)), none, none)
 
 
 def some_points(count: int, views: int) -> PointMap:

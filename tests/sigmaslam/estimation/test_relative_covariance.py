@@ -17,10 +17,12 @@ from tests.support.dense_window import (
     ITERATIONS,
     KEYFRAMES,
     NARROW,
+    NO_WALK,
     STEP,
     STEP_SIGMA,
     Dense,
     World,
+    dense_slice,
     fit,
     in_sigmas,
     unsolved,
@@ -42,7 +44,7 @@ def split(given: World) -> tuple[KeyframeWindow, World, LandmarkViews]:
 def expected(dense: Dense, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
     """T_i_j and the covariance of j relative to i, perturbed from the left in the world."""
     covariance = dense.covariance()
-    blocks = [slice(k, k + 6) for k in (CALIBRATION_SIZE + 6 * i, CALIBRATION_SIZE + 6 * j)]
+    blocks = [dense_slice(i), dense_slice(j)]
     difference = np.zeros((6, len(covariance)))
     difference[:, blocks[0]], difference[:, blocks[1]] = -np.eye(6), np.eye(6)
     return se3_inverse(dense.poses[i]) @ dense.poses[j], difference @ covariance @ difference.T
@@ -99,7 +101,7 @@ def test_a_frame_s_relative_pose_is_that_of_the_window_s_own_update():
     window, given, views = split(world(1, NARROW, count=30))
     found, state = fit(window, given, views), window.posterior
     step = np.diag((given.scale * STEP_SIGMA) ** 2)
-    grown = state.grow(state.poses[-1] @ STEP, step, np.zeros(CALIBRATION_SIZE))
+    grown = state.grow(state.poses[-1] @ STEP, step, NO_WALK)
     vector = found.joint.score + found.joint.information @ found.joint.step
     moved = grown.given(found.joint.information, vector)
     poses, covariances = frame_relative_to(state, found.joint, np.arange(KEYFRAMES))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sigmaslam.estimation.constant_velocity import MotionState
-from sigmaslam.estimation.state_layout import CALIBRATION_SIZE, pose_slice
+from sigmaslam.estimation.state_layout import pose_slice
 from sigmaslam.evaluation.metrics.trajectory_errors import (
     absolute_trajectory_error,
     is_regular,
@@ -22,7 +22,7 @@ from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.slam.frame_history import FrameHistory
 from sigmaslam.slam.keyframes import Keyframes
 from sigmaslam.slam.tracker import StereoTracker, TrackerConfig
-from tests.support.dense_window import make_window
+from tests.support.dense_window import NO_WALK, make_window
 from tests.support.simulated_frontend import SCALES, Scale, SimulatedFrontend, frame_of, run_simulated
 
 # ---- simulated runs
@@ -147,7 +147,7 @@ class Walk:
     """
 
     def __init__(self, max_keyframes: int) -> None:
-        self.window = make_window(np.zeros(CALIBRATION_SIZE))
+        self.window = make_window(np.zeros(3))
         self.keyframes = Keyframes(self.window, max_keyframes, 100)
         self.history = FrameHistory(self.window, self.keyframes, np.eye(4))
         self.count = 0
@@ -172,7 +172,7 @@ class Walk:
         last = window.posterior.poses[-1] if len(window) else np.eye(4)
         step = STEP if len(window) else np.eye(4)
         spread = turn_covariance(last, SPREAD) if len(window) else np.zeros((6, 6))
-        window.add_keyframe(last @ step, step, spread, np.zeros(CALIBRATION_SIZE), 1.0)
+        window.add_keyframe(last @ step, step, spread, NO_WALK, 1.0)
         self.keyframes.append(empty_view(), float(self.count))
 
 

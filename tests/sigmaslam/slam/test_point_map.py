@@ -7,9 +7,10 @@ from scipy.stats import chi2
 
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
+from sigmaslam.estimation.state_layout import CALIBRATION_SIZE
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse
 from sigmaslam.slam.point_map import PointMap, merge_maps, window_points
-from tests.support.dense_window import CAMERA, DEPTH, make_window
+from tests.support.dense_window import CAMERA, DEPTH, NO_WALK, make_window
 from tests.support.quantiles import squared_sigmas
 
 SIGMA = np.array([0.3, 0.4, 0.5])
@@ -44,8 +45,8 @@ def world_points(truth: np.ndarray) -> np.ndarray:
 def window_of(measured: np.ndarray, sigma: np.ndarray = SIGMA, own: float = 0.0) -> KeyframeWindow:
     """One keyframe with landmarks; `own` is the deviation of what a landmark's disparities are all off by."""
     window = make_window(np.full(3, CERTAIN))
-    window.prior = window.posterior = replace(window.posterior, calibration=np.array([OFFSET, 0.0, 0.0]))
-    window.add_keyframe(WORLD, WORLD, CERTAIN**2 * np.eye(6), np.zeros(3), DEPTH)
+    window.prior = window.posterior = replace(window.posterior, calibration=np.eye(CALIBRATION_SIZE)[0] * OFFSET)
+    window.add_keyframe(WORLD, WORLD, CERTAIN**2 * np.eye(6), NO_WALK, DEPTH)
     count = len(measured)
     variance = np.column_stack([np.tile(sigma**2, (count, 1)), np.full(count, max(own, CERTAIN) ** 2)])
     window.add_landmarks(np.arange(count), measured, variance)
@@ -55,7 +56,7 @@ def window_of(measured: np.ndarray, sigma: np.ndarray = SIGMA, own: float = 0.0)
 def see(window: KeyframeWindow, T_key_camera: np.ndarray, seen: np.ndarray) -> None:
     """One more keyframe, in a known place, that sees all landmarks."""
     step = se3_inverse(window.posterior.poses[-1]) @ WORLD @ T_key_camera
-    window.add_keyframe(WORLD @ T_key_camera, step, CERTAIN**2 * np.eye(6), np.zeros(3), DEPTH)
+    window.add_keyframe(WORLD @ T_key_camera, step, CERTAIN**2 * np.eye(6), NO_WALK, DEPTH)
     window.add_views(LandmarkViews(np.arange(len(seen)), seen, noise_of(len(seen)), np.zeros((len(seen), 3, 2))))
     window.landmarks.views = window.landmarks.views + 1
 
@@ -175,7 +176,7 @@ def test_points_at_infinity_do_not_enter_the_map():
 def test_a_turned_right_camera_is_taken_out_of_the_disparity():
     truth = points_in_view(20)
     window = window_of(truth)
-    calibration = np.array([0.3, 2.0, -1.0])
+    calibration = np.pad([0.3, 2.0, -1.0], (0, CALIBRATION_SIZE - 3))
     window.posterior = replace(window.posterior, calibration=calibration)
     x, y = (truth[:, 0] - truth[:, 2] - CAMERA.cx) / CAMERA.fx, (truth[:, 1] - CAMERA.cy) / CAMERA.fy
     biased = window_of(truth + np.array([0, 0, 1]) * (0.3 + 2 * x * x - x * y)[:, None])

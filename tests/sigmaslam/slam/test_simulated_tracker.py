@@ -1,8 +1,11 @@
 """The tracker on points with exactly the errors that their matches claim: its covariance can be believed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.slam.tracker import StereoTracker
 from tests.support.quantiles import chi_square_quantile
 from tests.support.simulated_frontend import SCALES, SimulatedFrontend, SimulatedRun, run_simulated
@@ -76,3 +79,22 @@ def test_coverage_over_sixty_worlds(kind: str):
     assert 0.90 < (nees < NEES_95).mean() < 0.98
     assert 0.8 < nees.mean() < 1.25
     assert 0.6 < np.sqrt(np.mean([offset_in_sigmas(run) ** 2 for run in runs])) < 1.4
+
+
+@pytest.mark.parametrize("kind", SCALES)
+def test_errors_of_the_calibration_widen_the_covariance_and_nothing_else(kind: str):
+    """The same frames by a calibration without errors, and by one as good as most."""
+    scale, runs = SCALES[kind], []
+    for sigmas in (CalibrationSigmas.none(), CalibrationSigmas()):
+        frontend = SimulatedFrontend(scale, 0, 25, offset=OFFSET)
+        tracker = StereoTracker(replace(frontend.camera, sigmas=sigmas), frontend)
+        runs.append(run_simulated(tracker, frontend, scale).estimates)
+    for exact, usual in zip(*runs, strict=True):
+        np.testing.assert_array_equal(exact.covariance, exact.matching_covariance)
+        np.testing.assert_allclose(usual.T_world_camera, exact.T_world_camera, atol=1e-9)
+        np.testing.assert_allclose(usual.matching_covariance, exact.matching_covariance, rtol=1e-6, atol=1e-15)
+        assert usual.calibration.disparity_offset == pytest.approx(exact.calibration.disparity_offset, abs=1e-9)
+        gained = np.linalg.eigvalsh(usual.covariance - usual.matching_covariance)
+        assert gained[0] >= -1e-9 * gained[-1]
+    np.testing.assert_array_equal(runs[1][0].covariance, runs[1][0].matching_covariance)  # the first one is the world
+    assert np.trace(runs[1][-1].covariance[:3, :3]) > 1.1 * np.trace(runs[0][-1].covariance[:3, :3])
