@@ -164,23 +164,8 @@ class KeyframeWindow:
         agree = _agree(self, self._observations)
         if not agree.all():
             self._observations = self._observations.select(agree)
-        self._refuse_calibration(iterations)
-
-    def _refuse_calibration(self, iterations: int) -> None:
-        """Considers estimated errors that the images move beyond what a calibration can be off by, and solves anew.
-
-        They stand for something else then, of a lens or of the other eye, that this model does not have.
-        """
-        calibration = self.posterior.calibration
-        beyond = self.calibration.estimated & (np.abs(calibration) > _CREDIBLE * self.calibration.sigma)
-        if not beyond.any():
-            return
-        for index in np.flatnonzero(beyond).tolist():
-            self.refused[index] = calibration[index]
-            self.calibration = self.calibration.considering(index)
-            self.prior = self.prior.without_estimate(index, self.calibration.sigma[index])
-            self.posterior = self.posterior.without_estimate(index, self.calibration.sigma[index])
-        self.solve(iterations)
+        if _refuse_errors(self):
+            self.solve(iterations)
 
     def add_loop_constraint(self, index: int, T_past_last: np.ndarray, covariance: np.ndarray) -> bool:
         """Closes a loop: the last keyframe sees what a past pose saw, and the past is corrected with the window.
@@ -229,13 +214,31 @@ class KeyframeWindow:
 
     def forget_past(self, index: int) -> None:
         """Forgets a pose that left the window."""
-        self.prior, self.posterior = self.prior.forget(index), self.posterior.forget(index)
+        self.prior, self.posterior = (
+            replace(state, past=state.past.drop(index)) for state in (self.prior, self.posterior)
+        )
 
     def as_calibrated(self, measured: np.ndarray) -> np.ndarray:
         """(u, v, disparity) (K, 3) without errors of the calibration, and of landmarks (K, 6) their own errors."""
         uvd = measured[:, :3] - measured_errors(self.camera, measured[:, :3]) @ self.posterior.calibration
         uvd[:, 2] -= measured[:, 3:MODELLED].sum(axis=1)
         return np.asarray(uvd)
+
+
+def _refuse_errors(window: KeyframeWindow) -> bool:
+    """Considers estimated errors that the images move beyond what a calibration can be off by; whether there were any.
+
+    They stand for something else then, of a lens or of the other eye, that this model does not have.
+    """
+    estimate, prior = window.posterior.calibration, window.calibration
+    beyond = np.flatnonzero(prior.estimated & (np.abs(estimate) > _CREDIBLE * prior.sigma)).tolist()
+    for index in beyond:
+        window.refused[index] = estimate[index]
+        window.calibration = window.calibration.considering(index)
+        window.prior, window.posterior = (
+            state.without_estimate(index, prior.sigma[index]) for state in (window.prior, window.posterior)
+        )
+    return bool(beyond)
 
 
 # ---- the equations

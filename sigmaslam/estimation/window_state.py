@@ -150,10 +150,6 @@ class WindowState:
         )
         return replace(self.moved(step, posterior, common), past=past)
 
-    def forget(self, index: int) -> WindowState:
-        """Drops a marginalised pose."""
-        return replace(self, past=self.past.drop(index))
-
     def without_poses(self) -> WindowState:
         """What is known of the calibration alone."""
         covariance, common = self.covariance[CALIBRATION, CALIBRATION], self.common[CALIBRATION]

@@ -136,7 +136,7 @@ def test_learning_of_the_window_and_marginalising_commute(seed: int):
 def test_forgetting_a_pose_leaves_the_others_as_they_were(index: int):
     state = random_state(index)
     remaining = np.delete(np.arange(pose_slice(PAST + POSES).start), pose_slice(index))
-    after = state.forget(index)
+    after = replace(state, past=state.past.drop(index))
     np.testing.assert_array_equal(joint_of(after), joint_of(state)[np.ix_(remaining, remaining)])
     np.testing.assert_array_equal(common_of(after), common_of(state)[remaining])
     np.testing.assert_array_equal(poses_of(after), np.delete(poses_of(state), index, axis=0))
@@ -211,3 +211,19 @@ def test_covariances_relative_to_a_pose_are_those_of_the_differences():
         np.testing.assert_allclose(joint[block, block], turn_covariance(back, poses.relative(index)[1]), atol=1e-18)
     np.testing.assert_allclose(joint, joint.T, atol=1e-18)
     assert np.linalg.eigvalsh(joint)[0] > -1e-18
+
+
+def test_an_error_that_is_not_estimated_after_all_is_zero_give_or_take_its_prior():
+    """The poses are those given that it is zero; how it then enters them is what they had learned with it."""
+    state, sigma = random_state(3), 0.02
+    state = replace(state, common=np.zeros_like(state.common))
+    state = replace(state, past=replace(state.past, common=np.zeros_like(state.past.common)))
+    before, after = joint_of(state), state.without_estimate(0, sigma)
+    gain = before[:, 0] / before[0, 0]
+    expected = before - np.outer(gain, before[0]) + sigma**2 * np.outer(gain, gain)
+    found = joint_of(after) + common_of(after) @ common_of(after).T
+    scale = np.sqrt(np.diag(expected))
+    assert np.abs((found - expected) / np.outer(scale, scale)).max() < 1e-9
+    assert after.calibration[0] == 0.0
+    moved = se3_log(poses_of(after) @ se3_inverse(poses_of(state))).ravel()
+    np.testing.assert_allclose(moved, -gain[CALIBRATION_SIZE:] * state.calibration[0], atol=1e-12)

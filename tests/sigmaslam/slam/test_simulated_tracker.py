@@ -47,6 +47,20 @@ def test_errors_are_as_large_as_the_covariance_says_at_every_scale(kind: str):
     assert 0.4 < np.mean(nees) < 1.8, nees
 
 
+@pytest.mark.parametrize(("offset", "refused"), [(1.5, False), (3.0, True)])
+def test_an_offset_that_no_calibration_has_is_refused(offset: float, refused: bool):
+    """1.5 px are three sigma of its prior, 3 px six: then it is not estimated any more."""
+    scale = SCALES["drone"]
+    frontend = SimulatedFrontend(scale, 0, 20, 150, offset=offset)
+    calibration = run_simulated(StereoTracker(frontend.camera, frontend), frontend, scale).estimates[-1].calibration
+    if refused:
+        assert calibration.refused_offset > 2.0
+        assert (calibration.disparity_offset, calibration.disparity_offset_sigma) == (0.0, 0.5)
+    else:
+        assert calibration.refused_offset == 0.0
+        assert abs(calibration.disparity_offset - offset) < 3 * calibration.disparity_offset_sigma
+
+
 def test_wrong_matches_cost_little():
     """One in five is up to 20 px off."""
     run = simulate("drone", 0, 30, outliers=0.2)
