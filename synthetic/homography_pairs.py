@@ -73,9 +73,9 @@ class HomographyPairs:
         if rng.random() < 0.3:  # seen from afar
             texture = _shrunk(texture, np.exp(rng.uniform(0.1, 0.9)))
         H_0_texture, H_1_texture = (
-            _random_view(rng, texture.shape[0], self.size, strength) for strength in self._strengths
+            random_view(rng, texture.shape[0], self.size, strength) for strength in self._strengths
         )
-        images = [_warp(texture, H, self.size) for H in (H_0_texture, H_1_texture)]
+        images = [warp(texture, H, self.size) for H in (H_0_texture, H_1_texture)]
         hidden = np.zeros((self.size, self.size), dtype=bool)
         if rng.random() < 0.3:
             foreign = self._bank.texture(index + 1)
@@ -92,7 +92,7 @@ def _shrunk(texture: np.ndarray, factor: float) -> np.ndarray:
     return np.asarray(cv2.resize(texture, (side, side), interpolation=cv2.INTER_AREA))
 
 
-def _random_view(rng: np.random.Generator, texture_size: int, size: int, strength: float) -> np.ndarray:
+def random_view(rng: np.random.Generator, texture_size: int, size: int, strength: float) -> np.ndarray:
     """Homography from texture pixels to the pixels of one view, (3, 3).
 
     Rotation to +-40 degrees, scale e^+-0.45, shear, perspective and shift, each scaled by `strength`; one view in
@@ -118,7 +118,8 @@ def _random_view(rng: np.random.Generator, texture_size: int, size: int, strengt
     return np.asarray(to_view @ H @ to_centre)
 
 
-def _warp(texture: np.ndarray, H: np.ndarray, size: int) -> np.ndarray:
+def warp(texture: np.ndarray, H: np.ndarray, size: int) -> np.ndarray:
+    """A texture (S, S) uint8, mirrored at its borders, as a view of that size sees it: (H, W) float32 in [0, 1]."""
     image = cv2.warpPerspective(texture, H, (size, size), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
     return image.astype(np.float32) / 255.0
 
@@ -131,7 +132,7 @@ def _occlude(image: np.ndarray, foreign: np.ndarray, rng: np.random.Generator) -
     cv2.fillPoly(mask, [fixed_point(outline)], 255, cv2.LINE_AA, 4)
     if rng.random() < 0.3:  # nearer than the focus
         mask = cv2.blur(mask, (9, 9))
-    patch = _warp(foreign, _random_view(rng, foreign.shape[0], size, strength=1.0), size)
+    patch = warp(foreign, random_view(rng, foreign.shape[0], size, strength=1.0), size)
     return np.asarray(image + mask * np.float32(1 / 255) * (patch - image)), mask > 64
 
 

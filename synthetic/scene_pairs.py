@@ -26,7 +26,7 @@ DOMAINS = {
     "organ": organ.generate,
 }
 _SCENES = 8  # neighbouring pairs come from as many scenes ...
-_USES = 32  # ... each of which serves so many pairs before it is replaced
+_USES = 32  # ... each of which serves so many pairs before it is replaced; of forward motion, as it has views
 _VIEWS = 8  # of a scene
 _SCENES_A_BANK = 64  # share their textures
 _DURATION = 8.0  # seconds of an episode
@@ -34,6 +34,10 @@ _MAX_MOVING_SHARE = 0.4
 _MIN_OVERLAP = 0.15  # of a raster of points, between the views of a pair
 _RASTER = 12
 _BASELINES = (0.01, 0.12)  # of stereo pairs, in median depths, drawn evenly in the logarithm
+_ADVANCES = (0.02, 0.35)  # of forward motion, likewise
+_DRIFT, _TURN = 0.1, 1.0  # its standard deviations: of sideways motion, in advances, and of rotation, degrees
+_LATER = (0.1, 0.5)  # seconds between its views
+_EXPOSURE = 0.05  # standard deviation of the logarithm of their exposures' quotient
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +68,7 @@ class ScenePairs:
         domains: keys of `DOMAINS`, drawn alike.
         stereo: the two views are the eyes of a rectified stereo pair, through sensors of one kind.
         max_moving_share: share of the image that may move on its own in a scene.
+        forward: the two views are of one camera that advances or retreats, as a car's or a drone's.
     """
 
     def __init__(
@@ -73,12 +78,16 @@ class ScenePairs:
         domains: tuple[str, ...] = tuple(DOMAINS),
         stereo: bool = False,
         max_moving_share: float = _MAX_MOVING_SHARE,
+        forward: bool = False,
     ) -> None:
         unknown = set(domains) - set(DOMAINS)
         if unknown or not domains:
             raise ValueError(f"unknown domains {sorted(unknown)}; give one or more of {', '.join(DOMAINS)}")
-        self.seed, self.size, self.domains, self.stereo = seed, size, domains, stereo
+        if stereo and forward:
+            raise ValueError("pairs are of two eyes or of forward motion: give one of stereo and forward")
+        self.seed, self.size, self.domains, self.stereo, self.forward = seed, size, domains, stereo, forward
         self._max_moving_share = max_moving_share
+        self._uses = _VIEWS if forward else _USES
         self._kept: OrderedDict[int, list[RenderedViews]] = OrderedDict()
 
     def pair(self, index: int) -> ScenePair:
@@ -88,17 +97,22 @@ class ScenePairs:
         order = rng.permutation([(i, j) for i in range(_VIEWS) for j in range(_VIEWS) if self._go_together(i, j)])
         # Of views that hardly overlap there is little to learn; if all are so, the last ones will do.
         i, j = next(((i, j) for i, j in order if self._overlap(views[i], views[j]) >= _MIN_OVERLAP), order[-1])
-        sensor = random_sensor(rng) if self.stereo else None
-        images = [self._photograph(views[k], rng, sensor) for k in (i, j)]
+        if self.forward:
+            images = self._film((views[i], views[j]), rng)
+        else:
+            sensor = random_sensor(rng) if self.stereo else None
+            images = [self._photograph(views[k], rng, sensor) for k in (i, j)]
         return ScenePair(images[0], images[1], views[i], views[j])
 
     def _go_together(self, i: int, j: int) -> bool:
+        if self.forward:
+            return i // 2 == j // 2 and i != j
         return j == i + 1 and i % 2 == 0 if self.stereo else i != j
 
     def _scene_of(self, index: int) -> int:
         """Scenes are replaced one after another, so that rendering takes its time evenly."""
         turn, place = divmod(index, _SCENES)
-        return (turn + place * _USES // _SCENES) // _USES * _SCENES + place
+        return (turn + place * self._uses // _SCENES) // self._uses * _SCENES + place
 
     def _views(self, scene: int) -> list[RenderedViews]:
         if scene not in self._kept:
@@ -123,7 +137,7 @@ class ScenePairs:
         middle = rng.uniform(1.0, _DURATION - 1.0)
         span = np.exp(rng.uniform(np.log(0.1), np.log(2.0)))
         result: list[RenderedViews] = []
-        for k in range(0, _VIEWS, 2 if self.stereo else 1):
+        for k in range(0, _VIEWS, 2 if self.stereo or self.forward else 1):
             time = np.clip(middle + span * rng.uniform(-0.5, 0.5), 0.0, _DURATION)[None]
             T = episode.path.poses(time)
             if k:
@@ -135,19 +149,36 @@ class ScenePairs:
             result.append(renderer.render(eye, T, time))
             if self.stereo:
                 result.append(renderer.render(eye, T @ _to_right_eye(rng, _median_depth(result[0])), time))
+            if self.forward:
+                later = np.minimum(time + rng.uniform(*_LATER), _DURATION)
+                result.append(renderer.render(eye, T @ _advance(rng, _median_depth(result[-1])), later))
         return result
+
+    def _film(self, views: tuple[RenderedViews, RenderedViews], rng: np.random.Generator) -> list[np.ndarray]:
+        """Images of one camera, whose exposure follows the light a little."""
+        sensor = random_sensor(rng)
+        exposure = rng.uniform(0.3, 0.6) / max(float(views[0].image.mean()), 1e-6)
+        exposures = exposure, exposure * np.exp(_EXPOSURE * rng.standard_normal())
+        return [
+            _expose(view.image[0].numpy() * factor, sensor, rng, None)
+            for view, factor in zip(views, exposures, strict=True)
+        ]
 
     def _photograph(self, views: RenderedViews, rng: np.random.Generator, sensor: Sensor | None) -> np.ndarray:
         light = views.image[0].numpy()
         light = light * (rng.uniform(0.3, 0.6) / max(float(light.mean()), 1e-6))
         flow = rng.normal(0.0, 4.0, 2) if rng.random() < 0.15 else None
-        # White is where the light of few pixels ends, so that the sensor's contrast means the same everywhere.
-        return expose(np.minimum(light, 1.0), sensor or random_sensor(rng), rng, flow).astype(np.float32) / 255.0
+        return _expose(light, sensor or random_sensor(rng), rng, flow)
 
     def _overlap(self, views0: RenderedViews, views1: RenderedViews) -> float:
         ticks = (np.arange(_RASTER) + 0.5) * self.size / _RASTER
         raster = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
         return float(_transfer(views0, views1, raster)[1].mean())
+
+
+def _expose(light: np.ndarray, sensor: Sensor, rng: np.random.Generator, flow: np.ndarray | None) -> np.ndarray:
+    # White is where the light of few pixels ends, so that the sensor's contrast means the same everywhere.
+    return expose(np.minimum(light, 1.0), sensor, rng, flow).astype(np.float32) / np.float32(255.0)
 
 
 def _transfer(views0: RenderedViews, views1: RenderedViews, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -171,6 +202,14 @@ def _to_right_eye(rng: np.random.Generator, depth: float) -> np.ndarray:
     T = np.eye(4)
     T[0, 3] = depth * np.exp(rng.uniform(*np.log(_BASELINES)))
     return T
+
+
+def _advance(rng: np.random.Generator, depth: float) -> np.ndarray:
+    """Motion of a camera along its axis, nearly, (4, 4)."""
+    step = depth * np.exp(rng.uniform(*np.log(_ADVANCES)))
+    drift = _DRIFT * rng.standard_normal(2)
+    turn = np.deg2rad(_TURN) * rng.standard_normal(3)
+    return rigid_motion(Rotation.from_rotvec(turn).as_matrix(), step * np.array([*drift, 1.0]))
 
 
 def _step_aside(rng: np.random.Generator, depth: float) -> np.ndarray:

@@ -74,7 +74,7 @@ class ConsistencyResult:
 
 
 Results: TypeAlias = Mapping[Scale, Mapping[str, Sequence[ConsistencyResult]]]
-"""By scale and method, in the order of seeds."""
+"""By scale and method, in the order of seeds; the last method has a calibration that is drawn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,12 +132,18 @@ def format_page(results: Results, offset: float, frames: int, first_seed: int, c
         + ".",
         "The room stands for indoor flight and the organ for endoscopy because their images are written rectified:",
         "there the offset is the same in the whole image.",
+        "The calibration is right but for that, and the tracker is told so (`sigmas: 0`). *Calibration drawn*: every",
+        "number of it is off as the default sigmas say, anew for each sequence, and the tracker knows these sigmas.",
         "",
         "Mean ± standard error over sequences. NEES and NIS per degree of freedom: 1 is right, more is overconfident.",
         "",
         "## Goals, for ours",
         "",
-        *_goals(results),
+        *_goals(results, 0, GOALS),
+        "",
+        "## Goals, for ours with a calibration that is drawn",
+        "",
+        *_goals(results, -1, GOALS[:3]),
         "",
         "The tracker scales its noise by the NIS of earlier frames, so NIS near 1 proves little; NEES is the judge.",
         "",
@@ -167,15 +173,16 @@ _NOTES = [
 ]
 
 
-def _goals(results: Results) -> Iterator[str]:
+def _goals(results: Results, method: int, goals: Sequence[Goal]) -> Iterator[str]:
+    """Which goals the method of that position meets."""
     yield "| | goal | " + " | ".join(scale.name for scale in results) + " |"
     yield "|---|---|" + "---|" * len(results)
     missed = []
-    for goal in GOALS:
+    for goal in goals:
         cells = []
         for scale, methods in results.items():
-            ours = next(iter(methods.values()))
-            value, error = mean_with_error([getattr(result, goal.name) for result in ours])
+            judged = list(methods.values())[method]
+            value, error = mean_with_error([getattr(result, goal.name) for result in judged])
             cells.append(f"{goal.write(value)} ± {goal.write(error)}" + ("" if goal.holds(value) else ", **missed**"))
             if not goal.holds(value):
                 missed.append(f"{goal.label} in {scale.name} ({goal.write(value)})")

@@ -33,7 +33,7 @@ BLOCK = 500
 _BEYOND = 60  # frames of the second lap that the run without loops goes on for
 
 
-class RepeatedPairs:
+class LappedPairs:
     """A lap over and over, in memory from the start; time goes on.
 
     Args:
@@ -74,7 +74,7 @@ class WatchedSequence(StereoSequence):
         cpu_ms: of all threads, a frame of each block.
     """
 
-    def __init__(self, pairs: RepeatedPairs, lap: StereoSequence, block: int) -> None:
+    def __init__(self, pairs: LappedPairs, lap: StereoSequence, block: int) -> None:
         super().__init__(pairs, lap.camera, lap.source, lap.format)
         self._block = block
         self.megabytes: list[float] = []
@@ -137,7 +137,7 @@ def write_endurance(
         without = Path(scratch) / "without"
         some = min(frames, recipe.frames + _BEYOND)
         without_loops = partial(track_sequence, config=TrackerConfig(max_keyframes=10), tracks=True)
-        open_run = Trial(WatchedSequence(RepeatedPairs(lap, some), lap, block), None, without_loops).run(without)
+        open_run = Trial(WatchedSequence(LappedPairs(lap, some), lap, block), None, without_loops).run(without)
         with np.load(without / TRACKS_NAME) as tracks:
             names = ("frame", "landmark", "measurement", "covariance")
             tracks_bytes = sum(tracks[name].nbytes for name in names) / some
@@ -145,7 +145,7 @@ def write_endurance(
         note("tracked without loops")
 
         run = Path(scratch) / "run"
-        sequence = WatchedSequence(RepeatedPairs(lap, frames), lap, block)
+        sequence = WatchedSequence(LappedPairs(lap, frames), lap, block)
         began = time.perf_counter()
         try:
             Trial(sequence, None).run(run)

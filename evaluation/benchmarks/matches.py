@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import astuple, fields
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -11,6 +12,12 @@ import torch
 
 from sigmaslam.evaluation.benchmarks.page import header, opening, row, write_page
 from sigmaslam.evaluation.matching.dynamic_scenes import SHARES, MoverJudgement, judge_movers
+from sigmaslam.evaluation.matching.forward_motion import (
+    EDGES,
+    judge_probability,
+    measure_renders,
+    measure_steps,
+)
 from sigmaslam.evaluation.matching.image_pairs import ImagePair, Motion, SameRows
 from sigmaslam.evaluation.matching.judgement import (
     HomographyJudgement,
@@ -20,13 +27,20 @@ from sigmaslam.evaluation.matching.judgement import (
 )
 from sigmaslam.evaluation.matching.rejection import KEYPOINTS, compare_rejection
 from sigmaslam.evaluation.matching.relative_pose import compare_starts
-from sigmaslam.evaluation.matching.sets import check_sets, load_set
+from sigmaslam.evaluation.matching.sets import check_sets, load_advances, load_set
 from sigmaslam.frontend.match_confidence import ConfidenceEstimator
-from sigmaslam.training.matching.match_sets import DETECTORS
+from sigmaslam.synthetic.homography_pairs import HomographyPair
+from sigmaslam.synthetic.repeated_pairs import RepeatedPairs
+from sigmaslam.synthetic.scene_pairs import ScenePair, ScenePairs
+from sigmaslam.training.matching.match_sets import DETECTORS, SIZE
 
 _HOMOGRAPHIES, _STEREO = ("set12", "boat", "churchill"), ("kitti", "euroc")
 _PHOTOGRAPH_KEYPOINTS, _STEREO_KEYPOINTS = 1024, 1500
 _MOVER_SEED, _MOVER_PAIRS = 2_000_003, 320
+_RENDER_SEED, _RENDER_PAIRS = 2_000_005, 64
+_RENDERED = range(_RENDER_PAIRS)
+# Worlds in which cameras advance.
+_FORWARD_DOMAINS = ("street", "street", "drone", "room")
 
 
 def write_matches(path: Path, data: Path, command: str, note: Callable[[str], None] = lambda text: None) -> str:
@@ -47,7 +61,7 @@ def write_matches(path: Path, data: Path, command: str, note: Callable[[str], No
     try:
         judge = ConfidenceEstimator()
         lines = _introduction(command)
-        for part in (_homographies, _rows, _rejection, _starts, _movers):
+        for part in (_homographies, _rows, _probability, _rejection, _starts, _movers):
             note(part.__name__.strip("_"))
             lines += part(data, judge)
     finally:
@@ -104,6 +118,40 @@ def _rows(data: Path, judge: ConfidenceEstimator) -> list[str]:
             matches, *shares, correlation, median, sigma, bias = astuple(measured)
             cells = [f"{matches:.0f}", *(f"{100 * share:.1f}" for share in shares), f"{correlation:.2f}"]
             lines.append(row(name, kind, *cells, f"{median:.3f}", f"{sigma:.3f}", f"{bias:+.3f}"))
+    return [*lines, ""]
+
+
+def _probability(data: Path, judge: ConfidenceEstimator) -> list[str]:
+    bins = [f"{low:g}-{high:g}" for low, high in pairwise(EDGES)]
+    lines = [
+        "## Probability in forward motion and on repeated structure",
+        "",
+        f"Mutual nearest neighbours of {_PHOTOGRAPH_KEYPOINTS} keypoints an image. *claimed / right*: mean probability",
+        "and share of right ones of the matches of such a probability; right: within 3 px of the true place, which on",
+        "real pairs is that of keypoints with a stereo match of at least 0.9, moved by the true motion. *precision*,",
+        "*lost*: right ones among those of at least 0.5, and right ones that are not among them. *within*: errors of",
+        "right matches within 1 and 2 sigma along the axes of their covariance.",
+        f"Renders: {_RENDER_PAIRS} pairs of worlds and patterns of their own seed.",
+        "",
+        *header("set", "features", "matches", *bins, "ece", "precision", "lost", "within 1", "within 2"),
+    ]
+    renders: dict[str, Sequence[ScenePair | HomographyPair]] = {
+        "renders, forward": list(map(ScenePairs(_RENDER_SEED, SIZE, _FORWARD_DOMAINS, forward=True).pair, _RENDERED)),
+        "renders, repeated": list(map(RepeatedPairs(_RENDER_SEED, SIZE).pair, _RENDERED)),
+    }
+    gaps = {f"kitti gap {gap}": load_advances(data, gap) for gap in (1, 3)}
+    for kind, make in DETECTORS.items():
+        detect = make(_PHOTOGRAPH_KEYPOINTS)
+        measured = {name: measure_steps(steps, detect, judge) for name, steps in gaps.items()}
+        measured |= {name: measure_renders(pairs, detect, judge) for name, pairs in renders.items()}
+        for name, matches in measured.items():
+            judged = judge_probability(matches)
+            curve = (
+                f"{claimed:.2f} / {right:.2f}" for claimed, right in zip(judged.claimed, judged.right, strict=True)
+            )
+            shares = judged.precision, judged.lost, judged.within_1, judged.within_2
+            cells = *curve, f"{judged.ece:.3f}", *(f"{100 * share:.1f}" for share in shares)
+            lines.append(row(name, kind, str(judged.matches), *cells))
     return [*lines, ""]
 
 

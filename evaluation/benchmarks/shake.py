@@ -21,6 +21,7 @@ from sigmaslam.evaluation.benchmarks.trial_pool import run_trials
 from sigmaslam.evaluation.metrics.claimed_errors import MotionErrors, motion_errors
 from sigmaslam.evaluation.metrics.image_motion import ImageMotion, read_image_motion
 from sigmaslam.evaluation.metrics.map_consistency import coverage
+from sigmaslam.evaluation.rendered_camera import open_rendered
 from sigmaslam.evaluation.trial import Method, Trial, TrialCache, hash_code, render, rendered_truth
 from sigmaslam.files import make_folder
 from sigmaslam.readers.trajectory_files import read_trajectory
@@ -108,7 +109,7 @@ def judge(source: Path, method: Method) -> ShakeResult:
     with tempfile.TemporaryDirectory() as scratch:
         run = Path(scratch) / "run"
         with Path(os.devnull).open("w") as nowhere, redirect_stderr(nowhere):
-            trial = Trial(source, truth, method).run(run)
+            trial = Trial(open_rendered(source), truth, method).run(run)
         covariance = np.load(run / "covariance.npy")
     evaluation, estimate, true = trial.evaluation, trial.trajectory, read_trajectory(truth)
     assert evaluation.nees is not None

@@ -79,8 +79,7 @@ def judge_homographies(pairs: Sequence[ImagePair], detect: Detect, judge: Confid
         precisions = [calibration.average_precision(score, near) for score in (10.0 * mutual - ratio, logit)]
         # Score the same matches before and after verification, also those that the verifier does not see.
         seen = np.flatnonzero(mutual & (logit > MIN_LOGIT))
-        weight = 1.0 / (1.0 + np.exp(-logit[seen].astype(np.float64)))
-        refinement = refine_by_neighbours(pair.image0, pair.image1, points0[seen], points1[seen], weight)
+        refinement = refine_by_neighbours(pair.image0, pair.image1, points0[seen], points1[seen], logit[seen])
         sigma = features0.sigma[putative.index0[seen]], features1.sigma[putative.index1[seen]]
         verified, covariance = judge.verify(pair.image0, pair.image1, points0[seen], logit[seen], refinement, sigma)
         probability, error = np.zeros(len(logit)), points1 - places

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +27,11 @@ def kitti(folder: Path) -> list[ImagePair]:
 def euroc(folder: Path) -> list[ImagePair]:
     """Every keyframe: its two eyes rectified, and its left image with the next one (part next)."""
     return sequence_pairs(open_sequence(folder), folder / "groundtruth.csv", 1, {1: "next"})
+
+
+def kitti_steps(folder: Path, gap: int) -> list[StereoStep]:
+    """From every sixth frame to the one so many frames later."""
+    return sequence_steps(open_sequence(folder), folder / "poses.txt", _KITTI_STEP, gap)
 
 
 def euroc_steps(folder: Path) -> list[StereoStep]:
@@ -58,13 +62,17 @@ def sequence_pairs(sequence: StereoSequence, truth: Path, step: int, gaps: Mappi
     return pairs
 
 
-def sequence_steps(sequence: StereoSequence, truth: Path) -> list[StereoStep]:
-    """Steps from each frame to the next.
+def sequence_steps(sequence: StereoSequence, truth: Path, step: int = 1, gap: int = 1) -> list[StereoStep]:
+    """Steps from frames to later ones.
 
     Args:
         sequence: images as stored; they are rectified here.
         truth: trajectory of the left camera, any format.
+        step: every so many frames one begins.
+        gap: frames from one to the other.
     """
+    views = {view.index: view for view in _views(sequence, truth) if view.index % step in (0, gap % step)}
+    pairs = [(view, views[index + gap]) for index, view in views.items() if index % step == 0 and index + gap in views]
     return [
         StereoStep(
             f"{first.index} {second.index}",
@@ -74,8 +82,7 @@ def sequence_steps(sequence: StereoSequence, truth: Path) -> list[StereoStep]:
             first.camera,
             se3_inverse(second.T_world_camera) @ first.T_world_camera,
         )
-        for first, second in pairwise(_views(sequence, truth))
-        if second.index == first.index + 1
+        for first, second in pairs
     ]
 
 

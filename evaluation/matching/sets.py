@@ -71,6 +71,11 @@ def load_steps(data: Path) -> list[StereoStep]:
     return sequence_pairs.euroc_steps(_folder(data, _SETS["euroc"][0]))
 
 
+def load_advances(data: Path, gap: int) -> list[StereoStep]:
+    """From every sixth frame of the set kitti to the one so many frames later."""
+    return sequence_pairs.kitti_steps(_folder(data, _SETS["kitti"][0]), gap)
+
+
 def _folder(data: Path, name: str) -> Path:
     if not (data / name).is_dir():
         raise InputError(f"{data} does not hold {name}: set SIGMASLAM_DATA to the folder of the real data sets")

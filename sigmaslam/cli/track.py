@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from dataclasses import replace
 from enum import StrEnum
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -63,6 +64,14 @@ def track(
     config: Annotated[
         Path | None, typer.Option(help="YAML of tracker settings, `name: value` (names: sigmaslam.TrackerConfig).")
     ] = None,
+    estimate: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAMES",
+            help="Errors of the calibration to estimate beside the disparity offset, as far as images tell them from "
+            "motion: yaw,pitch,focal, ... (docs/input.md).",
+        ),
+    ] = None,
     map: Annotated[
         Path | None,
         typer.Option(help="map.npz of an earlier run with the same camera and front-end: poses are in its world."),
@@ -116,7 +125,7 @@ def track(
     """Track a stereo sequence, recorded or live: trajectory, covariance, map and report."""
     if backend.value == "torch":
         need_train_extra()
-    settings = None if config is None else _read_config(config, track_object is not None)
+    settings = _read_settings(config, estimate, track_object is not None)
     sequence = _open_input(source, format, calibration, camera, seconds, (topic_left, topic_right))
     try:
         summary = _track(
@@ -156,11 +165,19 @@ def _open_input(
     return open_cameras(camera, calibration, seconds)
 
 
-def _read_config(path: Path, track_object: bool) -> TrackerConfig:
-    from sigmaslam.slam.config import read_config
+def _read_settings(path: Path | None, estimate: str | None, track_object: bool) -> TrackerConfig | None:
+    """Settings of a file and of the command line; None where neither says anything."""
+    from sigmaslam.slam.config import TrackerConfig, check_estimated, read_config
     from sigmaslam.slam.object_tracker import OBJECT_CONFIG
 
-    return read_config(path, OBJECT_CONFIG if track_object else None)
+    if path is None and estimate is None:
+        return None
+    settings = OBJECT_CONFIG if track_object else TrackerConfig()
+    if path is not None:
+        settings = read_config(path, settings)
+    if estimate is not None:
+        settings = replace(settings, estimate=check_estimated("--estimate", estimate.split(",")))
+    return settings
 
 
 def _track(

@@ -8,7 +8,7 @@ Schmidt's filter, which trusts views less for them, every window makes up a cali
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -47,6 +47,12 @@ class CalibrationPrior:
     sigma: np.ndarray
     estimated: np.ndarray
 
+    def considering(self, index: int) -> CalibrationPrior:
+        """The same with one error more that is considered."""
+        estimated = self.estimated.copy()
+        estimated[index] = False
+        return replace(self, estimated=estimated)
+
     @property
     def estimated_covariance(self) -> np.ndarray:
         """(12, 12) of those that are estimated, zero for the others."""
@@ -58,12 +64,22 @@ class CalibrationPrior:
         return np.diag(np.where(self.estimated, 0.0, self.sigma))
 
     @classmethod
-    def of(cls, camera: RectifiedStereo, sigmas: CalibrationSigmas, offset_sigma: float) -> CalibrationPrior:
-        """Of a pair whose disparity offset alone is estimated; its standard deviation is in pixels."""
+    def of(
+        cls, camera: RectifiedStereo, sigmas: CalibrationSigmas, offset_sigma: float, estimate: tuple[str, ...] = ()
+    ) -> CalibrationPrior:
+        """Of a rectified pair.
+
+        Args:
+            camera: the pair.
+            sigmas: of its calibration.
+            offset_sigma: of the disparity offset, which is estimated, pixels.
+            estimate: names of other errors to estimate.
+        """
         turn, lens = camera.fx * sigmas.rotation, camera.fx * sigmas.distortion
         centre = camera.fx * sigmas.principal_point
         in_disparity = (offset_sigma, turn, turn, turn, lens, lens, lens)
-        return cls.independent(np.array([*in_disparity, sigmas.focal, centre, centre, lens, sigmas.baseline]), "offset")
+        sigma = np.array([*in_disparity, sigmas.focal, centre, centre, lens, sigmas.baseline])
+        return cls.independent(sigma, "offset", *estimate)
 
     @classmethod
     def independent(cls, sigma: np.ndarray, *estimated: str) -> CalibrationPrior:

@@ -29,6 +29,9 @@ from sigmaslam.estimation.state_layout import CALIBRATION_SIZE, LANDMARK_SIZE, M
 from sigmaslam.estimation.window_state import WindowState, loop_difference
 from sigmaslam.geometry.camera import RectifiedStereo
 
+# An error of the calibration beyond so many standard deviations of its prior is not believed.
+_CREDIBLE = 4.0
+
 
 class KeyframeWindow:
     """Poses of the last keyframes, the stereo calibration, and the landmarks that connect them; owns the state.
@@ -45,6 +48,7 @@ class KeyframeWindow:
         landmarks: estimated with the posterior.
         depth: of the scene that the last keyframe sees, metres.
         calibration: prior of the errors of the calibration.
+        refused: (12,) what images made of errors that are not estimated any more; zero for the others.
     """
 
     def __init__(
@@ -58,6 +62,7 @@ class KeyframeWindow:
         self.lineariser = lineariser
         self.student_freedom = student_freedom
         self.calibration = calibration
+        self.refused = np.zeros(CALIBRATION_SIZE)
         self.prior = self.posterior = WindowState.initial(calibration)
         self.landmarks = LandmarkTable.empty(CALIBRATION_SIZE)
         self.depth = 1.0
@@ -95,6 +100,7 @@ class KeyframeWindow:
             depth: of the scene that it sees, metres.
             origin: of the first one, the past pose relative to which `step_covariance` is; the world by default.
         """
+        walk = np.where(self.calibration.estimated, walk, 0.0)
         expected = self.prior.poses[-1] @ step if len(self.prior) else step
         self.prior = self.prior.grow(expected, step_covariance, walk, origin)
         self.posterior = self.posterior.grow(pose, step_covariance, walk, origin)
@@ -158,6 +164,23 @@ class KeyframeWindow:
         agree = _agree(self, self._observations)
         if not agree.all():
             self._observations = self._observations.select(agree)
+        self._refuse_calibration(iterations)
+
+    def _refuse_calibration(self, iterations: int) -> None:
+        """Considers estimated errors that the images move beyond what a calibration can be off by, and solves anew.
+
+        They stand for something else then, of a lens or of the other eye, that this model does not have.
+        """
+        calibration = self.posterior.calibration
+        beyond = self.calibration.estimated & (np.abs(calibration) > _CREDIBLE * self.calibration.sigma)
+        if not beyond.any():
+            return
+        for index in np.flatnonzero(beyond).tolist():
+            self.refused[index] = calibration[index]
+            self.calibration = self.calibration.considering(index)
+            self.prior = self.prior.without_estimate(index, self.calibration.sigma[index])
+            self.posterior = self.posterior.without_estimate(index, self.calibration.sigma[index])
+        self.solve(iterations)
 
     def add_loop_constraint(self, index: int, T_past_last: np.ndarray, covariance: np.ndarray) -> bool:
         """Closes a loop: the last keyframe sees what a past pose saw, and the past is corrected with the window.

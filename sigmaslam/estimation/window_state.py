@@ -75,6 +75,31 @@ class WindowState:
         common = condition_common(self.common, covariance, information)
         return replace(self.moved(step, covariance, common), past=past)
 
+    def without_estimate(self, index: int, sigma: float) -> WindowState:
+        """As if an estimated error of the calibration had been considered from the start: it is zero, give or take.
+
+        Args:
+            index: in `calibration_errors.ERRORS`.
+            sigma: standard deviation of its prior.
+        """
+        past, variance = self.past, self.covariance[index, index]
+        by_error = self.covariance[index]
+        states, poses = by_error / variance, past.cross[:, index] / variance
+        step = -self.calibration[index]
+        common, past_common = (
+            of - np.outer(slope, self.common[index]) for of, slope in ((self.common, states), (past.common, poses))
+        )
+        common[:, index], past_common[:, index] = sigma * states, sigma * poses
+        past = past.moved(
+            step * poses,
+            past.covariance - np.outer(poses, past.cross[:, index]),
+            past.cross - np.outer(poses, by_error),
+            past_common,
+        )
+        covariance = self.covariance - np.outer(states, by_error)
+        covariance[index], covariance[:, index] = 0.0, 0.0
+        return replace(self.moved(step * states, covariance, common), past=past)
+
     def grow(
         self, pose: np.ndarray, step_covariance: np.ndarray, walk: np.ndarray, origin: int | None = None
     ) -> WindowState:

@@ -328,5 +328,5 @@ def _world_drift_covariance(estimate: Estimate) -> np.ndarray:
 
 
 def _drift_covariance(estimate: Estimate) -> np.ndarray:
-    """(6, 6) covariance of the tracker's drift in the camera's frame."""
-    return estimate.covariance - _INDEPENDENT_SHARE * estimate.frame_covariance
+    """(6, 6) covariance of the tracker's drift in the camera's frame; errors of its calibration are no random walk."""
+    return estimate.matching_covariance - _INDEPENDENT_SHARE * estimate.frame_covariance

@@ -71,12 +71,15 @@ class RunWriter:
         self._rectified = rectified
         self._tracks: list[tuple[int, KeyframeTracks]] = []
 
-    def add(self, estimate: Estimate, pose: np.ndarray, covariance: np.ndarray, read_ms: float) -> None:
+    def add(
+        self, estimate: Estimate, pose: np.ndarray, covariance: np.ndarray, matching: np.ndarray, read_ms: float
+    ) -> None:
         """Takes the result of one frame; its row is on disk when this returns.
 
         Args:
             estimate: of the camera.
             pose, covariance: (4, 4), (6, 6) of what is tracked: the camera in the world, or a body in the camera.
+            matching: (6, 6) the part of the covariance that comes from matches and motion.
             read_ms: time it took to read the images.
         """
         milliseconds = {"read": read_ms, **estimate.milliseconds}
@@ -95,7 +98,7 @@ class RunWriter:
             ]
         )
         self._table.flush()
-        row = np.r_[estimate.timestamp, pose.ravel(), covariance.ravel()]
+        row = np.r_[estimate.timestamp, pose.ravel(), covariance.ravel(), matching.ravel()]
         self._poses.write(row.astype(np.float64).tobytes())
         self._relative_poses.add(self._statuses.total(), estimate.relative_poses)
         self._statuses[estimate.status] += 1
@@ -124,7 +127,8 @@ class RunWriter:
             point_map: the landmarks.
             keyframes: arrays by name, with which a later run relocalises in the map.
             run: entries of run.json beside versions, weights and the summary.
-            final: the frames as they are known now, with covariances; they are written beside those said at once.
+            final: the frames as they are known now, with covariances; they are written beside those said at once. None
+                where other sensors corrected the poses, whose covariances then have no part of matches alone.
         Returns:
             The summary.
         """
@@ -133,21 +137,20 @@ class RunWriter:
         content = {**run, "versions": _versions(), "weights_sha256": _weight_hashes(), "summary": summary}
         atomic_write_text(self._out / "run.json", json.dumps(content, indent=2) + "\n")
         self._poses.seek(0)
-        rows = np.frombuffer(self._poses.read()).reshape(-1, 1 + 16 + 36)
+        rows = np.frombuffer(self._poses.read()).reshape(-1, 1 + 16 + 36 + 36)
         self._poses.close()
         if not len(rows):
             return summary
         trajectory = Trajectory(rows[:, 0], rows[:, 1:17].reshape(-1, 4, 4))
         write_tum(self._out / "trajectory.tum", trajectory)
         write_kitti(self._out / "trajectory.kitti", trajectory, self._out / "times.txt")
-        with atomic_path(self._out / "covariance.npy") as path:
-            np.save(path, rows[:, 17:].reshape(-1, 6, 6))
+        _save(self._out / "covariance.npy", rows[:, 17:53].reshape(-1, 6, 6))
         self._relative_poses.finish(self._out, trajectory.timestamps)
         if final is not None:
             # A frame whose pose was not written, as the run was stopped in it, is in neither trajectory.
             write_tum(self._out / FINAL_TRAJECTORY, final[0].subset(np.arange(len(rows))))
-            with atomic_path(self._out / FINAL_COVARIANCE) as path:
-                np.save(path, final[1][: len(rows)])
+            _save(self._out / FINAL_COVARIANCE, final[1][: len(rows)])
+            _save(self._out / "covariance_matching.npy", rows[:, 53:].reshape(-1, 6, 6))
         with atomic_path(self._out / "map.npz") as path:
             points = {name: getattr(point_map, name) for name in PointMap.__slots__}
             np.savez_compressed(path, **points, **keyframes)
@@ -183,6 +186,7 @@ class RunWriter:
             "median_inliers": float(np.median(self._inliers)) if self._inliers else 0.0,
             "map_points": len(point_map.points),
             "calibration_verdict": calibration_verdict(last) if last else "No frame was read.",
+            "calibration_errors": {name: list(each) for name, each in last.errors.items()} if last else {},
         }
 
 
@@ -190,14 +194,28 @@ def calibration_verdict(calibration: CalibrationEstimate) -> str:
     """The estimated disparity offset in words."""
     offset, sigma = calibration.disparity_offset, calibration.disparity_offset_sigma
     figure = f"{offset:+.2f} ± {sigma:.2f} px"
+    if calibration.refused_offset:
+        return (
+            f"The images ask for a disparity offset of {calibration.refused_offset:+.1f} px, which is more than "
+            "calibrations are off by: nothing was corrected. A lens, the baseline or the right camera is wrong: "
+            "calibrate again."
+        )
     if sigma > 0.2:
-        return f"The motion says little about the disparity offset ({figure}): move closer to things, or further."
+        return (
+            f"It is too early to say whether the rectification is right (disparity offset {figure}): more frames, or "
+            "things nearer and farther, would tell."
+        )
     if abs(offset) > max(3.0 * sigma, 0.1):
         return (
             f"The rectification is off by {figure} of disparity. The poses are corrected for it; depth measured with "
             "this calibration elsewhere is not: calibrate again."
         )
     return f"The disparity offset is {figure}: nothing wrong with the rectification can be seen."
+
+
+def _save(path: Path, array: np.ndarray) -> None:
+    with atomic_path(path) as temporary:
+        np.save(temporary, array)
 
 
 def write_ply(path: Path, point_map: PointMap) -> None:

@@ -215,7 +215,9 @@ def _track(
             timing.note(frame.timestamp)
             if location is not None:
                 estimate = estimate.map_camera(location.fuse)
-            writer.add(estimate.camera, estimate.pose, estimate.pose_covariance, read_ms)
+            writer.add(
+                estimate.camera, estimate.pose, estimate.pose_covariance, estimate.pose_matching_covariance, read_ms
+            )
             done += 1
             since = time.perf_counter()
             progress.update(

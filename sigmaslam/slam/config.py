@@ -9,6 +9,7 @@ from typing import Any
 import yaml
 
 from sigmaslam.errors import InputError
+from sigmaslam.estimation.calibration_errors import ERRORS
 
 LINEARISATIONS = ("unscented", "extended")
 
@@ -30,6 +31,8 @@ class TrackerConfig:
         start_turn: of the angular velocity, rad/s.
         offset_sigma: prior of the disparity offset, pixels.
         offset_walk: its random walk, pixels per root second.
+        estimate: errors of the calibration that images may move beside the disparity offset, names of
+            `sigmaslam.estimation.calibration_errors.ERRORS`. The others are only considered.
         linearisation: "unscented" or "extended".
         iterations: linearisations in a frame's update.
         window: keyframes that are estimated jointly.
@@ -56,6 +59,7 @@ class TrackerConfig:
     start_turn: float = 1.0
     offset_sigma: float = 0.5
     offset_walk: float = 0.02
+    estimate: tuple[str, ...] = ()
     linearisation: str = "unscented"
     iterations: int = 2
     window: int = 6
@@ -92,12 +96,26 @@ def read_config(path: Path, base: TrackerConfig | None = None) -> TrackerConfig:
     return replace(base, **entries)
 
 
+def check_estimated(place: str, names: list[str]) -> tuple[str, ...]:
+    """Names of errors of the calibration that are to be estimated.
+
+    Raises:
+        InputError: there is no such error; the message begins with `place`.
+    """
+    for name in names:
+        if name not in ERRORS:
+            raise InputError(f"{place}: a calibration has no error {name!r}: choose among {', '.join(ERRORS)}")
+    return tuple(names)
+
+
 def _checked(place: str, value: Any, default: Any) -> Any:
     """The value in the kind of the default one."""
     if default is None:
         if isinstance(value, list) and len(value) == 2 and all(_is_positive(each) for each in value):
             return float(value[0]), float(value[1])
         raise InputError(f"{place}: expected two positive numbers in a list, found {value!r}")
+    if isinstance(default, tuple):
+        return check_estimated(place, value if isinstance(value, list) else [value])
     if isinstance(default, str):
         if value in LINEARISATIONS:
             return value

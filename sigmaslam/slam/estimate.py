@@ -18,10 +18,16 @@ class CalibrationEstimate:
     Attributes:
         disparity_offset: measured minus true disparity, pixels.
         disparity_offset_sigma: its standard deviation, pixels.
+        refused_offset: what the images made of it where no such calibration could be so far off, pixels; it is not
+            estimated any more then. Zero otherwise.
+        errors: other errors that are estimated, by their names: value and standard deviation, in the units of
+            `sigmaslam.estimation.calibration_errors.ERRORS`.
     """
 
     disparity_offset: float
     disparity_offset_sigma: float
+    refused_offset: float = 0.0
+    errors: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +38,8 @@ class Estimate:
         timestamp: seconds.
         T_world_camera: (4, 4) pose of the left camera; the world is the first left camera.
         covariance: (6, 6) of that pose in the camera's own frame, translation (metres) before rotation (radians).
+        matching_covariance: (6, 6) the part of the covariance that comes from matches and motion; the rest comes from
+            errors of the calibration.
         status: "starting", "tracking", "lost", or "relocalised": found again among keyframes that had left the window,
             or in the map.
         belief: 1 - sqrt of the largest eigenvalue of the covariance of the pose relative to the keyframe (metres and
@@ -40,8 +48,6 @@ class Estimate:
         nis, dof: normalised innovation squared and its degrees of freedom; 0 without an update.
         calibration: of the stereo pair.
         milliseconds: wall time by stage.
-        matching_covariance: (6, 6) the part of the covariance that comes from matches and motion; the rest comes from
-            errors of the calibration.
         frame_covariance: (6, 6) the part of the covariance that the frame's matches add to that of its keyframe; zero
             without them.
         tracks: what the frame saw, where it became a keyframe.
@@ -51,6 +57,7 @@ class Estimate:
     timestamp: float
     T_world_camera: np.ndarray
     covariance: np.ndarray
+    matching_covariance: np.ndarray
     status: str
     belief: float
     matches: int
@@ -59,7 +66,6 @@ class Estimate:
     dof: int
     calibration: CalibrationEstimate
     milliseconds: dict[str, float] = field(default_factory=dict)
-    matching_covariance: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
     frame_covariance: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
     tracks: KeyframeTracks | None = None
     relative_poses: RelativePoses = field(default_factory=RelativePoses.empty)
@@ -78,6 +84,11 @@ class Estimate:
     def pose_covariance(self) -> np.ndarray:
         """(6, 6) of `pose` in its own frame."""
         return self.covariance
+
+    @property
+    def pose_matching_covariance(self) -> np.ndarray:
+        """(6, 6) the part of `pose_covariance` that comes from matches and motion."""
+        return self.matching_covariance
 
     def map_camera(self, change: Callable[[Estimate], Estimate]) -> Estimate:
         """The result with another camera estimate."""

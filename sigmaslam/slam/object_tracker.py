@@ -59,8 +59,7 @@ class ObjectEstimate:
     @property
     def object_covariance(self) -> np.ndarray:
         """(6, 6) of `T_camera_object` in the body's own frame, translation (metres) before rotation (radians)."""
-        covariance = turn_covariance(self.camera.T_world_camera, self.camera.covariance)
-        return np.asarray(0.5 * (covariance + covariance.T))
+        return self._on_body(self.camera.covariance)
 
     @property
     def pose(self) -> np.ndarray:
@@ -71,6 +70,16 @@ class ObjectEstimate:
     def pose_covariance(self) -> np.ndarray:
         """(6, 6) of `pose` in its own frame."""
         return self.object_covariance
+
+    @property
+    def pose_matching_covariance(self) -> np.ndarray:
+        """(6, 6) the part of `pose_covariance` that comes from matches and motion."""
+        return self._on_body(self.camera.matching_covariance)
+
+    def _on_body(self, covariance: np.ndarray) -> np.ndarray:
+        """A covariance (6, 6) in the camera's frame as that of `T_camera_object` in the body's own frame."""
+        covariance = turn_covariance(self.camera.T_world_camera, covariance)
+        return np.asarray(0.5 * (covariance + covariance.T))
 
     def map_camera(self, change: Callable[[Estimate], Estimate]) -> ObjectEstimate:
         """The result with another camera estimate."""
@@ -133,19 +142,24 @@ class ObjectTracker:
                 "the first frame has too few points that both eyes see: start where the images are good, "
                 "and check the calibration"
             )
-        covariance, relative_poses = estimate.covariance, estimate.relative_poses
+        unseen, relative_poses = np.zeros((6, 6)), estimate.relative_poses
         if not self._body.separated:
             # In the body's frame, whose axes are the camera's still; from there into the left camera's.
             T_left_body = self._T_left_rectified @ self._body.T_camera_body
-            starting = estimate.status == "starting"
-            unseen = np.zeros((6, 6)) if starting else turn_covariance(T_left_body, self._body.unseen_motion())
-            covariance = covariance + unseen
-            self._unseen_motion.append(unseen)
-            if not starting:
+            if estimate.status != "starting":
+                unseen = turn_covariance(T_left_body, self._body.unseen_motion())
                 relative_poses = RelativePoses.empty()  # the body may have moved unseen
+            self._unseen_motion.append(unseen)
         T_body_camera = self._T_body_left() @ estimate.T_world_camera
-        changes = {"T_world_camera": T_body_camera, "covariance": covariance, "relative_poses": relative_poses}
-        return ObjectEstimate(replace(estimate, **changes))
+        return ObjectEstimate(
+            replace(
+                estimate,
+                T_world_camera=T_body_camera,
+                covariance=estimate.covariance + unseen,
+                matching_covariance=estimate.matching_covariance + unseen,
+                relative_poses=relative_poses,
+            )
+        )
 
     def final_trajectory(self) -> tuple[Trajectory, np.ndarray]:
         """T_camera_object of all frames as it is known now, with covariances (N, 6, 6) in the body's own frame."""

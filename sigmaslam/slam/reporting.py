@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sigmaslam.estimation.calibration_errors import ERRORS
 from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
@@ -49,11 +50,12 @@ class Reporter:
     ) -> Estimate:
         """What is known after a frame; without a fit by the prediction, without a keyframe nothing."""
         state = self.window.posterior
-        calibration, spread = state.calibration, state.covariance[CALIBRATION, CALIBRATION]
+        calibration, spread = state.calibration, state.whole_covariance[CALIBRATION, CALIBRATION]
         by_error = np.zeros((6, CALIBRATION_SIZE))
         if fit is not None:
             pose, absolute, relative = fit.pose, fit.covariance, fit.relative
-            calibration, spread, by_error = fit.calibration, fit.calibration_covariance, fit.joint.common[-6:]
+            by_error, on_calibration = fit.joint.common[-6:], fit.joint.common[CALIBRATION]
+            calibration, spread = fit.calibration, fit.calibration_covariance + on_calibration @ on_calibration.T
         elif len(state):
             prediction = Prediction.of(self.window, self.motion)
             last = pose_slice(len(state) - 1)
@@ -69,6 +71,7 @@ class Reporter:
         matching = adjoint @ absolute @ adjoint.T
         covariance = matching + (adjoint @ by_error) @ (adjoint @ by_error).T
         frame_covariance = adjoint @ relative @ adjoint.T if fit is not None else np.zeros((6, 6))
+        covariance, matching = _within_half_turn(covariance), _within_half_turn(matching)
         return Estimate(
             timestamp=timestamp,
             T_world_camera=T_left_rectified @ pose @ self.T_rectified_left,
@@ -80,10 +83,26 @@ class Reporter:
             inliers=fit.count if fit is not None else 0,
             nis=fit.nis if fit is not None else 0.0,
             dof=fit.dof if fit is not None else 0,
-            calibration=CalibrationEstimate(float(calibration[0]), float(np.sqrt(max(spread[0, 0], 0.0)))),
+            calibration=self._describe_calibration(calibration, spread),
             milliseconds=milliseconds,
             frame_covariance=0.5 * (frame_covariance + frame_covariance.T),
             tracks=tracks,
             # A keyframe is the window's by now, which has learned from it.
             relative_poses=self.relative_poses.report(timestamp, fit if tracks is None else None),
         )
+
+    def _describe_calibration(self, errors: np.ndarray, covariance: np.ndarray) -> CalibrationEstimate:
+        """What is known of errors (12,) with covariance (12, 12)."""
+        sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        chosen = [k for k in np.flatnonzero(self.window.calibration.estimated).tolist() if k]
+        others = {ERRORS[k]: (float(errors[k]), float(sigma[k])) for k in chosen}
+        return CalibrationEstimate(float(errors[0]), float(sigma[0]), float(self.window.refused[0]), others)
+
+
+def _within_half_turn(covariance: np.ndarray) -> np.ndarray:
+    """A covariance (6, 6) whose rotation is less certain than half a turn, as one that knows no more than nothing."""
+    sigma = np.sqrt(max(float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]), 0.0))
+    if sigma < np.pi:
+        return covariance
+    scale = np.repeat([1.0, np.pi / sigma], 3)
+    return np.asarray(scale[:, None] * covariance * scale)

@@ -7,7 +7,7 @@ import pytest
 
 from sigmaslam import open_sequence
 from sigmaslam.evaluation.benchmarks import endurance
-from sigmaslam.evaluation.benchmarks.endurance import RepeatedPairs, write_endurance
+from sigmaslam.evaluation.benchmarks.endurance import LappedPairs, write_endurance
 from sigmaslam.evaluation.benchmarks.endurance_page import Block, Endurance, Lap, format_endurance
 from sigmaslam.synthetic.simulation import Recipe
 
@@ -24,7 +24,7 @@ def renders(demo_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 def test_repeats_go_on_in_time_as_the_path_does(demo_sequence: Path):
     """The last frame of a lap comes two intervals before the first of the next."""
-    pairs = list(RepeatedPairs(open_sequence(demo_sequence), 85))
+    pairs = list(LappedPairs(open_sequence(demo_sequence), 85))
     assert len(pairs) == 85
     steps = np.diff([pair.timestamp for pair in pairs])
     np.testing.assert_allclose(np.delete(steps, [39, 79]), 0.05, rtol=1e-6)

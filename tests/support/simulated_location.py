@@ -14,7 +14,7 @@ FRAME = 0.05
 
 
 def estimate_of(timestamp: float, pose: np.ndarray, covariance: np.ndarray, status: str = "tracking") -> Estimate:
-    return Estimate(timestamp, pose, covariance, status, 1.0, 100, 100, 1.0, 1, CalibrationEstimate(0.0, 0.1))
+    return Estimate(timestamp, pose, covariance, covariance, status, 1.0, 100, 100, 1.0, 1, CalibrationEstimate(0.0, 0.1))
 
 
 @dataclass(frozen=True)

@@ -101,3 +101,22 @@ def test_eyes_of_a_stereo_pair_see_the_same_on_one_row_the_right_one_further_lef
 def test_an_unknown_domain_is_refused() -> None:
     with pytest.raises(ValueError, match="unknown domains"):
         ScenePairs(0, 96, ("moon",))
+
+
+def test_forward_motion_is_along_the_axis_through_one_camera_and_back() -> None:
+    pairs = ScenePairs(3, 96, ("small",), forward=True)
+    steps = []
+    for index in range(16):
+        views0, views1 = pairs.pair(index).views0, pairs.pair(index).views1
+        assert views0.sight.eye.camera == views1.sight.eye.camera
+        T_1_0 = views1.sight.T_view_mover[0, 0] @ np.linalg.inv(views0.sight.T_view_mover[0, 0])
+        step = np.asarray(T_1_0[:3, 3])
+        assert abs(step[2]) > 2.0 * np.hypot(*step[:2])
+        assert np.trace(T_1_0[:3, :3]) > 1.0 + 2.0 * np.cos(np.deg2rad(6.0))
+        steps.append(step[2])
+    assert 3 <= (np.array(steps) < 0).sum() <= 13
+
+
+def test_a_pair_is_not_of_two_eyes_and_of_forward_motion() -> None:
+    with pytest.raises(ValueError, match="one of stereo and forward"):
+        ScenePairs(3, 96, ("small",), stereo=True, forward=True)
