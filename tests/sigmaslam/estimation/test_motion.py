@@ -55,6 +55,21 @@ def test_onnx_and_torch_predict_the_same():
     np.testing.assert_allclose(joint_covariance(one), joint_covariance(other), atol=1e-14)
 
 
+def test_widening_leaves_the_motion_and_what_is_correlated_with_what():
+    """So that an image that fixes the pose says the same of the velocity, and leaves it that much less certain."""
+    motion, wide = moving(), moving()
+    before, seen = joint_covariance(motion).copy(), se3_exp(1e-3 * np.ones(6)) @ motion.step
+    wide.widen(9.0)
+    np.testing.assert_allclose(joint_covariance(wide), 9.0 * before)
+    np.testing.assert_array_equal(wide.step, motion.step)
+    np.testing.assert_array_equal(wide.twist, motion.twist)
+    for each in (motion, wide):
+        each.correct(seen, np.zeros((6, 6)))
+    np.testing.assert_allclose(wide.twist, motion.twist, atol=1e-9)
+    left = [joint_covariance(each)[6:, 6:] for each in (wide, motion)]
+    np.testing.assert_allclose(left[0], 9.0 * left[1], atol=1e-12)
+
+
 def test_correct_equals_the_kalman_update_of_pose_and_twist_together():
     motion = moving()
     predicted, twist, P = motion.step, motion.twist, joint_covariance(motion).copy()

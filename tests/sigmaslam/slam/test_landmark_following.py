@@ -45,9 +45,9 @@ class CarryingOnly:
         pose: np.ndarray,
         covariance: np.ndarray,
         carry: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
-    ) -> GuidedMatches:
+    ) -> tuple[GuidedMatches, float]:
         self.start = carry(left, self._landmark_id, self._predicted)
-        return GuidedMatches.empty()
+        return GuidedMatches.empty(), 1.0
 
 
 class CountingFrontend:
