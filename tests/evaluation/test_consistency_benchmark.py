@@ -114,13 +114,17 @@ def test_depths_around_pixels_are_those_of_the_image():
 
 def test_the_page_names_the_goals_that_are_missed():
     bad = replace(GOOD, nees=2.4, nis=0.5, relative={"1 s": (1.5, 0.8)})
+    drawn = replace(GOOD, nees=3.3)
     results = {
-        Scale("driving", "street", 64, 48): {"ours": [GOOD, GOOD], "EKF": [bad, bad]},
-        Scale("endoscope", "organ", 64, 48): {"ours": [bad, bad], "EKF": [GOOD, GOOD]},
+        Scale("driving", "street", 64, 48): {"ours": [GOOD, GOOD], "EKF": [bad, bad], "ours, drawn": [drawn, drawn]},
+        Scale("endoscope", "organ", 64, 48): {"ours": [bad, bad], "EKF": [GOOD, GOOD], "ours, drawn": [GOOD, GOOD]},
     }
     page = format_page(results, 0.3, 30, 1000, "the command")
-    assert "Missed: NEES of poses per dof in endoscope (2.40); NIS per dof in endoscope (0.50)." in page
-    assert page.count("**missed**") == 2
+    goals, goals_drawn = page.split("## Goals, for ours with a calibration that is drawn")
+    assert "Missed: NEES of poses per dof in endoscope (2.40); NIS per dof in endoscope (0.50)." in goals
+    assert goals.count("**missed**") == 2
+    assert "Missed: NEES of poses per dof in driving (3.30)." in goals_drawn
+    assert goals_drawn.count("**missed**") == 1
     assert "seeds 1000 to 1001" in page
     assert "`the command`" in page
     rows = [line for line in page.splitlines() if line.startswith("| EKF |")]

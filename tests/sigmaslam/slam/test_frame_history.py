@@ -178,7 +178,9 @@ class Walk:
 
 def estimate_at(timestamp: float) -> Estimate:
     """Of an unknown pose."""
-    return Estimate(timestamp, np.eye(4), np.eye(6), "lost", 0.0, 0, 0, 0.0, 0, CalibrationEstimate(0.0, 0.0))
+    return Estimate(
+        timestamp, np.eye(4), np.eye(6), np.eye(6), "lost", 0.0, 0, 0, 0.0, 0, CalibrationEstimate(0.0, 0.0)
+    )
 
 
 def empty_view() -> StereoView:

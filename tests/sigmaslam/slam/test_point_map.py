@@ -44,8 +44,14 @@ def world_points(truth: np.ndarray) -> np.ndarray:
 
 def window_of(measured: np.ndarray, sigma: np.ndarray = SIGMA, own: float = 0.0) -> KeyframeWindow:
     """One keyframe with landmarks; `own` is the deviation of what a landmark's disparities are all off by."""
-    window = make_window(np.full(3, CERTAIN))
-    window.prior = window.posterior = replace(window.posterior, calibration=np.eye(CALIBRATION_SIZE)[0] * OFFSET)
+    window = make_window(np.ones(3))
+    # By now the calibration is known, and the offset is one that its prior allows for.
+    known = replace(
+        window.posterior,
+        calibration=np.eye(CALIBRATION_SIZE)[0] * OFFSET,
+        covariance=CERTAIN**2 * window.posterior.covariance,
+    )
+    window.prior = window.posterior = known
     window.add_keyframe(WORLD, WORLD, CERTAIN**2 * np.eye(6), NO_WALK, DEPTH)
     count = len(measured)
     variance = np.column_stack([np.tile(sigma**2, (count, 1)), np.full(count, max(own, CERTAIN) ** 2)])

@@ -287,14 +287,17 @@ def test_a_view_that_is_nowhere_in_the_map_has_no_pose(demo: Demo, demo_run: Pat
         frame = mirrored(frames[k], 0.05 * k)
         estimate = tracker.step(frame.left, frame.right, frame.timestamp)
         assert estimate.status == "starting"
-        assert np.linalg.eigvalsh(estimate.covariance)[0] > 1e5
+        assert np.linalg.eigvalsh(estimate.covariance[:3, :3])[0] > 1e5
+        # A rotation is never less certain than by half a turn.
+        np.testing.assert_allclose(np.linalg.eigvalsh(estimate.covariance[3:, 3:]), np.pi**2)
         assert estimate.belief == 0.0
     estimate = tracker.step(frames[5].left, frames[5].right, 0.3)
     assert estimate.status == "relocalised"
     final, covariances = tracker.final_trajectory()
     assert len(final) == 5
     np.testing.assert_array_equal(final.poses[:4], [np.eye(4)] * 4)
-    assert np.linalg.eigvalsh(covariances[:4]).min() > 1e5
+    assert np.linalg.eigvalsh(covariances[:4, :3, :3]).min() > 1e5
+    np.testing.assert_allclose(np.linalg.eigvalsh(covariances[:4, 3:, 3:]), np.pi**2)
     np.testing.assert_allclose(final.poses[4], estimate.T_world_camera, atol=1e-9)
     np.testing.assert_allclose(covariances[4], estimate.covariance, atol=1e-9)
 
