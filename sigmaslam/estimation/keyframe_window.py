@@ -231,14 +231,15 @@ def _refuse_errors(window: KeyframeWindow) -> bool:
     They stand for something else then, of a lens or of the other eye, that this model does not have.
     """
     estimate, prior = window.posterior.calibration, window.calibration
-    beyond = np.flatnonzero(prior.estimated & (np.abs(estimate) > _CREDIBLE * prior.sigma)).tolist()
-    for index in beyond:
+    beyond = prior.estimated & (prior.sigma > 0.0) & (np.abs(estimate) > _CREDIBLE * prior.sigma)
+    indices = np.flatnonzero(beyond).tolist()
+    for index in indices:
         window.refused[index] = estimate[index]
         window.calibration = window.calibration.considering(index)
         window.prior, window.posterior = (
             state.without_estimate(index, prior.sigma[index]) for state in (window.prior, window.posterior)
         )
-    return bool(beyond)
+    return bool(indices)
 
 
 # ---- the equations
