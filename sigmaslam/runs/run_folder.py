@@ -235,6 +235,7 @@ def describe_camera(camera: StereoCamera) -> dict[str, Any]:
         "right": asdict(camera.right),
         "T_left_right": camera.T_left_right.tolist(),
         "baseline": camera.baseline,
+        "sigmas": asdict(camera.sigmas),
     }
 
 

@@ -59,6 +59,8 @@ def test_track_writes_every_output_and_evaluate_reads_them(whole_sequence: Path,
     covariance = np.load(out / "covariance.npy")
     assert covariance.shape == (FRAMES, 6, 6)
     assert (np.linalg.eigvalsh(covariance[1:]) > 0).all()
+    matching = np.load(out / "covariance_matching.npy")
+    assert (np.linalg.eigvalsh(covariance[1:] - matching[1:])[:, -1] > 0).all()  # the calibration is not exact
     assert len(rows(out)) == FRAMES
     pairs = read_frame_pairs(out / "relative_poses.npz", FRAMES)
     assert (pairs.earlier < pairs.later).all()
@@ -68,12 +70,24 @@ def test_track_writes_every_output_and_evaluate_reads_them(whole_sequence: Path,
     assert f"element vertex {vertices}\n".encode() in (out / "map.ply").read_bytes()
     run = json.loads((out / "run.json").read_text())
     assert run["ended"] == "complete"
+    assert run["calibration"]["sigmas"]["focal"] == 0.003
     assert len(run["weights_sha256"]["features.onnx"]) == 64
     assert "<svg" in (out / "report.html").read_text()
 
     result = run_here("evaluate", out, "--truth", whole_sequence / "poses.txt", "--json")
     assert result.returncode == 0, result.stderr
     assert json.loads(result.stdout)["matched"] == FRAMES
+
+
+@pytest.mark.usefixtures("without_report")
+def test_errors_of_the_calibration_are_estimated_where_they_are_named(short_sequence: Path, tmp_path: Path):
+    result = run_here("track", short_sequence, "--out", tmp_path / "run", "--estimate", "yaw,focal")
+    assert result.returncode == 0, result.stderr
+    errors = json.loads((tmp_path / "run" / "run.json").read_text())["summary"]["calibration_errors"]
+    assert set(errors) == {"yaw", "focal"}
+    assert 0 < errors["focal"][1] <= 0.003
+    refused = run_here("track", short_sequence, "--out", tmp_path / "other", "--estimate", "yow")
+    assert_refused(refused, "--estimate", "yow", "yaw, pitch")
 
 
 def test_two_runs_are_identical_to_the_bit(whole_sequence: Path, tracked: tuple[Path, Finished], tmp_path: Path):
