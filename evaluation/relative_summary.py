@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from scipy.stats import chi2
 
+from sigmaslam.estimation.chi_square import CHI_SQUARE_BAND_OF_6
 from sigmaslam.evaluation.metrics.relative_consistency import SpanConsistency
 from sigmaslam.plot_style import BLUE, SKY, VERMILLION
 from sigmaslam.runs.relative_pose_file import RELATIVE_POSES_NAME
@@ -37,7 +37,7 @@ def format_relative(spans: tuple[SpanConsistency, ...] | None) -> list[str]:
 def draw_relative(left: Axes, right: Axes, spans: tuple[SpanConsistency, ...]) -> None:
     """NEES of relative poses within their band, and errors beside what the covariances say of them."""
     places = np.arange(len(spans))
-    low, high = chi2.ppf((0.025, 0.975), 6) / 6
+    low, high = CHI_SQUARE_BAND_OF_6 / 6
     left.axhspan(low, high, color=SKY, alpha=0.3, lw=0, label="95 % where the covariance is right")
     quantiles = np.array([np.quantile(span.nees, (0.025, 0.5, 0.975)) for span in spans])
     left.vlines(places, quantiles[:, 0], quantiles[:, 2], color=BLUE, lw=1.6, label="95 % of the pairs")

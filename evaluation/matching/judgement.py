@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sigmaslam.estimation.chi_square import CHI_SQUARE_95_OF_2
+from sigmaslam.estimation.chi_square import CHI_SQUARE_95
 from sigmaslam.estimation.mahalanobis import squared_mahalanobis
 from sigmaslam.evaluation.matching.image_pairs import Homography, ImagePair, SameRows
 from sigmaslam.evaluation.metrics import probability_calibration as calibration
@@ -110,7 +110,7 @@ def judge_homographies(pairs: Sequence[ImagePair], detect: Detect, judge: Confid
         calibration.spearman(before, length),
         calibration.spearman(size, length),
         calibration.best_half(size, length),
-        float((squared_mahalanobis(error, covariance.astype(np.float64)) < CHI_SQUARE_95_OF_2).mean()),
+        float((squared_mahalanobis(error, covariance.astype(np.float64)) < CHI_SQUARE_95[2]).mean()),
         float(np.median(length)),
     )
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.stats import chi2
 
+from sigmaslam.estimation.chi_square import CHI_SQUARE_95
 from sigmaslam.estimation.mahalanobis import squared_mahalanobis
 from sigmaslam.geometry.camera import RectifiedStereo
 
@@ -14,14 +14,14 @@ EDGE = 0.02
 """Where inverse depth bends by more than this share of itself within a pixel, a point's true depth is in doubt."""
 
 
-def coverage(nees: np.ndarray, dof: int, share: float = 0.95) -> float:
-    """Share of errors inside the ellipsoid that holds `share` of a Gaussian's; NaN without errors.
+def coverage(nees: np.ndarray, dof: int) -> float:
+    """Share of errors inside the ellipsoid that holds 95 % of a Gaussian's; NaN without errors.
 
     Args:
         nees: (N,) normalised errors squared, per degree of freedom.
-        dof: of each.
+        dof: of each, 1 to 6.
     """
-    return float((nees * dof <= chi2.ppf(share, dof)).mean()) if len(nees) else float("nan")
+    return float((nees * dof <= CHI_SQUARE_95[dof]).mean()) if len(nees) else float("nan")
 
 
 def mean_with_error(values: Sequence[float] | np.ndarray) -> tuple[float, float]:

@@ -15,7 +15,7 @@ from rich.progress import Progress
 from safetensors.torch import save_file
 
 from sigmaslam.errors import InputError
-from sigmaslam.estimation.chi_square import CHI_SQUARE_68_OF_2, CHI_SQUARE_95_OF_2
+from sigmaslam.estimation.chi_square import CHI_SQUARE_68_OF_2, CHI_SQUARE_95
 from sigmaslam.evaluation.metrics import probability_calibration as calibration
 from sigmaslam.evaluation.metrics.probability_calibration import RIGHT
 from sigmaslam.files import atomic_path, atomic_write_text, make_folder
@@ -217,7 +217,7 @@ def _verifier_metrics(verifier: MatchVerifier, rows: VerifierRows) -> dict[str, 
         "expected_calibration_error": calibration.calibration_error(1.0 / (1.0 + np.exp(-logit)), right),
         "spearman_sigma_error": calibration.spearman(size, length),
         "best_half_rms": calibration.best_half(size, length),
-        "inside_95_ellipse": float((square < CHI_SQUARE_95_OF_2).mean()),
+        "inside_95_ellipse": float((square < CHI_SQUARE_95[2]).mean()),
         "inside_68_ellipse": float((square < CHI_SQUARE_68_OF_2).mean()),
     }
 
