@@ -19,7 +19,7 @@ from sigmaslam.evaluation.benchmarks.page import write_page
 from sigmaslam.evaluation.benchmarks.trial_pool import run_trials
 from sigmaslam.evaluation.metrics import map_consistency as consistency
 from sigmaslam.evaluation.rendered_camera import draw_calibration, open_rendered
-from sigmaslam.evaluation.trial import Trial, TrialCache, hash_code, render
+from sigmaslam.evaluation.trial import Trial, TrialCache, hash_code, render, rendered_truth
 from sigmaslam.files import make_folder
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.geometry.rectification import StereoRectifier
@@ -36,16 +36,16 @@ SCALES = (
     Scale("indoors", "room", 360, 270),
     Scale("endoscope", "organ", 360, 288),
 )
+_DRAWN = "ours, calibration drawn"
 METHODS = {
     "ours": TrackerConfig(linearisation="unscented"),
     "UKF, one iteration": TrackerConfig(linearisation="unscented", iterations=1),
     "EKF, iterated": TrackerConfig(linearisation="extended"),
     "EKF, one iteration": TrackerConfig(linearisation="extended", iterations=1),
     "ours, offset not estimated": TrackerConfig(linearisation="unscented", offset_sigma=0.0, offset_walk=0.0),
-    "ours, calibration drawn": TrackerConfig(linearisation="unscented"),
+    _DRAWN: TrackerConfig(linearisation="unscented"),
 }
 """The first is what `sigmaslam track` does, and what the others are compared with."""
-_DRAWN = "ours, calibration drawn"
 OFFSET = 0.3
 """Pixels by which the rendered disparities exceed what the calibration says."""
 FRAMES = 30
@@ -138,7 +138,7 @@ def depths_around(studio: Studio, frame: int, pixels: np.ndarray) -> np.ndarray:
 
 
 def _track(source: Path, method: str, seed: int, scene: Studio) -> ConsistencyResult:
-    truth = source / "poses.txt"
+    truth = rendered_truth(source)
     # The others are given what is right but for the offset, which is estimated.
     sequence, config = open_rendered(source), METHODS[method]
     if method == _DRAWN:
@@ -152,10 +152,9 @@ def _track(source: Path, method: str, seed: int, scene: Studio) -> ConsistencyRe
     offset, sigma = columns["disparity_offset"][-1], columns["disparity_offset_sigma"][-1]
     if method == _DRAWN:
         sigma = 0.0  # the angle between its eyes changes disparities, too
-    true = read_trajectory(truth)
-    if method == _DRAWN:
         # Its pixels are those of another camera than the one that the true depths are known of.
         point_map = {name: point_map[name][:0] for name in PointMap.__slots__}
+    true = read_trajectory(truth)
     hosts = np.abs(point_map["timestamps"][:, None] - true.timestamps).argmin(axis=1)
     pixels = point_map["pixels"]
     depths = np.zeros((len(pixels), 3, 3))

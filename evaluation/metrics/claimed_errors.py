@@ -9,7 +9,7 @@ from scipy.special import ndtri_exp
 
 from sigmaslam.estimation.mahalanobis import squared_mahalanobis
 from sigmaslam.evaluation.metrics.trajectory_errors import associate, is_regular
-from sigmaslam.geometry.se3 import se3_adjoint, se3_inverse, se3_log
+from sigmaslam.geometry.se3 import se3_inverse, se3_log, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
 
 
@@ -58,8 +58,7 @@ def motion_errors(
     first, last = first[known], last[known]
     motion = se3_inverse(estimate.poses[first]) @ estimate.poses[last]
     errors = se3_log(se3_inverse(motion) @ se3_inverse(true[first]) @ true[last])
-    adjoint = se3_adjoint(se3_inverse(motion))
-    claimed = covariance[last] + adjoint @ covariance[first] @ np.swapaxes(adjoint, -1, -2)
+    claimed = covariance[last] + turn_covariance(se3_inverse(motion), covariance[first])
     regular = is_regular(claimed)
     sigmas, metres, degrees = (np.full(count, np.nan) for _ in range(3))
     sigmas[last[regular]] = sigmas_of_pose(squared_mahalanobis(errors[regular], claimed[regular]))

@@ -50,12 +50,16 @@ class Reporter:
     ) -> Estimate:
         """What is known after a frame; without a fit by the prediction, without a keyframe nothing."""
         state = self.window.posterior
-        calibration, spread = state.calibration, state.whole_covariance[CALIBRATION, CALIBRATION]
+        calibration, spread, on_calibration = (
+            state.calibration,
+            state.covariance[CALIBRATION, CALIBRATION],
+            state.common[CALIBRATION],
+        )
         by_error = np.zeros((6, CALIBRATION_SIZE))
         if fit is not None:
             pose, absolute, relative = fit.pose, fit.covariance, fit.relative
-            by_error, on_calibration = fit.joint.common[-6:], fit.joint.common[CALIBRATION]
-            calibration, spread = fit.calibration, fit.calibration_covariance + on_calibration @ on_calibration.T
+            calibration, spread = fit.calibration, fit.calibration_covariance
+            on_calibration, by_error = fit.joint.common[CALIBRATION], fit.joint.common[-6:]
         elif len(state):
             prediction = Prediction.of(self.window, self.motion)
             last = pose_slice(len(state) - 1)
@@ -68,8 +72,8 @@ class Reporter:
         T_left_rectified = se3_inverse(self.T_rectified_left)
         adjoint = se3_adjoint(T_left_rectified) @ se3_adjoint(se3_inverse(pose))
         belief = 1.0 - np.sqrt(max(np.linalg.eigvalsh(turn_covariance(se3_inverse(pose), relative))[-1], 0.0))
-        matching = adjoint @ absolute @ adjoint.T
-        covariance = matching + (adjoint @ by_error) @ (adjoint @ by_error).T
+        matching, by_error = adjoint @ absolute @ adjoint.T, adjoint @ by_error
+        covariance = matching + by_error @ by_error.T
         frame_covariance = adjoint @ relative @ adjoint.T if fit is not None else np.zeros((6, 6))
         covariance, matching = _within_half_turn(covariance), _within_half_turn(matching)
         return Estimate(
@@ -83,7 +87,7 @@ class Reporter:
             inliers=fit.count if fit is not None else 0,
             nis=fit.nis if fit is not None else 0.0,
             dof=fit.dof if fit is not None else 0,
-            calibration=self._describe_calibration(calibration, spread),
+            calibration=self._describe_calibration(calibration, spread + on_calibration @ on_calibration.T),
             milliseconds=milliseconds,
             frame_covariance=0.5 * (frame_covariance + frame_covariance.T),
             tracks=tracks,
