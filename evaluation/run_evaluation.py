@@ -1,9 +1,10 @@
 """Evaluate a run, or a trajectory of any origin, against the truth."""
 
 import json
+import logging
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +36,11 @@ from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.plot_style import BLUE, VERMILLION, style_axes
 from sigmaslam.readers.trajectory_files import check_covariances, kitti_times_path, read_trajectory, trajectory_format
 from sigmaslam.runs.figures import AXIS_NAMES, plot_trajectory, save_png
+from sigmaslam.runs.frame_table import FRAMES_NAME, FrameTable, predicted_poses, read_frames
 from sigmaslam.runs.relative_pose_file import RELATIVE_POSES_NAME, read_frame_pairs
-from sigmaslam.runs.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY
+from sigmaslam.runs.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY, check_has_trajectory
+
+_LOGGER = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +62,8 @@ class Evaluation:
         association: how frames were paired: "time", "index" (a file without times, as many poses in both) or
             "time at 10 Hz" (a KITTI file without times).
         matched: number of estimated poses with a true one.
-        frames: number of frames that a full trajectory would have (see `evaluate_run`).
+        frames: number of frames with a truth, with a pose or without (see `evaluate_run`).
+        predicted: number of the matched poses that the motion alone predicts, while the camera was lost.
         path_length, estimate_path_length: of the matched poses, metres.
         ate, ate_origin: absolute error after the best rigid alignment, and with only the first poses equal.
         rpe: error of the motion from frame to frame.
@@ -84,6 +89,7 @@ class Evaluation:
     relative: tuple[SpanConsistency, ...] | None
     figure_path: Path | None
     final: FinalErrors | None = None
+    predicted: int = 0
 
     @property
     def coverage(self) -> float:
@@ -99,6 +105,7 @@ class Evaluation:
             "matched": self.matched,
             "frames": self.frames,
             "coverage": self.coverage,
+            "predicted": self.predicted,
             "path_length": self.path_length,
             "estimate_path_length": self.estimate_path_length,
             **_errors_to_dict(self),
@@ -122,11 +129,11 @@ def evaluate_run(
 ) -> Evaluation:
     """Compare a run folder or a trajectory file with the truth.
 
-    Frames are paired by time. Where either file is KITTI without times.txt and both have as many poses, they
-    are paired by index; where they have not, the 10 Hz of KITTI are assumed and every time must then agree.
+    Frames are paired by time. Where either file is KITTI without times.txt and both have as many poses, or a run has as
+    many frames, they are paired by index; else the 10 Hz of KITTI are assumed and every time must then agree.
     Of a run with `--track-object` the truth is T_camera_object of any frame that is fixed to the body.
-    The frames of a run are those of its `frames.csv`; for a file alone they are as many as fit into the time
-    of the truth at the estimate's rate, and never more than there are true poses.
+    The frames of a run are those of its `frames.csv` that have a truth; for a file alone they are as many as fit into
+    the time of the truth at the estimate's rate, and never more than there are true poses.
 
     Args:
         run_or_trajectory: a folder with `trajectory.tum` (and `covariance.npy`, (N, 6, 6) in the body frame;
@@ -139,14 +146,17 @@ def evaluate_run(
             and about each axis (degrees), for the poses relative to earlier ones; where one alone is given the other is
             zero.
     Raises:
-        InputError: a file is missing or wrong, or the timestamps do not meet.
+        InputError: a file is missing or wrong, no frame has a pose, or the timestamps do not meet.
     """
     run_or_trajectory, truth = Path(run_or_trajectory), Path(truth)
     is_run = run_or_trajectory.is_dir()
     estimate_path = run_or_trajectory / "trajectory.tum" if is_run else run_or_trajectory
-    if is_run and not estimate_path.is_file():
-        raise InputError(f"{run_or_trajectory}: holds no trajectory.tum; give a folder written by `sigmaslam track`")
-    estimate, true, association = _same_clock(estimate_path, truth)
+    frames = None
+    if is_run:
+        check_has_trajectory(run_or_trajectory)
+        if (run_or_trajectory / FRAMES_NAME).is_file():
+            frames = read_frames(run_or_trajectory / FRAMES_NAME)
+    estimate, true, association = _same_clock(estimate_path, truth, frames)
     paired, _ = associate(estimate, true, 1e-3 if association == "time at 10 Hz" else MAX_DIFFERENCE)
     if association == "time at 10 Hz" and len(paired) < len(estimate):
         raise InputError(
@@ -161,12 +171,13 @@ def evaluate_run(
         true = _of_followed_frame(estimate, true)
     covariance = _read_covariance(run_or_trajectory / "covariance.npy", len(estimate)) if is_run else None
     matched_estimate, matched_truth = synchronise(estimate, true)
+    predicted = np.zeros(len(estimate), bool) if frames is None else predicted_poses(frames, estimate.timestamps)
     evaluation = Evaluation(
         estimate_path=estimate_path,
         truth_path=truth,
         association=association,
         matched=len(matched_estimate),
-        frames=_frame_count(run_or_trajectory if is_run else None, estimate, true, len(matched_estimate)),
+        frames=_frame_count(frames, estimate, true, len(matched_estimate)),
         path_length=matched_truth.path_length,
         estimate_path_length=matched_estimate.path_length,
         ate=absolute_trajectory_error(estimate, true, "se3"),
@@ -177,10 +188,15 @@ def evaluate_run(
         relative=relative,
         figure_path=estimate_path.parent / "evaluation.png" if plot else None,
         final=_evaluate_final(run_or_trajectory, estimate, true) if is_run else None,
+        predicted=int(predicted[associate(estimate, true)[0]].sum()),
     )
     if evaluation.figure_path:
-        figure = draw_evaluation(evaluation, estimate, true, covariance)
-        save_png(figure, evaluation.figure_path)
+        figure = draw_evaluation(evaluation, estimate, true, covariance, predicted)
+        try:
+            save_png(figure, evaluation.figure_path)
+        except (OSError, InputError) as error:
+            _LOGGER.warning("evaluation.png is not written: %s", getattr(error, "strerror", None) or error)
+            return replace(evaluation, figure_path=None)
     return evaluation
 
 
@@ -190,7 +206,8 @@ def format_evaluation(evaluation: Evaluation) -> str:
     lines = [
         f"estimate  {e.estimate_path}",
         f"truth     {e.truth_path} (paired by {e.association})",
-        f"frames    {e.matched} of {e.frames} ({100 * e.coverage:.1f} %)",
+        f"frames    {e.matched} of the {e.frames} with a truth have an estimate ({100 * e.coverage:.1f} %)"
+        + (f", {e.predicted} of them while lost, from the motion alone" if e.predicted else ""),
         f"path      {e.path_length:.2f} m true, {e.estimate_path_length:.2f} m estimated",
         "",
         f"{'':<24}{'rmse [m]':>11}{'mean [m]':>11}{'median [m]':>12}{'max [m]':>11}{'rotation [deg]':>16}",
@@ -221,6 +238,7 @@ def draw_evaluation(
     estimate: Trajectory,
     truth: Trajectory,
     covariance: np.ndarray | None = None,
+    predicted: np.ndarray | None = None,
 ) -> Figure:
     """View from above, height, errors over time with 3 sigma, and segment errors.
 
@@ -228,6 +246,7 @@ def draw_evaluation(
         evaluation: of these trajectories.
         estimate, truth: trajectories in one clock.
         covariance: (N, 6, 6) of the estimate, body frame, translation first.
+        predicted: (N,) bool, which poses of the estimate no image confirms; None: none of them.
     """
     spans = evaluation.relative or ()
     rows = (1.5, 1, 1, 1) if spans else (1.5, 1, 1)
@@ -238,7 +257,8 @@ def draw_evaluation(
     seconds = matched_estimate.timestamps - matched_estimate.timestamps[0]
 
     above = figure.add_subplot(grid[0, 0])
-    _, _, height = plot_trajectory(above, {"truth": matched_truth, "estimate": aligned})
+    guesses = {} if predicted is None else {"estimate": predicted[associate(estimate, truth)[0]]}
+    _, _, height = plot_trajectory(above, {"truth": matched_truth, "estimate": aligned}, predicted=guesses)
     above.set_title(f"From above, best alignment: ATE {evaluation.ate.rmse:.3g} m rmse", fontsize=10)
 
     side = figure.add_subplot(grid[0, 1])
@@ -378,8 +398,8 @@ def _evaluate_final(run: Path, estimate: Trajectory, truth: Trajectory) -> Final
     )
 
 
-def _same_clock(estimate_path: Path, truth_path: Path) -> tuple[Trajectory, Trajectory, str]:
-    """Both trajectories, in one clock, and how that was reached."""
+def _same_clock(estimate_path: Path, truth_path: Path, frames: FrameTable | None) -> tuple[Trajectory, Trajectory, str]:
+    """Both trajectories, in one clock, and how that was reached; with all frames of a run, with a pose or without."""
     estimate, truth = read_trajectory(estimate_path), read_trajectory(truth_path)
     untimed = any(
         trajectory_format(path) == "kitti" and kitti_times_path(path) is None for path in (estimate_path, truth_path)
@@ -388,6 +408,8 @@ def _same_clock(estimate_path: Path, truth_path: Path) -> tuple[Trajectory, Traj
         return estimate, truth, "time"
     if len(estimate) == len(truth):
         return estimate, Trajectory(estimate.timestamps, truth.poses), "index"
+    if frames is not None and len(frames) == len(truth):
+        return estimate, Trajectory(frames.columns["timestamp"], truth.poses), "index"
     return estimate, truth, "time at 10 Hz"
 
 
@@ -419,11 +441,11 @@ def _read_covariance(path: Path, count: int) -> np.ndarray | None:
     return check_covariances(covariance, path, count)
 
 
-def _frame_count(run: Path | None, estimate: Trajectory, truth: Trajectory, matched: int) -> int:
-    frames = run / "frames.csv" if run else None
-    if frames and frames.is_file():
-        rows = [line for line in frames.read_text(encoding="utf-8").splitlines() if line.strip()]
-        return max(len(rows) - 1, matched)
+def _frame_count(frames: FrameTable | None, estimate: Trajectory, truth: Trajectory, matched: int) -> int:
+    if frames is not None:
+        times = frames.columns["timestamp"]
+        everywhere = Trajectory(times, np.tile(np.eye(4), (len(times), 1, 1)))
+        return max(len(associate(everywhere, truth)[0]), matched)
     if len(estimate) < 2:
         return max(len(truth), matched)
     interval = float(np.median(np.diff(estimate.timestamps)))

@@ -212,6 +212,8 @@ def _measure(
 def _errors(run: TrialResult, truth: _LapTruth) -> np.ndarray:
     """(N,) distance between every position and the true one, in the world of the first frame, metres."""
     poses = run.trajectory.poses
+    if len(poses) < len(run.table):
+        raise InputError(f"tracking started {len(run.table) - len(poses)} frames late: the lap cannot be compared")
     return np.asarray(np.linalg.norm(poses[:, :3, 3] - truth.poses(len(poses))[:, :3, 3], axis=1))
 
 

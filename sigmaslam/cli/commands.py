@@ -14,12 +14,14 @@ from rich.logging import RichHandler
 from sigmaslam.cli.benchmark import benchmark
 from sigmaslam.cli.evaluate import evaluate
 from sigmaslam.cli.export import export
+from sigmaslam.cli.finish import finish
 from sigmaslam.cli.match import match
 from sigmaslam.cli.refine import refine
 from sigmaslam.cli.render import render
 from sigmaslam.cli.track import demo, track
 from sigmaslam.cli.train import train, train_scorer
 from sigmaslam.errors import SigmaSlamError
+from sigmaslam.files import printable
 
 app = typer.Typer(name="sigmaslam", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
@@ -39,12 +41,12 @@ def _root(
     """Stereo visual SLAM: poses with an honest covariance and a sparse map, on a plain CPU."""
 
 
-for _command in (demo, track, match, evaluate, refine, render, train, train_scorer, export, benchmark):
+for _command in (demo, track, finish, match, evaluate, refine, render, train, train_scorer, export, benchmark):
     app.command()(_command)
 
 
 def main() -> None:
-    """Entry point of the console script; exit code 2 on bad input, 130 on Ctrl-C."""
+    """Entry point of the console script; exit code 2 on bad input or output, 130 on Ctrl-C."""
     logging.basicConfig(
         level=logging.WARNING,
         format="%(message)s",
@@ -53,7 +55,9 @@ def main() -> None:
     try:
         app()
     except SigmaSlamError as error:
-        Console(stderr=True).print(f"error: {error}", style="red", highlight=False, markup=False, soft_wrap=True)
+        Console(stderr=True).print(
+            f"error: {printable(str(error))}", style="red", highlight=False, markup=False, soft_wrap=True
+        )
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)

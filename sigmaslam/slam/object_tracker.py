@@ -166,7 +166,7 @@ class ObjectTracker:
         )
 
     def final_trajectory(self) -> tuple[Trajectory, np.ndarray]:
-        """T_camera_object of all frames with a pose as it is known now, with covariances (N, 6, 6) in the body's own frame."""
+        """T_camera_object of all frames with a pose as known now, covariances (N, 6, 6) in the body's own frame."""
         camera, covariances = self._tracker.final_trajectory()
         for covariance, unseen in zip(covariances, self._unseen_motion, strict=False):
             covariance += unseen

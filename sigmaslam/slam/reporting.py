@@ -19,7 +19,6 @@ from sigmaslam.slam.mapping import KeyframeTracks
 from sigmaslam.slam.relative_poses import RelativePoseReporter
 
 
-
 @dataclass(frozen=True, slots=True)
 class Reporter:
     """Makes estimates of frames.
