@@ -112,7 +112,9 @@ def test_missing_frames_lower_the_coverage(drive):
     (run / "frames.csv").write_text("\n".join([header, *rows]) + "\n")
     evaluation = evaluate_run(run, truth, plot=False)
     assert (evaluation.matched, evaluation.frames, evaluation.predicted) == (156, 186, 3)
-    assert "156 of the 186 with a truth have an estimate (83.9 %), 3 of them while lost" in format_evaluation(evaluation)
+    assert "156 of the 186 with a truth have an estimate (83.9 %), 3 of them while lost" in format_evaluation(
+        evaluation
+    )
 
 
 def test_a_picture_that_cannot_be_written_costs_a_warning_alone(drive, monkeypatch, caplog):

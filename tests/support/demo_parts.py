@@ -13,9 +13,21 @@ Pair = tuple[np.ndarray, np.ndarray]
 
 
 def copy_frames(
-    demo: Path, folder: Path, count: int, change: Callable[[int, np.ndarray, np.ndarray], Pair] | None = None
+    demo: Path,
+    folder: Path,
+    count: int,
+    change: Callable[[int, np.ndarray, np.ndarray], Pair] | None = None,
+    slower: float = 1.0,
 ) -> Path:
-    """Copies frames into a folder of the same layout, with what `change` makes of a number and its pair of images."""
+    """Copies frames into a folder of the same layout.
+
+    Args:
+        demo: folder of the sequence.
+        folder: to make.
+        count: of frames.
+        change: makes another pair of images of a frame's number and its pair.
+        slower: factor on the time between frames.
+    """
     for name in ("image_0", "image_1"):
         (folder / name).mkdir(parents=True)
     for k, image in enumerate(sorted((demo / "image_0").iterdir())[:count]):
@@ -30,7 +42,6 @@ def copy_frames(
         for path, changed in zip(paths, change(k, pair[0], pair[1]), strict=True):
             cv2.imwrite(str(folder / path.parent.name / image.name), changed)
     shutil.copy(demo / "calib.txt", folder)
-    for name in ("times.txt", "poses.txt"):
-        lines = (demo / name).read_text().splitlines(keepends=True)
-        (folder / name).write_text("".join(lines[:count]))
+    (folder / "poses.txt").write_text("".join((demo / "poses.txt").read_text().splitlines(keepends=True)[:count]))
+    np.savetxt(folder / "times.txt", slower * np.loadtxt(demo / "times.txt")[:count], "%.9f")
     return folder

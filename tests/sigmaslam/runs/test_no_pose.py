@@ -28,7 +28,7 @@ def dark_at_first(k: int, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarr
 @pytest.fixture(scope="module")
 def late(demo_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A sequence whose light comes on late, and its run."""
-    source = copy_frames(demo_sequence, tmp_path_factory.mktemp("late") / "sequence", FRAMES, dark_at_first)
+    source = copy_frames(demo_sequence, tmp_path_factory.mktemp("late") / "sequence", FRAMES, dark_at_first, 4.0)
     track_sequence(open_sequence(source), source.with_name("run"), "klt", tracks=True)
     return source, source.with_name("run")
 
@@ -48,6 +48,7 @@ def test_files_of_a_run_are_aligned_from_the_first_pose_on(late: tuple[Path, Pat
     with np.load(run / "tracks.npz") as tracks:
         assert tracks["frame"][0] == 0
         assert tracks["frame"].max() < len(trajectory)
+    assert len(pairs)
     # What is said of a pair of frames is what the trajectory has between them, but for what was learned since.
     for earlier, later, pose in zip(pairs.earlier, pairs.later, pairs.pose, strict=True):
         between = np.linalg.inv(trajectory.poses[earlier]) @ trajectory.poses[later]
