@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,8 @@ class AppendedFile:
         self._path = path
         self._file = path.open("xb", buffering=0)
         if sys.platform != "win32":
-            fcntl.flock(self._file, fcntl.LOCK_EX)
+            with suppress(OSError):  # a file system without locks
+                fcntl.flock(self._file, fcntl.LOCK_EX)
 
     def append(self, content: bytes) -> None:
         """Writes a piece.
@@ -39,7 +41,10 @@ class AppendedFile:
             while left:
                 left = left[self._file.write(left) :]
         except OSError as error:
-            raise OutputError(f"{self._path}: cannot be written ({error.strerror}): make room on the disk") from error
+            raise OutputError(
+                f"{self._path}: cannot be written ({error.strerror}): make room on the disk; "
+                f"`sigmaslam finish {self._path.parent}` then writes the results that are not there"
+            ) from error
 
     def close(self) -> None:
         """Nothing can be appended any more."""

@@ -28,6 +28,8 @@ from sigmaslam.runs.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY, RUN_NA
 from sigmaslam.slam.estimate import CalibrationEstimate
 from sigmaslam.slam.point_map import PointMap
 
+MAP_NAME = "map.npz"
+REPORT_NAME = "report.html"
 _LOGGER = logging.getLogger(__name__)
 
 
@@ -54,8 +56,8 @@ def write_results(
 ) -> tuple[dict[str, Any], list[str]]:
     """Writes trajectory and covariances, then relative poses, map, run.json and report.html.
 
-    Poses and frames are read from the folder. They stay there in their raw form if a trajectory or covariance could not
-    be written.
+    Poses and frames are read from the folder. They stay there in their raw form if something could not be written that
+    can be made of them.
 
     Args:
         folder: of the run.
@@ -78,22 +80,30 @@ def write_results(
         records = records.select(np.zeros(0, np.int64))
     calibration = calibration or _last_calibration(frames, records)
     _write_poses(files, records, run.get("location") is None)
-    poses_failed = bool(files.failed)
-    points = None
+    of_folder = list(files.failed)
+    points = 0
     if len(records) and tracker is not None:
         _write_final(files, tracker, len(records))
         for name, write in tracker.others.items():
             files.attempt(name, write)
         points = _write_map(files, tracker)
+    elif (folder / MAP_NAME).is_file():
+        with np.load(folder / MAP_NAME, allow_pickle=False) as point_map:
+            points = len(point_map["points"])
     summary = _summarise(frames, records, calibration, points)
+    if tracker is None:
+        # Of a first attempt, if there was one.
+        known = ("calibration_verdict", "calibration_errors")
+        summary |= {name: value for name, value in run.get("summary", {}).items() if name in known}
     summary["world"] = _describe_world(summary, run)
     # What the images themselves say of a failure belongs here.
     summary["failure"] = explain_failure(summary, run.get("map") is not None, started)
     content = json.dumps({**run, "summary": summary}, indent=2) + "\n"
     files.attempt(RUN_NAME, lambda path: atomic_write_text(path, content))
     if frames is not None:
-        files.attempt("report.html", _write_report)
-    if not poses_failed:
+        files.attempt(REPORT_NAME, _write_report)
+    of_folder += [name for name in files.failed if name in (RUN_NAME, REPORT_NAME)]
+    if not of_folder:
         for name in (PARTIAL_POSES, PARTIAL_RELATIVE_POSES):
             (folder / name).unlink(missing_ok=True)
     return summary, files.failed
@@ -101,8 +111,8 @@ def write_results(
 
 def output_error(folder: Path, failed: list[str]) -> OutputError:
     """What to say where these files could not be written."""
-    left = f"; then `sigmaslam finish {folder}`" if (folder / PARTIAL_POSES).is_file() else " and run it again"
-    return OutputError(f"{folder}: could not write {', '.join(failed)}; make room on the disk{left}")
+    mend = f"`sigmaslam finish {folder}`" if (folder / PARTIAL_POSES).is_file() else "track again"
+    return OutputError(f"{folder}: could not write {', '.join(failed)}; make room on the disk, then {mend}")
 
 
 class _Files:
@@ -179,8 +189,8 @@ def _write_final(files: _Files, tracker: TrackerResults, count: int) -> None:
     files.attempt(FINAL_TRAJECTORY, write)
 
 
-def _write_map(files: _Files, tracker: TrackerResults) -> int | None:
-    """Writes the map; returns how many points it has, if it could be made."""
+def _write_map(files: _Files, tracker: TrackerResults) -> int:
+    """Writes the map; returns how many points it has."""
     made: list[PointMap] = []
 
     def write(path: Path) -> None:
@@ -190,9 +200,9 @@ def _write_map(files: _Files, tracker: TrackerResults) -> int | None:
         with atomic_path(path) as temporary:
             np.savez_compressed(temporary, **arrays, **tracker.keyframes())
 
-    files.attempt("map.npz", write)
+    files.attempt(MAP_NAME, write)
     if not made:
-        return None
+        return 0
     files.attempt("map.ply", lambda path: write_ply(path, made[0]))
     return len(made[0].points)
 
@@ -204,7 +214,7 @@ def _write_report(path: Path) -> None:
 
 
 def _summarise(
-    frames: FrameTable | None, records: PoseRecords, calibration: CalibrationEstimate | None, points: int | None
+    frames: FrameTable | None, records: PoseRecords, calibration: CalibrationEstimate | None, points: int
 ) -> dict[str, Any]:
     """Counts and verdicts for run.json."""
     inliers = np.zeros(0) if frames is None else frames.columns["inliers"]
@@ -218,7 +228,7 @@ def _summarise(
         "poses": len(records),
         "first_frame_with_pose": first,
         "median_inliers": float(np.median(inliers)) if len(inliers) else 0.0,
-        "map_points": points or 0,
+        "map_points": points,
         "calibration_verdict": _verdict(records, calibration),
         "calibration_errors": {} if calibration is None else {k: list(v) for k, v in calibration.errors.items()},
     }

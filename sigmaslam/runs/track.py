@@ -27,8 +27,6 @@ from sigmaslam.slam.object_region import read_region
 from sigmaslam.slam.object_tracker import ObjectTracker
 from sigmaslam.slam.tracker import StereoTracker
 
-LOCATION_TRAJECTORY = "trajectory_location.tum"
-
 Tracker = StereoTracker | ObjectTracker
 
 
@@ -114,9 +112,8 @@ def track_sequence(
             **_describe_location(location),
         }
         others = {"tracks.npz": writer.write_tracks} if writer.has_tracks else {}
-        trajectory = None if location is None else location.trajectory()
-        if trajectory is not None:
-            others[LOCATION_TRAJECTORY] = lambda path: write_tum(path, trajectory)
+        if location is not None and location.T_sensor_world is not None:
+            others["trajectory_location.tum"] = lambda path: _write_location(path, location)
         # A sensor's readings correct poses as they come, not after the fact.
         final = tracker.final_trajectory if location is None else None
         results = TrackerResults(tracker.map, tracker.pack_keyframes, final, others)
@@ -127,6 +124,13 @@ def track_sequence(
         raise output_error(out, failed)
     summary = {**summary, **timing.describe()}
     return summary if location is None else {**summary, "location": asdict(location.summary)}
+
+
+def _write_location(path: Path, location: LocationFilter) -> None:
+    """Writes the poses in the world of a sensor that is known."""
+    trajectory = location.trajectory()
+    assert trajectory is not None
+    write_tum(path, trajectory)
 
 
 def _describe_end(stopped_by: BaseException | None) -> str:

@@ -204,6 +204,15 @@ def test_finish_of_a_run_that_did_not_track_ends_like_it(demo_sequence: Path, tm
     assert "never started" in finished.stderr
 
 
+def test_finish_of_a_run_without_a_frame_says_so(killed: Path):
+    for name in ("frames.csv", *PARTIAL):
+        content = (killed / name).read_bytes()
+        (killed / name).write_bytes(content[: content.find(b"\n") + 1] if name == "frames.csv" else b"")
+    finished = run_here("finish", killed)
+    assert finished.returncode == 3
+    assert "There was no frame" in finished.stderr
+
+
 def test_finish_refuses_what_is_no_run(tmp_path: Path):
     assert_refused(run_here("finish", tmp_path), "holds no run.json and frames.csv")
 
@@ -238,11 +247,14 @@ def test_a_file_without_room_costs_a_message_and_not_the_others(
     lost = {name} | ({"covariance_final.npy"} if name == "trajectory_final.tum" else set())
     left = {path.name for path in (tmp_path / "run").iterdir()}
     assert left - set(PARTIAL) == {path.name for path in whole.iterdir()} - (lost - {"run.json"}) - {"report.html"}
-    is_pose = name in POSES
-    assert left & set(PARTIAL) == (set(PARTIAL) if is_pose else set())
-    if is_pose:
+    can_be_made = name in (*POSES, "run.json")
+    assert left & set(PARTIAL) == (set(PARTIAL) if can_be_made else set())
+    if can_be_made:
         assert "sigmaslam finish" in result.stderr
         assert run_here("finish", tmp_path / "run").returncode == 0
+        summary = json.loads((tmp_path / "run" / "run.json").read_text())["summary"]
+        undisturbed = json.loads((whole / "run.json").read_text())["summary"]
+        assert summary == undisturbed
     for each in POSES[:-1]:
         assert (tmp_path / "run" / each).read_bytes() == (whole / each).read_bytes(), each
 

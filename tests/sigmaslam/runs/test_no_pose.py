@@ -6,13 +6,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
+from sigmaslam.bundle_adjustment.track_file import read_tracks
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.run_evaluation import evaluate_run, format_evaluation
 from sigmaslam.evaluation.trial import read_trial
+from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import open_sequence
 from sigmaslam.readers.trajectory_files import read_kitti, read_tum, write_kitti
 from sigmaslam.runs.failure import explain_failure
+from sigmaslam.runs.figures import plot_trajectory
 from sigmaslam.runs.frame_table import predicted_poses, read_frames
 from sigmaslam.runs.relative_pose_file import read_frame_pairs
 from sigmaslam.runs.track import track_sequence
@@ -45,9 +49,7 @@ def test_files_of_a_run_are_aligned_from_the_first_pose_on(late: tuple[Path, Pat
     for name in ("covariance", "covariance_matching", "covariance_final"):
         assert np.load(run / f"{name}.npy").shape == (FRAMES - DARK, 6, 6)
     pairs = read_frame_pairs(run / "relative_poses.npz", len(trajectory))
-    with np.load(run / "tracks.npz") as tracks:
-        assert tracks["frame"][0] == 0
-        assert tracks["frame"].max() < len(trajectory)
+    assert read_tracks(run / "tracks.npz", len(trajectory)).frame[0] == 0
     assert len(pairs)
     # What is said of a pair of frames is what the trajectory has between them, but for what was learned since.
     for earlier, later, pose in zip(pairs.earlier, pairs.later, pairs.pose, strict=True):
@@ -157,3 +159,16 @@ def test_poses_are_guesses_where_the_camera_is_lost_or_has_not_moved_yet(tmp_pat
     with_pose = [1, 2, 3, 4, 6, 7]
     predicted = predicted_poses(read_frames(tmp_path / "frames.csv"), 1.5e9 + 0.1 * np.array(with_pose))
     assert predicted.tolist() == [False, True, False, True, True, False]
+
+
+def test_a_path_is_solid_where_it_was_seen_and_dashed_where_it_was_not():
+    positions = np.column_stack([np.arange(6.0), np.zeros(6), np.arange(6.0) ** 2])
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[:, :3, 3] = positions
+    lost = np.array([False, False, True, True, False, False])
+    axes = Figure().add_subplot()
+    plot_trajectory(axes, {"estimate": Trajectory(np.arange(6.0), poses)}, predicted={"estimate": lost})
+    lines = {line.get_linestyle(): np.asarray(line.get_xydata()) for line in axes.lines if len(line.get_xydata()) > 1}
+    drawn = {style: set(np.flatnonzero(np.isfinite(path[:-1] + path[1:]).all(axis=1))) for style, path in lines.items()}
+    # Segments: the ways to a lost frame and from it are not seen either.
+    assert drawn == {"-": {0, 4}, "--": {1, 2, 3}}

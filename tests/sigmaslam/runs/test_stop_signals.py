@@ -26,7 +26,7 @@ def send(number: signal.Signals) -> None:
     signal.getsignal(number)  # Python runs handlers between instructions
 
 
-@pytest.mark.parametrize(("number", "code"), zip(NUMBERS, (130, 143, 129), strict=True))
+@pytest.mark.parametrize(("number", "code"), list(zip(NUMBERS, (130, 143, 129), strict=True)))
 def test_the_first_signal_is_raised_and_later_ones_are_not(number: signal.Signals, code: int):
     before = [signal.getsignal(each) for each in NUMBERS]
     with StopSignals() as signals:
