@@ -72,7 +72,9 @@ def plot_trajectory(
         if guess.any():
             # The ways into a guess and out of it are guesses, too.
             beside = guess | np.append(guess[1:], False) | np.append(False, guess[:-1])
-            axes.plot(*np.where(beside[:, None], path, np.nan).T, "--", lw=0.6 * width, **style)
+            axes.plot(
+                *np.where(beside[:, None], path, np.nan).T, "--", lw=0.6 * width, label=f"{label} while lost", **style
+            )
         axes.plot(path[:1, 0], path[:1, 1], "o", ms=5, **style)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel(f"{AXIS_NAMES[horizontal]} [m]")
