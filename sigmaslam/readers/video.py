@@ -12,7 +12,8 @@ import numpy as np
 
 from sigmaslam.errors import CalibrationError, InputError
 from sigmaslam.geometry.camera import StereoCamera
-from sigmaslam.readers.calibration_files import ImageSize, read_calibration
+from sigmaslam.readers.calibration import find_calibration, read_calibration
+from sigmaslam.readers.image_size import ImageSize
 from sigmaslam.readers.images import IMAGE_SUFFIXES, RawPair
 from sigmaslam.readers.kitti import common_size
 from sigmaslam.readers.stereo_sequence import StereoSequence
@@ -50,10 +51,12 @@ def find_videos(folder: Path) -> tuple[Path, Path] | None:
 
 
 def beside_calibration(folder: Path, calibration: Path | None, image_size: ImageSize) -> StereoCamera:
-    """The calibration given, else calibration.yaml of the folder."""
-    path = calibration or folder / "calibration.yaml"
-    if not path.is_file():
-        raise CalibrationError(f"{path}: no calibration; write it there or give one with --calibration")
+    """The calibration given, else that of the folder."""
+    path = calibration or find_calibration(folder)
+    if path is None:
+        raise CalibrationError(
+            f"{folder / 'calibration.yaml'}: no calibration; write it there or give one with --calibration"
+        )
     return read_calibration(path, image_size)
 
 

@@ -453,7 +453,7 @@ K = np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]])
         ({"P": projection(K, -0.1)}, "/left/camera_info and /right/camera_info: left and right look swapped"),
         ({"P": np.zeros((3, 4))}, "/right/camera_info: not calibrated, P is .*; give --calibration"),
         ({"K": np.zeros((3, 3))}, "/right/camera_info: not calibrated, K is"),
-        ({"model": "fov", "D": [1.0]}, "/right/camera_info: distortion_model is 'fov'; known are radial-tangential"),
+        ({"model": "fov", "D": [1.0]}, "/right/camera_info: distortion_model is 'fov', the field-of-view model"),
         ({"D": [0.1, 0.1]}, "/right/camera_info: distortion has 2 coefficients"),
         ({"size": (128, 96)}, "right image is 64x48, the calibration is for 128x96"),
     ],
