@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 from sigmaslam.cli.benchmark import benchmark
+from sigmaslam.cli.calibration import calibration
 from sigmaslam.cli.evaluate import evaluate
 from sigmaslam.cli.export import export
 from sigmaslam.cli.match import match
@@ -41,6 +42,7 @@ def _root(
 
 for _command in (demo, track, match, evaluate, refine, render, train, train_scorer, export, benchmark):
     app.command()(_command)
+app.add_typer(calibration)
 
 
 def main() -> None:

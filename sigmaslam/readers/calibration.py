@@ -6,10 +6,10 @@ from pathlib import Path
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.checked_yaml import CalibrationYaml
+from sigmaslam.readers.calibration_size import ImageSize, UnknownImageSizeError
 from sigmaslam.readers.camera_infos import is_camera_info, read_camera_infos
 from sigmaslam.readers.euroc_calibration import read_sensors
 from sigmaslam.readers.four_seasons_calibration import UNDISTORTED, read_four_seasons
-from sigmaslam.readers.image_size import ImageSize, UnknownImageSizeError
 from sigmaslam.readers.kalibr_calibration import is_kalibr, read_kalibr
 from sigmaslam.readers.kitti_calibration import GREY_PAIR, read_kitti_calibration
 from sigmaslam.readers.oak_calibration import read_oak

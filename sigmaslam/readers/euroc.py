@@ -12,7 +12,7 @@ from sigmaslam.readers.pairing import is_stamp, list_images, pair_by_stamp
 from sigmaslam.readers.stereo_sequence import StereoSequence
 
 LOOKED_FOR = (
-    "folders cam0/data + cam1/data or mav0/cam0/data + mav0/cam1/data, or images/<ns>_0.* and <ns>_1.* "
+    "(also TUM-VI) folders cam0/data + cam1/data or mav0/cam0/data + mav0/cam1/data, or images/<ns>_0.* and <ns>_1.* "
     "with cam0_sensor.yaml"
 )
 

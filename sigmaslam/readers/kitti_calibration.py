@@ -6,8 +6,8 @@ import numpy as np
 
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
+from sigmaslam.readers.calibration_size import ImageSize, UnknownImageSizeError, need_image_size
 from sigmaslam.readers.camera_infos import right_position
-from sigmaslam.readers.image_size import ImageSize, UnknownImageSizeError, need_image_size
 
 GREY_PAIR = (0, 1)
 

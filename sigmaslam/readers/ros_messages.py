@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sigmaslam.errors import FrameError, InputError
+from sigmaslam.errors import CalibrationError, FrameError, InputError
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.readers.camera_infos import CameraInfo, stereo_from_infos
 from sigmaslam.readers.images import decode_image
@@ -110,6 +110,9 @@ def _camera_info(message: Any, name: str) -> CameraInfo:
         key: np.array(getattr(message, key if hasattr(message, key) else key.lower()), dtype=np.float64)
         for key in ("D", "K", "R", "P")
     }
+    for key, size in (("K", 9), ("R", 9), ("P", 12)):
+        if values[key].size != size:
+            raise CalibrationError(f"{name}: {key} has {values[key].size} numbers, not {size}")
     return CameraInfo(
         name=name,
         width=int(message.width),

@@ -9,7 +9,7 @@ import numpy as np
 
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
-from sigmaslam.readers.image_size import ImageSize, need_image_size
+from sigmaslam.readers.calibration_size import ImageSize, need_image_size
 from sigmaslam.readers.lens_models import read_lens
 
 logger = logging.getLogger(__name__)
