@@ -1,5 +1,6 @@
 """A stereo calibration in any of the forms that people have."""
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -23,10 +24,11 @@ FOLDER_FILES = (
     ("mav0/cam0/sensor.yaml", "mav0/cam1/sensor.yaml"),
     ("cam0/sensor.yaml", "cam1/sensor.yaml"),
     ("cam0_sensor.yaml", "cam1_sensor.yaml"),
+    # Beside a camchain.yaml, which is of 4Seasons' distorted images.
+    UNDISTORTED,
     ("*camchain*.yaml",),
     ("dso/camchain.yaml",),
     ("intrinsics.yml", "extrinsics.yml"),
-    UNDISTORTED,
     ("SN*.conf",),
     ("calib*.json",),
     ("calib.txt",),
@@ -35,7 +37,10 @@ FOLDER_FILES = (
 
 
 def read_calibration(
-    path: Path, image_size: ImageSize | None = None, cameras: tuple[int, int] = GREY_PAIR, rectified: bool = False
+    path: str | os.PathLike[str],
+    image_size: ImageSize | None = None,
+    cameras: tuple[int, int] = GREY_PAIR,
+    rectified: bool = False,
 ) -> StereoCamera:
     """Read a calibration; its content says what it is.
 
@@ -52,7 +57,7 @@ def read_calibration(
         CalibrationError: names file, key and what was expected.
         UnknownImageSizeError: the image size is needed.
     """
-    paths = _files(path)
+    paths = _files(Path(path))
     if len(paths) == len(UNDISTORTED):
         return read_four_seasons(paths)
     texts = [_read_text(each) for each in paths]
@@ -98,8 +103,8 @@ def calibrated_size(path: Path) -> ImageSize | None:
 
 
 def find_calibration(folder: Path) -> Path | None:
-    """The calibration in a folder, as `read_calibration` takes it; None where there is none."""
-    return next((Path(",".join(map(str, paths))) for paths in _candidates(folder)), None)
+    """The file of the calibration in a folder, the folder itself where it has more than one; None where it has none."""
+    return next((paths[0] if len(paths) == 1 else folder for paths in _candidates(folder)), None)
 
 
 def _candidates(folder: Path) -> Iterator[list[Path]]:

@@ -41,9 +41,8 @@ def open_four_seasons(folder: Path, calibration: Path | None = None) -> StereoSe
 def _find_undistorted(folder: Path) -> Path:
     folders = [folder, *(top / name for top in (folder, folder.parent) for name in ("calibration", "Calibration"))]
     for candidate in folders:
-        files = [candidate / name for name in UNDISTORTED]
-        if all(path.is_file() for path in files):
-            return Path(",".join(map(str, files)))
+        if all((candidate / name).is_file() for name in UNDISTORTED):
+            return candidate
     raise CalibrationError(
         f"{folder}: no {', '.join(UNDISTORTED)} in {', '.join(map(str, folders))}; give one with --calibration"
     )

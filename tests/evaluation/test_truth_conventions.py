@@ -66,8 +66,8 @@ CONVENTIONS = [
 @pytest.mark.parametrize("convention", CONVENTIONS[1:], ids=TruthConvention.describe)
 def test_a_convention_is_named_and_its_options_undo_it(truth: Trajectory, tmp_path: Path, convention: TruthConvention):
     across = np.linalg.svd(truth.positions - truth.positions.mean(axis=0), compute_uv=False)
-    if convention.inverse and convention.quaternion == "wxyz" and across[1] < 0.05 * across[0]:
-        pytest.skip("on a straight road the two turn the path to and fro: nothing tells them")
+    if convention.inverse and convention.quaternion == "wxyz" and across[1] < 0.005 * across[0]:
+        pytest.skip("a road straight to 0.2 %: the two turn it to and fro, and the drift is larger than what is left")
     write_estimate(tmp_path / "estimate.tum", truth)
     write_tum(tmp_path / "plain.tum", truth)
     write_truth(tmp_path / "truth.tum", truth, convention)

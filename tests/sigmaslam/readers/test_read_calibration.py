@@ -137,6 +137,20 @@ def test_a_folder_with_a_calibration_is_one(tmp_path: Path, form: str):
     assert_same_rig(read_calibration(found, SIZE), rig)
 
 
+def test_folders_may_have_commas_in_their_names(tmp_path: Path):
+    (tmp_path / "one, two").mkdir()
+    RAW_FORMS["ROS"](raw_rig("radtan"), tmp_path / "one, two")
+    found = find_calibration(tmp_path / "one, two")
+    assert found is not None
+    assert_same_rig(read_calibration(found), raw_rig("radtan"))
+
+
+def test_of_4seasons_the_undistorted_calibration_is_taken(tmp_path: Path):
+    forms.write_kalibr(raw_rig("equidistant"), tmp_path)
+    forms.write_four_seasons(rectified_rig(), tmp_path)
+    assert_same_rig(read_calibration(tmp_path), rectified_rig())
+
+
 def test_a_folder_without_a_calibration_says_what_it_looked_for(tmp_path: Path):
     assert find_calibration(tmp_path) is None
     with pytest.raises(CalibrationError) as caught:
