@@ -43,8 +43,8 @@ def evaluate(
     truth_frame: Annotated[
         Frame, typer.Option(help="Whose poses the truth has: of the camera (z ahead), or of a body with x ahead.")
     ] = Frame.camera,
-    truth_inverse: Annotated[bool, typer.Option("--truth-inverse", help="The truth takes the world into it.")] = False,
-    truth_quaternion: Annotated[Quaternion, typer.Option(help="Order in a TUM file.")] = Quaternion.xyzw,
+    truth_inverse: Annotated[bool, typer.Option("--truth-inverse", help="The truth is T_camera_world.")] = False,
+    truth_quaternion: Annotated[Quaternion, typer.Option(help="Order of a TUM truth's quaternions.")] = Quaternion.xyzw,
     truth_unit: Annotated[Unit, typer.Option(help="Of the true positions.")] = Unit.m,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:

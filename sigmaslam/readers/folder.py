@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from sigmaslam.errors import CalibrationError, InputError
-from sigmaslam.readers.calibration import find_calibration
+from sigmaslam.errors import InputError
 from sigmaslam.readers.images import IMAGE_SUFFIXES, ImagePairs
 from sigmaslam.readers.kitti import common_size
 from sigmaslam.readers.pairing import (
@@ -62,11 +61,5 @@ def open_folder(folder: Path, calibration: Path | None = None) -> StereoSequence
         files = pair_by_name(left, right, prefixes)
         timestamps = read_times(times, len(files)) if times.is_file() else default_times(range(len(files)), folder)
     pairs = ImagePairs(files, timestamps, folder)
-    found = find_calibration(folder)
-    if calibration is None and left == right and found is not None and found.suffix == ".conf":
-        raise CalibrationError(
-            f"{found}: is of raw images; left*, right* in one folder are what the ZED SDK exports, rectified: write "
-            "its calibration_parameters into calibration.yaml; if the images are raw, give --calibration"
-        )
-    camera = beside_calibration(folder, calibration, common_size(pairs.first_pair))
+    camera = beside_calibration(folder, calibration, common_size(pairs.first_pair), zed_export=left == right)
     return StereoSequence(pairs, camera, folder, "folder")

@@ -4,6 +4,7 @@ import logging
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -13,6 +14,7 @@ from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.readers import open_sequence
 from tests.support import calibration_forms as forms
 from tests.support.calibration_yaml import write_calibration
+from tests.support.videos import write_video
 
 FRAMES = 8
 START = 1520530308199447626
@@ -126,9 +128,18 @@ def test_zed_export_in_one_folder(tmp_path: Path, demo_sequence: Path, rig: Ster
         open_sequence(tmp_path)
 
 
-def test_raw_images_of_a_zed_take_its_factory_calibration(tmp_path: Path, caplog):
-    import cv2
+def test_zed_export_as_a_video(tmp_path: Path):
+    zed = forms.raw_rig("radtan")
+    rng = np.random.default_rng(0)
+    frames = [rng.integers(0, 255, (zed.left.height, 2 * zed.left.width), dtype=np.uint8) for _ in range(3)]
+    write_video(tmp_path / "export.avi", frames, 15.0)
+    path = forms.write_zed(zed, tmp_path)
+    with pytest.raises(CalibrationError, match=r"is of raw images.* give --calibration"):
+        open_sequence(tmp_path / "export.avi")
+    forms.assert_same_rig(open_sequence(tmp_path / "export.avi", calibration=path).camera, zed)
 
+
+def test_raw_images_of_a_zed_take_its_factory_calibration(tmp_path: Path, caplog):
     zed = forms.raw_rig("radtan")
     for eye in ("left", "right"):
         (tmp_path / eye).mkdir()
