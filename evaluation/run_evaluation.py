@@ -31,6 +31,7 @@ from sigmaslam.evaluation.metrics.trajectory_errors import (
     synchronise,
 )
 from sigmaslam.evaluation.relative_summary import draw_relative, format_relative, span_to_dict
+from sigmaslam.evaluation.truth_conventions import TruthConvention, find_convention, find_time_unit, scale_times
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.plot_style import BLUE, VERMILLION, style_axes
@@ -59,8 +60,8 @@ class Evaluation:
 
     Attributes:
         estimate_path, truth_path: the files that were compared.
-        association: how frames were paired: "time", "index" (a file without times, as many poses in both) or
-            "time at 10 Hz" (a KITTI file without times).
+        association: how frames were paired: "time" (with the unit where the truth's times are not in seconds), "index"
+            (a file without times, as many poses in both) or "time at 10 Hz" (a KITTI file without times).
         matched: number of estimated poses with a true one.
         frames: number of frames with a truth, with a pose or without (see `evaluate_run`).
         predicted: number of the matched poses that the motion alone predicts, while the camera was lost.
@@ -72,6 +73,8 @@ class Evaluation:
         relative: consistency of poses relative to earlier ones, by span; None where the run does not say.
         figure_path: the plots; None where none were asked for.
         final: of the trajectory after the fact; None where there is none.
+        truth_hint: the convention in which the truth would fit, in words and as options; None where it fits as it was
+            read, or in no way.
     """
 
     estimate_path: Path
@@ -90,6 +93,7 @@ class Evaluation:
     figure_path: Path | None
     final: FinalErrors | None = None
     predicted: int = 0
+    truth_hint: str | None = None
 
     @property
     def coverage(self) -> float:
@@ -102,6 +106,7 @@ class Evaluation:
             "estimate": str(self.estimate_path),
             "truth": str(self.truth_path),
             "association": self.association,
+            "truth_hint": self.truth_hint,
             "matched": self.matched,
             "frames": self.frames,
             "coverage": self.coverage,
@@ -126,6 +131,7 @@ def evaluate_run(
     plot: bool = True,
     truth_sigma_position: float | None = None,
     truth_sigma_rotation: float | None = None,
+    truth_convention: TruthConvention | None = None,
 ) -> Evaluation:
     """Compare a run folder or a trajectory file with the truth.
 
@@ -133,7 +139,8 @@ def evaluate_run(
     many frames, they are paired by index; else the 10 Hz of KITTI are assumed and every time must then agree.
     Of a run with `--track-object` the truth is T_camera_object of any frame that is fixed to the body.
     The frames of a run are those of its `frames.csv` that have a truth; for a file alone they are as many as fit into
-    the time of the truth at the estimate's rate, and never more than there are true poses.
+    the time of the truth at the estimate's rate, and never more than there are true poses. Where the truth would fit in
+    another convention the evaluation says so, and is not changed.
 
     Args:
         run_or_trajectory: a folder with `trajectory.tum` (and `covariance.npy`, (N, 6, 6) in the body frame;
@@ -145,6 +152,7 @@ def evaluate_run(
         truth_sigma_position, truth_sigma_rotation: standard deviations of each true pose, of each coordinate (metres)
             and about each axis (degrees), for the poses relative to earlier ones; where one alone is given the other is
             zero.
+        truth_convention: how the truth is to be read; None: as T_world_camera in metres, x before w.
     Raises:
         InputError: a file is missing or wrong, no frame has a pose, or the timestamps do not meet.
     """
@@ -165,6 +173,11 @@ def evaluate_run(
             "times.txt of the images beside the pose file"
         )
     follows_object = is_run and _follows_object(run_or_trajectory)
+    convention, has_quaternions = truth_convention or TruthConvention(), trajectory_format(truth) == "tum"
+    if convention.quaternion != "xyzw" and not has_quaternions:
+        raise InputError(f"{truth}: the order of quaternions can be chosen for TUM files alone, and this is none")
+    other = None if follows_object else find_convention(estimate, true, convention, has_quaternions)
+    true = convention.apply(true)
     sigmas = truth_sigma_position, truth_sigma_rotation
     relative = _judge_relative_poses(run_or_trajectory, estimate, true, sigmas, follows_object) if is_run else None
     if follows_object:
@@ -189,6 +202,7 @@ def evaluate_run(
         figure_path=estimate_path.parent / "evaluation.png" if plot else None,
         final=_evaluate_final(run_or_trajectory, estimate, true) if is_run else None,
         predicted=int(predicted[associate(estimate, true)[0]].sum()),
+        truth_hint=None if other is None else other.describe(),
     )
     if evaluation.figure_path:
         figure = draw_evaluation(evaluation, estimate, true, covariance, predicted)
@@ -209,6 +223,7 @@ def format_evaluation(evaluation: Evaluation) -> str:
         f"frames    {e.matched} of the {e.frames} with a truth have an estimate ({100 * e.coverage:.1f} %)"
         + (f", {e.predicted} of them while lost, from the motion alone" if e.predicted else ""),
         f"path      {e.path_length:.2f} m true, {e.estimate_path_length:.2f} m estimated",
+        *([f"The truth looks like {e.truth_hint}"] if e.truth_hint else []),
         "",
         f"{'':<24}{'rmse [m]':>11}{'mean [m]':>11}{'median [m]':>12}{'max [m]':>11}{'rotation [deg]':>16}",
         *_error_rows(e),
@@ -340,10 +355,16 @@ def _judge_relative_poses(
 
 def _error_rows(errors: Evaluation | FinalErrors) -> list[str]:
     """ATE and RPE, a line each."""
+    # On a straight path the best alignment may turn about the path, by much more than the rotations are wrong.
+    rotation_error = errors.ate_origin.rotation_rmse_deg
+    straight = errors.ate.turn_deg > rotation_error and errors.ate.rotation_rmse_deg > 2 * rotation_error
+    turn = "not determined" if straight else f"{errors.ate.rotation_rmse_deg:.4f}"
     rows = [
-        f"{name:<24}{ate.rmse:>11.4f}{ate.mean:>11.4f}{ate.median:>12.4f}{ate.maximum:>11.4f}"
-        f"{ate.rotation_rmse_deg:>16.4f}"
-        for name, ate in (("ATE, best alignment", errors.ate), ("ATE, first pose", errors.ate_origin))
+        f"{name:<24}{ate.rmse:>11.4f}{ate.mean:>11.4f}{ate.median:>12.4f}{ate.maximum:>11.4f}{rotation:>16}"
+        for name, ate, rotation in (
+            ("ATE, best alignment", errors.ate, turn),
+            ("ATE, first pose", errors.ate_origin, f"{errors.ate_origin.rotation_rmse_deg:.4f}"),
+        )
     ]
     rpe = errors.rpe
     name = f"RPE, {rpe.delta} frame" + ("s" if rpe.delta > 1 else "")
@@ -405,7 +426,10 @@ def _same_clock(estimate_path: Path, truth_path: Path, frames: FrameTable | None
         trajectory_format(path) == "kitti" and kitti_times_path(path) is None for path in (estimate_path, truth_path)
     )
     if not untimed:
-        return estimate, truth, "time"
+        unit = find_time_unit(estimate, truth)
+        if unit is None:
+            return estimate, truth, "time"
+        return estimate, scale_times(truth, unit), f"time, that of the truth in {unit}"
     if len(estimate) == len(truth):
         return estimate, Trajectory(estimate.timestamps, truth.poses), "index"
     if frames is not None and len(frames) == len(truth):

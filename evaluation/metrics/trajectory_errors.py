@@ -35,6 +35,8 @@ class AbsoluteError:
         rmse, mean, median, maximum: of the distance between positions, metres.
         rotation_rmse_deg: root mean square of the rotation angle between aligned and true poses, degrees.
         count: number of associated poses.
+        turn_deg: by how much the alignment may turn about the path and change no position by more than `rmse`: large
+            for a straight path, where `rotation_rmse_deg` says little; zero for "origin".
     """
 
     rmse: float
@@ -43,6 +45,7 @@ class AbsoluteError:
     maximum: float
     rotation_rmse_deg: float
     count: int
+    turn_deg: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,13 +201,18 @@ def absolute_trajectory_error(estimate: Trajectory, truth: Trajectory, alignment
     aligned = align(estimate, truth, alignment)
     distance = np.linalg.norm(aligned.positions - truth.positions, axis=1)
     angle = _angles_deg(np.swapaxes(truth.rotations, 1, 2) @ aligned.rotations)
+    rmse = _root_mean_square(distance)
+    # The second singular value is the extent of the path across the direction in which it is longest.
+    centred = truth.positions - truth.positions.mean(axis=0)
+    across = float(np.linalg.svd(centred, compute_uv=False)[1:2].sum()) / math.sqrt(len(distance))
     return AbsoluteError(
-        rmse=_root_mean_square(distance),
+        rmse=rmse,
         mean=float(distance.mean()),
         median=float(np.median(distance)),
         maximum=float(distance.max()),
         rotation_rmse_deg=_root_mean_square(angle),
         count=len(distance),
+        turn_deg=math.degrees(math.atan2(rmse, across)) if alignment == "se3" else 0.0,
     )
 
 

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 from sigmaslam.cli.benchmark import benchmark
+from sigmaslam.cli.calibration import calibration
 from sigmaslam.cli.evaluate import evaluate
 from sigmaslam.cli.export import export
 from sigmaslam.cli.finish import finish
@@ -57,6 +58,7 @@ for _command in (
     benchmark,
 ):
     app.command()(_command)
+app.add_typer(calibration)
 
 
 def main() -> None:

@@ -57,7 +57,10 @@ def track(
     ] = None,
     format: Annotated[InputFormat, typer.Option(help="Kind of input.")] = InputFormat["auto"],
     calibration: Annotated[
-        Path | None, typer.Option(help="Calibration YAML (or KITTI calib.txt) instead of the input's own.")
+        Path | None,
+        typer.Option(
+            help="Calibration of any form (docs/input.md), or two as left.yaml,right.yaml, instead of the input's own."
+        ),
     ] = None,
     frontend: Annotated[Frontend, typer.Option(help="Where correspondences come from.")] = Frontend["learned"],
     backend: Annotated[

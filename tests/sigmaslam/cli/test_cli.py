@@ -229,7 +229,8 @@ def test_training_without_its_extra_says_how_to_install_it(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    "command", ["demo", "track", "evaluate", "match", "render", "train", "train-scorer", "export", "benchmark"]
+    "command",
+    ["demo", "track", "evaluate", "match", "calibration", "render", "train", "train-scorer", "export", "benchmark"],
 )
 def test_every_command_has_help(command: str):
     result = run_here(command, "--help")
