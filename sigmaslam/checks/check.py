@@ -9,7 +9,7 @@ import numpy as np
 
 from sigmaslam.checks.calibration import check_calibration
 from sigmaslam.checks.eye_matches import EyeMatcher, EyeMatches
-from sigmaslam.checks.finding import Finding, has_errors
+from sigmaslam.checks.finding import Finding, has_errors, wrong
 from sigmaslam.checks.images import check_images
 from sigmaslam.checks.rig import TOO_FEW, check_pairing, check_rig, suspect_pairing, unknown_rig
 from sigmaslam.checks.row_fit import MIN_INLIERS, MIN_MATCHES
@@ -23,6 +23,7 @@ SAMPLES_BEFORE_TRACKING = 4
 """Pairs that are looked at before tracking: under two seconds."""
 # An image that was turned or mirrored gives so many times the matches once that is undone.
 _BETTER = 3.0
+_INTRINSICS = {"principal point", "focal length"}
 _TURNS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "mirrored left to right": lambda image: image[:, ::-1],
     "mirrored top to bottom": lambda image: image[::-1],
@@ -64,7 +65,8 @@ def check_sequence(sequence: StereoSequence, samples: int = SAMPLES, threads: in
         intervals = np.array([after.timestamp - frame.timestamp for frame, after in steps if after is not None])
     rectifier = StereoRectifier(sequence.camera)
     matcher = EyeMatcher(rectifier, threads)
-    findings = [check_time_stamps(intervals.tolist()), *check_calibration(sequence.camera)]
+    calibration = check_calibration(sequence.camera)
+    findings = [check_time_stamps(intervals.tolist()), *calibration]
     if not steps:
         return Check(findings, [], [], EyeMatches.empty())
     images = check_images([(frame.left, frame.right) for frame, _ in steps])
@@ -81,14 +83,21 @@ def check_sequence(sequence: StereoSequence, samples: int = SAMPLES, threads: in
         if overlap.severity == "error":
             findings += unknown_rig(TOO_FEW)
         else:
-            findings += _check_rig(matches, steps, matcher, interval)
+            findings += _check_rig(matches, steps, matcher, interval, {each.name for each in wrong(calibration)})
     return Check(findings, steps, [rectifier.rectify(frame.left, frame.right) for frame, _ in steps], matches)
 
 
 def _check_rig(
-    matches: EyeMatches, steps: Sequence[FrameStep], matcher: EyeMatcher, interval: float | None
+    matches: EyeMatches,
+    steps: Sequence[FrameStep],
+    matcher: EyeMatcher,
+    interval: float | None,
+    wrong_calibration: set[str],
 ) -> list[Finding]:
     rectifier = matcher.rectifier
+    if wrong_calibration & _INTRINSICS:
+        # Lenses that are undistorted wrongly move rows as a delay does.
+        return check_rig(matches.unfollowed(), rectifier, interval)
     pairing = None
     if suspect_pairing(matches, rectifier):
         pairing = check_pairing(matches, _shift_frames(steps, matcher), rectifier, interval)

@@ -11,6 +11,7 @@ from sigmaslam.checks.finding import Finding, Severity
 from sigmaslam.checks.hypotheses import exchange_eyes, leave_unrectified, stand_upright
 from sigmaslam.checks.row_fit import MIN_MATCHES, SIGNIFICANT, RowFit, fit_rows
 from sigmaslam.frontend.row_search import ROW_TOLERANCE
+from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.two_view.epipolar import estimate_epipolar_pose
 
@@ -48,17 +49,13 @@ def check_rig(matches: EyeMatches, rectifier: StereoRectifier, frame_interval: f
     view = rectifier.rectified
     given = fit_rows(matches, view)
     share = given.agreement(ROW_TOLERANCE)
-
-    def explains(other: EyeMatches) -> float:
-        return fit_rows(other, view).agreement(ROW_TOLERANCE) if len(other) >= MIN_MATCHES else 0.0
-
     exchanged = exchange_eyes(matches, rectifier)
-    swapped = explains(exchanged)
+    swapped = _agreement(exchanged, view)
     findings = [_check_eyes(matches, share, swapped)]
     if findings[0].severity == "error":
         # The other checks judge the rig as it is once the eyes are exchanged.
         matches, given, share = exchanged, fit_rows(exchanged, view), swapped
-    findings.append(_check_position(matches, rectifier, share, explains(stand_upright(matches))))
+    findings.append(_check_position(matches, rectifier, share, _agreement(stand_upright(matches), view)))
     findings.append(_check_distortion(matches, rectifier))
     if share < _EXPLAINED:
         return findings + unknown_rig("the matches do not follow the calibrated rig", _NAMES[3:])
@@ -159,8 +156,8 @@ def _check_synchronisation(fit: RowFit, frame_interval: float | None) -> Finding
     return Finding(
         _SYNCHRONISATION,
         "error" if float(np.median(np.abs(fit.by_lag[:, 1]))) > ROW_TOLERANCE else "warning",
-        f"the right images are {figure} {_when(fit.lag)} than the left ones, which moves them by {fit.lag_shift:.1f} px "
-        "in the median: trigger both cameras together",
+        f"the right images are {figure} {_when(fit.lag)} than the left ones, which moves them by {fit.lag_shift:.1f} "
+        "px in the median: trigger both cameras together",
         fit.lag,
     )
 
@@ -170,7 +167,9 @@ def suspect_pairing(matches: EyeMatches, rectifier: StereoRectifier) -> bool:
     if len(matches) < MIN_MATCHES:
         return False
     fit = fit_rows(matches, rectifier.rectified)
-    return fit.lag_shift >= _WARN_LAG or fit.agreement(ROW_TOLERANCE) < _EXPLAINED
+    if fit.agreement(ROW_TOLERANCE) >= _EXPLAINED:
+        return fit.lag_shift >= _WARN_LAG
+    return _agreement(exchange_eyes(matches, rectifier), rectifier.rectified) < _EXPLAINED
 
 
 def check_pairing(
@@ -266,10 +265,15 @@ def _check_infinity(fit: RowFit) -> Finding:
     return Finding(
         "infinity",
         "error" if behind > _MAX_BEHIND else "warning",
-        f"{100 * behind:.0f} % of the matches lie behind infinity, with disparities from {lowest:.1f} px: cx of one eye "
-        "or the yaw of the right camera is wrong: calibrate again",
+        f"{100 * behind:.0f} % of the matches lie behind infinity, with disparities from {lowest:.1f} px: cx of one "
+        "eye or the yaw of the right camera is wrong: calibrate again",
         behind,
     )
+
+
+def _agreement(matches: EyeMatches, view: RectifiedStereo) -> float:
+    """Share of the matches that follow a rig which is nearly that of `view`; zero with few matches."""
+    return fit_rows(matches, view).agreement(ROW_TOLERANCE) if len(matches) >= MIN_MATCHES else 0.0
 
 
 def _spread(values: np.ndarray) -> float:

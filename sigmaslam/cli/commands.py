@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 from sigmaslam.cli.benchmark import benchmark
+from sigmaslam.cli.check import check
 from sigmaslam.cli.evaluate import evaluate
 from sigmaslam.cli.export import export
 from sigmaslam.cli.match import match
@@ -39,12 +40,12 @@ def _root(
     """Stereo visual SLAM: poses with an honest covariance and a sparse map, on a plain CPU."""
 
 
-for _command in (demo, track, match, evaluate, refine, render, train, train_scorer, export, benchmark):
+for _command in (demo, check, track, match, evaluate, refine, render, train, train_scorer, export, benchmark):
     app.command()(_command)
 
 
 def main() -> None:
-    """Entry point of the console script; exit code 2 on bad input, 130 on Ctrl-C."""
+    """Entry point of the console script; exit code 1 on errors that `check` finds, 2 on bad input, 130 on Ctrl-C."""
     logging.basicConfig(
         level=logging.WARNING,
         format="%(message)s",

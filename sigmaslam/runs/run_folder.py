@@ -9,6 +9,7 @@ import platform
 import tempfile
 from array import array
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -16,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from sigmaslam.checks.finding import Finding
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder
 from sigmaslam.geometry.camera import StereoCamera
@@ -24,6 +26,7 @@ from sigmaslam.inference.onnx_graph import shipped_weights
 from sigmaslam.readers.trajectory_files import write_kitti, write_tum
 from sigmaslam.runs.frame_table import COLUMNS
 from sigmaslam.runs.relative_pose_file import RelativePoseWriter
+from sigmaslam.runs.verdict import calibration_verdict, expected_offset
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.slam.mapping import KeyframeTracks
 from sigmaslam.slam.point_map import PointMap
@@ -120,6 +123,7 @@ class RunWriter:
         keyframes: dict[str, Any],
         run: dict[str, Any],
         final: tuple[Trajectory, np.ndarray] | None = None,
+        findings: Sequence[Finding] = (),
     ) -> dict[str, Any]:
         """Writes trajectory, covariance, relative poses, map, run.json and report.html.
 
@@ -129,11 +133,12 @@ class RunWriter:
             run: entries of run.json beside versions, weights and the summary.
             final: the frames as they are known now, with covariances; they are written beside those said at once. None
                 where other sensors corrected the poses, whose covariances then have no part of matches alone.
+            findings: what a check of the input found.
         Returns:
             The summary.
         """
         self._table.close()
-        summary = self._summary(point_map)
+        summary = self._summary(point_map, expected_offset(run["calibration"]), findings)
         content = {**run, "versions": _versions(), "weights_sha256": _weight_hashes(), "summary": summary}
         atomic_write_text(self._out / "run.json", json.dumps(content, indent=2) + "\n")
         self._poses.seek(0)
@@ -177,40 +182,20 @@ class RunWriter:
                 **self._rectified,
             )
 
-    def _summary(self, point_map: PointMap) -> dict[str, Any]:
-        last = self._calibration
+    def _summary(self, point_map: PointMap, expected: float, findings: Sequence[Finding]) -> dict[str, Any]:
+        last, points = self._calibration, len(point_map.points)
+        tracked = self._statuses["tracking"]
         return {
             "frames": self._statuses.total() + self._skipped,
             "skipped": self._skipped,
             **{status: self._statuses[status] for status in ("starting", "tracking", "relocalised", "lost")},
             "median_inliers": float(np.median(self._inliers)) if self._inliers else 0.0,
-            "map_points": len(point_map.points),
-            "calibration_verdict": calibration_verdict(last) if last else "No frame was read.",
+            "map_points": points,
+            "calibration_verdict": (
+                calibration_verdict(last, tracked, points, expected, findings) if last else "No frame was read."
+            ),
             "calibration_errors": {name: list(each) for name, each in last.errors.items()} if last else {},
         }
-
-
-def calibration_verdict(calibration: CalibrationEstimate) -> str:
-    """The estimated disparity offset in words."""
-    offset, sigma = calibration.disparity_offset, calibration.disparity_offset_sigma
-    figure = f"{offset:+.2f} ± {sigma:.2f} px"
-    if calibration.refused_offset:
-        return (
-            f"The images ask for a disparity offset of {calibration.refused_offset:+.1f} px, which is more than "
-            "calibrations are off by: nothing was corrected. A lens, the baseline or the right camera is wrong: "
-            "calibrate again."
-        )
-    if sigma > 0.2:
-        return (
-            f"It is too early to say whether the rectification is right (disparity offset {figure}): more frames, or "
-            "things nearer and farther, would tell."
-        )
-    if abs(offset) > max(3.0 * sigma, 0.1):
-        return (
-            f"The rectification is off by {figure} of disparity. The poses are corrected for it; depth measured with "
-            "this calibration elsewhere is not: calibrate again."
-        )
-    return f"The disparity offset is {figure}: nothing wrong with the rectification can be seen."
 
 
 def _save(path: Path, array: np.ndarray) -> None:

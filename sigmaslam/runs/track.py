@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from sigmaslam.checks.finding import Finding
 from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.fusion.location_filter import LocationFilter
 from sigmaslam.fusion.readings import Locations
@@ -38,6 +39,7 @@ def track_sequence(
     locations: Locations | None = None,
     real_time: bool = False,
     threads: int = 2,
+    findings: Sequence[Finding] = (),
 ) -> dict[str, Any]:
     """Tracks a sequence and writes the run folder; partial results are kept when it is stopped or fails.
 
@@ -52,6 +54,7 @@ def track_sequence(
         locations: readings to fuse of a sensor on the moving camera or body; writes trajectory_location.tum, too, the
             poses in the sensor's world.
         real_time: play a recording at its time stamps; frames are dropped when tracking falls behind.
+        findings: what a check of the input found, for run.json and the verdict on the calibration.
     Returns:
         The summary in run.json; with `locations` also the counts of the readings, under `location`, and in real time
         what was dropped and the latency, under `real_time`.
@@ -97,6 +100,7 @@ def track_sequence(
                 "frontend": frontend,
                 "backend": backend,
                 "ended": ended,
+                "checks": [asdict(each) for each in findings],
                 "dropped": timing.dropped,
                 **timing.describe(),
                 "configuration": asdict(tracker.config),
@@ -106,6 +110,7 @@ def track_sequence(
             },
             # A sensor's readings correct poses as they come, not after the fact.
             tracker.final_trajectory() if location is None else None,
+            findings,
         )
         trajectory = None if location is None else location.trajectory()
         if trajectory is not None:
