@@ -55,9 +55,9 @@ def check_rig(matches: EyeMatches, rectifier: StereoRectifier, frame_interval: f
     if findings[0].severity == "error":
         # The other checks judge the rig as it is once the eyes are exchanged.
         matches, given, share = exchanged, fit_rows(exchanged, view), swapped
-    findings.append(_check_position(matches, rectifier, share, _agreement(stand_upright(matches), view)))
+    findings.append(_check_position(given, rectifier, share))
     findings.append(_check_distortion(matches, rectifier))
-    if share < _EXPLAINED:
+    if findings[1].severity == "error":
         return findings + unknown_rig("the matches do not follow the calibrated rig", _NAMES[3:])
     findings.append(_check_synchronisation(given, frame_interval))
     if findings[-1].severity not in ("ok", "unknown"):
@@ -83,18 +83,22 @@ def _check_eyes(matches: EyeMatches, given: float, swapped: float) -> Finding:
     return Finding("eyes", "ok", f"left is left: {100 * given:.0f} % of the matches have the right order", given)
 
 
-def _check_position(matches: EyeMatches, rectifier: StereoRectifier, share: float, upright: float) -> Finding:
+def _check_position(given: RowFit, rectifier: StereoRectifier, share: float) -> Finding:
     """Where the right camera is, if the matches do not follow the calibration."""
-    if share >= _EXPLAINED:
-        return Finding("rig", "ok", f"{100 * share:.0f} % of the matches follow the calibrated rig", share)
-    if upright > _EXPLAINED and upright > _BETTER * share:
+    matches = given.matches
+    upright = fit_rows(stand_upright(matches), rectifier.rectified)
+    columns = upright.agreement(ROW_TOLERANCE)
+    shifted = abs(float(np.median(matches.row_difference))) > ROW_TOLERANCE
+    if shifted and columns > _EXPLAINED and _BETTER * _spread(upright.residual) < _spread(given.residual):
         return Finding(
             "rig",
             "error",
-            f"the cameras stand one above the other: {100 * upright:.0f} % of the matches lie in one column: turn "
+            f"the cameras stand one above the other: {100 * columns:.0f} % of the matches lie in one column: turn "
             "images and calibration by 90 degrees",
-            upright,
+            columns,
         )
+    if share >= _EXPLAINED:
+        return Finding("rig", "ok", f"{100 * share:.0f} % of the matches follow the calibrated rig", share)
     pose = estimate_epipolar_pose(
         rectifier.rectified.matrix, matches.left, matches.right, matches.probability, matches.covariance
     )
