@@ -51,11 +51,15 @@ def check_rig(matches: EyeMatches, rectifier: StereoRectifier, frame_interval: f
     share = given.agreement(ROW_TOLERANCE)
     exchanged = exchange_eyes(matches, rectifier)
     swapped = _agreement(exchanged, view)
-    findings = [_check_eyes(matches, share, swapped)]
+    # Lenses that are undistorted for the other eye may look like a shift and a zoom: what needs neither is right.
+    plainly = _follows(exchanged) > max(_EXPLAINED, _BETTER * _follows(matches)) and swapped >= share
+    better = plainly or swapped > max(_EXPLAINED, _BETTER * share)
+    usable = better and _share_behind(fit_rows(exchanged, view)) <= _MAX_BEHIND
+    findings = [_check_eyes(matches, share, swapped, usable)]
     if findings[0].severity == "error":
         # The other checks judge the rig as it is once the eyes are exchanged.
-        matches, given, share = exchanged, fit_rows(exchanged, view), swapped
-    findings.append(_check_position(given, rectifier, share))
+        matches, given = exchanged, fit_rows(exchanged, view)
+    findings.append(_check_position(given, rectifier))
     findings.append(_check_distortion(matches, rectifier))
     if findings[1].severity == "error":
         return findings + unknown_rig("the matches do not follow the calibrated rig", _NAMES[3:])
@@ -71,8 +75,8 @@ def check_rig(matches: EyeMatches, rectifier: StereoRectifier, frame_interval: f
     return [*findings, _check_shift(given), rotation, _check_scale(given, view.fy), infinity]
 
 
-def _check_eyes(matches: EyeMatches, given: float, swapped: float) -> Finding:
-    if swapped > _EXPLAINED and swapped > _BETTER * given:
+def _check_eyes(matches: EyeMatches, given: float, swapped: float, exchanged: bool) -> Finding:
+    if exchanged:
         return Finding(
             "eyes",
             "error",
@@ -83,8 +87,9 @@ def _check_eyes(matches: EyeMatches, given: float, swapped: float) -> Finding:
     return Finding("eyes", "ok", f"left is left: {100 * given:.0f} % of the matches have the right order", given)
 
 
-def _check_position(given: RowFit, rectifier: StereoRectifier, share: float) -> Finding:
-    """Where the right camera is, if the matches do not follow the calibration."""
+def _check_position(given: RowFit, rectifier: StereoRectifier) -> Finding:
+    """Where the right camera is, if rows do not follow the calibration, nearly."""
+    share = float((np.abs(given.residual) <= ROW_TOLERANCE).mean())
     matches = given.matches
     upright = fit_rows(stand_upright(matches), rectifier.rectified)
     columns = upright.agreement(ROW_TOLERANCE)
@@ -261,9 +266,8 @@ def _judge_place(name: str, rows: np.ndarray, what: str, cure: str, good: str) -
 
 
 def _check_infinity(fit: RowFit) -> Finding:
-    disparity = fit.matches.disparity + fit.by_lag[:, 0]
-    behind = float((disparity < -1.0).mean())
-    lowest = float(np.percentile(disparity, 5))
+    behind = _share_behind(fit)
+    lowest = float(np.percentile(_disparity_in_rows(fit), 5))
     if behind <= _WARN_BEHIND:
         return Finding("infinity", "ok", f"{100 * behind:.0f} % of the matches lie behind infinity", behind)
     return Finding(
@@ -278,6 +282,23 @@ def _check_infinity(fit: RowFit) -> Finding:
 def _agreement(matches: EyeMatches, view: RectifiedStereo) -> float:
     """Share of the matches that follow a rig which is nearly that of `view`; zero with few matches."""
     return fit_rows(matches, view).agreement(ROW_TOLERANCE) if len(matches) >= MIN_MATCHES else 0.0
+
+
+def _disparity_in_rows(fit: RowFit) -> np.ndarray:
+    """Disparities of the matches whose rows agree, without what a lag adds to them, pixels."""
+    return np.asarray((fit.matches.disparity + fit.by_lag[:, 0])[np.abs(fit.residual) <= ROW_TOLERANCE])
+
+
+def _share_behind(fit: RowFit) -> float:
+    """Share of these that lie behind infinity by more than a pixel; zero without any."""
+    disparity = _disparity_in_rows(fit)
+    return float((disparity < -1.0).mean()) if len(disparity) else 0.0
+
+
+def _follows(matches: EyeMatches) -> float:
+    """Share of the matches that follow the calibration as it is."""
+    level = np.abs(matches.row_difference) <= ROW_TOLERANCE
+    return float((level & (matches.disparity > -1.0)).mean()) if len(matches) else 0.0
 
 
 def _spread(values: np.ndarray) -> float:

