@@ -14,7 +14,7 @@ _DARK, _BRIGHT = 5, 250
 _WARN_CLIPPED, _MAX_CLIPPED = 0.5, 0.95
 # Contrast below the steps of 8 bits: difference of the 99th and the 1st percentile.
 _MIN_CONTRAST = 10
-# Standard deviation of the blur of edges, pixels: rows of matches scatter twice as much as in sharp images from here on,
+# Standard deviation of the blur of edges, pixels: from here on rows of matches scatter twice as much as in sharp ones,
 # in renders of rooms that are blurred by a Gaussian of 3 px. Matches remain.
 _WARN_BLUR = 2.0
 # Images are one and the same where they differ by less than the noise of two cameras, grey values.

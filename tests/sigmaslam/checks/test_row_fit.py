@@ -27,7 +27,7 @@ def matches_of(
     outliers: float = 0.1,
     count: int = 300,
 ) -> EyeMatches:
-    """Matches of points 1 to 20 m away, with rows = (shift, roll, zoom, yaw) and a lag in frames of a swaying camera."""
+    """Matches of points 1 to 20 m away, rows = (shift, roll, zoom, yaw) and a lag in frames of a swaying camera."""
     rng = np.random.default_rng(0)
     left = rng.uniform((80, 0), (VIEW.width, VIEW.height), (count, 2))
     disparity = VIEW.focal_baseline / rng.uniform(1.0, 20.0, count)
