@@ -15,6 +15,7 @@ from sigmaslam.cli.benchmark import benchmark
 from sigmaslam.cli.check import check
 from sigmaslam.cli.evaluate import evaluate
 from sigmaslam.cli.export import export
+from sigmaslam.cli.geometry import geometry
 from sigmaslam.cli.match import match
 from sigmaslam.cli.refine import refine
 from sigmaslam.cli.render import render
@@ -40,7 +41,20 @@ def _root(
     """Stereo visual SLAM: poses with an honest covariance and a sparse map, on a plain CPU."""
 
 
-for _command in (demo, check, track, match, evaluate, refine, render, train, train_scorer, export, benchmark):
+for _command in (
+    demo,
+    check,
+    track,
+    match,
+    geometry,
+    evaluate,
+    refine,
+    render,
+    train,
+    train_scorer,
+    export,
+    benchmark,
+):
     app.command()(_command)
 
 
