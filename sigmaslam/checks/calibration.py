@@ -7,8 +7,8 @@ import numpy as np
 from sigmaslam.checks.finding import Finding
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 
-# From the eyes of an endoscope to the roof of a lorry, metres.
-MIN_BASELINE, MAX_BASELINE = 0.005, 3.0
+# From the eyes of an endoscope, 4 mm apart, to the roof of a lorry, metres.
+MIN_BASELINE, MAX_BASELINE = 0.003, 3.0
 _LENGTH_UNITS = (("millimetres", 1e-3), ("centimetres", 1e-2), ("micrometres", 1e-6))
 # How far from the middle a principal point may be, as a share of width and height.
 MAX_OFF_CENTRE = 0.2
