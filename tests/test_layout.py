@@ -35,7 +35,7 @@ FLOORS = (
     ("frontend",),
     ("two_view",),
     ("slam",),
-    ("fusion",),
+    ("checks", "fusion"),
     ("runs",),
     ("bundle_adjustment",),
     ("cli",),

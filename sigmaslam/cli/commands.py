@@ -13,6 +13,7 @@ from rich.logging import RichHandler
 
 from sigmaslam.cli.benchmark import benchmark
 from sigmaslam.cli.calibration import calibration
+from sigmaslam.cli.check import check
 from sigmaslam.cli.evaluate import evaluate
 from sigmaslam.cli.export import export
 from sigmaslam.cli.finish import finish
@@ -45,6 +46,7 @@ def _root(
 
 for _command in (
     demo,
+    check,
     track,
     finish,
     match,
@@ -62,7 +64,10 @@ app.add_typer(calibration)
 
 
 def main() -> None:
-    """Entry point of the console script; exit code 2 on bad input or output, 130 on Ctrl-C."""
+    """Entry point of the console script.
+
+    Exit codes: 1 on errors that `check` finds, 2 on bad input or output, 3 where too little was tracked, 130 on Ctrl-C.
+    """
     logging.basicConfig(
         level=logging.WARNING,
         format="%(message)s",

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import tempfile
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from enum import StrEnum
@@ -12,10 +14,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from sigmaslam.checks.check import SAMPLES_BEFORE_TRACKING, check_sequence
+from sigmaslam.checks.finding import Finding, wrong
 from sigmaslam.cli.extras import need_train_extra
 from sigmaslam.cli.run_summary import tell_summary
 from sigmaslam.errors import InputError
-from sigmaslam.files import printable
+from sigmaslam.files import check_new_folder, printable
 from sigmaslam.frontend import FRONTENDS
 from sigmaslam.inference.onnx_graph import BACKENDS
 from sigmaslam.readers import StereoSequence, open_cameras, open_sequence
@@ -23,6 +27,8 @@ from sigmaslam.readers.open import FORMATS
 
 if TYPE_CHECKING:
     from sigmaslam.slam.config import TrackerConfig
+
+logger = logging.getLogger(__name__)
 
 # mypy reads the members of an enum from literals alone.
 Frontend = StrEnum("Frontend", FRONTENDS)  # type: ignore[misc]
@@ -127,6 +133,9 @@ def track(
     threads: Annotated[
         int, typer.Option(min=1, help="Threads of the network and of OpenCV; from 2 on keyframes are foreseen.")
     ] = 2,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Do not track where the check of the first frames warns of something.")
+    ] = False,
 ) -> None:
     """Track a stereo sequence, recorded or live: trajectory, covariance, map and report.
 
@@ -137,12 +146,16 @@ def track(
     if backend.value == "torch":
         need_train_extra()
     settings = _read_settings(config, estimate, track_object is not None)
-    sequence = _open_input(source, format, calibration, camera, seconds, (topic_left, topic_right))
-    summary = _track(sequence, out, frontend, backend, settings, map, tracks, track_object, location, realtime, threads)
+    sequence = open_input(source, format, calibration, camera, seconds, (topic_left, topic_right))
+    check_new_folder(out)
+    findings = _check(sequence, strict, threads)
+    summary = _track(
+        sequence, out, frontend, backend, settings, map, tracks, track_object, location, realtime, threads, findings
+    )
     tell_summary(summary, out)
 
 
-def _open_input(
+def open_input(
     source: Path | None,
     format: InputFormat,
     calibration: Path | None,
@@ -150,6 +163,11 @@ def _open_input(
     seconds: float | None,
     topics: tuple[str | None, str | None],
 ) -> StereoSequence:
+    """The recording or the live cameras that the command line names.
+
+    Raises:
+        InputError: neither or both are named, or options do not fit.
+    """
     if (source is None) == (camera is None):
         raise InputError("give either INPUT, a recording, or --camera, live cameras" + (", not both" if source else ""))
     if source is not None:
@@ -191,6 +209,7 @@ def _track(
     location: Path | None = None,
     realtime: bool = False,
     threads: int = 2,
+    findings: Sequence[Finding] = (),
 ) -> dict[str, Any]:
     import cv2
 
@@ -212,8 +231,23 @@ def _track(
             locations=None if location is None else read_locations(location),
             real_time=realtime,
             threads=threads,
+            findings=findings,
         )
     except Stopped as stop:
         with suppress(OSError):  # the terminal may be gone
             typer.echo(f"Stopped; what was tracked until then is in {printable(out)}")
         raise typer.Exit(stop.exit_code) from stop
+
+
+def _check(sequence: StereoSequence, strict: bool, threads: int) -> list[Finding]:
+    """Findings about the first frames; those that are not good are warned of, and refused with `strict`."""
+    import cv2
+
+    cv2.setNumThreads(threads)
+    findings = check_sequence(sequence, SAMPLES_BEFORE_TRACKING, threads).findings
+    faults = wrong(findings)
+    if strict and faults:
+        raise InputError(f"{sequence.source}: " + "; ".join(each.message for each in faults))
+    for each in faults:
+        logger.warning("%s: %s", each.name, each.message)
+    return findings

@@ -231,6 +231,13 @@ class StereoCamera:
                 f"the rotation in T_left_right is not orthonormal with determinant +1 (off by {defect:.2g}):\n{T}"
             )
         x, y, z = T[:3, 3]
+        if not T[:3, 3].any():
+            raise CalibrationError("the baseline is zero: T_left_right must give where the right camera is, in metres")
+        if abs(y) > abs(x):
+            raise CalibrationError(
+                f"one camera stands above the other: T_left_right puts the right camera at ({x:.4g}, {y:.4g}, {z:.4g}) "
+                "m in the left frame; turn images and calibration by 90 degrees, as only horizontal pairs are supported"
+            )
         if x <= 0:
             raise CalibrationError(
                 f"left and right look swapped: T_left_right puts the right camera at x = {x:.6g} m in the "

@@ -14,6 +14,27 @@ from sigmaslam.errors import CalibrationError
 _REQUIRED: Any = object()
 
 
+class _UniqueKeyLoader(yaml.SafeLoader):
+    """Refuses a key that is given twice, of which YAML takes the last."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """The mapping; a scalar key may be there once."""
+        lines: dict[str, int] = {}
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
+                line = key.start_mark.line + 1
+                if key.value in lines:
+                    raise _DuplicateKeyError(
+                        f"key '{key.value}' is given twice, in lines {lines[key.value]} and {line}: keep one of them"
+                    )
+                lines[key.value] = line
+        return super().construct_mapping(node, deep)
+
+
+class _DuplicateKeyError(yaml.YAMLError):
+    """A key of a mapping is there twice; the message is for the user."""
+
+
 class CalibrationYaml:
     """A YAML calibration file whose getters raise errors that name file, key and what was expected."""
 
@@ -34,7 +55,10 @@ class CalibrationYaml:
         if first.startswith("%YAML"):
             text = "\n" + _without_opencv_syntax(body)
         try:
-            entries = yaml.safe_load(text)
+            # A subclass of the safe loader.
+            entries = yaml.load(text, _UniqueKeyLoader)
+        except _DuplicateKeyError as error:
+            raise CalibrationError(f"{path}: {error}") from None
         except yaml.YAMLError as error:
             raise CalibrationError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
         if not isinstance(entries, dict):

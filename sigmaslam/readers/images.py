@@ -209,9 +209,13 @@ class ImagePairs:
         return first_readable(self, self._source)
 
     def __iter__(self) -> Iterator[RawPair | SkippedFrame]:
+        return (self.read(index) for index in range(len(self.files)))
+
+    def read(self, index: int) -> RawPair | SkippedFrame:
+        """The pair with that number."""
         assert self.timestamps is not None
-        for index, ((left, right), timestamp) in enumerate(zip(self.files, self.timestamps, strict=True)):
-            try:
-                yield RawPair(index, timestamp, read_image(left), read_image(right), str(left), str(right))
-            except FrameError as error:
-                yield SkippedFrame(index, timestamp, str(error))
+        (left, right), timestamp = self.files[index], self.timestamps[index]
+        try:
+            return RawPair(index, timestamp, read_image(left), read_image(right), str(left), str(right))
+        except FrameError as error:
+            return SkippedFrame(index, timestamp, str(error))

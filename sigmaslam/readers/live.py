@@ -4,6 +4,7 @@ import logging
 import threading
 import time
 from collections.abc import Generator, Iterator
+from contextlib import closing
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -14,7 +15,7 @@ from sigmaslam.readers.calibration import calibrated_size, read_calibration
 from sigmaslam.readers.capture import Capture, StereoCapture, open_capture
 from sigmaslam.readers.images import MAX_FAILURES, RawPair, SkippedFrame
 from sigmaslam.readers.kitti import common_size
-from sigmaslam.readers.stereo_sequence import StereoFrame, StereoSequence
+from sigmaslam.readers.stereo_sequence import FrameStep, StereoFrame, StereoSequence
 
 logger = logging.getLogger(__name__)
 
@@ -73,7 +74,13 @@ class LiveSequence(StereoSequence):
 
     def _items(self) -> Generator[StereoFrame | SkippedFrame, None, None]:
         # Live pairs are not read ahead: they would age in the queue.
-        return self._convert()
+        return self._convert(self._live)
+
+    def sample(self, count: int) -> list[FrameStep]:
+        """The next `count` pairs of frames; to be called before `frames`, which begins after them."""
+        with closing(self._convert(self._live.take(2 * count))) as converted:
+            frames = [item for item in converted if isinstance(item, StereoFrame)]
+        return list(zip(frames[::2], frames[1::2], strict=False))
 
 
 class LivePairs:
@@ -117,6 +124,18 @@ class LivePairs:
             f"{self._capture.failed} gives no images; is another program using it? Two cameras on one USB hub may ask "
             "for more than it carries: use another port, or smaller images and a calibration for them"
         )
+
+    def take(self, count: int) -> list[RawPair]:
+        """The next pairs, before the iteration begins; cameras are left half a second to settle first."""
+        settled = time.monotonic() + SETTLE_S
+        pairs: list[RawPair] = []
+        failures = 0
+        while len(pairs) < count and failures <= MAX_FAILURES:
+            pair = self._capture.take(len(pairs))
+            failures += pair is None
+            if pair is not None and (self._capture.played or pair.timestamp >= settled):
+                pairs.append(pair)
+        return pairs
 
     def __iter__(self) -> Iterator[RawPair]:
         if self._thread is not None:

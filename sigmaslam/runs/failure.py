@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
+from sigmaslam.checks.finding import Finding, explain
 
-def explain_failure(summary: dict[str, Any], in_map: bool, started: bool) -> str | None:
-    """One line on a run of which less than half of the frames were tracked; None for any other.
+
+def explain_failure(summary: dict[str, Any], in_map: bool, started: bool, findings: Sequence[Finding]) -> str | None:
+    """Why so little of a run, of which less than half of the frames were tracked; None for any other.
 
     Args:
         summary: counts of frames by status, under the names of the statuses, and of all under `frames`.
         in_map: poses were to be in the world of a map.
         started: a frame was good enough to define the world.
+        findings: of a check of the input: where it found a fault, that is the reason.
     """
     frames, skipped = summary["frames"], summary["skipped"]
     tracked = summary["tracking"] + summary["relocalised"]
@@ -19,11 +23,15 @@ def explain_failure(summary: dict[str, Any], in_map: bool, started: bool) -> str
         return None
     if frames == skipped:
         return f"None of the {frames} frames could be read." if frames else "There was no frame."
+    reasons = " ".join(explain(findings).splitlines())
     if tracked:
-        return (
+        counts = (
             f"Less than half of the frames were tracked: of {frames}, {summary['lost']} are lost, "
             f"{summary['starting']} were before or at the start, {skipped} could not be read."
         )
+        return f"{counts} {reasons}".rstrip()
+    if reasons:
+        return f"Nothing was tracked. {reasons}"
     if in_map:
         return "The place was not found in the map: is it a map of this place, seen from where the camera is now?"
     if frames - skipped == 1:

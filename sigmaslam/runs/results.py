@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from sigmaslam.checks.finding import Finding, wrong
 from sigmaslam.errors import OutputError, SigmaSlamError
 from sigmaslam.files import atomic_path, atomic_write_text
 from sigmaslam.geometry.trajectory import Trajectory
@@ -24,7 +25,8 @@ from sigmaslam.runs.relative_pose_file import (
     collect_frame_pairs,
     write_frame_pairs,
 )
-from sigmaslam.runs.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY, RUN_NAME, calibration_verdict, write_ply
+from sigmaslam.runs.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY, RUN_NAME, write_ply
+from sigmaslam.runs.verdict import calibration_verdict, expected_offset
 from sigmaslam.slam.estimate import CalibrationEstimate
 from sigmaslam.slam.point_map import PointMap
 
@@ -90,14 +92,18 @@ def write_results(
     elif (folder / MAP_NAME).is_file():
         with np.load(folder / MAP_NAME, allow_pickle=False) as point_map:
             points = len(point_map["points"])
-    summary = _summarise(frames, records, calibration, points)
+    findings = [Finding(**each) for each in run.get("checks", ())]
+    verdict = "Nothing is known of the calibration: no frame was tracked."
+    if calibration is not None and (len(records) or wrong(findings)):
+        tracked = frames.status.count("tracking") if frames is not None else 0
+        verdict = calibration_verdict(calibration, tracked, points, expected_offset(run["calibration"]), findings)
+    summary = {**_summarise(frames, records, calibration, points), "calibration_verdict": verdict}
     if tracker is None:
         # Of a first attempt, if there was one.
         known = ("calibration_verdict", "calibration_errors")
         summary |= {name: value for name, value in run.get("summary", {}).items() if name in known}
     summary["world"] = _describe_world(summary, run)
-    # What the images themselves say of a failure belongs here.
-    summary["failure"] = explain_failure(summary, run.get("map") is not None, started)
+    summary["failure"] = explain_failure(summary, run.get("map") is not None, started, findings)
     content = json.dumps({**run, "summary": summary}, indent=2) + "\n"
     files.attempt(RUN_NAME, lambda path: atomic_write_text(path, content))
     if frames is not None:
@@ -216,7 +222,7 @@ def _write_report(path: Path) -> None:
 def _summarise(
     frames: FrameTable | None, records: PoseRecords, calibration: CalibrationEstimate | None, points: int
 ) -> dict[str, Any]:
-    """Counts and verdicts for run.json."""
+    """Counts for run.json."""
     inliers = np.zeros(0) if frames is None else frames.columns["inliers"]
     inliers = inliers[inliers > 0]
     first = None
@@ -229,7 +235,6 @@ def _summarise(
         "first_frame_with_pose": first,
         "median_inliers": float(np.median(inliers)) if len(inliers) else 0.0,
         "map_points": points,
-        "calibration_verdict": _verdict(records, calibration),
         "calibration_errors": {} if calibration is None else {k: list(v) for k, v in calibration.errors.items()},
     }
 
@@ -242,12 +247,6 @@ def _describe_world(summary: dict[str, Any], run: dict[str, Any]) -> str | None:
     if run.get("map") is not None:
         return f"that of the map, in which the camera was found in frame {first} (from 0 on)"
     return f"the left camera of frame {first} (from 0 on), where tracking started"
-
-
-def _verdict(records: PoseRecords, calibration: CalibrationEstimate | None) -> str:
-    if calibration is None or not len(records):
-        return "Nothing is known of the calibration: no frame was tracked."
-    return calibration_verdict(calibration)
 
 
 def _save(path: Path, array: np.ndarray) -> None:

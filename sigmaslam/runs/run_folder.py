@@ -165,29 +165,6 @@ def check_has_trajectory(run: Path) -> None:
     raise InputError(f"{run}: holds no trajectory.tum: {reason}")
 
 
-def calibration_verdict(calibration: CalibrationEstimate) -> str:
-    """The estimated disparity offset in words."""
-    offset, sigma = calibration.disparity_offset, calibration.disparity_offset_sigma
-    figure = f"{offset:+.2f} ± {sigma:.2f} px"
-    if calibration.refused_offset:
-        return (
-            f"The images ask for a disparity offset of {calibration.refused_offset:+.1f} px, which is more than "
-            "calibrations are off by: nothing was corrected. A lens, the baseline or the right camera is wrong: "
-            "calibrate again."
-        )
-    if sigma > 0.2:
-        return (
-            f"It is too early to say whether the rectification is right (disparity offset {figure}): more frames, or "
-            "things nearer and farther, would tell."
-        )
-    if abs(offset) > max(3.0 * sigma, 0.1):
-        return (
-            f"The rectification is off by {figure} of disparity. The poses are corrected for it; depth measured with "
-            "this calibration elsewhere is not: calibrate again."
-        )
-    return f"The disparity offset is {figure}: nothing wrong with the rectification can be seen."
-
-
 def write_ply(path: Path, point_map: PointMap) -> None:
     """Points as a binary PLY with x, y, z and sigma, the root of the largest eigenvalue of the covariance, metres."""
     sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(point_map.covariances)[:, -1], 0.0))

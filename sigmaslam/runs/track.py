@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from sigmaslam.checks.finding import Finding
 from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.files import printable
 from sigmaslam.fusion.location_filter import LocationFilter
@@ -42,6 +43,7 @@ def track_sequence(
     locations: Locations | None = None,
     real_time: bool = False,
     threads: int = 2,
+    findings: Sequence[Finding] = (),
 ) -> dict[str, Any]:
     """Tracks a sequence and writes the run folder; partial results are kept when it is stopped or fails.
 
@@ -56,6 +58,7 @@ def track_sequence(
         locations: readings to fuse of a sensor on the moving camera or body; writes trajectory_location.tum, too, the
             poses in the sensor's world.
         real_time: play a recording at its time stamps; frames are dropped when tracking falls behind.
+        findings: what a check of the input found; they are kept in run.json, and explain a run that fails.
     Returns:
         The summary in run.json, in which `failure` says why less than half of the frames were tracked, and is None
         where more were; with `locations` also the counts of the readings, under `location`, and in real time
@@ -83,6 +86,7 @@ def track_sequence(
         "map": None if map_path is None else printable(map_path),
         "configuration": asdict(tracker.config),
         "calibration": describe_camera(sequence.camera),
+        "checks": [asdict(each) for each in findings],
     }
     run |= _describe_location(location)
     if track_object is not None:
