@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sigmaslam.bounded_files import CALIBRATION_BYTES, read_text, shorten
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 
@@ -59,13 +60,10 @@ def read_kitti_calibration(path: Path, image_size: ImageSize, cameras: tuple[int
 
 
 def _read_entries(path: Path, cameras: tuple[int, int]) -> dict[str, str]:
-    try:
-        lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-    except (OSError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"{path}: cannot read the calibration: {error}") from None
-    keyed = dict(line.split(":", 1) for line in lines if ":" in line)
-    if keyed:
-        return {key.strip(): value for key, value in keyed.items()}
+    text = read_text(path, CALIBRATION_BYTES, "the calibration", CalibrationError)
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    if any(":" in line for line in lines):
+        return _without_doubles(path, lines)
     if len(lines) == 2:
         return {f"P{camera}": line for camera, line in zip(cameras, lines, strict=True)}
     if len(lines) == 4:
@@ -76,6 +74,18 @@ def _read_entries(path: Path, cameras: tuple[int, int]) -> dict[str, str]:
     )
 
 
+def _without_doubles(path: Path, lines: list[str]) -> dict[str, str]:
+    """Values by key of lines `key: value`; others are left out."""
+    entries: dict[str, str] = {}
+    for line in lines:
+        key, colon, value = line.partition(":")
+        if colon and key.strip() in entries:
+            raise CalibrationError(f"{path}: key '{shorten(key.strip())}' stands twice: remove the wrong line")
+        if colon:
+            entries[key.strip()] = value
+    return entries
+
+
 def _matrix(path: Path, entries: dict[str, str], key: str, shape: tuple[int, ...]) -> np.ndarray:
     count = int(np.prod(shape))
     if key not in entries:
@@ -84,9 +94,11 @@ def _matrix(path: Path, entries: dict[str, str], key: str, shape: tuple[int, ...
     try:
         values = np.array([float(word) for word in words])
     except ValueError as error:
-        raise CalibrationError(f"{path}: key '{key}' must be {count} numbers: {error}") from None
+        raise CalibrationError(f"{path}: key '{key}' must be {count} numbers: {shorten(str(error))}") from None
     if len(values) != count or not np.all(np.isfinite(values)):
-        raise CalibrationError(f"{path}: key '{key}' must be {count} finite numbers, got {len(values)}: {words}")
+        raise CalibrationError(
+            f"{path}: key '{key}' must be {count} finite numbers, got {len(values)}: {shorten(entries[key])}"
+        )
     return values.reshape(shape)
 
 

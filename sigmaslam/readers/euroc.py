@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sigmaslam.bounded_files import TABLE_BYTES, read_text, shorten
 from sigmaslam.errors import CalibrationError, InputError
 from sigmaslam.geometry.camera import CameraModel, DistortionModel, StereoCamera
 from sigmaslam.geometry.checked_yaml import CalibrationYaml
@@ -83,16 +84,16 @@ def read_sensors(left: Path, right: Path) -> StereoCamera:
 def _read_sensor(path: Path) -> tuple[CameraModel, np.ndarray]:
     content = CalibrationYaml.read(path)
     if content.text("camera_model", "pinhole") != "pinhole":
-        raise content.error(f"camera_model is {content.text('camera_model')!r}; only pinhole is supported")
+        raise content.error(f"camera_model is {shorten(repr(content.text('camera_model')))}; only pinhole is supported")
     name = content.text("distortion_model", "none")
     if name not in DISTORTION_MODELS:
-        raise content.error(f"distortion_model is {name!r}; known are {', '.join(DISTORTION_MODELS)}")
-    width, height = content.numbers("resolution", (2,)).tolist()
+        raise content.error(f"distortion_model is {shorten(repr(name))}; known are {', '.join(DISTORTION_MODELS)}")
+    width, height = (round(side) for side in content.numbers("resolution", (2,)))
     fx, fy, cx, cy = content.numbers("intrinsics", (4,)).tolist()
     model = DISTORTION_MODELS[name]
     distortion = () if model == "none" else tuple(content.numbers("distortion_coefficients", (None,)).tolist())
     try:
-        camera = CameraModel(int(width), int(height), fx, fy, cx, cy, 0.0, model, distortion)
+        camera = CameraModel(width, height, fx, fy, cx, cy, 0.0, model, distortion)
     except CalibrationError as error:
         raise content.error(str(error)) from None
     if isinstance(content.entries.get("T_BS"), dict):
@@ -107,12 +108,13 @@ def _asl_images(camera: Path) -> dict[int, Path]:
         return {int(path.stem): path for path in files}
     table = camera / "data.csv"
     try:
-        with table.open(newline="", encoding="utf-8") as file:
-            rows = [row for row in csv.reader(file) if len(row) >= 2 and not row[0].startswith("#")]
+        lines = read_text(table, TABLE_BYTES, "the time stamps").splitlines()
+        rows = [row for row in csv.reader(lines) if len(row) >= 2 and not row[0].startswith("#")]
         stamps = {row[1].strip(): int(row[0]) for row in rows}
-    except (OSError, ValueError) as error:
+    except (InputError, ValueError, csv.Error) as error:
         raise InputError(
-            f"{camera / 'data'}: names are no time stamps (such as {files[0].name}) and {table} cannot be used: {error}"
+            f"{camera / 'data'}: names are no time stamps (such as {files[0].name}) and {table} cannot be used: "
+            f"{shorten(str(error), 300)}"
         ) from None
     missing = [path.name for path in files if path.name not in stamps]
     if missing:
