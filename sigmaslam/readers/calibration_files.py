@@ -136,7 +136,12 @@ def _from_projections(
     left, right = (_matrix(path, entries, key, (3, 4)) for key in keys)
     models = [_model(path, key, P[:, :3], image_size) for key, P in zip(keys, (left, right), strict=True)]
     T_left_right = np.eye(4)
-    T_left_right[:3, 3] = right_position(left, right)
+    try:
+        T_left_right[:3, 3] = right_position(left, right)
+    except np.linalg.LinAlgError:
+        raise CalibrationError(
+            f"{path}: keys '{keys[0]}' and '{keys[1]}': K has no inverse; correct the numbers"
+        ) from None
     return _stereo(path, models[0], models[1], T_left_right)
 
 
@@ -159,4 +164,8 @@ def _from_originals(
         T_camera_camera0[:3, :3] = _matrix(path, entries, f"R_{camera:02d}", (3, 3))
         T_camera_camera0[:3, 3] = _matrix(path, entries, f"T_{camera:02d}", (3,))
         poses.append(T_camera_camera0)
-    return _stereo(path, models[0], models[1], poses[0] @ np.linalg.inv(poses[1]))
+    try:
+        T_left_right = poses[0] @ np.linalg.inv(poses[1])
+    except np.linalg.LinAlgError:
+        raise CalibrationError(f"{path}: key 'R_{cameras[1]:02d}' is no rotation; correct the numbers") from None
+    return _stereo(path, models[0], models[1], T_left_right)

@@ -7,6 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from sigmaslam.bounded_files import shorten
 from sigmaslam.errors import CalibrationError, FrameError, InputError
 from sigmaslam.geometry.camera import CameraModel, DistortionModel, StereoCamera
 from sigmaslam.readers.calibration_files import right_position
@@ -61,7 +62,8 @@ def image_array(message: Any, name: str) -> np.ndarray:
     if message.__msgtype__ == COMPRESSED_IMAGE:
         return decode_image(message.data.tobytes(), name)
     if message.encoding not in _ENCODINGS:
-        raise FrameError(f"{name}: encoding {message.encoding!r} is not known; known are {', '.join(_ENCODINGS)}")
+        unknown = shorten(repr(message.encoding))
+        raise FrameError(f"{name}: encoding {unknown} is not known; known are {', '.join(_ENCODINGS)}")
     size, channels, conversion = _ENCODINGS[message.encoding]
     height, width = int(message.height), int(message.width)
     row = width * channels * size
@@ -75,7 +77,12 @@ def image_array(message: Any, name: str) -> np.ndarray:
     values = rows.view(np.dtype(f"{'>' if message.is_bigendian else '<'}u{size}"))
     image = values.astype(f"u{size}", copy=False)
     image = image.reshape((height, width) if channels == 1 else (height, width, channels))
-    return image if conversion is None else cv2.cvtColor(image, conversion)
+    try:
+        return image if conversion is None else cv2.cvtColor(image, conversion)
+    except cv2.error:
+        raise FrameError(
+            f"{name}: {width}x{height} pixels cannot be {message.encoding}; is the recording whole?"
+        ) from None
 
 
 def is_rectified(topic: str) -> bool:
@@ -134,6 +141,8 @@ def stereo_from_infos(
 def _matrix(info: Any, key: str, shape: tuple[int, int], name: str) -> np.ndarray:
     # ROS 1 writes K, D, R, P; ROS 2 k, d, r, p.
     matrix = np.array(getattr(info, key, None) if hasattr(info, key) else getattr(info, key.upper()), dtype=np.float64)
+    if matrix.size != np.prod(shape):
+        raise CalibrationError(f"{name}: {key.upper()} has {matrix.size} numbers, not {np.prod(shape)}")
     matrix = matrix.reshape(shape)
     if not np.all(np.isfinite(matrix)) or abs(np.linalg.det(matrix[:, :3])) == 0.0:
         raise CalibrationError(f"{name}: not calibrated, {key.upper()} is {matrix.tolist()}; give --calibration")
@@ -154,7 +163,7 @@ def _lens(info: Any, name: str) -> tuple[DistortionModel, tuple[float, ...]]:
     if info.distortion_model not in _LENS_MODELS:
         known = ", ".join(model for model in _LENS_MODELS if model)
         raise CalibrationError(
-            f"{name}: distortion_model is {info.distortion_model!r}; known are {known}; give --calibration"
+            f"{name}: distortion_model is {shorten(repr(info.distortion_model))}; known are {known}; give --calibration"
         )
     model = _LENS_MODELS[info.distortion_model]
     distortion = [float(value) for value in (info.d if hasattr(info, "d") else info.D)]

@@ -14,7 +14,7 @@ from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import se3_inverse, transform_points
 from sigmaslam.readers.images import read_image
 
-_NUMBER = r"\s*([-+]?[0-9]*\.?[0-9]+)\s*"
+_NUMBER = r"\s*([-+]?(?:[0-9]{1,9}(?:\.[0-9]{0,9})?|\.[0-9]{1,9}))\s*"
 _BOX = re.compile(",".join([_NUMBER] * 4))
 # Points further from the middle of a body than so many median distances are not taken for its outline.
 _FARTHEST = 4.0
@@ -38,10 +38,10 @@ def read_region(text: str, width: int, height: int) -> np.ndarray:
     if box:
         x, y, across, down = (float(value) for value in box.groups())
         if across < 1 or down < 1:
-            raise InputError(f"--track-object {text}: width and height of the box must be 1 pixel or more")
+            raise InputError(f"--track-object {shorten(text)}: width and height of the box must be 1 pixel or more")
         if x < 0 or y < 0 or x + across > width or y + down > height:
             raise InputError(
-                f"--track-object {text}: the box (x, y, width, height) reaches beyond the left image of "
+                f"--track-object {shorten(text)}: the box (x, y, width, height) reaches beyond the left image of "
                 f"{width}x{height} pixels; give one inside it"
             )
         region = np.zeros((height, width), bool)
