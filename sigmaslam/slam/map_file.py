@@ -33,7 +33,7 @@ _SHAPES: dict[str, tuple[str | int, ...]] = {
     "frontend": (),
     "intrinsics": (7,),
 }
-_KINDS = {_PREFIX + "images": "u", _PREFIX + "counts": "iu", _PREFIX + "descriptors": "fu", "frontend": "U"}
+_KINDS = {_PREFIX + "images": "u", _PREFIX + "counts": "iu", "frontend": "U"}
 _MEND = "map the place again with `sigmaslam track`"
 _ORTHONORMAL, _SYMMETRY = 1e-6, 1e-6
 
@@ -90,7 +90,7 @@ def read_keyframes(path: Path, frontend: str, camera: RectifiedStereo) -> tuple[
             f"one {expected.tolist()}; a map serves the camera that made it"
         )
     _check(path, arrays)
-    ends = np.cumsum(arrays[_PREFIX + "counts"])
+    ends = np.cumsum(arrays[_PREFIX + "counts"].astype(np.int64))
     keyframes = []
     for k, (begin, end) in enumerate(zip(np.r_[0, ends[:-1]], ends, strict=True)):
         columns = {name: arrays[_PREFIX + name][begin:end] for name in (*_PER_FEATURE, "disparity", "disparity_sigma")}
@@ -118,6 +118,7 @@ def _check(path: Path, arrays: dict[str, np.ndarray]) -> None:
     counts, poses, covariance = array["counts"], array["poses"], array["covariance"]
     width, height = arrays["intrinsics"][5:7]
     count = len(counts)
+    refuse(array["images"].dtype != np.uint8, "images", f"are {array['images'].dtype}, not uint8")
     refuse(count == 0, "counts", "has no keyframe")
     refuse(
         bool((counts < 0).any()) or int(counts.sum(dtype=object)) != len(array["disparity"]),

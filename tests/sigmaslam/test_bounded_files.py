@@ -188,7 +188,7 @@ def test_arrays_come_back_as_numpy_reads_them(tmp_path: Path):
     assert list(read) == list(ARRAYS)
     for name, array in ARRAYS.items():
         np.testing.assert_array_equal(read[name], array)
-        assert read[name].dtype == array.dtype
+        assert read[name].dtype == array.dtype.newbyteorder("=")
         assert read[name].flags.writeable
         np.save(tmp_path / "one.npy", array)
         np.testing.assert_array_equal(load_array(tmp_path / "one.npy", MEND), array)
@@ -219,6 +219,7 @@ def test_bad_arrays_are_refused_with_the_mend(tmp_path: Path, content: bytes, wo
     [
         ({"x": np.zeros((3, 2), "U2")}, "x is <U2 (3, 2) and must be floating (3, 2)"),
         ({"x": np.zeros((4, 2))}, "x is float64 (4, 2) and must be floating (3, 2)"),
+        ({"x": np.zeros((3, 2), np.float16)}, "x is float16 (3, 2) and must be floating (3, 2)"),
         ({"x": np.zeros(3)}, "x is float64 (3,) and must be floating (3, 2)"),
         ({"n": np.zeros(3)}, "n is float64 (3,) and must be integer or unsigned (M)"),
     ],

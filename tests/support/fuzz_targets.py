@@ -69,9 +69,14 @@ class FuzzTarget:
     read: Callable[[Path], object]
     mutator: Mutator = mutate
 
-    def changed(self, random: Random) -> bytes:
-        """One of the seeds, changed."""
-        return self.mutator(random.choice(self.seeds), self.seeds, random)
+    def changed(self, random: Random, content: bytes | None = None) -> bytes:
+        """A content, or else one of the seeds, changed."""
+        if content is None:
+            content = random.choice(self.seeds)
+        try:
+            return self.mutator(content, self.seeds, random)
+        except Exception:  # a content that is no archive any more
+            return mutate(content, self.seeds, random)
 
 
 @dataclass
@@ -156,7 +161,7 @@ def make_targets(folder: Path) -> dict[str, FuzzTarget]:
     truth = folder / "cam0_sensor.yaml"
     truth.write_text(_sensor(0.0))
     targets = [
-        FuzzTarget("calibration", "stereo.yaml", _calibrations(), lambda path: _rectify(StereoCamera.from_yaml(path))),
+        FuzzTarget("calibration", "stereo.yaml", _calibrations(), _rectify),
         FuzzTarget("EuRoC sensor", "sensor.yaml", [_sensor(0.0).encode()], lambda path: read_sensors(path, sensor)),
         FuzzTarget(
             "KITTI calibration", "calib.txt", _kitti(), lambda path: read_kitti_calibration(path, (64, 48), (0, 1))
@@ -186,10 +191,11 @@ def make_targets(folder: Path) -> dict[str, FuzzTarget]:
     return {target.name: target for target in targets}
 
 
-def _rectify(camera: StereoCamera) -> None:
+def _rectify(path: Path) -> None:
+    camera = StereoCamera.from_yaml(path)
     # A file may state a size whose maps take a GB.
     if camera.left.width * camera.left.height < 10_000:
-        StereoRectifier(camera)
+        _named(lambda _: StereoRectifier(camera))(path)
 
 
 def _read_box(path: Path) -> None:

@@ -222,6 +222,7 @@ def changed(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[
         (changed("poses", lambda a: 2 * a), "keyframe_poses are not rigid"),
         (changed("counts", lambda a: a + 1), "keyframe_counts are not of the 57 keypoints"),
         (changed("counts", lambda a: a * [-1, 1]), "keyframe_counts are not of the 57 keypoints"),
+        (changed("images", lambda a: a.astype(np.uint16)), "keyframe_images are uint16, not uint8"),
         (changed("counts", lambda a: a * 1.0), "keyframe_counts is float64"),
         (changed("keypoints", lambda a: a[1:]), "keyframe_descriptors is float32 (57, 64) and must be"),
         (changed("images", lambda a: a[:, 1:]), "keyframe_images have 64x47 pixels, the camera 64x48"),
