@@ -77,12 +77,7 @@ def image_array(message: Any, name: str) -> np.ndarray:
     values = rows.view(np.dtype(f"{'>' if message.is_bigendian else '<'}u{size}"))
     image = values.astype(f"u{size}", copy=False)
     image = image.reshape((height, width) if channels == 1 else (height, width, channels))
-    try:
-        return image if conversion is None else cv2.cvtColor(image, conversion)
-    except cv2.error:
-        raise FrameError(
-            f"{name}: {width}x{height} pixels cannot be {message.encoding}; is the recording whole?"
-        ) from None
+    return image if conversion is None else cv2.cvtColor(image, conversion)
 
 
 def is_rectified(topic: str) -> bool:
