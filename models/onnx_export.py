@@ -122,9 +122,11 @@ def export_features(weights: Path, out: Path) -> float:
 
 def export_filter(folder: Path) -> dict[str, float]:
     """Writes the two filter graphs and returns the largest difference of each from torch."""
-    return {
+    differences = {
         name: _export(graph, folder / f"{name}.onnx", _FILTER_TOLERANCE) for name, graph in _filter_graphs().items()
     }
+    update_manifest(folder, [f"{name}.onnx" for name in differences])
+    return differences
 
 
 def export_all(
@@ -150,7 +152,7 @@ def export_all(
         path.write_bytes(copied)
     atomic_write_text(out / "features.json", json.dumps(content, indent=2) + "\n")
     atomic_write_text(out / "features.md", card_page(content))
-    update_manifest(out, ["features.safetensors", *(f"{name}.onnx" for name in differences)])
+    update_manifest(out, ["features.safetensors", "features.onnx"])
     return differences
 
 
