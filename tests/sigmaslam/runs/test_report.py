@@ -192,5 +192,5 @@ def test_missing_and_broken_files_are_named(tmp_path):
     with pytest.raises(InputError, match=r"run\.json: is no JSON"):
         write_report(tmp_path / "run")
     (tmp_path / "run/frames.csv").unlink()
-    with pytest.raises(InputError, match=r"frames\.csv: cannot be read"):
+    with pytest.raises(InputError, match=r"frames\.csv: cannot read the frames"):
         write_report(tmp_path / "run")
