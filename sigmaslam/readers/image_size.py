@@ -22,7 +22,7 @@ def image_size(content: bytes) -> tuple[int, int] | None:
     """
     try:
         if content.startswith(b"\x89PNG\r\n\x1a\n"):
-            return struct.unpack_from(">II", content, 16)
+            return _png_size(content)
         if content.startswith(b"\xff\xd8"):
             return _jpeg_size(content)
         if content.startswith(b"BM"):
@@ -33,6 +33,19 @@ def image_size(content: bytes) -> tuple[int, int] | None:
         return (int(found[1]), int(found[2])) if found else None
     except (struct.error, IndexError):
         return None
+
+
+def _png_size(content: bytes) -> tuple[int, int] | None:
+    """None also where a chunk is longer than the file: OpenCV 5 takes memory, and a minute, for 4 GB of it."""
+    place = 8
+    while place + 8 <= len(content):
+        length = struct.unpack_from(">I", content, place)[0]
+        if content[place + 4 : place + 8] == b"IEND":
+            break
+        place += 12 + length
+        if place > len(content):
+            return None
+    return struct.unpack_from(">II", content, 16)
 
 
 def _jpeg_size(content: bytes) -> tuple[int, int] | None:

@@ -82,7 +82,7 @@ def decode_image(content: bytes, name: str) -> np.ndarray:
         raise FrameError(f"{name}: JPEG is truncated")
     size = image_size(content)
     if size is None:
-        raise FrameError(f"{name}: not an image of a known kind ({', '.join(_KINDS)}), or truncated")
+        raise FrameError(f"{name}: not an image, or truncated; {', '.join(_KINDS)} are read")
     if size[0] * size[1] > MAX_PIXELS:
         raise FrameError(
             f"{name}: states a size of {size[0]}x{size[1]} pixels, at most {MAX_PIXELS:,} are read; "

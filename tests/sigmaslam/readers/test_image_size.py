@@ -12,7 +12,7 @@ import pytest
 from sigmaslam.errors import FrameError, InputError
 from sigmaslam.readers import open_sequence
 from sigmaslam.readers.image_size import image_size
-from sigmaslam.readers.images import read_image
+from sigmaslam.readers.images import decode_image, read_image
 from sigmaslam.slam.object_region import read_region
 
 KINDS = [
@@ -78,6 +78,16 @@ def test_a_decompression_bomb_is_refused_before_it_is_decoded(tmp_path: Path, mo
         read_image(tmp_path / "bomb.png")
     with pytest.raises(InputError, match=r"bomb\.png: states a size.*give the mask"):
         read_region(str(tmp_path / "bomb.png"), 64, 48)
+
+
+def test_a_chunk_that_is_longer_than_the_file_is_refused_before_it_is_decoded(monkeypatch: pytest.MonkeyPatch):
+    """Found by the fuzzer: OpenCV took 4 GB and 76 s."""
+    content = bytearray(bomb(64, 48))
+    data = content.index(b"IDAT")
+    content[data - 4 : data] = b"\xff\x00\x0c\x3b"
+    monkeypatch.setattr(cv2, "imdecode", lambda *arguments: pytest.fail("it is decoded"))
+    with pytest.raises(FrameError, match="or truncated"):
+        decode_image(bytes(content), "image")
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/dev/zero"), Path.mkdir])
