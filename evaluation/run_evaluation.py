@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from sigmaslam.bounded_files import TABLE_BYTES, read_text
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.metrics.map_consistency import coverage
 from sigmaslam.evaluation.metrics.relative_consistency import SpanConsistency, relative_consistency, truth_covariance
@@ -35,7 +36,7 @@ from sigmaslam.evaluation.truth_conventions import TruthConvention, find_convent
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.plot_style import BLUE, VERMILLION, style_axes
-from sigmaslam.readers.trajectory_files import check_covariances, kitti_times_path, read_trajectory, trajectory_format
+from sigmaslam.readers.trajectory_files import kitti_times_path, read_covariances, read_trajectory, trajectory_format
 from sigmaslam.runs.figures import AXIS_NAMES, plot_trajectory, save_png
 from sigmaslam.runs.frame_table import FRAMES_NAME, FrameTable, predicted_poses, read_frames
 from sigmaslam.runs.relative_pose_file import RELATIVE_POSES_NAME, read_frame_pairs
@@ -440,8 +441,8 @@ def _same_clock(estimate_path: Path, truth_path: Path, frames: FrameTable | None
 def _follows_object(run: Path) -> bool:
     """Whether a run's poses are those of a body before a camera at rest."""
     try:
-        return "object" in json.loads((run / "run.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return "object" in json.loads(read_text(run / "run.json", TABLE_BYTES, "the run"))
+    except (InputError, ValueError, RecursionError, TypeError):
         return False
 
 
@@ -458,11 +459,7 @@ def _of_followed_frame(estimate: Trajectory, truth: Trajectory) -> Trajectory:
 def _read_covariance(path: Path, count: int) -> np.ndarray | None:
     if not path.is_file():
         return None
-    try:
-        covariance = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path}: is no numpy array ({error}); run `sigmaslam track` again") from error
-    return check_covariances(covariance, path, count)
+    return read_covariances(path, count)
 
 
 def _frame_count(frames: FrameTable | None, estimate: Trajectory, truth: Trajectory, matched: int) -> int:

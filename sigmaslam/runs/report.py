@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
+from sigmaslam.bounded_files import TABLE_BYTES, check_columns, load_arrays, read_text, shorten
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text, printable
 from sigmaslam.geometry.trajectory import Trajectory
@@ -83,23 +84,19 @@ def _read_points(path: Path) -> np.ndarray | None:
     """Map points (M, 3), or None if the run has no map."""
     if not path.is_file():
         return None
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            points = np.asarray(archive["points"], dtype=np.float64)
-    except (OSError, ValueError, KeyError, EOFError, TypeError) as error:
-        raise InputError(f"{path}: holds no array `points` ({error}); run `sigmaslam track` again") from error
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"{path}: points must be (M, 3), not {points.shape}; run `sigmaslam track` again")
-    return points
+    mend = "run `sigmaslam track` again"
+    arrays = load_arrays(path, mend, ("points",))
+    check_columns(path, arrays, {"points": ("M", 3)}, {}, mend)
+    return arrays["points"].astype(np.float64)
 
 
 def _read_run(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        run = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: is no JSON ({error}); run `sigmaslam track` again") from error
+        run = json.loads(read_text(path, TABLE_BYTES, "the run"))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: is no JSON ({shorten(str(error))}); run `sigmaslam track` again") from error
     return run if isinstance(run, dict) else {}
 
 
