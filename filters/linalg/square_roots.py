@@ -11,6 +11,7 @@ from functools import lru_cache
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from sigmaslam.filters.linalg import semidefinite, unrolled
 
@@ -52,6 +53,13 @@ def may_look(array: Tensor) -> bool:
     return array.device.type == "cpu" and not torch.compiler.is_compiling()
 
 
+def is_differentiated(array: Tensor) -> bool:
+    """Whether derivatives of what is made of this will be asked for, backward or forward."""
+    if torch.is_grad_enabled() and array.requires_grad:
+        return True
+    return forward_ad.unpack_dual(array).tangent is not None
+
+
 def triangularise(pieces: Sequence[Tensor], diagonal: Tensor | None = None) -> Tensor:
     """Lower factor L, L L^T = A A^T for A = [pieces side by side, diag(diagonal)], by QR of A^T.
 
@@ -72,8 +80,8 @@ def triangularise(pieces: Sequence[Tensor], diagonal: Tensor | None = None) -> T
         pieces = _broadcast([*pieces, torch.diag_embed(diagonal)])
         columns += size
     stacked = torch.cat(pieces, dim=-1) if len(pieces) > 1 else pieces[0]
-    # The backward pass needs Q; without one it need not be formed.
-    mode = "reduced" if torch.is_grad_enabled() and stacked.requires_grad else "r"
+    # Derivatives need Q; without them it need not be formed.
+    mode = "reduced" if is_differentiated(stacked) else "r"
     upper = torch.linalg.qr(stacked.mT, mode=mode).R
     # Signs of a QR are arbitrary. A root does not mind, but sigma points should not depend on the form.
     sign = 1.0 - 2.0 * torch.signbit(torch.diagonal(upper, dim1=-2, dim2=-1)).to(upper.dtype)
@@ -130,6 +138,19 @@ def finite(vector: Tensor, matrix: Tensor) -> Tensor | None:
         return None
     total = vector.sum(dim=-1) + matrix.sum(dim=(-2, -1))
     return total - total == 0
+
+
+def nonnegative(variance: Tensor, floor: Tensor | float = 0.0) -> Tensor | None:
+    """Whether all of (..., n) are at least the floor, (...,) bool, or None if all elements' are; NaN is not."""
+    sound = variance >= floor
+    if may_look(variance) and bool(sound.all()):
+        return None
+    return sound.all(dim=-1)
+
+
+def round_off(variance: Tensor) -> Tensor:
+    """What round-off may leave of a variance that is zero, beside the largest of (..., n): (..., 1)."""
+    return semidefinite.PIVOT_TOLERANCES[variance.dtype] * variance.abs().amax(dim=-1, keepdim=True)
 
 
 def log_diagonal(factor: Tensor) -> Tensor:
