@@ -15,6 +15,7 @@ from sigmaslam.filters.gaussian_belief import Gaussian
 from sigmaslam.filters.linalg.square_roots import (
     apply,
     finite,
+    is_traced,
     may_look,
     multiply,
     nonnegative,
@@ -200,7 +201,7 @@ class BayesFilter:
                 usable = _both(usable, last.usable)
         elif seen.error is not None:
             bent = seen.error(mask, noise) > TOLERATED_ERROR
-            if torch.compiler.is_compiling() or bool(bent.any()):
+            if is_traced() or bool(bent.any()):
                 last, again = linearise(solution)
                 solution = again.where(bent, solution)
                 usable = _both(usable, None if last.usable is None else last.usable | ~bent)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from sigmaslam.filters.gaussian_belief import Gaussian
+from sigmaslam.filters.linalg.square_roots import is_traced
 from sigmaslam.filters.manifolds import Space
 from sigmaslam.filters.models import AnyMeasurement, AnyMotion, LinearMeasurement, LinearMotion
 from sigmaslam.filters.noise_covariance import Noise
@@ -103,7 +104,7 @@ def check_measurement(measurement: AnyMeasurement, noise: Noise, value: Tensor, 
 
 
 def _check_batch(name: str, given: torch.Size, expected: torch.Size) -> None:
-    if not given or given == expected or torch.compiler.is_compiling():
+    if not given or given == expected or is_traced():
         return
     try:
         torch.broadcast_shapes(given, expected)
