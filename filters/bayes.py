@@ -110,7 +110,7 @@ class BayesFilter:
         check_belief(belief, self.space)
         check_inputs(inputs)
         check_motion(motion, noise, belief)
-        if isinstance(motion, LinearMotion) and not self._by_root(belief):
+        if isinstance(motion, LinearMotion) and not self.goes_on_with_roots(belief):
             return self._predict_linear(belief, motion, noise, inputs)
         root, usable, sound = self._root(belief)
         usable = _both(usable, nonnegative(noise.variance()))
@@ -125,7 +125,7 @@ class BayesFilter:
             entering, noise_matrix = noise, motion.noise_matrix
         else:
             columns = _with_noise_columns(columns, root.shape[-1])
-        if self._by_root(belief):
+        if self.goes_on_with_roots(belief):
             factor = _predicted_factor(columns, entering, noise_matrix)
             predicted = Gaussian(mean, factor=factor, factor_is_lower=True)
         else:
@@ -222,7 +222,8 @@ class BayesFilter:
     filter = filter_sequence
     smooth = smooth
 
-    def _by_root(self, belief: Gaussian) -> bool:
+    def goes_on_with_roots(self, belief: Gaussian) -> bool:
+        """Whether the belief after a step is held by a root."""
         if self.form != "auto":
             return self.form == "qr"
         return belief.is_square_root or torch.finfo(belief.mean.dtype).bits < 64
@@ -230,7 +231,7 @@ class BayesFilter:
     def _form(self, belief: Gaussian, columns: Columns, measurements: int, additive: bool) -> Form:
         if self.form != "auto":
             return self.form
-        return "qr" if self._by_root(belief) else choose_form(columns, measurements, additive)
+        return "qr" if self.goes_on_with_roots(belief) else choose_form(columns, measurements, additive)
 
     def _root(self, belief: Gaussian) -> tuple[Tensor, Tensor | None, Tensor | None]:
         """Lower root of the covariance (..., n, n); whether it is usable (...,), and whether it needed no mending."""

@@ -177,8 +177,8 @@ def _kept_identity(size: int, dtype: torch.dtype, device: torch.device) -> Tenso
 
 def _broadcast(pieces: Sequence[Tensor], other: torch.Size | None = None) -> list[Tensor]:
     """Matrices (..., r, c_i) with one batch shape, that of the other included."""
-    batches = {piece.shape[:-2] for piece in pieces} | ({other} if other is not None else set())
-    if len(batches) == 1:
+    batches = [piece.shape[:-2] for piece in pieces] + ([other] if other is not None else [])
+    if all(batch == batches[0] for batch in batches):
         return list(pieces)
     batch = torch.broadcast_shapes(*batches)
     return [piece.expand(*batch, *piece.shape[-2:]) for piece in pieces]

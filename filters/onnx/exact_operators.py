@@ -31,7 +31,11 @@ class ExactOperators(TorchFunctionMode):
         if name in _REPLACED and len(args) == _REPLACED[name].__code__.co_argcount and not options:
             return _REPLACED[name](*args)
         if name == "where" and len(args) == 3 and not options:
-            return func(*_as_tensors(*args))
+            condition, first, second = _as_tensors(*args)
+            # ONNX Runtime chooses numbers only.
+            if isinstance(first, Tensor) and first.dtype == second.dtype == torch.bool:
+                return (condition & first) | (~condition & second)
+            return func(condition, first, second)
         if not _is_double([*args, *options.values()]):
             return func(*args, **options)
         if name in ("add", "sub", "subtract") and "alpha" in options:
@@ -151,6 +155,10 @@ _ELEMENTWISE = {
     *_NAMES.split(),
     *_COMPARISONS.split(),
     *_BOUNDS.split(),
-    *(f"__{side}{name}__" for name in "add sub mul div truediv floordiv mod pow".split() for side in ("", "r")),
-    *(f"__{name}__" for name in "eq ne lt le gt ge".split()),
+    *(
+        f"__{side}{name}__"
+        for name in ["add", "sub", "mul", "div", "truediv", "floordiv", "mod", "pow"]
+        for side in ("", "r")
+    ),
+    *(f"__{name}__" for name in ["eq", "ne", "lt", "le", "gt", "ge"]),
 }
