@@ -106,7 +106,7 @@ def choose_form(columns: Columns, measurements: int, additive: bool) -> Form:
 
 def _is_more(measurements: int, count: int) -> bool:
     """Whether there are more measurements than columns; a number that a graph leaves open is taken for many."""
-    return isinstance(measurements, torch.SymInt) or measurements > count
+    return type(measurements) is not int or measurements > count
 
 
 def solve(form: Form, innovation: Tensor, columns: Columns, noise: Noise | None, prior: Tensor) -> TangentPosterior:

@@ -12,22 +12,24 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.fx.experimental.proxy_tensor import make_fx
 
 from sigmaslam.errors import SigmaSlamError
 from sigmaslam.files import atomic_path
 from sigmaslam.filters.bayes import BayesFilter
 from sigmaslam.filters.gaussian_belief import Gaussian
 from sigmaslam.filters.linalg.plain import traced_for_export
-from sigmaslam.filters.models import AnyMeasurement, AnyMotion, several
+from sigmaslam.filters.models import AnyMeasurement, AnyMotion, NonlinearModel, several
 from sigmaslam.filters.noise_covariance import as_noise
 from sigmaslam.filters.onnx.exact_operators import ExactOperators
 from sigmaslam.filters.onnx.graph_file import strip_origins
+from sigmaslam.filters.transforms import Taylor
 
 _OPSET = 20
 # Largest difference of graph and torch, relative to an output's largest value; more than this is a wrong graph.
 TOLERANCES = {torch.float64: 1e-9, torch.float32: 1e-4}
 # Batches and numbers of measurements that the graph is traced with, unlike any size of a model; and checked with.
-_TRACED = 5, 7
+_TRACED = 131, 137
 _CHECKED = (1, 1), (3, 4), (8, 2)
 _MISSING = 0.2
 
@@ -128,6 +130,12 @@ class _Step(nn.Module):
         return named
 
     @property
+    def differentiates(self) -> bool:
+        """Whether a model is linearised by automatic differentiation."""
+        models = [model for model in (self.motion, self.measurement) if isinstance(model, NonlinearModel)]
+        return isinstance(self.bayes.transform, Taylor) and any(model.jacobian is None for model in models)
+
+    @property
     def outputs(self) -> list[str]:
         """Names of what comes out."""
         held = "posterior_root" if self.by_root else "posterior_covariance"
@@ -222,17 +230,21 @@ def _write(step: _Step, path: Path) -> None:
     except ImportError as error:
         raise ExportError("writing a graph needs onnx and onnxscript: pip install 'sigmaslam[train]'") from error
     traced = tuple(step.resized(*_TRACED))
+    module: nn.Module = _Traced(step).eval()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
         try:
+            if step.differentiates:
+                # The exporter cannot trace derivatives; once they are arithmetic it can.
+                module = make_fx(module, tracing_mode="symbolic", _allow_non_fake_inputs=True)(*traced)
             program = torch.onnx.export(
-                _Traced(step).eval(),
+                module,
                 traced,
                 dynamo=True,
                 input_names=list(step.arguments),
                 output_names=step.outputs,
-                dynamic_shapes=(step.free(),),
+                dynamic_shapes=(step.free(),) if isinstance(module, _Traced) else step.free(),
                 opset_version=_OPSET,
                 verbose=False,
             )
@@ -285,8 +297,8 @@ def _check(step: _Step, path: Path) -> float:
             scale = max(1.0, mean_scale) if name == "posterior_mean" else float(np.abs(b.astype(float)).max())
             if name in ("log_likelihood", "nis"):
                 scale = max(1.0, scale)
-            error = np.abs(a.astype(float) - b.astype(float)).max() / max(scale, np.finfo(float).tiny)
-            largest = max(largest, float(error)) if np.isfinite(error) else np.inf
+            off = float(np.abs(a.astype(float) - b.astype(float)).max()) / max(scale, float(np.finfo(float).tiny))
+            largest = max(largest, off) if np.isfinite(off) else np.inf
     return largest
 
 

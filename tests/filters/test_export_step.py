@@ -14,6 +14,7 @@ from sigmaslam.filters import systems
 from sigmaslam.filters.linalg import plain, square_roots
 from sigmaslam.filters.models import several
 from sigmaslam.filters.onnx.exact_operators import ExactOperators
+from sigmaslam.filters.transforms import push_forward
 from tests.support.filter_assertions import assert_close, assert_same_update
 from tests.support.filter_builders import beliefs, bent_measurement, bent_motion, covariances, random_numbers, tensor
 
@@ -145,6 +146,29 @@ def test_graph_of_a_robot_equals_torch_for_any_batch_and_number_of_landmarks(dty
         for a, b in zip(found, expected, strict=False):
             np.testing.assert_allclose(a, b.numpy(), rtol=100 * tolerance, atol=10 * tolerance)
         assert found[-1].tolist() == torch.as_tensor(stacked.count).expand(batch).tolist()
+
+
+@pytest.mark.slow
+def test_graph_of_an_extended_filter_needs_no_derivatives_of_the_models(tmp_path):
+    motion, see, example = robot(torch.float64)
+    example = filters.StepExample(
+        example.belief, tensor(3.0, 0.4), example.motion_inputs, {"landmark": tensor(3.0, 1.0)}
+    )
+    ekf = filters.ExtendedKalmanFilter(form="dense")
+    assert filters.export_step(ekf, motion, see, example, tmp_path / "ekf.onnx") < 1e-12
+
+
+def test_derivatives_through_the_backward_pass_are_the_forward_ones():
+    x, along = random_numbers(5, 3), random_numbers(5, 3, seed=1)
+
+    def function(offsets):
+        return torch.atan2(offsets, 1.0 + offsets * offsets)
+
+    expected = push_forward(function, x, along)
+    with plain.traced_for_export():
+        found = push_forward(function, x, along)
+    for a, b in zip(found, expected, strict=True):
+        assert_close(a, b, 1e-15)
 
 
 @pytest.mark.slow
