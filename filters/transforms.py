@@ -120,8 +120,9 @@ def push_forward(function: Evaluate, offsets: Tensor, directions: Tensor) -> tup
         pushed = torch.func.jvp(function, (offsets,), (directions,))
         return pushed[0], pushed[1]
     # Forward derivatives cannot be traced, those of the backward pass, which is linear in its argument, can.
-    values, pull = torch.func.vjp(function, offsets)
-    _, push = torch.func.vjp(lambda cotangent: pull(cotangent)[0], torch.zeros_like(values))
+    pulled = torch.func.vjp(function, offsets)
+    values, pull = pulled[0], pulled[1]
+    push = torch.func.vjp(lambda cotangent: pull(cotangent)[0], torch.zeros_like(values))[1]
     return values, push(directions)[0]
 
 
