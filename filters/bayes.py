@@ -12,6 +12,7 @@ from torch import Tensor
 from sigmaslam.filters.checks import check_belief, check_entering, check_inputs, check_measurement, check_motion
 from sigmaslam.filters.failure import POLICIES, OnFailure, Suspects, jittered, raise_unless_healthy
 from sigmaslam.filters.gaussian_belief import Gaussian
+from sigmaslam.filters.linalg.plain import PIVOT_TOLERANCES
 from sigmaslam.filters.linalg.square_roots import (
     apply,
     finite,
@@ -19,7 +20,6 @@ from sigmaslam.filters.linalg.square_roots import (
     may_look,
     multiply,
     nonnegative,
-    round_off,
     solve_lower_transposed,
     square,
     triangularise,
@@ -438,7 +438,7 @@ def _sound_variances(belief: Gaussian) -> Tensor | None:
     if belief.is_square_root:
         return None
     variance = torch.diagonal(belief.held, dim1=-2, dim2=-1)
-    return nonnegative(variance, -round_off(variance))
+    return nonnegative(variance, PIVOT_TOLERANCES[variance.dtype])
 
 
 def _is_additive(model: AnyMotion | AnyMeasurement) -> bool:

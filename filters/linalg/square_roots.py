@@ -145,17 +145,15 @@ def finite(vector: Tensor, matrix: Tensor) -> Tensor | None:
     return total - total == 0
 
 
-def nonnegative(variance: Tensor, floor: Tensor | float = 0.0) -> Tensor | None:
-    """Whether all of (..., n) are at least the floor, (...,) bool, or None if all elements' are; NaN is not."""
-    sound = variance >= floor
-    if may_look(variance) and bool(sound.all()):
+def nonnegative(variance: Tensor, tolerance: float = 0.0) -> Tensor | None:
+    """Whether none of (..., n) is negative, (...,) bool, or None if so for all elements; NaN is not sound.
+
+    Down to the tolerance, as a share of the largest, a negative one is taken for round-off of zero.
+    """
+    if may_look(variance) and variance.numel() and float(variance.detach().amin()) >= 0:
         return None
-    return sound.all(dim=-1)
-
-
-def round_off(variance: Tensor) -> Tensor:
-    """What round-off may leave of a variance that is zero, beside the largest of (..., n): (..., 1)."""
-    return plain.PIVOT_TOLERANCES[variance.dtype] * variance.abs().amax(dim=-1, keepdim=True)
+    floor = -tolerance * variance.abs().amax(dim=-1, keepdim=True) if tolerance else 0.0
+    return (variance >= floor).all(dim=-1)
 
 
 def log_diagonal(factor: Tensor) -> Tensor:
