@@ -1,15 +1,15 @@
 """Evaluate a run, or a trajectory of any origin, against the truth."""
 
+from __future__ import annotations
+
 import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.metrics.map_consistency import coverage
@@ -32,11 +32,15 @@ from sigmaslam.evaluation.metrics.trajectory_errors import (
 from sigmaslam.evaluation.relative_summary import draw_relative, format_relative, span_to_dict
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
-from sigmaslam.plot_style import BLUE, VERMILLION, style_axes
+from sigmaslam.plot_style import BLUE, VERMILLION, has_matplotlib, style_axes
 from sigmaslam.readers.trajectory_files import check_covariances, kitti_times_path, read_trajectory, trajectory_format
 from sigmaslam.runs.figures import AXIS_NAMES, plot_trajectory, save_png
 from sigmaslam.runs.relative_pose_file import RELATIVE_POSES_NAME, read_frame_pairs
 from sigmaslam.runs.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +69,7 @@ class Evaluation:
         kitti: segment errors.
         nees: of poses relative to the first; None where there is no covariance.
         relative: consistency of poses relative to earlier ones, by span; None where the run does not say.
-        figure_path: the plots; None where none were asked for.
+        figure_path: the plots; None where none were asked for, or matplotlib is not installed.
         final: of the trajectory after the fact; None where there is none.
     """
 
@@ -134,7 +138,7 @@ def evaluate_run(
             relative to earlier ones are judged where it holds `relative_poses.npz`.
         truth: TUM, KITTI, or EuRoC ground truth.
         lengths, step: segments of the KITTI errors (see `kitti_errors`).
-        plot: write `evaluation.png` into the run folder or beside the trajectory.
+        plot: write `evaluation.png` into the run folder or beside the trajectory, where matplotlib is installed.
         truth_sigma_position, truth_sigma_rotation: standard deviations of each true pose, of each coordinate (metres)
             and about each axis (degrees), for the poses relative to earlier ones; where one alone is given the other is
             zero.
@@ -175,7 +179,7 @@ def evaluate_run(
         kitti=kitti_errors(estimate, true, lengths, step),
         nees=pose_nees(estimate, true, covariance) if covariance is not None else None,
         relative=relative,
-        figure_path=estimate_path.parent / "evaluation.png" if plot else None,
+        figure_path=estimate_path.parent / "evaluation.png" if plot and has_matplotlib() else None,
         final=_evaluate_final(run_or_trajectory, estimate, true) if is_run else None,
     )
     if evaluation.figure_path:
@@ -229,6 +233,8 @@ def draw_evaluation(
         estimate, truth: trajectories in one clock.
         covariance: (N, 6, 6) of the estimate, body frame, translation first.
     """
+    from matplotlib.figure import Figure
+
     spans = evaluation.relative or ()
     rows = (1.5, 1, 1, 1) if spans else (1.5, 1, 1)
     figure = Figure(figsize=(11, 2.0 + 2.6 * sum(rows) - 0.1), layout="constrained")

@@ -21,7 +21,8 @@ from sigmaslam.cli.track import demo, track
 from sigmaslam.cli.train import train, train_scorer
 from sigmaslam.errors import SigmaSlamError
 
-app = typer.Typer(name="sigmaslam", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+# Plain help: rich's tables cut long words and give flags a type.
+app = typer.Typer(name="sigmaslam", no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
 
 
 def _show_version(wanted: bool) -> None:
@@ -39,8 +40,20 @@ def _root(
     """Stereo visual SLAM: poses with an honest covariance and a sparse map, on a plain CPU."""
 
 
-for _command in (demo, track, match, evaluate, refine, render, train, train_scorer, export, benchmark):
-    app.command()(_command)
+# A line each for the list of commands, short enough for 80 columns.
+for _command, _line in (
+    (demo, "Track the sequence that ships with the package."),
+    (track, "Track a stereo sequence, recorded or live."),
+    (match, "Match two images."),
+    (evaluate, "Compare a trajectory with the truth."),
+    (refine, "Adjust all of a run at once (extra 'graph')."),
+    (render, "Render a stereo sequence with exact truth (extra 'train')."),
+    (train, "Train the correspondence network (extra 'train')."),
+    (train_scorer, "Train the probability of matches (extra 'train')."),
+    (export, "Export trained weights to ONNX (extra 'train')."),
+    (benchmark, "Run a benchmark and write its page."),
+):
+    app.command(short_help=_line)(_command)
 
 
 def main() -> None:

@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from sigmaslam.plot_style import NO_MATPLOTLIB
+
 
 def evaluate(
     run: Annotated[Path, typer.Argument(metavar="RUN_OR_TRAJECTORY", help="Run folder, or a TUM or KITTI file.")],
@@ -22,6 +24,8 @@ def evaluate(
 ) -> None:
     """Compare a trajectory with the truth: ATE, RPE, KITTI t_rel and r_rel, NEES; draws evaluation.png.
 
+    The picture needs the extra 'report'; the figures are the same without it.
+
     Poses of a run are also judged relative to earlier ones, 1, 10, 50, 100 m or 1, 5, 20 s back. Say how good the truth
     is with --truth-sigma-position and --truth-sigma-rotation: it counts there, and you see where it is no better than
     the estimate.
@@ -34,3 +38,5 @@ def evaluate(
         run, truth, truth_sigma_position=truth_sigma_position, truth_sigma_rotation=truth_sigma_rotation
     )
     typer.echo(json.dumps(evaluation.to_dict(), indent=2) if as_json else format_evaluation(evaluation))
+    if evaluation.figure_path is None:
+        typer.echo(f"No picture: {NO_MATPLOTLIB}", err=True)
