@@ -77,12 +77,13 @@ def _write_bags(folder: Path, pairs: list, times: np.ndarray, camera: StereoCame
 
 def _fill(writer, store, serialize, pairs: list, times: np.ndarray, camera: StereoCamera) -> None:
     """Images and calibrations of both eyes under /stereo/left and /stereo/right."""
-    make = {name.split("/")[-1]: kind for name, kind in store.types.items()}
-    lists = ("D", "K", "R", "P") if "ROS1" in serialize.__name__.upper() else ("d", "k", "r", "p")
+    make = {name.removeprefix("sensor_msgs/msg/"): kind for name, kind in store.types.items()}
+    is_ros1 = serialize == store.serialize_ros1
+    lists = ("D", "K", "R", "P") if is_ros1 else ("d", "k", "r", "p")
     height, width = pairs[0][0].shape
     with writer:
         for eye, name in enumerate(("left", "right")):
-            K = (camera.left, camera.right)[eye].K
+            K = (camera.left, camera.right)[eye].matrix
             P = np.hstack([K, [[-K[0, 0] * camera.baseline * eye], [0], [0]]])
             arrays = dict(zip(lists, (np.zeros(5), K.ravel(), np.eye(3).ravel(), P.ravel()), strict=True))
             channels = {
@@ -91,8 +92,11 @@ def _fill(writer, store, serialize, pairs: list, times: np.ndarray, camera: Ster
             }
             for pair, seconds in zip(pairs, times, strict=True):
                 stamp = 1_700_000_000 * 10**9 + round(seconds * 1e9)
-                fields = {"stamp": make["Time"](sec=stamp // 10**9, nanosec=stamp % 10**9), "frame_id": name}
-                header = make["Header"](**fields, **({"seq": 0} if lists[0] == "D" else {}))
+                fields = {
+                    "stamp": make["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9),
+                    "frame_id": name,
+                }
+                header = make["std_msgs/msg/Header"](**fields, **({"seq": 0} if is_ros1 else {}))
                 picture = make["Image"](
                     header=header,
                     height=height,
