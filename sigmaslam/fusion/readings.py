@@ -21,6 +21,10 @@ _ONE_SIGMA = ("sigma_position",)
 _AXIS_SIGMAS = ("sigma_x", "sigma_y", "sigma_z")
 _MATRIX = ("cxx", "cxy", "cxz", "cyy", "cyz", "czz")
 _ROTATION_SIGMA = "sigma_rotation"
+_FORM = (
+    f"the first line names the columns: {', '.join((*_POSITION, *_ONE_SIGMA))} and, with rotations, "
+    f"{', '.join((*_QUATERNION, _ROTATION_SIGMA))}"
+)
 # The length of a quaternion may differ from 1 by so much, as files have few digits.
 _LENGTH_TOLERANCE = 0.01
 
@@ -63,9 +67,7 @@ def read_locations(path: Path) -> Locations:
         file = io.StringIO(read_text(path, TABLE_BYTES, "the readings"), newline="")
         rows = [(number, row) for number, row in enumerate(csv.reader(file), 1) if any(cell.strip() for cell in row)]
     except csv.Error as error:
-        raise InputError(
-            f"{path}: not a CSV file that can be read ({error}); see docs/object.md for its form"
-        ) from None
+        raise InputError(f"{path}: not a CSV file that can be read ({error}); {_FORM}") from None
     if len(rows) < 2:
         raise InputError(f"{path}: holds no readings; its first line names the columns, each further line is a reading")
     names = [cell.strip().lstrip("#").strip() for cell in rows[0][1]]
@@ -108,8 +110,7 @@ def _columns(path: Path, names: list[str]) -> list[str]:
         missing = [name for name in some if name not in names]
         if missing:
             raise InputError(
-                f"{path}, line 1: column {missing[0]} is missing, there are {shorten(', '.join(names), 200)}; "
-                "see docs/object.md"
+                f"{path}, line 1: column {missing[0]} is missing, there are {shorten(', '.join(names), 200)}; {_FORM}"
             )
         return list(some)
 
