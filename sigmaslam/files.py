@@ -43,6 +43,11 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         raise
 
 
+def printable(name: str | Path) -> str:
+    """A name that can be written as UTF-8: bytes of a path that are none become `\\udc..`."""
+    return str(name).encode("utf-8", "backslashreplace").decode("utf-8")
+
+
 def make_folder(path: Path) -> None:
     """Makes a folder, and those above it, where there is none.
 

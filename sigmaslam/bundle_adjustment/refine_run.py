@@ -21,7 +21,7 @@ from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder, ma
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import check_covariances, read_tum, write_kitti, write_tum
-from sigmaslam.runs.run_folder import FINAL_TRAJECTORY, write_ply
+from sigmaslam.runs.run_folder import FINAL_TRAJECTORY, check_has_trajectory, write_ply
 from sigmaslam.slam.point_map import PointMap
 
 
@@ -43,8 +43,7 @@ def refine_run(
     load_gtsam()
     config = config or RefineConfig()
     began = time.perf_counter()
-    if not (run / "trajectory.tum").is_file():
-        raise InputError(f"{run}: holds no trajectory.tum; give a folder written by `sigmaslam track --tracks`")
+    check_has_trajectory(run)
     check_new_folder(out)
     trajectory = _read_trajectory(run)
     tracks = read_tracks(run / TRACKS_NAME, len(trajectory))

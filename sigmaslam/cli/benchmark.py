@@ -18,7 +18,7 @@ from sigmaslam.errors import InputError
 # as keywords of their names, the options that it serves.
 _BENCHMARKS: dict[str, Callable[..., str]] = {}
 # They leave out what needs the extra `train`.
-_WITHOUT_TRAIN = ("sequences", "runtime")
+_WITHOUT_TRAIN = ("sequences", "runtime", "geometry")
 # Their pages need a picture, which the extra `report` draws.
 _DRAWN = ("claims", "renders")
 
@@ -63,6 +63,13 @@ def _claims(out: Path, command: str) -> str:
 
     with Console(stderr=True).status("simulating a dozen scenarios (two to seven minutes)"):
         return write_claims(out, out.with_suffix(".png"), command)
+
+
+@_registered
+def _geometry(out: Path, command: str) -> str:
+    from sigmaslam.evaluation.benchmarks.two_view_geometry import write_geometry
+
+    return write_geometry(out, command, _note)
 
 
 @_registered

@@ -12,14 +12,18 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 from sigmaslam.cli.benchmark import benchmark
+from sigmaslam.cli.calibration import calibration
 from sigmaslam.cli.evaluate import evaluate
 from sigmaslam.cli.export import export
+from sigmaslam.cli.finish import finish
+from sigmaslam.cli.geometry import geometry
 from sigmaslam.cli.match import match
 from sigmaslam.cli.refine import refine
 from sigmaslam.cli.render import render
 from sigmaslam.cli.track import demo, track
 from sigmaslam.cli.train import train, train_scorer
 from sigmaslam.errors import SigmaSlamError
+from sigmaslam.files import printable
 
 # Plain help: rich's tables cut long words and give flags a type.
 app = typer.Typer(name="sigmaslam", no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
@@ -44,7 +48,9 @@ def _root(
 for _command, _line in (
     (demo, "Track the sequence that ships with the package."),
     (track, "Track a stereo sequence, recorded or live."),
+    (finish, "Write what a killed run left unfinished."),
     (match, "Match two images."),
+    (geometry, "Geometry of two images."),
     (evaluate, "Compare a trajectory with the truth."),
     (refine, "Adjust all of a run at once (extra 'graph')."),
     (render, "Render a stereo sequence with exact truth (extra 'train')."),
@@ -54,10 +60,11 @@ for _command, _line in (
     (benchmark, "Run a benchmark and write its page."),
 ):
     app.command(short_help=_line)(_command)
+app.add_typer(calibration)
 
 
 def main() -> None:
-    """Entry point of the console script; exit code 2 on bad input, 130 on Ctrl-C."""
+    """Entry point of the console script; exit code 2 on bad input or output, 130 on Ctrl-C."""
     logging.basicConfig(
         level=logging.WARNING,
         format="%(message)s",
@@ -66,7 +73,9 @@ def main() -> None:
     try:
         app()
     except SigmaSlamError as error:
-        Console(stderr=True).print(f"error: {error}", style="red", highlight=False, markup=False, soft_wrap=True)
+        Console(stderr=True).print(
+            f"error: {printable(str(error))}", style="red", highlight=False, markup=False, soft_wrap=True
+        )
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)

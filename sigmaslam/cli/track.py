@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from contextlib import suppress
 from dataclasses import replace
 from enum import StrEnum
 from importlib.resources import as_file, files
@@ -12,7 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sigmaslam.cli.extras import need_train_extra
+from sigmaslam.cli.run_summary import tell_summary
 from sigmaslam.errors import InputError
+from sigmaslam.files import printable
 from sigmaslam.frontend import FRONTENDS
 from sigmaslam.inference.onnx_graph import BACKENDS
 from sigmaslam.plot_style import NO_MATPLOTLIB
@@ -56,7 +59,10 @@ def track(
     ] = None,
     format: Annotated[InputFormat, typer.Option(help="Kind of input.")] = InputFormat["auto"],
     calibration: Annotated[
-        Path | None, typer.Option(help="Calibration YAML (or KITTI calib.txt) instead of the input's own.")
+        Path | None,
+        typer.Option(
+            help="Calibration of any form (docs/input.md), or two as left.yaml,right.yaml, instead of the input's own."
+        ),
     ] = None,
     frontend: Annotated[Frontend, typer.Option(help="Where correspondences come from.")] = Frontend["learned"],
     backend: Annotated[
@@ -124,25 +130,18 @@ def track(
         int, typer.Option(min=1, help="Threads of the network and of OpenCV; from 2 on keyframes are foreseen.")
     ] = 2,
 ) -> None:
-    """Track a stereo sequence, recorded or live: trajectory, covariance, map and report."""
+    """Track a stereo sequence, recorded or live: trajectory, covariance, map and report.
+
+    Ctrl-C, SIGTERM and SIGHUP end it with what was tracked until then (exit codes 130, 143, 129). After a kill -9
+    `sigmaslam finish` makes the results. Exit code 3: less than half of the frames were tracked, and the last line says
+    why. 2: the input cannot be used, or a result not be written.
+    """
     if backend.value == "torch":
         need_train_extra()
     settings = _read_settings(config, estimate, track_object is not None)
     sequence = _open_input(source, format, calibration, camera, seconds, (topic_left, topic_right))
-    try:
-        summary = _track(
-            sequence, out, frontend, backend, settings, map, tracks, track_object, location, realtime, threads
-        )
-    except KeyboardInterrupt:
-        if (out / "run.json").exists():
-            typer.echo(f"Stopped; what was tracked until then is in {out}")
-        raise
-    typer.echo(
-        f"{summary['tracking']} of {summary['frames']} frames tracked, {summary['lost']} lost, "
-        f"{summary['skipped']} skipped; {summary['median_inliers']:.0f} inliers in the median frame, "
-        f"{summary['map_points']} map points.\n{summary['calibration_verdict']}\n"
-        f"{_location_verdict(summary)}{_real_time_verdict(summary)}Report: {out / 'report.html'}"
-    )
+    summary = _track(sequence, out, frontend, backend, settings, map, tracks, track_object, location, realtime, threads)
+    tell_summary(summary, out)
 
 
 def _open_input(
@@ -198,45 +197,25 @@ def _track(
     import cv2
 
     from sigmaslam.fusion.readings import read_locations
+    from sigmaslam.runs.stop_signals import Stopped
     from sigmaslam.runs.track import track_sequence
 
     cv2.setNumThreads(threads)
-    return track_sequence(
-        sequence,
-        out,
-        frontend.value,
-        backend.value,
-        config,
-        map_path=map_path,
-        tracks=tracks,
-        track_object=track_object,
-        locations=None if location is None else read_locations(location),
-        real_time=realtime,
-        threads=threads,
-    )
-
-
-def _location_verdict(summary: dict[str, Any]) -> str:
-    """A line about the location sensor; empty without one."""
-    if "location" not in summary:
-        return ""
-    used, weakened, unused, ready = (summary["location"][name] for name in ("used", "weakened", "unused", "ready"))
-    if ready is None:
-        return (
-            f"The location sensor was not fused: its {used} readings with a pose do not show how its world lies to "
-            "ours. Is it the same clock? Positions need a path that is no straight line.\n"
+    try:
+        return track_sequence(
+            sequence,
+            out,
+            frontend.value,
+            backend.value,
+            config,
+            map_path=map_path,
+            tracks=tracks,
+            track_object=track_object,
+            locations=None if location is None else read_locations(location),
+            real_time=realtime,
+            threads=threads,
         )
-    return (
-        f"Location sensor: {used} readings used ({weakened} disagreed and count less), {unused} not; poses are fused "
-        f"from {ready:.3f} s on.\n"
-    )
-
-
-def _real_time_verdict(summary: dict[str, Any]) -> str:
-    """A line about dropped frames and latency; empty where frames were tracked as fast as they could be."""
-    if "real_time" not in summary:
-        return ""
-    from sigmaslam.runs.real_time import format_latency
-
-    figures = format_latency(summary["real_time"]["latency_ms"])
-    return f"In real time: {summary['real_time']['dropped']} frames dropped; latency in ms: {figures}.\n"
+    except Stopped as stop:
+        with suppress(OSError):  # the terminal may be gone
+            typer.echo(f"Stopped; what was tracked until then is in {printable(out)}")
+        raise typer.Exit(stop.exit_code) from stop

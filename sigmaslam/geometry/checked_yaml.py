@@ -1,6 +1,7 @@
 """YAML calibration files whose values are checked as they are read."""
 
 import os
+import re
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any, Self, cast
@@ -23,15 +24,15 @@ class CalibrationYaml:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Self:
-        """Read a file; OpenCV's '%YAML:1.0' first line, which is no YAML, is skipped."""
+        """Read a file; what OpenCV writes into its files and is no plain YAML is taken out."""
         path = Path(path)
         try:
             text = path.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
             raise CalibrationError(f"{path}: cannot read the calibration: {error}") from None
         first, _, body = text.partition("\n")
-        if first.startswith("%YAML:"):
-            text = "\n" + body
+        if first.startswith("%YAML"):
+            text = "\n" + _without_opencv_syntax(body)
         try:
             entries = yaml.safe_load(text)
         except yaml.YAMLError as error:
@@ -103,3 +104,8 @@ class CalibrationYaml:
     def _wrong(self, key: str, expected: str, value: Any, detail: str = "") -> CalibrationError:
         shown = str(value) if len(str(value)) <= 80 else str(value)[:77] + "..."
         return CalibrationError(f"{self.path}: key '{self.prefix}{key}' must be {expected}, got {shown}{detail}")
+
+
+def _without_opencv_syntax(text: str) -> str:
+    """The text without the tag of matrices, and with the space between key and list that OpenCV can do without."""
+    return re.sub(r"^(\s*[\w.]+):(?=\[)", r"\1: ", text.replace("!!opencv-matrix", ""), flags=re.MULTILINE)

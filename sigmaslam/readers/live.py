@@ -10,7 +10,7 @@ from pathlib import Path
 
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.camera import StereoCamera
-from sigmaslam.readers.calibration_files import read_calibration
+from sigmaslam.readers.calibration import calibrated_size, read_calibration
 from sigmaslam.readers.capture import Capture, StereoCapture, open_capture
 from sigmaslam.readers.images import MAX_FAILURES, RawPair, SkippedFrame
 from sigmaslam.readers.kitti import common_size
@@ -33,7 +33,7 @@ def open_cameras(device: str, calibration: Path, seconds: float | None = None) -
     Args:
         device: 'LEFT,RIGHT' or 'side-by-side:DEVICE'. Each is a number, a path (/dev/video2), a URL, or a video
             file, which is played at its own rate as if it were a camera.
-        calibration: our YAML form, whose image size the cameras are asked for, or KITTI's.
+        calibration: as for `read_calibration`; the cameras are asked for the image size that it names.
         seconds: ends the sequence after so long.
 
     Raises:
@@ -44,10 +44,9 @@ def open_cameras(device: str, calibration: Path, seconds: float | None = None) -
     devices = [device.removeprefix(SIDE_BY_SIDE)] if both else device.split(",")
     if len(devices) != (1 if both else 2) or not all(devices) or len(set(devices)) < len(devices):
         raise InputError(f"camera {device!r}: give two different ones as LEFT,RIGHT (0,1), or {SIDE_BY_SIDE}0")
-    size = None
-    if calibration.suffix.lower() in (".yaml", ".yml"):
-        eye = StereoCamera.from_yaml(calibration).left
-        size = (2 * eye.width if both else eye.width, eye.height)
+    size = calibrated_size(calibration)
+    if size is not None and both:
+        size = (2 * size[0], size[1])
     captures: list[Capture] = []
     try:
         for name in devices:

@@ -44,16 +44,25 @@ def list_images(folder: Path) -> list[Path]:
     return files
 
 
-def pair_by_name(left_folder: Path, right_folder: Path) -> list[tuple[Path, Path]]:
+def pair_by_name(
+    left_folder: Path, right_folder: Path, prefixes: tuple[str, str] = ("", "")
+) -> list[tuple[Path, Path]]:
     """Pairs of equal frame numbers (all the numbers in a name), in their order.
 
     Where a name has no number, or a folder has the same numbers twice, whole names are compared.
+
+    Args:
+        left_folder, right_folder: may be the same.
+        prefixes: what the names of left and right images begin with; others are left out.
 
     Raises:
         InputError: an image has no partner; the message gives both counts and the first names.
     """
     folders = (left_folder, right_folder)
-    files = [list_images(folder) for folder in folders]
+    files = [
+        [path for path in list_images(folder) if path.name.startswith(prefix)]
+        for folder, prefix in zip(folders, prefixes, strict=True)
+    ]
     keys: list[list[Key]] = [[_numbers(path) for path in side] for side in files]
     if any(() in side or len(set(side)) < len(side) for side in keys):
         keys = [[path.stem for path in side] for side in files]

@@ -11,6 +11,7 @@ import numpy as np
 
 from sigmaslam.errors import InputError
 
+FRAMES_NAME = "frames.csv"
 COLUMNS = (
     "timestamp",
     "matches",
@@ -54,6 +55,20 @@ class FrameTable:
         stages = np.array(list(self.milliseconds.values())).reshape(-1, len(self))
         measured = np.isfinite(stages).any(axis=0)
         return np.where(measured, np.nansum(stages, axis=0), np.nan)
+
+
+def predicted_poses(frames: FrameTable, timestamps: np.ndarray) -> np.ndarray:
+    """(N,) bool, which poses the motion alone predicts: of frames that are lost, or start without success.
+
+    Args:
+        frames: of the run.
+        timestamps: (N,) of its poses, seconds.
+    """
+    status = np.array(frames.status)
+    without_images = frames.columns["timestamp"][(status == "lost") | (status == "starting")]
+    predicted = np.isin(np.round(timestamps, 6), np.round(without_images, 6))
+    predicted[:1] = False
+    return np.asarray(predicted)
 
 
 def read_frames(path: Path) -> FrameTable:

@@ -12,7 +12,7 @@ import numpy as np
 from markupsafe import Markup
 
 from sigmaslam.errors import InputError
-from sigmaslam.files import atomic_write_text
+from sigmaslam.files import atomic_write_text, printable
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.plot_style import (
     BLUE,
@@ -27,7 +27,7 @@ from sigmaslam.plot_style import (
 )
 from sigmaslam.readers.trajectory_files import read_tum
 from sigmaslam.runs.figures import plot_trajectory, to_svg
-from sigmaslam.runs.frame_table import STATUSES, FrameTable, read_frames
+from sigmaslam.runs.frame_table import FRAMES_NAME, STATUSES, FrameTable, predicted_poses, read_frames
 from sigmaslam.runs.real_time import format_latency
 from sigmaslam.runs.run_folder import FINAL_TRAJECTORY
 
@@ -47,17 +47,17 @@ MAX_CONFIGURATION = 20_000
 def write_report(run_dir: str | Path) -> Path:
     """Write `report.html` from the files of a run folder.
 
-    Reads trajectory.tum and frames.csv, and trajectory_final.tum, map.npz and run.json if they exist. Without
-    matplotlib the report says how to install it in place of the figures.
+    Reads frames.csv, and trajectory.tum, trajectory_final.tum, map.npz and run.json if they exist. Without matplotlib
+    the report says how to install it in place of the figures.
 
     Returns:
         The path of the report.
     Raises:
-        InputError: trajectory.tum or frames.csv is missing, or a file is wrong.
+        InputError: frames.csv is missing, or a file is wrong.
     """
     run_dir = Path(run_dir)
-    trajectory = read_tum(run_dir / "trajectory.tum")
-    frames = read_frames(run_dir / "frames.csv")
+    frames = read_frames(run_dir / FRAMES_NAME)
+    trajectory = _read_trajectory(run_dir / "trajectory.tum")
     points = _read_points(run_dir / "map.npz")
     run = _read_run(run_dir / "run.json")
     configuration = json.dumps(run, indent=2, ensure_ascii=False)
@@ -67,12 +67,14 @@ def write_report(run_dir: str | Path) -> Path:
         loader=jinja2.PackageLoader("sigmaslam.runs", "templates"), autoescape=True, undefined=jinja2.StrictUndefined
     )
     summary = run.get("summary")
+    summary = summary if isinstance(summary, dict) else {}
     draws = has_matplotlib()
     text = environment.get_template("report.html").render(
-        name=run_dir.resolve().name,
+        name=printable(run_dir.resolve().name),
         facts=[*_facts(trajectory, frames, points), *_real_time_facts(run)],
         statuses=[(status, frames.status.count(status)) for status in STATUSES],
-        verdict=summary.get("calibration_verdict") if isinstance(summary, dict) else None,
+        failure=summary.get("failure"),
+        verdict=summary.get("calibration_verdict"),
         figures=_figures(trajectory, _read_final(run_dir / FINAL_TRAJECTORY), frames, points) if draws else [],
         no_figures=None if draws else NO_MATPLOTLIB,
         configuration=configuration if run else None,
@@ -80,6 +82,11 @@ def write_report(run_dir: str | Path) -> Path:
     path = run_dir / "report.html"
     atomic_write_text(path, text)
     return path
+
+
+def _read_trajectory(path: Path) -> Trajectory:
+    """What was said live; empty where no frame has a pose."""
+    return read_tum(path) if path.is_file() else Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
 
 
 def _read_final(path: Path) -> dict[str, Trajectory]:
@@ -162,8 +169,13 @@ def _figures(
     figures = []
     if len(trajectory):
         figure = Figure(figsize=(8, 5.5), layout="constrained")
-        plot_trajectory(figure.add_subplot(), {"trajectory": trajectory, **final}, points)
+        predicted = predicted_poses(frames, trajectory.timestamps)
+        drawn = {"trajectory": trajectory, **final}
+        guesses = {label: predicted for label, each in drawn.items() if len(each) == len(predicted)}
+        plot_trajectory(figure.add_subplot(), drawn, points, guesses)
         caption = "From above; the dot marks the start."
+        if predicted.any():
+            caption += " Dashed where the camera was lost, and its way is a guess."
         if points is not None and len(points):
             caption += f" An even selection of the {len(points)} map points; far ones are cut off."
         figures.append(("Trajectory and map", caption, figure))

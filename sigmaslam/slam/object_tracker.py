@@ -78,6 +78,8 @@ class ObjectEstimate:
 
     def _on_body(self, covariance: np.ndarray) -> np.ndarray:
         """A covariance (6, 6) in the camera's frame as that of `T_camera_object` in the body's own frame."""
+        if not self.camera.has_pose:
+            return covariance
         covariance = turn_covariance(self.camera.T_world_camera, covariance)
         return np.asarray(0.5 * (covariance + covariance.T))
 
@@ -122,7 +124,7 @@ class ObjectTracker:
         rectified_region = rectifier.rectify(raw, raw)[0] > 127
         self._body = BodyAdmission(rectifier.rectified, rectified_region, frontend, config)
         self._tracker = StereoTracker(camera, frontend, backend, config, self._body, threads)
-        # What each frame before the body moved on its own adds to its covariance.
+        # What each frame with a pose before the body moved on its own adds to its covariance.
         self._unseen_motion: list[np.ndarray] = []
 
     @property
@@ -142,6 +144,8 @@ class ObjectTracker:
                 "the first frame has too few points that both eyes see: start where the images are good, "
                 "and check the calibration"
             )
+        if not estimate.has_pose:
+            return ObjectEstimate(estimate)
         unseen, relative_poses = np.zeros((6, 6)), estimate.relative_poses
         if not self._body.separated:
             # In the body's frame, whose axes are the camera's still; from there into the left camera's.
@@ -162,7 +166,7 @@ class ObjectTracker:
         )
 
     def final_trajectory(self) -> tuple[Trajectory, np.ndarray]:
-        """T_camera_object of all frames as it is known now, with covariances (N, 6, 6) in the body's own frame."""
+        """T_camera_object of all frames with a pose as known now, covariances (N, 6, 6) in the body's own frame."""
         camera, covariances = self._tracker.final_trajectory()
         for covariance, unseen in zip(covariances, self._unseen_motion, strict=False):
             covariance += unseen

@@ -99,7 +99,7 @@ class StereoTracker:
         self._relocaliser = Relocaliser(window, keyframes, unguided, admission, config.min_inliers)
         self._recovery = Recovery(course, window, keyframes, motion, self._mapper, admission, config)
         relative_poses = RelativePoseReporter(self._T_rectified_left, window, keyframes, motion)
-        self._reporter = Reporter(self._T_rectified_left, window, motion, course, relative_poses)
+        self._reporter = Reporter(self._T_rectified_left, window, motion, relative_poses)
         self._history = FrameHistory(window, keyframes, self._T_rectified_left)
 
     def load_map(self, path: Path) -> None:
@@ -167,7 +167,7 @@ class StereoTracker:
         return self._keyframes.map().transform(se3_inverse(self._T_rectified_left))
 
     def final_trajectory(self) -> tuple[Trajectory, np.ndarray]:
-        """All frames so far as they are known now, with covariances (N, 6, 6) in the camera's own frame."""
+        """All frames with a pose so far as they are known now, with covariances (N, 6, 6) in the camera's own frame."""
         return self._history.final()
 
     def describe_rectified(self) -> dict[str, Any]:

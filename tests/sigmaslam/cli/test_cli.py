@@ -268,7 +268,23 @@ def test_training_without_its_extra_says_how_to_install_it(tmp_path: Path):
 
 @pytest.mark.parametrize(
     "command",
-    ["", "demo", "track", "evaluate", "match", "refine", "render", "train", "train-scorer", "export", "benchmark"],
+    [
+        "",
+        "demo",
+        "track",
+        "finish",
+        "match",
+        "geometry",
+        "evaluate",
+        "refine",
+        "calibration",
+        "calibration convert",
+        "render",
+        "train",
+        "train-scorer",
+        "export",
+        "benchmark",
+    ],
 )
 def test_every_command_has_help_that_80_columns_do_not_cut(command: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("COLUMNS", "80")

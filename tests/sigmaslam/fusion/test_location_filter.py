@@ -159,6 +159,20 @@ def test_nothing_is_fused_while_the_body_rests_and_poses_stay_as_they_are():
     assert location.trajectory() is None
 
 
+def test_frames_before_the_first_pose_come_back_as_they_are_and_their_readings_are_not_used():
+    drive = Drive(3)
+    estimates = drifting_estimates(drive, 60, SIGMA, 3)
+    times = np.arange(-0.49, 3.0, 0.1)
+    readings = sense(drive.pose(times), times, 3, 0.02, 0.01, MOUNT)
+    nowhere = np.full((4, 4), np.nan), np.diag(np.full(6, np.inf))
+    before = [estimate_of(FRAME * k, *nowhere, "starting") for k in range(-10, 0)]
+    late, location = LocationFilter(readings), LocationFilter(readings)
+    assert all(late.fuse(estimate) is estimate for estimate in before)
+    for estimate in estimates:
+        np.testing.assert_array_equal(late.fuse(estimate).T_world_camera, location.fuse(estimate).T_world_camera)
+    assert (late.summary.used, late.summary.unused) == (location.summary.used, 5)
+
+
 def test_after_a_loss_the_error_is_what_it_was_before():
     """The tracker predicts for two seconds and finds its way back: nothing of the prediction's error stays."""
     drive = Drive(3)

@@ -325,7 +325,9 @@ def test_float_images_are_refused(tmp_path):
 def test_missing_folder_and_unknown_format(tmp_path):
     with pytest.raises(InputError, match="no such file or folder"):
         open_sequence(tmp_path / "nothing")
-    with pytest.raises(InputError, match="'ros' is unknown; use one of auto, kitti, euroc, folder, video, bag"):
+    with pytest.raises(
+        InputError, match="'ros' is unknown; use one of auto, kitti, euroc, 4seasons, folder, video, bag"
+    ):
         open_sequence(tmp_path, format="ros")
 
 
@@ -335,7 +337,8 @@ def test_auto_lists_what_it_looked_for(tmp_path):
         open_sequence(tmp_path)
     for text in (
         "kitti: folders image_0 + image_1",
-        "euroc: folders cam0/data",
+        "euroc: (also TUM-VI) folders cam0/data",
+        "4seasons: folders undistorted_images",
         "folder: folders left",
         "video: one",
         "bag: a ROS bag",
@@ -556,8 +559,8 @@ def test_euroc_names_that_are_no_stamps_need_data_csv(tmp_path):
         ({"intrinsics": [50, 50, 32]}, r"key 'intrinsics' must be 4 numbers in lists, got .* \(size 3\)"),
         ({"T_BS": {"cols": 4, "rows": 4, "data": [1, 2]}}, "key 'T_BS.data' must be 16 numbers"),
         ({"T_BS": {"cols": 4}}, "key 'T_BS.data' is missing"),
-        ({"camera_model": "omni"}, "camera_model is 'omni'; only pinhole"),
-        ({"distortion_model": "fov"}, "distortion_model is 'fov'; known are radial-tangential"),
+        ({"camera_model": "omni"}, "camera_model is 'omni', the omnidirectional model, which is not supported"),
+        ({"distortion_model": "fov"}, "distortion_model is 'fov', the field-of-view model, which is not supported"),
         ({"distortion_coefficients": [0.1]}, "distortion has 1 coefficients"),
         ({"T_BS": {"data": [0.0] * 16}}, "T_BS of"),
     ],

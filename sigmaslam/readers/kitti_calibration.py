@@ -1,4 +1,4 @@
-"""Calibration files in three forms: the project's YAML, and KITTI's two."""
+"""KITTI's calibration files: calib.txt and calib_cam_to_cam.txt."""
 
 from pathlib import Path
 
@@ -6,29 +6,13 @@ import numpy as np
 
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
-
-ImageSize = tuple[int, int]
+from sigmaslam.readers.calibration_size import ImageSize, UnknownImageSizeError, need_image_size
+from sigmaslam.readers.camera_infos import right_position
 
 GREY_PAIR = (0, 1)
 
 
-def read_calibration(path: Path, image_size: ImageSize, cameras: tuple[int, int] = GREY_PAIR) -> StereoCamera:
-    """Read the project's YAML form, or one of KITTI's text forms.
-
-    Args:
-        path: `*.yaml` / `*.yml` for `StereoCamera.from_yaml`, anything else for `read_kitti_calibration`.
-        image_size: (width, height) of the images, which KITTI's files do not give.
-        cameras: KITTI's numbers of the left and right camera.
-
-    Raises:
-        CalibrationError: names file, key and what was expected.
-    """
-    if path.suffix.lower() in (".yaml", ".yml"):
-        return StereoCamera.from_yaml(path)
-    return read_kitti_calibration(path, image_size, cameras)
-
-
-def read_kitti_calibration(path: Path, image_size: ImageSize, cameras: tuple[int, int]) -> StereoCamera:
+def read_kitti_calibration(path: Path, image_size: ImageSize | None, cameras: tuple[int, int]) -> StereoCamera:
     """Read KITTI's calib.txt ('P0: ' and 12 numbers, or bare lines of 12) or calib_cam_to_cam.txt.
 
     With calib_cam_to_cam.txt the image size decides: P_rect for rectified images (S_rect), else K, D, R, T of
@@ -47,11 +31,13 @@ def read_kitti_calibration(path: Path, image_size: ImageSize, cameras: tuple[int
         for name in ("S_rect", "S")
         if f"{name}_{left:02d}" in entries
     }
+    known = ", ".join(f"{name}_{left:02d} {size[0]}x{size[1]}" for name, size in sizes.items())
+    if image_size is None:
+        raise UnknownImageSizeError(f"{path}: is for {known or 'images of a size it does not name'}; give --size")
     if not sizes or sizes.get("S_rect") == image_size:
         return _from_projections(path, entries, (f"P_rect_{left:02d}", f"P_rect_{right:02d}"), image_size)
     if sizes.get("S") == image_size:
         return _from_originals(path, entries, cameras, image_size)
-    known = ", ".join(f"{name}_{left:02d} {size[0]}x{size[1]}" for name, size in sizes.items())
     raise CalibrationError(
         f"{path}: images are {image_size[0]}x{image_size[1]}, the calibration is for {known}; "
         "use the calibration that belongs to these images"
@@ -118,20 +104,15 @@ def _model(
 
 
 def _from_projections(
-    path: Path, entries: dict[str, str], keys: tuple[str, str], image_size: ImageSize
+    path: Path, entries: dict[str, str], keys: tuple[str, str], image_size: ImageSize | None
 ) -> StereoCamera:
     """From P = K [I | t], where t is the position of camera 0 in this camera's frame."""
+    image_size = need_image_size(str(path), image_size)
     left, right = (_matrix(path, entries, key, (3, 4)) for key in keys)
     models = [_model(path, key, P[:, :3], image_size) for key, P in zip(keys, (left, right), strict=True)]
     T_left_right = np.eye(4)
     T_left_right[:3, 3] = right_position(left, right)
     return _stereo(path, models[0], models[1], T_left_right)
-
-
-def right_position(P_left: np.ndarray, P_right: np.ndarray) -> np.ndarray:
-    """Position of the right camera in the left one, (3,) metres, from (3, 4) projections of parallel cameras."""
-    left, right = (np.linalg.solve(P[:, :3], P[:, 3]) for P in (P_left, P_right))
-    return left - right
 
 
 def _from_originals(
