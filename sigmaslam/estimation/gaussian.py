@@ -24,14 +24,6 @@ def condition_common(common: np.ndarray, covariance: np.ndarray, information: np
     return np.asarray(common - covariance @ (information @ common))
 
 
-def weighted_information(whitened: np.ndarray, offset: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What `condition` takes, from derivatives with residuals (3 M, n + 1) about `offset`, weighted (M,)."""
-    rows = whitened * np.sqrt(np.repeat(weight, 3))[:, None]
-    by_state, residual = rows[:, :-1], rows[:, -1]
-    information = by_state.T @ by_state
-    return information, by_state.T @ residual + information @ offset
-
-
 def matrix_root(covariance: np.ndarray) -> np.ndarray:
     """A with A A^T = covariance, which may be singular."""
     values, vectors = np.linalg.eigh(covariance)

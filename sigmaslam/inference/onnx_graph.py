@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from importlib.resources import as_file, files
 from pathlib import Path
 
@@ -56,8 +57,12 @@ def shipped_weights(name: str) -> Path:
         return Path(path)
 
 
+@cache
 def load_step(name: str, backend: str) -> Callable[[Mapping[str, np.ndarray]], list[np.ndarray]]:
-    """A step of the filter by the name of its graph, with one of `BACKENDS`; "torch" is the same step in torch."""
+    """A step of the filter by the name of its graph, with one of `BACKENDS`; "torch" is the same step in torch.
+
+    It has no state, and is loaded once in a process.
+    """
     if backend == "torch":
         from sigmaslam.models.torch_runtime import filter_module
 
