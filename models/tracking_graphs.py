@@ -31,9 +31,9 @@ def frame_axes(*inputs: str) -> tuple[dict[int, Any], ...]:
     poses = torch.export.Dim("poses", min=2, max=1000)
     columns = torch.export.Dim("columns", min=1, max=10_000)
     state = 6 * poses + CALIBRATION_SIZE
-    axes: dict[str, dict[int, Any]] = dict.fromkeys(("pair", "common", "covariance", "estimate"), {0: views})
-    axes |= dict.fromkeys(("measurement", "noise", "moved"), {0: views})
-    axes |= dict.fromkeys(("anchors", "views"), {0: pairs})
+    names = ("pair", "common", "covariance", "estimate", "measurement", "noise", "moved")
+    axes: dict[str, dict[int, Any]] = {name: {0: views} for name in names}
+    axes |= {name: {0: pairs} for name in ("anchors", "views")}
     axes |= {"dependence": {0: views, 2: state}, "poses": {0: poses}, "factor": {0: state, 1: columns}}
     axes |= {"offset": {0: state}, "spread": {0: state, 1: state}, "prior": {0: state}}
     return tuple(axes.get(name, {}) for name in inputs)
@@ -46,11 +46,10 @@ def window_axes(*inputs: str) -> tuple[dict[int, Any], ...]:
     pairs = torch.export.Dim("pairs", min=1, max=10_000)
     poses = torch.export.Dim("poses", min=2, max=1000)
     state = 6 * poses + CALIBRATION_SIZE
-    axes: dict[str, dict[int, Any]] = dict.fromkeys(
-        ("pair", "common", "owner", "measurement", "noise"), {0: observations}
-    )
-    axes |= dict.fromkeys(("estimate", "covariance", "measured", "variance"), {0: landmarks})
-    axes |= dict.fromkeys(("anchors", "views"), {0: pairs})
+    names = ("pair", "common", "owner", "measurement", "noise")
+    axes: dict[str, dict[int, Any]] = {name: {0: observations} for name in names}
+    axes |= {name: {0: landmarks} for name in ("estimate", "covariance", "measured", "variance")}
+    axes |= {name: {0: pairs} for name in ("anchors", "views")}
     axes |= {"poses": {0: poses}, "spread": {0: state, 1: state}}
     return tuple(axes.get(name, {}) for name in inputs)
 

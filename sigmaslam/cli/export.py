@@ -21,7 +21,8 @@ def export(
 ) -> None:
     """Export what a run made to ONNX and check the graphs against torch (needs the extra 'train').
 
-    A run of 'train' gives the features' graph and those of the tracker's estimator, a run of 'train-scorer' scorer and verifier.
+    A run of 'train' gives the features' graph and those of the tracker's estimator, a run of 'train-scorer' scorer and
+    verifier.
     """
     need_train_extra()
     from sigmaslam.evaluation.matching import read_scores

@@ -1,8 +1,8 @@
 """The update of one frame's pose against a window of keyframes.
 
 A frame that is no keyframe is estimated from the window's posterior and its own views alone, and then forgotten but for
-the velocity: nothing of it can be counted twice. The equations are `sigmaslam.filters.tracking.frame_update`, which runs
-as graphs; here is what decides.
+the velocity: nothing of it can be counted twice. The equations are `sigmaslam.filters.tracking.frame_update`, which
+runs as graphs; here is what decides.
 """
 
 from __future__ import annotations

@@ -23,6 +23,7 @@ from sigmaslam.estimation.gaussian import condition, condition_common, matrix_ro
 from sigmaslam.estimation.landmark_table import KeyframeViews, LandmarkTable, LandmarkViews
 from sigmaslam.estimation.marginalised_poses import PastPoses, point_lever
 from sigmaslam.estimation.state_layout import CALIBRATION_SIZE, LANDMARK_SIZE, MODELLED, pose_slice
+from sigmaslam.estimation.window_equations import eliminate_landmarks, gate_views
 from sigmaslam.estimation.window_state import WindowState, loop_difference
 from sigmaslam.geometry.camera import RectifiedStereo
 
@@ -148,7 +149,7 @@ class KeyframeWindow:
         """Posterior of poses, calibration and landmarks from the prior and all views: Gauss-Newton, then a gate."""
         factor = matrix_root(self.prior.covariance)
         for _ in range(iterations):
-            information, vector, rows, landmarks = _eliminate(self, self._observations)
+            information, vector, rows, landmarks = eliminate_landmarks(self, self._observations)
             offset = self.posterior.minus(self.prior)
             vector = vector + information @ offset
             state, covariance = condition(factor, information, vector)
@@ -160,7 +161,7 @@ class KeyframeWindow:
                 self.landmarks.estimate[rows] += own_step + self.landmarks.dependence[rows] @ step
         past = self.prior.past.given(self.prior.covariance, self.prior.common, information, vector)
         self.posterior = replace(self.posterior, past=past)
-        agree = _agree(self, self._observations)
+        agree = gate_views(self, self._observations)
         if not agree.all():
             self._observations = self._observations.select(agree)
         if _refuse_errors(self):
@@ -198,7 +199,7 @@ class KeyframeWindow:
         """
         leaving = self.landmarks.anchor == 0
         observed = leaving[self._observations.views.landmark]
-        information, vector, *_ = _eliminate(self, self._observations.select(observed))
+        information, vector, *_ = eliminate_landmarks(self, self._observations.select(observed))
         vector = vector + information @ self.posterior.minus(self.prior)
         self.prior = self.prior.given(information, vector).marginalise_oldest()
         self.posterior = self.posterior.marginalise_oldest()
@@ -239,65 +240,3 @@ def _refuse_errors(window: KeyframeWindow) -> bool:
             state.without_estimate(index, prior.sigma[index]) for state in (window.prior, window.posterior)
         )
     return bool(indices)
-
-
-# ---- the equations
-
-
-def _eliminate(
-    window: KeyframeWindow, observations: KeyframeViews
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]]:
-    """Information matrix and vector of the state at the posterior, every landmark's own equations solved for it.
-
-    Returns:
-        Both, and of the landmarks (K,) that are seen: their rows; covariance, dependence on the state, and step to
-        their best places if it stays, or nothing where there are none.
-    """
-    size = len(window.posterior.covariance)
-    rows, owner = np.unique(observations.views.landmark, return_inverse=True)
-    if not len(rows):  # the graph takes no empty batch
-        return np.zeros((size, size)), np.zeros(size), rows, []
-    landmarks, freedom = window.landmarks, np.array(window.student_freedom)
-    own = {"measured": landmarks.measured[rows], "variance": landmarks.variance[rows], "freedom": freedom}
-    feed = {**own, **_views(window, observations, rows, owner)}
-    information, vector, *eliminated = window.graphs.eliminate_landmarks(feed)
-    return information, vector, rows, eliminated
-
-
-def _agree(window: KeyframeWindow, observations: KeyframeViews) -> np.ndarray:
-    """(O,) bool: which views fit the posterior (99.9 %)."""
-    rows, owner = np.unique(observations.views.landmark, return_inverse=True)
-    if not len(rows):
-        return np.zeros(0, bool)
-    return window.graphs.gate_window(_views(window, observations, rows, owner))[0]
-
-
-def _views(
-    window: KeyframeWindow, observations: KeyframeViews, rows: np.ndarray, owner: np.ndarray
-) -> dict[str, np.ndarray]:
-    """The fields of `sigmaslam.filters.tracking.window_solution.WindowViews`: views of landmarks (K,) by row.
-
-    Args:
-        window: at its posterior.
-        observations: O views.
-        rows: of the landmark table.
-        owner: (O,) which of these each view sees.
-    """
-    state, landmarks, views = window.posterior, window.landmarks, observations.views
-    anchor = landmarks.anchor[views.landmark]
-    pairs, pair = np.unique(anchor * len(state) + observations.keyframe, return_inverse=True)
-    return {
-        **window.graphs.constants(window.depth),
-        "anchors": pairs // len(state),
-        "views": pairs % len(state),
-        "pair": pair,
-        "common": views.common,
-        "owner": owner,
-        "estimate": landmarks.estimate[rows],
-        "covariance": landmarks.covariance[rows],
-        "poses": state.poses,
-        "calibration": state.calibration,
-        "spread": state.covariance,
-        "measurement": views.measurement,
-        "noise": views.noise,
-    }
