@@ -1,7 +1,7 @@
 """Factors and inverses of positive definite matrices, which export to ONNX in few operators.
 
-`torch.linalg.inv_ex` becomes ONNX Runtime's own operator `Inverse`; a Cholesky factor has no operator, and is unrolled over
-its columns.
+`torch.linalg.inv_ex` becomes ONNX Runtime's own operator `Inverse`; a Cholesky factor has no operator, and is unrolled
+over its columns.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ class FrameViews(NamedTuple):
     factor: Tensor
 
     def linearise(self, offset: Tensor, spread: Tensor, moved: Tensor) -> Slopes:
-        """The views at a state `offset` (n,) from the prior's mean, with landmarks `moved` (M, 6) from where it has them.
+        """The views at a state `offset` (n,) from the prior's mean, landmarks `moved` (M, 6) from where it has them.
 
         Args:
             offset, moved: see above.
