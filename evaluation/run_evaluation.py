@@ -1,16 +1,18 @@
 """Evaluate a run, or a trajectory of any origin, against the truth."""
 
+from __future__ import annotations
+
 import json
+import logging
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
+from sigmaslam.bounded_files import TABLE_BYTES, read_text
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.metrics.map_consistency import coverage
 from sigmaslam.evaluation.metrics.relative_consistency import SpanConsistency, relative_consistency, truth_covariance
@@ -30,13 +32,21 @@ from sigmaslam.evaluation.metrics.trajectory_errors import (
     synchronise,
 )
 from sigmaslam.evaluation.relative_summary import draw_relative, format_relative, span_to_dict
+from sigmaslam.evaluation.truth_conventions import TruthConvention, find_convention, find_time_unit, scale_times
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
-from sigmaslam.plot_style import BLUE, VERMILLION, style_axes
-from sigmaslam.readers.trajectory_files import check_covariances, kitti_times_path, read_trajectory, trajectory_format
+from sigmaslam.plot_style import BLUE, VERMILLION, has_matplotlib, style_axes
+from sigmaslam.readers.trajectory_files import kitti_times_path, read_covariances, read_trajectory, trajectory_format
 from sigmaslam.runs.figures import AXIS_NAMES, plot_trajectory, save_png
+from sigmaslam.runs.frame_table import FRAMES_NAME, FrameTable, predicted_poses, read_frames
 from sigmaslam.runs.relative_pose_file import RELATIVE_POSES_NAME, read_frame_pairs
-from sigmaslam.runs.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY
+from sigmaslam.runs.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY, check_has_trajectory
+
+_LOGGER = logging.getLogger(__name__)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,18 +65,21 @@ class Evaluation:
 
     Attributes:
         estimate_path, truth_path: the files that were compared.
-        association: how frames were paired: "time", "index" (a file without times, as many poses in both) or
-            "time at 10 Hz" (a KITTI file without times).
+        association: how frames were paired: "time" (with the unit where the truth's times are not in seconds), "index"
+            (a file without times, as many poses in both) or "time at 10 Hz" (a KITTI file without times).
         matched: number of estimated poses with a true one.
-        frames: number of frames that a full trajectory would have (see `evaluate_run`).
+        frames: number of frames with a truth, with a pose or without (see `evaluate_run`).
+        predicted: number of the matched poses that the motion alone predicts, while the camera was lost.
         path_length, estimate_path_length: of the matched poses, metres.
         ate, ate_origin: absolute error after the best rigid alignment, and with only the first poses equal.
         rpe: error of the motion from frame to frame.
         kitti: segment errors.
         nees: of poses relative to the first; None where there is no covariance.
         relative: consistency of poses relative to earlier ones, by span; None where the run does not say.
-        figure_path: the plots; None where none were asked for.
+        figure_path: the plots; None where none were asked for, or matplotlib is not installed.
         final: of the trajectory after the fact; None where there is none.
+        truth_hint: the convention in which the truth would fit, in words and as options; None where it fits as it was
+            read, or in no way.
     """
 
     estimate_path: Path
@@ -84,6 +97,8 @@ class Evaluation:
     relative: tuple[SpanConsistency, ...] | None
     figure_path: Path | None
     final: FinalErrors | None = None
+    predicted: int = 0
+    truth_hint: str | None = None
 
     @property
     def coverage(self) -> float:
@@ -96,9 +111,11 @@ class Evaluation:
             "estimate": str(self.estimate_path),
             "truth": str(self.truth_path),
             "association": self.association,
+            "truth_hint": self.truth_hint,
             "matched": self.matched,
             "frames": self.frames,
             "coverage": self.coverage,
+            "predicted": self.predicted,
             "path_length": self.path_length,
             "estimate_path_length": self.estimate_path_length,
             **_errors_to_dict(self),
@@ -119,14 +136,16 @@ def evaluate_run(
     plot: bool = True,
     truth_sigma_position: float | None = None,
     truth_sigma_rotation: float | None = None,
+    truth_convention: TruthConvention | None = None,
 ) -> Evaluation:
     """Compare a run folder or a trajectory file with the truth.
 
-    Frames are paired by time. Where either file is KITTI without times.txt and both have as many poses, they
-    are paired by index; where they have not, the 10 Hz of KITTI are assumed and every time must then agree.
+    Frames are paired by time. Where either file is KITTI without times.txt and both have as many poses, or a run has as
+    many frames, they are paired by index; else the 10 Hz of KITTI are assumed and every time must then agree.
     Of a run with `--track-object` the truth is T_camera_object of any frame that is fixed to the body.
-    The frames of a run are those of its `frames.csv`; for a file alone they are as many as fit into the time
-    of the truth at the estimate's rate, and never more than there are true poses.
+    The frames of a run are those of its `frames.csv` that have a truth; for a file alone they are as many as fit into
+    the time of the truth at the estimate's rate, and never more than there are true poses. Where the truth would fit in
+    another convention the evaluation says so, and is not changed.
 
     Args:
         run_or_trajectory: a folder with `trajectory.tum` (and `covariance.npy`, (N, 6, 6) in the body frame;
@@ -134,19 +153,23 @@ def evaluate_run(
             relative to earlier ones are judged where it holds `relative_poses.npz`.
         truth: TUM, KITTI, or EuRoC ground truth.
         lengths, step: segments of the KITTI errors (see `kitti_errors`).
-        plot: write `evaluation.png` into the run folder or beside the trajectory.
+        plot: write `evaluation.png` into the run folder or beside the trajectory, where matplotlib is installed.
         truth_sigma_position, truth_sigma_rotation: standard deviations of each true pose, of each coordinate (metres)
             and about each axis (degrees), for the poses relative to earlier ones; where one alone is given the other is
             zero.
+        truth_convention: how the truth is to be read; None: as T_world_camera in metres, x before w.
     Raises:
-        InputError: a file is missing or wrong, or the timestamps do not meet.
+        InputError: a file is missing or wrong, no frame has a pose, or the timestamps do not meet.
     """
     run_or_trajectory, truth = Path(run_or_trajectory), Path(truth)
     is_run = run_or_trajectory.is_dir()
     estimate_path = run_or_trajectory / "trajectory.tum" if is_run else run_or_trajectory
-    if is_run and not estimate_path.is_file():
-        raise InputError(f"{run_or_trajectory}: holds no trajectory.tum; give a folder written by `sigmaslam track`")
-    estimate, true, association = _same_clock(estimate_path, truth)
+    frames = None
+    if is_run:
+        check_has_trajectory(run_or_trajectory)
+        if (run_or_trajectory / FRAMES_NAME).is_file():
+            frames = read_frames(run_or_trajectory / FRAMES_NAME)
+    estimate, true, association = _same_clock(estimate_path, truth, frames)
     paired, _ = associate(estimate, true, 1e-3 if association == "time at 10 Hz" else MAX_DIFFERENCE)
     if association == "time at 10 Hz" and len(paired) < len(estimate):
         raise InputError(
@@ -155,18 +178,24 @@ def evaluate_run(
             "times.txt of the images beside the pose file"
         )
     follows_object = is_run and _follows_object(run_or_trajectory)
+    convention, has_quaternions = truth_convention or TruthConvention(), trajectory_format(truth) == "tum"
+    if convention.quaternion != "xyzw" and not has_quaternions:
+        raise InputError(f"{truth}: the order of quaternions can be chosen for TUM files alone, and this is none")
+    other = None if follows_object else find_convention(estimate, true, convention, has_quaternions)
+    true = convention.apply(true)
     sigmas = truth_sigma_position, truth_sigma_rotation
     relative = _judge_relative_poses(run_or_trajectory, estimate, true, sigmas, follows_object) if is_run else None
     if follows_object:
         true = _of_followed_frame(estimate, true)
     covariance = _read_covariance(run_or_trajectory / "covariance.npy", len(estimate)) if is_run else None
     matched_estimate, matched_truth = synchronise(estimate, true)
+    predicted = np.zeros(len(estimate), bool) if frames is None else predicted_poses(frames, estimate.timestamps)
     evaluation = Evaluation(
         estimate_path=estimate_path,
         truth_path=truth,
         association=association,
         matched=len(matched_estimate),
-        frames=_frame_count(run_or_trajectory if is_run else None, estimate, true, len(matched_estimate)),
+        frames=_frame_count(frames, estimate, true, len(matched_estimate)),
         path_length=matched_truth.path_length,
         estimate_path_length=matched_estimate.path_length,
         ate=absolute_trajectory_error(estimate, true, "se3"),
@@ -175,12 +204,18 @@ def evaluate_run(
         kitti=kitti_errors(estimate, true, lengths, step),
         nees=pose_nees(estimate, true, covariance) if covariance is not None else None,
         relative=relative,
-        figure_path=estimate_path.parent / "evaluation.png" if plot else None,
+        figure_path=estimate_path.parent / "evaluation.png" if plot and has_matplotlib() else None,
         final=_evaluate_final(run_or_trajectory, estimate, true) if is_run else None,
+        predicted=int(predicted[associate(estimate, true)[0]].sum()),
+        truth_hint=None if other is None else other.describe(),
     )
     if evaluation.figure_path:
-        figure = draw_evaluation(evaluation, estimate, true, covariance)
-        save_png(figure, evaluation.figure_path)
+        figure = draw_evaluation(evaluation, estimate, true, covariance, predicted)
+        try:
+            save_png(figure, evaluation.figure_path)
+        except (OSError, InputError) as error:
+            _LOGGER.warning("evaluation.png is not written: %s", getattr(error, "strerror", None) or error)
+            return replace(evaluation, figure_path=None)
     return evaluation
 
 
@@ -190,8 +225,10 @@ def format_evaluation(evaluation: Evaluation) -> str:
     lines = [
         f"estimate  {e.estimate_path}",
         f"truth     {e.truth_path} (paired by {e.association})",
-        f"frames    {e.matched} of {e.frames} ({100 * e.coverage:.1f} %)",
+        f"frames    {e.matched} of the {e.frames} with a truth have an estimate ({100 * e.coverage:.1f} %)"
+        + (f", {e.predicted} of them while lost, from the motion alone" if e.predicted else ""),
         f"path      {e.path_length:.2f} m true, {e.estimate_path_length:.2f} m estimated",
+        *([f"The truth looks like {e.truth_hint}"] if e.truth_hint else []),
         "",
         f"{'':<24}{'rmse [m]':>11}{'mean [m]':>11}{'median [m]':>12}{'max [m]':>11}{'rotation [deg]':>16}",
         *_error_rows(e),
@@ -221,6 +258,7 @@ def draw_evaluation(
     estimate: Trajectory,
     truth: Trajectory,
     covariance: np.ndarray | None = None,
+    predicted: np.ndarray | None = None,
 ) -> Figure:
     """View from above, height, errors over time with 3 sigma, and segment errors.
 
@@ -228,7 +266,10 @@ def draw_evaluation(
         evaluation: of these trajectories.
         estimate, truth: trajectories in one clock.
         covariance: (N, 6, 6) of the estimate, body frame, translation first.
+        predicted: (N,) bool, which poses of the estimate no image confirms; None: none of them.
     """
+    from matplotlib.figure import Figure
+
     spans = evaluation.relative or ()
     rows = (1.5, 1, 1, 1) if spans else (1.5, 1, 1)
     figure = Figure(figsize=(11, 2.0 + 2.6 * sum(rows) - 0.1), layout="constrained")
@@ -238,7 +279,8 @@ def draw_evaluation(
     seconds = matched_estimate.timestamps - matched_estimate.timestamps[0]
 
     above = figure.add_subplot(grid[0, 0])
-    _, _, height = plot_trajectory(above, {"truth": matched_truth, "estimate": aligned})
+    guesses = {} if predicted is None else {"estimate": predicted[associate(estimate, truth)[0]]}
+    _, _, height = plot_trajectory(above, {"truth": matched_truth, "estimate": aligned}, predicted=guesses)
     above.set_title(f"From above, best alignment: ATE {evaluation.ate.rmse:.3g} m rmse", fontsize=10)
 
     side = figure.add_subplot(grid[0, 1])
@@ -320,10 +362,16 @@ def _judge_relative_poses(
 
 def _error_rows(errors: Evaluation | FinalErrors) -> list[str]:
     """ATE and RPE, a line each."""
+    # On a straight path the best alignment may turn about the path, by much more than the rotations are wrong.
+    rotation_error = errors.ate_origin.rotation_rmse_deg
+    straight = errors.ate.turn_deg > rotation_error and errors.ate.rotation_rmse_deg > 2 * rotation_error
+    turn = "not determined" if straight else f"{errors.ate.rotation_rmse_deg:.4f}"
     rows = [
-        f"{name:<24}{ate.rmse:>11.4f}{ate.mean:>11.4f}{ate.median:>12.4f}{ate.maximum:>11.4f}"
-        f"{ate.rotation_rmse_deg:>16.4f}"
-        for name, ate in (("ATE, best alignment", errors.ate), ("ATE, first pose", errors.ate_origin))
+        f"{name:<24}{ate.rmse:>11.4f}{ate.mean:>11.4f}{ate.median:>12.4f}{ate.maximum:>11.4f}{rotation:>16}"
+        for name, ate, rotation in (
+            ("ATE, best alignment", errors.ate, turn),
+            ("ATE, first pose", errors.ate_origin, f"{errors.ate_origin.rotation_rmse_deg:.4f}"),
+        )
     ]
     rpe = errors.rpe
     name = f"RPE, {rpe.delta} frame" + ("s" if rpe.delta > 1 else "")
@@ -378,24 +426,29 @@ def _evaluate_final(run: Path, estimate: Trajectory, truth: Trajectory) -> Final
     )
 
 
-def _same_clock(estimate_path: Path, truth_path: Path) -> tuple[Trajectory, Trajectory, str]:
-    """Both trajectories, in one clock, and how that was reached."""
+def _same_clock(estimate_path: Path, truth_path: Path, frames: FrameTable | None) -> tuple[Trajectory, Trajectory, str]:
+    """Both trajectories, in one clock, and how that was reached; with all frames of a run, with a pose or without."""
     estimate, truth = read_trajectory(estimate_path), read_trajectory(truth_path)
     untimed = any(
         trajectory_format(path) == "kitti" and kitti_times_path(path) is None for path in (estimate_path, truth_path)
     )
     if not untimed:
-        return estimate, truth, "time"
+        unit = find_time_unit(estimate, truth)
+        if unit is None:
+            return estimate, truth, "time"
+        return estimate, scale_times(truth, unit), f"time, that of the truth in {unit}"
     if len(estimate) == len(truth):
         return estimate, Trajectory(estimate.timestamps, truth.poses), "index"
+    if frames is not None and len(frames) == len(truth):
+        return estimate, Trajectory(frames.columns["timestamp"], truth.poses), "index"
     return estimate, truth, "time at 10 Hz"
 
 
 def _follows_object(run: Path) -> bool:
     """Whether a run's poses are those of a body before a camera at rest."""
     try:
-        return "object" in json.loads((run / "run.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return "object" in json.loads(read_text(run / "run.json", TABLE_BYTES, "the run"))
+    except (InputError, ValueError, RecursionError, TypeError):
         return False
 
 
@@ -412,18 +465,14 @@ def _of_followed_frame(estimate: Trajectory, truth: Trajectory) -> Trajectory:
 def _read_covariance(path: Path, count: int) -> np.ndarray | None:
     if not path.is_file():
         return None
-    try:
-        covariance = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path}: is no numpy array ({error}); run `sigmaslam track` again") from error
-    return check_covariances(covariance, path, count)
+    return read_covariances(path, count)
 
 
-def _frame_count(run: Path | None, estimate: Trajectory, truth: Trajectory, matched: int) -> int:
-    frames = run / "frames.csv" if run else None
-    if frames and frames.is_file():
-        rows = [line for line in frames.read_text(encoding="utf-8").splitlines() if line.strip()]
-        return max(len(rows) - 1, matched)
+def _frame_count(frames: FrameTable | None, estimate: Trajectory, truth: Trajectory, matched: int) -> int:
+    if frames is not None:
+        times = frames.columns["timestamp"]
+        everywhere = Trajectory(times, np.tile(np.eye(4), (len(times), 1, 1)))
+        return max(len(associate(everywhere, truth)[0]), matched)
     if len(estimate) < 2:
         return max(len(truth), matched)
     interval = float(np.median(np.diff(estimate.timestamps)))

@@ -22,6 +22,7 @@ from sigmaslam.inference.onnx_graph import shipped_weights
 from sigmaslam.readers import StereoSequence, open_sequence
 from sigmaslam.readers.trajectory_files import read_trajectory
 from sigmaslam.runs.frame_table import FrameTable, read_frames
+from sigmaslam.runs.run_folder import check_has_trajectory
 from sigmaslam.runs.track import track_sequence
 
 if TYPE_CHECKING:
@@ -84,6 +85,12 @@ class TrialResult:
         return np.array(self.table.status) == "tracking"
 
     @property
+    def tracked_poses(self) -> np.ndarray:
+        """(M,) bool, `tracked` of the frames of the trajectory, in which frames before the start have no row."""
+        rows = np.searchsorted(self.table.columns["timestamp"], self.trajectory.timestamps - 1e-6)
+        return self.tracked[rows]
+
+    @property
     def nis(self) -> np.ndarray:
         """(M,) normalised innovation squared per degree of freedom of the tracked frames."""
         columns = self.table.columns
@@ -125,6 +132,7 @@ def read_trial(
     run: Path, truth: Path | None, lengths: Sequence[float] | None = None, step: int | None = None
 ) -> TrialResult:
     """The result of a trial whose run folder is there; arguments as `Trial` and `Trial.run` take them."""
+    check_has_trajectory(run)
     point_map = {}
     if (run / "map.npz").is_file():
         with np.load(run / "map.npz") as content:

@@ -11,9 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import onnx
 import torch
-from onnxscript.values import Opset
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
@@ -21,13 +19,16 @@ from torch import Tensor, nn
 from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.files import atomic_path, atomic_write_text, make_folder
 from sigmaslam.filters.onnx.exportable_se3 import exp_se3
+from sigmaslam.filters.onnx.graph_file import strip_origins
 from sigmaslam.filters.onnx.pose_prediction import STATE_SIZE, Predict
 from sigmaslam.filters.tracking.frame_update import FrameViews, GatedStep, PredictViews, RobustStep
 from sigmaslam.filters.tracking.window_solution import EliminateLandmarks, GateWindow, WindowViews
 from sigmaslam.inference.onnx_graph import OnnxGraph
+from sigmaslam.inference.weight_manifest import check_weights, update_manifest
 from sigmaslam.models.extractor import EXTRACTOR_SIZE_MULTIPLE, FeatureExtractor
 from sigmaslam.models.feature_network import DESCRIPTOR_SIZE, STRIDE, FeatureNetwork
 from sigmaslam.models.model_card import card_page, read_card, scoring_page
+from sigmaslam.models.runtime_operators import inverse_operator
 from sigmaslam.models.scorer_network import NEIGHBOURS, SIDE_CHANNELS, MatchScorer, ScoredMatches
 from sigmaslam.models.tracking_graphs import (
     GATED_INPUTS,
@@ -72,7 +73,7 @@ def load_network(weights: Path, descriptor_size: int = DESCRIPTOR_SIZE, stride: 
         weights: safetensors file.
         descriptor_size, stride: of the network that was trained.
     Raises:
-        InputError: the file is missing or holds another network.
+        InputError: the file is missing, not the one that its manifest names, or holds another network.
     """
     return _load(FeatureNetwork(descriptor_size, stride), weights)
 
@@ -111,6 +112,7 @@ def export_scoring(run: Path, out: Path) -> dict[str, float]:
             path.write_bytes(copied)
     atomic_write_text(out / "matching.json", json.dumps(content, indent=2) + "\n")
     atomic_write_text(out / "matching.md", scoring_page(content))
+    update_manifest(out, [f"{name}{suffix}" for name in graphs for suffix in (".onnx", ".safetensors")])
     return differences
 
 
@@ -135,9 +137,11 @@ def export_features(weights: Path, out: Path) -> float:
 
 def export_filter(folder: Path) -> dict[str, float]:
     """Writes the filter's graphs and returns the largest difference of each from torch."""
-    return {
+    differences = {
         name: _export(graph, folder / f"{name}.onnx", _FILTER_TOLERANCE) for name, graph in _filter_graphs().items()
     }
+    update_manifest(folder, [f"{name}.onnx" for name in differences])
+    return differences
 
 
 def export_all(
@@ -162,12 +166,14 @@ def export_all(
         path.write_bytes(copied)
     atomic_write_text(out / "features.json", json.dumps(content, indent=2) + "\n")
     atomic_write_text(out / "features.md", card_page(content))
+    update_manifest(out, ["features.safetensors", "features.onnx"])
     return differences
 
 
 def _load(module: _Module, weights: Path) -> _Module:
     if not weights.is_file():
         raise InputError(f"{weights} does not exist: train first, or give the path of a .safetensors file")
+    check_weights(weights, weights.read_bytes())
     try:
         module.load_state_dict(load_file(weights))
     except (RuntimeError, ValueError, SafetensorError) as error:
@@ -292,7 +298,7 @@ def _export(
             dynamic_shapes=graph.dynamic,
             opset_version=_OPSET,
             verbose=False,
-            custom_translation_table={torch.ops.aten.linalg_inv_ex.default: _declare_inverse()},
+            custom_translation_table={torch.ops.aten.linalg_inv_ex.default: inverse_operator()},
         )
         assert program is not None
         program.save(path, external_data=False)
@@ -308,41 +314,6 @@ def _export(
                 f"{out.name} differs from torch by {difference:.2e}, more than {tolerance:.0e}: not written"
             )
     return difference
-
-
-def _declare_inverse() -> Callable[..., Any]:
-    """ONNX Runtime's operator for the inverse of matrices, as the exporter takes it: ONNX itself has none."""
-    domain = "com.microsoft"
-    parameter = onnx.defs.OpSchema.FormalParameter
-    schema = onnx.defs.OpSchema(
-        "Inverse",
-        domain,
-        1,
-        inputs=[parameter("X", "T")],
-        outputs=[parameter("Y", "T")],
-        type_constraints=[("T", ["tensor(float)", "tensor(double)"], "")],
-    )
-    if not onnx.defs.has("Inverse", domain):
-        onnx.defs.register_schema(schema)
-    operators = Opset(domain, 1)
-
-    def inverse(matrix: Any, check_errors: bool = False) -> tuple[Any, Any]:
-        """Of `torch.linalg.inv_ex`; nothing asks for its second result."""
-        found = operators.Inverse(matrix)
-        return found, found
-
-    return inverse
-
-
-def strip_origins(path: Path) -> None:
-    """Takes out of a graph where in whose source each node came from: paths of a machine, and half of the file."""
-    model = onnx.load(path)
-    for function in (model.graph, *model.functions):
-        for node in function.node:
-            del node.metadata_props[:]
-            node.doc_string = ""
-    del model.graph.metadata_props[:]
-    onnx.save(model, path)
 
 
 def _relative_difference(actual: list[np.ndarray], expected: list[np.ndarray]) -> float:

@@ -13,5 +13,9 @@ class CalibrationError(InputError):
     """A calibration misses a key, has a wrong size, or does not fit the images."""
 
 
+class OutputError(SigmaSlamError):
+    """A result cannot be written."""
+
+
 class FrameError(InputError):
     """One image cannot be read; the sequence around it can still be used."""

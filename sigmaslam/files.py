@@ -43,6 +43,11 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         raise
 
 
+def printable(name: str | Path) -> str:
+    """A name that can be written as UTF-8: bytes of a path that are none become `\\udc..`."""
+    return str(name).encode("utf-8", "backslashreplace").decode("utf-8")
+
+
 def make_folder(path: Path) -> None:
     """Makes a folder, and those above it, where there is none.
 
@@ -68,7 +73,8 @@ def check_new_folder(path: Path) -> None:
 def atomic_write_text(path: str | Path, text: str) -> None:
     """Write `text` as UTF-8; see `atomic_path`."""
     with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        # Names of files may have bytes that are no UTF-8, which Python keeps as lone surrogates.
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def atomic_write_bytes(path: str | Path, content: bytes) -> None:

@@ -15,10 +15,11 @@ from sigmaslam.bundle_adjustment.track_file import TRACKS_NAME
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.benchmarks.endurance_page import Block, Endurance, Lap, format_endurance
 from sigmaslam.evaluation.benchmarks.page import write_page
+from sigmaslam.evaluation.rendered_camera import open_rendered
 from sigmaslam.evaluation.trial import Trial, TrialResult, read_trial, render
 from sigmaslam.geometry.se3 import se3_inverse
 from sigmaslam.geometry.trajectory import Trajectory
-from sigmaslam.readers import StereoFrame, StereoSequence, open_sequence
+from sigmaslam.readers import StereoFrame, StereoSequence
 from sigmaslam.readers.images import RawPair
 from sigmaslam.readers.trajectory_files import read_trajectory
 from sigmaslam.runs.track import track_sequence
@@ -130,7 +131,7 @@ def write_endurance(
     with tempfile.TemporaryDirectory() as scratch:
         source = render(renders or Path(scratch), recipe, default_workers())
         note(f"the lap is in {source}")
-        lap = open_sequence(source)
+        lap = open_rendered(source)
         truth = _LapTruth(read_trajectory(source / "poses.txt"), recipe.frames)
 
         # With ten keyframes in memory all are recent and none closes a loop.
@@ -212,6 +213,8 @@ def _measure(
 def _errors(run: TrialResult, truth: _LapTruth) -> np.ndarray:
     """(N,) distance between every position and the true one, in the world of the first frame, metres."""
     poses = run.trajectory.poses
+    if len(poses) < len(run.table):
+        raise InputError(f"tracking started {len(run.table) - len(poses)} frames late: the lap cannot be compared")
     return np.asarray(np.linalg.norm(poses[:, :3, 3] - truth.poses(len(poses))[:, :3, 3], axis=1))
 
 

@@ -12,8 +12,9 @@ import numpy as np
 
 from sigmaslam.evaluation.benchmarks.page import header, opening, row, write_page
 from sigmaslam.evaluation.benchmarks.sequences import REAL
+from sigmaslam.evaluation.rendered_camera import open_rendered
 from sigmaslam.evaluation.trial import Trial, render, rendered_truth
-from sigmaslam.readers import open_sequence
+from sigmaslam.readers import StereoSequence, open_sequence
 from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam.synthetic.simulation import Recipe
@@ -70,7 +71,7 @@ def write_noise(
             renders.setdefault(seed, {})[source.name] = (source, rendered_truth(source))
     note(f"tuning {len(CONSTANTS)} constants")
     tuning = {
-        constant: [_track(source, truth, constant) for source, truth in renders[_TUNING_SEED].values()]
+        constant: [_track(open_rendered(source), truth, constant) for source, truth in renders[_TUNING_SEED].values()]
         for constant in CONSTANTS
     }
     chosen = min(tuning, key=lambda constant: _geometric_mean([result.ate for result in tuning[constant]]))
@@ -80,11 +81,12 @@ def write_noise(
         sequences |= {name: (data / name, data / name / truth) for name, truth in REAL}
         for name, (source, truth) in sequences.items():
             note(name)
-            results[name] = _track(source, truth, None), _track(source, truth, chosen)
+            opener = open_sequence if data in source.parents else open_rendered
+            results[name] = _track(opener(source), truth, None), _track(opener(source), truth, chosen)
     return write_page(path, _page(command, tuning, chosen, results))
 
 
-def _track(source: Path, truth: Path, constant: tuple[float, float] | None) -> NoiseResult:
+def _track(source: StereoSequence, truth: Path, constant: tuple[float, float] | None) -> NoiseResult:
     result = Trial(source, truth, partial(track_sequence, config=TrackerConfig(constant_sigma=constant))).run()
     evaluation = result.evaluation
     assert evaluation.nees is not None

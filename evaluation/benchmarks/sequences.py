@@ -26,8 +26,9 @@ from sigmaslam.evaluation.benchmarks.sequences_page import (
     method_label,
     total_cell,
 )
+from sigmaslam.evaluation.rendered_camera import open_rendered
 from sigmaslam.evaluation.trial import Method, Trial, TrialResult, read_trial, render
-from sigmaslam.readers import open_sequence
+from sigmaslam.readers import StereoSequence, open_sequence
 from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.tracker import TrackerConfig
 
@@ -68,6 +69,10 @@ class _BenchmarkSequence:
     source: Path
     truth: Path
     exact: bool
+
+    def open(self) -> StereoSequence:
+        """The sequence; where the truth is exact, its calibration is."""
+        return open_rendered(self.source) if self.exact else open_sequence(self.source)
 
 
 def write_results(
@@ -162,7 +167,7 @@ def _render(preset: str, folder: Path, note: Callable[[str], None]) -> _Benchmar
 def _run(job: _BenchmarkSequence, method: str, runs: Path) -> SequenceResult | Omission:
     if method == "bundle":
         return _adjust(job, runs)
-    trial = Trial(job.source, job.truth, _TRIED[method]).run(runs / method)
+    trial = Trial(job.open(), job.truth, _TRIED[method]).run(runs / method)
     nees = trial.evaluation.nees.mean if job.exact and trial.evaluation.nees else np.nan
     return SequenceResult(job.name, method, trial, nees)
 
@@ -171,7 +176,7 @@ def _adjust(job: _BenchmarkSequence, runs: Path) -> SequenceResult | Omission:
     """Bundle adjustment of the tracks of ours."""
     run, out = runs / "ours", runs / "bundle"
     if not run.is_dir():
-        track_ours(open_sequence(job.source), run)
+        track_ours(job.open(), run)
     try:
         refined = refine_run(run, out)
     except SigmaSlamError as error:

@@ -136,8 +136,8 @@ def _row(result: SequenceResult) -> list[str]:
     if frames is not None:
         tracked = np.isin(frames.status, ("tracking", "relocalised"))
         count = f"{tracked.sum()} of {len(frames) - 1}"
-        # Frame k ends step k - 1; frames that were skipped have no pose and no step.
-        ends = tracked[np.array(frames.status) != "skipped"][1:]
+        # Frame k ends step k - 1; frames that were skipped, or before the start, have no pose and no step.
+        ends = tracked[np.isfinite(frames.columns["inliers"])][1:]
         ends_tracked = ends if len(ends) == len(translations) else ends_tracked
         if tracked.any():
             updated = frames.columns["dof"] > 0  # a relocalised frame is not

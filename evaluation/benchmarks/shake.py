@@ -115,11 +115,11 @@ def judge(source: Path, method: Method) -> ShakeResult:
     assert evaluation.nees is not None
     rate = round(1.0 / float(np.median(np.diff(estimate.timestamps))))
     step, second, start = (motion_errors(estimate, true, covariance, frames) for frames in (1, rate, None))
-    tracked = trial.tracked
+    tracked = trial.tracked_poses
     tracked[0] = False
     return ShakeResult(
         tracking=int(tracked.sum()),
-        lost=int((~tracked[1:]).sum()),
+        lost=len(trial.table) - 1 - int(tracked.sum()),
         ate=evaluation.ate.rmse,
         path_length=evaluation.path_length,
         nees=evaluation.nees.mean,

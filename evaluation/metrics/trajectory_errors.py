@@ -11,6 +11,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.estimation.mahalanobis import squared_mahalanobis
 from sigmaslam.geometry.se3 import rotation_log, se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.two_view.absolute_orientation import absolute_orientation
 
 Alignment = Literal["se3", "origin"]
 # Seconds that the timestamps of an estimated and a true pose may differ.
@@ -34,6 +35,8 @@ class AbsoluteError:
         rmse, mean, median, maximum: of the distance between positions, metres.
         rotation_rmse_deg: root mean square of the rotation angle between aligned and true poses, degrees.
         count: number of associated poses.
+        turn_deg: by how much the alignment may turn about the path and change no position by more than `rmse`: large
+            for a straight path, where `rotation_rmse_deg` says little; zero for "origin".
     """
 
     rmse: float
@@ -42,6 +45,7 @@ class AbsoluteError:
     maximum: float
     rotation_rmse_deg: float
     count: int
+    turn_deg: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,29 +169,6 @@ def synchronise(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, Tr
     return estimate.subset(estimate_index), truth.subset(truth_index)
 
 
-def align_umeyama(estimate_positions: np.ndarray, truth_positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation R and translation t that minimise the sum of |R estimate + t - truth|^2.
-
-    Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 1991.
-    Where positions are on a line or in one place, one of the many best rotations is given.
-
-    Args:
-        estimate_positions, truth_positions: (N, 3) metres.
-    Returns:
-        R (3, 3) and t (3,).
-    Raises:
-        ValueError: the arrays differ in shape.
-    """
-    if estimate_positions.shape != truth_positions.shape or estimate_positions.shape[-1:] != (3,):
-        raise ValueError(f"positions must both be (N, 3); got {estimate_positions.shape} and {truth_positions.shape}")
-    estimate_mean, truth_mean = estimate_positions.mean(axis=0), truth_positions.mean(axis=0)
-    estimate_centred, truth_centred = estimate_positions - estimate_mean, truth_positions - truth_mean
-    u, _, vt = np.linalg.svd(truth_centred.T @ estimate_centred / len(truth_positions))
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
-    R = (u * sign) @ vt
-    return R, truth_mean - R @ estimate_mean
-
-
 def align(estimate: Trajectory, truth: Trajectory, alignment: Alignment = "se3") -> Trajectory:
     """The estimate moved onto the truth; both must hold the same frames (see `synchronise`).
 
@@ -201,10 +182,10 @@ def align(estimate: Trajectory, truth: Trajectory, alignment: Alignment = "se3")
         raise ValueError(f"{len(estimate)} estimated and {len(truth)} true poses: synchronise them first")
     if alignment == "origin":
         return Trajectory(estimate.timestamps, truth.poses[0] @ se3_inverse(estimate.poses[0]) @ estimate.poses)
-    R, t = align_umeyama(estimate.positions, truth.positions)
+    best = absolute_orientation(estimate.positions, truth.positions)
     poses = estimate.poses.copy()
-    poses[:, :3, :3] = R @ estimate.rotations
-    poses[:, :3, 3] = estimate.positions @ R.T + t
+    poses[:, :3, :3] = best.R @ estimate.rotations
+    poses[:, :3, 3] = best.apply(estimate.positions)
     return Trajectory(estimate.timestamps, poses)
 
 
@@ -220,13 +201,18 @@ def absolute_trajectory_error(estimate: Trajectory, truth: Trajectory, alignment
     aligned = align(estimate, truth, alignment)
     distance = np.linalg.norm(aligned.positions - truth.positions, axis=1)
     angle = _angles_deg(np.swapaxes(truth.rotations, 1, 2) @ aligned.rotations)
+    rmse = _root_mean_square(distance)
+    # The second singular value is the extent of the path across the direction in which it is longest.
+    centred = truth.positions - truth.positions.mean(axis=0)
+    across = float(np.linalg.svd(centred, compute_uv=False)[1:2].sum()) / math.sqrt(len(distance))
     return AbsoluteError(
-        rmse=_root_mean_square(distance),
+        rmse=rmse,
         mean=float(distance.mean()),
         median=float(np.median(distance)),
         maximum=float(distance.max()),
         rotation_rmse_deg=_root_mean_square(angle),
         count=len(distance),
+        turn_deg=math.degrees(math.atan2(rmse, across)) if alignment == "se3" else 0.0,
     )
 
 

@@ -1,4 +1,4 @@
-"""The command line: parses, calls, prints. Exit code 2 on bad input."""
+"""The command line: parses, calls, prints. Exit code 2 on bad input, 1 where `check` finds an error."""
 
 from sigmaslam.cli.commands import app, main
 

@@ -12,16 +12,22 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 from sigmaslam.cli.benchmark import benchmark
+from sigmaslam.cli.calibration import calibration
+from sigmaslam.cli.check import check
 from sigmaslam.cli.evaluate import evaluate
 from sigmaslam.cli.export import export
+from sigmaslam.cli.finish import finish
+from sigmaslam.cli.geometry import geometry
 from sigmaslam.cli.match import match
 from sigmaslam.cli.refine import refine
 from sigmaslam.cli.render import render
 from sigmaslam.cli.track import demo, track
 from sigmaslam.cli.train import train, train_scorer
 from sigmaslam.errors import SigmaSlamError
+from sigmaslam.files import printable
 
-app = typer.Typer(name="sigmaslam", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+# Plain help: rich's tables cut long words and give flags a type.
+app = typer.Typer(name="sigmaslam", no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
 
 
 def _show_version(wanted: bool) -> None:
@@ -39,12 +45,31 @@ def _root(
     """Stereo visual SLAM: poses with an honest covariance and a sparse map, on a plain CPU."""
 
 
-for _command in (demo, track, match, evaluate, refine, render, train, train_scorer, export, benchmark):
-    app.command()(_command)
+# A line each for the list of commands, short enough for 80 columns.
+for _command, _line in (
+    (demo, "Track the sequence that ships with the package."),
+    (check, "Look at an input before it is tracked."),
+    (track, "Track a stereo sequence, recorded or live."),
+    (finish, "Make the results of a run that was killed."),
+    (evaluate, "Compare a trajectory with the truth."),
+    (refine, "Adjust all of a run at once (extra 'graph')."),
+    (match, "Match two images."),
+    (geometry, "Find how two views lie to each other."),
+    (render, "Render a stereo sequence with exact truth (extra 'train')."),
+    (train, "Train the correspondence network (extra 'train')."),
+    (train_scorer, "Train the probability of matches (extra 'train')."),
+    (export, "Export trained weights to ONNX (extra 'train')."),
+    (benchmark, "Run a benchmark and write its page."),
+):
+    app.command(short_help=_line)(_command)
+app.add_typer(calibration)
 
 
 def main() -> None:
-    """Entry point of the console script; exit code 2 on bad input, 130 on Ctrl-C."""
+    """Entry point of the console script.
+
+    Exit codes: 1 on errors that `check` finds, 2 on bad input or output, 3 where too little was tracked, 130 on Ctrl-C.
+    """
     logging.basicConfig(
         level=logging.WARNING,
         format="%(message)s",
@@ -53,7 +78,9 @@ def main() -> None:
     try:
         app()
     except SigmaSlamError as error:
-        Console(stderr=True).print(f"error: {error}", style="red", highlight=False, markup=False, soft_wrap=True)
+        Console(stderr=True).print(
+            f"error: {printable(str(error))}", style="red", highlight=False, markup=False, soft_wrap=True
+        )
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)

@@ -3,10 +3,34 @@
 from __future__ import annotations
 
 import json
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from sigmaslam.plot_style import NO_MATPLOTLIB
+
+
+class Frame(StrEnum):
+    """Whose poses a truth has."""
+
+    camera = "camera"
+    body = "body"
+
+
+class Quaternion(StrEnum):
+    """Order of the numbers of a quaternion."""
+
+    xyzw = "xyzw"
+    wxyz = "wxyz"
+
+
+class Unit(StrEnum):
+    """Of lengths."""
+
+    m = "m"
+    mm = "mm"
 
 
 def evaluate(
@@ -18,19 +42,37 @@ def evaluate(
     truth_sigma_rotation: Annotated[
         float | None, typer.Option(metavar="DEG", min=0.0, help="Of the true rotations about each axis, degrees.")
     ] = None,
+    truth_frame: Annotated[
+        Frame, typer.Option(help="Whose poses the truth has: of the camera (z ahead), or of a body with x ahead.")
+    ] = Frame.camera,
+    truth_inverse: Annotated[bool, typer.Option("--truth-inverse", help="The truth is T_camera_world.")] = False,
+    truth_quaternion: Annotated[Quaternion, typer.Option(help="Order of a TUM truth's quaternions.")] = Quaternion.xyzw,
+    truth_unit: Annotated[Unit, typer.Option(help="Of the true positions.")] = Unit.m,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
     """Compare a trajectory with the truth: ATE, RPE, KITTI t_rel and r_rel, NEES; draws evaluation.png.
+
+    The picture needs the extra 'report'; the figures are the same without it.
 
     Poses of a run are also judged relative to earlier ones, 1, 10, 50, 100 m or 1, 5, 20 s back. Say how good the truth
     is with --truth-sigma-position and --truth-sigma-rotation: it counts there, and you see where it is no better than
     the estimate.
 
+    Where the truth would fit in another frame, order or unit, a line says so with the option that applies it; seconds,
+    milli-, micro- and nanoseconds are found out.
+
     Of a run with --track-object the truth is T_camera_object of any frame that is fixed to the body.
     """
     from sigmaslam.evaluation.run_evaluation import evaluate_run, format_evaluation
+    from sigmaslam.evaluation.truth_conventions import TruthConvention
 
     evaluation = evaluate_run(
-        run, truth, truth_sigma_position=truth_sigma_position, truth_sigma_rotation=truth_sigma_rotation
+        run,
+        truth,
+        truth_sigma_position=truth_sigma_position,
+        truth_sigma_rotation=truth_sigma_rotation,
+        truth_convention=TruthConvention(truth_frame.value, truth_inverse, truth_quaternion.value, truth_unit.value),
     )
     typer.echo(json.dumps(evaluation.to_dict(), indent=2) if as_json else format_evaluation(evaluation))
+    if evaluation.figure_path is None:
+        typer.echo(f"No picture: {NO_MATPLOTLIB}", err=True)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import tempfile
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from enum import StrEnum
 from importlib.resources import as_file, files
@@ -11,15 +14,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from sigmaslam.checks.check import SAMPLES_BEFORE_TRACKING, check_sequence
+from sigmaslam.checks.finding import Finding, wrong
 from sigmaslam.cli.extras import need_train_extra
+from sigmaslam.cli.run_summary import tell_summary
 from sigmaslam.errors import InputError
+from sigmaslam.files import check_new_folder, printable
 from sigmaslam.frontend import FRONTENDS
 from sigmaslam.inference.onnx_graph import BACKENDS
+from sigmaslam.plot_style import NO_MATPLOTLIB
 from sigmaslam.readers import StereoSequence, open_cameras, open_sequence
 from sigmaslam.readers.open import FORMATS
 
 if TYPE_CHECKING:
     from sigmaslam.slam.config import TrackerConfig
+
+logger = logging.getLogger(__name__)
 
 # mypy reads the members of an enum from literals alone.
 Frontend = StrEnum("Frontend", FRONTENDS)  # type: ignore[misc]
@@ -42,8 +52,9 @@ def demo(
     folder = out or Path(tempfile.mkdtemp(prefix="sigmaslam-demo-"))
     with as_file(files("sigmaslam.synthetic") / "demo") as sequence:
         _track(open_sequence(sequence, "kitti"), folder, frontend, Backend["onnx"])
-        typer.echo(format_evaluation(evaluate_run(folder, sequence / "poses.txt")))
-    typer.echo(f"Report: {folder / 'report.html'}\nPicture: {folder / 'evaluation.png'}")
+        evaluation = evaluate_run(folder, sequence / "poses.txt")
+    picture = f"Picture: {evaluation.figure_path}" if evaluation.figure_path else f"No picture: {NO_MATPLOTLIB}"
+    typer.echo(f"{format_evaluation(evaluation)}\nReport: {folder / 'report.html'}\n{picture}")
 
 
 def track(
@@ -54,7 +65,10 @@ def track(
     ] = None,
     format: Annotated[InputFormat, typer.Option(help="Kind of input.")] = InputFormat["auto"],
     calibration: Annotated[
-        Path | None, typer.Option(help="Calibration YAML (or KITTI calib.txt) instead of the input's own.")
+        Path | None,
+        typer.Option(
+            help="Calibration of any form (docs/input.md), or two as left.yaml,right.yaml, instead of the input's own."
+        ),
     ] = None,
     frontend: Annotated[Frontend, typer.Option(help="Where correspondences come from.")] = Frontend["learned"],
     backend: Annotated[
@@ -69,7 +83,7 @@ def track(
         typer.Option(
             metavar="NAMES",
             help="Errors of the calibration to estimate beside the disparity offset, as far as images tell them from "
-            "motion: yaw,pitch,focal, ... (docs/input.md).",
+            "motion, for example yaw,pitch,focal.",
         ),
     ] = None,
     map: Annotated[
@@ -106,8 +120,8 @@ def track(
     location: Annotated[
         Path | None,
         typer.Option(
-            help="CSV of a location sensor on what moves, to fuse: timestamp,x,y,z[,qx,qy,qz,qw],sigma_position"
-            "[,sigma_rotation]; any rate, any world (docs/object.md)."
+            help="CSV of a location sensor on what moves, to fuse, with columns timestamp, x, y, z, "
+            "sigma_position and, with rotations, qx, qy, qz, qw, sigma_rotation; any rate, any world."
         ),
     ] = None,
     realtime: Annotated[
@@ -121,29 +135,29 @@ def track(
     threads: Annotated[
         int, typer.Option(min=1, help="Threads of the network and of OpenCV; from 2 on keyframes are foreseen.")
     ] = 2,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Do not track where the check of the first frames warns of something.")
+    ] = False,
 ) -> None:
-    """Track a stereo sequence, recorded or live: trajectory, covariance, map and report."""
+    """Track a stereo sequence, recorded or live: trajectory, covariance, map and report.
+
+    Ctrl-C, SIGTERM and SIGHUP end it with what was tracked until then (exit codes 130, 143, 129). After a kill -9
+    `sigmaslam finish` makes the results. Exit code 3: less than half of the frames were tracked, and the last line says
+    why. 2: the input cannot be used, or a result not be written.
+    """
     if backend.value == "torch":
         need_train_extra()
     settings = _read_settings(config, estimate, track_object is not None)
-    sequence = _open_input(source, format, calibration, camera, seconds, (topic_left, topic_right))
-    try:
-        summary = _track(
-            sequence, out, frontend, backend, settings, map, tracks, track_object, location, realtime, threads
-        )
-    except KeyboardInterrupt:
-        if (out / "run.json").exists():
-            typer.echo(f"Stopped; what was tracked until then is in {out}")
-        raise
-    typer.echo(
-        f"{summary['tracking']} of {summary['frames']} frames tracked, {summary['lost']} lost, "
-        f"{summary['skipped']} skipped; {summary['median_inliers']:.0f} inliers in the median frame, "
-        f"{summary['map_points']} map points.\n{summary['calibration_verdict']}\n"
-        f"{_location_verdict(summary)}{_real_time_verdict(summary)}Report: {out / 'report.html'}"
+    sequence = open_input(source, format, calibration, camera, seconds, (topic_left, topic_right))
+    check_new_folder(out)
+    findings = _check(sequence, strict, threads)
+    summary = _track(
+        sequence, out, frontend, backend, settings, map, tracks, track_object, location, realtime, threads, findings
     )
+    tell_summary(summary, out)
 
 
-def _open_input(
+def open_input(
     source: Path | None,
     format: InputFormat,
     calibration: Path | None,
@@ -151,6 +165,11 @@ def _open_input(
     seconds: float | None,
     topics: tuple[str | None, str | None],
 ) -> StereoSequence:
+    """The recording or the live cameras that the command line names.
+
+    Raises:
+        InputError: neither or both are named, or options do not fit.
+    """
     if (source is None) == (camera is None):
         raise InputError("give either INPUT, a recording, or --camera, live cameras" + (", not both" if source else ""))
     if source is not None:
@@ -192,49 +211,45 @@ def _track(
     location: Path | None = None,
     realtime: bool = False,
     threads: int = 2,
+    findings: Sequence[Finding] = (),
 ) -> dict[str, Any]:
     import cv2
 
     from sigmaslam.fusion.readings import read_locations
+    from sigmaslam.runs.stop_signals import Stopped
     from sigmaslam.runs.track import track_sequence
 
     cv2.setNumThreads(threads)
-    return track_sequence(
-        sequence,
-        out,
-        frontend.value,
-        backend.value,
-        config,
-        map_path=map_path,
-        tracks=tracks,
-        track_object=track_object,
-        locations=None if location is None else read_locations(location),
-        real_time=realtime,
-        threads=threads,
-    )
-
-
-def _location_verdict(summary: dict[str, Any]) -> str:
-    """A line about the location sensor; empty without one."""
-    if "location" not in summary:
-        return ""
-    used, weakened, unused, ready = (summary["location"][name] for name in ("used", "weakened", "unused", "ready"))
-    if ready is None:
-        return (
-            f"The location sensor was not fused: its {used} readings with a pose do not show how its world lies to "
-            "ours. Is it the same clock? Positions need a path that is no straight line.\n"
+    try:
+        return track_sequence(
+            sequence,
+            out,
+            frontend.value,
+            backend.value,
+            config,
+            map_path=map_path,
+            tracks=tracks,
+            track_object=track_object,
+            locations=None if location is None else read_locations(location),
+            real_time=realtime,
+            threads=threads,
+            findings=findings,
         )
-    return (
-        f"Location sensor: {used} readings used ({weakened} disagreed and count less), {unused} not; poses are fused "
-        f"from {ready:.3f} s on.\n"
-    )
+    except Stopped as stop:
+        with suppress(OSError):  # the terminal may be gone
+            typer.echo(f"Stopped; what was tracked until then is in {printable(out)}")
+        raise typer.Exit(stop.exit_code) from stop
 
 
-def _real_time_verdict(summary: dict[str, Any]) -> str:
-    """A line about dropped frames and latency; empty where frames were tracked as fast as they could be."""
-    if "real_time" not in summary:
-        return ""
-    from sigmaslam.runs.real_time import format_latency
+def _check(sequence: StereoSequence, strict: bool, threads: int) -> list[Finding]:
+    """Findings about the first frames; those that are not good are warned of, and refused with `strict`."""
+    import cv2
 
-    figures = format_latency(summary["real_time"]["latency_ms"])
-    return f"In real time: {summary['real_time']['dropped']} frames dropped; latency in ms: {figures}.\n"
+    cv2.setNumThreads(threads)
+    findings = check_sequence(sequence, SAMPLES_BEFORE_TRACKING, threads).findings
+    faults = wrong(findings)
+    if strict and faults:
+        raise InputError(f"{sequence.source}: " + "; ".join(each.message for each in faults))
+    for each in faults:
+        logger.warning("%s: %s", each.name, each.message)
+    return findings

@@ -143,13 +143,16 @@ class LocationFilter:
         return Trajectory(times, self.T_sensor_world @ (se3_inverse(poses) if self._on_object else poses))
 
     def fuse(self, estimate: Estimate) -> Estimate:
-        """The estimate, corrected by the readings until its time stamp.
+        """The estimate, corrected by the readings until its time stamp; one without a pose comes back as it is.
 
         Raises:
             InputError: at the first frame, if all readings are earlier.
         """
-        if self._last is None:
+        if self._last is None and not self._next:
             self._check_times(estimate.timestamp)
+        if not estimate.has_pose:
+            self.summary.unused += len(self._due_readings(estimate.timestamp))
+            return estimate
         # Before its first pose the tracker counts as tracked: its world has no error yet.
         tracked = estimate.status != "lost"
         relocalised = tracked and not self._was_tracked

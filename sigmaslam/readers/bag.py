@@ -9,9 +9,10 @@ from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from sigmaslam.bounded_files import shorten
 from sigmaslam.errors import CalibrationError, FrameError, InputError, SigmaSlamError
 from sigmaslam.geometry.camera import StereoCamera
-from sigmaslam.readers.calibration_files import read_calibration
+from sigmaslam.readers.calibration import read_calibration
 from sigmaslam.readers.images import RawPair, SkippedFrame, first_readable
 from sigmaslam.readers.kitti import common_size
 from sigmaslam.readers.pairing import STAMP_TOLERANCE_NS, Stamped, pair_streams
@@ -21,7 +22,7 @@ from sigmaslam.readers.ros_messages import (
     IMAGE,
     image_array,
     stamp_ns,
-    stereo_from_infos,
+    stereo_from_messages,
 )
 from sigmaslam.readers.stereo_sequence import StereoSequence
 
@@ -32,7 +33,10 @@ Topics = tuple[str | None, str | None]
 LOOKED_FOR = "a ROS bag *.bag, *.mcap or *.db3, or a folder with metadata.yaml"
 _SUFFIXES = (".bag", ".mcap", ".db3")
 # These words in a topic's name identify the eye.
-_EYES = tuple(re.compile(rf"(?<![a-z])({words})(?![a-z0-9])") for words in ("left|cam0|infra1", "right|cam1|infra2"))
+_EYES = tuple(
+    re.compile(rf"(?<![a-z])({words})(?![a-z0-9])")
+    for words in (r"left|cam0|infra(?:red_)?1", r"right|cam1|infra(?:red_)?2")
+)
 
 
 def is_bag(path: Path) -> bool:
@@ -122,8 +126,8 @@ def open_reader(path: Path) -> Iterator[BagReader]:
         raise
     except Exception as error:
         raise InputError(
-            f"{path}: cannot be read as a ROS bag ({error or type(error).__name__}); where a recording was cut off, "
-            "`rosbag reindex` or `ros2 bag reindex` may mend it"
+            f"{path}: cannot be read as a ROS bag ({shorten(str(error), 300) or type(error).__name__}); where a "
+            "recording was cut off, `rosbag reindex` or `ros2 bag reindex` may mend it"
         ) from error
 
 
@@ -162,7 +166,7 @@ def _read_infos(bag: BagReader, image_topics: tuple[str, str]) -> StereoCamera:
             first.setdefault(topic, message)
             if len(first) == 2:
                 break
-    return stereo_from_infos(first[infos[0]], first[infos[1]], image_topics, (infos[0], infos[1]))
+    return stereo_from_messages(first[infos[0]], first[infos[1]], image_topics, (infos[0], infos[1]))
 
 
 def _info_topic(bag: BagReader, image_topic: str) -> str | None:

@@ -3,30 +3,19 @@
 import csv
 from pathlib import Path
 
-import numpy as np
-
-from sigmaslam.errors import CalibrationError, InputError
-from sigmaslam.geometry.camera import CameraModel, DistortionModel, StereoCamera
-from sigmaslam.geometry.checked_yaml import CalibrationYaml
-from sigmaslam.readers.calibration_files import read_calibration
+from sigmaslam.bounded_files import TABLE_BYTES, read_text, shorten
+from sigmaslam.errors import InputError
+from sigmaslam.readers.calibration import find_calibration, read_calibration
+from sigmaslam.readers.euroc_calibration import read_sensors
 from sigmaslam.readers.images import ImagePairs
 from sigmaslam.readers.kitti import common_size
 from sigmaslam.readers.pairing import is_stamp, list_images, pair_by_stamp
 from sigmaslam.readers.stereo_sequence import StereoSequence
 
 LOOKED_FOR = (
-    "folders cam0/data + cam1/data or mav0/cam0/data + mav0/cam1/data, or images/<ns>_0.* and <ns>_1.* "
+    "(also TUM-VI) folders cam0/data + cam1/data or mav0/cam0/data + mav0/cam1/data, or images/<ns>_0.* and <ns>_1.* "
     "with cam0_sensor.yaml"
 )
-
-DISTORTION_MODELS: dict[str, DistortionModel] = {
-    "radial-tangential": "radtan",
-    "radtan": "radtan",
-    "plumb_bob": "radtan",
-    "equidistant": "equidistant",
-    "fisheye": "equidistant",
-    "none": "none",
-}
 
 
 def find_asl_root(folder: Path) -> Path | None:
@@ -43,7 +32,7 @@ def is_flat(folder: Path) -> bool:
 
 
 def open_euroc(folder: Path, calibration: Path | None = None) -> StereoSequence:
-    """Open a EuRoC (ASL) folder: images paired by time stamp, two sensor.yaml.
+    """Open a EuRoC (ASL) or TUM-VI folder: images paired by time stamp, two sensor.yaml or dso/camchain.yaml.
 
     Raises:
         InputError: the layout is not EuRoC's, or the left and right images differ by more than 10 %.
@@ -60,44 +49,14 @@ def open_euroc(folder: Path, calibration: Path | None = None) -> StereoSequence:
         raise InputError(f"{folder}: not a EuRoC folder; looked for {LOOKED_FOR}")
     files, timestamps = pair_by_stamp(left, right, folder)
     pairs = ImagePairs(files, timestamps, folder)
+    # TUM-VI has no sensor.yaml, and a camchain.yaml in a folder beside.
+    if calibration is None and not any(sensor.exists() for sensor in sensors):
+        calibration = find_calibration(folder)
     if calibration is None:
         camera = read_sensors(sensors[0], sensors[1])
     else:
         camera = read_calibration(calibration, common_size(pairs.first_pair))
     return StereoSequence(pairs, camera, folder, "euroc")
-
-
-def read_sensors(left: Path, right: Path) -> StereoCamera:
-    """Stereo camera from two sensor.yaml; T_BS maps sensor points into the body frame.
-
-    Raises:
-        CalibrationError: names file, key and what was expected.
-    """
-    (left_model, T_body_left), (right_model, T_body_right) = (_read_sensor(path) for path in (left, right))
-    try:
-        return StereoCamera(left_model, right_model, np.linalg.inv(T_body_left) @ T_body_right)
-    except (CalibrationError, np.linalg.LinAlgError) as error:
-        raise CalibrationError(f"T_BS of {left} and {right}: {error}") from None
-
-
-def _read_sensor(path: Path) -> tuple[CameraModel, np.ndarray]:
-    content = CalibrationYaml.read(path)
-    if content.text("camera_model", "pinhole") != "pinhole":
-        raise content.error(f"camera_model is {content.text('camera_model')!r}; only pinhole is supported")
-    name = content.text("distortion_model", "none")
-    if name not in DISTORTION_MODELS:
-        raise content.error(f"distortion_model is {name!r}; known are {', '.join(DISTORTION_MODELS)}")
-    width, height = content.numbers("resolution", (2,)).tolist()
-    fx, fy, cx, cy = content.numbers("intrinsics", (4,)).tolist()
-    model = DISTORTION_MODELS[name]
-    distortion = () if model == "none" else tuple(content.numbers("distortion_coefficients", (None,)).tolist())
-    try:
-        camera = CameraModel(int(width), int(height), fx, fy, cx, cy, 0.0, model, distortion)
-    except CalibrationError as error:
-        raise content.error(str(error)) from None
-    if isinstance(content.entries.get("T_BS"), dict):
-        return camera, content.section("T_BS").numbers("data", (16,)).reshape(4, 4)
-    return camera, content.numbers("T_BS", (4, 4))
 
 
 def _asl_images(camera: Path) -> dict[int, Path]:
@@ -107,12 +66,13 @@ def _asl_images(camera: Path) -> dict[int, Path]:
         return {int(path.stem): path for path in files}
     table = camera / "data.csv"
     try:
-        with table.open(newline="", encoding="utf-8") as file:
-            rows = [row for row in csv.reader(file) if len(row) >= 2 and not row[0].startswith("#")]
+        lines = read_text(table, TABLE_BYTES, "the time stamps").splitlines()
+        rows = [row for row in csv.reader(lines) if len(row) >= 2 and not row[0].startswith("#")]
         stamps = {row[1].strip(): int(row[0]) for row in rows}
-    except (OSError, ValueError) as error:
+    except (InputError, ValueError, csv.Error) as error:
         raise InputError(
-            f"{camera / 'data'}: names are no time stamps (such as {files[0].name}) and {table} cannot be used: {error}"
+            f"{camera / 'data'}: names are no time stamps (such as {files[0].name}) and {table} cannot be used: "
+            f"{shorten(str(error), 300)}"
         ) from None
     missing = [path.name for path in files if path.name not in stamps]
     if missing:

@@ -1,9 +1,9 @@
-"""A plain folder: left/ and right/ images (or left.* and right.* videos) and calibration.yaml."""
+"""A plain folder: left and right images (or left.* and right.* videos) and a calibration."""
 
 from pathlib import Path
 
 from sigmaslam.errors import InputError
-from sigmaslam.readers.images import ImagePairs
+from sigmaslam.readers.images import IMAGE_SUFFIXES, ImagePairs
 from sigmaslam.readers.kitti import common_size
 from sigmaslam.readers.pairing import (
     default_times,
@@ -16,16 +16,27 @@ from sigmaslam.readers.pairing import (
 from sigmaslam.readers.stereo_sequence import StereoSequence
 from sigmaslam.readers.video import beside_calibration, find_videos, open_video
 
-LOOKED_FOR = "folders left + right with images"
+# RealSense calls its eyes infra1 and infra2.
+EYE_FOLDERS = (("left", "right"), ("infra1", "infra2"))
+LOOKED_FOR = "folders left + right (or infra1 + infra2) with images, or images left*.png + right*.png"
 
 
-def has_image_folders(folder: Path) -> bool:
-    """Whether there are left/ and right/."""
-    return (folder / "left").is_dir() and (folder / "right").is_dir()
+def find_eyes(folder: Path) -> tuple[Path, Path] | None:
+    """The folders of the left and right images; twice this one where they lie in it as left* and right*."""
+    for left, right in EYE_FOLDERS:
+        if (folder / left).is_dir() and (folder / right).is_dir():
+            return folder / left, folder / right
+    if all(_has_images(folder, eye) for eye in ("left", "right")):
+        return folder, folder
+    return None
+
+
+def _has_images(folder: Path, prefix: str) -> bool:
+    return any(path.suffix.lower() in IMAGE_SUFFIXES for path in folder.glob(f"{prefix}*"))
 
 
 def open_folder(folder: Path, calibration: Path | None = None) -> StereoSequence:
-    """Open left/ and right/ with calibration.yaml, our form or the one given.
+    """Open left and right images with the calibration in the folder, of any form, or the one given.
 
     Images are paired by the numbers in their names. Times come from times.txt (seconds, a line per pair),
     else from names that are nanoseconds (then the pairing is by time, to 5 ms), else 10 Hz with a warning.
@@ -34,19 +45,21 @@ def open_folder(folder: Path, calibration: Path | None = None) -> StereoSequence
         InputError: a sub-folder is missing, the left and right images differ, or the times do not fit.
         CalibrationError: the calibration is missing or does not fit.
     """
-    if not has_image_folders(folder):
+    eyes = find_eyes(folder)
+    if eyes is None:
         if find_videos(folder):
             return open_video(folder, calibration)
         raise InputError(f"{folder}: not a stereo folder; looked for {LOOKED_FOR}, or videos left.* + right.*")
-    left, right = folder / "left", folder / "right"
+    left, right = eyes
+    prefixes = ("left", "right") if left == right else ("", "")
     times = folder / "times.txt"
     images = [list_images(eye) for eye in (left, right)]
     if not times.is_file() and all(is_stamp(path.stem) for side in images for path in side):
         stamps = [{int(path.stem): path for path in side} for side in images]
         files, timestamps = pair_by_stamp(stamps[0], stamps[1], folder)
     else:
-        files = pair_by_name(left, right)
+        files = pair_by_name(left, right, prefixes)
         timestamps = read_times(times, len(files)) if times.is_file() else default_times(range(len(files)), folder)
     pairs = ImagePairs(files, timestamps, folder)
-    camera = beside_calibration(folder, calibration, common_size(pairs.first_pair))
+    camera = beside_calibration(folder, calibration, common_size(pairs.first_pair), zed_export=left == right)
     return StereoSequence(pairs, camera, folder, "folder")

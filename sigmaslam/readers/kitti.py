@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from sigmaslam.errors import CalibrationError, InputError
-from sigmaslam.readers.calibration_files import read_calibration
+from sigmaslam.readers.calibration import read_calibration
 from sigmaslam.readers.images import ImagePairs, RawPair
 from sigmaslam.readers.pairing import default_times, frame_numbers, pair_by_name, read_times
 from sigmaslam.readers.stereo_sequence import StereoSequence

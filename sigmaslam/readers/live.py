@@ -4,17 +4,18 @@ import logging
 import threading
 import time
 from collections.abc import Generator, Iterator
+from contextlib import closing
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.camera import StereoCamera
-from sigmaslam.readers.calibration_files import read_calibration
+from sigmaslam.readers.calibration import calibrated_size, read_calibration
 from sigmaslam.readers.capture import Capture, StereoCapture, open_capture
 from sigmaslam.readers.images import MAX_FAILURES, RawPair, SkippedFrame
 from sigmaslam.readers.kitti import common_size
-from sigmaslam.readers.stereo_sequence import StereoFrame, StereoSequence
+from sigmaslam.readers.stereo_sequence import FrameStep, StereoFrame, StereoSequence
 
 logger = logging.getLogger(__name__)
 
@@ -33,7 +34,7 @@ def open_cameras(device: str, calibration: Path, seconds: float | None = None) -
     Args:
         device: 'LEFT,RIGHT' or 'side-by-side:DEVICE'. Each is a number, a path (/dev/video2), a URL, or a video
             file, which is played at its own rate as if it were a camera.
-        calibration: our YAML form, whose image size the cameras are asked for, or KITTI's.
+        calibration: as for `read_calibration`; the cameras are asked for the image size that it names.
         seconds: ends the sequence after so long.
 
     Raises:
@@ -44,10 +45,9 @@ def open_cameras(device: str, calibration: Path, seconds: float | None = None) -
     devices = [device.removeprefix(SIDE_BY_SIDE)] if both else device.split(",")
     if len(devices) != (1 if both else 2) or not all(devices) or len(set(devices)) < len(devices):
         raise InputError(f"camera {device!r}: give two different ones as LEFT,RIGHT (0,1), or {SIDE_BY_SIDE}0")
-    size = None
-    if calibration.suffix.lower() in (".yaml", ".yml"):
-        eye = StereoCamera.from_yaml(calibration).left
-        size = (2 * eye.width if both else eye.width, eye.height)
+    size = calibrated_size(calibration)
+    if size is not None and both:
+        size = (2 * size[0], size[1])
     captures: list[Capture] = []
     try:
         for name in devices:
@@ -74,7 +74,13 @@ class LiveSequence(StereoSequence):
 
     def _items(self) -> Generator[StereoFrame | SkippedFrame, None, None]:
         # Live pairs are not read ahead: they would age in the queue.
-        return self._convert()
+        return self._convert(self._live)
+
+    def sample(self, count: int) -> list[FrameStep]:
+        """The next `count` pairs of frames; to be called before `frames`, which begins after them."""
+        with closing(self._convert(self._live.take(2 * count))) as converted:
+            frames = [item for item in converted if isinstance(item, StereoFrame)]
+        return list(zip(frames[::2], frames[1::2], strict=False))
 
 
 class LivePairs:
@@ -118,6 +124,18 @@ class LivePairs:
             f"{self._capture.failed} gives no images; is another program using it? Two cameras on one USB hub may ask "
             "for more than it carries: use another port, or smaller images and a calibration for them"
         )
+
+    def take(self, count: int) -> list[RawPair]:
+        """The next pairs, before the iteration begins; cameras are left half a second to settle first."""
+        settled = time.monotonic() + SETTLE_S
+        pairs: list[RawPair] = []
+        failures = 0
+        while len(pairs) < count and failures <= MAX_FAILURES:
+            pair = self._capture.take(len(pairs))
+            failures += pair is None
+            if pair is not None and (self._capture.played or pair.timestamp >= settled):
+                pairs.append(pair)
+        return pairs
 
     def __iter__(self) -> Iterator[RawPair]:
         if self._thread is not None:

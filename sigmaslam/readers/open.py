@@ -5,12 +5,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from sigmaslam.errors import InputError
-from sigmaslam.readers import bag, euroc, folder, kitti, video
+from sigmaslam.readers import bag, euroc, folder, four_seasons, kitti, video
 from sigmaslam.readers.stereo_sequence import StereoSequence
 
 _OPENERS: dict[str, Callable[[Path, Path | None], StereoSequence]] = {
     "kitti": kitti.open_kitti,
     "euroc": euroc.open_euroc,
+    "4seasons": four_seasons.open_four_seasons,
     "folder": folder.open_folder,
     "video": video.open_video,
 }
@@ -26,10 +27,9 @@ def open_sequence(
     """Open a stereo sequence; everything that needs no reading of images is checked at once.
 
     Args:
-        path: a folder (KITTI, EuRoC, plain, or with two videos), a side-by-side video or a ROS bag.
+        path: a folder (KITTI, EuRoC, TUM-VI, 4Seasons, plain, or with two videos), a side-by-side video or a ROS bag.
         format: one of `FORMATS`; 'auto' tries them in that order.
-        calibration: replaces the calibration of the format: YAML (`StereoCamera.from_yaml`)
-            or KITTI's calib.txt or calib_cam_to_cam.txt.
+        calibration: replaces the calibration of the format; any that `read_calibration` reads.
         topics: left and right image topic of a bag; None finds the only one whose name tells the eye.
 
     Raises:
@@ -39,18 +39,27 @@ def open_sequence(
     path = Path(path)
     if format not in FORMATS:
         raise InputError(f"format {format!r} is unknown; use one of {', '.join(FORMATS)}")
+    calibration_path = None if calibration is None else Path(calibration)
+    try:
+        return _open(path, format, calibration_path, topics)
+    except OSError as error:  # a folder that may not be read
+        raise InputError(
+            f"{error.filename or path}: cannot be read ({error.strerror}); give a folder that you may read"
+        ) from error
+
+
+def _open(path: Path, format: str, calibration: Path | None, topics: bag.Topics) -> StereoSequence:
     if not path.exists():
         raise InputError(f"{path}: no such file or folder")
     if format == "auto":
         format = _detect(path)
-    calibration_path = None if calibration is None else Path(calibration)
     if format == "bag":
-        return bag.open_bag(path, calibration_path, topics)
+        return bag.open_bag(path, calibration, topics)
     if topics != (None, None):
         raise InputError(f"{path}: topics are given, and the format is {format!r}; only bags have topics")
     if format != "video" and not path.is_dir():
         raise InputError(f"{path}: a file; format {format!r} needs a folder")
-    return _OPENERS[format](path, calibration_path)
+    return _OPENERS[format](path, calibration)
 
 
 def _detect(path: Path) -> str:
@@ -62,12 +71,14 @@ def _detect(path: Path) -> str:
         return "kitti"
     if euroc.find_asl_root(path) or euroc.is_flat(path):
         return "euroc"
-    if folder.has_image_folders(path):
+    if four_seasons.has_undistorted_images(path):
+        return "4seasons"
+    if folder.find_eyes(path):
         return "folder"
     if video.find_videos(path):
         return "video"
     looked_for = "".join(
-        f"\n  {module.__name__.rpartition('.')[2]}: {module.LOOKED_FOR}"
-        for module in (kitti, euroc, folder, video, bag)
+        f"\n  {format}: {module.LOOKED_FOR}"
+        for format, module in zip(FORMATS[1:], (kitti, euroc, four_seasons, folder, video, bag), strict=True)
     )
     raise InputError(f"{path}: no stereo sequence of a known format; looked for{looked_for}")

@@ -7,10 +7,10 @@ from typing import Any
 import cv2
 import numpy as np
 
+from sigmaslam.bounded_files import shorten
 from sigmaslam.errors import CalibrationError, FrameError, InputError
-from sigmaslam.geometry.camera import CameraModel, DistortionModel, StereoCamera
-from sigmaslam.readers.calibration_files import right_position
-from sigmaslam.readers.euroc import DISTORTION_MODELS
+from sigmaslam.geometry.camera import StereoCamera
+from sigmaslam.readers.camera_infos import CameraInfo, stereo_from_infos
 from sigmaslam.readers.images import decode_image
 
 logger = logging.getLogger(__name__)
@@ -41,7 +41,6 @@ _ENCODINGS: dict[str, tuple[int, int, int | None]] = {
     **dict.fromkeys(("yuv422", "uyvy"), (1, 2, cv2.COLOR_YUV2GRAY_UYVY)),
     **dict.fromkeys(("yuv422_yuy2", "yuyv"), (1, 2, cv2.COLOR_YUV2GRAY_YUY2)),
 }
-_LENS_MODELS: dict[str, DistortionModel] = {**DISTORTION_MODELS, "rational_polynomial": "radtan", "": "none"}
 
 
 def stamp_ns(message: Any) -> int:
@@ -61,7 +60,8 @@ def image_array(message: Any, name: str) -> np.ndarray:
     if message.__msgtype__ == COMPRESSED_IMAGE:
         return decode_image(message.data.tobytes(), name)
     if message.encoding not in _ENCODINGS:
-        raise FrameError(f"{name}: encoding {message.encoding!r} is not known; known are {', '.join(_ENCODINGS)}")
+        unknown = shorten(repr(message.encoding))
+        raise FrameError(f"{name}: encoding {unknown} is not known; known are {', '.join(_ENCODINGS)}")
     size, channels, conversion = _ENCODINGS[message.encoding]
     height, width = int(message.height), int(message.width)
     row = width * channels * size
@@ -87,13 +87,10 @@ def is_rectified(topic: str) -> bool:
     return rectified
 
 
-def stereo_from_infos(
+def stereo_from_messages(
     left: Any, right: Any, image_topics: tuple[str, str], info_topics: tuple[str, str]
 ) -> StereoCamera:
-    """Stereo camera from the CameraInfo of both eyes.
-
-    Rectified images (by the name of their topic) have the pinhole cameras of P; raw ones have K and D, and R
-    and P say how the two are placed: x_rectified = R x, and P = K' [I | t].
+    """Stereo camera from the CameraInfo messages of both eyes, rectified by the names of the image topics or raw.
 
     Raises:
         InputError: one topic is rectified, the other is not.
@@ -105,64 +102,26 @@ def stereo_from_infos(
             f"one of {image_topics[0]} and {image_topics[1]} is rectified by its name, the other is not; choose "
             "with --topic-left and --topic-right"
         )
-    P_left, P_right = (_matrix(info, "p", (3, 4), name) for info, name in zip((left, right), info_topics, strict=True))
-    T_left_right = np.eye(4)
-    T_left_right[:3, 3] = right_position(P_left, P_right)
-    if not np.any(T_left_right[:3, 3]):
-        raise CalibrationError(
-            f"{info_topics[1]}: no baseline (P[0, 3] is 0): the eyes were calibrated one by one; calibrate them as a "
-            "stereo pair, or give --calibration"
-        )
-    if rectified[0]:
-        models = [
-            _model(info, P[:, :3], name, False)
-            for info, P, name in zip((left, right), (P_left, P_right), info_topics, strict=True)
-        ]
-    else:
-        rotations = np.broadcast_to(np.eye(4), (2, 4, 4)).copy()
-        models = []
-        for rotation, info, name in zip(rotations, (left, right), info_topics, strict=True):
-            rotation[:3, :3] = _matrix(info, "r", (3, 3), name)
-            models.append(_model(info, _matrix(info, "k", (3, 3), name), name, True))
-        T_left_right = rotations[0].T @ T_left_right @ rotations[1]
-    try:
-        return StereoCamera(models[0], models[1], T_left_right)
-    except CalibrationError as error:
-        raise CalibrationError(f"{info_topics[0]} and {info_topics[1]}: {error}") from None
+    infos = [_camera_info(message, name) for message, name in zip((left, right), info_topics, strict=True)]
+    return stereo_from_infos(infos[0], infos[1], rectified[0])
 
 
-def _matrix(info: Any, key: str, shape: tuple[int, int], name: str) -> np.ndarray:
+def _camera_info(message: Any, name: str) -> CameraInfo:
     # ROS 1 writes K, D, R, P; ROS 2 k, d, r, p.
-    matrix = np.array(getattr(info, key, None) if hasattr(info, key) else getattr(info, key.upper()), dtype=np.float64)
-    matrix = matrix.reshape(shape)
-    if not np.all(np.isfinite(matrix)) or abs(np.linalg.det(matrix[:, :3])) == 0.0:
-        raise CalibrationError(f"{name}: not calibrated, {key.upper()} is {matrix.tolist()}; give --calibration")
-    return matrix
-
-
-def _model(info: Any, K: np.ndarray, name: str, distorted: bool) -> CameraModel:
-    model, distortion = _lens(info, name) if distorted else ("none", ())
-    try:
-        return CameraModel(
-            int(info.width), int(info.height), K[0, 0], K[1, 1], K[0, 2], K[1, 2], K[0, 1], model, distortion
-        )
-    except CalibrationError as error:
-        raise CalibrationError(f"{name}: {error}; give --calibration") from None
-
-
-def _lens(info: Any, name: str) -> tuple[DistortionModel, tuple[float, ...]]:
-    if info.distortion_model not in _LENS_MODELS:
-        known = ", ".join(model for model in _LENS_MODELS if model)
-        raise CalibrationError(
-            f"{name}: distortion_model is {info.distortion_model!r}; known are {known}; give --calibration"
-        )
-    model = _LENS_MODELS[info.distortion_model]
-    distortion = [float(value) for value in (info.d if hasattr(info, "d") else info.D)]
-    if model == "radtan" and not any(distortion):
-        model = "none"
-    if model == "none":
-        return "none", ()
-    # The eight coefficients of the rational model precede thin prism and tilt, which are nearly always zero.
-    while len(distortion) > 8 and distortion[-1] == 0.0:
-        distortion.pop()
-    return model, tuple(distortion)
+    values = {
+        key: np.array(getattr(message, key if hasattr(message, key) else key.lower()), dtype=np.float64)
+        for key in ("D", "K", "R", "P")
+    }
+    for key, size in (("K", 9), ("R", 9), ("P", 12)):
+        if values[key].size != size:
+            raise CalibrationError(f"{name}: {key} has {values[key].size} numbers, not {size}")
+    return CameraInfo(
+        name=name,
+        width=int(message.width),
+        height=int(message.height),
+        lens=message.distortion_model,
+        D=values["D"].tolist(),
+        K=values["K"].reshape(3, 3),
+        R=values["R"].reshape(3, 3),
+        P=values["P"].reshape(3, 4),
+    )

@@ -3,9 +3,10 @@
 import logging
 import queue
 import threading
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Protocol, TypeVar
 
@@ -13,11 +14,13 @@ import numpy as np
 
 from sigmaslam.errors import CalibrationError, FrameError, InputError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
-from sigmaslam.readers.images import MAX_FAILURES, GreyConverter, RawPair, SkippedFrame
+from sigmaslam.readers.images import MAX_FAILURES, GreyConverter, ImagePairs, RawPair, SkippedFrame
 
 logger = logging.getLogger(__name__)
 
 READ_AHEAD = 4
+# Of a sequence that is read in order, one of so many frames is sampled.
+_SAMPLED_EVERY = 5
 
 T = TypeVar("T")
 
@@ -36,6 +39,10 @@ class StereoFrame:
     timestamp: float
     left: np.ndarray
     right: np.ndarray
+
+
+FrameStep = tuple[StereoFrame, StereoFrame | None]
+"""A frame and the one after it; None where that is missing or cannot be read."""
 
 
 class PairSource(Protocol):
@@ -57,7 +64,7 @@ class StereoSequence:
     Attributes:
         camera: calibration of the images as stored.
         source: the file or folder, or the name of a camera.
-        format: 'kitti', 'euroc', 'folder', 'video', 'bag' or 'camera'.
+        format: 'kitti', 'euroc', '4seasons', 'folder', 'video', 'bag' or 'camera'.
         timestamps: seconds, one per pair, or None if only reading gives them (videos).
         length: number of pairs, or None if the file does not give it.
         skipped: the pairs that the latest run of `frames` could not use.
@@ -124,11 +131,31 @@ class StereoSequence:
         if not any_read:
             raise InputError(f"{self.source}: not one of {len(self.skipped)} pairs can be read")
 
-    def _items(self) -> Generator[StereoFrame | SkippedFrame, None, None]:
-        return read_ahead(self._convert, READ_AHEAD)
+    def sample(self, count: int) -> list[FrameStep]:
+        """Frames to judge the sequence by, each with the one after it; those that cannot be read are left out.
 
-    def _convert(self) -> Generator[StereoFrame | SkippedFrame, None, None]:
-        for item in self._pairs:
+        Of image files they are spread over the whole recording, of a video or bag over its first frames.
+
+        Args:
+            count: how many, at most.
+        """
+        pairs = self._pairs
+        if isinstance(pairs, ImagePairs):
+            firsts = np.unique(np.linspace(0, max(len(pairs.files) - 2, 0), count).astype(int)).tolist()
+            wanted = sorted({first + k for first in firsts for k in (0, 1) if first + k < len(pairs.files)})
+            items: Iterator[RawPair | SkippedFrame] = (pairs.read(index) for index in wanted)
+        else:
+            firsts = [_SAMPLED_EVERY * k for k in range(count)]
+            items = islice(iter(pairs), firsts[-1] + 2)
+        with closing(self._convert(items)) as converted:
+            frames = {item.index: item for item in converted if isinstance(item, StereoFrame)}
+        return [(frames[first], frames.get(first + 1)) for first in firsts if first in frames]
+
+    def _items(self) -> Generator[StereoFrame | SkippedFrame, None, None]:
+        return read_ahead(lambda: self._convert(self._pairs), READ_AHEAD)
+
+    def _convert(self, pairs: Iterable[RawPair | SkippedFrame]) -> Generator[StereoFrame | SkippedFrame, None, None]:
+        for item in pairs:
             if isinstance(item, SkippedFrame):
                 yield item
                 continue

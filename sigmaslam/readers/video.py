@@ -12,7 +12,8 @@ import numpy as np
 
 from sigmaslam.errors import CalibrationError, InputError
 from sigmaslam.geometry.camera import StereoCamera
-from sigmaslam.readers.calibration_files import ImageSize, read_calibration
+from sigmaslam.readers.calibration import find_calibration, read_calibration
+from sigmaslam.readers.calibration_size import ImageSize
 from sigmaslam.readers.images import IMAGE_SUFFIXES, RawPair
 from sigmaslam.readers.kitti import common_size
 from sigmaslam.readers.stereo_sequence import StereoSequence
@@ -49,18 +50,39 @@ def find_videos(folder: Path) -> tuple[Path, Path] | None:
     return chosen[0], chosen[1]
 
 
-def beside_calibration(folder: Path, calibration: Path | None, image_size: ImageSize) -> StereoCamera:
-    """The calibration given, else calibration.yaml of the folder."""
-    path = calibration or folder / "calibration.yaml"
-    if not path.is_file():
-        raise CalibrationError(f"{path}: no calibration; write it there or give one with --calibration")
+def beside_calibration(
+    folder: Path, calibration: Path | None, image_size: ImageSize, zed_export: bool = False
+) -> StereoCamera:
+    """The calibration given, else that of the folder.
+
+    Args:
+        folder: that has the images.
+        calibration: as for `read_calibration`.
+        image_size: (width, height) of the images.
+        zed_export: the images lie as the ZED SDK exports them, rectified; the camera's SN*.conf, of raw images, must
+            then be given and is not taken from the folder.
+
+    Raises:
+        CalibrationError: there is none, or it does not fit.
+    """
+    path = calibration or find_calibration(folder)
+    if path is None:
+        raise CalibrationError(
+            f"{folder / 'calibration.yaml'}: no calibration; write it there or give one with --calibration"
+        )
+    if zed_export and calibration is None and path.suffix == ".conf":
+        raise CalibrationError(
+            f"{path}: is of raw images, and the ZED SDK exports rectified ones side by side, or as left* and right* in "
+            "one folder: write its calibration_parameters into calibration.yaml; if the images are raw, give "
+            "--calibration"
+        )
     return read_calibration(path, image_size)
 
 
 def open_video(path: Path, calibration: Path | None = None) -> StereoSequence:
     """Open one side-by-side video (left half, right half) or a folder with left.* and right.*.
 
-    The calibration is calibration.yaml beside the video unless one is given. Times are the container's, or
+    The calibration is the one beside the video unless one is given. Times are the container's, or
     from its frame rate where those do not increase.
 
     Raises:
@@ -76,7 +98,7 @@ def open_video(path: Path, calibration: Path | None = None) -> StereoSequence:
         if path.suffix.lower() in IMAGE_SUFFIXES:
             raise InputError(f"{path}: an image, not a video; give the folder that has the left and right images")
         pairs, folder = VideoPairs(path), path.parent
-    camera = beside_calibration(folder, calibration, common_size(pairs.first_pair))
+    camera = beside_calibration(folder, calibration, common_size(pairs.first_pair), zed_export=path.is_file())
     return StereoSequence(pairs, camera, path, "video")
 
 

@@ -1,18 +1,22 @@
 """Figures shared by the evaluation and the report; matplotlib through its object interface only."""
 
+from __future__ import annotations
+
 import io
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from sigmaslam.files import atomic_path
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.plot_style import GREY, SERIES, style_axes
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 AXIS_NAMES = ("x", "y", "z")
 
@@ -33,14 +37,16 @@ def plot_trajectory(
     axes: Axes,
     trajectories: Mapping[str, Trajectory],
     points: np.ndarray | None = None,
+    predicted: Mapping[str, np.ndarray] | None = None,
     max_points: int = 3000,
 ) -> tuple[int, int, int]:
-    """Draw trajectories from above, with equal scales and a mark where each begins.
+    """Draw trajectories from above, with equal scales and a mark where each begins; dashed where they are guesses.
 
     Args:
         axes: where to draw.
         trajectories: by label; the first determines the plane of the view.
         points: (M, 3) map points, metres; an even selection of them is drawn, rasterised.
+        predicted: by label, (N,) bool, which poses no image confirms; a trajectory that is not named has none.
         max_points: upper limit of the drawn map points.
     Returns:
         The axes of the view (see `view_axes`).
@@ -62,9 +68,17 @@ def plot_trajectory(
     for number, (label, trajectory) in enumerate(trajectories.items()):
         colour = SERIES[number % len(SERIES)]
         path = trajectory.positions[:, plane]
-        dashes = "-" if number == 0 else "--"
-        axes.plot(path[:, 0], path[:, 1], dashes, color=colour, lw=1.6, label=label, zorder=3 + number)
-        axes.plot(path[:1, 0], path[:1, 1], "o", color=colour, ms=5, zorder=3 + number)
+        style: dict[str, Any] = {"color": colour, "zorder": 3 + number}
+        width = 2.6 if number == 0 and len(trajectories) > 1 else 1.4
+        guess = (predicted or {}).get(label, np.zeros(len(path), bool))
+        axes.plot(*np.where(guess[:, None], np.nan, path).T, "-", lw=width, label=label, **style)
+        if guess.any():
+            # The ways into a guess and out of it are guesses, too.
+            beside = guess | np.append(guess[1:], False) | np.append(False, guess[:-1])
+            axes.plot(
+                *np.where(beside[:, None], path, np.nan).T, "--", lw=0.6 * width, label=f"{label} while lost", **style
+            )
+        axes.plot(path[:1, 0], path[:1, 1], "o", ms=5, **style)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel(f"{AXIS_NAMES[horizontal]} [m]")
     axes.set_ylabel(f"{AXIS_NAMES[vertical]} [m]")
@@ -87,6 +101,8 @@ def to_svg(figure: Figure, name: str, dots_per_inch: int = 100) -> str:
         name: unique among the figures of one page, as it makes their identifiers unique.
         dots_per_inch: of rasterised artists.
     """
+    import matplotlib
+
     target = io.StringIO()
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
         figure.savefig(

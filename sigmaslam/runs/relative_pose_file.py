@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import tempfile
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from sigmaslam.bounded_files import check_columns, load_arrays
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path
+from sigmaslam.runs.appended_file import AppendedFile, read_records
 from sigmaslam.slam.relative_poses import SPANS, RelativePoses
 from sigmaslam.table import Table
 
 RELATIVE_POSES_NAME = "relative_poses.npz"
+PARTIAL_RELATIVE_POSES = "relative_poses.partial"
 # Numbers of a row on disk: frame, span, time stamp of the earlier frame, pose, covariance.
 _WIDTH = 3 + 16 + 36
 
@@ -38,10 +39,10 @@ class FramePairs(Table):
 
 
 class RelativePoseWriter:
-    """Collects relative poses on disk, so that memory does not grow with the run."""
+    """Appends relative poses to a file in the folder of a run, so that they outlive it and memory does not grow."""
 
-    def __init__(self) -> None:
-        self._rows = tempfile.TemporaryFile()  # noqa: SIM115
+    def __init__(self, folder: Path) -> None:
+        self._file = AppendedFile(folder / PARTIAL_RELATIVE_POSES)
 
     def add(self, frame: int, relative: RelativePoses) -> None:
         """Takes those of a frame, by its row in trajectory.tum."""
@@ -53,26 +54,29 @@ class RelativePoseWriter:
             relative.pose.reshape(count, 16),
             relative.covariance.reshape(count, 36),
         )
-        self._rows.write(np.column_stack(columns).astype(np.float64).tobytes())
+        self._file.append(np.column_stack(columns).astype(np.float64).tobytes())
 
-    def finish(self, folder: Path, timestamps: np.ndarray) -> None:
-        """Writes relative_poses.npz.
+    def close(self) -> None:
+        """The last relative poses have come."""
+        self._file.close()
 
-        Args:
-            folder: of the run.
-            timestamps: (N,) of all frames, seconds, as they were tracked.
-        """
-        self._rows.seek(0)
-        rows = np.frombuffer(self._rows.read()).reshape(-1, _WIDTH)
-        self._rows.close()
-        pairs = FramePairs(
-            np.array(SPANS)[rows[:, 1].astype(np.int64)],
-            np.searchsorted(timestamps, rows[:, 2]),
-            rows[:, 0].astype(np.int64),
-            rows[:, 3:19].reshape(-1, 4, 4),
-            rows[:, 19:].reshape(-1, 6, 6),
-        )
-        write_frame_pairs(folder / RELATIVE_POSES_NAME, pairs)
+
+def collect_frame_pairs(folder: Path, timestamps: np.ndarray) -> FramePairs:
+    """The relative poses that a run has left in its folder so far.
+
+    Args:
+        folder: of the run.
+        timestamps: (N,) of the frames with a pose, seconds, as they were tracked.
+    """
+    rows = read_records(folder / PARTIAL_RELATIVE_POSES, _WIDTH)
+    rows = rows[rows[:, 0] < len(timestamps)]
+    return FramePairs(
+        np.array(SPANS)[rows[:, 1].astype(np.int64)],
+        np.searchsorted(timestamps, rows[:, 2]),
+        rows[:, 0].astype(np.int64),
+        rows[:, 3:19].reshape(-1, 4, 4),
+        rows[:, 19:].reshape(-1, 6, 6),
+    )
 
 
 def write_frame_pairs(path: Path, pairs: FramePairs) -> None:
@@ -91,15 +95,17 @@ def read_frame_pairs(path: Path, count: int) -> FramePairs:
         InputError: it is no such file, or of another run.
     """
     mend = "run `sigmaslam track` again"
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            pairs = FramePairs(*(archive[name] for name in FramePairs.__slots__))
-    except (OSError, ValueError, EOFError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: holds no relative poses ({error}); {mend}") from error
+    arrays = load_arrays(path, mend, FramePairs.__slots__)
+    shapes: dict[str, tuple[str | int, ...]] = {
+        "span": ("M",),
+        "earlier": ("M",),
+        "later": ("M",),
+        "pose": ("M", 4, 4),
+        "covariance": ("M", 6, 6),
+    }
+    check_columns(path, arrays, shapes, {"span": "U", "earlier": "iu", "later": "iu"}, mend)
+    pairs = FramePairs(**arrays)
     rows = len(pairs.span)
-    shapes = tuple(column.shape for column in pairs.columns())
-    if shapes != ((rows,), (rows,), (rows,), (rows, 4, 4), (rows, 6, 6)):
-        raise InputError(f"{path}: its arrays are {', '.join(map(str, shapes))}, which do not go together; {mend}")
     frames = np.concatenate([pairs.earlier, pairs.later])
     if rows and not (frames.min() >= 0 and frames.max() < count):
         raise InputError(

@@ -1,26 +1,39 @@
 """The report of a run: one HTML file without links to anything outside it."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jinja2
 import numpy as np
 from markupsafe import Markup
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
+from sigmaslam.bounded_files import TABLE_BYTES, check_columns, load_arrays, read_text, shorten
 from sigmaslam.errors import InputError
-from sigmaslam.files import atomic_write_text
+from sigmaslam.files import atomic_write_text, printable
 from sigmaslam.geometry.trajectory import Trajectory
-from sigmaslam.plot_style import BLUE, GREEN, GREY, PURPLE, SERIES, VERMILLION, style_axes
+from sigmaslam.plot_style import (
+    BLUE,
+    GREEN,
+    GREY,
+    NO_MATPLOTLIB,
+    PURPLE,
+    SERIES,
+    VERMILLION,
+    has_matplotlib,
+    style_axes,
+)
 from sigmaslam.readers.trajectory_files import read_tum
 from sigmaslam.runs.figures import plot_trajectory, to_svg
-from sigmaslam.runs.frame_table import STATUSES, FrameTable, read_frames
+from sigmaslam.runs.frame_table import FRAMES_NAME, STATUSES, FrameTable, predicted_poses, read_frames
 from sigmaslam.runs.real_time import format_latency
 from sigmaslam.runs.run_folder import FINAL_TRAJECTORY
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 STATUS_COLOURS = {"lost": VERMILLION, "relocalised": PURPLE, "skipped": GREY}
 
@@ -35,16 +48,17 @@ MAX_CONFIGURATION = 20_000
 def write_report(run_dir: str | Path) -> Path:
     """Write `report.html` from the files of a run folder.
 
-    Reads trajectory.tum and frames.csv, and trajectory_final.tum, map.npz and run.json if they exist.
+    Reads frames.csv, and trajectory.tum, trajectory_final.tum, map.npz and run.json if they exist. Without
+    matplotlib the report says how to install it in place of the figures.
 
     Returns:
         The path of the report.
     Raises:
-        InputError: trajectory.tum or frames.csv is missing, or a file is wrong.
+        InputError: frames.csv is missing, or a file is wrong.
     """
     run_dir = Path(run_dir)
-    trajectory = read_tum(run_dir / "trajectory.tum")
-    frames = read_frames(run_dir / "frames.csv")
+    frames = read_frames(run_dir / FRAMES_NAME)
+    trajectory = _read_trajectory(run_dir / "trajectory.tum")
     points = _read_points(run_dir / "map.npz")
     run = _read_run(run_dir / "run.json")
     configuration = json.dumps(run, indent=2, ensure_ascii=False)
@@ -54,17 +68,26 @@ def write_report(run_dir: str | Path) -> Path:
         loader=jinja2.PackageLoader("sigmaslam.runs", "templates"), autoescape=True, undefined=jinja2.StrictUndefined
     )
     summary = run.get("summary")
+    summary = summary if isinstance(summary, dict) else {}
+    draws = has_matplotlib()
     text = environment.get_template("report.html").render(
-        name=run_dir.resolve().name,
+        name=printable(run_dir.resolve().name),
         facts=[*_facts(trajectory, frames, points), *_real_time_facts(run)],
         statuses=[(status, frames.status.count(status)) for status in STATUSES],
-        verdict=summary.get("calibration_verdict") if isinstance(summary, dict) else None,
-        figures=_figures(trajectory, _read_final(run_dir / FINAL_TRAJECTORY), frames, points),
+        failure=summary.get("failure"),
+        verdict=summary.get("calibration_verdict"),
+        figures=_figures(trajectory, _read_final(run_dir / FINAL_TRAJECTORY), frames, points) if draws else [],
+        no_figures=None if draws else NO_MATPLOTLIB,
         configuration=configuration if run else None,
     )
     path = run_dir / "report.html"
     atomic_write_text(path, text)
     return path
+
+
+def _read_trajectory(path: Path) -> Trajectory:
+    """What was said live; empty where no frame has a pose."""
+    return read_tum(path) if path.is_file() else Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
 
 
 def _read_final(path: Path) -> dict[str, Trajectory]:
@@ -76,23 +99,19 @@ def _read_points(path: Path) -> np.ndarray | None:
     """Map points (M, 3), or None if the run has no map."""
     if not path.is_file():
         return None
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            points = np.asarray(archive["points"], dtype=np.float64)
-    except (OSError, ValueError, KeyError, EOFError, TypeError) as error:
-        raise InputError(f"{path}: holds no array `points` ({error}); run `sigmaslam track` again") from error
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"{path}: points must be (M, 3), not {points.shape}; run `sigmaslam track` again")
-    return points
+    mend = "run `sigmaslam track` again"
+    arrays = load_arrays(path, mend, ("points",))
+    check_columns(path, arrays, {"points": ("M", 3)}, {}, mend)
+    return arrays["points"].astype(np.float64)
 
 
 def _read_run(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        run = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: is no JSON ({error}); run `sigmaslam track` again") from error
+        run = json.loads(read_text(path, TABLE_BYTES, "the run"))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: is no JSON ({shorten(str(error))}); run `sigmaslam track` again") from error
     return run if isinstance(run, dict) else {}
 
 
@@ -142,11 +161,18 @@ def _figures(
     trajectory: Trajectory, final: dict[str, Trajectory], frames: FrameTable, points: np.ndarray | None
 ) -> list[tuple[str, str, Markup]]:
     """Title, caption and SVG of each figure that has data."""
+    from matplotlib.figure import Figure
+
     figures = []
     if len(trajectory):
         figure = Figure(figsize=(8, 5.5), layout="constrained")
-        plot_trajectory(figure.add_subplot(), {"trajectory": trajectory, **final}, points)
+        predicted = predicted_poses(frames, trajectory.timestamps)
+        drawn = {"trajectory": trajectory, **final}
+        guesses = {label: predicted for label, each in drawn.items() if len(each) == len(predicted)}
+        plot_trajectory(figure.add_subplot(), drawn, points, guesses)
         caption = "From above; the dot marks the start."
+        if predicted.any():
+            caption += " Dashed where the camera was lost, and its way is a guess."
         if points is not None and len(points):
             caption += f" An even selection of the {len(points)} map points; far ones are cut off."
         figures.append(("Trajectory and map", caption, figure))
@@ -195,6 +221,8 @@ def _draw_inliers(axes: Axes, frames: FrameTable) -> bool:
 
 
 def _draw_nis(axes: Axes, frames: FrameTable) -> bool:
+    from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
+
     ratio = _nis_per_dof(frames)
     ratio = np.where(ratio > 0, ratio, np.nan)
     if not np.isfinite(ratio).any():

@@ -1,14 +1,13 @@
-"""Files of a run: rows of frames are written at once, the other files when the run ends, however it ends."""
+"""The folder of a run: what is known of each frame is written there as it comes."""
 
 from __future__ import annotations
 
 import csv
 import hashlib
+import io
 import json
 import platform
-import tempfile
-from array import array
-from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -19,16 +18,19 @@ import numpy as np
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder
 from sigmaslam.geometry.camera import StereoCamera
-from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.inference.onnx_graph import shipped_weights
-from sigmaslam.readers.trajectory_files import write_kitti, write_tum
-from sigmaslam.runs.frame_table import COLUMNS
+from sigmaslam.runs.appended_file import AppendedFile
+from sigmaslam.runs.frame_table import COLUMNS, FRAMES_NAME
+from sigmaslam.runs.pose_file import PARTIAL_POSES, PoseWriter
 from sigmaslam.runs.relative_pose_file import RelativePoseWriter
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.slam.mapping import KeyframeTracks
 from sigmaslam.slam.point_map import PointMap
 
 FINAL_TRAJECTORY, FINAL_COVARIANCE = "trajectory_final.tum", "covariance_final.npy"
+RUN_NAME = "run.json"
+UNFINISHED = "not yet"
+"""What run.json has under `ended` while a run goes on, and after it was killed."""
 STAGES = ("read", "rectify", "features", "match", "filter", "map")
 _COLUMNS = (COLUMNS[0], "status", *COLUMNS[1:], *(f"ms_{stage}" for stage in STAGES))
 _GRAPHS = (
@@ -46,180 +48,125 @@ _GRAPHS = (
 
 
 class RunWriter:
-    """Writes a run folder.
+    """Writes to a run folder what is known of each frame, as it comes; `write_results` makes the results of it.
 
     Args:
         out: folder to make; it must not exist, or be empty.
-        rectified: result of `StereoTracker.describe_rectified`, to write tracks.npz as well.
+        run: entries of run.json, which is written at once, so that a run that is killed says what it was.
+        rectified: result of `StereoTracker.describe_rectified`, to keep what `write_tracks` writes.
+
+    Attributes:
+        run: the entries, with versions and weights.
+        calibration: what the last frame said of it; None before the first.
     Raises:
         InputError: the folder holds something, or cannot be made.
     """
 
-    def __init__(self, out: Path, rectified: dict[str, Any] | None = None) -> None:
+    def __init__(self, out: Path, run: dict[str, Any], rectified: dict[str, Any] | None = None) -> None:
         check_new_folder(out)
+        self.run = {**run, "versions": _versions(), "weights_sha256": _weight_hashes()}
+        self.calibration: CalibrationEstimate | None = None
         try:
             out.mkdir(parents=True, exist_ok=True)
-            self._table = (out / "frames.csv").open("w", newline="", encoding="utf-8")
+            atomic_write_text(out / RUN_NAME, json.dumps({**self.run, "ended": UNFINISHED}, indent=2) + "\n")
+            self._poses = PoseWriter(out)
+            self._relative_poses = RelativePoseWriter(out)
+            self._table = AppendedFile(out / FRAMES_NAME)
         except OSError as error:
             raise InputError(f"{out}: cannot be written ({error.strerror}): choose another --out") from error
-        self._out = out
-        self._rows = csv.writer(self._table)
-        self._rows.writerow(_COLUMNS)
-        # Time stamp, pose and covariance of each frame go to disk, so that memory does not grow with the run.
-        self._poses = tempfile.TemporaryFile()  # noqa: SIM115
-        self._relative_poses = RelativePoseWriter()
-        self._statuses: Counter[str] = Counter()
-        self._inliers = array("i")  # positive counts alone
-        self._calibration: CalibrationEstimate | None = None
-        self._skipped = 0
+        self._add_row(_COLUMNS)
+        self._count = 0
         self._rectified = rectified
         self._tracks: list[tuple[int, KeyframeTracks]] = []
 
     def add(
         self, estimate: Estimate, pose: np.ndarray, covariance: np.ndarray, matching: np.ndarray, read_ms: float
     ) -> None:
-        """Takes the result of one frame; its row is on disk when this returns.
+        """Takes the result of one frame; it is on disk when this returns.
 
         Args:
             estimate: of the camera.
             pose, covariance: (4, 4), (6, 6) of what is tracked: the camera in the world, or a body in the camera.
             matching: (6, 6) the part of the covariance that comes from matches and motion.
             read_ms: time it took to read the images.
+        Raises:
+            OutputError: the disk is full.
         """
+        self.calibration = estimate.calibration
+        if estimate.has_pose:
+            refused = estimate.calibration.refused_offset
+            self._poses.add(estimate.timestamp, pose, covariance, matching, refused)
+            self._relative_poses.add(self._count, estimate.relative_poses)
+            if estimate.tracks is not None and self._rectified is not None:
+                self._tracks.append((self._count, estimate.tracks))
+            self._count += 1
+            of_pose = [estimate.matches, estimate.inliers, f"{estimate.nis:.3f}", estimate.dof]
+        else:
+            of_pose = [""] * 4
         milliseconds = {"read": read_ms, **estimate.milliseconds}
-        self._rows.writerow(
+        self._add_row(
             [
                 f"{estimate.timestamp:.9f}",
                 estimate.status,
-                estimate.matches,
-                estimate.inliers,
-                f"{estimate.nis:.3f}",
-                estimate.dof,
+                *of_pose,
                 f"{estimate.belief:.6f}",
                 f"{estimate.calibration.disparity_offset:.5f}",
                 f"{estimate.calibration.disparity_offset_sigma:.5f}",
                 *(f"{milliseconds[stage]:.2f}" for stage in STAGES),
             ]
         )
-        self._table.flush()
-        row = np.r_[estimate.timestamp, pose.ravel(), covariance.ravel(), matching.ravel()]
-        self._poses.write(row.astype(np.float64).tobytes())
-        self._relative_poses.add(self._statuses.total(), estimate.relative_poses)
-        self._statuses[estimate.status] += 1
-        if estimate.inliers:
-            self._inliers.append(estimate.inliers)
-        self._calibration = estimate.calibration
-        if estimate.tracks is not None and self._rectified is not None:
-            self._tracks.append((self._statuses.total() - 1, estimate.tracks))
 
     def add_skipped(self, timestamp: float) -> None:
         """Notes a frame that could not be read."""
-        self._rows.writerow([f"{timestamp:.9f}", "skipped", *[""] * (len(_COLUMNS) - 2)])
-        self._table.flush()
-        self._skipped += 1
+        self._add_row([f"{timestamp:.9f}", "skipped", *[""] * (len(_COLUMNS) - 2)])
 
-    def finish(
-        self,
-        point_map: PointMap,
-        keyframes: dict[str, Any],
-        run: dict[str, Any],
-        final: tuple[Trajectory, np.ndarray] | None = None,
-    ) -> dict[str, Any]:
-        """Writes trajectory, covariance, relative poses, map, run.json and report.html.
+    def close(self) -> None:
+        """The last frame has come."""
+        for file in (self._poses, self._relative_poses, self._table):
+            file.close()
 
-        Args:
-            point_map: the landmarks.
-            keyframes: arrays by name, with which a later run relocalises in the map.
-            run: entries of run.json beside versions, weights and the summary.
-            final: the frames as they are known now, with covariances; they are written beside those said at once. None
-                where other sensors corrected the poses, whose covariances then have no part of matches alone.
-        Returns:
-            The summary.
-        """
-        self._table.close()
-        summary = self._summary(point_map)
-        content = {**run, "versions": _versions(), "weights_sha256": _weight_hashes(), "summary": summary}
-        atomic_write_text(self._out / "run.json", json.dumps(content, indent=2) + "\n")
-        self._poses.seek(0)
-        rows = np.frombuffer(self._poses.read()).reshape(-1, 1 + 16 + 36 + 36)
-        self._poses.close()
-        if not len(rows):
-            return summary
-        trajectory = Trajectory(rows[:, 0], rows[:, 1:17].reshape(-1, 4, 4))
-        write_tum(self._out / "trajectory.tum", trajectory)
-        write_kitti(self._out / "trajectory.kitti", trajectory, self._out / "times.txt")
-        _save(self._out / "covariance.npy", rows[:, 17:53].reshape(-1, 6, 6))
-        self._relative_poses.finish(self._out, trajectory.timestamps)
-        if final is not None:
-            # A frame whose pose was not written, as the run was stopped in it, is in neither trajectory.
-            write_tum(self._out / FINAL_TRAJECTORY, final[0].subset(np.arange(len(rows))))
-            _save(self._out / FINAL_COVARIANCE, final[1][: len(rows)])
-            _save(self._out / "covariance_matching.npy", rows[:, 53:].reshape(-1, 6, 6))
-        with atomic_path(self._out / "map.npz") as path:
-            points = {name: getattr(point_map, name) for name in PointMap.__slots__}
-            np.savez_compressed(path, **points, **keyframes)
-        write_ply(self._out / "map.ply", point_map)
-        self._write_tracks()
-        from sigmaslam.runs.report import write_report  # draws: not needed before the run has ended
+    @property
+    def has_tracks(self) -> bool:
+        """Whether there is something for `write_tracks`."""
+        return bool(self._tracks)
 
-        write_report(self._out)
-        return summary
-
-    def _write_tracks(self) -> None:
-        calibration = self._calibration
-        if self._rectified is None or not self._tracks or calibration is None:
-            return
+    def write_tracks(self, path: Path) -> None:
+        """Writes what keyframes saw, for `sigmaslam refine`; there is something only if `has_tracks` says so."""
+        assert self._rectified is not None
+        assert self.calibration is not None
         seen = KeyframeTracks.concatenate([tracks for _, tracks in self._tracks])
-        with atomic_path(self._out / "tracks.npz") as path:
+        with atomic_path(path) as temporary:
             np.savez_compressed(
-                path,
+                temporary,
                 frame=np.concatenate([np.full(len(tracks), frame) for frame, tracks in self._tracks]),
                 landmark=seen.landmark_id,
                 measurement=seen.measurement,
                 covariance=seen.covariance,
-                disparity_offset=np.array([calibration.disparity_offset, calibration.disparity_offset_sigma]),
+                disparity_offset=np.array([self.calibration.disparity_offset, self.calibration.disparity_offset_sigma]),
                 **self._rectified,
             )
 
-    def _summary(self, point_map: PointMap) -> dict[str, Any]:
-        last = self._calibration
-        return {
-            "frames": self._statuses.total() + self._skipped,
-            "skipped": self._skipped,
-            **{status: self._statuses[status] for status in ("starting", "tracking", "relocalised", "lost")},
-            "median_inliers": float(np.median(self._inliers)) if self._inliers else 0.0,
-            "map_points": len(point_map.points),
-            "calibration_verdict": calibration_verdict(last) if last else "No frame was read.",
-            "calibration_errors": {name: list(each) for name, each in last.errors.items()} if last else {},
-        }
+    def _add_row(self, fields: Sequence[Any]) -> None:
+        line = io.StringIO()
+        csv.writer(line, lineterminator="\n").writerow(fields)
+        self._table.append(line.getvalue().encode("utf-8"))
 
 
-def calibration_verdict(calibration: CalibrationEstimate) -> str:
-    """The estimated disparity offset in words."""
-    offset, sigma = calibration.disparity_offset, calibration.disparity_offset_sigma
-    figure = f"{offset:+.2f} ± {sigma:.2f} px"
-    if calibration.refused_offset:
-        return (
-            f"The images ask for a disparity offset of {calibration.refused_offset:+.1f} px, which is more than "
-            "calibrations are off by: nothing was corrected. A lens, the baseline or the right camera is wrong: "
-            "calibrate again."
-        )
-    if sigma > 0.2:
-        return (
-            f"It is too early to say whether the rectification is right (disparity offset {figure}): more frames, or "
-            "things nearer and farther, would tell."
-        )
-    if abs(offset) > max(3.0 * sigma, 0.1):
-        return (
-            f"The rectification is off by {figure} of disparity. The poses are corrected for it; depth measured with "
-            "this calibration elsewhere is not: calibrate again."
-        )
-    return f"The disparity offset is {figure}: nothing wrong with the rectification can be seen."
+def check_has_trajectory(run: Path) -> None:
+    """A run has poses to read.
 
-
-def _save(path: Path, array: np.ndarray) -> None:
-    with atomic_path(path) as temporary:
-        np.save(temporary, array)
+    Raises:
+        InputError: it has none; the message says why.
+    """
+    if (run / "trajectory.tum").is_file():
+        return
+    if (run / PARTIAL_POSES).is_file():
+        reason = f"it was stopped before its results were written; `sigmaslam finish {run}` writes them"
+    elif (run / FRAMES_NAME).is_file():
+        reason = "none of its frames has a pose, so there is nothing to compare; its report.html says why"
+    else:
+        reason = "give a folder written by `sigmaslam track`"
+    raise InputError(f"{run}: holds no trajectory.tum: {reason}")
 
 
 def write_ply(path: Path, point_map: PointMap) -> None:

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from sigmaslam.checks.finding import Finding
 from sigmaslam.errors import InputError, SigmaSlamError
+from sigmaslam.files import printable
 from sigmaslam.fusion.location_filter import LocationFilter
 from sigmaslam.fusion.readings import Locations
 from sigmaslam.progress import open_progress
 from sigmaslam.readers import StereoFrame, StereoSequence
 from sigmaslam.readers.trajectory_files import write_tum
 from sigmaslam.runs.real_time import Latency, RealTimePlayer, describe_real_time
+from sigmaslam.runs.results import TrackerResults, output_error, write_results
 from sigmaslam.runs.run_folder import RunWriter, describe_camera
+from sigmaslam.runs.stop_signals import Stopped, StopSignals
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.estimate import Estimate
 from sigmaslam.slam.object_region import read_region
@@ -38,6 +43,7 @@ def track_sequence(
     locations: Locations | None = None,
     real_time: bool = False,
     threads: int = 2,
+    findings: Sequence[Finding] = (),
 ) -> dict[str, Any]:
     """Tracks a sequence and writes the run folder; partial results are kept when it is stopped or fails.
 
@@ -52,13 +58,16 @@ def track_sequence(
         locations: readings to fuse of a sensor on the moving camera or body; writes trajectory_location.tum, too, the
             poses in the sensor's world.
         real_time: play a recording at its time stamps; frames are dropped when tracking falls behind.
+        findings: what a check of the input found; they are kept in run.json, and explain a run that fails.
     Returns:
-        The summary in run.json; with `locations` also the counts of the readings, under `location`, and in real time
+        The summary in run.json, in which `failure` says why less than half of the frames were tracked, and is None
+        where more were; with `locations` also the counts of the readings, under `location`, and in real time
         what was dropped and the latency, under `real_time`.
     Raises:
         InputError: the folder is not empty, an argument is wrong, or the sequence breaks off; what was computed is on
             disk then.
-        KeyboardInterrupt: passed on after the partial results are written.
+        OutputError: results could not be written, the others are; what was said of each frame is on disk.
+        Stopped: by Ctrl-C, SIGTERM or SIGHUP, after the partial results are written.
     """
     if track_object is not None and (map_path is not None or tracks):
         raise InputError("--map and --tracks are of a moving camera's world: leave them out with --track-object")
@@ -69,49 +78,77 @@ def track_sequence(
         if map_path is not None:
             tracker.load_map(map_path)
         rectified = tracker.describe_rectified() if tracks else None
-    writer = RunWriter(out, rectified)
+    run: dict[str, Any] = {
+        "input": printable(sequence.source),
+        "format": sequence.format,
+        "frontend": frontend,
+        "backend": backend,
+        "map": None if map_path is None else printable(map_path),
+        "configuration": asdict(tracker.config),
+        "calibration": describe_camera(sequence.camera),
+        "checks": [asdict(each) for each in findings],
+    }
+    run |= _describe_location(location)
+    if track_object is not None:
+        run["object"] = {"region": track_object, "origin": None}  # which the first frame gives
+    writer = RunWriter(out, run, rectified)
     timing = _Timing(sequence, real_time)
     if timing.is_real:
         tracker.warm_up()
-    ended = "complete"
-    try:
-        # Cameras are released before the results are written, even after an error.
-        with closing(sequence.frames()) as frames:
-            _track(sequence, timing.play(frames), tracker, writer, location, timing)
-    except KeyboardInterrupt:
-        ended = "interrupted"
-        raise
-    except SigmaSlamError as error:
-        ended = f"failed: {error}"
-        raise
-    except BaseException as error:
-        ended = f"crashed: {error!r}"
-        raise
-    finally:
-        summary = writer.finish(
-            tracker.map(),
-            tracker.pack_keyframes(),
-            {
-                "input": str(sequence.source),
-                "format": sequence.format,
-                "frontend": frontend,
-                "backend": backend,
-                "ended": ended,
-                "dropped": timing.dropped,
-                **timing.describe(),
-                "configuration": asdict(tracker.config),
-                "calibration": describe_camera(sequence.camera),
-                **_describe_object(tracker, track_object),
-                **_describe_location(location),
-            },
-            # A sensor's readings correct poses as they come, not after the fact.
-            tracker.final_trajectory() if location is None else None,
-        )
-        trajectory = None if location is None else location.trajectory()
-        if trajectory is not None:
-            write_tum(out / "trajectory_location.tum", trajectory)
+    stopped_by: BaseException | None = None
+    with StopSignals() as signals:
+        try:
+            # Cameras are released before the results are written, even after an error.
+            with closing(sequence.frames()) as frames:
+                _track(sequence, timing.play(frames), tracker, writer, location, timing)
+            signals.hold()
+        except BaseException as error:
+            signals.hold()
+            # Where the terminal is gone, showing the progress fails as well.
+            stopped_by = error if signals.received is None else Stopped(signals.received)
+        writer.close()
+        run = {
+            **writer.run,
+            "ended": _describe_end(stopped_by),
+            "dropped": timing.dropped,
+            **timing.describe(),
+            **_describe_object(tracker, track_object),
+            **_describe_location(location),
+        }
+        others = {"tracks.npz": writer.write_tracks} if writer.has_tracks else {}
+        if location is not None and location.T_sensor_world is not None:
+            others["trajectory_location.tum"] = lambda path: _write_location(path, location)
+        # A sensor's readings correct poses as they come, not after the fact.
+        final = tracker.final_trajectory if location is None else None
+        results = TrackerResults(tracker.map, tracker.pack_keyframes, final, others)
+        summary, failed = write_results(out, run, writer.calibration, results)
+    if stopped_by is not None:
+        raise stopped_by
+    if failed:
+        raise output_error(out, failed)
     summary = {**summary, **timing.describe()}
     return summary if location is None else {**summary, "location": asdict(location.summary)}
+
+
+def _write_location(path: Path, location: LocationFilter) -> None:
+    """Writes the poses in the world of a sensor that is known."""
+    trajectory = location.trajectory()
+    assert trajectory is not None
+    write_tum(path, trajectory)
+
+
+def _describe_end(stopped_by: BaseException | None) -> str:
+    """Of a run, for run.json."""
+    match stopped_by:
+        case None:
+            return "complete"
+        case Stopped() if stopped_by.signal != signal.SIGINT:
+            return f"interrupted by {stopped_by.signal.name}"
+        case KeyboardInterrupt():
+            return "interrupted"
+        case SigmaSlamError():
+            return f"failed: {printable(str(stopped_by))}"
+    return f"crashed: {stopped_by!r}"
 
 
 class _Timing:

@@ -36,14 +36,16 @@ class Estimate:
 
     Attributes:
         timestamp: seconds.
-        T_world_camera: (4, 4) pose of the left camera; the world is the first left camera.
-        covariance: (6, 6) of that pose in the camera's own frame, translation (metres) before rotation (radians).
+        T_world_camera: (4, 4) pose of the left camera; the world is the left camera of the first frame with a pose, or
+            the map's. NaN before that frame.
+        covariance: (6, 6) of that pose in the camera's own frame, translation (metres) before rotation (radians). Zero
+            in the frame that defines the world, infinite variances before it.
         matching_covariance: (6, 6) the part of the covariance that comes from matches and motion; the rest comes from
             errors of the calibration.
         status: "starting", "tracking", "lost", or "relocalised": found again among keyframes that had left the window,
             or in the map.
         belief: 1 - sqrt of the largest eigenvalue of the covariance of the pose relative to the keyframe (metres and
-            radians together), clipped to [0, 1] (Tables 9.1, 9.2).
+            radians together), clipped to [0, 1] (Tables 9.1, 9.2); 0 without a pose.
         matches, inliers: points matched to the keyframe, and those that passed the gate.
         nis, dof: normalised innovation squared and its degrees of freedom; 0 without an update.
         calibration: of the stereo pair.
@@ -69,6 +71,11 @@ class Estimate:
     frame_covariance: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
     tracks: KeyframeTracks | None = None
     relative_poses: RelativePoses = field(default_factory=RelativePoses.empty)
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether the frame has a pose: tracking has started, in this frame or before it."""
+        return bool(np.isfinite(self.T_world_camera).all())
 
     @property
     def camera(self) -> Estimate:

@@ -109,7 +109,7 @@ class FrameHistory:
         self._window, self._keyframes = window, keyframes
         self._T_rectified_left = T_rectified_left
         self._timestamps = array("d")
-        # Frames without a keyframe, or whose keyframes are gone: they stay what they were.
+        # Frames whose keyframes are gone: they stay what they were.
         self._settled: list[tuple[np.ndarray, np.ndarray]] = []
         # Keyframes that frames hang at, by time; interval k lies before keyframe k, the links behind the last one.
         self._chain: list[int] = []
@@ -121,22 +121,20 @@ class FrameHistory:
         self._state = window.posterior
 
     def append(self, estimate: Estimate, predicted: MotionState, filtered: MotionState) -> None:
-        """Takes a frame.
+        """Takes a frame; one without a pose has no row in the trajectory.
 
         Args:
             estimate: what is said of it.
             predicted: motion since the last keyframe before it, without its images.
             filtered: the same with them, or again without where they gave no pose.
         """
+        if not estimate.has_pose:
+            return
         active = self._keyframes.active
         ids = [keyframe.id for keyframe in (*self._keyframes.remembered, *active)]
         if self._chain and not set(self._ids) & set(ids):
             self._settle()
         if not self._chain:
-            if not active:
-                self._settled.append((estimate.T_world_camera[None], estimate.covariance[None]))
-                self._timestamps.append(estimate.timestamp)
-                return
             self._chain, self._began = [active[0].id], active[0].timestamp
             self._intervals = [_Interval(HangingFrames.at_first(smooth_motion([])), np.eye(4))]
         link = MotionLink(estimate.timestamp, predicted, filtered)
@@ -152,10 +150,10 @@ class FrameHistory:
         self._timestamps.append(estimate.timestamp)
 
     def final(self) -> tuple[Trajectory, np.ndarray]:
-        """All frames as they are known now.
+        """All frames with a pose as they are known now.
 
         Returns:
-            Poses of the left camera; the world is the first one, or the map's. And their covariances (N, 6, 6) in the
+            Poses of the left camera; the world is the first one's, or the map's. And their covariances (N, 6, 6) in the
             camera's own frame, translation (metres) before rotation (radians).
         """
         parts = [*self._settled, *self._hanging()]

@@ -18,6 +18,7 @@ from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.slam.argument_checks import check_region, check_tracker_arguments
 from sigmaslam.slam.body_admission import BodyAdmission
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.estimate import Estimate
@@ -78,6 +79,8 @@ class ObjectEstimate:
 
     def _on_body(self, covariance: np.ndarray) -> np.ndarray:
         """A covariance (6, 6) in the camera's frame as that of `T_camera_object` in the body's own frame."""
+        if not self.camera.has_pose:
+            return covariance
         covariance = turn_covariance(self.camera.T_world_camera, covariance)
         return np.asarray(0.5 * (covariance + covariance.T))
 
@@ -102,6 +105,8 @@ class ObjectTracker:
         region: (H, W) bool, where the body is in the first raw left image; background inside does little harm.
         frontend, backend, threads: of `StereoTracker`.
         config: likewise; by default `OBJECT_CONFIG`, with more acceleration.
+    Raises:
+        InputError: an argument is of another type or size, or nothing is in the region.
     """
 
     def __init__(
@@ -113,6 +118,8 @@ class ObjectTracker:
         config: TrackerConfig | None = None,
         threads: int = 2,
     ) -> None:
+        check_tracker_arguments(camera, frontend, backend, config, threads)
+        check_region(region, camera)
         self.config = config = config or OBJECT_CONFIG
         rectifier = StereoRectifier(camera)
         self._T_left_rectified = se3_inverse(rectifier.T_rectified_left)
@@ -122,7 +129,7 @@ class ObjectTracker:
         rectified_region = rectifier.rectify(raw, raw)[0] > 127
         self._body = BodyAdmission(rectifier.rectified, rectified_region, frontend, config)
         self._tracker = StereoTracker(camera, frontend, backend, config, self._body, threads)
-        # What each frame before the body moved on its own adds to its covariance.
+        # What each frame with a pose before the body moved on its own adds to its covariance.
         self._unseen_motion: list[np.ndarray] = []
 
     @property
@@ -142,6 +149,8 @@ class ObjectTracker:
                 "the first frame has too few points that both eyes see: start where the images are good, "
                 "and check the calibration"
             )
+        if not estimate.has_pose:
+            return ObjectEstimate(estimate)
         unseen, relative_poses = np.zeros((6, 6)), estimate.relative_poses
         if not self._body.separated:
             # In the body's frame, whose axes are the camera's still; from there into the left camera's.
@@ -162,7 +171,7 @@ class ObjectTracker:
         )
 
     def final_trajectory(self) -> tuple[Trajectory, np.ndarray]:
-        """T_camera_object of all frames as it is known now, with covariances (N, 6, 6) in the body's own frame."""
+        """T_camera_object of all frames with a pose as known now, covariances (N, 6, 6) in the body's own frame."""
         camera, covariances = self._tracker.final_trajectory()
         for covariance, unseen in zip(covariances, self._unseen_motion, strict=False):
             covariance += unseen

@@ -16,11 +16,7 @@ from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.localisation import Prediction
 from sigmaslam.slam.mapping import KeyframeTracks
-from sigmaslam.slam.phase import Course, Phase
 from sigmaslam.slam.relative_poses import RelativePoseReporter
-
-# Variance of a pose that is not known at all, m^2 and rad^2.
-_ANYWHERE = 1e6
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,14 +25,13 @@ class Reporter:
 
     Attributes:
         T_rectified_left: (4, 4) takes points of the left camera into the rectified one.
-        window, motion, course: of the tracker.
+        window, motion: of the tracker.
         relative_poses: relates frames to keyframes.
     """
 
     T_rectified_left: np.ndarray
     window: KeyframeWindow
     motion: MotionFilter
-    course: Course
     relative_poses: RelativePoseReporter
 
     def report(
@@ -50,6 +45,8 @@ class Reporter:
     ) -> Estimate:
         """What is known after a frame; without a fit by the prediction, without a keyframe nothing."""
         state = self.window.posterior
+        if not len(state):
+            return self._report_nothing(timestamp, status, milliseconds)
         calibration, spread, on_calibration = (
             state.calibration,
             state.covariance[CALIBRATION, CALIBRATION],
@@ -60,14 +57,11 @@ class Reporter:
             pose, absolute, relative = fit.pose, fit.covariance, fit.relative
             calibration, spread = fit.calibration, fit.calibration_covariance
             on_calibration, by_error = fit.joint.common[CALIBRATION], fit.joint.common[-6:]
-        elif len(state):
+        else:
             prediction = Prediction.of(self.window, self.motion)
             last = pose_slice(len(state) - 1)
             pose, relative = prediction.pose, prediction.covariance
             absolute, by_error = state.covariance[last, last] + relative, state.common[last]
-        else:
-            pose = np.eye(4)
-            relative = absolute = (_ANYWHERE if self.course.phase is Phase.WAITING_IN_MAP else 0.0) * np.eye(6)
         # The filter knows the rectified camera; users know the left camera of their calibration.
         T_left_rectified = se3_inverse(self.T_rectified_left)
         adjoint = se3_adjoint(T_left_rectified) @ se3_adjoint(se3_inverse(pose))
@@ -93,6 +87,27 @@ class Reporter:
             tracks=tracks,
             # A keyframe is the window's by now, which has learned from it.
             relative_poses=self.relative_poses.report(timestamp, fit if tracks is None else None),
+        )
+
+    def _report_nothing(self, timestamp: float, status: str, milliseconds: dict[str, float]) -> Estimate:
+        """A frame before the first keyframe, which has no pose."""
+        state = self.window.posterior
+        errors = state.common[CALIBRATION]
+        spread = state.covariance[CALIBRATION, CALIBRATION] + errors @ errors.T
+        anywhere = np.diag(np.full(6, np.inf))
+        return Estimate(
+            timestamp=timestamp,
+            T_world_camera=np.full((4, 4), np.nan),
+            covariance=anywhere,
+            matching_covariance=anywhere.copy(),
+            status=status,
+            belief=0.0,
+            matches=0,
+            inliers=0,
+            nis=0.0,
+            dof=0,
+            calibration=self._describe_calibration(state.calibration, spread),
+            milliseconds=milliseconds,
         )
 
     def _describe_calibration(self, errors: np.ndarray, covariance: np.ndarray) -> CalibrationEstimate:

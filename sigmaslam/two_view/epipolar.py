@@ -1,4 +1,4 @@
-"""Relative pose of two calibrated views from matches: the 5-point method, then least squares by covariance."""
+"""Relative orientation of two calibrated views from matches: the 5-point method, then least squares by covariance."""
 
 from __future__ import annotations
 
@@ -25,6 +25,8 @@ _PLANE_SHARE, _PLANE_THRESHOLD, _MIN_PARALLAX = 0.8, 2.0, 1e-3
 # The scale of the robust loss and the bound of an inlier count in standard deviations of the epipolar distance.
 _ROBUST = 2.0
 _INLIER = 3.0
+# Beyond this condition number the matches leave something free.
+_MAX_CONDITION = 1e14
 # Keypoints in image 0 have this standard deviation, pixels.
 _SIGMA0 = 0.1
 
@@ -38,11 +40,14 @@ class EpipolarPose:
         direction: (3,) unit vector, translation of the points of camera 0 in camera 1.
         inliers: (M,) bool, probable matches within three standard deviations of their epipolar lines whose rays meet
             in front of both cameras, or are parallel within their errors.
+        covariance: (6, 6) of direction before rotation, from the inliers' noise: direction + d, of rank 2, and
+            exp(r) R, radians; infinite where they leave it free.
     """
 
     R: np.ndarray
     direction: np.ndarray
     inliers: np.ndarray
+    covariance: np.ndarray
 
 
 def estimate_epipolar_pose(
@@ -82,32 +87,35 @@ def estimate_epipolar_pose(
     agreeing = probable[mask.ravel() > 0]
     # The covariances are in the units of the rays.
     J = K_inverse[:2, :2]
-    rays = _MatchedRays(rays0, rays1, _SIGMA0**2 * J @ J.T, J @ covariance.astype(np.float64) @ J.T)
+    rays = MatchedRays(rays0, rays1, _SIGMA0**2 * J @ J.T, J @ covariance.astype(np.float64) @ J.T)
     subset = agreeing[:: max(1, len(agreeing) // _SUBSET)]
     starts = [_pose_of_essential(essential, rays0[subset], rays1[subset])]
     starts += _poses_of_plane(K, points0[subset], points1[subset])
     best: EpipolarPose | None = None
     for start in starts:
         R, direction = _refine_pose(rays, probability, *start)
-        near = (np.abs(rays.whitened(R, direction)[0]) < _INLIER) & (probability >= _MIN_PROBABILITY)
-        pose = EpipolarPose(R, direction, near & rays.in_front(R, direction))
+        near = (np.abs(rays.whitened(essential_matrix(R, direction))[0]) < _INLIER) & (probability >= _MIN_PROBABILITY)
+        inliers = near & rays.in_front(R, direction)
+        pose = EpipolarPose(R, direction, inliers, _pose_covariance(rays, inliers, R, direction))
         if best is None or pose.inliers.sum() > best.inliers.sum():
             best = pose
     return best
 
 
 @dataclass(frozen=True, slots=True)
-class _MatchedRays:
-    """Rays (M, 3) of the matches with third component 1, and the covariance of the other two: (2, 2) and (M, 2, 2)."""
+class MatchedRays:
+    """Rays (M, 3) of the matches with third component 1, and the covariance of the other two: (2, 2) and (M, 2, 2).
+
+    Homogeneous pixels will do as well, with the fundamental matrix.
+    """
 
     rays0: np.ndarray
     rays1: np.ndarray
     spread0: np.ndarray
     spread1: np.ndarray
 
-    def whitened(self, R: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def whitened(self, E: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Epipolar residual over its standard deviation to first order (Sampson), and that deviation, both (M,)."""
-        E = skew(direction) @ R
         by1, by0 = self.rays0 @ E.T, self.rays1 @ E
         a, b, c, d = by1[:, 0], by1[:, 1], by0[:, 0], by0[:, 1]
         (uu0, uv0), (_, vv0) = self.spread0
@@ -150,18 +158,12 @@ def _poses_of_plane(K: np.ndarray, points0: np.ndarray, points1: np.ndarray) -> 
 
 
 def _refine_pose(
-    rays: _MatchedRays, probability: np.ndarray, R: np.ndarray, direction: np.ndarray
+    rays: MatchedRays, probability: np.ndarray, R: np.ndarray, direction: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Gauss-Newton over the five degrees of freedom, with a robust loss."""
     for _ in range(_ITERATIONS):
-        residual, sigma = rays.whitened(R, direction)
-        turned = rays.rays0 @ R.T
-        inner = (rays.rays1 * turned).sum(axis=1)
-        by_rotation = (turned @ direction)[:, None] * rays.rays1 - inner[:, None] * direction
-        tangent = np.linalg.svd(direction[None])[2][1:].T
-        by_direction = _cross(turned, rays.rays1) @ tangent
-        J = np.concatenate([by_rotation, by_direction], axis=1) / sigma[:, None]
-        weighted = J * (probability / (1.0 + (residual / _ROBUST) ** 2) ** 2)[:, None]
+        residual, J, tangent = _slopes(rays, R, direction)
+        weighted = J * (probability * robust_weight(residual))[:, None]
         normal = weighted.T @ J
         step = -np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(5), weighted.T @ residual)
         R = cv2.Rodrigues(step[:3])[0] @ R
@@ -170,6 +172,50 @@ def _refine_pose(
         if np.abs(step).max() < _CONVERGED:
             break
     return R, direction
+
+
+def _slopes(rays: MatchedRays, R: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Whitened residuals (M,), derivatives (M, 5) by rotation and direction, and the tangent (3, 2) of the latter."""
+    residual, sigma = rays.whitened(essential_matrix(R, direction))
+    turned = rays.rays0 @ R.T
+    inner = (rays.rays1 * turned).sum(axis=1)
+    by_rotation = (turned @ direction)[:, None] * rays.rays1 - inner[:, None] * direction
+    tangent = np.linalg.svd(direction[None])[2][1:].T
+    by_direction = _cross(turned, rays.rays1) @ tangent
+    return residual, np.concatenate([by_rotation, by_direction], axis=1) / sigma[:, None], tangent
+
+
+def _pose_covariance(rays: MatchedRays, inliers: np.ndarray, R: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """(6, 6) of direction and rotation, from the inliers."""
+    residual, J, tangent = _slopes(rays, R, direction)
+    covariance = robust_covariance(residual[inliers], J[inliers])
+    expand = np.zeros((6, 5))
+    expand[:3, 3:], expand[3:, :3] = tangent, np.eye(3)
+    return np.asarray(expand @ covariance @ expand.T) if np.isfinite(covariance).all() else np.full((6, 6), np.inf)
+
+
+def essential_matrix(R: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """E (3, 3) with ray1^T E ray0 = 0 (9.32)."""
+    return np.asarray(skew(direction) @ R)
+
+
+def robust_weight(residual: np.ndarray) -> np.ndarray:
+    """Weights of Geman and McClure's loss, from residuals in standard deviations."""
+    return np.asarray(1.0 / (1.0 + (residual / _ROBUST) ** 2) ** 2)
+
+
+def robust_covariance(residual: np.ndarray, J: np.ndarray) -> np.ndarray:
+    """Covariance (n, n) of what minimises that loss, from whitened residuals (M,) and derivatives (M, n) of inliers.
+
+    It is the inverse information times what the loss wastes: the mean of its squared slope over the square of its mean
+    curvature (Huber 1981); infinite where the inliers leave something free.
+    """
+    information = J.T @ J
+    bend = 1.0 + (residual / _ROBUST) ** 2
+    slope, curvature = residual / bend**2, (1.0 - 3.0 * (residual / _ROBUST) ** 2) / bend**3
+    if len(J) <= J.shape[1] or np.linalg.cond(information) > _MAX_CONDITION or curvature.mean() <= 0.0:
+        return np.full(information.shape, np.inf)
+    return np.asarray(np.linalg.inv(information) * (slope**2).mean() / curvature.mean() ** 2)
 
 
 def _depths_positive(

@@ -1,3 +1,4 @@
+import errno
 import json
 import shutil
 from pathlib import Path
@@ -106,8 +107,25 @@ def test_missing_frames_lower_the_coverage(drive):
     write_tum(run / "trajectory.tum", full.subset(kept))
     np.save(run / "covariance.npy", np.load(run / "covariance.npy")[kept])
     assert evaluate_run(run, truth, plot=False).coverage == pytest.approx(156 / 186, abs=0.01)
-    (run / "frames.csv").write_text("timestamp,status\n" + "0,tracking\n" * 186)
-    assert evaluate_run(run, truth, plot=False).coverage == 156 / 186
+    header = "timestamp,status,matches,inliers,nis,dof,belief,disparity_offset,disparity_offset_sigma"
+    rows = [f"{time:.9f},{'lost' if 10 <= k < 13 else 'tracking'},,,,,,," for k, time in enumerate(full.timestamps)]
+    (run / "frames.csv").write_text("\n".join([header, *rows]) + "\n")
+    evaluation = evaluate_run(run, truth, plot=False)
+    assert (evaluation.matched, evaluation.frames, evaluation.predicted) == (156, 186, 3)
+    assert "156 of the 186 with a truth have an estimate (83.9 %), 3 of them while lost" in format_evaluation(
+        evaluation
+    )
+
+
+def test_a_picture_that_cannot_be_written_costs_a_warning_alone(drive, monkeypatch, caplog):
+    def full(path: Path) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("sigmaslam.runs.figures.atomic_path", full)
+    evaluation = evaluate_run(*drive)
+    assert evaluation.figure_path is None
+    assert evaluation.matched == 186
+    assert "evaluation.png is not written: No space left on device" in caplog.text
 
 
 def test_kitti_truth_without_times_is_paired_by_index_when_counts_agree(real_data: Path, tmp_path):

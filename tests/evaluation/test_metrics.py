@@ -9,7 +9,6 @@ from evo.core.trajectory import PoseTrajectory3D
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.metrics.trajectory_errors import (
     absolute_trajectory_error,
-    align_umeyama,
     associate,
     is_regular,
     kitti_errors,
@@ -179,23 +178,6 @@ def test_no_segment_gives_nan_not_zero():
     errors = kitti_errors(_straight(1, 20), _straight(1, 20))
     assert len(errors.lengths) == 0
     assert np.isnan(errors.mean_translation_percent)
-
-
-def test_umeyama_finds_the_transform_and_never_a_reflection():
-    generator = np.random.default_rng(1)
-    positions = generator.normal(size=(30, 3))
-    R, t = rotation_exp(np.array([0.3, 2.0, -1.0])), np.array([1.0, -5.0, 2.0])
-    found_R, found_t = align_umeyama(positions, positions @ R.T + t)
-    np.testing.assert_allclose(found_R, R, atol=1e-12)
-    np.testing.assert_allclose(found_t, t, atol=1e-12)
-    mirrored, _ = align_umeyama(positions, positions * [1, 1, -1])
-    assert np.linalg.det(mirrored) == pytest.approx(1.0)
-
-
-def test_umeyama_of_one_place_is_a_shift():
-    R, t = align_umeyama(np.zeros((5, 3)), np.ones((5, 3)))
-    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-15)
-    np.testing.assert_allclose(t, 1.0)
 
 
 def test_association_is_nearest_and_one_to_one():

@@ -20,7 +20,13 @@ from sigmaslam.evaluation.run_evaluation import evaluate_run, format_evaluation
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import write_tum
-from sigmaslam.runs.relative_pose_file import FramePairs, RelativePoseWriter, read_frame_pairs, write_frame_pairs
+from sigmaslam.runs.relative_pose_file import (
+    FramePairs,
+    RelativePoseWriter,
+    collect_frame_pairs,
+    read_frame_pairs,
+    write_frame_pairs,
+)
 from sigmaslam.slam.relative_poses import SPANS, RelativePoses
 from tests.support.commands import run_here
 
@@ -182,11 +188,12 @@ def some_rows(timestamps: np.ndarray, spans: list[int], seed: int) -> RelativePo
 
 def test_the_file_round_trips(tmp_path: Path):
     times = 1.5e9 + np.cumsum(np.random.default_rng(0).uniform(0.01, 0.2, 20))
-    writer = RelativePoseWriter()
+    writer = RelativePoseWriter(tmp_path)
     rows = {5: some_rows(times[[0, 3]], [4, 0], 1), 6: RelativePoses.empty(), 19: some_rows(times[[17]], [6], 2)}
     for frame in range(20):
         writer.add(frame, rows.get(frame, RelativePoses.empty()))
-    writer.finish(tmp_path, times)
+    writer.close()
+    write_frame_pairs(tmp_path / "relative_poses.npz", collect_frame_pairs(tmp_path, times))
     pairs = read_frame_pairs(tmp_path / "relative_poses.npz", 20)
     assert pairs.span.tolist() == [SPANS[4], SPANS[0], SPANS[6]]
     assert (pairs.earlier.tolist(), pairs.later.tolist()) == ([0, 3, 17], [5, 5, 19])
@@ -200,10 +207,10 @@ def test_files_of_other_runs_and_other_files_are_refused(tmp_path: Path):
     with pytest.raises(InputError, match=r"relative_poses\.npz: has frame 29, but .* 20 poses"):
         read_frame_pairs(path, 20)
     np.savez(path, span=np.zeros(3))
-    with pytest.raises(InputError, match=r"relative_poses\.npz: holds no relative poses"):
+    with pytest.raises(InputError, match=r"relative_poses\.npz: misses earlier, later, pose, covariance; run"):
         read_frame_pairs(path, 20)
     path.write_bytes(b"nothing")
-    with pytest.raises(InputError, match=r"relative_poses\.npz: holds no relative poses"):
+    with pytest.raises(InputError, match=r"relative_poses\.npz: is no numpy archive"):
         read_frame_pairs(path, 20)
 
 

@@ -27,6 +27,17 @@ def changed(
     return broken(frames, which, lambda frame: (change(frame.left), change(frame.right)))
 
 
+def assert_no_pose(estimate: Estimate) -> None:
+    """A frame before the start says nothing of its pose, and says so."""
+    assert estimate.status == "starting"
+    assert not estimate.has_pose
+    assert np.isnan(estimate.T_world_camera).all()
+    for covariance in (estimate.covariance, estimate.matching_covariance):
+        np.testing.assert_array_equal(np.diag(covariance), np.inf)
+    assert estimate.belief == 0.0
+    assert len(estimate.relative_poses) == 0
+
+
 def assert_honest(estimates: list[Estimate], truth: np.ndarray) -> None:
     """Every frame is lost or starting, or right within three sigma."""
     wrong = {

@@ -72,6 +72,25 @@ def test_a_wrong_file_is_refused_with_file_line_and_value(tmp_path: Path, text: 
         read_locations(write(tmp_path / "location.csv", text))
 
 
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            "timestamp;x;y;z;sigma_position\n0;0,5;0;0;0,1\n",
+            "line 1: the columns are separated by semicolons: separate",
+        ),
+        ("timestamp\tx\ty\tz\tsigma_position\n0\t0\t0\t0\t1\n", "line 1: the columns are separated by tabs"),
+        ("timestamp,x,x,y,z,sigma_position\n0,0,0,0,0,1\n", "line 1: column x stands twice"),
+        ("timestamp,x,y,z,sigma_position\n0,0,0,0,1\n100000000,0,0,0,1\n", "look like nanoseconds: write seconds"),
+    ],
+)
+def test_other_separators_and_units_are_named(tmp_path: Path, text: str, words: str):
+    with pytest.raises(InputError) as caught:
+        read_locations(write(tmp_path / "readings.csv", text))
+    for word in ("readings.csv", words):
+        assert word in str(caught.value)
+
+
 def test_a_missing_file_is_refused(tmp_path: Path):
     with pytest.raises(InputError, match=r"nowhere\.csv"):
         read_locations(tmp_path / "nowhere.csv")
@@ -157,6 +176,20 @@ def test_nothing_is_fused_while_the_body_rests_and_poses_stay_as_they_are():
         assert location.fuse(estimate) is estimate
     assert location.summary.ready is None
     assert location.trajectory() is None
+
+
+def test_frames_before_the_first_pose_come_back_as_they_are_and_their_readings_are_not_used():
+    drive = Drive(3)
+    estimates = drifting_estimates(drive, 60, SIGMA, 3)
+    times = np.arange(-0.49, 3.0, 0.1)
+    readings = sense(drive.pose(times), times, 3, 0.02, 0.01, MOUNT)
+    nowhere = np.full((4, 4), np.nan), np.diag(np.full(6, np.inf))
+    before = [estimate_of(FRAME * k, *nowhere, "starting") for k in range(-10, 0)]
+    late, location = LocationFilter(readings), LocationFilter(readings)
+    assert all(late.fuse(estimate) is estimate for estimate in before)
+    for estimate in estimates:
+        np.testing.assert_array_equal(late.fuse(estimate).T_world_camera, location.fuse(estimate).T_world_camera)
+    assert (late.summary.used, late.summary.unused) == (location.summary.used, 5)
 
 
 def test_after_a_loss_the_error_is_what_it_was_before():

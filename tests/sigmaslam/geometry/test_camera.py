@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, RectifiedStereo, StereoCamera
+from sigmaslam.geometry.checked_yaml import CalibrationYaml
 from tests.support.calibration_yaml import write_calibration
 
 RADTAN4 = (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05)
@@ -150,8 +151,12 @@ def test_wrong_extrinsics_are_refused():
             StereoCamera(camera, camera, T)
     with pytest.raises(CalibrationError, match="left and right look swapped"):
         make_stereo(translation=(-0.11, 0, 0))
-    with pytest.raises(CalibrationError, match="not beside the left camera"):
+    with pytest.raises(CalibrationError, match="stands above the other"):
         make_stereo(translation=(0.01, 0.11, 0))
+    with pytest.raises(CalibrationError, match="not beside the left camera"):
+        make_stereo(translation=(0.01, 0, 0.11))
+    with pytest.raises(CalibrationError, match="baseline is zero"):
+        make_stereo(translation=(0, 0, 0))
 
 
 def test_rectified_pairs_are_recognised():
@@ -256,6 +261,8 @@ def test_yaml_errors_name_file_and_key(tmp_path, path, value, message):
         ("left: [1, 2", "not valid YAML"),
         ("- 1\n- 2\n", "expected keys with values, found list"),
         ("", "found NoneType"),
+        ("left: {fx: 1,\n  fx: 2}\n", "key 'fx' is given twice, in lines 1 and 2: keep one"),
+        ("T_left_right: 1\nleft: {}\nT_left_right: 2\n", "key 'T_left_right' is given twice, in lines 1 and 3"),
     ],
 )
 def test_unparsable_yaml_is_refused(tmp_path: Path, text, message):
@@ -263,6 +270,13 @@ def test_unparsable_yaml_is_refused(tmp_path: Path, text, message):
     file.write_text(text)
     with pytest.raises(CalibrationError, match=message):
         StereoCamera.from_yaml(file)
+
+
+def test_one_key_in_two_sections_and_merged_keys_are_no_duplicates(tmp_path: Path):
+    file = tmp_path / "stereo.yaml"
+    file.write_text("left: &eye {fx: 1.0, fy: 2.0}\nright: {<<: *eye, fx: 3.0}\n")
+    right = CalibrationYaml.read(file).section("right")
+    assert (right.number("fx"), right.number("fy")) == (3.0, 2.0)
 
 
 def test_missing_or_binary_yaml_is_refused(tmp_path):

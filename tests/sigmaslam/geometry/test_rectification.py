@@ -8,7 +8,7 @@ from sigmaslam.errors import CalibrationError, FrameError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.readers import open_sequence
-from sigmaslam.readers.calibration_files import read_kitti_calibration
+from sigmaslam.readers.kitti_calibration import read_kitti_calibration
 
 RADTAN = (-0.28, 0.07, 2e-4, 2e-5)
 

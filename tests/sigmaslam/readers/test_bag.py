@@ -16,6 +16,7 @@ from sigmaslam.errors import CalibrationError, InputError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.readers import open_sequence
+from sigmaslam.readers.calibration_writer import write_calibration
 from sigmaslam.readers.pairing import MAX_WAITING, Stamped, pair_streams
 from sigmaslam.readers.ros_messages import image_array
 from sigmaslam.readers.trajectory_files import read_tum
@@ -354,6 +355,17 @@ def test_topics_of_common_cameras_are_found(tmp_path: Path, pictures, demo_camer
     assert len(list(sequence.frames())) == COUNT
 
 
+def test_a_realsense_bag_is_read_with_a_calibration(tmp_path: Path, pictures, demo_camera: StereoCamera):
+    sensor = "/device_0/sensor_0"
+    topics = (f"{sensor}/Infrared_1/image/data", f"{sensor}/Infrared_2/image/data")
+    path = record("bag", pictures, None, *topics).write(tmp_path)
+    with pytest.raises(CalibrationError, match=r"no CameraInfo that belongs to .* give --calibration"):
+        open_sequence(path)
+    write_calibration(tmp_path / "stereo.yaml", demo_camera)
+    sequence = open_sequence(path, calibration=tmp_path / "stereo.yaml")
+    np.testing.assert_array_equal(next(sequence.frames()).right, pictures[0][1])
+
+
 def test_unclear_topics_are_listed_and_can_be_chosen(tmp_path: Path, pictures, demo_camera: StereoCamera):
     recording = record("mcap", pictures, demo_camera)
     other = record("mcap", pictures[::-1], None, "/other/left/image_raw", "/other/right/image_raw")
@@ -453,7 +465,7 @@ K = np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]])
         ({"P": projection(K, -0.1)}, "/left/camera_info and /right/camera_info: left and right look swapped"),
         ({"P": np.zeros((3, 4))}, "/right/camera_info: not calibrated, P is .*; give --calibration"),
         ({"K": np.zeros((3, 3))}, "/right/camera_info: not calibrated, K is"),
-        ({"model": "fov", "D": [1.0]}, "/right/camera_info: distortion_model is 'fov'; known are radial-tangential"),
+        ({"model": "fov", "D": [1.0]}, "/right/camera_info: distortion_model is 'fov', the field-of-view model"),
         ({"D": [0.1, 0.1]}, "/right/camera_info: distortion has 2 coefficients"),
         ({"size": (128, 96)}, "right image is 64x48, the calibration is for 128x96"),
     ],

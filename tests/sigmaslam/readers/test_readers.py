@@ -252,7 +252,7 @@ def test_image_that_vanishes_after_opening_is_skipped(tmp_path):
     sequence = open_sequence(make_folder(tmp_path))
     (tmp_path / "right" / "000002.png").unlink()
     assert [frame.index for frame in sequence.frames()] == [0, 1, 3, 4, 5]
-    assert "missing" in sequence.skipped[0].reason
+    assert "no such file" in sequence.skipped[0].reason
 
 
 def test_truncated_jpeg_is_skipped(tmp_path):
@@ -325,7 +325,9 @@ def test_float_images_are_refused(tmp_path):
 def test_missing_folder_and_unknown_format(tmp_path):
     with pytest.raises(InputError, match="no such file or folder"):
         open_sequence(tmp_path / "nothing")
-    with pytest.raises(InputError, match="'ros' is unknown; use one of auto, kitti, euroc, folder, video, bag"):
+    with pytest.raises(
+        InputError, match="'ros' is unknown; use one of auto, kitti, euroc, 4seasons, folder, video, bag"
+    ):
         open_sequence(tmp_path, format="ros")
 
 
@@ -335,7 +337,8 @@ def test_auto_lists_what_it_looked_for(tmp_path):
         open_sequence(tmp_path)
     for text in (
         "kitti: folders image_0 + image_1",
-        "euroc: folders cam0/data",
+        "euroc: (also TUM-VI) folders cam0/data",
+        "4seasons: folders undistorted_images",
         "folder: folders left",
         "video: one",
         "bag: a ROS bag",
@@ -556,8 +559,8 @@ def test_euroc_names_that_are_no_stamps_need_data_csv(tmp_path):
         ({"intrinsics": [50, 50, 32]}, r"key 'intrinsics' must be 4 numbers in lists, got .* \(size 3\)"),
         ({"T_BS": {"cols": 4, "rows": 4, "data": [1, 2]}}, "key 'T_BS.data' must be 16 numbers"),
         ({"T_BS": {"cols": 4}}, "key 'T_BS.data' is missing"),
-        ({"camera_model": "omni"}, "camera_model is 'omni'; only pinhole"),
-        ({"distortion_model": "fov"}, "distortion_model is 'fov'; known are radial-tangential"),
+        ({"camera_model": "omni"}, "camera_model is 'omni', the omnidirectional model, which is not supported"),
+        ({"distortion_model": "fov"}, "distortion_model is 'fov', the field-of-view model, which is not supported"),
         ({"distortion_coefficients": [0.1]}, "distortion has 1 coefficients"),
         ({"T_BS": {"data": [0.0] * 16}}, "T_BS of"),
     ],
@@ -639,3 +642,34 @@ def test_files_that_are_no_videos(tmp_path):
     cv2.imwrite(str(tmp_path / "left01.png"), picture(0))
     with pytest.raises(InputError, match="an image, not a video"):
         open_sequence(tmp_path / "left01.png")
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e9, "nanoseconds"), (1e6, "microseconds")])
+def test_times_in_another_unit_are_refused(tmp_path, factor, unit):
+    """They ended in a LinAlgError while tracking, or in a path of ten kilometres."""
+    make_kitti(tmp_path)
+    (tmp_path / "times.txt").write_text("".join(f"{0.1 * factor * k:.0f}\n" for k in range(6)))
+    with pytest.raises(InputError, match=rf"times\.txt: times such as .* look like {unit}: write seconds"):
+        open_sequence(tmp_path)
+
+
+@pytest.mark.parametrize("stamp", ["9" * 19, "9" * 40])
+def test_names_that_are_no_nanoseconds_are_refused(tmp_path, stamp):
+    make_folder(tmp_path, 1, name=stamp + ".png")
+    with pytest.raises(InputError, match=r"99\.png: 9+(\.\.\.)? is no time in nanoseconds since 1970"):
+        open_sequence(tmp_path)
+
+
+def test_a_key_of_kitti_that_stands_twice_is_refused(tmp_path):
+    make_kitti(tmp_path)
+    with (tmp_path / "calib.txt").open("a") as calibration:
+        calibration.write(f"P1: {kitti_line(-9)}\n")
+    with pytest.raises(CalibrationError, match=r"calib\.txt: key 'P1' stands twice"):
+        open_sequence(tmp_path)
+
+
+def test_kitti_cameras_without_an_inverse_are_refused(tmp_path):
+    make_kitti(tmp_path)
+    (tmp_path / "calib.txt").write_text(f"P0: {'0 ' * 12}\nP1: {kitti_line(-5)}\n")
+    with pytest.raises(CalibrationError, match=r"calib\.txt: .*'P0'"):
+        open_sequence(tmp_path)

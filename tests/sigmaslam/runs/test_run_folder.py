@@ -1,31 +1,11 @@
-"""What a run says and writes."""
+"""What a run writes."""
 
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-from sigmaslam.runs.run_folder import calibration_verdict, write_ply
+from sigmaslam.runs.run_folder import write_ply
 from sigmaslam.slam.point_map import PointMap
-from sigmaslam.slam.tracker import CalibrationEstimate
-
-
-@pytest.mark.parametrize(
-    ("offset", "sigma", "words"),
-    [
-        (0.01, 0.03, "nothing wrong"),
-        (0.27, 0.04, "off by +0.27 ± 0.04 px"),
-        (-0.27, 0.04, "off by -0.27 ± 0.04 px"),
-        (0.09, 0.01, "nothing wrong"),  # certain, but too small to matter
-        (0.3, 0.25, "too early to say"),
-    ],
-)
-def test_the_verdict_on_the_calibration_is_in_words(offset: float, sigma: float, words: str):
-    assert words in calibration_verdict(CalibrationEstimate(offset, sigma))
-
-
-def test_the_verdict_names_an_offset_that_was_refused():
-    assert "ask for a disparity offset of +2.4 px" in calibration_verdict(CalibrationEstimate(0.0, 0.5, 2.4))
 
 
 def test_a_ply_file_round_trips(tmp_path: Path):

@@ -11,7 +11,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
 from sigmaslam.readers import StereoFrame
 from tests.support.estimates import Demo, position_sigma, squared_error, statuses, track
-from tests.support.faults import Pair, assert_honest, broken, changed
+from tests.support.faults import Pair, assert_honest, assert_no_pose, broken, changed
 from tests.support.quantiles import WITHIN_3_SIGMA
 
 
@@ -75,6 +75,11 @@ def test_noise_from_the_start_is_no_start(demo: Demo, texture: Callable[..., np.
     )
     assert statuses(estimates) == ["starting"] * 6 + ["tracking"] * 4
     assert_honest(estimates, se3_inverse(truth[5]) @ truth)
+    for estimate in estimates[:5]:
+        assert_no_pose(estimate)
+    # The frame that defines the world is where it is, by definition.
+    np.testing.assert_array_equal(estimates[5].T_world_camera, np.eye(4))
+    np.testing.assert_array_equal(estimates[5].covariance, np.zeros((6, 6)))
 
 
 # ---- frames and their times

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -253,14 +253,15 @@ def test_a_restart_leaves_what_was_before_as_it_was():
     np.testing.assert_allclose(after.poses[20], np.eye(4), atol=1e-12)
 
 
-def test_frames_before_the_first_keyframe_stay_as_they_were_said():
+def test_a_frame_without_a_pose_is_not_in_the_trajectory():
     walk = Walk(60)
-    walk.history.append(estimate_at(-1.0), *[MotionState(np.eye(4), np.zeros(6), np.zeros((12, 12)))] * 2)
+    nowhere = replace(estimate_at(-1.0), T_world_camera=np.full((4, 4), np.nan))
+    walk.history.append(nowhere, *[MotionState(np.eye(4), np.zeros(6), np.zeros((12, 12)))] * 2)
     walk.add()
     poses, spread = walk.history.final()
-    assert poses.timestamps.tolist() == [-1.0, 0.0]
-    np.testing.assert_array_equal(poses.poses, [np.eye(4)] * 2)
-    np.testing.assert_array_equal(spread, [np.eye(6), np.zeros((6, 6))])
+    assert poses.timestamps.tolist() == [0.0]
+    np.testing.assert_array_equal(poses.poses, [np.eye(4)])
+    np.testing.assert_array_equal(spread, [np.zeros((6, 6))])
 
 
 def test_the_frame_of_a_keyframe_has_its_covariance():

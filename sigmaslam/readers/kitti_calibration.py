@@ -1,34 +1,19 @@
-"""Calibration files in three forms: the project's YAML, and KITTI's two."""
+"""KITTI's calibration files: calib.txt and calib_cam_to_cam.txt."""
 
 from pathlib import Path
 
 import numpy as np
 
+from sigmaslam.bounded_files import CALIBRATION_BYTES, read_text, shorten
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
-
-ImageSize = tuple[int, int]
+from sigmaslam.readers.calibration_size import ImageSize, UnknownImageSizeError, need_image_size
+from sigmaslam.readers.camera_infos import right_position
 
 GREY_PAIR = (0, 1)
 
 
-def read_calibration(path: Path, image_size: ImageSize, cameras: tuple[int, int] = GREY_PAIR) -> StereoCamera:
-    """Read the project's YAML form, or one of KITTI's text forms.
-
-    Args:
-        path: `*.yaml` / `*.yml` for `StereoCamera.from_yaml`, anything else for `read_kitti_calibration`.
-        image_size: (width, height) of the images, which KITTI's files do not give.
-        cameras: KITTI's numbers of the left and right camera.
-
-    Raises:
-        CalibrationError: names file, key and what was expected.
-    """
-    if path.suffix.lower() in (".yaml", ".yml"):
-        return StereoCamera.from_yaml(path)
-    return read_kitti_calibration(path, image_size, cameras)
-
-
-def read_kitti_calibration(path: Path, image_size: ImageSize, cameras: tuple[int, int]) -> StereoCamera:
+def read_kitti_calibration(path: Path, image_size: ImageSize | None, cameras: tuple[int, int]) -> StereoCamera:
     """Read KITTI's calib.txt ('P0: ' and 12 numbers, or bare lines of 12) or calib_cam_to_cam.txt.
 
     With calib_cam_to_cam.txt the image size decides: P_rect for rectified images (S_rect), else K, D, R, T of
@@ -47,11 +32,13 @@ def read_kitti_calibration(path: Path, image_size: ImageSize, cameras: tuple[int
         for name in ("S_rect", "S")
         if f"{name}_{left:02d}" in entries
     }
+    known = ", ".join(f"{name}_{left:02d} {size[0]}x{size[1]}" for name, size in sizes.items())
+    if image_size is None:
+        raise UnknownImageSizeError(f"{path}: is for {known or 'images of a size it does not name'}; give --size")
     if not sizes or sizes.get("S_rect") == image_size:
         return _from_projections(path, entries, (f"P_rect_{left:02d}", f"P_rect_{right:02d}"), image_size)
     if sizes.get("S") == image_size:
         return _from_originals(path, entries, cameras, image_size)
-    known = ", ".join(f"{name}_{left:02d} {size[0]}x{size[1]}" for name, size in sizes.items())
     raise CalibrationError(
         f"{path}: images are {image_size[0]}x{image_size[1]}, the calibration is for {known}; "
         "use the calibration that belongs to these images"
@@ -59,13 +46,10 @@ def read_kitti_calibration(path: Path, image_size: ImageSize, cameras: tuple[int
 
 
 def _read_entries(path: Path, cameras: tuple[int, int]) -> dict[str, str]:
-    try:
-        lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-    except (OSError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"{path}: cannot read the calibration: {error}") from None
-    keyed = dict(line.split(":", 1) for line in lines if ":" in line)
-    if keyed:
-        return {key.strip(): value for key, value in keyed.items()}
+    text = read_text(path, CALIBRATION_BYTES, "the calibration", CalibrationError)
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    if any(":" in line for line in lines):
+        return _without_doubles(path, lines)
     if len(lines) == 2:
         return {f"P{camera}": line for camera, line in zip(cameras, lines, strict=True)}
     if len(lines) == 4:
@@ -76,6 +60,18 @@ def _read_entries(path: Path, cameras: tuple[int, int]) -> dict[str, str]:
     )
 
 
+def _without_doubles(path: Path, lines: list[str]) -> dict[str, str]:
+    """Values by key of lines `key: value`; others are left out."""
+    entries: dict[str, str] = {}
+    for line in lines:
+        key, colon, value = line.partition(":")
+        if colon and key.strip() in entries:
+            raise CalibrationError(f"{path}: key '{shorten(key.strip())}' stands twice: remove the wrong line")
+        if colon:
+            entries[key.strip()] = value
+    return entries
+
+
 def _matrix(path: Path, entries: dict[str, str], key: str, shape: tuple[int, ...]) -> np.ndarray:
     count = int(np.prod(shape))
     if key not in entries:
@@ -84,9 +80,11 @@ def _matrix(path: Path, entries: dict[str, str], key: str, shape: tuple[int, ...
     try:
         values = np.array([float(word) for word in words])
     except ValueError as error:
-        raise CalibrationError(f"{path}: key '{key}' must be {count} numbers: {error}") from None
+        raise CalibrationError(f"{path}: key '{key}' must be {count} numbers: {shorten(str(error))}") from None
     if len(values) != count or not np.all(np.isfinite(values)):
-        raise CalibrationError(f"{path}: key '{key}' must be {count} finite numbers, got {len(values)}: {words}")
+        raise CalibrationError(
+            f"{path}: key '{key}' must be {count} finite numbers, got {len(values)}: {shorten(entries[key])}"
+        )
     return values.reshape(shape)
 
 
@@ -118,20 +116,20 @@ def _model(
 
 
 def _from_projections(
-    path: Path, entries: dict[str, str], keys: tuple[str, str], image_size: ImageSize
+    path: Path, entries: dict[str, str], keys: tuple[str, str], image_size: ImageSize | None
 ) -> StereoCamera:
     """From P = K [I | t], where t is the position of camera 0 in this camera's frame."""
+    image_size = need_image_size(str(path), image_size)
     left, right = (_matrix(path, entries, key, (3, 4)) for key in keys)
     models = [_model(path, key, P[:, :3], image_size) for key, P in zip(keys, (left, right), strict=True)]
     T_left_right = np.eye(4)
-    T_left_right[:3, 3] = right_position(left, right)
+    try:
+        T_left_right[:3, 3] = right_position(left, right)
+    except np.linalg.LinAlgError:
+        raise CalibrationError(
+            f"{path}: keys '{keys[0]}' and '{keys[1]}': K has no inverse; correct the numbers"
+        ) from None
     return _stereo(path, models[0], models[1], T_left_right)
-
-
-def right_position(P_left: np.ndarray, P_right: np.ndarray) -> np.ndarray:
-    """Position of the right camera in the left one, (3,) metres, from (3, 4) projections of parallel cameras."""
-    left, right = (np.linalg.solve(P[:, :3], P[:, 3]) for P in (P_left, P_right))
-    return left - right
 
 
 def _from_originals(
@@ -147,4 +145,8 @@ def _from_originals(
         T_camera_camera0[:3, :3] = _matrix(path, entries, f"R_{camera:02d}", (3, 3))
         T_camera_camera0[:3, 3] = _matrix(path, entries, f"T_{camera:02d}", (3,))
         poses.append(T_camera_camera0)
-    return _stereo(path, models[0], models[1], poses[0] @ np.linalg.inv(poses[1]))
+    try:
+        T_left_right = poses[0] @ np.linalg.inv(poses[1])
+    except np.linalg.LinAlgError:
+        raise CalibrationError(f"{path}: key 'R_{cameras[1]:02d}' is no rotation; correct the numbers") from None
+    return _stereo(path, models[0], models[1], T_left_right)

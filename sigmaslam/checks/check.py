@@ -1,0 +1,147 @@
+"""All checks of a stereo sequence from a few of its frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sigmaslam.checks.calibration import check_calibration
+from sigmaslam.checks.eye_matches import EyeMatcher, EyeMatches
+from sigmaslam.checks.finding import Finding, has_errors, wrong
+from sigmaslam.checks.images import check_images
+from sigmaslam.checks.rig import TOO_FEW, check_pairing, check_rig, suspect_pairing, unknown_rig
+from sigmaslam.checks.row_fit import MIN_INLIERS, MIN_MATCHES
+from sigmaslam.checks.time_stamps import check_time_stamps
+from sigmaslam.geometry.rectification import StereoRectifier
+from sigmaslam.readers.stereo_sequence import FrameStep, StereoSequence
+
+SAMPLES = 8
+"""Pairs that `sigmaslam check` looks at."""
+SAMPLES_BEFORE_TRACKING = 4
+"""Pairs that are looked at before tracking: under two seconds."""
+# An image that was turned or mirrored gives so many times the matches once that is undone.
+_BETTER = 3.0
+_INTRINSICS = {"principal point", "focal length"}
+_TURNS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "mirrored left to right": lambda image: image[:, ::-1],
+    "mirrored top to bottom": lambda image: image[::-1],
+    "turned by 180 degrees": lambda image: image[::-1, ::-1],
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """What was found, and what it was found in.
+
+    Attributes:
+        findings: of all checks, in their order.
+        steps: the frames that were looked at.
+        rectified: left and right (H, W) uint8 of the first frame of each.
+        matches: between these.
+    """
+
+    findings: list[Finding]
+    steps: list[FrameStep]
+    rectified: list[tuple[np.ndarray, np.ndarray]]
+    matches: EyeMatches
+
+
+def check_sequence(sequence: StereoSequence, samples: int = SAMPLES, threads: int = 2) -> Check:
+    """Checks a sequence; of live cameras it takes the next frames.
+
+    Args:
+        sequence: opened by `sigmaslam.readers.open_sequence` or `open_cameras`, and not yet read.
+        samples: pairs to look at.
+        threads: of ONNX Runtime.
+    Raises:
+        InputError: a file cannot be read.
+    """
+    steps = sequence.sample(samples)
+    if sequence.timestamps is not None:
+        intervals = np.diff(sequence.timestamps)
+    else:
+        intervals = np.array([after.timestamp - frame.timestamp for frame, after in steps if after is not None])
+    rectifier = StereoRectifier(sequence.camera)
+    matcher = EyeMatcher(rectifier, threads)
+    calibration = check_calibration(sequence.camera)
+    findings = [check_time_stamps(intervals.tolist()), *calibration]
+    if not steps:
+        return Check(findings, [], [], EyeMatches.empty())
+    images = check_images([(frame.left, frame.right) for frame, _ in steps])
+    findings += images
+    matches = EyeMatches.empty()
+    if has_errors(images):
+        # Features of such images would tell nothing, or the same once more.
+        findings += unknown_rig("the images allow no matches")
+    else:
+        matches = matcher.match(steps)
+        overlap = _check_overlap(matches, steps, matcher)
+        findings.append(overlap)
+        interval = float(np.median(intervals)) if len(intervals) else None
+        if overlap.severity == "error":
+            findings += unknown_rig(TOO_FEW)
+        else:
+            findings += _check_rig(matches, steps, matcher, interval, {each.name for each in wrong(calibration)})
+    return Check(findings, steps, [rectifier.rectify(frame.left, frame.right) for frame, _ in steps], matches)
+
+
+def _check_rig(
+    matches: EyeMatches,
+    steps: Sequence[FrameStep],
+    matcher: EyeMatcher,
+    interval: float | None,
+    wrong_calibration: set[str],
+) -> list[Finding]:
+    rectifier = matcher.rectifier
+    if wrong_calibration & _INTRINSICS:
+        # Lenses that are undistorted wrongly move rows as a delay does.
+        return check_rig(matches.unfollowed(), rectifier, interval)
+    pairing = None
+    if suspect_pairing(matches, rectifier):
+        pairing = check_pairing(matches, _shift_frames(steps, matcher), rectifier, interval)
+    if pairing is None:
+        return check_rig(matches, rectifier, interval)
+    return [pairing, *unknown_rig("the eyes are not synchronised", but=pairing.name)]
+
+
+def _shift_frames(steps: Sequence[FrameStep], matcher: EyeMatcher) -> dict[int, EyeMatches]:
+    """Matches of left images with right ones of the frame after (1) and before (-1)."""
+    couples = [(frame, after) for frame, after in steps if after is not None]
+    shifted = {
+        1: [(replace(frame, right=after.right), None) for frame, after in couples],
+        -1: [(replace(after, right=frame.right), None) for frame, after in couples],
+    }
+    return {frames: matcher.match(each) for frames, each in shifted.items() if each}
+
+
+def _check_overlap(matches: EyeMatches, steps: Sequence[FrameStep], matcher: EyeMatcher) -> Finding:
+    counts = np.bincount(matches.pair, minlength=len(steps))
+    count = int(np.median(counts))
+    if count >= MIN_MATCHES:
+        return Finding("overlap", "ok", f"{count} matches between the eyes in the median pair", count)
+    # The pair with the median count stands for all.
+    step = steps[int(np.argsort(counts)[len(counts) // 2])]
+    turned = {what: matcher.count_turned(step, turn) for what, turn in _TURNS.items()}
+    what = max(turned, key=lambda each: turned[each])
+    if turned[what] >= max(MIN_MATCHES, _BETTER * count):
+        return Finding(
+            "mirrored",
+            "error",
+            f"one eye is {what}: {count} matches between the eyes as given, {turned[what]} once the right image is "
+            "turned back: undo it in the one of the two that is wrong",
+            turned[what],
+        )
+    keypoints = matcher.count_keypoints(step)
+    cure = (
+        "do both cameras see the same, and are the images of one time?"
+        if keypoints >= 2 * MIN_MATCHES
+        else "point the cameras at something with more texture"
+    )
+    return Finding(
+        "overlap",
+        "error" if count < MIN_INLIERS else "warning",
+        f"{count} matches between the eyes in the median pair of {keypoints} keypoints: {cure}",
+        count,
+    )

@@ -1,0 +1,68 @@
+"""What a check of the input found, and the reason that findings give for a failed run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+Severity = Literal["ok", "unknown", "warning", "error"]
+
+# A fault comes before its consequences: swapped eyes also have wrong rows.
+_CAUSES_FIRST = (
+    "principal point",
+    "focal length",
+    "exposure",
+    "sharpness",
+    "same image",
+    "mirrored",
+    "overlap",
+    "distortion",
+    "synchronisation",
+    "eyes",
+    "rig",
+    "rows",
+    "rotation",
+    "scale",
+    "infinity",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """The result of one check.
+
+    Attributes:
+        name: of the check, one or two words.
+        severity: "ok"; "unknown", the input does not show it; "warning"; or "error", tracking will fail or be wrong.
+        message: one line; names the value, and for warnings and errors the cure.
+        figure: the value that was judged, None where there is none.
+    """
+
+    name: str
+    severity: Severity
+    message: str
+    figure: float | None = None
+
+
+def wrong(findings: Sequence[Finding]) -> list[Finding]:
+    """Warnings and errors, causes before their consequences, what does not hinder tracking last."""
+    rank = {name: number for number, name in enumerate(_CAUSES_FIRST)}
+    chosen = [each for each in findings if each.severity in ("warning", "error")]
+    return sorted(chosen, key=lambda each: rank.get(each.name, len(rank)))
+
+
+def has_errors(findings: Sequence[Finding]) -> bool:
+    """Whether tracking will fail or be wrong."""
+    return any(each.severity == "error" for each in findings)
+
+
+def explain(findings: Sequence[Finding]) -> str:
+    """Why a run on this input fails, a line for each reason: errors with the warnings that may have caused them.
+
+    All warnings where there is no error; empty where there is neither.
+    """
+    ranked = wrong(findings)
+    errors = [number for number, each in enumerate(ranked) if each.severity == "error"]
+    chosen = [each for number, each in enumerate(ranked) if not errors or number <= errors[-1]]
+    return "\n".join(each.message for each in chosen)

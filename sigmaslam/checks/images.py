@@ -1,0 +1,110 @@
+"""What single images show, without matching: light, contrast, sharpness, and one image given for both eyes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sigmaslam.checks.finding import Finding
+from sigmaslam.frontend.image_sharpness import sharpness
+
+# Grey values at which a camera clips, and the shares of the pixels that may.
+_DARK, _BRIGHT = 5, 250
+_WARN_CLIPPED, _MAX_CLIPPED = 0.5, 0.95
+# Contrast below the steps of 8 bits: difference of the 99th and the 1st percentile.
+_MIN_CONTRAST = 10
+# Standard deviation of the blur of edges, pixels: from here on rows of matches scatter twice as much as in sharp ones,
+# in renders of rooms that are blurred by a Gaussian of 3 px. Matches remain.
+_WARN_BLUR = 2.0
+# Images are one and the same where they differ by less than the noise of two cameras, grey values.
+_SAME = 0.5
+EYES = ("left", "right")
+
+
+def check_images(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[Finding]:
+    """Findings from images as they are stored.
+
+    Args:
+        pairs: left and right (H, W) uint8 images.
+    """
+    return [_check_exposure(pairs), _check_sharpness(pairs), _check_same(pairs)]
+
+
+def _check_exposure(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Finding:
+    """The worst of dark, bright and without contrast in the median pair, of either eye."""
+    worst = Finding("exposure", "ok", "", 0.0)
+    for eye, name in enumerate(EYES):
+        images = [pair[eye] for pair in pairs]
+        contrast = float(np.median([_contrast(image) for image in images]))
+        for clipped, what, cure in (
+            ([(image <= _DARK).mean() for image in images], "black", "light, aperture or exposure time; lens cap on?"),
+            ([(image >= _BRIGHT).mean() for image in images], "over-exposed", "expose for a shorter time"),
+        ):
+            share = float(np.median(clipped))
+            if share > _WARN_CLIPPED and share > (worst.figure or 0.0):
+                worst = Finding(
+                    "exposure",
+                    "error" if share > _MAX_CLIPPED else "warning",
+                    f"{100 * share:.0f} % of the pixels of the {name} images are {what}: {cure}",
+                    share,
+                )
+        if contrast < _MIN_CONTRAST and worst.severity != "error":
+            worst = Finding(
+                "exposure",
+                "error",
+                f"grey values of the {name} images span {contrast:.0f} of 255: nothing can be seen in them",
+                contrast,
+            )
+    if worst.severity == "ok":
+        clipped = [((image <= _DARK) | (image >= _BRIGHT)).mean() for pair in pairs for image in pair]
+        share = float(np.median(clipped))
+        return Finding("exposure", "ok", f"{100 * share:.0f} % of the pixels are black or over-exposed", share)
+    return worst
+
+
+def _contrast(image: np.ndarray) -> float:
+    low, high = np.percentile(image, (1, 99))
+    return float(high - low)
+
+
+def blur_radius(image: np.ndarray) -> float:
+    """Standard deviation of a Gaussian blur of step edges that are as sharp as those of an (H, W) uint8 image, pixels.
+
+    The energy of the second derivative of such an edge is that of the first over twice the variance; `sharpness` takes
+    the first derivative twice as large.
+    """
+    return float(1.0 / np.sqrt(8.0 * max(sharpness(image), 1e-6)))
+
+
+def _check_sharpness(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Finding:
+    if any(_contrast(image) < _MIN_CONTRAST for pair in pairs for image in pair):
+        return Finding("sharpness", "unknown", "images without contrast have no edges")
+    blurs = [float(np.median([blur_radius(pair[eye]) for pair in pairs])) for eye in range(2)]
+    worse = int(np.argmax(blurs))
+    blur = blurs[worse]
+    if blur <= _WARN_BLUR:
+        return Finding("sharpness", "ok", f"edges are blurred by {blur:.1f} px", blur)
+    return Finding(
+        "sharpness",
+        "warning",
+        f"edges of the {EYES[worse]} images are blurred by {blur:.1f} px ({EYES[1 - worse]} {blurs[1 - worse]:.1f}): "
+        "focus, clean the lens, move slowly, expose for a shorter time, or use smaller images",
+        blur,
+    )
+
+
+def _check_same(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Finding:
+    if any(left.shape != right.shape for left, right in pairs):
+        return Finding("same image", "ok", "the eyes have images of different sizes")
+    difference = float(np.median([np.abs(left.astype(np.int16) - right).mean() for left, right in pairs]))
+    informative = float(np.median([left.std() for left, _ in pairs])) > _SAME
+    if difference < _SAME and informative:
+        return Finding(
+            "same image",
+            "error",
+            f"left and right images are the same (they differ by {difference:.2f} grey values): give the images of "
+            "both cameras",
+            difference,
+        )
+    return Finding("same image", "ok", f"left and right images differ by {difference:.1f} grey values", difference)

@@ -1,0 +1,56 @@
+"""The page of a check: one HTML file with its findings and the pairs that it looked at."""
+
+from __future__ import annotations
+
+import base64
+from pathlib import Path
+
+import cv2
+import jinja2
+import numpy as np
+
+from sigmaslam.checks.check import Check
+from sigmaslam.checks.eye_matches import draw_rows
+from sigmaslam.files import atomic_write_text
+from sigmaslam.frontend.row_search import ROW_TOLERANCE
+
+# Thumbnails, pixels, and how many.
+_WIDTH, _MOST = 640, 4
+# So many matches show in a thumbnail.
+_SHOWN = 80
+
+
+def write_page(path: Path, check: Check, source: str) -> None:
+    """Writes the page.
+
+    Raises:
+        InputError: the folder is missing or cannot be written.
+    """
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("sigmaslam.checks", "templates"), autoescape=True, undefined=jinja2.StrictUndefined
+    )
+    text = environment.get_template("check.html").render(
+        source=source,
+        findings=check.findings,
+        pictures=[(f"pair {index}", _picture(check, k)) for k, index in _shown(check)],
+        tolerance=ROW_TOLERANCE,
+    )
+    atomic_write_text(path, text)
+
+
+def _shown(check: Check) -> list[tuple[int, int]]:
+    """Number among the samples and index in the sequence of the pairs that are drawn."""
+    chosen = np.unique(np.linspace(0, len(check.steps) - 1, min(_MOST, len(check.steps))).astype(int)).tolist()
+    return [(k, check.steps[k][0].index) for k in chosen]
+
+
+def _picture(check: Check, number: int) -> str:
+    """A data URI of the rectified pair, left above right, with some of its matches."""
+    left, right = check.rectified[number]
+    rows = np.flatnonzero(check.matches.pair == number)
+    every = max(1, len(rows) // _SHOWN)
+    canvas = draw_rows(left, right, check.matches.select(rows[::every]), ROW_TOLERANCE)
+    scale = min(1.0, _WIDTH / canvas.shape[1])
+    small = cv2.resize(canvas, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
+    return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode("ascii")

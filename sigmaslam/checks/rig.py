@@ -1,0 +1,305 @@
+"""What matches between the eyes say about the rig: order of the eyes, rows, rotation, scale and synchronisation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sigmaslam.checks.eye_matches import EyeMatches
+from sigmaslam.checks.finding import Finding, Severity
+from sigmaslam.checks.hypotheses import exchange_eyes, leave_unrectified, stand_upright
+from sigmaslam.checks.row_fit import MIN_MATCHES, SIGNIFICANT, RowFit, fit_rows
+from sigmaslam.frontend.row_search import ROW_TOLERANCE
+from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam.geometry.rectification import StereoRectifier
+from sigmaslam.two_view.epipolar import estimate_epipolar_pose
+
+# The tracker searches rows within ROW_TOLERANCE: further off, an error; from half of it on, a warning.
+_WARN_ROWS = 0.5 * ROW_TOLERANCE
+# The tracker takes a pair for swapped where more than this share of the disparities is below -1 px.
+_MAX_BEHIND, _WARN_BEHIND = 0.1, 0.02
+# A rig is explained by a hypothesis that this share of the matches follows, if it is so many times the share of
+# those that follow the calibration.
+_EXPLAINED, _BETTER = 0.5, 2.0
+# A delay that moves the median place by less than this is within the noise of a match, pixels.
+_WARN_LAG = 0.5
+# Rows in the stored images agree within this if these are rectified already, pixels.
+_RECTIFIED_ROWS = 0.5
+_SYNCHRONISATION = "synchronisation"
+_NAMES = ("eyes", "rig", "distortion", _SYNCHRONISATION, "rows", "rotation", "scale", "infinity")
+TOO_FEW = "too few matches between the eyes to tell"
+
+
+def unknown_rig(reason: str, names: Sequence[str] = _NAMES, but: str = "") -> list[Finding]:
+    """The findings of those names, all but one, where the images do not show the rig."""
+    return [Finding(name, "unknown", reason) for name in names if name != but]
+
+
+def check_rig(matches: EyeMatches, rectifier: StereoRectifier, frame_interval: float | None) -> list[Finding]:
+    """Findings from the matches of all pairs together.
+
+    Args:
+        matches: of pairs of one rig, rectified by `rectifier`.
+        rectifier: of the calibration.
+        frame_interval: seconds from one frame to the next; None: unknown.
+    """
+    if len(matches) < MIN_MATCHES:
+        return unknown_rig(TOO_FEW)
+    view = rectifier.rectified
+    given = fit_rows(matches, view)
+    share = given.agreement(ROW_TOLERANCE)
+    exchanged = exchange_eyes(matches, rectifier)
+    swapped = _agreement(exchanged, view)
+    # Lenses that are undistorted for the other eye may look like a shift and a zoom: what needs neither is right.
+    plainly = _follows(exchanged) > max(_EXPLAINED, _BETTER * _follows(matches)) and swapped >= share
+    better = plainly or swapped > max(_EXPLAINED, _BETTER * share)
+    usable = better and _share_behind(fit_rows(exchanged, view)) <= _MAX_BEHIND
+    findings = [_check_eyes(matches, share, swapped, usable)]
+    if findings[0].severity == "error":
+        # The other checks judge the rig as it is once the eyes are exchanged.
+        matches, given = exchanged, fit_rows(exchanged, view)
+    findings.append(_check_position(given, rectifier))
+    findings.append(_check_distortion(matches, rectifier))
+    if findings[1].severity == "error":
+        return findings + unknown_rig("the matches do not follow the calibrated rig", _NAMES[3:])
+    findings.append(_check_synchronisation(given, frame_interval))
+    if findings[-1].severity not in ("ok", "unknown"):
+        return findings + unknown_rig("the eyes are not synchronised", _NAMES[4:])
+    rotation = _check_rotation(given, view.fx)
+    infinity = (
+        _check_infinity(given)
+        if rotation.severity == "ok"
+        else Finding("infinity", "unknown", "the right camera is turned, which changes disparities, too")
+    )
+    return [*findings, _check_shift(given), rotation, _check_scale(given, view.fy), infinity]
+
+
+def _check_eyes(matches: EyeMatches, given: float, swapped: float, exchanged: bool) -> Finding:
+    if exchanged:
+        return Finding(
+            "eyes",
+            "error",
+            f"left and right are exchanged: {100 * swapped:.0f} % of {len(matches)} matches fit the calibration with "
+            f"the eyes exchanged, {100 * given:.0f} % as given: swap the two (or do not mirror both)",
+            swapped,
+        )
+    return Finding("eyes", "ok", f"left is left: {100 * given:.0f} % of the matches have the right order", given)
+
+
+def _check_position(given: RowFit, rectifier: StereoRectifier) -> Finding:
+    """Where the right camera is, if rows do not follow the calibration, nearly."""
+    share = float((np.abs(given.residual) <= ROW_TOLERANCE).mean())
+    matches = given.matches
+    upright = fit_rows(stand_upright(matches), rectifier.rectified)
+    columns = upright.agreement(ROW_TOLERANCE)
+    shifted = abs(float(np.median(matches.row_difference))) > ROW_TOLERANCE
+    if shifted and columns > _EXPLAINED and _BETTER * _spread(upright.residual) < _spread(given.residual):
+        return Finding(
+            "rig",
+            "error",
+            f"the cameras stand one above the other: {100 * columns:.0f} % of the matches lie in one column: turn "
+            "images and calibration by 90 degrees",
+            columns,
+        )
+    if share >= _EXPLAINED:
+        return Finding("rig", "ok", f"{100 * share:.0f} % of the matches follow the calibrated rig", share)
+    pose = estimate_epipolar_pose(
+        rectifier.rectified.matrix, matches.left, matches.right, matches.probability, matches.covariance
+    )
+    if pose is not None and pose.inliers.mean() > _EXPLAINED:
+        x, y, z = -pose.R.T @ pose.direction
+        angle = np.degrees(np.arccos(np.clip(0.5 * (np.trace(pose.R) - 1.0), -1.0, 1.0)))
+        where = f"in the direction ({x:.2f}, {y:.2f}, {z:.2f}), turned by {angle:.1f} degrees"
+    else:
+        where = "where the pairs do not agree on"
+    return Finding(
+        "rig",
+        "error",
+        f"{100 * share:.0f} % of the matches follow the calibration: the images have the right camera {where}, not "
+        "(1.00, 0.00, 0.00): give the calibration of this rig, and images taken at the same time",
+        share,
+    )
+
+
+def _check_distortion(matches: EyeMatches, rectifier: StereoRectifier) -> Finding:
+    """Whether images that the calibration undistorts are rectified already.
+
+    A rectification that is right leaves smaller row differences than there were, whatever else is wrong.
+    """
+    if rectifier.camera.is_rectified:
+        return Finding("distortion", "ok", "the calibration is of rectified images")
+    stored = leave_unrectified(matches, rectifier)
+    if len(stored) < MIN_MATCHES:
+        return Finding("distortion", "unknown", TOO_FEW)
+    before, after = (_spread(fit_rows(each, rectifier.rectified).residual) for each in (stored, matches))
+    rows = float(np.median(np.abs(stored.row_difference)))
+    # A median of absolute values is known to about one part in the root of their number.
+    worse = after > before * (1.0 + SIGNIFICANT / np.sqrt(len(stored)))
+    if rows < _RECTIFIED_ROWS and worse:
+        return Finding(
+            "distortion",
+            "warning",
+            f"the images look rectified already: rows scatter by {before:.2f} px as they are stored, by {after:.2f} px "
+            "after the rectification: give the calibration of the rectified images (no distortion)",
+            after / before,
+        )
+    return Finding(
+        "distortion",
+        "ok",
+        f"rectification takes the scatter of rows from {before:.2f} to {after:.2f} px",
+        after / before,
+    )
+
+
+def _check_synchronisation(fit: RowFit, frame_interval: float | None) -> Finding:
+    if not np.isfinite(fit.lag):
+        return Finding(
+            _SYNCHRONISATION, "unknown", "the camera does not move up, down or ahead in these frames: no delay is seen"
+        )
+    sigma = float(fit.sigmas[4])
+    figure = f"{abs(fit.lag):.2f} ± {sigma:.2f} of a frame{_milliseconds(fit.lag, frame_interval)}"
+    explained = _BETTER * _spread(fit.residual) < _spread(fit.residual + fit.by_lag[:, 1])
+    if fit.lag_shift < _WARN_LAG or not explained:
+        return Finding(_SYNCHRONISATION, "ok", f"the eyes are {figure} apart", fit.lag)
+    return Finding(
+        _SYNCHRONISATION,
+        "error" if float(np.median(np.abs(fit.by_lag[:, 1]))) > ROW_TOLERANCE else "warning",
+        f"the right images are {figure} {_when(fit.lag)} than the left ones, which moves them by {fit.lag_shift:.1f} "
+        "px in the median: trigger both cameras together",
+        fit.lag,
+    )
+
+
+def suspect_pairing(matches: EyeMatches, rectifier: StereoRectifier) -> bool:
+    """Whether row differences go with the motion, or follow no rig, as if the right images were of other frames."""
+    if len(matches) < MIN_MATCHES:
+        return False
+    fit = fit_rows(matches, rectifier.rectified)
+    if fit.agreement(ROW_TOLERANCE) >= _EXPLAINED:
+        return fit.lag_shift >= _WARN_LAG
+    return _agreement(exchange_eyes(matches, rectifier), rectifier.rectified) < _EXPLAINED
+
+
+def check_pairing(
+    matches: EyeMatches, shifted: dict[int, EyeMatches], rectifier: StereoRectifier, frame_interval: float | None
+) -> Finding | None:
+    """The finding that the right images belong to left ones of other frames; None if they do not.
+
+    Args:
+        matches: as given.
+        shifted: of each left image with the right one so many frames later.
+        rectifier, frame_interval: as of `check_rig`.
+    """
+    view = rectifier.rectified
+    scatter = {
+        frames: _spread(fit_rows(each.unfollowed(), view).residual)
+        for frames, each in {0: matches, **shifted}.items()
+        if len(each) >= MIN_MATCHES
+    }
+    best = min(scatter, key=lambda frames: scatter[frames], default=0)
+    if not best or _BETTER * scatter[best] > scatter.get(0, np.inf):
+        return None
+    lag = -best
+    how_many = "one frame" if scatter[best] < _WARN_LAG else "a frame or more"
+    return Finding(
+        _SYNCHRONISATION,
+        "error",
+        f"the right images are {how_many}{_milliseconds(lag, frame_interval)} {_when(lag)} than the left ones: rows of "
+        f"matches scatter by {scatter[best]:.1f} px with the right image one {'after' if best > 0 else 'before'}, by "
+        f"{scatter[0]:.1f} px as given: pair them so, or trigger both cameras together",
+        lag,
+    )
+
+
+def _milliseconds(lag: float, frame_interval: float | None) -> str:
+    return "" if frame_interval is None else f" ({1e3 * abs(lag) * frame_interval:.0f} ms)"
+
+
+def _when(lag: float) -> str:
+    return "later" if lag > 0 else "earlier"
+
+
+def _check_shift(fit: RowFit) -> Finding:
+    if abs(fit.shift) <= _WARN_ROWS:
+        return Finding("rows", "ok", f"right rows are {fit.shift:+.2f} px from the left ones", fit.shift)
+    return Finding(
+        "rows",
+        "error" if abs(fit.shift) > ROW_TOLERANCE else "warning",
+        f"right rows are {fit.shift:+.2f} px from the left ones; {ROW_TOLERANCE:g} px can be tracked: crop both images "
+        "alike, correct cy of one eye, or calibrate again",
+        fit.shift,
+    )
+
+
+def _check_rotation(fit: RowFit, focal: float) -> Finding:
+    roll, yaw = (float(np.degrees(np.arctan(abs(each) / focal))) for each in (fit.roll, fit.yaw))
+    return _judge_place(
+        "rotation",
+        fit.by_rotation,
+        f"the right camera is turned against the calibration by {roll:.2f} degrees about its axis and {yaw:.2f} about "
+        "the vertical",
+        "calibrate again, or correct the rotation of the right camera",
+        f"the right camera is turned by {roll:.2f} degrees about its axis, {yaw:.2f} about the vertical",
+    )
+
+
+def _check_scale(fit: RowFit, focal: float) -> Finding:
+    percent = 100.0 * fit.zoom / focal
+    return _judge_place(
+        "scale",
+        fit.by_zoom,
+        f"the right image is {percent:+.2f} % taller than the calibration says",
+        "correct fy of one eye, use the same zoom and size in both, or calibrate again",
+        f"the right image is {percent:+.2f} % taller",
+    )
+
+
+def _judge_place(name: str, rows: np.ndarray, what: str, cure: str, good: str) -> Finding:
+    """Of row differences (M,) that depend on the place."""
+    rows = np.abs(rows)
+    most = float(np.percentile(rows, 90))
+    if most <= _WARN_ROWS:
+        return Finding(name, "ok", f"{good}: rows move by {most:.2f} px in a tenth of the places", most)
+    severity: Severity = "error" if most > ROW_TOLERANCE else "warning"
+    return Finding(name, severity, f"{what}: rows move by {most:.1f} px in a tenth of the places: {cure}", most)
+
+
+def _check_infinity(fit: RowFit) -> Finding:
+    behind = _share_behind(fit)
+    lowest = float(np.percentile(_disparity_in_rows(fit), 5))
+    if behind <= _WARN_BEHIND:
+        return Finding("infinity", "ok", f"{100 * behind:.0f} % of the matches lie behind infinity", behind)
+    return Finding(
+        "infinity",
+        "error" if behind > _MAX_BEHIND else "warning",
+        f"{100 * behind:.0f} % of the matches lie behind infinity, with disparities from {lowest:.1f} px: cx of one "
+        "eye or the yaw of the right camera is wrong: calibrate again",
+        behind,
+    )
+
+
+def _agreement(matches: EyeMatches, view: RectifiedStereo) -> float:
+    """Share of the matches that follow a rig which is nearly that of `view`; zero with few matches."""
+    return fit_rows(matches, view).agreement(ROW_TOLERANCE) if len(matches) >= MIN_MATCHES else 0.0
+
+
+def _disparity_in_rows(fit: RowFit) -> np.ndarray:
+    """Disparities of the matches whose rows agree, without what a lag adds to them, pixels."""
+    return np.asarray((fit.matches.disparity + fit.by_lag[:, 0])[np.abs(fit.residual) <= ROW_TOLERANCE])
+
+
+def _share_behind(fit: RowFit) -> float:
+    """Share of these that lie behind infinity by more than a pixel; zero without any."""
+    disparity = _disparity_in_rows(fit)
+    return float((disparity < -1.0).mean()) if len(disparity) else 0.0
+
+
+def _follows(matches: EyeMatches) -> float:
+    """Share of the matches that follow the calibration as it is."""
+    level = np.abs(matches.row_difference) <= ROW_TOLERANCE
+    return float((level & (matches.disparity > -1.0)).mean()) if len(matches) else 0.0
+
+
+def _spread(values: np.ndarray) -> float:
+    return float(np.median(np.abs(values - np.median(values))))

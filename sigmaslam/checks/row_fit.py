@@ -1,0 +1,117 @@
+"""Row differences between the eyes in terms of what causes them: a shift, a turned or enlarged eye, a delay."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sigmaslam.checks.eye_matches import EyeMatches
+from sigmaslam.geometry.camera import RectifiedStereo
+
+_ITERATIONS = 20
+# Scale of the robust loss in robust standard deviations, and the smallest such deviation, pixels.
+_ROBUST, _MIN_SIGMA = 2.0, 0.05
+# Causes count where they are larger than so many standard deviations.
+SIGNIFICANT = 5.0
+MIN_INLIERS = 15
+"""A pose needs so many matches that agree; as in `sigmaslam.TrackerConfig`."""
+MIN_MATCHES = 3 * MIN_INLIERS
+"""So many matches are needed to judge a rig, as the tracker needs for a pose that it did not expect."""
+# Without this vertical motion of a tenth of the points, pixels, rows say nothing about a delay.
+_MIN_FLOW = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class RowFit:
+    """Row differences of matches by least squares with Geman and McClure's loss.
+
+    Attributes:
+        matches: those that were fitted.
+        shift: rows in the middle of the image, pixels.
+        roll, zoom, yaw: of the right camera, pixels at unit normalised coordinates about the middle of the
+            image: row differences with x, y, x y.
+        lag: frames by which the right images are later than the left ones; NaN where the motion does not show it.
+        sigmas: (5,) standard deviations of all these, in this order.
+        by_rotation, by_zoom: (M,) what roll and yaw, and what zoom make of the rows, pixels.
+        by_lag: (M, 2) what the lag makes of the right places, pixels.
+        residual: (M,) row differences that are left, pixels.
+    """
+
+    matches: EyeMatches
+    shift: float
+    roll: float
+    zoom: float
+    yaw: float
+    lag: float
+    sigmas: np.ndarray
+    by_rotation: np.ndarray
+    by_zoom: np.ndarray
+    by_lag: np.ndarray
+    residual: np.ndarray
+
+    @property
+    def disparity(self) -> np.ndarray:
+        """(M,) disparities without what yaw and lag add to them, pixels."""
+        yaw = self.yaw if abs(self.yaw) > SIGNIFICANT * self.sigmas[3] else 0.0
+        return np.asarray(self.matches.disparity + yaw + self.by_lag[:, 0])
+
+    @property
+    def lag_shift(self) -> float:
+        """What the lag makes of the median right place, pixels; zero where it is not significant."""
+        if not abs(self.lag) > SIGNIFICANT * self.sigmas[4]:
+            return 0.0
+        return float(np.median(np.linalg.norm(self.by_lag, axis=1)))
+
+    def agreement(self, tolerance: float) -> float:
+        """Share of the matches that a parallel pair with these errors has: rows agree, disparities are positive.
+
+        Args:
+            tolerance: of the rows, pixels; of disparities half of it.
+        """
+        return float(((np.abs(self.residual) <= tolerance) & (self.disparity > -0.5 * tolerance)).mean())
+
+
+def fit_rows(matches: EyeMatches, camera: RectifiedStereo) -> RowFit:
+    """Fit of `matches`, at least 5, in the rectified pair `camera`."""
+    followed = np.isfinite(matches.flow).all(axis=1)
+    moving = followed.sum() >= MIN_MATCHES and np.percentile(np.abs(matches.flow[followed, 1]), 90) >= _MIN_FLOW
+    if moving:
+        matches = matches.select(followed)
+    x, y = ((matches.right - 0.5 * np.array([camera.width - 1, camera.height - 1])) / [camera.fx, camera.fy]).T
+    flow = matches.flow if moving else np.zeros_like(matches.flow)
+    columns = np.column_stack([np.ones(len(matches)), x, y, x * y, flow[:, 1]])
+    estimated = np.array([True, True, True, True, moving])
+    coefficients, sigmas = np.zeros(5), np.full(5, np.nan)
+    coefficients[estimated], sigmas[estimated] = _fit(
+        columns[:, estimated], matches.row_difference, matches.probability
+    )
+    shift, roll, zoom, yaw, lag = coefficients.tolist()
+    return RowFit(
+        matches,
+        shift,
+        roll,
+        zoom,
+        yaw,
+        lag if moving else np.nan,
+        sigmas,
+        columns[:, [1, 3]] @ coefficients[[1, 3]],
+        columns[:, 2] * zoom,
+        lag * flow,
+        matches.row_difference - columns @ coefficients,
+    )
+
+
+def _fit(columns: np.ndarray, values: np.ndarray, probability: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients (k,) and standard deviations (k,) of values (M,) by columns (M, k), the first of which is one."""
+    coefficients = np.zeros(columns.shape[1])
+    coefficients[0] = np.median(values)
+    damping = 1e-9 * np.eye(len(coefficients))
+    for _ in range(_ITERATIONS):
+        residual = values - columns @ coefficients
+        sigma = max(1.4826 * float(np.median(np.abs(residual))), _MIN_SIGMA)
+        weighted = columns * (probability / (1.0 + (residual / (_ROBUST * sigma)) ** 2) ** 2)[:, None]
+        normal = weighted.T @ columns
+        normal += damping * np.trace(normal)
+        coefficients = np.linalg.solve(normal, weighted.T @ values)
+    return coefficients, sigma * np.sqrt(np.diag(np.linalg.inv(normal)))

@@ -1,0 +1,35 @@
+"""Whether time stamps are in seconds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sigmaslam.checks.finding import Finding
+
+# Frame intervals, seconds: high-speed cameras, and keyframes or slow rovers.
+MIN_INTERVAL, MAX_INTERVAL = 1e-3, 5.0
+# The interval of which rates differ least from the usual ones, seconds.
+_USUAL = 0.05
+_UNITS = (("nanoseconds", 1e-9), ("microseconds", 1e-6), ("milliseconds", 1e-3), ("minutes", 60.0), ("hours", 3600.0))
+
+
+def check_time_stamps(intervals: Sequence[float]) -> Finding:
+    """The finding from seconds between successive frames."""
+    if not len(intervals):
+        return Finding("time stamps", "unknown", "one frame alone has no frame interval")
+    interval = float(np.median(intervals))
+    if MIN_INTERVAL <= interval <= MAX_INTERVAL:
+        return Finding("time stamps", "ok", f"{1e3 * interval:.4g} ms from frame to frame in the median", interval)
+    fitting = [(name, unit) for name, unit in _UNITS if MIN_INTERVAL <= interval * unit <= MAX_INTERVAL]
+    guess = "give seconds"
+    if fitting and interval > 0:
+        name, unit = min(fitting, key=lambda each: abs(np.log(interval * each[1] / _USUAL)))
+        guess = f"they look like {name} ({interval * unit:.4g} s): give seconds"
+    return Finding(
+        "time stamps",
+        "warning",
+        f"time stamps are {interval:.4g} s apart in the median, not {MIN_INTERVAL:g} to {MAX_INTERVAL:g} s: {guess}",
+        interval,
+    )

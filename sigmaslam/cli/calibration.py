@@ -1,0 +1,63 @@
+"""`sigmaslam calibration`."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sigmaslam.errors import InputError
+from sigmaslam.geometry.camera import StereoCamera
+from sigmaslam.readers.calibration import read_calibration
+from sigmaslam.readers.calibration_writer import describe_calibration, write_calibration
+
+calibration = typer.Typer(name="calibration", no_args_is_help=True, help="Show or convert a stereo calibration.")
+
+Source = Annotated[
+    Path,
+    typer.Argument(
+        metavar="FILE",
+        help="Kalibr, OpenCV, ORB-SLAM, ROS, KITTI, EuRoC, ZED, OAK or 4Seasons file, our YAML, a folder with one, or "
+        "two files as left.yaml,right.yaml.",
+    ),
+]
+Size = Annotated[
+    str | None,
+    typer.Option("--size", metavar="WIDTHxHEIGHT", help="Of the images, for files that do not name it."),
+]
+Rectified = Annotated[
+    bool,
+    typer.Option("--rectified", help="The images are rectified: take the cameras of P (ROS and OpenCV have both)."),
+]
+
+
+@calibration.command()
+def show(file: Source, size: Size = None, rectified: Rectified = False) -> None:
+    """Print baseline, rotation, lens models and fields of view."""
+    typer.echo(describe_calibration(_read(file, size, rectified)))
+
+
+@calibration.command(short_help="Write a calibration of any form as our YAML.")
+def convert(
+    file: Source,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="YAML file to write.")],
+    size: Size = None,
+    rectified: Rectified = False,
+) -> None:
+    """Write a calibration of any form as our YAML, and print what is in it."""
+    if out.suffix.lower() not in (".yaml", ".yml"):
+        raise InputError(f"{out}: our form is YAML; choose a name that ends in .yaml")
+    camera = _read(file, size, rectified)
+    write_calibration(out, camera)
+    typer.echo(f"{describe_calibration(camera)}\nWritten: {out}")
+
+
+def _read(file: Path, size: str | None, rectified: bool) -> StereoCamera:
+    if size is None:
+        return read_calibration(file, rectified=rectified)
+    numbers = re.fullmatch(r"(\d{1,5})x(\d{1,5})", size)
+    if numbers is None:
+        raise InputError(f"--size is {size!r}: give width and height in pixels, as 752x480")
+    return read_calibration(file, (int(numbers[1]), int(numbers[2])), rectified=rectified)

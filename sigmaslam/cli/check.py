@@ -1,0 +1,62 @@
+"""`sigmaslam check`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from sigmaslam.checks import Finding, check_sequence, has_errors
+from sigmaslam.cli.track import InputFormat, open_input
+
+_STYLES = {"ok": "green", "unknown": "dim", "warning": "yellow", "error": "bold red"}
+
+
+def check(
+    source: Annotated[
+        Path | None,
+        typer.Argument(metavar="INPUT", help="KITTI, EuRoC or plain folder, video or ROS bag.", show_default=False),
+    ] = None,
+    format: Annotated[InputFormat, typer.Option(help="Kind of input.")] = InputFormat["auto"],
+    calibration: Annotated[
+        Path | None, typer.Option(help="Calibration YAML (or KITTI calib.txt) instead of the input's own.")
+    ] = None,
+    camera: Annotated[
+        str | None, typer.Option(metavar="LEFT,RIGHT", help="Live cameras in place of INPUT, as `track` takes them.")
+    ] = None,
+    topic_left: Annotated[
+        str | None, typer.Option(help="Image topic in a bag.", show_default="the one with 'left', cam0 or infra1")
+    ] = None,
+    topic_right: Annotated[
+        str | None, typer.Option(help="Image topic in a bag.", show_default="the one with 'right', cam1 or infra2")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="PAGE.HTML", help="Page to write: the findings, and pairs with matches.")
+    ] = None,
+) -> None:
+    """Check images, calibration and time stamps before they are trusted; seconds, from a few pairs.
+
+    Finds exchanged, mirrored or unsynchronised eyes, rows that do not agree, a turned camera, a wrong calibration, dark
+    or blurred images and wrong units. Exit code 1 where tracking would fail or be wrong.
+    """
+    sequence = open_input(source, format, calibration, camera, None, (topic_left, topic_right))
+    result = check_sequence(sequence)
+    _print_table(result.findings)
+    if out is not None:
+        from sigmaslam.checks.page import write_page  # loads jinja2
+
+        write_page(out, result, str(sequence.source))
+        typer.echo(f"Page: {out}")
+    if has_errors(result.findings):
+        raise typer.Exit(1)
+
+
+def _print_table(findings: list[Finding]) -> None:
+    table = Table("check", "result", "what was seen")
+    for each in findings:
+        style = _STYLES[each.severity]
+        table.add_row(each.name, f"[{style}]{each.severity}[/{style}]", each.message)
+    Console(highlight=False).print(table)

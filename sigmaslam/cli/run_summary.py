@@ -1,0 +1,64 @@
+"""What commands print of a run, and how they end after one that has failed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from sigmaslam.files import printable
+
+NOT_TRACKED = 3
+"""Exit code where less than half of the frames were tracked."""
+
+
+def tell_summary(summary: dict[str, Any], out: Path) -> None:
+    """Prints the summary of a run.
+
+    Raises:
+        typer.Exit: less than half of the frames were tracked; the last line says why.
+    """
+    typer.echo(
+        f"{summary['tracking'] + summary['relocalised']} of {summary['frames']} frames tracked, "
+        f"{summary['starting']} starting, {summary['lost']} lost, {summary['skipped']} skipped; "
+        f"{summary['median_inliers']:.0f} inliers in the median frame, {summary['map_points']} map points.\n"
+        f"{_world(summary)}{summary['calibration_verdict']}\n"
+        f"{_location_verdict(summary)}{_real_time_verdict(summary)}Report: {printable(out / 'report.html')}"
+    )
+    if summary["failure"] is not None:
+        typer.echo(summary["failure"], err=True)
+        raise typer.Exit(NOT_TRACKED)
+
+
+def _world(summary: dict[str, Any]) -> str:
+    """A line about the world, where it is not that of the first frame."""
+    if not summary["first_frame_with_pose"] or summary["world"] is None:
+        return ""
+    return f"The world is {summary['world']}; frames before it have no pose.\n"
+
+
+def _location_verdict(summary: dict[str, Any]) -> str:
+    """A line about the location sensor; empty without one."""
+    if "location" not in summary:
+        return ""
+    used, weakened, unused, ready = (summary["location"][name] for name in ("used", "weakened", "unused", "ready"))
+    if ready is None:
+        return (
+            f"The location sensor was not fused: its {used} readings with a pose do not show how its world lies to "
+            "ours. Is it the same clock? Positions need a path that is no straight line.\n"
+        )
+    return (
+        f"Location sensor: {used} readings used ({weakened} disagreed and count less), {unused} not; poses are fused "
+        f"from {ready:.3f} s on.\n"
+    )
+
+
+def _real_time_verdict(summary: dict[str, Any]) -> str:
+    """A line about dropped frames and latency; empty where frames were tracked as fast as they could be."""
+    if "real_time" not in summary:
+        return ""
+    from sigmaslam.runs.real_time import format_latency
+
+    figures = format_latency(summary["real_time"]["latency_ms"])
+    return f"In real time: {summary['real_time']['dropped']} frames dropped; latency in ms: {figures}.\n"

@@ -1,0 +1,48 @@
+"""Results of a run that was killed, or whose disk was full, from what it left in its folder."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from sigmaslam.errors import InputError
+from sigmaslam.runs.appended_file import check_not_in_use
+from sigmaslam.runs.frame_table import FRAMES_NAME
+from sigmaslam.runs.pose_file import PARTIAL_POSES
+from sigmaslam.runs.relative_pose_file import PARTIAL_RELATIVE_POSES
+from sigmaslam.runs.results import output_error, write_results
+from sigmaslam.runs.run_folder import RUN_NAME, UNFINISHED
+
+
+def finish_run(run: Path) -> dict[str, Any] | None:
+    """Writes trajectory, covariances, relative poses, run.json and report.html of a run that did not write them.
+
+    The map, the tracks of `--tracks` and the trajectory after the fact were in memory alone: those that are not there
+    are lost.
+
+    Args:
+        run: folder of the run.
+    Returns:
+        The summary in run.json; None where the run is finished, and nothing was to be done.
+    Raises:
+        InputError: it is no folder of a run, or the run still goes on.
+        OutputError: a file could not be written.
+    """
+    partial = run / PARTIAL_POSES
+    described = (run / RUN_NAME).is_file() and (run / FRAMES_NAME).is_file()
+    if not described:
+        raise InputError(f"{run}: holds no {RUN_NAME} and {FRAMES_NAME}; give a folder written by `sigmaslam track`")
+    if not (partial.is_file() and (run / PARTIAL_RELATIVE_POSES).is_file()):
+        return None
+    check_not_in_use(partial)
+    try:
+        entries = json.loads((run / RUN_NAME).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{run / RUN_NAME}: is no JSON ({error}); remove it") from error
+    if entries["ended"] == UNFINISHED:
+        entries["ended"] = "killed"
+    summary, failed = write_results(run, entries, None, None)
+    if failed:
+        raise output_error(run, failed)
+    return summary

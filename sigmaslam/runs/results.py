@@ -1,0 +1,254 @@
+"""The results of a run, made from what it left on disk as it went; each is tried on its own."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sigmaslam.checks.finding import Finding, wrong
+from sigmaslam.errors import OutputError, SigmaSlamError
+from sigmaslam.files import atomic_path, atomic_write_text
+from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.readers.trajectory_files import write_kitti, write_tum
+from sigmaslam.runs.failure import explain_failure
+from sigmaslam.runs.frame_table import FRAMES_NAME, STATUSES, FrameTable, read_frames
+from sigmaslam.runs.pose_file import PARTIAL_POSES, PoseRecords, read_pose_records
+from sigmaslam.runs.relative_pose_file import (
+    PARTIAL_RELATIVE_POSES,
+    RELATIVE_POSES_NAME,
+    collect_frame_pairs,
+    write_frame_pairs,
+)
+from sigmaslam.runs.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY, RUN_NAME, write_ply
+from sigmaslam.runs.verdict import calibration_verdict, expected_offset
+from sigmaslam.slam.estimate import CalibrationEstimate
+from sigmaslam.slam.point_map import PointMap
+
+MAP_NAME = "map.npz"
+REPORT_NAME = "report.html"
+_LOGGER = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class TrackerResults:
+    """What the tracker alone knows when a run ends; each is computed when it is written.
+
+    Attributes:
+        point_map: the landmarks.
+        keyframes: arrays by name, with which a later run relocalises in the map.
+        final: the frames as they are known in the end, with covariances; they are written beside those said at once.
+            None where other sensors corrected the poses, whose covariances then have no part of matches alone.
+        others: more files, by name, in the order in which they are written before the map.
+    """
+
+    point_map: Callable[[], PointMap]
+    keyframes: Callable[[], dict[str, Any]]
+    final: Callable[[], tuple[Trajectory, np.ndarray]] | None
+    others: Mapping[str, Callable[[Path], None]]
+
+
+def write_results(
+    folder: Path, run: dict[str, Any], calibration: CalibrationEstimate | None, tracker: TrackerResults | None
+) -> tuple[dict[str, Any], list[str]]:
+    """Writes trajectory and covariances, then relative poses, map, run.json and report.html.
+
+    Poses and frames are read from the folder. They stay there in their raw form if something could not be written that
+    can be made of them.
+
+    Args:
+        folder: of the run.
+        run: entries of run.json beside the summary.
+        calibration: what the last frame said of it; None: what is on disk of that.
+        tracker: None for a run that was killed: the map and the trajectory after the fact are lost then.
+    Returns:
+        The summary, and the names of the files that could not be written; the log says why.
+    """
+    files = _Files(folder)
+    frames = _read_complete_frames(folder / FRAMES_NAME)
+    records = read_pose_records(folder)
+    if frames is None:
+        records = records.select(np.zeros(0, np.int64))
+    else:
+        records = records.select(records.timestamp <= frames.columns["timestamp"][-1] + 1e-9)
+    started = len(records) > 0
+    if frames is None or not {"tracking", "relocalised"} & set(frames.status):
+        # A start that no second frame confirms is none.
+        records = records.select(np.zeros(0, np.int64))
+    calibration = calibration or _last_calibration(frames, records)
+    _write_poses(files, records, run.get("location") is None)
+    of_folder = list(files.failed)
+    points = 0
+    if len(records) and tracker is not None:
+        _write_final(files, tracker, len(records))
+        for name, write in tracker.others.items():
+            files.attempt(name, write)
+        points = _write_map(files, tracker)
+    elif (folder / MAP_NAME).is_file():
+        with np.load(folder / MAP_NAME, allow_pickle=False) as point_map:
+            points = len(point_map["points"])
+    findings = [Finding(**each) for each in run.get("checks", ())]
+    verdict = "Nothing is known of the calibration: no frame was tracked."
+    if calibration is not None and (len(records) or wrong(findings)):
+        tracked = frames.status.count("tracking") if frames is not None else 0
+        verdict = calibration_verdict(calibration, tracked, points, expected_offset(run["calibration"]), findings)
+    summary = {**_summarise(frames, records, calibration, points), "calibration_verdict": verdict}
+    if tracker is None:
+        # Of a first attempt, if there was one.
+        known = ("calibration_verdict", "calibration_errors")
+        summary |= {name: value for name, value in run.get("summary", {}).items() if name in known}
+    summary["world"] = _describe_world(summary, run)
+    summary["failure"] = explain_failure(summary, run.get("map") is not None, started, findings)
+    content = json.dumps({**run, "summary": summary}, indent=2) + "\n"
+    files.attempt(RUN_NAME, lambda path: atomic_write_text(path, content))
+    if frames is not None:
+        files.attempt(REPORT_NAME, _write_report)
+    of_folder += [name for name in files.failed if name in (RUN_NAME, REPORT_NAME)]
+    if not of_folder:
+        for name in (PARTIAL_POSES, PARTIAL_RELATIVE_POSES):
+            (folder / name).unlink(missing_ok=True)
+    return summary, files.failed
+
+
+def output_error(folder: Path, failed: list[str]) -> OutputError:
+    """What to say where these files could not be written."""
+    mend = f"`sigmaslam finish {folder}`" if (folder / PARTIAL_POSES).is_file() else "track again"
+    return OutputError(f"{folder}: could not write {', '.join(failed)}; make room on the disk, then {mend}")
+
+
+class _Files:
+    """Files of a folder that are written one by one; one that fails costs a message and not the others.
+
+    Attributes:
+        failed: names of those that could not be written.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.failed: list[str] = []
+        self._folder = folder
+
+    def attempt(self, name: str, write: Callable[[Path], None]) -> None:
+        """Writes one."""
+        try:
+            write(self._folder / name)
+        except (OSError, SigmaSlamError) as error:
+            _LOGGER.error("%s is not written: %s", name, getattr(error, "strerror", None) or error)
+            self.failed.append(name)
+        except Exception:
+            _LOGGER.exception("%s is not written", name)
+            self.failed.append(name)
+
+
+def _read_complete_frames(path: Path) -> FrameTable | None:
+    """The rows of frames.csv; a last one that was cut off is removed from the file. None without a row."""
+    content = path.read_bytes()
+    whole = content.rfind(b"\n") + 1
+    if whole < len(content):
+        with path.open("rb+") as file:
+            file.truncate(whole)
+    return read_frames(path) if content.count(b"\n") > 1 else None
+
+
+def _last_calibration(frames: FrameTable | None, records: PoseRecords) -> CalibrationEstimate | None:
+    """What frames.csv and the poses say of it; other errors than the disparity offset are not on disk."""
+    if frames is None:
+        return None
+    offset, sigma = (frames.columns[name] for name in ("disparity_offset", "disparity_offset_sigma"))
+    said = np.flatnonzero(np.isfinite(offset))
+    if not len(said):
+        return None
+    refused = float(records.refused_offset[-1]) if len(records) else 0.0
+    return CalibrationEstimate(float(offset[said[-1]]), float(sigma[said[-1]]), refused)
+
+
+def _write_poses(files: _Files, records: PoseRecords, has_matching: bool) -> None:
+    if not len(records):
+        return
+    trajectory = Trajectory(records.timestamp, records.pose)
+    files.attempt("trajectory.tum", lambda path: write_tum(path, trajectory))
+    files.attempt("covariance.npy", lambda path: _save(path, records.covariance))
+    files.attempt("trajectory.kitti", lambda path: write_kitti(path, trajectory, path.with_name("times.txt")))
+    if has_matching:
+        files.attempt("covariance_matching.npy", lambda path: _save(path, records.matching))
+    files.attempt(
+        RELATIVE_POSES_NAME,
+        lambda path: write_frame_pairs(path, collect_frame_pairs(path.parent, records.timestamp)),
+    )
+
+
+def _write_final(files: _Files, tracker: TrackerResults, count: int) -> None:
+    """The first `count` frames with a pose after the fact; one more is known if the run was stopped in it."""
+    final = tracker.final
+    if final is None:
+        return
+
+    def write(path: Path) -> None:
+        trajectory, covariances = final()
+        write_tum(path, trajectory.subset(np.arange(count)))
+        files.attempt(FINAL_COVARIANCE, lambda path: _save(path, covariances[:count]))
+
+    files.attempt(FINAL_TRAJECTORY, write)
+
+
+def _write_map(files: _Files, tracker: TrackerResults) -> int:
+    """Writes the map; returns how many points it has."""
+    made: list[PointMap] = []
+
+    def write(path: Path) -> None:
+        point_map = tracker.point_map()
+        made.append(point_map)
+        arrays = {name: getattr(point_map, name) for name in PointMap.__slots__}
+        with atomic_path(path) as temporary:
+            np.savez_compressed(temporary, **arrays, **tracker.keyframes())
+
+    files.attempt(MAP_NAME, write)
+    if not made:
+        return 0
+    files.attempt("map.ply", lambda path: write_ply(path, made[0]))
+    return len(made[0].points)
+
+
+def _write_report(path: Path) -> None:
+    from sigmaslam.runs.report import write_report  # draws: not needed before the run has ended
+
+    write_report(path.parent)
+
+
+def _summarise(
+    frames: FrameTable | None, records: PoseRecords, calibration: CalibrationEstimate | None, points: int
+) -> dict[str, Any]:
+    """Counts for run.json."""
+    inliers = np.zeros(0) if frames is None else frames.columns["inliers"]
+    inliers = inliers[inliers > 0]
+    first = None
+    if frames is not None and len(records):
+        first = int(np.abs(frames.columns["timestamp"] - records.timestamp[0]).argmin())
+    return {
+        "frames": 0 if frames is None else len(frames),
+        **{status: 0 if frames is None else frames.status.count(status) for status in STATUSES},
+        "poses": len(records),
+        "first_frame_with_pose": first,
+        "median_inliers": float(np.median(inliers)) if len(inliers) else 0.0,
+        "map_points": points,
+        "calibration_errors": {} if calibration is None else {k: list(v) for k, v in calibration.errors.items()},
+    }
+
+
+def _describe_world(summary: dict[str, Any], run: dict[str, Any]) -> str | None:
+    """Which world the poses are in; None where there is none, or it is the followed body."""
+    first = summary["first_frame_with_pose"]
+    if first is None or "object" in run:
+        return None
+    if run.get("map") is not None:
+        return f"that of the map, in which the camera was found in frame {first} (from 0 on)"
+    return f"the left camera of frame {first} (from 0 on), where tracking started"
+
+
+def _save(path: Path, array: np.ndarray) -> None:
+    with atomic_path(path) as temporary:
+        np.save(temporary, array)

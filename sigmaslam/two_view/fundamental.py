@@ -1,0 +1,184 @@
+"""The fundamental matrix of two views, epipoles and epipolar lines (9.31)-(9.33)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from sigmaslam.geometry.se3 import rotation_exp, skew
+from sigmaslam.two_view.epipolar import MatchedRays, robust_weight
+
+_SEVEN, _EIGHT = 7, 8
+_MIN_PROBABILITY = 0.5
+# The sampling consensus accepts this epipolar distance, pixels, and draws this many samples.
+_THRESHOLD, _SAMPLES = 1.0, 2000
+_ITERATIONS, _CONVERGED = 20, 1e-9
+# An inlier is nearer than so many standard deviations.
+_INLIER = 3.0
+# Beyond this condition number the matches leave something free.
+_MAX_CONDITION = 1e14
+
+
+@dataclass(frozen=True, slots=True)
+class FundamentalMatrix:
+    """F with p1^T F p0 = 0 for homogeneous pixels of the same point.
+
+    Attributes:
+        F: (3, 3) of rank 2 and norm 1.
+        covariance: (9, 9) of its entries row by row, from the inliers' noise, of rank 7; infinite where they leave it
+            free.
+        inliers: (M,) bool, probable matches within three standard deviations of their epipolar lines.
+    """
+
+    F: np.ndarray
+    covariance: np.ndarray
+    inliers: np.ndarray
+
+
+def fundamental_by_seven(points0: np.ndarray, points1: np.ndarray) -> list[np.ndarray]:
+    """The one or three F (3, 3) that seven matches (7, 2), (7, 2) allow; none where they are degenerate."""
+    stacked = _by_points(points0, points1, cv2.FM_7POINT, _SEVEN)
+    return [each / np.linalg.norm(each) for each in stacked.reshape(-1, 3, 3)]
+
+
+def fundamental_by_eight(points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
+    """F (3, 3) of the normalised 8-point method, from eight matches (M, 2) or more.
+
+    Raises:
+        ValueError: there are fewer, or they are degenerate.
+    """
+    F = _by_points(points0, points1, cv2.FM_8POINT, _EIGHT)
+    if F.shape != (3, 3):
+        raise ValueError(f"the {len(points0)} matches allow more than one fundamental matrix")
+    return np.asarray(F / np.linalg.norm(F))
+
+
+def estimate_fundamental(
+    points0: np.ndarray,
+    points1: np.ndarray,
+    probability: np.ndarray,
+    covariance: np.ndarray,
+    sigma0: float = 0.1,
+) -> FundamentalMatrix | None:
+    """F that matches agree on, each weighted by its probability and covariance.
+
+    A sampling consensus (OpenCV's USAC_ACCURATE) starts Gauss-Newton on the seven degrees of freedom, turns of U and V
+    and the ratio of the singular values (Bartoli and Sturm 2004), with Sampson's error over its standard deviation:
+    first with Geman and McClure's loss, then by the inliers alone.
+
+    Args:
+        points0, points1: (M, 2) pixels.
+        probability: (M,) of the matches.
+        covariance: (M, 2, 2) of points1, pixels squared.
+        sigma0: standard deviation of points0, each coordinate, pixels.
+    Returns:
+        None with fewer than eight probable matches, or where the consensus fails.
+    """
+    probable = np.flatnonzero(probability >= _MIN_PROBABILITY)
+    if len(probable) < _EIGHT:
+        return None
+    points0, points1 = points0.astype(np.float64), points1.astype(np.float64)
+    start, _ = cv2.findFundamentalMat(
+        points0[probable], points1[probable], cv2.USAC_ACCURATE, _THRESHOLD, 0.999, _SAMPLES
+    )
+    # OpenCV returns None on failure, although its type hints exclude None.
+    if np.shape(start) != (3, 3):
+        return None
+    # Pixels are scaled alike in both images, so that F is well conditioned and residuals keep their meaning.
+    (to0, scaled0), (to1, scaled1) = _normalised(points0), _normalised(points1)
+    spread0 = (sigma0 * to0[0, 0]) ** 2 * np.eye(2)
+    matches = MatchedRays(scaled0, scaled1, spread0, to1[0, 0] ** 2 * covariance.astype(np.float64))
+    F = np.linalg.inv(to1).T @ start @ np.linalg.inv(to0)
+    u, values, vt = np.linalg.svd(F)
+    v, angle = vt.T, float(np.arctan2(values[1], values[0]))
+    u, angle, v = _refine(matches, u, angle, v, lambda residual: probability * robust_weight(residual))
+    # The robust loss wastes a part of good matches: the inliers alone, equally weighted, are used in full.
+    near = (np.abs(_slopes(matches, u, angle, v)[0]) < _INLIER) & (probability >= _MIN_PROBABILITY)
+    u, angle, v = _refine(matches, u, angle, v, lambda residual: near.astype(float))
+    residual, J = _slopes(matches, u, angle, v)
+    inliers = (np.abs(residual) < _INLIER) & (probability >= _MIN_PROBABILITY)
+    by_step = np.stack([each.ravel() for each in _directions(u, angle, v)], axis=1)
+    information = J[inliers].T @ J[inliers]
+    free = inliers.sum() <= _SEVEN or np.linalg.cond(information) > _MAX_CONDITION
+    spread = np.full((7, 7), np.inf) if free else np.linalg.inv(information)
+    return _in_pixels(_compose(u, angle, v), by_step, spread, to0, to1, inliers)
+
+
+def epipoles(F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where each image sees the other camera's centre: homogeneous pixels (3,) of norm 1, F e0 = 0 and F^T e1 = 0."""
+    u, _, vt = np.linalg.svd(F)
+    return vt[2], u[:, 2]
+
+
+def epipolar_lines(F: np.ndarray, points0: np.ndarray) -> np.ndarray:
+    """Lines (M, 3) a u + b v + c = 0 in image 1 on which points (M, 2) of image 0 lie; a^2 + b^2 = 1.
+
+    F transposed takes points of image 1 to lines in image 0.
+    """
+    lines = np.column_stack([points0, np.ones(len(points0))]) @ F.T
+    return np.asarray(lines / np.linalg.norm(lines[:, :2], axis=1, keepdims=True))
+
+
+def _refine(
+    matches: MatchedRays, u: np.ndarray, angle: float, v: np.ndarray, weigh: Callable[[np.ndarray], np.ndarray]
+) -> tuple[np.ndarray, float, np.ndarray]:
+    """Gauss-Newton from F = U diag(cos, sin, 0) V^T; `weigh` gives weights of whitened residuals (M,)."""
+    for _ in range(_ITERATIONS):
+        residual, J = _slopes(matches, u, angle, v)
+        weighted = J * weigh(residual)[:, None]
+        normal = weighted.T @ J
+        step = -np.linalg.solve(normal + 1e-12 * np.trace(normal) * np.eye(7), weighted.T @ residual)
+        u, v, angle = u @ rotation_exp(step[:3]), v @ rotation_exp(step[3:6]), angle + float(step[6])
+        if np.abs(step).max() < _CONVERGED:
+            break
+    return u, angle, v
+
+
+def _by_points(points0: np.ndarray, points1: np.ndarray, method: int, least: int) -> np.ndarray:
+    if len(points0) != len(points1) or len(points0) < least or (least == _SEVEN and len(points0) != least):
+        raise ValueError(f"{least} matches are needed, got {len(points0)} and {len(points1)} points")
+    F, _ = cv2.findFundamentalMat(points0.astype(np.float64), points1.astype(np.float64), method)
+    return np.zeros((0, 3)) if F is None else F
+
+
+def _normalised(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Similarity (3, 3) to mean zero and root mean square distance sqrt(2), and homogeneous points (M, 3) after it."""
+    mean = points.mean(axis=0)
+    scale = np.sqrt(2.0 / ((points - mean) ** 2).sum(axis=1).mean())
+    T = np.array([[scale, 0.0, -scale * mean[0]], [0.0, scale, -scale * mean[1]], [0.0, 0.0, 1.0]])
+    return T, np.column_stack([points, np.ones(len(points))]) @ T.T
+
+
+def _compose(u: np.ndarray, angle: float, v: np.ndarray) -> np.ndarray:
+    return np.asarray((u * [np.cos(angle), np.sin(angle), 0.0]) @ v.T)
+
+
+def _directions(u: np.ndarray, angle: float, v: np.ndarray) -> np.ndarray:
+    """(7, 3, 3) derivatives of F by the turns of U and V and by the angle."""
+    S = np.diag([np.cos(angle), np.sin(angle), 0.0])
+    turns = skew(np.eye(3))
+    by_angle = np.diag([-np.sin(angle), np.cos(angle), 0.0])
+    return np.asarray(u @ np.concatenate([turns @ S, -S @ turns, by_angle[None]]) @ v.T)
+
+
+def _slopes(matches: MatchedRays, u: np.ndarray, angle: float, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Whitened residuals (M,) and derivatives (M, 7)."""
+    residual, sigma = matches.whitened(_compose(u, angle, v))
+    J = np.einsum("mi,kij,mj->mk", matches.rays1, _directions(u, angle, v), matches.rays0)
+    return residual, J / sigma[:, None]
+
+
+def _in_pixels(
+    F: np.ndarray, by_step: np.ndarray, covariance: np.ndarray, to0: np.ndarray, to1: np.ndarray, inliers: np.ndarray
+) -> FundamentalMatrix:
+    """From scaled coordinates to pixels and norm 1; by_step (9, 7)."""
+    whole = np.kron(to1.T, to0.T)
+    entries = whole @ F.ravel()
+    norm = float(np.linalg.norm(entries))
+    unit = entries / norm
+    J = (np.eye(9) - np.outer(unit, unit)) @ whole @ by_step / norm
+    spread = J @ covariance @ J.T if np.isfinite(covariance).all() else np.full((9, 9), np.inf)
+    return FundamentalMatrix(unit.reshape(3, 3), spread, inliers)

@@ -1,0 +1,175 @@
+"""Each convention of truth files, put into a real truth, is named with the options that undo it; none is else."""
+
+import itertools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sigmaslam.errors import InputError
+from sigmaslam.evaluation.run_evaluation import evaluate_run, format_evaluation
+from sigmaslam.evaluation.truth_conventions import TIME_UNITS, TruthConvention
+from sigmaslam.geometry.se3 import matrix_to_quaternion, se3_exp, se3_inverse
+from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.readers.trajectory_files import read_kitti, read_trajectory, write_kitti, write_tum
+from tests.support.commands import assert_refused, run_here
+
+KITTI = ("04", "05", "07", "10")
+
+
+@pytest.fixture(params=["demo", "drive", *KITTI])
+def truth(request: pytest.FixtureRequest, demo_sequence: Path) -> Trajectory:
+    """The rendered demo, a real drive, and real roads: 04 is straight."""
+    if request.param == "demo":
+        return read_kitti(demo_sequence / "poses.txt")
+    data = request.getfixturevalue("real_data")
+    if request.param == "drive":
+        return read_trajectory(data / "kitti_raw_0926_0039_a" / "poses.txt")
+    return read_kitti(data / "kitti_gt_trajectories" / f"{request.param}.txt").subset(slice(0, 400))
+
+
+def write_estimate(path: Path, truth: Trajectory) -> None:
+    """The truth with a drift of 1 % and a tenth of a degree a metre, at most, in a world of its own."""
+    generator = np.random.default_rng(3)
+    motions = se3_inverse(truth.poses[:-1]) @ truth.poses[1:]
+    steps = np.linalg.norm(motions[:, :3, 3], axis=1, keepdims=True)
+    errors = generator.normal(size=(len(motions), 6)) * steps * np.repeat([0.01, 0.002], 3)
+    poses = [np.eye(4)]
+    for motion, error in zip(motions, errors, strict=True):
+        poses.append(poses[-1] @ motion @ se3_exp(error))
+    write_tum(path, Trajectory(truth.timestamps, np.array(poses)))
+
+
+def write_truth(path: Path, truth: Trajectory, convention: TruthConvention, seconds: float = 1.0) -> None:
+    """A TUM file in this convention, by its definition; `seconds` is the unit of its times."""
+    poses = truth.poses.copy()
+    if convention.frame == "body":
+        # The body's x, y, z axes in the camera: ahead, left, up.
+        axes = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]).T
+        poses[:, :3, :3] = poses[:, :3, :3] @ axes
+    if convention.inverse:
+        poses = np.linalg.inv(poses)
+    if convention.unit == "mm":
+        poses[:, :3, 3] *= 1000
+    x, y, z, w = matrix_to_quaternion(poses[:, :3, :3]).T
+    columns = (w, x, y, z) if convention.quaternion == "wxyz" else (x, y, z, w)
+    np.savetxt(path, np.column_stack([truth.timestamps / seconds, poses[:, :3, 3], *columns]), fmt="%.9f")
+
+
+CONVENTIONS = [
+    TruthConvention(*values)
+    for values in itertools.product(("camera", "body"), (False, True), ("xyzw", "wxyz"), ("m", "mm"))
+]
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS[1:], ids=TruthConvention.describe)
+def test_a_convention_is_named_and_its_options_undo_it(truth: Trajectory, tmp_path: Path, convention: TruthConvention):
+    across = np.linalg.svd(truth.positions - truth.positions.mean(axis=0), compute_uv=False)
+    if convention.inverse and convention.quaternion == "wxyz" and across[1] < 0.005 * across[0]:
+        pytest.skip("a road straight to 0.2 %: the two turn it to and fro, and the drift is larger than what is left")
+    write_estimate(tmp_path / "estimate.tum", truth)
+    write_tum(tmp_path / "plain.tum", truth)
+    write_truth(tmp_path / "truth.tum", truth, convention)
+    right = evaluate_run(tmp_path / "estimate.tum", tmp_path / "plain.tum", plot=False)
+    wrong = evaluate_run(tmp_path / "estimate.tum", tmp_path / "truth.tum", plot=False)
+    assert wrong.truth_hint == convention.describe()
+    assert f"The truth looks like {wrong.truth_hint}" in format_evaluation(wrong)
+    assert wrong.ate_origin.rmse > 5 * right.ate_origin.rmse  # said, not applied
+    mended = evaluate_run(tmp_path / "estimate.tum", tmp_path / "truth.tum", plot=False, truth_convention=convention)
+    assert mended.truth_hint is None
+    assert mended.ate_origin.rmse == pytest.approx(right.ate_origin.rmse, rel=1e-4, abs=1e-6)
+    assert mended.ate_origin.rotation_rmse_deg == pytest.approx(right.ate_origin.rotation_rmse_deg, rel=1e-4, abs=1e-5)
+
+
+def test_the_right_truth_gives_no_hint(truth: Trajectory, tmp_path: Path):
+    write_estimate(tmp_path / "estimate.tum", truth)
+    for name, write in (("truth.tum", write_tum), ("truth.txt", write_kitti)):
+        write(tmp_path / name, truth)
+        evaluation = evaluate_run(tmp_path / "estimate.tum", tmp_path / name, plot=False)
+        assert evaluation.truth_hint is None
+        assert "looks like" not in format_evaluation(evaluation)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_an_estimate_of_another_path_gives_no_hint(truth: Trajectory, tmp_path: Path, seed: int):
+    """A bad estimate is no reason to doubt the truth."""
+    generator = np.random.default_rng(seed)
+    steps = np.median(np.linalg.norm(np.diff(truth.positions, axis=0), axis=1))
+    twists = generator.normal(size=(len(truth) - 1, 6)) * np.repeat([steps, 0.05], 3)
+    poses = list(itertools.accumulate(se3_exp(twists), np.matmul, initial=np.eye(4)))
+    write_tum(tmp_path / "estimate.tum", Trajectory(truth.timestamps, np.array(poses)))
+    write_tum(tmp_path / "truth.tum", truth)
+    assert evaluate_run(tmp_path / "estimate.tum", tmp_path / "truth.tum", plot=False).truth_hint is None
+
+
+@pytest.mark.parametrize("origin", [0.0, 1.5e9])
+@pytest.mark.parametrize("unit", TIME_UNITS)
+def test_the_unit_of_times_is_found_and_told(demo_sequence: Path, tmp_path: Path, unit: str, origin: float):
+    truth = read_kitti(demo_sequence / "poses.txt")
+    truth = Trajectory(truth.timestamps + origin, truth.poses)
+    write_estimate(tmp_path / "estimate.tum", truth)
+    write_truth(tmp_path / "truth.tum", truth, TruthConvention(), TIME_UNITS[unit])
+    evaluation = evaluate_run(tmp_path / "estimate.tum", tmp_path / "truth.tum", plot=False)
+    assert evaluation.association == f"time, that of the truth in {unit}"
+    assert evaluation.matched == len(truth)
+    write_tum(tmp_path / "plain.tum", truth)
+    plain = evaluate_run(tmp_path / "estimate.tum", tmp_path / "plain.tum", plot=False)
+    assert plain.association == "time"
+    assert evaluation.ate.rmse == pytest.approx(plain.ate.rmse, rel=1e-4)
+
+
+def test_a_standing_camera_gives_no_hint(real_data: Path, tmp_path: Path):
+    truth = real_data / "euroc_v1_01_static" / "groundtruth.csv"
+    still = read_trajectory(truth)
+    noise = se3_exp(1e-3 * np.random.default_rng(0).normal(size=(len(still), 6)))
+    write_tum(tmp_path / "estimate.tum", Trajectory(still.timestamps, noise))
+    assert evaluate_run(tmp_path / "estimate.tum", truth, plot=False).truth_hint is None
+
+
+def test_the_order_of_quaternions_is_refused_where_there_are_none(demo_sequence: Path, tmp_path: Path):
+    write_estimate(tmp_path / "estimate.tum", read_kitti(demo_sequence / "poses.txt"))
+    with pytest.raises(InputError, match=r"poses\.txt: the order of quaternions can be chosen for TUM files alone"):
+        evaluate_run(
+            tmp_path / "estimate.tum",
+            demo_sequence / "poses.txt",
+            plot=False,
+            truth_convention=TruthConvention(quaternion="wxyz"),
+        )
+
+
+def test_the_command_says_and_takes_the_options(demo_sequence: Path, tmp_path: Path):
+    truth = read_kitti(demo_sequence / "poses.txt")
+    write_estimate(tmp_path / "estimate.tum", truth)
+    convention = TruthConvention("body", True, "wxyz", "mm")
+    write_truth(tmp_path / "truth.tum", truth, convention)
+    command = ("evaluate", tmp_path / "estimate.tum", "--truth", tmp_path / "truth.tum")
+    said = run_here(*command)
+    assert said.returncode == 0, said.stderr
+    line = next(line for line in said.stdout.splitlines() if "looks like" in line)
+    options = line.rpartition(": ")[2].split()
+    assert len(options) == 7
+    mended = run_here(*command, *options, "--json")
+    assert mended.returncode == 0, mended.stderr
+    content = json.loads(mended.stdout)
+    assert content["truth_hint"] is None
+    assert content["ate_origin"]["rmse"] < 0.05 * content["path_length"]
+    refused = run_here(*command[:2], "--truth", demo_sequence / "poses.txt", "--truth-quaternion", "wxyz")
+    assert_refused(refused, "poses.txt", "TUM files alone")
+
+
+def test_the_turn_about_a_straight_path_is_not_reported_as_an_error(tmp_path: Path):
+    """Positions on a line to a millimetre leave the turn about it free; those of a curve do not."""
+    generator = np.random.default_rng(1)
+    for bend, determined in ((0.0, False), (1.0, True)):
+        angles = bend * np.linspace(0, 2, 100)
+        poses = np.tile(np.eye(4), (100, 1, 1))
+        poses[:, 0, 3], poses[:, 2, 3] = 10 * (1 - np.cos(angles)), 50 * np.linspace(0, 1, 100)
+        write_tum(tmp_path / "truth.tum", Trajectory(np.arange(100.0), poses))
+        poses[:, :3, 3] += 1e-3 * generator.normal(size=(100, 3))
+        poses = poses @ se3_exp(generator.normal(size=(100, 6)) * np.repeat([0.0, 1e-3], 3))
+        write_tum(tmp_path / "estimate.tum", Trajectory(np.arange(100.0), poses))
+        evaluation = evaluate_run(tmp_path / "estimate.tum", tmp_path / "truth.tum", plot=False)
+        assert (evaluation.ate.turn_deg < 1) == determined
+        assert ("not determined" in format_evaluation(evaluation)) != determined
+        assert evaluation.ate_origin.turn_deg == 0

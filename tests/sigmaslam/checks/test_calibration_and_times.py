@@ -1,0 +1,111 @@
+"""Calibrations and time stamps whose units or places are those of a mistake."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sigmaslam.checks.calibration import check_calibration
+from sigmaslam.checks.images import blur_radius, check_images
+from sigmaslam.checks.time_stamps import check_time_stamps
+from sigmaslam.geometry.camera import CameraModel, StereoCamera
+
+GOOD = CameraModel(752, 480, 458.7, 457.3, 367.2, 248.4)
+
+
+def judge(left: CameraModel = GOOD, right: CameraModel = GOOD, baseline: float = 0.11) -> dict[str, tuple[str, str]]:
+    T = np.eye(4)
+    T[0, 3] = baseline
+    return {each.name: (each.severity, each.message) for each in check_calibration(StereoCamera(left, right, T))}
+
+
+@pytest.mark.parametrize("baseline", [0.004, 0.11, 2.9])
+def test_baselines_of_endoscopes_to_lorries_are_good(baseline: float):
+    assert judge(baseline=baseline)["baseline"][0] == "ok"
+
+
+@pytest.mark.parametrize(
+    ("baseline", "words"),
+    [(110.0, "millimetres (0.11 m)"), (11.0, "centimetres (0.11 m)"), (1e-6, "in metres"), (110e3, "micrometres")],
+)
+def test_other_baselines_name_the_likely_unit(baseline: float, words: str):
+    severity, message = judge(baseline=baseline)["baseline"]
+    assert severity == "warning"
+    assert words in message
+
+
+@pytest.mark.parametrize("eye", ["left", "right"])
+def test_a_principal_point_of_another_image_size_is_named_in_either_eye(eye: str):
+    double = replace(GOOD, fx=2 * GOOD.fx, fy=2 * GOOD.fy, cx=2 * GOOD.cx, cy=2 * GOOD.cy)
+    severity, message = judge(**{eye: double})["principal point"]
+    assert severity == "warning"
+    assert eye in message
+    assert "1504x960" in message
+    assert "0.5" in message
+
+
+def test_principal_points_a_sixth_from_the_middle_are_good():
+    assert judge(left=replace(GOOD, cx=GOOD.cx + 752 / 6))["principal point"][0] == "ok"
+
+
+def test_exchanged_coordinates_of_the_principal_point_are_named():
+    severity, message = judge(left=replace(GOOD, cx=GOOD.cy, cy=GOOD.cx))["principal point"]
+    assert severity == "warning"
+    assert "exchanged" in message
+
+
+@pytest.mark.parametrize(
+    ("model", "words"),
+    [
+        (replace(GOOD, fx=4.0, fy=4.0), "in pixels"),
+        (replace(GOOD, fx=50_000.0, fy=50_000.0), "in pixels"),
+        (replace(GOOD, fx=0.5 * GOOD.fx), "square"),
+    ],
+)
+def test_focal_lengths_that_no_camera_has_are_named(model: CameraModel, words: str):
+    severity, message = judge(left=model)["focal length"]
+    assert severity == "warning"
+    assert words in message
+
+
+def test_a_fisheye_lens_may_see_more_than_a_plane_holds():
+    fisheye = replace(GOOD, fx=60.0, fy=60.0, distortion_model="equidistant", distortion=(0.0, 0.0, 0.0, 0.0))
+    assert judge(left=fisheye, right=fisheye)["focal length"][0] == "ok"
+
+
+@pytest.mark.parametrize(
+    ("interval", "severity", "words"),
+    [
+        (0.05, "ok", ""),
+        (0.002, "ok", ""),
+        (4.0, "ok", ""),
+        (100.0, "warning", "milliseconds (0.1 s)"),
+        (5e4, "warning", "microseconds (0.05 s)"),
+        (33_333_333.0, "warning", "nanoseconds (0.03333 s)"),
+        (1e-4, "warning", "give seconds"),
+    ],
+)
+def test_the_likely_unit_of_time_stamps_is_named(interval: float, severity: str, words: str):
+    finding = check_time_stamps([interval, interval, 7 * interval])
+    assert finding.severity == severity
+    assert words in finding.message
+
+
+def test_the_blur_of_a_step_is_its_standard_deviation():
+    """Of a step smoothed by a Gaussian, sampled as pixels are."""
+    from math import erf
+
+    u = np.arange(200) - 99.7
+    for sigma in (2.0, 4.0, 6.0):
+        row = np.array([128 + 100 * erf(each / (sigma * 2**0.5)) for each in u])
+        image = np.tile(np.rint(row).astype(np.uint8), (120, 1))
+        # The measure smooths a little itself, and grey values are rounded.
+        assert blur_radius(image) == pytest.approx(sigma, rel=0.15)
+
+
+def test_images_that_differ_by_less_than_noise_are_the_same():
+    rng = np.random.default_rng(0)
+    left = rng.integers(0, 255, (120, 160)).astype(np.uint8)
+    noisy = np.clip(left + rng.normal(scale=3.0, size=left.shape), 0, 255).astype(np.uint8)
+    assert {each.name: each.severity for each in check_images([(left, left.copy())])}["same image"] == "error"
+    assert {each.name: each.severity for each in check_images([(left, noisy)])}["same image"] == "ok"

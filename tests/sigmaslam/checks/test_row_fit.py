@@ -1,0 +1,117 @@
+"""Row differences of matches whose causes are known."""
+
+import numpy as np
+import pytest
+
+from sigmaslam.checks.eye_matches import EyeMatches
+from sigmaslam.checks.rig import check_rig
+from sigmaslam.checks.row_fit import fit_rows
+from sigmaslam.geometry.camera import CameraModel, RectifiedStereo, StereoCamera
+from sigmaslam.geometry.rectification import StereoRectifier
+
+VIEW = RectifiedStereo(500.0, 500.0, 319.5, 239.5, 0.1, 640, 480)
+NOISE = 0.2
+
+
+def camera(baseline: float = VIEW.baseline) -> StereoCamera:
+    T = np.eye(4)
+    T[0, 3] = baseline
+    model = CameraModel(VIEW.width, VIEW.height, VIEW.fx, VIEW.fy, VIEW.cx, VIEW.cy)
+    return StereoCamera(model, model, T)
+
+
+def matches_of(
+    rows: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
+    lag: float = 0.0,
+    offset: float = 0.0,
+    outliers: float = 0.1,
+    count: int = 300,
+) -> EyeMatches:
+    """Matches of points 1 to 20 m away, rows = (shift, roll, zoom, yaw) and a lag in frames of a swaying camera."""
+    rng = np.random.default_rng(0)
+    left = rng.uniform((80, 0), (VIEW.width, VIEW.height), (count, 2))
+    disparity = VIEW.focal_baseline / rng.uniform(1.0, 20.0, count)
+    right = left - np.column_stack([disparity + offset, np.zeros(count)])
+    # Two pairs: the camera looks up in one, and ahead in the other.
+    pair = np.arange(count) % 2
+    shift, roll, zoom, yaw = rows
+    x = (right[:, 0] - VIEW.cx) / VIEW.fx
+    right[:, 0] -= yaw * (1 + x * x)
+    x, y = ((right - (VIEW.cx, VIEW.cy)) / VIEW.fx).T
+    flow = np.where(pair[:, None] == 0, [2.0, 8.0], np.column_stack([x, y]) * disparity[:, None])
+    right = right + np.column_stack([np.zeros(count), shift + roll * x + zoom * y + yaw * x * y]) + lag * flow
+    right += rng.normal(scale=NOISE, size=right.shape)
+    wrong = rng.random(count) < outliers
+    right[wrong] = rng.uniform((0, 0), (VIEW.width, VIEW.height), (wrong.sum(), 2))
+    return EyeMatches(left, right, np.tile(NOISE**2 * np.eye(2), (count, 1, 1)), np.full(count, 0.9), flow, pair)
+
+
+@pytest.mark.parametrize(
+    ("rows", "lag"),
+    [
+        ((0.0, 0.0, 0.0, 0.0), 0.0),
+        ((3.0, 0.0, 0.0, 0.0), 0.0),
+        ((-1.5, 8.0, -12.0, 40.0), 0.0),
+        ((0.5, 3.0, 0.0, -10.0), 0.4),
+    ],
+)
+def test_the_causes_of_row_differences_are_told_apart(rows: tuple[float, float, float, float], lag: float):
+    fit = fit_rows(matches_of(rows, lag), VIEW)
+    found = np.array([fit.shift, fit.roll, fit.zoom, fit.yaw, fit.lag])
+    # Weights of a robust loss cost some certainty; a fit that neglects outliers is off by tens of sigmas.
+    # The fit is of first order: a tenth of what is there may be left.
+    truth = np.array([*rows, lag])
+    np.testing.assert_array_less(np.abs(found - truth), 5.0 * fit.sigmas + 0.1 * np.abs(truth))
+    assert fit.sigmas[0] < 0.05
+    assert np.median(np.abs(fit.residual)) < 2.0 * NOISE
+
+
+def test_a_camera_at_rest_shows_no_lag():
+    fit = fit_rows(matches_of().unfollowed(), VIEW)
+    assert np.isnan(fit.lag)
+    assert fit.lag_shift == 0.0
+
+
+def findings_of(matches: EyeMatches) -> dict[str, tuple[str, float | None]]:
+    found = check_rig(matches, StereoRectifier(camera()), 0.1)
+    return {each.name: (each.severity, each.figure) for each in found}
+
+
+def test_a_good_rig_is_good():
+    assert {severity for severity, _ in findings_of(matches_of()).values()} == {"ok"}
+
+
+@pytest.mark.parametrize(
+    ("shift", "severity"), [(0.5, "ok"), (-0.5, "ok"), (1.5, "warning"), (-1.5, "warning"), (3.0, "error")]
+)
+def test_rows_are_judged_by_what_the_tracker_can_follow(shift: float, severity: str):
+    found = findings_of(matches_of((shift, 0.0, 0.0, 0.0)))
+    assert found["rows"][0] == severity
+    assert found["rows"][1] == pytest.approx(shift, abs=0.1)
+    assert {each for name, (each, _) in found.items() if name != "rows"} == {"ok"}
+
+
+def test_a_disparity_offset_shows_where_it_leads_behind_infinity():
+    far = matches_of(offset=-8.0, outliers=0.0)
+    found = findings_of(far)
+    assert found["eyes"][0] == "ok"
+    assert found["infinity"] == ("error", pytest.approx((far.disparity < -1.0).mean(), abs=0.02))
+
+
+def test_a_right_camera_turned_outwards_is_not_taken_for_exchanged_eyes():
+    found = findings_of(matches_of((0.0, 0.0, 0.0, 60.0)))
+    assert found["eyes"][0] == "ok"
+    assert found["rotation"][0] == "error"
+
+
+def test_a_part_of_a_frame_between_the_eyes_is_measured():
+    found = findings_of(matches_of(lag=0.3))
+    severity, figure = found["synchronisation"]
+    assert severity in ("warning", "error")
+    assert figure == pytest.approx(0.3, abs=0.02)
+    # Whatever else is wrong cannot be told from it.
+    assert {found[name][0] for name in ("rows", "rotation", "scale", "infinity")} == {"unknown"}
+
+
+def test_few_matches_judge_nothing():
+    assert {severity for severity, _ in findings_of(matches_of(count=40)).values()} == {"unknown"}

@@ -1,0 +1,299 @@
+"""Runs that are killed, stopped, or out of disk: every pose that was said is kept."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sigmaslam.readers import open_sequence
+from sigmaslam.readers.trajectory_files import read_tum
+from sigmaslam.runs.finish import finish_run
+from sigmaslam.runs.frame_table import read_frames
+from sigmaslam.runs.relative_pose_file import read_frame_pairs
+from sigmaslam.runs.track import track_sequence
+from tests.support.commands import assert_refused, environment, run_here, run_process
+from tests.support.demo_parts import copy_frames
+
+FRAMES = 12
+PARTIAL = ("poses.partial", "relative_poses.partial")
+POSES = (
+    "trajectory.tum",
+    "trajectory.kitti",
+    "times.txt",
+    "covariance.npy",
+    "covariance_matching.npy",
+    "relative_poses.npz",
+)
+
+
+@pytest.fixture(scope="module")
+def sequence(demo_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A second or two, so that there are poses relative to earlier ones."""
+    return copy_frames(demo_sequence, tmp_path_factory.mktemp("some") / "sequence", FRAMES, slower=4.0)
+
+
+@pytest.fixture(scope="module")
+def whole(sequence: Path) -> Path:
+    """The run that nobody disturbed."""
+    run = sequence.with_name("whole")
+    track_sequence(open_sequence(sequence), run, "klt")
+    return run
+
+
+def statuses(run: Path) -> list[str]:
+    """Of the rows of frames.csv that are there whole."""
+    table = run / "frames.csv"
+    return [line.split(b",")[1].decode() for line in table.read_bytes().split(b"\n")[1:-1]] if table.exists() else []
+
+
+def start(source: Path, run: Path, *options: str, rows: int = 4) -> subprocess.Popen[str]:
+    """A run with so many frames done; it takes ages for each more, so that signals come in the midst of it."""
+    script = (
+        "import sys, time\n"
+        "from sigmaslam.cli import main\n"
+        "from sigmaslam.slam.tracker import StereoTracker\n"
+        "step, done = StereoTracker.step, []\n"
+        "def slow(*arguments):\n"
+        f"    time.sleep(60 if len(done) >= {rows} else 0)\n"
+        "    done.append(1)\n"
+        "    return step(*arguments)\n"
+        "StereoTracker.step = slow\n"
+        "main()\n"
+    )
+    command = [sys.executable, "-c", script, "track", str(source), "--out", str(run), "--frontend", "klt", *options]
+    process = subprocess.Popen(
+        command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    deadline = time.monotonic() + 60
+    while len(statuses(run)) < rows:
+        assert time.monotonic() < deadline, "no frame came"
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.02)
+    return process
+
+
+def end(process: subprocess.Popen[str]) -> tuple[int, str, str]:
+    output, errors = process.communicate(timeout=60)
+    return process.returncode, output, errors
+
+
+def assert_first_poses_of(whole: Path, run: Path, count: int) -> None:
+    """The run has the first poses of another one, to the bit, and what goes with them."""
+    for name in ("trajectory.tum", "trajectory.kitti", "times.txt"):
+        assert (run / name).read_text().splitlines() == (whole / name).read_text().splitlines()[:count], name
+    for name in ("covariance.npy", "covariance_matching.npy"):
+        np.testing.assert_array_equal(np.load(run / name), np.load(whole / name)[:count])
+    pairs, all_pairs = (
+        read_frame_pairs(folder / "relative_poses.npz", length) for folder, length in ((run, count), (whole, FRAMES))
+    )
+    assert len(all_pairs)
+    first = all_pairs.select(all_pairs.later < count)
+    np.testing.assert_array_equal(pairs.pose, first.pose)
+    np.testing.assert_array_equal(pairs.earlier, first.earlier)
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129), (signal.SIGINT, 130)])
+def test_a_signal_ends_a_run_with_its_results(
+    sequence: Path, whole: Path, tmp_path: Path, number: signal.Signals, code: int
+):
+    run = tmp_path / "run"
+    process = start(sequence, run)
+    # The second and the third come while the results are written, or just before.
+    for _ in range(3):
+        process.send_signal(number)
+        time.sleep(0.1)
+    returned, output, errors = end(process)
+    assert returned == code, errors
+    assert "Traceback" not in errors
+    assert f"Stopped; what was tracked until then is in {run}" in output
+    assert_first_poses_of(whole, run, 4)
+    described = json.loads((run / "run.json").read_text())
+    assert described["ended"] == "interrupted" + ("" if number == signal.SIGINT else f" by {number.name}")
+    assert described["summary"]["poses"] == len(read_tum(run / "trajectory_final.tum")) == 4
+    assert {path.name for path in whole.iterdir()} == {path.name for path in run.iterdir()}
+    assert "nothing to do" in run_here("finish", run).stdout
+
+
+def test_finish_makes_the_results_of_a_killed_run(sequence: Path, whole: Path, tmp_path: Path):
+    run = tmp_path / "run"
+    process = start(sequence, run)
+    refused = run_here("finish", run)
+    assert_refused(refused, "still goes on")
+    process.kill()
+    assert end(process)[0] == -signal.SIGKILL
+    assert not (run / "trajectory.tum").exists()
+    assert_refused(run_here("evaluate", run, "--truth", sequence / "poses.txt"), f"`sigmaslam finish {run}`")
+
+    result = run_here("finish", run)
+    assert result.returncode == 0, result.stderr
+    assert "3 of 4 frames tracked, 1 starting, 0 lost, 0 skipped" in result.stdout
+    assert_first_poses_of(whole, run, 4)
+    described, undisturbed = (json.loads((each / "run.json").read_text()) for each in (run, whole))
+    assert described["ended"] == "killed"
+    for name in ("input", "frontend", "configuration", "calibration", "weights_sha256"):
+        assert described[name] == undisturbed[name]
+    assert "<svg" in (run / "report.html").read_text()
+    assert not any((run / name).exists() for name in PARTIAL)
+    evaluated = run_here("evaluate", run, "--truth", sequence / "poses.txt", "--json")
+    assert json.loads(evaluated.stdout)["matched"] == 4
+
+    again = run_here("finish", run)
+    assert (again.returncode, again.stdout) == (0, f"{run} is finished: there is nothing to do.\n")
+
+
+@pytest.fixture
+def killed(sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A run that tracked everything and was killed before it wrote any result."""
+
+    def killed(*_: object) -> None:
+        raise SystemExit
+
+    run = tmp_path / "killed"
+    monkeypatch.setattr("sigmaslam.runs.track.write_results", killed)
+    with pytest.raises(SystemExit):
+        track_sequence(open_sequence(sequence), run, "klt")
+    return run
+
+
+@pytest.mark.usefixtures("without_report")
+@pytest.mark.parametrize(
+    ("name", "cut", "poses"),
+    [
+        ("poses.partial", 1, FRAMES - 1),
+        ("poses.partial", 700, FRAMES - 1),
+        ("relative_poses.partial", 5, FRAMES),
+        ("frames.csv", 9, FRAMES - 1),
+    ],
+)
+def test_a_last_record_that_is_cut_off_is_left_out(killed: Path, whole: Path, name: str, cut: int, poses: int):
+    os.truncate(killed / name, (killed / name).stat().st_size - cut)
+    assert finish_run(killed) is not None
+    if name == "relative_poses.partial":
+        left, whole_pairs = (read_frame_pairs(run / "relative_poses.npz", FRAMES) for run in (killed, whole))
+        np.testing.assert_array_equal(left.pose, whole_pairs.pose[:-1])
+    else:
+        assert_first_poses_of(whole, killed, poses)
+    assert len(read_tum(killed / "trajectory.tum")) == poses
+    assert len(read_frames(killed / "frames.csv")) >= poses
+
+
+@pytest.mark.usefixtures("without_report")
+def test_finish_of_a_run_that_did_not_track_ends_like_it(demo_sequence: Path, tmp_path: Path):
+    swapped = copy_frames(demo_sequence, tmp_path / "sequence", 3, lambda k, left, right: (right, left))
+    run = tmp_path / "run"
+    tracked = run_here("track", swapped, "--out", run, "--frontend", "klt")
+    assert tracked.returncode == 3
+    assert "0 of 3 frames tracked, 3 starting" in tracked.stdout
+    assert len(tracked.stderr.strip().splitlines()[-1]) > 20  # after the progress, why
+    process = start(swapped, tmp_path / "killed", rows=3)
+    process.kill()
+    end(process)
+    finished = run_here("finish", tmp_path / "killed")
+    assert finished.returncode == 3
+    assert "never started" in finished.stderr
+
+
+def test_finish_of_a_run_without_a_frame_says_so(killed: Path):
+    for name in ("frames.csv", *PARTIAL):
+        content = (killed / name).read_bytes()
+        (killed / name).write_bytes(content[: content.find(b"\n") + 1] if name == "frames.csv" else b"")
+    finished = run_here("finish", killed)
+    assert finished.returncode == 3
+    assert "There was no frame" in finished.stderr
+
+
+def test_finish_refuses_what_is_no_run(tmp_path: Path):
+    assert_refused(run_here("finish", tmp_path), "holds no run.json and frames.csv")
+
+
+# ---- a full disk
+
+
+def full_for(names: set[str]) -> Callable[[Path], object]:
+    """`atomic_path` on a disk without room for these files."""
+    from sigmaslam.files import atomic_path
+
+    def limited(path: Path) -> object:
+        if Path(path).name in names:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return atomic_path(path)
+
+    return limited
+
+
+@pytest.mark.usefixtures("without_report")
+@pytest.mark.parametrize("name", ["trajectory.tum", "covariance.npy", "trajectory_final.tum", "map.npz", "run.json"])
+def test_a_file_without_room_costs_a_message_and_not_the_others(
+    sequence: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+):
+    with monkeypatch.context() as disk:
+        for module in ("files", "runs.results", "runs.relative_pose_file", "runs.run_folder"):
+            disk.setattr(f"sigmaslam.{module}.atomic_path", full_for({name}))
+        if name == "run.json":  # there was room for it when the run began
+            disk.setattr("sigmaslam.runs.run_folder.atomic_write_text", lambda path, text: path.write_text(text))
+        result = run_here("track", sequence, "--out", tmp_path / "run", "--frontend", "klt")
+    assert_refused(result, f"could not write {name}; make room", "No space left on device")
+    lost = {name} | ({"covariance_final.npy"} if name == "trajectory_final.tum" else set())
+    left = {path.name for path in (tmp_path / "run").iterdir()}
+    assert left - set(PARTIAL) == {path.name for path in whole.iterdir()} - (lost - {"run.json"}) - {"report.html"}
+    can_be_made = name in (*POSES, "run.json")
+    assert left & set(PARTIAL) == (set(PARTIAL) if can_be_made else set())
+    if can_be_made:
+        assert "sigmaslam finish" in result.stderr
+        assert run_here("finish", tmp_path / "run").returncode == 0
+        summary = json.loads((tmp_path / "run" / "run.json").read_text())["summary"]
+        undisturbed = json.loads((whole / "run.json").read_text())["summary"]
+        assert summary == undisturbed
+    for each in POSES[:-1]:
+        assert (tmp_path / "run" / each).read_bytes() == (whole / each).read_bytes(), each
+
+
+def test_a_disk_that_is_full_in_the_midst_of_a_run_keeps_what_was_said(sequence: Path, whole: Path, tmp_path: Path):
+    """No file may grow beyond 5 kB: some poses fit, and no result does."""
+    script = (
+        "import resource\n"
+        "from sigmaslam.cli import main\n"
+        "from sigmaslam.slam.tracker import StereoTracker\n"
+        "from sigmaslam.runs.run_folder import RunWriter\n"
+        "begin = RunWriter.__init__\n"
+        "def fill(*arguments):\n"
+        "    begin(*arguments)\n"
+        "    resource.setrlimit(resource.RLIMIT_FSIZE, (5000, 5000))\n"
+        "RunWriter.__init__ = fill\n"
+        "main()\n"
+    )
+    run = tmp_path / "run"
+    command = [sys.executable, "-c", script, "track", str(sequence), "--out", str(run), "--frontend", "klt"]
+    result = subprocess.run(command, env=environment(), capture_output=True, text=True, check=False, timeout=60)
+    assert_refused(result, "poses.partial: cannot be written")
+    count = len(statuses(run))
+    assert 3 <= count < FRAMES
+    finished = run_here("finish", run)
+    assert finished.returncode == 0, finished.stderr
+    assert_first_poses_of(whole, run, count)
+
+
+# ---- names
+
+
+def test_an_input_whose_name_is_no_text_is_tracked(sequence: Path, tmp_path: Path):
+    """Bytes that are no UTF-8, in the names of input and output."""
+    source = Path(os.fsdecode(os.fsencode(tmp_path) + b"/in\xff"))
+    run = Path(os.fsdecode(os.fsencode(tmp_path) + b"/out\xfe"))
+    shutil.copytree(sequence, source)
+    result = run_process("track", source, "--out", run, "--frontend", "klt")
+    assert result.returncode == 0, result.stderr
+    assert json.loads((run / "run.json").read_text())["input"].endswith("in\\udcff")
+    assert "out\\udcfe" in (run / "report.html").read_text()
+    assert "out\\udcfe" in result.stdout
