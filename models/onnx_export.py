@@ -22,7 +22,7 @@ from sigmaslam.filters.onnx.exportable_se3 import exp_se3
 from sigmaslam.filters.onnx.graph_file import strip_origins
 from sigmaslam.filters.onnx.pose_prediction import STATE_SIZE, Predict
 from sigmaslam.filters.tracking.frame_update import FrameViews, GatedStep, PredictViews, RobustStep
-from sigmaslam.filters.tracking.window_solution import EliminateLandmarks, GateWindow, WindowViews
+from sigmaslam.filters.tracking.window_solution import Condition, EliminateLandmarks, GateWindow, WindowViews
 from sigmaslam.inference.onnx_graph import OnnxGraph
 from sigmaslam.inference.weight_manifest import check_weights, update_manifest
 from sigmaslam.models.extractor import EXTRACTOR_SIZE_MULTIPLE, FeatureExtractor
@@ -38,6 +38,7 @@ from sigmaslam.models.tracking_graphs import (
     ROBUST_OUTPUTS,
     WINDOW_INPUTS,
     WINDOW_OUTPUTS,
+    condition_example,
     frame_axes,
     frame_example,
     window_axes,
@@ -231,6 +232,7 @@ def _noisy_texture(rng: np.random.Generator, shape: tuple[int, int]) -> Tensor:
 
 def _filter_graphs() -> dict[str, _Graph]:
     fixed: dict[int, Any] = {}
+    state, columns = (torch.export.Dim(name, min=1, max=10_000) for name in ("state", "columns"))
     return {
         "pose_predict": _Graph(
             Predict(),
@@ -245,6 +247,14 @@ def _filter_graphs() -> dict[str, _Graph]:
         "frame_gated": _frame_graph(GatedStep(), GATED_INPUTS, GATED_OUTPUTS),
         "window_eliminate": _window_graph(EliminateLandmarks(), WINDOW_INPUTS, WINDOW_OUTPUTS),
         "window_gate": _window_graph(GateWindow(), (), ("agree",)),
+        "window_condition": _Graph(
+            Condition(),
+            condition_example(0, 18, 7),
+            condition_example(1, 30, 25),
+            ["factor", "information", "vector", "common"],
+            ["mean", "covariance", "common_after"],
+            ({0: state, 1: columns}, {0: state, 1: state}, {0: state}, {0: state}),
+        ),
     }
 
 

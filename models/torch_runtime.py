@@ -11,7 +11,7 @@ from torch import nn
 
 from sigmaslam.filters.onnx.pose_prediction import Predict
 from sigmaslam.filters.tracking.frame_update import GatedStep, PredictViews, RobustStep
-from sigmaslam.filters.tracking.window_solution import EliminateLandmarks, GateWindow
+from sigmaslam.filters.tracking.window_solution import Condition, EliminateLandmarks, GateWindow
 from sigmaslam.inference.onnx_graph import shipped_weights
 from sigmaslam.models.extractor import FeatureExtractor
 from sigmaslam.models.onnx_export import load_network, load_scorer, load_verifier
@@ -58,5 +58,6 @@ def filter_module(name: str) -> TorchModule:
             "frame_gated": GatedStep,
             "window_eliminate": EliminateLandmarks,
             "window_gate": GateWindow,
+            "window_condition": Condition,
         }[name]()
     )

@@ -145,6 +145,14 @@ def frame_example(seed: int, keyframes: int, count: int, *inputs: str) -> tuple[
     return tuple(values[name] for name in inputs)
 
 
+def condition_example(seed: int, size: int, columns: int) -> tuple[Tensor, ...]:
+    """Inputs of `Condition`: a state of that size, and so many columns of its prior's factor."""
+    generator = torch.Generator().manual_seed(seed)
+    shapes = ((size, columns), (size, size), (size,), (size, CALIBRATION_SIZE))
+    factor, root, vector, common = (torch.randn(*shape, generator=generator, dtype=torch.float64) for shape in shapes)
+    return factor, root @ root.mT, vector, common
+
+
 def _predicted(values: dict[str, Tensor]) -> Tensor:
     """(M, 3) expected views at the prior's mean."""
     frame = FrameViews(*(values[name] for name in FrameViews._fields))

@@ -110,6 +110,25 @@ class EliminateLandmarks(nn.Module):
         return whole[:size, :size], whole[:size, size], inverse, -solved[:, :, :size], solved[:, :, size]
 
 
+class Condition(nn.Module):
+    """Posterior of a state of which something is learned; the prior may be singular.
+
+    Shapes:
+        factor (n, k) of the prior covariance, factor factor^T, information (n, n) and vector (n,) of the likelihood
+        exp(-x^T information x / 2 + vector^T x) for x from the prior's mean, common (n, 12) how considered errors enter
+        the state -> mean (n,), covariance (n, n), common (n, 12), by the same gain.
+    """
+
+    def forward(self, factor: Tensor, information: Tensor, vector: Tensor, common: Tensor) -> tuple[Tensor, ...]:
+        """In units of the prior."""
+        identity = torch.eye(factor.shape[1], dtype=factor.dtype, device=factor.device)
+        whole = identity + factor.mT @ information @ factor
+        covariance = factor @ regular.invert((whole + whole.mT) / 2.0) @ factor.mT
+        learned = torch.cat([vector[:, None], -information @ common], dim=1)
+        moved = covariance @ learned
+        return moved[:, 0], covariance, common + moved[:, 1:]
+
+
 def _prior_precision(departure: Tensor, variance: Tensor, freedom: Tensor) -> Tensor:
     """(L, 6) precisions of landmarks as measured, by how far (L, 6) their estimates are from there.
 

@@ -40,7 +40,7 @@ def export(
         return
 
     on_real_sets = None if scores is None else read_scores(scores)
-    with Console(stderr=True).status("exporting seven graphs (some minutes)"):
+    with Console(stderr=True).status("exporting eight graphs (some minutes)"):
         differences = export_all(run / WEIGHTS_NAME, run / CARD_NAME, out, on_real_sets)
     _tell_differences(differences)
 

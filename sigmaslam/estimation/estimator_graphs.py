@@ -18,7 +18,7 @@ class EstimatorGraphs:
 
     Attributes:
         predict_views, robust_step, gated_step: of a frame, see `sigmaslam.filters.tracking.frame_update`.
-        eliminate_landmarks, gate_window: of a window, see `sigmaslam.filters.tracking.window_solution`.
+        eliminate_landmarks, gate_window, condition: of a window, see `sigmaslam.filters.tracking.window_solution`.
     """
 
     def __init__(self, camera: RectifiedStereo, backend: str, unscented: bool) -> None:
@@ -27,6 +27,7 @@ class EstimatorGraphs:
         self.gated_step = load_step("frame_gated", backend)
         self.eliminate_landmarks = load_step("window_eliminate", backend)
         self.gate_window = load_step("window_gate", backend)
+        self.condition = load_step("window_condition", backend)
         self._intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.focal_baseline])
         self._unscented = np.array(float(unscented))
 

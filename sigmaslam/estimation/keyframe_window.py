@@ -19,7 +19,7 @@ import numpy as np
 from sigmaslam.estimation.calibration_errors import CalibrationPrior, measured_errors
 from sigmaslam.estimation.chi_square import CHI_SQUARE_9999_OF_6
 from sigmaslam.estimation.estimator_graphs import EstimatorGraphs
-from sigmaslam.estimation.gaussian import condition, condition_common, matrix_root
+from sigmaslam.estimation.gaussian import matrix_root
 from sigmaslam.estimation.landmark_table import KeyframeViews, LandmarkTable, LandmarkViews
 from sigmaslam.estimation.marginalised_poses import PastPoses, point_lever
 from sigmaslam.estimation.state_layout import CALIBRATION_SIZE, LANDMARK_SIZE, MODELLED, pose_slice
@@ -152,9 +152,9 @@ class KeyframeWindow:
             information, vector, rows, landmarks = eliminate_landmarks(self, self._observations)
             offset = self.posterior.minus(self.prior)
             vector = vector + information @ offset
-            state, covariance = condition(factor, information, vector)
+            learned = {"factor": factor, "information": information, "vector": vector, "common": self.prior.common}
+            state, covariance, common = self.graphs.condition(learned)
             step = state - offset
-            common = condition_common(self.prior.common, covariance, information)
             self.posterior = self.posterior.moved(step, covariance, common)
             if len(rows):
                 self.landmarks.covariance[rows], self.landmarks.dependence[rows], own_step = landmarks
@@ -201,7 +201,7 @@ class KeyframeWindow:
         observed = leaving[self._observations.views.landmark]
         information, vector, *_ = eliminate_landmarks(self, self._observations.select(observed))
         vector = vector + information @ self.posterior.minus(self.prior)
-        self.prior = self.prior.given(information, vector).marginalise_oldest()
+        self.prior = self.prior.given(information, vector, self.graphs.condition).marginalise_oldest()
         self.posterior = self.posterior.marginalise_oldest()
         new_row = np.where(leaving, -1, np.cumsum(~leaving) - 1)
         self._observations = self._observations.without_oldest(new_row)

@@ -21,6 +21,10 @@ BACKENDS = ("onnx", "torch")
 _GRAPH_BYTES = 1 << 31
 
 
+Step = Callable[[Mapping[str, np.ndarray]], list[np.ndarray]]
+"""What a loaded graph is called as: arrays by name, outputs in order."""
+
+
 class OnnxGraph:
     """A loaded graph that is called with named arrays.
 
@@ -70,7 +74,7 @@ def shipped_weights(name: str) -> Path:
 
 
 @cache
-def load_step(name: str, backend: str) -> Callable[[Mapping[str, np.ndarray]], list[np.ndarray]]:
+def load_step(name: str, backend: str) -> Step:
     """A step of the filter by the name of its graph, with one of `BACKENDS`; "torch" is the same step in torch.
 
     It has no state, and is loaded once in a process.

@@ -44,6 +44,7 @@ _GRAPHS = (
     "frame_gated.onnx",
     "window_eliminate.onnx",
     "window_gate.onnx",
+    "window_condition.onnx",
 )
 
 

@@ -12,7 +12,7 @@ from sigmaslam.filters.linalg import regular
 from sigmaslam.filters.tracking.calibration_errors import unmodelled_errors
 from sigmaslam.filters.tracking.frame_update import FrameEstimate, FrameViews, RobustStep, update_frame
 from sigmaslam.filters.tracking.robust import common_scale, mask_missing, student_weight
-from sigmaslam.filters.tracking.window_solution import EliminateLandmarks, WindowViews
+from sigmaslam.filters.tracking.window_solution import Condition, EliminateLandmarks, WindowViews
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.models.tracking_graphs import ROBUST_INPUTS, WINDOW_INPUTS, frame_example, window_example
 from tests.support.filter_builders import tensor
@@ -148,3 +148,19 @@ def test_the_order_of_views_does_not_matter():
     torch.testing.assert_close(found.offset, expected.offset, rtol=1e-8, atol=1e-11)
     torch.testing.assert_close(found.covariance, expected.covariance, rtol=1e-8, atol=1e-11)
     assert (found.agree == expected.agree[order]).all()
+
+
+def test_what_is_learned_of_a_singular_prior_is_the_textbook_posterior():
+    """Of three numbers the last is a copy of the first, and the second is known."""
+    factor = tensor(2.0, 0.0, 2.0)[:, None]
+    prior = factor @ factor.mT
+    generator = torch.Generator().manual_seed(0)
+    root, common = (torch.randn(3, size, generator=generator, dtype=torch.float64) for size in (3, 12))
+    information, vector = root @ root.mT, tensor(1.0, -2.0, 3.0)
+    gain = torch.linalg.inv(torch.eye(3, dtype=torch.float64) + prior @ information)
+    mean, covariance, considered = Condition()(factor, information, vector, common)
+    torch.testing.assert_close(covariance, gain @ prior, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(mean, gain @ prior @ vector, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(considered, common - gain @ prior @ information @ common, rtol=1e-9, atol=1e-9)
+    assert mean[1] == 0.0
+    assert mean[2] == mean[0]

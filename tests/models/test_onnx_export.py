@@ -24,13 +24,13 @@ from sigmaslam.models.onnx_export import (
 )
 from sigmaslam.models.scorer_network import MatchScorer
 from sigmaslam.models.torch_runtime import TorchFeatures, filter_module, scoring_module
-from sigmaslam.models.tracking_graphs import frame_example, window_example
+from sigmaslam.models.tracking_graphs import condition_example, frame_example, window_example
 from sigmaslam.models.verifier_network import PLACE_COLUMNS, VERIFIER_COLUMNS, MatchVerifier
 from sigmaslam.synthetic.rendering.textures import dead_leaves
 
 FRAME_STEPS = ("frame_predict", "frame_robust", "frame_gated")
 WINDOW_STEPS = ("window_eliminate", "window_gate")
-FILTERS = ("pose_predict", *FRAME_STEPS, *WINDOW_STEPS)
+FILTERS = ("pose_predict", *FRAME_STEPS, *WINDOW_STEPS, "window_condition")
 
 
 def untrained_networks() -> dict[str, torch.nn.Module]:
@@ -121,6 +121,8 @@ def assert_filter_graphs_equal_torch(folder: Path, names: tuple[str, ...] = FILT
             ]
         elif name in WINDOW_STEPS:
             examples = [window_example(seed, *sizes, *inputs) for seed, sizes in ((5, (2, 3)), (6, (7, 120)))]
+        elif name == "window_condition":
+            examples = [condition_example(5, 12, 1), condition_example(6, 54, 43)]
         else:
             examples = [onnx_export._predict_example(seed) for seed in (5, 6)]
         for example in examples:
