@@ -11,10 +11,10 @@ from threadpoolctl import ThreadpoolController
 
 from sigmaslam.estimation.calibration_errors import CalibrationPrior
 from sigmaslam.estimation.constant_velocity import MotionFilter
+from sigmaslam.estimation.estimator_graphs import EstimatorGraphs
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.frame_update import FrameUpdate
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
-from sigmaslam.estimation.sigma_point_linearisation import ViewLineariser
 from sigmaslam.frontend import Frontend, build_frontend
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
@@ -85,9 +85,9 @@ class StereoTracker:
         self._blas = ThreadpoolController()
         self._beside = ThreadPoolExecutor(1, "keyframe") if threads > 1 else None
         self._admission = admission = admission or AdmitAll(config.min_inliers)
-        lineariser = ViewLineariser(rectified, backend, config.linearisation == "unscented")
+        graphs = EstimatorGraphs(rectified, backend, config.linearisation == "unscented")
         prior = CalibrationPrior.of(rectified, camera.sigmas, config.offset_sigma, config.estimate)
-        self._window = window = KeyframeWindow(rectified, prior, lineariser)
+        self._window = window = KeyframeWindow(rectified, prior, graphs)
         self._noise = noise = MeasurementNoise(config)
         self._motion = motion = MotionFilter(backend)
         self._course = course = Course()
