@@ -1,5 +1,6 @@
 """Batched Bayesian filters and inference in torch: see docs/filters.md."""
 
+from sigmaslam.filters.adaptive import adapted_noise
 from sigmaslam.filters.bayes import BayesFilter, ExtendedKalmanFilter, KalmanFilter, UnscentedKalmanFilter
 from sigmaslam.filters.belief import degree_of_belief
 from sigmaslam.filters.compiled import compile_step
@@ -45,6 +46,7 @@ __all__ = [
     "Track",
     "UnscentedKalmanFilter",
     "Update",
+    "adapted_noise",
     "compile_step",
     "cubature",
     "degree_of_belief",

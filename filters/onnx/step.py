@@ -187,8 +187,12 @@ class _Step(nn.Module):
         """Whether an input has the batch as its first dimension, and the number of measurements as its second."""
         value = self.example.value
         batched = given.ndim > 0 and given.shape[:1] == self.example.belief.batch_shape
-        each = self.is_stack and batched and value is not None and given.shape[:2] == value.shape[:2]
-        return batched, each and (given.ndim > 2 or given is value)
+        if given is value:
+            return batched, self.is_stack
+        # The belief and the motion's inputs have no such dimension, whatever their sizes are.
+        seen = any(given is one for one in self.example.measurement_inputs.values())
+        each = self.is_stack and batched and seen and value is not None and given.shape[:2] == value.shape[:2]
+        return batched, each and given.ndim > 2
 
     def free(self) -> tuple[dict[int, Any] | None, ...]:
         """Which dimensions of each input the graph leaves free."""
