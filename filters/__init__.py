@@ -15,7 +15,7 @@ from sigmaslam.filters.noise_covariance import BlockDiagonal, Dense, Diagonal
 from sigmaslam.filters.onnx.step import ExportError, StepExample, export_step
 from sigmaslam.filters.results import TimeUpdate, Update
 from sigmaslam.filters.sigma_points import Simplex, cubature, julier, merwe
-from sigmaslam.filters.time_series import Track
+from sigmaslam.filters.time_series import Event, Track
 
 __all__ = [
     "SE2",
@@ -27,6 +27,7 @@ __all__ = [
     "Dense",
     "Diagonal",
     "Euclidean",
+    "Event",
     "ExportError",
     "ExtendedKalmanFilter",
     "FilterError",

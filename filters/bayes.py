@@ -32,7 +32,7 @@ from sigmaslam.filters.results import TimeUpdate, Update
 from sigmaslam.filters.robust import Blocks, Robust, WeightedPosterior
 from sigmaslam.filters.sigma_points import Columns, SigmaPoints, cubature
 from sigmaslam.filters.tensors import require_tensor
-from sigmaslam.filters.time_series import filter_sequence, smooth
+from sigmaslam.filters.time_series import filter_events, filter_sequence, smooth
 from sigmaslam.filters.transforms import Difference, Exact, Taylor, Transform, Transformed, Unscented
 from sigmaslam.filters.updates import FORMS, Form, TangentPosterior, choose_form, solve
 
@@ -250,6 +250,7 @@ class BayesFilter:
         return Update(posterior, seen.innovation, seen.form, count, healthy, usable, at_prior, seen.columns, root)
 
     filter = filter_sequence
+    filter_events = filter_events
     smooth = smooth
 
     def goes_on_with_roots(self, belief: Gaussian) -> bool:
