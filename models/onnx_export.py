@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import onnx
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file
@@ -20,6 +19,7 @@ from torch import Tensor, nn
 from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.files import atomic_path, atomic_write_text, make_folder
 from sigmaslam.filters.onnx.exportable_se3 import exp_se3
+from sigmaslam.filters.onnx.graph_file import strip_origins
 from sigmaslam.filters.onnx.pose_prediction import STATE_SIZE, Predict
 from sigmaslam.filters.onnx.stereo_window import StereoTransfer
 from sigmaslam.inference.onnx_graph import OnnxGraph
@@ -292,17 +292,6 @@ def _export(
                 f"{out.name} differs from torch by {difference:.2e}, more than {tolerance:.0e}: not written"
             )
     return difference
-
-
-def strip_origins(path: Path) -> None:
-    """Takes out of a graph where in whose source each node came from: paths of a machine, and half of the file."""
-    model = onnx.load(path)
-    for function in (model.graph, *model.functions):
-        for node in function.node:
-            del node.metadata_props[:]
-            node.doc_string = ""
-    del model.graph.metadata_props[:]
-    onnx.save(model, path)
 
 
 def _relative_difference(actual: list[np.ndarray], expected: list[np.ndarray]) -> float:
