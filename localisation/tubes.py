@@ -1,0 +1,65 @@
+"""Recordings in the form of "Lost in the Woods" (Barfoot): a MATLAB file of one robot with a laser among tubes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sigmaslam.errors import InputError
+from sigmaslam.localisation.recording import PlanarTruth, Recording
+
+
+def read_tubes(path: Path, largest_range: float | None = None) -> Recording:
+    """The robot's odometry and its laser's sightings of tubes.
+
+    Args:
+        path: the .mat file.
+        largest_range: leaves out sightings from further away, metres.
+    Raises:
+        InputError: the file cannot be read, or misses a variable.
+    """
+    file = read_mat(path, ("t", "l", "r", "b", "d", "v", "om"))
+    seconds = file["t"].ravel()
+    ranges, bearings = file["r"], file["b"]
+    seen = ranges > 0
+    if largest_range is not None:
+        seen &= ranges <= largest_range
+    step, landmark = np.nonzero(seen)
+    truth = None
+    if {"x_true", "y_true", "th_true", "true_valid"} <= file.keys():
+        valid = file["true_valid"].ravel() == 1
+        poses = np.column_stack([file[key].ravel()[valid] for key in ("x_true", "y_true", "th_true")])
+        poses[:, 2] = np.unwrap(poses[:, 2])
+        truth = PlanarTruth(seconds[valid], poses, 1.5 * float(np.median(np.diff(seconds))))
+    return Recording(
+        path.stem,
+        seconds,
+        np.column_stack([file["v"].ravel(), file["om"].ravel()]),
+        seconds[step],
+        landmark,
+        np.column_stack([ranges[seen], bearings[seen]]),
+        "range-bearing",
+        file["l"],
+        float(file["d"].ravel()[0]),
+        truth,
+    )
+
+
+def read_mat(path: Path, required: tuple[str, ...]) -> dict[str, Any]:
+    """The variables of a MATLAB file, in double precision.
+
+    Raises:
+        InputError: it cannot be read, or misses a variable.
+    """
+    from scipy.io import loadmat  # the only use of scipy.io here
+
+    try:
+        file = loadmat(path)
+    except (OSError, ValueError, NotImplementedError) as error:
+        raise InputError(f"{path}: is no MATLAB file that can be read ({error}): save it with -v7") from error
+    missing = [name for name in required if name not in file]
+    if missing:
+        raise InputError(f"{path}: misses the variable {missing[0]}: another --format may fit")
+    return {name: np.asarray(value, dtype=float) for name, value in file.items() if not name.startswith("__")}
