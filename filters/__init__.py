@@ -9,7 +9,7 @@ from sigmaslam.filters.inference import Observation, PointEstimate, maximum_a_po
 from sigmaslam.filters.layout import stack
 from sigmaslam.filters.lie_groups import wrap_angle
 from sigmaslam.filters.manifolds import SE2, SE3, SO2, SO3, Euclidean, Manifold, Product
-from sigmaslam.filters.models import LinearMeasurement, LinearMotion, MeasurementModel, MotionModel
+from sigmaslam.filters.models import LinearMeasurement, LinearMotion, MeasurementModel, MotionModel, several
 from sigmaslam.filters.noise_covariance import BlockDiagonal, Dense, Diagonal
 from sigmaslam.filters.onnx.step import ExportError, StepExample, export_step
 from sigmaslam.filters.results import TimeUpdate, Update
@@ -53,6 +53,7 @@ __all__ = [
     "maximum_a_posteriori",
     "maximum_likelihood",
     "merwe",
+    "several",
     "stack",
     "wrap_angle",
 ]

@@ -14,6 +14,7 @@ from sigmaslam.filters.gaussian_belief import Gaussian
 from sigmaslam.filters.linalg.square_roots import apply, multiply, solve_lower_transposed, square, triangularise
 from sigmaslam.filters.models import AnyMeasurement, AnyMotion
 from sigmaslam.filters.results import TimeUpdate, Update
+from sigmaslam.filters.robust import Robust
 from sigmaslam.filters.tensors import require_tensor
 
 if TYPE_CHECKING:
@@ -52,6 +53,9 @@ def filter_sequence(
     values: Tensor,
     motion_inputs: Sequence[Tensor] = (),
     measurement_inputs: Sequence[Tensor] = (),
+    *,
+    gate: float | None = None,
+    robust: Robust | None = None,
 ) -> Track:
     """Update, predict, update, ...: T measurements and the T - 1 motions between them.
 
@@ -64,6 +68,7 @@ def filter_sequence(
         values: (T, ..., m); NaN for what is missing.
         motion_inputs: (T - 1, ...) each: element k moves step k to k + 1.
         measurement_inputs: (T, ...) each.
+        gate, robust: as `update`.
     Raises:
         FilterError: as `predict` and `update`; the message begins with the step.
         ValueError: lengths do not fit.
@@ -88,7 +93,8 @@ def filter_sequence(
                 moved = bayes.predict(updates[-1].belief, motion, *(given[k - 1] for given in motion_inputs))
                 predictions.append(moved)
                 predicted.append(moved.belief)
-            seen = bayes.update(predicted[-1], measurement, values[k], *(given[k] for given in measurement_inputs))
+            inputs = [given[k] for given in measurement_inputs]
+            seen = bayes.update(predicted[-1], measurement, values[k], *inputs, gate=gate, robust=robust)
         except FilterError as error:
             raise FilterError(f"step {k} of {steps}: {error}") from error
         updates.append(seen)

@@ -23,6 +23,7 @@ from sigmaslam.filters.onnx.graph_file import strip_origins
 from sigmaslam.filters.onnx.pose_prediction import STATE_SIZE, Predict
 from sigmaslam.filters.onnx.stereo_window import StereoTransfer
 from sigmaslam.inference.onnx_graph import OnnxGraph
+from sigmaslam.inference.weight_manifest import check_weights, update_manifest
 from sigmaslam.models.extractor import EXTRACTOR_SIZE_MULTIPLE, FeatureExtractor
 from sigmaslam.models.feature_network import DESCRIPTOR_SIZE, STRIDE, FeatureNetwork
 from sigmaslam.models.model_card import card_page, read_card, scoring_page
@@ -57,7 +58,7 @@ def load_network(weights: Path, descriptor_size: int = DESCRIPTOR_SIZE, stride: 
         weights: safetensors file.
         descriptor_size, stride: of the network that was trained.
     Raises:
-        InputError: the file is missing or holds another network.
+        InputError: the file is missing, not the one that its manifest names, or holds another network.
     """
     return _load(FeatureNetwork(descriptor_size, stride), weights)
 
@@ -96,6 +97,7 @@ def export_scoring(run: Path, out: Path) -> dict[str, float]:
             path.write_bytes(copied)
     atomic_write_text(out / "matching.json", json.dumps(content, indent=2) + "\n")
     atomic_write_text(out / "matching.md", scoring_page(content))
+    update_manifest(out, [f"{name}{suffix}" for name in graphs for suffix in (".onnx", ".safetensors")])
     return differences
 
 
@@ -120,9 +122,11 @@ def export_features(weights: Path, out: Path) -> float:
 
 def export_filter(folder: Path) -> dict[str, float]:
     """Writes the two filter graphs and returns the largest difference of each from torch."""
-    return {
+    differences = {
         name: _export(graph, folder / f"{name}.onnx", _FILTER_TOLERANCE) for name, graph in _filter_graphs().items()
     }
+    update_manifest(folder, [f"{name}.onnx" for name in differences])
+    return differences
 
 
 def export_all(
@@ -148,12 +152,14 @@ def export_all(
         path.write_bytes(copied)
     atomic_write_text(out / "features.json", json.dumps(content, indent=2) + "\n")
     atomic_write_text(out / "features.md", card_page(content))
+    update_manifest(out, ["features.safetensors", "features.onnx"])
     return differences
 
 
 def _load(module: _Module, weights: Path) -> _Module:
     if not weights.is_file():
         raise InputError(f"{weights} does not exist: train first, or give the path of a .safetensors file")
+    check_weights(weights, weights.read_bytes())
     try:
         module.load_state_dict(load_file(weights))
     except (RuntimeError, ValueError, SafetensorError) as error:

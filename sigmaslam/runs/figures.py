@@ -1,19 +1,22 @@
 """Figures shared by the evaluation and the report; matplotlib through its object interface only."""
 
+from __future__ import annotations
+
 import io
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from sigmaslam.files import atomic_path
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.plot_style import GREY, SERIES, style_axes
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 AXIS_NAMES = ("x", "y", "z")
 
@@ -98,6 +101,8 @@ def to_svg(figure: Figure, name: str, dots_per_inch: int = 100) -> str:
         name: unique among the figures of one page, as it makes their identifiers unique.
         dots_per_inch: of rasterised artists.
     """
+    import matplotlib
+
     target = io.StringIO()
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
         figure.savefig(

@@ -1,26 +1,39 @@
 """The report of a run: one HTML file without links to anything outside it."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jinja2
 import numpy as np
 from markupsafe import Markup
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
+from sigmaslam.bounded_files import TABLE_BYTES, check_columns, load_arrays, read_text, shorten
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text, printable
 from sigmaslam.geometry.trajectory import Trajectory
-from sigmaslam.plot_style import BLUE, GREEN, GREY, PURPLE, SERIES, VERMILLION, style_axes
+from sigmaslam.plot_style import (
+    BLUE,
+    GREEN,
+    GREY,
+    NO_MATPLOTLIB,
+    PURPLE,
+    SERIES,
+    VERMILLION,
+    has_matplotlib,
+    style_axes,
+)
 from sigmaslam.readers.trajectory_files import read_tum
 from sigmaslam.runs.figures import plot_trajectory, to_svg
 from sigmaslam.runs.frame_table import FRAMES_NAME, STATUSES, FrameTable, predicted_poses, read_frames
 from sigmaslam.runs.real_time import format_latency
 from sigmaslam.runs.run_folder import FINAL_TRAJECTORY
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 STATUS_COLOURS = {"lost": VERMILLION, "relocalised": PURPLE, "skipped": GREY}
 
@@ -35,7 +48,8 @@ MAX_CONFIGURATION = 20_000
 def write_report(run_dir: str | Path) -> Path:
     """Write `report.html` from the files of a run folder.
 
-    Reads frames.csv, and trajectory.tum, trajectory_final.tum, map.npz and run.json if they exist.
+    Reads frames.csv, and trajectory.tum, trajectory_final.tum, map.npz and run.json if they exist. Without
+    matplotlib the report says how to install it in place of the figures.
 
     Returns:
         The path of the report.
@@ -55,13 +69,15 @@ def write_report(run_dir: str | Path) -> Path:
     )
     summary = run.get("summary")
     summary = summary if isinstance(summary, dict) else {}
+    draws = has_matplotlib()
     text = environment.get_template("report.html").render(
         name=printable(run_dir.resolve().name),
         facts=[*_facts(trajectory, frames, points), *_real_time_facts(run)],
         statuses=[(status, frames.status.count(status)) for status in STATUSES],
         failure=summary.get("failure"),
         verdict=summary.get("calibration_verdict"),
-        figures=_figures(trajectory, _read_final(run_dir / FINAL_TRAJECTORY), frames, points),
+        figures=_figures(trajectory, _read_final(run_dir / FINAL_TRAJECTORY), frames, points) if draws else [],
+        no_figures=None if draws else NO_MATPLOTLIB,
         configuration=configuration if run else None,
     )
     path = run_dir / "report.html"
@@ -83,23 +99,19 @@ def _read_points(path: Path) -> np.ndarray | None:
     """Map points (M, 3), or None if the run has no map."""
     if not path.is_file():
         return None
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            points = np.asarray(archive["points"], dtype=np.float64)
-    except (OSError, ValueError, KeyError, EOFError, TypeError) as error:
-        raise InputError(f"{path}: holds no array `points` ({error}); run `sigmaslam track` again") from error
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"{path}: points must be (M, 3), not {points.shape}; run `sigmaslam track` again")
-    return points
+    mend = "run `sigmaslam track` again"
+    arrays = load_arrays(path, mend, ("points",))
+    check_columns(path, arrays, {"points": ("M", 3)}, {}, mend)
+    return arrays["points"].astype(np.float64)
 
 
 def _read_run(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        run = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: is no JSON ({error}); run `sigmaslam track` again") from error
+        run = json.loads(read_text(path, TABLE_BYTES, "the run"))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: is no JSON ({shorten(str(error))}); run `sigmaslam track` again") from error
     return run if isinstance(run, dict) else {}
 
 
@@ -149,6 +161,8 @@ def _figures(
     trajectory: Trajectory, final: dict[str, Trajectory], frames: FrameTable, points: np.ndarray | None
 ) -> list[tuple[str, str, Markup]]:
     """Title, caption and SVG of each figure that has data."""
+    from matplotlib.figure import Figure
+
     figures = []
     if len(trajectory):
         figure = Figure(figsize=(8, 5.5), layout="constrained")
@@ -207,6 +221,8 @@ def _draw_inliers(axes: Axes, frames: FrameTable) -> bool:
 
 
 def _draw_nis(axes: Axes, frames: FrameTable) -> bool:
+    from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
+
     ratio = _nis_per_dof(frames)
     ratio = np.where(ratio > 0, ratio, np.nan)
     if not np.isfinite(ratio).any():

@@ -10,6 +10,7 @@ from safetensors.torch import save_file
 
 from sigmaslam.errors import InputError
 from sigmaslam.inference.onnx_graph import OnnxGraph, shipped_weights
+from sigmaslam.inference.weight_manifest import read_manifest
 from sigmaslam.models import onnx_export
 from sigmaslam.models.extractor import FeatureExtractor
 from sigmaslam.models.feature_network import FeatureNetwork
@@ -154,7 +155,10 @@ def test_scorer_and_verifiers_of_a_run_are_exported_with_their_card(tmp_path):
     assert set(differences) == set(networks)
     assert max(differences.values()) <= 1e-4
     files = [f"{name}.{kind}" for name in networks for kind in ("onnx", "safetensors")]
-    assert {path.name for path in out.iterdir()} == {*files, "matching.json", "matching.md"}
+    assert {path.name for path in out.iterdir()} == {*files, "matching.json", "matching.md", "manifest.json"}
+    assert set(read_manifest(out / "manifest.json")) == set(files)
+    for name in networks:
+        OnnxGraph(out / f"{name}.onnx")
     for name in networks:
         assert (out / f"{name}.safetensors").read_bytes() == (run / f"{name}.safetensors").read_bytes()
     card = json.loads((out / "matching.json").read_text())
