@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
@@ -18,9 +18,10 @@ from sigmaslam.filters import (
     MeasurementModel,
     MotionModel,
     UnscentedKalmanFilter,
+    Update,
+    several,
 )
 from sigmaslam.filters.manifolds import Space
-from sigmaslam.filters.models import several
 from sigmaslam.localisation.sighting_noise import STUDENT_DOF, NoiseScale, repetition
 from sigmaslam.localisation.steps import Steps
 
@@ -126,11 +127,12 @@ def localise(
         if anything[k]:
             there, inputs = present[k], (value[k].flatten(-2), position[k])
             expected = torch.where(there[..., None], nominal[k] * noise.scale[:, None], 1.0)
-            sighted = _compare(bayes, belief, see, expected, inputs, there)
-            used = expected * (growth[k] / sighted.weight)[..., None]
-            belief = bayes.update(belief, replace(see, noise=Diagonal(used.flatten(-2))), *inputs).belief
+            noisy = replace(see, noise=Diagonal((expected * growth[k, ..., None]).flatten(-2)))
+            updated = bayes.update(belief, noisy, *inputs, robust="student_t")
+            belief = updated.belief
+            sighted = _compare(updated, expected, growth[k], there)
             log_likelihood += torch.where(there, _log_student(sighted, m) / growth[k], 0.0).sum(dim=-1)
-            predicted = torch.diagonal(sighted.covariance, dim1=-2, dim2=-1) - expected
+            predicted = (torch.diagonal(sighted.covariance, dim1=-2, dim2=-1) - expected).clamp_min(0.0)
             noise = noise.learn(sighted.innovation, predicted, expected, sighted.weight / growth[k], there)
             nis[k] = torch.where(there, sighted.distance, torch.nan)
             innovation[k] = torch.where(there[..., None], sighted.innovation, torch.nan)
@@ -150,23 +152,17 @@ def localise(
     )
 
 
-def _compare(
-    bayes: BayesFilter,
-    belief: Gaussian,
-    see: MeasurementModel,
-    variance: Tensor,
-    inputs: Sequence[Tensor],
-    there: Tensor,
-) -> _Sighted:
-    """Each sighting's innovation and what Student's t makes of it."""
-    look = bayes.update(belief, replace(see, noise=Diagonal(variance.flatten(-2))), *inputs)
-    L, m = variance.shape[-2:]
-    innovation = look.innovation.unflatten(-1, (L, m))
-    full = look.innovation_covariance.unflatten(-1, (L, m)).unflatten(-3, (L, m))
-    covariance = torch.diagonal(full, dim1=-4, dim2=-2).movedim(-1, -3)
+def _compare(updated: Update, expected: Tensor, growth: Tensor, there: Tensor) -> _Sighted:
+    """What an update says of each sighting, with the variance (B, L, m) that it would have if it were new."""
+    L, m = expected.shape[-2:]
+    assert updated.weight is not None
+    weight = torch.where(there, updated.weight, 1.0)
+    innovation = updated.innovation.unflatten(-1, (L, m))
+    blocks = updated.innovation_covariance.unflatten(-1, (L, m)).unflatten(-3, (L, m))
+    used = torch.diag_embed(expected * (growth / weight)[..., None])
+    covariance = torch.diagonal(blocks, dim1=-4, dim2=-2).movedim(-1, -3) - used + torch.diag_embed(expected)
     distance = (innovation * torch.linalg.solve(covariance, innovation)).sum(dim=-1)
-    weight = ((STUDENT_DOF + m) / (STUDENT_DOF + distance)).clamp_max(1.0)
-    return _Sighted(innovation, covariance, distance, torch.where(there, weight, 1.0))
+    return _Sighted(innovation, covariance, distance, weight)
 
 
 def _log_student(sighted: _Sighted, components: int) -> Tensor:
