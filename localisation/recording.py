@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -60,3 +60,11 @@ class Recording:
     landmarks: np.ndarray
     lever: float = 0.0
     truth: PlanarTruth | None = None
+
+    def within(self, largest_range: float) -> Recording:
+        """The recording without sightings from further away, metres."""
+        distance = self.sightings[:, 0] if self.kind == "range-bearing" else np.hypot(*self.sightings.T)
+        near = distance <= largest_range
+        return replace(
+            self, seconds=self.seconds[near], landmark=self.landmark[near], sightings=self.sightings[near]
+        )

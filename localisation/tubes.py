@@ -11,12 +11,9 @@ from sigmaslam.errors import InputError
 from sigmaslam.localisation.recording import PlanarTruth, Recording
 
 
-def read_tubes(path: Path, largest_range: float | None = None) -> Recording:
+def read_tubes(path: Path) -> Recording:
     """The robot's odometry and its laser's sightings of tubes.
 
-    Args:
-        path: the .mat file.
-        largest_range: leaves out sightings from further away, metres.
     Raises:
         InputError: the file cannot be read, or misses a variable.
     """
@@ -24,8 +21,6 @@ def read_tubes(path: Path, largest_range: float | None = None) -> Recording:
     seconds = file["t"].ravel()
     ranges, bearings = file["r"], file["b"]
     seen = ranges > 0
-    if largest_range is not None:
-        seen &= ranges <= largest_range
     step, landmark = np.nonzero(seen)
     truth = None
     if {"x_true", "y_true", "th_true", "true_valid"} <= file.keys():
