@@ -67,7 +67,7 @@ def write_trajectories(path: Path, estimates: Sequence[RobotEstimate]) -> None:
             for second, numbers, seen in zip(estimate.seconds, table, count, strict=True):
                 yield f"{estimate.name},{second:.6f},{','.join(f'{number:.9g}' for number in numbers)},{seen}"
 
-    _write_lines(path, lines())
+    write_lines(path, lines())
 
 
 def _write_innovations(path: Path, estimates: Sequence[RobotEstimate]) -> None:
@@ -84,9 +84,10 @@ def _write_innovations(path: Path, estimates: Sequence[RobotEstimate]) -> None:
                     f"{','.join(f'{number:.6g}' for number in numbers)}"
                 )
 
-    _write_lines(path, lines())
+    write_lines(path, lines())
 
 
-def _write_lines(path: Path, lines: Iterable[str]) -> None:
+def write_lines(path: Path, lines: Iterable[str]) -> None:
+    """Write lines of text, whole or not at all."""
     with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.writelines(f"{line}\n" for line in lines)

@@ -89,12 +89,12 @@ def _steps(recording: Recording, delay: float) -> Steps:
         seconds = np.insert(seconds, 0, start)
     path = _integrated(recording, delay, seconds)
     step = np.maximum(np.searchsorted(seconds, times, side="right") - 2, 0)
-    slot = _slots(step)
+    slot = slots(step)
     shape = (len(seconds) - 1, int(slot.max(initial=0)) + 1)
     value = np.full((*shape, sightings.shape[1]), np.nan)
     index = np.zeros(shape, int)
     since = np.full(shape, np.inf)
-    value[step, slot], index[step, slot], since[step, slot] = sightings, landmark, _since(times, landmark)
+    value[step, slot], index[step, slot], since[step, slot] = sightings, landmark, since_before(times, landmark)
     return Steps(
         np.array([len(path)]),
         seconds[:, None],
@@ -128,13 +128,13 @@ def _integrated(recording: Recording, delay: float, seconds: np.ndarray) -> np.n
     return np.diff(np.stack([np.interp(seconds, edges, column) for column in total.T], axis=1), axis=0)
 
 
-def _slots(step: np.ndarray) -> np.ndarray:
+def slots(step: np.ndarray) -> np.ndarray:
     """Place (S,) of each sighting among those of its step; steps are in order."""
     first = np.searchsorted(step, step, side="left")
     return np.arange(len(step)) - first
 
 
-def _since(seconds: np.ndarray, landmark: np.ndarray) -> np.ndarray:
+def since_before(seconds: np.ndarray, landmark: np.ndarray) -> np.ndarray:
     """Seconds (S,) since the sighting before of the same landmark."""
     since = np.full(len(seconds), np.inf)
     order = np.lexsort((np.arange(len(seconds)), landmark))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -53,7 +54,7 @@ def localize(
     report.html. Noise, delay and systematic errors are found from the recording's innovations, not from its truth.
     """
     need_train_extra()
-    from sigmaslam.localisation.formats import detect_format, read_recordings
+    from sigmaslam.localisation.formats import detect_format
 
     check_new_folder(out)
     first_pose = None if start is None else _parse_pose(start)
@@ -62,17 +63,48 @@ def localize(
     kind = detect_format(path) if format is RecordingFormat.auto else format.value
     settings = {"source": str(path), "format": kind, "filter": filter.value, "max_range": max_range, "start": start}
     with Console(stderr=True).status("reading") as status:
-        from sigmaslam.localisation.output import write_robots
-        from sigmaslam.localisation.robots import localise_robots
-
-        recordings = read_recordings(path, kind, robot)
-        if max_range is not None:
-            recordings = [recording.within(max_range) for recording in recordings]
-        first, second = localise_robots(recordings, filter.value, first_pose, status.update)
-        make_folder(out)
-        summaries = write_robots(out, path.resolve().name, first, second, recordings[0].landmarks, settings)
+        if kind == "starry":
+            if robot is not None or first_pose is not None or max_range is not None:
+                raise InputError("--robot, --start and --max-range are for robots in the plane: leave them out here")
+            summaries = _localise_body(path, out, settings, status.update)
+        else:
+            summaries = _localise_robots(path, out, kind, robot, first_pose, max_range, settings, status.update)
     _print_summaries(summaries)
     typer.echo(f"Report: {out / 'report.html'}")
+
+
+def _localise_robots(
+    path: Path,
+    out: Path,
+    kind: str,
+    robot: int | None,
+    start: tuple[float, float, float] | None,
+    max_range: float | None,
+    settings: dict[str, Any],
+    tell: Callable[[str], None],
+) -> dict[str, dict[str, Any]]:
+    from sigmaslam.localisation.formats import read_recordings
+    from sigmaslam.localisation.output import write_robots
+    from sigmaslam.localisation.robots import localise_robots
+
+    recordings = read_recordings(path, kind, robot)
+    if max_range is not None:
+        recordings = [recording.within(max_range) for recording in recordings]
+    first, second = localise_robots(recordings, settings["filter"], start, tell)
+    make_folder(out)
+    return write_robots(out, path.resolve().name, first, second, recordings[0].landmarks, settings)
+
+
+def _localise_body(
+    path: Path, out: Path, settings: dict[str, Any], tell: Callable[[str], None]
+) -> dict[str, dict[str, Any]]:
+    from sigmaslam.localisation.body import localise_body, write_body
+    from sigmaslam.localisation.starry import read_starry
+
+    recording = read_starry(path)
+    estimate = localise_body(recording, settings["filter"], tell)
+    make_folder(out)
+    return write_body(out, recording, estimate, settings)
 
 
 def _parse_pose(text: str) -> tuple[float, float, float]:
@@ -83,13 +115,18 @@ def _parse_pose(text: str) -> tuple[float, float, float]:
     return x, y, heading
 
 
-_SHOWN = ("position_rmse", "heading_rmse", "rotation_rmse", "nees_median", "nees_mean", "sightings", "nis_per_dof")
+_SHOWN = ("position_rmse", "heading_rmse", "rotation_rmse", "nees_median", "nees_mean", "nis_per_dof", "delay")
 
 
 def _print_summaries(summaries: dict[str, dict[str, Any]]) -> None:
-    shown = [*(label for label in _SHOWN if any(label in each for each in summaries.values())), "delay"]
+    shown = [label for label in _SHOWN if any(label in each for each in summaries.values())]
     table = Table("", *(label.replace("_", " ") for label in shown))
     for name, summary in summaries.items():
-        cells = (summary.get(label) for label in shown)
-        table.add_row(name, *("–" if cell is None else f"{cell:.3g}" if isinstance(cell, float) else str(cell) for cell in cells))
+        table.add_row(name, *(_cell(summary.get(label)) for label in shown))
     Console(highlight=False).print(table)
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return "–"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
