@@ -13,12 +13,13 @@ import torch
 
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text
-from sigmaslam.filters import SO3, degree_of_belief
-from sigmaslam.localisation.localise import FilterName, localise, make_filter
+from sigmaslam.filters import SO3, Gaussian, degree_of_belief
+from sigmaslam.localisation.localise import FilterName, Localisation, localise, make_filter
 from sigmaslam.localisation.output import write_lines
 from sigmaslam.localisation.page import write_page
 from sigmaslam.localisation.starry import StereoRecording
-from sigmaslam.localisation.stereo_points import BODY, SPACE, StereoBody
+from sigmaslam.localisation.steps import Steps
+from sigmaslam.localisation.stereo_points import BODY, CONSTANTS, SPACE, StereoBody
 from sigmaslam.plot_style import BLUE, GREY, has_matplotlib, style_axes
 from sigmaslam.runs.figures import save_png
 
@@ -55,17 +56,28 @@ class BodyEstimate:
 
 def localise_body(
     recording: StereoRecording, filter_name: FilterName = "ukf", tell: Callable[[str], None] = lambda _: None
-) -> BodyEstimate:
-    """The body's poses, each from what was seen until then.
+) -> tuple[BodyEstimate, BodyEstimate]:
+    """The body's poses, in two passes as those of `localise_robots`: the second begins with the constants of the first.
 
     Raises:
         InputError: there is no true pose to start from.
     """
     if recording.truth is None:
         raise InputError(f"{recording.name}: has no true pose to start from: add theta_vk_i and r_i_vk_i")
-    body, steps = StereoBody(recording.rig), recording.steps
+    body, steps, bayes = StereoBody(recording.rig), recording.steps, make_filter(filter_name, SPACE)
     prior = body.prior(torch.from_numpy(recording.truth[:1]))
-    result = localise(make_filter(filter_name, SPACE), body, prior, steps, tell=lambda done: tell(f"{done:.0%}"))
+    first = localise(bayes, body, prior, steps, tell=lambda done: tell(f"first pass: {done:.0%}"))
+    mean, covariance_of_prior = prior.mean.clone(), prior.covariance.clone()
+    # A point has one number more than its tangent.
+    mean[:, CONSTANTS.start + 1 : CONSTANTS.stop + 1] = first.final.mean[:, CONSTANTS.start + 1 : CONSTANTS.stop + 1]
+    covariance_of_prior[:, CONSTANTS, CONSTANTS] = first.final.covariance[:, CONSTANTS, CONSTANTS]
+    prior = Gaussian(mean, covariance_of_prior)
+    scale = torch.from_numpy(first.scale[-1])
+    result = localise(bayes, body, prior, steps, scale, lambda done: tell(f"second pass: {done:.0%}"))
+    return _estimate(recording, steps, first), _estimate(recording, steps, result)
+
+
+def _estimate(recording: StereoRecording, steps: Steps, result: Localisation) -> BodyEstimate:
     covariance = result.covariance[:, 0, :6, :6]
     nis = result.nis[:, 0]
     return BodyEstimate(
@@ -89,6 +101,7 @@ def score_body(estimate: BodyEstimate) -> dict[str, float]:
         "nis_per_dof": float(estimate.nis[there].mean() / 4),
         "nis_per_dof_median": float(np.median(estimate.nis[there]) / 4),
         "outliers": float(np.mean(estimate.weight[there] < 0.5)),
+        **{f"noise_scale_{index}": float(value) for index, value in enumerate(estimate.scale)},
     }
     if estimate.truth is None:
         return scores
@@ -106,17 +119,23 @@ def score_body(estimate: BodyEstimate) -> dict[str, float]:
 
 
 def write_body(
-    folder: Path, recording: StereoRecording, estimate: BodyEstimate, settings: Mapping[str, Any]
+    folder: Path,
+    recording: StereoRecording,
+    first: BodyEstimate,
+    estimate: BodyEstimate,
+    settings: Mapping[str, Any],
 ) -> dict[str, dict[str, Any]]:
-    """Write trajectory.csv, run.json, map.png and report.html into a folder that is there.
+    """Write trajectory.csv, trajectory_first_pass.csv, run.json, map.png and report.html into a folder that is there.
 
     Returns:
         The summary by name, as in run.json.
     """
     write_lines(folder / "trajectory.csv", _lines(recording.name, estimate))
-    scale = {f"noise_scale_{index}": float(value) for index, value in enumerate(estimate.scale)}
-    summaries = {recording.name: {**score_body(estimate), **scale}}
-    atomic_write_text(folder / "run.json", json.dumps({**settings, "robots": summaries}, indent=2) + "\n")
+    write_lines(folder / "trajectory_first_pass.csv", _lines(recording.name, first))
+    summaries, at_first = ({recording.name: score_body(each)} for each in (estimate, first))
+    atomic_write_text(
+        folder / "run.json", json.dumps({**settings, "robots": summaries, "first_pass": at_first}, indent=2) + "\n"
+    )
     write_page(folder / "report.html", recording.name, summaries, _draw(recording, estimate, folder / "map.png"))
     return summaries
 

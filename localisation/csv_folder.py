@@ -30,7 +30,9 @@ def read_csv_folder(folder: Path) -> Recording:
     path = folder / "sightings.csv"
     kind = next((kind for kind, columns in KINDS.items() if columns == _header(path)[2:]), None)
     if kind is None:
-        raise InputError(f"{path}: the header is {','.join(_header(path))}, not time,landmark,range,bearing or ..,ahead,left")
+        raise InputError(
+            f"{path}: the header is {','.join(_header(path))}, not time,landmark,range,bearing or ..,ahead,left"
+        )
     seen, sightings = _read(path, ["time", "landmark", *KINDS[kind]], named=1)
     index = {name: place for place, name in enumerate(names)}
     unknown = sorted(set(seen) - set(index))

@@ -25,7 +25,7 @@ def detect_format(path: Path) -> str:
     elif path.suffix == ".mat" and path.is_file():
         return "starry" if "y_k_j" in read_mat(path, ()) else "tubes"
     raise InputError(
-        f"{path}: is no recording that is known: give a folder with Robot1_Measurement.dat, a folder with landmarks.csv,"
+        f"{path}: is no recording that is known: give a folder with Robot1_Measurement.dat or with landmarks.csv,"
         " or a .mat file of tubes or stereo points"
     )
 

@@ -1,4 +1,4 @@
-"""Recordings in the form of the UTIAS MRCLAM data: text files of five robots in a room of barcodes (Leung et al. 2011)."""
+"""Recordings in the form of the UTIAS MRCLAM data: robots in a room of barcodes (Leung et al. 2011)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,9 @@ def read_mrclam(folder: Path, robot: int) -> Recording:
     sightings = _read(folder, f"Robot{robot}_Measurement.dat", 4)
     index_of_subject = {int(subject): index for index, subject in enumerate(landmarks[:, 0])}
     index_of_barcode = {
-        int(barcode): index_of_subject[int(subject)] for subject, barcode in barcodes if int(subject) in index_of_subject
+        int(barcode): index_of_subject[int(subject)]
+        for subject, barcode in barcodes
+        if int(subject) in index_of_subject
     }
     landmark = np.array([index_of_barcode.get(int(barcode), -1) for barcode in sightings[:, 1]])
     # A camera in a dead cell says 0 m.

@@ -59,9 +59,7 @@ def write_page(
     atomic_write_text(path, text)
 
 
-def draw_robots(
-    estimates: Sequence[RobotEstimate], landmarks: np.ndarray, png: Path
-) -> list[tuple[str, str, Figure]]:
+def draw_robots(estimates: Sequence[RobotEstimate], landmarks: np.ndarray, png: Path) -> list[tuple[str, str, Figure]]:
     """The map, also as a PNG, and innovations over time; nothing without matplotlib."""
     if not has_matplotlib():
         return []

@@ -65,6 +65,4 @@ class Recording:
         """The recording without sightings from further away, metres."""
         distance = self.sightings[:, 0] if self.kind == "range-bearing" else np.hypot(*self.sightings.T)
         near = distance <= largest_range
-        return replace(
-            self, seconds=self.seconds[near], landmark=self.landmark[near], sightings=self.sightings[near]
-        )
+        return replace(self, seconds=self.seconds[near], landmark=self.landmark[near], sightings=self.sightings[near])

@@ -63,9 +63,9 @@ def localise_robots(
 ) -> tuple[list[RobotEstimate], list[RobotEstimate]]:
     """Estimates of each robot: of the first pass, and of the second.
 
-    The first pass filters each robot under every one of `DELAYS` and keeps the most likely. Its poses depend on what was
-    seen until then alone, but for that choice. The second begins with the constants and the noise that the first ended
-    with, so its poses depend on the whole recording through these few numbers.
+    The first pass filters each robot under every one of `DELAYS` and keeps the most likely. Its poses depend on what
+    was seen until then alone, but for that choice. The second begins with the constants and the noise that the first
+    ended with, so its poses depend on the whole recording through these few numbers.
 
     Args:
         recordings: of robots of one kind.
@@ -94,9 +94,7 @@ def localise_robots(
     return at_first, _estimates(recordings, delays, steps, second, np.arange(len(recordings)))
 
 
-def _starts(
-    recordings: Sequence[Recording], seconds: np.ndarray, start: tuple[float, float, float] | None
-) -> Tensor:
+def _starts(recordings: Sequence[Recording], seconds: np.ndarray, start: tuple[float, float, float] | None) -> Tensor:
     if start is not None:
         return torch.tensor(start, dtype=torch.float64).expand(len(recordings), 3)
     poses = []

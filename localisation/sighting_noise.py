@@ -38,7 +38,9 @@ class NoiseScale:
 
     scale: Tensor
 
-    def learn(self, innovation: Tensor, predicted: Tensor, nominal: Tensor, share: Tensor, present: Tensor) -> NoiseScale:
+    def learn(
+        self, innovation: Tensor, predicted: Tensor, nominal: Tensor, share: Tensor, present: Tensor
+    ) -> NoiseScale:
         """The scale after some sightings: what innovations have beyond the belief's part is the noise's.
 
         Args:

@@ -10,8 +10,8 @@ import torch
 
 from sigmaslam.errors import InputError
 from sigmaslam.filters import SO3
-from sigmaslam.localisation.stereo_points import StereoRig
 from sigmaslam.localisation.steps import Steps, since_before, slots
+from sigmaslam.localisation.stereo_points import StereoRig
 from sigmaslam.localisation.tubes import read_mat
 
 VARIABLES = ("t", "w_vk_vk_i", "v_vk_vk_i", "rho_i_pj_i", "y_k_j", "C_c_v", "rho_v_c_v", "fu", "fv", "cu", "cv", "b")

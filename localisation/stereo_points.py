@@ -6,10 +6,11 @@ estimates on the way:
 | component | unit | what it is |
 |---|---|---|
 | speed offset (3), turn offset (3) | m/s, rad/s | what the sensors of motion say of a body at rest; constant |
-| camera turn (3) | rad | the camera's rotation beside the one that calibration gives it; a first-order Markov process |
+| turn scale (3) | 1 | relative error of the turn rates; constant |
+| camera turn (3) | rad | the camera's rotation beside the calibrated one; a first-order Markov process |
 
-The camera's turn shifts all points of a frame alike: errors of mounting, of time and of calibration. A filter that takes
-them for independent noise of each point averages what does not average out.
+The camera's turn shifts all points of a frame alike: errors of mounting, of time and of calibration. A filter that
+takes them for independent noise of each point averages what does not average out.
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ from sigmaslam.filters.layout import concatenate
 from sigmaslam.filters.lie_groups import exp_so3, matrix_from_quaternion
 
 BODY = SE3("right")
-SPACE = Product(BODY, Euclidean(9))
+SPACE = Product(BODY, Euclidean(12))
+CONSTANTS = slice(6, 15)
+"""Of the tangent: offsets and scales, which a second pass begins with."""
 NEAREST = 0.05
 """Metres. A sigma point's depth is no less, so that what it sees is finite."""
 
@@ -56,8 +59,9 @@ class StereoNoise:
     Attributes:
         start: of the first pose: metres, radians.
         offsets: of speed and turn rate: m/s, rad/s.
-        velocity: of the speed per step: m/s and per second^1/2 of it.
-        turn_rate: likewise, rad/s.
+        turn_scale: of the turn rates' scale.
+        velocity: of the speed during a step, m/s, anew in each.
+        turn_rate: of the turn rate, rad/s, likewise.
         camera_turn: rad.
         camera_seconds: time constant of the camera's turn.
         pixels: of a point's columns and rows.
@@ -65,6 +69,7 @@ class StereoNoise:
 
     start: tuple[float, float] = (0.01, 0.01)
     offsets: tuple[float, float] = (0.02, 0.02)
+    turn_scale: float = 0.1
     velocity: float = 0.05
     turn_rate: float = 0.1
     camera_turn: float = 0.02
@@ -87,9 +92,9 @@ class StereoBody:
     def prior(self, start: Tensor) -> Gaussian:
         """The belief at the first pose (..., 7), a translation and a quaternion."""
         noise = self.noise
-        sizes = zip((*noise.start, *noise.offsets, noise.camera_turn), [3] * 5, strict=True)
-        deviations = start.new_tensor([size for size, count in sizes for _ in range(count)])
-        mean = torch.nn.functional.pad(start, (0, 9))
+        sizes = (*noise.start, *noise.offsets, noise.turn_scale, noise.camera_turn)
+        deviations = start.new_tensor(sizes).repeat_interleave(3)
+        mean = torch.nn.functional.pad(start, (0, 12))
         return Gaussian(mean, torch.diag(deviations.square()).expand(*start.shape[:-1], -1, -1))
 
     def motion(self, path: Tensor, duration: Tensor) -> MotionModel:
@@ -110,20 +115,21 @@ class StereoBody:
         return torch.full_like(value, self.noise.pixels**2)
 
     def _move(self, state: Tensor, noise: Tensor, path: Tensor, duration: Tensor) -> Tensor:
-        step = path + duration * state[..., 7:13] + noise[..., :6]
+        driven = path[..., :3] + duration * state[..., 7:10] + noise[..., :3]
+        turned = path[..., 3:] * (1.0 + state[..., 13:16]) + duration * state[..., 10:13] + noise[..., 3:6]
         # The path is a translation, then a rotation, as the sensors' rates are integrated.
-        still = torch.zeros_like(step[..., :3])
-        moved = BODY.retract(state[..., :7], torch.cat([step[..., :3], still], dim=-1))
-        moved = BODY.retract(moved, torch.cat([still, step[..., 3:]], dim=-1))
-        turn = state[..., 13:] * torch.exp(-duration / self.noise.camera_seconds) + noise[..., 6:]
-        return concatenate([moved, state[..., 7:13], turn])
+        still = torch.zeros_like(driven)
+        moved = BODY.retract(state[..., :7], torch.cat([driven, still], dim=-1))
+        moved = BODY.retract(moved, torch.cat([still, turned], dim=-1))
+        turn = state[..., 16:] * torch.exp(-duration / self.noise.camera_seconds) + noise[..., 6:]
+        return concatenate([moved, state[..., 7:16], turn])
 
     def _project(self, state: Tensor, point: Tensor) -> Tensor:
         rig = self.rig
         R_world_body = BODY.to_matrix(state[..., :7])[..., :3, :3]
         in_body = (R_world_body.mT @ (point - state[..., :3])[..., None])[..., 0] - rig.camera_in_body
         in_camera = (rig.R_camera_body @ in_body[..., None])[..., 0]
-        turn = matrix_from_quaternion(exp_so3(tuple(state[..., 13:].unbind(-1))))
+        turn = matrix_from_quaternion(exp_so3((state[..., 16], state[..., 17], state[..., 18])))
         x, y, z = (turn @ in_camera[..., None])[..., 0].unbind(-1)
         inverse = 1.0 / z.clamp_min(NEAREST)
         row = rig.fy * y * inverse + rig.cy

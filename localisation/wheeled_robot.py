@@ -18,7 +18,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sigmaslam.filters import SE2, Diagonal, Euclidean, Gaussian, MeasurementModel, MotionModel, Product, stack, wrap_angle
+from sigmaslam.filters import (
+    SE2,
+    Diagonal,
+    Euclidean,
+    Gaussian,
+    MeasurementModel,
+    MotionModel,
+    Product,
+    stack,
+    wrap_angle,
+)
 from sigmaslam.localisation.recording import Recording
 
 BODY = SE2("right")
@@ -95,8 +105,7 @@ class WheeledRobot:
         constant, share = self.noise.distance
         if self.kind == "cartesian":
             squared = value.square().sum(dim=-1, keepdim=True)
-            along = (constant**2 + share**2 * squared).expand_as(value)
-            return along
+            return (constant**2 + share**2 * squared).expand_as(value)
         distance = constant**2 + (share * value[..., 0]) ** 2
         return torch.stack([distance, torch.full_like(distance, self.noise.bearing**2)], dim=-1)
 

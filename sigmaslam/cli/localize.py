@@ -102,9 +102,9 @@ def _localise_body(
     from sigmaslam.localisation.starry import read_starry
 
     recording = read_starry(path)
-    estimate = localise_body(recording, settings["filter"], tell)
+    first, second = localise_body(recording, settings["filter"], tell)
     make_folder(out)
-    return write_body(out, recording, estimate, settings)
+    return write_body(out, recording, first, second, settings)
 
 
 def _parse_pose(text: str) -> tuple[float, float, float]:

@@ -48,7 +48,8 @@ def test_sightings_stand_at_the_end_of_their_step():
 def test_what_is_seen_at_the_start_is_not_lost():
     steps = make_steps([recording(seconds=(0.0, 0.9), landmark=(0, 1))], [0.0])
     assert np.isfinite(steps.value[..., 0]).sum() == 2
-    assert steps.duration[0, 0] == 0 and np.isfinite(steps.value[0, 0, 0]).all()
+    assert steps.duration[0, 0] == 0
+    assert np.isfinite(steps.value[0, 0, 0]).all()
 
 
 def test_a_batch_holds_what_its_robots_hold_alone():

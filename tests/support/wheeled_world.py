@@ -41,7 +41,9 @@ def drive(world: World) -> Recording:
     step = 0.02
     times = np.arange(0.0, world.seconds, step)
     controls = np.column_stack([0.3 + 0.1 * np.sin(0.5 * times), 0.2 + 0.3 * np.sin(0.3 * times)])
-    obeyed = np.where(times[:, None] >= world.delay, controls[np.searchsorted(times, times - world.delay + 1e-9) - 1], 0)
+    obeyed = np.where(
+        times[:, None] >= world.delay, controls[np.searchsorted(times, times - world.delay + 1e-9) - 1], 0
+    )
     poses = np.zeros((len(times) + 1, 3))
     poses[0] = [2.0, 1.0, 0.0]
     for k, (speed, turn) in enumerate(obeyed):
