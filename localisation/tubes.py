@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.io import loadmat
+from scipy.io.matlab import MatReadError
 
 from sigmaslam.errors import InputError
 from sigmaslam.localisation.recording import PlanarTruth, Recording
@@ -48,13 +50,14 @@ def read_mat(path: Path, required: tuple[str, ...]) -> dict[str, Any]:
     Raises:
         InputError: it cannot be read, or misses a variable.
     """
-    from scipy.io import loadmat  # the only use of scipy.io here
-
     try:
         file = loadmat(path)
-    except (OSError, ValueError, NotImplementedError) as error:
+    except (OSError, ValueError, NotImplementedError, MatReadError) as error:
         raise InputError(f"{path}: is no MATLAB file that can be read ({error}): save it with -v7") from error
     missing = [name for name in required if name not in file]
     if missing:
         raise InputError(f"{path}: misses the variable {missing[0]}: another --format may fit")
-    return {name: np.asarray(value, dtype=float) for name, value in file.items() if not name.startswith("__")}
+    numbers = {
+        name: value for name, value in file.items() if isinstance(value, np.ndarray) and value.dtype.kind in "biuf"
+    }
+    return {name: value.astype(float) for name, value in numbers.items()}

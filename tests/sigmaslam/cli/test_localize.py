@@ -10,7 +10,7 @@ from tests.support.commands import assert_refused, run_here
 
 pytest.importorskip("torch")
 
-from tests.support.wheeled_world import World, drive, write_csv_folder  # noqa: E402 - needs torch
+from tests.support.wheeled_world import World, drive, write_csv_folder
 
 pytestmark = [pytest.mark.usefixtures("one_thread"), pytest.mark.timeout(300)]
 
