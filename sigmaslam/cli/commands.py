@@ -18,6 +18,7 @@ from sigmaslam.cli.evaluate import evaluate
 from sigmaslam.cli.export import export
 from sigmaslam.cli.finish import finish
 from sigmaslam.cli.geometry import geometry
+from sigmaslam.cli.localize import localize
 from sigmaslam.cli.match import match
 from sigmaslam.cli.refine import refine
 from sigmaslam.cli.render import render
@@ -53,6 +54,7 @@ for _command, _line in (
     (finish, "Make the results of a run that was killed."),
     (evaluate, "Compare a trajectory with the truth."),
     (refine, "Adjust all of a run at once (extra 'graph')."),
+    (localize, "Localise robots among known landmarks (extra 'train')."),
     (match, "Match two images."),
     (geometry, "Find how two views lie to each other."),
     (render, "Render a stereo sequence with exact truth (extra 'train')."),
