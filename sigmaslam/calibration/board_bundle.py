@@ -1,8 +1,8 @@
 """Bundle adjustment of one camera or a stereo pair over images of a board, by Levenberg and Marquardt.
 
 The poses of the board are eliminated image by image (Schur complement), so that every image leaves an information
-matrix and a gradient of the rig alone: the sum of these is what is solved, and their scatter says how far the corners of
-one image are wrong together.
+matrix and a gradient of the rig alone: the sum of these is what is solved, and their scatter says how far the corners
+of one image are wrong together.
 """
 
 from __future__ import annotations
@@ -193,9 +193,7 @@ def _linearise(
     return inverse, inverse @ across, (inverse @ pull)[..., 0], information, gradient[..., 0]
 
 
-def _step(
-    system: tuple[np.ndarray, ...], weights: np.ndarray, damping: float
-) -> tuple[np.ndarray, np.ndarray]:
+def _step(system: tuple[np.ndarray, ...], weights: np.ndarray, damping: float) -> tuple[np.ndarray, np.ndarray]:
     """Steps of the rig (P,) and of the poses (n, 6)."""
     _, across, pull, information, gradient = system
     matrix, vector = np.tensordot(weights, information, 1), weights @ gradient

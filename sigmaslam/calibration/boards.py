@@ -39,14 +39,11 @@ NOTHING = DetectedCorners(np.zeros(0, np.int64), np.zeros((0, 2)))
 
 
 class Board(Protocol):
-    """A plane with points that images show.
-
-    Attributes:
-        points: (M, 3) metres, Z = 0.
-    """
+    """A plane with points that images show, Z = 0, metres."""
 
     @property
-    def points(self) -> np.ndarray: ...
+    def points(self) -> np.ndarray:
+        """(M, 3) on the board."""
 
     def detect(self, image: np.ndarray) -> DetectedCorners:
         """Corners in an (H, W) uint8 image; none where the board is not found."""
@@ -122,7 +119,7 @@ class Charuco:
 class AprilGrid:
     """Kalibr's grid of AprilTags 36h11 with small black squares between their corners, of which parts are enough.
 
-    Point 4 k + c is corner c of tag k, from its bottom left anti-clockwise; tags count from the bottom left, row by row.
+    Point 4 k + c is corner c of tag k, from its bottom left anti-clockwise; tags count from the bottom left, by rows.
 
     Attributes:
         columns, rows: numbers of tags.

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from sigmaslam.calibration.board_bundle import BoardBundle, Corners, Rig, solve_bundle
+from sigmaslam.calibration.board_bundle import BoardBundle, Corners, Rig, project_corners, solve_bundle
 from sigmaslam.calibration.boards import DetectedCorners
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, DistortionModel
@@ -60,7 +60,8 @@ class BoardCalibration:
         corners: those that are used.
         residuals: (N, 2) theirs, pixels.
         outlier_images: those that are not used.
-        outlier_corners: (K, 2) pixels, and (K,) eyes, of single corners that are not used.
+        outlier_corners: single corners of these images that are not used.
+        outlier_residuals: (K, 2) theirs, pixels.
         bundle: the solution.
     """
 
@@ -73,6 +74,7 @@ class BoardCalibration:
     residuals: np.ndarray
     outlier_images: tuple[OutlierImage, ...]
     outlier_corners: Corners
+    outlier_residuals: np.ndarray
     bundle: BoardBundle
 
     @property
@@ -118,6 +120,7 @@ def calibrate(
     outliers += [OutlierImage(names[image], reason) for image, reason in refused]
     numbers, images = np.unique(corners.image, return_inverse=True)
     covariance, sigma, effect = rig_covariance(bundle)
+    single = replace(dropped, image=np.searchsorted(numbers, dropped.image))
     return BoardCalibration(
         bundle.rig,
         covariance,
@@ -127,7 +130,8 @@ def calibrate(
         replace(corners, image=images),
         bundle.residuals,
         tuple(outliers),
-        dropped,
+        single,
+        single.pixels - project_corners(bundle.rig, bundle.poses, single),
         bundle,
     )
 
@@ -249,9 +253,7 @@ def _place_right_camera(rig: Rig, corners: Corners) -> np.ndarray:
     return np.asarray(candidates[np.argmin(np.sum(turned + moved, axis=1))])
 
 
-def _solve_without_outliers(
-    rig: Rig, corners: Corners
-) -> tuple[BoardBundle, Corners, list[tuple[int, str]], Corners]:
+def _solve_without_outliers(rig: Rig, corners: Corners) -> tuple[BoardBundle, Corners, list[tuple[int, str]], Corners]:
     """The bundle of all images that agree, its corners, the numbers of the other images with reasons, other corners."""
     refused: list[tuple[int, str]] = []
     all_corners = corners
@@ -276,7 +278,9 @@ def _solve_without_outliers(
         wrong = rms > OUTLIER_IMAGE * np.median(rms)
         if wrong.any():
             for image, size in zip(numbers[wrong].tolist(), rms[wrong].tolist(), strict=True):
-                refused.append((image, f"rms {size:.2f} px, {size / np.median(rms):.1f} times that of the median image"))
+                refused.append(
+                    (image, f"rms {size:.2f} px, {size / np.median(rms):.1f} times that of the median image")
+                )
             dropped |= np.isin(all_corners.image, numbers[wrong])
             continue
         limit = OUTLIER_CORNER * float(np.sqrt(np.median(squared))) / _MEDIAN_DISTANCE

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 from sigmaslam.cli.benchmark import benchmark
+from sigmaslam.cli.calibrate import calibrate
 from sigmaslam.cli.calibration import calibration
 from sigmaslam.cli.check import check
 from sigmaslam.cli.evaluate import evaluate
@@ -19,6 +20,7 @@ from sigmaslam.cli.export import export
 from sigmaslam.cli.finish import finish
 from sigmaslam.cli.geometry import geometry
 from sigmaslam.cli.match import match
+from sigmaslam.cli.rectify import rectify
 from sigmaslam.cli.refine import refine
 from sigmaslam.cli.render import render
 from sigmaslam.cli.track import demo, track
@@ -51,6 +53,8 @@ for _command in (
     finish,
     match,
     geometry,
+    calibrate,
+    rectify,
     evaluate,
     refine,
     render,
