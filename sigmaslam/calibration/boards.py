@@ -112,7 +112,9 @@ class Charuco:
         if ids is None or len(ids) < _MIN_CORNERS:
             return NOTHING
         ids, pixels = ids.ravel().astype(np.int64), pixels.reshape(-1, 2)
-        return DetectedCorners(ids, _refined(image, pixels, _nearest_distance(pixels)))
+        # Markers come as near to a corner as the white rim around them.
+        rim = 0.5 * (self.square - self.marker) / self.square
+        return DetectedCorners(ids, _refined(image, pixels, _nearest_distance(pixels) * rim / _WINDOW_SHARE))
 
 
 @dataclass(frozen=True, slots=True)

@@ -101,7 +101,8 @@ def coverage(result: BoardCalibration, eye: int) -> float:
     """Share of the cells of an eye's image with a corner."""
     model = result.rig.eyes[eye]
     pixels = result.corners.pixels[result.corners.eye == eye]
-    return float(np.mean(np.histogram2d(*pixels.T, _CELLS, [(0, model.width), (0, model.height)])[0] > 0))
+    cells = (pixels / (model.width, model.height) * _CELLS).astype(int)
+    return len(np.unique(cells, axis=0)) / (_CELLS[0] * _CELLS[1])
 
 
 def draw_board_calibration(path: Path, result: BoardCalibration) -> None:

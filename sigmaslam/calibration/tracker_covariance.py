@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from sigmaslam.calibration.board_bundle import Rig
+from sigmaslam.calibration.board_bundle import INTRINSICS, Rig
 from sigmaslam.estimation.calibration_errors import ERRORS, measured_errors
+from sigmaslam.estimation.gaussian import matrix_root
 from sigmaslam.geometry.calibration_covariance import ERROR_NAMES, CalibrationCovariance
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
@@ -14,8 +15,8 @@ from sigmaslam.geometry.se3 import se3_inverse
 # Where the errors are compared: columns, rows and inverse depths of a grid, from infinity to so many baselines.
 _GRID = (24, 16, 6)
 _NEAREST = 10.0
-# Steps of the derivatives, in sigmas.
-_STEP = 1e-3
+# Steps of the derivatives: of intrinsics in pixels, of coefficients, metres and radians.
+_STEP_PIXELS, _STEP = 1e-2, 1e-5
 
 
 def tracker_covariance(rig: Rig, covariance: np.ndarray) -> tuple[CalibrationCovariance, float]:
@@ -52,10 +53,11 @@ def tracker_covariance(rig: Rig, covariance: np.ndarray) -> tuple[CalibrationCov
         seen, seen_right = view.project(rays_left), view.project(rays_right)
         return np.column_stack([seen[:, :2], seen[:, 0] - seen_right[:, 0]])
 
-    steps = _STEP * np.diag(np.sqrt(np.diag(covariance)))
-    sizes = np.diag(steps)
+    intrinsics = [name.partition(".")[2] in INTRINSICS for name in rig.names]
+    sizes = np.where(intrinsics, _STEP_PIXELS, _STEP)
     columns = [
-        ((measured(step) - measured(-step)) / (2.0 * size)).ravel() for step, size in zip(steps, sizes, strict=True)
+        ((measured(step) - measured(-step)) / (2.0 * size)).ravel()
+        for step, size in zip(np.diag(sizes), sizes.tolist(), strict=True)
     ]
     by_parameter = np.stack(columns, axis=-1)
     usable = np.all(np.isfinite(by_parameter), axis=1)
@@ -63,7 +65,8 @@ def tracker_covariance(rig: Rig, covariance: np.ndarray) -> tuple[CalibrationCov
     to_errors = np.linalg.lstsq(by_error, by_parameter, rcond=None)[0]
     missed = by_parameter - by_error @ to_errors
     variance, missing = (float(np.einsum("ij,jk,ik->", each, covariance, each)) for each in (by_parameter, missed))
-    errors = to_errors @ covariance @ to_errors.T
+    root = to_errors @ matrix_root(covariance)
+    errors = root @ root.T
     rows = [ERRORS.index(name) for name in ERROR_NAMES]
     units = np.array([1.0 if name in ("focal", "baseline") else view.fx for name in ERROR_NAMES])
     matrix = errors[np.ix_(rows, rows)] / np.outer(units, units)
