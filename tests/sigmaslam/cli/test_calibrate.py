@@ -90,7 +90,7 @@ def test_bad_requests_are_refused(rendered: Path, tmp_path: Path):
     assert_refused(run_here("calibrate", rendered, "--board", "grid", "--out", out), "--board is 'grid'")
     assert_refused(run_here("calibrate", rendered, "--board", BOARD, "--out", tmp_path / "a.xml"), "is YAML")
     assert_refused(run_here("calibrate", tmp_path / "no", "--board", BOARD, "--out", out), "no such file or folder")
-    wrong = run_here("calibrate", rendered, "--board", "chessboard:5x4:0.025", "--out", out)
+    wrong = run_here("calibrate", rendered, "--board", "chessboard:13x4:0.025", "--out", out)
     assert_refused(wrong, "the board is found in none of 12 images: check --board")
     assert not out.exists()
 
@@ -176,11 +176,13 @@ def test_corners_of_the_grid_are_those_that_another_detector_found(real_data: Pa
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", REAL)
-def test_sigmas_are_those_of_a_bootstrap_over_images(real_results: dict[str, BoardCalibration], name: str):
-    """Half the central 68 % of 100 resamples: few images leave some resamples without a parameter."""
+@pytest.mark.parametrize(("name", "resamples"), [("euroc", 100), ("opencv", 300)])
+def test_sigmas_are_those_of_a_bootstrap_over_images(
+    real_results: dict[str, BoardCalibration], name: str, resamples: int
+):
+    """Half the central 68 %: of 13 images some resamples leave out what a lens' last coefficient comes from."""
     result = real_results[name]
-    ratios = bootstrap_sigmas(result, 100, seed=1) / result.sigmas
+    ratios = bootstrap_sigmas(result, resamples, seed=1) / result.sigmas
     assert np.all(ratios < 1.5), dict(zip(result.rig.names, ratios, strict=True))
     assert np.all(ratios > 1.0 / 1.5), dict(zip(result.rig.names, ratios, strict=True))
 
