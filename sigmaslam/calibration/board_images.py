@@ -71,7 +71,7 @@ def find_board_images(paths: Sequence[Path]) -> list[BoardImages]:
         if all(any(eyes[k] for eyes in moments.values()) for k in (0, 1)):
             return [
                 BoardImages(" + ".join(file.name for file in eyes if file), tuple(eyes))
-                for _, eyes in sorted(moments.items())
+                for _, eyes in sorted(moments.items(), key=lambda moment: _by_number(moment[0]))
             ]
     return [BoardImages(file.name, (file,)) for file in files]
 
@@ -134,6 +134,11 @@ def _tells() -> Iterable[Callable[[Path], tuple[str, int] | None]]:
 def _word(name: str, words: tuple[str, str], behind: str = "") -> tuple[str, int] | None:
     found = re.search(f"({words[0]}|{words[1]}){behind}", name, re.IGNORECASE)
     return found and (name[: found.start()] + "*" + name[found.end() :], words.index(found[1].lower()))
+
+
+def _by_number(name: str) -> str:
+    """A key that sorts 2 before 10."""
+    return re.sub(r"\d+", lambda digits: digits[0].zfill(20), name)
 
 
 def _in_folder(file: Path, words: tuple[str, str]) -> tuple[str, int] | None:

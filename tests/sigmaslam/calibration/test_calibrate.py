@@ -176,7 +176,7 @@ def test_images_without_a_board_are_named():
     rig = stereo_rig()
     views = views_of(rig, CHESSBOARD, seen_corners(rig, CHESSBOARD, board_poses(CHESSBOARD, 6, seed=9)))
     nothing = DetectedCorners(np.zeros(0, np.int64), np.zeros((0, 2)))
-    result = calibrate(list("abcdefg"), [*views, (nothing, nothing)], CHESSBOARD.points, [SIZE] * 2, "radtan4")
+    result = calibrate(list("abcdefg"), [*views, (nothing, nothing)], CHESSBOARD.points, [SIZE] * 2, "radtan5")
     assert [(each.name, each.reason) for each in result.outlier_images] == [("g", "the board is not found")]
 
 
