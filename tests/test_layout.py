@@ -35,7 +35,7 @@ FLOORS = (
     ("frontend",),
     ("two_view",),
     ("slam",),
-    ("checks", "fusion"),
+    ("calibration", "checks", "fusion"),
     ("runs",),
     ("bundle_adjustment",),
     ("cli",),

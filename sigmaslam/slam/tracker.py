@@ -86,7 +86,7 @@ class StereoTracker:
         self._beside = ThreadPoolExecutor(1, "keyframe") if threads > 1 else None
         self._admission = admission = admission or AdmitAll(config.min_inliers)
         graphs = EstimatorGraphs(rectified, backend, config.linearisation == "unscented")
-        prior = CalibrationPrior.of(rectified, camera.sigmas, config.offset_sigma, config.estimate)
+        prior = CalibrationPrior.of(rectified, camera.sigmas, config.offset_sigma, config.estimate, camera.covariance)
         self._window = window = KeyframeWindow(rectified, prior, graphs)
         self._noise = noise = MeasurementNoise(config)
         self._motion = motion = MotionFilter(backend)
