@@ -119,10 +119,9 @@ def _write(out: Path, trajectory: Trajectory, adjustment: Adjustment) -> None:
         np.save(path, adjustment.covariances[keyframe_before(adjustment.frames, len(trajectory))])
     count = len(adjustment.points)
     # The adjustment does not keep the keyframe and the pixel that first saw a point.
-    unknown = np.full((count, 3), np.nan)
-    point_map = PointMap(
-        adjustment.points, adjustment.point_covariances, adjustment.point_views, unknown[:, 0], unknown[:, 1:]
-    )
+    unknown = np.full((count, 4), np.nan)
+    seen_first = unknown[:, 0], unknown[:, 1:3], unknown[:, 3]
+    point_map = PointMap(adjustment.points, adjustment.point_covariances, adjustment.point_views, *seen_first)
     with atomic_path(out / "map.npz") as path:
         np.savez_compressed(
             path, points=point_map.points, covariances=point_map.covariances, observations=point_map.observations

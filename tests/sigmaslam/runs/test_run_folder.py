@@ -12,7 +12,7 @@ def test_a_ply_file_round_trips(tmp_path: Path):
     rng = np.random.default_rng(0)
     root = rng.normal(size=(5, 3, 3))
     points, covariances = rng.normal(size=(5, 3)), root @ root.transpose(0, 2, 1)
-    point_map = PointMap(points, covariances, np.arange(3, 8), np.zeros(5), np.zeros((5, 2)))
+    point_map = PointMap(points, covariances, np.arange(3, 8), np.zeros(5), np.zeros((5, 2)), np.full(5, np.nan))
     write_ply(tmp_path / "map.ply", point_map)
     header, _, body = (tmp_path / "map.ply").read_bytes().partition(b"end_header\n")
     assert header.splitlines()[:3] == [b"ply", b"format binary_little_endian 1.0", b"element vertex 5"]
