@@ -19,7 +19,7 @@ from sigmaslam.slam.matched_frame import MatchedFrame
 
 PICTURES_NAME = "pictures.npz"
 MAX_PICTURES, WORST = 60, 10
-"""Frames that are spread evenly over the run (up to twice as many where its length is not known), and the worst ones."""
+"""Frames that are spread evenly over the run, up to twice as many where its length is not known, and the worst ones."""
 _WIDTH, _QUALITY = 480, 70
 _MAX_MATCHES = 300
 _TRAIL = 4

@@ -17,8 +17,8 @@ from sigmaslam.files import atomic_path, atomic_write_text
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import write_kitti, write_tum
 from sigmaslam.runs.failure import explain_failure
-from sigmaslam.runs.frame_table import FRAMES_NAME, STATUSES, FrameTable, read_frames
 from sigmaslam.runs.frame_pictures import PICTURES_NAME
+from sigmaslam.runs.frame_table import FRAMES_NAME, STATUSES, FrameTable, read_frames
 from sigmaslam.runs.pose_file import PARTIAL_POSES, PoseRecords, read_pose_records
 from sigmaslam.runs.pose_table import POSES_NAME, write_pose_table
 from sigmaslam.runs.relative_pose_file import (

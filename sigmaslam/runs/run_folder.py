@@ -179,7 +179,7 @@ def write_ply(path: Path, point_map: PointMap) -> None:
     """
     columns = {name: ("float", "<f4", point_map.points[:, axis]) for axis, name in enumerate("xyz")}
     if np.isfinite(point_map.intensity).all():
-        columns |= {name: ("uchar", "u1", point_map.intensity) for name in ("red", "green", "blue")}
+        columns |= dict.fromkeys(("red", "green", "blue"), ("uchar", "u1", point_map.intensity))
     sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(point_map.covariances)[:, -1], 0.0))
     columns["sigma"] = ("float", "<f4", sigma)
     vertices = np.zeros(len(sigma), [(name, kind) for name, (_, kind, _) in columns.items()])

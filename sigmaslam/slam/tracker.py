@@ -140,7 +140,9 @@ class StereoTracker:
             self._motion.predict(timestamp - self._course.timestamp, densities(self.config, self._window.depth))
         matches, fit = self._localise(frame, timestamp, clock)
         landmarks = self._window.landmarks.id[matches.views.landmark]
-        self.last_frame = MatchedFrame(frame.left, frame.right, landmarks, matches, None if fit is None else fit.inliers)
+        self.last_frame = MatchedFrame(
+            frame.left, frame.right, landmarks, matches, None if fit is None else fit.inliers
+        )
         predicted = filtered = self._motion.state
         if fit is not None:
             status = "tracking"

@@ -1,0 +1,64 @@
+"""evaluation.json and evaluation.npz of a run: its errors, in all and frame by frame."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sigmaslam.errors import InputError
+from sigmaslam.files import atomic_path, atomic_write_text
+from sigmaslam.table import Table
+
+EVALUATION_NAME, EVALUATED_FRAMES_NAME = "evaluation.json", "evaluation.npz"
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluatedFrames(Table):
+    """Frames with a pose and a truth; errors are those of poses relative to the first of them.
+
+    Attributes:
+        row: (M,) in trajectory.tum.
+        position_error: (M,) metres.
+        rotation_error: (M,) radians.
+        nees: (M,) normalised estimation error squared, per degree of freedom; NaN where there is none.
+        truth: (M, 3) true positions in the world of the estimate, by the best alignment, metres.
+    """
+
+    row: np.ndarray
+    position_error: np.ndarray
+    rotation_error: np.ndarray
+    nees: np.ndarray
+    truth: np.ndarray
+
+
+def write_evaluation(folder: Path, evaluation: dict[str, Any], frames: EvaluatedFrames) -> None:
+    """Writes both files into the folder of the run."""
+    with atomic_path(folder / EVALUATED_FRAMES_NAME) as temporary:
+        np.savez_compressed(temporary, **{name: getattr(frames, name) for name in EvaluatedFrames.__slots__})
+    atomic_write_text(folder / EVALUATION_NAME, json.dumps(evaluation, indent=2) + "\n")
+
+
+def read_evaluated_frames(path: Path, count: int) -> EvaluatedFrames:
+    """The content of an evaluation.npz.
+
+    Args:
+        path: of the file.
+        count: poses of trajectory.tum beside it.
+    Raises:
+        InputError: it is no such file, or of another run.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            frames = EvaluatedFrames(*(archive[name] for name in EvaluatedFrames.__slots__))
+        rows = len(frames.row)
+        fits = frames.truth.shape == (rows, 3) and (not rows or frames.row.max() < count)
+    except (OSError, ValueError, EOFError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path}: holds no errors of frames ({error}); run `sigmaslam evaluate` again") from error
+    if not fits:
+        raise InputError(f"{path}: is not of the {count} poses of trajectory.tum; run `sigmaslam evaluate` again")
+    return frames
