@@ -32,7 +32,7 @@ from sigmaslam.runs.report_scene import build_scene, pack
 REPORT_NAME = "report.html"
 MAX_CONFIGURATION = 20_000
 """The report shows at most so many characters of run.json."""
-PICTURE_MAGNIFICATION = 10
+PICTURE_MAGNIFICATION = 4
 """Ellipses of matches are drawn so many times as large; most are smaller than a pixel of the pictures."""
 _SCRIPTS = ("three-0.170.0.min.js", "uplot-1.6.32.min.js", "scene.js", "plots.js", "frames.js", "page.js")
 _STYLES = ("uplot-1.6.32.min.css", "report.css")
@@ -114,7 +114,7 @@ def write_report(run_dir: str | Path) -> Path:
 
 def _to_json(page: dict[str, Any]) -> Markup:
     """JSON that cannot end the script element it stands in."""
-    return Markup(json.dumps(page, separators=(",", ":")).replace("<", "\\u003c"))
+    return Markup(json.dumps(page, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"))
 
 
 def _configuration(entries: dict[str, Any]) -> str | None:

@@ -12,7 +12,7 @@ from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.runs.frame_table import STATUSES
 from sigmaslam.runs.recorded_run import RecordedRun
 
-MAX_POSES, MAX_POINTS, MAX_ELLIPSOIDS, MAX_KEYFRAMES = 20_000, 40_000, 60, 400
+MAX_POSES, MAX_POINTS, MAX_ELLIPSOIDS, MAX_KEYFRAMES = 20_000, 40_000, 40, 400
 """With more of them an even selection is shown."""
 # 3-sigma ellipsoids are drawn so many times as large that the median one is this share of the view, or as they are.
 _VISIBLE = 0.02
@@ -38,11 +38,13 @@ def build_scene(run: RecordedRun) -> dict[str, Any] | None:
     shown = np.union1d(shown, lost[_even(len(lost), MAX_POSES)])
     seconds = run.trajectory.timestamps - run.frames.columns["timestamp"][0]
     status = np.array([STATUSES.index(each) for each in run.pose_status], np.uint8)
-    centre, size = _extent(run)
+    low, high = _extent(run)
+    size = max(float(np.linalg.norm(high - low)), 1e-3)
     keyframes, loops = _keyframes(run)
     ellipsoids, chosen = _ellipsoids(run)
     scene = {
-        "centre": centre.tolist(),
+        "centre": (0.5 * (low + high)).tolist(),
+        "extent": (high - low).tolist(),
         "size": size,
         "path": pack(positions[shown]),
         "path_seconds": pack(seconds[shown]),
@@ -72,16 +74,18 @@ def _positions(trajectory: Trajectory | None) -> np.ndarray | None:
     return None if trajectory is None else trajectory.positions
 
 
-def _extent(run: RecordedRun) -> tuple[np.ndarray, float]:
-    """Centre (3,) and size of the view: the path, and the map as far as it is near."""
+def _extent(run: RecordedRun) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (3,), (3,) of what the view shows: the path, and the map as far as it is near."""
     low, high = run.trajectory.positions.min(axis=0), run.trajectory.positions.max(axis=0)
     if run.map is not None and len(run.map.points):
         # Far points are the least certain ones.
-        margin = max(0.3 * float(np.max(high - low)), 1.0)
-        near_low, near_high = np.percentile(_placed_points(run), (10, 90), axis=0)
+        points = _placed_points(run)
+        distance = float(np.median(np.linalg.norm(points - 0.5 * (low + high), axis=1)))
+        margin = max(0.3 * float(np.max(high - low)), distance)
+        near_low, near_high = np.percentile(points, (10, 90), axis=0)
         low = np.minimum(low, np.maximum(near_low, low - margin))
         high = np.maximum(high, np.minimum(near_high, high + margin))
-    return 0.5 * (low + high), max(float(np.linalg.norm(high - low)), 1e-3)
+    return low, high
 
 
 def _placed_points(run: RecordedRun) -> np.ndarray:

@@ -53,7 +53,9 @@ function buildFrames(pictures, size, magnification, chosen) {
       }
       context.stroke();
       context.lineWidth = 1;
+      context.globalAlpha = 0.7;
       ellipse(context, u, v, covariance[4 * k], covariance[4 * k + 1], covariance[4 * k + 3], scale);
+      context.globalAlpha = 1;
     }
     about.textContent = picture.label;
   };
@@ -71,14 +73,14 @@ function buildFrames(pictures, size, magnification, chosen) {
       button.title = pictures[k].label;
       button.classList.toggle("lost", pictures[k].is_lost);
       button.append(Object.assign(new Image(), { src: pictures[k].left, alt: `frame at ${pictures[k].seconds} s` }));
-      if (id === "worst") button.append(pictures[k].why);
+      if (id === "worst") button.append(Object.assign(document.createElement("span"), { textContent: pictures[k].why }));
       button.addEventListener("click", () => { show(k); chosen(pictures[k].seconds); });
       document.getElementById(id).append(button);
     }
   }
   slider.max = pictures.length - 1;
   slider.addEventListener("input", () => { show(+slider.value); chosen(pictures[+slider.value].seconds); });
-  show(0);
+  show(Math.floor(pictures.length / 2));
   return {
     select: (seconds) => {
       const gaps = pictures.map((picture) => Math.abs(picture.seconds - seconds));

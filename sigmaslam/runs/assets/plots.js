@@ -25,7 +25,7 @@ function buildPlot(box, seconds, intervals, plot, select) {
   const write = (_, value) => (value === null || value === undefined ? "–" : Number(value.toPrecision(4)).toString());
   const axis = { stroke: soft, grid: { stroke: line, width: 1 }, ticks: { stroke: line, width: 1 } };
   const series = plot.series.map((each) => ({
-    label: each.label, stroke: each.colour, width: each.width ?? 1.5, dash: each.dash, fill: each.fill, value: write,
+    label: each.label, stroke: each.colour, width: each.width ?? 1.5, dash: each.dash, fill: each.fill, value: write, class: each.label ? undefined : "nameless",
     points: { show: Boolean(each.dots), size: 4 }, paths: each.dots ? () => null : undefined, spanGaps: false,
   }));
   const options = {

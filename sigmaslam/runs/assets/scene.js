@@ -76,26 +76,34 @@ function frustums(scene, size) {
   const geometry = new THREE.BufferGeometry();
   geometry.setAttribute("position", new THREE.BufferAttribute(Float32Array.from(positions), 3));
   return new THREE.LineSegments(geometry, new THREE.LineBasicMaterial({ color: "#7fd6b3", transparent: true,
-    opacity: 0.75 }));
+    opacity: 0.6 }));
 }
 
 function ellipsoids(scene) {
   const count = scene.ellipsoid_status.length;
-  const material = new THREE.MeshLambertMaterial({ transparent: true, opacity: 0.4, depthWrite: false });
-  const mesh = new THREE.InstancedMesh(new THREE.SphereGeometry(1, 20, 14), material, count);
-  mesh.frustumCulled = false;
-  for (let k = 0; k < count; k++) mesh.setColorAt(k, new THREE.Color(STATUS_COLOURS[scene.ellipsoid_status[k]]));
-  mesh.magnify = (factor) => {
+  // Those that fill the view, of frames that are lost, would hide all else: they are fainter.
+  const meshes = [0.28, 0.05].map((opacity) => {
+    const material = new THREE.MeshLambertMaterial({ transparent: true, opacity, depthWrite: false });
+    const mesh = new THREE.InstancedMesh(new THREE.SphereGeometry(1, 32, 24), material, count);
+    mesh.frustumCulled = false;
+    for (let k = 0; k < count; k++) mesh.setColorAt(k, new THREE.Color(STATUS_COLOURS[scene.ellipsoid_status[k]]));
+    return mesh;
+  });
+  const group = new THREE.Group();
+  group.add(...meshes);
+  group.magnify = (factor) => {
     for (let k = 0; k < count; k++) {
       const matrix = new THREE.Matrix4().fromArray(scene.ellipsoids, 16 * k).transpose();
       const e = matrix.elements;
       for (const axis of [0, 4, 8]) for (let i = 0; i < 3; i++) e[axis + i] *= 3 * factor;
-      mesh.setMatrixAt(k, matrix);
+      const isLarge = Math.hypot(...[0, 1, 2, 4, 5, 6, 8, 9, 10].map((i) => e[i])) > scene.size / 4;
+      const nothing = new THREE.Matrix4().makeScale(0, 0, 0);
+      meshes.forEach((mesh, large) => mesh.setMatrixAt(k, isLarge === Boolean(large) ? matrix : nothing));
     }
-    mesh.instanceMatrix.needsUpdate = true;
+    for (const mesh of meshes) mesh.instanceMatrix.needsUpdate = true;
   };
-  mesh.magnify(scene.magnification);
-  return mesh;
+  group.magnify(scene.magnification);
+  return group;
 }
 
 function buildScene(box, scene, select) {
@@ -107,6 +115,7 @@ function buildScene(box, scene, select) {
     return null;
   }
   box.prepend(renderer.domElement);
+  renderer.setClearColor("#14181d");
   renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
   const world = new THREE.Scene();
   const camera = new THREE.PerspectiveCamera(45, 1, scene.size / 1000, scene.size * 100);
@@ -123,14 +132,18 @@ function buildScene(box, scene, select) {
   cloud.setAttribute("position", new THREE.BufferAttribute(scene.points, 3));
   const colourBy = (by) => cloud.setAttribute("color", new THREE.BufferAttribute(mapPoints(scene, by), 3));
   colourBy(scene.point_grey ? "grey" : "sigma");
-  layers.points = new THREE.Points(cloud, new THREE.PointsMaterial({ size: 2.2 * renderer.getPixelRatio(),
+  layers.points = new THREE.Points(cloud, new THREE.PointsMaterial({ size: 2.6 * renderer.getPixelRatio(),
     sizeAttenuation: false, vertexColors: true }));
-  layers.keyframes = frustums(scene, scene.size / 70);
+  layers.keyframes = frustums(scene, scene.size / 130);
   layers.loops = lineSegments(scene.loops, null, { linewidth: 2, color: "#ffb000" });
   for (const [name, colour] of [["truth", "#00c08a"], ["final", "#f0e442"], ["refined", "#e0aaff"]]) {
     if (scene[name]) layers[name] = polyline(scene[name], { linewidth: 1.6, color: colour });
   }
   Object.values(layers).forEach((layer) => world.add(layer));
+  const tips = [0, 1, 2].map((axis) => new THREE.Vector3().setComponent(axis, scene.size / 14).toArray());
+  const hues = [[1, 0.25, 0.25], [0.2, 0.85, 0.3], [0.35, 0.5, 1]];
+  world.add(lineSegments(tips.flatMap((end) => [0, 0, 0, ...end]), hues.flatMap((hue) => [...hue, ...hue]),
+    { linewidth: 2.5 }));
   const marker = new THREE.Mesh(new THREE.SphereGeometry(1, 16, 12), new THREE.MeshBasicMaterial({ color: "#ffffff" }));
   marker.visible = false;
   world.add(marker);
@@ -151,13 +164,13 @@ function buildScene(box, scene, select) {
     redraw();
   };
   const view = (direction) => {
-    const reach = (0.75 * scene.size) / Math.tan((22.5 * Math.PI) / 180) / Math.min(camera.aspect, 1.3);
+    const reach = (0.6 * scene.size) / Math.tan((22.5 * Math.PI) / 180) / Math.min(camera.aspect, 1.3);
     controls.target.copy(target);
     camera.position.copy(target).addScaledVector(new THREE.Vector3(...direction).normalize(), reach);
     controls.update();
     redraw();
   };
-  const views = { oblique: [-0.5, -0.75, -0.8], above: [0, -1, -1e-4], side: [-1, -0.02, 0], behind: [0, -0.05, -1] };
+  const views = { oblique: scene.extent[2] > scene.extent[0] ? [-1, -0.8, -0.4] : [-0.4, -0.8, -1], above: [0, -1, -1e-4], side: [-1, -0.02, 0], behind: [0, -0.05, -1] };
 
   // The nearest vertex of the path, or else of the map, within 12 pixels.
   const projected = new THREE.Vector3();
