@@ -221,7 +221,7 @@ def _write_map(files: _Files, tracker: TrackerResults) -> int:
 
 
 def _write_report(path: Path) -> None:
-    from sigmaslam.runs.report import write_report  # draws: not needed before the run has ended
+    from sigmaslam.runs.report import write_report  # not needed before the run has ended
 
     write_report(path.parent)
 

@@ -243,7 +243,7 @@ def _track(
 ) -> None:
     with open_progress() as progress:
         task = progress.add_task("frames", total=sequence.length, note="")
-        reported, done = 0, 0
+        reported, done, lost = 0, 0, 0
         began = since = time.perf_counter()
         for frame in frames:
             read_ms = 1e3 * (time.perf_counter() - since - timing.waited)
@@ -261,14 +261,14 @@ def _track(
             if tracker.last_frame is not None:
                 pictures.add(estimate.camera, tracker.last_frame)
             done += 1
+            lost += estimate.status == "lost"
             since = time.perf_counter()
-            progress.update(
-                task, completed=done + reported + timing.dropped, note=_note(estimate.camera, done / (since - began))
-            )
+            note = _note(estimate.camera, lost, done / (since - began))
+            progress.update(task, completed=done + reported + timing.dropped, note=note)
         for skipped in sequence.skipped[reported:]:
             writer.add_skipped(skipped.timestamp)
         progress.update(task, completed=done + len(sequence.skipped) + timing.dropped)
 
 
-def _note(estimate: Estimate, rate: float) -> str:
-    return f"{rate:.1f}/s, {estimate.inliers} inliers, belief {estimate.belief:.3f}, {estimate.status}"
+def _note(estimate: Estimate, lost: int, rate: float) -> str:
+    return f"{rate:.1f} frames/s, {lost} lost; {estimate.status}, {estimate.inliers} inliers"

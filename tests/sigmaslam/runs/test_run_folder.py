@@ -21,6 +21,26 @@ def test_a_ply_file_round_trips(tmp_path: Path):
     np.testing.assert_allclose(vertices[:, 3] ** 2, np.linalg.eigvalsh(point_map.covariances)[:, -1], rtol=1e-5)
 
 
+def test_a_ply_file_has_grey_values_where_they_are_known(tmp_path: Path):
+    grey = np.array([0.0, 7.0, 255.0], np.float32)
+    point_map = PointMap(np.eye(3), np.tile(np.eye(3), (3, 1, 1)), np.ones(3), np.zeros(3), np.zeros((3, 2)), grey)
+    write_ply(tmp_path / "map.ply", point_map)
+    header, _, body = (tmp_path / "map.ply").read_bytes().partition(b"end_header\n")
+    assert [line.split()[1:] for line in header.splitlines()[3:]] == [
+        [b"float", b"x"],
+        [b"float", b"y"],
+        [b"float", b"z"],
+        [b"uchar", b"red"],
+        [b"uchar", b"green"],
+        [b"uchar", b"blue"],
+        [b"float", b"sigma"],
+    ]
+    vertices = np.frombuffer(body, [("place", "<f4", 3), ("colour", "u1", 3), ("sigma", "<f4")])
+    np.testing.assert_array_equal(vertices["place"], np.eye(3))
+    np.testing.assert_array_equal(vertices["colour"], grey[:, None].repeat(3, 1))
+    np.testing.assert_array_equal(vertices["sigma"], 1.0)
+
+
 def test_an_empty_map_is_a_valid_file(tmp_path: Path):
     write_ply(tmp_path / "map.ply", PointMap.empty())
     assert b"element vertex 0\n" in (tmp_path / "map.ply").read_bytes()
