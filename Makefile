@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV ?= .venv
 # The exact versions that CI runs with; empty: the newest ones that pyproject.toml allows.
 INSTALL_FLAGS ?= --constraint requirements.lock
+# Interpreters that `make dist` compiles kernels for, e.g. PYTHONS="python3.11 python3.12 python3.13".
+PYTHONS ?= $(PYTHON)
 # Tests on real data read SIGMASLAM_DATA; where it is not set, the folder beside the checkout, if it is there.
 ifeq ($(SIGMASLAM_DATA),)
 ifneq ($(wildcard ../shared/data),)
@@ -13,7 +15,7 @@ endif
 # What an installation is made of: when one of these changes, it is made again.
 BUILD := pyproject.toml setup.py requirements.lock sigmaslam/frontend/kernels.cpp sigmaslam/frontend/kernels.inc
 
-.PHONY: demo test test-slow lint wheel clean
+.PHONY: demo test test-slow lint dist wheel sbom clean
 
 demo: $(VENV)/.runtime
 	$(VENV)/bin/sigmaslam demo
@@ -30,14 +32,30 @@ lint: $(VENV)/.dev
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
 
-# A wheel with compiled kernels, and the demo run from it in an environment of its own.
-wheel: $(VENV)/bin/python
-	rm -rf dist build
-	$(VENV)/bin/python -m pip wheel --quiet --no-deps --wheel-dir dist .
-	$(PYTHON) -m venv build/check
-	build/check/bin/python -m pip install --quiet $(INSTALL_FLAGS) dist/*.whl
-	cd build && check/bin/python -c "import sigmaslam.frontend._kernels"
-	cd build && check/bin/sigmaslam demo
+# What is handed out, of the last commit: sdist, wheel without kernels, a wheel with kernels for each Python.
+dist: $(VENV)/bin/python
+	rm -rf dist
+	$(VENV)/bin/python release/build_dist.py dist $(PYTHONS)
+
+# The demo run from the wheel, in an environment of its own for each Python.
+wheel: dist
+	set -e; for python in $(PYTHONS); do \
+	    rm -rf build/check; $$python -m venv build/check; \
+	    build/check/bin/python -m pip install --quiet --no-index --no-deps --find-links dist sigmaslam; \
+	    build/check/bin/python -m pip install --quiet $(INSTALL_FLAGS) sigmaslam; \
+	    (cd build && check/bin/python -c "import sigmaslam.frontend._kernels" && check/bin/sigmaslam demo); \
+	done
+
+# The runtime's packages, versions and licences as CycloneDX JSON: dist/sbom.cdx.json.
+sbom: dist
+	rm -rf build/sbom build/runtime
+	$(PYTHON) -m venv build/sbom
+	build/sbom/bin/python -m pip install --quiet --constraint requirements.lock cyclonedx-bom
+	$(PYTHON) -m venv --without-pip build/runtime
+	build/sbom/bin/python -m pip --python build/runtime install --quiet --no-index --no-deps --find-links dist sigmaslam
+	build/sbom/bin/python -m pip --python build/runtime install --quiet $(INSTALL_FLAGS) sigmaslam
+	SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) build/sbom/bin/cyclonedx-py environment build/runtime \
+	    --pyproject pyproject.toml --output-reproducible --output-file dist/sbom.cdx.json
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info
@@ -45,9 +63,9 @@ clean:
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 
-# The runtime alone: no torch.
+# The runtime and its pictures: no torch.
 $(VENV)/.runtime: $(BUILD) | $(VENV)/bin/python
-	$(VENV)/bin/python -m pip install --quiet $(INSTALL_FLAGS) --editable .
+	$(VENV)/bin/python -m pip install --quiet $(INSTALL_FLAGS) --editable ".[report]"
 	touch $@
 
 $(VENV)/.dev: $(BUILD) | $(VENV)/bin/python

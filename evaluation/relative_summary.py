@@ -1,16 +1,20 @@
 """Consistency of relative poses as text, figure and plain numbers."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import asdict
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
 
 from sigmaslam.estimation.chi_square import CHI_SQUARE_BAND_OF_6
 from sigmaslam.evaluation.metrics.relative_consistency import SpanConsistency
 from sigmaslam.plot_style import BLUE, SKY, VERMILLION
 from sigmaslam.runs.relative_pose_file import RELATIVE_POSES_NAME
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 def format_relative(spans: tuple[SpanConsistency, ...] | None) -> list[str]:

@@ -1,17 +1,18 @@
 """Evaluate a run, or a trajectory of any origin, against the truth."""
 
+from __future__ import annotations
+
 import json
 import logging
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
+from sigmaslam.bounded_files import TABLE_BYTES, read_text
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.kept_evaluation import keep_evaluation
 from sigmaslam.evaluation.metrics.map_consistency import coverage
@@ -35,14 +36,18 @@ from sigmaslam.evaluation.relative_summary import draw_relative, format_relative
 from sigmaslam.evaluation.truth_conventions import TruthConvention, find_convention, find_time_unit, scale_times
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
-from sigmaslam.plot_style import BLUE, VERMILLION, style_axes
-from sigmaslam.readers.trajectory_files import check_covariances, kitti_times_path, read_trajectory, trajectory_format
+from sigmaslam.plot_style import BLUE, VERMILLION, has_matplotlib, style_axes
+from sigmaslam.readers.trajectory_files import kitti_times_path, read_covariances, read_trajectory, trajectory_format
 from sigmaslam.runs.figures import AXIS_NAMES, plot_trajectory, save_png
 from sigmaslam.runs.frame_table import FRAMES_NAME, FrameTable, predicted_poses, read_frames
 from sigmaslam.runs.relative_pose_file import RELATIVE_POSES_NAME, read_frame_pairs
 from sigmaslam.runs.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY, check_has_trajectory
 
 _LOGGER = logging.getLogger(__name__)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +77,7 @@ class Evaluation:
         kitti: segment errors.
         nees: of poses relative to the first; None where there is no covariance.
         relative: consistency of poses relative to earlier ones, by span; None where the run does not say.
-        figure_path: the plots; None where none were asked for.
+        figure_path: the plots; None where none were asked for, or matplotlib is not installed.
         final: of the trajectory after the fact; None where there is none.
         truth_hint: the convention in which the truth would fit, in words and as options; None where it fits as it was
             read, or in no way.
@@ -149,8 +154,8 @@ def evaluate_run(
             relative to earlier ones are judged where it holds `relative_poses.npz`.
         truth: TUM, KITTI, or EuRoC ground truth.
         lengths, step: segments of the KITTI errors (see `kitti_errors`).
-        plot: write `evaluation.png` into the run folder or beside the trajectory; of a run also `evaluation.json` and
-            `evaluation.npz`, with which its report is written anew.
+        plot: write `evaluation.png` into the run folder or beside the trajectory, where matplotlib is installed; of a
+            run also `evaluation.json` and `evaluation.npz`, with which its report is written anew.
         truth_sigma_position, truth_sigma_rotation: standard deviations of each true pose, of each coordinate (metres)
             and about each axis (degrees), for the poses relative to earlier ones; where one alone is given the other is
             zero.
@@ -201,7 +206,7 @@ def evaluate_run(
         kitti=kitti_errors(estimate, true, lengths, step),
         nees=pose_nees(estimate, true, covariance) if covariance is not None else None,
         relative=relative,
-        figure_path=estimate_path.parent / "evaluation.png" if plot else None,
+        figure_path=estimate_path.parent / "evaluation.png" if plot and has_matplotlib() else None,
         final=_evaluate_final(run_or_trajectory, estimate, true) if is_run else None,
         predicted=int(predicted[associate(estimate, true)[0]].sum()),
         truth_hint=None if other is None else other.describe(),
@@ -267,6 +272,8 @@ def draw_evaluation(
         covariance: (N, 6, 6) of the estimate, body frame, translation first.
         predicted: (N,) bool, which poses of the estimate no image confirms; None: none of them.
     """
+    from matplotlib.figure import Figure
+
     spans = evaluation.relative or ()
     rows = (1.5, 1, 1, 1) if spans else (1.5, 1, 1)
     figure = Figure(figsize=(11, 2.0 + 2.6 * sum(rows) - 0.1), layout="constrained")
@@ -444,8 +451,8 @@ def _same_clock(estimate_path: Path, truth_path: Path, frames: FrameTable | None
 def _follows_object(run: Path) -> bool:
     """Whether a run's poses are those of a body before a camera at rest."""
     try:
-        return "object" in json.loads((run / "run.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return "object" in json.loads(read_text(run / "run.json", TABLE_BYTES, "the run"))
+    except (InputError, ValueError, RecursionError, TypeError):
         return False
 
 
@@ -462,11 +469,7 @@ def _of_followed_frame(estimate: Trajectory, truth: Trajectory) -> Trajectory:
 def _read_covariance(path: Path, count: int) -> np.ndarray | None:
     if not path.is_file():
         return None
-    try:
-        covariance = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path}: is no numpy array ({error}); run `sigmaslam track` again") from error
-    return check_covariances(covariance, path, count)
+    return read_covariances(path, count)
 
 
 def _frame_count(frames: FrameTable | None, estimate: Trajectory, truth: Trajectory, matched: int) -> int:

@@ -11,6 +11,7 @@ from sigmaslam.filters.lie_groups import wrap_angle
 from sigmaslam.filters.manifolds import SE2, SE3, SO2, SO3, Euclidean, Manifold, Product
 from sigmaslam.filters.models import LinearMeasurement, LinearMotion, MeasurementModel, MotionModel
 from sigmaslam.filters.noise_covariance import BlockDiagonal, Dense, Diagonal
+from sigmaslam.filters.onnx.step import ExportError, StepExample, export_step
 from sigmaslam.filters.results import TimeUpdate, Update
 from sigmaslam.filters.sigma_points import Simplex, cubature, julier, merwe
 from sigmaslam.filters.time_series import Track
@@ -25,6 +26,7 @@ __all__ = [
     "Dense",
     "Diagonal",
     "Euclidean",
+    "ExportError",
     "ExtendedKalmanFilter",
     "FilterError",
     "Gaussian",
@@ -38,6 +40,7 @@ __all__ = [
     "PointEstimate",
     "Product",
     "Simplex",
+    "StepExample",
     "TimeUpdate",
     "Track",
     "UnscentedKalmanFilter",
@@ -45,6 +48,7 @@ __all__ = [
     "compile_step",
     "cubature",
     "degree_of_belief",
+    "export_step",
     "julier",
     "maximum_a_posteriori",
     "maximum_likelihood",

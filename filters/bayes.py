@@ -3,21 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
 from torch import Tensor
 
+from sigmaslam.filters.checks import check_belief, check_entering, check_inputs, check_measurement, check_motion
 from sigmaslam.filters.failure import POLICIES, OnFailure, Suspects, jittered, raise_unless_healthy
 from sigmaslam.filters.gaussian_belief import Gaussian
-from sigmaslam.filters.linalg.square_roots import apply, finite, multiply, solve_lower_transposed, square, triangularise
+from sigmaslam.filters.linalg.plain import PIVOT_TOLERANCES
+from sigmaslam.filters.linalg.square_roots import (
+    apply,
+    finite,
+    is_traced,
+    may_look,
+    multiply,
+    nonnegative,
+    solve_lower_transposed,
+    square,
+    triangularise,
+)
 from sigmaslam.filters.linalg.unrolled import join
-from sigmaslam.filters.manifolds import Manifold
-from sigmaslam.filters.models import AnyMeasurement, AnyMotion, LinearMeasurement, LinearMotion
+from sigmaslam.filters.manifolds import Space, is_flat
+from sigmaslam.filters.models import AnyMeasurement, AnyMotion, LinearMeasurement, LinearMotion, MeasurementModel
 from sigmaslam.filters.noise_covariance import Noise, as_noise
 from sigmaslam.filters.results import TimeUpdate, Update
 from sigmaslam.filters.sigma_points import Columns, SigmaPoints, cubature
+from sigmaslam.filters.tensors import require_tensor
 from sigmaslam.filters.time_series import filter_sequence, smooth
 from sigmaslam.filters.transforms import Difference, Exact, Taylor, Transform, Transformed, Unscented
 from sigmaslam.filters.updates import FORMS, Form, TangentPosterior, choose_form, solve
@@ -25,6 +38,29 @@ from sigmaslam.filters.updates import FORMS, Form, TangentPosterior, choose_form
 # Squared linearisation error of a whole measurement, in units of its noise's variance, from which on an update is worth
 # a second linearisation.
 TOLERATED_ERROR = 1.0
+
+
+_Error = Callable[[Tensor | None, Noise], Tensor]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """A measurement's function, linearised.
+
+    Attributes:
+        innovation: (..., m).
+        columns: deviations of what is seen.
+        error: makes the linearisation's expected squared error (...,), in units of the noise's variance, of a mask
+            and the noise; None where there is none to be seen.
+        form: that the update is computed in.
+        usable: (...,) bool, whether all of it is finite; None: it is for all.
+    """
+
+    innovation: Tensor
+    columns: Columns
+    error: _Error | None = None
+    form: Form = "dense"
+    usable: Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,12 +76,13 @@ class BayesFilter:
             square roots, "dense" and "low-rank" with covariances.
         iterations: linearisations of an update, from the second on at the posterior of the one before (posterior
             linearisation, García-Fernández et al. 2015; with derivatives, the iterated EKF). "auto": a second one for
-            elements whose sigma points show more linearisation error than `TOLERATED_ERROR`; the EKF sees none.
+            elements whose sigma points show more linearisation error than `TOLERATED_ERROR`; the EKF sees none. A set
+            that cannot show it, `Simplex`, always takes the second.
         on_failure: see `sigmaslam.filters.failure`.
     """
 
     transform: Transform
-    space: Manifold | None = None
+    space: Space | None = None
     form: Form | Literal["auto"] = "auto"
     iterations: int | Literal["auto"] = "auto"
     on_failure: OnFailure = "raise"
@@ -69,41 +106,51 @@ class BayesFilter:
             FilterError: an element's covariance is not positive semidefinite or not finite, and on_failure is "raise".
             ValueError: shapes do not fit.
         """
-        if isinstance(motion, LinearMotion) and not self._by_root(belief):
-            return self._predict_linear(belief, motion, inputs)
+        noise = as_noise(motion.noise, f"{type(motion).__name__}.noise")
+        check_belief(belief, self.space)
+        check_inputs(inputs)
+        check_motion(motion, noise, belief)
+        if isinstance(motion, LinearMotion) and not self.goes_on_with_roots(belief):
+            return self._predict_linear(belief, motion, noise, inputs)
         root, usable, sound = self._root(belief)
-        noise = as_noise(motion.noise)
+        usable = _both(usable, nonnegative(noise.variance()))
         moved = self._move(belief.mean, root, motion, noise, inputs)
         mean = moved.mean if moved.reference is None else moved.reference
         columns, entering, noise_matrix = moved.columns, None, None
+        usable = _both(usable, finite(mean, columns.odd))
+        if usable is not None:
+            columns = _where(usable, columns)
         if _is_additive(motion):
+            check_entering(motion, noise, columns.odd.shape[-2])
             entering, noise_matrix = noise, motion.noise_matrix
         else:
             columns = _with_noise_columns(columns, root.shape[-1])
-        if self._by_root(belief):
+        if self.goes_on_with_roots(belief):
             factor = _predicted_factor(columns, entering, noise_matrix)
             predicted = Gaussian(mean, factor=factor, factor_is_lower=True)
         else:
             predicted = Gaussian(mean, _predicted_covariance(columns, entering, noise_matrix))
-        usable = _both(finite(mean, predicted.held), usable)
-        predicted = self._deal_with(usable, predicted, belief, "predict", {})
-        return TimeUpdate(predicted, _both(usable, sound), lambda: (root, columns), entering, noise_matrix)
+        usable = _both(_both(finite(mean, predicted.held), usable), _sound_variances(predicted))
+        predicted = self._deal_with(usable, predicted, belief, "predict", _suspects(noise, predicted))
+        return TimeUpdate(predicted, _both(usable, sound), usable, lambda: (root, columns), entering, noise_matrix)
 
-    def _predict_linear(self, belief: Gaussian, motion: LinearMotion, inputs: tuple[Tensor, ...]) -> TimeUpdate:
+    def _predict_linear(
+        self, belief: Gaussian, motion: LinearMotion, noise: Noise, inputs: tuple[Tensor, ...]
+    ) -> TimeUpdate:
         """A P A^T + B2 Q B2^T, (9.22): no root is needed, so a covariance is not checked for being semidefinite."""
         self._require_flat("LinearMotion")
-        noise = as_noise(motion.noise)
         mean = motion.function(belief.mean, *inputs)
         covariance = multiply(multiply(motion.matrix, belief.covariance), motion.matrix.mT)
         predicted = Gaussian(mean, covariance + _entering_twice(noise, motion.noise_matrix))
-        healthy = finite(mean, predicted.held)
-        predicted = self._deal_with(healthy, predicted, belief, "predict", {})
+        healthy = _both(finite(mean, predicted.held), nonnegative(noise.variance()))
+        healthy = _both(healthy, _sound_variances(predicted))
+        predicted = self._deal_with(healthy, predicted, belief, "predict", _suspects(noise, predicted))
 
         def joint() -> tuple[Tensor, Columns]:
             root = belief.factor
             return root, Columns(multiply(motion.matrix, root))
 
-        return TimeUpdate(predicted, healthy, joint, noise, motion.noise_matrix)
+        return TimeUpdate(predicted, healthy, healthy, joint, noise, motion.noise_matrix)
 
     def update(self, belief: Gaussian, measurement: AnyMeasurement, value: Tensor, *inputs: Tensor) -> Update:
         """The belief after a measurement: the "perception" of (9.21); Table 9.1 and steps 4 to 7 of Table 9.2.
@@ -118,43 +165,65 @@ class BayesFilter:
                 and on_failure is "raise".
             ValueError: shapes do not fit.
         """
+        require_tensor("the value", value)
+        noise = as_noise(measurement.noise, f"{type(measurement).__name__}.noise")
+        check_belief(belief, self.space)
+        check_inputs(inputs)
+        check_measurement(measurement, noise, value, belief)
         if belief.batch_shape != value.shape[:-1]:
             belief = belief.expand(torch.broadcast_shapes(belief.batch_shape, value.shape[:-1]))
         root, usable, sound = self._root(belief)
-        noise = as_noise(measurement.noise)
-        value, mask, count = _without_missing(value, measurement.mask)
+        value, mask, count, measured = _without_missing(value, measurement.mask)
+        usable = _both(usable, measured)
         added = None
         if _is_additive(measurement):
             added = noise = noise if mask is None else noise.masked(mask)
+        usable = _both(usable, nonnegative(noise.variance()))
 
-        def linearise(previous: TangentPosterior | None) -> tuple[Tensor, Columns, Form, TangentPosterior]:
-            innovation, columns = self._innovate(belief.mean, root, measurement, noise, value, inputs, previous)
+        def linearise(previous: TangentPosterior | None) -> tuple[_Seen, TangentPosterior]:
+            seen = self._innovate(belief.mean, root, measurement, noise, value, inputs, previous)
+            innovation, columns = seen.innovation, seen.columns
             if mask is not None:
                 innovation, columns = torch.where(mask, innovation, 0.0), _masked(columns, mask, added is None)
+            # What cannot be used is not looked at, so that it harms no derivative either.
+            used = _both(usable, finite(innovation, columns.odd))
+            if used is not None:
+                innovation, columns = torch.where(used[..., None], innovation, 0.0), _where(used, columns)
             form = self._form(belief, columns, innovation.shape[-1], added is not None)
-            return innovation, columns, form, solve(form, innovation, columns, added, root)
+            seen = replace(seen, innovation=innovation, columns=columns, form=form, usable=used)
+            return seen, solve(form, innovation, columns, added, root)
 
-        innovation, columns, form, at_prior = linearise(None)
-        solution = at_prior
+        seen, at_prior = linearise(None)
+        usable, solution = seen.usable, at_prior
         if self.iterations != "auto":
             for _ in range(0 if isinstance(measurement, LinearMeasurement) else self.iterations - 1):
-                solution = linearise(solution)[-1]
-        elif added is not None and columns.even is not None:
-            bent = _linearisation_error(columns.even, added) > TOLERATED_ERROR
-            if torch.compiler.is_compiling() or bool(bent.any()):
-                solution = linearise(solution)[-1].where(bent, solution)
+                last, solution = linearise(solution)
+                usable = _both(usable, last.usable)
+        elif seen.error is not None:
+            bent = seen.error(mask, noise) > TOLERATED_ERROR
+            if is_traced() or bool(bent.any()):
+                last, again = linearise(solution)
+                solution = again.where(bent, solution)
+                usable = _both(usable, None if last.usable is None else last.usable | ~bent)
         posterior = self._correct(belief, solution)
         usable = _both(_both(finite(posterior.mean, posterior.held), solution.healthy), usable)
+        usable = _both(usable, _sound_variances(posterior))
         suspects: dict[str, Callable[[], Tensor]] = {"measurement noise": noise.covariance}
         if (factored := solution.matrix) is not None:
             suspects["innovation covariance"] = lambda: factored
         posterior = self._deal_with(usable, posterior, belief, "update", suspects)
-        return Update(posterior, innovation, form, count, _both(usable, sound), at_prior, columns, added, root)
+        if usable is not None:
+            count = torch.where(usable, count, 0)
+        healthy = _both(usable, sound)
+        return Update(
+            posterior, seen.innovation, seen.form, count, healthy, usable, at_prior, seen.columns, added, root
+        )
 
     filter = filter_sequence
     smooth = smooth
 
-    def _by_root(self, belief: Gaussian) -> bool:
+    def goes_on_with_roots(self, belief: Gaussian) -> bool:
+        """Whether the belief after a step is held by a root."""
         if self.form != "auto":
             return self.form == "qr"
         return belief.is_square_root or torch.finfo(belief.mean.dtype).bits < 64
@@ -162,14 +231,17 @@ class BayesFilter:
     def _form(self, belief: Gaussian, columns: Columns, measurements: int, additive: bool) -> Form:
         if self.form != "auto":
             return self.form
-        return "qr" if self._by_root(belief) else choose_form(columns, measurements, additive)
+        return "qr" if self.goes_on_with_roots(belief) else choose_form(columns, measurements, additive)
 
     def _root(self, belief: Gaussian) -> tuple[Tensor, Tensor | None, Tensor | None]:
         """Lower root of the covariance (..., n, n); whether it is usable (...,), and whether it needed no mending."""
-        root, sound = belief.checked_factor()
-        if self.on_failure != "jitter" or sound is None:
-            return root, sound, None
-        root, usable = jittered(belief.covariance, root, sound)
+        root, usable = belief.checked_factor()
+        sound = None
+        if self.on_failure == "jitter" and usable is not None:
+            sound = usable
+            root, usable = jittered(belief.covariance, root, sound)
+        if usable is not None:
+            root = torch.where(usable[..., None, None], root, 0.0)
         return root, usable, sound
 
     def _require_flat(self, model: str) -> None:
@@ -180,7 +252,7 @@ class BayesFilter:
     def chart(self) -> Difference | None:
         """(points, reference) -> tangent at the reference; None in R^n, where it is their difference."""
         space = self.space
-        if space is None or space.flat:
+        if space is None or is_flat(space):
             return None
         return lambda points, reference: space.local(reference, points)
 
@@ -233,14 +305,14 @@ class BayesFilter:
         value: Tensor,
         inputs: tuple[Tensor, ...],
         previous: TangentPosterior | None,
-    ) -> tuple[Tensor, Columns]:
+    ) -> _Seen:
         """Innovation and deviations of a linearisation at the prior, or at the posterior of the previous one."""
         if isinstance(measurement, LinearMeasurement):
             self._require_flat("LinearMeasurement")
             if inputs:
                 raise ValueError("an input was given, but a LinearMeasurement takes none")
             innovation = value - measurement.function(mean)
-            return innovation, Columns(multiply(measurement.matrix, root))
+            return _Seen(innovation, Columns(multiply(measurement.matrix, root)))
         size = root.shape[-1]
         shift = None if previous is None else previous.shift
         spread = None if previous is None else previous.spread()
@@ -267,10 +339,25 @@ class BayesFilter:
         innovation = seen.from_mean(value, measurement.residual)
         seen_columns = seen.columns if measurement.additive else _with_noise_columns(seen.columns, size)
         if previous is None or spread is None:
-            return innovation, seen_columns
+            return _Seen(innovation, seen_columns, self._error(measurement, seen.columns, size))
         # The slope was taken along L M; the update wants it along L, and M is far from singular.
         odd = solve_lower_transposed(spread, seen_columns.odd.mT).mT
-        return innovation + apply(odd, previous.mean), Columns(odd, seen_columns.even, seen_columns.negative)
+        return _Seen(innovation + apply(odd, previous.mean), Columns(odd, seen_columns.even, seen_columns.negative))
+
+    def _error(self, measurement: MeasurementModel, columns: Columns, size: int) -> _Error | None:
+        """Makes the error of a linearisation, as far as the transform can see any; None: as good as none."""
+        if isinstance(self.transform, Unscented) and not self.transform.points.sees_error:
+            # Nothing shows whether a second linearisation is worth while: it is made.
+            return lambda mask, noise: torch.full_like(columns.odd[..., 0, 0], torch.inf)
+        even = columns.even
+        if even is None:
+            return None
+
+        def error(mask: Tensor | None, noise: Noise) -> Tensor:
+            variance = noise.variance() if measurement.additive else columns.odd[..., size:].square().sum(dim=-1)
+            return _linearisation_error(even, variance, mask)
+
+        return error
 
     def _correct(self, belief: Gaussian, solution: TangentPosterior) -> Gaussian:
         """The posterior of the state, with its covariance in the chart at the new mean."""
@@ -303,7 +390,7 @@ def KalmanFilter(  # noqa: N802 - three names for users, one class
 
 
 def ExtendedKalmanFilter(  # noqa: N802
-    space: Manifold | None = None,
+    space: Space | None = None,
     *,
     form: Form | Literal["auto"] = "auto",
     iterations: int | Literal["auto"] = "auto",
@@ -314,7 +401,7 @@ def ExtendedKalmanFilter(  # noqa: N802
 
 
 def UnscentedKalmanFilter(  # noqa: N802
-    space: Manifold | None = None,
+    space: Space | None = None,
     points: SigmaPoints | None = None,
     *,
     form: Form | Literal["auto"] = "auto",
@@ -325,9 +412,33 @@ def UnscentedKalmanFilter(  # noqa: N802
     return BayesFilter(Unscented(points or cubature()), space, form, iterations, on_failure)
 
 
-def _linearisation_error(even: Tensor, noise: Noise) -> Tensor:
+def _linearisation_error(even: Tensor, variance: Tensor, mask: Tensor | None) -> Tensor:
     """Expected square of what sigma points see of the linearisation's error, (...,), over the noise's variance."""
-    return ((even * even).sum(dim=-1) / noise.variance()).sum(dim=-1)
+    # Where there is no noise, no error is small.
+    share = (even * even).sum(dim=-1) / variance.clamp_min(torch.finfo(variance.dtype).tiny)
+    return (share if mask is None else torch.where(mask, share, 0.0)).sum(dim=-1)
+
+
+def _suspects(noise: Noise, predicted: Gaussian) -> Suspects:
+    """What may have made a prediction fail, beside the prior."""
+    return {"process noise": noise.covariance, "predicted covariance": lambda: predicted.covariance}
+
+
+def _where(usable: Tensor, columns: Columns) -> Columns:
+    """The columns where usable (...,) bool is true, zeros elsewhere."""
+    rows = usable[..., None, None]
+    odd = torch.where(rows, columns.odd, 0.0)
+    even = None if columns.even is None else torch.where(rows, columns.even, 0.0)
+    negative = None if columns.negative is None else torch.where(rows, columns.negative, 0.0)
+    return Columns(odd, even, negative)
+
+
+def _sound_variances(belief: Gaussian) -> Tensor | None:
+    """Whether no variance is negative beyond round-off, (...,) bool or None if so for all; a root has none."""
+    if belief.is_square_root:
+        return None
+    variance = torch.diagonal(belief.held, dim1=-2, dim2=-1)
+    return nonnegative(variance, PIVOT_TOLERANCES[variance.dtype])
 
 
 def _is_additive(model: AnyMotion | AnyMeasurement) -> bool:
@@ -370,14 +481,19 @@ def _entering_twice(noise: Noise, noise_matrix: Tensor | None) -> Tensor:
     return multiply(multiply(noise_matrix, noise.covariance()), noise_matrix.mT)
 
 
-def _without_missing(value: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None, Tensor | int]:
-    """Value with zeros for what is missing, mask (..., m) if anything can be, and the number of components."""
-    present = ~torch.isnan(value)
+def _without_missing(value: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None, Tensor | int, Tensor | None]:
+    """Value with zeros for what is missing, mask (..., m) if anything can be, and the number of components.
+
+    The last is whether what is there is finite, (...,) bool, or None if it is for all.
+    """
     # Whether anything is missing is worth a look on a CPU; compiled or on a GPU the look costs more than the mask.
-    if mask is None and value.device.type == "cpu" and not torch.compiler.is_compiling() and bool(present.all()):
-        return value, None, value.shape[-1]
+    regular = torch.isfinite(value)
+    if mask is None and may_look(value) and bool(regular.all()):
+        return value, None, value.shape[-1], None
+    present = ~torch.isnan(value)
     present = present if mask is None else present & mask
-    return torch.where(present, value, 0.0), present, present.sum(dim=-1)
+    measured = (regular | ~present).all(dim=-1)
+    return torch.where(present & regular, value, 0.0), present, present.sum(dim=-1), measured
 
 
 def _masked(columns: Columns, mask: Tensor, unit_noise: bool) -> Columns:

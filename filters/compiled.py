@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import wraps
 from types import FunctionType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
+
+from sigmaslam.filters.failure import FAILED
 
 F = TypeVar("F", bound=Callable)
 
@@ -17,13 +20,14 @@ def compile_step(step: F) -> F:
     A step is a function of tensors that calls `predict` and `update` and returns tensors. Batches of small filters are
     fused into a few loops; of a single filter most of the overhead goes. The first call for each set of shapes takes
     from ten seconds to a minute. Filters and models that the step refers to are taken as they are then: compile anew
-    after changing one. Give the filter on_failure="hold" and a fixed number of iterations, or the step is either cut
-    in two or always linearises twice.
+    after changing one. A filter with iterations="auto" always linearises twice in compiled code. One with
+    on_failure="raise" raises as it does elsewhere; the step is run once more, uncompiled, to find what to name.
 
     Args:
         step: a plain function of tensors, without side effects.
     Raises:
         TypeError: the step is not a plain function.
+        FilterError: by the compiled step, where the step raises it.
     """
     if not isinstance(step, FunctionType):
         raise TypeError(f"compile_step takes a plain function (def or lambda), got {type(step).__name__}")
@@ -37,4 +41,15 @@ def compile_step(step: F) -> F:
     }
     if not torch.cuda.is_available():
         options["cpp_wrapper"] = True  # Python's share of a call is most of it for a single filter
-    return torch.compile(copy, dynamic=False, fullgraph=True, options=options)  # type: ignore[arg-type,return-value]
+    compiled = torch.compile(copy, dynamic=False, fullgraph=True, options=options)  # type: ignore[arg-type]
+
+    @wraps(step)
+    def run(*arguments: Any, **named: Any) -> Any:
+        try:
+            return compiled(*arguments, **named)
+        except RuntimeError as error:
+            if FAILED not in str(error):
+                raise
+        return step(*arguments, **named)
+
+    return run  # type: ignore[return-value]

@@ -19,6 +19,9 @@ POLICIES: tuple[OnFailure, ...] = ("raise", "hold", "jitter")
 
 Suspects = Mapping[str, Callable[[], Tensor]]
 
+# What compiled code says, which can name neither stage nor element.
+FAILED = "a filter failed for an element of the batch: run the step uncompiled to see which"
+
 _JITTERS = tuple(10.0 ** (half / 2) for half in range(-24, -5))
 _SHOWN = 5
 
@@ -35,8 +38,11 @@ def raise_unless_healthy(healthy: Tensor, stage: str, suspects: Suspects) -> Non
         stage: what was being done.
         suspects: makers of symmetric matrices (..., n, n), by name, the first to be suspected first.
     Raises:
-        FilterError: an element is not healthy.
+        FilterError: an element is not healthy. In compiled code, where nothing can be named, RuntimeError.
     """
+    if torch.compiler.is_compiling():
+        torch._assert_async(healthy.all(), FAILED)
+        return
     if bool(healthy.all()):
         return
     first = tuple((~healthy).nonzero()[0].tolist())
@@ -75,12 +81,17 @@ def jittered(covariance: Tensor, factor: Tensor, healthy: Tensor) -> tuple[Tenso
 
 
 def _diagnosis(index: tuple[int, ...], batch: torch.Size, suspects: Suspects) -> str:
+    smallest = {}
     for name, make in suspects.items():
         matrix = make()
         element = matrix.detach().expand(*batch, *matrix.shape[-2:])[index]
         if not bool(torch.isfinite(element).all()):
             return f"the {name} of the first has entries that are not finite."
-        smallest = float(torch.linalg.eigvalsh(element)[0])
-        if smallest <= 0:
-            return f"the {name} of the first has the smallest eigenvalue {smallest:.3g}."
+        smallest[name] = float(torch.linalg.eigvalsh(element)[0])
+        if smallest[name] < 0:
+            return f"the {name} of the first has the smallest eigenvalue {smallest[name]:.3g}."
+    # Only where nothing is worse: a covariance may be singular.
+    for name, value in smallest.items():
+        if value == 0:
+            return f"the {name} of the first has the smallest eigenvalue 0."
     return "the result is not finite."

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from sigmaslam.filters.layout import choose
-from sigmaslam.filters.linalg.square_roots import cholesky, square, triangularise
+from sigmaslam.filters.linalg.square_roots import cholesky, may_look, square, triangularise
+from sigmaslam.filters.tensors import require_floating, require_tensor
 
 
 class Gaussian:
@@ -21,7 +22,7 @@ class Gaussian:
         mean: (..., p) point; p = n in R^n.
     """
 
-    __slots__ = ("_covariance", "_factor", "_is_lower", "mean")
+    __slots__ = ("_covariance", "_factor", "_is_lower", "_unrooted", "mean")
 
     def __init__(
         self,
@@ -40,16 +41,20 @@ class Gaussian:
             factor_is_lower: the factor is known to be lower triangular, which saves making it so.
         Raises:
             ValueError: both or neither are given, or a shape or dtype does not fit.
+            TypeError: something other than a tensor is given.
         """
         if (covariance is None) == (factor is None):
             raise ValueError("a Gaussian needs either a covariance or a factor of it")
         given = covariance if covariance is not None else factor
         assert given is not None
+        require_tensor("the mean", mean)
+        require_tensor("the covariance" if covariance is not None else "the factor", given)
         if mean.ndim < 1 or given.ndim < 2 or (covariance is not None and given.shape[-1] != given.shape[-2]):
             kind = "covariance (..., n, n)" if covariance is not None else "factor (..., n, k)"
             raise ValueError(f"mean (..., p) and {kind} expected, got {tuple(mean.shape)} and {tuple(given.shape)}")
-        if mean.dtype != given.dtype or not mean.dtype.is_floating_point:
+        if mean.dtype != given.dtype:
             raise ValueError(f"mean and covariance need one floating dtype, got {mean.dtype} and {given.dtype}")
+        require_floating("the belief", mean)
         if given.shape[:-2] != mean.shape[:-1]:
             try:
                 given = given.expand(*mean.shape[:-1], *given.shape[-2:])
@@ -62,13 +67,18 @@ class Gaussian:
         self._covariance = given if covariance is not None else None
         self._factor = given if covariance is None else None
         self._is_lower = factor_is_lower
+        # Of a belief held by a root: the covariance (..., n, n) of elements that have no root, whose factor is NaN.
+        self._unrooted: Tensor | None = None
 
     @property
     def covariance(self) -> Tensor:
         """(..., n, n)."""
         if self._covariance is None:
             assert self._factor is not None
-            return square([self._factor])
+            covariance = square([self._factor])
+            if self._unrooted is None:
+                return covariance
+            return choose(self._factor[..., 0, 0].isnan(), self._unrooted, covariance, 2)
         return self._covariance
 
     @property
@@ -79,12 +89,14 @@ class Gaussian:
     def checked_factor(self) -> tuple[Tensor, Tensor | None]:
         """Lower triangular root (..., n, n), and (...,) bool: the covariance is positive semidefinite.
 
-        The second is None for a belief that is held by a root, of which any is as good as another.
+        The second is None for a belief that is held by a root, of which any is as good as another; but for elements
+        that were held because their covariance has none.
         """
         if self._covariance is not None:
             return cholesky(self._covariance)
         assert self._factor is not None
-        return self._factor if self._is_lower else triangularise([self._factor]), None
+        sound = None if self._unrooted is None else ~self._factor[..., 0, 0].isnan()
+        return self._factor if self._is_lower else triangularise([self._factor]), sound
 
     @property
     def held(self) -> Tensor:
@@ -113,13 +125,14 @@ class Gaussian:
         mean = self.mean[_of_batch(index, 1)]
         if self._covariance is not None:
             return Gaussian(mean, self._covariance[_of_batch(index, 2)])
-        assert self._factor is not None
-        return self._like(mean, self._factor[_of_batch(index, 2)])
+        return self._like(mean, lambda matrix: matrix[_of_batch(index, 2)])
 
     def expand(self, batch: Sequence[int]) -> Gaussian:
         """The same belief in every element of a larger batch."""
-        mean, held = self.mean.expand(*batch, -1), self.held.expand(*batch, -1, -1)
-        return Gaussian(mean, held) if self._covariance is not None else self._like(mean, held)
+        mean = self.mean.expand(*batch, -1)
+        if self._covariance is not None:
+            return Gaussian(mean, self._covariance.expand(*batch, -1, -1))
+        return self._like(mean, lambda matrix: matrix.expand(*batch, -1, -1))
 
     def where(self, chosen: Tensor, other: Gaussian) -> Gaussian:
         """This belief where chosen (...,) bool is true, the other elsewhere; held as this one is."""
@@ -128,26 +141,35 @@ class Gaussian:
         mean = choose(chosen, self.mean, other.mean, 1)
         if self._covariance is not None:
             return Gaussian(mean, choose(chosen, self._covariance, other.covariance, 2))
-        return Gaussian(mean, factor=choose(chosen, self.factor, other.factor, 2), factor_is_lower=True)
+        factor, sound = other.checked_factor()
+        if sound is None:
+            return Gaussian(mean, factor=choose(chosen, self.factor, factor, 2), factor_is_lower=True)
+        factor = torch.where(sound[..., None, None], factor, torch.nan)
+        mixed = Gaussian(mean, factor=choose(chosen, self.factor, factor, 2), factor_is_lower=True)
+        if not may_look(mean) or not bool((chosen | sound).all()):
+            mixed._unrooted = other.covariance
+        return mixed
 
     def to(self, *arguments: Any, **options: Any) -> Gaussian:
         """Another dtype or device, as `Tensor.to`."""
         mean = self.mean.to(*arguments, **options)
         if self._covariance is not None:
             return Gaussian(mean, self._covariance.to(*arguments, **options))
-        assert self._factor is not None
-        return self._like(mean, self._factor.to(*arguments, **options))
+        return self._like(mean, lambda matrix: matrix.to(*arguments, **options))
 
     def batch_last(self) -> Gaussian:
         """The same belief with batch-last memory: `mean[..., i]` is contiguous, and large batches run much faster."""
         mean = _with_batch_last_memory(self.mean, 1)
         if self._covariance is not None:
             return Gaussian(mean, _with_batch_last_memory(self._covariance, 2))
-        assert self._factor is not None
-        return self._like(mean, _with_batch_last_memory(self._factor, 2))
+        return self._like(mean, lambda matrix: _with_batch_last_memory(matrix, 2))
 
-    def _like(self, mean: Tensor, factor: Tensor) -> Gaussian:
-        return Gaussian(mean, factor=factor, factor_is_lower=self._is_lower)
+    def _like(self, mean: Tensor, change: Callable[[Tensor], Tensor]) -> Gaussian:
+        """With another mean, and the root changed; what has no root changes likewise."""
+        assert self._factor is not None
+        changed = Gaussian(mean, factor=change(self._factor), factor_is_lower=self._is_lower)
+        changed._unrooted = None if self._unrooted is None else change(self._unrooted)
+        return changed
 
     def __repr__(self) -> str:
         kind = "factor" if self.is_square_root else "covariance"

@@ -28,7 +28,7 @@ from sigmaslam.filters.linalg.square_roots import (
     solve_lower_transposed,
     triangularise,
 )
-from sigmaslam.filters.manifolds import Manifold
+from sigmaslam.filters.manifolds import Space, is_flat
 from sigmaslam.filters.models import AnyMeasurement, LinearMeasurement
 from sigmaslam.filters.noise_covariance import Dense, Noise, Rooted, as_noise
 from sigmaslam.filters.transforms import Taylor
@@ -87,7 +87,7 @@ class PointEstimate:
 def maximum_likelihood(
     observations: Sequence[Observation],
     initial: Tensor,
-    space: Manifold | None = None,
+    space: Space | None = None,
     *,
     iterations: int = 20,
     tolerance: float = 1e-10,
@@ -129,7 +129,7 @@ def maximum_likelihood(
 def maximum_a_posteriori(
     prior: Gaussian,
     observations: Sequence[Observation],
-    space: Manifold | None = None,
+    space: Space | None = None,
     *,
     iterations: int = 20,
     tolerance: float = 1e-10,
@@ -249,7 +249,7 @@ class _LeastSquares:
     """
 
     terms: Sequence[_Term]
-    space: Manifold | None
+    space: Space | None
     root: Tensor
     has_prior: bool
 
@@ -269,7 +269,7 @@ class _LeastSquares:
     def columns(self, anchor: Tensor, zeta: Tensor, state: Tensor) -> Tensor:
         """Derivative (..., n, n) by zeta of the tangent at the state; in R^n that is the root."""
         space = self.space
-        if space is None or space.flat:
+        if space is None or is_flat(space):
             return self.root
         shift = apply(self.root, zeta)
         return Taylor()(
@@ -405,10 +405,10 @@ def _estimate(
     return PointEstimate(belief, solution.cost, freedom, solution.iterations, solution.converged, healthy)
 
 
-def _prepare(k: int, observation: Observation, like: Tensor, batch: torch.Size, space: Manifold | None) -> _Term:
+def _prepare(k: int, observation: Observation, like: Tensor, batch: torch.Size, space: Space | None) -> _Term:
     model, value = observation.model, observation.value
     if isinstance(model, LinearMeasurement):
-        if (space is not None and not space.flat) or observation.inputs:
+        if not is_flat(space) or observation.inputs:
             raise TypeError(
                 f"observation {k}: LinearMeasurement is for states in R^n and takes no inputs; use MeasurementModel"
             )

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -28,8 +29,35 @@ from sigmaslam.filters.layout import concatenate, stack
 from sigmaslam.filters.lie_groups import Quaternion, Vector
 
 
+class Space(Protocol):
+    """What a filter asks of a space: two functions and two sizes. A `Manifold` is one, and so is any such object."""
+
+    @property
+    def point_size(self) -> int:
+        """Length p of a point."""
+        ...
+
+    @property
+    def tangent_size(self) -> int:
+        """Length n of a tangent."""
+        ...
+
+    def retract(self, point: Tensor, tangent: Tensor) -> Tensor:
+        """The point that a tangent leads to, point [+] tangent: (..., p), (..., n) -> (..., p)."""
+        ...
+
+    def local(self, point: Tensor, other: Tensor) -> Tensor:
+        """The shortest tangent that leads to another point, other [-] point: (..., p), (..., p) -> (..., n)."""
+        ...
+
+
+def is_flat(space: Space | None) -> bool:
+    """Whether retract is addition and local is subtraction: in R^n, and where a space says so."""
+    return space is None or bool(getattr(space, "flat", False))
+
+
 class Manifold(ABC):
-    """A space with a tangent space at each point: what a filter needs of it.
+    """A space with a tangent space at each point, whose arguments' sizes are checked.
 
     Subclasses implement `_retract` and `_local`, which may rely on the sizes of their arguments.
     """

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from sigmaslam.filters.linalg.square_roots import apply
-from sigmaslam.filters.noise_covariance import Noise
+from sigmaslam.filters.noise_covariance import BlockDiagonal, Diagonal, Noise, as_noise
 
 Function = Callable[..., Tensor]
 Residual = Callable[[Tensor, Tensor], Tensor]
@@ -108,6 +108,63 @@ class LinearMeasurement:
     def function(self, state: Tensor) -> Tensor:
         """H x for (..., n)."""
         return apply(self.matrix, state)
+
+
+def several(measurement: AnyMeasurement, count: int) -> AnyMeasurement:
+    """The measurement taken `count` times at one time, of what its inputs name: landmarks, beacons.
+
+    Values are (..., count m), end to end, and inputs (..., count, ·); each has the noise of its own, independent of
+    the others'.
+
+    Args:
+        measurement: of m components.
+        count: how many.
+    Raises:
+        ValueError: the noise is not additive, which would be noise of all in each.
+    """
+    noise = _repeated(as_noise(measurement.noise), count)
+    mask = measurement.mask
+    if mask is not None:
+        mask = mask.unsqueeze(-2).expand(*mask.shape[:-1], count, mask.shape[-1]).flatten(-2)
+    if isinstance(measurement, LinearMeasurement):
+        matrix = measurement.matrix
+        rows = matrix.unsqueeze(-3).expand(*matrix.shape[:-2], count, *matrix.shape[-2:])
+        return LinearMeasurement(rows.flatten(-3, -2), noise, mask)
+    if not measurement.additive:
+        raise ValueError("several measurements at one time need additive noise")
+
+    residual, see, slope = measurement.residual, measurement.function, measurement.jacobian
+
+    def values(state: Tensor, *inputs: Tensor) -> Tensor:
+        each = see(state.unsqueeze(-2), *inputs)
+        return each.expand(*each.shape[:-2], count, each.shape[-1]).flatten(-2)
+
+    def slopes(state: Tensor, *inputs: Tensor) -> Tensor:
+        assert slope is not None
+        each = slope(state.unsqueeze(-2), *inputs)
+        return each.expand(*each.shape[:-3], count, *each.shape[-2:]).flatten(-3, -2)
+
+    def differences(measured: Tensor, predicted: Tensor) -> Tensor:
+        assert residual is not None
+        measured, predicted = (each.unflatten(-1, (count, -1)) for each in (measured, predicted))
+        return residual(measured, predicted).flatten(-2)
+
+    return MeasurementModel(
+        values,
+        noise,
+        jacobian=None if slope is None else slopes,
+        residual=None if residual is None else differences,
+        mask=mask,
+    )
+
+
+def _repeated(noise: Noise, count: int) -> Noise:
+    """Independent noises of one covariance."""
+    if isinstance(noise, Diagonal):
+        variance = noise.variance().unsqueeze(-2)
+        return Diagonal(variance.expand(*variance.shape[:-2], count, variance.shape[-1]).flatten(-2))
+    block = noise.covariance().unsqueeze(-3)
+    return BlockDiagonal(block.expand(*block.shape[:-3], count, *block.shape[-2:]))
 
 
 AnyMotion = MotionModel | LinearMotion

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from sigmaslam.filters.linalg.square_roots import cholesky, identity, log_diagonal, solve_lower, square, triangularise
+from sigmaslam.filters.tensors import require_tensor
 
 
 class Noise(ABC):
@@ -48,6 +49,7 @@ class Diagonal(Noise):
 
     def __init__(self, variance: Tensor) -> None:
         """Takes the variances (..., m)."""
+        require_tensor("Diagonal's variance", variance)
         if variance.ndim < 1:
             raise ValueError("variances (..., m) expected, got a scalar")
         self._variance = variance
@@ -86,6 +88,7 @@ class BlockDiagonal(Noise):
 
     def __init__(self, blocks: Tensor) -> None:
         """Takes the blocks (..., b, k, k); component i k + j of the measurement is component j of block i."""
+        require_tensor("BlockDiagonal's blocks", blocks)
         if blocks.ndim < 3 or blocks.shape[-1] != blocks.shape[-2]:
             raise ValueError(f"blocks (..., b, k, k) expected, got {tuple(blocks.shape)}")
         self._blocks = Dense(blocks)
@@ -121,6 +124,7 @@ class Dense(Noise):
 
     def __init__(self, covariance: Tensor) -> None:
         """Takes the covariance (..., m, m)."""
+        require_tensor("Dense's covariance", covariance)
         if covariance.ndim < 2 or covariance.shape[-1] != covariance.shape[-2]:
             raise ValueError(f"a covariance (..., m, m) expected, got {tuple(covariance.shape)}")
         self._covariance = covariance
@@ -159,9 +163,21 @@ class Rooted(Noise):
         return self._root
 
 
-def as_noise(noise: Noise | Tensor) -> Noise:
-    """A tensor is taken for a dense covariance (..., m, m)."""
-    return Dense(noise) if isinstance(noise, Tensor) else noise
+def as_noise(noise: Noise | Tensor, name: str = "noise") -> Noise:
+    """A tensor is taken for a dense covariance (..., m, m); the name is for messages.
+
+    Raises:
+        TypeError: it is neither.
+        ValueError: the covariance is not square.
+    """
+    if isinstance(noise, Noise):
+        return noise
+    require_tensor(name, noise)
+    if noise.ndim < 2 or noise.shape[-1] != noise.shape[-2]:
+        raise ValueError(
+            f"{name} must be a covariance (..., m, m), got {tuple(noise.shape)}; variances alone are a Diagonal"
+        )
+    return Dense(noise)
 
 
 def _masked(covariance: Tensor, mask: Tensor) -> Tensor:

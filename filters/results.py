@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sigmaslam.filters.gaussian_belief import Gaussian
-from sigmaslam.filters.linalg.square_roots import multiply
+from sigmaslam.filters.linalg.square_roots import identity, multiply
 from sigmaslam.filters.noise_covariance import Noise
 from sigmaslam.filters.sigma_points import Columns
 from sigmaslam.filters.updates import Form, TangentPosterior, log_likelihood
@@ -25,6 +25,7 @@ class TimeUpdate:
 
     belief: Gaussian
     _healthy: Tensor | None = field(repr=False)
+    _usable: Tensor | None = field(repr=False)
     _joint: Callable[[], tuple[Tensor, Columns]] = field(repr=False)
     _noise: Noise | None = field(repr=False)
     _noise_matrix: Tensor | None = field(repr=False)
@@ -35,7 +36,10 @@ class TimeUpdate:
         return _all_of(self.belief) if self._healthy is None else self._healthy
 
     def joint_root(self) -> tuple[Tensor, list[Tensor], Tensor]:
-        """Deviations of the predicted state from the prior's (..., n, n), all others (..., n, c), the prior's root."""
+        """Deviations of the predicted state from the prior's (..., n, n), all others (..., n, c), the prior's root.
+
+        For an element that was held they stand for a state that did not move.
+        """
         root, columns = self._joint()
         if columns.negative is not None:
             raise ValueError("a smoother needs sigma weights that are not negative, such as those of cubature()")
@@ -43,7 +47,13 @@ class TimeUpdate:
         if self._noise is not None:
             factor = self._noise.factor()
             others.append(factor if self._noise_matrix is None else multiply(self._noise_matrix, factor))
-        return columns.odd, others, root
+        if self._usable is None:
+            return columns.odd, others, root
+        # A held state stood still: it is its own prediction.
+        moved = self._usable[..., None, None]
+        still = identity(root.shape[-1], root)
+        others = [torch.where(moved, other, 0.0) for other in others]
+        return torch.where(moved, columns.odd, still), others, torch.where(moved, root, still)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,7 +64,8 @@ class Update:
         belief: the posterior.
         innovation: (..., m) measured minus expected, zero where masked.
         form: how the update was computed, see `sigmaslam.filters.updates`.
-        count: components that took part, (...,) or a number: the degrees of freedom of the NIS.
+        count: components that took part, (...,) or a number: the degrees of freedom of the NIS. Of an element that
+            was held none did, so its NIS and log-likelihood are zero.
     """
 
     belief: Gaussian
@@ -62,6 +73,7 @@ class Update:
     form: Form
     count: Tensor | int
     _healthy: Tensor | None = field(repr=False)
+    _usable: Tensor | None = field(repr=False)
     _solution: TangentPosterior = field(repr=False)
     _columns: Columns = field(repr=False)
     _noise: Noise | None = field(repr=False)
@@ -75,12 +87,15 @@ class Update:
     @property
     def nis(self) -> Tensor:
         """Normalised innovation squared e^T S^-1 e, (...,)."""
-        return self._solution.nis()
+        return self._unless_held(self._solution.nis())
 
     @property
     def log_likelihood(self) -> Tensor:
         """Of the measurement, (...,)."""
-        return log_likelihood(self._solution, self.count)
+        return self._unless_held(log_likelihood(self._solution, self.count))
+
+    def _unless_held(self, amount: Tensor) -> Tensor:
+        return amount if self._usable is None else torch.where(self._usable, amount, 0.0)
 
     @property
     def innovation_covariance(self) -> Tensor:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor
@@ -44,7 +44,13 @@ class Columns:
 
 
 class SigmaPoints(Protocol):
-    """A sigma set for any dimension. Values are (k, ..., m), the k points first, in the order of `offsets`."""
+    """A sigma set for any dimension. Values are (k, ..., m), the k points first, in the order of `offsets`.
+
+    Attributes:
+        sees_error: whether the even columns show the error of a linearisation.
+    """
+
+    sees_error: ClassVar[bool]
 
     def offsets(self, columns: Tensor, with_centre: bool) -> Tensor:
         """Offsets (k, ..., n) of the points for a root (..., n, c) of the covariance; a centre comes last."""
@@ -77,6 +83,8 @@ class Symmetric:
     beta: float = 0.0
     kappa: float = 0.0
     allow_negative: bool = False
+
+    sees_error: ClassVar[bool] = True
 
     def weights(self, size: int) -> tuple[float, float, float]:
         """Of each pair's points, and the centre's for mean and covariance, for n = size.
@@ -142,6 +150,8 @@ class Symmetric:
 @dataclass(frozen=True, slots=True)
 class Simplex:
     """n + 1 points of equal weight, the fewest there can be; no even part is seen (Moireau & Chapelle 2011)."""
+
+    sees_error: ClassVar[bool] = False
 
     def has_centre(self, size: int) -> bool:
         """Never."""

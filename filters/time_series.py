@@ -14,6 +14,7 @@ from sigmaslam.filters.gaussian_belief import Gaussian
 from sigmaslam.filters.linalg.square_roots import apply, multiply, solve_lower_transposed, square, triangularise
 from sigmaslam.filters.models import AnyMeasurement, AnyMotion
 from sigmaslam.filters.results import TimeUpdate, Update
+from sigmaslam.filters.tensors import require_tensor
 
 if TYPE_CHECKING:
     from sigmaslam.filters.bayes import BayesFilter
@@ -56,7 +57,8 @@ def filter_sequence(
 
     Args:
         bayes: a Kalman, extended or unscented filter.
-        belief: at the time of the first measurement, before it; batch (...,).
+        belief: at the time of the first measurement, before it; batch (...,), to which that of the values broadcasts,
+            or the other way round.
         motion: the same for all steps, but for its inputs.
         measurement: the same for all steps, but for its inputs.
         values: (T, ..., m); NaN for what is missing.
@@ -66,13 +68,17 @@ def filter_sequence(
         FilterError: as `predict` and `update`; the message begins with the step.
         ValueError: lengths do not fit.
     """
-    steps = values.shape[0]
+    require_tensor("values", values)
+    steps = values.shape[0] if values.ndim else 0
     if values.ndim < 2 or steps == 0:
         raise ValueError(f"values (T, ..., m) with T > 0 expected, got {tuple(values.shape)}")
     for inputs, length, name in ((motion_inputs, steps - 1, "motion"), (measurement_inputs, steps, "measurement")):
         if any(len(given) != length for given in inputs):
             lengths = ", ".join(str(len(given)) for given in inputs)
             raise ValueError(f"{steps} measurements need {name} inputs of length {length}, got {lengths}")
+    batch = values.shape[1:-1]
+    if belief.batch_shape != batch:
+        belief = belief.expand(torch.broadcast_shapes(belief.batch_shape, batch))
     predictions: list[TimeUpdate] = []
     predicted: list[Gaussian] = [belief]
     updates: list[Update] = []

@@ -14,6 +14,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from sigmaslam.filters.linalg.plain import is_exporting
 from sigmaslam.filters.sigma_points import Columns, SigmaPoints, Symmetric
 
 Evaluate = Callable[[Tensor], Tensor]
@@ -109,9 +110,20 @@ class Taylor:
             values = evaluate(offsets)
             return values if difference is None else difference(values, reference)
 
-        pushed = torch.func.jvp(local, (torch.zeros_like(directions),), (directions,))
-        values, slopes = pushed[0], pushed[1]
+        values, slopes = push_forward(local, torch.zeros_like(directions), directions)
         return Transformed(None if difference is None else reference, values[0], Columns(slopes.movedim(0, -1)))
+
+
+def push_forward(function: Evaluate, offsets: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+    """Values of a function, and its derivative along the directions, which have the offsets' shape."""
+    if not is_exporting():
+        pushed = torch.func.jvp(function, (offsets,), (directions,))
+        return pushed[0], pushed[1]
+    # Forward derivatives cannot be traced, those of the backward pass, which is linear in its argument, can.
+    pulled = torch.func.vjp(function, offsets)
+    values, pull = pulled[0], pulled[1]
+    push = torch.func.vjp(lambda cotangent: pull(cotangent)[0], torch.zeros_like(values))[1]
+    return values, push(directions)[0]
 
 
 @dataclass(frozen=True, slots=True)

@@ -101,7 +101,12 @@ def _choose_flags(chosen: Tensor, first: Tensor | None, second: Tensor | None) -
 def choose_form(columns: Columns, measurements: int, additive: bool) -> Form:
     """Dense or low-rank, by what is larger: the measurement or the number of columns."""
     count = sum(part.shape[-1] for part in columns.all())
-    return "low-rank" if additive and columns.negative is None and measurements > count else "dense"
+    return "low-rank" if additive and columns.negative is None and _is_more(measurements, count) else "dense"
+
+
+def _is_more(measurements: int, count: int) -> bool:
+    """Whether there are more measurements than columns; a number that a graph leaves open is taken for many."""
+    return type(measurements) is not int or measurements > count
 
 
 def solve(form: Form, innovation: Tensor, columns: Columns, noise: Noise | None, prior: Tensor) -> TangentPosterior:
@@ -119,7 +124,7 @@ def solve(form: Form, innovation: Tensor, columns: Columns, noise: Noise | None,
         raise ValueError(f"the {form} form needs sigma weights that are not negative; use form='dense'")
     odd, even = columns.odd, columns.even
     count = odd.shape[-1] + (0 if even is None else even.shape[-1])
-    if even is not None and (noise is None or innovation.shape[-1] <= count):
+    if even is not None and (noise is None or not _is_more(innovation.shape[-1], count)):
         # Few measurements: the even columns join the noise, and only n unknowns are left.
         if form == "qr":
             noise = Rooted(triangularise([even]) if noise is None else noise.triangularised([even]))

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from sigmaslam.bounded_files import read_text, shorten
 from sigmaslam.errors import InputError
 from sigmaslam.models.feature_network import DESCRIPTOR_SIZE
 
@@ -13,6 +14,7 @@ _CARD_FIELDS = (
     *("config", "metrics_on_held_out_renders", "parameters", "data", "command", "commit", "seed"),
     *("duration_s", "hardware"),
 )
+_CARD_BYTES = 1 << 24
 
 
 def read_card(card: Path) -> dict[str, Any]:
@@ -24,9 +26,11 @@ def read_card(card: Path) -> dict[str, Any]:
     if not card.is_file():
         raise InputError(f"{card} does not exist: weights ship only with the card of the run that made them")
     try:
-        content: dict[str, Any] = json.loads(card.read_text())
-    except ValueError as error:
-        raise InputError(f"{card} is no card of a training run ({error}): train again") from error
+        content: Any = json.loads(read_text(card, _CARD_BYTES, "the card"))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{card} is no card of a training run ({shorten(str(error))}): train again") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{card} is no card of a training run: it is a {type(content).__name__}: train again")
     missing = [name for name in _CARD_FIELDS if name not in content]
     if missing:
         raise InputError(f"{card} is no card of a training run: it says nothing of {', '.join(missing)}")

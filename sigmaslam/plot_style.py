@@ -1,12 +1,28 @@
-"""Colours and axes of every figure."""
+"""Colours and axes of every figure, and what to say where matplotlib is not installed."""
 
-from matplotlib.axes import Axes
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 # Okabe and Ito's palette, which people with colour-blindness can tell apart.
 BLUE, VERMILLION, GREEN, ORANGE = "#0072B2", "#D55E00", "#009E73", "#E69F00"
 SKY, PURPLE, GREY, BLACK = "#56B4E9", "#CC79A7", "#8C8C8C", "#1A1A1A"
 SERIES = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
 """Colours of series in the order to use them."""
+
+NO_MATPLOTLIB = "matplotlib is not installed: pip install 'sigmaslam[report]' for the pictures"
+
+
+def has_matplotlib() -> bool:
+    """Whether figures can be drawn here."""
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError:
+        return False
+    return True
 
 
 def style_axes(axes: Axes) -> None:

@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from sigmaslam import StereoCamera
 
@@ -23,3 +24,18 @@ def test_links_in_the_pages_lead_to_files():
     for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:
         for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
             assert target.startswith("http") or (page.parent / target).exists(), f"{page.name} links to {target}"
+
+
+def test_the_python_in_the_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    pytest.importorskip("torch")
+    text = (ROOT / "README.md").read_text()
+    blocks = {name: re.findall(rf"```{name}\n(.*?)```", text, re.DOTALL) for name in ("python", "yaml")}
+    assert len(blocks["python"]) == 2
+    (tmp_path / "stereo.yaml").write_text(blocks["yaml"][0])
+    monkeypatch.chdir(tmp_path)
+    image = np.random.default_rng(0).integers(0, 255, (480, 752), dtype=np.uint8)
+    names: dict[str, object] = {"left": image, "right": image, "timestamp": 0.0}
+    for block in blocks["python"]:
+        exec(compile(block, "README.md", "exec"), names)
+    assert names["estimate"].covariance.shape == (6, 6)
+    assert names["result"].belief.mean.shape == (1000, 2)

@@ -27,11 +27,11 @@ from sigmaslam.filters import (
     Euclidean,
     ExtendedKalmanFilter,
     Gaussian,
-    Manifold,
     MotionModel,
     Product,
     UnscentedKalmanFilter,
 )
+from sigmaslam.filters.manifolds import Space
 from sigmaslam.filters.systems import differential_drive
 from sigmaslam.plot_style import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION, style_axes
 from sigmaslam.runs.figures import save_png
@@ -371,13 +371,13 @@ def _control() -> Tensor:
     return torch.tensor([_SPEED, 0.0], dtype=torch.float64)
 
 
-def _draw(belief: Gaussian, space: Manifold, count: int) -> Tensor:
+def _draw(belief: Gaussian, space: Space, count: int) -> Tensor:
     generator = torch.Generator().manual_seed(3)
     tangent = torch.randn(count, 3, generator=generator, dtype=torch.float64) @ belief.factor.mT
     return space.retract(belief.mean.expand(count, 3), tangent)
 
 
-def _cartesian_moments(belief: Gaussian, space: Manifold | None) -> tuple[Tensor, Tensor]:
+def _cartesian_moments(belief: Gaussian, space: Space | None) -> tuple[Tensor, Tensor]:
     """Mean and covariance of (x, y, theta) under a belief; on a manifold by a million samples."""
     if space is None:
         return belief.mean, belief.covariance

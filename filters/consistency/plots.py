@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 from torch import Tensor
 
 from sigmaslam.filters.consistency.statistics import Consistency, Coverage, Whiteness
-from sigmaslam.plot_style import BLUE, GREEN, GREY, SERIES, style_axes
+from sigmaslam.plot_style import BLUE, GREEN, GREY, NO_MATPLOTLIB, SERIES, style_axes
+
+try:
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
+except ImportError as error:
+    raise ImportError(NO_MATPLOTLIB) from error
 
 # A mean beyond this multiple of the band flattens it on a linear axis.
 _LINEAR_UP_TO = 5.0

@@ -11,8 +11,9 @@ from functools import lru_cache
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
-from sigmaslam.filters.linalg import semidefinite, unrolled
+from sigmaslam.filters.linalg import plain, unrolled
 
 
 def cholesky(matrix: Tensor) -> tuple[Tensor, Tensor | None]:
@@ -24,7 +25,9 @@ def cholesky(matrix: Tensor) -> tuple[Tensor, Tensor | None]:
         (..., n, n) lower triangular factor; (...,) bool, True where the matrix is positive semidefinite and finite, or
         None where that is known to hold for all. Where it does not, the factor is arbitrary.
     """
-    tolerance = semidefinite.PIVOT_TOLERANCES[matrix.dtype]
+    tolerance = plain.PIVOT_TOLERANCES[matrix.dtype]
+    if plain.is_exporting():
+        return plain.cholesky(matrix)
     if unrolled.is_small(matrix):
         return unrolled.cholesky(matrix, tolerance)
     factor, failure = torch.linalg.cholesky_ex(matrix)
@@ -35,21 +38,25 @@ def cholesky(matrix: Tensor) -> tuple[Tensor, Tensor | None]:
         return factor, failure == 0
     # LAPACK knows positive definite matrices only.
     healthy = failure == 0
-    lower = semidefinite.cholesky(matrix)
-    # Where a pivot was dropped, it is still there on the diagonal of what is missing, and must not be negative; beside
-    # it there may be as much as its root.
-    missing = (matrix - lower @ lower.mT).tril()
-    diagonal = torch.diagonal(matrix, dim1=-2, dim2=-1).abs()
-    pivots = torch.diagonal(missing, dim1=-2, dim2=-1)
-    allowed = tolerance * diagonal.unsqueeze(-1) * diagonal.unsqueeze(-2)
-    # Comparisons are False for NaN.
-    restored = (pivots >= -tolerance * diagonal).all(dim=-1) & (missing * missing <= allowed).all(dim=-1).all(dim=-1)
+    lower, restored = plain.cholesky(matrix)
     return torch.where(healthy[..., None, None], factor, lower), healthy | restored
 
 
 def may_look(array: Tensor) -> bool:
     """Whether control flow may depend on values: on a CPU a look is cheap, elsewhere it waits or breaks a graph."""
-    return array.device.type == "cpu" and not torch.compiler.is_compiling()
+    return array.device.type == "cpu" and not is_traced()
+
+
+def is_traced() -> bool:
+    """Whether a graph is made of what is called, and values are not there to be looked at."""
+    return torch.compiler.is_compiling() or plain.is_exporting()
+
+
+def is_differentiated(array: Tensor) -> bool:
+    """Whether derivatives of what is made of this will be asked for, backward or forward."""
+    if torch.is_grad_enabled() and array.requires_grad:
+        return True
+    return forward_ad.unpack_dual(array).tangent is not None
 
 
 def triangularise(pieces: Sequence[Tensor], diagonal: Tensor | None = None) -> Tensor:
@@ -65,15 +72,17 @@ def triangularise(pieces: Sequence[Tensor], diagonal: Tensor | None = None) -> T
     """
     pieces = _broadcast(pieces, None if diagonal is None else diagonal.shape[:-1])
     size = pieces[0].shape[-2]
-    columns = sum(piece.shape[-1] for piece in pieces)
+    columns = 0 if plain.is_exporting() else sum(piece.shape[-1] for piece in pieces)
     if unrolled.is_small(pieces[0], columns):
         return unrolled.triangularise(pieces, diagonal)
     if diagonal is not None:
         pieces = _broadcast([*pieces, torch.diag_embed(diagonal)])
         columns += size
     stacked = torch.cat(pieces, dim=-1) if len(pieces) > 1 else pieces[0]
-    # The backward pass needs Q; without one it need not be formed.
-    mode = "reduced" if torch.is_grad_enabled() and stacked.requires_grad else "r"
+    if plain.is_exporting():
+        return plain.triangularise(stacked)
+    # Derivatives need Q; without them it need not be formed.
+    mode = "reduced" if is_differentiated(stacked) else "r"
     upper = torch.linalg.qr(stacked.mT, mode=mode).R
     # Signs of a QR are arbitrary. A root does not mind, but sigma points should not depend on the form.
     sign = 1.0 - 2.0 * torch.signbit(torch.diagonal(upper, dim1=-2, dim2=-1)).to(upper.dtype)
@@ -87,6 +96,8 @@ def solve_lower(factor: Tensor, right: Tensor, regular: bool = False) -> Tensor:
     A zero pivot is a known direction, of which nothing is asked; with `regular` it is an error, and the result is not
     finite.
     """
+    if plain.is_exporting():
+        return plain.solve_lower(factor, right, regular)
     if unrolled.is_small(factor, right.shape[-1]):
         return unrolled.solve_lower(factor, right, regular)
     return torch.linalg.solve_triangular(factor if regular else _without_zero_pivots(factor), right, upper=False)
@@ -94,6 +105,8 @@ def solve_lower(factor: Tensor, right: Tensor, regular: bool = False) -> Tensor:
 
 def solve_lower_transposed(factor: Tensor, right: Tensor) -> Tensor:
     """L^-T B for lower triangular L (..., n, n) and B (..., n, c); a zero pivot is a known direction."""
+    if plain.is_exporting():
+        return plain.solve_lower_transposed(factor, right)
     if unrolled.is_small(factor, right.shape[-1]):
         return unrolled.solve_lower_transposed(factor, right)
     return torch.linalg.solve_triangular(_without_zero_pivots(factor).mT, right, upper=True)
@@ -132,6 +145,17 @@ def finite(vector: Tensor, matrix: Tensor) -> Tensor | None:
     return total - total == 0
 
 
+def nonnegative(variance: Tensor, tolerance: float = 0.0) -> Tensor | None:
+    """Whether none of (..., n) is negative, (...,) bool, or None if so for all elements; NaN is not sound.
+
+    Down to the tolerance, as a share of the largest, a negative one is taken for round-off of zero.
+    """
+    if may_look(variance) and variance.numel() and float(variance.detach().amin()) >= 0:
+        return None
+    floor = -tolerance * variance.abs().amax(dim=-1, keepdim=True) if tolerance else 0.0
+    return (variance >= floor).all(dim=-1)
+
+
 def log_diagonal(factor: Tensor) -> Tensor:
     """Logarithm of the determinant of L L^T, (..., n, n) -> (...,)."""
     return 2.0 * torch.log(torch.diagonal(factor, dim1=-2, dim2=-1)).sum(dim=-1)
@@ -139,7 +163,7 @@ def log_diagonal(factor: Tensor) -> Tensor:
 
 def identity(size: int, like: Tensor) -> Tensor:
     """Identity (n, n) of the other's dtype and device."""
-    if torch.compiler.is_compiling():
+    if is_traced():
         return torch.eye(size, dtype=like.dtype, device=like.device)
     return _kept_identity(size, like.dtype, like.device)
 
@@ -151,8 +175,8 @@ def _kept_identity(size: int, dtype: torch.dtype, device: torch.device) -> Tenso
 
 def _broadcast(pieces: Sequence[Tensor], other: torch.Size | None = None) -> list[Tensor]:
     """Matrices (..., r, c_i) with one batch shape, that of the other included."""
-    batches = {piece.shape[:-2] for piece in pieces} | ({other} if other is not None else set())
-    if len(batches) == 1:
+    batches = [piece.shape[:-2] for piece in pieces] + ([other] if other is not None else [])
+    if all(batch == batches[0] for batch in batches):
         return list(pieces)
     batch = torch.broadcast_shapes(*batches)
     return [piece.expand(*batch, *piece.shape[-2:]) for piece in pieces]

@@ -14,6 +14,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from sigmaslam.filters.linalg.plain import is_exporting
+
 ROWS = 8
 BATCH = 128
 # With more columns than this the unrolled program would be too long.
@@ -22,7 +24,7 @@ COLUMNS = 32
 
 def is_small(matrix: Tensor, columns: int = 0) -> bool:
     """Whether (..., rows, columns) is worth unrolling: few rows, and many of them (or compiled)."""
-    if matrix.shape[-2] > ROWS or max(columns, matrix.shape[-1]) > COLUMNS:
+    if is_exporting() or matrix.shape[-2] > ROWS or max(columns, matrix.shape[-1]) > COLUMNS:
         return False
     return torch.compiler.is_compiling() or math.prod(matrix.shape[:-2]) >= BATCH
 

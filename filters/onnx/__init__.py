@@ -1,1 +1,1 @@
-"""The parts of the filter that ship as ONNX graphs and that the tracker runs; they call no LAPACK."""
+"""ONNX: any filter's step as a graph (`step`), and the parts of the filter that the tracker runs as graphs."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from sigmaslam.filters.linalg.semidefinite import cholesky
+from sigmaslam.filters.linalg.plain import cholesky
 from sigmaslam.filters.onnx.exportable_se3 import adjoint_se3, exp_se3, invert_se3, log_se3
 from sigmaslam.filters.onnx.unscented import covariance_of, sigma_offsets
 
@@ -32,7 +32,7 @@ class Predict(nn.Module):
         self, pose: Tensor, twist: Tensor, covariance: Tensor, step: Tensor, densities: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Sigma points through T Exp(twist dt); noise is added after."""
-        offsets = sigma_offsets(cholesky(covariance))
+        offsets = sigma_offsets(cholesky(covariance)[0])
         predicted = pose @ exp_se3(twist * step)
         moved = exp_se3(offsets[:, POSE]) @ pose @ exp_se3((twist + offsets[:, TWIST]) * step)
         error = log_se3(moved @ invert_se3(predicted))

@@ -21,7 +21,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder, make_folder
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory
-from sigmaslam.readers.trajectory_files import check_covariances, read_tum, write_kitti, write_tum
+from sigmaslam.readers.trajectory_files import read_covariances, read_tum, write_kitti, write_tum
 from sigmaslam.runs.frame_table import FRAMES_NAME
 from sigmaslam.runs.recorded_run import REFINE_NAME, REFINED_TRAJECTORY
 from sigmaslam.runs.report import write_report
@@ -53,7 +53,7 @@ def refine_run(
     check_new_folder(out)
     trajectory = _read_trajectory(run)
     tracks = read_tracks(run / TRACKS_NAME, len(trajectory))
-    covariances = _read_covariances(run / "covariance.npy", len(trajectory))
+    covariances = read_covariances(run / "covariance.npy", len(trajectory))
     make_folder(out)
     read = time.perf_counter()
 
@@ -160,11 +160,3 @@ def _read_trajectory(run: Path) -> Trajectory:
             "both must come from the same run"
         )
     return final
-
-
-def _read_covariances(path: Path, count: int) -> np.ndarray:
-    try:
-        covariances = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); run `sigmaslam track --tracks` again") from error
-    return check_covariances(covariances, path, count)

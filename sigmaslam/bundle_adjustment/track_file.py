@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from sigmaslam.bounded_files import load_arrays
 from sigmaslam.errors import InputError
 
 TRACKS_NAME = "tracks.npz"
@@ -64,14 +63,7 @@ def read_tracks(path: Path, frames: int) -> Tracks:
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file; {_MEND.replace(' again', '')} to make a run with the observations")
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            missing = [name for name in _SHAPES if name not in archive.files]
-            if missing:
-                raise InputError(f"{path}: misses {', '.join(missing)}; {_MEND}")
-            arrays = {name: archive[name] for name in _SHAPES}
-    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"{path}: is no numpy archive, or is cut off ({error}); {_MEND}") from error
+    arrays = load_arrays(path, _MEND, _SHAPES)
     count = len(arrays["frame"]) if arrays["frame"].ndim else 0
     for name, shape in _SHAPES.items():
         array = arrays[name]

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from sigmaslam.cli.extras import need_train_extra
+from sigmaslam.cli.extras import need_report_extra, need_train_extra
 from sigmaslam.errors import InputError
 
 # Each runs one benchmark and returns its page. It is given where the page goes, the command that the page names, and,
@@ -19,6 +19,8 @@ from sigmaslam.errors import InputError
 _BENCHMARKS: dict[str, Callable[..., str]] = {}
 # They leave out what needs the extra `train`.
 _WITHOUT_TRAIN = ("sequences", "runtime", "geometry")
+# Their pages need a picture, which the extra `report` draws.
+_DRAWN = ("claims", "renders")
 
 
 def _registered(function: Callable[..., str]) -> Callable[..., str]:
@@ -178,7 +180,7 @@ Benchmark = StrEnum("Benchmark", list(_BENCHMARKS))  # type: ignore[misc]
 
 def benchmark(
     context: typer.Context,
-    name: Annotated[Benchmark, typer.Argument(help="Which benchmark.")],
+    name: Annotated[Benchmark, typer.Argument(metavar="NAME", help="Which benchmark, of those above.")],
     out: Annotated[Path, typer.Option(help="Markdown page to write; notes below '<!-- notes -->' in it are kept.")],
     data: Annotated[
         Path | None,
@@ -254,7 +256,7 @@ def benchmark(
     frames of a shaken camera with a slow shutter are right when they are called tracked. endurance: memory,
     time and error over 10,000 frames of a lap over and over (ten minutes to render, then a quarter of an hour).
     runtime: CPU and wall time, memory and start-up beside OpenCV's odometry, cuVSLAM and ORB-SLAM3 (extra 'peers').
-    All but sequences and runtime need the extra 'train'.
+    All but sequences and runtime need the extra 'train', claims and renders also 'report'.
     """
     values = {option: value for option, value in locals().items() if option not in ("context", "name", "out")}
     run = _BENCHMARKS[name.value]
@@ -266,6 +268,8 @@ def benchmark(
             raise InputError(f"--{option} is not an option of the benchmark {name.value}: leave it out")
     if name.value not in _WITHOUT_TRAIN:
         need_train_extra()
+    if name.value in _DRAWN:
+        need_report_extra()
     typer.echo(run(out, f"sigmaslam benchmark {name.value} --out {out}", **{each: values[each] for each in served}))
 
 

@@ -26,7 +26,8 @@ from sigmaslam.cli.train import train, train_scorer
 from sigmaslam.errors import SigmaSlamError
 from sigmaslam.files import printable
 
-app = typer.Typer(name="sigmaslam", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+# Plain help: rich's tables cut long words and give flags a type.
+app = typer.Typer(name="sigmaslam", no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
 
 
 def _show_version(wanted: bool) -> None:
@@ -44,22 +45,23 @@ def _root(
     """Stereo visual SLAM: poses with an honest covariance and a sparse map, on a plain CPU."""
 
 
-for _command in (
-    demo,
-    check,
-    track,
-    finish,
-    match,
-    geometry,
-    evaluate,
-    refine,
-    render,
-    train,
-    train_scorer,
-    export,
-    benchmark,
+# A line each for the list of commands, short enough for 80 columns.
+for _command, _line in (
+    (demo, "Track the sequence that ships with the package."),
+    (check, "Look at an input before it is tracked."),
+    (track, "Track a stereo sequence, recorded or live."),
+    (finish, "Make the results of a run that was killed."),
+    (evaluate, "Compare a trajectory with the truth."),
+    (refine, "Adjust all of a run at once (extra 'graph')."),
+    (match, "Match two images."),
+    (geometry, "Find how two views lie to each other."),
+    (render, "Render a stereo sequence with exact truth (extra 'train')."),
+    (train, "Train the correspondence network (extra 'train')."),
+    (train_scorer, "Train the probability of matches (extra 'train')."),
+    (export, "Export trained weights to ONNX (extra 'train')."),
+    (benchmark, "Run a benchmark and write its page."),
 ):
-    app.command()(_command)
+    app.command(short_help=_line)(_command)
 app.add_typer(calibration)
 
 

@@ -9,6 +9,8 @@ from typing import Annotated
 
 import typer
 
+from sigmaslam.plot_style import NO_MATPLOTLIB
+
 
 class Frame(StrEnum):
     """Whose poses a truth has."""
@@ -50,6 +52,8 @@ def evaluate(
 ) -> None:
     """Compare a trajectory with the truth: ATE, RPE, KITTI t_rel and r_rel, NEES; draws evaluation.png.
 
+    The picture needs the extra 'report'; the figures are the same without it.
+
     Poses of a run are also judged relative to earlier ones, 1, 10, 50, 100 m or 1, 5, 20 s back. Say how good the truth
     is with --truth-sigma-position and --truth-sigma-rotation: it counts there, and you see where it is no better than
     the estimate.
@@ -70,3 +74,5 @@ def evaluate(
         truth_convention=TruthConvention(truth_frame.value, truth_inverse, truth_quaternion.value, truth_unit.value),
     )
     typer.echo(json.dumps(evaluation.to_dict(), indent=2) if as_json else format_evaluation(evaluation))
+    if evaluation.figure_path is None:
+        typer.echo(f"No picture: {NO_MATPLOTLIB}", err=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from sigmaslam.errors import InputError
+from sigmaslam.plot_style import NO_MATPLOTLIB, has_matplotlib
 
 
 def need_train_extra() -> None:
@@ -12,3 +13,9 @@ def need_train_extra() -> None:
         import torch  # noqa: F401
     except ImportError as error:
         raise InputError(f"{error.name} is not installed: pip install 'sigmaslam[train]'") from error
+
+
+def need_report_extra() -> None:
+    """Refuses a command that only draws where matplotlib is missing."""
+    if not has_matplotlib():
+        raise InputError(NO_MATPLOTLIB)

@@ -22,6 +22,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.files import check_new_folder, printable
 from sigmaslam.frontend import FRONTENDS
 from sigmaslam.inference.onnx_graph import BACKENDS
+from sigmaslam.plot_style import NO_MATPLOTLIB
 from sigmaslam.readers import StereoSequence, open_cameras, open_sequence
 from sigmaslam.readers.open import FORMATS
 
@@ -51,8 +52,9 @@ def demo(
     folder = out or Path(tempfile.mkdtemp(prefix="sigmaslam-demo-"))
     with as_file(files("sigmaslam.synthetic") / "demo") as sequence:
         _track(open_sequence(sequence, "kitti"), folder, frontend, Backend["onnx"])
-        typer.echo(format_evaluation(evaluate_run(folder, sequence / "poses.txt")))
-    typer.echo(f"Report: {folder / 'report.html'}\nPicture: {folder / 'evaluation.png'}")
+        evaluation = evaluate_run(folder, sequence / "poses.txt")
+    picture = f"Picture: {evaluation.figure_path}" if evaluation.figure_path else f"No picture: {NO_MATPLOTLIB}"
+    typer.echo(f"{format_evaluation(evaluation)}\nReport: {folder / 'report.html'}\n{picture}")
 
 
 def track(
@@ -81,7 +83,7 @@ def track(
         typer.Option(
             metavar="NAMES",
             help="Errors of the calibration to estimate beside the disparity offset, as far as images tell them from "
-            "motion: yaw,pitch,focal, ... (docs/input.md).",
+            "motion, for example yaw,pitch,focal.",
         ),
     ] = None,
     map: Annotated[
@@ -118,8 +120,8 @@ def track(
     location: Annotated[
         Path | None,
         typer.Option(
-            help="CSV of a location sensor on what moves, to fuse: timestamp,x,y,z[,qx,qy,qz,qw],sigma_position"
-            "[,sigma_rotation]; any rate, any world (docs/object.md)."
+            help="CSV of a location sensor on what moves, to fuse, with columns timestamp, x, y, z, "
+            "sigma_position and, with rotations, qx, qy, qz, qw, sigma_rotation; any rate, any world."
         ),
     ] = None,
     realtime: Annotated[

@@ -19,7 +19,7 @@ from sigmaslam.frontend.learned import LearnedDetector
 from sigmaslam.frontend.match_confidence import ConfidenceEstimator
 from sigmaslam.frontend.nearest_neighbours import nearest_anywhere
 from sigmaslam.frontend.types import Features
-from sigmaslam.readers.images import read_grey
+from sigmaslam.readers.images import check_grey, read_grey
 
 DETECTORS = {"learned": LearnedDetector, "sift": SiftDetector, "orb": OrbDetector}
 # Matches with a smaller probability are dropped by default.
@@ -184,21 +184,20 @@ def draw_lines(
 
 
 def _detector(frontend: str, max_keypoints: int) -> Callable[[np.ndarray], Features]:
-    if frontend not in DETECTORS:
+    if not isinstance(frontend, str) or frontend not in DETECTORS:
         raise InputError(f"there is no front-end '{frontend}' for two images: choose one of {', '.join(DETECTORS)}")
-    if max_keypoints < _MIN_KEYPOINTS:
-        raise InputError(f"--max-keypoints is {max_keypoints}: give at least {_MIN_KEYPOINTS}")
+    if not isinstance(max_keypoints, int | np.integer) or max_keypoints < _MIN_KEYPOINTS:
+        raise InputError(f"--max-keypoints is {max_keypoints!r}: give a whole number of at least {_MIN_KEYPOINTS}")
     return DETECTORS[frontend](max_keypoints)
 
 
 def _check_probability(min_probability: float) -> None:
-    if not 0.0 <= min_probability <= 1.0:
-        raise InputError(f"--min-probability is {min_probability}: give a number from 0 to 1")
+    if not isinstance(min_probability, int | float | np.number) or not 0.0 <= min_probability <= 1.0:
+        raise InputError(f"--min-probability is {min_probability!r}: give a number from 0 to 1")
 
 
 def _checked(image: np.ndarray, name: str) -> np.ndarray:
-    if image.ndim != 2 or image.dtype != np.uint8:
-        raise InputError(f"{name} is {image.dtype} of shape {image.shape}: give a grey (H, W) uint8 image")
+    check_grey(image, name)
     height, width = image.shape
     if min(height, width) < _MIN_SIDE:
         raise InputError(f"{name} is {width}x{height} pixels: give one of at least {_MIN_SIDE} on each side")

@@ -253,5 +253,6 @@ def _gradients(patches: np.ndarray, radius: int, spacing: float) -> tuple[np.nda
 def _tell_slow() -> None:
     """Once."""
     _LOGGER.warning(
-        "patches are aligned in NumPy, which is several times slower: install a C++ compiler and then sigmaslam again"
+        "patches are aligned in NumPy, which is several times slower: install the wheel of this Python and platform, "
+        "or a C++ compiler and then sigmaslam from its sources"
     )

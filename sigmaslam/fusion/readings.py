@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from sigmaslam.bounded_files import TABLE_BYTES, read_text, shorten
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.se3 import quaternion_to_matrix
+from sigmaslam.readers.pairing import in_seconds
 
 _POSITION = ("timestamp", "x", "y", "z")
 _QUATERNION = ("qx", "qy", "qz", "qw")
@@ -18,6 +21,10 @@ _ONE_SIGMA = ("sigma_position",)
 _AXIS_SIGMAS = ("sigma_x", "sigma_y", "sigma_z")
 _MATRIX = ("cxx", "cxy", "cxz", "cyy", "cyz", "czz")
 _ROTATION_SIGMA = "sigma_rotation"
+_FORM = (
+    f"the first line names the columns: {', '.join((*_POSITION, *_ONE_SIGMA))} and, with rotations, "
+    f"{', '.join((*_QUATERNION, _ROTATION_SIGMA))}"
+)
 # The length of a quaternion may differ from 1 by so much, as files have few digits.
 _LENGTH_TOLERANCE = 0.01
 
@@ -57,19 +64,25 @@ def read_locations(path: Path) -> Locations:
         InputError: a column is missing or a value is wrong; the message gives file, line and value.
     """
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = [
-                (number, row) for number, row in enumerate(csv.reader(file), 1) if any(cell.strip() for cell in row)
-            ]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(
-            f"{path}: not a CSV file that can be read ({error}); see docs/object.md for its form"
-        ) from None
+        file = io.StringIO(read_text(path, TABLE_BYTES, "the readings"), newline="")
+        rows = [(number, row) for number, row in enumerate(csv.reader(file), 1) if any(cell.strip() for cell in row)]
+    except csv.Error as error:
+        raise InputError(f"{path}: not a CSV file that can be read ({error}); {_FORM}") from None
     if len(rows) < 2:
         raise InputError(f"{path}: holds no readings; its first line names the columns, each further line is a reading")
     names = [cell.strip().lstrip("#").strip() for cell in rows[0][1]]
+    for separator, word in ((";", "semicolons"), ("\t", "tabs")):
+        if len(names) == 1 and separator in names[0]:
+            raise InputError(
+                f"{path}, line 1: the columns are separated by {word}: separate them by commas, and write numbers with "
+                "a decimal point"
+            )
+    if len(set(names)) < len(names):
+        double = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"{path}, line 1: column {shorten(double)} stands twice: remove one")
     columns = _columns(path, names)
     table = np.array([_numbers(path, number, row, names, columns) for number, row in rows[1:]])
+    in_seconds(path, table[:, columns.index("timestamp")].tolist())
     lines = [number for number, _ in rows[1:]]
     value = dict(zip(columns, table.T, strict=True))
     for k in np.flatnonzero(np.diff(value["timestamp"]) <= 0)[:1]:
@@ -97,7 +110,7 @@ def _columns(path: Path, names: list[str]) -> list[str]:
         missing = [name for name in some if name not in names]
         if missing:
             raise InputError(
-                f"{path}, line 1: column {missing[0]} is missing, there are {', '.join(names)}; see docs/object.md"
+                f"{path}, line 1: column {missing[0]} is missing, there are {shorten(', '.join(names), 200)}; {_FORM}"
             )
         return list(some)
 
@@ -105,8 +118,9 @@ def _columns(path: Path, names: list[str]) -> list[str]:
     spreads = [some for some in (_ONE_SIGMA, _AXIS_SIGMAS, _MATRIX) if some[0] in names]
     if len(spreads) != 1:
         raise InputError(
-            f"{path}, line 1: the covariance of the position must be given once, there are {', '.join(names)}; give "
-            f"the column {_ONE_SIGMA[0]}, or {', '.join(_AXIS_SIGMAS)}, or {', '.join(_MATRIX)}"
+            f"{path}, line 1: the covariance of the position must be given once, there are "
+            f"{shorten(', '.join(names), 200)}; "
+            f"give the column {_ONE_SIGMA[0]}, or {', '.join(_AXIS_SIGMAS)}, or {', '.join(_MATRIX)}"
         )
     columns += need(spreads[0])
     if any(name in names for name in _QUATERNION):
@@ -125,7 +139,9 @@ def _numbers(path: Path, line: int, row: list[str], names: list[str], columns: l
         except ValueError:
             number = math.nan
         if not math.isfinite(number):
-            raise InputError(f"{path}, line {line}: {name} is {cells[name]!r}, no number; mend or remove the line")
+            raise InputError(
+                f"{path}, line {line}: {name} is {shorten(repr(cells[name]))}, no number; mend or remove the line"
+            )
         values.append(number)
     return values
 

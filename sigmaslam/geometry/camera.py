@@ -20,6 +20,8 @@ ORTHONORMAL_TOLERANCE = 1e-4
 # A pair counts as rectified when rows agree to about 0.01 px. Angles are in radians, offsets relative to the baseline.
 RECTIFIED_ANGLE = 1e-5
 RECTIFIED_OFFSET = 1e-4
+# Pixels; OpenCV's maps address no more.
+MAX_SIDE = 32_767
 
 _NEWTON_STEPS = 50
 _NEWTON_RESIDUAL = 1e-11
@@ -37,7 +39,7 @@ class CameraModel:
         distortion: coefficients: k1 k2 p1 p2 [k3 [k4 k5 k6]] for 'radtan', k1 k2 k3 k4 for 'equidistant'.
 
     Raises:
-        CalibrationError: a size or focal length is not positive, a value is not finite, or the number of
+        CalibrationError: a size or focal length is not positive or too large, a value is not finite, or the number of
             coefficients does not fit the model.
     """
 
@@ -53,8 +55,11 @@ class CameraModel:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "distortion", tuple(float(value) for value in self.distortion))
-        if self.width <= 0 or self.height <= 0:
-            raise CalibrationError(f"image size is {self.width}x{self.height}; width and height must be positive")
+        if not (0 < self.width <= MAX_SIDE and 0 < self.height <= MAX_SIDE):
+            raise CalibrationError(
+                f"image size is {self.width:.6g}x{self.height:.6g}; width and height must be positive, and at most "
+                f"{MAX_SIDE}"
+            )
         numbers = (self.fx, self.fy, self.cx, self.cy, self.skew, *self.distortion)
         if not np.all(np.isfinite(numbers)):
             raise CalibrationError(f"fx, fy, cx, cy, skew, distortion must be finite numbers, got {numbers}")

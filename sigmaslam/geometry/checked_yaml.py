@@ -7,32 +7,12 @@ from pathlib import Path
 from typing import Any, Self, cast
 
 import numpy as np
-import yaml
 
+from sigmaslam.bounded_files import CALIBRATION_BYTES, read_text, shorten
 from sigmaslam.errors import CalibrationError
+from sigmaslam.geometry.restricted_yaml import parse_yaml
 
 _REQUIRED: Any = object()
-
-
-class _UniqueKeyLoader(yaml.SafeLoader):
-    """Refuses a key that is given twice, of which YAML takes the last."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """The mapping; a scalar key may be there once."""
-        lines: dict[str, int] = {}
-        for key, _ in node.value:
-            if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
-                line = key.start_mark.line + 1
-                if key.value in lines:
-                    raise _DuplicateKeyError(
-                        f"key '{key.value}' is given twice, in lines {lines[key.value]} and {line}: keep one of them"
-                    )
-                lines[key.value] = line
-        return super().construct_mapping(node, deep)
-
-
-class _DuplicateKeyError(yaml.YAMLError):
-    """A key of a mapping is there twice; the message is for the user."""
 
 
 class CalibrationYaml:
@@ -47,20 +27,11 @@ class CalibrationYaml:
     def read(cls, path: str | os.PathLike[str]) -> Self:
         """Read a file; what OpenCV writes into its files and is no plain YAML is taken out."""
         path = Path(path)
-        try:
-            text = path.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise CalibrationError(f"{path}: cannot read the calibration: {error}") from None
+        text = read_text(path, CALIBRATION_BYTES, "the calibration", CalibrationError)
         first, _, body = text.partition("\n")
         if first.startswith("%YAML"):
             text = "\n" + _without_opencv_syntax(body)
-        try:
-            # A subclass of the safe loader.
-            entries = yaml.load(text, _UniqueKeyLoader)
-        except _DuplicateKeyError as error:
-            raise CalibrationError(f"{path}: {error}") from None
-        except yaml.YAMLError as error:
-            raise CalibrationError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
+        entries = parse_yaml(text, path, CalibrationError)
         if not isinstance(entries, dict):
             raise CalibrationError(f"{path}: expected keys with values, found {type(entries).__name__}")
         return cls(path, entries)
@@ -99,10 +70,8 @@ class CalibrationYaml:
         expected = "a number" if not shape else "a list of numbers" if size == "any" else f"{size} numbers in lists"
         value = self._get(key, expected, default)
         try:
-            # The conversion goes through str, as YAML 1.1 reads 1e-5 as text and booleans are no numbers.
-            array = np.array(value, dtype=str) if value != [] else np.zeros(0, dtype=str)
-            numbers = array.astype(np.float64)
-        except ValueError:
+            numbers = np.array(_floats(value), dtype=np.float64)
+        except (ValueError, OverflowError):
             raise self._wrong(key, expected, value) from None
         fits = numbers.ndim == len(shape) and all(
             n is None or n == m for n, m in zip(shape, numbers.shape, strict=True)
@@ -116,7 +85,7 @@ class CalibrationYaml:
         """Refuse unknown keys, as a misspelt optional key would be ignored."""
         unknown = [str(key) for key in self.entries if key not in known]
         if unknown:
-            raise self.error(f"unknown key {', '.join(unknown)}; known are {', '.join(known)}")
+            raise self.error(f"unknown key {shorten(', '.join(unknown))}; known are {', '.join(known)}")
 
     def _get(self, key: str, expected: str, default: Any = _REQUIRED) -> Any:
         if key in self.entries:
@@ -126,8 +95,22 @@ class CalibrationYaml:
         raise CalibrationError(f"{self.path}: key '{self.prefix}{key}' is missing; expected {expected}")
 
     def _wrong(self, key: str, expected: str, value: Any, detail: str = "") -> CalibrationError:
-        shown = str(value) if len(str(value)) <= 80 else str(value)[:77] + "..."
-        return CalibrationError(f"{self.path}: key '{self.prefix}{key}' must be {expected}, got {shown}{detail}")
+        return CalibrationError(
+            f"{self.path}: key '{self.prefix}{key}' must be {expected}, got {shorten(value)}{detail}"
+        )
+
+
+def _floats(value: Any) -> Any:
+    """Nested lists of floats; text counts where it is a number, as YAML 1.1 reads 1e-5 as text.
+
+    Raises:
+        ValueError, OverflowError: an item is something else, or too large.
+    """
+    if isinstance(value, list):
+        return [_floats(each) for each in value]
+    if isinstance(value, str | int | float) and not isinstance(value, bool):
+        return float(value)
+    raise ValueError
 
 
 def _without_opencv_syntax(text: str) -> str:

@@ -9,6 +9,7 @@ from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from sigmaslam.bounded_files import shorten
 from sigmaslam.errors import CalibrationError, FrameError, InputError, SigmaSlamError
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.readers.calibration import read_calibration
@@ -125,8 +126,8 @@ def open_reader(path: Path) -> Iterator[BagReader]:
         raise
     except Exception as error:
         raise InputError(
-            f"{path}: cannot be read as a ROS bag ({error or type(error).__name__}); where a recording was cut off, "
-            "`rosbag reindex` or `ros2 bag reindex` may mend it"
+            f"{path}: cannot be read as a ROS bag ({shorten(str(error), 300) or type(error).__name__}); where a "
+            "recording was cut off, `rosbag reindex` or `ros2 bag reindex` may mend it"
         ) from error
 
 

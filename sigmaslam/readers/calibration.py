@@ -4,6 +4,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+from sigmaslam.bounded_files import CALIBRATION_BYTES, read_text
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.checked_yaml import CalibrationYaml
@@ -128,10 +129,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _read_text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"{path}: cannot read the calibration: {error}") from None
+    return read_text(path, CALIBRATION_BYTES, "the calibration", CalibrationError)
 
 
 def _read_pair(

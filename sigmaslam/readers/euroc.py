@@ -3,6 +3,7 @@
 import csv
 from pathlib import Path
 
+from sigmaslam.bounded_files import TABLE_BYTES, read_text, shorten
 from sigmaslam.errors import InputError
 from sigmaslam.readers.calibration import find_calibration, read_calibration
 from sigmaslam.readers.euroc_calibration import read_sensors
@@ -65,12 +66,13 @@ def _asl_images(camera: Path) -> dict[int, Path]:
         return {int(path.stem): path for path in files}
     table = camera / "data.csv"
     try:
-        with table.open(newline="", encoding="utf-8") as file:
-            rows = [row for row in csv.reader(file) if len(row) >= 2 and not row[0].startswith("#")]
+        lines = read_text(table, TABLE_BYTES, "the time stamps").splitlines()
+        rows = [row for row in csv.reader(lines) if len(row) >= 2 and not row[0].startswith("#")]
         stamps = {row[1].strip(): int(row[0]) for row in rows}
-    except (OSError, ValueError) as error:
+    except (InputError, ValueError, csv.Error) as error:
         raise InputError(
-            f"{camera / 'data'}: names are no time stamps (such as {files[0].name}) and {table} cannot be used: {error}"
+            f"{camera / 'data'}: names are no time stamps (such as {files[0].name}) and {table} cannot be used: "
+            f"{shorten(str(error), 300)}"
         ) from None
     missing = [path.name for path in files if path.name not in stamps]
     if missing:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sigmaslam.bounded_files import CALIBRATION_BYTES, read_text
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 
@@ -49,10 +50,8 @@ def _camera_model(path: Path) -> CameraModel:
 
 
 def _lines(path: Path) -> list[str]:
-    try:
-        return [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-    except (OSError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"{path}: cannot read the calibration: {error}") from None
+    text = read_text(path, CALIBRATION_BYTES, "the calibration", CalibrationError)
+    return [line for line in text.splitlines() if line.strip()]
 
 
 def _numbers(path: Path, text: str) -> list[float]:

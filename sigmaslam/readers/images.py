@@ -9,11 +9,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from sigmaslam.bounded_files import read_bytes
 from sigmaslam.errors import FrameError, InputError
+from sigmaslam.readers.image_size import image_size
 
 logger = logging.getLogger(__name__)
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"})
+
+_KINDS = ("PNG", "JPEG", "BMP", "TIFF", "PNM")
+# Of a camera of today; files of a few kB can state sizes that take all memory to decode.
+MAX_PIXELS, MAX_FILE_BYTES = 1 << 26, 1 << 28
 
 # Reading stops after more failed pairs in a row.
 MAX_FAILURES = 20
@@ -54,14 +60,9 @@ def read_image(path: Path) -> np.ndarray:
         (H, W) or (H, W, C) array, colours in OpenCV's order.
 
     Raises:
-        FrameError: the file is missing, empty, truncated or no image.
+        FrameError: the file is missing, empty, truncated, too large or no image.
     """
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError:
-        raise FrameError(f"{path}: file is missing") from None
-    except OSError as error:
-        raise FrameError(f"{path}: cannot be read ({error.strerror})") from None
+    content = read_bytes(path, MAX_FILE_BYTES, "the image", FrameError)
     return decode_image(content, str(path))
 
 
@@ -72,13 +73,21 @@ def decode_image(content: bytes, name: str) -> np.ndarray:
         (H, W) or (H, W, C) array, colours in OpenCV's order.
 
     Raises:
-        FrameError: it is empty, truncated or no image.
+        FrameError: it is empty, truncated, too large or no image.
     """
     if not content:
         raise FrameError(f"{name}: file is empty (0 bytes)")
     # OpenCV 4 fills the missing part of a truncated JPEG with grey. A whole one ends with a marker after its last scan.
     if content[:2] == b"\xff\xd8" and content.rfind(b"\xff\xd9") < content.rfind(b"\xff\xda"):
         raise FrameError(f"{name}: JPEG is truncated")
+    size = image_size(content)
+    if size is None:
+        raise FrameError(f"{name}: not an image, or truncated; {', '.join(_KINDS)} are read")
+    if size[0] * size[1] > MAX_PIXELS:
+        raise FrameError(
+            f"{name}: states a size of {size[0]}x{size[1]} pixels, at most {MAX_PIXELS:,} are read; "
+            "is it the right file?"
+        )
     try:
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
@@ -86,6 +95,23 @@ def decode_image(content: bytes, name: str) -> np.ndarray:
     if image is None:
         raise FrameError(f"{name}: not an image, or truncated ({len(content)} bytes)")
     return image
+
+
+def check_grey(image: np.ndarray, name: str) -> None:
+    """Refuses what is no (H, W) uint8 array, in constant time.
+
+    Raises:
+        FrameError: names the image and what was given.
+    """
+    if not isinstance(image, np.ndarray):
+        raise FrameError(
+            f"{name} is {type(image).__name__} and no array: give a grey (H, W) uint8 image, such as "
+            "cv2.imread(path, cv2.IMREAD_GRAYSCALE) returns"
+        )
+    if image.ndim != 2 or image.dtype != np.uint8:
+        mend = "; colours go by cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)" if image.ndim == 3 else ""
+        mend += "" if image.dtype == np.uint8 else "; scale the values to 0 to 255 and use image.astype(np.uint8)"
+        raise FrameError(f"{name} is {image.dtype} of shape {image.shape}: give a grey (H, W) uint8 image{mend}")
 
 
 def read_grey(path: Path) -> np.ndarray:

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sigmaslam.bounded_files import CALIBRATION_BYTES, read_text, shorten
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.readers.calibration_size import ImageSize, UnknownImageSizeError, need_image_size
@@ -45,13 +46,10 @@ def read_kitti_calibration(path: Path, image_size: ImageSize | None, cameras: tu
 
 
 def _read_entries(path: Path, cameras: tuple[int, int]) -> dict[str, str]:
-    try:
-        lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-    except (OSError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"{path}: cannot read the calibration: {error}") from None
-    keyed = dict(line.split(":", 1) for line in lines if ":" in line)
-    if keyed:
-        return {key.strip(): value for key, value in keyed.items()}
+    text = read_text(path, CALIBRATION_BYTES, "the calibration", CalibrationError)
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    if any(":" in line for line in lines):
+        return _without_doubles(path, lines)
     if len(lines) == 2:
         return {f"P{camera}": line for camera, line in zip(cameras, lines, strict=True)}
     if len(lines) == 4:
@@ -62,6 +60,18 @@ def _read_entries(path: Path, cameras: tuple[int, int]) -> dict[str, str]:
     )
 
 
+def _without_doubles(path: Path, lines: list[str]) -> dict[str, str]:
+    """Values by key of lines `key: value`; others are left out."""
+    entries: dict[str, str] = {}
+    for line in lines:
+        key, colon, value = line.partition(":")
+        if colon and key.strip() in entries:
+            raise CalibrationError(f"{path}: key '{shorten(key.strip())}' stands twice: remove the wrong line")
+        if colon:
+            entries[key.strip()] = value
+    return entries
+
+
 def _matrix(path: Path, entries: dict[str, str], key: str, shape: tuple[int, ...]) -> np.ndarray:
     count = int(np.prod(shape))
     if key not in entries:
@@ -70,9 +80,11 @@ def _matrix(path: Path, entries: dict[str, str], key: str, shape: tuple[int, ...
     try:
         values = np.array([float(word) for word in words])
     except ValueError as error:
-        raise CalibrationError(f"{path}: key '{key}' must be {count} numbers: {error}") from None
+        raise CalibrationError(f"{path}: key '{key}' must be {count} numbers: {shorten(str(error))}") from None
     if len(values) != count or not np.all(np.isfinite(values)):
-        raise CalibrationError(f"{path}: key '{key}' must be {count} finite numbers, got {len(values)}: {words}")
+        raise CalibrationError(
+            f"{path}: key '{key}' must be {count} finite numbers, got {len(values)}: {shorten(entries[key])}"
+        )
     return values.reshape(shape)
 
 
@@ -111,7 +123,12 @@ def _from_projections(
     left, right = (_matrix(path, entries, key, (3, 4)) for key in keys)
     models = [_model(path, key, P[:, :3], image_size) for key, P in zip(keys, (left, right), strict=True)]
     T_left_right = np.eye(4)
-    T_left_right[:3, 3] = right_position(left, right)
+    try:
+        T_left_right[:3, 3] = right_position(left, right)
+    except np.linalg.LinAlgError:
+        raise CalibrationError(
+            f"{path}: keys '{keys[0]}' and '{keys[1]}': K has no inverse; correct the numbers"
+        ) from None
     return _stereo(path, models[0], models[1], T_left_right)
 
 
@@ -128,4 +145,8 @@ def _from_originals(
         T_camera_camera0[:3, :3] = _matrix(path, entries, f"R_{camera:02d}", (3, 3))
         T_camera_camera0[:3, 3] = _matrix(path, entries, f"T_{camera:02d}", (3,))
         poses.append(T_camera_camera0)
-    return _stereo(path, models[0], models[1], poses[0] @ np.linalg.inv(poses[1]))
+    try:
+        T_left_right = poses[0] @ np.linalg.inv(poses[1])
+    except np.linalg.LinAlgError:
+        raise CalibrationError(f"{path}: key 'R_{cameras[1]:02d}' is no rotation; correct the numbers") from None
+    return _stereo(path, models[0], models[1], T_left_right)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from sigmaslam.bounded_files import CALIBRATION_BYTES, read_text
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.geometry.checked_yaml import CalibrationYaml
@@ -27,8 +28,8 @@ def read_oak(path: Path) -> StereoCamera:
         CalibrationError: names file, key and what was expected.
     """
     try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+        entries = json.loads(read_text(path, CALIBRATION_BYTES, "the calibration", CalibrationError))
+    except (ValueError, RecursionError) as error:
         raise CalibrationError(f"{path}: cannot read the calibration: {error}") from None
     if not isinstance(entries, dict) or not isinstance(entries.get("cameraData"), list):
         raise CalibrationError(

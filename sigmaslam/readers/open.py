@@ -39,18 +39,27 @@ def open_sequence(
     path = Path(path)
     if format not in FORMATS:
         raise InputError(f"format {format!r} is unknown; use one of {', '.join(FORMATS)}")
+    calibration_path = None if calibration is None else Path(calibration)
+    try:
+        return _open(path, format, calibration_path, topics)
+    except OSError as error:  # a folder that may not be read
+        raise InputError(
+            f"{error.filename or path}: cannot be read ({error.strerror}); give a folder that you may read"
+        ) from error
+
+
+def _open(path: Path, format: str, calibration: Path | None, topics: bag.Topics) -> StereoSequence:
     if not path.exists():
         raise InputError(f"{path}: no such file or folder")
     if format == "auto":
         format = _detect(path)
-    calibration_path = None if calibration is None else Path(calibration)
     if format == "bag":
-        return bag.open_bag(path, calibration_path, topics)
+        return bag.open_bag(path, calibration, topics)
     if topics != (None, None):
         raise InputError(f"{path}: topics are given, and the format is {format!r}; only bags have topics")
     if format != "video" and not path.is_dir():
         raise InputError(f"{path}: a file; format {format!r} needs a folder")
-    return _OPENERS[format](path, calibration_path)
+    return _OPENERS[format](path, calibration)
 
 
 def _detect(path: Path) -> str:

@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 import cv2
 import numpy as np
 
+from sigmaslam.bounded_files import CALIBRATION_BYTES, read_text
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, DistortionModel, StereoCamera
 from sigmaslam.geometry.checked_yaml import CalibrationYaml
@@ -47,11 +48,11 @@ def _read_storage(paths: Sequence[Path]) -> CalibrationYaml:
 
 
 def _read_xml(path: Path) -> dict[str, Any]:
+    text = read_text(path, CALIBRATION_BYTES, "the calibration", CalibrationError)
     try:
-        text = path.read_text(encoding="utf-8")
         # Entities, which could grow without limit, are declared in a DOCTYPE.
         root = None if "<!DOCTYPE" in text else ElementTree.fromstring(text)
-    except (OSError, UnicodeDecodeError, ElementTree.ParseError) as error:
+    except ElementTree.ParseError as error:
         raise CalibrationError(f"{path}: cannot read the calibration: {error}") from None
     if root is None or root.tag != "opencv_storage":
         raise CalibrationError(f"{path}: expected <opencv_storage> and no DOCTYPE")

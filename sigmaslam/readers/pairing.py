@@ -11,6 +11,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from sigmaslam.bounded_files import TABLE_BYTES, list_folder, read_text, shorten
 from sigmaslam.errors import InputError
 from sigmaslam.readers.images import IMAGE_SUFFIXES
 
@@ -20,6 +21,9 @@ DEFAULT_RATE_HZ = 10.0
 STAMP_TOLERANCE_NS = 5_000_000
 # Nanoseconds since 1970 have 19 digits; 16 also admit clocks with another origin.
 STAMP_DIGITS = 16
+_STAMPS = range(-(2**63), 2**63)
+# Seconds: times since 1970 in our century are smaller, and steps between pairs of a moving camera are shorter.
+_LATEST, _LONGEST_STEP = 4.1e9, 1e3
 
 # At most so many images of one eye wait for a partner.
 MAX_WAITING = 50
@@ -32,13 +36,11 @@ def list_images(folder: Path) -> list[Path]:
     """Image files of a folder by name; hidden files are left out.
 
     Raises:
-        InputError: the folder is missing or has no image.
+        InputError: the folder is missing, may not be read, or has no image.
     """
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder")
-    files = sorted(
-        path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
-    )
+    files = [
+        path for path in list_folder(folder) if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
+    ]
     if not files:
         raise InputError(f"{folder}: no image files ({' '.join(sorted(IMAGE_SUFFIXES))})")
     return files
@@ -115,6 +117,9 @@ def pair_by_stamp(
         raise InputError(
             f"{source}: unequal left and right images: {len(left)} left, {len(right)} right; copy the missing files"
         )
+    for stamp, file in [*left.items(), *right.items()]:
+        if stamp not in _STAMPS:
+            raise InputError(f"{file}: {shorten(str(stamp))} is no time in nanoseconds since 1970: rename the image")
     left_stamps, right_stamps = np.array(sorted(left), np.int64), np.array(sorted(right), np.int64)
     to_right, to_left = _nearest(left_stamps, right_stamps), _nearest(right_stamps, left_stamps)
     mutual = to_left[to_right] == np.arange(len(left_stamps))
@@ -203,24 +208,21 @@ def read_times(path: Path, count: int, numbers: Collection[int] | None = None) -
         Seconds, one per pair.
 
     Raises:
-        InputError: a line is no time, or the number of lines does not fit.
+        InputError: a line is no time, the times are no seconds, or the number of lines does not fit.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot read the timestamps: {error}") from None
+    lines = read_text(path, TABLE_BYTES, "the timestamps").splitlines()
     times = []
     for number, line in enumerate(lines, start=1):
         if not line.strip() or line.startswith("#"):
             continue
         try:
             times.append(_seconds(line.strip()))
-        except ValueError:
-            raise InputError(f"{path}: line {number} is not a time in seconds: {line!r}") from None
+        except (ValueError, OverflowError):
+            raise InputError(f"{path}: line {number} is not a time in seconds: {shorten(repr(line))}") from None
     if len(times) == count:
-        return times
+        return in_seconds(path, times)
     if numbers is not None and len(times) > max(numbers):
-        return [times[number] for number in numbers]
+        return in_seconds(path, [times[number] for number in numbers])
     raise InputError(f"{path}: {len(times)} timestamps for {count} image pairs; one line per pair is needed")
 
 
@@ -231,6 +233,25 @@ def _seconds(text: str) -> float:
     # datetime cannot read nine decimals.
     whole, _, decimals = clock.partition(".")
     return datetime.fromisoformat(f"{date} {whole}+00:00").timestamp() + float(f"0.{decimals or 0}")
+
+
+def in_seconds(path: Path, times: Sequence[float]) -> list[float]:
+    """The times, if they can be seconds; their unit is told by their size and by the median of their steps.
+
+    Raises:
+        InputError: they are so large or so far apart that they must be in nano-, micro- or milliseconds.
+    """
+    if not np.all(np.isfinite(times)) or not len(times):
+        return list(times)
+    largest, step = float(np.max(np.abs(times))), float(np.median(np.abs(np.diff(times)))) if len(times) > 1 else 0.0
+    for unit, factor in (("nanoseconds", 1e9), ("microseconds", 1e6), ("milliseconds", 1e3)):
+        # Seconds since 1970 have ten digits, and no pairs of a moving camera are a quarter of an hour apart.
+        if largest > 0.1 * factor * _LATEST or (factor > 1e3 and step > max(factor / 1e3, _LONGEST_STEP)):
+            raise InputError(
+                f"{path}: times such as {times[0]:.0f}, {step:.6g} apart, look like {unit}: write seconds, the numbers "
+                f"divided by {factor:.0e}"
+            )
+    return list(times)
 
 
 def default_times(numbers: Sequence[int], source: Path) -> list[float]:

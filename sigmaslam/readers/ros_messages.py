@@ -7,6 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from sigmaslam.bounded_files import shorten
 from sigmaslam.errors import CalibrationError, FrameError, InputError
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.readers.camera_infos import CameraInfo, stereo_from_infos
@@ -59,7 +60,8 @@ def image_array(message: Any, name: str) -> np.ndarray:
     if message.__msgtype__ == COMPRESSED_IMAGE:
         return decode_image(message.data.tobytes(), name)
     if message.encoding not in _ENCODINGS:
-        raise FrameError(f"{name}: encoding {message.encoding!r} is not known; known are {', '.join(_ENCODINGS)}")
+        unknown = shorten(repr(message.encoding))
+        raise FrameError(f"{name}: encoding {unknown} is not known; known are {', '.join(_ENCODINGS)}")
     size, channels, conversion = _ENCODINGS[message.encoding]
     height, width = int(message.height), int(message.width)
     row = width * channels * size

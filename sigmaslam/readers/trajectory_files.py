@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from sigmaslam.bounded_files import TABLE_BYTES, load_array, read_text, shorten
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text
 from sigmaslam.geometry.checked_yaml import CalibrationYaml
@@ -57,25 +58,24 @@ def read_trajectory(path: str | Path) -> Trajectory:
     return readers[trajectory_format(path)](path)
 
 
-def check_covariances(loaded: object, path: Path, count: int) -> np.ndarray:
+def read_covariances(path: Path, count: int) -> np.ndarray:
     """The covariances of a covariance.npy, checked against the number of poses in the trajectory beside it.
 
     Args:
-        loaded: content of the file.
         path: of the file.
         count: poses of trajectory.tum.
     Returns:
         (count, 6, 6) float64.
     Raises:
-        InputError: it has another shape, or is an archive.
+        InputError: it cannot be read, has another shape, or is an archive.
     """
-    if not isinstance(loaded, np.ndarray) or loaded.shape != (count, 6, 6):
-        shape = getattr(loaded, "shape", "an archive")
+    covariances = load_array(path, "run `sigmaslam track` again")
+    if covariances.shape != (count, 6, 6) or covariances.dtype.kind != "f":
         raise InputError(
-            f"{path}: is {shape}, but trajectory.tum beside it has {count} poses and needs ({count}, 6, 6): "
-            "both must come from the same run"
+            f"{path}: is {covariances.dtype} {covariances.shape}, but trajectory.tum beside it has {count} poses and "
+            f"needs floating numbers ({count}, 6, 6): both must come from the same run"
         )
-    return np.asarray(loaded, dtype=np.float64)
+    return covariances.astype(np.float64)
 
 
 def read_tum(path: str | Path) -> Trajectory:
@@ -174,6 +174,13 @@ def read_euroc_truth(path: str | Path) -> Trajectory:
     """
     path = Path(path)
     rows, numbers = _numbers(path, columns=None, form="EuRoC: timestamp, p (3), q (4), ...", separator=",")
+    # Rows of poses are a tenth of a millisecond apart, or more.
+    step = np.ptp(rows[:, 0]) / (len(rows) - 1) if len(rows) > 1 else rows[0, 0]
+    if rows.shape[1] == 8 and step < 1e5:
+        raise InputError(
+            f"{path}: times such as {rows[0, 0]:.9g} in the first of eight columns are no nanoseconds, so this is no "
+            "EuRoC truth; TUM form has spaces: replace each comma by a space (t x y z qx qy qz qw)"
+        )
     # A second column as large as a time in nanoseconds is a time stamp, no position.
     first = 2 if rows.shape[1] > 1 and abs(rows[0, 1]) > 1e15 else 1
     if rows.shape[1] < first + 7:
@@ -198,25 +205,14 @@ def _camera_in_body(truth: Path) -> np.ndarray:
             f"{truth}: EuRoC truth is of the body, and no cam0/sensor.yaml or cam0_sensor.yaml with T_BS is "
             f"in {folders[0]} or the two folders above: put it there, or convert the truth to TUM form"
         )
-    entries = CalibrationYaml.read(sensor).entries
-    try:
-        T_body_camera = np.array(entries["T_BS"]["data"], dtype=np.float64).reshape(4, 4)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{sensor}: T_BS: data must be a list of 16 numbers by rows ({error})") from error
+    T_body_camera = CalibrationYaml.read(sensor).section("T_BS").numbers("data", (16,)).reshape(4, 4)
     T_body_camera[:3, :3] = nearest_rotation(T_body_camera[:3, :3])
     return T_body_camera
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Lines that are neither empty nor comments, each with its number from 1."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file; check the path") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is not text; give a trajectory in TUM, KITTI or EuRoC form") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give a readable file") from error
+    text = read_text(path, TABLE_BYTES, "the trajectory")
     for number, line in enumerate(text.splitlines(), start=1):
         stripped = line.strip()
         if stripped and not stripped.startswith("#"):
@@ -240,7 +236,7 @@ def _numbers(path: Path, columns: int | None, form: str, separator: str | None =
                 value = math.nan
             if not math.isfinite(value):
                 raise InputError(
-                    f"{path}: line {number}: {field.strip()!r} is not a finite number ({form}); "
+                    f"{path}: line {number}: {shorten(repr(field.strip()))} is not a finite number ({form}); "
                     "correct or remove the line"
                 )
             row.append(value)

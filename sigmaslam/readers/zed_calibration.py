@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from sigmaslam.bounded_files import CALIBRATION_BYTES, read_text
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.readers.calibration_size import ImageSize, need_image_size
@@ -39,8 +40,8 @@ def read_zed(path: Path, image_size: ImageSize | None) -> StereoCamera:
     """
     parser = configparser.ConfigParser(interpolation=None, strict=False)
     try:
-        parser.read_string(path.read_text(encoding="utf-8-sig"))
-    except (OSError, UnicodeDecodeError, configparser.Error) as error:
+        parser.read_string(read_text(path, CALIBRATION_BYTES, "the calibration", CalibrationError))
+    except configparser.Error as error:
         raise CalibrationError(f"{path}: cannot read the calibration: {' '.join(str(error).split())}") from None
     # Names of sections and keys are written in capitals or not.
     sections = {name.upper(): dict(parser[name]) for name in parser.sections()}

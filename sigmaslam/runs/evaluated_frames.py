@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sigmaslam.bounded_files import check_columns, load_arrays
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path, atomic_write_text
 from sigmaslam.table import Table
@@ -52,13 +52,14 @@ def read_evaluated_frames(path: Path, count: int) -> EvaluatedFrames:
     Raises:
         InputError: it is no such file, or of another run.
     """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            frames = EvaluatedFrames(*(archive[name] for name in EvaluatedFrames.__slots__))
-        rows = len(frames.row)
-        fits = frames.truth.shape == (rows, 3) and (not rows or frames.row.max() < count)
-    except (OSError, ValueError, EOFError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: holds no errors of frames ({error}); run `sigmaslam evaluate` again") from error
-    if not fits:
-        raise InputError(f"{path}: is not of the {count} poses of trajectory.tum; run `sigmaslam evaluate` again")
+    mend = "run `sigmaslam evaluate` again"
+    arrays = load_arrays(path, mend, EvaluatedFrames.__slots__)
+    shapes: dict[str, tuple[str | int, ...]] = {
+        **dict.fromkeys(EvaluatedFrames.__slots__, ("M",)),
+        "truth": ("M", 3),
+    }
+    check_columns(path, arrays, shapes, {"row": "iu"}, mend)
+    frames = EvaluatedFrames(**arrays)
+    if len(frames) and not (frames.row.min() >= 0 and frames.row.max() < count):
+        raise InputError(f"{path}: is not of the {count} poses of trajectory.tum; {mend}")
     return frames

@@ -1,16 +1,20 @@
 """Figures of the evaluation; matplotlib through its object interface only."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from sigmaslam.files import atomic_path
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.plot_style import SERIES, style_axes
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 AXIS_NAMES = ("x", "y", "z")
 

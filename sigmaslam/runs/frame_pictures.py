@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import heapq
-import zipfile
 from collections import deque
 from dataclasses import dataclass, fields
 from itertools import count
@@ -12,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from sigmaslam.bounded_files import check_columns, load_arrays
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path
 from sigmaslam.slam.estimate import Estimate
@@ -76,6 +76,29 @@ class FramePictures:
     def matches(self, index: int) -> slice:
         """The rows of the matches of one frame."""
         return slice(int(self.match_end[index - 1]) if index else 0, int(self.match_end[index]))
+
+
+_SHAPES: dict[str, tuple[str | int, ...]] = {
+    "timestamp": ("P",),
+    "score": ("P",),
+    "worst": ("P",),
+    "left": ("B",),
+    "left_end": ("P",),
+    "right": ("C",),
+    "right_end": ("P",),
+    "size": (2,),
+    "match_end": ("P",),
+    "pixels": ("M", 2),
+    "covariance": ("M", 2, 2),
+    "probability": ("M",),
+    "inlier": ("M",),
+    "trail": ("M", "T", 2),
+}
+_KINDS = {
+    **dict.fromkeys(("left", "right"), "u"),
+    **dict.fromkeys(("left_end", "right_end", "size", "match_end"), "iu"),
+    **dict.fromkeys(("worst", "inlier"), "b"),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,11 +216,14 @@ def read_pictures(path: Path) -> FramePictures:
     Raises:
         InputError: it is no such file.
     """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            return FramePictures(**{field.name: archive[field.name] for field in fields(FramePictures)})
-    except (OSError, ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: holds no pictures of frames ({error}); run `sigmaslam track` again") from error
+    mend = "run `sigmaslam track` again"
+    arrays = load_arrays(path, mend, FramePictures.__slots__)
+    check_columns(path, arrays, _SHAPES, _KINDS, mend)
+    ends = (("left_end", "left"), ("right_end", "right"), ("match_end", "pixels"))
+    for end, values in ((arrays[name], arrays[of]) for name, of in ends):
+        if not (np.diff(end, prepend=0) >= 0).all() or (end[-1] if len(end) else 0) != len(values):
+            raise InputError(f"{path}: its parts do not go together; {mend}")
+    return FramePictures(**arrays)
 
 
 def _jpeg(image: np.ndarray) -> bytes:

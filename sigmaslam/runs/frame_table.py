@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
+import io
 import re
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from sigmaslam.bounded_files import TABLE_BYTES, read_text, shorten
 from sigmaslam.errors import InputError
 
 FRAMES_NAME = "frames.csv"
@@ -81,11 +83,10 @@ def read_frames(path: Path) -> FrameTable:
         InputError: the file is missing or empty, a column is missing, or a field is no number or no status.
     """
     try:
-        with path.open(newline="", encoding="utf-8") as stream:
-            reader = csv.DictReader(stream)
-            names = reader.fieldnames or []
-            rows = list(reader)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        reader = csv.DictReader(io.StringIO(read_text(path, TABLE_BYTES, "the frames"), newline=""))
+        names = reader.fieldnames or []
+        rows = list(reader)
+    except csv.Error as error:
         raise InputError(f"{path}: cannot be read ({error}); give a folder written by `sigmaslam track`") from error
     missing = [name for name in (*COLUMNS, "status") if name not in names]
     if missing:
@@ -94,7 +95,9 @@ def read_frames(path: Path) -> FrameTable:
         raise InputError(f"{path}: holds no frames; run `sigmaslam track` again")
     for number, row in enumerate(rows, start=2):
         if row["status"] not in STATUSES:
-            raise InputError(f"{path}: line {number}: status {row['status']!r} is none of {', '.join(STATUSES)}")
+            raise InputError(
+                f"{path}: line {number}: status {shorten(repr(row['status']))} is none of {', '.join(STATUSES)}"
+            )
     stages = [name for name in names if re.fullmatch(r"ms_[a-z0-9_]+", name)]
     return FrameTable(
         status=[row["status"] for row in rows],
@@ -115,6 +118,6 @@ def _column(path: Path, rows: list[dict[str, str]], name: str) -> np.ndarray:
             values[index] = float(field)
         except ValueError as error:
             raise InputError(
-                f"{path}: line {index + 2}: {name} is {field!r}, not a number; leave it empty if unknown"
+                f"{path}: line {index + 2}: {name} is {shorten(repr(field))}, not a number; leave it empty if unknown"
             ) from error
     return values

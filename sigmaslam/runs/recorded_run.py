@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from sigmaslam.bounded_files import TABLE_BYTES, check_columns, load_arrays, read_text, shorten
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.trajectory import Trajectory
-from sigmaslam.readers.trajectory_files import check_covariances, read_tum
+from sigmaslam.readers.trajectory_files import read_covariances, read_tum
 from sigmaslam.runs.evaluated_frames import (
     EVALUATED_FRAMES_NAME,
     EVALUATION_NAME,
@@ -134,46 +135,36 @@ def _read_trajectory(path: Path) -> Trajectory | None:
 
 
 def _read_covariances(path: Path, count: int) -> np.ndarray:
-    if not path.is_file():
-        return np.full((count, 6, 6), np.nan)
-    try:
-        return check_covariances(np.load(path, allow_pickle=False), path, count)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); run `sigmaslam track` again") from error
+    return read_covariances(path, count) if path.is_file() else np.full((count, 6, 6), np.nan)
 
 
 def _read_map(path: Path) -> RecordedMap | None:
-    """None where there is no map. Maps of earlier versions have neither grey values nor, perhaps, covariances."""
+    """None where there is no map. Maps of earlier versions have no grey values."""
     if not path.is_file():
         return None
     mend = "run `sigmaslam track` again"
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            points = np.asarray(archive["points"], np.float64)
-            unknown = np.full(len(points), np.nan)
-            covariances = archive["covariances"] if "covariances" in archive else unknown[:, None, None] * np.eye(3)
-            intensity = archive.get("intensity", unknown)
-    except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: holds no array `points` ({error}); {mend}") from error
-    shapes = points.shape, covariances.shape, intensity.shape
-    count = len(points)
-    if shapes != ((count, 3), (count, 3, 3), (count,)):
-        raise InputError(
-            f"{path}: points, covariances and intensity must be (M, 3), (M, 3, 3), (M,), not {shapes}; {mend}"
-        )
-    kept = np.isfinite(points).all(axis=1)
-    largest = np.full(count, np.nan)
-    known = np.isfinite(covariances).all(axis=(1, 2))
+    # The whole archive has the images of all keyframes, too.
+    arrays = load_arrays(path, mend, ("points",))
+    with zipfile.ZipFile(path) as archive:
+        there = {name.removesuffix(".npy") for name in archive.namelist()}
+    arrays |= load_arrays(path, mend, [name for name in ("covariances", "intensity") if name in there])
+    unknown = np.full(len(arrays["points"]), np.nan)
+    arrays = {"covariances": unknown[:, None, None] * np.eye(3), "intensity": unknown, **arrays}
+    shapes: dict[str, tuple[str | int, ...]] = {"points": ("M", 3), "covariances": ("M", 3, 3), "intensity": ("M",)}
+    check_columns(path, arrays, shapes, {}, mend)
+    points, covariances = (arrays[name].astype(np.float64) for name in ("points", "covariances"))
+    kept, known = np.isfinite(points).all(axis=1), np.isfinite(covariances).all(axis=(1, 2))
+    largest = np.full(len(points), np.nan)
     if known.any():
         largest[known] = np.linalg.eigvalsh(covariances[known])[:, -1]
-    return RecordedMap(points[kept], np.sqrt(np.maximum(largest, 0.0))[kept], intensity[kept])
+    return RecordedMap(points[kept], np.sqrt(np.maximum(largest, 0.0))[kept], arrays["intensity"][kept])
 
 
 def _read_json(path: Path, command: str) -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: is no JSON ({error}); run `sigmaslam {command}` again") from error
+        content = json.loads(read_text(path, TABLE_BYTES, "the run"))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: is no JSON ({shorten(str(error))}); run `sigmaslam {command}` again") from error
     return content if isinstance(content, dict) else {}

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from sigmaslam.bounded_files import check_columns, load_arrays
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path
 from sigmaslam.runs.appended_file import AppendedFile, read_records
@@ -95,15 +95,17 @@ def read_frame_pairs(path: Path, count: int) -> FramePairs:
         InputError: it is no such file, or of another run.
     """
     mend = "run `sigmaslam track` again"
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            pairs = FramePairs(*(archive[name] for name in FramePairs.__slots__))
-    except (OSError, ValueError, EOFError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: holds no relative poses ({error}); {mend}") from error
+    arrays = load_arrays(path, mend, FramePairs.__slots__)
+    shapes: dict[str, tuple[str | int, ...]] = {
+        "span": ("M",),
+        "earlier": ("M",),
+        "later": ("M",),
+        "pose": ("M", 4, 4),
+        "covariance": ("M", 6, 6),
+    }
+    check_columns(path, arrays, shapes, {"span": "U", "earlier": "iu", "later": "iu"}, mend)
+    pairs = FramePairs(**arrays)
     rows = len(pairs.span)
-    shapes = tuple(column.shape for column in pairs.columns())
-    if shapes != ((rows,), (rows,), (rows,), (rows, 4, 4), (rows, 6, 6)):
-        raise InputError(f"{path}: its arrays are {', '.join(map(str, shapes))}, which do not go together; {mend}")
     frames = np.concatenate([pairs.earlier, pairs.later])
     if rows and not (frames.min() >= 0 and frames.max() < count):
         raise InputError(

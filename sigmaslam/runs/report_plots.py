@@ -7,15 +7,11 @@ from typing import Any
 import numpy as np
 
 from sigmaslam.estimation.chi_square import CHI_SQUARE_BAND_OF_6
+from sigmaslam.plot_style import BLUE, GREEN, GREY, SERIES, VERMILLION
 from sigmaslam.runs.frame_table import FrameTable
 from sigmaslam.runs.recorded_run import RecordedRun
 from sigmaslam.runs.report_scene import pack
 
-# Okabe and Ito's palette, which people with colour-blindness can tell apart.
-_BLUE, _VERMILLION, _GREEN, _ORANGE, _SKY, _PURPLE, _GREY = (
-    *("#0072B2", "#D55E00", "#009E73", "#E69F00", "#56B4E9", "#CC79A7", "#8C8C8C"),
-)
-_STAGES = (_BLUE, _VERMILLION, _GREEN, _PURPLE, _ORANGE, _SKY)
 MAX_FRAMES = 20_000
 """With more frames an even selection is drawn."""
 # A scale is logarithmic where the largest value is so many times the median.
@@ -73,14 +69,14 @@ def _sigmas(run: RecordedRun) -> list[dict[str, Any] | None]:
     for (kind, unit, scale), sigma in zip(kinds, run.sigmas, strict=True):
         claimed = run.of_frames(3.0 * scale * sigma)
         title, caption = f"{kind}: 3 sigma [{unit}]", "Of the pose in the world, as it was said with the frame."
-        series = [_line("3 sigma", claimed, _BLUE, width=2)]
+        series = [_line("3 sigma", claimed, BLUE, width=2)]
         values = claimed
         if errors is not None:
             error = scale * (errors.position_error if kind == "Position" else errors.rotation_error)
             found = run.of_frames(error, errors.row)
             title = f"{kind}: error and 3 sigma [{unit}]"
             caption += " The error is that of the pose relative to the first one with a truth."
-            series.append(_line("error", found, _VERMILLION, width=2))
+            series.append(_line("error", found, VERMILLION, width=2))
             values = np.concatenate([claimed, found])
         is_log = _is_wide(values)
         if is_log:  # which has no zero
@@ -92,7 +88,7 @@ def _sigmas(run: RecordedRun) -> list[dict[str, Any] | None]:
 
 
 def _band(low: np.ndarray, high: np.ndarray, label: str) -> list[dict[str, Any]]:
-    return [_line(label, high, _GREEN, width=0.5), _line("", low, _GREEN, width=0.5)]
+    return [_line(label, high, GREEN, width=0.5), _line("", low, GREEN, width=0.5)]
 
 
 _BANDS = [{"series": [1, 2], "fill": "rgb(0 158 115 / 20%)"}]
@@ -107,7 +103,7 @@ def _nees(run: RecordedRun) -> dict[str, Any] | None:
         "Normalised estimation error squared, per degree of freedom: 1 is right, above the band the covariance is too "
         "small. The band holds 95 % of a right one's."
     )
-    series = [*_band(low, high, "95 %"), _line("NEES / dof", np.where(ratio > 0, ratio, np.nan), _BLUE, dots=True)]
+    series = [*_band(low, high, "95 %"), _line("NEES / dof", np.where(ratio > 0, ratio, np.nan), BLUE, dots=True)]
     return _plot("NEES", caption, series, log=True, bands=_BANDS)
 
 
@@ -124,7 +120,7 @@ def _nis(frames: FrameTable) -> dict[str, Any] | None:
         "Normalised innovation squared, per degree of freedom: about 1 where the claimed uncertainty is right, above "
         "the band where it is too small. The band holds 95 % of the frames of a consistent filter."
     )
-    series = [*_band(low, high, "95 %"), _line("NIS / dof", ratio, _BLUE, dots=True)]
+    series = [*_band(low, high, "95 %"), _line("NIS / dof", ratio, BLUE, dots=True)]
     return _plot("NIS", caption, series, log=True, bands=_BANDS)
 
 
@@ -132,7 +128,7 @@ def _inliers(frames: FrameTable) -> dict[str, Any] | None:
     matches, inliers = frames.columns["matches"], frames.columns["inliers"]
     if not _has_numbers(matches, inliers):
         return None
-    series = [_line("matches", matches, _BLUE), _line("inliers", inliers, _VERMILLION)]
+    series = [_line("matches", matches, BLUE), _line("inliers", inliers, VERMILLION)]
     return _plot("Matches and inliers", "Inliers are the matches that the filter used.", series)
 
 
@@ -141,9 +137,9 @@ def _offset(frames: FrameTable) -> dict[str, Any] | None:
     if not _has_numbers(offset):
         return None
     series = [
-        _line("+ 2 sigma", offset + 2 * sigma, _GREY, width=0.5),
-        _line("- 2 sigma", offset - 2 * sigma, _GREY, width=0.5),
-        _line("offset", offset, _BLUE, width=2),
+        _line("+ 2 sigma", offset + 2 * sigma, GREY, width=0.5),
+        _line("- 2 sigma", offset - 2 * sigma, GREY, width=0.5),
+        _line("offset", offset, BLUE, width=2),
     ]
     bands = [{"series": [1, 2], "fill": "rgb(0 114 178 / 18%)"}]
     return _plot("Disparity offset [px]", "Estimated error of the calibration.", series, bands=bands)
@@ -154,7 +150,7 @@ def _belief(frames: FrameTable) -> dict[str, Any] | None:
     if not _has_numbers(belief):
         return None
     caption = "How far the tracker believes each of its poses, 0 to 1."
-    return _plot("Belief", caption, [_line("belief", belief, _BLUE)], range=[-0.03, 1.03])
+    return _plot("Belief", caption, [_line("belief", belief, BLUE)], range=[-0.03, 1.03])
 
 
 def _times(frames: FrameTable) -> dict[str, Any] | None:
@@ -165,13 +161,13 @@ def _times(frames: FrameTable) -> dict[str, Any] | None:
     stacked[:, ~np.isfinite(frames.total_milliseconds)] = np.nan
     # The tallest first, so that each covers those above it down to its own.
     series = [
-        _line(f"to {names[k].replace('_', ' ')}", stacked[k], _STAGES[k % 6], width=1, fill=f"{_STAGES[k % 6]}66")
+        _line(f"to {names[k].replace('_', ' ')}", stacked[k], SERIES[k % 6], width=1, fill=f"{SERIES[k % 6]}66")
         for k in reversed(range(len(names)))
     ]
     caption = "Stages one upon the other."
     interval = frame_interval(frames)
     if interval is not None:
-        series.append(_line("real time", np.full(len(frames), 1e3 * interval), _GREY, width=1.5, dash=[6, 4]))
+        series.append(_line("real time", np.full(len(frames), 1e3 * interval), GREY, width=1.5, dash=[6, 4]))
         caption += f" Frames come every {1e3 * interval:.0f} ms."
     return _plot("Time spent [ms]", caption, series)
 

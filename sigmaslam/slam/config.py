@@ -6,10 +6,10 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from sigmaslam.bounded_files import CALIBRATION_BYTES, read_text, shorten
 from sigmaslam.errors import InputError
 from sigmaslam.estimation.calibration_errors import ERRORS
+from sigmaslam.geometry.restricted_yaml import parse_yaml
 
 LINEARISATIONS = ("unscented", "extended")
 
@@ -82,16 +82,13 @@ def read_config(path: Path, base: TrackerConfig | None = None) -> TrackerConfig:
         InputError: the file cannot be read, names no setting, or gives a value of the wrong kind.
     """
     base = base or TrackerConfig()
-    try:
-        entries = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(f"{path}: settings that cannot be read: {' '.join(str(error).split())}") from None
+    entries = parse_yaml(read_text(path, CALIBRATION_BYTES, "the settings"), path)
     if not isinstance(entries, dict):
         raise InputError(f"{path}: expected lines like `keyframe_ratio: 0.75`, found {type(entries).__name__}")
     known = {field.name: getattr(base, field.name) for field in fields(base)}
     for name, value in entries.items():
         if name not in known:
-            raise InputError(f"{path}: there is no setting '{name}': choose among {', '.join(known)}")
+            raise InputError(f"{path}: there is no setting '{shorten(name)}': choose among {', '.join(known)}")
         entries[name] = _checked(f"{path}: {name}", value, known[name])
     return replace(base, **entries)
 
@@ -104,7 +101,9 @@ def check_estimated(place: str, names: list[str]) -> tuple[str, ...]:
     """
     for name in names:
         if name not in ERRORS:
-            raise InputError(f"{place}: a calibration has no error {name!r}: choose among {', '.join(ERRORS)}")
+            raise InputError(
+                f"{place}: a calibration has no error {shorten(repr(name))}: choose among {', '.join(ERRORS)}"
+            )
     return tuple(names)
 
 
@@ -113,19 +112,19 @@ def _checked(place: str, value: Any, default: Any) -> Any:
     if default is None:
         if isinstance(value, list) and len(value) == 2 and all(_is_positive(each) for each in value):
             return float(value[0]), float(value[1])
-        raise InputError(f"{place}: expected two positive numbers in a list, found {value!r}")
+        raise InputError(f"{place}: expected two positive numbers in a list, found {shorten(repr(value))}")
     if isinstance(default, tuple):
         return check_estimated(place, value if isinstance(value, list) else [value])
     if isinstance(default, str):
         if value in LINEARISATIONS:
             return value
-        raise InputError(f"{place}: expected one of {', '.join(LINEARISATIONS)}, found {value!r}")
+        raise InputError(f"{place}: expected one of {', '.join(LINEARISATIONS)}, found {shorten(repr(value))}")
     if isinstance(default, int) and isinstance(value, int) and _is_positive(value):
         return value
     if isinstance(default, float) and (value == 0 or _is_positive(value)) and not isinstance(value, bool):
         return float(value)
     kind = "a whole number above zero" if isinstance(default, int) else "a number, zero or more"
-    raise InputError(f"{place}: expected {kind}, found {value!r}")
+    raise InputError(f"{place}: expected {kind}, found {shorten(repr(value))}")
 
 
 def _is_positive(value: Any) -> bool:

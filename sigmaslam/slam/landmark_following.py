@@ -10,11 +10,10 @@ from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.guided_matching import GuidedMatcher, GuidedMatches
 from sigmaslam.slam.keyframe import Keyframe
 
-# With a smaller share of the landmarks found, or of those seen by both eyes, than so much of the usual one, something
-# has happened that following cannot judge.
+# With a smaller share of the landmarks seen by both eyes than so much of the usual one, something has happened that
+# following cannot judge: the eyes are swapped, say.
 _FALLEN = 0.6
-_MIN_SHARE = 0.3
-# How fast the usual shares follow those of a frame.
+# How fast the usual share follows that of a frame.
 _ADAPTATION = 0.2
 
 
@@ -28,7 +27,7 @@ class LandmarkFollower:
     def __init__(self, guided: GuidedMatcher) -> None:
         self._guided = guided
         self._left: np.ndarray | None = None
-        self._usual: np.ndarray | None = None
+        self._usual: float | None = None
 
     @property
     def is_ready(self) -> bool:
@@ -66,18 +65,20 @@ class LandmarkFollower:
         return self._guided.follow(frame.left, frame.right, views, pose, covariance, self._carry)
 
     def has_fallen(self, matches: GuidedMatches, inliers: np.ndarray) -> bool:
-        """Whether suddenly less is found than usual: of the landmarks, or of their disparities.
+        """Whether suddenly fewer of the landmarks have a disparity than usual.
+
+        How many landmarks are found does not matter: where something covers half the image the rest is still right.
 
         Args:
             matches: as `follow` gives them.
             inliers: (M,) bool, those that agree with the pose.
         """
         stereo = np.isfinite(matches.views.measurement[inliers, 2])
-        shares = np.array([inliers.sum() / max(len(matches.searched), 1), stereo.mean() if len(stereo) else 0.0])
-        usual = shares if self._usual is None else self._usual
+        share = float(stereo.mean()) if len(stereo) else 0.0
+        usual = share if self._usual is None else self._usual
         # Also after a fall, so that what stays so becomes usual.
-        self._usual = usual + _ADAPTATION * (shares - usual)
-        return bool(shares[0] < _MIN_SHARE or (shares < _FALLEN * usual).any())
+        self._usual = usual + _ADAPTATION * (share - usual)
+        return share < _FALLEN * usual
 
     def _carry(self, left: np.ndarray, landmark_id: np.ndarray, predicted: np.ndarray) -> np.ndarray:
         """(K, 2) where optical flow takes landmarks; NaN for those that the last frame did not see."""

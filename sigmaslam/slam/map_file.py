@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sigmaslam.bounded_files import check_columns, load_arrays, shorten
 from sigmaslam.errors import InputError
 from sigmaslam.estimation.marginalised_poses import PastPoses
 from sigmaslam.estimation.state_layout import CALIBRATION_SIZE
@@ -19,6 +18,24 @@ from sigmaslam.slam.keyframe import Keyframe
 _PER_FEATURE = ("keypoints", "descriptors", "scores", "sigma")
 _ARRAYS = ("poses", "covariance", "timestamps", "images", "counts", *_PER_FEATURE, "disparity", "disparity_sigma")
 _PREFIX = "keyframe_"
+_SHAPES: dict[str, tuple[str | int, ...]] = {
+    _PREFIX + "poses": ("K", 4, 4),
+    _PREFIX + "covariance": ("S", "S"),
+    _PREFIX + "timestamps": ("K",),
+    _PREFIX + "images": ("K", "H", "W"),
+    _PREFIX + "counts": ("K",),
+    _PREFIX + "keypoints": ("N", 2),
+    _PREFIX + "descriptors": ("N", "D"),
+    _PREFIX + "scores": ("N",),
+    _PREFIX + "sigma": ("N",),
+    _PREFIX + "disparity": ("N",),
+    _PREFIX + "disparity_sigma": ("N",),
+    "frontend": (),
+    "intrinsics": (7,),
+}
+_KINDS = {_PREFIX + "images": "u", _PREFIX + "counts": "iu", "frontend": "U"}
+_MEND = "map the place again with `sigmaslam track`"
+_ORTHONORMAL, _SYMMETRY = 1e-6, 1e-3
 
 
 def pack_keyframes(
@@ -52,24 +69,19 @@ def read_keyframes(path: Path, frontend: str, camera: RectifiedStereo) -> tuple[
     Returns:
         The keyframes, and their poses together.
     Raises:
-        InputError: the file is missing, broken, without keyframes, or of another front-end or camera.
+        InputError: the file is missing, broken, inconsistent, without keyframes, or of another front-end or camera.
     """
-    try:
-        with np.load(path, allow_pickle=False) as content:
-            arrays = {name: content[name] for name in content.files}
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such map; give map.npz of a run of `sigmaslam track`") from None
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"{path}: not a map that can be read ({error}); track the sequence again") from error
+    arrays = load_arrays(path, "give map.npz of a run of `sigmaslam track`, or track the sequence again")
     missing = [name for name in (*(_PREFIX + name for name in _ARRAYS), "frontend", "intrinsics") if name not in arrays]
     if missing:
         raise InputError(
             f"{path}: a map without keyframes to find ({missing[0]} is missing); make it by a run of several keyframes"
         )
+    check_columns(path, arrays, _SHAPES, _KINDS, _MEND)
     if str(arrays["frontend"]) != frontend:
+        other = shorten(str(arrays["frontend"]))
         raise InputError(
-            f"{path}: made with the front-end {arrays['frontend']}, not {frontend}; give --frontend "
-            f"{arrays['frontend']}, or map again"
+            f"{path}: made with the front-end {other}, not {frontend}; give --frontend {other}, or map again"
         )
     expected = _intrinsics(camera)
     if not np.allclose(arrays["intrinsics"], expected, rtol=1e-4):
@@ -77,7 +89,8 @@ def read_keyframes(path: Path, frontend: str, camera: RectifiedStereo) -> tuple[
             f"{path}: its camera has fx, fy, cx, cy, baseline, width, height of {arrays['intrinsics'].tolist()}, this "
             f"one {expected.tolist()}; a map serves the camera that made it"
         )
-    ends = np.cumsum(arrays[_PREFIX + "counts"])
+    _check(path, arrays)
+    ends = np.cumsum(arrays[_PREFIX + "counts"].astype(np.int64))
     keyframes = []
     for k, (begin, end) in enumerate(zip(np.r_[0, ends[:-1]], ends, strict=True)):
         columns = {name: arrays[_PREFIX + name][begin:end] for name in (*_PER_FEATURE, "disparity", "disparity_sigma")}
@@ -92,6 +105,40 @@ def read_keyframes(path: Path, frontend: str, camera: RectifiedStereo) -> tuple[
     joint = arrays[_PREFIX + "covariance"]
     none = np.zeros((len(joint), CALIBRATION_SIZE))
     return keyframes, PastPoses(arrays[_PREFIX + "poses"], joint, none, none)
+
+
+def _check(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Values of the arrays that `read_keyframes` takes, whose shapes go together."""
+
+    def refuse(wrong: bool, name: str, what: str) -> None:
+        if wrong:
+            raise InputError(f"{path}: {_PREFIX}{name} {what}; {_MEND}")
+
+    array = {name: arrays[_PREFIX + name] for name in _ARRAYS}
+    counts, poses, covariance = array["counts"], array["poses"], array["covariance"]
+    width, height = arrays["intrinsics"][5:7]
+    count = len(counts)
+    refuse(array["images"].dtype != np.uint8, "images", f"are {array['images'].dtype}, not uint8")
+    refuse(count == 0, "counts", "has no keyframe")
+    refuse(
+        bool((counts < 0).any()) or int(counts.sum(dtype=object)) != len(array["disparity"]),
+        "counts",
+        f"are not of the {len(array['disparity'])} keypoints of the other arrays",
+    )
+    size = array["images"].shape[1:]
+    refuse(size != (height, width), "images", f"have {size[1]}x{size[0]} pixels, the camera {width:g}x{height:g}")
+    refuse(len(covariance) != 6 * count, "covariance", f"is {covariance.shape} for {count} poses of 6")
+    for name in ("poses", "covariance", "timestamps", "keypoints", "descriptors", "scores", "sigma"):
+        refuse(not np.isfinite(array[name]).all(), name, "has a value that is not finite")
+    refuse(bool(np.isinf(array["disparity"]).any()), "disparity", "has an infinite value")
+    rotation = poses[:, :3, :3]
+    defect = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max()
+    rigid = defect < _ORTHONORMAL and bool((np.linalg.det(rotation) > 0).all())
+    refuse(not rigid or not np.array_equal(poses[:, 3], np.tile([0.0, 0, 0, 1], (count, 1))), "poses", "are not rigid")
+    # Round-off of a long run leaves a covariance symmetric to far better than this.
+    scale = np.sqrt(np.abs(np.diagonal(covariance)))
+    lopsided = np.abs(covariance - covariance.T) > _SYMMETRY * np.outer(scale, scale)
+    refuse(bool((np.diagonal(covariance) < 0).any() or lopsided.any()), "covariance", "is no covariance")
 
 
 def _intrinsics(camera: RectifiedStereo) -> np.ndarray:

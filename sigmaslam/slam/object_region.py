@@ -8,11 +8,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sigmaslam.errors import InputError
+from sigmaslam.bounded_files import shorten
+from sigmaslam.errors import FrameError, InputError
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import se3_inverse, transform_points
+from sigmaslam.readers.images import read_image
 
-_NUMBER = r"\s*([-+]?[0-9]*\.?[0-9]+)\s*"
+_NUMBER = r"\s*([-+]?(?:[0-9]{1,9}(?:\.[0-9]{0,9})?|\.[0-9]{1,9}))\s*"
 _BOX = re.compile(",".join([_NUMBER] * 4))
 # Points further from the middle of a body than so many median distances are not taken for its outline.
 _FARTHEST = 4.0
@@ -36,24 +38,25 @@ def read_region(text: str, width: int, height: int) -> np.ndarray:
     if box:
         x, y, across, down = (float(value) for value in box.groups())
         if across < 1 or down < 1:
-            raise InputError(f"--track-object {text}: width and height of the box must be 1 pixel or more")
+            raise InputError(f"--track-object {shorten(text)}: width and height of the box must be 1 pixel or more")
         if x < 0 or y < 0 or x + across > width or y + down > height:
             raise InputError(
-                f"--track-object {text}: the box (x, y, width, height) reaches beyond the left image of "
+                f"--track-object {shorten(text)}: the box (x, y, width, height) reaches beyond the left image of "
                 f"{width}x{height} pixels; give one inside it"
             )
         region = np.zeros((height, width), bool)
         region[round(y) : max(round(y + down), round(y) + 1), round(x) : max(round(x + across), round(x) + 1)] = True
         return region
     path = Path(text)
-    if not path.is_file():
+    if not _is_there(path):
         raise InputError(
-            f"--track-object {text}: neither a box nor an image file; give x,y,width,height in pixels of the first "
-            "left image, or a mask of its size that is not zero on the body"
+            f"--track-object {shorten(text)}: neither a box nor an image file; give x,y,width,height in pixels of the "
+            "first left image, or a mask of its size that is not zero on the body"
         )
-    mask = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if mask is None:
-        raise InputError(f"{path}: not an image that can be read; give the mask as a PNG")
+    try:
+        mask = read_image(path)
+    except FrameError as error:
+        raise InputError(f"{error}: give the mask as a PNG") from None
     if mask.shape[:2] != (height, width):
         raise InputError(
             f"{path}: the mask is {mask.shape[1]}x{mask.shape[0]} pixels, the left image {width}x{height}; "
@@ -64,6 +67,13 @@ def read_region(text: str, width: int, height: int) -> np.ndarray:
     if not mask.any():
         raise InputError(f"{path}: the mask is zero everywhere; pixels of the body must not be zero")
     return np.asarray(mask > 0)
+
+
+def _is_there(path: Path) -> bool:
+    try:
+        return path.exists()
+    except (OSError, ValueError):  # no file can have such a name
+        return False
 
 
 def inner_half(region: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.slam.argument_checks import check_region, check_tracker_arguments
 from sigmaslam.slam.body_admission import BodyAdmission
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.estimate import Estimate
@@ -105,6 +106,8 @@ class ObjectTracker:
         region: (H, W) bool, where the body is in the first raw left image; background inside does little harm.
         frontend, backend, threads: of `StereoTracker`.
         config: likewise; by default `OBJECT_CONFIG`, with more acceleration.
+    Raises:
+        InputError: an argument is of another type or size, or nothing is in the region.
     """
 
     def __init__(
@@ -116,6 +119,8 @@ class ObjectTracker:
         config: TrackerConfig | None = None,
         threads: int = 2,
     ) -> None:
+        check_tracker_arguments(camera, frontend, backend, config, threads)
+        check_region(region, camera)
         self.config = config = config or OBJECT_CONFIG
         rectifier = StereoRectifier(camera)
         self._T_left_rectified = se3_inverse(rectifier.T_rectified_left)

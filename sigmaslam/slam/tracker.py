@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from sigmaslam.errors import InputError
 from sigmaslam.estimation.calibration_errors import CalibrationPrior
 from sigmaslam.estimation.constant_velocity import MotionFilter
+from sigmaslam.estimation.estimator_graphs import EstimatorGraphs
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.frame_update import FrameUpdate
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
-from sigmaslam.estimation.sigma_point_linearisation import ViewLineariser
 from sigmaslam.frontend import Frontend, build_frontend
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.slam.argument_checks import check_frame, check_tracker_arguments
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.slam.frame import Frame
@@ -65,6 +65,8 @@ class StereoTracker:
 
     Attributes:
         last_frame: what the last frame saw, for pictures; None before the first.
+    Raises:
+        InputError: an argument is of another type, or there is no such front-end or backend.
     """
 
     def __init__(
@@ -76,6 +78,7 @@ class StereoTracker:
         admission: LandmarkAdmission | None = None,
         threads: int = 2,
     ) -> None:
+        check_tracker_arguments(camera, frontend, backend, config, threads)
         self.config = config = config or TrackerConfig()
         self._rectifier = StereoRectifier(camera)
         self._camera = rectified = self._rectifier.rectified
@@ -86,9 +89,9 @@ class StereoTracker:
         self._blas = ThreadpoolController()
         self._beside = ThreadPoolExecutor(1, "keyframe") if threads > 1 else None
         self._admission = admission = admission or AdmitAll(config.min_inliers)
-        lineariser = ViewLineariser(rectified, backend, config.linearisation == "unscented")
+        graphs = EstimatorGraphs(rectified, backend, config.linearisation == "unscented")
         prior = CalibrationPrior.of(rectified, camera.sigmas, config.offset_sigma, config.estimate)
-        self._window = window = KeyframeWindow(rectified, prior, lineariser)
+        self._window = window = KeyframeWindow(rectified, prior, graphs)
         self._noise = noise = MeasurementNoise(config)
         self._motion = motion = MotionFilter(backend)
         self._course = course = Course()
@@ -113,7 +116,7 @@ class StereoTracker:
         Raises:
             InputError: the file is no map, or made with another front-end or camera.
         """
-        self._keyframes.load(path, self._frontend.name, self._camera)
+        self._keyframes.load(Path(path), self._frontend.name, self._camera)
         self._course.phase = Phase.WAITING_IN_MAP
 
     def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> Estimate:
@@ -123,10 +126,10 @@ class StereoTracker:
             left, right: (H, W) uint8, raw images of the calibrated size.
             timestamp: seconds, larger than the one before.
         Raises:
-            InputError: the time stamp does not increase.
+            InputError: the time stamp is no finite number, or does not increase.
             FrameError: an image has the wrong type or size.
         """
-        _check_time(self._course.timestamp, timestamp)
+        check_frame(left, right, timestamp, self._course.timestamp)
         # The matrices are small: threads of BLAS would wait for each other for longer than they compute.
         with self._blas.limit(limits=1, user_api="blas"):
             return self._step(left, right, timestamp)
@@ -238,8 +241,3 @@ class StereoTracker:
             self._follower.remember(frame.left, self._window.landmarks.id[seen.landmark], seen.measurement[:, :2])
         else:
             self._follower.forget()
-
-
-def _check_time(before: float | None, timestamp: float) -> None:
-    if before is not None and timestamp <= before:
-        raise InputError(f"time stamp {timestamp:.6f} s does not come after {before:.6f} s: sort the frames by time")

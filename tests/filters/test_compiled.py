@@ -24,6 +24,25 @@ def make_step(scale: float):
 
 
 @pytest.mark.slow
+def test_a_filter_with_the_default_settings_compiles_and_raises_as_it_does_uncompiled():
+    ukf = filters.UnscentedKalmanFilter()
+    see = filters.MeasurementModel(lambda x: x[..., :1] * x[..., :1], filters.Diagonal(torch.full((1,), 0.1)))
+    still = filters.MotionModel(lambda x: 1.0 * x, filters.Diagonal(torch.full((2,), 0.01)))
+
+    def step(mean, covariance, value):
+        result = ukf.update(ukf.predict(filters.Gaussian(mean, covariance), still).belief, see, value)
+        return result.belief.mean, result.belief.covariance, result.healthy
+
+    mean, covariance, value = torch.ones(3, 2), torch.eye(2).repeat(3, 1, 1), 2.0 * torch.ones(3, 1)
+    compiled = filters.compile_step(step)
+    for a, b in zip(compiled(mean, covariance, value), step(mean, covariance, value), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
+    covariance[1, 0, 0] = -1.0
+    with pytest.raises(filters.FilterError, match=r"predict failed.*\(1,\).*prior covariance.*eigenvalue -1"):
+        compiled(mean, covariance, value)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("batch", [(), (200,)], ids=["one", "batch"])
 def test_steps_of_one_factory_do_not_share_compiled_code(batch):
     generator = torch.Generator().manual_seed(0)

@@ -279,3 +279,20 @@ def test_gradients_are_finite_with_known_states_and_no_innovation(form, count):
         assert bool(gradient.isfinite().all())
     assert_close(update.belief.mean[:, 2], mean[:, 2], 1e-14)
     assert_close(tensor(0.0).expand(count), update.nis.detach(), 1e-14)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_forward_derivatives_equal_backward_ones(form):
+    """Of the likelihood, by the measurement and the noise."""
+    prior, z, variance = beliefs(3), random_numbers(2), tensor(0.3, 0.2)
+    motion, see = bent_motion(3), bent_measurement(3, 2).function
+
+    def likelihood(value, noise):
+        bayes = filters.UnscentedKalmanFilter(form=form, iterations=1)
+        predicted = bayes.predict(prior, motion).belief
+        return bayes.update(predicted, filters.MeasurementModel(see, filters.Diagonal(noise)), value).log_likelihood
+
+    forward = torch.func.jacfwd(likelihood, argnums=(0, 1))(z, variance)
+    backward = torch.func.jacrev(likelihood, argnums=(0, 1))(z, variance)
+    for a, b in zip(forward, backward, strict=True):
+        assert_close(a, b, 1e-10)

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from sigmaslam import filters
 from sigmaslam.filters.sigma_points import SigmaPoints
+from sigmaslam.filters.transforms import Unscented
 from tests.support.filter_assertions import assert_close
 from tests.support.filter_builders import beliefs, covariances, random_numbers, tensor
 
@@ -119,9 +120,16 @@ def test_negative_centre_weight_is_refused_with_a_way_out(points):
 def test_negative_centre_weight_is_taken_when_asked_for():
     """kappa = 3 - n, W0 = -1/3 at n = 4: the kappa-variance of |x|^2 is then negative."""
     belief = filters.Gaussian(torch.zeros(4, dtype=torch.float64), torch.eye(4, dtype=torch.float64))
-    bayes = filters.UnscentedKalmanFilter(points=filters.julier(-1.0, allow_negative=True))
-    found = transform(bayes, belief, lambda x: x.square().sum(dim=-1, keepdim=True))
-    assert_close(found.covariance, tensor(-4.0)[None], 1e-12)
+    points = filters.julier(-1.0, allow_negative=True)
+
+    def squared(x):
+        return x.square().sum(dim=-1, keepdim=True)
+
+    found = Unscented(points)(squared, belief.factor, None).columns.covariance()
+    assert_close(found, tensor(-4.0)[None], 1e-12)
+    motion = filters.MotionModel(squared, filters.Diagonal(tensor(0.0)))
+    with pytest.raises(filters.FilterError, match="predicted covariance of the first has the smallest eigenvalue -4"):
+        filters.UnscentedKalmanFilter(points=points).predict(belief, motion)
 
 
 def test_points_that_would_be_imaginary_are_refused():

@@ -60,7 +60,7 @@ def test_cards_of_runs_without_a_recipe_have_a_page_too(tiny):
     assert "Recipe: none, started from random weights." in card_page({**card, "onnx_minus_torch": {}})
 
 
-@pytest.mark.parametrize("content", [None, "no json", '{"config": {}}'])
+@pytest.mark.parametrize("content", [None, "no json", '{"config": {}}', "[1]", "[" * 100_000])
 def test_a_file_that_is_no_card_is_refused(tmp_path, content):
     path = tmp_path / "card.json"
     if content is not None:

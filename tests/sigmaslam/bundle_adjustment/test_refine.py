@@ -262,7 +262,7 @@ def truncate(path: Path) -> None:
         (lambda run: (run / "tracks.npz").unlink(), "tracks.npz: no such file; run `sigmaslam track --tracks`"),
         (lambda run: truncate(run / "tracks.npz"), "tracks.npz: is no numpy archive, or is cut off"),
         (lambda run: (run / "tracks.npz").write_bytes(b""), "tracks.npz: is no numpy archive, or is cut off"),
-        (lambda run: truncate(run / "covariance.npy"), "covariance.npy: cannot be read"),
+        (lambda run: truncate(run / "covariance.npy"), "covariance.npy: is no numpy array, or is cut off"),
         (lambda run: np.save(run / "covariance.npy", np.zeros((3, 6, 6))), "both must come from the same run"),
         (lambda run: (run / "trajectory.tum").unlink(), "holds no trajectory.tum"),
         (spoil(lambda a: a.pop("landmark")), "tracks.npz: misses landmark"),

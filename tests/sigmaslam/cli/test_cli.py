@@ -1,6 +1,7 @@
 """The command line on the shipped sequence, and what it says to bad input."""
 
 import json
+import re
 import shutil
 import signal
 import subprocess
@@ -203,6 +204,7 @@ def test_the_runtime_needs_no_extra(demo_sequence: Path):
     script = (
         "import sys\n"
         "extras = 'torch kornia onnx onnxscript safetensors tensorboard scipy rosbags gtsam ray evo'.split()\n"
+        "extras.append('matplotlib')\n"
         "class Absent:\n"
         "    def find_spec(self, name, path=None, target=None):\n"
         "        if name.partition('.')[0] in extras:\n"
@@ -221,6 +223,42 @@ def test_the_runtime_needs_no_extra(demo_sequence: Path):
     assert result.returncode == 0, result.stderr
 
 
+@pytest.fixture
+def without_matplotlib(tmp_path: Path) -> dict[str, str]:
+    """Environment of a process in which matplotlib is not installed."""
+    absent = tmp_path / "absent"
+    absent.mkdir()
+    (absent / "matplotlib.py").write_text(
+        "raise ModuleNotFoundError(\"No module named 'matplotlib'\", name=__name__)\n"
+    )
+    return environment(absent)
+
+
+def test_track_and_evaluate_need_no_matplotlib(
+    whole_sequence: Path, tracked: tuple[Path, Finished], tmp_path: Path, without_matplotlib: dict[str, str]
+):
+    out, truth = tmp_path / "run", whole_sequence / "poses.txt"
+    for arguments in (("track", whole_sequence, "--out", out), ("evaluate", out, "--truth", truth)):
+        result = subprocess.run(
+            command_line(*arguments), env=without_matplotlib, capture_output=True, text=True, check=False, timeout=120
+        )
+        assert result.returncode == 0, result.stderr
+    assert "sigmaslam[report]" in result.stderr
+    assert not (out / "evaluation.png").exists()
+    page = (out / "report.html").read_text()
+    assert "sigmaslam[report]" in page
+    assert "<svg" not in page
+    assert "<svg" in (tracked[0] / "report.html").read_text()
+    for name in ("trajectory.tum", "trajectory_final.tum"):
+        assert (out / name).read_bytes() == (tracked[0] / name).read_bytes()
+
+
+def test_a_benchmark_that_draws_asks_for_matplotlib(tmp_path: Path, without_matplotlib: dict[str, str]):
+    command = command_line("benchmark", "claims", "--out", tmp_path / "page.md")
+    result = subprocess.run(command, env=without_matplotlib, capture_output=True, text=True, check=False, timeout=120)
+    assert_refused(result, "matplotlib", "sigmaslam[report]")
+
+
 def test_training_without_its_extra_says_how_to_install_it(tmp_path: Path):
     (tmp_path / "torch.py").write_text("raise ModuleNotFoundError(\"No module named 'torch'\", name='torch')\n")
     command = command_line("train", "--out", tmp_path / "run")
@@ -230,12 +268,56 @@ def test_training_without_its_extra_says_how_to_install_it(tmp_path: Path):
 
 @pytest.mark.parametrize(
     "command",
-    ["demo", "track", "evaluate", "match", "calibration", "render", "train", "train-scorer", "export", "benchmark"],
+    [
+        "",
+        "demo",
+        "check",
+        "track",
+        "finish",
+        "evaluate",
+        "match",
+        "geometry",
+        "refine",
+        "calibration",
+        "calibration show",
+        "calibration convert",
+        "render",
+        "train",
+        "train-scorer",
+        "export",
+        "benchmark",
+    ],
 )
-def test_every_command_has_help(command: str):
-    result = run_here(command, "--help")
+def test_every_command_has_help_that_80_columns_do_not_cut(command: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    result = run_here(*command.split(), "--help")
     assert result.returncode == 0
     assert "Usage" in result.stdout
+    assert not re.search(r"\w(…|\.\.\.)|<bool>", result.stdout), result.stdout
+
+
+def test_the_list_of_columns_is_whole_in_80_columns(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    words = re.findall(r"\w+", run_here("track", "--help").stdout)
+    assert {"timestamp", "qx", "qy", "qz", "qw", "sigma_position", "sigma_rotation"} <= set(words)
+
+
+def test_tab_completes_commands_options_and_choices():
+    for typed, expected in (
+        ("sigmaslam tr", {"track", "train", "train-scorer"}),
+        ("sigmaslam track --fron", {"--frontend"}),
+        ("sigmaslam track --frontend s", {"sift"}),
+    ):
+        words = {"_SIGMASLAM_COMPLETE": "complete_bash", "COMP_WORDS": typed, "COMP_CWORD": str(typed.count(" "))}
+        result = subprocess.run(
+            [sys.executable, "-c", "import sys; sys.argv = ['sigmaslam']; from sigmaslam.cli import main; main()"],
+            env={**environment(), **words},
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=60,
+        )
+        assert set(result.stdout.split()) == expected, result.stderr
 
 
 def test_an_option_that_the_benchmark_does_not_serve_is_refused(tmp_path: Path):

@@ -72,6 +72,25 @@ def test_a_wrong_file_is_refused_with_file_line_and_value(tmp_path: Path, text: 
         read_locations(write(tmp_path / "location.csv", text))
 
 
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            "timestamp;x;y;z;sigma_position\n0;0,5;0;0;0,1\n",
+            "line 1: the columns are separated by semicolons: separate",
+        ),
+        ("timestamp\tx\ty\tz\tsigma_position\n0\t0\t0\t0\t1\n", "line 1: the columns are separated by tabs"),
+        ("timestamp,x,x,y,z,sigma_position\n0,0,0,0,0,1\n", "line 1: column x stands twice"),
+        ("timestamp,x,y,z,sigma_position\n0,0,0,0,1\n100000000,0,0,0,1\n", "look like nanoseconds: write seconds"),
+    ],
+)
+def test_other_separators_and_units_are_named(tmp_path: Path, text: str, words: str):
+    with pytest.raises(InputError) as caught:
+        read_locations(write(tmp_path / "readings.csv", text))
+    for word in ("readings.csv", words):
+        assert word in str(caught.value)
+
+
 def test_a_missing_file_is_refused(tmp_path: Path):
     with pytest.raises(InputError, match=r"nowhere\.csv"):
         read_locations(tmp_path / "nowhere.csv")

@@ -252,7 +252,7 @@ def test_image_that_vanishes_after_opening_is_skipped(tmp_path):
     sequence = open_sequence(make_folder(tmp_path))
     (tmp_path / "right" / "000002.png").unlink()
     assert [frame.index for frame in sequence.frames()] == [0, 1, 3, 4, 5]
-    assert "missing" in sequence.skipped[0].reason
+    assert "no such file" in sequence.skipped[0].reason
 
 
 def test_truncated_jpeg_is_skipped(tmp_path):
@@ -642,3 +642,34 @@ def test_files_that_are_no_videos(tmp_path):
     cv2.imwrite(str(tmp_path / "left01.png"), picture(0))
     with pytest.raises(InputError, match="an image, not a video"):
         open_sequence(tmp_path / "left01.png")
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e9, "nanoseconds"), (1e6, "microseconds")])
+def test_times_in_another_unit_are_refused(tmp_path, factor, unit):
+    """They ended in a LinAlgError while tracking, or in a path of ten kilometres."""
+    make_kitti(tmp_path)
+    (tmp_path / "times.txt").write_text("".join(f"{0.1 * factor * k:.0f}\n" for k in range(6)))
+    with pytest.raises(InputError, match=rf"times\.txt: times such as .* look like {unit}: write seconds"):
+        open_sequence(tmp_path)
+
+
+@pytest.mark.parametrize("stamp", ["9" * 19, "9" * 40])
+def test_names_that_are_no_nanoseconds_are_refused(tmp_path, stamp):
+    make_folder(tmp_path, 1, name=stamp + ".png")
+    with pytest.raises(InputError, match=r"99\.png: 9+(\.\.\.)? is no time in nanoseconds since 1970"):
+        open_sequence(tmp_path)
+
+
+def test_a_key_of_kitti_that_stands_twice_is_refused(tmp_path):
+    make_kitti(tmp_path)
+    with (tmp_path / "calib.txt").open("a") as calibration:
+        calibration.write(f"P1: {kitti_line(-9)}\n")
+    with pytest.raises(CalibrationError, match=r"calib\.txt: key 'P1' stands twice"):
+        open_sequence(tmp_path)
+
+
+def test_kitti_cameras_without_an_inverse_are_refused(tmp_path):
+    make_kitti(tmp_path)
+    (tmp_path / "calib.txt").write_text(f"P0: {'0 ' * 12}\nP1: {kitti_line(-5)}\n")
+    with pytest.raises(CalibrationError, match=r"calib\.txt: .*'P0'"):
+        open_sequence(tmp_path)

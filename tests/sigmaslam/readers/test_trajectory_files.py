@@ -11,7 +11,9 @@ from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path
 from sigmaslam.geometry.se3 import rotation_exp, se3_exp
 from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.readers.pairing import in_seconds
 from sigmaslam.readers.trajectory_files import (
+    read_covariances,
     read_euroc_truth,
     read_kitti,
     read_trajectory,
@@ -121,7 +123,7 @@ def test_euroc_truth_without_sensor_file_says_what_to_do(tmp_path):
 def test_euroc_sensor_file_without_extrinsics_is_named(tmp_path):
     (tmp_path / "cam0_sensor.yaml").write_text("%YAML:1.0\nrate_hz: 20\n")
     (tmp_path / "data.csv").write_text("1403715273262142976,0,0,0,1,0,0,0\n")
-    with pytest.raises(InputError, match=r"cam0_sensor\.yaml: T_BS"):
+    with pytest.raises(InputError, match=r"cam0_sensor\.yaml: key 'T_BS' is missing"):
         read_trajectory(tmp_path / "data.csv")
 
 
@@ -147,12 +149,12 @@ def test_bad_files_are_named_with_line_and_value(tmp_path, text, message):
 
 
 def test_missing_and_binary_files_are_named(tmp_path):
-    with pytest.raises(InputError, match=r"gone\.tum: no such file"):
+    with pytest.raises(InputError, match=r"gone\.tum: cannot read the trajectory: no such file"):
         read_trajectory(tmp_path / "gone.tum")
     (tmp_path / "image.png").write_bytes(b"\x89PNG\xff\xfe\x00")
-    with pytest.raises(InputError, match=r"image\.png: is not text"):
+    with pytest.raises(InputError, match=r"image\.png: cannot read the trajectory: is not text"):
         read_trajectory(tmp_path / "image.png")
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="cannot read the trajectory: Is a directory"):
         read_trajectory(tmp_path)
 
 
@@ -188,3 +190,50 @@ def test_failed_write_leaves_the_old_file(tmp_path):
 def test_missing_folder_is_named(tmp_path):
     with pytest.raises(InputError, match=r"no/such\b.*create it"):
         write_tum(tmp_path / "no/such/trajectory.tum", _trajectory(2))
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e9, "nanoseconds"), (1e6, "microseconds"), (1e3, "milliseconds")])
+@pytest.mark.parametrize("origin", [0.0, 1.7e9])
+def test_times_in_another_unit_are_named(tmp_path, factor, unit, origin):
+    """Milliseconds from zero on could be seconds of a slow camera. A truth's unit is found by `evaluate`."""
+    path, times = tmp_path / "truth.tum", [round(factor * (origin + 0.1 * k)) for k in range(9)]
+    path.write_text("".join(f"{time} {k} 0 0 0 0 0 1\n" for k, time in enumerate(times)))
+    assert len(read_trajectory(path)) == 9
+    if unit == "milliseconds" and not origin:
+        assert in_seconds(path, times) == times
+        return
+    with pytest.raises(InputError, match=rf"truth\.tum: times such as .* look like {unit}: write seconds"):
+        in_seconds(path, times)
+
+
+@pytest.mark.parametrize("times", [[0.0, 0.1, 0.2], [1.7e9, 1.7e9 + 1, 1.7e9 + 500], [5.0], [0.0, 900.0, 1800.0]])
+def test_times_in_seconds_are_taken(tmp_path, times):
+    path = tmp_path / "truth.tum"
+    path.write_text("".join(f"{t} {k} 0 0 0 0 0 1\n" for k, t in enumerate(times)))
+    np.testing.assert_array_equal(read_trajectory(path).timestamps, times)
+
+
+@pytest.mark.parametrize("times", [(0.0, 0.1), (1.7e9, 1.7e9 + 0.1), (3,)])
+@pytest.mark.parametrize("separator", [",", ", "])
+def test_tum_form_with_commas_is_not_taken_for_euroc(tmp_path, times, separator):
+    path = tmp_path / "truth.csv"
+    path.write_text("".join(separator.join([str(t), *"0000001"]) + "\n" for t in times))
+    with pytest.raises(InputError, match=r"truth\.csv: .*replace each comma by a space"):
+        read_trajectory(path)
+
+
+@pytest.mark.parametrize(
+    "array", [np.zeros((3, 6, 6)), np.zeros((4, 6)), np.zeros((4, 6, 6), "U3"), np.zeros((4, 6, 6), int)]
+)
+def test_covariances_of_another_shape_or_type_are_refused(tmp_path, array):
+    np.save(tmp_path / "covariance.npy", array)
+    with pytest.raises(InputError, match=r"covariance\.npy: is .*needs floating numbers \(4, 6, 6\): both must come"):
+        read_covariances(tmp_path / "covariance.npy", 4)
+
+
+def test_covariances_come_back_in_float64(tmp_path):
+    array = np.random.default_rng(0).normal(size=(4, 6, 6)).astype(np.float32)
+    np.save(tmp_path / "covariance.npy", array)
+    read = read_covariances(tmp_path / "covariance.npy", 4)
+    assert read.dtype == np.float64
+    np.testing.assert_array_equal(read, array)

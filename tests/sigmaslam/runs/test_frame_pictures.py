@@ -79,5 +79,5 @@ def test_trails_lead_to_where_the_landmark_was_in_the_frames_before(tmp_path: Pa
 
 def test_another_file_is_refused(tmp_path: Path):
     np.savez(tmp_path / "pictures.npz", left=np.zeros(3))
-    with pytest.raises(InputError, match=r"pictures\.npz: holds no pictures of frames"):
+    with pytest.raises(InputError, match=r"pictures\.npz: misses timestamp"):
         read_pictures(tmp_path / "pictures.npz")

@@ -299,16 +299,16 @@ def test_bad_frames_are_named_with_line_and_value(tmp_path, old, new, message):
 
 
 def test_missing_and_broken_files_are_named(tmp_path):
-    with pytest.raises(InputError, match=r"frames\.csv: cannot be read"):
+    with pytest.raises(InputError, match=r"frames\.csv: cannot read the frames: no such file"):
         write_report(tmp_path)
     make_run(tmp_path / "run")
     (tmp_path / "run/map.npz").write_text("none")
-    with pytest.raises(InputError, match=r"map\.npz: holds no array"):
+    with pytest.raises(InputError, match=r"map\.npz: is no numpy archive"):
         write_report(tmp_path / "run")
     (tmp_path / "run/map.npz").unlink()
     (tmp_path / "run/run.json").write_text("{")
     with pytest.raises(InputError, match=r"run\.json: is no JSON"):
         write_report(tmp_path / "run")
     (tmp_path / "run/frames.csv").unlink()
-    with pytest.raises(InputError, match=r"frames\.csv: cannot be read"):
+    with pytest.raises(InputError, match=r"frames\.csv: cannot read the frames"):
         write_report(tmp_path / "run")

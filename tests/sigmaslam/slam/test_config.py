@@ -40,7 +40,7 @@ def test_every_setting_can_be_written_and_read(tmp_path: Path):
         ("constant_sigma: 1", ("constant_sigma: expected two positive numbers in a list, found 1",)),
         ("linearisation: cubature", ("expected one of unscented, extended",)),
         ("- 1", ("expected lines like", "found list")),
-        ("a: [", ("cannot be read",)),
+        ("a: [", ("not valid YAML",)),
     ],
 )
 def test_a_bad_file_is_refused_by_name(tmp_path: Path, text: str, words: tuple[str, ...]):
@@ -52,5 +52,5 @@ def test_a_bad_file_is_refused_by_name(tmp_path: Path, text: str, words: tuple[s
 
 
 def test_a_missing_file_is_refused(tmp_path: Path):
-    with pytest.raises(InputError, match="No such file"):
+    with pytest.raises(InputError, match="cannot read the settings: no such file"):
         read_config(tmp_path / "nothing.yaml")

@@ -1,5 +1,6 @@
 """Keyframes that left the window: kept within bounds, found again, and a map to localise in."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -172,7 +173,7 @@ def refused(path: Path, *words: str, frontend: str = "learned", camera: Rectifie
 
 
 def test_a_missing_map_is_refused(tmp_path: Path):
-    refused(tmp_path / "nowhere.npz", "no such map", "give map.npz")
+    refused(tmp_path / "nowhere.npz", "no such file")
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
@@ -180,13 +181,13 @@ def test_a_truncated_map_is_refused(tmp_path: Path, share: float):
     path = tmp_path / "map.npz"
     np.savez_compressed(path, **pack_keyframes([keyframe(0)], ONE_POSE, "learned", CAMERA))
     path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
-    refused(path, "not a map that can be read", "track the sequence again")
+    refused(path, "is no numpy archive", "track the sequence again")
 
 
 def test_a_map_that_is_no_archive_is_refused(tmp_path: Path):
     path = tmp_path / "map.npz"
     path.write_text("x y z\n")
-    refused(path, "not a map that can be read", "track the sequence again")
+    refused(path, "is no numpy archive", "track the sequence again")
 
 
 def test_a_map_without_keyframes_is_refused(tmp_path: Path):
@@ -205,6 +206,48 @@ def test_a_map_of_another_camera_is_refused(tmp_path: Path):
     path = tmp_path / "map.npz"
     np.savez_compressed(path, **pack_keyframes([keyframe(0)], ONE_POSE, "learned", CAMERA))
     refused(path, "0.1", "0.2", "a map serves the camera that made it", camera=replace(CAMERA, baseline=0.2))
+
+
+def changed(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[dict], dict]:
+    return lambda arrays: arrays | {f"keyframe_{name}": change(arrays[f"keyframe_{name}"])}
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (changed("covariance", lambda a: a[:5]), "keyframe_covariance is float64 (5, 12) and must be floating (5, 5)"),
+        (changed("covariance", lambda a: a[:6, :6]), "keyframe_covariance is (6, 6) for 2 poses of 6"),
+        (changed("covariance", lambda a: -a), "keyframe_covariance is no covariance"),
+        (changed("poses", lambda a: a.astype(str)), "keyframe_poses is <U32 (2, 4, 4) and must be floating"),
+        (changed("poses", lambda a: a * np.nan), "keyframe_poses has a value that is not finite"),
+        (changed("poses", lambda a: 2 * a), "keyframe_poses are not rigid"),
+        (changed("counts", lambda a: a + 1), "keyframe_counts are not of the 57 keypoints"),
+        (changed("counts", lambda a: a * [-1, 1]), "keyframe_counts are not of the 57 keypoints"),
+        (changed("images", lambda a: a.astype(np.uint16)), "keyframe_images are uint16, not uint8"),
+        (changed("counts", lambda a: a * 1.0), "keyframe_counts is float64"),
+        (changed("keypoints", lambda a: a[1:]), "keyframe_descriptors is float32 (57, 64) and must be"),
+        (changed("images", lambda a: a[:, 1:]), "keyframe_images have 64x47 pixels, the camera 64x48"),
+        (changed("sigma", lambda a: a + np.inf), "keyframe_sigma has a value that is not finite"),
+        (lambda arrays: arrays | {"intrinsics": np.zeros(3)}, "intrinsics is float64 (3,) and must be floating (7)"),
+        (lambda arrays: arrays | {"intrinsics": np.full(7, np.nan)}, "a map serves the camera that made it"),
+    ],
+)
+def test_a_map_whose_arrays_do_not_go_together_is_refused(tmp_path: Path, change: Callable[[dict], dict], words: str):
+    none = np.zeros((12, CALIBRATION_SIZE))
+    past = PastPoses(np.stack([looking(0.0), looking(1.0)]), np.eye(12), none, none)
+    arrays = pack_keyframes([keyframe(0, 40), keyframe(1, 17)], past, "learned", CAMERA)
+    np.savez_compressed(tmp_path / "map.npz", **change(arrays))
+    refused(tmp_path / "map.npz", words)
+
+
+def test_an_array_in_place_of_a_map_is_refused_without_advice_to_unpickle(tmp_path: Path):
+    np.save(tmp_path / "map.npy", np.eye(4))
+    (tmp_path / "map.npy").rename(tmp_path / "map.npz")
+    refused(tmp_path / "map.npz", "is a single array (.npy) and no archive")
+    (tmp_path / "map.npz").write_text("x y z\n")
+    with pytest.raises(InputError) as caught:
+        read_keyframes(tmp_path / "map.npz", "learned", CAMERA)
+    assert "pickle" not in str(caught.value)
 
 
 # ---- the tracker

@@ -1,0 +1,138 @@
+"""Build what is handed out: the sdist, a wheel without kernels, and a wheel with kernels for each Python.
+
+    python release/build_dist.py OUT [PYTHON ...]
+
+The same commit gives the same bytes in any folder: sources come from `git archive HEAD`, tools from requirements.lock,
+times from the commit (or SOURCE_DATE_EPOCH), and archives are sorted and name no user. The compiler is that of the
+machine: kernels are the same where it is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gzip
+import hashlib
+import io
+import os
+import subprocess
+import sys
+import tarfile
+import tempfile
+import zipfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+TOOLS = ("build", "setuptools", "pybind11")
+KERNELS = "sigmaslam/frontend/_kernels."
+
+
+def main() -> None:
+    """Entry point."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("out", type=Path, help="folder for the archives and their SHA256SUMS")
+    parser.add_argument("pythons", nargs="*", default=[sys.executable], help="interpreters to compile kernels for")
+    arguments = parser.parse_args()
+    try:
+        for path in build_dist(arguments.out, arguments.pythons):
+            print(path)
+    except (RuntimeError, subprocess.CalledProcessError) as error:
+        sys.exit(f"error: {error}")
+
+
+def build_dist(out: Path, pythons: list[str]) -> list[Path]:
+    """Build all archives; the first Python makes the sdist and the wheel without kernels.
+
+    Returns:
+        The archives, and SHA256SUMS.
+    Raises:
+        RuntimeError: a wheel has no kernels, because there is no C++ compiler.
+        subprocess.CalledProcessError: a tool failed, which has said why.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    os.umask(0o022)  # modes of files go into the archives
+    epoch = os.environ.get("SOURCE_DATE_EPOCH") or _git("log", "-1", "--format=%ct").decode().strip()
+    environment = {**os.environ, "SOURCE_DATE_EPOCH": epoch, "PYTHONHASHSEED": "0"}
+    environment.pop("PYTHONPATH", None)
+    with tempfile.TemporaryDirectory() as name:
+        work = Path(name)
+        builders = [_install_tools(python, work / f"tools{number}") for number, python in enumerate(pythons)]
+        _unpack(_git("archive", "--format=tar", "HEAD"), work / "commit")
+        raw = _build(builders[0], "sdist", work / "commit", work / "raw", environment)
+        sdist = out / raw.name
+        sdist.write_bytes(normalise_tar(raw.read_bytes(), int(epoch)))
+        archives = [sdist]
+        for number, builder in enumerate([builders[0], *builders]):
+            _unpack(gzip.decompress(sdist.read_bytes()), work / f"sources{number}")
+            sources = work / f"sources{number}" / sdist.name.removesuffix(".tar.gz")
+            if number == 0:
+                (sources / "setup.py").unlink()  # which holds the kernels alone
+            wheel = _build(builder, "wheel", sources, out, environment)
+            with zipfile.ZipFile(wheel) as content:
+                compiled = any(each.startswith(KERNELS) for each in content.namelist())
+            if compiled != (number > 0):
+                raise RuntimeError(f"{wheel} holds no compiled kernels: install a C++ compiler (apt install g++)")
+            archives.append(wheel)
+    sums = out / "SHA256SUMS"
+    lines = sorted(f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.name}\n" for path in archives)
+    sums.write_text("".join(lines), encoding="utf-8")
+    return [*archives, sums]
+
+
+def normalise_tar(archive: bytes, seconds: int) -> bytes:
+    """The same files as a .tar.gz that depends on their names, contents and rights to be run alone.
+
+    Args:
+        archive: a .tar.gz.
+        seconds: since 1970, the time of every file.
+    """
+    written = io.BytesIO()
+    with (
+        tarfile.open(fileobj=io.BytesIO(archive), mode="r:gz") as source,
+        tarfile.open(fileobj=written, mode="w", format=tarfile.PAX_FORMAT) as target,
+    ):
+        for member in sorted(source.getmembers(), key=lambda each: each.name):
+            plain = tarfile.TarInfo(member.name)
+            plain.type, plain.linkname = member.type, member.linkname
+            plain.size, plain.mtime = member.size, seconds
+            plain.mode = 0o755 if member.isdir() or member.mode & 0o100 else 0o644
+            target.addfile(plain, source.extractfile(member) if member.isfile() else None)
+    return gzip.compress(written.getvalue(), mtime=seconds)
+
+
+def _install_tools(python: str, folder: Path) -> Path:
+    """An environment of that Python with the tools of requirements.lock; its interpreter."""
+    _run(python, "-m", "venv", folder)
+    interpreter = folder / "bin" / "python"
+    lock = ROOT / "requirements.lock"
+    _run(interpreter, "-m", "pip", "install", "--quiet", "--constraint", lock, *TOOLS)
+    return interpreter
+
+
+def _build(builder: Path, kind: str, sources: Path, out: Path, environment: dict[str, str]) -> Path:
+    """One archive, built without isolation as the tools are pinned; its path in `out`."""
+    with tempfile.TemporaryDirectory(dir=sources.parent) as fresh:
+        _run(builder, "-m", "build", "--no-isolation", f"--{kind}", "--outdir", fresh, sources, environment=environment)
+        (made,) = Path(fresh).iterdir()
+        out.mkdir(exist_ok=True)
+        target = out / made.name
+        target.write_bytes(made.read_bytes())
+    return target
+
+
+def _unpack(archive: bytes, folder: Path) -> None:
+    with tarfile.open(fileobj=io.BytesIO(archive), mode="r:") as source:
+        source.extractall(folder, filter="tar")
+
+
+def _git(*arguments: str) -> bytes:
+    """What git prints about this repository."""
+    return subprocess.run(["git", "-C", str(ROOT), *arguments], stdout=subprocess.PIPE, check=True).stdout
+
+
+def _run(*command: str | Path, environment: dict[str, str] | None = None) -> None:
+    """Runs a tool; only its errors are shown."""
+    subprocess.run([*map(str, command)], env=environment, stdout=subprocess.DEVNULL, check=True)
+
+
+if __name__ == "__main__":
+    main()

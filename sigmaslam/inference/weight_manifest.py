@@ -1,0 +1,64 @@
+"""manifest.json beside weights and graphs: their SHA-256, as they were exported."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable
+from pathlib import Path
+
+from sigmaslam.bounded_files import read_text, shorten
+from sigmaslam.errors import InputError
+from sigmaslam.files import atomic_write_text
+
+MANIFEST_NAME = "manifest.json"
+_MANIFEST_BYTES = 1 << 20
+_MEND = "reinstall the package, or export the graphs again with `sigmaslam export`"
+
+
+def check_weights(path: Path, content: bytes) -> None:
+    """Compares a file of weights with the manifest beside it; without a manifest, or if it is not in it, it may pass.
+
+    Args:
+        path: of the file.
+        content: of the file.
+    Raises:
+        InputError: the file is not the one that was exported, or the manifest cannot be read.
+    """
+    manifest = path.parent / MANIFEST_NAME
+    if not manifest.is_file():
+        return
+    expected = read_manifest(manifest).get(path.name)
+    actual = hashlib.sha256(content).hexdigest()
+    if expected is not None and expected != actual:
+        raise InputError(
+            f"{path}: is not the file that was exported (SHA-256 {actual[:12]}..., {manifest.name} beside it says "
+            f"{shorten(expected, 15)}): {_MEND}"
+        )
+
+
+def read_manifest(path: Path) -> dict[str, str]:
+    """SHA-256 in hexadecimal digits by file name.
+
+    Raises:
+        InputError: the file cannot be read, or is no such table.
+    """
+    try:
+        content = json.loads(read_text(path, _MANIFEST_BYTES, "the hashes of the weights"))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: is no JSON ({shorten(str(error))}): {_MEND}") from None
+    if not isinstance(content, dict) or not all(isinstance(each, str) for each in content.values()):
+        raise InputError(f"{path}: is no table of file names and SHA-256: {_MEND}")
+    return content
+
+
+def update_manifest(folder: Path, names: Iterable[str]) -> None:
+    """Writes the hashes of these files of a folder into its manifest; other entries stay.
+
+    Raises:
+        InputError: the manifest that is there cannot be read, or the folder cannot be written.
+    """
+    path = folder / MANIFEST_NAME
+    hashes = read_manifest(path) if path.is_file() else {}
+    hashes |= {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names}
+    atomic_write_text(path, json.dumps(dict(sorted(hashes.items())), indent=2) + "\n")

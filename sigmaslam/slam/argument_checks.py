@@ -1,0 +1,89 @@
+"""Arguments of the trackers, checked in constant time before anything is computed with them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from sigmaslam.bounded_files import shorten
+from sigmaslam.errors import InputError
+from sigmaslam.geometry.camera import StereoCamera
+from sigmaslam.inference.onnx_graph import BACKENDS
+from sigmaslam.readers.images import check_grey
+from sigmaslam.slam.config import TrackerConfig
+
+# Seconds. A clock that jumps further has another unit, or began anew; the motion in between would be unknown anyway.
+_LONGEST_PAUSE = 1e5
+_FRONTEND_METHODS = ("name", "observe", "match", "follow")
+
+
+def check_tracker_arguments(camera: object, frontend: object, backend: object, config: object, threads: object) -> None:
+    """The arguments with which a tracker is made.
+
+    Raises:
+        InputError: one is of another type, or names nothing; names the argument, what was given, and the mend.
+    """
+    if not isinstance(camera, StereoCamera):
+        raise _wrong("camera", camera, "a StereoCamera, such as StereoCamera.from_yaml('stereo.yaml')")
+    if not isinstance(frontend, str) and not _has_methods(frontend):
+        raise _wrong("frontend", frontend, f"a name, or an object with {', '.join(_FRONTEND_METHODS)}")
+    if backend not in BACKENDS:
+        raise _wrong("backend", backend, f"one of {', '.join(BACKENDS)}")
+    if config is not None and not isinstance(config, TrackerConfig):
+        raise _wrong("config", config, "a TrackerConfig, such as TrackerConfig(window=8)")
+    if not isinstance(threads, int | np.integer) or isinstance(threads, bool) or threads < 1:
+        raise _wrong("threads", threads, "a whole number from 1")
+
+
+def check_region(region: Any, camera: StereoCamera) -> None:
+    """The region of a body in the first raw left image.
+
+    Raises:
+        InputError: it is no array of truth values of the image's size, or nothing is in it.
+    """
+    size = (camera.left.height, camera.left.width)
+    if not isinstance(region, np.ndarray) or region.dtype != np.bool_ or region.shape != size:
+        given = f"{region.dtype} {region.shape}" if isinstance(region, np.ndarray) else region
+        raise _wrong("region", given, f"a bool array {size}, true on the body, such as read_region makes")
+    if not region.any():
+        raise InputError("region is false everywhere: pixels of the body must be true")
+
+
+def check_frame(left: Any, right: Any, timestamp: Any, before: float | None) -> None:
+    """A stereo pair and its time.
+
+    Args:
+        left, right: images; their size is checked where they are rectified.
+        timestamp: seconds.
+        before: of the last pair, None for the first one.
+    Raises:
+        InputError: the time stamp is no finite number, or does not come after the last one, or far after it.
+        FrameError: an image is no (H, W) uint8 array.
+    """
+    check_grey(left, "left image")
+    check_grey(right, "right image")
+    if (
+        not isinstance(timestamp, int | float | np.number)
+        or isinstance(timestamp, bool)
+        or not math.isfinite(timestamp)
+    ):
+        raise _wrong("timestamp", timestamp, "seconds as a finite number")
+    if before is None:
+        return
+    if timestamp <= before:
+        raise InputError(f"time stamp {timestamp:.6f} s does not come after {before:.6f} s: sort the frames by time")
+    if timestamp - before > _LONGEST_PAUSE:
+        raise InputError(
+            f"time stamp {timestamp:.6f} s comes {timestamp - before:.3g} s after the one before: give seconds, not "
+            "nano- or microseconds; after a pause of days make a new tracker"
+        )
+
+
+def _wrong(name: str, value: object, expected: str) -> InputError:
+    return InputError(f"{name} is {shorten(repr(value), 60)}: give {expected}")
+
+
+def _has_methods(frontend: object) -> bool:
+    return all(hasattr(frontend, name) for name in _FRONTEND_METHODS)

@@ -1,0 +1,61 @@
+"""What is handed out is the same, byte for byte, wherever and whenever it is built."""
+
+import io
+import os
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from release.build_dist import normalise_tar
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def pack(names: list[str], user: str, seconds: int, mode: int) -> bytes:
+    """A .tar.gz of files that hold their own names."""
+    written = io.BytesIO()
+    with tarfile.open(fileobj=written, mode="w:gz") as archive:
+        for name in names:
+            member = tarfile.TarInfo(name)
+            member.size, member.mtime, member.mode, member.uname, member.uid = len(name), seconds, mode, user, seconds
+            archive.addfile(member, io.BytesIO(name.encode()))
+    return written.getvalue()
+
+
+def test_order_user_time_and_umask_leave_no_trace_in_an_archive():
+    one = normalise_tar(pack(["p/a", "p/b"], "ann", 1, 0o600), 1000)
+    other = normalise_tar(pack(["p/b", "p/a"], "bob", 2, 0o664), 1000)
+    assert one == other
+    with tarfile.open(fileobj=io.BytesIO(one)) as archive:
+        assert {each.name: archive.extractfile(each).read().decode() for each in archive} == {
+            "p/a": "p/a",
+            "p/b": "p/b",
+        }
+        assert {(each.mtime, each.mode, each.uname) for each in archive.getmembers()} == {(1000, 0o644, "")}
+    assert normalise_tar(pack(["p/a", "p/b"], "ann", 1, 0o700), 1000) != one
+
+
+@pytest.mark.slow
+def test_two_folders_give_the_same_archives(tmp_path: Path):
+    """Of what is committed; needs a package index for the tools."""
+    sums = []
+    for folder, zone, umask in (("one", "UTC", 0o022), ("another/folder", "Asia/Tokyo", 0o077)):
+        clone, out = tmp_path / folder, tmp_path / f"dist{umask}"
+        subprocess.run(["git", "clone", "--quiet", str(ROOT), str(clone)], check=True, umask=umask)
+        command = [sys.executable, str(clone / "release" / "build_dist.py"), str(out)]
+        subprocess.run(command, check=True, umask=umask, env={**os.environ, "TZ": zone})
+        sums.append((out / "SHA256SUMS").read_text())
+    assert sums[0] == sums[1]
+    names = [line.split()[1] for line in sums[0].splitlines()]
+    assert [name.endswith("none-any.whl") for name in names].count(True) == 1
+    for name in names:
+        if name.endswith(".whl"):
+            with zipfile.ZipFile(out / name) as wheel:
+                content = b"".join(map(wheel.read, wheel.namelist()))
+                assert any(each.endswith("licenses/LICENSE") for each in wheel.namelist())
+                assert any(each.endswith("docs/object.md") for each in wheel.namelist())
+            assert str(tmp_path).encode() not in content

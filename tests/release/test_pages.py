@@ -1,0 +1,90 @@
+"""The commands on the pages run as they stand there, from an installed wheel, outside the checkout."""
+
+import os
+import re
+import shutil
+import site
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from release.build_dist import build_dist
+from tests.support.stand_ins import write_stand_ins
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+# What is not run, by how it begins, and why.
+NOT_RUN = {
+    "sigmaslam track --camera": "needs cameras",
+    "sigmaslam train": "half an hour and more",
+    "sigmaslam export": "needs what `train` makes",
+}
+
+
+def commands() -> list[tuple[str, str]]:
+    """Page and line of every command in a block without a language."""
+    found = []
+    for page in PAGES:
+        blocks = re.findall(r"^```(\w*)\n(.*?)^```$", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+        for block in [content for language, content in blocks if not language]:
+            lines = [line.partition("  #")[0].strip() for line in block.splitlines()]
+            found += [(page.name, line) for line in lines if line.startswith("sigmaslam ")]
+    return found
+
+
+def test_the_pages_have_commands():
+    lines = [line for _, line in commands()]
+    assert len(lines) > 30
+    assert all(any(line.startswith(start) for line in lines) for start in NOT_RUN)
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Environment in which `sigmaslam` is the wheel of the last commit, beside what is installed here."""
+    folder = tmp_path_factory.mktemp("installed")
+    wheel = next(
+        path
+        for path in build_dist(folder / "dist", [sys.executable])
+        if "none-any" not in path.name and path.suffix == ".whl"
+    )
+    venv = folder / "venv"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(venv)], check=True)
+    pip = [sys.executable, "-m", "pip", "--python", str(venv), "install", "--quiet", "--no-deps", "--no-index"]
+    subprocess.run([*pip, str(wheel)], check=True)
+    packages = next(venv.glob("lib/python*/site-packages"))
+    # A folder that a .pth file names is searched last, and .pth files in it, of an editable installation, are not read.
+    (packages / "others.pth").write_text("\n".join(site.getsitepackages()))
+    environment = {**os.environ, "PATH": f"{venv / 'bin'}{os.pathsep}{os.environ['PATH']}"}
+    environment.pop("PYTHONPATH", None)
+    return environment
+
+
+@pytest.fixture(scope="module")
+def folder(installed: dict[str, str], demo_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Stand-ins for what the commands read, and a run; what one command renders is there for the next."""
+    folder = tmp_path_factory.mktemp("empty")
+    write_stand_ins(demo_sequence, folder)
+    subprocess.run("sigmaslam track FOLDER --out tracked --tracks", shell=True, check=True, cwd=folder, env=installed)
+    shutil.copytree(folder / "tracked", folder / "run")
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize(("page", "command"), commands())
+def test_a_command_runs_as_it_stands(installed: dict[str, str], folder: Path, page: str, command: str):
+    for start, reason in NOT_RUN.items():
+        if command.startswith(start):
+            pytest.skip(reason)
+    # Lines that write the same folder are alternatives; a map is read from a run with the same front-end.
+    for out in re.findall(r"--out (\S+)", command):
+        shutil.rmtree(folder / out, ignore_errors=True)
+    if "run/map.npz" in command:
+        shutil.rmtree(folder / "run", ignore_errors=True)
+        shutil.copytree(folder / "tracked", folder / "run")
+    done = subprocess.run(
+        command, shell=True, cwd=folder, env=installed, capture_output=True, text=True, check=False, timeout=3600
+    )
+    assert done.returncode == 0, f"{page}: {command}\n{done.stdout}\n{done.stderr}"
