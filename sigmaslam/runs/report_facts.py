@@ -181,7 +181,7 @@ def _speed(run: RecordedRun) -> Facts:
         interval = frame_interval(run.frames)
         if interval:
             ratio = 1e3 * interval / milliseconds
-            facts.append(("real time", f"{ratio:.2g} ×, as frames come {1 / interval:.2g}/s"))
+            facts.append(("real time", f"{ratio:.2g} × {1 / interval:.3g} frames/s"))
     timing = run.entries.get("real_time")
     if isinstance(timing, dict):
         return [

@@ -14,7 +14,9 @@ from sigmaslam.runs.recorded_run import RecordedRun
 
 MAX_POSES, MAX_POINTS, MAX_ELLIPSOIDS, MAX_KEYFRAMES = 20_000, 40_000, 40, 400
 """With more of them an even selection is shown."""
-# 3-sigma ellipsoids are drawn so many times as large that the median one is this share of the view, or as they are.
+MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
+"""Ellipsoids may be drawn so many times as large."""
+# At first such that the median one of 3 sigma is this share of the view, or as they are.
 _VISIBLE = 0.02
 
 
@@ -53,6 +55,7 @@ def build_scene(run: RecordedRun) -> dict[str, Any] | None:
         "ellipsoids": pack(ellipsoids),
         "ellipsoid_status": pack(status[chosen]),
         "magnification": _magnification(run, size),
+        "magnifications": MAGNIFICATIONS,
         "keyframes": pack(keyframes),
         "loops": pack(loops),
         **_points(run),
@@ -132,14 +135,14 @@ def _ellipsoids(run: RecordedRun) -> tuple[np.ndarray, np.ndarray]:
     return transforms, rows
 
 
-def _magnification(run: RecordedRun, size: float) -> float:
-    """A power of ten, 1 or more, by which ellipsoids are drawn larger."""
+def _magnification(run: RecordedRun, size: float) -> int:
+    """One of `MAGNIFICATIONS` by which ellipsoids can be seen."""
     sigma = run.sigmas[0]
     sigma = sigma[np.isfinite(sigma) & (sigma > 0)]
     if not len(sigma):
-        return 1.0
+        return 1
     wanted = _VISIBLE * size / (3.0 * float(np.median(sigma)))
-    return float(10.0 ** np.clip(np.round(np.log10(wanted)), 0, 4))
+    return int(MAGNIFICATIONS[np.abs(np.log(np.array(MAGNIFICATIONS) / wanted)).argmin()])
 
 
 def _labels(run: RecordedRun, seconds: np.ndarray, shown: np.ndarray) -> list[str]:
