@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Self, get_args
 
 import numpy as np
@@ -75,6 +75,22 @@ class CameraModel:
                 f"distortion has {len(self.distortion)} coefficients; model {self.distortion_model!r} "
                 f"takes {' or '.join(map(str, counts))}"
             )
+
+    def scaled(self, factor: float) -> Self:
+        """Of images that are so many times as large, rounded to whole pixels."""
+        width, height = (max(round(factor * size), 1) for size in (self.width, self.height))
+        x, y = width / self.width, height / self.height
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=x * self.fx,
+            fy=y * self.fy,
+            # (0, 0) is the centre of a pixel, whose corner stays where it is.
+            cx=x * (self.cx + 0.5) - 0.5,
+            cy=y * (self.cy + 0.5) - 0.5,
+            skew=x * self.skew,
+        )
 
     @property
     def matrix(self) -> np.ndarray:
@@ -263,6 +279,10 @@ class StereoCamera:
     def baseline(self) -> float:
         """Distance between the two centres of projection, metres."""
         return float(np.linalg.norm(self.T_left_right[:3, 3]))
+
+    def scaled(self, factor: float) -> Self:
+        """Of images that are so many times as large."""
+        return replace(self, left=self.left.scaled(factor), right=self.right.scaled(factor))
 
     @property
     def is_rectified(self) -> bool:
