@@ -16,7 +16,6 @@ from sigmaslam.filters.linalg.plain import PIVOT_TOLERANCES
 from sigmaslam.filters.linalg.square_roots import (
     apply,
     finite,
-    is_traced,
     may_look,
     multiply,
     nonnegative,
@@ -233,7 +232,7 @@ class BayesFilter:
                 usable = _both(usable, last.usable)
         elif seen.error is not None:
             bent = seen.error(mask, noise) > TOLERATED_ERROR
-            if is_traced() or bool(bent.any()):
+            if not may_look(bent) or bool(bent.any()):
                 last, again = linearise(solution)
                 solution = again.solution.where(bent, solution)
                 usable = _both(usable, None if last.usable is None else last.usable | ~bent)

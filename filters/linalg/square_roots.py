@@ -44,7 +44,12 @@ def cholesky(matrix: Tensor) -> tuple[Tensor, Tensor | None]:
 
 def may_look(array: Tensor) -> bool:
     """Whether control flow may depend on values: on a CPU a look is cheap, elsewhere it waits or breaks a graph."""
-    return array.device.type == "cpu" and not is_traced()
+    return array.device.type == "cpu" and not is_traced() and not is_mapped()
+
+
+def is_mapped() -> bool:
+    """Whether this runs within a transform of torch.func, such as vmap, in which values may not be looked at."""
+    return torch._C._functorch.maybe_current_level() is not None
 
 
 def is_traced() -> bool:

@@ -14,6 +14,7 @@ from sigmaslam.filters import systems
 from sigmaslam.filters.linalg import plain, square_roots
 from sigmaslam.filters.models import several
 from sigmaslam.filters.onnx.exact_operators import ExactOperators
+from sigmaslam.filters.onnx.step import _Step
 from sigmaslam.filters.transforms import push_forward
 from tests.support.filter_assertions import assert_close, assert_same_update
 from tests.support.filter_builders import beliefs, bent_measurement, bent_motion, covariances, random_numbers, tensor
@@ -146,6 +147,16 @@ def test_graph_of_a_robot_equals_torch_for_any_batch_and_number_of_landmarks(dty
         for a, b in zip(found, expected, strict=False):
             np.testing.assert_allclose(a, b.numpy(), rtol=100 * tolerance, atol=10 * tolerance)
         assert found[-1].tolist() == torch.as_tensor(stacked.count).expand(batch).tolist()
+
+
+def test_a_belief_of_as_many_states_as_there_are_landmarks_is_not_one_of_them():
+    motion, see, example = robot(torch.float64)
+    values, landmarks = random_numbers(1, 3, 2), random_numbers(1, 3, 2, seed=1)
+    example = filters.StepExample(
+        example.belief.expand((1,)), values, {"control": tensor(1.0, 0.1)[None]}, {"landmark": landmarks}
+    )
+    step = _Step(filters.UnscentedKalmanFilter(), motion, see, example, None, None)
+    assert [tuple(each.shape) for each in step.resized(2, 5)] == [(2, 3), (2, 3, 3), (2, 2), (2, 5, 2), (2, 5, 2)]
 
 
 @pytest.mark.slow

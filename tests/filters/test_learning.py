@@ -72,6 +72,20 @@ def test_derivatives_of_the_likelihood_forward_and_backward_agree():
     assert_close(torch.func.jacfwd(likelihood)(at), torch.func.jacrev(likelihood)(at), 1e-11)
 
 
+def test_filters_can_be_mapped_over_parameters():
+    """vmap over noises, as a loop; where nothing can be looked at, nothing can be raised."""
+    values, ukf = sequences(3, 2), filters.UnscentedKalmanFilter(on_failure="hold")
+
+    def likelihood(process: Tensor, noise: Tensor) -> Tensor:
+        motion = filters.MotionModel(lambda x: torch.sin(x), filters.Diagonal(process))
+        see = filters.MeasurementModel(lambda x: x + 0.1 * x.square(), filters.Diagonal(noise))
+        return ukf.filter(PRIOR, motion, see, values, robust="student_t").log_likelihood.sum()
+
+    process, noise = random_numbers(3, 2).exp(), random_numbers(3, 2, seed=1).exp()
+    expected = torch.stack([likelihood(q, r) for q, r in zip(process, noise, strict=True)])
+    assert_close(torch.func.vmap(likelihood)(process, noise), expected, 1e-11)
+
+
 def test_sequences_that_cannot_be_fitted_are_refused():
     values = sequences(5, 1)
     values[2, 0, 1] = torch.nan

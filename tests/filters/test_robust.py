@@ -218,13 +218,13 @@ def test_a_sequence_passes_its_options_on_to_each_update():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [{"gate": 0.99, "robust": "student_t"}, {"robust": "huber"}])
+@pytest.mark.parametrize("options", [{"gate": 0.99}, {"robust": "student_t"}], ids=str)
 def test_a_graph_gates_and_weighs_as_torch_does(options, tmp_path):
     see = systems.range_and_bearing(filters.Diagonal(tensor(0.1, 0.02) ** 2))
     example = filters.StepExample(
         filters.Gaussian(tensor(0.0, 0.0, 0.1), torch.diag(tensor(0.1, 0.1, 0.02))),
-        value=tensor(3.0, 0.4, 9.0, -1.0, 2.0, 0.1).reshape(3, 2),
-        measurement_inputs={"landmark": tensor(3.0, 1.0, 1.5, -1.5, 2.0, 0.1).reshape(3, 2)},
+        value=tensor(9.0, -1.0),
+        measurement_inputs={"landmark": tensor(3.0, 1.0)},
     )
     ukf = filters.UnscentedKalmanFilter(iterations=1)
     assert filters.export_step(ukf, None, see, example, tmp_path / "robust.onnx", **options) < 1e-9
