@@ -1,4 +1,4 @@
-"""One frame by the graphs that ship, in numpy and onnxruntime alone: from two stereo pairs to a pose and its covariance.
+"""One frame by the graphs that ship, in numpy and onnxruntime: from two stereo pairs to a pose and its covariance.
 
     python examples/run_one_frame.py models/weights synthetic/demo 4
 
