@@ -18,15 +18,16 @@ import onnxruntime
 KEYPOINTS = 400
 # The tracker's: the graph's float64 products lose digits by this fusion.
 DISABLED = ["MatMulScaleFusion"]
-# Slopes are taken over a share of the prior's width: it is as wide as the motion.
-NARROWER = 8.0
+FREEDOM = 2.0  # of the Student-t that errors are taken for, as the tracker's
+OUTPUTS = ["agree", "count", "usable", "squared", "noise_scale_found", "offset_after", "spread_after", "moved_after"]
 
 
 def load(weights: Path, name: str) -> onnxruntime.InferenceSession:
     """A graph of the folder, on the CPU."""
-    return onnxruntime.InferenceSession(
-        weights / f"{name}.onnx", providers=["CPUExecutionProvider"], disabled_optimizers=DISABLED
-    )
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3  # of errors alone
+    path, providers = weights / f"{name}.onnx", ["CPUExecutionProvider"]
+    return onnxruntime.InferenceSession(path, options, providers=providers, disabled_optimizers=DISABLED)
 
 
 def detect(features: onnxruntime.InferenceSession, path: Path) -> list[np.ndarray]:
@@ -61,29 +62,10 @@ def stereo(features: onnxruntime.InferenceSession, folder: Path, index: int) -> 
     return measured.astype(np.float64), covariance, left[2][rows]
 
 
-def exponential(twist: np.ndarray) -> np.ndarray:
-    """Rigid motion (4, 4) of a twist (6,): translation, rotation."""
-    matrix = np.zeros((4, 4))
-    x, y, z = twist[3:]
-    matrix[:3, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
-    matrix[:3, 3] = twist[:3]
-    term, total = np.eye(4), np.eye(4)
-    for k in range(1, 20):
-        term = term @ matrix / k
-        total = total + term
-    return total
-
-
-def adjoint(pose: np.ndarray) -> np.ndarray:
-    """Matrix (6, 6) that carries a twist through a rigid motion (4, 4)."""
-    x, y, z = pose[:3, 3]
-    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.block([[pose[:3, :3], skew @ pose[:3, :3]], [np.zeros((3, 3)), pose[:3, :3]]])
-
-
 def run(weights: Path, folder: Path, index: int) -> tuple[np.ndarray, np.ndarray]:
-    """Pose T_0_index (4, 4) in metres, and the covariance (6, 6) of its inverse, perturbed from the left."""
-    features, predict, transfer = (load(weights, name) for name in ("features", "pose_predict", "stereo_transfer"))
+    """Pose T_0_index (4, 4) in metres, and its covariance (6, 6), perturbed from the left: translation, rotation."""
+    names = ("features", "pose_predict", "frame_robust", "frame_gated")
+    features, predict, robust, gated = (load(weights, name) for name in names)
     lines = (folder / "calib.txt").read_text().splitlines()
     P = [np.array(line.split()[1:], dtype=float).reshape(3, 4) for line in lines[:2]]
     intrinsics = np.array([P[0][0, 0], P[0][1, 1], P[0][0, 2], P[0][1, 2], P[0][0, 3] - P[1][0, 3]])
@@ -91,40 +73,64 @@ def run(weights: Path, folder: Path, index: int) -> tuple[np.ndarray, np.ndarray
 
     # Predict: at rest in the first image, of a speed that is known to 0.5 m/s and 0.5 rad/s.
     prior = np.diag([1e-12] * 6 + [0.25] * 6)
-    feed = {"pose": np.eye(4), "twist": np.zeros(6), "covariance": prior, "step": np.array(times[index] - times[0])}
-    pose, covariance = predict.run(None, {**feed, "densities": np.array([0.1, 0.1])})
-    relative = np.linalg.inv(pose)
-    across = adjoint(relative)
-    spread = np.zeros((1, 9, 9))
-    spread[0, :6, :6] = np.linalg.cholesky(across @ covariance[:6, :6] @ across.T)
+    at_rest = {"pose": np.eye(4), "twist": np.zeros(6), "covariance": prior, "densities": np.array([0.1, 0.1])}
+    pose, covariance = predict.run(None, {**at_rest, "step": np.array(times[index] - times[0])})
 
     # Measure: landmarks of the first pair, found again in the second.
     (hosted, hosted_covariance, hosted_look), (seen, noise, look) = (stereo(features, folder, k) for k in (0, index))
     near = np.linalg.norm(hosted[:, None, :2] - seen[None, :, :2], axis=2) < 60.0
     rows, others = match([hosted, hosted, hosted_look], [seen, seen, look], near)
-    measured, noise = seen[others], noise[others]
-    landmark_spread = np.zeros((len(rows), 4, 4))
-    landmark_spread[:, :3, :3] = np.linalg.cholesky(hosted_covariance[rows] + 1e-6 * np.eye(3))
-    landmark_spread[:, 3, 3] = 1e-3
-    landmarks = np.column_stack([hosted[rows], np.zeros(len(rows))])
+    count = len(rows)
+    landmark_covariance = np.zeros((count, 6, 6))
+    landmark_covariance[:, :3, :3] = hosted_covariance[rows]
 
-    # Update: linearise at the best pose so far, whiten by all that is not the pose, and weigh outliers down.
-    zeta, root = np.zeros(6), spread[0, :6, :6]
-    feed = {"pair": np.zeros(len(rows), dtype=np.int64), "calibration": np.zeros(3), "intrinsics": intrinsics}
-    feed |= {"landmarks": landmarks, "landmark_spread": landmark_spread, "spread": spread / NARROWER}
-    for _ in range(8):
-        here = exponential(root @ zeta) @ relative
-        mean, slope, rest, in_front = transfer.run(None, {**feed, "relative": here[None]})
-        S, L = NARROWER * slope[..., :6], slope[..., 9:]
-        weight_root = np.linalg.inv(np.linalg.cholesky(noise + rest + L @ L.mT))
-        A = weight_root @ S
-        e = (weight_root @ (measured - mean + (S @ zeta))[..., None])[..., 0]
-        distance = np.linalg.norm(e - A @ zeta, axis=1)
-        weight = in_front / (1.0 + distance**2 / 3.0)
-        information = np.eye(6) + np.einsum("m,mij,mik->jk", weight, A, A)
-        zeta = np.linalg.solve(information, np.einsum("m,mij,mi->j", weight, A, e))
-    print(f"{len(rows)} landmarks, {np.sum(distance < 3.0)} of them within 3 sigma")
-    return np.linalg.inv(exponential(root @ zeta) @ relative), root @ np.linalg.inv(information) @ root.T
+    # Update: the state is 12 errors of the calibration and the first pose, which are known here, and the frame's pose.
+    size = 12 + 6 + 6
+    factor = np.zeros((size, 6))
+    factor[-6:] = np.linalg.cholesky(covariance[:6, :6])
+    known = {
+        "intrinsics": intrinsics,
+        "depth": np.array(np.median(intrinsics[4] / hosted[rows, 2])),
+        "unscented": np.array(1.0),
+        "anchors": np.array([0]),
+        "views": np.array([1]),
+        "pair": np.zeros(count, dtype=np.int64),
+        "common": np.zeros((count, 3, 2)),
+        "covariance": landmark_covariance,
+        "estimate": np.column_stack([hosted[rows], np.zeros((count, 3))]),
+        "dependence": np.zeros((count, 6, size)),
+        "poses": np.stack([np.eye(4), pose]),
+        "calibration": np.zeros(12),
+        "factor": factor,
+        "measurement": seen[others],
+        "noise": noise[others],
+        "scale": np.array(1.0),
+    }
+    offset, spread, moved = np.zeros(size), factor @ factor.T, np.zeros((count, 6))
+    for first in (1.0, 0.0):
+        at = {"offset": offset, "spread": spread, "moved": moved, "gated": np.array(first)}
+        offset, spread, moved, _ = robust.run(None, {**known, **at})
+    noise_scale, student = np.array(0.0), {"freedom": np.array(FREEDOM), "prior": np.zeros((size, 12))}
+    for _ in range(2):
+        at = {"offset": offset, "spread": spread, "moved": moved, "noise_scale": noise_scale}
+        found = dict(zip(OUTPUTS, gated.run(None, {**known, **student, **at})[: len(OUTPUTS)], strict=True))
+        offset, spread, moved = found["offset_after"], found["spread_after"], found["moved_after"]
+        noise_scale = found["noise_scale_found"]
+    print(f"{count} landmarks, {int(found['count'])} of them agree")
+    return exponential(offset[-6:]) @ pose, spread[-6:, -6:]
+
+
+def exponential(twist: np.ndarray) -> np.ndarray:
+    """Rigid motion (4, 4) of a twist (6,): translation, rotation."""
+    x, y, z = twist[3:]
+    matrix = np.zeros((4, 4))
+    matrix[:3, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
+    matrix[:3, 3] = twist[:3]
+    term, total = np.eye(4), np.eye(4)
+    for k in range(1, 20):
+        term = term @ matrix / k
+        total = total + term
+    return total
 
 
 if __name__ == "__main__":

@@ -33,6 +33,40 @@ _PLACE = {
     "covariance": "of its place in the second image, pixels squared",
 }
 
+_SCENE = {
+    "intrinsics": "fx, fy, cx, cy, fx times baseline; pixels and pixel metres",
+    "depth": "of the scene, metres: the scale of what a slope is taken over",
+    "unscented": "1 to linearise by sigma points, 0 by first derivatives",
+    "anchors": "of each pair of poses, the one that landmarks are anchored to",
+    "views": "of each pair of poses, the one that sees them",
+    "pair": "the pair that a view belongs to",
+    "common": "how errors of place that all views of a landmark share enter a view",
+    "poses": "T_world_camera, metres",
+    "calibration": "errors of the stereo calibration, `sigmaslam.estimation.state_layout`",
+    "estimate": "landmarks in their anchors: u, v, disparity, its offset, two errors of place; pixels",
+    "covariance": "of the landmarks given poses and calibration, pixels squared",
+    "measurement": "(u, v, disparity), pixels; NaN for a missing disparity",
+    "noise": "covariance of a view's own errors, pixels squared",
+}
+_VIEWS = {
+    "dependence": "how a landmark moves with the state: calibration (12), then six for each pose, the frame's last",
+    "factor": "of the state's prior covariance, factor factor^T; poses perturbed from the left: translation, rotation",
+}
+_STEP = {
+    "offset": "the state where it is linearised, from the prior's mean",
+    "spread": "covariance that sigma points are drawn from",
+    "moved": "landmarks from where the state has them",
+    "scale": "how much smaller than claimed the variances are by which views are told to agree",
+    "offset_after": "the state after the step",
+    "spread_after": "its covariance",
+    "moved_after": "the landmarks' moves",
+    "usable": "how many views are in front of the camera and anywhere near",
+}
+_WINDOW = {
+    "owner": "the landmark that a view sees",
+    "spread": "covariance of calibration and poses, which sigma points are drawn from",
+}
+
 # In the order in which a frame meets them.
 TEXTS: Mapping[str, GraphText] = {
     "pose_predict": GraphText(
@@ -77,22 +111,72 @@ TEXTS: Mapping[str, GraphText] = {
         "The same for a place that was found without features, by aligning patches. For loops and relocalisation too.",
         _PLACE,
     ),
-    "stereo_transfer": GraphText(
-        "Measurement update: what is expected of every landmark in every view, its slope, and the error of the slope, "
-        "by sigma points (Table 9.2). Once for each linearisation of a frame update and of the window.",
-        {
-            "relative": "T_view_host of each pair of poses, metres",
-            "spread": "lower root of the covariance of relative pose (6) and calibration (3)",
-            "pair": "the row of `relative` of each measurement",
-            "calibration": "what the disparity is off by: constant, with x^2, with x y; pixels",
-            "intrinsics": "fx, fy, cx, cy, fx times baseline; pixels and pixel metres",
-            "landmarks": "u, v, disparity and its offset in the hosting keyframe, pixels",
-            "landmark_spread": "lower root of their covariance",
-            "mean": "expected u, v, disparity in the view, pixels",
-            "slope": "of the mean along the columns of both roots",
-            "left": "covariance of what the slope leaves, pixels squared",
-            "in_front": "1 where the landmark is in front of the view, else 0",
+    "frame_predict": GraphText(
+        "Where a frame should see the window's landmarks, by sigma points. Before its landmarks are looked for.",
+        _SCENE
+        | _VIEWS
+        | {
+            "mean": "expected (u, v, disparity), pixels",
+            "views_covariance": "of the mean, without the measurement's noise, pixels squared",
+            "in_front": "whether the landmark is in front of the camera",
         },
+    ),
+    "frame_robust": GraphText(
+        "Update of a frame's pose (Table 9.2), one linearisation with a robust loss that narrows. Twice a frame.",
+        _SCENE | _VIEWS | _STEP | {"gated": "1 to weigh residuals by what the prior expects of them: the first time"},
+    ),
+    "frame_gated": GraphText(
+        "Update of a frame's pose, one linearisation with a gate and weights of a Student-t. At most thrice a frame, "
+        "until the same views pass; the last call is the gate alone.",
+        _SCENE
+        | _VIEWS
+        | _STEP
+        | {
+            "noise_scale": "what the variances of all views are multiplied by; 0 to find it",
+            "freedom": "of the Student-t",
+            "prior": "how considered errors of the calibration enter the state",
+            "agree": "whether a view passes the gate",
+            "count": "how many do",
+            "squared": "lengths of the whitened residuals",
+            "noise_scale_found": "to be given to the next call",
+            "common_after": "how considered errors enter the state after the step",
+            "information": "of all views about the state",
+            "scores": "slope of each view's log-likelihood by the frame's pose",
+            "score": "slope of all views' by the state",
+            "prior_cost": "squared length of the step in units of the prior",
+        },
+    ),
+    "window_eliminate": GraphText(
+        "What the views of a window say of its state, every landmark solved for it (Schur's complement). For each "
+        "linearisation of the window, after a new keyframe.",
+        _SCENE
+        | _WINDOW
+        | {
+            "measured": "landmarks as first measured in their anchor keyframes, pixels",
+            "variance": "of them, pixels squared",
+            "freedom": "of the Student-t",
+            "information": "of the views about the state",
+            "vector": "slope of their log-likelihood by the state, at the posterior",
+            "covariance_after": "of the landmarks given the state",
+            "dependence": "how they move with the state",
+            "step": "to their best places if the state stays",
+        },
+    ),
+    "window_condition": GraphText(
+        "Posterior of the window's state from its prior and what the views say. After `window_eliminate`.",
+        {
+            "factor": "of the prior covariance, factor factor^T; state is 12 + 6 poses",
+            "information": "of the likelihood",
+            "vector": "slope of the log-likelihood at the prior's mean",
+            "common": "how considered errors enter the state",
+            "mean": "of the state, from the prior's mean",
+            "covariance": "of the state",
+            "common_after": "how considered errors enter it afterwards",
+        },
+    ),
+    "window_gate": GraphText(
+        "Which views fit the window's posterior. After the last `window_condition`.",
+        _SCENE | _WINDOW | {"agree": "whether a view's residual is within what 99.9 % are"},
     ),
 }
 
@@ -115,8 +199,9 @@ def graph_page(folder: Path, command: str) -> str:
         "",
         f"Made by `{command}` from the files in `models/weights`.",
         "They are plain ONNX, which any runtime takes; ours is `sigmaslam.inference.OnnxGraph`, on the CPU. Beside",
-        "them run numpy and OpenCV: image pyramids and following keypoints, choosing among matches, the algebra of the",
-        "window, and loops. `sigmaslam export --check` compares every graph with torch.",
+        "them run numpy and OpenCV: image pyramids and following keypoints, choosing among matches, which keyframes and",
+        "landmarks are kept, and loops. `sigmaslam export --check` compares every graph with torch;",
+        "`examples/run_one_frame.py` runs a frame by them without the package.",
         "",
         "| order | graph | opset | nodes | kB |",
         "|---|---|---|---|---|",

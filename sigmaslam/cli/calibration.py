@@ -39,7 +39,7 @@ def show(file: Source, size: Size = None, rectified: Rectified = False) -> None:
     typer.echo(describe_calibration(_read(file, size, rectified)))
 
 
-@calibration.command()
+@calibration.command(short_help="Write a calibration of any form as our YAML.")
 def convert(
     file: Source,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="YAML file to write.")],

@@ -31,7 +31,7 @@ def explain_failure(summary: dict[str, Any], in_map: bool, started: bool, findin
         )
         return f"{counts} {reasons}".rstrip()
     if reasons:
-        return f"Nothing was tracked. {reasons}"
+        return f"Nothing was tracked: {reasons}"
     if in_map:
         return "The place was not found in the map: is it a map of this place, seen from where the camera is now?"
     if frames - skipped == 1:

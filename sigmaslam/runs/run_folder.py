@@ -39,7 +39,12 @@ _GRAPHS = (
     "verifier.onnx",
     "place_verifier.onnx",
     "pose_predict.onnx",
-    "stereo_transfer.onnx",
+    "frame_predict.onnx",
+    "frame_robust.onnx",
+    "frame_gated.onnx",
+    "window_eliminate.onnx",
+    "window_gate.onnx",
+    "window_condition.onnx",
 )
 
 

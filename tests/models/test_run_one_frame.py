@@ -18,7 +18,7 @@ def test_the_pose_is_within_its_covariance_of_the_truth(index):
     folder = ROOT / "synthetic" / "demo"
     pose, covariance = example.run(ROOT / "models" / "weights", folder, index)
     truth = np.vstack([np.loadtxt(folder / "poses.txt")[index].reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
-    error = np.linalg.inv(truth) @ pose
-    twist = np.array([*error[:3, 3], error[2, 1], error[0, 2], error[1, 0]])  # of the inverse, from the left
+    error = truth @ np.linalg.inv(pose)
+    twist = np.array([*error[:3, 3], error[2, 1], error[0, 2], error[1, 0]])  # from the left
     assert twist @ np.linalg.solve(covariance, twist) < chi2.ppf(0.999, 6)
     assert np.linalg.norm(twist[:3]) < 0.1 * np.linalg.norm(truth[:3, 3])

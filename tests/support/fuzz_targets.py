@@ -27,9 +27,9 @@ from sigmaslam.geometry.camera import RectifiedStereo, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.inference.weight_manifest import read_manifest
 from sigmaslam.readers import open_sequence
-from sigmaslam.readers.calibration_files import read_kitti_calibration
-from sigmaslam.readers.euroc import read_sensors
+from sigmaslam.readers.euroc_calibration import read_sensors
 from sigmaslam.readers.images import read_grey
+from sigmaslam.readers.kitti_calibration import read_kitti_calibration
 from sigmaslam.readers.pairing import read_times
 from sigmaslam.readers.trajectory_files import read_covariances, read_trajectory
 from sigmaslam.runs.frame_table import COLUMNS, read_frames

@@ -9,6 +9,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from sigmaslam.bundle_adjustment.track_file import read_tracks
+from sigmaslam.checks.finding import Finding
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.run_evaluation import evaluate_run, format_evaluation
 from sigmaslam.evaluation.trial import read_trial
@@ -146,9 +147,23 @@ def summary_of(**counts: int) -> dict[str, int]:
     ],
 )
 def test_a_failure_is_explained_by_the_statuses(counts: dict, in_map: bool, started: bool, words: str | None):
-    explanation = explain_failure(summary_of(**counts), in_map, started)
+    explanation = explain_failure(summary_of(**counts), in_map, started, ())
     assert (explanation is None) == (words is None)
     assert words is None or words in (explanation or "")
+
+
+def test_what_a_check_found_explains_a_failure():
+    findings = [
+        Finding("eyes", "error", "left and right are exchanged: swap them"),
+        Finding("rows", "ok", "rows agree"),
+    ]
+    nothing = explain_failure(summary_of(starting=8), False, False, findings)
+    assert nothing == "Nothing was tracked: left and right are exchanged: swap them"
+    little = explain_failure(summary_of(tracking=2, lost=6), False, True, findings)
+    assert little is not None
+    assert "6 are lost" in little
+    assert little.endswith("left and right are exchanged: swap them")
+    assert explain_failure(summary_of(tracking=8), False, True, findings) is None
 
 
 def test_poses_are_guesses_where_the_camera_is_lost_or_has_not_moved_yet(tmp_path: Path):

@@ -181,7 +181,7 @@ def test_bad_frames_are_named_with_line_and_value(tmp_path, old, new, message):
 
 
 def test_missing_and_broken_files_are_named(tmp_path):
-    with pytest.raises(InputError, match=r"frames\.csv: cannot be read"):
+    with pytest.raises(InputError, match=r"frames\.csv: cannot read the frames: no such file"):
         write_report(tmp_path)
     make_run(tmp_path / "run")
     (tmp_path / "run/map.npz").write_text("none")
