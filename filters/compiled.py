@@ -11,14 +11,18 @@ import torch
 
 from sigmaslam.filters.failure import FAILED
 
+# Operations that are fused into one loop; by default 64, which cuts a filter's step into a dozen.
+_LARGEST_LOOP = 8192
+
 F = TypeVar("F", bound=Callable)
 
 
 def compile_step(step: F) -> F:
     """The step made into machine code for the shapes and dtypes that it is called with.
 
-    A step is a function of tensors that calls `predict` and `update` and returns tensors. Batches of small filters are
-    fused into a few loops; of a single filter most of the overhead goes. The first call for each set of shapes takes
+    A step is a function of tensors that calls `predict` and `update` and returns tensors. Batches of small filters, of
+    up to six states and measured components, become one loop over the batch, see `sigmaslam.filters.components`; others
+    are fused into a few; of a single filter most of the overhead goes. The first call for each set of shapes takes
     from ten seconds to a minute. Filters and models that the step refers to are taken as they are then: compile anew
     after changing one. A filter with iterations="auto" always linearises twice in compiled code. One with
     on_failure="raise" raises as it does elsewhere; the step is run once more, uncompiled, to find what to name.
@@ -34,7 +38,12 @@ def compile_step(step: F) -> F:
     # torch keeps compiled code by the function's code, which two functions made by one factory share; as what they
     # refer to is not checked, each needs code of its own.
     copy = FunctionType(step.__code__.replace(), step.__globals__, step.__name__, step.__defaults__, step.__closure__)
+    # The compiler takes a second to load, which only this function has a use for.
+    from sigmaslam.filters.components import InComponents
+
     options: dict[str, object] = {
+        "post_grad_custom_pre_pass": InComponents(),
+        "max_fusion_size": _LARGEST_LOOP,
         # Tensors' shapes are checked at each call; the models, which are constants, are not.
         "guard_filter_fn": torch.compiler.keep_tensor_guards_unsafe,
         "size_asserts": False,

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from sigmaslam.filters.layout import choose
 from sigmaslam.filters.linalg.square_roots import cholesky, may_look, square, triangularise
+from sigmaslam.filters.linalg.unrolled import known_lower
 from sigmaslam.filters.tensors import require_floating, require_tensor
 
 
@@ -96,7 +97,7 @@ class Gaussian:
             return cholesky(self._covariance)
         assert self._factor is not None
         sound = None if self._unrooted is None else ~self._factor[..., 0, 0].isnan()
-        return self._factor if self._is_lower else triangularise([self._factor]), sound
+        return known_lower(self._factor) if self._is_lower else triangularise([self._factor]), sound
 
     @property
     def held(self) -> Tensor:

@@ -119,21 +119,58 @@ def export_scoring(run: Path, out: Path) -> dict[str, float]:
 
 def export_features(weights: Path, out: Path) -> float:
     """Writes the feature graph and returns the largest difference from torch, in pixels where there are any."""
-    extractor = FeatureExtractor(load_network(weights)).eval()
+    return _export(_feature_graph(load_network(weights)), out, _FEATURE_TOLERANCE, _feature_difference)
+
+
+def check_graphs(folder: Path) -> dict[str, float]:
+    """Compares every graph of a folder with torch, on inputs that are the same each time, and returns the differences.
+
+    Args:
+        folder: with the graphs and the weights, as `sigmaslam export` writes it and as it ships.
+    Raises:
+        InputError: a file is missing or not the one of the manifest, or there is a graph of which torch knows nothing.
+        SigmaSlamError: a graph differs from torch by more than its tolerance.
+    """
+    present = {path.stem for path in folder.glob("*.onnx")}
+    graphs = _filter_graphs()
+    if "features" in present:
+        graphs["features"] = _feature_graph(load_network(folder / "features.safetensors"))
+    if "scorer" in present:
+        graphs |= _scoring_graphs(
+            load_scorer(folder / "scorer.safetensors"),
+            load_verifier(folder / "verifier.safetensors"),
+            load_verifier(folder / "place_verifier.safetensors", PLACE_COLUMNS),
+        )
+    if not present or present - graphs.keys():
+        strangers = ", ".join(f"{name}.onnx" for name in sorted(present - graphs.keys())) or "no .onnx file"
+        raise InputError(f"{folder}: {strangers}, but only what `sigmaslam export` writes can be compared with torch")
+    differences = {}
+    for name in sorted(present):
+        compare = _feature_difference if name == "features" else _relative_difference
+        differences[name] = _difference(graphs[name], folder / f"{name}.onnx", compare)
+        tolerance = _FILTER_TOLERANCE if name in _filter_graphs() else _FEATURE_TOLERANCE
+        if not differences[name] <= tolerance:
+            raise SigmaSlamError(
+                f"{folder / name}.onnx differs from torch by {differences[name]:.2e}, more than {tolerance:.0e}: "
+                "export it again with `sigmaslam export`"
+            )
+    return differences
+
+
+def _feature_graph(network: FeatureNetwork) -> _Graph:
     height = torch.export.Dim("height_blocks", min=3, max=256)
     width = torch.export.Dim("width_blocks", min=3, max=256)
     rng = np.random.default_rng(0)
     image, other = (_noisy_texture(rng, shape) for shape in ((256, 320), (192, 416)))
     multiple = EXTRACTOR_SIZE_MULTIPLE
-    graph = _Graph(
-        extractor,
+    return _Graph(
+        FeatureExtractor(network).eval(),
         (image, torch.tensor(512)),
         (other, torch.tensor(700)),
         ["image", "count"],
         ["keypoints", "scores", "descriptors", "sigma"],
         ({2: multiple * height, 3: multiple * width}, None),
     )
-    return _export(graph, out, _FEATURE_TOLERANCE, _feature_difference)
 
 
 def export_filter(folder: Path) -> dict[str, float]:
@@ -313,17 +350,22 @@ def _export(
         assert program is not None
         program.save(path, external_data=False)
         strip_origins(path)
-        feed = {name: np.asarray(value) for name, value in zip(graph.inputs, graph.checked, strict=True)}
-        actual = OnnxGraph(path)(feed)
-        with torch.no_grad():
-            outputs = graph.module(*graph.checked)
-        expected = [value.numpy() for value in (outputs if isinstance(outputs, tuple) else (outputs,))]
-        difference = (compare or _relative_difference)(actual, expected)
+        difference = _difference(graph, path, compare or _relative_difference)
         if not difference <= tolerance:
             raise SigmaSlamError(
                 f"{out.name} differs from torch by {difference:.2e}, more than {tolerance:.0e}: not written"
             )
     return difference
+
+
+def _difference(graph: _Graph, path: Path, compare: Callable[[list[np.ndarray], list[np.ndarray]], float]) -> float:
+    """Of a written graph from its module, on inputs that it was not traced with."""
+    feed = {name: np.asarray(value) for name, value in zip(graph.inputs, graph.checked, strict=True)}
+    actual = OnnxGraph(path)(feed)
+    with torch.no_grad():
+        outputs = graph.module(*graph.checked)
+    expected = [value.numpy() for value in (outputs if isinstance(outputs, tuple) else (outputs,))]
+    return compare(actual, expected)
 
 
 def _relative_difference(actual: list[np.ndarray], expected: list[np.ndarray]) -> float:

@@ -514,6 +514,35 @@ def torch_kf(work: LinearWork, dtype: str = "float64") -> Step:
     return step
 
 
+def numpy_batched(work: Work, dtype: str = "float64") -> Step:
+    """No library: the filter of `torch_linalg` in numpy, whose linear algebra takes stacks of matrices too."""
+    _check_dtype(dtype, "float64")
+    problem = _problem(work)
+    transition_inputs, measure_inputs = problem.transition_inputs[:, None], problem.measure_inputs[:, None]
+
+    def sigma_points(mean: Array, covariance: Array) -> Array:
+        offsets = math.sqrt(mean.shape[-1]) * np.linalg.cholesky(covariance).mT
+        return np.concatenate([mean[:, None] + offsets, mean[:, None] - offsets], axis=-2)
+
+    def step() -> tuple[Array, Array]:
+        points = problem.transition(np, sigma_points(problem.mean, problem.covariance), transition_inputs)
+        count = points.shape[-2]
+        predicted = points.mean(axis=-2)
+        deviations = points - predicted[:, None]
+        P = deviations.mT @ deviations / count + problem.process_noise
+
+        points = sigma_points(predicted, P)
+        measured = problem.measure(np, points, measure_inputs)
+        expected = measured.mean(axis=-2)
+        X, Z = points - predicted[:, None], measured - expected[:, None]
+        S = Z.mT @ Z / count + problem.measurement_noise
+        gain = np.linalg.solve(S, Z.mT @ X / count).mT
+        posterior = predicted + (gain @ (problem.measurement - expected)[..., None])[..., 0]
+        return posterior, P - gain @ S @ gain.mT
+
+    return step
+
+
 def torch_linalg(work: Work, dtype: str = "float64") -> Step:
     """No library: the batched filter that a person writes with torch.linalg, batch first and without unrolling."""
     _check_dtype(dtype, "float64", "float32")
@@ -577,6 +606,7 @@ PEERS = (
     Peer("Stone Soup", ("stonesoup",), _UNSCENTED, _DOUBLE, stone_soup, batched=False),
     Peer("dynamax", ("dynamax", "jax"), _UNSCENTED, _BOTH, dynamax, batched=True),
     Peer("PyPose, repaired", ("pypose", "torch"), _UNSCENTED, _BOTH, pypose, batched=True),
+    Peer("numpy batched", ("numpy",), _BATCHED, _DOUBLE, numpy_batched, batched=True),
     Peer("torch.linalg batched", ("torch",), _BATCHED, _BOTH, torch_linalg, batched=True),
     Peer("torch-kf", ("torch_kf", "torch"), (LinearWork,), _BOTH, torch_kf, batched=True),
 )

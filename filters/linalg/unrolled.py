@@ -179,6 +179,13 @@ def solve_lower_transposed(factor: Tensor, right: Tensor) -> Tensor:
     return assemble(rows)
 
 
+def known_lower(factor: Tensor) -> Tensor:
+    """A lower triangular (..., n, n); compiled code is told of its zeros, which it need not read."""
+    if not torch.compiler.is_compiling() or factor.shape[-1] > ROWS:
+        return factor
+    return _from_lower([[factor[..., i, j] for j in range(i + 1)] for i in range(factor.shape[-1])])
+
+
 # A row in parts (..., c_i); None is a part that is known to be zero.
 _Row = list[Tensor | None]
 

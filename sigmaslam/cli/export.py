@@ -13,10 +13,16 @@ from sigmaslam.errors import InputError
 
 
 def export(
-    run: Annotated[Path, typer.Argument(help="Folder of a finished training run.")],
-    out: Annotated[Path, typer.Option(help="Folder for the graphs, the weights and their card.")],
+    run: Annotated[Path | None, typer.Argument(help="Folder of a finished training run.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the graphs, the weights and their card.")] = None,
     scores: Annotated[
         Path | None, typer.Option(help="The .json of 'benchmark features' for these weights: into the card.")
+    ] = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Compare the graphs that ship with torch; without RUN.")
+    ] = False,
+    page: Annotated[
+        Path | None, typer.Option(help="Write the page of the graphs that ship, docs/onnx.md; without RUN.")
     ] = None,
 ) -> None:
     """Export what a run made to ONNX and check the graphs against torch (needs the extra 'train').
@@ -25,6 +31,13 @@ def export(
     verifier.
     """
     need_train_extra()
+    if check or page is not None:
+        if run is not None or out is not None:
+            raise InputError("--check and --page are of the graphs that ship: leave out RUN and --out")
+        _tell_of_shipped(check, page)
+        return
+    if run is None or out is None:
+        raise InputError("give the folder of a run and --out, or --check, or --page")
     from sigmaslam.evaluation.matching import read_scores
     from sigmaslam.models.onnx_export import export_all, export_scoring
     from sigmaslam.training.features.loop import WEIGHTS_NAME
@@ -43,6 +56,19 @@ def export(
     with Console(stderr=True).status("exporting eight graphs (some minutes)"):
         differences = export_all(run / WEIGHTS_NAME, run / CARD_NAME, out, on_real_sets)
     _tell_differences(differences)
+
+
+def _tell_of_shipped(check: bool, page: Path | None) -> None:
+    from sigmaslam.files import atomic_write_text
+    from sigmaslam.inference.onnx_graph import shipped_weights
+    from sigmaslam.models.graph_page import PAGE_COMMAND, graph_page
+    from sigmaslam.models.onnx_export import check_graphs
+
+    folder = shipped_weights("features.onnx").parent
+    if page is not None:
+        atomic_write_text(page, graph_page(folder, PAGE_COMMAND))
+    if check:
+        _tell_differences(check_graphs(folder))
 
 
 def _tell_differences(differences: dict[str, float]) -> None:
