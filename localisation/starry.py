@@ -47,9 +47,9 @@ def read_starry(path: Path) -> StereoRecording:
     if not (np.diff(seconds) > 0).all():
         raise InputError(f"{path}: the times t do not increase: sort its steps by time")
     duration = np.diff(seconds)
-    # The rates of a step's beginning hold until its end.
     rates = np.concatenate([file["v_vk_vk_i"], file["w_vk_vk_i"]]).T
-    path_of_steps = rates[:-1] * duration[:, None]
+    # Sampled at the frames: between them they are taken to change evenly.
+    path_of_steps = 0.5 * (rates[:-1] + rates[1:]) * duration[:, None]
     pixels = file["y_k_j"].transpose(1, 2, 0)
     # Nothing is said of the first frame: the filter starts there.
     step, landmark = np.nonzero((pixels[1:, :, 0] >= 0).copy())

@@ -18,6 +18,7 @@ MAPPED = ("evaluation", "filters", "localisation", "models", "synthetic", "train
 # What a layer must never import, nor anything that it imports: names of modules or of folders outside the layer.
 FORBIDDEN = {
     "filters": ("models", "training", "synthetic", "evaluation", "tracker", "frontend", "camera"),
+    "localisation": ("training", "synthetic", "evaluation", "tracker", "frontend"),
     "synthetic": ("models", "training", "evaluation", "tracker", "filters"),
     "models": ("training", "evaluation", "tracker", "frontend"),
     "sigmaslam": ("training", "synthetic", "torch"),
