@@ -161,7 +161,10 @@ def rig_covariance(bundle: BoardBundle) -> tuple[np.ndarray, float, float]:
     variance = float(np.sum(bundle.residuals**2)) / free
     # In coordinates where the information of all images is the identity.
     scale = np.sqrt(np.diag(information))
-    root = np.linalg.inv(np.linalg.cholesky(information / np.outer(scale, scale))) / scale
+    try:
+        root = np.linalg.inv(np.linalg.cholesky(information / np.outer(scale, scale))) / scale
+    except np.linalg.LinAlgError:
+        raise CalibrationError("the images leave a camera parameter open: take more, with the board tilted") from None
     shares = root @ bundle.information @ root.T
     gradients = bundle.gradient @ root.T
     expected = variance * (size - float(np.sum(shares**2)))
