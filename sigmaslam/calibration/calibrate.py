@@ -30,7 +30,8 @@ MIN_IMAGES = 3
 OUTLIER_IMAGE = 3.0
 # A corner so many sigmas off, of which the normal distribution has one in 270,000.
 OUTLIER_CORNER = 5.0
-_ROUNDS = 10
+# A lens model that does not fit would lose its border round by round.
+_CORNER_ROUNDS = 5
 # Focal lengths to start from, in image widths: fields of view of 14 to 120 degrees (pinhole).
 _FOCAL_STARTS = np.geomspace(0.3, 4.0, 12)
 # Of what an image knows least, the share that other images know.
@@ -160,7 +161,10 @@ def rig_covariance(bundle: BoardBundle) -> tuple[np.ndarray, float, float]:
     variance = float(np.sum(bundle.residuals**2)) / free
     # In coordinates where the information of all images is the identity.
     scale = np.sqrt(np.diag(information))
-    root = np.linalg.inv(np.linalg.cholesky(information / np.outer(scale, scale))) / scale
+    try:
+        root = np.linalg.inv(np.linalg.cholesky(information / np.outer(scale, scale))) / scale
+    except np.linalg.LinAlgError:
+        raise CalibrationError("the images leave a camera parameter open: take more, with the board tilted") from None
     shares = root @ bundle.information @ root.T
     gradients = bundle.gradient @ root.T
     expected = variance * (size - float(np.sum(shares**2)))
@@ -258,7 +262,8 @@ def _solve_without_outliers(rig: Rig, corners: Corners) -> tuple[BoardBundle, Co
     refused: list[tuple[int, str]] = []
     all_corners = corners
     dropped = np.zeros(len(corners), bool)
-    for _ in range(_ROUNDS):
+    rounds = 0
+    while True:
         corners = all_corners.select(~dropped)
         poses = _start_poses(rig, corners)
         numbers = np.unique(corners.image)
@@ -285,8 +290,9 @@ def _solve_without_outliers(rig: Rig, corners: Corners) -> tuple[BoardBundle, Co
             continue
         limit = OUTLIER_CORNER * float(np.sqrt(np.median(squared))) / _MEDIAN_DISTANCE
         far = squared > max(limit, 1e-9) ** 2
-        if not far.any():
+        if not far.any() or rounds == _CORNER_ROUNDS:
             break
+        rounds += 1
         dropped[np.flatnonzero(~dropped)[far]] = True
         thin = np.bincount(all_corners.image[~dropped], minlength=len(all_corners)) < MIN_CORNERS
         for image in [image for image in numbers.tolist() if thin[image]]:

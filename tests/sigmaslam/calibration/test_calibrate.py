@@ -188,3 +188,20 @@ def test_too_few_images_say_so():
     nothing = DetectedCorners(np.zeros(0, np.int64), np.zeros((0, 2)))
     with pytest.raises(CalibrationError, match="the board is found in none of 1 images: check --board"):
         calibrate(["a"], [(nothing,)], CHESSBOARD.points, [SIZE], "radtan4")
+
+
+def test_boards_that_are_not_tilted_leave_the_focal_length_open():
+    """Nearer and longer look the same: the sigma says so, or the images are refused."""
+    rig = Rig((replace(RADTAN, distortion_model="none", distortion=()),), np.eye(4))
+    rng = np.random.default_rng(0)
+    poses = np.tile(np.eye(4), (8, 1, 1))
+    poses[:, :3, 3] = np.column_stack([rng.uniform((-0.2, -0.15), (0.0, 0.05), (8, 2)), rng.uniform(0.4, 0.6, 8)])
+    corners = seen_corners(rig, CHESSBOARD, poses)
+    noisy = replace(corners, pixels=corners.pixels + 0.1 * rng.standard_normal(corners.pixels.shape))
+    tilted = seen_corners(rig, CHESSBOARD, board_poses(CHESSBOARD, 8, seed=1))
+    known = run(rig, replace(tilted, pixels=tilted.pixels + 0.1 * rng.standard_normal(tilted.pixels.shape)), "none")
+    try:
+        result = run(rig, noisy, "none")
+    except CalibrationError:
+        return
+    assert result.sigmas[0] > 20.0 * known.sigmas[0]
