@@ -17,7 +17,7 @@ GATED_INPUTS = ("measurement", "noise", "offset", "spread", "moved", "noise_scal
 ROBUST_OUTPUTS = ("offset_after", "spread_after", "moved_after", "usable")
 GATED_OUTPUTS = (
     *("agree", "count", "usable", "squared", "noise_scale_found", "offset_after", "spread_after", "moved_after"),
-    *("common_after", "information", "score", "prior_cost"),
+    *("common_after", "information", "scores", "score", "prior_cost"),
 )
 WINDOW_INPUTS = ("measured", "variance", "freedom")
 WINDOW_OUTPUTS = ("information", "vector", "covariance_after", "dependence", "step")

@@ -164,7 +164,8 @@ class GatedStep(nn.Module):
         (n, 12) how considered errors enter the state, fields of `FrameViews` ->
         agree (M,) bool, of the usable views those that pass, their number (), number of usable views (), squared (M,)
         lengths of the residuals, noise_scale (), and after the step: offset (n,), spread (n, n), moved (M, 6), common
-        (n, 12), information (n, n) of the views, score (n,) slope of their log-likelihood, cost () of the prior.
+        (n, 12), information (n, n) of the views, scores (M, 6) slope of each view's log-likelihood by the frame's pose,
+        score (n,) slope of all views' by the state, cost () of the prior.
     """
 
     def forward(
@@ -194,6 +195,7 @@ class GatedStep(nn.Module):
         after = seen.beyond - seen.by_prior @ z
         weighted = seen.by_state * _each_row(weight)
         information = weighted.mT @ seen.by_state
+        scores = (weighted[:, -6:] * after).unflatten(0, (-1, 3)).sum(dim=1)
         return (
             agree,
             passed.sum(),
@@ -205,6 +207,7 @@ class GatedStep(nn.Module):
             _landmark_step(frame, seen.by_landmark, (after / noise_scale).unflatten(0, (-1, 3))[..., 0]),
             prior - posterior @ (information @ prior),
             information,
+            scores,
             (weighted.mT @ after)[:, 0],
             (z * z).sum(),
         )

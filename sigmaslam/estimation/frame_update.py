@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from sigmaslam.estimation.clustered_errors import clustering
 from sigmaslam.estimation.frame_fit import FrameFit, FramePosterior
 from sigmaslam.estimation.gaussian import append_moved, matrix_root, replace_part
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
@@ -112,12 +113,12 @@ class FrameUpdate:
             inliers = agree
             if usable < min_inliers or count < min_inliers:
                 return None
-            offset, spread, moved, common, information, score, prior_cost = step
+            offset, spread, moved, common, information, scores, score, prior_cost = step
         assert inliers is not None
         inliers = inliers & agree
         if inliers.sum() < min_inliers:
             return None
-        cross = spread[frame, last]
+        cross, size = spread[frame, last], (self._window.camera.width, self._window.camera.height)
         return FrameFit(
             nearest_rigid(se3_exp(offset[frame]) @ pose),
             spread[frame, frame] + spread[last, last] - cross - cross.T,
@@ -129,6 +130,7 @@ class FrameUpdate:
             float(prior_cost + squared[inliers].sum()),
             int(views.components[inliers].sum()),
             float(noise_scale),
+            clustering(views.measurement[:, :2], size, scores, information[frame, frame]),
         )
 
     def _prior_factor(self, step_covariance: np.ndarray, reference: int) -> np.ndarray:

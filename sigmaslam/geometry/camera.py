@@ -8,6 +8,7 @@ from typing import Any, Literal, Self, get_args
 import numpy as np
 
 from sigmaslam.errors import CalibrationError
+from sigmaslam.geometry.calibration_covariance import CalibrationCovariance
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.geometry.checked_yaml import CalibrationYaml
 
@@ -228,6 +229,7 @@ class StereoCamera:
         T_left_right: (4, 4) float64, read-only; maps right-camera points into the left frame, metres. Its
             translation is the position of the right camera in the left frame.
         sigmas: how well all this is known.
+        covariance: the same, measured and joint; what it names is not taken from `sigmas`.
 
     Raises:
         CalibrationError: T_left_right is no rigid transformation, or the right camera is not to the right.
@@ -237,6 +239,7 @@ class StereoCamera:
     right: CameraModel
     T_left_right: np.ndarray
     sigmas: CalibrationSigmas = field(default_factory=CalibrationSigmas)
+    covariance: CalibrationCovariance | None = None
 
     def __post_init__(self) -> None:
         T = np.array(self.T_left_right, dtype=np.float64)
@@ -308,6 +311,7 @@ class StereoCamera:
             right: {...}
             T_left_right: [[1, 0, 0, 0.11], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
             sigmas: {focal: 0.003}                 # optional, see `CalibrationSigmas`; 0: without errors
+            covariance: {names: [focal, yaw], matrix: [[1e-6, 0], [0, 1e-8]]}   # optional, `CalibrationCovariance`
 
         Raises:
             CalibrationError: the file cannot be read, a key is missing or wrong; names file, key and value.
@@ -315,8 +319,9 @@ class StereoCamera:
         content = CalibrationYaml.read(path)
         left, right = (_camera_from_yaml(content.section(eye)) for eye in ("left", "right"))
         T_left_right, sigmas = content.numbers("T_left_right", (4, 4)), CalibrationSigmas.from_yaml(content)
+        covariance = CalibrationCovariance.from_yaml(content)
         try:
-            return cls(left, right, T_left_right, sigmas)
+            return cls(left, right, T_left_right, sigmas, covariance)
         except CalibrationError as error:
             raise content.error(str(error)) from None
 

@@ -198,12 +198,14 @@ def write_ply(path: Path, point_map: PointMap) -> None:
 
 def describe_camera(camera: StereoCamera) -> dict[str, Any]:
     """The calibration for run.json."""
+    covariance = camera.covariance
     return {
         "left": asdict(camera.left),
         "right": asdict(camera.right),
         "T_left_right": camera.T_left_right.tolist(),
         "baseline": camera.baseline,
         "sigmas": asdict(camera.sigmas),
+        "covariance": covariance and {"names": list(covariance.names), "matrix": covariance.matrix.tolist()},
     }
 
 

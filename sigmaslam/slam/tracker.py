@@ -90,7 +90,7 @@ class StereoTracker:
         self._beside = ThreadPoolExecutor(1, "keyframe") if threads > 1 else None
         self._admission = admission = admission or AdmitAll(config.min_inliers)
         graphs = EstimatorGraphs(rectified, backend, config.linearisation == "unscented")
-        prior = CalibrationPrior.of(rectified, camera.sigmas, config.offset_sigma, config.estimate)
+        prior = CalibrationPrior.of(rectified, camera.sigmas, config.offset_sigma, config.estimate, camera.covariance)
         self._window = window = KeyframeWindow(rectified, prior, graphs)
         self._noise = noise = MeasurementNoise(config)
         self._motion = motion = MotionFilter(backend)
@@ -219,8 +219,8 @@ class StereoTracker:
     def _correct(self, fit: FrameFit, matches: GuidedMatches, frame: Frame, timestamp: float) -> FrameFit:
         """Takes a pose over, less certain where the frame is blurred."""
         # Patches that are blurred are misplaced alike, along the blur and towards where they were expected: many of
-        # them say no more than a few.
-        fit = fit.inflated(max(fit.nis_before_scaling, 1.0) * self._keyframes.blur(frame.left))
+        # them say no more than a few. So do those of a body that moves on its own.
+        fit = fit.inflated(max(fit.nis_before_scaling, 1.0) * self._keyframes.blur(frame.left) * fit.clustering)
         seen = matches.views.select(fit.inliers)
         self._admission.confirm(seen, self._window)
         self._window.count_sightings(matches.searched, seen.landmark)
