@@ -29,7 +29,7 @@ function buildPlot(box, seconds, intervals, plot, select) {
     points: { show: Boolean(each.dots), size: 4 }, paths: each.dots ? () => null : undefined, spanGaps: false,
   }));
   const options = {
-    width: box.clientWidth, height: 230, cursor: { sync: { key: "run" }, focus: { prox: 20 } },
+    width: box.clientWidth, height: 230, cursor: { sync: { key: "run" } },
     scales: { x: { time: false }, y: plot.log ? { distr: 3 } : { range: plot.range } },
     series: [{ label: "time [s]", value: write }, ...series], bands: plot.bands, axes: [axis, { ...axis, size: 62 }],
     hooks: { drawClear: [shadeStatuses(intervals)] },

@@ -91,6 +91,25 @@ def test_errors_of_the_calibration_are_estimated_where_they_are_named(short_sequ
     assert_refused(refused, "--estimate", "yow", "yaw, pitch")
 
 
+@pytest.mark.usefixtures("without_report")
+def test_a_part_of_a_recording_is_tracked_in_small_and_may_replace_an_earlier_run(whole_sequence: Path, tmp_path: Path):
+    out = tmp_path / "run"
+    part = ("--start", "2", "--frames", "3", "--every", "2", "--scale", "0.5", "--frontend", "klt")
+    assert run_here("track", whole_sequence, "--out", out, *part).returncode in (0, 3)
+    times = np.loadtxt(whole_sequence / "times.txt")
+    np.testing.assert_allclose([float(row[0]) for row in rows(out)], times[[2, 4, 6]], atol=1e-9)
+    camera = json.loads((out / "run.json").read_text())["calibration"]["left"]
+    stored = cv2.imread(str(next((whole_sequence / "image_0").iterdir())), cv2.IMREAD_GRAYSCALE)
+    assert (2 * camera["height"], 2 * camera["width"]) == stored.shape
+    assert_refused(run_here("track", whole_sequence, "--out", out, *part), "not an empty folder")
+    again = run_here("track", whole_sequence, "--out", out, "--overwrite", "--frames", "2", "--frontend", "klt")
+    assert again.returncode in (0, 3)
+    assert len(rows(out)) == 2
+    (out / "notes.txt").write_text("mine")
+    assert_refused(run_here("track", whole_sequence, "--out", out, "--overwrite"), "notes.txt")
+    assert len(rows(out)) == 2
+
+
 def test_two_runs_are_identical_to_the_bit(whole_sequence: Path, tracked: tuple[Path, Finished], tmp_path: Path):
     assert run_process("track", whole_sequence, "--out", tmp_path / "again").returncode == 0
     for name in ("trajectory.tum", "trajectory.kitti", "covariance.npy", "map.ply"):

@@ -158,6 +158,16 @@ def test_the_view_shows_path_keyframes_loop_and_points(tmp_path):
     np.testing.assert_allclose(_unpack(scene["point_sigma"]), 1.0)
 
 
+def test_points_of_a_followed_body_are_where_it_was_last(tmp_path):
+    make_run(tmp_path / "run", points=50)
+    (tmp_path / "run/run.json").write_text(json.dumps({"object": {"region": "1,2,3,4", "origin": [0, 0, 1]}}))
+    last = read_tum(tmp_path / "run/trajectory.tum").poses[-1]
+    with np.load(tmp_path / "run/map.npz") as content:
+        expected = content["points"] @ last[:3, :3].T + last[:3, 3]
+    found = _unpack(_page(tmp_path / "run").data["scene"]["points"], 3)
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+
+
 def test_a_loss_of_one_frame_is_seen_in_a_long_run(tmp_path):
     make_run(tmp_path / "run", 45_000)
     path = tmp_path / "run/frames.csv"
