@@ -212,7 +212,8 @@ def read_times(path: Path, count: int, numbers: Collection[int] | None = None) -
         InputError: a line is no time, times do not increase or are no seconds, or the number of lines does not fit.
     """
     lines = read_text(path, TABLE_BYTES, "the timestamps").splitlines()
-    times, rows = [], []
+    times: list[float] = []
+    rows: list[int] = []
     for number, line in enumerate(lines, start=1):
         if not line.strip() or line.startswith("#"):
             continue
@@ -224,7 +225,7 @@ def read_times(path: Path, count: int, numbers: Collection[int] | None = None) -
     if len(times) != count:
         if numbers is None or len(times) <= max(numbers):
             raise InputError(f"{path}: {len(times)} timestamps for {count} image pairs; one line per pair is needed")
-        times, rows = ([column[number] for number in numbers] for column in (times, rows))
+        times, rows = [times[number] for number in numbers], [rows[number] for number in numbers]
     _check_increase(path, times, rows)
     return in_seconds(path, times)
 

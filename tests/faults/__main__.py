@@ -1,7 +1,7 @@
 """Runs all faults and counts what is survived: `python -m tests.faults --out docs/reliability.md`.
 
-Each fault is put into a good input, and the command line runs on it in a process of its own. Real data are those of
-SIGMASLAM_DATA; without it their faults are left out.
+Each fault is put into a good input, and the command line runs on it, with --processes in a process of its own, whose
+memory is bounded. Real data are those of SIGMASLAM_DATA; without it their faults are left out.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from pathlib import Path
 
 from sigmaslam.bounded_files import shorten
 from sigmaslam.evaluation.benchmarks.page import header, opening, row, write_page
-from tests.faults.case import Case, Verdict, judge
-from tests.faults.running import attempt, run_in_process
+from tests.faults.case import Case, Runner, Verdict, judge
+from tests.faults.running import attempt, run_in_process, run_in_this_process
 from tests.faults.table import CASES
 
 _LONGEST = 230
@@ -41,11 +41,11 @@ class Result:
     said: str
 
 
-def run_case(case: Case) -> Result:
+def run_case(case: Case, runner: Runner) -> Result:
     """Runs a case in a folder that is removed."""
     with tempfile.TemporaryDirectory(prefix="sigmaslam-fault-") as name:
         folder = Path(name)
-        outcome = attempt(case, folder, run_in_process)
+        outcome = attempt(case, folder, runner)
         verdict, reason = judge(case, outcome, folder)
         text = outcome.text.replace(f"{name}/", "")
         said = _excerpt(text, case.says) if verdict == Verdict.GOOD else reason.replace(f"{name}/", "")
@@ -72,8 +72,8 @@ def write_reliability(path: Path, results: list[Result], command: str) -> str:
         "Each fault is put into a good input: the demo that ships with the package, or a real drive. The program",
         "must name it, with the exit code that README says, and lose no pose. The rules are in `tests/faults/case.py`:",
         "",
-        "- **good**: exit code and words are as expected; where a fault does no harm, every pose is within three of its",
-        "  own sigmas of the truth;",
+        "- **good**: exit code and words are as expected; where a fault does no harm, every pose is within three of",
+        "  its own sigmas of the truth;",
         "- **unclear**: another exit code or other words;",
         "- **crash or loss**: a traceback, no end, or fewer poses than there were;",
         "- **silent wrong**: a success that does not name the fault, poses beyond three sigmas or without a variance.",
@@ -102,6 +102,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__)
     parser.add_argument("--out", type=Path, help="Markdown page to write")
     parser.add_argument("--only", nargs="*", default=[], help="groups, or parts of names; all by default")
+    parser.add_argument("--processes", action="store_true", help="a process for each, which takes thrice the time")
     arguments = parser.parse_args()
     chosen = [
         case
@@ -109,16 +110,18 @@ def main() -> int:
         if (not arguments.only or any(word in (case.group, *case.name.split(", ")) for word in arguments.only))
         and (case.data is None or (Path(os.environ.get("SIGMASLAM_DATA") or "/nowhere") / case.data).is_dir())
     ]
-    results = []
+    results: list[Result] = []
+    command = "python -m tests.faults" + (f" --out {arguments.out}" if arguments.out else "")
+    command += " --processes" if arguments.processes else ""
     for case in chosen:
-        result = run_case(case)
+        result = run_case(case, run_in_process if arguments.processes else run_in_this_process)
         results.append(result)
         mark = "" if result.verdict == case.expected else "  <- expected: " + case.expected
         print(f"{result.verdict:14} {result.code:4} {case.group}: {case.name}{mark}\n    {result.said}", flush=True)
     counts = Counter(result.verdict for result in results)
     print(f"{counts[Verdict.GOOD]} of {len(results)} survived; {', '.join(f'{counts[v]} {v}' for v in Verdict)}")
     if arguments.out is not None:
-        write_reliability(arguments.out, results, f"python -m tests.faults --out {arguments.out}")
+        write_reliability(arguments.out, results, command)
     return int(any(result.verdict != result.case.expected for result in results))
 
 
