@@ -259,7 +259,7 @@ def test_yaml_errors_name_file_and_key(tmp_path, path, value, message):
     ("text", "message"),
     [
         ("left: [1, 2", "not valid YAML"),
-        ("- 1\n- 2\n", "expected keys with values, found list"),
+        ("- 1\n- 2\n", "expected keys with values, found a list"),
         ("", "found NoneType"),
         ("left: {fx: 1,\n  fx: 2}\n", "key 'fx' is given twice, in lines 1 and 2: keep one"),
         ("T_left_right: 1\nleft: {}\nT_left_right: 2\n", "key 'T_left_right' is given twice, in lines 1 and 3"),
