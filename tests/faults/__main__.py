@@ -80,9 +80,7 @@ def write_reliability(path: Path, results: list[Result], command: str) -> str:
         "",
         *header("", *Verdict, numbers_from=1),
         row("all faults", *(str(counts[verdict]) for verdict in Verdict)),
-        row(
-            f"the {len(tried)} of them that a first trial had found or tried, then", *(str(before[v]) for v in Verdict)
-        ),
+        row(f"{len(tried)} of them, in a first trial", *(str(before[v]) for v in Verdict)),
         row("these, now", *(str(after[verdict]) for verdict in Verdict)),
         "",
         "Those that are not good are known limits ([known-limits.md](known-limits.md)): no image shows half of a",

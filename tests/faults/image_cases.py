@@ -84,7 +84,7 @@ def _of_kitti(name: str, fault: Fault, code: int) -> Case:
         data = Path(os.environ["SIGMASLAM_DATA"]).resolve()
         return track_injected(fault, source=lambda: data / _KITTI)(folder, run)
 
-    return Case("rig", f"{name} (KITTI)", attempt, code, (fault.word,), slow=True, data=_KITTI, first=_FIRST.get(name))
+    return Case("rig", f"{name} (KITTI)", attempt, code, (fault.word,), slow=True, data=_KITTI)
 
 
 # No image shows the first and the last: known limits. Turns of the camera show the focal length.

@@ -381,13 +381,19 @@ def _short_run(folder: Path, run: Runner) -> Outcome:
 
 
 def _camera(folder: Path, run: Runner) -> Outcome:
-    """Devices that are no cameras."""
+    """Cameras that are not there."""
     from tests.support.calibration_yaml import write_calibration
 
     write_calibration(open_sequence(DEMO).camera, folder / "stereo.yaml")
     with mock.patch.dict(os.environ, {"OPENCV_LOG_LEVEL": "SILENT"}):
         return run(
-            "track", "--camera", "/dev/null,/dev/null", "--calibration", folder / "stereo.yaml", "--out", folder / "run"
+            "track",
+            "--camera",
+            "/dev/video97,/dev/video98",
+            "--calibration",
+            folder / "stereo.yaml",
+            "--out",
+            folder / "run",
         )
 
 
@@ -403,7 +409,7 @@ _OTHER_CASES = [
         right=True,
         first=Verdict.SILENT,
     ),
-    Case("cameras", "no camera there", _camera, 2, ("/dev/null",), first=Verdict.GOOD),
+    Case("cameras", "no camera there", _camera, 2, ("/dev/video97",), first=Verdict.GOOD),
 ]
 
 PROCESS_CASES = [*_WEIGHT_CASES, *_SIGNAL_CASES, *_API_CASES, *_OTHER_CASES]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 import time
@@ -32,7 +33,13 @@ def start(source: Path, run: Path, *options: str, rows: int = 4) -> subprocess.P
     )
     command = [sys.executable, "-c", script, "track", str(source), "--out", str(run), "--frontend", "klt", *options]
     process = subprocess.Popen(
-        command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+        command,
+        env=environment(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=_hear_signals,
     )
     deadline = time.monotonic() + 60
     while len(statuses(run)) < rows:
@@ -42,6 +49,16 @@ def start(source: Path, run: Path, *options: str, rows: int = 4) -> subprocess.P
     return process
 
 
+def _hear_signals() -> None:
+    """Under nohup, and in the background of a shell, signals are ignored, and so by the program."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+
+
 def end(process: subprocess.Popen[str]) -> tuple[int, str, str]:
-    output, errors = process.communicate(timeout=60)
+    try:
+        output, errors = process.communicate(timeout=60)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        raise
     return process.returncode, output, errors
