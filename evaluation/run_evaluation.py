@@ -14,6 +14,7 @@ import numpy as np
 
 from sigmaslam.bounded_files import TABLE_BYTES, read_text
 from sigmaslam.errors import InputError
+from sigmaslam.evaluation.kept_evaluation import keep_evaluation
 from sigmaslam.evaluation.metrics.map_consistency import coverage
 from sigmaslam.evaluation.metrics.relative_consistency import SpanConsistency, relative_consistency, truth_covariance
 from sigmaslam.evaluation.metrics.trajectory_errors import (
@@ -155,7 +156,8 @@ def evaluate_run(
             relative to earlier ones are judged where it holds `relative_poses.npz`.
         truth: TUM, KITTI, or EuRoC ground truth.
         lengths, step: segments of the KITTI errors (see `kitti_errors`).
-        plot: write `evaluation.png` into the run folder or beside the trajectory, where matplotlib is installed.
+        plot: write `evaluation.png` into the run folder or beside the trajectory, where matplotlib is installed; of a
+            run also `evaluation.json` and `evaluation.npz`, with which its report is written anew.
         truth_sigma_position, truth_sigma_rotation: standard deviations of each true pose, of each coordinate (metres)
             and about each axis (degrees), for the poses relative to earlier ones; where one alone is given the other is
             zero.
@@ -216,6 +218,8 @@ def evaluate_run(
         predicted=int(predicted[associate(estimate, true)[0]].sum()),
         truth_hint=None if other is None else other.describe(),
     )
+    if plot and is_run:
+        keep_evaluation(run_or_trajectory, evaluation.to_dict(), estimate, true, evaluation.nees)
     if evaluation.figure_path:
         figure = draw_evaluation(evaluation, estimate, true, covariance, predicted)
         try:

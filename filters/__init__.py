@@ -1,20 +1,24 @@
 """Batched Bayesian filters and inference in torch: see docs/filters.md."""
 
+from sigmaslam.filters.adaptive import adapted_noise
 from sigmaslam.filters.bayes import BayesFilter, ExtendedKalmanFilter, KalmanFilter, UnscentedKalmanFilter
 from sigmaslam.filters.belief import degree_of_belief
 from sigmaslam.filters.compiled import compile_step
 from sigmaslam.filters.failure import FilterError
 from sigmaslam.filters.gaussian_belief import Gaussian
 from sigmaslam.filters.inference import Observation, PointEstimate, maximum_a_posteriori, maximum_likelihood
+from sigmaslam.filters.interacting import InteractingMultipleModels, Mixture
 from sigmaslam.filters.layout import stack
+from sigmaslam.filters.learning import FittedNoise, fit_noise
 from sigmaslam.filters.lie_groups import wrap_angle
 from sigmaslam.filters.manifolds import SE2, SE3, SO2, SO3, Euclidean, Manifold, Product
-from sigmaslam.filters.models import LinearMeasurement, LinearMotion, MeasurementModel, MotionModel
+from sigmaslam.filters.models import LinearMeasurement, LinearMotion, MeasurementModel, MotionModel, several
 from sigmaslam.filters.noise_covariance import BlockDiagonal, Dense, Diagonal
 from sigmaslam.filters.onnx.step import ExportError, StepExample, export_step
+from sigmaslam.filters.particles import ParticleFilter, Particles
 from sigmaslam.filters.results import TimeUpdate, Update
 from sigmaslam.filters.sigma_points import Simplex, cubature, julier, merwe
-from sigmaslam.filters.time_series import Track
+from sigmaslam.filters.time_series import Event, Track
 
 __all__ = [
     "SE2",
@@ -26,17 +30,23 @@ __all__ = [
     "Dense",
     "Diagonal",
     "Euclidean",
+    "Event",
     "ExportError",
     "ExtendedKalmanFilter",
     "FilterError",
+    "FittedNoise",
     "Gaussian",
+    "InteractingMultipleModels",
     "KalmanFilter",
     "LinearMeasurement",
     "LinearMotion",
     "Manifold",
     "MeasurementModel",
+    "Mixture",
     "MotionModel",
     "Observation",
+    "ParticleFilter",
+    "Particles",
     "PointEstimate",
     "Product",
     "Simplex",
@@ -45,14 +55,17 @@ __all__ = [
     "Track",
     "UnscentedKalmanFilter",
     "Update",
+    "adapted_noise",
     "compile_step",
     "cubature",
     "degree_of_belief",
     "export_step",
+    "fit_noise",
     "julier",
     "maximum_a_posteriori",
     "maximum_likelihood",
     "merwe",
+    "several",
     "stack",
     "wrap_angle",
 ]

@@ -29,9 +29,10 @@ from sigmaslam.filters.manifolds import Space, is_flat
 from sigmaslam.filters.models import AnyMeasurement, AnyMotion, LinearMeasurement, LinearMotion, MeasurementModel
 from sigmaslam.filters.noise_covariance import Noise, as_noise
 from sigmaslam.filters.results import TimeUpdate, Update
+from sigmaslam.filters.robust import Blocks, Robust, WeightedPosterior
 from sigmaslam.filters.sigma_points import Columns, SigmaPoints, cubature
 from sigmaslam.filters.tensors import require_tensor
-from sigmaslam.filters.time_series import filter_sequence, smooth
+from sigmaslam.filters.time_series import filter_events, filter_sequence, smooth
 from sigmaslam.filters.transforms import Difference, Exact, Taylor, Transform, Transformed, Unscented
 from sigmaslam.filters.updates import FORMS, Form, TangentPosterior, choose_form, solve
 
@@ -152,7 +153,15 @@ class BayesFilter:
 
         return TimeUpdate(predicted, healthy, healthy, joint, noise, motion.noise_matrix)
 
-    def update(self, belief: Gaussian, measurement: AnyMeasurement, value: Tensor, *inputs: Tensor) -> Update:
+    def update(
+        self,
+        belief: Gaussian,
+        measurement: AnyMeasurement,
+        value: Tensor,
+        *inputs: Tensor,
+        gate: float | None = None,
+        robust: Robust | None = None,
+    ) -> Update:
         """The belief after a measurement: the "perception" of (9.21); Table 9.1 and steps 4 to 7 of Table 9.2.
 
         Args:
@@ -160,6 +169,9 @@ class BayesFilter:
             measurement: see `MeasurementModel`; noise and matrices broadcast over the batch.
             value: (..., m) what was measured; NaN for a component that is missing.
             inputs: passed on to the measurement's function, each of batch shape (..., ·): landmarks, calibration.
+            gate: probability that a block of a right measurement is inside the gate, such as 0.999; None: no gate.
+            robust: "student_t" or "huber", noise with heavy tails; None: Gaussian. Blocks are the model's, see
+                `MeasurementModel` and `sigmaslam.filters.robust`.
         Raises:
             FilterError: an element's covariance or innovation covariance is not positive semidefinite or not finite,
                 and on_failure is "raise".
@@ -180,7 +192,7 @@ class BayesFilter:
             added = noise = noise if mask is None else noise.masked(mask)
         usable = _both(usable, nonnegative(noise.variance()))
 
-        def linearise(previous: TangentPosterior | None) -> tuple[_Seen, TangentPosterior]:
+        def look(previous: TangentPosterior | None) -> _Seen:
             seen = self._innovate(belief.mean, root, measurement, noise, value, inputs, previous)
             innovation, columns = seen.innovation, seen.columns
             if mask is not None:
@@ -190,20 +202,40 @@ class BayesFilter:
             if used is not None:
                 innovation, columns = torch.where(used[..., None], innovation, 0.0), _where(used, columns)
             form = self._form(belief, columns, innovation.shape[-1], added is not None)
-            seen = replace(seen, innovation=innovation, columns=columns, form=form, usable=used)
-            return seen, solve(form, innovation, columns, added, root)
+            return replace(seen, innovation=innovation, columns=columns, form=form, usable=used)
+
+        blocks = None
+        if gate is not None or robust is not None:
+            blocks = Blocks.of(measurement, noise, value, mask, robust)
+        if gate is not None and blocks is not None:
+            seen = look(None)
+            blocks = blocks.gated(gate, seen.innovation, seen.columns, noise)
+            mask = blocks.masked(mask)
+            count = mask.sum(dim=-1)
+            noise = added = blocks.weighted(noise.masked(mask))
+
+        def linearise(previous: TangentPosterior | None) -> tuple[_Seen, WeightedPosterior]:
+            seen = look(previous)
+
+            def posterior(noise: Noise | None) -> TangentPosterior:
+                return solve(seen.form, seen.innovation, seen.columns, noise, root)
+
+            if blocks is None or added is None:
+                return seen, WeightedPosterior(posterior(added), added)
+            return seen, blocks.solve(posterior, seen.innovation, seen.columns, added)
 
         seen, at_prior = linearise(None)
-        usable, solution = seen.usable, at_prior
+        usable, solution = seen.usable, at_prior.solution
         if self.iterations != "auto":
             for _ in range(0 if isinstance(measurement, LinearMeasurement) else self.iterations - 1):
-                last, solution = linearise(solution)
+                last, weighted = linearise(solution)
+                solution = weighted.solution
                 usable = _both(usable, last.usable)
         elif seen.error is not None:
             bent = seen.error(mask, noise) > TOLERATED_ERROR
             if is_traced() or bool(bent.any()):
                 last, again = linearise(solution)
-                solution = again.where(bent, solution)
+                solution = again.solution.where(bent, solution)
                 usable = _both(usable, None if last.usable is None else last.usable | ~bent)
         posterior = self._correct(belief, solution)
         usable = _both(_both(finite(posterior.mean, posterior.held), solution.healthy), usable)
@@ -215,11 +247,10 @@ class BayesFilter:
         if usable is not None:
             count = torch.where(usable, count, 0)
         healthy = _both(usable, sound)
-        return Update(
-            posterior, seen.innovation, seen.form, count, healthy, usable, at_prior, seen.columns, added, root
-        )
+        return Update(posterior, seen.innovation, seen.form, count, healthy, usable, at_prior, seen.columns, root)
 
     filter = filter_sequence
+    filter_events = filter_events
     smooth = smooth
 
     def goes_on_with_roots(self, belief: Gaussian) -> bool:

@@ -57,10 +57,13 @@ class MeasurementModel(NonlinearModel):
         residual: (measured (..., m), predicted (..., m)) -> their difference, where that is not a plain difference
             (an angle, see `wrap_angle`); None: subtraction.
         mask: (..., m) bool, True for components that take part; None: all.
+        block_size: components that are right or wrong together, side by side, for gates and robust weights; None: the
+            blocks of a `BlockDiagonal` noise, else all components.
     """
 
     residual: Residual | None = None
     mask: Tensor | None = None
+    block_size: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,11 +102,13 @@ class LinearMeasurement:
         matrix: H (..., m, n).
         noise: covariance R (..., m, m) of v, or a `Noise`.
         mask: (..., m) bool, True for components that take part; None: all.
+        block_size: as `MeasurementModel`.
     """
 
     matrix: Tensor
     noise: Noise | Tensor
     mask: Tensor | None = None
+    block_size: int | None = None
 
     def function(self, state: Tensor) -> Tensor:
         """H x for (..., n)."""
@@ -114,7 +119,7 @@ def several(measurement: AnyMeasurement, count: int) -> AnyMeasurement:
     """The measurement taken `count` times at one time, of what its inputs name: landmarks, beacons.
 
     Values are (..., count m), end to end, and inputs (..., count, ·); each has the noise of its own, independent of
-    the others'.
+    the others', and is a block to gates and robust weights.
 
     Args:
         measurement: of m components.
@@ -122,14 +127,17 @@ def several(measurement: AnyMeasurement, count: int) -> AnyMeasurement:
     Raises:
         ValueError: the noise is not additive, which would be noise of all in each.
     """
-    noise = _repeated(as_noise(measurement.noise), count)
+    one = as_noise(measurement.noise)
+    noise, block_size = _repeated(one, count), measurement.block_size
+    if block_size is None:
+        block_size = one.block_size if isinstance(one, BlockDiagonal) else one.variance().shape[-1]
     mask = measurement.mask
     if mask is not None:
         mask = mask.unsqueeze(-2).expand(*mask.shape[:-1], count, mask.shape[-1]).flatten(-2)
     if isinstance(measurement, LinearMeasurement):
         matrix = measurement.matrix
         rows = matrix.unsqueeze(-3).expand(*matrix.shape[:-2], count, *matrix.shape[-2:])
-        return LinearMeasurement(rows.flatten(-3, -2), noise, mask)
+        return LinearMeasurement(rows.flatten(-3, -2), noise, mask, block_size)
     if not measurement.additive:
         raise ValueError("several measurements at one time need additive noise")
 
@@ -155,6 +163,7 @@ def several(measurement: AnyMeasurement, count: int) -> AnyMeasurement:
         jacobian=None if slope is None else slopes,
         residual=None if residual is None else differences,
         mask=mask,
+        block_size=block_size,
     )
 
 

@@ -23,6 +23,15 @@ class Noise(ABC):
         """The noise with unit variance, and no correlation, where mask (..., m) is False."""
         return Dense(_masked(self.covariance(), mask))
 
+    def scaled(self, factor: Tensor) -> Noise:
+        """The noise of components that are multiplied by factors (..., m)."""
+        return Dense(self.covariance() * (factor.unsqueeze(-1) * factor.unsqueeze(-2)))
+
+    def blocks(self, size: int) -> Tensor:
+        """Covariances of m / size parts of equal size, (..., m / size, size, size)."""
+        parts = self.covariance().unflatten(-1, (-1, size)).unflatten(-3, (-1, size))
+        return torch.diagonal(parts, dim1=-4, dim2=-2).movedim(-1, -3)
+
     @abstractmethod
     def variance(self) -> Tensor:
         """Diagonal of R, (..., m)."""
@@ -82,6 +91,14 @@ class Diagonal(Noise):
         """Unit variance where mask (..., m) is False."""
         return Diagonal(torch.where(mask, self._variance, 1.0))
 
+    def scaled(self, factor: Tensor) -> Diagonal:
+        """The noise of components that are multiplied by factors (..., m)."""
+        return Diagonal(self._variance * (factor * factor))
+
+    def blocks(self, size: int) -> Tensor:
+        """Covariances of parts of equal size, (..., m / size, size, size)."""
+        return torch.diag_embed(self._variance.unflatten(-1, (-1, size)))
+
 
 class BlockDiagonal(Noise):
     """Independent blocks, such as one 2x2 or 3x3 covariance for each point."""
@@ -93,6 +110,11 @@ class BlockDiagonal(Noise):
             raise ValueError(f"blocks (..., b, k, k) expected, got {tuple(blocks.shape)}")
         self._blocks = Dense(blocks)
         self._shape = blocks.shape[-3], blocks.shape[-1]
+
+    @property
+    def block_size(self) -> int:
+        """k, components of a block."""
+        return self._shape[1]
 
     def covariance(self) -> Tensor:
         """R, (..., m, m)."""
@@ -117,6 +139,15 @@ class BlockDiagonal(Noise):
     def masked(self, mask: Tensor) -> BlockDiagonal:
         """Unit variance and no correlation where mask (..., m) is False."""
         return BlockDiagonal(_masked(self._blocks.covariance(), mask.unflatten(-1, self._shape)))
+
+    def scaled(self, factor: Tensor) -> BlockDiagonal:
+        """The noise of components that are multiplied by factors (..., m)."""
+        parts = factor.unflatten(-1, self._shape)
+        return BlockDiagonal(self._blocks.covariance() * (parts.unsqueeze(-1) * parts.unsqueeze(-2)))
+
+    def blocks(self, size: int) -> Tensor:
+        """Covariances of parts of equal size, (..., m / size, size, size)."""
+        return self._blocks.covariance() if size == self.block_size else super().blocks(size)
 
 
 class Dense(Noise):

@@ -11,8 +11,9 @@ from torch import Tensor
 from sigmaslam.filters.gaussian_belief import Gaussian
 from sigmaslam.filters.linalg.square_roots import identity, multiply
 from sigmaslam.filters.noise_covariance import Noise
+from sigmaslam.filters.robust import WeightedPosterior
 from sigmaslam.filters.sigma_points import Columns
-from sigmaslam.filters.updates import Form, TangentPosterior, log_likelihood
+from sigmaslam.filters.updates import Form, log_likelihood
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,9 +75,8 @@ class Update:
     count: Tensor | int
     _healthy: Tensor | None = field(repr=False)
     _usable: Tensor | None = field(repr=False)
-    _solution: TangentPosterior = field(repr=False)
+    _posterior: WeightedPosterior = field(repr=False)
     _columns: Columns = field(repr=False)
-    _noise: Noise | None = field(repr=False)
     _prior_root: Tensor = field(repr=False)
 
     @property
@@ -87,12 +87,21 @@ class Update:
     @property
     def nis(self) -> Tensor:
         """Normalised innovation squared e^T S^-1 e, (...,)."""
-        return self._unless_held(self._solution.nis())
+        return self._unless_held(self._posterior.solution.nis())
+
+    @property
+    def weight(self) -> Tensor | None:
+        """(..., b) of blocks, from the gate and the robust weights; None: neither was asked for.
+
+        A block took part with its noise over its weight, or not at all where that is zero. All else that an update
+        says is of the noise with its weights.
+        """
+        return self._posterior.weight
 
     @property
     def log_likelihood(self) -> Tensor:
         """Of the measurement, (...,)."""
-        return self._unless_held(log_likelihood(self._solution, self.count))
+        return self._unless_held(log_likelihood(self._posterior.solution, self.count))
 
     def _unless_held(self, amount: Tensor) -> Tensor:
         return amount if self._usable is None else torch.where(self._usable, amount, 0.0)
@@ -101,7 +110,7 @@ class Update:
     def innovation_covariance(self) -> Tensor:
         """S (..., m, m); unit rows where masked."""
         S = self._columns.covariance()
-        return S if self._noise is None else S + self._noise.covariance()
+        return S if self._posterior.noise is None else S + self._posterior.noise.covariance()
 
     @property
     def gain(self) -> Tensor:

@@ -21,13 +21,29 @@ from sigmaslam.files import atomic_path, atomic_write_text, make_folder
 from sigmaslam.filters.onnx.exportable_se3 import exp_se3
 from sigmaslam.filters.onnx.graph_file import strip_origins
 from sigmaslam.filters.onnx.pose_prediction import STATE_SIZE, Predict
-from sigmaslam.filters.onnx.stereo_window import StereoTransfer
+from sigmaslam.filters.tracking.frame_update import FrameViews, GatedStep, PredictViews, RobustStep
+from sigmaslam.filters.tracking.window_solution import Condition, EliminateLandmarks, GateWindow, WindowViews
 from sigmaslam.inference.onnx_graph import OnnxGraph
 from sigmaslam.inference.weight_manifest import check_weights, update_manifest
 from sigmaslam.models.extractor import EXTRACTOR_SIZE_MULTIPLE, FeatureExtractor
 from sigmaslam.models.feature_network import DESCRIPTOR_SIZE, STRIDE, FeatureNetwork
 from sigmaslam.models.model_card import card_page, read_card, scoring_page
+from sigmaslam.models.runtime_operators import inverse_operator
 from sigmaslam.models.scorer_network import NEIGHBOURS, SIDE_CHANNELS, MatchScorer, ScoredMatches
+from sigmaslam.models.tracking_graphs import (
+    GATED_INPUTS,
+    GATED_OUTPUTS,
+    PREDICTED,
+    ROBUST_INPUTS,
+    ROBUST_OUTPUTS,
+    WINDOW_INPUTS,
+    WINDOW_OUTPUTS,
+    condition_example,
+    frame_axes,
+    frame_example,
+    window_axes,
+    window_example,
+)
 from sigmaslam.models.verifier_network import PLACE_COLUMNS, VERIFIER_COLUMNS, MatchCovariance, MatchVerifier
 from sigmaslam.synthetic.rendering.textures import dead_leaves
 
@@ -48,7 +64,7 @@ class _Graph:
     checked: tuple[Tensor, ...]
     inputs: list[str]
     outputs: list[str]
-    dynamic: tuple[dict[int, Any] | None, ...]
+    dynamic: tuple[Any, ...]
 
 
 def load_network(weights: Path, descriptor_size: int = DESCRIPTOR_SIZE, stride: int = STRIDE) -> FeatureNetwork:
@@ -121,7 +137,7 @@ def export_features(weights: Path, out: Path) -> float:
 
 
 def export_filter(folder: Path) -> dict[str, float]:
-    """Writes the two filter graphs and returns the largest difference of each from torch."""
+    """Writes the filter's graphs and returns the largest difference of each from torch."""
     differences = {
         name: _export(graph, folder / f"{name}.onnx", _FILTER_TOLERANCE) for name, graph in _filter_graphs().items()
     }
@@ -138,8 +154,7 @@ def export_all(
         weights: safetensors file of a training run.
         card: its JSON card; the differences found here are added to the copy in `out`.
         scores: of these weights on real sets, by set, for the card.
-        out: folder that gets features.onnx, pose_predict.onnx, stereo_transfer.onnx, features.safetensors, and
-            features.json and .md.
+        out: folder that gets features.onnx, the filter's graphs, features.safetensors, and features.json and .md.
     """
     content = read_card(card)
     if scores is not None:
@@ -216,10 +231,8 @@ def _noisy_texture(rng: np.random.Generator, shape: tuple[int, int]) -> Tensor:
 
 
 def _filter_graphs() -> dict[str, _Graph]:
-    pairs = torch.export.Dim("pairs", min=1, max=10_000)
-    measurements = torch.export.Dim("measurements", min=1, max=1_000_000)
     fixed: dict[int, Any] = {}
-    by_pair, each = {0: pairs}, {0: measurements}
+    state, columns = (torch.export.Dim(name, min=1, max=10_000) for name in ("state", "columns"))
     return {
         "pose_predict": _Graph(
             Predict(),
@@ -229,15 +242,40 @@ def _filter_graphs() -> dict[str, _Graph]:
             ["predicted_pose", "predicted_covariance"],
             (fixed,) * 5,
         ),
-        "stereo_transfer": _Graph(
-            StereoTransfer(),
-            _transfer_example(0, 5, 40),
-            _transfer_example(1, 3, 17),
-            ["relative", "spread", "pair", "calibration", "intrinsics", "landmarks", "landmark_spread"],
-            ["mean", "slope", "left", "in_front"],
-            (by_pair, by_pair, each, fixed, fixed, each, each),
+        "frame_predict": _frame_graph(PredictViews(), (), PREDICTED),
+        "frame_robust": _frame_graph(RobustStep(), ROBUST_INPUTS, ROBUST_OUTPUTS),
+        "frame_gated": _frame_graph(GatedStep(), GATED_INPUTS, GATED_OUTPUTS),
+        "window_eliminate": _window_graph(EliminateLandmarks(), WINDOW_INPUTS, WINDOW_OUTPUTS),
+        "window_gate": _window_graph(GateWindow(), (), ("agree",)),
+        "window_condition": _Graph(
+            Condition(),
+            condition_example(0, 18, 7),
+            condition_example(1, 30, 25),
+            ["factor", "information", "vector", "common"],
+            ["mean", "covariance", "common_after"],
+            ({0: state, 1: columns}, {0: state, 1: state}, {0: state}, {0: state}),
         ),
     }
+
+
+def _frame_graph(module: nn.Module, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> _Graph:
+    """A step of a frame's update with inputs of its own, before the fields of `FrameViews`."""
+    fields = FrameViews._fields
+    traced, checked = (
+        frame_example(seed, keyframes, count, *inputs, *fields) for seed, keyframes, count in ((0, 3, 40), (1, 5, 77))
+    )
+    axes = (*frame_axes(*inputs), frame_axes(*fields))
+    return _Graph(module, traced, checked, [*inputs, *fields], list(outputs), axes)
+
+
+def _window_graph(module: nn.Module, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> _Graph:
+    """A step of a window's solution with inputs of its own, before the fields of `WindowViews`."""
+    fields = WindowViews._fields
+    traced, checked = (
+        window_example(seed, keyframes, count, *inputs, *fields) for seed, keyframes, count in ((0, 4, 30), (1, 5, 50))
+    )
+    axes = (*window_axes(*inputs), window_axes(*fields))
+    return _Graph(module, traced, checked, [*inputs, *fields], list(outputs), axes)
 
 
 def _predict_example(seed: int) -> tuple[Tensor, ...]:
@@ -250,20 +288,6 @@ def _predict_example(seed: int) -> tuple[Tensor, ...]:
     densities = 0.1 + random(2).abs()
     step = torch.tensor(0.1 + 0.2 * seed, dtype=torch.float64)
     return exp_se3(0.3 * random(6)), random(6), root @ root.T, step, densities
-
-
-def _transfer_example(seed: int, pairs: int, measurements: int) -> tuple[Tensor, ...]:
-    generator = torch.Generator().manual_seed(seed)
-
-    def uniform(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator, dtype=torch.float64)
-
-    relative = exp_se3(0.1 * uniform(pairs, 6))
-    spread = 0.01 * uniform(pairs, 9, 9).tril()
-    pair = torch.randint(0, pairs, (measurements,), generator=generator)
-    intrinsics = torch.tensor([400.0, 410.0, 320.0, 240.0, 80.0], dtype=torch.float64)
-    landmarks = uniform(measurements, 4) * torch.tensor([640.0, 480.0, 40.0, 0.3], dtype=torch.float64)
-    return relative, spread, pair, 0.3 * uniform(3), intrinsics, landmarks, uniform(measurements, 4, 4).tril()
 
 
 def _export(
@@ -284,6 +308,7 @@ def _export(
             dynamic_shapes=graph.dynamic,
             opset_version=_OPSET,
             verbose=False,
+            custom_translation_table={torch.ops.aten.linalg_inv_ex.default: inverse_operator()},
         )
         assert program is not None
         program.save(path, external_data=False)
@@ -291,7 +316,8 @@ def _export(
         feed = {name: np.asarray(value) for name, value in zip(graph.inputs, graph.checked, strict=True)}
         actual = OnnxGraph(path)(feed)
         with torch.no_grad():
-            expected = [value.numpy() for value in graph.module(*graph.checked)]
+            outputs = graph.module(*graph.checked)
+        expected = [value.numpy() for value in (outputs if isinstance(outputs, tuple) else (outputs,))]
         difference = (compare or _relative_difference)(actual, expected)
         if not difference <= tolerance:
             raise SigmaSlamError(
@@ -302,9 +328,8 @@ def _export(
 
 def _relative_difference(actual: list[np.ndarray], expected: list[np.ndarray]) -> float:
     """Largest difference over all outputs, relative to an output's largest value where that exceeds 1."""
-    return max(
-        float(np.abs(a - b).max() / max(1.0, float(np.abs(b).max()))) for a, b in zip(actual, expected, strict=True)
-    )
+    pairs = [(np.asarray(a, np.float64), np.asarray(b, np.float64)) for a, b in zip(actual, expected, strict=True)]
+    return max(float(np.abs(a - b).max() / max(1.0, float(np.abs(b).max()))) for a, b in pairs)
 
 
 def _feature_difference(actual: list[np.ndarray], expected: list[np.ndarray]) -> float:

@@ -10,7 +10,8 @@ import torch
 from torch import nn
 
 from sigmaslam.filters.onnx.pose_prediction import Predict
-from sigmaslam.filters.onnx.stereo_window import StereoTransfer
+from sigmaslam.filters.tracking.frame_update import GatedStep, PredictViews, RobustStep
+from sigmaslam.filters.tracking.window_solution import Condition, EliminateLandmarks, GateWindow
 from sigmaslam.inference.onnx_graph import shipped_weights
 from sigmaslam.models.extractor import FeatureExtractor
 from sigmaslam.models.onnx_export import load_network, load_scorer, load_verifier
@@ -28,7 +29,7 @@ class TorchModule:
         """Outputs in the order of the module."""
         with torch.inference_mode():
             outputs = self._module(*(torch.from_numpy(np.asarray(value)) for value in feed.values()))
-        return [value.numpy() for value in outputs]
+        return [value.numpy() for value in (outputs if isinstance(outputs, tuple) else (outputs,))]
 
 
 class TorchFeatures(TorchModule):
@@ -48,5 +49,15 @@ def scoring_module(name: str) -> TorchModule:
 
 
 def filter_module(name: str) -> TorchModule:
-    """pose_predict or stereo_transfer."""
-    return TorchModule({"pose_predict": Predict(), "stereo_transfer": StereoTransfer()}[name])
+    """A step of the filter by the name of its graph."""
+    return TorchModule(
+        {
+            "pose_predict": Predict,
+            "frame_predict": PredictViews,
+            "frame_robust": RobustStep,
+            "frame_gated": GatedStep,
+            "window_eliminate": EliminateLandmarks,
+            "window_gate": GateWindow,
+            "window_condition": Condition,
+        }[name]()
+    )

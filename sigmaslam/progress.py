@@ -9,14 +9,13 @@ if TYPE_CHECKING:
 
 
 def open_progress(hidden: bool = False) -> Progress:
-    """Tasks with a field `note`, which stands behind the bar; nothing is shown where it is hidden."""
+    """Tasks with a field `note`, behind the bar and the time that is left; nothing is shown where it is hidden."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
         Progress,
         TextColumn,
-        TimeElapsedColumn,
         TimeRemainingColumn,
     )
 
@@ -24,8 +23,8 @@ def open_progress(hidden: bool = False) -> Progress:
         TextColumn("{task.description}"),
         BarColumn(bar_width=16),
         MofNCompleteColumn(),
-        TimeElapsedColumn(),
         TimeRemainingColumn(),
+        TextColumn("left,"),
         TextColumn("{task.fields[note]}"),
         console=Console(stderr=True),
         disable=hidden,

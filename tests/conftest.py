@@ -46,5 +46,5 @@ def one_thread() -> Iterator[None]:
 
 @pytest.fixture
 def without_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs in this process draw no figures, which would take longer than to track a few frames."""
+    """Runs in this process write no report, which would take longer than to track a few frames."""
     monkeypatch.setattr("sigmaslam.runs.report.write_report", lambda run_dir: None)

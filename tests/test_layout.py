@@ -14,7 +14,7 @@ import pytest
 import sigmaslam
 
 ROOT = Path(__file__).resolve().parents[1]
-MAPPED = ("evaluation", "filters", "models", "synthetic", "training")
+MAPPED = ("evaluation", "filters", "localisation", "models", "synthetic", "training")
 # What a layer must never import, nor anything that it imports: names of modules or of folders outside the layer.
 FORBIDDEN = {
     "filters": ("models", "training", "synthetic", "evaluation", "tracker", "frontend", "camera"),
@@ -35,7 +35,7 @@ FLOORS = (
     ("frontend",),
     ("two_view",),
     ("slam",),
-    ("checks", "fusion"),
+    ("calibration", "checks", "fusion"),
     ("runs",),
     ("bundle_adjustment",),
     ("cli",),

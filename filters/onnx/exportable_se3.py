@@ -15,11 +15,14 @@ _SMALL = 1e-3  # radians; below it the series are exact to round-off in float64
 # third is written as a division by three.
 
 
+# Row k is the cross-product matrix of the k-th unit vector, row by row.
+_CROSS = ((0, 0, 0, 0, 0, -1, 0, 1, 0), (0, 0, 1, 0, 0, 0, -1, 0, 0), (0, -1, 0, 1, 0, 0, 0, 0, 0))
+
+
 def skew(vector: Tensor) -> Tensor:
     """Cross-product matrix, (..., 3) -> (..., 3, 3)."""
-    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
-    zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+    cross = torch.tensor(_CROSS, dtype=vector.dtype, device=vector.device)
+    return (vector @ cross).unflatten(-1, (3, 3))
 
 
 def _coefficients(squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -23,6 +23,7 @@ from sigmaslam.filters.models import AnyMeasurement, AnyMotion, NonlinearModel, 
 from sigmaslam.filters.noise_covariance import as_noise
 from sigmaslam.filters.onnx.exact_operators import ExactOperators
 from sigmaslam.filters.onnx.graph_file import strip_origins
+from sigmaslam.filters.robust import Robust
 from sigmaslam.filters.transforms import Taylor
 
 _OPSET = 20
@@ -63,6 +64,9 @@ def export_step(
     measurement: AnyMeasurement | None,
     example: StepExample,
     path: str | Path,
+    *,
+    gate: float | None = None,
+    robust: Robust | None = None,
 ) -> float:
     """Writes a step of a filter as an ONNX graph, for any batch, in the dtype of the example.
 
@@ -78,6 +82,7 @@ def export_step(
         measurement: None for a graph that predicts only.
         example: see there.
         path: the file to write; its folder must exist.
+        gate, robust: as `update`; each of several measurements is a block.
     Returns:
         The largest difference from torch, on arguments drawn at random about the example, in batches of other sizes and
         with missing components; relative to an output's largest value.
@@ -86,7 +91,7 @@ def export_step(
             than `TOLERANCES`. Nothing is written.
         ValueError: the example does not fit the models.
     """
-    step = _Step(bayes, motion, measurement, _complete(example))
+    step = _Step(bayes, motion, measurement, _complete(example), gate, robust)
     path = Path(path)
     with atomic_path(path) as written:
         _write(step, written)
@@ -103,7 +108,13 @@ class _Step(nn.Module):
     """predict and update between named arrays."""
 
     def __init__(
-        self, bayes: BayesFilter, motion: AnyMotion | None, measurement: AnyMeasurement | None, example: StepExample
+        self,
+        bayes: BayesFilter,
+        motion: AnyMotion | None,
+        measurement: AnyMeasurement | None,
+        example: StepExample,
+        gate: float | None,
+        robust: Robust | None,
     ) -> None:
         super().__init__()
         if motion is None and measurement is None:
@@ -112,6 +123,7 @@ class _Step(nn.Module):
             raise ValueError("a measurement needs a value in the example, and a value a measurement")
         self.bayes = replace(bayes, on_failure="hold") if bayes.on_failure == "raise" else bayes
         self.motion, self.measurement, self.example = motion, measurement, example
+        self.gate, self.robust = gate, robust
         self.by_root = bayes.goes_on_with_roots(example.belief)
         self.is_stack = example.value is not None and example.value.ndim == 3
 
@@ -161,7 +173,7 @@ class _Step(nn.Module):
             measurement = several(measurement, value.shape[-2])
             inputs = [self._for_each(one) for one in inputs]
             value = value.flatten(-2)
-        seen = self.bayes.update(belief, measurement, value, *inputs)
+        seen = self.bayes.update(belief, measurement, value, *inputs, gate=self.gate, robust=self.robust)
         count = torch.as_tensor(seen.count).expand(healthy.shape)
         healthy = healthy & seen.healthy
         return seen.belief.mean, seen.belief.held, healthy, seen.log_likelihood, seen.nis, count
@@ -175,8 +187,12 @@ class _Step(nn.Module):
         """Whether an input has the batch as its first dimension, and the number of measurements as its second."""
         value = self.example.value
         batched = given.ndim > 0 and given.shape[:1] == self.example.belief.batch_shape
-        each = self.is_stack and batched and value is not None and given.shape[:2] == value.shape[:2]
-        return batched, each and (given.ndim > 2 or given is value)
+        if given is value:
+            return batched, self.is_stack
+        # The belief and the motion's inputs have no such dimension, whatever their sizes are.
+        seen = any(given is one for one in self.example.measurement_inputs.values())
+        each = self.is_stack and batched and seen and value is not None and given.shape[:2] == value.shape[:2]
+        return batched, each and given.ndim > 2
 
     def free(self) -> tuple[dict[int, Any] | None, ...]:
         """Which dimensions of each input the graph leaves free."""

@@ -17,11 +17,12 @@ function gives the Jacobian: the extended filter is the limit of the unscented o
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 
 from sigmaslam.filters.onnx.exportable_se3 import exp_se3
-from sigmaslam.filters.onnx.unscented import odd_and_even
 
 POSE = slice(0, 6)
 CALIBRATION = slice(6, 9)
@@ -57,38 +58,67 @@ class StereoTransfer(nn.Module):
         """The unscented transform (steps 4 and 5 of Table 9.2), landmark by landmark."""
         root = torch.sqrt(torch.tensor(float(SIZE), dtype=relative.dtype, device=relative.device))
         steps = root * spread.movedim(-1, 0)
-        steps = torch.cat([steps, -steps])
-        moved = (exp_se3(steps[..., POSE]) @ relative).index_select(1, pair)
-        biased = (calibration + steps[..., CALIBRATION]).index_select(1, pair)
-        by_pose, _ = _project(moved, biased, intrinsics, landmarks)
-        steps = root * landmark_spread.movedim(-1, 0)
-        here = relative.index_select(0, pair)
-        by_landmark, _ = _project(here, calibration, intrinsics, landmarks + torch.cat([steps, -steps]))
-        nine, four = LANDMARK.start, SIZE - LANDMARK.start
-        samples = torch.cat([by_pose[:nine], by_landmark[:four], by_pose[nine:], by_landmark[four:]])
-        mean, odd, even = odd_and_even(samples)
-        _, depth = _project(here, calibration, intrinsics, landmarks)
-        residual_covariance = torch.stack([(even * even[:, i : i + 1]).sum(dim=-1) for i in range(3)], dim=-1)
-        return mean, odd, residual_covariance, (depth > _NEAREST).to(mean.dtype)
+        six, nine = CALIBRATION.start, LANDMARK.start
+        # The last three columns of a lower factor do not move the pose.
+        moving, biasing = steps[:six], steps[six:, :, CALIBRATION]
+        moving, biasing = torch.cat([moving, -moving]), torch.cat([biasing, -biasing])
+        moved = torch.cat([exp_se3(moving[..., POSE]) @ relative, relative[None]])[..., :3, :]
+        biased = torch.cat([moving[..., CALIBRATION], biasing]) + calibration
+        # A product with zeros and ones takes each measurement's pair out, entry by entry, and is faster than indexing.
+        entries = torch.cat([moved.permute(2, 3, 0, 1).flatten(0, 2), biased.permute(2, 0, 1).flatten(0, 1)])
+        pairs = torch.arange(relative.shape[0], device=relative.device)
+        each = entries @ (pairs[:, None] == pair).to(relative.dtype)
+        poses = each[: 12 * (2 * six + 1)].unflatten(0, (12, -1)).unbind(0)
+        biases = each[12 * (2 * six + 1) :].unflatten(0, (3, -1))
+        own = landmarks.mT
+        by_pose, _ = _project(
+            [entry[:-1] for entry in poses], biases[:, : 2 * six].unbind(0), intrinsics, own.unbind(0)
+        )
+        # At the pose itself: other calibrations, the landmark and calibration themselves, and other landmarks.
+        steps = root * landmark_spread.permute(1, 2, 0)
+        count = 2 * (nine - six) + 1
+        own = own[:, None]
+        around = torch.cat([own.expand(-1, count, -1), own + steps, own - steps], dim=1)
+        constant = calibration[:, None, None].expand(-1, 1 + 2 * (SIZE - nine), landmarks.shape[0])
+        biases = torch.cat([biases[:, 2 * six :], constant], dim=1)
+        others, depth = _project([entry[-1] for entry in poses], biases.unbind(0), intrinsics, around.unbind(0))
+        three, four = nine - six, SIZE - nine
+        plus = torch.cat([by_pose[:, :six], others[:, :three], others[:, count : count + four]], dim=1)
+        minus = torch.cat([by_pose[:, six:], others[:, three : count - 1], others[:, count + four :]], dim=1)
+        total = plus + minus
+        mean = total.sum(dim=1) / (2.0 * SIZE)
+        even = ((total - 2.0 * mean[:, None]) / (2.0 * root)).permute(2, 0, 1)
+        odd = ((plus - minus) / (2.0 * root)).permute(2, 0, 1)
+        return mean.mT, odd, even @ even.mT, (depth[count - 1] > _NEAREST).to(mean.dtype)
 
 
-def _project(relative: Tensor, calibration: Tensor, intrinsics: Tensor, landmarks: Tensor) -> tuple[Tensor, Tensor]:
-    """(u, v, disparity) (..., m, 3) in the view, and the depth there as a share of that in the host (..., m)."""
-    fx, fy, cx, cy, focal_baseline = (intrinsics[i] for i in range(5))
-    x, y = (landmarks[..., 0] - cx) / fx, (landmarks[..., 1] - cy) / fy
-    d, landmark_offset = landmarks[..., 2], landmarks[..., 3]
-    inverse_depth = (d - landmark_offset - _bias(calibration, x - d / fx, y)) / focal_baseline
+def _project(
+    pose: Sequence[Tensor], calibration: Sequence[Tensor], intrinsics: Tensor, landmark: Sequence[Tensor]
+) -> tuple[Tensor, Tensor]:
+    """What is seen of landmarks, component by component.
+
+    Args:
+        pose: the upper twelve entries of T_view_host, row by row, (k, m) or (m,) each.
+        calibration, intrinsics: as of `StereoTransfer`.
+        landmark: u, v, disparity and its own error, (k, m) or (m,) each.
+    Returns:
+        (u, v, disparity) (3, k, m) in the view, and the depth there as a share of that in the host (k, m).
+    """
+    fx, fy, cx, cy, focal_baseline = intrinsics.unbind(0)
+    x, y, own = (landmark[0] - cx) / fx, (landmark[1] - cy) / fy, landmark[3]
+    true = landmark[2] - own - _bias(calibration, x - landmark[2] / fx, y)
+    inverse_depth = true / focal_baseline
     # Written out, because millions of tiny matrix products are slow.
-    seen = [
-        relative[..., i, 0] * x + relative[..., i, 1] * y + relative[..., i, 2] + relative[..., i, 3] * inverse_depth
-        for i in range(3)
-    ]
-    share = 1.0 / seen[2].clamp_min(0.5 * _NEAREST)
-    u, v, true_disparity = seen[0] * share, seen[1] * share, focal_baseline * inverse_depth * share
-    disparity = true_disparity + landmark_offset + _bias(calibration, u - true_disparity / fx, v)
-    return torch.stack([fx * u + cx, fy * v + cy, disparity], dim=-1), seen[2]
+    across, down, ahead = (
+        pose[4 * i] * x + pose[4 * i + 1] * y + pose[4 * i + 2] + pose[4 * i + 3] * inverse_depth for i in range(3)
+    )
+    share = 1.0 / ahead.clamp_min(0.5 * _NEAREST)
+    u, v, true_disparity = across * share, down * share, true * share
+    disparity = true_disparity + own + _bias(calibration, u - true_disparity / fx, v)
+    return torch.stack([fx * u + cx, fy * v + cy, disparity]), ahead
 
 
-def _bias(calibration: Tensor, x: Tensor, y: Tensor) -> Tensor:
+def _bias(calibration: Sequence[Tensor], x: Tensor, y: Tensor) -> Tensor:
     """Measured minus true disparity at normalised coordinates of the right image, to first order in the angles."""
-    return calibration[..., 0] + calibration[..., 1] * x * x + calibration[..., 2] * x * y
+    constant, yaw, pitch = calibration
+    return constant + (yaw * x + pitch * y) * x

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import platform
 import time
 from collections.abc import Callable
@@ -21,8 +22,13 @@ from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder, ma
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import read_covariances, read_tum, write_kitti, write_tum
+from sigmaslam.runs.frame_table import FRAMES_NAME
+from sigmaslam.runs.recorded_run import REFINE_NAME, REFINED_TRAJECTORY
+from sigmaslam.runs.report import write_report
 from sigmaslam.runs.run_folder import FINAL_TRAJECTORY, check_has_trajectory, write_ply
 from sigmaslam.slam.point_map import PointMap
+
+_LOGGER = logging.getLogger(__name__)
 
 
 def refine_run(
@@ -81,7 +87,9 @@ def refine_run(
         },
     }
     _write(out, trajectory, adjustment)
-    atomic_write_text(out / "refine.json", json.dumps(summary, indent=2) + "\n")
+    content = json.dumps(summary, indent=2) + "\n"
+    atomic_write_text(out / REFINE_NAME, content)
+    _add_to_report(run, out, content)
     return summary
 
 
@@ -119,15 +127,25 @@ def _write(out: Path, trajectory: Trajectory, adjustment: Adjustment) -> None:
         np.save(path, adjustment.covariances[keyframe_before(adjustment.frames, len(trajectory))])
     count = len(adjustment.points)
     # The adjustment does not keep the keyframe and the pixel that first saw a point.
-    unknown = np.full((count, 3), np.nan)
-    point_map = PointMap(
-        adjustment.points, adjustment.point_covariances, adjustment.point_views, unknown[:, 0], unknown[:, 1:]
-    )
+    unknown = np.full((count, 4), np.nan)
+    seen_first = unknown[:, 0], unknown[:, 1:3], unknown[:, 3]
+    point_map = PointMap(adjustment.points, adjustment.point_covariances, adjustment.point_views, *seen_first)
     with atomic_path(out / "map.npz") as path:
         np.savez_compressed(
             path, points=point_map.points, covariances=point_map.covariances, observations=point_map.observations
         )
     write_ply(out / "map.ply", point_map)
+
+
+def _add_to_report(run: Path, out: Path, content: str) -> None:
+    """Leaves what was refined in the folder of the run, too, and writes its report anew."""
+    try:
+        atomic_write_text(run / REFINE_NAME, content)
+        write_tum(run / REFINED_TRAJECTORY, read_tum(out / "trajectory.tum"))
+        if (run / FRAMES_NAME).is_file():
+            write_report(run)
+    except (OSError, InputError) as error:
+        _LOGGER.warning("the result is not in the report of the run: %s", getattr(error, "strerror", None) or error)
 
 
 def _read_trajectory(run: Path) -> Trajectory:

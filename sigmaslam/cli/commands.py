@@ -12,13 +12,16 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 from sigmaslam.cli.benchmark import benchmark
+from sigmaslam.cli.calibrate import calibrate
 from sigmaslam.cli.calibration import calibration
 from sigmaslam.cli.check import check
 from sigmaslam.cli.evaluate import evaluate
 from sigmaslam.cli.export import export
 from sigmaslam.cli.finish import finish
 from sigmaslam.cli.geometry import geometry
+from sigmaslam.cli.localize import localize
 from sigmaslam.cli.match import match
+from sigmaslam.cli.rectify import rectify
 from sigmaslam.cli.refine import refine
 from sigmaslam.cli.render import render
 from sigmaslam.cli.track import demo, track
@@ -53,8 +56,11 @@ for _command, _line in (
     (finish, "Make the results of a run that was killed."),
     (evaluate, "Compare a trajectory with the truth."),
     (refine, "Adjust all of a run at once (extra 'graph')."),
+    (localize, "Localise robots among known landmarks (extra 'train')."),
     (match, "Match two images."),
     (geometry, "Find how two views lie to each other."),
+    (calibrate, "Calibrate one or two cameras from images of a board."),
+    (rectify, "Write rectified pairs."),
     (render, "Render a stereo sequence with exact truth (extra 'train')."),
     (train, "Train the correspondence network (extra 'train')."),
     (train_scorer, "Train the probability of matches (extra 'train')."),

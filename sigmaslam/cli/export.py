@@ -21,7 +21,8 @@ def export(
 ) -> None:
     """Export what a run made to ONNX and check the graphs against torch (needs the extra 'train').
 
-    A run of 'train' gives the features' graph and those of the filter, a run of 'train-scorer' scorer and verifier.
+    A run of 'train' gives the features' graph and those of the tracker's estimator, a run of 'train-scorer' scorer and
+    verifier.
     """
     need_train_extra()
     from sigmaslam.evaluation.matching import read_scores
@@ -33,13 +34,13 @@ def export(
     if (run / SCORER_NAME).is_file():
         if scores is not None:
             raise InputError(f"--scores is of features, {run} is a run of train-scorer: leave it out")
-        with Console(stderr=True).status("exporting two graphs"):
+        with Console(stderr=True).status("exporting three graphs"):
             differences = export_scoring(run, out)
         _tell_differences(differences)
         return
 
     on_real_sets = None if scores is None else read_scores(scores)
-    with Console(stderr=True).status("exporting four graphs (about a minute)"):
+    with Console(stderr=True).status("exporting eight graphs (some minutes)"):
         differences = export_all(run / WEIGHTS_NAME, run / CARD_NAME, out, on_real_sets)
     _tell_differences(differences)
 

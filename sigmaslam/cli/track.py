@@ -25,6 +25,8 @@ from sigmaslam.inference.onnx_graph import BACKENDS
 from sigmaslam.plot_style import NO_MATPLOTLIB
 from sigmaslam.readers import StereoSequence, open_cameras, open_sequence
 from sigmaslam.readers.open import FORMATS
+from sigmaslam.readers.selection import Selection
+from sigmaslam.runs.removal import remove_run
 
 if TYPE_CHECKING:
     from sigmaslam.slam.config import TrackerConfig
@@ -138,6 +140,15 @@ def track(
     strict: Annotated[
         bool, typer.Option("--strict", help="Do not track where the check of the first frames warns of something.")
     ] = False,
+    start: Annotated[int, typer.Option(min=0, help="Number of the first pair to track, from 0 on.")] = 0,
+    frames: Annotated[int | None, typer.Option(min=1, help="Track at most so many pairs.")] = None,
+    every: Annotated[int, typer.Option(min=1, help="Track one of so many pairs.")] = 1,
+    scale: Annotated[
+        float, typer.Option(min=0.05, max=1.0, help="Shrink images to this share of their width and height.")
+    ] = 1.0,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Remove the run that is in the folder, if nothing else is in it.")
+    ] = False,
 ) -> None:
     """Track a stereo sequence, recorded or live: trajectory, covariance, map and report.
 
@@ -149,8 +160,12 @@ def track(
         need_train_extra()
     settings = _read_settings(config, estimate, track_object is not None)
     sequence = open_input(source, format, calibration, camera, seconds, (topic_left, topic_right))
-    check_new_folder(out)
+    sequence = _select(sequence, Selection(start, frames, every), scale)
+    if not overwrite:
+        check_new_folder(out)
     findings = _check(sequence, strict, threads)
+    if overwrite:
+        remove_run(out)
     summary = _track(
         sequence, out, frontend, backend, settings, map, tracks, track_object, location, realtime, threads, findings
     )
@@ -182,6 +197,15 @@ def open_input(
     if format.value != "auto" or topics != (None, None):
         raise InputError("--format, --topic-left and --topic-right go with INPUT, not with --camera")
     return open_cameras(camera, calibration, seconds)
+
+
+def _select(sequence: StereoSequence, selection: Selection, scale: float) -> StereoSequence:
+    """The part of a recording that the command line asks for."""
+    if selection == Selection() and scale == 1.0:
+        return sequence
+    if sequence.format == "camera":
+        raise InputError("--start, --frames, --every and --scale go with INPUT, not with --camera")
+    return sequence.select(selection, scale)
 
 
 def _read_settings(path: Path | None, estimate: str | None, track_object: bool) -> TrackerConfig | None:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sigmaslam.geometry.calibration_covariance import CalibrationCovariance
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.geometry.camera import RectifiedStereo
 
@@ -40,12 +41,21 @@ class CalibrationPrior:
     """What is known of the errors of a calibration before any image; their mean is zero.
 
     Attributes:
-        sigma: (12,) standard deviations, in the units and order of `ERRORS`.
+        covariance: (12, 12), in the units and order of `ERRORS`; zero between errors that are estimated and others.
         estimated: (12,) bool, those that images may move; the others are considered.
     """
 
-    sigma: np.ndarray
+    covariance: np.ndarray
     estimated: np.ndarray
+
+    def __post_init__(self) -> None:
+        same = self.estimated[:, None] == self.estimated
+        object.__setattr__(self, "covariance", np.where(same, self.covariance, 0.0))
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """(12,) standard deviations."""
+        return np.sqrt(np.diag(self.covariance))
 
     def considering(self, index: int) -> CalibrationPrior:
         """The same with one error more that is considered."""
@@ -56,16 +66,26 @@ class CalibrationPrior:
     @property
     def estimated_covariance(self) -> np.ndarray:
         """(12, 12) of those that are estimated, zero for the others."""
-        return np.diag(np.where(self.estimated, self.sigma, 0.0) ** 2)
+        return np.where(np.outer(self.estimated, self.estimated), self.covariance, 0.0)
 
     @property
     def considered_factor(self) -> np.ndarray:
         """(12, 12) factor of the covariance of those that are considered, zero for the others."""
-        return np.diag(np.where(self.estimated, 0.0, self.sigma))
+        sigma = self.sigma
+        scale = np.where(sigma > 0.0, sigma, 1.0)
+        considered = np.where(np.outer(self.estimated, self.estimated), 0.0, self.covariance)
+        values, vectors = np.linalg.eigh(considered / np.outer(scale, scale))
+        # The symmetric root has a column of its own for each error, zero for those that are estimated.
+        return np.asarray(scale[:, None] * (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
 
     @classmethod
     def of(
-        cls, camera: RectifiedStereo, sigmas: CalibrationSigmas, offset_sigma: float, estimate: tuple[str, ...] = ()
+        cls,
+        camera: RectifiedStereo,
+        sigmas: CalibrationSigmas,
+        offset_sigma: float,
+        estimate: tuple[str, ...] = (),
+        covariance: CalibrationCovariance | None = None,
     ) -> CalibrationPrior:
         """Of a rectified pair.
 
@@ -74,17 +94,25 @@ class CalibrationPrior:
             sigmas: of its calibration.
             offset_sigma: of the disparity offset, which is estimated, pixels.
             estimate: names of other errors to estimate.
+            covariance: of the calibration, in place of `sigmas` for what it names.
         """
         turn, lens = camera.fx * sigmas.rotation, camera.fx * sigmas.distortion
         centre = camera.fx * sigmas.principal_point
         in_disparity = (offset_sigma, turn, turn, turn, lens, lens, lens)
         sigma = np.array([*in_disparity, sigmas.focal, centre, centre, lens, sigmas.baseline])
-        return cls.independent(sigma, "offset", *estimate)
+        prior = cls.independent(sigma, "offset", *estimate)
+        if covariance is None:
+            return prior
+        rows = [ERRORS.index(name) for name in covariance.names]
+        units = np.array([1.0 if name in ("focal", "baseline") else camera.fx for name in covariance.names])
+        joint = prior.covariance.copy()
+        joint[np.ix_(rows, rows)] = covariance.matrix * np.outer(units, units)
+        return cls(joint, prior.estimated)
 
     @classmethod
     def independent(cls, sigma: np.ndarray, *estimated: str) -> CalibrationPrior:
         """Independent errors with standard deviations (12,); `estimated` are names of `ERRORS`."""
-        return cls(np.asarray(sigma, float), np.isin(ERRORS, estimated))
+        return cls(np.diag(np.asarray(sigma, float) ** 2), np.isin(ERRORS, estimated))
 
 
 def measured_errors(camera: RectifiedStereo, uvd: np.ndarray) -> np.ndarray:

@@ -40,6 +40,7 @@ class FrameFit:
         inliers: (M,) bool, the views that agree.
         nis, dof: of the inliers.
         noise_scale: what the variances of all views are multiplied by in the posterior, 1 or more, as they scatter.
+        clustering: by what errors that neighbours share make `relative` too small, 1 or more; not applied to it.
         inflation: by what `relative` was multiplied for errors that all views share.
     """
 
@@ -53,6 +54,7 @@ class FrameFit:
     nis: float
     dof: int
     noise_scale: float
+    clustering: float
     inflation: float = 1.0
 
     @property

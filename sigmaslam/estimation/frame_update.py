@@ -1,57 +1,39 @@
 """The update of one frame's pose against a window of keyframes.
 
 A frame that is no keyframe is estimated from the window's posterior and its own views alone, and then forgotten but for
-the velocity: nothing of it can be counted twice.
+the velocity: nothing of it can be counted twice. The equations are `sigmaslam.filters.tracking.frame_update`, which
+runs as graphs; here is what decides.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 import numpy as np
 
-from sigmaslam.estimation.chi_square import CHI_SQUARE_999
+from sigmaslam.estimation.clustered_errors import clustering
 from sigmaslam.estimation.frame_fit import FrameFit, FramePosterior
-from sigmaslam.estimation.gaussian import (
-    append_moved,
-    condition,
-    condition_common,
-    matrix_root,
-    project_covariance,
-    replace_part,
-    weighted_information,
-)
+from sigmaslam.estimation.gaussian import append_moved, matrix_root, replace_part
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
-from sigmaslam.estimation.mahalanobis import squared_mahalanobis
-from sigmaslam.estimation.robust import (
-    UNKNOWN_VARIANCE,
-    common_scale,
-    mask_missing,
-    student_weight,
-    whiten,
-)
-from sigmaslam.estimation.sigma_point_linearisation import Linearisation
-from sigmaslam.estimation.state_layout import CALIBRATION, CALIBRATION_SIZE, LANDMARK_SIZE, pose_slice
+from sigmaslam.estimation.state_layout import CALIBRATION, LANDMARK_SIZE, pose_slice
+from sigmaslam.estimation.window_state import WindowState
 from sigmaslam.geometry.se3 import nearest_rigid, se3_exp, se3_inverse, se3_log
 
-# Scales of the robust loss by which a frame's pose is first found, in standard deviations: it narrows.
-_ROBUST_SCALES = (6.0, 4.0, 3.0)
 # Linearisations with a gate, which must agree twice or give way to the last.
 _GATED = 3
 
 
-@dataclass(frozen=True, slots=True)
 class FrameUpdate:
     """Predicts what a frame sees of a window's landmarks, and estimates its pose; changes nothing.
 
-    Attributes:
+    Args:
         window: whose posterior is the prior.
         iterations: linearisations with a robust loss.
     """
 
-    window: KeyframeWindow
-    iterations: int
+    def __init__(self, window: KeyframeWindow, iterations: int) -> None:
+        self._window = window
+        self._iterations = iterations
+        self._rooted: tuple[WindowState, np.ndarray] | None = None
 
     def predict(
         self, rows: np.ndarray, pose: np.ndarray, step_covariance: np.ndarray, reference: int = -1
@@ -66,13 +48,10 @@ class FrameUpdate:
         Returns:
             (u, v, disparity) (K, 3), its covariance without the measurement's noise (K, 3, 3), in front (K,) bool.
         """
-        state = self.window.posterior
-        covariance = append_moved(matrix_root(state.covariance), pose_slice(reference % len(state)), step_covariance)
-        covariance = covariance @ covariance.T
-        moved, common = np.zeros((len(rows), LANDMARK_SIZE)), np.zeros((len(rows), 3, 2))
-        linear = self._linearise(rows, pose, np.zeros(len(covariance)), covariance, moved, common)
-        noise, by_state = self._through_landmarks(rows, linear, np.zeros((len(rows), 3, 3)))
-        return linear.mean, noise + project_covariance(by_state, covariance), linear.in_front
+        if not len(rows):  # the graph takes no empty batch
+            return np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0, bool)
+        factor = self._prior_factor(step_covariance, reference)
+        return tuple(self._window.graphs.predict_views(self._views(rows, np.zeros((len(rows), 3, 2)), pose, factor)))
 
     def fit(
         self,
@@ -95,172 +74,98 @@ class FrameUpdate:
         Returns:
             None where too few views agree.
         """
-        window = self.window
-        last, frame = pose_slice(len(window) - 1), pose_slice(len(window))
-        factor = append_moved(matrix_root(window.posterior.covariance), last, step_covariance)
-        prior = factor @ factor.T
-        components = views.components
-        offset = np.zeros(len(prior))
-        spread = prior
+        if len(views) < min_inliers:
+            return None
+        posterior = self._window.posterior
+        last, frame = pose_slice(len(posterior) - 1), pose_slice(len(posterior))
+        factor = self._prior_factor(step_covariance, -1)
+        spread = factor @ factor.T
+        offset = np.zeros(len(spread))
         if start is not None:
             offset[frame] = se3_log(start @ se3_inverse(pose))
             # As certain as the last keyframe, to draw sigma points about a good start.
-            spread = replace_part(prior, frame, last)
+            spread = replace_part(spread, frame, last)
         # Landmarks are estimated along with the pose: measured places and depths in the role of true ones would
         # draw the pose towards no motion.
         moved = np.zeros((len(views), LANDMARK_SIZE))
+        measured = {"measurement": views.measurement, "noise": views.noise}
+        known = self._views(views.landmark, views.common, pose, factor)
 
-        for iteration in range(self.iterations):
-            update = self._linearised(views, pose, offset, spread, moved, 1.0)
-            if update.usable.sum() < min_inliers:
+        for iteration in range(self._iterations):
+            gated = np.array(float(iteration == 0 and start is None))
+            at = {"offset": offset, "spread": spread, "moved": moved, "gated": gated, "scale": np.array(scale)}
+            offset, spread, moved, usable = self._window.graphs.robust_step({**measured, **at, **known})
+            if usable < min_inliers:
                 return None
-            squared = update.squared
-            if iteration == 0 and start is None:
-                # About what the prior expects.
-                innovation_covariance = update.noise + project_covariance(update.by_state, prior)
-                squared = squared_mahalanobis(update.residual, innovation_covariance)
-            whitened = update.whitened()
-            for limit in _ROBUST_SCALES:
-                weight = update.usable / (1.0 + squared / (scale * limit**2)) ** 2
-                solution, spread = condition(factor, *weighted_information(whitened, offset, weight))
-                after = update.residual - update.by_state @ (solution - offset)
-                squared = np.einsum("mi,mij,mj->m", after, update.precision, after)
-            offset, moved = solution, self._landmark_step(views, update, solution - offset)
 
         inliers: np.ndarray | None = None
-        noise_scale = 1.0
+        noise_scale = np.array(0.0)  # the first step finds it: before the gate, which would hide how far they scatter
+        prior = np.concatenate([posterior.common, posterior.common[last]])
+        freedom = np.array(self._window.student_freedom)
         for iteration in range(_GATED):
-            update = self._linearised(views, pose, offset, spread, moved, noise_scale)
-            if inliers is None:
-                # Before the gate, which would hide how far they scatter.
-                noise_scale = common_scale(update.squared[update.usable], components[update.usable])
-                update = update.scaled(noise_scale)
-            agree = update.usable & (update.squared <= scale * CHI_SQUARE_999[components])
+            at = {"offset": offset, "spread": spread, "moved": moved, "noise_scale": noise_scale}
+            at |= {"scale": np.array(scale), "freedom": freedom, "prior": prior}
+            agree, count, usable, squared, noise_scale, *step = self._window.graphs.gated_step(
+                {**measured, **at, **known}
+            )
             if iteration == _GATED - 1 or (inliers is not None and (agree == inliers).all()):
                 break
             inliers = agree
-            if update.usable.sum() < min_inliers or inliers.sum() < min_inliers:
+            if usable < min_inliers or count < min_inliers:
                 return None
-            weight = inliers * student_weight(update.squared, components, window.student_freedom)
-            information, vector = weighted_information(update.whitened(), offset, weight)
-            solution, spread = condition(factor, information, vector)
-            offset, moved = solution, self._landmark_step(views, update, solution - offset)
+            offset, spread, moved, common, information, scores, score, prior_cost = step
+        assert inliers is not None
         inliers = inliers & agree
         if inliers.sum() < min_inliers:
             return None
-        common = window.posterior.common
-        common = condition_common(np.concatenate([common, common[last]]), spread, information)
-        standard = np.linalg.lstsq(factor, offset, rcond=1e-12)[0]
-        prior_cost = float(standard @ standard)
-        cross = spread[frame, last]
+        cross, size = spread[frame, last], (self._window.camera.width, self._window.camera.height)
         return FrameFit(
             nearest_rigid(se3_exp(offset[frame]) @ pose),
             spread[frame, frame] + spread[last, last] - cross - cross.T,
             spread[frame, frame],
-            window.posterior.calibration + offset[CALIBRATION],
+            posterior.calibration + offset[CALIBRATION],
             spread[CALIBRATION, CALIBRATION],
-            FramePosterior(offset, spread, common, information, vector - information @ offset),
+            FramePosterior(offset, spread, common, information, score),
             inliers,
-            prior_cost + float(update.squared[inliers].sum()),
-            int(components[inliers].sum()),
-            noise_scale,
+            float(prior_cost + squared[inliers].sum()),
+            int(views.components[inliers].sum()),
+            float(noise_scale),
+            clustering(views.measurement[:, :2], size, scores, information[frame, frame]),
         )
 
-    # ---- the equations
+    def _prior_factor(self, step_covariance: np.ndarray, reference: int) -> np.ndarray:
+        """Factor (n, k) of the covariance of window and frame, which moves on from a keyframe."""
+        state = self._window.posterior
+        if self._rooted is None or self._rooted[0] is not state:
+            estimated = np.r_[self._window.calibration.estimated, np.ones(6 * len(state), bool)]
+            self._rooted = state, _root_of_part(state.covariance, np.flatnonzero(estimated))
+        return append_moved(self._rooted[1], pose_slice(reference % len(state)), step_covariance)
 
-    def _linearised(
-        self,
-        views: LandmarkViews,
-        pose: np.ndarray,
-        offset: np.ndarray,
-        spread: np.ndarray,
-        moved: np.ndarray,
-        noise_scale: float,
-    ) -> _LinearisedViews:
-        """The views at a state `offset` from the prior's mean, with landmarks `moved` from where it has them."""
-        linear = self._linearise(views.landmark, pose, offset, spread, moved, views.common)
-        noise, by_state = self._through_landmarks(views.landmark, linear, views.noise)
-        expected = linear.mean - (linear.by_landmark @ moved[..., None])[..., 0]
-        residual, noise = mask_missing(views.measurement - expected, noise_scale * noise)
-        precision = np.linalg.inv(noise)
-        squared = np.einsum("mi,mij,mj->m", residual, precision, residual)
-        usable = linear.in_front & (squared < UNKNOWN_VARIANCE)
-        return _LinearisedViews(residual, noise, precision, by_state, linear.by_landmark, squared, usable)
-
-    def _landmark_step(self, views: LandmarkViews, update: _LinearisedViews, step: np.ndarray) -> np.ndarray:
-        """(M, 6) how far the landmarks move when the state moves by a step."""
-        after = update.residual - update.by_state @ step
-        cross = self.window.landmarks.covariance[views.landmark] @ update.by_landmark.transpose(0, 2, 1)
-        return np.asarray((cross @ (update.precision @ after[..., None]))[..., 0])
-
-    def _linearise(
-        self,
-        rows: np.ndarray,
-        pose: np.ndarray,
-        offset: np.ndarray,
-        covariance: np.ndarray,
-        moved: np.ndarray,
-        common: np.ndarray,
-    ) -> Linearisation:
-        """Views of landmarks by the frame, with the state moved by `offset` from the window's posterior and `pose`.
-
-        The landmarks follow the state, and lie `moved` (M, 6) from there.
-        """
-        window, state = self.window, self.window.posterior
-        size = len(state.covariance)
-        poses = np.concatenate([state.poses, pose[None]])
-        poses = se3_exp(offset[CALIBRATION_SIZE:].reshape(-1, 6)) @ poses
-        landmarks = window.landmarks
-        return window.lineariser.linearise(
-            poses,
-            state.calibration + offset[CALIBRATION],
-            covariance,
-            landmarks.estimate[rows] + landmarks.dependence[rows] @ offset[:size] + moved,
-            landmarks.covariance[rows],
-            landmarks.anchor[rows],
-            np.full(len(rows), len(state)),
-            common,
-            window.depth,
-        )
-
-    def _through_landmarks(
-        self, rows: np.ndarray, linear: Linearisation, noise: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Noise with that of the landmarks, and derivatives by the state with those through the landmarks."""
-        landmarks, size = self.window.landmarks, len(self.window.posterior.covariance)
-        by_state = linear.by_state.copy()
-        by_state[:, :, :size] += linear.by_landmark @ landmarks.dependence[rows]
-        through = project_covariance(linear.by_landmark, landmarks.covariance[rows])
-        return noise + linear.nonlinearity + through, by_state
+    def _views(
+        self, rows: np.ndarray, common: np.ndarray, pose: np.ndarray, factor: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """The fields of `sigmaslam.filters.tracking.frame_update.FrameViews` for landmarks (M,) by row."""
+        window, state, landmarks = self._window, self._window.posterior, self._window.landmarks
+        dependence = np.zeros((len(rows), LANDMARK_SIZE, len(factor)))
+        dependence[:, :, :-6] = landmarks.dependence[rows]
+        anchors, pair = np.unique(landmarks.anchor[rows], return_inverse=True)
+        return {
+            **window.graphs.constants(window.depth),
+            "anchors": anchors,
+            "views": np.full(len(anchors), len(state)),
+            "pair": pair,
+            "common": common,
+            "covariance": landmarks.covariance[rows],
+            "estimate": landmarks.estimate[rows],
+            "dependence": dependence,
+            "poses": np.concatenate([state.poses, pose[None]]),
+            "calibration": state.calibration,
+            "factor": factor,
+        }
 
 
-@dataclass(frozen=True, slots=True)
-class _LinearisedViews:
-    """The views of a frame at one linearisation point.
-
-    Attributes:
-        residual: (M, 3), zero for what is missing.
-        noise, precision: (M, 3, 3) of it and inverse, with the uncertainty of the landmarks.
-        by_state: (M, 3, n) derivatives, also through the landmarks.
-        by_landmark: (M, 3, 6) derivatives, given the state.
-        squared: (M,) squared length of the residual, in units of the noise.
-        usable: (M,) bool, in front of the camera and anywhere near.
-    """
-
-    residual: np.ndarray
-    noise: np.ndarray
-    precision: np.ndarray
-    by_state: np.ndarray
-    by_landmark: np.ndarray
-    squared: np.ndarray
-    usable: np.ndarray
-
-    def scaled(self, factor: float) -> _LinearisedViews:
-        """The same with so many times the noise."""
-        return replace(
-            self, noise=self.noise * factor, precision=self.precision / factor, squared=self.squared / factor
-        )
-
-    def whitened(self) -> np.ndarray:
-        """(3 M, n + 1) derivatives and residuals in units of the noise."""
-        return whiten(np.concatenate([self.by_state, self.residual[..., None]], axis=2), self.noise)
+def _root_of_part(covariance: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """A (n, k) with A A^T = covariance (n, n), of which nothing but a part (k,) is not zero."""
+    root = np.zeros((len(covariance), len(part)))
+    root[part] = matrix_root(covariance[np.ix_(part, part)])
+    return root

@@ -1,35 +1,8 @@
-"""Gaussians of a state as arrays: conditioning, square roots, and parts that are copied."""
+"""Gaussians of a state as arrays: square roots, regression, and parts that are copied."""
 
 from __future__ import annotations
 
 import numpy as np
-
-
-def condition(factor: np.ndarray, information: np.ndarray, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and covariance of N(0, factor factor^T) times exp(-x^T information x / 2 + vector^T x); factor (n, k)."""
-    whole = np.eye(factor.shape[1]) + factor.T @ information @ factor
-    lower = np.linalg.cholesky(0.5 * (whole + whole.T))
-    reduced = np.linalg.solve(lower, factor.T)
-    return reduced.T @ (reduced @ vector), reduced.T @ reduced
-
-
-def condition_common(common: np.ndarray, covariance: np.ndarray, information: np.ndarray) -> np.ndarray:
-    """How considered errors, which are not estimated, enter a state that was conditioned: by the gain of `condition`.
-
-    Args:
-        common: (n, m) how they entered before.
-        covariance: (n, n) posterior, from `condition`.
-        information: (n, n) of what was learned.
-    """
-    return np.asarray(common - covariance @ (information @ common))
-
-
-def weighted_information(whitened: np.ndarray, offset: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What `condition` takes, from derivatives with residuals (3 M, n + 1) about `offset`, weighted (M,)."""
-    rows = whitened * np.sqrt(np.repeat(weight, 3))[:, None]
-    by_state, residual = rows[:, :-1], rows[:, -1]
-    information = by_state.T @ by_state
-    return information, by_state.T @ residual + information @ offset
 
 
 def matrix_root(covariance: np.ndarray) -> np.ndarray:

@@ -17,20 +17,21 @@ from dataclasses import replace
 import numpy as np
 
 from sigmaslam.estimation.calibration_errors import CalibrationPrior, measured_errors
-from sigmaslam.estimation.chi_square import CHI_SQUARE_999, CHI_SQUARE_9999_OF_6
-from sigmaslam.estimation.gaussian import condition, condition_common, matrix_root
-from sigmaslam.estimation.landmark_elimination import Elimination, eliminate_landmarks
+from sigmaslam.estimation.chi_square import CHI_SQUARE_9999_OF_6
+from sigmaslam.estimation.estimator_graphs import EstimatorGraphs
+from sigmaslam.estimation.gaussian import matrix_root
 from sigmaslam.estimation.landmark_table import KeyframeViews, LandmarkTable, LandmarkViews
-from sigmaslam.estimation.mahalanobis import squared_mahalanobis
 from sigmaslam.estimation.marginalised_poses import PastPoses, point_lever
-from sigmaslam.estimation.robust import STUDENT_FREEDOM, UNKNOWN_VARIANCE, mask_missing
-from sigmaslam.estimation.sigma_point_linearisation import Linearisation, ViewLineariser
 from sigmaslam.estimation.state_layout import CALIBRATION_SIZE, LANDMARK_SIZE, MODELLED, pose_slice
+from sigmaslam.estimation.window_equations import eliminate_landmarks, gate_views
 from sigmaslam.estimation.window_state import WindowState, loop_difference
 from sigmaslam.geometry.camera import RectifiedStereo
 
 # An error of the calibration beyond so many standard deviations of its prior is not believed.
 _CREDIBLE = 4.0
+# Errors of right matches have longer tails than a Gaussian's: degrees of freedom of the Student-t that is fitted.
+# 4 and 1 are no better on rendered streets.
+_STUDENT_FREEDOM = 2.0
 
 
 class KeyframeWindow:
@@ -39,7 +40,7 @@ class KeyframeWindow:
     Args:
         camera: the rectified pair.
         calibration: prior of its errors.
-        lineariser: of views of landmarks.
+        graphs: the equations.
         student_freedom: degrees of freedom of the errors' Student-t; infinite: Gaussian.
 
     Attributes:
@@ -55,11 +56,11 @@ class KeyframeWindow:
         self,
         camera: RectifiedStereo,
         calibration: CalibrationPrior,
-        lineariser: ViewLineariser,
-        student_freedom: float = STUDENT_FREEDOM,
+        graphs: EstimatorGraphs,
+        student_freedom: float = _STUDENT_FREEDOM,
     ) -> None:
         self.camera = camera
-        self.lineariser = lineariser
+        self.graphs = graphs
         self.student_freedom = student_freedom
         self.calibration = calibration
         self.refused = np.zeros(CALIBRATION_SIZE)
@@ -148,20 +149,19 @@ class KeyframeWindow:
         """Posterior of poses, calibration and landmarks from the prior and all views: Gauss-Newton, then a gate."""
         factor = matrix_root(self.prior.covariance)
         for _ in range(iterations):
-            information, vector, elimination = _eliminate(self, self._observations)
+            information, vector, rows, landmarks = eliminate_landmarks(self, self._observations)
             offset = self.posterior.minus(self.prior)
             vector = vector + information @ offset
-            state, covariance = condition(factor, information, vector)
+            learned = {"factor": factor, "information": information, "vector": vector, "common": self.prior.common}
+            state, covariance, common = self.graphs.condition(learned)
             step = state - offset
-            common = condition_common(self.prior.common, covariance, information)
             self.posterior = self.posterior.moved(step, covariance, common)
-            rows = elimination.landmark
-            self.landmarks.estimate[rows] += elimination.step + elimination.dependence @ step
-            self.landmarks.covariance[rows] = elimination.covariance
-            self.landmarks.dependence[rows] = elimination.dependence
+            if len(rows):
+                self.landmarks.covariance[rows], self.landmarks.dependence[rows], own_step = landmarks
+                self.landmarks.estimate[rows] += own_step + self.landmarks.dependence[rows] @ step
         past = self.prior.past.given(self.prior.covariance, self.prior.common, information, vector)
         self.posterior = replace(self.posterior, past=past)
-        agree = _agree(self, self._observations)
+        agree = gate_views(self, self._observations)
         if not agree.all():
             self._observations = self._observations.select(agree)
         if _refuse_errors(self):
@@ -199,9 +199,9 @@ class KeyframeWindow:
         """
         leaving = self.landmarks.anchor == 0
         observed = leaving[self._observations.views.landmark]
-        information, vector, _ = _eliminate(self, self._observations.select(observed))
+        information, vector, *_ = eliminate_landmarks(self, self._observations.select(observed))
         vector = vector + information @ self.posterior.minus(self.prior)
-        self.prior = self.prior.given(information, vector).marginalise_oldest()
+        self.prior = self.prior.given(information, vector, self.graphs.condition).marginalise_oldest()
         self.posterior = self.posterior.marginalise_oldest()
         new_row = np.where(leaving, -1, np.cumsum(~leaving) - 1)
         self._observations = self._observations.without_oldest(new_row)
@@ -240,40 +240,3 @@ def _refuse_errors(window: KeyframeWindow) -> bool:
             state.without_estimate(index, prior.sigma[index]) for state in (window.prior, window.posterior)
         )
     return bool(indices)
-
-
-# ---- the equations
-
-
-def _eliminate(window: KeyframeWindow, observations: KeyframeViews) -> tuple[np.ndarray, np.ndarray, Elimination]:
-    """Information matrix and vector of the state at the posterior, every landmark's own equations solved for it."""
-    linear, residual, noise, components = _linearise(window, observations)
-    noise = np.where(linear.in_front[:, None, None], noise, UNKNOWN_VARIANCE * np.eye(3))
-    landmark = observations.views.landmark
-    return eliminate_landmarks(window.landmarks, landmark, linear, residual, noise, components, window.student_freedom)
-
-
-def _agree(window: KeyframeWindow, observations: KeyframeViews) -> np.ndarray:
-    """(O,) bool: which views fit the posterior (99.9 %)."""
-    linear, residual, noise, components = _linearise(window, observations)
-    return np.asarray(linear.in_front & (squared_mahalanobis(residual, noise) <= CHI_SQUARE_999[components]))
-
-
-def _linearise(
-    window: KeyframeWindow, observations: KeyframeViews
-) -> tuple[Linearisation, np.ndarray, np.ndarray, np.ndarray]:
-    """Views by keyframes at the posterior, residuals (O, 3), their noise (O, 3, 3), components (O,)."""
-    state, landmarks, views = window.posterior, window.landmarks, observations.views
-    linear = window.lineariser.linearise(
-        state.poses,
-        state.calibration,
-        state.covariance,
-        landmarks.estimate[views.landmark],
-        landmarks.covariance[views.landmark],
-        landmarks.anchor[views.landmark],
-        observations.keyframe,
-        views.common,
-        window.depth,
-    )
-    residual, noise = mask_missing(views.measurement - linear.mean, views.noise + linear.nonlinearity)
-    return linear, residual, noise, views.components

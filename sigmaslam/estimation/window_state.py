@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sigmaslam.estimation.calibration_errors import CalibrationPrior
-from sigmaslam.estimation.gaussian import condition, condition_common, matrix_root
+from sigmaslam.estimation.gaussian import matrix_root
 from sigmaslam.estimation.marginalised_poses import PastPoses, past_slice
 from sigmaslam.estimation.state_layout import CALIBRATION, CALIBRATION_SIZE, pose_slice
 from sigmaslam.geometry.se3 import nearest_rigid, se3_exp, se3_inverse, se3_log
+from sigmaslam.inference.onnx_graph import Step
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,11 +69,17 @@ class WindowState:
         calibration = self.calibration + step[CALIBRATION]
         return replace(self, calibration=calibration, poses=poses, covariance=covariance, common=common)
 
-    def given(self, information: np.ndarray, vector: np.ndarray) -> WindowState:
-        """Posterior when exp(-x^T information x / 2 + vector^T x) is learned about the error state x."""
+    def given(self, information: np.ndarray, vector: np.ndarray, condition: Step) -> WindowState:
+        """Posterior when exp(-x^T information x / 2 + vector^T x) is learned about the error state x.
+
+        Args:
+            information, vector: (n, n), (n,).
+            condition: `sigmaslam.filters.tracking.window_solution.Condition`.
+        """
         past = self.past.given(self.covariance, self.common, information, vector)
-        step, covariance = condition(matrix_root(self.covariance), information, vector)
-        common = condition_common(self.common, covariance, information)
+        factor = matrix_root(self.covariance)
+        learned = {"factor": factor, "information": information, "vector": vector, "common": self.common}
+        step, covariance, common = condition(learned)
         return replace(self.moved(step, covariance, common), past=past)
 
     def without_estimate(self, index: int, sigma: float) -> WindowState:

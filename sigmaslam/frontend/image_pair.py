@@ -26,7 +26,9 @@ DETECTORS = {"learned": LearnedDetector, "sift": SiftDetector, "orb": OrbDetecto
 MIN_PROBABILITY = 0.5
 _MIN_SIDE = 96
 _MIN_KEYPOINTS = 4
-_MAX_LINES = 200
+_MAX_LINES = 60
+# Lines begin so far apart at least, as a share of the image's longer side.
+_LINE_SPACING = 0.04
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,12 +158,15 @@ def match_files(
 def draw_matches(image0: np.ndarray, image1: np.ndarray, matches: Matches) -> np.ndarray:
     """Both images (H, W) uint8 side by side, lines from purple (probability 0) to yellow (1); (H, W, 3) BGR.
 
-    At most 200 matches are drawn, evenly chosen from the first to the last.
+    Of the matches, best first, those are drawn that lie apart from better ones, at most 60: lines that can be followed.
     """
     palette = cv2.applyColorMap(np.arange(256, dtype=np.uint8), cv2.COLORMAP_VIRIDIS).reshape(256, 3).tolist()
-    count = len(matches.probability)
-    # The most probable matches are drawn last, so that their lines lie on top.
-    rows = np.linspace(count - 1, 0, min(count, _MAX_LINES)).round().astype(int)
+    apart = _LINE_SPACING * max(image0.shape)
+    rows: list[int] = []
+    for row, point in enumerate(matches.keypoints0):
+        if len(rows) < _MAX_LINES and (np.linalg.norm(matches.keypoints0[rows] - point, axis=1) > apart).all():
+            rows.append(row)
+    rows.reverse()  # the most probable ones lie on top
     colours = [palette[round(255.0 * float(probability))] for probability in matches.probability[rows]]
     return draw_lines(image0, image1, matches.keypoints0[rows], matches.keypoints1[rows], colours)
 

@@ -2,12 +2,13 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Self, get_args
 
 import numpy as np
 
 from sigmaslam.errors import CalibrationError
+from sigmaslam.geometry.calibration_covariance import CalibrationCovariance
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.geometry.checked_yaml import CalibrationYaml
 
@@ -74,6 +75,22 @@ class CameraModel:
                 f"distortion has {len(self.distortion)} coefficients; model {self.distortion_model!r} "
                 f"takes {' or '.join(map(str, counts))}"
             )
+
+    def scaled(self, factor: float) -> Self:
+        """Of images that are so many times as large, rounded to whole pixels."""
+        width, height = (max(round(factor * size), 1) for size in (self.width, self.height))
+        x, y = width / self.width, height / self.height
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=x * self.fx,
+            fy=y * self.fy,
+            # (0, 0) is the centre of a pixel, whose corner stays where it is.
+            cx=x * (self.cx + 0.5) - 0.5,
+            cy=y * (self.cy + 0.5) - 0.5,
+            skew=x * self.skew,
+        )
 
     @property
     def matrix(self) -> np.ndarray:
@@ -212,6 +229,7 @@ class StereoCamera:
         T_left_right: (4, 4) float64, read-only; maps right-camera points into the left frame, metres. Its
             translation is the position of the right camera in the left frame.
         sigmas: how well all this is known.
+        covariance: the same, measured and joint; what it names is not taken from `sigmas`.
 
     Raises:
         CalibrationError: T_left_right is no rigid transformation, or the right camera is not to the right.
@@ -221,6 +239,7 @@ class StereoCamera:
     right: CameraModel
     T_left_right: np.ndarray
     sigmas: CalibrationSigmas = field(default_factory=CalibrationSigmas)
+    covariance: CalibrationCovariance | None = None
 
     def __post_init__(self) -> None:
         T = np.array(self.T_left_right, dtype=np.float64)
@@ -261,6 +280,10 @@ class StereoCamera:
         """Distance between the two centres of projection, metres."""
         return float(np.linalg.norm(self.T_left_right[:3, 3]))
 
+    def scaled(self, factor: float) -> Self:
+        """Of images that are so many times as large."""
+        return replace(self, left=self.left.scaled(factor), right=self.right.scaled(factor))
+
     @property
     def is_rectified(self) -> bool:
         """Whether the images need no rectification: equal K, no distortion, parallel axes, a baseline along x."""
@@ -288,6 +311,7 @@ class StereoCamera:
             right: {...}
             T_left_right: [[1, 0, 0, 0.11], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
             sigmas: {focal: 0.003}                 # optional, see `CalibrationSigmas`; 0: without errors
+            covariance: {names: [focal, yaw], matrix: [[1e-6, 0], [0, 1e-8]]}   # optional, `CalibrationCovariance`
 
         Raises:
             CalibrationError: the file cannot be read, a key is missing or wrong; names file, key and value.
@@ -295,8 +319,9 @@ class StereoCamera:
         content = CalibrationYaml.read(path)
         left, right = (_camera_from_yaml(content.section(eye)) for eye in ("left", "right"))
         T_left_right, sigmas = content.numbers("T_left_right", (4, 4)), CalibrationSigmas.from_yaml(content)
+        covariance = CalibrationCovariance.from_yaml(content)
         try:
-            return cls(left, right, T_left_right, sigmas)
+            return cls(left, right, T_left_right, sigmas, covariance)
         except CalibrationError as error:
             raise content.error(str(error)) from None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from importlib.resources import as_file, files
 from pathlib import Path
 
@@ -18,6 +19,10 @@ from sigmaslam.inference.weight_manifest import check_weights
 _DISABLED = ["MatMulScaleFusion"]
 BACKENDS = ("onnx", "torch")
 _GRAPH_BYTES = 1 << 31
+
+
+Step = Callable[[Mapping[str, np.ndarray]], list[np.ndarray]]
+"""What a loaded graph is called as: arrays by name, outputs in order."""
 
 
 class OnnxGraph:
@@ -68,8 +73,12 @@ def shipped_weights(name: str) -> Path:
         return Path(path)
 
 
-def load_step(name: str, backend: str) -> Callable[[Mapping[str, np.ndarray]], list[np.ndarray]]:
-    """A step of the filter by the name of its graph, with one of `BACKENDS`; "torch" is the same step in torch."""
+@cache
+def load_step(name: str, backend: str) -> Step:
+    """A step of the filter by the name of its graph, with one of `BACKENDS`; "torch" is the same step in torch.
+
+    It has no state, and is loaded once in a process.
+    """
     if backend == "torch":
         from sigmaslam.models.torch_runtime import filter_module
 

@@ -2,6 +2,7 @@
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -12,23 +13,39 @@ from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.geometry.se3 import rotation_log
 
 
-def write_calibration(path: Path, camera: StereoCamera) -> None:
+def write_calibration(path: Path, camera: StereoCamera, more: dict[str, Any] | None = None) -> None:
     """Write what `StereoCamera.from_yaml` reads back exactly; sigmas only where they are not the defaults.
+
+    Args:
+        path: of the YAML file.
+        camera: the calibration.
+        more: further entries, which `from_yaml` leaves alone.
 
     Raises:
         InputError: the folder cannot be written.
     """
-    content = {
-        "left": {**asdict(camera.left), "distortion": list(camera.left.distortion)},
-        "right": {**asdict(camera.right), "distortion": list(camera.right.distortion)},
+    content: dict[str, Any] = {
+        "left": camera_entries(camera.left),
+        "right": camera_entries(camera.right),
         "T_left_right": camera.T_left_right.tolist(),
     }
     if camera.sigmas != CalibrationSigmas():
         content["sigmas"] = asdict(camera.sigmas)
+    if camera.covariance is not None:
+        content["covariance"] = {
+            "names": list(camera.covariance.names),
+            "matrix": camera.covariance.matrix.tolist(),
+        }
+    content |= more or {}
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
     atomic_write_text(
         path, "# Pixels and metres; T_left_right takes points of the right camera into the left one.\n" + text
     )
+
+
+def camera_entries(camera: CameraModel) -> dict[str, Any]:
+    """One camera as a mapping of a calibration file."""
+    return {**asdict(camera), "distortion": list(camera.distortion)}
 
 
 def describe_calibration(camera: StereoCamera) -> str:

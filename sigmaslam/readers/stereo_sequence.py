@@ -10,11 +10,13 @@ from itertools import islice
 from pathlib import Path
 from typing import Protocol, TypeVar
 
+import cv2
 import numpy as np
 
 from sigmaslam.errors import CalibrationError, FrameError, InputError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.readers.images import MAX_FAILURES, GreyConverter, ImagePairs, RawPair, SkippedFrame
+from sigmaslam.readers.selection import Selection, select_pairs
 
 logger = logging.getLogger(__name__)
 
@@ -62,7 +64,7 @@ class StereoSequence:
     """Stereo pairs with their calibration.
 
     Attributes:
-        camera: calibration of the images as stored.
+        camera: calibration of the frames: of the images as stored, or of those that `select` makes smaller.
         source: the file or folder, or the name of a camera.
         format: 'kitti', 'euroc', '4seasons', 'folder', 'video', 'bag' or 'camera'.
         timestamps: seconds, one per pair, or None if only reading gives them (videos).
@@ -74,8 +76,11 @@ class StereoSequence:
         InputError: no image can be read.
     """
 
-    def __init__(self, pairs: PairSource, camera: StereoCamera, source: Path | str, format: str) -> None:
-        self.camera = camera
+    def __init__(
+        self, pairs: PairSource, camera: StereoCamera, source: Path | str, format: str, scale: float = 1.0
+    ) -> None:
+        self.camera = camera if scale == 1.0 else camera.scaled(scale)
+        self._stored = camera
         self.source = source
         self.format = format
         self.timestamps = pairs.timestamps
@@ -98,6 +103,15 @@ class StereoSequence:
                 self._grey.convert(image, name)
             except FrameError as error:
                 raise InputError(str(error)) from None
+
+    def select(self, selection: Selection, scale: float = 1.0) -> "StereoSequence":
+        """A part of the sequence, with images so many times as large as those that are stored.
+
+        Raises:
+            InputError: none of its pairs is in the sequence, or can be read.
+        """
+        pairs = select_pairs(self._pairs, selection, self.source)
+        return StereoSequence(pairs, self._stored, self.source, self.format, scale)
 
     @property
     def dropped(self) -> int:
@@ -160,17 +174,20 @@ class StereoSequence:
                 yield item
                 continue
             try:
-                left = self._check(item.left, item.left_name, self.camera.left)
-                right = self._check(item.right, item.right_name, self.camera.right)
+                left = self._check(item.left, item.left_name, self._stored.left, self.camera.left)
+                right = self._check(item.right, item.right_name, self._stored.right, self.camera.right)
                 yield StereoFrame(item.index, item.timestamp, left, right)
             except FrameError as error:
                 yield SkippedFrame(item.index, item.timestamp, str(error))
 
-    def _check(self, image: np.ndarray, name: str, model: CameraModel) -> np.ndarray:
+    def _check(self, image: np.ndarray, name: str, model: CameraModel, wanted: CameraModel) -> np.ndarray:
         mismatch = _size_mismatch(image, model)
         if mismatch:
             raise FrameError(f"{name}: {mismatch}")
-        return self._grey.convert(image, name)
+        grey = self._grey.convert(image, name)
+        if wanted is model:
+            return grey
+        return np.asarray(cv2.resize(grey, (wanted.width, wanted.height), interpolation=cv2.INTER_AREA))
 
 
 def _size_mismatch(image: np.ndarray, model: CameraModel) -> str | None:

@@ -1,9 +1,7 @@
-"""Figures shared by the evaluation and the report; matplotlib through its object interface only."""
+"""Figures of the evaluation; matplotlib through its object interface only."""
 
 from __future__ import annotations
 
-import io
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +10,7 @@ import numpy as np
 
 from sigmaslam.files import atomic_path
 from sigmaslam.geometry.trajectory import Trajectory
-from sigmaslam.plot_style import GREY, SERIES, style_axes
+from sigmaslam.plot_style import SERIES, style_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,35 +34,19 @@ def view_axes(positions: np.ndarray) -> tuple[int, int, int]:
 def plot_trajectory(
     axes: Axes,
     trajectories: Mapping[str, Trajectory],
-    points: np.ndarray | None = None,
     predicted: Mapping[str, np.ndarray] | None = None,
-    max_points: int = 3000,
 ) -> tuple[int, int, int]:
     """Draw trajectories from above, with equal scales and a mark where each begins; dashed where they are guesses.
 
     Args:
         axes: where to draw.
         trajectories: by label; the first determines the plane of the view.
-        points: (M, 3) map points, metres; an even selection of them is drawn, rasterised.
         predicted: by label, (N,) bool, which poses no image confirms; a trajectory that is not named has none.
-        max_points: upper limit of the drawn map points.
     Returns:
         The axes of the view (see `view_axes`).
     """
     horizontal, vertical, height = view_axes(next(iter(trajectories.values())).positions)
     plane = [horizontal, vertical]
-    stacked = np.concatenate([trajectory.positions[:, plane] for trajectory in trajectories.values()])
-    low, high = stacked.min(axis=0), stacked.max(axis=0)
-    if points is not None and len(points):
-        points = points[np.isfinite(points).all(axis=1)][:, plane]
-    if points is not None and len(points):
-        # Far points are the least certain ones, so the margin limits their effect on the scale of the view.
-        margin = max(0.5 * float(np.max(high - low)), 5.0)
-        low = np.minimum(low, np.maximum(np.percentile(points, 2, axis=0), low - margin))
-        high = np.maximum(high, np.minimum(np.percentile(points, 98, axis=0), high + margin))
-        points = points[((points >= low) & (points <= high)).all(axis=1)]
-        shown = points[:: max(1, -(-len(points) // max_points))]
-        axes.plot(*shown.T, color=GREY, marker=".", ms=1.6, mew=0, ls="", rasterized=True, label="map points", zorder=1)
     for number, (label, trajectory) in enumerate(trajectories.items()):
         colour = SERIES[number % len(SERIES)]
         path = trajectory.positions[:, plane]
@@ -82,7 +64,7 @@ def plot_trajectory(
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel(f"{AXIS_NAMES[horizontal]} [m]")
     axes.set_ylabel(f"{AXIS_NAMES[vertical]} [m]")
-    axes.legend(loc="best", fontsize=8, framealpha=0.85, markerscale=1.0 if points is None else 3.0)
+    axes.legend(loc="best", fontsize=8, framealpha=0.85)
     style_axes(axes)
     return horizontal, vertical, height
 
@@ -91,27 +73,3 @@ def save_png(figure: Figure, path: str | Path, dots_per_inch: int = 130) -> None
     """Write the figure as PNG, whole or not at all."""
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", dpi=dots_per_inch)
-
-
-def to_svg(figure: Figure, name: str, dots_per_inch: int = 100) -> str:
-    """The figure as an `<svg>` element to put into a page; the same figure gives the same text.
-
-    Args:
-        figure: what to draw; rasterised artists become a PNG inside.
-        name: unique among the figures of one page, as it makes their identifiers unique.
-        dots_per_inch: of rasterised artists.
-    """
-    import matplotlib
-
-    target = io.StringIO()
-    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
-        figure.savefig(
-            target, format="svg", dpi=dots_per_inch, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type"))
-        )
-    text = target.getvalue()
-    text = text[text.index("<svg") :]
-    # Matplotlib writes six digits; a screen does not resolve a hundredth of a point.
-    text = re.sub(r' (?:d|x|y)="[^"]*"', lambda attribute: re.sub(r"(\.\d\d)\d+", r"\1", attribute[0]), text)
-    # Matplotlib repeats the names of groups in each figure. Only groups with references need one.
-    used = set(re.findall(r'(?:href="#|url\(#)([^")]+)', text))
-    return re.sub(r' id="([^"]*)"', lambda match: match[0] if match[1] in used else "", text)

@@ -25,6 +25,9 @@ COLUMNS = (
     "disparity_offset_sigma",
 )
 """Columns of numbers that frames.csv must have, next to `status` and any number of `ms_...`."""
+KEYFRAME_COLUMNS = ("keyframe", "loop")
+"""Columns that runs of earlier versions lack: 1 where the frame became a keyframe, and the time stamp of the one of
+long ago with which it closed a loop."""
 STATUSES = ("starting", "tracking", "lost", "relocalised", "skipped")
 
 
@@ -34,7 +37,7 @@ class FrameTable:
 
     Attributes:
         status: one of `STATUSES` for each of N frames.
-        columns: by name of `COLUMNS`, (N,) float64; NaN where the field is empty.
+        columns: by name of `COLUMNS` and `KEYFRAME_COLUMNS`, (N,) float64; NaN where the field is empty.
         milliseconds: by stage ("read", "features", ...), (N,) float64; NaN where the field is empty.
     """
 
@@ -98,7 +101,7 @@ def read_frames(path: Path) -> FrameTable:
     stages = [name for name in names if re.fullmatch(r"ms_[a-z0-9_]+", name)]
     return FrameTable(
         status=[row["status"] for row in rows],
-        columns={name: _column(path, rows, name) for name in COLUMNS},
+        columns={name: _column(path, rows, name) for name in (*COLUMNS, *KEYFRAME_COLUMNS)},
         milliseconds={name.removeprefix("ms_"): _column(path, rows, name) for name in stages},
     )
 
@@ -106,7 +109,7 @@ def read_frames(path: Path) -> FrameTable:
 def _column(path: Path, rows: list[dict[str, str]], name: str) -> np.ndarray:
     values = np.full(len(rows), np.nan)
     for index, row in enumerate(rows):
-        field = (row[name] or "").strip()
+        field = (row.get(name) or "").strip()
         if not field:
             if name == "timestamp":
                 raise InputError(f"{path}: line {index + 2}: has no timestamp; every frame needs one")

@@ -17,8 +17,10 @@ from sigmaslam.files import atomic_path, atomic_write_text
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import write_kitti, write_tum
 from sigmaslam.runs.failure import explain_failure
+from sigmaslam.runs.frame_pictures import PICTURES_NAME
 from sigmaslam.runs.frame_table import FRAMES_NAME, STATUSES, FrameTable, read_frames
 from sigmaslam.runs.pose_file import PARTIAL_POSES, PoseRecords, read_pose_records
+from sigmaslam.runs.pose_table import POSES_NAME, write_pose_table
 from sigmaslam.runs.relative_pose_file import (
     PARTIAL_RELATIVE_POSES,
     RELATIVE_POSES_NAME,
@@ -45,12 +47,14 @@ class TrackerResults:
         final: the frames as they are known in the end, with covariances; they are written beside those said at once.
             None where other sensors corrected the poses, whose covariances then have no part of matches alone.
         others: more files, by name, in the order in which they are written before the map.
+        pictures: writes pictures of frames, also of a run that failed.
     """
 
     point_map: Callable[[], PointMap]
     keyframes: Callable[[], dict[str, Any]]
     final: Callable[[], tuple[Trajectory, np.ndarray]] | None
     others: Mapping[str, Callable[[Path], None]]
+    pictures: Callable[[Path], None]
 
 
 def write_results(
@@ -81,7 +85,7 @@ def write_results(
         # A start that no second frame confirms is none.
         records = records.select(np.zeros(0, np.int64))
     calibration = calibration or _last_calibration(frames, records)
-    _write_poses(files, records, run.get("location") is None)
+    _write_poses(files, records, frames, run.get("location") is None)
     of_folder = list(files.failed)
     points = 0
     if len(records) and tracker is not None:
@@ -92,6 +96,8 @@ def write_results(
     elif (folder / MAP_NAME).is_file():
         with np.load(folder / MAP_NAME, allow_pickle=False) as point_map:
             points = len(point_map["points"])
+    if tracker is not None:
+        files.attempt(PICTURES_NAME, tracker.pictures)
     findings = [Finding(**each) for each in run.get("checks", ())]
     verdict = "Nothing is known of the calibration: no frame was tracked."
     if calibration is not None and (len(records) or wrong(findings)):
@@ -166,12 +172,13 @@ def _last_calibration(frames: FrameTable | None, records: PoseRecords) -> Calibr
     return CalibrationEstimate(float(offset[said[-1]]), float(sigma[said[-1]]), refused)
 
 
-def _write_poses(files: _Files, records: PoseRecords, has_matching: bool) -> None:
-    if not len(records):
+def _write_poses(files: _Files, records: PoseRecords, frames: FrameTable | None, has_matching: bool) -> None:
+    if frames is None or not len(records):
         return
     trajectory = Trajectory(records.timestamp, records.pose)
     files.attempt("trajectory.tum", lambda path: write_tum(path, trajectory))
     files.attempt("covariance.npy", lambda path: _save(path, records.covariance))
+    files.attempt(POSES_NAME, lambda path: write_pose_table(path, records, frames))
     files.attempt("trajectory.kitti", lambda path: write_kitti(path, trajectory, path.with_name("times.txt")))
     if has_matching:
         files.attempt("covariance_matching.npy", lambda path: _save(path, records.matching))
@@ -214,7 +221,7 @@ def _write_map(files: _Files, tracker: TrackerResults) -> int:
 
 
 def _write_report(path: Path) -> None:
-    from sigmaslam.runs.report import write_report  # draws: not needed before the run has ended
+    from sigmaslam.runs.report import write_report  # not needed before the run has ended
 
     write_report(path.parent)
 

@@ -6,9 +6,13 @@ import csv
 import hashlib
 import io
 import json
+import os
 import platform
+import shlex
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict
+from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -16,11 +20,11 @@ from typing import Any
 import numpy as np
 
 from sigmaslam.errors import InputError
-from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder
+from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder, printable
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.inference.onnx_graph import shipped_weights
 from sigmaslam.runs.appended_file import AppendedFile
-from sigmaslam.runs.frame_table import COLUMNS, FRAMES_NAME
+from sigmaslam.runs.frame_table import COLUMNS, FRAMES_NAME, KEYFRAME_COLUMNS
 from sigmaslam.runs.pose_file import PARTIAL_POSES, PoseWriter
 from sigmaslam.runs.relative_pose_file import RelativePoseWriter
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
@@ -32,14 +36,19 @@ RUN_NAME = "run.json"
 UNFINISHED = "not yet"
 """What run.json has under `ended` while a run goes on, and after it was killed."""
 STAGES = ("read", "rectify", "features", "match", "filter", "map")
-_COLUMNS = (COLUMNS[0], "status", *COLUMNS[1:], *(f"ms_{stage}" for stage in STAGES))
+_COLUMNS = (COLUMNS[0], "status", *COLUMNS[1:], *KEYFRAME_COLUMNS, *(f"ms_{stage}" for stage in STAGES))
 _GRAPHS = (
     "features.onnx",
     "scorer.onnx",
     "verifier.onnx",
     "place_verifier.onnx",
     "pose_predict.onnx",
-    "stereo_transfer.onnx",
+    "frame_predict.onnx",
+    "frame_robust.onnx",
+    "frame_gated.onnx",
+    "window_eliminate.onnx",
+    "window_gate.onnx",
+    "window_condition.onnx",
 )
 
 
@@ -60,7 +69,7 @@ class RunWriter:
 
     def __init__(self, out: Path, run: dict[str, Any], rectified: dict[str, Any] | None = None) -> None:
         check_new_folder(out)
-        self.run = {**run, "versions": _versions(), "weights_sha256": _weight_hashes()}
+        self.run = {**run, **_describe_start(), "versions": _versions(), "weights_sha256": _weight_hashes()}
         self.calibration: CalibrationEstimate | None = None
         try:
             out.mkdir(parents=True, exist_ok=True)
@@ -108,6 +117,8 @@ class RunWriter:
                 f"{estimate.belief:.6f}",
                 f"{estimate.calibration.disparity_offset:.5f}",
                 f"{estimate.calibration.disparity_offset_sigma:.5f}",
+                int(estimate.tracks is not None),
+                "" if estimate.loop is None else f"{estimate.loop:.9f}",
                 *(f"{milliseconds[stage]:.2f}" for stage in STAGES),
             ]
         )
@@ -166,10 +177,20 @@ def check_has_trajectory(run: Path) -> None:
 
 
 def write_ply(path: Path, point_map: PointMap) -> None:
-    """Points as a binary PLY with x, y, z and sigma, the root of the largest eigenvalue of the covariance, metres."""
+    """Points as a binary PLY with x, y, z, their grey value in the images, and sigma.
+
+    Sigma is the root of the largest eigenvalue of the covariance, metres. The grey value stands for red, green and
+    blue, which viewers know; a map of points whose grey values are not known has none.
+    """
+    columns = {name: ("float", "<f4", point_map.points[:, axis]) for axis, name in enumerate("xyz")}
+    if np.isfinite(point_map.intensity).all():
+        columns |= dict.fromkeys(("red", "green", "blue"), ("uchar", "u1", point_map.intensity))
     sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(point_map.covariances)[:, -1], 0.0))
-    vertices = np.column_stack([point_map.points, sigma]).astype("<f4")
-    names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "sigma"))
+    columns["sigma"] = ("float", "<f4", sigma)
+    vertices = np.zeros(len(sigma), [(name, kind) for name, (_, kind, _) in columns.items()])
+    for name, (_, _, values) in columns.items():
+        vertices[name] = values
+    names = "".join(f"property {kind} {name}\n" for name, (kind, _, _) in columns.items())
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{names}end_header\n"
     with atomic_path(path) as temporary:
         temporary.write_bytes(header.encode("ascii") + vertices.tobytes())
@@ -177,13 +198,37 @@ def write_ply(path: Path, point_map: PointMap) -> None:
 
 def describe_camera(camera: StereoCamera) -> dict[str, Any]:
     """The calibration for run.json."""
+    covariance = camera.covariance
     return {
         "left": asdict(camera.left),
         "right": asdict(camera.right),
         "T_left_right": camera.T_left_right.tolist(),
         "baseline": camera.baseline,
         "sigmas": asdict(camera.sigmas),
+        "covariance": covariance and {"names": list(covariance.names), "matrix": covariance.matrix.tolist()},
     }
+
+
+def _describe_start() -> dict[str, Any]:
+    """The command, when it was given, and to what kind of machine."""
+    program = Path(sys.argv[0]).name.replace("__main__.py", "sigmaslam")
+    return {
+        "command": printable(shlex.join([program, *sys.argv[1:]])),
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "machine": {
+            "system": platform.platform(),
+            "processor": _processor(),
+            "cores": os.cpu_count(),
+        },
+    }
+
+
+def _processor() -> str:
+    """The model where Linux tells it, else the architecture."""
+    cpus = Path("/proc/cpuinfo")
+    lines = cpus.read_text(errors="replace").splitlines() if cpus.is_file() else []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.machine()
 
 
 def _versions() -> dict[str, str]:

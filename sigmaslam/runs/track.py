@@ -18,6 +18,7 @@ from sigmaslam.fusion.readings import Locations
 from sigmaslam.progress import open_progress
 from sigmaslam.readers import StereoFrame, StereoSequence
 from sigmaslam.readers.trajectory_files import write_tum
+from sigmaslam.runs.frame_pictures import PictureRecorder
 from sigmaslam.runs.real_time import Latency, RealTimePlayer, describe_real_time
 from sigmaslam.runs.results import TrackerResults, output_error, write_results
 from sigmaslam.runs.run_folder import RunWriter, describe_camera
@@ -92,6 +93,7 @@ def track_sequence(
     if track_object is not None:
         run["object"] = {"region": track_object, "origin": None}  # which the first frame gives
     writer = RunWriter(out, run, rectified)
+    pictures = PictureRecorder(sequence.length)
     timing = _Timing(sequence, real_time)
     if timing.is_real:
         tracker.warm_up()
@@ -100,7 +102,7 @@ def track_sequence(
         try:
             # Cameras are released before the results are written, even after an error.
             with closing(sequence.frames()) as frames:
-                _track(sequence, timing.play(frames), tracker, writer, location, timing)
+                _track(sequence, timing.play(frames), tracker, writer, pictures, location, timing)
             signals.hold()
         except BaseException as error:
             signals.hold()
@@ -120,7 +122,7 @@ def track_sequence(
             others["trajectory_location.tum"] = lambda path: _write_location(path, location)
         # A sensor's readings correct poses as they come, not after the fact.
         final = tracker.final_trajectory if location is None else None
-        results = TrackerResults(tracker.map, tracker.pack_keyframes, final, others)
+        results = TrackerResults(tracker.map, tracker.pack_keyframes, final, others, pictures.write)
         summary, failed = write_results(out, run, writer.calibration, results)
     if stopped_by is not None:
         raise stopped_by
@@ -235,12 +237,13 @@ def _track(
     frames: Iterator[StereoFrame],
     tracker: Tracker,
     writer: RunWriter,
+    pictures: PictureRecorder,
     location: LocationFilter | None,
     timing: _Timing,
 ) -> None:
     with open_progress() as progress:
         task = progress.add_task("frames", total=sequence.length, note="")
-        reported, done = 0, 0
+        reported, done, lost = 0, 0, 0
         began = since = time.perf_counter()
         for frame in frames:
             read_ms = 1e3 * (time.perf_counter() - since - timing.waited)
@@ -255,15 +258,17 @@ def _track(
             writer.add(
                 estimate.camera, estimate.pose, estimate.pose_covariance, estimate.pose_matching_covariance, read_ms
             )
+            if tracker.last_frame is not None:
+                pictures.add(estimate.camera, tracker.last_frame)
             done += 1
+            lost += estimate.status == "lost"
             since = time.perf_counter()
-            progress.update(
-                task, completed=done + reported + timing.dropped, note=_note(estimate.camera, done / (since - began))
-            )
+            note = _note(estimate.camera, lost, done / (since - began))
+            progress.update(task, completed=done + reported + timing.dropped, note=note)
         for skipped in sequence.skipped[reported:]:
             writer.add_skipped(skipped.timestamp)
         progress.update(task, completed=done + len(sequence.skipped) + timing.dropped)
 
 
-def _note(estimate: Estimate, rate: float) -> str:
-    return f"{rate:.1f}/s, {estimate.inliers} inliers, belief {estimate.belief:.3f}, {estimate.status}"
+def _note(estimate: Estimate, lost: int, rate: float) -> str:
+    return f"{rate:.1f} frames/s, {lost} lost; {estimate.status}, {estimate.inliers} inliers"

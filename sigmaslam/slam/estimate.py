@@ -54,6 +54,7 @@ class Estimate:
             without them.
         tracks: what the frame saw, where it became a keyframe.
         relative_poses: relative to keyframes some way and some time back.
+        loop: time stamp of the keyframe of long ago that the frame, a keyframe, closes a loop with, seconds.
     """
 
     timestamp: float
@@ -71,6 +72,7 @@ class Estimate:
     frame_covariance: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
     tracks: KeyframeTracks | None = None
     relative_poses: RelativePoses = field(default_factory=RelativePoses.empty)
+    loop: float | None = None
 
     @property
     def has_pose(self) -> bool:

@@ -96,6 +96,7 @@ class Keyframes:
         """
         self.active[0].measure_surfaces(self._window.landmarks, 0)
         points = anchor_points(self._window, 0, _times(self.active))
+        points = points.shade(self.active[0].view.left, self.active[0].timestamp)
         new_row = self._window.marginalise_oldest()
         self._remember(self.active.pop(0).leave_window(points), spare)
         return new_row
@@ -111,7 +112,10 @@ class Keyframes:
         for anchor, keyframe in enumerate(self.active):
             keyframe.measure_surfaces(self._window.landmarks, anchor)
         past = points_in_world([keyframe.points for keyframe in self.remembered], self._window.posterior.past)
-        return merge_maps([past, window_points(self._window, _times(self.active))])
+        points = window_points(self._window, _times(self.active))
+        for keyframe in self.active:
+            points = points.shade(keyframe.view.left, keyframe.timestamp)
+        return merge_maps([past, points])
 
     def load(self, path: Path, frontend: str, camera: RectifiedStereo) -> None:
         """Remembers the keyframes of a map, before there are others.

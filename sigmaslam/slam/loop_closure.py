@@ -38,8 +38,13 @@ class LoopCloser:
     keyframes: Keyframes
     matcher: UnguidedMatcher
 
-    def close(self) -> None:
-        """Closes a loop where the newest keyframe sees what one of long ago saw."""
+    def close(self) -> float | None:
+        """Closes a loop where the newest keyframe sees what one of long ago saw.
+
+        Returns:
+            The time stamp of that one, seconds; None where there is no loop.
+        """
+        closed = None
         view = self.keyframes.active[-1].view
         for keyframe in retrieve(view, 1, self._revisited()):
             relative = self.matcher.relative_pose_to(keyframe.view, view)
@@ -50,6 +55,8 @@ class LoopCloser:
             index = self.keyframes.index(keyframe.id)
             if self.window.add_loop_constraint(index, relative.T_key_camera, covariance):
                 _LOGGER.info("loop closed with the keyframe of %.3f s", keyframe.timestamp)
+                closed = keyframe.timestamp
+        return closed
 
     def _revisited(self) -> list[Keyframe]:
         """Keyframes that left the window long ago and should see what its newest one sees."""

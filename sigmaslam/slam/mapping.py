@@ -123,14 +123,16 @@ class Mapper:
         self._loss += _LOSS_ADAPTATION * (self._last_count - fit.count - self._loss)
         self._last_count = fit.count
         # A scale beyond the NIS is that of blur: such a keyframe would spoil what comes after it.
-        blurred = fit.inflation > fit.nis_before_scaling > _SCATTERED
+        inflation = fit.inflation / fit.clustering
+        blurred = inflation > fit.nis_before_scaling > _SCATTERED
         if fit.count >= self.config.keyframe_ratio * self._landmarks_in_keyframe or blurred:
             return None
         view = frame.view
         admitted = view.only(self.admission.admit(view, fit.pose, self.window))
         if not admitted.has_stereo(self.admission.min_points, self.config.min_inliers):
             return None
-        views = matches.views.select(fit.inliers).inflated(fit.inflation)
+        # With what neighbours share counted here, too, the truth is missed by more where the calibration is off.
+        views = matches.views.select(fit.inliers).inflated(inflation)
         return self.insert(NewKeyframe(admitted, timestamp, fit.pose, *expected, views))
 
     def insert(self, new: NewKeyframe) -> KeyframeTracks:

@@ -22,6 +22,7 @@ from sigmaslam.slam.argument_checks import check_region, check_tracker_arguments
 from sigmaslam.slam.body_admission import BodyAdmission
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.estimate import Estimate
+from sigmaslam.slam.matched_frame import MatchedFrame
 from sigmaslam.slam.point_map import PointMap
 from sigmaslam.slam.relative_poses import RelativePoses
 from sigmaslam.slam.tracker import StereoTracker
@@ -179,6 +180,11 @@ class ObjectTracker:
         turned = turn_covariance(T_body_camera, covariances)
         poses = se3_inverse(T_body_camera)
         return Trajectory(camera.timestamps, poses), 0.5 * (turned + turned.transpose(0, 2, 1))
+
+    @property
+    def last_frame(self) -> MatchedFrame | None:
+        """As of `StereoTracker`."""
+        return self._tracker.last_frame
 
     def warm_up(self) -> None:
         """As of `StereoTracker`."""

@@ -32,6 +32,7 @@ class PointMap(Table):
         observations: (M,) views that confirmed it.
         timestamps: (M,) of the keyframe that saw the point first, seconds.
         pixels: (M, 2) its place there, in the rectified left image.
+        intensity: (M,) float32 grey value of that place, 0 to 255; NaN where it is not known.
     """
 
     points: np.ndarray
@@ -39,12 +40,27 @@ class PointMap(Table):
     observations: np.ndarray
     timestamps: np.ndarray
     pixels: np.ndarray
+    intensity: np.ndarray
 
     @classmethod
     def empty(cls) -> PointMap:
         """No points."""
         flat = np.zeros(0)
-        return cls(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0, np.int64), flat, np.zeros((0, 2)))
+        return cls(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0, np.int64), flat, np.zeros((0, 2)), _unknown(0))
+
+    def shade(self, image: np.ndarray, timestamp: float) -> PointMap:
+        """The map with the grey values of the points that the keyframe of that time saw first.
+
+        Args:
+            image: (H, W) its rectified left image.
+            timestamp: seconds.
+        """
+        rows = self.timestamps == timestamp
+        last = np.array(image.shape[::-1]) - 1
+        u, v = np.clip(np.rint(self.pixels[rows]).astype(np.int64), 0, last).T
+        intensity = self.intensity.copy()
+        intensity[rows] = image[v, u]
+        return replace(self, intensity=intensity)
 
     def transform(self, T: np.ndarray) -> PointMap:
         """The map in another world, T (4, 4) takes this one there."""
@@ -133,9 +149,13 @@ def _triangulate(
     covariances += by_landmark @ landmarks.covariance @ by_landmark.transpose(0, 2, 1)
     by_surface = _EITHER_SURFACE * landmarks.disparity_range[:, None, None] * by_disparity[:, :, 2:]
     covariances += by_surface @ by_surface.transpose(0, 2, 1)
-    return PointMap(
-        points, covariances, landmarks.views, keyframe_times[landmarks.anchor], landmarks.measured[:, :2].copy()
-    )
+    times, pixels = keyframe_times[landmarks.anchor], landmarks.measured[:, :2].copy()
+    return PointMap(points, covariances, landmarks.views, times, pixels, _unknown(len(points)))
+
+
+def _unknown(count: int) -> np.ndarray:
+    """Grey values (count,) that are not known."""
+    return np.full(count, np.nan, np.float32)
 
 
 def merge_maps(parts: list[PointMap]) -> PointMap:

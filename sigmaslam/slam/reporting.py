@@ -41,6 +41,7 @@ class Reporter:
         matches: GuidedMatches,
         fit: FrameFit | None,
         tracks: KeyframeTracks | None,
+        loop: float | None,
         milliseconds: dict[str, float],
     ) -> Estimate:
         """What is known after a frame; without a fit by the prediction, without a keyframe nothing."""
@@ -87,6 +88,7 @@ class Reporter:
             tracks=tracks,
             # A keyframe is the window's by now, which has learned from it.
             relative_poses=self.relative_poses.report(timestamp, fit if tracks is None else None),
+            loop=loop,
         )
 
     def _report_nothing(self, timestamp: float, status: str, milliseconds: dict[str, float]) -> Estimate:

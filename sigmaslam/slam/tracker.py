@@ -11,10 +11,10 @@ from threadpoolctl import ThreadpoolController
 
 from sigmaslam.estimation.calibration_errors import CalibrationPrior
 from sigmaslam.estimation.constant_velocity import MotionFilter
+from sigmaslam.estimation.estimator_graphs import EstimatorGraphs
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.frame_update import FrameUpdate
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
-from sigmaslam.estimation.sigma_point_linearisation import ViewLineariser
 from sigmaslam.frontend import Frontend, build_frontend
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
@@ -32,6 +32,7 @@ from sigmaslam.slam.landmark_following import LandmarkFollower
 from sigmaslam.slam.localisation import Localiser, Prediction
 from sigmaslam.slam.loop_closure import LoopCloser
 from sigmaslam.slam.mapping import KeyframeTracks, Mapper
+from sigmaslam.slam.matched_frame import MatchedFrame
 from sigmaslam.slam.measurement_noise import MeasurementNoise
 from sigmaslam.slam.motion_prior import densities
 from sigmaslam.slam.phase import Course, Phase
@@ -61,6 +62,9 @@ class StereoTracker:
         admission: what may become a landmark; by default everything.
         threads: of the network; with more than one the features of a keyframe that is foreseen are made beside the
             tracking of its frame. The results are the same whether it was foreseen or not.
+
+    Attributes:
+        last_frame: what the last frame saw, for pictures; None before the first.
     Raises:
         InputError: an argument is of another type, or there is no such front-end or backend.
     """
@@ -85,9 +89,9 @@ class StereoTracker:
         self._blas = ThreadpoolController()
         self._beside = ThreadPoolExecutor(1, "keyframe") if threads > 1 else None
         self._admission = admission = admission or AdmitAll(config.min_inliers)
-        lineariser = ViewLineariser(rectified, backend, config.linearisation == "unscented")
-        prior = CalibrationPrior.of(rectified, camera.sigmas, config.offset_sigma, config.estimate)
-        self._window = window = KeyframeWindow(rectified, prior, lineariser)
+        graphs = EstimatorGraphs(rectified, backend, config.linearisation == "unscented")
+        prior = CalibrationPrior.of(rectified, camera.sigmas, config.offset_sigma, config.estimate, camera.covariance)
+        self._window = window = KeyframeWindow(rectified, prior, graphs)
         self._noise = noise = MeasurementNoise(config)
         self._motion = motion = MotionFilter(backend)
         self._course = course = Course()
@@ -103,6 +107,7 @@ class StereoTracker:
         self._recovery = Recovery(course, window, keyframes, motion, self._mapper, admission, config)
         relative_poses = RelativePoseReporter(self._T_rectified_left, window, keyframes, motion)
         self._reporter = Reporter(self._T_rectified_left, window, motion, relative_poses)
+        self.last_frame: MatchedFrame | None = None
         self._history = FrameHistory(window, keyframes, self._T_rectified_left)
 
     def load_map(self, path: Path) -> None:
@@ -137,6 +142,10 @@ class StereoTracker:
             # Constant velocity since the last frame.
             self._motion.predict(timestamp - self._course.timestamp, densities(self.config, self._window.depth))
         matches, fit = self._localise(frame, timestamp, clock)
+        landmarks = self._window.landmarks.id[matches.views.landmark]
+        self.last_frame = MatchedFrame(
+            frame.left, frame.right, landmarks, matches, None if fit is None else fit.inliers
+        )
         predicted = filtered = self._motion.state
         if fit is not None:
             status = "tracking"
@@ -152,11 +161,10 @@ class StereoTracker:
             tracks = self._recovery.start_or_recover(frame.view, timestamp)
         self._remember(frame, matches, fit, tracks)
         frame.finish()
-        if tracks is not None:
-            self._loops.close()
+        loop = self._loops.close() if tracks is not None else None
         clock.lap("map")
         self._course.timestamp = timestamp
-        estimate = self._reporter.report(timestamp, status, matches, fit, tracks, clock.milliseconds)
+        estimate = self._reporter.report(timestamp, status, matches, fit, tracks, loop, clock.milliseconds)
         self._history.append(estimate, predicted, filtered)
         return estimate
 
@@ -211,8 +219,8 @@ class StereoTracker:
     def _correct(self, fit: FrameFit, matches: GuidedMatches, frame: Frame, timestamp: float) -> FrameFit:
         """Takes a pose over, less certain where the frame is blurred."""
         # Patches that are blurred are misplaced alike, along the blur and towards where they were expected: many of
-        # them say no more than a few.
-        fit = fit.inflated(max(fit.nis_before_scaling, 1.0) * self._keyframes.blur(frame.left))
+        # them say no more than a few. So do those of a body that moves on its own.
+        fit = fit.inflated(max(fit.nis_before_scaling, 1.0) * self._keyframes.blur(frame.left) * fit.clustering)
         seen = matches.views.select(fit.inliers)
         self._admission.confirm(seen, self._window)
         self._window.count_sightings(matches.searched, seen.landmark)

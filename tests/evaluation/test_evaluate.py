@@ -10,7 +10,8 @@ from sigmaslam.errors import InputError
 from sigmaslam.evaluation.run_evaluation import evaluate_run, format_evaluation
 from sigmaslam.geometry.se3 import se3_adjoint, se3_exp, se3_inverse
 from sigmaslam.geometry.trajectory import Trajectory
-from sigmaslam.readers.trajectory_files import read_kitti, read_trajectory, write_kitti, write_tum
+from sigmaslam.readers.trajectory_files import read_kitti, read_trajectory, read_tum, write_kitti, write_tum
+from sigmaslam.runs.evaluated_frames import read_evaluated_frames
 
 
 def make_run(folder: Path, truth: Trajectory, seed: int = 0) -> None:
@@ -50,9 +51,18 @@ def test_run_folder_gives_every_number(drive):
     assert evaluation.figure_path.read_bytes().startswith(b"\x89PNG")
     assert sorted(path.name for path in run.iterdir()) == [
         "covariance.npy",
+        "evaluation.json",
+        "evaluation.npz",
         "evaluation.png",
         "trajectory.tum",
     ]
+    kept = read_evaluated_frames(run / "evaluation.npz", 186)
+    assert kept.row.tolist() == list(range(186))
+    assert np.nanmean(kept.nees) == pytest.approx(evaluation.nees.mean)
+    # In the world of the estimate the truth is as far from it as in its own.
+    distance = np.linalg.norm(read_tum(run / "trajectory.tum").positions - kept.truth, axis=1)
+    assert np.sqrt(np.mean(distance**2)) == pytest.approx(evaluation.ate.rmse)
+    assert json.loads((run / "evaluation.json").read_text()) == evaluation.to_dict()
 
 
 def test_dictionary_is_json_and_table_shows_the_same(drive):

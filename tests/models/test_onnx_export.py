@@ -24,10 +24,13 @@ from sigmaslam.models.onnx_export import (
 )
 from sigmaslam.models.scorer_network import MatchScorer
 from sigmaslam.models.torch_runtime import TorchFeatures, filter_module, scoring_module
+from sigmaslam.models.tracking_graphs import condition_example, frame_example, window_example
 from sigmaslam.models.verifier_network import PLACE_COLUMNS, VERIFIER_COLUMNS, MatchVerifier
 from sigmaslam.synthetic.rendering.textures import dead_leaves
 
-FILTERS = ("pose_predict", "stereo_transfer")
+FRAME_STEPS = ("frame_predict", "frame_robust", "frame_gated")
+WINDOW_STEPS = ("window_eliminate", "window_gate")
+FILTERS = ("pose_predict", *FRAME_STEPS, *WINDOW_STEPS, "window_condition")
 
 
 def untrained_networks() -> dict[str, torch.nn.Module]:
@@ -107,21 +110,27 @@ def test_shipped_filter_equals_torch(name):
 
 
 def assert_filter_graphs_equal_torch(folder: Path, names: tuple[str, ...] = FILTERS) -> None:
-    """On states and numbers of pairs and measurements that the export neither traced nor checked."""
-    examples = {
-        "pose_predict": [onnx_export._predict_example(seed) for seed in (5, 6)],
-        "stereo_transfer": [
-            onnx_export._transfer_example(seed, pairs, count)
-            for seed, pairs, count in ((5, 1, 1), (6, 1, 211), (7, 36, 2))
-        ],
-    }
-    inputs = {name: graph.inputs for name, graph in onnx_export._filter_graphs().items()}
+    """On states and numbers of keyframes, landmarks and views that the export neither traced nor checked."""
+    graphs = onnx_export._filter_graphs()
     for name in names:
-        for example in examples[name]:
-            feed = {key: value.numpy() for key, value in zip(inputs[name], example, strict=True)}
+        inputs = graphs[name].inputs
+        if name in FRAME_STEPS:
+            # Two views of one keyframe's landmarks, and a full window.
+            examples = [
+                frame_example(seed, *sizes, *inputs) for seed, sizes in ((5, (1, 2)), (6, (6, 211)), (7, (7, 40)))
+            ]
+        elif name in WINDOW_STEPS:
+            examples = [window_example(seed, *sizes, *inputs) for seed, sizes in ((5, (2, 3)), (6, (7, 120)))]
+        elif name == "window_condition":
+            examples = [condition_example(5, 12, 1), condition_example(6, 54, 43)]
+        else:
+            examples = [onnx_export._predict_example(seed) for seed in (5, 6)]
+        for example in examples:
+            feed = {key: value.numpy() for key, value in zip(inputs, example, strict=True)}
             found, expected = OnnxGraph(folder / f"{name}.onnx")(feed), filter_module(name)(feed)
             for a, b in zip(found, expected, strict=True):
-                np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9, err_msg=name)
+                size = max(1.0, float(np.abs(b).max()))
+                np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * size, err_msg=name)
 
 
 @pytest.mark.parametrize("name", ["scorer", "verifier", "place_verifier"])

@@ -9,11 +9,11 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from sigmaslam.estimation.calibration_errors import ERRORS, CalibrationPrior, measured_errors
+from sigmaslam.estimation.estimator_graphs import EstimatorGraphs
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.frame_update import FrameUpdate
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
-from sigmaslam.estimation.sigma_point_linearisation import ViewLineariser
 from sigmaslam.estimation.state_layout import CALIBRATION_SIZE
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
@@ -131,10 +131,10 @@ def make_window(
         camera: the rectified pair.
         considered_sigma: (9,) of those that are considered; none by default.
     """
-    lineariser = ViewLineariser(camera, "onnx", linearisation == "unscented")
+    graphs = EstimatorGraphs(camera, "onnx", linearisation == "unscented")
     others = np.zeros(len(ERRORS) - len(ESTIMATED)) if considered_sigma is None else considered_sigma
     prior = CalibrationPrior.independent(np.r_[calibration_sigma, others], *ESTIMATED)
-    return KeyframeWindow(camera, prior, lineariser, student_freedom=GAUSSIAN)
+    return KeyframeWindow(camera, prior, graphs, student_freedom=GAUSSIAN)
 
 
 def add_keyframe(window: KeyframeWindow, given: World, k: int, views: LandmarkViews, hosted: bool = True) -> None:

@@ -73,7 +73,7 @@ def test_track_writes_every_output_and_evaluate_reads_them(whole_sequence: Path,
     assert run["ended"] == "complete"
     assert run["calibration"]["sigmas"]["focal"] == 0.003
     assert len(run["weights_sha256"]["features.onnx"]) == 64
-    assert "<svg" in (out / "report.html").read_text()
+    assert 'id="scene"' in (out / "report.html").read_text()
 
     result = run_here("evaluate", out, "--truth", whole_sequence / "poses.txt", "--json")
     assert result.returncode == 0, result.stderr
@@ -246,9 +246,8 @@ def test_track_and_evaluate_need_no_matplotlib(
     assert "sigmaslam[report]" in result.stderr
     assert not (out / "evaluation.png").exists()
     page = (out / "report.html").read_text()
-    assert "sigmaslam[report]" in page
-    assert "<svg" not in page
-    assert "<svg" in (tracked[0] / "report.html").read_text()
+    assert 'id="scene"' in page
+
     for name in ("trajectory.tum", "trajectory_final.tum"):
         assert (out / name).read_bytes() == (tracked[0] / name).read_bytes()
 
@@ -277,6 +276,9 @@ def test_training_without_its_extra_says_how_to_install_it(tmp_path: Path):
         "evaluate",
         "match",
         "geometry",
+        "calibrate",
+        "rectify",
+        "localize",
         "refine",
         "calibration",
         "calibration show",

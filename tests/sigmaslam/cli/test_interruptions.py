@@ -165,7 +165,7 @@ def test_finish_of_a_run_that_did_not_track_ends_like_it(demo_sequence: Path, tm
     end(process)
     finished = run_here("finish", tmp_path / "killed")
     assert finished.returncode == 3
-    assert "never started" in finished.stderr
+    assert "left and right are exchanged" in finished.stderr
 
 
 def test_finish_of_a_run_without_a_frame_says_so(killed: Path):

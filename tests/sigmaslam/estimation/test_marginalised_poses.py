@@ -198,9 +198,8 @@ def chained(count: int) -> PastPoses:
 def some_points(count: int, views: int) -> PointMap:
     rng = np.random.default_rng(count)
     points = rng.uniform(1, 3, (count, 3))
-    return PointMap(
-        points, np.tile(1e-6 * np.eye(3), (count, 1, 1)), np.full(count, views), np.zeros(count), points[:, :2]
-    )
+    covariances, times = np.tile(1e-6 * np.eye(3), (count, 1, 1)), np.zeros(count)
+    return PointMap(points, covariances, np.full(count, views), times, points[:, :2], np.zeros(count, np.float32))
 
 
 def test_points_move_with_their_keyframe():

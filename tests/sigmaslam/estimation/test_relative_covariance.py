@@ -13,6 +13,7 @@ from sigmaslam.estimation.landmark_table import LandmarkViews
 from sigmaslam.estimation.relative_covariance import frame_relative_to, last_relative_to
 from sigmaslam.estimation.state_layout import CALIBRATION_SIZE
 from sigmaslam.geometry.se3 import se3_inverse, se3_log
+from sigmaslam.inference.onnx_graph import load_step
 from tests.support.dense_window import (
     ITERATIONS,
     KEYFRAMES,
@@ -103,7 +104,7 @@ def test_a_frame_s_relative_pose_is_that_of_the_window_s_own_update():
     step = np.diag((given.scale * STEP_SIGMA) ** 2)
     grown = state.grow(state.poses[-1] @ STEP, step, NO_WALK)
     vector = found.joint.score + found.joint.information @ found.joint.step
-    moved = grown.given(found.joint.information, vector)
+    moved = grown.given(found.joint.information, vector, load_step("window_condition", "onnx"))
     poses, covariances = frame_relative_to(state, found.joint, np.arange(KEYFRAMES))
     others, expected_covariances = last_relative_to(moved, np.arange(KEYFRAMES))
     for one, other in zip(covariances, expected_covariances, strict=True):

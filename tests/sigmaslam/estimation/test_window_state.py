@@ -14,9 +14,11 @@ from sigmaslam.estimation.relative_covariance import relative_to_first
 from sigmaslam.estimation.state_layout import CALIBRATION, CALIBRATION_SIZE, pose_slice
 from sigmaslam.estimation.window_state import WindowState
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log, turn_covariance
+from sigmaslam.inference.onnx_graph import load_step
 
 POSES, PAST = 3, 2
 NO_WALK = np.zeros(CALIBRATION_SIZE)
+CONDITION = load_step("window_condition", "onnx")
 LOOP_SIGMA = 1e-5 * np.array([1.0, 2.0, 3.0, 0.5, 0.4, 0.3])
 
 
@@ -106,7 +108,7 @@ def test_what_is_learned_of_the_window_is_the_update_of_all_poses_together(seed:
     H[:, own] = rng.normal(size=(3, len(own)))
     R, difference = 1e-8 * np.diag([1.0, 2.0, 3.0]), 1e-4 * rng.normal(size=3)
     weighted = H[:, own].T @ np.linalg.inv(R)
-    after = state.given(weighted @ H[:, own], weighted @ difference)
+    after = state.given(weighted @ H[:, own], weighted @ difference, CONDITION)
     P, C = joint_of(state), common_of(state)
     gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
     scale = np.sqrt(np.diag(P))
@@ -127,8 +129,8 @@ def test_learning_of_the_window_and_marginalising_commute(seed: int):
     rows[:, pose_slice(0)] = 0.0
     information, vector = rows.T @ rows, rows.T @ rng.normal(size=4)
     stays = np.r_[CALIBRATION, pose_slice(1).start : len(vector)]
-    first = state.given(information, vector).marginalise_oldest()
-    then = state.marginalise_oldest().given(information[np.ix_(stays, stays)], vector[stays])
+    first = state.given(information, vector, CONDITION).marginalise_oldest()
+    then = state.marginalise_oldest().given(information[np.ix_(stays, stays)], vector[stays], CONDITION)
     assert_same(first, then)
 
 

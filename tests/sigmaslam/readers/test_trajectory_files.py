@@ -11,6 +11,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path
 from sigmaslam.geometry.se3 import rotation_exp, se3_exp
 from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.readers.pairing import in_seconds
 from sigmaslam.readers.trajectory_files import (
     read_covariances,
     read_euroc_truth,
@@ -194,14 +195,15 @@ def test_missing_folder_is_named(tmp_path):
 @pytest.mark.parametrize(("factor", "unit"), [(1e9, "nanoseconds"), (1e6, "microseconds"), (1e3, "milliseconds")])
 @pytest.mark.parametrize("origin", [0.0, 1.7e9])
 def test_times_in_another_unit_are_named(tmp_path, factor, unit, origin):
-    """Milliseconds from zero on could be seconds of a slow camera."""
-    path = tmp_path / "truth.tum"
-    path.write_text("".join(f"{factor * (origin + 0.1 * k):.0f} {k} 0 0 0 0 0 1\n" for k in range(9)))
+    """Milliseconds from zero on could be seconds of a slow camera. A truth's unit is found by `evaluate`."""
+    path, times = tmp_path / "truth.tum", [round(factor * (origin + 0.1 * k)) for k in range(9)]
+    path.write_text("".join(f"{time} {k} 0 0 0 0 0 1\n" for k, time in enumerate(times)))
+    assert len(read_trajectory(path)) == 9
     if unit == "milliseconds" and not origin:
-        assert len(read_trajectory(path)) == 9
+        assert in_seconds(path, times) == times
         return
     with pytest.raises(InputError, match=rf"truth\.tum: times such as .* look like {unit}: write seconds"):
-        read_trajectory(path)
+        in_seconds(path, times)
 
 
 @pytest.mark.parametrize("times", [[0.0, 0.1, 0.2], [1.7e9, 1.7e9 + 1, 1.7e9 + 500], [5.0], [0.0, 900.0, 1800.0]])

@@ -1,5 +1,6 @@
 """Frames before the start have no pose, anywhere in the folder of a run, and every reader of it copes."""
 
+import csv
 import json
 import shutil
 from pathlib import Path
@@ -9,6 +10,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from sigmaslam.bundle_adjustment.track_file import read_tracks
+from sigmaslam.checks.finding import Finding
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.run_evaluation import evaluate_run, format_evaluation
 from sigmaslam.evaluation.trial import read_trial
@@ -55,6 +57,31 @@ def test_files_of_a_run_are_aligned_from_the_first_pose_on(late: tuple[Path, Pat
     for earlier, later, pose in zip(pairs.earlier, pairs.later, pairs.pose, strict=True):
         between = np.linalg.inv(trajectory.poses[earlier]) @ trajectory.poses[later]
         np.testing.assert_allclose(pose[:3, 3], between[:3, 3], atol=0.01)
+
+
+def test_the_table_of_poses_says_what_the_other_files_say(late: tuple[Path, Path]):
+    run = late[1]
+    with (run / "poses.csv").open(newline="") as file:
+        head, *rows = csv.reader(file)
+    columns = {name: [row[k] for row in rows] for k, name in enumerate(head)}
+    trajectory = read_tum(run / "trajectory.tum")
+    np.testing.assert_allclose(np.array(columns["timestamp"], float), trajectory.timestamps, atol=1e-6)
+    assert columns["status"] == read_frames(run / "frames.csv").status[DARK:]
+    positions = np.column_stack([np.array(columns[axis], float) for axis in "xyz"])
+    np.testing.assert_allclose(positions, trajectory.positions, atol=1e-8)
+    covariance, names = np.load(run / "covariance.npy"), ("x", "y", "z", "rx", "ry", "rz")
+    for i, j in zip(*np.triu_indices(6), strict=True):
+        written = np.array(columns[f"cov_{names[i]}_{names[j]}"], float)
+        np.testing.assert_allclose(written, covariance[:, i, j], rtol=1e-7)
+
+
+def test_map_points_have_the_grey_values_of_their_images(late: tuple[Path, Path]):
+    with np.load(late[1] / "map.npz") as content:
+        pixels, intensity, timestamps = (content[name] for name in ("pixels", "intensity", "timestamps"))
+        images = dict(zip(content["keyframe_timestamps"].tolist(), content["keyframe_images"], strict=True))
+    assert len(pixels)
+    for (u, v), grey, timestamp in zip(np.rint(pixels).astype(int), intensity, timestamps.tolist(), strict=True):
+        assert images[timestamp][v, u] == grey
 
 
 def test_frames_before_the_start_have_a_row_without_belief(late: tuple[Path, Path]):
@@ -110,8 +137,8 @@ def test_a_run_that_tracked_nothing_has_no_pose_and_says_why(demo_sequence: Path
     assert summary["tracking"] == summary["poses"] == summary["map_points"] == 0
     assert summary["first_frame_with_pose"] is summary["world"] is None
     assert ("single frame" if fault == "one frame" else "never started") in summary["failure"]
-    assert sorted(path.name for path in run.iterdir()) == ["frames.csv", "report.html", "run.json"]
-    assert "Not tracked" in (run / "report.html").read_text()
+    assert sorted(path.name for path in run.iterdir()) == ["frames.csv", "pictures.npz", "report.html", "run.json"]
+    assert '<body class="bad">' in (run / "report.html").read_text()
     with pytest.raises(InputError, match=r"run: holds no trajectory\.tum: none of its frames has a pose"):
         evaluate_run(run, source / "poses.txt")
 
@@ -146,9 +173,23 @@ def summary_of(**counts: int) -> dict[str, int]:
     ],
 )
 def test_a_failure_is_explained_by_the_statuses(counts: dict, in_map: bool, started: bool, words: str | None):
-    explanation = explain_failure(summary_of(**counts), in_map, started)
+    explanation = explain_failure(summary_of(**counts), in_map, started, ())
     assert (explanation is None) == (words is None)
     assert words is None or words in (explanation or "")
+
+
+def test_what_a_check_found_explains_a_failure():
+    findings = [
+        Finding("eyes", "error", "left and right are exchanged: swap them"),
+        Finding("rows", "ok", "rows agree"),
+    ]
+    nothing = explain_failure(summary_of(starting=8), False, False, findings)
+    assert nothing == "Nothing was tracked: left and right are exchanged: swap them"
+    little = explain_failure(summary_of(tracking=2, lost=6), False, True, findings)
+    assert little is not None
+    assert "6 are lost" in little
+    assert little.endswith("left and right are exchanged: swap them")
+    assert explain_failure(summary_of(tracking=8), False, True, findings) is None
 
 
 def test_poses_are_guesses_where_the_camera_is_lost_or_has_not_moved_yet(tmp_path: Path):

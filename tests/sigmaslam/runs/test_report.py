@@ -1,57 +1,21 @@
+import base64
 import json
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from sigmaslam.errors import InputError
-from sigmaslam.geometry.se3 import rotation_exp
-from sigmaslam.geometry.trajectory import Trajectory
-from sigmaslam.readers.trajectory_files import write_tum
-from sigmaslam.runs.frame_table import read_frames
+from sigmaslam.readers.trajectory_files import read_tum
+from sigmaslam.runs.evaluated_frames import EvaluatedFrames, write_evaluation
+from sigmaslam.runs.frame_table import STATUSES, read_frames
+from sigmaslam.runs.recorded_run import read_run
 from sigmaslam.runs.report import write_report
+from tests.support.recorded_runs import HEADER, STAGES, make_run
 
-STAGES = ("read", "features", "match", "filter", "map")
-HEADER = (
-    "timestamp,status,matches,inliers,nis,dof,belief,disparity_offset,disparity_offset_sigma,"
-    "ms_read,ms_features,ms_match,ms_filter,ms_map"
-)
-
-
-def make_run(folder: Path, count: int = 200, points: int = 20000) -> None:
-    """A run folder as `track` writes it, with lost, relocalised and skipped frames."""
-    generator = np.random.default_rng(0)
-    timestamps = 1403715273.26 + 0.1 * np.arange(count)
-    angle = np.linspace(0, 5, count)
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3, :3] = rotation_exp(angle[:, None] * np.array([0.0, 1.0, 0.0]))
-    poses[:, :3, 3] = 40 * np.column_stack([np.sin(angle), 0.02 * angle, 1 - np.cos(angle)])
-    status = np.array(["tracking"] * count, dtype="<U12")
-    status[0], status[count // 2 : count // 2 + 5], status[count // 2 + 5] = "starting", "lost", "relocalised"
-    status[count // 4] = "skipped"
-    rows = [HEADER]
-    for k in range(count):
-        if status[k] == "skipped":
-            rows.append(f"{timestamps[k]:.9f},skipped" + "," * (HEADER.count(",") - 1))
-            continue
-        dof = int(generator.integers(200, 400))
-        numbers = [dof, dof // 2, generator.chisquare(dof), dof, 1 - 0.1 * generator.random()]
-        numbers += [-0.3 * (1 - np.exp(-k / 30)), 0.2 / (1 + k / 10), *generator.gamma(9, (0.3, 3, 1.2, 0.6, 0.5))]
-        rows.append(f"{timestamps[k]:.9f},{status[k]}," + ",".join(f"{number:.5g}" for number in numbers))
-    folder.mkdir(exist_ok=True)
-    (folder / "frames.csv").write_text("\n".join(rows) + "\n")
-    kept = status != "skipped"
-    write_tum(folder / "trajectory.tum", Trajectory(timestamps[kept], poses[kept]))
-    cloud = poses[generator.integers(0, count, points), :3, 3] + generator.normal(0, 8, (points, 3))
-    np.savez(
-        folder / "map.npz",
-        points=cloud,
-        covariances=np.tile(np.eye(3), (points, 1, 1)),
-        observations=np.ones(points, dtype=np.int64),
-    )
-    summary = {"calibration_verdict": "disparity is 0.30 px <too small>; depth reads 1 % long"}
-    (folder / "run.json").write_text(json.dumps({"versions": {"sigmaslam": "0.1.0"}, "summary": summary}))
+MOST_BYTES = 8_000_000
 
 
 class _Page(HTMLParser):
@@ -63,10 +27,11 @@ class _Page(HTMLParser):
         self.text: list[str] = []
         self.links: list[str] = []
         self.identifiers: list[str] = []
+        self.data: dict[str, Any] = {}
         self.feed(content)
 
     def handle_starttag(self, tag, attrs):
-        if tag not in ("meta", "br"):
+        if tag not in ("meta", "br", "link", "input"):
             self.open.append(tag)
         self._attributes(attrs)
 
@@ -81,34 +46,182 @@ class _Page(HTMLParser):
         assert self.open.pop() == tag
 
     def handle_data(self, data):
+        if self.open and self.open[-1] in ("script", "style"):
+            if data.startswith('{"seconds"'):
+                self.data = json.loads(data)
+            return
         self.text.append(data)
 
 
-@pytest.mark.parametrize("count", [12, 200, 1100, 5000])
-def test_report_is_one_small_file(tmp_path, count):
-    make_run(tmp_path / "run", count)
+def _page(run: Path) -> _Page:
+    return _Page(write_report(run).read_text(encoding="utf-8"))
+
+
+def _text(run: Path) -> str:
+    return " ".join(" ".join(_page(run).text).split())
+
+
+def _unpack(packed: dict[str, str], *shape: int) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(packed["base64"]), packed["dtype"]).reshape(-1, *shape)
+
+
+def _values(page: _Page, title: str, label: str) -> np.ndarray:
+    """The numbers of a series in a plot."""
+    plot = next(plot for plot in page.data["plots"] if plot["title"].startswith(title))
+    return _unpack(next(each for each in plot["series"] if each["label"] == label)["values"])
+
+
+@pytest.mark.parametrize("count", [12, 1100, 30_000])
+def test_report_is_one_file_that_needs_no_other(tmp_path, count):
+    make_run(tmp_path / "run", count, pictures=count < 2000)
     weights = {f"network_{k}": {"file": "features.onnx", "sha256": "0" * 64} for k in range(500)}
     (tmp_path / "run/run.json").write_text(json.dumps({"weights": weights}))
     path = write_report(tmp_path / "run")
-    content = path.read_text(encoding="utf-8")
-    assert len(content.encode()) <= 300_000
-    page = _Page(content)
+    assert path.stat().st_size <= MOST_BYTES
+    page = _Page(path.read_text(encoding="utf-8"))
     assert page.open == []
-    assert all(link.startswith(("#", "data:image/png")) for link in page.links)
+    assert all(link.startswith("data:") or (tmp_path / "run" / link).is_file() for link in page.links)
     assert len(page.identifiers) == len(set(page.identifiers))
-    assert content.count("<svg") == 6
+    titles = [plot["title"] for plot in page.data["plots"]]
+    assert titles == [
+        "Position: 3 sigma [m]",
+        "Rotation: 3 sigma [deg]",
+        "NIS",
+        "Matches and inliers",
+        "Disparity offset [px]",
+        "Time spent [ms]",
+        "Belief",
+    ]
 
 
 def test_report_says_what_the_run_was(tmp_path):
     make_run(tmp_path / "run")
-    content = write_report(tmp_path / "run").read_text(encoding="utf-8")
-    text = " ".join(" ".join(_Page(content).text).split())
+    text = _text(tmp_path / "run")
     assert "frames 200" in text
     assert "poses 199" in text
     assert "map points 20000" in text
+    assert "keyframes 19 loops 1" in text
     assert "1 starting, 192 tracking, 5 lost, 1 relocalised, 1 skipped." in text
     assert "disparity is 0.30 px <too small>; depth reads 1 % long" in text
-    assert "<too small>" not in content
+    assert "<too small>" not in write_report(tmp_path / "run").read_text(encoding="utf-8")
+    assert "sigmaslam track x" in text
+    assert "Run run with losses" in text
+    total = read_frames(tmp_path / "run/frames.csv").total_milliseconds
+    assert f"speed {1000 / np.nanmedian(total):.1f} frames/s" in text
+    p50, p95, p99 = np.nanpercentile(total, (50, 95, 99))
+    assert f"p99 {p50:.0f}, {p95:.0f}, {p99:.0f} ms" in text
+
+
+def test_a_failed_run_looks_failed(tmp_path):
+    make_run(tmp_path / "run")
+    path = tmp_path / "run/run.json"
+    path.write_text(json.dumps({"summary": {"failure": "Nothing was tracked: swap the eyes."}, "ended": "complete"}))
+    content = write_report(tmp_path / "run").read_text(encoding="utf-8")
+    assert "<title>FAILED: run" in content
+    assert '<body class="bad">' in content
+    assert '<p class="notice bad">Nothing was tracked: swap the eyes.</p>' in content
+    assert "Run run failed" in _text(tmp_path / "run")
+
+
+def test_a_run_that_was_stopped_says_so(tmp_path):
+    make_run(tmp_path / "run")
+    (tmp_path / "run/run.json").write_text(json.dumps({"ended": "interrupted by SIGTERM"}))
+    assert "did not come to its end: interrupted by SIGTERM." in _text(tmp_path / "run")
+
+
+def test_ellipsoids_are_the_covariances_of_positions_in_the_world(tmp_path):
+    make_run(tmp_path / "run")
+    scene = _page(tmp_path / "run").data["scene"]
+    transforms = _unpack(scene["ellipsoids"], 4, 4).astype(float)
+    run = read_run(tmp_path / "run")
+    rows = [np.linalg.norm(run.trajectory.positions - T[:3, 3], axis=1).argmin() for T in transforms]
+    assert len(set(rows)) == len(transforms) == 40
+    R = run.trajectory.rotations[rows]
+    expected = R @ run.covariances[rows, :3, :3] @ R.transpose(0, 2, 1)
+    found = transforms[:, :3, :3] @ transforms[:, :3, :3].transpose(0, 2, 1)
+    np.testing.assert_allclose(found, expected, atol=1e-6 * expected.max())
+
+
+def test_the_view_shows_path_keyframes_loop_and_points(tmp_path):
+    make_run(tmp_path / "run", points=500)
+    scene = _page(tmp_path / "run").data["scene"]
+    trajectory = read_tum(tmp_path / "run/trajectory.tum")
+    np.testing.assert_allclose(_unpack(scene["path"], 3), trajectory.positions, atol=1e-4)
+    assert [STATUSES[k] for k in _unpack(scene["path_status"])].count("lost") == 5
+    # Every tenth frame is a keyframe; the skipped one, 50, has no pose.
+    np.testing.assert_allclose(_unpack(scene["keyframes"], 4, 4)[1], trajectory.poses[10], atol=1e-4)
+    assert len(_unpack(scene["keyframes"], 4, 4)) == 19
+    np.testing.assert_allclose(_unpack(scene["loops"], 2, 3), [trajectory.positions[[-1, 1]]], atol=1e-4)
+    with np.load(tmp_path / "run/map.npz") as content:
+        np.testing.assert_allclose(_unpack(scene["points"], 3), content["points"], atol=1e-4)
+        np.testing.assert_array_equal(_unpack(scene["point_grey"]), content["intensity"])
+    np.testing.assert_allclose(_unpack(scene["point_sigma"]), 1.0)
+
+
+def test_a_loss_of_one_frame_is_seen_in_a_long_run(tmp_path):
+    make_run(tmp_path / "run", 45_000)
+    path = tmp_path / "run/frames.csv"
+    lines = path.read_text().splitlines()
+    lines[7001] = lines[7001].replace("tracking", "lost")
+    path.write_text("\n".join(lines) + "\n")
+    scene = _page(tmp_path / "run").data["scene"]
+    assert [STATUSES[k] for k in _unpack(scene["path_status"])].count("lost") == 6
+
+
+def test_sigmas_are_those_of_the_covariance(tmp_path):
+    make_run(tmp_path / "run")
+    page = _page(tmp_path / "run")
+    variances = np.diagonal(np.load(tmp_path / "run/covariance.npy"), axis1=1, axis2=2)
+    for title, part, unit in (("Position", slice(0, 3), 1.0), ("Rotation", slice(3, 6), 180 / np.pi)):
+        drawn = _values(page, title, "3 sigma")
+        assert np.flatnonzero(np.isnan(drawn)).tolist() == [50]
+        np.testing.assert_allclose(np.delete(drawn, 50), 3 * unit * np.sqrt(variances[:, part].sum(axis=1)), rtol=1e-5)
+
+
+def test_an_evaluation_is_in_the_report(tmp_path):
+    make_run(tmp_path / "run")
+    run, count = tmp_path / "run", 100
+    row, line = np.arange(60, 60 + count), np.linspace(0, 1, count)
+    frames = EvaluatedFrames(row, line, 0.1 * line, 2 * line + 0.1, np.column_stack([line, line, line]))
+    ate = {"rmse": 0.1234, "rotation_rmse_deg": 0.5}
+    errors = {"ate": ate, "ate_origin": ate, "rpe": {"translation_rmse": 0.01}, "nees": {"mean": 2.5, "inside": 0.4}}
+    write_evaluation(run, {**errors, "final": None, "truth_hint": None}, frames)
+    page = _page(run)
+    text = " ".join(" ".join(page.text).split())
+    assert "as it was said 0.1234 0.1234 0.5 0.01 2.50 40 %" in text
+    assert "NEES per dof 2.50" in text
+    # A frame is skipped before the first of them.
+    np.testing.assert_allclose(_values(page, "Position", "error")[61 : 61 + count], line, atol=1e-6)
+    np.testing.assert_allclose(_values(page, "Rotation", "error")[61 : 61 + count], np.degrees(0.1 * line), rtol=1e-5)
+    np.testing.assert_allclose(_values(page, "NEES", "NEES / dof")[61 : 61 + count], 2 * line + 0.1, rtol=1e-5)
+    np.testing.assert_allclose(_unpack(page.data["scene"]["truth"], 3)[:, 0], line, atol=1e-6)
+
+
+def test_a_refinement_is_in_the_report(tmp_path):
+    make_run(tmp_path / "run")
+    found = {"keyframes": 7, "landmarks": 80, "observations": 900, "converged": True, "disparity_offset": 0.1}
+    found |= {"disparity_offset_sigma": 0.02, "cost_per_dof_before": 3.0, "cost_per_dof_after": 1.25}
+    (tmp_path / "run/refine.json").write_text(json.dumps(found))
+    (tmp_path / "run/trajectory_refined.tum").write_text((tmp_path / "run/trajectory.tum").read_text())
+    page = _page(tmp_path / "run")
+    text = " ".join(" ".join(page.text).split())
+    assert "landmarks 80" in text
+    assert "cost per dof 3 → 1.25" in text
+    np.testing.assert_array_equal(_unpack(page.data["scene"]["refined"], 3), _unpack(page.data["scene"]["path"], 3))
+
+
+def test_runs_of_earlier_versions_have_a_report(tmp_path):
+    make_run(tmp_path / "run", points=50)
+    path = tmp_path / "run/frames.csv"
+    rows = [line.split(",") for line in path.read_text().splitlines()]
+    keep = [k for k, name in enumerate(rows[0]) if name not in ("keyframe", "loop")]
+    path.write_text("\n".join(",".join(row[k] for k in keep) for row in rows) + "\n")
+    np.savez(tmp_path / "run/map.npz", points=np.ones((4, 3)))
+    (tmp_path / "run/covariance.npy").unlink()
+    page = _page(tmp_path / "run")
+    assert page.data["scene"]["point_grey"] is None
+    assert page.data["scene"]["ellipsoids"]["base64"] == ""
+    assert "keyframes" not in _text(tmp_path / "run").partition("Frames by status")[0]
 
 
 def test_same_run_gives_the_same_report(tmp_path):
@@ -138,18 +251,23 @@ def test_run_without_map_and_configuration_has_a_report(tmp_path):
     make_run(tmp_path / "run")
     (tmp_path / "run/map.npz").unlink()
     (tmp_path / "run/run.json").unlink()
-    content = write_report(tmp_path / "run").read_text(encoding="utf-8")
-    assert "map points" not in content
-    assert "Configuration" not in content
+    page = _page(tmp_path / "run")
+    assert page.data["scene"]["points"]["base64"] == ""
+    assert "map.npz" not in page.links
+    assert "run.json" not in _text(tmp_path / "run")
 
 
 def test_run_with_only_skipped_frames_has_a_report(tmp_path):
     make_run(tmp_path / "run")
     empty = "," * (HEADER.count(",") - 1)
     (tmp_path / "run/frames.csv").write_text(f"{HEADER}\n0.0,skipped{empty}\n0.1,skipped{empty}\n")
-    content = write_report(tmp_path / "run").read_text(encoding="utf-8")
-    assert content.count("<svg") == 1
-    assert "2 skipped." in content
+    for name in ("trajectory.tum", "covariance.npy", "map.npz"):
+        (tmp_path / "run" / name).unlink()
+    page = _page(tmp_path / "run")
+    assert page.data["plots"] == []
+    assert page.data["scene"] is None
+    assert "2 skipped." in _text(tmp_path / "run")
+    assert "Run run failed" in _text(tmp_path / "run")
 
 
 def test_empty_map_has_a_report(tmp_path):
@@ -181,7 +299,7 @@ def test_bad_frames_are_named_with_line_and_value(tmp_path, old, new, message):
 
 
 def test_missing_and_broken_files_are_named(tmp_path):
-    with pytest.raises(InputError, match=r"frames\.csv: cannot be read"):
+    with pytest.raises(InputError, match=r"frames\.csv: cannot read the frames: no such file"):
         write_report(tmp_path)
     make_run(tmp_path / "run")
     (tmp_path / "run/map.npz").write_text("none")

@@ -1,0 +1,29 @@
+"""What errors of a stereo calibration do to the measurements of a rectified pair."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def unmodelled_errors(intrinsics: Tensor, uvd: Tensor) -> Tensor:
+    """By how much each error that `StereoTransfer` does not have, of size one, changes what is measured of points.
+
+    Args:
+        intrinsics: (5,) fx, fy, cx, cy, fx baseline.
+        uvd: (..., 3) (u, v, disparity).
+    Returns:
+        (..., 3, 9) to first order, in the order of `sigmaslam.estimation.calibration_errors.ERRORS`.
+    """
+    fx, fy, cx, cy = intrinsics[:4].unbind(0)
+    u, v, disparity = uvd.unbind(-1)
+    across, down = u - cx, v - cy
+    x, y = across / fx, down / fy
+    x_right, y_squared = x - disparity / fx, y * y
+    squared = x * x + y_squared
+    zero, one = torch.zeros_like(x), torch.ones_like(x)
+    lens, right_lens = x * squared, x_right * (x_right * x_right + y_squared)
+    in_u = [zero] * 4 + [across, one, zero, lens, zero]
+    in_v = [zero] * 4 + [down, zero, one, down * squared / fx, zero]
+    in_disparity = [y, x_right, y_squared, right_lens, disparity, zero, zero, lens - right_lens, disparity]
+    return torch.stack([*in_u, *in_v, *in_disparity], dim=-1).unflatten(-1, (3, len(in_u)))

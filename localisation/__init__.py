@@ -1,0 +1,1 @@
+"""Localisation of wheeled robots and stereo cameras among known landmarks: see docs/localisation.md."""

@@ -1,0 +1,161 @@
+"""Robots of a recording, localised in two passes: the first finds delay, constants and noise, the second uses them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sigmaslam.errors import InputError
+from sigmaslam.filters import Gaussian, degree_of_belief
+from sigmaslam.localisation.localise import FilterName, Localisation, localise, make_filter
+from sigmaslam.localisation.recording import PlanarTruth, Recording
+from sigmaslam.localisation.steps import Steps, make_steps
+from sigmaslam.localisation.wheeled_robot import CONSTANTS, SPACE, WheeledRobot
+
+DELAYS = (0.0, 0.1, 0.2, 0.3, 0.4)
+"""Seconds by which a robot may follow its controls; the most likely one is taken."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RobotEstimate:
+    """What is known of one robot.
+
+    Attributes:
+        name: of the robot.
+        seconds: (K + 1,).
+        pose: (K + 1, 3) x, y in metres, heading in radians.
+        covariance: (K + 1, 3, 3) of the same, in the world.
+        belief: (K + 1,) degree of belief in the position, in metres.
+        seen: (K + 1, L) landmarks that were seen then, -1 for none.
+        innovation: (K + 1, L, m), NaN for none.
+        nis: (K + 1, L) of each sighting, of m degrees of freedom.
+        weight: (K + 1, L) by robust weights.
+        delay: seconds by which the robot follows its controls.
+        constants: value and standard deviation of each by its name, at the end.
+        scale: (m,) standard deviation of the sightings over the nominal one, at the end.
+        truth: None if there is none.
+    """
+
+    name: str
+    seconds: np.ndarray
+    pose: np.ndarray
+    covariance: np.ndarray
+    belief: np.ndarray
+    seen: np.ndarray
+    innovation: np.ndarray
+    nis: np.ndarray
+    weight: np.ndarray
+    delay: float
+    constants: dict[str, tuple[float, float]]
+    scale: np.ndarray
+    truth: PlanarTruth | None
+
+
+def localise_robots(
+    recordings: Sequence[Recording],
+    filter_name: FilterName = "ukf",
+    start: tuple[float, float, float] | None = None,
+    tell: Callable[[str], None] = lambda _: None,
+) -> tuple[list[RobotEstimate], list[RobotEstimate]]:
+    """Estimates of each robot: of the first pass, and of the second.
+
+    The first pass filters each robot under every one of `DELAYS` and keeps the most likely. Its poses depend on what
+    was seen until then alone, but for that choice. The second begins with the constants and the noise that the first
+    ended with, so its poses depend on the whole recording through these few numbers.
+
+    Args:
+        recordings: of robots of one kind.
+        filter_name: see `make_filter`.
+        start: x, y, heading of all robots; None: the first pose of the truth.
+        tell: takes a line of progress.
+    Raises:
+        InputError: there is no pose to start from.
+    """
+    platform = WheeledRobot.of(recordings[0])
+    bayes = make_filter(filter_name, SPACE)
+    count = len(DELAYS)
+    steps = make_steps([each for each in recordings for _ in DELAYS], [*DELAYS] * len(recordings))
+    prior = platform.prior(_starts(recordings, steps.seconds[0, ::count], start))
+    repeated = _pick(prior, torch.arange(len(recordings)).repeat_interleave(count))
+    first = localise(bayes, platform, repeated, steps, tell=lambda done: tell(f"first pass: {done:.0%}"))
+    best = first.log_likelihood.reshape(-1, count).argmax(axis=1)
+    chosen = np.arange(len(recordings)) * count + best
+    delays = [DELAYS[index] for index in best]
+    at_first = _estimates(recordings, delays, steps, first, chosen)
+
+    steps = make_steps(recordings, delays)
+    prior = _with_constants(prior, _pick(first.final, torch.from_numpy(chosen)))
+    scale = torch.from_numpy(first.scale[-1, chosen])
+    second = localise(bayes, platform, prior, steps, scale, lambda done: tell(f"second pass: {done:.0%}"))
+    return at_first, _estimates(recordings, delays, steps, second, np.arange(len(recordings)))
+
+
+def _starts(recordings: Sequence[Recording], seconds: np.ndarray, start: tuple[float, float, float] | None) -> Tensor:
+    if start is not None:
+        return torch.tensor(start, dtype=torch.float64).expand(len(recordings), 3)
+    poses = []
+    for recording, second in zip(recordings, seconds, strict=True):
+        pose = None if recording.truth is None else recording.truth.at(np.array([second]))[0]
+        if pose is None or not np.isfinite(pose).all():
+            raise InputError(f"{recording.name}: there is no true pose to start from: give --start X,Y,HEADING")
+        poses.append(pose)
+    return torch.from_numpy(np.stack(poses))
+
+
+def _pick(belief: Gaussian, index: Tensor) -> Gaussian:
+    return Gaussian(belief.mean[index], belief.covariance[index])
+
+
+def _with_constants(prior: Gaussian, known: Gaussian) -> Gaussian:
+    """The prior's poses, and the constants as they are known."""
+    mean, covariance = prior.mean.clone(), prior.covariance.clone()
+    mean[:, 3:], covariance[:, 3:, 3:] = known.mean[:, 3:], known.covariance[:, 3:, 3:]
+    return Gaussian(mean, covariance)
+
+
+def _estimates(
+    recordings: Sequence[Recording], delays: Sequence[float], steps: Steps, result: Localisation, chosen: np.ndarray
+) -> list[RobotEstimate]:
+    estimates = []
+    for recording, delay, b in zip(recordings, delays, chosen, strict=True):
+        K = int(steps.count[b])
+        pose = result.mean[: K + 1, b, :3]
+        covariance = _in_world(pose, result.covariance[: K + 1, b, :3, :3])
+        belief = degree_of_belief(torch.from_numpy(covariance[:, :2, :2])).numpy()
+        final, deviation = result.mean[K, b], np.sqrt(np.diagonal(result.covariance[K, b]))
+        nis = result.nis[:K, b]
+
+        def after_start(column: np.ndarray, fill: float) -> np.ndarray:
+            """With a row for the start, at which nothing was seen."""
+            return np.concatenate([np.full_like(column[:1], fill), column])
+
+        estimates.append(
+            RobotEstimate(
+                recording.name,
+                steps.seconds[: K + 1, b],
+                pose,
+                covariance,
+                belief,
+                after_start(np.where(np.isnan(nis), -1, steps.landmark[:K, b]), -1),
+                after_start(result.innovation[:K, b], np.nan),
+                after_start(nis, np.nan),
+                after_start(result.weight[:K, b], 1.0),
+                delay,
+                {name: (float(final[i]), float(deviation[i])) for i, name in enumerate(CONSTANTS, start=3)},
+                np.sqrt(result.scale[K - 1, b]),
+                recording.truth,
+            )
+        )
+    return estimates
+
+
+def _in_world(pose: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Covariances (K, 3, 3) of x, y, heading from those of twists in the robot's frame."""
+    sine, cosine, zero, one = np.sin(pose[:, 2]), np.cos(pose[:, 2]), np.zeros(len(pose)), np.ones(len(pose))
+    turn = np.stack([cosine, -sine, zero, sine, cosine, zero, zero, zero, one], axis=1).reshape(-1, 3, 3)
+    turned: np.ndarray = turn @ covariance @ turn.transpose(0, 2, 1)
+    return turned

@@ -1,0 +1,53 @@
+"""A sequence as a folder of rectified pairs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from sigmaslam.files import atomic_write_bytes, atomic_write_text, check_new_folder, make_folder
+from sigmaslam.geometry.camera import CameraModel, RectifiedStereo, StereoCamera
+from sigmaslam.geometry.rectification import StereoRectifier
+from sigmaslam.readers.calibration_writer import write_calibration
+from sigmaslam.readers.stereo_sequence import StereoSequence
+
+
+def rectified_camera(camera: StereoCamera, view: RectifiedStereo) -> StereoCamera:
+    """The calibration of a pair after rectification, known as well as before."""
+    eye = CameraModel(view.width, view.height, view.fx, view.fy, view.cx, view.cy)
+    T_left_right = np.eye(4)
+    T_left_right[0, 3] = view.baseline
+    return replace(camera, left=eye, right=eye, T_left_right=T_left_right)
+
+
+def write_rectified(sequence: StereoSequence, out: Path, done: Callable[[int], object]) -> int:
+    """Write `left/` and `right/` PNG images, `times.txt` and `calibration.yaml`, which `track` reads.
+
+    Args:
+        sequence: what to rectify.
+        out: folder, new or empty.
+        done: called with the number of pairs so far.
+
+    Returns:
+        The number of pairs.
+
+    Raises:
+        InputError: `out` holds something or cannot be written, or no pair can be read.
+    """
+    check_new_folder(out)
+    rectifier = StereoRectifier(sequence.camera)
+    for eye in ("left", "right"):
+        make_folder(out / eye)
+    write_calibration(out / "calibration.yaml", rectified_camera(sequence.camera, rectifier.rectified))
+    times = []
+    for frame in sequence.frames():
+        for eye, image in zip(("left", "right"), rectifier.rectify(frame.left, frame.right), strict=True):
+            atomic_write_bytes(out / eye / f"{frame.index:06d}.png", cv2.imencode(".png", image)[1].tobytes())
+        times.append(frame.timestamp)
+        done(len(times))
+    atomic_write_text(out / "times.txt", "".join(f"{time!r}\n" for time in times))
+    return len(times)

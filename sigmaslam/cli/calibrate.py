@@ -1,0 +1,60 @@
+"""`sigmaslam calibrate`."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sigmaslam.calibration.board_images import find_board_images, read_board_views
+from sigmaslam.calibration.boards import BOARD_FORMS, parse_board
+from sigmaslam.calibration.calibrate import LENSES
+from sigmaslam.calibration.calibrate import calibrate as solve
+from sigmaslam.calibration.calibration_report import (
+    describe_board_calibration,
+    draw_board_calibration,
+    write_board_calibration,
+)
+from sigmaslam.errors import InputError
+from sigmaslam.progress import open_progress
+
+# mypy reads the members of an enum from literals alone.
+Lens = StrEnum("Lens", list(LENSES))  # type: ignore[misc]
+"""Lens models."""
+
+
+def calibrate(
+    images: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="IMAGES...",
+            help="Image files or folders; pairs where all names have left and right, cam0 and cam1, infra1 and infra2, "
+            "or end in _0 and _1, or _l and _r; else of one camera.",
+        ),
+    ],
+    board: Annotated[str, typer.Option(help=f"{BOARD_FORMS}; metres.")],
+    out: Annotated[Path, typer.Option(help="YAML file to write, which `track` reads; of one camera, its K and lens.")],
+    lens: Annotated[
+        Lens, typer.Option(help="Lens model: radial-tangential with 4, 5 or 8 coefficients, or fisheye.")
+    ] = Lens["radtan5"],
+    picture: Annotated[Path | None, typer.Option(help="PNG to draw: corners, residuals, the rms of images.")] = None,
+) -> None:
+    """Calibrate a stereo pair, or one camera, from images of a board, with the covariance of all parameters."""
+    if out.suffix.lower() not in (".yaml", ".yml"):
+        raise InputError(f"{out}: a calibration is YAML; choose a name that ends in .yaml")
+    plan = parse_board(board)
+    moments = find_board_images(images)
+    with open_progress() as progress:
+        task = progress.add_task("images", total=len(moments), note="")
+        seen = read_board_views(moments, plan, lambda: progress.advance(task))
+    for name, reason in seen.unreadable:
+        typer.echo(f"left out  {name}: {reason}")
+    result = solve(seen.names, seen.views, plan.points, seen.sizes, lens.value)
+    typer.echo(describe_board_calibration(result))
+    write_board_calibration(out, result)
+    if picture is not None:
+        draw_board_calibration(picture, result)
+        typer.echo(f"Picture: {picture}")
+    typer.echo(f"Written: {out}")

@@ -1,0 +1,65 @@
+"""evaluation.json and evaluation.npz of a run: its errors, in all and frame by frame."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sigmaslam.bounded_files import check_columns, load_arrays
+from sigmaslam.errors import InputError
+from sigmaslam.files import atomic_path, atomic_write_text
+from sigmaslam.table import Table
+
+EVALUATION_NAME, EVALUATED_FRAMES_NAME = "evaluation.json", "evaluation.npz"
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluatedFrames(Table):
+    """Frames with a pose and a truth; errors are those of poses relative to the first of them.
+
+    Attributes:
+        row: (M,) in trajectory.tum.
+        position_error: (M,) metres.
+        rotation_error: (M,) radians.
+        nees: (M,) normalised estimation error squared, per degree of freedom; NaN where there is none.
+        truth: (M, 3) true positions in the world of the estimate, by the best alignment, metres.
+    """
+
+    row: np.ndarray
+    position_error: np.ndarray
+    rotation_error: np.ndarray
+    nees: np.ndarray
+    truth: np.ndarray
+
+
+def write_evaluation(folder: Path, evaluation: dict[str, Any], frames: EvaluatedFrames) -> None:
+    """Writes both files into the folder of the run."""
+    with atomic_path(folder / EVALUATED_FRAMES_NAME) as temporary:
+        np.savez_compressed(temporary, **{name: getattr(frames, name) for name in EvaluatedFrames.__slots__})
+    atomic_write_text(folder / EVALUATION_NAME, json.dumps(evaluation, indent=2) + "\n")
+
+
+def read_evaluated_frames(path: Path, count: int) -> EvaluatedFrames:
+    """The content of an evaluation.npz.
+
+    Args:
+        path: of the file.
+        count: poses of trajectory.tum beside it.
+    Raises:
+        InputError: it is no such file, or of another run.
+    """
+    mend = "run `sigmaslam evaluate` again"
+    arrays = load_arrays(path, mend, EvaluatedFrames.__slots__)
+    shapes: dict[str, tuple[str | int, ...]] = {
+        **dict.fromkeys(EvaluatedFrames.__slots__, ("M",)),
+        "truth": ("M", 3),
+    }
+    check_columns(path, arrays, shapes, {"row": "iu"}, mend)
+    frames = EvaluatedFrames(**arrays)
+    if len(frames) and not (frames.row.min() >= 0 and frames.row.max() < count):
+        raise InputError(f"{path}: is not of the {count} poses of trajectory.tum; {mend}")
+    return frames

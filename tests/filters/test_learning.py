@@ -1,0 +1,82 @@
+"""Noise that is learned: by expectation maximisation, and by the likelihood's derivatives."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from sigmaslam import filters
+from tests.support.filter_assertions import assert_close
+from tests.support.filter_builders import covariances, random_numbers, tensor
+
+EYE = torch.eye(2, dtype=torch.float64)
+A = 0.9 * EYE + 0.1 * random_numbers(2, 2)
+H = EYE + 0.3 * random_numbers(2, 2, seed=1)
+Q, R = covariances(2, seed=2), covariances(2, seed=3)
+PRIOR = filters.Gaussian(tensor(0.0, 0.0), EYE)
+
+
+def sequences(steps: int, batch: int) -> Tensor:
+    """(T, B, 2) values of the model."""
+    state = random_numbers(batch, 2, seed=4)
+    moves = random_numbers(steps, batch, 2, seed=5) @ torch.linalg.cholesky(Q).mT
+    noise = random_numbers(steps, batch, 2, seed=6) @ torch.linalg.cholesky(R).mT
+    values = []
+    for k in range(steps):
+        values.append(state @ H.mT + noise[k])
+        state = state @ A.mT + moves[k]
+    return torch.stack(values)
+
+
+def test_expectation_maximisation_finds_the_noise_and_never_loses_likelihood():
+    values = sequences(60, 100)
+    values[7, 3] = torch.nan
+    found = filters.fit_noise(
+        PRIOR, filters.LinearMotion(A, 0.2 * EYE), filters.LinearMeasurement(H, 5.0 * EYE), values, 25
+    )
+    likelihood = found.log_likelihood
+    assert bool((likelihood.diff() > -1e-9 * likelihood.abs().max()).all())
+    assert_close(found.motion.noise, Q, 0.15)
+    assert_close(found.measurement.noise, R, 0.15)
+    best = filters.KalmanFilter().filter(PRIOR, found.motion, found.measurement, values).log_likelihood.sum()
+    true = filters.KalmanFilter().filter(PRIOR, filters.LinearMotion(A, Q), filters.LinearMeasurement(H, R), values)
+    assert float(best) > float(true.log_likelihood.sum()) - 5.0
+
+
+def test_a_step_of_expectation_maximisation_ascends_as_the_gradient_does():
+    """At the noise that EM stays at, the likelihood's derivatives vanish."""
+    values = sequences(30, 20)
+    found = filters.fit_noise(PRIOR, filters.LinearMotion(A, Q), filters.LinearMeasurement(H, R), values, 150)
+
+    def likelihood(process: Tensor, noise: Tensor) -> Tensor:
+        track = filters.KalmanFilter().filter(
+            PRIOR, filters.LinearMotion(A, process), filters.LinearMeasurement(H, noise), values
+        )
+        return track.log_likelihood.sum()
+
+    learned = found.motion.noise, found.measurement.noise
+    at_start = torch.autograd.functional.jacobian(likelihood, (Q, R))
+    at_end = torch.autograd.functional.jacobian(likelihood, learned)
+    for first, last in zip(at_start, at_end, strict=True):
+        assert float(last.abs().max()) < 0.05 * float(first.abs().max())
+
+
+def test_derivatives_of_the_likelihood_forward_and_backward_agree():
+    values = sequences(4, 2)
+
+    def likelihood(logarithm: Tensor) -> Tensor:
+        motion = filters.LinearMotion(A, filters.Diagonal(torch.exp(logarithm[:2])))
+        see = filters.LinearMeasurement(H, filters.Diagonal(torch.exp(logarithm[2:])))
+        return filters.KalmanFilter().filter(PRIOR, motion, see, values).log_likelihood.sum()
+
+    at = tensor(0.1, -0.2, 0.3, 0.0)
+    assert_close(torch.func.jacfwd(likelihood)(at), torch.func.jacrev(likelihood)(at), 1e-11)
+
+
+def test_sequences_that_cannot_be_fitted_are_refused():
+    values = sequences(5, 1)
+    values[2, 0, 1] = torch.nan
+    motion, see = filters.LinearMotion(A, Q), filters.LinearMeasurement(H, R)
+    with pytest.raises(ValueError, match="some components missing"):
+        filters.fit_noise(PRIOR, motion, see, values)
+    with pytest.raises(ValueError, match="without noise_matrix"):
+        filters.fit_noise(PRIOR, filters.LinearMotion(A, Q, noise_matrix=EYE), see, values)

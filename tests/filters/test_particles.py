@@ -1,0 +1,65 @@
+"""The particle filter against the Kalman filter, on a manifold, and where no Gaussian does."""
+
+import pytest
+import torch
+
+from sigmaslam import filters
+from tests.support.filter_assertions import assert_close
+from tests.support.filter_builders import beliefs, covariances, random_numbers, tensor
+
+NUMBER = 40000
+
+
+def test_particles_of_a_linear_model_converge_to_the_kalman_filter():
+    motion = filters.LinearMotion(torch.eye(2, dtype=torch.float64) * 0.9, covariances(2, seed=2, scale=0.3))
+    see = filters.LinearMeasurement(random_numbers(2, 2, seed=3), covariances(2, seed=4))
+    bayes, cloud = filters.KalmanFilter(), filters.ParticleFilter(torch.Generator().manual_seed(0))
+    belief = beliefs(3, 2)
+    particles = cloud.sample(belief, NUMBER)
+    values = random_numbers(4, 3, 2, seed=5)
+    values[2, 1, 0] = torch.nan
+    for value in values:
+        belief, particles = bayes.predict(belief, motion).belief, cloud.predict(particles, motion)
+        update = bayes.update(belief, see, value)
+        belief = update.belief
+        particles, likelihood = cloud.update(particles, see, value)
+        found = cloud.gaussian(particles)
+        # Five standard errors at an effective number of a tenth.
+        error = 5.0 / (0.1 * NUMBER) ** 0.5
+        scale = belief.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+        assert_close(found.mean / scale, belief.mean / scale, error)
+        relative = scale.unsqueeze(-1) * scale.unsqueeze(-2)
+        assert_close(found.covariance / relative, belief.covariance / relative, 2.0 * error)
+        assert_close(likelihood, update.log_likelihood, error)
+
+
+def test_noise_that_is_not_additive_goes_through_the_function():
+    motion = filters.MotionModel(lambda x, w: x + 2.0 * w, torch.eye(1, dtype=torch.float64), additive=False)
+    cloud = filters.ParticleFilter(torch.Generator().manual_seed(1))
+    moved = cloud.predict(cloud.sample(filters.Gaussian(tensor(1.0), tensor(1.0)[None]), NUMBER), motion)
+    assert_close(cloud.gaussian(moved).covariance, tensor(5.0)[None], 0.04)
+    see = filters.MeasurementModel(lambda x, v: x + v, torch.eye(1, dtype=torch.float64), additive=False)
+    with pytest.raises(ValueError, match="declare it additive"):
+        cloud.update(moved, see, tensor(0.0))
+
+
+def test_moments_on_a_manifold_are_those_of_the_belief():
+    """A heading across the cut."""
+    space = filters.SE2()
+    cloud = filters.ParticleFilter(torch.Generator().manual_seed(2), space)
+    belief = filters.Gaussian(tensor(1.0, 2.0, 3.1), covariances(3, scale=0.1))
+    found = cloud.gaussian(cloud.sample(belief, NUMBER))
+    assert_close(space.local(belief.mean, found.mean), tensor(0.0, 0.0, 0.0), 0.02)
+    assert_close(found.covariance, belief.covariance, 0.01)
+
+
+def test_two_peaks_stay_two():
+    """A position of which only the square is measured: half of the particles stay on each side."""
+    cloud = filters.ParticleFilter(torch.Generator().manual_seed(3))
+    particles = cloud.sample(filters.Gaussian(tensor(0.0), tensor(4.0)[None]), NUMBER)
+    see = filters.MeasurementModel(lambda x: x.square(), filters.Diagonal(tensor(0.1)))
+    particles, _ = cloud.update(particles, see, tensor(4.0))
+    right = torch.exp(particles.log_weights)[particles.states[:, 0] > 0].sum()
+    assert 0.45 < float(right) < 0.55
+    assert_close(cloud.gaussian(particles).covariance, tensor(4.0)[None], 0.1)
+    assert float(particles.effective_number) > 0.5 * NUMBER

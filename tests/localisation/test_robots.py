@@ -1,0 +1,65 @@
+"""Robots in a world that is known: accuracy, consistency, and faults that the filter must find or stand."""
+
+import numpy as np
+import pytest
+
+from sigmaslam.errors import InputError
+from sigmaslam.localisation.robots import localise_robots
+from sigmaslam.localisation.scores import innovation_statistics, score
+from tests.support.wheeled_world import World, drive, started_wrong
+
+pytestmark = [pytest.mark.usefixtures("one_thread"), pytest.mark.timeout(300)]
+
+
+@pytest.mark.parametrize("kind", ["range-bearing", "cartesian"])
+def test_a_robot_with_faults_is_found_and_so_are_its_faults(kind):
+    world = World(kind=kind, delay=0.2, drift=0.06, speed_scale=0.05, outliers=0.1, seed=1)
+    first, second = localise_robots([drive(world)])
+    estimate = second[0]
+    found = score(estimate)
+    assert found["position_rmse"] < 0.05
+    assert found["heading_rmse"] < 0.04
+    assert 0.2 < found["nees_mean"] < 9
+    assert abs(estimate.delay - 0.2) <= 0.1
+    for name, true in (("drift", 0.06), ("speed scale", 0.05)):
+        value, deviation = estimate.constants[name]
+        assert abs(value - true) < 3.5 * deviation
+    assert 0.03 < innovation_statistics(estimate)["outliers"] < 0.25
+    assert len(first[0].pose) == len(estimate.pose)
+
+
+def test_filters_agree_on_a_gentle_problem():
+    recording = drive(World(seconds=20.0, seed=2))
+    poses = [localise_robots([recording], name)[1][0].pose for name in ("ukf", "ekf", "iterated")]
+    for pose in poses[1:]:
+        assert np.abs(pose - poses[0]).max() < 0.03
+
+
+def test_a_belief_that_is_wrong_and_too_sure_does_not_lock_the_sightings_out():
+    """The start is 0.7 m off, 70 of its sigmas: a gate at three sigma would refuse every sighting for ever."""
+    recording = started_wrong(drive(World(seed=3)), 0.5)
+    estimate = localise_robots([recording])[1][0]
+    true = drive(World(seed=3)).truth.at(estimate.seconds)
+    error = np.hypot(*(estimate.pose - true)[:, :2].T)
+    assert error[0] > 0.6
+    assert error[len(error) // 2 :].max() < 0.2
+
+
+def test_robots_of_a_batch_are_what_they_are_alone():
+    robots = [drive(World(seconds=10.0, seed=seed)) for seed in (4, 5)]
+    together = localise_robots(robots)[1]
+    for robot, estimate in zip(robots, together, strict=True):
+        alone = localise_robots([robot])[1][0]
+        np.testing.assert_allclose(estimate.pose, alone.pose, atol=1e-9)
+        np.testing.assert_allclose(estimate.covariance, alone.covariance, atol=1e-9)
+
+
+def test_without_a_truth_a_start_is_asked_for():
+    from dataclasses import replace
+
+    recording = replace(drive(World(seconds=5.0)), truth=None)
+    with pytest.raises(InputError, match="--start X,Y,HEADING"):
+        localise_robots([recording])
+    estimate = localise_robots([recording], start=(2.0, 1.0, 0.0))[1][0]
+    assert score(estimate) == {}
+    np.testing.assert_allclose(estimate.pose[0], [2.0, 1.0, 0.0])

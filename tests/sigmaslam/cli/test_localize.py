@@ -1,0 +1,49 @@
+"""`sigmaslam localize` on a robot's CSV files."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from tests.support.commands import assert_refused, run_here
+
+pytest.importorskip("torch")
+
+from tests.support.wheeled_world import World, drive, write_csv_folder
+
+pytestmark = [pytest.mark.usefixtures("one_thread"), pytest.mark.timeout(300)]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return write_csv_folder(tmp_path_factory.mktemp("robot"), drive(World(seconds=10.0)))
+
+
+def test_a_robot_is_localised_and_everything_is_written(folder, tmp_path):
+    out = tmp_path / "out"
+    result = run_here("localize", folder, "--out", out)
+    assert result.returncode == 0, result.stderr
+    names = {"innovations.csv", "report.html", "run.json", "trajectory.csv", "trajectory_first_pass.csv"}
+    assert names <= {path.name for path in out.iterdir()} <= names | {"map.png"}
+    with (out / "trajectory.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    numbers = np.array([[float(row[key]) for key in ("time", "x", "y", "cov_xx", "belief")] for row in rows])
+    assert np.isfinite(numbers).all()
+    assert (np.diff(numbers[:, 0]) >= 0).all()
+    run = json.loads((out / "run.json").read_text())
+    (summary,) = run["robots"].values()
+    assert summary["position_rmse"] < 0.1
+    assert summary["sightings"] == sum(int(row["sightings"]) for row in rows) > 0
+    page = (out / "report.html").read_text()
+    assert "position rmse" in page
+    assert "http://" not in page.replace("http://www.w3.org", "").replace("http://purl.org", "")
+
+
+def test_wrong_options_are_refused(folder, tmp_path):
+    out = tmp_path / "out"
+    assert_refused(run_here("localize", folder, "--out", out, "--start", "1,2"), "--start 1,2", "X,Y,HEADING")
+    assert_refused(run_here("localize", folder, "--out", out, "--robot", "3"), "leave out --robot")
+    assert_refused(run_here("localize", tmp_path / "nowhere", "--out", out), "nowhere", "is not there")
+    assert_refused(run_here("localize", folder, "--out", folder), "not an empty folder")
+    assert not out.exists()
