@@ -1,7 +1,9 @@
-"""Figures of the evaluation; matplotlib through its object interface only."""
+"""Figures of evaluations; matplotlib through its object interface only."""
 
 from __future__ import annotations
 
+import io
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -73,3 +75,27 @@ def save_png(figure: Figure, path: str | Path, dots_per_inch: int = 130) -> None
     """Write the figure as PNG, whole or not at all."""
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", dpi=dots_per_inch)
+
+
+def to_svg(figure: Figure, name: str, dots_per_inch: int = 100) -> str:
+    """The figure as an `<svg>` element to put into a page; the same figure gives the same text.
+
+    Args:
+        figure: what to draw; rasterised artists become a PNG inside.
+        name: unique among the figures of one page, as it makes their identifiers unique.
+        dots_per_inch: of rasterised artists.
+    """
+    import matplotlib
+
+    target = io.StringIO()
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
+        figure.savefig(
+            target, format="svg", dpi=dots_per_inch, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type"))
+        )
+    text = target.getvalue()
+    text = text[text.index("<svg") :]
+    # Matplotlib writes six digits; a screen does not resolve a hundredth of a point.
+    text = re.sub(r' (?:d|x|y)="[^"]*"', lambda attribute: re.sub(r"(\.\d\d)\d+", r"\1", attribute[0]), text)
+    # Matplotlib repeats the names of groups in each figure. Only groups with references need one.
+    used = set(re.findall(r'(?:href="#|url\(#)([^")]+)', text))
+    return re.sub(r' id="([^"]*)"', lambda match: match[0] if match[1] in used else "", text)
