@@ -44,6 +44,8 @@ from sigmaslam.runs.relative_pose_file import RELATIVE_POSES_NAME, read_frame_pa
 from sigmaslam.runs.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY, check_has_trajectory
 
 _LOGGER = logging.getLogger(__name__)
+# An error is of poses relative to others.
+_FEWEST_PAIRS = 2
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -173,6 +175,11 @@ def evaluate_run(
             frames = read_frames(run_or_trajectory / FRAMES_NAME)
     estimate, true, association = _same_clock(estimate_path, truth, frames)
     paired, _ = associate(estimate, true, 1e-3 if association == "time at 10 Hz" else MAX_DIFFERENCE)
+    if len(paired) < _FEWEST_PAIRS:
+        raise InputError(
+            f"{truth}: one of its {len(true)} poses alone is of the time of a pose of {estimate_path}; two are needed. "
+            "Is it the truth of this run, and are both in the same clock?"
+        )
     if association == "time at 10 Hz" and len(paired) < len(estimate):
         raise InputError(
             f"{truth}: a KITTI file without times.txt beside it is taken as 10 Hz, but only "

@@ -19,3 +19,12 @@ class OutputError(SigmaSlamError):
 
 class FrameError(InputError):
     """One image cannot be read; the sequence around it can still be used."""
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether an error of Python, OpenCV or ONNX Runtime says that there is not enough memory."""
+    if isinstance(error, MemoryError):
+        return True
+    text = str(error)
+    said = ("bad_alloc", "Insufficient memory", "Failed to allocate memory", "can't start new thread")
+    return isinstance(error, Exception) and any(words in text for words in said)

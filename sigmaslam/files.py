@@ -64,9 +64,14 @@ def check_new_folder(path: Path) -> None:
     """Nothing that is there is written over.
 
     Raises:
-        InputError: `path` is a file, or a folder that holds something.
+        InputError: `path` is a file, a folder that holds something, or no possible name.
     """
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+    try:
+        holds_something = path.exists() and (not path.is_dir() or any(path.iterdir()))
+    except (OSError, ValueError) as error:  # a name that is too long, a folder that may not be read
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{path}: cannot be a new folder ({reason}): choose another --out") from None
+    if holds_something:
         raise InputError(f"{path} exists and is not an empty folder: choose another --out, or remove it")
 
 

@@ -77,6 +77,8 @@ def read_locations(path: Path) -> Locations:
                 f"{path}, line 1: the columns are separated by {word}: separate them by commas, and write numbers with "
                 "a decimal point"
             )
+    if all(_is_number(name) for name in names):
+        raise InputError(f"{path}, line 1: holds numbers; {_FORM}")
     if len(set(names)) < len(names):
         double = next(name for name in names if names.count(name) > 1)
         raise InputError(f"{path}, line 1: column {shorten(double)} stands twice: remove one")
@@ -126,6 +128,14 @@ def _columns(path: Path, names: list[str]) -> list[str]:
     if any(name in names for name in _QUATERNION):
         columns += need((*_QUATERNION, _ROTATION_SIGMA))
     return columns
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
 
 
 def _numbers(path: Path, line: int, row: list[str], names: list[str], columns: list[str]) -> list[float]:

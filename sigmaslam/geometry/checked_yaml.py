@@ -33,7 +33,8 @@ class CalibrationYaml:
             text = "\n" + _without_opencv_syntax(body)
         entries = parse_yaml(text, path, CalibrationError)
         if not isinstance(entries, dict):
-            raise CalibrationError(f"{path}: expected keys with values, found {type(entries).__name__}")
+            found = {type(None): "nothing", list: "a list", str: "text"}.get(type(entries), "a single value")
+            raise CalibrationError(f"{path}: expected keys with values, found {found}: give a calibration file")
         return cls(path, entries)
 
     def error(self, message: str) -> CalibrationError:

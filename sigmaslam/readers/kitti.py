@@ -30,6 +30,15 @@ def find_layout(folder: Path) -> tuple[Path, Path, tuple[int, int]] | None:
     return None
 
 
+def find_single_eye(folder: Path) -> tuple[str, str] | None:
+    """Names of the folder that is there and of the one that is missing, if `folder` has one eye under KITTI's names."""
+    for left, right, _ in LAYOUTS:
+        for present, missing in ((left, right), (right, left)):
+            if (folder / present).is_dir() and not (folder / missing).exists():
+                return present, missing
+    return None
+
+
 def open_kitti(folder: Path, calibration: Path | None = None) -> StereoSequence:
     """Open a KITTI folder: images paired by name, calib.txt or calib_cam_to_cam.txt, times.txt.
 

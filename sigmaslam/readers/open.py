@@ -77,6 +77,8 @@ def _detect(path: Path) -> str:
         return "folder"
     if video.find_videos(path):
         return "video"
+    if single := kitti.find_single_eye(path):
+        raise InputError(f"{path}: holds {single[0]} and no {single[1]}, the images of the other eye: put them there")
     looked_for = "".join(
         f"\n  {format}: {module.LOOKED_FOR}"
         for format, module in zip(FORMATS[1:], (kitti, euroc, four_seasons, folder, video, bag), strict=True)

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from math import isfinite
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -208,10 +209,11 @@ def read_times(path: Path, count: int, numbers: Collection[int] | None = None) -
         Seconds, one per pair.
 
     Raises:
-        InputError: a line is no time, the times are no seconds, or the number of lines does not fit.
+        InputError: a line is no time, times do not increase or are no seconds, or the number of lines does not fit.
     """
     lines = read_text(path, TABLE_BYTES, "the timestamps").splitlines()
-    times = []
+    times: list[float] = []
+    rows: list[int] = []
     for number, line in enumerate(lines, start=1):
         if not line.strip() or line.startswith("#"):
             continue
@@ -219,11 +221,25 @@ def read_times(path: Path, count: int, numbers: Collection[int] | None = None) -
             times.append(_seconds(line.strip()))
         except (ValueError, OverflowError):
             raise InputError(f"{path}: line {number} is not a time in seconds: {shorten(repr(line))}") from None
-    if len(times) == count:
-        return in_seconds(path, times)
-    if numbers is not None and len(times) > max(numbers):
-        return in_seconds(path, [times[number] for number in numbers])
-    raise InputError(f"{path}: {len(times)} timestamps for {count} image pairs; one line per pair is needed")
+        rows.append(number)
+    if len(times) != count:
+        if numbers is None or len(times) <= max(numbers):
+            raise InputError(f"{path}: {len(times)} timestamps for {count} image pairs; one line per pair is needed")
+        times, rows = [times[number] for number in numbers], [rows[number] for number in numbers]
+    _check_increase(path, times, rows)
+    return in_seconds(path, times)
+
+
+def _check_increase(path: Path, times: Sequence[float], lines: Sequence[int]) -> None:
+    """Refuses times that are not finite, or not later than the one before; `lines` are their numbers in the file."""
+    for k, (time, line) in enumerate(zip(times, lines, strict=True)):
+        if not isfinite(time):
+            raise InputError(f"{path}: line {line} is {time}: give a finite time in seconds")
+        if k and time <= times[k - 1]:
+            raise InputError(
+                f"{path}: line {line} is {time!r}, the time before is {times[k - 1]!r}: times must increase; correct "
+                "them, or sort images and times together"
+            )
 
 
 def _seconds(text: str) -> float:

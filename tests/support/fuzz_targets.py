@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import io
 import json
-import signal
 import time
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
-from types import FrameType
 
 import cv2
 import numpy as np
@@ -39,16 +36,13 @@ from sigmaslam.slam.keyframe import Keyframe
 from sigmaslam.slam.map_file import pack_keyframes, read_keyframes
 from sigmaslam.slam.object_region import read_region
 from tests.support.mutation import mutate, mutate_archive, mutate_array
+from tests.support.time_limit import HangError, limited_time
 
 HANG_SECONDS = 5.0
 LONGEST_MESSAGE = 2_000
 WIDTH, HEIGHT = 64, 48
 CAMERA = RectifiedStereo(fx=50.0, fy=50.0, cx=32.0, cy=24.0, baseline=0.1, width=WIDTH, height=HEIGHT)
 Mutator = Callable[[bytes, list[bytes], Random], bytes]
-
-
-class HangError(BaseException):
-    """A reader took longer than `HANG_SECONDS`; no Exception, which readers may catch."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +105,7 @@ class Tally:
         self.executions += 1
         begin = time.perf_counter()
         try:
-            with _limited(HANG_SECONDS), np.errstate(all="ignore"):
+            with limited_time(HANG_SECONDS), np.errstate(all="ignore"):
                 target.read(path)
             self.read += 1
         except SigmaSlamError as error:
@@ -131,23 +125,6 @@ class Tally:
             self.crashes[kind].count += 1
         else:
             self.crashes[kind] = Crash(f"{kind} ({what})", content)
-
-
-@contextmanager
-def _limited(seconds: float) -> Iterator[None]:
-    """Raises a HangError in the block after so long."""
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        raise HangError(f"more than {seconds:g} s")
-
-    handler = signal.signal(signal.SIGALRM, stop)
-    # pytest-timeout has the same timer; what a few executions take does not matter to it.
-    timer = signal.setitimer(signal.ITIMER_REAL, seconds)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, *timer)
-        signal.signal(signal.SIGALRM, handler)
 
 
 def make_targets(folder: Path) -> dict[str, FuzzTarget]:

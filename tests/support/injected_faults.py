@@ -60,7 +60,7 @@ class Fault:
         return sequence_of(self.frames(frames, camera), self.camera(camera))
 
 
-def _images(change: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]) -> Callable[..., Frames]:
+def of_images(change: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]) -> Callable[..., Frames]:
     def apply(frames: Frames, camera: StereoCamera) -> Frames:
         changed = [change(frame.left, frame.right) for frame in frames]
         return [
@@ -77,13 +77,13 @@ def _turned(degrees: float, axis: tuple[float, float, float]) -> Callable[..., F
     def apply(frames: Frames, camera: StereoCamera) -> Frames:
         K = camera.right.matrix
         H = K @ cv2.Rodrigues(np.radians(degrees) * np.array(axis))[0] @ np.linalg.inv(K)
-        return _images(lambda left, right: (left, cv2.warpPerspective(right, H, right.shape[::-1])))(frames, camera)
+        return of_images(lambda left, right: (left, cv2.warpPerspective(right, H, right.shape[::-1])))(frames, camera)
 
     return apply
 
 
 def _moved(M: list[list[float]]) -> Callable[..., Frames]:
-    return _images(lambda left, right: (left, cv2.warpAffine(right, np.array(M), right.shape[::-1])))
+    return of_images(lambda left, right: (left, cv2.warpAffine(right, np.array(M), right.shape[::-1])))
 
 
 def _zoomed(factor: float) -> Callable[..., Frames]:
@@ -105,7 +105,7 @@ def _delayed(count: int) -> Callable[..., Frames]:
 
 
 def _upright(frames: Frames, camera: StereoCamera) -> Frames:
-    return _images(lambda left, right: (np.rot90(left), np.rot90(right)))(frames, camera)
+    return of_images(lambda left, right: (np.rot90(left), np.rot90(right)))(frames, camera)
 
 
 def _turn_camera(camera: StereoCamera) -> StereoCamera:
@@ -115,7 +115,7 @@ def _turn_camera(camera: StereoCamera) -> StereoCamera:
     return replace(camera, left=model, right=model)
 
 
-def _both(change: Callable[[CameraModel], dict[str, Any]]) -> Callable[[StereoCamera], StereoCamera]:
+def of_both(change: Callable[[CameraModel], dict[str, Any]]) -> Callable[[StereoCamera], StereoCamera]:
     def apply(camera: StereoCamera) -> StereoCamera:
         left, right = (replace(model, **change(model)) for model in (camera.left, camera.right))
         return replace(camera, left=left, right=right)
@@ -123,7 +123,7 @@ def _both(change: Callable[[CameraModel], dict[str, Any]]) -> Callable[[StereoCa
     return apply
 
 
-def _scaled_baseline(factor: float) -> Callable[[StereoCamera], StereoCamera]:
+def scaled_baseline(factor: float) -> Callable[[StereoCamera], StereoCamera]:
     def apply(camera: StereoCamera) -> StereoCamera:
         T = camera.T_left_right.copy()
         T[:3, 3] *= factor
@@ -148,14 +148,16 @@ def _another_place(frames: Frames, camera: StereoCamera) -> Frames:
 
 def _sizes(factor: float) -> Callable[[StereoCamera], StereoCamera]:
     names = ("fx", "fy", "cx", "cy")
-    return _both(lambda model: {name: factor * getattr(model, name) for name in names})
+    return of_both(lambda model: {name: factor * getattr(model, name) for name in names})
 
 
 # Of any pair.
 FAULTS = {
-    "eyes exchanged": Fault("eyes", "swap the two", _images(lambda left, right: (right, left))),
-    "both eyes mirrored": Fault("eyes", "do not mirror", _images(lambda left, right: (left[:, ::-1], right[:, ::-1]))),
-    "one image for both eyes": Fault("same image", "both cameras", _images(lambda left, right: (left, left))),
+    "eyes exchanged": Fault("eyes", "swap the two", of_images(lambda left, right: (right, left))),
+    "both eyes mirrored": Fault(
+        "eyes", "do not mirror", of_images(lambda left, right: (left[:, ::-1], right[:, ::-1]))
+    ),
+    "one image for both eyes": Fault("same image", "both cameras", of_images(lambda left, right: (left, left))),
     "rows off by 3": Fault("rows", "+", _moved([[1, 0, 0], [0, 1, 3.0]])),
     "rows off by -3": Fault("rows", "-", _moved([[1, 0, 0], [0, 1, -3.0]])),
     "turned by yaw 5": Fault("rotation", "about the vertical", _turned(5, (0, 1, 0))),
@@ -163,26 +165,26 @@ FAULTS = {
     "turned by roll 1": Fault("rotation", "about its axis", _turned(1, (0, 0, 1))),
     "turned by pitch 2": Fault("rows", "correct cy", _turned(2, (1, 0, 0))),
     "zoomed by 3 %": Fault("scale", "+", _zoomed(1.03)),
-    "right eye mirrored": Fault("mirrored", "left to right", _images(lambda left, right: (left, right[:, ::-1]))),
-    "left eye mirrored": Fault("mirrored", "left to right", _images(lambda left, right: (left[:, ::-1], right))),
-    "right eye upside down": Fault("mirrored", "180", _images(lambda left, right: (left, right[::-1, ::-1]))),
+    "right eye mirrored": Fault("mirrored", "left to right", of_images(lambda left, right: (left, right[:, ::-1]))),
+    "left eye mirrored": Fault("mirrored", "left to right", of_images(lambda left, right: (left[:, ::-1], right))),
+    "right eye upside down": Fault("mirrored", "180", of_images(lambda left, right: (left, right[::-1, ::-1]))),
     "no overlap": Fault("overlap", "see the same", _another_place),
-    "left eye black": Fault("exposure", "lens cap", _images(lambda left, right: (0 * left, right))),
-    "grey": Fault("exposure", "nothing can be seen", _images(lambda left, right: (0 * left + 90, 0 * right + 90))),
+    "left eye black": Fault("exposure", "lens cap", of_images(lambda left, right: (0 * left, right))),
+    "grey": Fault("exposure", "nothing can be seen", of_images(lambda left, right: (0 * left + 90, 0 * right + 90))),
     "over-exposed": Fault(
-        "exposure", "shorter", _images(lambda left, right: (left, cv2.convertScaleAbs(right, alpha=20, beta=200)))
+        "exposure", "shorter", of_images(lambda left, right: (left, cv2.convertScaleAbs(right, alpha=20, beta=200)))
     ),
     "right eye blurred": Fault(
-        "sharpness", "focus", _images(lambda left, right: (left, cv2.GaussianBlur(right, (0, 0), 6)))
+        "sharpness", "focus", of_images(lambda left, right: (left, cv2.GaussianBlur(right, (0, 0), 6)))
     ),
     "right eye late": Fault("synchronisation", "later", _delayed(1)),
     "right eye early": Fault("synchronisation", "earlier", _delayed(-1)),
-    "baseline in mm": Fault("baseline", "millimetres", camera=_scaled_baseline(1e3)),
-    "baseline in cm": Fault("baseline", "centimetres", camera=_scaled_baseline(1e2)),
-    "baseline of a micrometre": Fault("baseline", "metres", camera=_scaled_baseline(1e-6)),
+    "baseline in mm": Fault("baseline", "millimetres", camera=scaled_baseline(1e3)),
+    "baseline in cm": Fault("baseline", "centimetres", camera=scaled_baseline(1e2)),
+    "baseline of a micrometre": Fault("baseline", "metres", camera=scaled_baseline(1e-6)),
     "intrinsics of twice the size": Fault("principal point", "multiply fx, fy, cx, cy by 0.5", camera=_sizes(2.0)),
     "intrinsics of half the size": Fault("principal point", "by 2", camera=_sizes(0.5)),
-    "focal length in mm": Fault("focal length", "in pixels", camera=_both(lambda model: {"fx": 4.0, "fy": 4.0})),
+    "focal length in mm": Fault("focal length", "in pixels", camera=of_both(lambda model: {"fx": 4.0, "fy": 4.0})),
     "times in ms": Fault("time stamps", "milliseconds", _stamps(1e3)),
     "times in us": Fault("time stamps", "microseconds", _stamps(1e6)),
     "times in ns": Fault("time stamps", "nanoseconds", _stamps(1e9)),
@@ -190,7 +192,7 @@ FAULTS = {
 # Of wide images, where the two differ enough.
 WIDE_FAULTS = {
     "cx and cy exchanged": Fault(
-        "principal point", "exchange", camera=_both(lambda model: {"cx": model.cy, "cy": model.cx})
+        "principal point", "exchange", camera=of_both(lambda model: {"cx": model.cy, "cy": model.cx})
     ),
 }
 # Of rectified images.
@@ -199,6 +201,6 @@ RECTIFIED_FAULTS = {
     "distortion of rectified images": Fault(
         "distortion",
         "no distortion",
-        camera=_both(lambda model: {"distortion_model": "radtan", "distortion": EUROC_LENS}),
+        camera=of_both(lambda model: {"distortion_model": "radtan", "distortion": EUROC_LENS}),
     ),
 }

@@ -24,6 +24,7 @@ from sigmaslam.runs.relative_pose_file import read_frame_pairs
 from sigmaslam.runs.track import track_sequence
 from tests.support.commands import assert_refused, environment, run_here, run_process
 from tests.support.demo_parts import copy_frames
+from tests.support.stopped_runs import end, start, statuses
 
 FRAMES = 12
 PARTIAL = ("poses.partial", "relative_poses.partial")
@@ -49,43 +50,6 @@ def whole(sequence: Path) -> Path:
     run = sequence.with_name("whole")
     track_sequence(open_sequence(sequence), run, "klt")
     return run
-
-
-def statuses(run: Path) -> list[str]:
-    """Of the rows of frames.csv that are there whole."""
-    table = run / "frames.csv"
-    return [line.split(b",")[1].decode() for line in table.read_bytes().split(b"\n")[1:-1]] if table.exists() else []
-
-
-def start(source: Path, run: Path, *options: str, rows: int = 4) -> subprocess.Popen[str]:
-    """A run with so many frames done; it takes ages for each more, so that signals come in the midst of it."""
-    script = (
-        "import sys, time\n"
-        "from sigmaslam.cli import main\n"
-        "from sigmaslam.slam.tracker import StereoTracker\n"
-        "step, done = StereoTracker.step, []\n"
-        "def slow(*arguments):\n"
-        f"    time.sleep(60 if len(done) >= {rows} else 0)\n"
-        "    done.append(1)\n"
-        "    return step(*arguments)\n"
-        "StereoTracker.step = slow\n"
-        "main()\n"
-    )
-    command = [sys.executable, "-c", script, "track", str(source), "--out", str(run), "--frontend", "klt", *options]
-    process = subprocess.Popen(
-        command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
-    deadline = time.monotonic() + 60
-    while len(statuses(run)) < rows:
-        assert time.monotonic() < deadline, "no frame came"
-        assert process.poll() is None, process.communicate()
-        time.sleep(0.02)
-    return process
-
-
-def end(process: subprocess.Popen[str]) -> tuple[int, str, str]:
-    output, errors = process.communicate(timeout=60)
-    return process.returncode, output, errors
 
 
 def assert_first_poses_of(whole: Path, run: Path, count: int) -> None:

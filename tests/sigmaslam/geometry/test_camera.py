@@ -259,8 +259,8 @@ def test_yaml_errors_name_file_and_key(tmp_path, path, value, message):
     ("text", "message"),
     [
         ("left: [1, 2", "not valid YAML"),
-        ("- 1\n- 2\n", "expected keys with values, found list"),
-        ("", "found NoneType"),
+        ("- 1\n- 2\n", "expected keys with values, found a list"),
+        ("", "found nothing"),
         ("left: {fx: 1,\n  fx: 2}\n", "key 'left.fx' stands twice, in lines 1 and 2: remove"),
         ("T_left_right: 1\nleft: {}\nT_left_right: 2\n", "key 'T_left_right' stands twice, in lines 1 and 3"),
     ],

@@ -414,8 +414,8 @@ def test_folder_times(tmp_path, caplog):
     for text, message in (
         ("1\n2\n", "2 timestamps for 3 image pairs"),
         ("1\ntwo\n3\n", "line 2 is not a time in seconds: 'two'"),
-        ("1\n3\n3\n", r"timestamp of pair 2 \(000002.png\) is 3.0, the one before 3.0; they must be"),
-        ("nan\n3\n4\n", "timestamp of pair 0"),
+        ("1\n3\n3\n", "times.txt: line 3 is 3.0, the time before is 3.0: times must increase"),
+        ("nan\n3\n4\n", "times.txt: line 1 is nan: give a finite time"),
     ):
         (tmp_path / "times.txt").write_text(text)
         with pytest.raises(InputError, match=message):

@@ -1,0 +1,127 @@
+"""Runs all faults and counts what is survived: `python -m tests.faults --out docs/reliability.md`.
+
+Each fault is put into a good input, and the command line runs on it, with --processes in a process of its own, whose
+memory is bounded. Real data are those of SIGMASLAM_DATA; without it their faults are left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import sys
+import tempfile
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+from sigmaslam.bounded_files import shorten
+from sigmaslam.evaluation.benchmarks.page import header, opening, row, write_page
+from tests.faults.case import Case, Runner, Verdict, judge
+from tests.faults.running import attempt, run_in_process, run_in_this_process
+from tests.faults.table import CASES
+
+_LONGEST = 230
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What became of a fault.
+
+    Attributes:
+        case: the fault.
+        verdict: on it.
+        code: exit code.
+        said: of what was written, the part with the words that the case expects; else the reason of the verdict.
+    """
+
+    case: Case
+    verdict: Verdict
+    code: int
+    said: str
+
+
+def run_case(case: Case, runner: Runner) -> Result:
+    """Runs a case in a folder that is removed."""
+    with tempfile.TemporaryDirectory(prefix="sigmaslam-fault-") as name:
+        folder = Path(name)
+        outcome = attempt(case, folder, runner)
+        verdict, reason = judge(case, outcome, folder)
+        text = outcome.text.replace(f"{name}/", "")
+        said = _excerpt(text, case.says) if verdict == Verdict.GOOD else reason.replace(f"{name}/", "")
+        return Result(case, verdict, outcome.code, said)
+
+
+def _excerpt(text: str, words: tuple[str, ...]) -> str:
+    """The sentence of the text that has the first of the words, and what follows it."""
+    text = re.sub(r" frames [━╸╺ ]+ .*?(tracking|starting|lost|relocalised)(?= |$)", "", text)
+    place = text.find(words[0]) if words else 0
+    starts = [match.end() for match in re.finditer(r"WARNING |error: |html |Nothing was tracked: |\. ", text[:place])]
+    return shorten(text[starts[-1] if starts else 0 :], _LONGEST)
+
+
+def write_reliability(path: Path, results: list[Result], command: str) -> str:
+    """Writes the page of results and returns it."""
+    counts = Counter(result.verdict for result in results)
+    tried = [result for result in results if result.case.first is not None]
+    before = Counter(result.case.first for result in tried)
+    after = Counter(result.verdict for result in tried)
+    lines = [
+        *opening("Reliability", command, f": {counts[Verdict.GOOD]} of {len(results)} faults are survived."),
+        "",
+        "Each fault is put into a good input: the demo that ships with the package, or a real drive. The program",
+        "must name it, with the exit code that README says, and lose no pose. The rules are in `tests/faults/case.py`:",
+        "",
+        "- **good**: exit code and words are as expected; where a fault does no harm, every pose is within three of",
+        "  its own sigmas of the truth;",
+        "- **unclear**: another exit code or other words;",
+        "- **crash or loss**: a traceback, no end, or fewer poses than there were;",
+        "- **silent wrong**: a success that does not name the fault, poses beyond three sigmas or without a variance.",
+        "",
+        *header("", *Verdict, numbers_from=1),
+        row("all faults", *(str(counts[verdict]) for verdict in Verdict)),
+        row(f"{len(tried)} of them, in a first trial", *(str(before[v]) for v in Verdict)),
+        row("these, now", *(str(after[verdict]) for verdict in Verdict)),
+        "",
+        "Those that are not good are known limits ([known-limits.md](known-limits.md)): no image shows half of a",
+        "baseline, or that both eyes hang upside down; and changed bits in the images of a bag are taken for noise, as",
+        "rosbags compares no check sums.",
+        "",
+        *header("group", "fault", "first trial", "verdict", "exit code", "what is said"),
+    ]
+    for result in results:
+        case, said = result.case, result.said.replace("|", "\\|").replace("<", "&lt;")
+        lines.append(row(case.group, case.name, case.first or "", result.verdict, str(result.code), said))
+    return write_page(path, "\n".join(lines) + "\n")
+
+
+def main() -> int:
+    """Runs the cases; exit code 1 if a verdict is another than expected."""
+    parser = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__)
+    parser.add_argument("--out", type=Path, help="Markdown page to write")
+    parser.add_argument("--only", nargs="*", default=[], help="groups, or parts of names; all by default")
+    parser.add_argument("--processes", action="store_true", help="a process for each, which takes thrice the time")
+    arguments = parser.parse_args()
+    chosen = [
+        case
+        for case in CASES
+        if (not arguments.only or any(word in (case.group, *case.name.split(", ")) for word in arguments.only))
+        and (case.data is None or (Path(os.environ.get("SIGMASLAM_DATA") or "/nowhere") / case.data).is_dir())
+    ]
+    results: list[Result] = []
+    command = "python -m tests.faults" + (f" --out {arguments.out}" if arguments.out else "")
+    command += " --processes" if arguments.processes else ""
+    for case in chosen:
+        result = run_case(case, run_in_process if arguments.processes else run_in_this_process)
+        results.append(result)
+        mark = "" if result.verdict == case.expected else "  <- expected: " + case.expected
+        print(f"{result.verdict:14} {result.code:4} {case.group}: {case.name}{mark}\n    {result.said}", flush=True)
+    counts = Counter(result.verdict for result in results)
+    print(f"{counts[Verdict.GOOD]} of {len(results)} survived; {', '.join(f'{counts[v]} {v}' for v in Verdict)}")
+    if arguments.out is not None:
+        write_reliability(arguments.out, results, command)
+    return int(any(result.verdict != result.case.expected for result in results))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
