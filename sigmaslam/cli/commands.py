@@ -14,6 +14,7 @@ from rich.logging import RichHandler
 from sigmaslam.cli.benchmark import benchmark
 from sigmaslam.cli.calibration import calibration
 from sigmaslam.cli.check import check
+from sigmaslam.cli.denoise import denoise
 from sigmaslam.cli.evaluate import evaluate
 from sigmaslam.cli.export import export
 from sigmaslam.cli.finish import finish
@@ -54,6 +55,7 @@ for _command, _line in (
     (evaluate, "Compare a trajectory with the truth."),
     (refine, "Adjust all of a run at once (extra 'graph')."),
     (match, "Match two images."),
+    (denoise, "Filter noise out of images."),
     (geometry, "Find how two views lie to each other."),
     (render, "Render a stereo sequence with exact truth (extra 'train')."),
     (train, "Train the correspondence network (extra 'train')."),

@@ -153,11 +153,9 @@ def mean_of_others(image: np.ndarray, left_out: np.ndarray, size: int) -> np.nda
     return np.asarray(np.where(count > 0.5, total / np.maximum(count, 1.0), overall), np.float32)
 
 
-def _block_energies(
-    image: np.ndarray, saturated: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _block_energies(image: np.ndarray, saturated: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Of blocks (B,): mean, energy of low frequencies, variance of high ones, and whether no pixel is saturated."""
-    blocks, whole = _cut(image), ~_cut(saturated).any(axis=(1, 2))
+    blocks, whole = _cut(image), np.asarray(~_cut(saturated).any(axis=(1, 2)))
     line = cv2.dct(np.eye(_BLOCK), flags=cv2.DCT_ROWS).T.astype(np.float32)
     coefficients = line @ blocks @ line.T
     low = ~_HIGH

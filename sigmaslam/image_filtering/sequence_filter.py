@@ -10,21 +10,21 @@ from sigmaslam.image_filtering.patch_filter import filter_patches
 
 _DRIFT = 2.0
 """Grey levels by which a point of a surface changes between frames, as light and view do."""
-_FLOW_SIGMA = 0.15
+_FLOW_SIGMA = 0.3
 """Error of the optical flow, pixels, where it is right."""
 # Windows in which innovations are compared with what they should be, from what is small to what is faint.
 _WINDOWS = (5, 11)
 # Sigmas up to which a window's statistic is chance.
-_GATE = 2.5
+_GATE = 1.5
 
 
 class SequenceFilter:
     """Filters the images of one camera, one after the other.
 
-    The state of a pixel is its grey level, mean and variance. It moves by dense inverse search optical flow; its process
-    noise is the drift of light, what the flow's error makes of the image's gradient, and by how much the innovations
-    around exceed what they should be: a pixel that shows something else than before starts anew. What noise is left,
-    which the variance tells, the patches of the image take out; the state keeps it, so that no blur piles up.
+    The state of a pixel is its grey level, mean and variance. It moves by dense optical flow. Its process noise is the
+    drift of light, what the flow's error makes of the image's gradient, and by how much the innovations around exceed
+    what they should be: a pixel that shows something else than before starts anew. What noise is left, which the
+    variance tells, the patches of the image take out; the state keeps it, so that no blur piles up.
 
     Args:
         noise: of the images; None to estimate it from the first one.
@@ -32,7 +32,7 @@ class SequenceFilter:
 
     def __init__(self, noise: NoiseModel | None = None) -> None:
         self.noise = noise
-        self._flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+        self._flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         self._mean: np.ndarray | None = None
         self._variance: np.ndarray | None = None
         self._shown: np.ndarray | None = None
@@ -93,8 +93,8 @@ class SequenceFilter:
         low, high = np.percentile(now, (1, 99))
         scale = 255.0 / max(float(high - low), 16.0)
         stretched = [np.clip((each - low) * scale, 0, 255).astype(np.uint8) for each in (now, before)]
-        flow = self._flow.calc(stretched[0], stretched[1], None)
         height, width = now.shape
+        flow = self._flow.calc(stretched[0], stretched[1], np.zeros((height, width, 2), np.float32))
         columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
         return columns + flow[..., 0], rows + flow[..., 1]
 
@@ -116,6 +116,7 @@ def _excess(innovation: np.ndarray, expected: np.ndarray, noise: np.ndarray) -> 
         spread = square - typical * np.float32(1.0 + _GATE * np.sqrt(2.0 / count))
         # The mean of a window; errors of the prediction are alike in neighbours, those of the measurement are not.
         white = cv2.boxFilter(noise, -1, (size, size))
+        # Where it is off, all pixels of the window say so: together they weigh as many times as much.
         bias = mean * mean - np.float32(_GATE**2) * (white * np.float32(2.0 / count) + np.float32(_DRIFT**2))
         most = np.maximum(most, np.maximum(spread, bias * np.float32(count)))
     return most
