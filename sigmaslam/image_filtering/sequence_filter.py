@@ -37,6 +37,17 @@ class SequenceFilter:
         self._variance: np.ndarray | None = None
         self._shown: np.ndarray | None = None
 
+    @property
+    def state(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and variance (H, W) of the grey level of each pixel after the last frame, grey levels and squared.
+
+        Raises:
+            ValueError: there was no frame.
+        """
+        if self._mean is None or self._variance is None:
+            raise ValueError("there is no state before the first frame: call step")
+        return self._mean, self._variance
+
     def step(self, image: np.ndarray) -> np.ndarray:
         """The estimate of one frame from it and those before it.
 
