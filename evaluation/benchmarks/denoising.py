@@ -14,7 +14,7 @@ import numpy as np
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.benchmarks.page import header, opening, row, write_page
 from sigmaslam.evaluation.trial import Trial, render, rendered_truth
-from sigmaslam.files import make_folder
+from sigmaslam.files import atomic_path, make_folder
 from sigmaslam.image_filtering import NoiseModel, SequenceFilter, denoise_image, estimate_noise
 from sigmaslam.readers.images import read_grey
 from sigmaslam.readers.pairing import list_images
@@ -33,7 +33,7 @@ NIGHTS = {
 }
 """Sensors before which a rendered sequence is shown again."""
 _REAL = ("kitti_raw_0926_0039_a", "euroc_mh01_f000_099")
-_SEQUENCE_FRAMES, _FIRST = 16, 4
+_SEQUENCE_FRAMES, _FIRST = 12, 4
 
 Filter = Callable[[np.ndarray, NoiseModel], np.ndarray]
 Spoil = Callable[[np.ndarray, np.random.Generator], np.ndarray]
@@ -42,7 +42,7 @@ Spoil = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 def write_denoising(
     path: Path, data: Path, runs: Path, command: str, note: Callable[[str], None] = lambda text: None
 ) -> str:
-    """Writes the page and returns it; notes in it are kept.
+    """Writes the page and returns it; notes in it are kept. A picture goes beside it.
 
     Args:
         path: Markdown page.
@@ -61,6 +61,7 @@ def write_denoising(
         note(f"{recipe.preset}{recipe.seed} is there")
     lines = opening("Image filtering", command, ", one thread. PSNR in dB of the whole image, peak 255;")
     lines += ["seconds are of CPU time.", ""]
+    page = ""
     parts: tuple[Callable[[], list[str]], ...] = (
         partial(_gaussian, images),
         partial(_others, images),
@@ -73,9 +74,15 @@ def write_denoising(
         for part in parts:
             lines += [*part(), ""]
             note(lines[-2])
+            page = write_page(path, "\n".join(lines))
+        picture = path.with_suffix(".jpg")
+        draw_sequences(picture, [data / _REAL[0], *sources.values()])
+        lines += [f"![A frame of three sequences]({picture.name})", ""]
+        lines += ["*Noise of sigma 25, the frame filtered by itself, and over time; the last frame of the table.*", ""]
+        page = write_page(path, "\n".join(lines))
     finally:
         cv2.setNumThreads(threads)
-    return write_page(path, "\n".join(lines))
+    return page
 
 
 def psnr(estimate: np.ndarray, truth: np.ndarray) -> float:
@@ -189,6 +196,22 @@ def _sequences(data: Path, sources: dict[str, Path]) -> list[str]:
         cells = [f"{each:.2f}" for each in (*mean, mean[3] - mean[0])]
         lines.append(row(name, *cells, f"{seconds / len(found):.3f}"))
     return lines
+
+
+def draw_sequences(path: Path, sources: list[Path]) -> None:
+    """Writes a picture: for each sequence a part of its last frame noisy, filtered by itself, and over time."""
+    rows = []
+    for source in sources:
+        rng, noise = np.random.default_rng(0), NoiseModel(25.0)
+        follow = SequenceFilter(noise)
+        for truth in _left_images(source):
+            image = truth + rng.normal(0.0, 25.0, truth.shape)
+            result = follow.step(image)
+        top, left = (image.shape[0] - 200) // 2, (image.shape[1] - 300) // 2
+        part = slice(top, top + 200), slice(left, left + 300)
+        rows.append(np.hstack([to_bytes(each[part]) for each in (image, denoise_image(image, noise), result)]))
+    with atomic_path(path) as temporary:
+        cv2.imwrite(str(temporary), np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, 80])
 
 
 def _left_images(source: Path) -> Iterator[np.ndarray]:

@@ -64,15 +64,17 @@ def _posterior(
     pixels = members[..., None] + offsets
     prior, measured = guide[pixels], image[pixels]
     mean = prior.mean(axis=1, keepdims=True)
-    prior = prior - mean
-    covariance = np.swapaxes(prior, 1, 2) @ prior / np.float32(_MEMBERS - 1)
-    power = noise[members].mean(axis=1)
-    eye = np.eye(len(offsets), dtype=np.float32)
-    # The covariance of the measured: C + s^2 I. Gain C (C + s^2 I)^-1 = I - s^2 (C + s^2 I)^-1.
-    inverse = np.linalg.inv(covariance + power[:, None, None] * eye)
-    gain = eye - power[:, None, None] * inverse
-    weight = 1.0 / (power * np.maximum(np.einsum("gij,gij->g", gain, gain), 1.0))
-    return mean + (measured - mean) @ gain, weight
+    deviations = (prior - mean) / np.float32(np.sqrt(_MEMBERS - 1))
+    power = noise[members].mean(axis=1)[:, None, None]
+    # With deviations A and covariance C = A^T A, the gain C (C + s^2 I)^-1 is A^T (A A^T + s^2 I)^-1 A: a group has
+    # fewer members than a patch has pixels.
+    transposed = np.swapaxes(deviations, 1, 2)
+    inverse = np.linalg.inv(deviations @ transposed + power * np.eye(_MEMBERS, dtype=np.float32))
+    estimates = mean + (((measured - mean) @ transposed) @ inverse) @ deviations
+    # Without their zeros, the gain has the eigenvalues of I - s^2 (A A^T + s^2 I)^-1.
+    kept = np.eye(_MEMBERS, dtype=np.float32) - power * inverse
+    weight = 1.0 / (power[:, 0, 0] * np.maximum(np.einsum("gij,gij->g", kept, kept), 1.0))
+    return estimates, weight
 
 
 def _alike(guide: np.ndarray, ys: np.ndarray, xs: np.ndarray) -> np.ndarray:
