@@ -38,6 +38,7 @@ _CODE = (
     "frontend",
     "fusion",
     "geometry",
+    "image_filtering",
     "inference",
     "readers",
     "runs",

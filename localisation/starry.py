@@ -69,8 +69,9 @@ def read_starry(path: Path) -> StereoRecording:
         points[index][:, None],
         since[:, None],
     )
+    fu, fv, cu, cv, baseline = (float(file[name].ravel()[0]) for name in ("fu", "fv", "cu", "cv", "b"))
     rig = StereoRig(
-        *(float(file[name].ravel()[0]) for name in ("fu", "fv", "cu", "cv", "b")),
+        *(fu, fv, cu, cv, baseline),
         torch.from_numpy(file["C_c_v"]),
         torch.from_numpy(file["rho_v_c_v"].ravel()),
     )

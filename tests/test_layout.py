@@ -32,7 +32,7 @@ FLOORS = (
     ("bounded_files", "files", "progress", "plot_style"),
     ("geometry",),
     ("inference",),
-    ("estimation", "readers"),
+    ("estimation", "image_filtering", "readers"),
     ("frontend",),
     ("two_view",),
     ("slam",),

@@ -136,6 +136,14 @@ def _shake(out: Path, command: str, *, runs: Path | None, seeds: int | None) -> 
 
 
 @_registered
+def _denoising(out: Path, command: str, *, data: Path | None, runs: Path | None) -> str:
+    from sigmaslam.evaluation.benchmarks.denoising import write_denoising
+
+    folder = _need_runs(runs, "denoising", "renders")
+    return write_denoising(out, _need_data(data), folder, f"{command} --runs {folder.name}", _note)
+
+
+@_registered
 def _endurance(out: Path, command: str, *, runs: Path | None, frames: int | None) -> str:
     from sigmaslam.evaluation.benchmarks.endurance import write_endurance
 
@@ -216,8 +224,8 @@ def benchmark(
     runs: Annotated[
         Path | None,
         typer.Option(
-            help="noise, consistency, shake, sequences, endurance, runtime: folder of the renders; what is there is "
-            "used again. sequences, endurance, runtime: a temporary one without it."
+            help="noise, consistency, shake, denoising, sequences, endurance, runtime: folder of the renders; what is "
+            "there is used again. sequences, endurance, runtime: a temporary one without it."
         ),
     ] = None,
     seeds: Annotated[
@@ -255,6 +263,7 @@ def benchmark(
     consistency: whether poses and map are as sure as they say, on 90 rendered sequences (an hour). shake: whether
     frames of a shaken camera with a slow shutter are right when they are called tracked. endurance: memory,
     time and error over 10,000 frames of a lap over and over (ten minutes to render, then a quarter of an hour).
+    denoising: PSNR and time of the image filters beside OpenCV's, and the tracker in the dark (ten minutes).
     runtime: CPU and wall time, memory and start-up beside OpenCV's odometry, cuVSLAM and ORB-SLAM3 (extra 'peers').
     All but sequences and runtime need the extra 'train', claims and renders also 'report'.
     """

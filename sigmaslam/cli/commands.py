@@ -15,6 +15,7 @@ from sigmaslam.cli.benchmark import benchmark
 from sigmaslam.cli.calibrate import calibrate
 from sigmaslam.cli.calibration import calibration
 from sigmaslam.cli.check import check
+from sigmaslam.cli.denoise import denoise
 from sigmaslam.cli.evaluate import evaluate
 from sigmaslam.cli.export import export
 from sigmaslam.cli.finish import finish
@@ -58,6 +59,7 @@ for _command, _line in (
     (refine, "Adjust all of a run at once (extra 'graph')."),
     (localize, "Localise robots among known landmarks (extra 'train')."),
     (match, "Match two images."),
+    (denoise, "Filter noise out of images."),
     (geometry, "Find how two views lie to each other."),
     (calibrate, "Calibrate one or two cameras from images of a board."),
     (rectify, "Write rectified pairs."),

@@ -134,6 +134,9 @@ def track(
             "that come meanwhile are dropped. Cameras always do.",
         ),
     ] = False,
+    denoise: Annotated[
+        bool, typer.Option("--denoise", help="Filter noise out of the images first: for the dark; slow.")
+    ] = False,
     threads: Annotated[
         int, typer.Option(min=1, help="Threads of the network and of OpenCV; from 2 on keyframes are foreseen.")
     ] = 2,
@@ -167,7 +170,19 @@ def track(
     if overwrite:
         remove_run(out)
     summary = _track(
-        sequence, out, frontend, backend, settings, map, tracks, track_object, location, realtime, threads, findings
+        sequence,
+        out,
+        frontend,
+        backend,
+        settings,
+        map,
+        tracks,
+        track_object,
+        location,
+        realtime,
+        threads,
+        findings,
+        denoise,
     )
     tell_summary(summary, out)
 
@@ -236,6 +251,7 @@ def _track(
     realtime: bool = False,
     threads: int = 2,
     findings: Sequence[Finding] = (),
+    denoise: bool = False,
 ) -> dict[str, Any]:
     import cv2
 
@@ -258,6 +274,7 @@ def _track(
             real_time=realtime,
             threads=threads,
             findings=findings,
+            denoise=denoise,
         )
     except Stopped as stop:
         with suppress(OSError):  # the terminal may be gone

@@ -191,6 +191,20 @@ def _open(path: Path) -> cv2.VideoCapture:
     return capture
 
 
+def read_frames(path: Path) -> Iterator[np.ndarray]:
+    """The grey frames of a video of one eye, (H, W) uint8.
+
+    Raises:
+        InputError: there is no such video, or it cannot be decoded.
+    """
+    capture = _open(path)
+    try:
+        while (image := _next_image(capture)) is not None:
+            yield image
+    finally:
+        capture.release()
+
+
 def split_halves(image: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Left and right half of an image that holds both eyes.
 

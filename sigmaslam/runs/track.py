@@ -18,6 +18,7 @@ from sigmaslam.fusion.readings import Locations
 from sigmaslam.progress import open_progress
 from sigmaslam.readers import StereoFrame, StereoSequence
 from sigmaslam.readers.trajectory_files import write_tum
+from sigmaslam.runs.denoise import StereoFilter
 from sigmaslam.runs.frame_pictures import PictureRecorder
 from sigmaslam.runs.real_time import Latency, RealTimePlayer, describe_real_time
 from sigmaslam.runs.results import TrackerResults, output_error, write_results
@@ -45,6 +46,7 @@ def track_sequence(
     real_time: bool = False,
     threads: int = 2,
     findings: Sequence[Finding] = (),
+    denoise: bool = False,
 ) -> dict[str, Any]:
     """Tracks a sequence and writes the run folder; partial results are kept when it is stopped or fails.
 
@@ -60,6 +62,7 @@ def track_sequence(
             poses in the sensor's world.
         real_time: play a recording at its time stamps; frames are dropped when tracking falls behind.
         findings: what a check of the input found; they are kept in run.json, and explain a run that fails.
+        denoise: filter the images before they are tracked, see `sigmaslam.image_filtering.SequenceFilter`.
     Returns:
         The summary in run.json, in which `failure` says why less than half of the frames were tracked, and is None
         where more were; with `locations` also the counts of the readings, under `location`, and in real time
@@ -95,6 +98,7 @@ def track_sequence(
     writer = RunWriter(out, run, rectified)
     pictures = PictureRecorder(sequence.length)
     timing = _Timing(sequence, real_time)
+    images = StereoFilter() if denoise else None
     if timing.is_real:
         tracker.warm_up()
     stopped_by: BaseException | None = None
@@ -102,7 +106,7 @@ def track_sequence(
         try:
             # Cameras are released before the results are written, even after an error.
             with closing(sequence.frames()) as frames:
-                _track(sequence, timing.play(frames), tracker, writer, pictures, location, timing)
+                _track(sequence, timing.play(frames), tracker, writer, pictures, location, timing, images)
             signals.hold()
         except BaseException as error:
             signals.hold()
@@ -116,6 +120,7 @@ def track_sequence(
             **timing.describe(),
             **_describe_object(tracker, track_object),
             **_describe_location(location),
+            **({} if images is None else {"noise": images.describe()}),
         }
         others = {"tracks.npz": writer.write_tracks} if writer.has_tracks else {}
         if location is not None and location.T_sensor_world is not None:
@@ -240,6 +245,7 @@ def _track(
     pictures: PictureRecorder,
     location: LocationFilter | None,
     timing: _Timing,
+    images: StereoFilter | None,
 ) -> None:
     with open_progress() as progress:
         task = progress.add_task("frames", total=sequence.length, note="")
@@ -251,6 +257,8 @@ def _track(
             while reported < len(sequence.skipped) and sequence.skipped[reported].timestamp < frame.timestamp:
                 writer.add_skipped(sequence.skipped[reported].timestamp)
                 reported += 1
+            if images is not None:
+                frame = images.step(frame)
             estimate = tracker.step(frame.left, frame.right, frame.timestamp)
             timing.note(frame.timestamp)
             if location is not None:

@@ -1,0 +1,201 @@
+"""Filtering images from disk: one by one, as a sequence, or both eyes of a stereo sequence."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from sigmaslam.errors import FrameError, InputError
+from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder, make_folder
+from sigmaslam.image_filtering import NoiseModel, SequenceFilter, denoise_image, estimate_noise
+from sigmaslam.progress import open_progress
+from sigmaslam.readers import StereoFrame, StereoSequence
+from sigmaslam.readers.calibration_writer import write_calibration
+from sigmaslam.readers.images import IMAGE_SUFFIXES, read_grey
+from sigmaslam.readers.pairing import list_images
+from sigmaslam.readers.video import read_frames
+
+_MIN_SIDE = 32
+
+
+@dataclass(frozen=True, slots=True)
+class DenoiseSummary:
+    """What was filtered.
+
+    Attributes:
+        images: how many were written.
+        noise: of the first image, or the first of each eye.
+        seconds: in the filters, reading and writing left out.
+    """
+
+    images: int
+    noise: tuple[NoiseModel, ...]
+    seconds: float
+
+    def describe(self) -> str:
+        """Two lines, or one for each eye and one."""
+        lines = [_describe_noise(noise) for noise in self.noise]
+        return "\n".join([*lines, f"{self.images} images in {self.seconds:.1f} s"])
+
+
+class StereoFilter:
+    """A filter for each eye.
+
+    Args:
+        noise: of the images of both; None to estimate that of each from its first image.
+    """
+
+    def __init__(self, noise: NoiseModel | None = None) -> None:
+        self._eyes = SequenceFilter(noise), SequenceFilter(noise)
+
+    def step(self, frame: StereoFrame) -> StereoFrame:
+        """The frame with its images filtered.
+
+        Raises:
+            FrameError: the images are too small to filter.
+        """
+        left, right = (
+            _to_grey(_filter_next(eye, image, f"frame {frame.index}"))
+            for eye, image in zip(self._eyes, (frame.left, frame.right), strict=True)
+        )
+        return replace(frame, left=left, right=right)
+
+    @property
+    def noise(self) -> tuple[NoiseModel, ...]:
+        """Of the left and right eye; empty before the first frame."""
+        return tuple(eye.noise for eye in self._eyes if eye.noise is not None)
+
+    def describe(self) -> list[dict[str, Any]]:
+        """Entries of run.json."""
+        return [asdict(noise) for noise in self.noise]
+
+
+def denoise_files(
+    source: Path, out: Path, noise: NoiseModel | None = None, single: bool = False, thorough: bool = False
+) -> DenoiseSummary:
+    """Filters an image, the images of a folder or those of a video; writes 8-bit grey PNG.
+
+    Args:
+        source: an image, a folder of images, which are a sequence in the order of their names, or a video of one eye.
+        out: new or empty folder.
+        noise: None to estimate it from the first image, or from each where they are filtered one by one.
+        single: filter each image by itself.
+        thorough: as of `denoise_image`; images are then filtered one by one.
+    Raises:
+        InputError: there is no image, one cannot be read, or has another size than those before.
+    """
+    check_new_folder(out)
+    make_folder(out)
+    alone = single or thorough or _is_image(source)
+    follow = SequenceFilter(noise)
+    used: NoiseModel | None = noise
+    count, seconds = 0, 0.0
+    with open_progress() as progress:
+        task = progress.add_task("images", total=None, note="")
+        for name, image in _read(source):
+            began = time.perf_counter()
+            if alone:
+                _check_size(image, name)
+                own = noise or estimate_noise(image)
+                used = used or own
+                result = denoise_image(image, own, thorough)
+            else:
+                result = _filter_next(follow, image, name)
+                used = follow.noise
+            seconds += time.perf_counter() - began
+            path = out / f"{Path(name).stem}.png"
+            if path.exists():
+                raise InputError(f"{source}: {name} and another image would both become {path.name}: rename one")
+            _write(path, result)
+            count += 1
+            progress.update(task, completed=count)
+    if used is None:
+        raise InputError(f"{source}: no image; give an image, a folder that holds some, or a video")
+    return DenoiseSummary(count, (used,), seconds)
+
+
+def denoise_stereo(sequence: StereoSequence, out: Path, noise: NoiseModel | None = None) -> DenoiseSummary:
+    """Filters both eyes of a stereo sequence; writes a folder that `sigmaslam track` reads.
+
+    Args:
+        sequence: opened by `sigmaslam.readers.open_sequence`.
+        out: new or empty folder, for left/ and right/, times.txt and calibration.yaml.
+        noise: None to estimate that of each eye from its first image.
+    Raises:
+        InputError: the sequence breaks off; what was filtered is on disk then.
+    """
+    check_new_folder(out)
+    for eye in ("left", "right"):
+        make_folder(out / eye)
+    write_calibration(out / "calibration.yaml", sequence.camera)
+    both = StereoFilter(noise)
+    times: list[float] = []
+    seconds = 0.0
+    try:
+        with open_progress() as progress, closing(sequence.frames()) as frames:
+            task = progress.add_task("pairs", total=sequence.length, note="")
+            for frame in frames:
+                began = time.perf_counter()
+                result = both.step(frame)
+                seconds += time.perf_counter() - began
+                for eye, image in (("left", result.left), ("right", result.right)):
+                    _write(out / eye / f"{len(times):06d}.png", image)
+                times.append(frame.timestamp)
+                progress.update(task, completed=len(times))
+    finally:
+        atomic_write_text(out / "times.txt", "".join(f"{each:.9f}\n" for each in times))
+    return DenoiseSummary(2 * len(times), both.noise, seconds)
+
+
+def _read(source: Path) -> Iterator[tuple[str, np.ndarray]]:
+    """Names and grey images."""
+    if source.is_dir():
+        for path in list_images(source):
+            yield path.name, read_grey(path)
+    elif _is_image(source):
+        yield source.name, read_grey(source)
+    else:
+        for index, image in enumerate(read_frames(source)):
+            yield f"{index:06d}.png", image
+
+
+def _is_image(source: Path) -> bool:
+    return source.is_file() and source.suffix.lower() in IMAGE_SUFFIXES
+
+
+def _filter_next(follow: SequenceFilter, image: np.ndarray, name: str) -> np.ndarray:
+    _check_size(image, name)
+    try:
+        return follow.step(image)
+    except ValueError as error:
+        raise FrameError(f"{name}: {error}; filter images of different sizes with --single") from None
+
+
+def _check_size(image: np.ndarray, name: str) -> None:
+    if min(image.shape) < _MIN_SIDE:
+        height, width = image.shape
+        raise FrameError(f"{name}: is {width}x{height} pixels; images from {_MIN_SIDE}x{_MIN_SIDE} on are filtered")
+
+
+def _to_grey(image: np.ndarray) -> np.ndarray:
+    return np.asarray(np.clip(np.rint(image), 0, 255), np.uint8)
+
+
+def _write(path: Path, image: np.ndarray) -> None:
+    with atomic_path(path) as temporary:
+        cv2.imwrite(str(temporary), _to_grey(image))
+
+
+def _describe_noise(noise: NoiseModel) -> str:
+    words = [f"sigma {noise.sigma:.2f}"]
+    words += [f"shot noise of {noise.gain:.2f} x signal"] if noise.gain > 0 else []
+    words += [f"quantiser steps of {noise.step:.1f}"] if noise.step > 0 else []
+    words += [f"{100 * noise.impulses:.1f} % of the pixels stuck"] if noise.impulses > 0 else []
+    return f"Noise: {', '.join(words)} (grey levels)"

@@ -1,0 +1,89 @@
+"""`sigmaslam denoise` and `track --denoise`, on files."""
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from sigmaslam.readers import open_sequence
+from sigmaslam.runs.track import track_sequence
+from tests.support.commands import assert_refused, run_here
+
+ROOT = Path(__file__).resolve().parents[3]
+DEMO = ROOT / "synthetic" / "demo"
+SIGMA = 20.0
+
+
+@pytest.fixture
+def noisy_pairs(tmp_path: Path) -> Path:
+    """Three pairs of the demo with noise."""
+    folder, rng = tmp_path / "noisy", np.random.default_rng(0)
+    for eye in ("image_0", "image_1"):
+        (folder / eye).mkdir(parents=True)
+        for name in ("000000.png", "000001.png", "000002.png"):
+            image = cv2.imread(str(DEMO / eye / name), 0) + rng.normal(0.0, SIGMA, (240, 320))
+            cv2.imwrite(str(folder / eye / name), np.clip(np.rint(image), 0, 255).astype(np.uint8))
+    shutil.copy(DEMO / "calib.txt", folder)
+    (folder / "times.txt").write_text("0.0\n0.05\n0.1\n")
+    return folder
+
+
+def rmse(path: Path, truth: Path) -> float:
+    difference = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(float) - cv2.imread(str(truth), 0)
+    return float(np.sqrt(np.mean(difference**2)))
+
+
+@pytest.mark.parametrize("options", [[], ["--single"], ["--sigma", "20"]])
+def test_the_images_of_a_folder_lose_most_of_their_noise(noisy_pairs: Path, tmp_path: Path, options: list[str]):
+    done = run_here("denoise", noisy_pairs / "image_0", "--out", tmp_path / "out", *options)
+    assert done.returncode == 0, done.stderr
+    sigma = float(done.stdout.split("sigma ")[1].split()[0].strip(","))
+    assert sigma == pytest.approx(SIGMA, rel=0.2)
+    files = sorted((tmp_path / "out").iterdir())
+    assert [path.name for path in files] == ["000000.png", "000001.png", "000002.png"]
+    for path in files:
+        assert rmse(path, DEMO / "image_0" / path.name) < 0.5 * SIGMA
+
+
+def test_a_video_becomes_images(tmp_path: Path):
+    video = cv2.VideoWriter(str(tmp_path / "one.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (64, 48), isColor=False)
+    for k in range(3):
+        video.write(np.full((48, 64), 50 * (k + 1), np.uint8))
+    video.release()
+    assert run_here("denoise", tmp_path / "one.avi", "--out", tmp_path / "out").returncode == 0
+    means = [cv2.imread(str(path), 0).mean() for path in sorted((tmp_path / "out").iterdir())]
+    assert means == pytest.approx([50.0, 100.0, 150.0], abs=2.0)
+
+
+def test_a_stereo_sequence_becomes_one_that_can_be_tracked(noisy_pairs: Path, tmp_path: Path):
+    done = run_here("denoise", noisy_pairs, "--stereo", "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    before, after = open_sequence(noisy_pairs), open_sequence(tmp_path / "out")
+    assert after.timestamps == pytest.approx(before.timestamps)
+    assert after.camera.baseline == pytest.approx(before.camera.baseline)
+    for eye, original in (("left", "image_0"), ("right", "image_1")):
+        assert rmse(tmp_path / "out" / eye / "000002.png", DEMO / original / "000002.png") < 0.5 * SIGMA
+
+
+def test_the_tracker_sees_filtered_images_and_the_run_says_so(noisy_pairs: Path, tmp_path: Path):
+    track_sequence(open_sequence(noisy_pairs), tmp_path / "run", "orb", threads=1, denoise=True)
+    noise = json.loads((tmp_path / "run" / "run.json").read_text())["noise"]
+    assert len(noise) == 2
+    for eye in noise:
+        assert np.sqrt(eye["sigma"] ** 2 + eye["gain"] * 100) == pytest.approx(SIGMA, rel=0.25)
+
+
+def test_what_cannot_be_filtered_is_refused(noisy_pairs: Path, tmp_path: Path):
+    images = noisy_pairs / "image_0"
+    cv2.imwrite(str(images / "000003.png"), np.zeros((64, 64), np.uint8))
+    assert_refused(run_here("denoise", images, "--out", tmp_path / "a"), "000003.png", "--single")
+    cv2.imwrite(str(images / "000003.png"), np.zeros((20, 64), np.uint8))
+    assert_refused(run_here("denoise", images, "--single", "--out", tmp_path / "b"), "000003.png", "64x20")
+    shutil.copy(images / "000000.png", images / "000000.bmp")
+    assert_refused(run_here("denoise", images, "--single", "--out", tmp_path / "c"), "000000.png", "rename")
+    assert_refused(run_here("denoise", tmp_path / "none", "--out", tmp_path / "d"), "no such file")
+    assert_refused(run_here("denoise", noisy_pairs, "--stereo", "--single", "--out", tmp_path / "e"), "--single")
+    assert_refused(run_here("denoise", images, "--format", "kitti", "--out", tmp_path / "f"), "--stereo")
