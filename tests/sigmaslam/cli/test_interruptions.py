@@ -107,7 +107,7 @@ def test_finish_makes_the_results_of_a_killed_run(sequence: Path, whole: Path, t
     assert described["ended"] == "killed"
     for name in ("input", "frontend", "configuration", "calibration", "weights_sha256"):
         assert described[name] == undisturbed[name]
-    assert 'id="scene"' in (run / "report.html").read_text()
+    assert "window.report" in (run / "report.html").read_text()
     assert not any((run / name).exists() for name in PARTIAL)
     evaluated = run_here("evaluate", run, "--truth", sequence / "poses.txt", "--json")
     assert json.loads(evaluated.stdout)["matched"] == 4
