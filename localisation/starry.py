@@ -69,12 +69,9 @@ def read_starry(path: Path) -> StereoRecording:
         points[index][:, None],
         since[:, None],
     )
-    fu, fv, cu, cv, baseline = (float(file[name].ravel()[0]) for name in ("fu", "fv", "cu", "cv", "b"))
-    rig = StereoRig(
-        *(fu, fv, cu, cv, baseline),
-        torch.from_numpy(file["C_c_v"]),
-        torch.from_numpy(file["rho_v_c_v"].ravel()),
-    )
+    fx, fy, cx, cy, baseline = (float(file[name].ravel()[0]) for name in ("fu", "fv", "cu", "cv", "b"))
+    mounting = torch.from_numpy(file["C_c_v"]), torch.from_numpy(file["rho_v_c_v"].ravel())
+    rig = StereoRig(fx, fy, cx, cy, baseline, *mounting)
     return StereoRecording(path.stem, steps, rig, points, _truth(file))
 
 
