@@ -108,7 +108,15 @@ def _draw_map(figure: Figure, estimates: Sequence[RobotEstimate], landmarks: np.
             width, height = 2 * SIGMAS * np.sqrt(np.maximum(variances, 0.0))
             angle = np.degrees(np.arctan2(directions[1, 0], directions[0, 0]))
             axes.add_patch(
-                Ellipse(estimate.pose[index, :2], width, height, angle=angle, fill=False, color=colour, lw=0.6)
+                Ellipse(
+                    tuple(estimate.pose[index, :2].tolist()),
+                    width,
+                    height,
+                    angle=angle,
+                    fill=False,
+                    color=colour,
+                    lw=0.6,
+                )
             )
     axes.plot(*landmarks.T, "x", ms=7, mew=1.6, color=GREY)
     axes.set_aspect("equal", adjustable="datalim")
