@@ -20,9 +20,9 @@ F = TypeVar("F", bound=Callable)
 def compile_step(step: F) -> F:
     """The step made into machine code for the shapes and dtypes that it is called with.
 
-    A step is a function of tensors that calls `predict` and `update` and returns tensors. Batches of small filters, of
-    up to six states and measured components, become one loop over the batch, see `sigmaslam.filters.components`; others
-    are fused into a few; of a single filter most of the overhead goes. The first call for each set of shapes takes
+    A step is a function of tensors that calls `predict` and `update` and returns tensors. Batches of small filters
+    become one loop over the batch, see `sigmaslam.filters.components`; others are fused into a few; of a single filter
+    most of the overhead goes. The first call for each set of shapes takes
     from ten seconds to a minute. Filters and models that the step refers to are taken as they are then: compile anew
     after changing one. A filter with iterations="auto" always linearises twice in compiled code. One with
     on_failure="raise" raises as it does elsewhere; the step is run once more, uncompiled, to find what to name.
