@@ -72,15 +72,13 @@ def prior(size=3, seed=0):
     return random, random(BATCH, size), root
 
 
-def localisation(bayes, forms=("factor",)):
+def localisation(bayes):
     motion = filters.MotionModel(drive, filters.Diagonal(torch.tensor([1e-4, 1e-4, 1e-5], dtype=torch.float64)))
     noise = filters.Diagonal(torch.tensor([0.01, 1e-4], dtype=torch.float64))
     sensor = filters.MeasurementModel(see, noise, residual=difference)
 
     def step(mean, root, control, value, landmark):
         belief = filters.Gaussian(mean, factor=root, factor_is_lower=True)
-        if "covariance" in forms:
-            belief = filters.Gaussian(mean, root @ root.mT)
         result = bayes.update(bayes.predict(belief, motion, control).belief, sensor, value, landmark)
         return (
             result.belief.mean, result.belief.covariance, result.healthy, result.count, result.log_likelihood,
@@ -111,6 +109,15 @@ def test_rewritten_steps_equal_the_library(bayes):
     assert not step(*arguments)[2][5:8].any()
     shapes = {node.meta["val"].shape for node in graph.nodes if node.target is torch.ops.aten.mul.Tensor}
     assert {shape for shape in shapes if BATCH in shape} == {torch.Size([BATCH])}, "only components are multiplied"
+
+
+def test_a_rewritten_step_raises_as_it_did():
+    step, arguments = localisation(filters.UnscentedKalmanFilter(iterations=1, on_failure="raise"))
+    arguments = [torch.where(torch.isfinite(each), each, 0.0) for each in arguments]
+    run, _ = rewritten(step, arguments)
+    arguments[0][7, 0] = torch.nan
+    with pytest.raises(RuntimeError, match="a filter failed for an element"):
+        run(*arguments)
 
 
 def test_a_filter_on_a_manifold_is_rewritten():
