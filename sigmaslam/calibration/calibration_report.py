@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from sigmaslam.calibration.board_bundle import INTRINSICS
 from sigmaslam.calibration.calibrate import BoardCalibration
@@ -17,6 +15,9 @@ from sigmaslam.files import atomic_path, atomic_write_text
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.plot_style import BLUE, GREY, VERMILLION, style_axes
 from sigmaslam.readers.calibration_writer import camera_entries, write_calibration
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 # Cells in which corners are looked for, columns and rows.
 _CELLS = (8, 6)
@@ -108,6 +109,8 @@ def coverage(result: BoardCalibration, eye: int) -> float:
 def draw_board_calibration(path: Path, result: BoardCalibration) -> None:
     """Draw where corners are in each eye with their residuals, and the rms of each image."""
     eyes = result.rig.eyes
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(6.0 * len(eyes), 7.0), layout="constrained")
     grid = figure.subplots(2, len(eyes), squeeze=False, height_ratios=(2, 1))
     for k, (name, eye) in enumerate(zip(_names(result), eyes, strict=True)):

@@ -17,6 +17,7 @@ from sigmaslam.calibration.calibration_report import (
     draw_board_calibration,
     write_board_calibration,
 )
+from sigmaslam.cli.extras import need_report_extra
 from sigmaslam.errors import InputError
 from sigmaslam.progress import open_progress
 
@@ -29,7 +30,7 @@ def calibrate(
     images: Annotated[
         list[Path],
         typer.Argument(
-            metavar="IMAGES...",
+            metavar="IMAGES",
             help="Image files or folders; pairs where all names have left and right, cam0 and cam1, infra1 and infra2, "
             "or end in _0 and _1, or _l and _r; else of one camera.",
         ),
@@ -44,6 +45,8 @@ def calibrate(
     """Calibrate a stereo pair, or one camera, from images of a board, with the covariance of all parameters."""
     if out.suffix.lower() not in (".yaml", ".yml"):
         raise InputError(f"{out}: a calibration is YAML; choose a name that ends in .yaml")
+    if picture is not None:
+        need_report_extra()
     plan = parse_board(board)
     moments = find_board_images(images)
     with open_progress() as progress:

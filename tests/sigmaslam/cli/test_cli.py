@@ -314,7 +314,9 @@ def test_every_command_has_help_that_80_columns_do_not_cut(command: str, monkeyp
     result = run_here(*command.split(), "--help")
     assert result.returncode == 0
     assert "Usage" in result.stdout
-    assert not re.search(r"\w(…|\.\.\.)|<bool>", result.stdout), result.stdout
+    # Arguments of which there may be many end in dots.
+    text = result.stdout.replace("IMAGES...", "IMAGES")
+    assert not re.search(r"\w(…|\.\.\.)|<bool>", text), text
 
 
 def test_the_list_of_columns_is_whole_in_80_columns(monkeypatch: pytest.MonkeyPatch):
