@@ -47,9 +47,13 @@ def run_case(case: Case, runner: Runner) -> Result:
         folder = Path(name)
         outcome = attempt(case, folder, runner)
         verdict, reason = judge(case, outcome, folder)
-        text = outcome.text.replace(f"{name}/", "")
-        said = _excerpt(text, case.says) if verdict == Verdict.GOOD else reason.replace(f"{name}/", "")
-        return Result(case, verdict, outcome.code, said)
+        said = _excerpt(_without_folders(outcome.text), case.says)
+        return Result(case, verdict, outcome.code, said if verdict == Verdict.GOOD else _without_folders(reason))
+
+
+def _without_folders(text: str) -> str:
+    """The text without the folders of this machine."""
+    return re.sub(r"/\S*?(?:sigmaslam-faults?-[^/\s]*|synthetic/demo)(?:/|(?=[\s:]))", "", text)
 
 
 def _excerpt(text: str, words: tuple[str, ...]) -> str:
