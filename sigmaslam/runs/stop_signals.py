@@ -30,6 +30,8 @@ class Stopped(KeyboardInterrupt):
 class StopSignals:
     """Inside the block the first of these signals raises `Stopped`; later ones, and any after `hold`, are ignored.
 
+    So are those that come after the block once one has been received.
+
     Signals that the process ignores already, as SIGHUP under nohup, stay ignored. Outside the main thread, where
     Python handles no signals, nothing changes.
 
@@ -51,7 +53,9 @@ class StopSignals:
 
     def __exit__(self, *_: object) -> None:
         for number, handler in self._before.items():
-            signal.signal(number, handler)
+            # The process is about to end after a stop, and one signal more must not change how. Python takes its
+            # handlers away before it ends, so that a signal would kill it; what is ignored stays ignored.
+            signal.signal(number, handler if self.received is None else signal.SIG_IGN)
 
     def hold(self) -> None:
         """From here on no signal interrupts."""

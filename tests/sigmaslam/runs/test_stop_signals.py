@@ -28,7 +28,6 @@ def send(number: signal.Signals) -> None:
 
 @pytest.mark.parametrize(("number", "code"), list(zip(NUMBERS, (130, 143, 129), strict=True)))
 def test_the_first_signal_is_raised_and_later_ones_are_not(number: signal.Signals, code: int):
-    before = [signal.getsignal(each) for each in NUMBERS]
     with StopSignals() as signals:
         with pytest.raises(Stopped) as stopped:
             send(number)
@@ -36,6 +35,14 @@ def test_the_first_signal_is_raised_and_later_ones_are_not(number: signal.Signal
             send(each)
         assert signals.received == number
     assert stopped.value.exit_code == code
+    # The process is about to end; nothing must end it otherwise.
+    assert [signal.getsignal(each) for each in NUMBERS] == [signal.SIG_IGN] * len(NUMBERS)
+
+
+def test_handlers_are_as_before_where_no_signal_came():
+    before = [signal.getsignal(each) for each in NUMBERS]
+    with StopSignals():
+        pass
     assert [signal.getsignal(each) for each in NUMBERS] == before
 
 
