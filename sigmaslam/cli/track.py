@@ -152,19 +152,24 @@ def track(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Remove the run that is in the folder, if nothing else is in it.")
     ] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the run in the folder, of the same input, that was stopped.")
+    ] = False,
 ) -> None:
     """Track a stereo sequence, recorded or live: trajectory, covariance, map and report.
 
     Ctrl-C, SIGTERM and SIGHUP end it with what was tracked until then (exit codes 130, 143, 129). After a kill -9
-    `sigmaslam finish` makes the results. Exit code 3: less than half of the frames were tracked, and the last line says
-    why. 2: the input cannot be used, or a result not be written.
+    `sigmaslam finish` makes the results, and --resume goes on with the run. Exit code 3: less than half of the frames
+    were tracked, and the last line says why. 2: the input cannot be used, or a result not be written.
     """
     if backend.value == "torch":
         need_train_extra()
+    if resume and overwrite:
+        raise InputError("--resume goes on with the run in the folder, --overwrite removes it: give one of them")
     settings = _read_settings(config, estimate, track_object is not None)
     sequence = open_input(source, format, calibration, camera, seconds, (topic_left, topic_right))
     sequence = _select(sequence, Selection(start, frames, every), scale)
-    if not overwrite:
+    if not (overwrite or resume):
         check_new_folder(out)
     findings = _check(sequence, strict, threads)
     if overwrite:
@@ -183,6 +188,7 @@ def track(
         threads,
         findings,
         denoise,
+        resume,
     )
     tell_summary(summary, out)
 
@@ -252,6 +258,7 @@ def _track(
     threads: int = 2,
     findings: Sequence[Finding] = (),
     denoise: bool = False,
+    resume: bool = False,
 ) -> dict[str, Any]:
     import cv2
 
@@ -275,6 +282,7 @@ def _track(
             threads=threads,
             findings=findings,
             denoise=denoise,
+            resume=resume,
         )
     except Stopped as stop:
         with suppress(OSError):  # the terminal may be gone

@@ -19,13 +19,14 @@ class AppendedFile:
 
     Args:
         path: of the file; it must not exist. It stays locked until it is closed, or the process ends.
+        goes_on: the file exists, and pieces are appended to those that it has.
     Raises:
         OSError: it cannot be made.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, goes_on: bool = False) -> None:
         self._path = path
-        self._file = path.open("xb", buffering=0)
+        self._file = path.open("ab" if goes_on else "xb", buffering=0)
         if sys.platform != "win32":
             with suppress(OSError):  # a file system without locks
                 fcntl.flock(self._file, fcntl.LOCK_EX)

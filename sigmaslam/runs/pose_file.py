@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sigmaslam.files import atomic_path
 from sigmaslam.runs.appended_file import AppendedFile, read_records
 from sigmaslam.table import Table
 
@@ -35,10 +36,10 @@ class PoseRecords(Table):
 
 
 class PoseWriter:
-    """Appends poses to the file in the folder of a run."""
+    """Appends poses to the file in the folder of a run, a new one or one that goes on."""
 
-    def __init__(self, folder: Path) -> None:
-        self._file = AppendedFile(folder / PARTIAL_POSES)
+    def __init__(self, folder: Path, goes_on: bool = False) -> None:
+        self._file = AppendedFile(folder / PARTIAL_POSES, goes_on)
 
     def add(
         self, timestamp: float, pose: np.ndarray, covariance: np.ndarray, matching: np.ndarray, refused: float
@@ -62,3 +63,12 @@ def read_pose_records(folder: Path) -> PoseRecords:
         rows[:, 53:89].reshape(-1, 6, 6),
         rows[:, 89],
     )
+
+
+def write_pose_records(folder: Path, records: PoseRecords) -> None:
+    """Writes poses as a run leaves them, so that it can go on."""
+    count = len(records)
+    columns = (records.timestamp, records.pose, records.covariance, records.matching, records.refused_offset)
+    rows = np.column_stack([column.reshape(count, -1) for column in columns])
+    with atomic_path(folder / PARTIAL_POSES) as temporary:
+        temporary.write_bytes(rows.astype(np.float64).tobytes())

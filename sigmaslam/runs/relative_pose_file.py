@@ -41,8 +41,8 @@ class FramePairs(Table):
 class RelativePoseWriter:
     """Appends relative poses to a file in the folder of a run, so that they outlive it and memory does not grow."""
 
-    def __init__(self, folder: Path) -> None:
-        self._file = AppendedFile(folder / PARTIAL_RELATIVE_POSES)
+    def __init__(self, folder: Path, goes_on: bool = False) -> None:
+        self._file = AppendedFile(folder / PARTIAL_RELATIVE_POSES, goes_on)
 
     def add(self, frame: int, relative: RelativePoses) -> None:
         """Takes those of a frame, by its row in trajectory.tum."""
@@ -72,11 +72,32 @@ def collect_frame_pairs(folder: Path, timestamps: np.ndarray) -> FramePairs:
     rows = rows[rows[:, 0] < len(timestamps)]
     return FramePairs(
         np.array(SPANS)[rows[:, 1].astype(np.int64)],
-        np.searchsorted(timestamps, rows[:, 2]),
+        # The nearest: time stamps that were read from trajectory.tum are rounded.
+        np.searchsorted(0.5 * (timestamps[1:] + timestamps[:-1]), rows[:, 2]),
         rows[:, 0].astype(np.int64),
         rows[:, 3:19].reshape(-1, 4, 4),
         rows[:, 19:].reshape(-1, 6, 6),
     )
+
+
+def write_partial_frame_pairs(folder: Path, pairs: FramePairs, timestamps: np.ndarray) -> None:
+    """Writes relative poses as a run leaves them, so that it can go on.
+
+    Args:
+        folder: of the run.
+        pairs: what `collect_frame_pairs` returns.
+        timestamps: (N,) of the frames with a pose, seconds.
+    """
+    count = len(pairs)
+    columns = (
+        pairs.later,
+        np.array([SPANS.index(span) for span in pairs.span], np.int64),
+        timestamps[pairs.earlier],
+        pairs.pose.reshape(count, 16),
+        pairs.covariance.reshape(count, 36),
+    )
+    with atomic_path(folder / PARTIAL_RELATIVE_POSES) as temporary:
+        temporary.write_bytes(np.column_stack(columns).astype(np.float64).tobytes())
 
 
 def write_frame_pairs(path: Path, pairs: FramePairs) -> None:

@@ -43,3 +43,10 @@ def remove_run(folder: Path) -> None:
         check_not_in_use(folder / PARTIAL_POSES)
     for name in _NAMES:
         (folder / name).unlink(missing_ok=True)
+
+
+def remove_results(folder: Path) -> None:
+    """Removes what was made of a run in its folder, and leaves what `write_results` makes it of."""
+    for name in _NAMES:
+        if name not in (RUN_NAME, FRAMES_NAME, PARTIAL_POSES, PARTIAL_RELATIVE_POSES):
+            (folder / name).unlink(missing_ok=True)

@@ -59,6 +59,7 @@ class RunWriter:
         out: folder to make; it must not exist, or be empty.
         run: entries of run.json, which is written at once, so that a run that is killed says what it was.
         rectified: result of `StereoTracker.describe_rectified`, to keep what `write_tracks` writes.
+        poses: number of poses in the folder, of a run that goes on in it; None: it is a new one.
 
     Attributes:
         run: the entries, with versions and weights.
@@ -67,20 +68,25 @@ class RunWriter:
         InputError: the folder holds something, or cannot be made.
     """
 
-    def __init__(self, out: Path, run: dict[str, Any], rectified: dict[str, Any] | None = None) -> None:
-        check_new_folder(out)
+    def __init__(
+        self, out: Path, run: dict[str, Any], rectified: dict[str, Any] | None = None, poses: int | None = None
+    ) -> None:
+        goes_on = poses is not None
+        if not goes_on:
+            check_new_folder(out)
         self.run = {**run, **_describe_start(), "versions": _versions(), "weights_sha256": _weight_hashes()}
         self.calibration: CalibrationEstimate | None = None
         try:
             out.mkdir(parents=True, exist_ok=True)
             atomic_write_text(out / RUN_NAME, json.dumps({**self.run, "ended": UNFINISHED}, indent=2) + "\n")
-            self._poses = PoseWriter(out)
-            self._relative_poses = RelativePoseWriter(out)
-            self._table = AppendedFile(out / FRAMES_NAME)
+            self._poses = PoseWriter(out, goes_on)
+            self._relative_poses = RelativePoseWriter(out, goes_on)
+            self._table = AppendedFile(out / FRAMES_NAME, goes_on)
         except OSError as error:
             raise InputError(f"{out}: cannot be written ({error.strerror}): choose another --out") from error
-        self._add_row(_COLUMNS)
-        self._count = 0
+        if not goes_on:
+            self._add_row(_COLUMNS)
+        self._count = poses or 0
         self._rectified = rectified
         self._tracks: list[tuple[int, KeyframeTracks]] = []
 

@@ -22,12 +22,14 @@ from sigmaslam.runs.denoise import StereoFilter
 from sigmaslam.runs.frame_pictures import PictureRecorder
 from sigmaslam.runs.real_time import Latency, RealTimePlayer, describe_real_time
 from sigmaslam.runs.results import TrackerResults, output_error, write_results
+from sigmaslam.runs.resume import StoppedRun, read_stopped_run
 from sigmaslam.runs.run_folder import RunWriter, describe_camera
 from sigmaslam.runs.stop_signals import Stopped, StopSignals
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.estimate import Estimate
 from sigmaslam.slam.object_region import read_region
-from sigmaslam.slam.object_tracker import ObjectTracker
+from sigmaslam.slam.object_tracker import OBJECT_CONFIG, ObjectTracker
+from sigmaslam.slam.start_pose import StartPose
 from sigmaslam.slam.tracker import StereoTracker
 
 Tracker = StereoTracker | ObjectTracker
@@ -47,6 +49,7 @@ def track_sequence(
     threads: int = 2,
     findings: Sequence[Finding] = (),
     denoise: bool = False,
+    resume: bool = False,
 ) -> dict[str, Any]:
     """Tracks a sequence and writes the run folder; partial results are kept when it is stopped or fails.
 
@@ -63,39 +66,53 @@ def track_sequence(
         real_time: play a recording at its time stamps; frames are dropped when tracking falls behind.
         findings: what a check of the input found; they are kept in run.json, and explain a run that fails.
         denoise: filter the images before they are tracked, see `sigmaslam.image_filtering.SequenceFilter`.
+        resume: `out` holds a run of the same sequence that was stopped or killed, which goes on where it was. The map
+            is then that of the frames from its last keyframe on, and there is no trajectory after the fact.
     Returns:
         The summary in run.json, in which `failure` says why less than half of the frames were tracked, and is None
         where more were; with `locations` also the counts of the readings, under `location`, and in real time
         what was dropped and the latency, under `real_time`.
     Raises:
-        InputError: the folder is not empty, an argument is wrong, or the sequence breaks off; what was computed is on
-            disk then.
+        InputError: the folder is not empty, or holds no run that could go on, an argument is wrong, or the sequence
+            breaks off; what was computed is on disk then.
         OutputError: results could not be written, the others are; what was said of each frame is on disk.
         Stopped: by Ctrl-C, SIGTERM or SIGHUP, after the partial results are written.
     """
     if track_object is not None and (map_path is not None or tracks):
         raise InputError("--map and --tracks are of a moving camera's world: leave them out with --track-object")
-    tracker = _build_tracker(sequence, frontend, backend, config, track_object, threads)
+    if resume:
+        _check_can_resume(sequence, map_path, tracks, track_object, locations, real_time)
+    settings: dict[str, Any] = {
+        "input": printable(sequence.source),
+        "format": sequence.format,
+        "frontend": frontend,
+        "backend": backend,
+        "map": None if map_path is None else printable(map_path),
+        "configuration": asdict(config or (TrackerConfig() if track_object is None else OBJECT_CONFIG)),
+        "calibration": describe_camera(sequence.camera),
+    }
+    stopped = read_stopped_run(out, settings) if resume else None
+    if stopped is not None:
+        stopped.check_sequence(sequence)
+    start = None if stopped is None else stopped.start
+    tracker = _build_tracker(sequence, frontend, backend, config, track_object, threads, start)
     location = None if locations is None else LocationFilter(locations, track_object is not None)
     rectified = None
     if isinstance(tracker, StereoTracker):
         if map_path is not None:
             tracker.load_map(map_path)
         rectified = tracker.describe_rectified() if tracks else None
-    run: dict[str, Any] = {
-        "input": printable(sequence.source),
-        "format": sequence.format,
-        "frontend": frontend,
-        "backend": backend,
-        "map": None if map_path is None else printable(map_path),
-        "configuration": asdict(tracker.config),
-        "calibration": describe_camera(sequence.camera),
+    run = {
+        **settings,
         "checks": [asdict(each) for each in findings],
+        **({} if stopped is None else {"resumed_at": stopped.resumed_at}),
     }
     run |= _describe_location(location)
     if track_object is not None:
         run["object"] = {"region": track_object, "origin": None}  # which the first frame gives
-    writer = RunWriter(out, run, rectified)
+    if stopped is not None:
+        stopped.make_ready()
+    writer = RunWriter(out, run, rectified, None if stopped is None else len(stopped.records))
     pictures = PictureRecorder(sequence.length)
     timing = _Timing(sequence, real_time)
     images = StereoFilter() if denoise else None
@@ -106,7 +123,7 @@ def track_sequence(
         try:
             # Cameras are released before the results are written, even after an error.
             with closing(sequence.frames()) as frames:
-                _track(sequence, timing.play(frames), tracker, writer, pictures, location, timing, images)
+                _track(sequence, timing.play(frames), tracker, writer, pictures, location, timing, images, stopped)
             signals.hold()
         except BaseException as error:
             signals.hold()
@@ -125,8 +142,8 @@ def track_sequence(
         others = {"tracks.npz": writer.write_tracks} if writer.has_tracks else {}
         if location is not None and location.T_sensor_world is not None:
             others["trajectory_location.tum"] = lambda path: _write_location(path, location)
-        # A sensor's readings correct poses as they come, not after the fact.
-        final = tracker.final_trajectory if location is None else None
+        # A sensor's readings correct poses as they come, not after the fact; what was before a stop is not in memory.
+        final = tracker.final_trajectory if location is None and stopped is None else None
         results = TrackerResults(tracker.map, tracker.pack_keyframes, final, others, pictures.write)
         summary, failed = write_results(out, run, writer.calibration, results)
     if stopped_by is not None:
@@ -209,11 +226,34 @@ def _build_tracker(
     config: TrackerConfig | None,
     track_object: str | None,
     threads: int,
+    start: StartPose | None,
 ) -> Tracker:
     if track_object is None:
-        return StereoTracker(sequence.camera, frontend, backend, config, threads=threads)
+        return StereoTracker(sequence.camera, frontend, backend, config, threads=threads, start=start)
     region = read_region(track_object, sequence.camera.left.width, sequence.camera.left.height)
     return ObjectTracker(sequence.camera, region, frontend, backend, config, threads)
+
+
+def _check_can_resume(
+    sequence: StereoSequence,
+    map_path: Path | None,
+    tracks: bool,
+    track_object: str | None,
+    locations: Locations | None,
+    real_time: bool,
+) -> None:
+    """What needs what was in memory when the run was stopped, or frames that do not come again, is refused."""
+    refused = {
+        "--camera": sequence.format == "camera",
+        "--map": map_path is not None,
+        "--tracks": tracks,
+        "--track-object": track_object is not None,
+        "--location": locations is not None,
+        "--realtime": real_time,
+    }
+    for option, given in refused.items():
+        if given:
+            raise InputError(f"--resume does not go with {option}: leave one of them out")
 
 
 def _describe_object(tracker: Tracker, track_object: str | None) -> dict[str, Any]:
@@ -246,7 +286,10 @@ def _track(
     location: LocationFilter | None,
     timing: _Timing,
     images: StereoFilter | None,
+    stopped: StoppedRun | None,
 ) -> None:
+    if stopped is not None:
+        frames = stopped.frames(frames)
     with open_progress() as progress:
         task = progress.add_task("frames", total=sequence.length, note="")
         reported, done, lost = 0, 0, 0
@@ -255,7 +298,8 @@ def _track(
             read_ms = 1e3 * (time.perf_counter() - since - timing.waited)
             # Skipped frames are reported together with a later readable one.
             while reported < len(sequence.skipped) and sequence.skipped[reported].timestamp < frame.timestamp:
-                writer.add_skipped(sequence.skipped[reported].timestamp)
+                if stopped is None or stopped.is_new(sequence.skipped[reported].timestamp):
+                    writer.add_skipped(sequence.skipped[reported].timestamp)
                 reported += 1
             if images is not None:
                 frame = images.step(frame)
@@ -263,9 +307,15 @@ def _track(
             timing.note(frame.timestamp)
             if location is not None:
                 estimate = estimate.map_camera(location.fuse)
-            writer.add(
-                estimate.camera, estimate.pose, estimate.pose_covariance, estimate.pose_matching_covariance, read_ms
-            )
+            if stopped is not None and not done and estimate.camera.tracks is None:
+                raise InputError(
+                    f"{sequence.source}: the frame at {frame.timestamp:.6f} s, the last keyframe of the run, "
+                    "is none any more: track anew with --overwrite"
+                )
+            if stopped is None or stopped.is_new(frame.timestamp):
+                writer.add(
+                    estimate.camera, estimate.pose, estimate.pose_covariance, estimate.pose_matching_covariance, read_ms
+                )
             if tracker.last_frame is not None:
                 pictures.add(estimate.camera, tracker.last_frame)
             done += 1
@@ -274,7 +324,8 @@ def _track(
             note = _note(estimate.camera, lost, done / (since - began))
             progress.update(task, completed=done + reported + timing.dropped, note=note)
         for skipped in sequence.skipped[reported:]:
-            writer.add_skipped(skipped.timestamp)
+            if stopped is None or stopped.is_new(skipped.timestamp):
+                writer.add_skipped(skipped.timestamp)
         progress.update(task, completed=done + len(sequence.skipped) + timing.dropped)
 
 

@@ -37,6 +37,8 @@ class Recovery:
         mapper: inserts keyframes.
         admission: what may become a landmark.
         config: settings.
+        start: pose (4, 4) and covariance (6, 6) of the first keyframe in the world of an earlier run, perturbed
+            from the left there; None: its camera is the world.
     """
 
     course: Course
@@ -46,6 +48,7 @@ class Recovery:
     mapper: Mapper
     admission: LandmarkAdmission
     config: TrackerConfig
+    start: tuple[np.ndarray, np.ndarray] | None = None
 
     def start_or_recover(self, view: StereoView, timestamp: float) -> KeyframeTracks | None:
         """Without a pose: starts, or waits for a while and goes on with the uncertainty of the prediction."""
@@ -55,7 +58,9 @@ class Recovery:
             return None
         if course.phase is Phase.WAITING:
             seen_by_both = np.isfinite(view.disparity).mean()
-            return self._start(view, timestamp) if seen_by_both >= _MIN_STEREO_SHARE else None
+            # Of an earlier run it was a keyframe.
+            known = self.start is not None
+            return self._start(view, timestamp) if known or seen_by_both >= _MIN_STEREO_SHARE else None
         since = timestamp - course.tracked_at
         if since <= self.config.lost_seconds or not self.admission.restarts_anywhere:
             return None
@@ -83,10 +88,13 @@ class Recovery:
         self.motion.predict(timestamp - started_at, densities(self.config, self.window.depth))
 
     def _start(self, view: StereoView, timestamp: float) -> KeyframeTracks:
-        """Makes the view the first keyframe, and its camera the world."""
+        """Makes the view the first keyframe, and its camera the world where no other one is given."""
         self.course.start(timestamp)
-        view = view.only(self.admission.admit(view, np.eye(4), self.window))
-        return self._insert(NewKeyframe(view, timestamp, np.eye(4), np.eye(4), np.zeros((6, 6))))
+        if self.start is not None:
+            self.course.resume(timestamp)
+        pose, covariance = (np.eye(4), np.zeros((6, 6))) if self.start is None else self.start
+        view = view.only(self.admission.admit(view, pose, self.window))
+        return self._insert(NewKeyframe(view, timestamp, pose, pose, covariance))
 
     def _insert(self, new: NewKeyframe) -> KeyframeTracks:
         """Makes a view a keyframe that sees no known landmark; its velocity is unknown."""

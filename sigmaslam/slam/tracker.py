@@ -41,6 +41,7 @@ from sigmaslam.slam.recovery import Recovery
 from sigmaslam.slam.relative_poses import RelativePoseReporter
 from sigmaslam.slam.relocalisation import Relocaliser
 from sigmaslam.slam.reporting import Reporter
+from sigmaslam.slam.start_pose import StartPose
 from sigmaslam.slam.stopwatch import Stopwatch
 from sigmaslam.slam.unguided_matching import UnguidedMatcher
 
@@ -62,6 +63,8 @@ class StereoTracker:
         admission: what may become a landmark; by default everything.
         threads: of the network; with more than one the features of a keyframe that is foreseen are made beside the
             tracking of its frame. The results are the same whether it was foreseen or not.
+        start: pose of the first frame in the world of an earlier run, in which it was a keyframe; by default the left
+            camera of the first frame is the world.
 
     Attributes:
         last_frame: what the last frame saw, for pictures; None before the first.
@@ -77,6 +80,7 @@ class StereoTracker:
         config: TrackerConfig | None = None,
         admission: LandmarkAdmission | None = None,
         threads: int = 2,
+        start: StartPose | None = None,
     ) -> None:
         check_tracker_arguments(camera, frontend, backend, config, threads)
         self.config = config = config or TrackerConfig()
@@ -104,7 +108,8 @@ class StereoTracker:
         self._mapper = Mapper(rectified, window, keyframes, motion, noise, admission, config)
         self._loops = LoopCloser(window, keyframes, unguided)
         self._relocaliser = Relocaliser(window, keyframes, unguided, admission, config.min_inliers)
-        self._recovery = Recovery(course, window, keyframes, motion, self._mapper, admission, config)
+        origin = None if start is None else start.of_rectified(self._T_rectified_left)
+        self._recovery = Recovery(course, window, keyframes, motion, self._mapper, admission, config, origin)
         relative_poses = RelativePoseReporter(self._T_rectified_left, window, keyframes, motion)
         self._reporter = Reporter(self._T_rectified_left, window, motion, relative_poses)
         self.last_frame: MatchedFrame | None = None
