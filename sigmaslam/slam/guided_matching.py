@@ -24,7 +24,7 @@ _CONFIRMED = 2
 # the chi-square distribution with two degrees of freedom is that of an exponential one.
 _RIGHT = 0.3
 _CHI_SQUARE_RIGHT = -2.0 * np.log1p(-_RIGHT)
-# Fewer of them say nothing of the prediction.
+# A keyframe of which fewer landmarks are in view is not searched for.
 _MIN_LANDMARKS = 8
 
 
@@ -150,7 +150,7 @@ class GuidedMatcher:
     def _searches(
         self, keyframes: list[StereoView], pose: np.ndarray, covariance: np.ndarray, reference: int
     ) -> Iterator[tuple[int, np.ndarray, KeypointSearch]]:
-        """For each keyframe of which landmarks are in view: its number, their rows, and what is searched for."""
+        """For each keyframe of which enough landmarks are in view: its number, their rows, and what is searched for."""
         landmarks = self.window.landmarks
         rows = np.flatnonzero(landmarks.misses < self.config.max_misses)
         if not len(rows):
@@ -163,7 +163,7 @@ class GuidedMatcher:
         T_view_key = se3_inverse(pose) @ self.window.posterior.poses
         for anchor, key in enumerate(keyframes):
             chosen = np.flatnonzero(landmarks.anchor[rows] == anchor)
-            if not len(chosen):
+            if len(chosen) < _MIN_LANDMARKS:
                 continue
             feature = landmarks.feature[rows[chosen]]
             maps = None
