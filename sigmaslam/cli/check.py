@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from sigmaslam.checks import Finding, check_sequence, has_errors
-from sigmaslam.cli.track import InputFormat, open_input
+from sigmaslam.cli.track import InputFormat, TopicLeft, TopicRight, open_input
 
 _STYLES = {"ok": "green", "unknown": "dim", "warning": "yellow", "error": "bold red"}
 
@@ -27,12 +27,8 @@ def check(
     camera: Annotated[
         str | None, typer.Option(metavar="LEFT,RIGHT", help="Live cameras in place of INPUT, as `track` takes them.")
     ] = None,
-    topic_left: Annotated[
-        str | None, typer.Option(help="Image topic in a bag.", show_default="the one with 'left', cam0 or infra1")
-    ] = None,
-    topic_right: Annotated[
-        str | None, typer.Option(help="Image topic in a bag.", show_default="the one with 'right', cam1 or infra2")
-    ] = None,
+    topic_left: TopicLeft = None,
+    topic_right: TopicRight = None,
     out: Annotated[
         Path | None, typer.Option(metavar="PAGE.HTML", help="Page to write: the findings, and pairs with matches.")
     ] = None,

@@ -41,6 +41,14 @@ Backend = StrEnum("Backend", BACKENDS)  # type: ignore[misc]
 InputFormat = StrEnum("InputFormat", FORMATS)  # type: ignore[misc]
 """Kinds of input."""
 
+# Options that `check` has as well.
+TopicLeft = Annotated[
+    str | None, typer.Option(help="Image topic in a bag.", show_default="the one with 'left', cam0 or infra1")
+]
+TopicRight = Annotated[
+    str | None, typer.Option(help="Image topic in a bag.", show_default="the one with 'right', cam1 or infra2")
+]
+
 
 def demo(
     out: Annotated[
@@ -105,12 +113,8 @@ def track(
     seconds: Annotated[
         float | None, typer.Option(min=0.1, help="With --camera: stop after so long. Ctrl-C stops as well.")
     ] = None,
-    topic_left: Annotated[
-        str | None, typer.Option(help="Image topic in a bag.", show_default="the one with 'left', cam0 or infra1")
-    ] = None,
-    topic_right: Annotated[
-        str | None, typer.Option(help="Image topic in a bag.", show_default="the one with 'right', cam1 or infra2")
-    ] = None,
+    topic_left: TopicLeft = None,
+    topic_right: TopicRight = None,
     track_object: Annotated[
         str | None,
         typer.Option(
