@@ -26,6 +26,7 @@ from sigmaslam.evaluation.benchmarks.sequences_page import (
     method_label,
     total_cell,
 )
+from sigmaslam.evaluation.benchmarks.stereo_peers import MissingPeerError, track_with_cuvslam
 from sigmaslam.evaluation.rendered_camera import open_rendered
 from sigmaslam.evaluation.trial import Method, Trial, TrialResult, read_trial, render
 from sigmaslam.readers import StereoSequence, open_sequence
@@ -35,6 +36,7 @@ from sigmaslam.slam.tracker import TrackerConfig
 REAL = (
     ("kitti_raw_0926_0039_a", "poses.txt"),
     ("kitti_odometry_01_f000_050", "poses.txt"),
+    ("euroc_mh01_f000_099", "groundtruth.tum"),
     ("euroc_v1_01_keyframes_a", "groundtruth.csv"),
     ("euroc_v1_01_static", "groundtruth.csv"),
 )
@@ -56,6 +58,7 @@ _TRIED: dict[str, Method] = {
     "klt": partial(track_sequence, frontend="klt"),
     "sift-pnp": partial(track_with_pnp, matcher="sift"),
     "klt-pnp": partial(track_with_pnp, matcher="klt"),
+    "cuvslam": track_with_cuvslam,
 }
 METHODS = (*_TRIED, "bundle")
 """In the order of the page; the bundle adjustment takes the tracks of the first."""
@@ -167,7 +170,10 @@ def _render(preset: str, folder: Path, note: Callable[[str], None]) -> _Benchmar
 def _run(job: _BenchmarkSequence, method: str, runs: Path) -> SequenceResult | Omission:
     if method == "bundle":
         return _adjust(job, runs)
-    trial = Trial(job.open(), job.truth, _TRIED[method]).run(runs / method)
+    try:
+        trial = Trial(job.open(), job.truth, _TRIED[method]).run(runs / method)
+    except MissingPeerError as error:
+        return Omission(job.name, method, str(error))
     nees = trial.evaluation.nees.mean if job.exact and trial.evaluation.nees else np.nan
     return SequenceResult(job.name, method, trial, nees)
 

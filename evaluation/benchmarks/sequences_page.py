@@ -21,6 +21,7 @@ _LABELS = {
     "klt": "ours with KLT",
     "sift-pnp": "SIFT + PnP",
     "klt-pnp": "KLT + PnP",
+    "cuvslam": "cuVSLAM",
     "bundle": "bundle adjustment",
 }
 _STAGES = ("features", "match", "filter", "map")
@@ -47,6 +48,8 @@ on one machine; times are wall milliseconds. No setting of any method differs be
   Jacobians, linearised once. *Ours with*: other features under the same filter.
 - *SIFT + PnP*, *KLT + PnP*: from OpenCV alone (`evaluation/benchmarks/pnp_baselines.py`): points of a keyframe, found
   again by ratio test or Lucas-Kanade, RANSAC, least squares. Landmarks count as known, the noise as 1 px.
+- *cuVSLAM*: on the CPU, by the package dim-odom (extra `peers`), given rectified pairs; rectifying is in its
+  time. It gives no covariance here, and no pose where it is lost.
 - *bundle adjustment*: of the tracks of *ours* (`track --tracks`, then `refine`), all keyframes at once; frames in
   between move with them. Its time is that of the optimisation, on top of the tracking; its NEES that of the keyframes.
 - *tracked*: frames with a pose from the images, relocalised ones too; the first frame of a run is its origin.

@@ -7,7 +7,9 @@ imports them. They come with the extra `peers`.
 
 from __future__ import annotations
 
+import csv
 import tempfile
+import time
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -15,8 +17,14 @@ from typing import Any
 import numpy as np
 
 from sigmaslam.errors import SigmaSlamError
+from sigmaslam.files import make_folder
 from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import quaternion_to_matrix
+from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.readers import StereoSequence
+from sigmaslam.readers.trajectory_files import write_tum
+from sigmaslam.runs.frame_table import COLUMNS
 
 _NO_TURN = (0.0, 0.0, 0.0, 1.0)
 # As in ORB-SLAM3's own settings for EuRoC and for KITTI.
@@ -166,6 +174,35 @@ def orb_settings(camera: RectifiedStereo, rate: float) -> str:
         rate=float(rate),
         keypoints=keypoints,
     )
+
+
+def track_with_cuvslam(sequence: StereoSequence, out: Path) -> None:
+    """Tracks a sequence; leaves trajectory.tum, without frames that are lost, and frames.csv in the new folder `out`.
+
+    Raises:
+        MissingPeerError: see `CuvslamPeer`.
+    """
+    rectifier = StereoRectifier(sequence.camera)
+    peer = CuvslamPeer(rectifier.rectified)
+    make_folder(out)
+    T = np.eye(4)
+    T[:3, :3] = rectifier.R_rectified_left
+    timestamps: list[float] = []
+    poses: list[np.ndarray] = []
+    with (out / "frames.csv").open("w", newline="", encoding="utf-8") as table:
+        rows = csv.DictWriter(table, ["status", *COLUMNS, "ms_step"])
+        rows.writeheader()
+        for frame in sequence.frames():
+            began = time.perf_counter()
+            pose = peer.step(*rectifier.rectify(frame.left, frame.right), frame.timestamp)
+            status = "lost" if pose is None else "tracking" if poses else "starting"
+            row = {"status": status, "timestamp": frame.timestamp, "matches": 0, "inliers": 0}
+            rows.writerow(row | {"ms_step": 1e3 * (time.perf_counter() - began)})
+            if pose is not None:
+                timestamps.append(frame.timestamp)
+                poses.append(T.T @ pose @ T)
+    peer.close()
+    write_tum(out / "trajectory.tum", Trajectory(np.array(timestamps), np.stack(poses)))
 
 
 def _not_installed(module: str, error: ImportError) -> MissingPeerError:

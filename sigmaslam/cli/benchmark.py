@@ -199,8 +199,8 @@ def benchmark(
     method: Annotated[
         list[str] | None,
         typer.Option(
-            help="sequences: ours, ekf, sift, orb, klt, sift-pnp, klt-pnp, bundle; runtime: ours, sift, orb, klt, "
-            "klt-pnp, sift-pnp, cuvslam, orbslam3; may be given more than once.",
+            help="sequences: ours, ekf, sift, orb, klt, sift-pnp, klt-pnp, cuvslam, bundle; runtime: ours, sift, orb, "
+            "klt, klt-pnp, sift-pnp, cuvslam, orbslam3; may be given more than once.",
             show_default="all",
         ),
     ] = None,
