@@ -4,41 +4,33 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sigmaslam.bounded_files import TABLE_BYTES, read_text
 from sigmaslam.errors import InputError
+from sigmaslam.evaluation.evaluation_figure import draw_evaluation
+from sigmaslam.evaluation.evaluation_result import Evaluation, FinalErrors
 from sigmaslam.evaluation.kept_evaluation import keep_evaluation
-from sigmaslam.evaluation.metrics.map_consistency import coverage
 from sigmaslam.evaluation.metrics.relative_consistency import SpanConsistency, relative_consistency, truth_covariance
 from sigmaslam.evaluation.metrics.trajectory_errors import (
     MAX_DIFFERENCE,
-    AbsoluteError,
-    KittiErrors,
-    PoseNees,
-    RelativeError,
     absolute_trajectory_error,
-    align,
     associate,
     kitti_errors,
-    pose_errors,
     pose_nees,
     relative_pose_error,
     synchronise,
 )
-from sigmaslam.evaluation.relative_summary import draw_relative, format_relative, span_to_dict
 from sigmaslam.evaluation.truth_conventions import TruthConvention, find_convention, find_time_unit, scale_times
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
-from sigmaslam.plot_style import BLUE, VERMILLION, has_matplotlib, style_axes
+from sigmaslam.plot_style import has_matplotlib
 from sigmaslam.readers.trajectory_files import kitti_times_path, read_covariances, read_trajectory, trajectory_format
-from sigmaslam.runs.figures import AXIS_NAMES, plot_trajectory, save_png
+from sigmaslam.runs.figures import save_png
 from sigmaslam.runs.frame_table import FRAMES_NAME, FrameTable, predicted_poses, read_frames
 from sigmaslam.runs.relative_pose_file import RELATIVE_POSES_NAME, read_frame_pairs
 from sigmaslam.runs.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY, check_has_trajectory
@@ -46,88 +38,6 @@ from sigmaslam.runs.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY, check_
 _LOGGER = logging.getLogger(__name__)
 # An error is of poses relative to others.
 _FEWEST_PAIRS = 2
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-
-@dataclass(frozen=True, slots=True)
-class FinalErrors:
-    """Errors of the same frames after the fact, of `trajectory_final.tum`; attributes as of `Evaluation`."""
-
-    ate: AbsoluteError
-    ate_origin: AbsoluteError
-    rpe: RelativeError
-    nees: PoseNees | None
-
-
-@dataclass(frozen=True, slots=True)
-class Evaluation:
-    """Everything that was found about one trajectory.
-
-    Attributes:
-        estimate_path, truth_path: the files that were compared.
-        association: how frames were paired: "time" (with the unit where the truth's times are not in seconds), "index"
-            (a file without times, as many poses in both) or "time at 10 Hz" (a KITTI file without times).
-        matched: number of estimated poses with a true one.
-        frames: number of frames with a truth, with a pose or without (see `evaluate_run`).
-        predicted: number of the matched poses that the motion alone predicts, while the camera was lost.
-        path_length, estimate_path_length: of the matched poses, metres.
-        ate, ate_origin: absolute error after the best rigid alignment, and with only the first poses equal.
-        rpe: error of the motion from frame to frame.
-        kitti: segment errors.
-        nees: of poses relative to the first; None where there is no covariance.
-        relative: consistency of poses relative to earlier ones, by span; None where the run does not say.
-        figure_path: the plots; None where none were asked for, or matplotlib is not installed.
-        final: of the trajectory after the fact; None where there is none.
-        truth_hint: the convention in which the truth would fit, in words and as options; None where it fits as it was
-            read, or in no way.
-    """
-
-    estimate_path: Path
-    truth_path: Path
-    association: str
-    matched: int
-    frames: int
-    path_length: float
-    estimate_path_length: float
-    ate: AbsoluteError
-    ate_origin: AbsoluteError
-    rpe: RelativeError
-    kitti: KittiErrors
-    nees: PoseNees | None
-    relative: tuple[SpanConsistency, ...] | None
-    figure_path: Path | None
-    final: FinalErrors | None = None
-    predicted: int = 0
-    truth_hint: str | None = None
-
-    @property
-    def coverage(self) -> float:
-        """Share of the frames that have a pose and a truth, 0 to 1."""
-        return self.matched / self.frames
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain numbers, texts and lists for JSON; None stands for what could not be computed."""
-        result = {
-            "estimate": str(self.estimate_path),
-            "truth": str(self.truth_path),
-            "association": self.association,
-            "truth_hint": self.truth_hint,
-            "matched": self.matched,
-            "frames": self.frames,
-            "coverage": self.coverage,
-            "predicted": self.predicted,
-            "path_length": self.path_length,
-            "estimate_path_length": self.estimate_path_length,
-            **_errors_to_dict(self),
-            "kitti": asdict(self.kitti),
-            "relative": None if self.relative is None else [span_to_dict(span) for span in self.relative],
-            "figure": str(self.figure_path) if self.figure_path else None,
-            "final": None if self.final is None else _errors_to_dict(self.final),
-        }
-        return {key: _plain(value) for key, value in result.items()}
 
 
 def evaluate_run(
@@ -230,126 +140,6 @@ def evaluate_run(
     return evaluation
 
 
-def format_evaluation(evaluation: Evaluation) -> str:
-    """The evaluation as a text table."""
-    e = evaluation
-    lines = [
-        f"estimate  {e.estimate_path}",
-        f"truth     {e.truth_path} (paired by {e.association})",
-        f"frames    {e.matched} of the {e.frames} with a truth have an estimate ({100 * e.coverage:.1f} %)"
-        + (f", {e.predicted} of them while lost, from the motion alone" if e.predicted else ""),
-        f"path      {e.path_length:.2f} m true, {e.estimate_path_length:.2f} m estimated",
-        *([f"The truth looks like {e.truth_hint}"] if e.truth_hint else []),
-        "",
-        f"{'':<24}{'rmse [m]':>11}{'mean [m]':>11}{'median [m]':>12}{'max [m]':>11}{'rotation [deg]':>16}",
-        *_error_rows(e),
-        "",
-    ]
-    if len(e.kitti.lengths):
-        lines.append(f"{'KITTI segments':<24}{'count':>11}{'t_rel [%]':>11}{'r_rel [deg/100 m]':>19}")
-        k = e.kitti
-        columns = (k.lengths, k.counts, k.translation_percent, k.rotation_deg_per_100m)
-        for length, count, translation, rotation in zip(*columns, strict=True):
-            lines.append(f"{f'  {length:g} m':<24}{count:>11}{translation:>11.3f}{rotation:>19.3f}")
-        lines.append(
-            f"{'  all':<24}{e.kitti.counts.sum():>11}{e.kitti.mean_translation_percent:>11.3f}"
-            f"{e.kitti.mean_rotation_deg_per_100m:>19.3f}"
-        )
-    else:
-        lines.append("KITTI segments: none, the path is shorter than a segment")
-    lines += ["", _nees_line(e.nees)]
-    if e.final is not None:
-        lines += ["", "After the fact, with loops and smoothing (trajectory_final.tum):", *_error_rows(e.final)]
-        lines.append(_nees_line(e.final.nees))
-    return "\n".join([*lines, "", *format_relative(e.relative)]) + "\n"
-
-
-def draw_evaluation(
-    evaluation: Evaluation,
-    estimate: Trajectory,
-    truth: Trajectory,
-    covariance: np.ndarray | None = None,
-    predicted: np.ndarray | None = None,
-) -> Figure:
-    """View from above, height, errors over time with 3 sigma, and segment errors.
-
-    Args:
-        evaluation: of these trajectories.
-        estimate, truth: trajectories in one clock.
-        covariance: (N, 6, 6) of the estimate, body frame, translation first.
-        predicted: (N,) bool, which poses of the estimate no image confirms; None: none of them.
-    """
-    from matplotlib.figure import Figure
-
-    spans = evaluation.relative or ()
-    rows = (1.5, 1, 1, 1) if spans else (1.5, 1, 1)
-    figure = Figure(figsize=(11, 2.0 + 2.6 * sum(rows) - 0.1), layout="constrained")
-    grid = figure.add_gridspec(len(rows), 2, height_ratios=rows)
-    matched_estimate, matched_truth = synchronise(estimate, truth)
-    aligned = align(matched_estimate, matched_truth, "se3")
-    seconds = matched_estimate.timestamps - matched_estimate.timestamps[0]
-
-    above = figure.add_subplot(grid[0, 0])
-    guesses = {} if predicted is None else {"estimate": predicted[associate(estimate, truth)[0]]}
-    _, _, height = plot_trajectory(above, {"truth": matched_truth, "estimate": aligned}, predicted=guesses)
-    above.set_title(f"From above, best alignment: ATE {evaluation.ate.rmse:.3g} m rmse", fontsize=10)
-
-    side = figure.add_subplot(grid[0, 1])
-    side.plot(seconds, matched_truth.positions[:, height], "-", color=BLUE, lw=1.6, label="truth")
-    side.plot(seconds, aligned.positions[:, height], "--", color=VERMILLION, lw=1.6, label="estimate")
-    side.set(xlabel="time [s]", ylabel=f"{AXIS_NAMES[height]} [m]")
-    side.set_title("Third axis, best alignment", fontsize=10)
-    side.legend(fontsize=8)
-
-    errors = pose_errors(estimate, truth)
-    units = ((slice(0, 3), 1.0, "position error [m]"), (slice(3, 6), 180 / math.pi, "rotation error [deg]"))
-    panels = [above, side]
-    for column, (part, unit, label) in enumerate(units):
-        panel = figure.add_subplot(grid[1, column])
-        size = unit * np.linalg.norm(errors.errors[:, part], axis=1)
-        panel.plot(seconds, size, color=BLUE, lw=1.3, label="error")
-        if covariance is not None:
-            variance = np.trace(covariance[errors.index][:, part, part], axis1=1, axis2=2)
-            sigma = unit * np.sqrt(np.maximum(variance, 0.0))
-            panel.plot(seconds, 3 * sigma, color=VERMILLION, lw=1.3, ls="--", label="3 sigma of the estimate")
-        panel.set(xlabel="time [s]", ylabel=label)
-        panel.set_ylim(bottom=0)
-        panel.set_title("Error, first poses equal", fontsize=10)
-        panel.legend(fontsize=8, loc="upper left")
-        panels.append(panel)
-
-    kitti = evaluation.kitti
-    values = (
-        (kitti.translation_percent, kitti.mean_translation_percent, "t_rel [%]"),
-        (kitti.rotation_deg_per_100m, kitti.mean_rotation_deg_per_100m, "r_rel [deg/100 m]"),
-    )
-    for column, (by_length, mean, label) in enumerate(values):
-        panel = figure.add_subplot(grid[2, column])
-        _draw_segments(panel, kitti.lengths, by_length, mean)
-        panel.set(xlabel="segment length [m]", ylabel=label)
-        panels.append(panel)
-    if spans:
-        panels += [figure.add_subplot(grid[3, 0]), figure.add_subplot(grid[3, 1])]
-        draw_relative(panels[-2], panels[-1], spans)
-    for panel in panels:
-        style_axes(panel)
-    return figure
-
-
-def _draw_segments(panel: Axes, lengths: np.ndarray, by_length: np.ndarray, mean: float) -> None:
-    panel.set_title("Segment errors", fontsize=10)
-    if len(lengths) == 0:
-        panel.text(0.5, 0.5, "path shorter than a segment", ha="center", va="center", transform=panel.transAxes)
-        panel.set_xticks([])
-        panel.set_yticks([])
-        return
-    panel.plot(lengths, by_length, "o-", color=BLUE, lw=1.3, label="mean of each length")
-    panel.axhline(mean, color=VERMILLION, lw=1.3, ls="--", label=f"mean of all segments: {mean:.3g}")
-    panel.set_xticks(lengths)
-    panel.set_ylim(0, 1.2 * max(float(np.max(by_length)), 1e-9))
-    panel.legend(fontsize=8, loc="best")
-
-
 def _judge_relative_poses(
     run: Path,
     estimate: Trajectory,
@@ -369,51 +159,6 @@ def _judge_relative_poses(
         covariances = covariances if covariances is None else turn_covariance(truth.poses, covariances)
         truth = Trajectory(truth.timestamps, se3_inverse(truth.poses))
     return relative_consistency(pairs, estimate, truth, covariances)
-
-
-def _error_rows(errors: Evaluation | FinalErrors) -> list[str]:
-    """ATE and RPE, a line each."""
-    # On a straight path the best alignment may turn about the path, by much more than the rotations are wrong.
-    rotation_error = errors.ate_origin.rotation_rmse_deg
-    straight = errors.ate.turn_deg > rotation_error and errors.ate.rotation_rmse_deg > 2 * rotation_error
-    turn = "not determined" if straight else f"{errors.ate.rotation_rmse_deg:.4f}"
-    rows = [
-        f"{name:<24}{ate.rmse:>11.4f}{ate.mean:>11.4f}{ate.median:>12.4f}{ate.maximum:>11.4f}{rotation:>16}"
-        for name, ate, rotation in (
-            ("ATE, best alignment", errors.ate, turn),
-            ("ATE, first pose", errors.ate_origin, f"{errors.ate_origin.rotation_rmse_deg:.4f}"),
-        )
-    ]
-    rpe = errors.rpe
-    name = f"RPE, {rpe.delta} frame" + ("s" if rpe.delta > 1 else "")
-    return [
-        *rows,
-        f"{name:<24}{rpe.translation_rmse:>11.4f}{rpe.translations.mean():>11.4f}"
-        f"{rpe.translation_median:>12.4f}{rpe.translations.max():>11.4f}{rpe.rotation_rmse_deg:>16.4f}",
-    ]
-
-
-def _nees_line(nees: PoseNees | None) -> str:
-    if nees is None:
-        return "NEES: no covariance"
-    if len(nees.per_frame) == 0:
-        return "NEES: no frame has a regular covariance"
-    return (
-        f"NEES per degree of freedom (1 is right, more is overconfident): {nees.mean:.2f}; translation "
-        f"{nees.mean_translation:.2f}, rotation {nees.mean_rotation:.2f}, median {nees.median:.2f}; "
-        f"inside 95 %: {100 * coverage(nees.per_frame, 6):.0f} %"
-    )
-
-
-def _errors_to_dict(errors: Evaluation | FinalErrors) -> dict[str, Any]:
-    """ATE, RPE without its steps, and NEES with the number of its frames in their place."""
-    rpe, nees = asdict(errors.rpe), asdict(errors.nees) if errors.nees else None
-    del rpe["translations"], rpe["rotations_deg"]
-    if nees:
-        per_frame = nees.pop("per_frame")
-        nees |= {"count": len(per_frame), "inside": coverage(per_frame, 6)}
-        del nees["timestamps"]
-    return {"ate": asdict(errors.ate), "ate_origin": asdict(errors.ate_origin), "rpe": rpe, "nees": nees}
 
 
 def _evaluate_final(run: Path, estimate: Trajectory, truth: Trajectory) -> FinalErrors | None:
@@ -489,16 +234,3 @@ def _frame_count(frames: FrameTable | None, estimate: Trajectory, truth: Traject
     interval = float(np.median(np.diff(estimate.timestamps)))
     fitting = round(float(truth.timestamps[-1] - truth.timestamps[0]) / interval) + 1
     return max(matched, min(len(truth), max(len(estimate), fitting)))
-
-
-def _plain(value: Any) -> Any:
-    """Arrays as lists, and None for NaN, which JSON does not know."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_plain(item) for item in value]
-    if isinstance(value, np.ndarray):
-        return [_plain(item) for item in value.tolist()]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

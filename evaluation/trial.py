@@ -15,7 +15,8 @@ import numpy as np
 
 from sigmaslam import errors
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.run_evaluation import Evaluation, evaluate_run
+from sigmaslam.evaluation.evaluation_result import Evaluation
+from sigmaslam.evaluation.run_evaluation import evaluate_run
 from sigmaslam.files import atomic_write_text
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.inference.onnx_graph import shipped_weights
