@@ -68,6 +68,14 @@ def test_a_peer_that_is_not_installed_is_left_out_with_a_note(tmp_path: Path, mo
     assert len(_rows(text, "klt-pnp")) == 1
 
 
+def test_ours_says_how_consistent_its_relative_poses_are(tmp_path: Path):
+    text = write_results(tmp_path / "results.md", None, "the command", ("ours", "klt-pnp"), ["demo"])
+    assert text.count("Relative poses of *ours*; sigmas of the truth: exact.") == 1
+    (row,) = (line.split("|")[1:-1] for line in text.splitlines() if line.startswith("| 1 s |"))
+    assert 0.05 < float(row[2]) < 5.0  # NEES per degree of freedom; 1 is right
+    assert float(row[4]) >= 80
+
+
 def test_cuvslam_follows_the_demo(tmp_path: Path):
     pytest.importorskip("dim_odom")
     row = _rows(write_results(tmp_path / "results.md", None, "the command", ("cuvslam",), ["demo"]), "cuvslam")[0]
