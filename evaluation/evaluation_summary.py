@@ -71,8 +71,9 @@ def _nees_line(nees: PoseNees | None) -> str:
         return "NEES: no covariance"
     if len(nees.per_frame) == 0:
         return "NEES: no frame has a regular covariance"
+    truth = ", with the errors of the truth" if nees.with_truth else ""
     return (
-        f"NEES per degree of freedom (1 is right, more is overconfident): {nees.mean:.2f}; translation "
+        f"NEES per degree of freedom (1 is right, more is overconfident){truth}: {nees.mean:.2f}; translation "
         f"{nees.mean_translation:.2f}, rotation {nees.mean_rotation:.2f}, median {nees.median:.2f}; "
         f"inside 95 %: {100 * coverage(nees.per_frame, 6):.0f} %"
     )

@@ -15,7 +15,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.evaluation.evaluation_figure import draw_evaluation
 from sigmaslam.evaluation.evaluation_result import Evaluation, FinalErrors
 from sigmaslam.evaluation.kept_evaluation import keep_evaluation
-from sigmaslam.evaluation.metrics.relative_consistency import SpanConsistency, relative_consistency, truth_covariance
+from sigmaslam.evaluation.metrics.relative_consistency import SpanConsistency, relative_consistency
 from sigmaslam.evaluation.metrics.trajectory_errors import (
     MAX_DIFFERENCE,
     absolute_trajectory_error,
@@ -25,6 +25,7 @@ from sigmaslam.evaluation.metrics.trajectory_errors import (
     relative_pose_error,
     synchronise,
 )
+from sigmaslam.evaluation.metrics.truth_covariance import truth_covariance
 from sigmaslam.evaluation.truth_conventions import TruthConvention, find_convention, find_time_unit, scale_times
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
@@ -69,8 +70,7 @@ def evaluate_run(
         plot: write `evaluation.png` into the run folder or beside the trajectory, where matplotlib is installed; of a
             run also `evaluation.json` and `evaluation.npz`, with which its report is written anew.
         truth_sigma_position, truth_sigma_rotation: standard deviations of each true pose, of each coordinate (metres)
-            and about each axis (degrees), for the poses relative to earlier ones; where one alone is given the other is
-            zero.
+            and about each axis (degrees): part of every NEES; where one alone is given the other is zero.
         truth_convention: how the truth is to be read; None: as T_world_camera in metres, x before w.
     Raises:
         InputError: a file is missing or wrong, no frame has a pose, or the timestamps do not meet.
@@ -102,10 +102,14 @@ def evaluate_run(
         raise InputError(f"{truth}: the order of quaternions can be chosen for TUM files alone, and this is none")
     other = None if follows_object else find_convention(estimate, true, convention, has_quaternions)
     true = convention.apply(true)
-    sigmas = truth_sigma_position, truth_sigma_rotation
-    relative = _judge_relative_poses(run_or_trajectory, estimate, true, sigmas, follows_object) if is_run else None
+    of_truth = None
+    if truth_sigma_position is not None or truth_sigma_rotation is not None:
+        of_truth = truth_covariance(truth_sigma_position or 0.0, truth_sigma_rotation or 0.0)
+    relative = _judge_relative_poses(run_or_trajectory, estimate, true, of_truth, follows_object) if is_run else None
     if follows_object:
-        true = _of_followed_frame(estimate, true)
+        T_body_followed = _followed_frame(estimate, true)
+        true = Trajectory(true.timestamps, true.poses @ T_body_followed)
+        of_truth = None if of_truth is None else turn_covariance(se3_inverse(T_body_followed), of_truth)
     covariance = _read_covariance(run_or_trajectory / "covariance.npy", len(estimate)) if is_run else None
     matched_estimate, matched_truth = synchronise(estimate, true)
     predicted = np.zeros(len(estimate), bool) if frames is None else predicted_poses(frames, estimate.timestamps)
@@ -121,10 +125,10 @@ def evaluate_run(
         ate_origin=absolute_trajectory_error(estimate, true, "origin"),
         rpe=relative_pose_error(estimate, true),
         kitti=kitti_errors(estimate, true, lengths, step),
-        nees=pose_nees(estimate, true, covariance) if covariance is not None else None,
+        nees=pose_nees(estimate, true, covariance, of_truth) if covariance is not None else None,
         relative=relative,
         figure_path=estimate_path.parent / "evaluation.png" if plot and has_matplotlib() else None,
-        final=_evaluate_final(run_or_trajectory, estimate, true) if is_run else None,
+        final=_evaluate_final(run_or_trajectory, estimate, true, of_truth) if is_run else None,
         predicted=int(predicted[associate(estimate, true)[0]].sum()),
         truth_hint=None if other is None else other.describe(),
     )
@@ -144,7 +148,7 @@ def _judge_relative_poses(
     run: Path,
     estimate: Trajectory,
     truth: Trajectory,
-    sigmas: tuple[float | None, float | None],
+    of_truth: np.ndarray | None,
     follows_object: bool,
 ) -> tuple[SpanConsistency, ...] | None:
     """Consistency of the camera's poses relative to earlier ones; of a followed body's run in the body's frame."""
@@ -152,16 +156,16 @@ def _judge_relative_poses(
     if not path.is_file():
         return None
     pairs = read_frame_pairs(path, len(estimate))
-    covariances = None
-    if any(sigma is not None for sigma in sigmas):
-        covariances = np.tile(truth_covariance(sigmas[0] or 0.0, sigmas[1] or 0.0), (len(truth), 1, 1))
+    covariances = None if of_truth is None else np.tile(of_truth, (len(truth), 1, 1))
     if follows_object:
         covariances = covariances if covariances is None else turn_covariance(truth.poses, covariances)
         truth = Trajectory(truth.timestamps, se3_inverse(truth.poses))
     return relative_consistency(pairs, estimate, truth, covariances)
 
 
-def _evaluate_final(run: Path, estimate: Trajectory, truth: Trajectory) -> FinalErrors | None:
+def _evaluate_final(
+    run: Path, estimate: Trajectory, truth: Trajectory, of_truth: np.ndarray | None
+) -> FinalErrors | None:
     """The errors after the fact, of a run that has them; the trajectories are in the clock of the truth."""
     path = run / FINAL_TRAJECTORY
     if not path.is_file():
@@ -178,7 +182,7 @@ def _evaluate_final(run: Path, estimate: Trajectory, truth: Trajectory) -> Final
         absolute_trajectory_error(final, truth, "se3"),
         absolute_trajectory_error(final, truth, "origin"),
         relative_pose_error(final, truth),
-        None if covariance is None else pose_nees(final, truth, covariance),
+        None if covariance is None else pose_nees(final, truth, covariance, of_truth),
     )
 
 
@@ -208,14 +212,13 @@ def _follows_object(run: Path) -> bool:
         return False
 
 
-def _of_followed_frame(estimate: Trajectory, truth: Trajectory) -> Trajectory:
-    """The truth of the frame on the body that the run follows; the truth may be of another frame on the body.
+def _followed_frame(estimate: Trajectory, truth: Trajectory) -> np.ndarray:
+    """T_body_followed (4, 4): the frame that the run follows, in that on the body whose poses are the truth.
 
-    The two frames are taken as the first pair of poses has them to each other. The fixed frame is the camera's in both.
+    The first pair of poses has them to each other. The fixed frame is the camera's in both.
     """
     estimate_index, truth_index = associate(estimate, truth)
-    first = se3_inverse(truth.poses[truth_index[0]]) @ estimate.poses[estimate_index[0]]
-    return Trajectory(truth.timestamps, truth.poses @ first)
+    return np.asarray(se3_inverse(truth.poses[truth_index[0]]) @ estimate.poses[estimate_index[0]])
 
 
 def _read_covariance(path: Path, count: int) -> np.ndarray | None:

@@ -55,8 +55,8 @@ def evaluate(
     The picture needs the extra 'report'; the figures are the same without it.
 
     Poses of a run are also judged relative to earlier ones, 1, 10, 50, 100 m or 1, 5, 20 s back. Say how good the truth
-    is with --truth-sigma-position and --truth-sigma-rotation: it counts there, and you see where it is no better than
-    the estimate.
+    is with --truth-sigma-position and --truth-sigma-rotation: it counts in every NEES, and you see where it is no
+    better than the estimate.
 
     Where the truth would fit in another frame, order or unit, a line says so with the option that applies it; seconds,
     milli-, micro- and nanoseconds are found out.
