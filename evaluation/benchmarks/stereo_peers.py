@@ -7,9 +7,7 @@ imports them. They come with the extra `peers`.
 
 from __future__ import annotations
 
-import csv
 import tempfile
-import time
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -17,14 +15,11 @@ from typing import Any
 import numpy as np
 
 from sigmaslam.errors import SigmaSlamError
-from sigmaslam.files import make_folder
+from sigmaslam.evaluation.benchmarks.peer_run import PeerStep, write_peer_run
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import quaternion_to_matrix
-from sigmaslam.geometry.trajectory import Trajectory
-from sigmaslam.readers import StereoSequence
-from sigmaslam.readers.trajectory_files import write_tum
-from sigmaslam.runs.frame_table import COLUMNS
+from sigmaslam.readers import StereoFrame, StereoSequence
 
 _NO_TURN = (0.0, 0.0, 0.0, 1.0)
 # As in ORB-SLAM3's own settings for EuRoC and for KITTI.
@@ -184,25 +179,21 @@ def track_with_cuvslam(sequence: StereoSequence, out: Path) -> None:
     """
     rectifier = StereoRectifier(sequence.camera)
     peer = CuvslamPeer(rectifier.rectified)
-    make_folder(out)
-    T = np.eye(4)
-    T[:3, :3] = rectifier.R_rectified_left
-    timestamps: list[float] = []
-    poses: list[np.ndarray] = []
-    with (out / "frames.csv").open("w", newline="", encoding="utf-8") as table:
-        rows = csv.DictWriter(table, ["status", *COLUMNS, "ms_step"])
-        rows.writeheader()
-        for frame in sequence.frames():
-            began = time.perf_counter()
-            pose = peer.step(*rectifier.rectify(frame.left, frame.right), frame.timestamp)
-            status = "lost" if pose is None else "tracking" if poses else "starting"
-            row = {"status": status, "timestamp": frame.timestamp, "matches": 0, "inliers": 0}
-            rows.writerow(row | {"ms_step": 1e3 * (time.perf_counter() - began)})
-            if pose is not None:
-                timestamps.append(frame.timestamp)
-                poses.append(T.T @ pose @ T)
+    T_rectified_left = np.eye(4)
+    T_rectified_left[:3, :3] = rectifier.R_rectified_left
+
+    has_started = False
+
+    def step(frame: StereoFrame) -> PeerStep:
+        nonlocal has_started
+        pose = peer.step(*rectifier.rectify(frame.left, frame.right), frame.timestamp)
+        if pose is None:
+            return PeerStep(None, "lost")
+        status, has_started = "tracking" if has_started else "starting", True
+        return PeerStep(T_rectified_left.T @ pose @ T_rectified_left, status)
+
+    write_peer_run(sequence, out, step)
     peer.close()
-    write_tum(out / "trajectory.tum", Trajectory(np.array(timestamps), np.stack(poses)))
 
 
 def _not_installed(module: str, error: ImportError) -> MissingPeerError:
