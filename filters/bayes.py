@@ -10,10 +10,7 @@ import torch
 from torch import Tensor
 
 from sigmaslam.filters.checks import check_belief, check_entering, check_inputs, check_measurement, check_motion
-from sigmaslam.filters.failure import POLICIES, OnFailure, Suspects, jittered, raise_unless_healthy
-from sigmaslam.filters.gaussian_belief import Gaussian
-from sigmaslam.filters.linalg.plain import PIVOT_TOLERANCES
-from sigmaslam.filters.linalg.square_roots import (
+from sigmaslam.filters.core.factors import (
     apply,
     finite,
     may_look,
@@ -23,17 +20,20 @@ from sigmaslam.filters.linalg.square_roots import (
     square,
     triangularise,
 )
-from sigmaslam.filters.linalg.unrolled import join
+from sigmaslam.filters.core.failure import POLICIES, OnFailure, Suspects, jittered, raise_unless_healthy
+from sigmaslam.filters.core.noise_covariance import Noise, as_noise
+from sigmaslam.filters.core.plain_factors import PIVOT_TOLERANCES
+from sigmaslam.filters.core.sigma_points import Columns, SigmaPoints, cubature
+from sigmaslam.filters.core.solve import FORMS, Form, TangentPosterior, choose_form, solve
+from sigmaslam.filters.core.tensors import require_tensor
+from sigmaslam.filters.core.transforms import Difference, Exact, Taylor, Transform, Transformed, Unscented
+from sigmaslam.filters.core.unrolled_factors import join
+from sigmaslam.filters.gaussian_belief import Gaussian
 from sigmaslam.filters.manifolds import Space, is_flat
 from sigmaslam.filters.models import AnyMeasurement, AnyMotion, LinearMeasurement, LinearMotion, MeasurementModel
-from sigmaslam.filters.noise_covariance import Noise, as_noise
 from sigmaslam.filters.results import TimeUpdate, Update
 from sigmaslam.filters.robust import Blocks, Robust, WeightedPosterior
-from sigmaslam.filters.sigma_points import Columns, SigmaPoints, cubature
-from sigmaslam.filters.tensors import require_tensor
 from sigmaslam.filters.time_series import filter_events, filter_sequence, smooth
-from sigmaslam.filters.transforms import Difference, Exact, Taylor, Transform, Transformed, Unscented
-from sigmaslam.filters.updates import FORMS, Form, TangentPosterior, choose_form, solve
 
 # Squared linearisation error of a whole measurement, in units of its noise's variance, from which on an update is worth
 # a second linearisation.
@@ -72,13 +72,13 @@ class BayesFilter:
     Attributes:
         transform: how a Gaussian goes through a function.
         space: manifold of the state; None: R^n.
-        form: of the update, see `sigmaslam.filters.updates`; "auto" chooses by shapes and dtype. "qr" goes on with
+        form: of the update, see `sigmaslam.filters.core.solve`; "auto" chooses by shapes and dtype. "qr" goes on with
             square roots, "dense" and "low-rank" with covariances.
         iterations: linearisations of an update, from the second on at the posterior of the one before (posterior
             linearisation, García-Fernández et al. 2015; with derivatives, the iterated EKF). "auto": a second one for
             elements whose sigma points show more linearisation error than `TOLERATED_ERROR`; the EKF sees none. A set
             that cannot show it, `Simplex`, always takes the second.
-        on_failure: see `sigmaslam.filters.failure`.
+        on_failure: see `sigmaslam.filters.core.failure`.
     """
 
     transform: Transform
@@ -438,7 +438,7 @@ def UnscentedKalmanFilter(  # noqa: N802
     iterations: int | Literal["auto"] = "auto",
     on_failure: OnFailure = "raise",
 ) -> BayesFilter:
-    """Sigma points, Table 9.2; `points` from `sigmaslam.filters.sigma_points`, by default `cubature()`."""
+    """Sigma points, Table 9.2; `points` from `sigmaslam.filters.core.sigma_points`, by default `cubature()`."""
     return BayesFilter(Unscented(points or cubature()), space, form, iterations, on_failure)
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from sigmaslam.filters.linalg.square_roots import apply
-from sigmaslam.filters.noise_covariance import BlockDiagonal, Diagonal, Noise, as_noise
+from sigmaslam.filters.core.factors import apply
+from sigmaslam.filters.core.noise_covariance import BlockDiagonal, Diagonal, Noise, as_noise
 
 Function = Callable[..., Tensor]
 Residual = Callable[[Tensor, Tensor], Tensor]

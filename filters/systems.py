@@ -12,10 +12,10 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.layout import stack
-from sigmaslam.filters.lie_groups import wrap_angle
+from sigmaslam.filters.core.layout import stack
+from sigmaslam.filters.core.noise_covariance import Noise
+from sigmaslam.filters.manifolds.lie_groups import wrap_angle
 from sigmaslam.filters.models import LinearMotion, MeasurementModel, MotionModel
-from sigmaslam.filters.noise_covariance import Noise
 
 
 class Rectified(Protocol):

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from sigmaslam import filters
 from sigmaslam.filters import systems
+from sigmaslam.filters.core.solve import FORMS
 from sigmaslam.filters.robust import ROBUST
-from sigmaslam.filters.updates import FORMS
 from tests.support.filter_assertions import assert_close, assert_same_belief, assert_same_update
 from tests.support.filter_builders import beliefs, bent_measurement, covariances, random_numbers, tensor
 

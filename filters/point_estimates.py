@@ -18,9 +18,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.failure import FilterError, name_elements
-from sigmaslam.filters.gaussian_belief import Gaussian
-from sigmaslam.filters.linalg.square_roots import (
+from sigmaslam.filters.core.factors import (
     apply,
     identity,
     multiply,
@@ -28,10 +26,12 @@ from sigmaslam.filters.linalg.square_roots import (
     solve_lower_transposed,
     triangularise,
 )
+from sigmaslam.filters.core.failure import FilterError, name_elements
+from sigmaslam.filters.core.noise_covariance import Dense, Noise, Rooted, as_noise
+from sigmaslam.filters.core.transforms import Taylor
+from sigmaslam.filters.gaussian_belief import Gaussian
 from sigmaslam.filters.manifolds import Space, is_flat
 from sigmaslam.filters.models import AnyMeasurement, LinearMeasurement
-from sigmaslam.filters.noise_covariance import Dense, Noise, Rooted, as_noise
-from sigmaslam.filters.transforms import Taylor
 
 # A step is halved at most this often while it raises the cost.
 _HALVINGS = 10

@@ -15,8 +15,8 @@ from typing import ClassVar, Protocol
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.linalg.square_roots import square
-from sigmaslam.filters.linalg.unrolled import ROWS, join
+from sigmaslam.filters.core.factors import square
+from sigmaslam.filters.core.unrolled_factors import ROWS, join
 
 
 @dataclass(frozen=True, slots=True)

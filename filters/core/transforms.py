@@ -14,8 +14,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.linalg.plain import is_exporting
-from sigmaslam.filters.sigma_points import Columns, SigmaPoints, Symmetric
+from sigmaslam.filters.core.plain_factors import is_exporting
+from sigmaslam.filters.core.sigma_points import Columns, SigmaPoints, Symmetric
 
 Evaluate = Callable[[Tensor], Tensor]
 Difference = Callable[[Tensor, Tensor], Tensor]
