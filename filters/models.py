@@ -115,6 +115,11 @@ class LinearMeasurement:
         return apply(self.matrix, state)
 
 
+def is_additive(model: AnyMotion | AnyMeasurement) -> bool:
+    """Whether the model's noise is added to what its function returns."""
+    return isinstance(model, LinearMotion | LinearMeasurement) or model.additive
+
+
 def several(measurement: AnyMeasurement, count: int) -> AnyMeasurement:
     """The measurement taken `count` times at one time, of what its inputs name: landmarks, beacons.
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from sigmaslam.filters.core.columns import Columns
 from sigmaslam.filters.core.factors import identity, multiply
 from sigmaslam.filters.core.noise_covariance import Noise
-from sigmaslam.filters.core.sigma_points import Columns
 from sigmaslam.filters.core.solve import Form, log_likelihood
 from sigmaslam.filters.gaussian_belief import Gaussian
 from sigmaslam.filters.robust import WeightedPosterior

@@ -23,9 +23,9 @@ import torch
 from scipy.special import chdtri
 from torch import Tensor
 
+from sigmaslam.filters.core.columns import Columns
 from sigmaslam.filters.core.factors import apply, cholesky, multiply, solve_lower, square
 from sigmaslam.filters.core.noise_covariance import BlockDiagonal, Noise
-from sigmaslam.filters.core.sigma_points import Columns
 from sigmaslam.filters.core.solve import TangentPosterior
 from sigmaslam.filters.core.unrolled_factors import join
 from sigmaslam.filters.models import AnyMeasurement, LinearMeasurement

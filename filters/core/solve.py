@@ -20,6 +20,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from sigmaslam.filters.core.columns import Columns
 from sigmaslam.filters.core.factors import (
     apply,
     cholesky,
@@ -33,7 +34,6 @@ from sigmaslam.filters.core.factors import (
 )
 from sigmaslam.filters.core.layout import choose
 from sigmaslam.filters.core.noise_covariance import Dense, Noise, Rooted
-from sigmaslam.filters.core.sigma_points import Columns
 from sigmaslam.filters.core.unrolled_factors import is_small, join, stacked_update
 
 Form = Literal["dense", "low-rank", "qr"]
