@@ -112,13 +112,13 @@ def test_several_measurements_are_those_of_one_model_side_by_side(kind):
 
 def robot(dtype: torch.dtype) -> tuple[filters.MotionModel, filters.MeasurementModel, filters.StepExample]:
     """Drives with noisy controls and sees ranges and bearings of landmarks."""
-    motion = systems.differential_drive(filters.Diagonal(tensor(0.05, 0.02).to(dtype) ** 2), 0.1)
+    motion = systems.differential_drive(filters.Diagonal(tensor(0.05, 0.02).to(dtype) ** 2))
     see = systems.range_and_bearing(filters.Diagonal(tensor(0.1, 0.02).to(dtype) ** 2))
     belief = filters.Gaussian(tensor(0.0, 0.0, 3.1).to(dtype), torch.diag(tensor(0.1, 0.1, 0.02)).to(dtype))
     example = filters.StepExample(
         belief,
         random_numbers(2, 2).to(dtype),
-        {"control": tensor(1.0, 0.1).to(dtype)},
+        {"control": tensor(1.0, 0.1).to(dtype), "time_step": tensor(0.1).to(dtype)},
         {"landmark": (5.0 * random_numbers(2, 2, seed=1)).to(dtype)},
     )
     return motion, see, example
