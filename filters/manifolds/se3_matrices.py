@@ -2,7 +2,8 @@
 
 What the tracker's graphs are made of. `lie_groups` has the same maps by quaternions, up to half a turn and with
 derivatives to round-off; a test compares the two. They are written twice because with the series of `lie_groups`, and
-its arc tangent, which ONNX Runtime lacks in float64, the tracker's graphs take 5 to 10 % longer. Here the angle comes from Newton steps on sine and cosine. Tangent order: (translation, rotation).
+its arc tangent, which ONNX Runtime lacks in float64, the tracker's graphs take 5 to 10 % longer. Here the angle comes
+from Newton steps on sine and cosine. Tangent order: (translation, rotation).
 """
 
 from __future__ import annotations
