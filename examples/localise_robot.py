@@ -43,12 +43,13 @@ def localise(folder: Path, duration: float, **options: Any) -> tuple[np.ndarray,
     landmarks = {barcode_of[subject]: k for k, subject in enumerate(table[:, 0])}
     robots = [read(folder, robot, landmarks, duration) for robot in range(1, 6)]
     controls, sightings, poses = (torch.tensor(np.stack(part, axis=1)) for part in zip(*robots, strict=True))
-    motion = differential_drive(Diagonal(torch.tensor([0.05, 0.15], dtype=torch.double) ** 2 / STEP), STEP)
+    motion = differential_drive(Diagonal(torch.tensor([0.05, 0.15], dtype=torch.double) ** 2 / STEP))
     see = several(range_and_bearing(Diagonal(torch.tensor([0.15, 0.02], dtype=torch.double) ** 2)), len(landmarks))
     prior = Gaussian(poses[0], torch.diag(torch.tensor([0.1, 0.1, 0.1], dtype=torch.double) ** 2))
     places = torch.tensor(table[:, 1:3]).expand(len(poses), -1, -1)
     ukf, values = UnscentedKalmanFilter(iterations=1), sightings.flatten(-2)
-    track = ukf.filter(prior, motion, see, values, [controls[:-1]], [places], **options)
+    steps = torch.full((len(poses) - 1, 1), STEP, dtype=torch.double)
+    track = ukf.filter(prior, motion, see, values, [controls[:-1], steps], [places], **options)
     error = track.filtered.mean - poses
     error = torch.stack([error[..., :2].norm(dim=-1), wrap_angle(error[..., 2])])
     return tuple(error.square().nanmean(dim=1).sqrt().numpy())

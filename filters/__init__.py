@@ -2,22 +2,21 @@
 
 from sigmaslam.filters.adaptive import adapted_noise
 from sigmaslam.filters.bayes import BayesFilter, ExtendedKalmanFilter, KalmanFilter, UnscentedKalmanFilter
-from sigmaslam.filters.belief import degree_of_belief
-from sigmaslam.filters.compiled import compile_step
-from sigmaslam.filters.failure import FilterError
-from sigmaslam.filters.gaussian_belief import Gaussian
-from sigmaslam.filters.inference import Observation, PointEstimate, maximum_a_posteriori, maximum_likelihood
+from sigmaslam.filters.core.compiled import compile_step
+from sigmaslam.filters.core.failure import FilterError
+from sigmaslam.filters.core.layout import stack
+from sigmaslam.filters.core.noise_covariance import BlockDiagonal, Dense, Diagonal
+from sigmaslam.filters.core.sigma_points import Simplex, cubature, julier, merwe
+from sigmaslam.filters.gaussian_belief import Gaussian, degree_of_belief
+from sigmaslam.filters.graphs.step_export import ExportError, StepExample, export_step
 from sigmaslam.filters.interacting import InteractingMultipleModels, Mixture
-from sigmaslam.filters.layout import stack
 from sigmaslam.filters.learning import FittedNoise, fit_noise
-from sigmaslam.filters.lie_groups import wrap_angle
 from sigmaslam.filters.manifolds import SE2, SE3, SO2, SO3, Euclidean, Manifold, Product
+from sigmaslam.filters.manifolds.lie_groups import wrap_angle
 from sigmaslam.filters.models import LinearMeasurement, LinearMotion, MeasurementModel, MotionModel, several
-from sigmaslam.filters.noise_covariance import BlockDiagonal, Dense, Diagonal
-from sigmaslam.filters.onnx.step import ExportError, StepExample, export_step
 from sigmaslam.filters.particles import ParticleFilter, Particles
+from sigmaslam.filters.point_estimates import Observation, PointEstimate, maximum_a_posteriori, maximum_likelihood
 from sigmaslam.filters.results import TimeUpdate, Update
-from sigmaslam.filters.sigma_points import Simplex, cubature, julier, merwe
 from sigmaslam.filters.time_series import Event, Track
 
 __all__ = [

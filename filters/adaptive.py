@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.noise_covariance import Dense, Diagonal
+from sigmaslam.filters.core.noise_covariance import Dense, Diagonal
 from sigmaslam.filters.results import Update
 
 

@@ -10,57 +10,33 @@ import torch
 from torch import Tensor
 
 from sigmaslam.filters.checks import check_belief, check_entering, check_inputs, check_measurement, check_motion
-from sigmaslam.filters.failure import POLICIES, OnFailure, Suspects, jittered, raise_unless_healthy
-from sigmaslam.filters.gaussian_belief import Gaussian
-from sigmaslam.filters.linalg.plain import PIVOT_TOLERANCES
-from sigmaslam.filters.linalg.square_roots import (
-    apply,
+from sigmaslam.filters.core.columns import Columns, noise_entering, predicted_covariance, predicted_factor
+from sigmaslam.filters.core.factors import (
     finite,
     may_look,
     multiply,
     nonnegative,
-    solve_lower_transposed,
     square,
     triangularise,
 )
-from sigmaslam.filters.linalg.unrolled import join
+from sigmaslam.filters.core.failure import POLICIES, OnFailure, Suspects, jittered, raise_unless_healthy
+from sigmaslam.filters.core.noise_covariance import Noise, as_noise
+from sigmaslam.filters.core.plain_factors import PIVOT_TOLERANCES
+from sigmaslam.filters.core.sigma_points import SigmaPoints, cubature
+from sigmaslam.filters.core.solve import FORMS, Form, TangentPosterior, choose_form, solve
+from sigmaslam.filters.core.tensors import require_tensor
+from sigmaslam.filters.core.transforms import Difference, Exact, Taylor, Transform, Unscented
+from sigmaslam.filters.gaussian_belief import Gaussian
+from sigmaslam.filters.linearisation import LinearisedMeasurement, linearise_measurement, linearise_motion, require_flat
 from sigmaslam.filters.manifolds import Space, is_flat
-from sigmaslam.filters.models import AnyMeasurement, AnyMotion, LinearMeasurement, LinearMotion, MeasurementModel
-from sigmaslam.filters.noise_covariance import Noise, as_noise
+from sigmaslam.filters.models import AnyMeasurement, AnyMotion, LinearMeasurement, LinearMotion, is_additive
 from sigmaslam.filters.results import TimeUpdate, Update
 from sigmaslam.filters.robust import Blocks, Robust, WeightedPosterior
-from sigmaslam.filters.sigma_points import Columns, SigmaPoints, cubature
-from sigmaslam.filters.tensors import require_tensor
 from sigmaslam.filters.time_series import filter_events, filter_sequence, smooth
-from sigmaslam.filters.transforms import Difference, Exact, Taylor, Transform, Transformed, Unscented
-from sigmaslam.filters.updates import FORMS, Form, TangentPosterior, choose_form, solve
 
 # Squared linearisation error of a whole measurement, in units of its noise's variance, from which on an update is worth
 # a second linearisation.
 TOLERATED_ERROR = 1.0
-
-
-_Error = Callable[[Tensor | None, Noise], Tensor]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Seen:
-    """A measurement's function, linearised.
-
-    Attributes:
-        innovation: (..., m).
-        columns: deviations of what is seen.
-        error: makes the linearisation's expected squared error (...,), in units of the noise's variance, of a mask
-            and the noise; None where there is none to be seen.
-        form: that the update is computed in.
-        usable: (...,) bool, whether all of it is finite; None: it is for all.
-    """
-
-    innovation: Tensor
-    columns: Columns
-    error: _Error | None = None
-    form: Form = "dense"
-    usable: Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,13 +48,13 @@ class BayesFilter:
     Attributes:
         transform: how a Gaussian goes through a function.
         space: manifold of the state; None: R^n.
-        form: of the update, see `sigmaslam.filters.updates`; "auto" chooses by shapes and dtype. "qr" goes on with
+        form: of the update, see `sigmaslam.filters.core.solve`; "auto" chooses by shapes and dtype. "qr" goes on with
             square roots, "dense" and "low-rank" with covariances.
         iterations: linearisations of an update, from the second on at the posterior of the one before (posterior
             linearisation, García-Fernández et al. 2015; with derivatives, the iterated EKF). "auto": a second one for
             elements whose sigma points show more linearisation error than `TOLERATED_ERROR`; the EKF sees none. A set
             that cannot show it, `Simplex`, always takes the second.
-        on_failure: see `sigmaslam.filters.failure`.
+        on_failure: see `sigmaslam.filters.core.failure`.
     """
 
     transform: Transform
@@ -114,22 +90,22 @@ class BayesFilter:
             return self._predict_linear(belief, motion, noise, inputs)
         root, usable, sound = self._root(belief)
         usable = _both(usable, nonnegative(noise.variance()))
-        moved = self._move(belief.mean, root, motion, noise, inputs)
+        moved = linearise_motion(self, belief.mean, root, motion, noise, inputs)
         mean = moved.mean if moved.reference is None else moved.reference
         columns, entering, noise_matrix = moved.columns, None, None
         usable = _both(usable, finite(mean, columns.odd))
         if usable is not None:
-            columns = _where(usable, columns)
-        if _is_additive(motion):
+            columns = columns.where(usable)
+        if is_additive(motion):
             check_entering(motion, noise, columns.odd.shape[-2])
             entering, noise_matrix = noise, motion.noise_matrix
         else:
-            columns = _with_noise_columns(columns, root.shape[-1])
+            columns = columns.without_noise(root.shape[-1])
         if self.goes_on_with_roots(belief):
-            factor = _predicted_factor(columns, entering, noise_matrix)
+            factor = predicted_factor(columns, entering, noise_matrix)
             predicted = Gaussian(mean, factor=factor, factor_is_lower=True)
         else:
-            predicted = Gaussian(mean, _predicted_covariance(columns, entering, noise_matrix))
+            predicted = Gaussian(mean, predicted_covariance(columns, entering, noise_matrix))
         usable = _both(_both(finite(mean, predicted.held), usable), _sound_variances(predicted))
         predicted = self._deal_with(usable, predicted, belief, "predict", _suspects(noise, predicted))
         return TimeUpdate(predicted, _both(usable, sound), usable, lambda: (root, columns), entering, noise_matrix)
@@ -138,10 +114,10 @@ class BayesFilter:
         self, belief: Gaussian, motion: LinearMotion, noise: Noise, inputs: tuple[Tensor, ...]
     ) -> TimeUpdate:
         """A P A^T + B2 Q B2^T, (9.22): no root is needed, so a covariance is not checked for being semidefinite."""
-        self._require_flat("LinearMotion")
+        require_flat(self, "LinearMotion")
         mean = motion.function(belief.mean, *inputs)
         covariance = multiply(multiply(motion.matrix, belief.covariance), motion.matrix.mT)
-        predicted = Gaussian(mean, covariance + _entering_twice(noise, motion.noise_matrix))
+        predicted = Gaussian(mean, covariance + noise_entering(noise, motion.noise_matrix))
         healthy = _both(finite(mean, predicted.held), nonnegative(noise.variance()))
         healthy = _both(healthy, _sound_variances(predicted))
         predicted = self._deal_with(healthy, predicted, belief, "predict", _suspects(noise, predicted))
@@ -187,19 +163,19 @@ class BayesFilter:
         value, mask, count, measured = _without_missing(value, measurement.mask)
         usable = _both(usable, measured)
         added = None
-        if _is_additive(measurement):
+        if is_additive(measurement):
             added = noise = noise if mask is None else noise.masked(mask)
         usable = _both(usable, nonnegative(noise.variance()))
 
-        def look(previous: TangentPosterior | None) -> _Seen:
-            seen = self._innovate(belief.mean, root, measurement, noise, value, inputs, previous)
+        def look(previous: TangentPosterior | None) -> LinearisedMeasurement:
+            seen = linearise_measurement(self, belief.mean, root, measurement, noise, value, inputs, previous)
             innovation, columns = seen.innovation, seen.columns
             if mask is not None:
-                innovation, columns = torch.where(mask, innovation, 0.0), _masked(columns, mask, added is None)
+                innovation, columns = torch.where(mask, innovation, 0.0), columns.masked(mask, added is None)
             # What cannot be used is not looked at, so that it harms no derivative either.
             used = _both(usable, finite(innovation, columns.odd))
             if used is not None:
-                innovation, columns = torch.where(used[..., None], innovation, 0.0), _where(used, columns)
+                innovation, columns = torch.where(used[..., None], innovation, 0.0), columns.where(used)
             form = self._form(belief, columns, innovation.shape[-1], added is not None)
             return replace(seen, innovation=innovation, columns=columns, form=form, usable=used)
 
@@ -213,7 +189,7 @@ class BayesFilter:
             count = mask.sum(dim=-1)
             noise = added = blocks.weighted(noise.masked(mask))
 
-        def linearise(previous: TangentPosterior | None) -> tuple[_Seen, WeightedPosterior]:
+        def linearise(previous: TangentPosterior | None) -> tuple[LinearisedMeasurement, WeightedPosterior]:
             seen = look(previous)
 
             def posterior(noise: Noise | None) -> TangentPosterior:
@@ -274,10 +250,6 @@ class BayesFilter:
             root = torch.where(usable[..., None, None], root, 0.0)
         return root, usable, sound
 
-    def _require_flat(self, model: str) -> None:
-        if self.chart is not None:
-            raise TypeError(f"{model} is for states in R^n; on a manifold use a model with a function")
-
     @property
     def chart(self) -> Difference | None:
         """(points, reference) -> tangent at the reference; None in R^n, where it is their difference."""
@@ -306,88 +278,6 @@ class BayesFilter:
             root,
             None,
         ).columns.all()
-
-    def _move(
-        self, mean: Tensor, root: Tensor, motion: AnyMotion, noise: Noise, inputs: tuple[Tensor, ...]
-    ) -> Transformed:
-        if isinstance(motion, LinearMotion):
-            self._require_flat("LinearMotion")
-            return Transformed(None, motion.function(mean, *inputs), Columns(multiply(motion.matrix, root)))
-        size = root.shape[-1]
-        transform = self.transform
-        if isinstance(transform, Taylor) and motion.jacobian is not None:
-            transform = Taylor(motion.jacobian(mean, *inputs))
-
-        def evaluate(offsets: Tensor) -> Tensor:
-            if motion.additive:
-                return motion.function(self.retract(mean, offsets), *inputs)
-            return motion.function(self.retract(mean, offsets[..., :size]), offsets[..., size:], *inputs)
-
-        columns = root if motion.additive else _block_diagonal(root, noise.factor())
-        return transform(evaluate, columns, self.chart, self.retract)
-
-    def _innovate(
-        self,
-        mean: Tensor,
-        root: Tensor,
-        measurement: AnyMeasurement,
-        noise: Noise,
-        value: Tensor,
-        inputs: tuple[Tensor, ...],
-        previous: TangentPosterior | None,
-    ) -> _Seen:
-        """Innovation and deviations of a linearisation at the prior, or at the posterior of the previous one."""
-        if isinstance(measurement, LinearMeasurement):
-            self._require_flat("LinearMeasurement")
-            if inputs:
-                raise ValueError("an input was given, but a LinearMeasurement takes none")
-            innovation = value - measurement.function(mean)
-            return _Seen(innovation, Columns(multiply(measurement.matrix, root)))
-        size = root.shape[-1]
-        shift = None if previous is None else previous.shift
-        spread = None if previous is None else previous.spread()
-        columns = root if spread is None else multiply(root, spread)
-        transform = self.transform
-        # A given derivative is in the chart of the point that it is taken at, which is the prior's only at first.
-        in_chart = shift is None or self.chart is None
-        if isinstance(transform, Taylor) and measurement.jacobian is not None and in_chart:
-            transform = Taylor(measurement.jacobian(mean if shift is None else mean + shift, *inputs))
-
-        def evaluate(offsets: Tensor) -> Tensor:
-            moved = offsets if measurement.additive else offsets[..., :size]
-            state = self.retract(mean, moved if shift is None else shift + moved)
-            if measurement.additive:
-                return measurement.function(state, *inputs)
-            return measurement.function(state, offsets[..., size:], *inputs)
-
-        offsets = columns if measurement.additive else _block_diagonal(columns, noise.factor())
-        seen = transform(evaluate, offsets, measurement.residual)
-        if seen.mean.shape[-1] != value.shape[-1]:
-            raise ValueError(
-                f"the measurement's function returns {seen.mean.shape[-1]} components, the value has {value.shape[-1]}"
-            )
-        innovation = seen.from_mean(value, measurement.residual)
-        seen_columns = seen.columns if measurement.additive else _with_noise_columns(seen.columns, size)
-        if previous is None or spread is None:
-            return _Seen(innovation, seen_columns, self._error(measurement, seen.columns, size))
-        # The slope was taken along L M; the update wants it along L, and M is far from singular.
-        odd = solve_lower_transposed(spread, seen_columns.odd.mT).mT
-        return _Seen(innovation + apply(odd, previous.mean), Columns(odd, seen_columns.even, seen_columns.negative))
-
-    def _error(self, measurement: MeasurementModel, columns: Columns, size: int) -> _Error | None:
-        """Makes the error of a linearisation, as far as the transform can see any; None: as good as none."""
-        if isinstance(self.transform, Unscented) and not self.transform.points.sees_error:
-            # Nothing shows whether a second linearisation is worth while: it is made.
-            return lambda mask, noise: torch.full_like(columns.odd[..., 0, 0], torch.inf)
-        even = columns.even
-        if even is None:
-            return None
-
-        def error(mask: Tensor | None, noise: Noise) -> Tensor:
-            variance = noise.variance() if measurement.additive else columns.odd[..., size:].square().sum(dim=-1)
-            return _linearisation_error(even, variance, mask)
-
-        return error
 
     def _correct(self, belief: Gaussian, solution: TangentPosterior) -> Gaussian:
         """The posterior of the state, with its covariance in the chart at the new mean."""
@@ -438,29 +328,13 @@ def UnscentedKalmanFilter(  # noqa: N802
     iterations: int | Literal["auto"] = "auto",
     on_failure: OnFailure = "raise",
 ) -> BayesFilter:
-    """Sigma points, Table 9.2; `points` from `sigmaslam.filters.sigma_points`, by default `cubature()`."""
+    """Sigma points, Table 9.2; `points` from `sigmaslam.filters.core.sigma_points`, by default `cubature()`."""
     return BayesFilter(Unscented(points or cubature()), space, form, iterations, on_failure)
-
-
-def _linearisation_error(even: Tensor, variance: Tensor, mask: Tensor | None) -> Tensor:
-    """Expected square of what sigma points see of the linearisation's error, (...,), over the noise's variance."""
-    # Where there is no noise, no error is small.
-    share = (even * even).sum(dim=-1) / variance.clamp_min(torch.finfo(variance.dtype).tiny)
-    return (share if mask is None else torch.where(mask, share, 0.0)).sum(dim=-1)
 
 
 def _suspects(noise: Noise, predicted: Gaussian) -> Suspects:
     """What may have made a prediction fail, beside the prior."""
     return {"process noise": noise.covariance, "predicted covariance": lambda: predicted.covariance}
-
-
-def _where(usable: Tensor, columns: Columns) -> Columns:
-    """The columns where usable (...,) bool is true, zeros elsewhere."""
-    rows = usable[..., None, None]
-    odd = torch.where(rows, columns.odd, 0.0)
-    even = None if columns.even is None else torch.where(rows, columns.even, 0.0)
-    negative = None if columns.negative is None else torch.where(rows, columns.negative, 0.0)
-    return Columns(odd, even, negative)
 
 
 def _sound_variances(belief: Gaussian) -> Tensor | None:
@@ -471,44 +345,11 @@ def _sound_variances(belief: Gaussian) -> Tensor | None:
     return nonnegative(variance, PIVOT_TOLERANCES[variance.dtype])
 
 
-def _is_additive(model: AnyMotion | AnyMeasurement) -> bool:
-    return isinstance(model, LinearMotion | LinearMeasurement) or model.additive
-
-
 def _both(first: Tensor | None, second: Tensor | None) -> Tensor | None:
     """Conjunction of flags (...,), of which None is all true."""
     if first is None or second is None:
         return second if first is None else first
     return first & second
-
-
-def _with_noise_columns(columns: Columns, size: int) -> Columns:
-    """Columns of a transform of state and noise: those of the noise, after the first `size`, are not the state's."""
-    noise = columns.odd[..., size:]
-    even = noise if columns.even is None else join([noise, columns.even])
-    return Columns(columns.odd[..., :size], even, columns.negative)
-
-
-def _predicted_factor(columns: Columns, noise: Noise | None, noise_matrix: Tensor | None) -> Tensor:
-    if columns.negative is not None:
-        raise ValueError("square roots need sigma weights that are not negative; use form='dense'")
-    if noise is None:
-        return triangularise(columns.all())
-    if noise_matrix is None:
-        return noise.triangularised(columns.all())
-    return triangularise([*columns.all(), multiply(noise_matrix, noise.factor())])
-
-
-def _predicted_covariance(columns: Columns, noise: Noise | None, noise_matrix: Tensor | None) -> Tensor:
-    covariance = columns.covariance()
-    return covariance if noise is None else covariance + _entering_twice(noise, noise_matrix)
-
-
-def _entering_twice(noise: Noise, noise_matrix: Tensor | None) -> Tensor:
-    """B2 Q B2^T, (..., n, n)."""
-    if noise_matrix is None:
-        return noise.covariance()
-    return multiply(multiply(noise_matrix, noise.covariance()), noise_matrix.mT)
 
 
 def _without_missing(value: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None, Tensor | int, Tensor | None]:
@@ -524,24 +365,3 @@ def _without_missing(value: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor
     present = present if mask is None else present & mask
     measured = (regular | ~present).all(dim=-1)
     return torch.where(present & regular, value, 0.0), present, present.sum(dim=-1), measured
-
-
-def _masked(columns: Columns, mask: Tensor, unit_noise: bool) -> Columns:
-    """Columns with zero rows where the mask is False; with unit noise of their own if no noise is added to them."""
-    rows = mask.unsqueeze(-1)
-    odd = torch.where(rows, columns.odd, 0.0)
-    even = None if columns.even is None else torch.where(rows, columns.even, 0.0)
-    if unit_noise:
-        unit = torch.diag_embed((~mask).to(odd.dtype)).expand(*odd.shape[:-1], odd.shape[-2])
-        even = unit if even is None else join([even, unit])
-    negative = None if columns.negative is None else torch.where(rows, columns.negative, 0.0)
-    return Columns(odd, even, negative)
-
-
-def _block_diagonal(first: Tensor, second: Tensor) -> Tensor:
-    """(..., n, n) and (..., q, q) into (..., n + q, n + q)."""
-    n, q = first.shape[-1], second.shape[-1]
-    batch = torch.broadcast_shapes(first.shape[:-2], second.shape[:-2])
-    upper = torch.nn.functional.pad(first, (0, q)).expand(*batch, n, n + q)
-    lower = torch.nn.functional.pad(second, (n, 0)).expand(*batch, q, n + q)
-    return torch.cat([upper, lower], dim=-2)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from sigmaslam.filters.core.factors import is_traced
+from sigmaslam.filters.core.noise_covariance import Noise
+from sigmaslam.filters.core.tensors import require_dtype, require_tensor
 from sigmaslam.filters.gaussian_belief import Gaussian
-from sigmaslam.filters.linalg.square_roots import is_traced
 from sigmaslam.filters.manifolds import Space
 from sigmaslam.filters.models import AnyMeasurement, AnyMotion, LinearMeasurement, LinearMotion
-from sigmaslam.filters.noise_covariance import Noise
-from sigmaslam.filters.tensors import require_dtype, require_tensor
 
 
 def check_belief(belief: Gaussian, space: Space | None) -> None:

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from sigmaslam.filters.bayes import BayesFilter
+from sigmaslam.filters.core.factors import square
 from sigmaslam.filters.gaussian_belief import Gaussian
-from sigmaslam.filters.linalg.square_roots import square
 from sigmaslam.filters.models import AnyMeasurement, AnyMotion
 from sigmaslam.filters.robust import Robust
 

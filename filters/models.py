@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from sigmaslam.filters.linalg.square_roots import apply
-from sigmaslam.filters.noise_covariance import BlockDiagonal, Diagonal, Noise, as_noise
+from sigmaslam.filters.core.factors import apply
+from sigmaslam.filters.core.noise_covariance import BlockDiagonal, Diagonal, Noise, as_noise
 
 Function = Callable[..., Tensor]
 Residual = Callable[[Tensor, Tensor], Tensor]
@@ -113,6 +113,11 @@ class LinearMeasurement:
     def function(self, state: Tensor) -> Tensor:
         """H x for (..., n)."""
         return apply(self.matrix, state)
+
+
+def is_additive(model: AnyMotion | AnyMeasurement) -> bool:
+    """Whether the model's noise is added to what its function returns."""
+    return isinstance(model, LinearMotion | LinearMeasurement) or model.additive
 
 
 def several(measurement: AnyMeasurement, count: int) -> AnyMeasurement:

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from sigmaslam.filters.core.factors import apply
+from sigmaslam.filters.core.noise_covariance import as_noise
 from sigmaslam.filters.gaussian_belief import Gaussian
-from sigmaslam.filters.linalg.square_roots import apply
 from sigmaslam.filters.manifolds import Space, is_flat
 from sigmaslam.filters.models import AnyMeasurement, AnyMotion, LinearMeasurement, LinearMotion
-from sigmaslam.filters.noise_covariance import as_noise
 
 # Share of the particles below which the effective number makes a resampling.
 _RESAMPLED_BELOW = 0.5

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from sigmaslam.filters.core.columns import Columns
+from sigmaslam.filters.core.factors import identity, multiply
+from sigmaslam.filters.core.noise_covariance import Noise
+from sigmaslam.filters.core.solve import Form, log_likelihood
 from sigmaslam.filters.gaussian_belief import Gaussian
-from sigmaslam.filters.linalg.square_roots import identity, multiply
-from sigmaslam.filters.noise_covariance import Noise
 from sigmaslam.filters.robust import WeightedPosterior
-from sigmaslam.filters.sigma_points import Columns
-from sigmaslam.filters.updates import Form, log_likelihood
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,7 +64,7 @@ class Update:
     Attributes:
         belief: the posterior.
         innovation: (..., m) measured minus expected, zero where masked.
-        form: how the update was computed, see `sigmaslam.filters.updates`.
+        form: how the update was computed, see `sigmaslam.filters.core.solve`.
         count: components that took part, (...,) or a number: the degrees of freedom of the NIS. Of an element that
             was held none did, so its NIS and log-likelihood are zero.
     """

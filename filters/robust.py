@@ -23,12 +23,12 @@ import torch
 from scipy.special import chdtri
 from torch import Tensor
 
-from sigmaslam.filters.linalg.square_roots import apply, cholesky, multiply, solve_lower, square
-from sigmaslam.filters.linalg.unrolled import join
+from sigmaslam.filters.core.columns import Columns
+from sigmaslam.filters.core.factors import apply, cholesky, multiply, solve_lower, square
+from sigmaslam.filters.core.noise_covariance import BlockDiagonal, Noise
+from sigmaslam.filters.core.solve import TangentPosterior
+from sigmaslam.filters.core.unrolled_factors import join
 from sigmaslam.filters.models import AnyMeasurement, LinearMeasurement
-from sigmaslam.filters.noise_covariance import BlockDiagonal, Noise
-from sigmaslam.filters.sigma_points import Columns
-from sigmaslam.filters.updates import TangentPosterior
 
 Robust = Literal["student_t", "huber"]
 ROBUST: tuple[Robust, ...] = ("student_t", "huber")

@@ -3,19 +3,23 @@
 The 12 states are (x, dx, y, dy, z, dz, alpha, dalpha, beta, dbeta, phi, dphi): position of the left camera in the
 world in metres and its Euler angles in radians, each followed by its rate per second. The rotation from camera to
 world is R = Rz(phi) Ry(beta) Rx(alpha), singular at beta = 90 degrees.
+
+A time step is an input of each step, (..., 1) in seconds: sensors need not be regular, nor the elements of a batch
+alike.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.layout import stack
-from sigmaslam.filters.lie_groups import wrap_angle
+from sigmaslam.filters.core.layout import stack
+from sigmaslam.filters.core.noise_covariance import Diagonal, Noise
+from sigmaslam.filters.manifolds.lie_groups import wrap_angle
 from sigmaslam.filters.models import LinearMotion, MeasurementModel, MotionModel
-from sigmaslam.filters.noise_covariance import Noise
 
 
 class Rectified(Protocol):
@@ -47,12 +51,37 @@ class Rectified(Protocol):
         ...
 
 
-def constant_velocity(densities: Tensor, time_step: float) -> LinearMotion:
-    """Pairs of a value and its rate, driven by white acceleration, (9.37) and (9.38).
+def constant_velocity(densities: Tensor) -> MotionModel:
+    """Pairs of a value and its rate, driven by white acceleration over any time step, (9.37) and (9.38).
+
+    The time step (..., 1) in seconds, which may differ from step to step and from element to element, is an input of
+    `predict`. Noise that gathers in it enters by its exact root, so the model is not additive; two steps are one step
+    of their length. Where all steps are of one length, `constant_velocity_over` is the same by a matrix.
 
     Args:
         densities: (p,) power spectral density of the acceleration of each value, its unit squared by s^3; six for the
             12 states.
+    Returns:
+        Motion of 2p states.
+    """
+
+    def move(state: Tensor, noise: Tensor, time_step: Tensor) -> Tensor:
+        T = time_step[..., :1]
+        value, rate = state[..., 0::2], state[..., 1::2]
+        first, second = noise[..., 0::2], noise[..., 1::2]
+        root = torch.sqrt(T)
+        moved = value + T * rate + T * root / math.sqrt(3) * first
+        changed = rate + root * (0.5 * math.sqrt(3) * first + 0.5 * second)
+        return torch.stack([moved, changed], dim=-1).flatten(-2)
+
+    return MotionModel(move, Diagonal(densities.repeat_interleave(2)), additive=False)
+
+
+def constant_velocity_over(densities: Tensor, time_step: float) -> LinearMotion:
+    """Motion of `constant_velocity` over one time step, for the Kalman filter and where all steps are of one length.
+
+    Args:
+        densities: as there.
         time_step: Ts, seconds.
     Returns:
         Motion of 2p states with the exact covariance of the noise that gathers in a time step.
@@ -102,21 +131,22 @@ def stereo_measurement(points: Tensor, camera: Rectified, noise: Noise | Tensor)
     return MeasurementModel(lambda state: project_stereo(state, points, camera), noise)
 
 
-def differential_drive(noise: Noise | Tensor, time_step: float) -> MotionModel:
+def differential_drive(noise: Noise | Tensor) -> MotionModel:
     """Robot with four wheels that drives and turns, (9.43) and (9.44): states (x, y, theta), metres and radians.
 
-    The control (..., 2), speed v in m/s and turn rate omega in rad/s, is an input of `predict`. Its noise, w_v and
-    w_omega, goes through the kinematics with it: the model is not additive.
+    The control (..., 2), speed v in m/s and turn rate omega in rad/s, and the time step (..., 1) in seconds are inputs
+    of `predict`, in this order; the step may differ from step to step and from element to element. The noise of the
+    control, w_v and w_omega, is constant over a step and goes through the kinematics with it: the model is not
+    additive.
 
     Args:
         noise: covariance of (w_v, w_omega), (..., 2, 2).
-        time_step: Ts, seconds.
     """
 
-    def drive(state: Tensor, noise: Tensor, control: Tensor) -> Tensor:
-        theta = state[..., 2]
-        distance = (control[..., 0] + noise[..., 0]) * time_step
-        turn = (control[..., 1] + noise[..., 1]) * time_step
+    def drive(state: Tensor, noise: Tensor, control: Tensor, time_step: Tensor) -> Tensor:
+        theta, T = state[..., 2], time_step[..., 0]
+        distance = (control[..., 0] + noise[..., 0]) * T
+        turn = (control[..., 1] + noise[..., 1]) * T
         return stack(
             [state[..., 0] + distance * torch.cos(theta), state[..., 1] + distance * torch.sin(theta), theta + turn]
         )

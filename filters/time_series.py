@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.failure import FilterError
+from sigmaslam.filters.core.factors import apply, multiply, solve_lower_transposed, square, triangularise
+from sigmaslam.filters.core.failure import FilterError
+from sigmaslam.filters.core.tensors import require_tensor
 from sigmaslam.filters.gaussian_belief import Gaussian
-from sigmaslam.filters.linalg.square_roots import apply, multiply, solve_lower_transposed, square, triangularise
 from sigmaslam.filters.models import AnyMeasurement, AnyMotion
 from sigmaslam.filters.results import TimeUpdate, Update
 from sigmaslam.filters.robust import Robust
-from sigmaslam.filters.tensors import require_tensor
 
 if TYPE_CHECKING:
     from sigmaslam.filters.bayes import BayesFilter

@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 
 from sigmaslam.filters import SE3, Diagonal, Euclidean, Gaussian, MeasurementModel, MotionModel, Product, stack
-from sigmaslam.filters.layout import concatenate
-from sigmaslam.filters.lie_groups import exp_so3, matrix_from_quaternion
+from sigmaslam.filters.core.layout import concatenate
+from sigmaslam.filters.manifolds.lie_groups import exp_so3, matrix_from_quaternion
 
 BODY = SE3("right")
 SPACE = Product(BODY, Euclidean(12))

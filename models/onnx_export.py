@@ -18,9 +18,9 @@ from torch import Tensor, nn
 
 from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.files import atomic_path, atomic_write_text, make_folder
-from sigmaslam.filters.onnx.exportable_se3 import exp_se3
-from sigmaslam.filters.onnx.graph_file import strip_origins
-from sigmaslam.filters.onnx.pose_prediction import STATE_SIZE, Predict
+from sigmaslam.filters.graphs.graph_file import strip_origins
+from sigmaslam.filters.graphs.pose_prediction import STATE_SIZE, Predict
+from sigmaslam.filters.manifolds.se3_matrices import exp_se3
 from sigmaslam.filters.tracking.frame_update import FrameViews, GatedStep, PredictViews, RobustStep
 from sigmaslam.filters.tracking.window_solution import Condition, EliminateLandmarks, GateWindow, WindowViews
 from sigmaslam.inference.onnx_graph import OnnxGraph

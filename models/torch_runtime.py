@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from sigmaslam.filters.onnx.pose_prediction import Predict
+from sigmaslam.filters.graphs.pose_prediction import Predict
 from sigmaslam.filters.tracking.frame_update import GatedStep, PredictViews, RobustStep
 from sigmaslam.filters.tracking.window_solution import Condition, EliminateLandmarks, GateWindow
 from sigmaslam.inference.onnx_graph import shipped_weights

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from sigmaslam.estimation.state_layout import CALIBRATION_SIZE, LANDMARK_SIZE
-from sigmaslam.filters.onnx.exportable_se3 import exp_se3
+from sigmaslam.filters.manifolds.se3_matrices import exp_se3
 from sigmaslam.filters.tracking.frame_update import FrameViews
 from sigmaslam.filters.tracking.window_solution import WindowViews
 

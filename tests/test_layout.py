@@ -42,6 +42,8 @@ FLOORS = (
     ("cli",),
     ("__main__", ""),
 )
+# The filters likewise, from the ground up; "" is the files that users read first.
+FILTER_FLOORS = (("core", "consistency"), ("manifolds",), ("",), ("graphs",), ("tracking",))
 # Of the tracker.
 MAX_LINES, MAX_METHODS = 300, 12
 
@@ -97,6 +99,16 @@ def test_folders_of_the_runtime_import_only_what_stands_below_them():
             other = _room(imported)
             if other and other in floor and other != room:
                 assert floor[other] < floor[room], f"{module} imports {imported}"
+
+
+def test_folders_of_the_filters_import_only_what_stands_below_them():
+    floor = {folder: k for k, folders in enumerate(FILTER_FLOORS) for folder in folders}
+    assert floor.keys() == {_folder_of_filters(module) for module in _modules_of("filters")}
+    for module in set(_modules_of("filters")) - {"sigmaslam.filters"}:
+        folder = _folder_of_filters(module)
+        for imported in _imports(module):
+            if imported.startswith("sigmaslam.filters.") and (other := _folder_of_filters(imported)) != folder:
+                assert floor[other] < floor[folder], f"{module} imports {imported}"
 
 
 def test_every_module_of_the_runtime_has_its_floor():
@@ -190,6 +202,12 @@ def _room(module: str) -> str:
     """The folder or file of a module in the runtime package."""
     parts = module.split(".")
     return parts[1] if len(parts) > 1 else ""
+
+
+def _folder_of_filters(module: str) -> str:
+    """The folder of a module of the filters; "" for the files beside the folders."""
+    package = module if _files()[module].name == "__init__.py" else module.rpartition(".")[0]
+    return ".".join(package.split(".")[2:])
 
 
 @cache

@@ -122,19 +122,19 @@ def drive_samples(spread: float, count: int, generator: Generator) -> Tensor:
     motion = _drive(spread)
     assert isinstance(motion.noise, Tensor)
     root = motion.noise.sqrt()
-    state, control = torch.zeros(count, 3, dtype=torch.float64), _control()
+    state = torch.zeros(count, 3, dtype=torch.float64)
     for _ in range(_STEPS):
         noise = torch.randn(count, 2, generator=generator, dtype=torch.float64) @ root
-        state = motion.function(state, noise, control)
+        state = motion.function(state, noise, *_motion_inputs())
     return state
 
 
 def predict_drive(bayes: BayesFilter, spread: float) -> Gaussian:
     """A filter's belief after the drive of `drive_samples`."""
     belief = Gaussian(torch.zeros(3, dtype=torch.float64), torch.zeros(3, 3, dtype=torch.float64))
-    motion, control = _drive(spread), _control()
+    motion = _drive(spread)
     for _ in range(_STEPS):
-        belief = bayes.predict(belief, motion, control).belief
+        belief = bayes.predict(belief, motion, *_motion_inputs()).belief
     return belief
 
 
@@ -362,13 +362,12 @@ def _contour(axes: Axes, points: NDArray[np.float64], colour: str, dashes: str, 
 
 def _drive(spread: float) -> MotionModel:
     turn_sigma = spread / (_TIME_STEP * math.sqrt(_STEPS))
-    return differential_drive(
-        torch.diag(torch.tensor([_SPEED_SIGMA**2, turn_sigma**2], dtype=torch.float64)), _TIME_STEP
-    )
+    return differential_drive(torch.diag(torch.tensor([_SPEED_SIGMA**2, turn_sigma**2], dtype=torch.float64)))
 
 
-def _control() -> Tensor:
-    return torch.tensor([_SPEED, 0.0], dtype=torch.float64)
+def _motion_inputs() -> tuple[Tensor, Tensor]:
+    """Control and time step of each step."""
+    return torch.tensor([_SPEED, 0.0], dtype=torch.float64), torch.tensor([_TIME_STEP], dtype=torch.float64)
 
 
 def _draw(belief: Gaussian, space: Space, count: int) -> Tensor:

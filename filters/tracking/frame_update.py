@@ -13,8 +13,8 @@ from torch import Tensor, nn
 
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999
 from sigmaslam.estimation.state_layout import CALIBRATION, CALIBRATION_SIZE, LANDMARK_SIZE, MODELLED
-from sigmaslam.filters.linalg import regular
-from sigmaslam.filters.onnx.exportable_se3 import exp_se3, invert_se3, log_se3
+from sigmaslam.filters.core import regular_factors
+from sigmaslam.filters.manifolds.se3_matrices import exp_se3, invert_se3, log_se3
 from sigmaslam.filters.tracking.robust import UNKNOWN_VARIANCE, chi_square, common_scale, mask_missing, student_weight
 from sigmaslam.filters.tracking.stereo_views import Scene, Slopes, by_state, linearise
 
@@ -137,7 +137,7 @@ class RobustStep(nn.Module):
         # About what the prior expects.
         slopes = seen.by_prior.unflatten(0, (-1, 3))
         innovation = slopes @ slopes.mT + torch.eye(3, dtype=noise.dtype, device=noise.device)
-        whitened = regular.whiten(seen.residual[..., None], innovation)
+        whitened = regular_factors.whiten(seen.residual[..., None], innovation)
         squared = torch.where(gated > 0.0, _lengths(whitened[..., 0]), seen.squared)
         usable = seen.usable.to(noise.dtype)
         z, inverse, after = seen.beyond, spread, seen.residual
@@ -286,7 +286,7 @@ def _linearised(
     through = linear.by_landmark @ frame.covariance @ linear.by_landmark.mT
     residual, noise, components = mask_missing(measurement, linear.mean, noise + linear.nonlinearity + through)
     pieces = [linear.by_pair, linear.by_landmark, residual[..., None]]
-    stacked = regular.whiten(torch.cat(pieces, dim=2), noise)
+    stacked = regular_factors.whiten(torch.cat(pieces, dim=2), noise)
     by_pair, by_landmark, residual = stacked[..., :18], stacked[..., 18:24], stacked[..., 24]
     derivatives = frame.by_state(by_pair, by_landmark, linear.chain)
     squared = _lengths(residual)
@@ -301,7 +301,7 @@ def _solve(seen: _Whitened, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Mean (k, 1) and covariance (k, k) of z ~ N(0, I) given the views, weighted (M,)."""
     weighted = seen.by_prior * _each_row(weight)
     identity = torch.eye(seen.by_prior.shape[1], dtype=weight.dtype, device=weight.device)
-    inverse = regular.invert(weighted.mT @ seen.by_prior + identity)
+    inverse = regular_factors.invert(weighted.mT @ seen.by_prior + identity)
     return inverse @ (weighted.mT @ seen.beyond), inverse
 
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999
 from sigmaslam.estimation.state_layout import LANDMARK_SIZE, MODELLED
-from sigmaslam.filters.linalg import regular
+from sigmaslam.filters.core import regular_factors
 from sigmaslam.filters.tracking.robust import UNKNOWN_VARIANCE, chi_square, mask_missing, student_weight
 from sigmaslam.filters.tracking.stereo_views import Scene, Slopes, by_state, linearise
 
@@ -67,7 +67,7 @@ class GateWindow(nn.Module):
     def forward(self, *views: Tensor) -> Tensor:
         """By the length of each view's residual."""
         linear, residual, noise, components = WindowViews(*views).linearise()
-        whitened = regular.whiten(residual[..., None], noise)[..., 0]
+        whitened = regular_factors.whiten(residual[..., None], noise)[..., 0]
         return linear.in_front & ((whitened * whitened).sum(dim=1) <= chi_square(CHI_SQUARE_999, components))
 
 
@@ -89,7 +89,7 @@ class EliminateLandmarks(nn.Module):
         unknown = torch.tensor(UNKNOWN_VARIANCE, dtype=noise.dtype, device=noise.device)
         noise = torch.where(linear.in_front[:, None, None], noise, unknown * identity)
         pieces = [linear.by_pair, linear.by_landmark, residual[..., None]]
-        stacked = regular.whiten(torch.cat(pieces, dim=2), noise)
+        stacked = regular_factors.whiten(torch.cat(pieces, dim=2), noise)
         squared = (stacked[..., -1] * stacked[..., -1]).sum(dim=1)
         stacked = stacked * torch.sqrt(student_weight(squared, components, freedom))[:, None, None]
         rows = by_state(stacked[..., :18], linear.chain, window.pair)
@@ -102,7 +102,7 @@ class EliminateLandmarks(nn.Module):
         sums = sums.index_put((window.owner,), products, accumulate=True)
         departure = measured - window.estimate
         precision = _prior_precision(departure, variance, freedom)
-        inverse = regular.invert(sums[:, :, :LANDMARK_SIZE] + torch.diag_embed(precision))
+        inverse = regular_factors.invert(sums[:, :, :LANDMARK_SIZE] + torch.diag_embed(precision))
         prior = torch.nn.functional.pad((departure * precision)[..., None], (size, 0))
         sums = sums[:, :, LANDMARK_SIZE:] + prior
         solved = inverse @ sums
@@ -123,7 +123,7 @@ class Condition(nn.Module):
         """In units of the prior."""
         identity = torch.eye(factor.shape[1], dtype=factor.dtype, device=factor.device)
         whole = identity + factor.mT @ information @ factor
-        covariance = factor @ regular.invert((whole + whole.mT) / 2.0) @ factor.mT
+        covariance = factor @ regular_factors.invert((whole + whole.mT) / 2.0) @ factor.mT
         learned = torch.cat([vector[:, None], -information @ common], dim=1)
         moved = covariance @ learned
         return moved[:, 0], covariance, common + moved[:, 1:]

@@ -8,7 +8,7 @@ from torch._dynamo.backends.common import aot_autograd
 from torch._inductor.decomposition import select_decomp_table
 
 from sigmaslam import filters
-from sigmaslam.filters import components
+from sigmaslam.filters.core import components
 
 BATCH = 200
 

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from sigmaslam import filters
 from sigmaslam.filters import systems
-from sigmaslam.filters.linalg import plain, square_roots
+from sigmaslam.filters.core import factors, plain_factors
+from sigmaslam.filters.core.transforms import push_forward
+from sigmaslam.filters.graphs.exact_operators import ExactOperators
+from sigmaslam.filters.graphs.step_export import _Step
 from sigmaslam.filters.models import several
-from sigmaslam.filters.onnx.exact_operators import ExactOperators
-from sigmaslam.filters.onnx.step import _Step
-from sigmaslam.filters.transforms import push_forward
 from tests.support.filter_assertions import assert_close, assert_same_update
 from tests.support.filter_builders import beliefs, bent_measurement, bent_motion, covariances, random_numbers, tensor
 
@@ -25,19 +25,21 @@ EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "export_my_filter.p
 @pytest.mark.parametrize("size", [1, 5, 24])
 def test_plain_operators_equal_lapack(size):
     P, right = covariances(3, size), random_numbers(3, size, 4, seed=2)
-    factor, healthy = plain.cholesky(P)
+    factor, healthy = plain_factors.cholesky(P)
     assert bool(healthy.all())
     assert_close(factor, torch.linalg.cholesky(P), 1e-12)
     wide = random_numbers(3, size, 2 * size + 1, seed=3)
-    assert_close(plain.triangularise(wide), square_roots.triangularise([wide]), 1e-11)
+    assert_close(plain_factors.triangularise(wide), factors.triangularise([wide]), 1e-11)
     narrow = random_numbers(3, size, max(size - 2, 1), seed=3)
-    lower = plain.triangularise(narrow)
+    lower = plain_factors.triangularise(narrow)
     assert_close(lower @ lower.mT, narrow @ narrow.mT, 1e-11)
     assert_close(
-        plain.solve_lower(factor, right, True), torch.linalg.solve_triangular(factor, right, upper=False), 1e-10
+        plain_factors.solve_lower(factor, right, True), torch.linalg.solve_triangular(factor, right, upper=False), 1e-10
     )
     assert_close(
-        plain.solve_lower_transposed(factor, right), torch.linalg.solve_triangular(factor.mT, right, upper=True), 1e-10
+        plain_factors.solve_lower_transposed(factor, right),
+        torch.linalg.solve_triangular(factor.mT, right, upper=True),
+        1e-10,
     )
 
 
@@ -53,10 +55,10 @@ def test_a_step_in_plain_operators_equals_the_step(form):
         return bayes.update(bayes.predict(prior, models[0]).belief, models[1], z)
 
     expected = step()
-    with plain.traced_for_export(), ExactOperators():
+    with plain_factors.traced_for_export(), ExactOperators():
         found = step()
         assert_same_update(found, expected, 1e-10)
-    assert not plain.is_exporting()
+    assert not plain_factors.is_exporting()
 
 
 def test_replaced_functions_keep_their_digits():
@@ -110,13 +112,13 @@ def test_several_measurements_are_those_of_one_model_side_by_side(kind):
 
 def robot(dtype: torch.dtype) -> tuple[filters.MotionModel, filters.MeasurementModel, filters.StepExample]:
     """Drives with noisy controls and sees ranges and bearings of landmarks."""
-    motion = systems.differential_drive(filters.Diagonal(tensor(0.05, 0.02).to(dtype) ** 2), 0.1)
+    motion = systems.differential_drive(filters.Diagonal(tensor(0.05, 0.02).to(dtype) ** 2))
     see = systems.range_and_bearing(filters.Diagonal(tensor(0.1, 0.02).to(dtype) ** 2))
     belief = filters.Gaussian(tensor(0.0, 0.0, 3.1).to(dtype), torch.diag(tensor(0.1, 0.1, 0.02)).to(dtype))
     example = filters.StepExample(
         belief,
         random_numbers(2, 2).to(dtype),
-        {"control": tensor(1.0, 0.1).to(dtype)},
+        {"control": tensor(1.0, 0.1).to(dtype), "time_step": tensor(0.1).to(dtype)},
         {"landmark": (5.0 * random_numbers(2, 2, seed=1)).to(dtype)},
     )
     return motion, see, example
@@ -176,7 +178,7 @@ def test_derivatives_through_the_backward_pass_are_the_forward_ones():
         return torch.atan2(offsets, 1.0 + offsets * offsets)
 
     expected = push_forward(function, x, along)
-    with plain.traced_for_export():
+    with plain_factors.traced_for_export():
         found = push_forward(function, x, along)
     for a, b in zip(found, expected, strict=True):
         assert_close(a, b, 1e-15)

@@ -5,8 +5,8 @@ import torch
 from torch import Tensor
 
 from sigmaslam import filters
-from sigmaslam.filters.linalg import square_roots, unrolled
-from sigmaslam.filters.noise_covariance import Noise
+from sigmaslam.filters.core import factors, unrolled_factors
+from sigmaslam.filters.core.noise_covariance import Noise
 from tests.support.filter_assertions import assert_close
 from tests.support.filter_builders import beliefs, bent_measurement, bent_motion, covariances, random_numbers, tensor
 
@@ -22,8 +22,8 @@ def each(function, *arrays: Tensor) -> Tensor:
 @pytest.mark.parametrize("size", SIZES)
 def test_unrolled_cholesky_equals_lapack(size):
     P = covariances(COUNT, size)
-    factor, _ = square_roots.cholesky(P)
-    assert unrolled.is_small(P)
+    factor, _ = factors.cholesky(P)
+    assert unrolled_factors.is_small(P)
     assert_close(factor, torch.linalg.cholesky(P), 1e-13)
 
 
@@ -32,12 +32,12 @@ def test_unrolled_cholesky_equals_lapack(size):
 def test_unrolled_triangularisation_equals_lapack(size, columns):
     pieces = [random_numbers(COUNT, size, columns), random_numbers(COUNT, size, 2, seed=1)]
     diagonal = 0.1 + random_numbers(COUNT, size, seed=2).square()
-    found = square_roots.triangularise(pieces, diagonal)
-    alone = each(lambda a, b, d: square_roots.triangularise([a, b], d), *pieces, diagonal)
+    found = factors.triangularise(pieces, diagonal)
+    alone = each(lambda a, b, d: factors.triangularise([a, b], d), *pieces, diagonal)
     joined = torch.cat([*pieces, torch.diag_embed(diagonal)], dim=-1)
     assert_close(found, alone, 1e-12)
     assert_close(found, torch.linalg.cholesky(joined @ joined.mT), 1e-12)
-    assert_close(square_roots.triangularise(pieces) @ square_roots.triangularise(pieces).mT, _outer(pieces), 1e-12)
+    assert_close(factors.triangularise(pieces) @ factors.triangularise(pieces).mT, _outer(pieces), 1e-12)
 
 
 def _outer(pieces: list[Tensor]) -> Tensor:
@@ -50,7 +50,7 @@ def _outer(pieces: list[Tensor]) -> Tensor:
 def test_triangularisation_of_a_singular_matrix_restores_it(count, dtype):
     for rank in (1, 2, 3):
         A = (random_numbers(count, 5, rank) @ random_numbers(count, rank, 7, seed=1)).to(dtype)
-        lower = square_roots.triangularise([A])
+        lower = factors.triangularise([A])
         assert bool((torch.diagonal(lower, dim1=-2, dim2=-1) >= 0).all())
         assert bool((lower.triu(1) == 0).all())
         assert_close(lower @ lower.mT, A @ A.mT, 50 * torch.finfo(dtype).eps)
@@ -61,8 +61,8 @@ def test_unrolled_solutions_equal_lapack(size):
     lower = torch.linalg.cholesky(covariances(COUNT, size))
     right = random_numbers(COUNT, size, 4)
     for found, upper, matrix in (
-        (square_roots.solve_lower(lower, right), False, lower),
-        (square_roots.solve_lower_transposed(lower, right), True, lower.mT),
+        (factors.solve_lower(lower, right), False, lower),
+        (factors.solve_lower_transposed(lower, right), True, lower.mT),
     ):
         assert_close(found, torch.linalg.solve_triangular(matrix, right, upper=upper), 1e-12)
 
@@ -74,7 +74,7 @@ def test_zero_pivots_are_known_directions(count):
     right = random_numbers(count, 4, 2)
     right[:, 1] = (lower[:, 1][:, None] @ right)[:, 0]  # whatever it is, the others do not depend on it
     keep = torch.tensor([0, 2, 3])
-    for transposed, solve in ((False, square_roots.solve_lower), (True, square_roots.solve_lower_transposed)):
+    for transposed, solve in ((False, factors.solve_lower), (True, factors.solve_lower_transposed)):
         reduced = lower[:, keep][:, :, keep]
         expected = torch.linalg.solve_triangular(
             reduced.mT if transposed else reduced, right[:, keep], upper=transposed
@@ -89,12 +89,12 @@ def test_zero_pivots_are_known_directions(count):
 def test_unrolled_products_equal_lapack(rows):
     left, right = random_numbers(COUNT, rows, 5), random_numbers(COUNT, 5, 7, seed=1)
     vector = random_numbers(COUNT, 5, seed=2)
-    assert_close(square_roots.multiply(left, right), left @ right, 1e-13)
-    assert_close(square_roots.multiply(left[0], right), left[0] @ right, 1e-13)
-    assert_close(square_roots.multiply(left, right[0]), left @ right[0], 1e-13)
-    assert_close(square_roots.apply(left, vector), torch.einsum("bij,bj->bi", left, vector), 1e-13)
-    assert_close(square_roots.apply(left[0], vector), vector @ left[0].mT, 1e-13)
-    assert_close(square_roots.square([left, left]), 2 * left @ left.mT, 1e-13)
+    assert_close(factors.multiply(left, right), left @ right, 1e-13)
+    assert_close(factors.multiply(left[0], right), left[0] @ right, 1e-13)
+    assert_close(factors.multiply(left, right[0]), left @ right[0], 1e-13)
+    assert_close(factors.apply(left, vector), torch.einsum("bij,bj->bi", left, vector), 1e-13)
+    assert_close(factors.apply(left[0], vector), vector @ left[0].mT, 1e-13)
+    assert_close(factors.square([left, left]), 2 * left @ left.mT, 1e-13)
 
 
 @pytest.mark.parametrize("count", [3, COUNT])
@@ -103,7 +103,7 @@ def test_cholesky_flags_each_bad_element_only(count):
     P[0, 2, 1] = torch.nan
     P[1] = -P[1]
     P[2] = 0.0
-    factor, healthy = square_roots.cholesky(P)
+    factor, healthy = factors.cholesky(P)
     assert healthy is not None
     assert healthy.tolist() == [False, False, *[True] * (count - 2)]
     assert_close(factor[2:], torch.cat([torch.zeros(1, 4, 4), torch.linalg.cholesky(P[3:])]).double(), 1e-13)

@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.onnx.exportable_se3 import adjoint_se3, exp_se3, invert_se3, log_se3
-from sigmaslam.filters.onnx.pose_prediction import POSE, STATE_SIZE, TWIST, Predict
+from sigmaslam.filters.graphs.pose_prediction import POSE, STATE_SIZE, TWIST, Predict
+from sigmaslam.filters.manifolds.se3_matrices import adjoint_se3, exp_se3, invert_se3, log_se3
 from tests.support.filter_builders import random_numbers, tensor
 
 NO_NOISE = torch.zeros(2, dtype=torch.float64)

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from sigmaslam import filters
 from sigmaslam.filters import systems
+from sigmaslam.filters.core.solve import FORMS
 from sigmaslam.filters.robust import ROBUST
-from sigmaslam.filters.updates import FORMS
 from tests.support.filter_assertions import assert_close, assert_same_belief, assert_same_update
 from tests.support.filter_builders import beliefs, bent_measurement, covariances, random_numbers, tensor
 
@@ -150,17 +150,17 @@ def refuse_always(update: filters.Update, value: Tensor, size: int) -> Tensor:
 @pytest.mark.parametrize("options", [*OPTIONS, None], ids=str)
 def test_a_belief_that_is_wrong_and_too_sure_is_pulled_back(options):
     """A robot whose wheels slipped by 3 m, its belief sure of 0.05 m; a gate that always refuses is lost."""
-    motion = systems.differential_drive(filters.Diagonal(tensor(0.02, 0.02) ** 2), 0.1)
+    motion = systems.differential_drive(filters.Diagonal(tensor(0.02, 0.02) ** 2))
     landmarks = tensor(*[0.0, 5.0, 5.0, 0.0, -5.0, 2.0]).reshape(3, 2)
     see = filters.several(systems.range_and_bearing(filters.Diagonal(tensor(0.1, 0.02) ** 2)), 3)
     ukf = filters.UnscentedKalmanFilter(iterations=1)
     truth = tensor(1.0, 1.0, 0.3)
     belief = filters.Gaussian(truth + tensor(3.0, 0.0, 0.0), torch.diag(tensor(0.05, 0.05, 0.02) ** 2))
-    noise, control = random_numbers(300, 6, seed=9), tensor(0.3, 0.3)
+    noise, inputs = random_numbers(300, 6, seed=9), (tensor(0.3, 0.3), tensor(0.1))
     for k in range(300):
-        truth = motion.function(truth, torch.zeros(2, dtype=torch.float64), control)
+        truth = motion.function(truth, torch.zeros(2, dtype=torch.float64), *inputs)
         value = see.function(truth, landmarks) + noise[k] * tensor(0.1, 0.02).repeat(3)
-        predicted = ukf.predict(belief, motion, control).belief
+        predicted = ukf.predict(belief, motion, *inputs).belief
         if options is None:
             value = refuse_always(ukf.update(predicted, see, value, landmarks), value, 2)
         belief = ukf.update(predicted, see, value, landmarks, **(options or {})).belief

@@ -24,6 +24,7 @@ from sigmaslam.evaluation.filters.scenarios import (
 from sigmaslam.filters.consistency import check_nees, nees
 from sigmaslam.filters.systems import (
     constant_velocity,
+    constant_velocity_over,
     differential_drive,
     project_stereo,
     range_and_bearing,
@@ -57,10 +58,37 @@ def assert_reproduces(values: Tensor, known: float, uncertainty: float, deviatio
 
 def test_constant_velocity_over_two_steps_equals_one_of_double_length() -> None:
     densities = tensor(0.5, 0.4, 0.3, 0.01, 0.02, 0.03)
-    short, long = constant_velocity(densities, 0.1), constant_velocity(densities, 0.2)
+    short, long = constant_velocity_over(densities, 0.1), constant_velocity_over(densities, 0.2)
     A, Q = short.matrix, short.noise
     torch.testing.assert_close(A @ A, long.matrix)
     torch.testing.assert_close(A @ Q @ A.mT + Q, long.noise)
+
+
+@pytest.mark.parametrize("bayes", [EKF, CUBATURE], ids=["ekf", "cubature"])
+def test_constant_velocity_takes_a_time_step_of_its_own_for_each_element(bayes: filters.BayesFilter) -> None:
+    densities, steps = tensor(0.5, 0.2), tensor(0.0, 0.1, 1.7)
+    prior = filters.Gaussian(random_numbers(3, 4), covariances(3, 4))
+    found = bayes.predict(prior, constant_velocity(densities), steps.unsqueeze(-1)).belief
+    for k, step in enumerate(steps.tolist()):
+        expected = filters.KalmanFilter().predict(prior[k], constant_velocity_over(densities, step)).belief
+        torch.testing.assert_close(found.mean[k], expected.mean, rtol=0, atol=1e-13)
+        torch.testing.assert_close(found.covariance[k], expected.covariance, rtol=0, atol=1e-12)
+
+
+def test_a_sequence_at_irregular_times_equals_the_kalman_filter_by_events() -> None:
+    densities, steps, values = tensor(0.5), tensor(0.1, 0.7, 0.02, 1.3), random_numbers(5, 1, seed=2)
+    prior, height = filters.Gaussian(tensor(0.0, 1.0), torch.eye(2).double()), tensor(1.0, 0.0).unsqueeze(0)
+    see = filters.LinearMeasurement(height, filters.Diagonal(tensor(0.04)))
+    found = CUBATURE.filter(prior, constant_velocity(densities), see, values, [steps.unsqueeze(-1)])
+    events = [filters.Event(None, see, values[0])]
+    for step, value in zip(steps.tolist(), values[1:], strict=True):
+        events.append(filters.Event(constant_velocity_over(densities, step), see, value))
+    expected = filters.KalmanFilter().filter_events(prior, events)
+    torch.testing.assert_close(found.filtered.mean, expected.filtered.mean, rtol=0, atol=1e-12)
+    torch.testing.assert_close(found.filtered.covariance, expected.filtered.covariance, rtol=0, atol=1e-12)
+    smoothed = CUBATURE.smooth(found), filters.KalmanFilter().smooth(expected)
+    torch.testing.assert_close(smoothed[0].mean, smoothed[1].mean, rtol=0, atol=1e-11)
+    torch.testing.assert_close(smoothed[0].covariance, smoothed[1].covariance, rtol=0, atol=1e-11)
 
 
 @pytest.mark.parametrize("shape", [(), (5,), (24, 5)])
@@ -78,7 +106,7 @@ def test_stereo_pixels_equal_the_plain_formula_for_shared_and_own_points(shape: 
 @pytest.mark.parametrize("m", [3, 50])
 def test_a_step_of_the_12_states_equals_the_reference(m: int) -> None:
     work = filter_work.stereo(m, seed=m)
-    motion = constant_velocity(tensor(0.5, 0.5, 0.5, 0.1, 0.1, 0.1), filter_work.TIME_STEP)
+    motion = constant_velocity_over(tensor(0.5, 0.5, 0.5, 0.1, 0.1, 0.1), filter_work.TIME_STEP)
     noise = filters.Diagonal(torch.as_tensor(work.measurement_noise).diagonal())
     belief = CUBATURE.predict(
         filters.Gaussian(torch.as_tensor(work.mean), torch.as_tensor(work.covariance)), motion
@@ -91,9 +119,9 @@ def test_a_step_of_the_12_states_equals_the_reference(m: int) -> None:
 
 
 def test_drive_noise_spreads_forward_and_in_heading_only() -> None:
-    motion = differential_drive(torch.diag(tensor(0.04, 0.01)), 0.5)
+    motion = differential_drive(torch.diag(tensor(0.04, 0.01)))
     still = filters.Gaussian(tensor(1.0, 2.0, 0.5 * math.pi), torch.zeros(3, 3, dtype=torch.float64))
-    moved = EKF.predict(still, motion, tensor(2.0, 0.2)).belief
+    moved = EKF.predict(still, motion, tensor(2.0, 0.2), tensor(0.5)).belief
     torch.testing.assert_close(moved.mean, tensor(1.0, 3.0, 0.5 * math.pi + 0.1))
     torch.testing.assert_close(moved.covariance.diagonal(), tensor(0.0, 0.01, 0.0025))
 

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from sigmaslam import filters
-from sigmaslam.filters.sigma_points import SigmaPoints
-from sigmaslam.filters.transforms import Unscented
+from sigmaslam.filters.core.sigma_points import SigmaPoints
+from sigmaslam.filters.core.transforms import Unscented
 from tests.support.filter_assertions import assert_close
 from tests.support.filter_builders import beliefs, covariances, random_numbers, tensor
 

@@ -3,8 +3,8 @@ import torch
 from torch import Tensor
 from torch.func import jacrev, vmap
 
-from sigmaslam.filters.onnx.exportable_se3 import exp_se3, invert_se3
-from sigmaslam.filters.onnx.stereo_window import CALIBRATION, LANDMARK, POSE, SIZE, StereoTransfer
+from sigmaslam.filters.graphs.stereo_window import CALIBRATION, LANDMARK, POSE, SIZE, StereoTransfer
+from sigmaslam.filters.manifolds.se3_matrices import exp_se3, invert_se3
 from sigmaslam.geometry.camera import RectifiedStereo
 from tests.support.filter_builders import random_numbers, tensor
 

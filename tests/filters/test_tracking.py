@@ -8,7 +8,7 @@ from torch.func import vmap
 
 from sigmaslam.estimation.calibration_errors import measured_errors
 from sigmaslam.estimation.chi_square import CHI_SQUARE_MEDIAN
-from sigmaslam.filters.linalg import regular
+from sigmaslam.filters.core import regular_factors
 from sigmaslam.filters.tracking.calibration_errors import unmodelled_errors
 from sigmaslam.filters.tracking.frame_update import FrameEstimate, FrameViews, RobustStep, update_frame
 from sigmaslam.filters.tracking.robust import common_scale, mask_missing, student_weight
@@ -33,10 +33,10 @@ def test_factors_and_inverses_are_those_of_lapack(shape):
     matrix = spd(*shape)
     right = torch.randn(*shape, 5, dtype=torch.float64)
     factor = torch.linalg.cholesky(matrix)
-    torch.testing.assert_close(regular.cholesky(matrix), factor, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(regular_factors.cholesky(matrix), factor, rtol=1e-9, atol=1e-12)
     expected = torch.linalg.solve_triangular(factor, right, upper=False)
-    torch.testing.assert_close(regular.whiten(right, matrix), expected, rtol=1e-8, atol=1e-9)
-    inverse = regular.invert(matrix)
+    torch.testing.assert_close(regular_factors.whiten(right, matrix), expected, rtol=1e-8, atol=1e-9)
+    inverse = regular_factors.invert(matrix)
     torch.testing.assert_close(inverse, inverse.mT, rtol=0, atol=0)
     # In units of each unknown's deviation: no digit is lost to the scales.
     sigma = torch.diagonal(torch.cholesky_inverse(factor), dim1=-2, dim2=-1).sqrt()

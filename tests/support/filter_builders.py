@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from sigmaslam.filters import BlockDiagonal, Dense, Diagonal, Gaussian, MeasurementModel, MotionModel
-from sigmaslam.filters.noise_covariance import Noise
+from sigmaslam.filters.core.noise_covariance import Noise
 
 
 def random_numbers(*shape: int, seed: int = 0) -> Tensor:

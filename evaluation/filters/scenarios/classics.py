@@ -17,7 +17,7 @@ from sigmaslam.filters import (
     stack,
     wrap_angle,
 )
-from sigmaslam.filters.systems import constant_velocity
+from sigmaslam.filters.systems import constant_velocity_over
 
 
 def growth(runs: int, generator: Generator, steps: int = 500) -> Scenario:
@@ -63,7 +63,7 @@ def bearings(runs: int, generator: Generator) -> Scenario:
         return stack([torch.atan2(state[..., 1] - y, state[..., 0] - x) for x, y in sensors.tolist()])
 
     noise = sigma**2 * torch.eye(2, dtype=torch.float64)
-    pairs = constant_velocity(torch.full((2,), 0.1, dtype=torch.float64), T)
+    pairs = constant_velocity_over(torch.full((2,), 0.1, dtype=torch.float64), T)
     order = torch.tensor([0, 2, 1, 3])
     assert isinstance(pairs.noise, Tensor)
     motion = LinearMotion(pairs.matrix[order][:, order], pairs.noise[order][:, order])
@@ -127,7 +127,7 @@ def coordinated_turn(runs: int, generator: Generator, turn_density: float = 1.75
     sigma = torch.tensor([10.0, math.sqrt(10.0) * 1e-3], dtype=torch.float64)
     start = torch.tensor([1000.0, 300.0, 1000.0, 0.0, math.radians(-3.0)], dtype=torch.float64)
     spread = torch.tensor([100.0, 10.0, 100.0, 10.0, 100e-6], dtype=torch.float64)
-    pairs = constant_velocity(torch.full((2,), 0.1, dtype=torch.float64), T).noise
+    pairs = constant_velocity_over(torch.full((2,), 0.1, dtype=torch.float64), T).noise
     assert isinstance(pairs, Tensor)
     noise = torch.block_diag(pairs, matrix([turn_density * T]))
 

@@ -10,7 +10,7 @@ from torch import Generator, Tensor
 
 from sigmaslam.evaluation.filters.scenarios.scenario import Scenario, normal
 from sigmaslam.filters import Diagonal, Gaussian, LinearMotion, MeasurementModel, MotionModel, stack, wrap_angle
-from sigmaslam.filters.systems import constant_velocity, project_stereo, stereo_measurement
+from sigmaslam.filters.systems import constant_velocity_over, project_stereo, stereo_measurement
 from sigmaslam.geometry.camera import RectifiedStereo
 
 CAMERA = RectifiedStereo(fx=718.0, fy=718.0, cx=607.0, cy=185.0, baseline=0.54, width=1241, height=376)
@@ -84,7 +84,7 @@ def stereo_pose(
         prior_sigma: of position, velocity, angles and their rates; metres, radians and seconds.
     """
     T = 0.1
-    motion = constant_velocity(torch.tensor([0.02] * 3 + [0.0002] * 3, dtype=torch.float64), T)
+    motion = constant_velocity_over(torch.tensor([0.02] * 3 + [0.0002] * 3, dtype=torch.float64), T)
     mean, covariance = _pose_prior(prior_sigma)
     seen = _points_ahead(runs, points, generator)
     assert isinstance(motion.noise, Tensor)

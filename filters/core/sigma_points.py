@@ -15,32 +15,8 @@ from typing import ClassVar, Protocol
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.linalg.square_roots import square
-from sigmaslam.filters.linalg.unrolled import ROWS, join
-
-
-@dataclass(frozen=True, slots=True)
-class Columns:
-    """Deviations of m values, as columns whose outer products add up to their covariance.
-
-    Attributes:
-        odd: (..., m, n) statistical linearisation: slope times root of the state's covariance.
-        even: (..., m, c) the rest, or None when there is none.
-        negative: (..., m, 1) the column of a negative centre weight, whose outer product is taken away.
-    """
-
-    odd: Tensor
-    even: Tensor | None = None
-    negative: Tensor | None = None
-
-    def all(self) -> list[Tensor]:
-        """The columns that are added."""
-        return [self.odd] if self.even is None else [self.odd, self.even]
-
-    def covariance(self) -> Tensor:
-        """Of the values, (..., m, m)."""
-        covariance = square(self.all())
-        return covariance if self.negative is None else covariance - square([self.negative])
+from sigmaslam.filters.core.columns import Columns
+from sigmaslam.filters.core.unrolled_factors import ROWS, join
 
 
 class SigmaPoints(Protocol):

@@ -1,7 +1,7 @@
 """Unscented transforms that export to ONNX: the cubature set.
 
-What the tracker's graphs are made of (`constant_velocity`, `stereo_window`). The general library begins with `bayes`;
-it calls LAPACK, for which ONNX has no operators.
+What the graph of the tracker's prediction is made of (`pose_prediction`). The general library begins with `bayes`; it
+calls LAPACK, for which ONNX has no operators.
 
 The deviations of a symmetric set come in pairs +-sqrt(n) l_i of equal weight 1 / (2n). Rotating each pair by 45 degrees
 splits what a function makes of it into an odd part (n columns, the statistical linearisation) and an even part

@@ -11,8 +11,7 @@ Nothing is asked of what was traced: the arithmetic is the same, operation by op
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,9 @@ import torch
 from torch import fx
 from torch._inductor.custom_graph_pass import CustomInferenceAwareGraphPass, get_hash_for_files
 from torch._subclasses.fake_tensor import FakeTensorMode
+
+from sigmaslam.filters.core import component_moves
+from sigmaslam.filters.core.component_moves import MOVES, RESHAPES, Entries, InRow, reshape, shape_of
 
 aten = torch.ops.aten
 
@@ -53,56 +55,21 @@ class InComponents(CustomInferenceAwareGraphPass):
 
     def uuid(self) -> Any:
         """What the compiler's cache knows the rewriting by."""
-        return get_hash_for_files((__file__,))
+        return get_hash_for_files((__file__, component_moves.__file__))
 
 
 class _TooLongError(Exception):
     """The program would take too long to compile."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Entries:
-    """A tensor by its entries.
-
-    Attributes:
-        parts: of the tensor's shape, but of length 1 along the batch; nodes (B,) or (), or numbers that are known.
-        axis: the batch's dimension, None if there is none.
-        dtype: of the tensor.
-        source: the tensor itself, if it is there.
-    """
-
-    parts: np.ndarray
-    axis: int | None
-    dtype: torch.dtype
-    source: fx.Node | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class _InRow:
-    """Tensors end to end along the batch: half of what `torch.stack` is made of, the other half is a reshape.
-
-    Attributes:
-        pieces: of one shape.
-    """
-
-    pieces: list[_Entries]
-
-    def stacked(self) -> _Entries:
-        """With a dimension for the pieces, before that of the batch."""
-        first = self.pieces[0]
-        assert first.axis is not None
-        parts = np.stack([piece.parts for piece in self.pieces], axis=first.axis)
-        return _Entries(parts, first.axis + 1, first.dtype)
-
-
 def _batch_size(graph: fx.Graph) -> int | None:
     """The length of the longest dimension of what goes in, if it is a batch: of no tensor is it the length twice."""
-    inputs = [_shape(node) for node in graph.nodes if node.op == "placeholder"]
+    inputs = [shape_of(node) for node in graph.nodes if node.op == "placeholder"]
     size = max((length for shape in inputs if shape is not None for length in shape), default=0)
     if not isinstance(size, int) or size < SMALLEST_BATCH:
         return None
     for node in graph.nodes:
-        shape = _shape(node)
+        shape = shape_of(node)
         if shape is not None and node.meta["val"].device.type != "cpu":
             return None
         if shape is not None and (any(type(length) is not int for length in shape) or shape.count(size) > 1):
@@ -110,11 +77,6 @@ def _batch_size(graph: fx.Graph) -> int | None:
         if node.op == "call_function" and _changes_arguments(node):
             return None
     return size
-
-
-def _shape(node: fx.Node) -> tuple[int, ...] | None:
-    value = node.meta.get("val")
-    return tuple(value.shape) if isinstance(value, torch.Tensor) else None
 
 
 def _changes_arguments(node: fx.Node) -> bool:
@@ -136,7 +98,7 @@ class _Rewriter:
         self._made: dict[fx.Node, Any] = {}
         self._known: dict[Any, fx.Node] = {}
         self._count = 0
-        likes = [node.meta["val"] for node in graph.nodes if _shape(node) is not None]
+        likes = [node.meta["val"] for node in graph.nodes if shape_of(node) is not None]
         self._device = likes[0].device
         self._fake: FakeTensorMode = likes[0].fake_mode
 
@@ -158,18 +120,18 @@ class _Rewriter:
             return given[0][index] if isinstance(given[0], list) else self._kept(node)
         if target is aten.full.default:
             return self._filled(node)
-        if target in _RESHAPES and isinstance(given[0], _InRow):
-            result = self.reshape(node, given[0].stacked(), None)
+        if target in RESHAPES and isinstance(given[0], InRow):
+            result = reshape(self._batch, node, given[0].stacked(), None)
             return self._kept(node) if result is None else result
-        if not any(isinstance(each, _Entries) for each in given) or any(isinstance(each, _InRow) for each in given):
+        if not any(isinstance(each, Entries) for each in given) or any(isinstance(each, InRow) for each in given):
             return self._kept(node)
         if torch.Tag.pointwise in getattr(target, "tags", ()) or target in _COPIES:
             return self._pointwise(node)
         if target in _REDUCTIONS:
             return self._reduced(node)
-        moved = _MOVES.get(target)
-        if moved is not None and node.args and isinstance(self._given(node.args[0]), _Entries):
-            result = moved(self, node, self._given(node.args[0]), *node.args[1:])
+        moved = MOVES.get(target)
+        if moved is not None and node.args and isinstance(self._given(node.args[0]), Entries):
+            result = moved(self._batch, node, self._given(node.args[0]), *node.args[1:])
             if result is not None:
                 return result
         joined = self._concatenated(node) if target is aten.cat.default else None
@@ -196,13 +158,13 @@ class _Rewriter:
 
     def _entries(self, node: fx.Node) -> Any:
         """A whole tensor by its entries if it has a batch."""
-        shape = _shape(node)
+        shape = shape_of(node)
         if shape is None or self._batch not in shape:
             return node
         return self._split(node)
 
-    def _split(self, node: fx.Node) -> _Entries:
-        shape = _shape(node)
+    def _split(self, node: fx.Node) -> Entries:
+        shape = shape_of(node)
         assert shape is not None
         axis = shape.index(self._batch) if self._batch in shape else None
         parts = np.empty([1 if k == axis else length for k, length in enumerate(shape)], dtype=object)
@@ -214,24 +176,24 @@ class _Rewriter:
                 if k != axis:
                     part = self._call(aten.select.int, part, k, index[k])
             parts[index] = part
-        return _Entries(parts, axis, node.meta["val"].dtype, node)
+        return Entries(parts, axis, node.meta["val"].dtype, node)
 
     def _filled(self, node: fx.Node) -> Any:
-        shape, value = _shape(node), node.args[1]
+        shape, value = shape_of(node), node.args[1]
         assert shape is not None
         if self._batch not in shape or not isinstance(value, int | float):
             return self._kept(node)
         axis = shape.index(self._batch)
         parts = np.full([1 if k == axis else length for k, length in enumerate(shape)], value, dtype=object)
-        return _Entries(parts, axis, node.meta["val"].dtype)
+        return Entries(parts, axis, node.meta["val"].dtype)
 
     def _whole(self, value: Any) -> Any:
         """The tensor of some entries, with the batch last in memory."""
         if isinstance(value, list):
             return [self._whole(each) for each in value]
-        if isinstance(value, _InRow):
+        if isinstance(value, InRow):
             return self._call(aten.cat.default, [self._whole(each) for each in value.pieces], value.pieces[0].axis)
-        if not isinstance(value, _Entries):
+        if not isinstance(value, Entries):
             return value
         if value.source is not None:
             return value.source
@@ -243,7 +205,7 @@ class _Rewriter:
             return self._call(aten.reshape.default, joined, shape)
         rows = []
         for part in parts:
-            row = part if _shape(part) else self._call(aten.expand.default, part, [self._batch])
+            row = part if shape_of(part) else self._call(aten.expand.default, part, [self._batch])
             rows.append(self._call(aten.unsqueeze.default, row, 0))
         joined = self._call(aten.cat.default, rows) if len(rows) > 1 else rows[0]
         others = [length for k, length in enumerate(shape) if k != value.axis]
@@ -281,7 +243,7 @@ class _Rewriter:
         if any(isinstance(each, fx.Node | list | tuple) for each in named.values()):
             return self._kept(node)
         given = [self._given(node.args[k]) for k in places]
-        given = [each if isinstance(each, _Entries) else self._split(each) for each in given]
+        given = [each if isinstance(each, Entries) else self._split(each) for each in given]
         dtype = node.meta["val"].dtype
         grids = np.broadcast_arrays(*(each.parts for each in given))
         parts = np.empty(grids[0].shape, dtype=object)
@@ -291,10 +253,10 @@ class _Rewriter:
                 arguments[k] = grid[index]
             parts[index] = self._entry(target, arguments, named, dict(zip(places, given, strict=True)), dtype)
         axis = next(each.axis - each.parts.ndim + parts.ndim for each in given if each.axis is not None)
-        return _Entries(parts, axis, dtype)
+        return Entries(parts, axis, dtype)
 
     def _entry(
-        self, target: Any, arguments: list[Any], named: dict[str, Any], given: dict[int, _Entries], dtype: torch.dtype
+        self, target: Any, arguments: list[Any], named: dict[str, Any], given: dict[int, Entries], dtype: torch.dtype
     ) -> Any:
         """One entry of a pointwise operation; what is known takes no part."""
         if not named and all(each.dtype == dtype for each in given.values()) and dtype.is_floating_point:
@@ -322,7 +284,7 @@ class _Rewriter:
     def _reduced(self, node: fx.Node) -> Any:
         """Sums and their like over dimensions other than the batch's."""
         given = self._given(node.args[0])
-        if not isinstance(given, _Entries) or node.kwargs or len(node.args) < 2:
+        if not isinstance(given, Entries) or node.kwargs or len(node.args) < 2:
             return self._kept(node)
         wanted: Any = node.args[1]
         dims = [wanted] if isinstance(wanted, int) else list(wanted or [])
@@ -344,99 +306,21 @@ class _Rewriter:
             if not keep:
                 parts = np.squeeze(parts, dim)
                 axis = axis - 1 if axis is not None and dim < axis else axis
-        return _Entries(parts, axis, dtype)
+        return Entries(parts, axis, dtype)
 
     # Moves
 
-    def _concatenated(self, node: fx.Node) -> _Entries | _InRow | None:
+    def _concatenated(self, node: fx.Node) -> Entries | InRow | None:
         pieces: Any = node.args[0]
         dim: Any = node.args[1] if len(node.args) > 1 else node.kwargs.get("dim", 0)
         given = [self._given(each) for each in pieces]
-        given = [each if isinstance(each, _Entries) else self._split(each) for each in given]
+        given = [each if isinstance(each, Entries) else self._split(each) for each in given]
         axes = {each.axis for each in given}
         if len(axes) != 1:
             return None
         if dim % given[0].parts.ndim in axes:
-            return _InRow(given)
-        return _Entries(np.concatenate([each.parts for each in given], axis=dim), given[0].axis, given[0].dtype)
-
-    def permute(self, node: fx.Node, given: _Entries, order: Sequence[int]) -> _Entries:
-        """aten.permute."""
-        order = [dim % given.parts.ndim for dim in order]
-        axis = None if given.axis is None else order.index(given.axis)
-        return _Entries(given.parts.transpose(order), axis, given.dtype)
-
-    def select(self, node: fx.Node, given: _Entries, dim: int, index: int) -> _Entries | None:
-        """aten.select."""
-        dim %= given.parts.ndim
-        if dim == given.axis:
-            return None
-        axis = given.axis - 1 if given.axis is not None and dim < given.axis else given.axis
-        return _Entries(np.moveaxis(given.parts, dim, 0)[index], axis, given.dtype) if given.parts.ndim > 1 else None
-
-    def slice(
-        self, node: fx.Node, given: _Entries, dim: int = 0, start: Any = None, end: Any = None, step: int = 1
-    ) -> _Entries | None:
-        """aten.slice."""
-        dim %= given.parts.ndim
-        if dim == given.axis:
-            return given if _shape(node) == _shape_of(node.args[0]) else None
-        wanted = [slice(None)] * given.parts.ndim
-        wanted[dim] = slice(start, end, step)
-        return _Entries(given.parts[tuple(wanted)], given.axis, given.dtype)
-
-    def unsqueeze(self, node: fx.Node, given: _Entries, dim: int) -> _Entries:
-        """aten.unsqueeze."""
-        dim %= given.parts.ndim + 1
-        axis = given.axis + 1 if given.axis is not None and dim <= given.axis else given.axis
-        return _Entries(np.expand_dims(given.parts, dim), axis, given.dtype)
-
-    def reshape(self, node: fx.Node, given: _Entries, size: Any) -> _Entries | None:
-        """aten.reshape and squeeze, where the batch stays between the same entries."""
-        shape = _shape(node)
-        assert shape is not None
-        if given.axis is None or self._batch not in shape:
-            return None
-        axis = shape.index(self._batch)
-        if np.prod(shape[:axis], dtype=int) != np.prod(given.parts.shape[: given.axis], dtype=int):
-            return None
-        shape = (*shape[:axis], 1, *shape[axis + 1 :])
-        return _Entries(given.parts.reshape(shape), axis, given.dtype)
-
-    def expand(self, node: fx.Node, given: _Entries, size: Any) -> _Entries | None:
-        """aten.expand."""
-        shape = _shape(node)
-        assert shape is not None
-        if self._batch not in shape:
-            return None
-        axis = shape.index(self._batch)
-        return _Entries(np.broadcast_to(given.parts, (*shape[:axis], 1, *shape[axis + 1 :])), axis, given.dtype)
-
-    def split(self, node: fx.Node, given: _Entries, sizes: Any, dim: int = 0) -> list[_Entries] | None:
-        """aten.split."""
-        dim %= given.parts.ndim
-        if dim == given.axis:
-            return None
-        length = given.parts.shape[dim]
-        sizes = [sizes] * (length // sizes) if isinstance(sizes, int) else sizes
-        pieces = np.split(given.parts, np.cumsum(sizes)[:-1], axis=dim)
-        return [_Entries(piece, given.axis, given.dtype) for piece in pieces]
-
-    def unbind(self, node: fx.Node, given: _Entries, dim: int = 0) -> list[_Entries] | None:
-        """aten.unbind."""
-        dim %= given.parts.ndim
-        if dim == given.axis:
-            return None
-        axis = given.axis - 1 if given.axis is not None and dim < given.axis else given.axis
-        return [_Entries(each, axis, given.dtype) for each in np.moveaxis(given.parts, dim, 0)]
-
-    def same(self, node: fx.Node, given: _Entries, *others: Any) -> _Entries:
-        """What does nothing to the entries."""
-        return given
-
-
-def _shape_of(node: Any) -> tuple[int, ...] | None:
-    return _shape(node) if isinstance(node, fx.Node) else None
+            return InRow(given)
+        return Entries(np.concatenate([each.parts for each in given], axis=dim), given[0].axis, given[0].dtype)
 
 
 def _simplified(target: Any, arguments: Sequence[Any]) -> Any:
@@ -476,19 +360,3 @@ _REDUCTIONS: dict[Any, Any] = {
     aten.amin.default: aten.minimum.default,
 }
 _COPIES = {aten._to_copy.default, aten.clone.default, torch.ops.prims.convert_element_type.default}
-_RESHAPES = {aten.reshape.default, aten.view.default}
-_MOVES: dict[Any, Callable[..., Any]] = {
-    aten.permute.default: _Rewriter.permute,
-    aten.select.int: _Rewriter.select,
-    aten.slice.Tensor: _Rewriter.slice,
-    aten.unsqueeze.default: _Rewriter.unsqueeze,
-    aten.reshape.default: _Rewriter.reshape,
-    aten.view.default: _Rewriter.reshape,
-    aten.squeeze.dim: _Rewriter.reshape,
-    aten.squeeze.dims: _Rewriter.reshape,
-    aten.expand.default: _Rewriter.expand,
-    aten.split.Tensor: _Rewriter.split,
-    aten.split_with_sizes.default: _Rewriter.split,
-    aten.unbind.int: _Rewriter.unbind,
-    aten.alias.default: _Rewriter.same,
-}

@@ -22,7 +22,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from sigmaslam.filters.onnx.exportable_se3 import exp_se3
+from sigmaslam.filters.manifolds.se3_matrices import exp_se3
 
 POSE = slice(0, 6)
 CALIBRATION = slice(6, 9)

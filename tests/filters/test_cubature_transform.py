@@ -2,13 +2,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.linalg import plain
-from sigmaslam.filters.onnx.unscented import covariance_of, odd_and_even, sigma_offsets
+from sigmaslam.filters.core import plain_factors
+from sigmaslam.filters.graphs.cubature_transform import covariance_of, odd_and_even, sigma_offsets
 from tests.support.filter_builders import random_numbers
 
 
 def cholesky(matrix: Tensor) -> Tensor:
-    return plain.cholesky(matrix)[0]
+    return plain_factors.cholesky(matrix)[0]
 
 
 def correlated_covariance(size: int, seed: int = 0) -> Tensor:

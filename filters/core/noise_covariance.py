@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.linalg.square_roots import cholesky, identity, log_diagonal, solve_lower, square, triangularise
-from sigmaslam.filters.tensors import require_tensor
+from sigmaslam.filters.core.factors import cholesky, identity, log_diagonal, solve_lower, square, triangularise
+from sigmaslam.filters.core.tensors import require_tensor
 
 
 class Noise(ABC):

@@ -24,9 +24,9 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from sigmaslam.filters import lie_groups
-from sigmaslam.filters.layout import concatenate, stack
-from sigmaslam.filters.lie_groups import Quaternion, Vector
+from sigmaslam.filters.core.layout import concatenate, stack
+from sigmaslam.filters.manifolds import lie_groups
+from sigmaslam.filters.manifolds.lie_groups import Quaternion, Vector
 
 
 class Space(Protocol):

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.linalg.plain import is_exporting
+from sigmaslam.filters.core.plain_factors import is_exporting
 
 ROWS = 8
 BATCH = 128
@@ -108,7 +108,7 @@ def triangularise(pieces: Sequence[Tensor], diagonal: Tensor | None) -> Tensor:
 
 
 def stacked_update(white: Tensor, size: int, prior: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Posterior from the triangular factor of the stacked system [W, e; I, 0], see `sigmaslam.filters.updates`.
+    """Posterior from the triangular factor of the stacked system [W, e; I, 0], see `sigmaslam.filters.core.solve`.
 
     The same as triangularising [W^T, I] with one more row, but no intermediate matrix is assembled, so that
     torch.compile makes one loop of it.

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import torch
 
-from sigmaslam.filters.failure import FAILED
+from sigmaslam.filters.core.failure import FAILED
 
 # Operations that are fused into one loop; by default 64, which cuts a filter's step into a dozen.
 _LARGEST_LOOP = 8192
@@ -21,11 +21,11 @@ def compile_step(step: F) -> F:
     """The step made into machine code for the shapes and dtypes that it is called with.
 
     A step is a function of tensors that calls `predict` and `update` and returns tensors. Batches of small filters
-    become one loop over the batch, see `sigmaslam.filters.components`; others are fused into a few; of a single filter
-    most of the overhead goes. The first call for each set of shapes takes
-    from ten seconds to a minute. Filters and models that the step refers to are taken as they are then: compile anew
-    after changing one. A filter with iterations="auto" always linearises twice in compiled code. One with
-    on_failure="raise" raises as it does elsewhere; the step is run once more, uncompiled, to find what to name.
+    become one loop over the batch, see `sigmaslam.filters.core.components`; others are fused into a few; of a single
+    filter most of the overhead goes. The first call for each set of shapes takes from ten seconds to a minute. Filters
+    and models that the step refers to are taken as they are then: compile anew after changing one. A filter with
+    iterations="auto" always linearises twice in compiled code. One with on_failure="raise" raises as it does elsewhere;
+    the step is run once more, uncompiled, to find what to name.
 
     Args:
         step: a plain function of tensors, without side effects.
@@ -39,7 +39,7 @@ def compile_step(step: F) -> F:
     # refer to is not checked, each needs code of its own.
     copy = FunctionType(step.__code__.replace(), step.__globals__, step.__name__, step.__defaults__, step.__closure__)
     # The compiler takes a second to load, which only this function has a use for.
-    from sigmaslam.filters.components import InComponents
+    from sigmaslam.filters.core.components import InComponents
 
     options: dict[str, object] = {
         "post_grad_custom_pre_pass": InComponents(),

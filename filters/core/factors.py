@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from sigmaslam.filters.linalg import plain, unrolled
+from sigmaslam.filters.core import plain_factors, unrolled_factors
 
 
 def cholesky(matrix: Tensor) -> tuple[Tensor, Tensor | None]:
@@ -25,11 +25,11 @@ def cholesky(matrix: Tensor) -> tuple[Tensor, Tensor | None]:
         (..., n, n) lower triangular factor; (...,) bool, True where the matrix is positive semidefinite and finite, or
         None where that is known to hold for all. Where it does not, the factor is arbitrary.
     """
-    tolerance = plain.PIVOT_TOLERANCES[matrix.dtype]
-    if plain.is_exporting():
-        return plain.cholesky(matrix)
-    if unrolled.is_small(matrix):
-        return unrolled.cholesky(matrix, tolerance)
+    tolerance = plain_factors.PIVOT_TOLERANCES[matrix.dtype]
+    if plain_factors.is_exporting():
+        return plain_factors.cholesky(matrix)
+    if unrolled_factors.is_small(matrix):
+        return unrolled_factors.cholesky(matrix, tolerance)
     factor, failure = torch.linalg.cholesky_ex(matrix)
     if may_look(matrix):
         if not bool(failure.any()):
@@ -38,7 +38,7 @@ def cholesky(matrix: Tensor) -> tuple[Tensor, Tensor | None]:
         return factor, failure == 0
     # LAPACK knows positive definite matrices only.
     healthy = failure == 0
-    lower, restored = plain.cholesky(matrix)
+    lower, restored = plain_factors.cholesky(matrix)
     return torch.where(healthy[..., None, None], factor, lower), healthy | restored
 
 
@@ -54,7 +54,7 @@ def is_mapped() -> bool:
 
 def is_traced() -> bool:
     """Whether a graph is made of what is called, and values are not there to be looked at."""
-    return torch.compiler.is_compiling() or plain.is_exporting()
+    return torch.compiler.is_compiling() or plain_factors.is_exporting()
 
 
 def is_differentiated(array: Tensor) -> bool:
@@ -77,15 +77,15 @@ def triangularise(pieces: Sequence[Tensor], diagonal: Tensor | None = None) -> T
     """
     pieces = _broadcast(pieces, None if diagonal is None else diagonal.shape[:-1])
     size = pieces[0].shape[-2]
-    columns = 0 if plain.is_exporting() else sum(piece.shape[-1] for piece in pieces)
-    if unrolled.is_small(pieces[0], columns):
-        return unrolled.triangularise(pieces, diagonal)
+    columns = 0 if plain_factors.is_exporting() else sum(piece.shape[-1] for piece in pieces)
+    if unrolled_factors.is_small(pieces[0], columns):
+        return unrolled_factors.triangularise(pieces, diagonal)
     if diagonal is not None:
         pieces = _broadcast([*pieces, torch.diag_embed(diagonal)])
         columns += size
     stacked = torch.cat(pieces, dim=-1) if len(pieces) > 1 else pieces[0]
-    if plain.is_exporting():
-        return plain.triangularise(stacked)
+    if plain_factors.is_exporting():
+        return plain_factors.triangularise(stacked)
     # Derivatives need Q; without them it need not be formed.
     mode = "reduced" if is_differentiated(stacked) else "r"
     upper = torch.linalg.qr(stacked.mT, mode=mode).R
@@ -101,26 +101,28 @@ def solve_lower(factor: Tensor, right: Tensor, regular: bool = False) -> Tensor:
     A zero pivot is a known direction, of which nothing is asked; with `regular` it is an error, and the result is not
     finite.
     """
-    if plain.is_exporting():
-        return plain.solve_lower(factor, right, regular)
-    if unrolled.is_small(factor, right.shape[-1]):
-        return unrolled.solve_lower(factor, right, regular)
+    if plain_factors.is_exporting():
+        return plain_factors.solve_lower(factor, right, regular)
+    if unrolled_factors.is_small(factor, right.shape[-1]):
+        return unrolled_factors.solve_lower(factor, right, regular)
     return torch.linalg.solve_triangular(factor if regular else _without_zero_pivots(factor), right, upper=False)
 
 
 def solve_lower_transposed(factor: Tensor, right: Tensor) -> Tensor:
     """L^-T B for lower triangular L (..., n, n) and B (..., n, c); a zero pivot is a known direction."""
-    if plain.is_exporting():
-        return plain.solve_lower_transposed(factor, right)
-    if unrolled.is_small(factor, right.shape[-1]):
-        return unrolled.solve_lower_transposed(factor, right)
+    if plain_factors.is_exporting():
+        return plain_factors.solve_lower_transposed(factor, right)
+    if unrolled_factors.is_small(factor, right.shape[-1]):
+        return unrolled_factors.solve_lower_transposed(factor, right)
     return torch.linalg.solve_triangular(_without_zero_pivots(factor).mT, right, upper=True)
 
 
 def multiply(left: Tensor, right: Tensor) -> Tensor:
     """Matrix product (..., r, k) @ (..., k, c)."""
-    if unrolled.is_small(left, right.shape[-1]) or (left.shape[-2] <= unrolled.ROWS and unrolled.is_small(right)):
-        return unrolled.multiply(left, right)
+    if unrolled_factors.is_small(left, right.shape[-1]) or (
+        left.shape[-2] <= unrolled_factors.ROWS and unrolled_factors.is_small(right)
+    ):
+        return unrolled_factors.multiply(left, right)
     return left @ right
 
 
@@ -128,7 +130,7 @@ def square(pieces: Sequence[Tensor]) -> Tensor:
     """A A^T for A = [pieces side by side], pieces (..., n, c_i) -> (..., n, n)."""
     total = None
     for piece in pieces:
-        part = unrolled.multiply(piece, piece.mT) if unrolled.is_small(piece) else piece @ piece.mT
+        part = unrolled_factors.multiply(piece, piece.mT) if unrolled_factors.is_small(piece) else piece @ piece.mT
         total = part if total is None else total + part
     assert total is not None
     return total
@@ -136,8 +138,10 @@ def square(pieces: Sequence[Tensor]) -> Tensor:
 
 def apply(matrix: Tensor, vector: Tensor) -> Tensor:
     """Matrix times vector, (..., r, k), (..., k) -> (..., r)."""
-    if unrolled.is_small(matrix) or (matrix.shape[-2] <= unrolled.ROWS and unrolled.is_small(vector.unsqueeze(-2))):
-        return unrolled.apply(matrix, vector)
+    if unrolled_factors.is_small(matrix) or (
+        matrix.shape[-2] <= unrolled_factors.ROWS and unrolled_factors.is_small(vector.unsqueeze(-2))
+    ):
+        return unrolled_factors.apply(matrix, vector)
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
 
 

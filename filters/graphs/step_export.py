@@ -17,14 +17,14 @@ from torch.fx.experimental.proxy_tensor import make_fx
 from sigmaslam.errors import SigmaSlamError
 from sigmaslam.files import atomic_path
 from sigmaslam.filters.bayes import BayesFilter
+from sigmaslam.filters.core.noise_covariance import as_noise
+from sigmaslam.filters.core.plain_factors import traced_for_export
+from sigmaslam.filters.core.transforms import Taylor
 from sigmaslam.filters.gaussian_belief import Gaussian
-from sigmaslam.filters.linalg.plain import traced_for_export
+from sigmaslam.filters.graphs.exact_operators import ExactOperators
+from sigmaslam.filters.graphs.graph_file import strip_origins
 from sigmaslam.filters.models import AnyMeasurement, AnyMotion, NonlinearModel, several
-from sigmaslam.filters.noise_covariance import as_noise
-from sigmaslam.filters.onnx.exact_operators import ExactOperators
-from sigmaslam.filters.onnx.graph_file import strip_origins
 from sigmaslam.filters.robust import Robust
-from sigmaslam.filters.transforms import Taylor
 
 _OPSET = 20
 # Largest difference of graph and torch, relative to an output's largest value; more than this is a wrong graph.

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from sigmaslam import filters
-from sigmaslam.filters.updates import FORMS
+from sigmaslam.filters.core.solve import FORMS
 from tests.support.filter_assertions import assert_close, assert_same_belief, assert_same_update
 from tests.support.filter_builders import beliefs, bent_measurement, bent_motion, covariances, noises, random_numbers
 

@@ -10,9 +10,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from sigmaslam.filters.linalg.plain import cholesky
-from sigmaslam.filters.onnx.exportable_se3 import adjoint_se3, exp_se3, invert_se3, log_se3
-from sigmaslam.filters.onnx.unscented import covariance_of, sigma_offsets
+from sigmaslam.filters.core.plain_factors import cholesky
+from sigmaslam.filters.graphs.cubature_transform import covariance_of, sigma_offsets
+from sigmaslam.filters.manifolds.se3_matrices import adjoint_se3, exp_se3, invert_se3, log_se3
 
 POSE = slice(0, 6)
 TWIST = slice(6, 12)

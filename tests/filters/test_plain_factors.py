@@ -4,11 +4,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from sigmaslam.filters.linalg import plain
+from sigmaslam.filters.core import plain_factors
 
 
 def cholesky(matrix: Tensor) -> Tensor:
-    return plain.cholesky(matrix)[0]
+    return plain_factors.cholesky(matrix)[0]
 
 
 def random_matrices(*shape: int, seed: int = 0) -> Tensor:

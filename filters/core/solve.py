@@ -20,8 +20,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.layout import choose
-from sigmaslam.filters.linalg.square_roots import (
+from sigmaslam.filters.core.columns import Columns
+from sigmaslam.filters.core.factors import (
     apply,
     cholesky,
     identity,
@@ -32,9 +32,9 @@ from sigmaslam.filters.linalg.square_roots import (
     square,
     triangularise,
 )
-from sigmaslam.filters.linalg.unrolled import is_small, join, stacked_update
-from sigmaslam.filters.noise_covariance import Dense, Noise, Rooted
-from sigmaslam.filters.sigma_points import Columns
+from sigmaslam.filters.core.layout import choose
+from sigmaslam.filters.core.noise_covariance import Dense, Noise, Rooted
+from sigmaslam.filters.core.unrolled_factors import is_small, join, stacked_update
 
 Form = Literal["dense", "low-rank", "qr"]
 FORMS: tuple[Form, ...] = ("dense", "low-rank", "qr")

@@ -1,10 +1,7 @@
 """Maximum likelihood (9.1)-(9.7) and maximum a posteriori (9.8)-(9.20) estimates by Gauss-Newton, batched.
 
 Both minimise 1/2 sum_k |z_k - h_k(x)|^2 in the norms of R_k^-1; the second adds the prior as one more observation, of x
-itself: Z = [z; x^-], g(x) = [h(x); x], C = diag(R, P). Each step is the least-squares problem of the whitened
-derivative [R^-1/2 H] and residual, solved by its triangular factor (QR); normal equations, which lose half of the
-digits, are never formed. A prior is whitened by the unknown: x = x^- [+] L zeta with L L^T = P, zeta ~ N(0, I), so that
-P is not inverted and may hold directions that are known exactly.
+itself: Z = [z; x^-], g(x) = [h(x); x], C = diag(R, P). `sigmaslam.filters.gauss_newton` takes the steps.
 
 (9.15) and (9.17) are printed with the wrong sign: the correction is + K (z - h(x)).
 """
@@ -18,27 +15,17 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.failure import FilterError, name_elements
-from sigmaslam.filters.gaussian_belief import Gaussian
-from sigmaslam.filters.linalg.square_roots import (
-    apply,
+from sigmaslam.filters.core.factors import (
     identity,
-    multiply,
     solve_lower,
-    solve_lower_transposed,
     triangularise,
 )
+from sigmaslam.filters.core.failure import FilterError, name_elements
+from sigmaslam.filters.core.noise_covariance import Dense, Rooted, as_noise
+from sigmaslam.filters.gauss_newton import LeastSquares, Minimum, Term, gauss_newton, holds_everywhere
+from sigmaslam.filters.gaussian_belief import Gaussian
 from sigmaslam.filters.manifolds import Space, is_flat
 from sigmaslam.filters.models import AnyMeasurement, LinearMeasurement
-from sigmaslam.filters.noise_covariance import Dense, Noise, Rooted, as_noise
-from sigmaslam.filters.transforms import Taylor
-
-# A step is halved at most this often while it raises the cost.
-_HALVINGS = 10
-# A pivot below this share of its column, in units of the dtype's epsilon, is round-off of zero. Up to 4 were measured,
-# to which derivatives add theirs; with a prior no pivot is zero, but it can be lost in the round-off of precise data.
-_SINGULAR = 64
-_LOST = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,7 +108,7 @@ def maximum_likelihood(
     size = initial.shape[-1] if space is None else space.tangent_size
     root = identity(size, initial).expand(*batch, size, size)
     start = initial.expand(*batch, initial.shape[-1])
-    problem = _LeastSquares(terms, space, root, has_prior=False)
+    problem = LeastSquares(terms, space, root, has_prior=False)
     failed_estimate = Gaussian(start, factor=torch.full_like(root, torch.nan), factor_is_lower=True)
     return _estimate("maximum likelihood", problem, failed_estimate, None, iterations, tolerance, on_failure)
 
@@ -165,211 +152,13 @@ def maximum_a_posteriori(
     )
     if sound is not None:
         sound = sound.expand(batch)
-    problem = _LeastSquares(terms, space, start.factor, has_prior=True)
+    problem = LeastSquares(terms, space, start.factor, has_prior=True)
     return _estimate("maximum a posteriori", problem, start, sound, iterations, tolerance, on_failure)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Term:
-    """An observation made ready, everything expanded to the batch.
-
-    Attributes:
-        value: (..., m), zero where missing.
-        noise: unit where missing.
-        mask: (..., m) bool; None: everything takes part.
-        scale: (..., m) square root of the weight; None: 1.
-        count: (...,) number of components that take part.
-        sound: (...,) bool: the noise is positive definite.
-    """
-
-    model: AnyMeasurement
-    value: Tensor
-    inputs: tuple[Tensor, ...]
-    noise: Noise
-    mask: Tensor | None
-    scale: Tensor | None
-    count: Tensor
-    sound: Tensor
-
-    def residual(self, state: Tensor) -> Tensor:
-        """Whitened z - h(x) for states (..., p), (..., m)."""
-        if isinstance(self.model, LinearMeasurement):
-            predicted, compare = self.model.function(state), None
-        else:
-            predicted, compare = self.model.function(state.unsqueeze(0), *self.inputs)[0], self.model.residual
-        if predicted.shape[-1] != self.value.shape[-1]:
-            raise ValueError(
-                f"a measurement's function returns {predicted.shape[-1]} components, its value has "
-                f"{self.value.shape[-1]}"
-            )
-        difference = self.value - predicted if compare is None else compare(self.value, predicted)
-        return self._whiten(difference.unsqueeze(-1)).squeeze(-1)
-
-    def linearised(self, problem: _LeastSquares, anchor: Tensor, zeta: Tensor) -> Tensor:
-        """Whitened derivative by zeta, with the whitened residual as one more column, (..., m, n + 1)."""
-        shift = apply(problem.root, zeta)
-        state = problem.retract(anchor, shift)
-        model = self.model
-        if isinstance(model, LinearMeasurement):
-            slope, innovation = multiply(model.matrix, problem.root), self.value - model.function(state)
-        else:
-            columns, jacobian = problem.root, None
-            if model.jacobian is not None:
-                # Without a prior the chart is at the state, where the given derivative is.
-                columns = problem.columns(anchor, zeta, state) if problem.has_prior else problem.root
-                jacobian = model.jacobian(state, *self.inputs)
-            seen = Taylor(jacobian)(
-                lambda offsets: model.function(problem.retract(anchor, shift + offsets), *self.inputs),
-                columns,
-                model.residual,
-            )
-            slope = seen.columns.odd
-            innovation = seen.from_mean(self.value, model.residual)
-        slope = slope.expand(*innovation.shape, slope.shape[-1])
-        return self._whiten(torch.cat([slope, innovation.unsqueeze(-1)], dim=-1))
-
-    def magnitude(self) -> Tensor:
-        """Squared length of the whitened value, (...,)."""
-        white = self._whiten(self.value.unsqueeze(-1))
-        return (white * white).sum(dim=(-2, -1))
-
-    def _whiten(self, columns: Tensor) -> Tensor:
-        if self.mask is not None:
-            columns = torch.where(self.mask.unsqueeze(-1), columns, 0.0)
-        if self.scale is not None:
-            columns = self.scale.unsqueeze(-1) * columns
-        return self.noise.whitened(columns)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _LeastSquares:
-    """Least squares in zeta (..., n), with the state anchor [+] root zeta.
-
-    With a prior the anchor is its mean for good. Without one, the root is the identity and the anchor goes along.
-    """
-
-    terms: Sequence[_Term]
-    space: Space | None
-    root: Tensor
-    has_prior: bool
-
-    @property
-    def is_linear(self) -> bool:
-        """Whether one step is exact."""
-        return all(isinstance(term.model, LinearMeasurement) for term in self.terms)
-
-    def retract(self, point: Tensor, tangent: Tensor) -> Tensor:
-        """point [+] tangent."""
-        return point + tangent if self.space is None else self.space.retract(point, tangent)
-
-    def state(self, anchor: Tensor, zeta: Tensor) -> Tensor:
-        """(..., p)."""
-        return self.retract(anchor, apply(self.root, zeta))
-
-    def columns(self, anchor: Tensor, zeta: Tensor, state: Tensor) -> Tensor:
-        """Derivative (..., n, n) by zeta of the tangent at the state; in R^n that is the root."""
-        space = self.space
-        if space is None or is_flat(space):
-            return self.root
-        shift = apply(self.root, zeta)
-        return Taylor()(
-            lambda offsets: space.local(state, space.retract(anchor, shift + offsets)), self.root, None
-        ).columns.odd
-
-    def cost(self, anchor: Tensor, zeta: Tensor) -> Tensor:
-        """Half of the sum of squares, (...,)."""
-        state = self.state(anchor, zeta)
-        residuals = [zeta] if self.has_prior else []
-        residuals += [term.residual(state) for term in self.terms]
-        return 0.5 * torch.stack([(residual * residual).sum(dim=-1) for residual in residuals]).sum(dim=0)
-
-    def triangle(self, anchor: Tensor, zeta: Tensor) -> Tensor:
-        """Lower factor (..., n + 1, n + 1) of the squares of [derivative, residual], one added to the last pivot's."""
-        size = zeta.shape[-1]
-        pieces = [term.linearised(self, anchor, zeta).mT for term in self.terms]
-        # The one keeps the last pivot, the length of the residual, off zero, where a QR has no gradient.
-        one = identity(size + 1, zeta)
-        if self.has_prior:
-            past = torch.nn.functional.pad(zeta.unsqueeze(-2), (0, 1, size, 0))
-            return triangularise([*pieces, one - past])
-        return triangularise([*pieces, one[:, size:]])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Minimum:
-    """Where Gauss-Newton ended; `factor` (..., n, n) is the lower root of the information on zeta of its last step."""
-
-    anchor: Tensor
-    zeta: Tensor
-    factor: Tensor
-    cost: Tensor
-    iterations: Tensor
-    converged: Tensor
-    finite: Tensor
-    determined: Tensor
-
-
-def _gauss_newton(problem: _LeastSquares, anchor: Tensor, sound: Tensor, iterations: int, tolerance: float) -> _Minimum:
-    size = problem.root.shape[-1]
-    epsilon = torch.finfo(anchor.dtype).eps
-    # Steps, in standard deviations, that change the cost by so little that its round-off has a say.
-    negligible = epsilon**0.25
-    zeta = torch.zeros_like(problem.root[..., 0])
-    factor = unit = identity(size, zeta).expand_as(problem.root)
-    cost = problem.cost(anchor, zeta)
-    if cost.shape != anchor.shape[:-1]:
-        raise ValueError(
-            f"inputs, noise or matrices have batch {tuple(cost.shape)}, the state and the values "
-            f"{tuple(anchor.shape[:-1])}: expand the state"
-        )
-    active, finite, determined = sound, torch.ones_like(sound), torch.ones_like(sound)
-    converged, count = torch.zeros_like(sound), torch.zeros_like(sound, dtype=torch.int64)
-    previous = torch.full_like(cost, torch.inf)
-    # Round-off of a cost c is about sqrt(2 c) times this: what the values lose, times the residuals.
-    lost = epsilon * torch.sqrt(sum((term.magnitude().detach() for term in problem.terms), torch.zeros_like(cost)))
-    linear = problem.is_linear
-    for _ in range(1 if linear else iterations):
-        if _holds_everywhere(~active):
-            break
-        if not problem.has_prior:
-            moving = active.unsqueeze(-1)
-            anchor = torch.where(moving, problem.state(anchor, zeta), anchor)
-            zeta = torch.where(moving, 0.0, zeta)
-        triangle = problem.triangle(anchor, zeta)
-        finite = torch.where(active, torch.isfinite(triangle).all(dim=-1).all(dim=-1), finite)
-        regular = _is_regular(triangle, _LOST if problem.has_prior else _SINGULAR)
-        determined = torch.where(active, regular, determined)
-        usable = active & finite & determined
-        current = torch.where(usable[..., None, None], triangle[..., :size, :size], unit)
-        projected = torch.where(usable.unsqueeze(-1), triangle[..., size, :size], 0.0)
-        step = solve_lower_transposed(current, projected.unsqueeze(-1)).squeeze(-1)
-        length = torch.linalg.vector_norm(projected.detach(), dim=-1)
-
-        scale = torch.ones_like(length)
-        for _ in range(_HALVINGS + 1):
-            candidate = zeta + scale.unsqueeze(-1) * step
-            reached = problem.cost(anchor, candidate)
-            fine = reached <= cost + lost * torch.sqrt(2 * cost.detach())
-            fine = fine | (torch.isfinite(reached) & ((length <= negligible) | linear))
-            if _holds_everywhere(fine | ~usable):
-                break
-            scale = torch.where(fine, scale, 0.5 * scale)
-
-        moved = usable & fine
-        zeta = torch.where(moved.unsqueeze(-1), candidate, zeta)
-        cost = torch.where(moved, reached, cost)
-        factor = torch.where(usable[..., None, None], current, factor)
-        count = count + usable
-        close = (length <= tolerance) | ((length <= negligible) & (length >= previous))
-        converged = converged | (moved & (close | linear))
-        active = moved & ~close
-        previous = length
-    return _Minimum(anchor, zeta, factor, cost, count, converged, finite, determined)
 
 
 def _estimate(
     stage: str,
-    problem: _LeastSquares,
+    problem: LeastSquares,
     start: Gaussian,
     sound_prior: Tensor | None,
     iterations: int,
@@ -385,7 +174,7 @@ def _estimate(
     sound = torch.ones_like(start.mean[..., 0], dtype=torch.bool)
     for _, holds in causes:
         sound = sound & holds
-    solution = _gauss_newton(problem, start.mean, sound, iterations, tolerance)
+    solution = gauss_newton(problem, start.mean, sound, iterations, tolerance)
     causes.append(("a residual or a derivative is not finite", solution.finite))
     text = "the observations do not determine the state"
     if problem.has_prior:
@@ -405,7 +194,7 @@ def _estimate(
     return PointEstimate(belief, solution.cost, freedom, solution.iterations, solution.converged, healthy)
 
 
-def _prepare(k: int, observation: Observation, like: Tensor, batch: torch.Size, space: Space | None) -> _Term:
+def _prepare(k: int, observation: Observation, like: Tensor, batch: torch.Size, space: Space | None) -> Term:
     model, value = observation.model, observation.value
     if isinstance(model, LinearMeasurement):
         if not is_flat(space) or observation.inputs:
@@ -427,13 +216,13 @@ def _prepare(k: int, observation: Observation, like: Tensor, batch: torch.Size, 
         weight = _expand_weight(k, observation.weight, value)
         present = present & (weight > 0)
         scale = torch.sqrt(torch.where(weight > 0, weight, 1.0))
-    mask = None if _holds_everywhere(present) else present
+    mask = None if holds_everywhere(present) else present
     if mask is not None:
         value, noise = torch.where(mask, value, 0.0), noise.masked(mask)
     if isinstance(noise, Dense):
         noise = Rooted(noise.factor())  # once, not at every step
     sound = torch.isfinite(noise.log_determinant())
-    return _Term(model, value, observation.inputs, noise, mask, scale, present.sum(dim=-1), sound)
+    return Term(model, value, observation.inputs, noise, mask, scale, present.sum(dim=-1), sound)
 
 
 def _expand_weight(k: int, weight: Tensor | float, value: Tensor) -> Tensor:
@@ -468,27 +257,12 @@ def _check_options(iterations: int, on_failure: str) -> None:
         raise ValueError(f"on_failure is {on_failure!r}; choose raise or hold")
 
 
-def _holds_everywhere(condition: Tensor) -> bool:
-    """Whether a condition holds everywhere; compiled, where looking would break the graph, nothing is known."""
-    return not torch.compiler.is_compiling() and bool(condition.all())
-
-
-def _is_regular(triangle: Tensor, tolerance: float) -> Tensor:
-    """Whether the derivative that (..., n + 1, n + 1) was made from has full rank, at any scale of its columns.
-
-    The tolerance is in units of the dtype's epsilon.
-    """
-    pivots = torch.diagonal(triangle, dim1=-2, dim2=-1)[..., :-1]
-    lengths = torch.linalg.vector_norm(triangle.detach(), dim=-1)[..., :-1]
-    return (pivots > tolerance * torch.finfo(triangle.dtype).eps * lengths).all(dim=-1)
-
-
 def _raise(
     stage: str,
     healthy: Tensor,
     causes: Sequence[tuple[str, Tensor]],
-    problem: _LeastSquares,
-    solution: _Minimum,
+    problem: LeastSquares,
+    solution: Minimum,
 ) -> None:
     first = tuple((~healthy).nonzero()[0].tolist())
     cause = next(text for text, holds in causes if not bool(holds.expand_as(healthy)[first]))

@@ -14,8 +14,9 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from sigmaslam.filters.linalg.plain import is_exporting
-from sigmaslam.filters.sigma_points import Columns, SigmaPoints, Symmetric
+from sigmaslam.filters.core.columns import Columns
+from sigmaslam.filters.core.plain_factors import is_exporting
+from sigmaslam.filters.core.sigma_points import SigmaPoints, Symmetric
 
 Evaluate = Callable[[Tensor], Tensor]
 Difference = Callable[[Tensor, Tensor], Tensor]

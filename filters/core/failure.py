@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sigmaslam.errors import SigmaSlamError
-from sigmaslam.filters.linalg.square_roots import cholesky
+from sigmaslam.filters.core.factors import cholesky
 
 # raise: FilterError. hold: the element keeps the belief it came with. jitter: a covariance that is not positive
 # semidefinite is given the smallest relative jitter that makes it so, and held when none does. hold and jitter flag the

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.func import jacrev
 
-from sigmaslam.filters.onnx.exportable_se3 import adjoint_se3, exp_se3, invert_se3, log_se3, skew
+from sigmaslam.filters.manifolds.se3_matrices import adjoint_se3, exp_se3, invert_se3, log_se3, skew
 from sigmaslam.geometry import se3 as rotation
 
 

@@ -11,7 +11,7 @@ from scipy.stats import kstest
 from torch import Tensor
 
 from sigmaslam import filters
-from sigmaslam.filters.inference import Observation, PointEstimate, maximum_a_posteriori, maximum_likelihood
+from sigmaslam.filters.point_estimates import Observation, PointEstimate, maximum_a_posteriori, maximum_likelihood
 from tests.support.filter_builders import covariances, random_numbers, tensor
 
 BEACONS = torch.tensor([[0.0, 0.0], [4.0, -1.0], [1.0, 5.0]], dtype=torch.float64)

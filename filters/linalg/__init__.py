@@ -1,1 +1,0 @@
-"""Square roots of covariances and products of batched matrices."""
