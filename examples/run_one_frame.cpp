@@ -3,9 +3,9 @@
 //     g++ -std=c++17 -O2 -I INCLUDE run_one_frame.cpp -o run_one_frame LIBRARY    (LIBRARY: libonnxruntime.so)
 //     ./run_one_frame models/weights FOLDER 4
 //
+// INCLUDE is the folder of onnxruntime_c_api.h, which releases of ONNX Runtime have; the wheel has the library alone.
 // FOLDER has KITTI's layout, but images 0 and 4 of image_0 and image_1 as PGM (P5, 8 bits), which needs no library.
-// The header is in releases of ONNX Runtime, in Debian's libonnxruntime-dev and in conda's onnxruntime-cpp; the library
-// is also in the wheel onnxruntime. Standard output: the pose T_0_4 (4 x 4, metres), then its covariance (6 x 6), perturbed from the left: translation,
+// Standard output: the pose T_0_4 (4 x 4, metres), then its covariance (6 x 6), perturbed from the left: translation,
 // rotation; row by row. docs/onnx.md says what each graph takes.
 
 #include <onnxruntime_c_api.h>
@@ -183,7 +183,8 @@ Features detect(const Graph& features, const std::string& path) {
     Features kept;
     for (std::size_t k = 0; k < scores.size(); ++k) {
         const float u = keypoints[2 * k], v = keypoints[2 * k + 1];
-        if (!(scores[k] > 0.0F && u < static_cast<float>(image.width) && v < static_cast<float>(image.height))) continue;
+        const bool inside = u < static_cast<float>(image.width) && v < static_cast<float>(image.height);
+        if (!(scores[k] > 0.0F && inside)) continue;
         kept.keypoints.push_back({u, v});
         kept.descriptors.emplace_back(&descriptors[k * length], &descriptors[k * length] + length);
         kept.sigma.push_back(sigma[k]);
@@ -305,7 +306,7 @@ void run(OrtEnv* environment, const std::string& weights, const std::string& fol
         std::string line;
         std::getline(calibration_file, line);
         row = read_numbers(line.substr(std::min(line.size(), line.find(' '))));
-        if (row.size() != 12) throw std::runtime_error(folder + "/calib.txt: a line does not hold 12 numbers: give P0, P1");
+        if (row.size() != 12) throw std::runtime_error(folder + "/calib.txt: P0 or P1 has no 12 numbers: write them");
     }
     const std::vector<double> intrinsics{P[0][0], P[0][5], P[0][2], P[0][6], P[0][3] - P[1][3]};
     const std::vector<double> times{std::istream_iterator<double>(times_file), {}};
@@ -411,7 +412,7 @@ int main(int count, char** words) {
         return 2;
     }
     if (ort == nullptr) {
-        std::fprintf(stderr, "error: the library is older than the header it is used with: take those of one version\n");
+        std::fprintf(stderr, "error: the library is older than the header: take those of one version\n");
         return 2;
     }
     OrtEnv* environment = nullptr;

@@ -14,7 +14,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 HEADER = "onnxruntime_c_api.h"
-# Of ONNXRUNTIME_INCLUDE, of Debian's libonnxruntime-dev, of conda's onnxruntime-cpp, and of an unpacked release.
+# Where packages of the system or of conda put it; ONNXRUNTIME_INCLUDE names that of an unpacked release.
 FOLDERS = [
     Path(os.environ.get("ONNXRUNTIME_INCLUDE", "/usr/include")),
     *(
