@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ from sigmaslam.filters.manifolds.se3_matrices import exp_se3
 from sigmaslam.filters.tracking.frame_update import FrameViews, GatedStep, PredictViews, RobustStep
 from sigmaslam.filters.tracking.window_solution import Condition, EliminateLandmarks, GateWindow, WindowViews
 from sigmaslam.inference.onnx_graph import OnnxGraph
+from sigmaslam.inference.session import check_provider
 from sigmaslam.inference.weight_manifest import check_weights, update_manifest
 from sigmaslam.models.extractor import EXTRACTOR_SIZE_MULTIPLE, FeatureExtractor
 from sigmaslam.models.feature_network import DESCRIPTOR_SIZE, STRIDE, FeatureNetwork
@@ -51,6 +53,7 @@ _OPSET = 20
 # ONNX Runtime and torch may order sums differently; more than this is a wrong graph.
 _FEATURE_TOLERANCE = 1e-4
 _FILTER_TOLERANCE = 1e-9
+_TIMED_CALLS = 9
 
 _Module = TypeVar("_Module", bound=nn.Module)
 
@@ -132,15 +135,7 @@ def check_graphs(folder: Path) -> dict[str, float]:
         SigmaSlamError: a graph differs from torch by more than its tolerance.
     """
     present = {path.stem for path in folder.glob("*.onnx")}
-    graphs = _filter_graphs()
-    if "features" in present:
-        graphs["features"] = _feature_graph(load_network(folder / "features.safetensors"))
-    if "scorer" in present:
-        graphs |= _scoring_graphs(
-            load_scorer(folder / "scorer.safetensors"),
-            load_verifier(folder / "verifier.safetensors"),
-            load_verifier(folder / "place_verifier.safetensors", PLACE_COLUMNS),
-        )
+    graphs = _filter_graphs() | _network_graphs(folder)
     if not present or present - graphs.keys():
         strangers = ", ".join(f"{name}.onnx" for name in sorted(present - graphs.keys())) or "no .onnx file"
         raise InputError(f"{folder}: {strangers}, but only what `sigmaslam export` writes can be compared with torch")
@@ -155,6 +150,84 @@ def check_graphs(folder: Path) -> dict[str, float]:
                 "export it again with `sigmaslam export`"
             )
     return differences
+
+
+@dataclass(frozen=True, slots=True)
+class CallTime:
+    """Medians of a graph's calls.
+
+    Attributes:
+        wall_ms: milliseconds.
+        process_ms: of CPU time, of all threads.
+    """
+
+    wall_ms: float
+    process_ms: float
+
+
+@dataclass(frozen=True, slots=True)
+class ProviderCheck:
+    """A network on an execution provider beside the same on the CPU.
+
+    Attributes:
+        difference: largest one of the outputs.
+        on_cpu, on_provider: what a call takes.
+    """
+
+    difference: float
+    on_cpu: CallTime
+    on_provider: CallTime
+
+
+def check_networks(folder: Path, provider: str) -> dict[str, ProviderCheck]:
+    """Runs the networks of a folder on an execution provider and on the CPU, on the inputs of `check_graphs`.
+
+    Args:
+        folder: as of `check_graphs`.
+        provider: one of `sigmaslam.inference.session.PROVIDERS`.
+    Raises:
+        InputError: the provider is not installed or does not start, or a file is missing.
+        SigmaSlamError: a network differs by more than its tolerance.
+    """
+    check_provider(provider)
+    checks = {}
+    for name, graph in _network_graphs(folder).items():
+        path, feed = folder / f"{name}.onnx", _feed(graph)
+        expected, on_cpu = _timed(OnnxGraph(path), feed)
+        actual, on_provider = _timed(OnnxGraph(path, provider=provider), feed)
+        difference = (_feature_difference if name == "features" else _relative_difference)(actual, expected)
+        if not difference <= _FEATURE_TOLERANCE:
+            raise SigmaSlamError(
+                f"{name}.onnx on the provider {provider} differs from the CPU by {difference:.2e}, more than "
+                f"{_FEATURE_TOLERANCE:.0e}: track without it"
+            )
+        checks[name] = ProviderCheck(difference, on_cpu, on_provider)
+    return checks
+
+
+def _timed(graph: OnnxGraph, feed: dict[str, np.ndarray]) -> tuple[list[np.ndarray], CallTime]:
+    """Outputs of a graph, and what a call takes."""
+    outputs = graph(feed)  # the first call makes what the others use
+    seconds = []
+    for _ in range(_TIMED_CALLS):
+        wall, process = time.perf_counter(), time.process_time()
+        graph(feed)
+        seconds.append((time.perf_counter() - wall, time.process_time() - process))
+    return outputs, CallTime(*(1e3 * float(median) for median in np.median(seconds, axis=0)))
+
+
+def _network_graphs(folder: Path) -> dict[str, _Graph]:
+    """The networks of which the folder has graphs."""
+    graphs = {}
+    if (folder / "features.onnx").is_file():
+        graphs["features"] = _feature_graph(load_network(folder / "features.safetensors"))
+    if (folder / "scorer.onnx").is_file():
+        graphs |= _scoring_graphs(
+            load_scorer(folder / "scorer.safetensors"),
+            load_verifier(folder / "verifier.safetensors"),
+            load_verifier(folder / "place_verifier.safetensors", PLACE_COLUMNS),
+        )
+    return graphs
 
 
 def _feature_graph(network: FeatureNetwork) -> _Graph:
@@ -360,12 +433,16 @@ def _export(
 
 def _difference(graph: _Graph, path: Path, compare: Callable[[list[np.ndarray], list[np.ndarray]], float]) -> float:
     """Of a written graph from its module, on inputs that it was not traced with."""
-    feed = {name: np.asarray(value) for name, value in zip(graph.inputs, graph.checked, strict=True)}
-    actual = OnnxGraph(path)(feed)
+    actual = OnnxGraph(path)(_feed(graph))
     with torch.no_grad():
         outputs = graph.module(*graph.checked)
     expected = [value.numpy() for value in (outputs if isinstance(outputs, tuple) else (outputs,))]
     return compare(actual, expected)
+
+
+def _feed(graph: _Graph) -> dict[str, np.ndarray]:
+    """The inputs by which it is checked."""
+    return {name: np.asarray(value) for name, value in zip(graph.inputs, graph.checked, strict=True)}
 
 
 def _relative_difference(actual: list[np.ndarray], expected: list[np.ndarray]) -> float:

@@ -517,6 +517,8 @@ def torch_kf(work: LinearWork, dtype: str = "float64") -> Step:
 def numpy_batched(work: Work, dtype: str = "float64") -> Step:
     """No library: the filter of `torch_linalg` in numpy, whose linear algebra takes stacks of matrices too."""
     _check_dtype(dtype, "float64")
+    if isinstance(work, LinearWork):
+        return _numpy_batched_linear(work)
     problem = _problem(work)
     transition_inputs, measure_inputs = problem.transition_inputs[:, None], problem.measure_inputs[:, None]
 
@@ -539,6 +541,22 @@ def numpy_batched(work: Work, dtype: str = "float64") -> Step:
         gain = np.linalg.solve(S, Z.mT @ X / count).mT
         posterior = predicted + (gain @ (problem.measurement - expected)[..., None])[..., 0]
         return posterior, P - gain @ S @ gain.mT
+
+    return step
+
+
+def _numpy_batched_linear(work: LinearWork) -> Step:
+    """The Kalman filter's textbook equations on stacks."""
+    A, H = work.transition, work.observation
+
+    def step() -> tuple[Array, Array]:
+        predicted = work.mean @ A.T
+        P = A @ work.covariance @ A.T + work.process_noise
+        cross = H @ P
+        S = cross @ H.T + work.measurement_noise
+        gain = np.linalg.solve(S, cross).mT
+        innovation = work.measurement - predicted @ H.T
+        return predicted + (gain @ innovation[..., None])[..., 0], P - gain @ cross
 
     return step
 
@@ -606,7 +624,7 @@ PEERS = (
     Peer("Stone Soup", ("stonesoup",), _UNSCENTED, _DOUBLE, stone_soup, batched=False),
     Peer("dynamax", ("dynamax", "jax"), _UNSCENTED, _BOTH, dynamax, batched=True),
     Peer("PyPose, repaired", ("pypose", "torch"), _UNSCENTED, _BOTH, pypose, batched=True),
-    Peer("numpy batched", ("numpy",), _BATCHED, _DOUBLE, numpy_batched, batched=True),
+    Peer("numpy batched", ("numpy",), (*_BATCHED, LinearWork), _DOUBLE, numpy_batched, batched=True),
     Peer("torch.linalg batched", ("torch",), _BATCHED, _BOTH, torch_linalg, batched=True),
     Peer("torch-kf", ("torch_kf", "torch"), (LinearWork,), _BOTH, torch_kf, batched=True),
 )

@@ -226,8 +226,8 @@ class FrameEstimate(NamedTuple):
     covariance: Tensor
     agree: Tensor
 
-    def log_likelihood(self, pose: Tensor, T_last_frame: Tensor, last: Tensor) -> Tensor:
-        """() of the frame's true pose relative to the last keyframe, a Gaussian's in the world.
+    def relative_error(self, pose: Tensor, T_last_frame: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
+        """Error (6,) of the frame's pose relative to the last keyframe, in the world, and its covariance (6, 6).
 
         Args:
             pose: (4, 4) T_world_camera as it was expected: the frame's of `FrameViews.poses`.
@@ -237,7 +237,11 @@ class FrameEstimate(NamedTuple):
         last, pose = (exp_se3(self.offset[k : k + 6 or None]) @ T for k, T in ((-12, last), (-6, pose)))
         error = log_se3(last @ T_last_frame @ invert_se3(pose))
         difference = self.covariance[-6:] - self.covariance[-12:-6]
-        covariance = difference[:, -6:] - difference[:, -12:-6]
+        return error, difference[:, -6:] - difference[:, -12:-6]
+
+    def log_likelihood(self, pose: Tensor, T_last_frame: Tensor, last: Tensor) -> Tensor:
+        """() of the frame's true pose relative to the last keyframe, a Gaussian's; arguments as of `relative_error`."""
+        error, covariance = self.relative_error(pose, T_last_frame, last)
         root = torch.linalg.cholesky(covariance)
         whitened = torch.linalg.solve_triangular(root, error[:, None], upper=False)
         return -0.5 * (whitened * whitened).sum() - torch.log(2.0 * torch.pi * torch.diagonal(root) ** 2).sum() / 2.0

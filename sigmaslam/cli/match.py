@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from sigmaslam.cli.track import Provider
 from sigmaslam.frontend.image_pair import DETECTORS, match_files
 
 # mypy reads the members of an enum from literals alone.
@@ -27,10 +28,15 @@ def match(
     picture: Annotated[
         Path | None, typer.Option(help="PNG to draw: both images, lines from purple (unlikely) to yellow (certain).")
     ] = None,
+    provider: Annotated[
+        Provider, typer.Option(help="Where ONNX Runtime computes the networks, if installed.")
+    ] = Provider["cpu"],
 ) -> None:
     """Match two images: which points show the same, how probably and how exactly; prints one line.
 
     Writes an .npz, best match first: keypoints0, keypoints1 (M, 2) pixels (u, v); probability (M,) that a match is
     right to 3 px; covariance (M, 2, 2) of keypoints1 given keypoints0; index0, index1 (M,). numpy.load reads it.
     """
-    typer.echo(match_files(image0, image1, out, frontend.value, max_keypoints, min_probability, picture))
+    typer.echo(
+        match_files(image0, image1, out, frontend.value, max_keypoints, min_probability, picture, provider.value)
+    )

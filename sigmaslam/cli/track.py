@@ -22,6 +22,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.files import check_new_folder, printable
 from sigmaslam.frontend import FRONTENDS
 from sigmaslam.inference.onnx_graph import BACKENDS
+from sigmaslam.inference.session import PROVIDERS, check_provider
 from sigmaslam.plot_style import NO_MATPLOTLIB
 from sigmaslam.readers import StereoSequence, open_cameras, open_sequence
 from sigmaslam.readers.open import FORMATS
@@ -38,6 +39,8 @@ Frontend = StrEnum("Frontend", FRONTENDS)  # type: ignore[misc]
 """Where correspondences come from."""
 Backend = StrEnum("Backend", BACKENDS)  # type: ignore[misc]
 """What runs the network and the filter."""
+Provider = StrEnum("Provider", list(PROVIDERS))  # type: ignore[misc]
+"""Where ONNX Runtime computes the networks."""
 InputFormat = StrEnum("InputFormat", FORMATS)  # type: ignore[misc]
 """Kinds of input."""
 
@@ -86,6 +89,9 @@ def track(
         Backend,
         typer.Option(help="What runs network and filter; torch needs 'train'."),
     ] = Backend["onnx"],
+    provider: Annotated[
+        Provider, typer.Option(help="Where ONNX Runtime computes the networks, if installed; the filter: on the CPU.")
+    ] = Provider["cpu"],
     config: Annotated[
         Path | None, typer.Option(help="YAML of tracker settings, `name: value` (names: sigmaslam.TrackerConfig).")
     ] = None,
@@ -169,6 +175,7 @@ def track(
     """
     if backend.value == "torch":
         need_train_extra()
+    check_provider(provider.value, backend.value)
     if resume and overwrite:
         raise InputError("--resume goes on with the run in the folder, --overwrite removes it: give one of them")
     settings = _read_settings(config, estimate, track_object is not None)
@@ -194,6 +201,7 @@ def track(
         findings,
         denoise,
         resume,
+        provider,
     )
     tell_summary(summary, out)
 
@@ -264,6 +272,7 @@ def _track(
     findings: Sequence[Finding] = (),
     denoise: bool = False,
     resume: bool = False,
+    provider: Provider = Provider["cpu"],
 ) -> dict[str, Any]:
     import cv2
 
@@ -288,6 +297,7 @@ def _track(
             findings=findings,
             denoise=denoise,
             resume=resume,
+            provider=provider.value,
         )
     except Stopped as stop:
         with suppress(OSError):  # the terminal may be gone

@@ -62,6 +62,7 @@ def match_images(
     frontend: str = "learned",
     max_keypoints: int = 1024,
     min_probability: float = MIN_PROBABILITY,
+    provider: str = "cpu",
 ) -> Matches:
     """Matches between two images of one scene.
 
@@ -70,13 +71,15 @@ def match_images(
         frontend: "learned", "sift" or "orb".
         max_keypoints: most an image, from 4; the time and memory of matching grow with its square.
         min_probability: of a match; 0 keeps every mutual nearest neighbour that the scorer does not refuse.
+        provider: where ONNX Runtime computes the networks, one of `sigmaslam.inference.session.PROVIDERS`.
     Raises:
-        InputError: an image has another shape or type or is too small, or an option is out of range.
+        InputError: an image has another shape or type or is too small, an option is out of range, or the provider is
+            not installed.
     """
-    detect = _detector(frontend, max_keypoints)
+    detect = _detector(frontend, max_keypoints, provider)
     _check_probability(min_probability)
     features0, features1 = detect(_checked(image0, "image0")), detect(_checked(image1, "image1"))
-    return match_features(ConfidenceEstimator(), image0, image1, features0, features1, min_probability)
+    return match_features(ConfidenceEstimator(provider=provider), image0, image1, features0, features1, min_probability)
 
 
 def match_features(
@@ -119,6 +122,7 @@ def match_files(
     max_keypoints: int,
     min_probability: float = MIN_PROBABILITY,
     picture: Path | None = None,
+    provider: str = "cpu",
 ) -> str:
     """Matches two image files and writes the fields of `Matches` as .npz and optionally a picture; returns a summary.
 
@@ -130,9 +134,9 @@ def match_files(
             raise InputError(f"{option} {path} does not end in {suffix}: choose a name that does")
     if picture is not None and picture.resolve() in (path0.resolve(), path1.resolve()):
         raise InputError(f"--picture {picture} would overwrite an image that is to be matched: choose another name")
-    detect = _detector(frontend, max_keypoints)
+    detect = _detector(frontend, max_keypoints, provider)
     _check_probability(min_probability)
-    estimator = ConfidenceEstimator()
+    estimator = ConfidenceEstimator(provider=provider)
     image0, image1 = (_checked(read_grey(path), str(path)) for path in (path0, path1))
     start = time.perf_counter()
     features0, features1 = detect(image0), detect(image1)
@@ -188,11 +192,13 @@ def draw_lines(
     return canvas
 
 
-def _detector(frontend: str, max_keypoints: int) -> Callable[[np.ndarray], Features]:
+def _detector(frontend: str, max_keypoints: int, provider: str) -> Callable[[np.ndarray], Features]:
     if not isinstance(frontend, str) or frontend not in DETECTORS:
         raise InputError(f"there is no front-end '{frontend}' for two images: choose one of {', '.join(DETECTORS)}")
     if not isinstance(max_keypoints, int | np.integer) or max_keypoints < _MIN_KEYPOINTS:
         raise InputError(f"--max-keypoints is {max_keypoints!r}: give a whole number of at least {_MIN_KEYPOINTS}")
+    if frontend == "learned":
+        return LearnedDetector(max_keypoints, provider=provider)
     return DETECTORS[frontend](max_keypoints)
 
 

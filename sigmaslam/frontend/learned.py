@@ -26,16 +26,17 @@ class LearnedDetector:
         max_keypoints: per image.
         backend: "onnx", or "torch" (needs the extra `train`).
         threads: of ONNX Runtime.
+        provider: where ONNX Runtime computes.
     """
 
-    def __init__(self, max_keypoints: int, backend: str = "onnx", threads: int = 2) -> None:
+    def __init__(self, max_keypoints: int, backend: str = "onnx", threads: int = 2, provider: str = "cpu") -> None:
         self._max_keypoints = max_keypoints
         if backend == "torch":
             from sigmaslam.models.torch_runtime import TorchFeatures
 
             self._graph: Graph = TorchFeatures(shipped_weights("features.safetensors"))
         else:
-            self._graph = OnnxGraph(shipped_weights("features.onnx"), threads)
+            self._graph = OnnxGraph(shipped_weights("features.onnx"), threads, provider)
 
     def __call__(self, image: np.ndarray) -> Features:
         """Features of an (H, W) uint8 image of any size from 96 pixels."""

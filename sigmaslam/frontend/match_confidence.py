@@ -25,9 +25,10 @@ class ConfidenceEstimator:
 
     Args:
         backend: "onnx", or "torch" (needs the extra `train`).
+        provider: where ONNX Runtime computes.
     """
 
-    def __init__(self, backend: str = "onnx") -> None:
+    def __init__(self, backend: str = "onnx", provider: str = "cpu") -> None:
         if backend == "torch":
             from sigmaslam.models.torch_runtime import scoring_module
 
@@ -35,9 +36,9 @@ class ConfidenceEstimator:
             self._verifier: _Graph = scoring_module("verifier")
             self._place_verifier: _Graph = scoring_module("place_verifier")
         else:
-            self._scorer = OnnxGraph(shipped_weights("scorer.onnx"))
-            self._verifier = OnnxGraph(shipped_weights("verifier.onnx"))
-            self._place_verifier = OnnxGraph(shipped_weights("place_verifier.onnx"))
+            self._scorer = OnnxGraph(shipped_weights("scorer.onnx"), provider=provider)
+            self._verifier = OnnxGraph(shipped_weights("verifier.onnx"), provider=provider)
+            self._place_verifier = OnnxGraph(shipped_weights("place_verifier.onnx"), provider=provider)
 
     def score(self, putative: Putative, features0: Features, features1: Features) -> np.ndarray:
         """Logit (M,) that each match is right, from its neighbours and its margins, without the images.

@@ -1,4 +1,4 @@
-"""ONNX Runtime sessions: their options, and the shipped graphs."""
+"""Graphs that are called with named arrays, and those that ship."""
 
 from __future__ import annotations
 
@@ -8,15 +8,12 @@ from importlib.resources import as_file, files
 from pathlib import Path
 
 import numpy as np
-import onnxruntime
 
 from sigmaslam.bounded_files import read_bytes, shorten
 from sigmaslam.errors import InputError
+from sigmaslam.inference.session import RUNTIME_VERSION, open_session
 from sigmaslam.inference.weight_manifest import check_weights
 
-# This fusion moves a constant factor into a float32 attribute of the product, even if the product is float64. The
-# covariances of the filter would be wrong in the eighth digit.
-_DISABLED = ["MatMulScaleFusion"]
 BACKENDS = ("onnx", "torch")
 _GRAPH_BYTES = 1 << 31
 
@@ -31,28 +28,26 @@ class OnnxGraph:
     Args:
         path: .onnx file.
         threads: within one operator; results are the same bit for bit as long as it does not change.
+        provider: where it computes, one of `sigmaslam.inference.session.PROVIDERS`.
     Raises:
-        InputError: the file is missing, not the one that its manifest names, or no usable graph.
+        InputError: the file is missing, not the one that its manifest names, or no usable graph, or the provider is
+            not installed.
     """
 
-    def __init__(self, path: Path, threads: int = 1) -> None:
+    def __init__(self, path: Path, threads: int = 1, provider: str = "cpu") -> None:
         self._path = path
         if not path.is_file():
             raise InputError(f"{path} does not exist: reinstall the package, or export the graph again")
         content = read_bytes(path, _GRAPH_BYTES, "the graph")
         check_weights(path, content)
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
-        options.inter_op_num_threads = 1
-        # Several sessions take turns. A session that spins while it waits halves the speed of the others.
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        options.log_severity_level = 3
         try:
-            self._session = onnxruntime.InferenceSession(
-                content, options, providers=["CPUExecutionProvider"], disabled_optimizers=_DISABLED
-            )
+            self._session = open_session(content, threads, provider)
+        except InputError:
+            raise
         except Exception as error:  # onnxruntime raises its own types, none of them public
-            raise InputError(f"{path} is not a graph that ONNX Runtime can load: {error}") from error
+            raise InputError(
+                f"{path} is not a graph that ONNX Runtime {RUNTIME_VERSION} can load, or it is older than 1.29: {error}"
+            ) from error
         self.outputs: Sequence[str] = [output.name for output in self._session.get_outputs()]
 
     def __call__(self, feed: Mapping[str, np.ndarray]) -> list[np.ndarray]:

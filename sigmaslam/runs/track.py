@@ -50,13 +50,14 @@ def track_sequence(
     findings: Sequence[Finding] = (),
     denoise: bool = False,
     resume: bool = False,
+    provider: str = "cpu",
 ) -> dict[str, Any]:
     """Tracks a sequence and writes the run folder; partial results are kept when it is stopped or fails.
 
     Args:
         sequence: opened by `sigmaslam.readers.open_sequence` or `open_cameras`.
         out: run folder, new or empty.
-        frontend, backend, config, threads: of `StereoTracker`.
+        frontend, backend, config, threads, provider: of `StereoTracker`.
         map_path: map.npz of an earlier run; poses are in its world.
         tracks: write tracks.npz, too, the observations of keyframes for `sigmaslam refine`.
         track_object: box or mask, see `read_region`: the camera is at rest and follows one body. Poses are then
@@ -87,6 +88,7 @@ def track_sequence(
         "format": sequence.format,
         "frontend": frontend,
         "backend": backend,
+        "provider": provider,
         "map": None if map_path is None else printable(map_path),
         "configuration": asdict(config or (TrackerConfig() if track_object is None else OBJECT_CONFIG)),
         "calibration": describe_camera(sequence.camera),
@@ -95,7 +97,7 @@ def track_sequence(
     if stopped is not None:
         stopped.check_sequence(sequence)
     start = None if stopped is None else stopped.start
-    tracker = _build_tracker(sequence, frontend, backend, config, track_object, threads, start)
+    tracker = _build_tracker(sequence, frontend, backend, config, track_object, threads, start, provider)
     location = None if locations is None else LocationFilter(locations, track_object is not None)
     rectified = None
     if isinstance(tracker, StereoTracker):
@@ -227,11 +229,14 @@ def _build_tracker(
     track_object: str | None,
     threads: int,
     start: StartPose | None,
+    provider: str,
 ) -> Tracker:
     if track_object is None:
-        return StereoTracker(sequence.camera, frontend, backend, config, threads=threads, start=start)
+        return StereoTracker(
+            sequence.camera, frontend, backend, config, threads=threads, start=start, provider=provider
+        )
     region = read_region(track_object, sequence.camera.left.width, sequence.camera.left.height)
-    return ObjectTracker(sequence.camera, region, frontend, backend, config, threads)
+    return ObjectTracker(sequence.camera, region, frontend, backend, config, threads, provider)
 
 
 def _check_can_resume(

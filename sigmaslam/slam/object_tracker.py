@@ -104,7 +104,7 @@ class ObjectTracker:
     Args:
         camera: calibration of the raw images.
         region: (H, W) bool, where the body is in the first raw left image; background inside does little harm.
-        frontend, backend, threads: of `StereoTracker`.
+        frontend, backend, threads, provider: of `StereoTracker`.
         config: likewise; by default `OBJECT_CONFIG`, with more acceleration.
     Raises:
         InputError: an argument is of another type or size, or nothing is in the region.
@@ -118,6 +118,7 @@ class ObjectTracker:
         backend: str = "onnx",
         config: TrackerConfig | None = None,
         threads: int = 2,
+        provider: str = "cpu",
     ) -> None:
         check_tracker_arguments(camera, frontend, backend, config, threads)
         check_region(region, camera)
@@ -125,7 +126,7 @@ class ObjectTracker:
         rectifier = StereoRectifier(camera)
         self._T_left_rectified = se3_inverse(rectifier.T_rectified_left)
         if isinstance(frontend, str):
-            frontend = build_frontend(frontend, config.max_keypoints, backend, threads)
+            frontend = build_frontend(frontend, config.max_keypoints, backend, threads, provider)
         raw = region.astype(np.uint8) * 255
         rectified_region = rectifier.rectify(raw, raw)[0] > 127
         self._body = BodyAdmission(rectifier.rectified, rectified_region, frontend, config)

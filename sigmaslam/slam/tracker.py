@@ -65,11 +65,13 @@ class StereoTracker:
             tracking of its frame. The results are the same whether it was foreseen or not.
         start: pose of the first frame in the world of an earlier run, in which it was a keyframe; by default the left
             camera of the first frame is the world.
+        provider: where ONNX Runtime computes the networks, "cpu", "cuda" or "openvino"; the estimator stays on the CPU.
 
     Attributes:
         last_frame: what the last frame saw, for pictures; None before the first.
     Raises:
-        InputError: an argument is of another type, or there is no such front-end or backend.
+        InputError: an argument is of another type, or there is no such front-end or backend, or the provider is
+            not installed.
     """
 
     def __init__(
@@ -81,6 +83,7 @@ class StereoTracker:
         admission: LandmarkAdmission | None = None,
         threads: int = 2,
         start: StartPose | None = None,
+        provider: str = "cpu",
     ) -> None:
         check_tracker_arguments(camera, frontend, backend, config, threads)
         self.config = config = config or TrackerConfig()
@@ -88,7 +91,7 @@ class StereoTracker:
         self._camera = rectified = self._rectifier.rectified
         self._T_rectified_left = self._rectifier.T_rectified_left
         if isinstance(frontend, str):
-            frontend = build_frontend(frontend, config.max_keypoints, backend, threads)
+            frontend = build_frontend(frontend, config.max_keypoints, backend, threads, provider)
         self._frontend = frontend
         self._blas = ThreadpoolController()
         self._beside = ThreadPoolExecutor(1, "keyframe") if threads > 1 else None

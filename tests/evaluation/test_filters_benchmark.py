@@ -7,7 +7,8 @@ import pytest
 
 from sigmaslam.evaluation.filters import ours as filter_ours
 from sigmaslam.evaluation.filters import work as filter_work
-from sigmaslam.evaluation.filters.speed import Contender, Timing, time_interleaved
+from sigmaslam.evaluation.filters.peer_filters import PEERS
+from sigmaslam.evaluation.filters.speed import KINDS, Contender, Timing, batch_contenders, time_interleaved
 
 
 @pytest.mark.parametrize("points", [3, 30])
@@ -23,6 +24,21 @@ def test_our_stereo_step_is_the_references(points: int, dtype: str, tolerance: f
 def test_our_batched_step_is_the_references(kind: str, batch: int, dtype: str, tolerance: float):
     work = getattr(filter_work, kind)(batch, seed=1)
     check(work, filter_work.step_loop(work), dtype, tolerance)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_numpy_has_a_row_that_steps_the_whole_batch_at_once(kind: str):
+    """The reference beside it is a loop, and stops at a thousand filters."""
+    batch, seed = 1200, 0  # the benchmark's seed
+    peers = [peer for peer in PEERS if peer.modules == ("numpy",)]
+    rows = {contender.name: (contender, size) for contender, size in batch_contenders(kind, batch, peers, False)}
+    batched, size = rows["numpy batched"]
+    assert (rows["plain numpy"][1], size) == (1000, batch)
+    mean, covariance = batched.step()
+    expected = filter_work.step_loop(getattr(filter_work, kind)(batch, seed))
+    sigma = np.sqrt(np.diagonal(expected[1], axis1=-2, axis2=-1))
+    assert np.abs((mean - expected[0]) / sigma).max() < 1e-9
+    assert np.abs((covariance - expected[1]) / (sigma[..., :, None] * sigma[..., None, :])).max() < 1e-9
 
 
 def check(work: filter_work.Work, expected: filter_work.Belief, dtype: str, tolerance: float) -> None:

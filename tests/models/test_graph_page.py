@@ -9,8 +9,9 @@ import pytest
 
 from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.inference.onnx_graph import shipped_weights
+from sigmaslam.models import onnx_export
 from sigmaslam.models.graph_page import PAGE_COMMAND, TEXTS, graph_page
-from sigmaslam.models.onnx_export import check_graphs
+from sigmaslam.models.onnx_export import check_graphs, check_networks
 
 WEIGHTS = shipped_weights("features.onnx").parent
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "onnx.md"
@@ -52,3 +53,25 @@ def test_a_graph_that_nobody_knows_is_named(tmp_path):
     with pytest.raises(InputError, match=r"other\.onnx"):
         check_graphs(tmp_path)
     assert "## other.onnx" in graph_page(tmp_path, "command")
+
+
+def test_the_cpu_is_checked_against_itself():
+    checks = check_networks(WEIGHTS, "cpu")
+    assert set(checks) == {"features", "scorer", "verifier", "place_verifier"}
+    for check in checks.values():
+        assert check.difference == 0.0
+        assert min(check.on_cpu.wall_ms, check.on_provider.process_ms) > 0.0
+
+
+def test_a_provider_that_computes_something_else_is_found(monkeypatch):
+    calls = []
+    right = onnx_export._timed
+
+    def wrong_on_the_provider(graph, feed):
+        outputs, times = right(graph, feed)
+        calls.append(graph)
+        return [each * (1.0 + 1e-3 * (len(calls) % 2 == 0)) for each in outputs], times
+
+    monkeypatch.setattr(onnx_export, "_timed", wrong_on_the_provider)
+    with pytest.raises(SigmaSlamError, match=r"features\.onnx on the provider cpu differs from the CPU by"):
+        check_networks(WEIGHTS, "cpu")
