@@ -47,3 +47,21 @@ def test_wrong_options_are_refused(folder, tmp_path):
     assert_refused(run_here("localize", tmp_path / "nowhere", "--out", out), "nowhere", "is not there")
     assert_refused(run_here("localize", folder, "--out", folder), "not an empty folder")
     assert not out.exists()
+
+
+def test_filters_are_compared_on_the_same_recording(folder, tmp_path):
+    out = tmp_path / "out"
+    result = run_here("localize", folder, "--out", out, "--compare")
+    assert result.returncode == 0, result.stderr
+    with (out / "comparison.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["filter"] for row in rows] == ["ukf", "ekf", "iterated"]
+    for row in rows:
+        run = json.loads((out / row["filter"] / "run.json").read_text())
+        assert run["filter"] == row["filter"]
+        (summary,) = run["robots"].values()
+        for label in ("position_rmse", "heading_rmse", "nees_mean", "nis_per_dof"):
+            assert float(row[label]) == summary[label]
+        assert float(row["cpu_seconds"]) > 0
+    # Three filters, not one under three names.
+    assert len({row["position_rmse"] for row in rows}) == 3
