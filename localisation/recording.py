@@ -48,6 +48,8 @@ class Recording:
         landmarks: (L, 2) in the world, metres.
         lever: metres by which the sensor stands ahead of the robot's centre.
         truth: None if there is none.
+        odometry: whether the controls are measured at the wheels. A command comes before its motion, so the robot is
+            late; odometry comes with it, so a delay is that of the sightings.
     """
 
     name: str
@@ -60,6 +62,7 @@ class Recording:
     landmarks: np.ndarray
     lever: float = 0.0
     truth: PlanarTruth | None = None
+    odometry: bool = False
 
     def within(self, largest_range: float) -> Recording:
         """The recording without sightings from further away, metres."""

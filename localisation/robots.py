@@ -17,7 +17,7 @@ from sigmaslam.localisation.steps import Steps, make_steps
 from sigmaslam.localisation.wheeled_robot import CONSTANTS, SPACE, WheeledRobot
 
 DELAYS = (0.0, 0.1, 0.2, 0.3, 0.4)
-"""Seconds by which a robot may follow its controls; the most likely one is taken."""
+"""Seconds by which a robot may follow its commands, or sightings its odometry; the most likely one is taken."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,7 +34,7 @@ class RobotEstimate:
         innovation: (K + 1, L, m), NaN for none.
         nis: (K + 1, L) of each sighting, of m degrees of freedom.
         weight: (K + 1, L) by robust weights.
-        delay: seconds by which the robot follows its controls.
+        delay: seconds by which the robot follows its commands, or the sightings its odometry.
         constants: value and standard deviation of each by its name, at the end.
         scale: (m,) standard deviation of the sightings over the nominal one, at the end.
         truth: None if there is none.

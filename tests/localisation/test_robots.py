@@ -1,5 +1,7 @@
 """Robots in a world that is known: accuracy, consistency, and faults that the filter must find or stand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -26,6 +28,17 @@ def test_a_robot_with_faults_is_found_and_so_are_its_faults(kind):
         assert abs(value - true) < 3.5 * deviation
     assert 0.03 < innovation_statistics(estimate)["outliers"] < 0.25
     assert len(first[0].pose) == len(estimate.pose)
+
+
+def test_sightings_that_come_late_do_not_shift_the_poses_in_time():
+    """Taken for a robot that follows its controls late, the same recording gives the poses of a while before."""
+    recording = drive(World(seconds=40.0, late=0.3, seed=6))
+    right, wrong = (
+        score(localise_robots([replace(recording, odometry=odometry)])[1][0]) for odometry in (True, False)
+    )
+    assert right["heading_rmse"] < 0.6 * wrong["heading_rmse"]
+    # The 90 % quantile of chi-square with three degrees of freedom, for the median.
+    assert right["nees_median"] < 6.25 < wrong["nees_median"]
 
 
 def test_filters_agree_on_a_gentle_problem():
@@ -55,8 +68,6 @@ def test_robots_of_a_batch_are_what_they_are_alone():
 
 
 def test_without_a_truth_a_start_is_asked_for():
-    from dataclasses import replace
-
     recording = replace(drive(World(seconds=5.0)), truth=None)
     with pytest.raises(InputError, match="--start X,Y,HEADING"):
         localise_robots([recording])
