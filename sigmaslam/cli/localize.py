@@ -37,12 +37,22 @@ class FilterKind(StrEnum):
     iterated = "iterated"
 
 
+class MapKind(StrEnum):
+    """Whether the places of the landmarks are known."""
+
+    known = "known"
+    unknown = "unknown"
+
+
 def localize(
     path: Annotated[Path, typer.Argument(help="Folder (MRCLAM or CSV) or .mat file of a recording.")],
     out: Annotated[Path, typer.Option(help="Folder, new or empty.")],
     format: Annotated[RecordingFormat, typer.Option(help="Kind of recording.")] = RecordingFormat["auto"],
     robot: Annotated[int | None, typer.Option(help="Number of a robot.", show_default="all, as one batch")] = None,
     filter: Annotated[FilterKind, typer.Option(help="Unscented, extended or iterated unscented.")] = FilterKind["ukf"],
+    map: Annotated[
+        MapKind, typer.Option(help="Places of the landmarks: as the recording has them, or to be found on the way.")
+    ] = MapKind["known"],
     compare: Annotated[
         bool, typer.Option("--compare", help="All filters one after the other, each in a folder of its name.")
     ] = False,
@@ -58,7 +68,9 @@ def localize(
 
     Writes trajectory.csv with covariance and belief, trajectory_first_pass.csv, innovations.csv, run.json, map.png and
     report.html. Noise, delay and systematic errors are found from the recording's innovations, not from its truth.
-    With --compare there is such a folder for each filter, and comparison.csv with errors, consistency and time of all.
+    With --map unknown the landmarks are found as well, and landmarks.csv is written (SLAM; which landmark a sighting is
+    of is known). With --compare there is such a folder for each filter, and comparison.csv with errors, consistency and
+    time of all.
     """
     need_train_extra()
     from sigmaslam.localisation.formats import detect_format
@@ -70,7 +82,9 @@ def localize(
     kind = detect_format(path) if format is RecordingFormat.auto else format.value
     if kind == "starry" and (robot is not None or first_pose is not None or max_range is not None):
         raise InputError("--robot, --start and --max-range are for robots in the plane: leave them out here")
-    settings = {"source": str(path), "format": kind, "max_range": max_range, "start": start}
+    if kind == "starry" and map is MapKind.unknown:
+        raise InputError("--map unknown is for robots in the plane: leave it out here")
+    settings = {"source": str(path), "format": kind, "max_range": max_range, "start": start, "map": map.value}
     rows: list[_Row] = []
     with Console(stderr=True).status("reading") as status:
         for name in [each.value for each in FilterKind] if compare else [filter.value]:
@@ -102,14 +116,15 @@ def _localise_robots(
     from sigmaslam.localisation.output import write_robots
     from sigmaslam.localisation.robots import localise_robots
 
-    recordings = read_recordings(path, kind, robot)
+    mapping = settings["map"] == MapKind.unknown
+    recordings = read_recordings(path, kind, robot, mapping)
     if max_range is not None:
         recordings = [recording.within(max_range) for recording in recordings]
     begin = time.process_time()
-    first, second = localise_robots(recordings, settings["filter"], start, tell)
+    first, second = localise_robots(recordings, settings["filter"], start, tell, mapping)
     seconds = time.process_time() - begin
     make_folder(out)
-    summaries = write_robots(out, path.resolve().name, first, second, recordings[0].landmarks, settings)
+    summaries = write_robots(out, path.resolve().name, first, second, recordings, settings)
     # The robots are one batch: each has the time of all.
     return {name: {**summary, "cpu_seconds": seconds} for name, summary in summaries.items()}
 
@@ -145,6 +160,9 @@ _SHOWN = (
     "rotation_rmse",
     "nees_median",
     "nees_mean",
+    "landmark_rmse",
+    "landmark_rmse_aligned",
+    "landmark_nees",
     "nis_per_dof",
     "delay",
     "cpu_seconds",
