@@ -15,17 +15,23 @@ LONGEST_GAP = 0.5
 """Seconds between poses of the truth above which nothing is interpolated."""
 
 
-def read_csv_folder(folder: Path) -> Recording:
+def read_csv_folder(folder: Path, mapping: bool = False) -> Recording:
     """One robot's recording.
 
     The files are landmarks.csv (landmark,x,y), controls.csv (time,speed,turn_rate), sightings.csv
     (time,landmark,range,bearing or time,landmark,ahead,left) and, if there is a truth, truth.csv (time,x,y,heading):
     seconds, metres, radians.
 
+    Args:
+        folder: of the files.
+        mapping: the landmarks are to be found, so landmarks.csv need not be there, nor name them all.
     Raises:
         InputError: a file is missing, or has other columns, or names a landmark that is not in the map.
     """
-    names, places = _read(folder / "landmarks.csv", ["landmark", "x", "y"], named=0)
+    names: list[str] = []
+    places = np.zeros((0, 2))
+    if not mapping or (folder / "landmarks.csv").is_file():
+        names, places = _read(folder / "landmarks.csv", ["landmark", "x", "y"], named=0)
     _, controls = _read(folder / "controls.csv", ["time", "speed", "turn_rate"])
     path = folder / "sightings.csv"
     kind = next((kind for kind, columns in KINDS.items() if columns == _header(path)[2:]), None)
@@ -34,10 +40,14 @@ def read_csv_folder(folder: Path) -> Recording:
             f"{path}: the header is {','.join(_header(path))}, not time,landmark,range,bearing or ..,ahead,left"
         )
     seen, sightings = _read(path, ["time", "landmark", *KINDS[kind]], named=1)
+    unknown = sorted(set(seen) - set(names))
+    if unknown and not mapping:
+        raise InputError(
+            f"{path}: landmark {unknown[0]} is not in landmarks.csv: add it there, leave it out here, or find the map"
+            " by --map unknown"
+        )
+    names, places = names + unknown, np.vstack([places, np.full((len(unknown), 2), np.nan)])
     index = {name: place for place, name in enumerate(names)}
-    unknown = sorted(set(seen) - set(index))
-    if unknown:
-        raise InputError(f"{path}: landmark {unknown[0]} is not in landmarks.csv: add it there, or leave it out here")
     controls = controls[np.argsort(controls[:, 0], kind="stable")]
     controls = controls[np.append(np.diff(controls[:, 0]) > 0, True)]
     order = np.argsort(sightings[:, 0], kind="stable")
@@ -56,6 +66,7 @@ def read_csv_folder(folder: Path) -> Recording:
         kind,
         places,
         truth=truth,
+        names=tuple(names),
     )
 
 

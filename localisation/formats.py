@@ -18,7 +18,7 @@ def detect_format(path: Path) -> str:
         InputError: it is none that is known.
     """
     if path.is_dir():
-        if (path / "landmarks.csv").is_file():
+        if (path / "sightings.csv").is_file() or (path / "landmarks.csv").is_file():
             return "csv"
         if find_robots(path):
             return "mrclam"
@@ -30,8 +30,8 @@ def detect_format(path: Path) -> str:
     )
 
 
-def read_recordings(path: Path, kind: str, robot: int | None) -> list[Recording]:
-    """The recordings of a path of wheeled robots: of one robot, or of all.
+def read_recordings(path: Path, kind: str, robot: int | None, mapping: bool = False) -> list[Recording]:
+    """The recordings of a path of wheeled robots: of one robot, or of all; for mapping, landmarks need no places.
 
     Raises:
         InputError: a file is wrong, or there is no such robot.
@@ -43,4 +43,4 @@ def read_recordings(path: Path, kind: str, robot: int | None) -> list[Recording]
         return [read_mrclam(path, number) for number in ([robot] if robot is not None else robots)]
     if robot is not None:
         raise InputError(f"{path}: a recording of this format has one robot: leave out --robot")
-    return [read_tubes(path) if kind == "tubes" else read_csv_folder(path)]
+    return [read_tubes(path) if kind == "tubes" else read_csv_folder(path, mapping)]

@@ -51,13 +51,23 @@ class Platform(Protocol):
         ...
 
 
+class Admission(Protocol):
+    """Takes landmarks into the state at their first sighting; see `MappingRobot.admit`."""
+
+    def __call__(
+        self, bayes: BayesFilter, belief: Gaussian, value: Tensor, variance: Tensor, landmark: Tensor, new: Tensor
+    ) -> Gaussian:
+        """The belief with the new landmarks."""
+        ...
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Localisation:
     """What a filter says of each step; time first, then robots.
 
     Attributes:
-        mean: (K + 1, B, p) points of the state's space; the first is the start.
-        covariance: (K + 1, B, n, n) of the tangent.
+        mean: (K + 1, B, p) points of the state's space, or what was to be kept of them; the first is the start.
+        covariance: (K + 1, B, n, n) of the tangent, likewise.
         nis: (K, B, L) squared normalised innovation of each sighting; NaN for none.
         weight: (K, B, L) that robust weights leave of a sighting.
         innovation: (K, B, L, m), NaN for none.
@@ -94,6 +104,8 @@ def localise(
     steps: Steps,
     scale: Tensor | None = None,
     tell: Callable[[float], None] | None = None,
+    admit: Admission | None = None,
+    kept: int | None = None,
 ) -> Localisation:
     """Filter all robots at once.
 
@@ -104,19 +116,27 @@ def localise(
         steps: (K, B) motions and sightings.
         scale: (B, m) variance of the noise at the start, over the nominal one; None: 1.
         tell: called with the share that is done.
+        admit: for a map that is not known: first sightings go to it and update nothing, and the measurement's input is
+            the number of the landmark (..., 1) instead of its place.
+        kept: components of the state whose history is returned, in points and tangents; None: all.
     """
     K, B, L, m = steps.value.shape
     path, duration, value, position = (
         torch.from_numpy(column) for column in (steps.path, steps.duration, steps.value, steps.position)
     )
     present = ~value.isnan().any(dim=-1)
+    landmark, new = torch.from_numpy(steps.landmark), torch.zeros_like(present)
+    if admit is not None:
+        new = present & torch.from_numpy(steps.since).isinf()
+        present, position = present & ~new, landmark[..., None]
+    admitted = new.any(dim=-1).any(dim=-1).tolist()
     anything = present.any(dim=-1).any(dim=-1).tolist()
     growth = repetition(torch.from_numpy(steps.since))
     nominal = platform.variance(value)
     noise = NoiseScale(torch.ones(B, m, dtype=torch.float64) if scale is None else scale)
     see = several(platform.measurement(), L)
     belief = prior
-    means, covariances = [belief.mean], [belief.covariance]
+    means, covariances = [belief.mean[:, :kept]], [belief.covariance[:, :kept, :kept]]
     nis = torch.full((K, B, L), torch.nan, dtype=torch.float64)
     weight, innovation, scales = torch.ones(K, B, L), torch.full_like(value, torch.nan), torch.ones(K, B, m)
     log_likelihood = torch.zeros(B, dtype=torch.float64)
@@ -125,7 +145,8 @@ def localise(
             tell(k / K)
         belief = bayes.predict(belief, platform.motion(path[k], duration[k]), path[k], duration[k, :, None]).belief
         if anything[k]:
-            there, inputs = present[k], (value[k].flatten(-2), position[k])
+            there = present[k]
+            inputs = torch.where(there[..., None], value[k], torch.nan).flatten(-2), position[k]
             expected = torch.where(there[..., None], nominal[k] * noise.scale[:, None], 1.0)
             noisy = replace(see, noise=Diagonal((expected * growth[k, ..., None]).flatten(-2)))
             updated = bayes.update(belief, noisy, *inputs, robust="student_t")
@@ -137,9 +158,13 @@ def localise(
             nis[k] = torch.where(there, sighted.distance, torch.nan)
             innovation[k] = torch.where(there[..., None], sighted.innovation, torch.nan)
             weight[k] = torch.where(there, sighted.weight, 1.0)
+        if admit is not None and admitted[k]:
+            # The variance of Student's t: a first sighting may be an outlier, and nothing tells.
+            spread = nominal[k] * noise.scale[:, None] * (STUDENT_DOF / (STUDENT_DOF - 2.0))
+            belief = admit(bayes, belief, value[k], spread, landmark[k], new[k])
         scales[k] = noise.scale
-        means.append(belief.mean)
-        covariances.append(belief.covariance)
+        means.append(belief.mean[:, :kept])
+        covariances.append(belief.covariance[:, :kept, :kept])
     return Localisation(
         torch.stack(means).numpy(),
         torch.stack(covariances).numpy(),

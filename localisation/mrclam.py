@@ -54,6 +54,7 @@ def read_mrclam(folder: Path, robot: int) -> Recording:
         "range-bearing",
         landmarks[:, 1:3],
         truth=_read_truth(folder, robot),
+        names=tuple(f"{subject:.0f}" for subject in landmarks[:, 0]),
     )
 
 

@@ -11,8 +11,9 @@ import numpy as np
 
 from sigmaslam.files import atomic_path, atomic_write_text
 from sigmaslam.localisation.page import draw_robots, write_page
+from sigmaslam.localisation.recording import Recording
 from sigmaslam.localisation.robots import RobotEstimate
-from sigmaslam.localisation.scores import innovation_statistics, score
+from sigmaslam.localisation.scores import innovation_statistics, score, score_map
 
 TRAJECTORY_COLUMNS = "robot,time,x,y,heading,cov_xx,cov_xy,cov_xh,cov_yy,cov_yh,cov_hh,belief,sightings"
 
@@ -22,7 +23,7 @@ def write_robots(
     name: str,
     first: Sequence[RobotEstimate],
     second: Sequence[RobotEstimate],
-    landmarks: np.ndarray,
+    recordings: Sequence[Recording],
     settings: Mapping[str, Any],
 ) -> dict[str, dict[str, Any]]:
     """Write all files into a folder that is there.
@@ -30,14 +31,19 @@ def write_robots(
     Returns:
         The summary of the second pass by robot, as in run.json.
     """
+    names = recordings[0].landmark_names
     write_trajectories(folder / "trajectory.csv", second)
     write_trajectories(folder / "trajectory_first_pass.csv", first)
     _write_innovations(folder / "innovations.csv", second)
+    if any(estimate.map is not None for estimate in second):
+        _write_maps(folder / "landmarks.csv", second, names)
     summaries = {estimate.name: summarise(estimate) for estimate in second}
     at_first = {estimate.name: summarise(estimate) for estimate in first}
     run = {**settings, "robots": summaries, "first_pass": at_first}
     atomic_write_text(folder / "run.json", json.dumps(run, indent=2) + "\n")
-    write_page(folder / "report.html", name, summaries, draw_robots(second, landmarks, folder / "map.png"))
+    write_page(
+        folder / "report.html", name, summaries, draw_robots(second, recordings[0].landmarks, folder / "map.png")
+    )
     return summaries
 
 
@@ -49,7 +55,15 @@ def summarise(estimate: RobotEstimate) -> dict[str, Any]:
         for suffix, value in zip(("", "_sigma"), pair, strict=True)
     }
     scale = {f"noise_scale_{index}": float(value) for index, value in enumerate(estimate.scale)}
-    return {**score(estimate), **innovation_statistics(estimate), "delay": estimate.delay, **scale, **constants}
+    of_map = {} if estimate.map is None else score_map(estimate.map)
+    return {
+        **score(estimate),
+        **of_map,
+        **innovation_statistics(estimate),
+        "delay": estimate.delay,
+        **scale,
+        **constants,
+    }
 
 
 def write_trajectories(path: Path, estimates: Sequence[RobotEstimate]) -> None:
@@ -83,6 +97,21 @@ def _write_innovations(path: Path, estimates: Sequence[RobotEstimate]) -> None:
                     f"{estimate.name},{estimate.seconds[row]:.6f},{estimate.seen[row, slot]},"
                     f"{','.join(f'{number:.6g}' for number in numbers)}"
                 )
+
+    write_lines(path, lines())
+
+
+def _write_maps(path: Path, estimates: Sequence[RobotEstimate], names: Sequence[str]) -> None:
+    """Places that the robots found, metres, and their covariances."""
+
+    def lines() -> Iterable[str]:
+        yield "robot,landmark,x,y,cov_xx,cov_xy,cov_yy"
+        for estimate in estimates:
+            found = estimate.map
+            assert found is not None
+            for row, (landmark, (x, y)) in enumerate(zip(found.landmark, found.place, strict=True)):
+                (xx, xy), (_, yy) = found.covariance[2 * row : 2 * row + 2, 2 * row : 2 * row + 2]
+                yield f"{estimate.name},{names[landmark]},{','.join(f'{each:.9g}' for each in (x, y, xx, xy, yy))}"
 
     write_lines(path, lines())
 

@@ -16,6 +16,7 @@ from sigmaslam.plot_style import BLUE, GREEN, GREY, NO_MATPLOTLIB, SERIES, has_m
 from sigmaslam.runs.figures import save_png, to_svg
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 ELLIPSES = 60
@@ -95,8 +96,6 @@ def draw_robots(estimates: Sequence[RobotEstimate], landmarks: np.ndarray, png: 
 
 
 def _draw_map(figure: Figure, estimates: Sequence[RobotEstimate], landmarks: np.ndarray) -> None:
-    from matplotlib.patches import Ellipse
-
     axes = figure.add_subplot()
     for estimate, colour in zip(estimates, _colours(estimates), strict=True):
         if estimate.truth is not None:
@@ -104,26 +103,29 @@ def _draw_map(figure: Figure, estimates: Sequence[RobotEstimate], landmarks: np.
         axes.plot(*estimate.pose[:, :2].T, color=colour, lw=1.0, label=estimate.name, rasterized=True)
         axes.plot(*estimate.pose[0, :2], "o", ms=5, color=colour)
         for index in np.linspace(0, len(estimate.pose) - 1, ELLIPSES).astype(int):
-            variances, directions = np.linalg.eigh(estimate.covariance[index, :2, :2])
-            width, height = 2 * SIGMAS * np.sqrt(np.maximum(variances, 0.0))
-            angle = np.degrees(np.arctan2(directions[1, 0], directions[0, 0]))
-            axes.add_patch(
-                Ellipse(
-                    tuple(estimate.pose[index, :2].tolist()),
-                    width,
-                    height,
-                    angle=angle,
-                    fill=False,
-                    color=colour,
-                    lw=0.6,
+            _draw_ellipse(axes, estimate.pose[index, :2], estimate.covariance[index, :2, :2], colour)
+        if estimate.map is not None:
+            axes.plot(*estimate.map.place.T, "+", ms=7, color=colour)
+            for row, place in enumerate(estimate.map.place):
+                _draw_ellipse(
+                    axes, place, estimate.map.covariance[2 * row : 2 * row + 2, 2 * row : 2 * row + 2], colour
                 )
-            )
     axes.plot(*landmarks.T, "x", ms=7, mew=1.6, color=GREY)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
     axes.legend(loc="best", fontsize=8)
     style_axes(axes)
+
+
+def _draw_ellipse(axes: Axes, centre: np.ndarray, covariance: np.ndarray, colour: str) -> None:
+    from matplotlib.patches import Ellipse
+
+    variances, directions = np.linalg.eigh(covariance)
+    width, height = 2 * SIGMAS * np.sqrt(np.maximum(variances, 0.0))
+    angle = np.degrees(np.arctan2(directions[1, 0], directions[0, 0]))
+    x, y = centre.tolist()
+    axes.add_patch(Ellipse((x, y), width, height, angle=angle, fill=False, color=colour, lw=0.6))
 
 
 def _colours(estimates: Sequence[RobotEstimate]) -> list[str]:

@@ -45,9 +45,12 @@ class Recording:
         landmark: (S,) index of the landmark seen.
         sightings: (S, 2) of the kind's components.
         kind: "range-bearing" (metres, radians, anticlockwise from ahead) or "cartesian" (metres ahead and to the left).
-        landmarks: (L, 2) in the world, metres.
+        landmarks: (L, 2) in the world, metres; NaN where that is not known.
         lever: metres by which the sensor stands ahead of the robot's centre.
         truth: None if there is none.
+        odometry: whether the controls are measured at the wheels. A command comes before its motion, so the robot is
+            late; odometry comes with it, so a delay is that of the sightings.
+        names: of the landmarks; None: their indices.
     """
 
     name: str
@@ -60,6 +63,13 @@ class Recording:
     landmarks: np.ndarray
     lever: float = 0.0
     truth: PlanarTruth | None = None
+    odometry: bool = False
+    names: tuple[str, ...] | None = None
+
+    @property
+    def landmark_names(self) -> tuple[str, ...]:
+        """Of the landmarks, in the order of their indices."""
+        return tuple(map(str, range(len(self.landmarks)))) if self.names is None else self.names
 
     def within(self, largest_range: float) -> Recording:
         """The recording without sightings from further away, metres."""

@@ -11,13 +11,31 @@ from torch import Tensor
 
 from sigmaslam.errors import InputError
 from sigmaslam.filters import Gaussian, degree_of_belief
-from sigmaslam.localisation.localise import FilterName, Localisation, localise, make_filter
+from sigmaslam.localisation.localise import FilterName, Localisation, Platform, localise, make_filter
+from sigmaslam.localisation.mapping_robot import ROBOT_SIZE, MappingRobot
 from sigmaslam.localisation.recording import PlanarTruth, Recording
 from sigmaslam.localisation.steps import Steps, make_steps
-from sigmaslam.localisation.wheeled_robot import CONSTANTS, SPACE, WheeledRobot
+from sigmaslam.localisation.wheeled_robot import BODY, CONSTANTS, SPACE, WheeledRobot
 
 DELAYS = (0.0, 0.1, 0.2, 0.3, 0.4)
-"""Seconds by which a robot may follow its controls; the most likely one is taken."""
+"""Seconds by which a robot may follow its commands, or sightings its odometry; the most likely one is taken."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LandmarkMap:
+    """Landmarks that a robot found on its way.
+
+    Attributes:
+        landmark: (M,) indices of those that it saw.
+        place: (M, 2) x, y in the world, metres.
+        covariance: (2 M, 2 M) of x, y of the first, x, y of the second, and so on.
+        true: (M, 2) where they are, NaN where that is not known; for scores alone.
+    """
+
+    landmark: np.ndarray
+    place: np.ndarray
+    covariance: np.ndarray
+    true: np.ndarray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,10 +52,11 @@ class RobotEstimate:
         innovation: (K + 1, L, m), NaN for none.
         nis: (K + 1, L) of each sighting, of m degrees of freedom.
         weight: (K + 1, L) by robust weights.
-        delay: seconds by which the robot follows its controls.
+        delay: seconds by which the robot follows its commands, or the sightings its odometry.
         constants: value and standard deviation of each by its name, at the end.
         scale: (m,) standard deviation of the sightings over the nominal one, at the end.
         truth: None if there is none.
+        map: landmarks at the end; None if their places were given.
     """
 
     name: str
@@ -53,6 +72,7 @@ class RobotEstimate:
     constants: dict[str, tuple[float, float]]
     scale: np.ndarray
     truth: PlanarTruth | None
+    map: LandmarkMap | None = None
 
 
 def localise_robots(
@@ -60,6 +80,7 @@ def localise_robots(
     filter_name: FilterName = "ukf",
     start: tuple[float, float, float] | None = None,
     tell: Callable[[str], None] = lambda _: None,
+    mapping: bool = False,
 ) -> tuple[list[RobotEstimate], list[RobotEstimate]]:
     """Estimates of each robot: of the first pass, and of the second.
 
@@ -72,16 +93,23 @@ def localise_robots(
         filter_name: see `make_filter`.
         start: x, y, heading of all robots; None: the first pose of the truth.
         tell: takes a line of progress.
+        mapping: find the places of the landmarks too, each robot for itself; the recordings' are not looked at but for
+            scores. The second pass begins without a map, as the first.
     Raises:
         InputError: there is no pose to start from.
     """
-    platform = WheeledRobot.of(recordings[0])
-    bayes = make_filter(filter_name, SPACE)
+    robot = WheeledRobot.of(recordings[0])
+    mapper = MappingRobot(robot, max(len(each.landmarks) for each in recordings)) if mapping else None
+    platform: Platform = robot if mapper is None else mapper
+    admit = None if mapper is None else mapper.admit
+    bayes = make_filter(filter_name, SPACE if mapper is None else mapper.space)
     count = len(DELAYS)
     steps = make_steps([each for each in recordings for _ in DELAYS], [*DELAYS] * len(recordings))
-    prior = platform.prior(_starts(recordings, steps.seconds[0, ::count], start))
+    prior = (robot if mapper is None else mapper).prior(_starts(recordings, steps.seconds[0, ::count], start))
     repeated = _pick(prior, torch.arange(len(recordings)).repeat_interleave(count))
-    first = localise(bayes, platform, repeated, steps, tell=lambda done: tell(f"first pass: {done:.0%}"))
+    first = localise(
+        bayes, platform, repeated, steps, None, lambda done: tell(f"first pass: {done:.0%}"), admit, ROBOT_SIZE
+    )
     best = first.log_likelihood.reshape(-1, count).argmax(axis=1)
     chosen = np.arange(len(recordings)) * count + best
     delays = [DELAYS[index] for index in best]
@@ -90,7 +118,9 @@ def localise_robots(
     steps = make_steps(recordings, delays)
     prior = _with_constants(prior, _pick(first.final, torch.from_numpy(chosen)))
     scale = torch.from_numpy(first.scale[-1, chosen])
-    second = localise(bayes, platform, prior, steps, scale, lambda done: tell(f"second pass: {done:.0%}"))
+    second = localise(
+        bayes, platform, prior, steps, scale, lambda done: tell(f"second pass: {done:.0%}"), admit, ROBOT_SIZE
+    )
     return at_first, _estimates(recordings, delays, steps, second, np.arange(len(recordings)))
 
 
@@ -113,7 +143,11 @@ def _pick(belief: Gaussian, index: Tensor) -> Gaussian:
 def _with_constants(prior: Gaussian, known: Gaussian) -> Gaussian:
     """The prior's poses, and the constants as they are known."""
     mean, covariance = prior.mean.clone(), prior.covariance.clone()
-    mean[:, 3:], covariance[:, 3:, 3:] = known.mean[:, 3:], known.covariance[:, 3:, 3:]
+    constants = slice(BODY.point_size, ROBOT_SIZE)
+    mean[:, constants], covariance[:, constants, constants] = (
+        known.mean[:, constants],
+        known.covariance[:, constants, constants],
+    )
     return Gaussian(mean, covariance)
 
 
@@ -148,9 +182,20 @@ def _estimates(
                 {name: (float(final[i]), float(deviation[i])) for i, name in enumerate(CONSTANTS, start=3)},
                 np.sqrt(result.scale[K - 1, b]),
                 recording.truth,
+                _map(recording, result.final[int(b)], steps.landmark[:K, b][~np.isnan(steps.value[:K, b, :, 0])]),
             )
         )
     return estimates
+
+
+def _map(recording: Recording, final: Gaussian, seen: np.ndarray) -> LandmarkMap | None:
+    """What the belief at the end says of the landmarks that were seen; None if they are no part of the state."""
+    if final.mean.shape[-1] == ROBOT_SIZE:
+        return None
+    landmark = np.unique(seen)
+    rows = (ROBOT_SIZE + 2 * landmark[:, None] + [0, 1]).ravel()
+    covariance = final.covariance.numpy()[np.ix_(rows, rows)]
+    return LandmarkMap(landmark, final.mean.numpy()[rows].reshape(-1, 2), covariance, recording.landmarks[landmark])
 
 
 def _in_world(pose: np.ndarray, covariance: np.ndarray) -> np.ndarray:

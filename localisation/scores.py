@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sigmaslam.localisation.robots import RobotEstimate
+from sigmaslam.localisation.robots import LandmarkMap, RobotEstimate
 
 RATE = 10.0
 """Poses are compared so often a second, each time with the latest estimate."""
@@ -29,6 +29,34 @@ def score(estimate: RobotEstimate) -> dict[str, float]:
         "heading_rmse": float(np.sqrt(np.mean(error[:, 2] ** 2))),
         "nees_median": float(np.median(nees)),
         "nees_mean": float(np.mean(nees)),
+    }
+
+
+def score_map(landmarks: LandmarkMap) -> dict[str, float]:
+    """Root mean square errors of landmarks, metres, and their NEES; empty without a truth.
+
+    `landmark_rmse` is in the frame of the first pose, `landmark_rmse_aligned` after the rotation and translation that
+    fit best. `landmark_nees` is the mean over landmarks, of two degrees of freedom; `map_nees_per_dof` is of all at
+    once, with their correlations.
+    """
+    there = np.isfinite(landmarks.true).all(axis=1)
+    if not there.any():
+        return {}
+    rows = there.repeat(2)
+    place, true, covariance = landmarks.place[there], landmarks.true[there], landmarks.covariance[np.ix_(rows, rows)]
+    error = true - place
+    blocks = covariance.reshape(len(place), 2, len(place), 2)[np.arange(len(place)), :, np.arange(len(place))]
+    nees = np.einsum("ni,ni->n", error, np.linalg.solve(blocks, error[..., None])[..., 0])
+    flat = error.ravel()
+    # As complex numbers, a rotation is a factor of modulus one.
+    a, b = ((each - each.mean(axis=0)) @ [1.0, 1.0j] for each in (place, true))
+    turn = np.exp(1j * np.angle(np.sum(b * a.conj())))
+    return {
+        "landmarks": len(place),
+        "landmark_rmse": float(np.sqrt(np.mean(np.sum(error**2, axis=1)))),
+        "landmark_rmse_aligned": float(np.sqrt(np.mean(np.abs(b - turn * a) ** 2))),
+        "landmark_nees": float(nees.mean()),
+        "map_nees_per_dof": float(flat @ np.linalg.solve(covariance, flat) / len(flat)),
     }
 
 

@@ -45,7 +45,7 @@ def make_steps(recordings: Sequence[Recording], delays: Sequence[float]) -> Step
 
     Args:
         recordings: of robots that see the same kind of thing.
-        delays: of each recording, seconds by which the robot follows its controls.
+        delays: of each recording, seconds by which the robot follows its commands, or the sightings its odometry.
     """
     robots = [_steps(recording, delay) for recording, delay in zip(recordings, delays, strict=True)]
     length, width = (max(each.value.shape[axis] for each in robots) for axis in (0, 2))
@@ -80,14 +80,15 @@ def _steps(recording: Recording, delay: float) -> Steps:
     start = recording.control_seconds[0]
     if recording.truth is not None:
         start = max(start, recording.truth.seconds[0])
-    used = recording.seconds >= start
-    times, landmark, sightings = recording.seconds[used], recording.landmark[used], recording.sightings[used]
+    late = delay if recording.odometry else 0.0
+    used = recording.seconds - late >= start
+    times, landmark, sightings = recording.seconds[used] - late, recording.landmark[used], recording.sightings[used]
     end = max(recording.control_seconds[-1], *times[-1:], start)
     seconds = _subdivided(np.unique(np.concatenate([[start], times, [end]])))
     if len(times) and times[0] == start:
         # What is seen at the start is seen after a step of no time.
         seconds = np.insert(seconds, 0, start)
-    path = _integrated(recording, delay, seconds)
+    path = _integrated(recording, delay - late, seconds)
     step = np.maximum(np.searchsorted(seconds, times, side="right") - 2, 0)
     slot = slots(step)
     shape = (len(seconds) - 1, int(slot.max(initial=0)) + 1)

@@ -41,6 +41,7 @@ def read_tubes(path: Path) -> Recording:
         file["l"],
         float(file["d"].ravel()[0]),
         truth,
+        odometry=True,
     )
 
 

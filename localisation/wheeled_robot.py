@@ -29,6 +29,7 @@ from sigmaslam.filters import (
     stack,
     wrap_angle,
 )
+from sigmaslam.localisation.derivatives import motion_slope, polar_slope, sighting_slope
 from sigmaslam.localisation.recording import Recording
 
 BODY = SE2("right")
@@ -91,14 +92,27 @@ class WheeledRobot:
             rates[0] ** 2 * duration + rates[1] ** 2 * path[..., i].abs()
             for i, rates in enumerate((self.noise.drive, self.noise.turn))
         ]
-        return MotionModel(_drive, Diagonal(torch.stack(variance, dim=-1)), additive=False)
+        noise = Diagonal(torch.stack(variance, dim=-1))
+        return MotionModel(_drive, noise, additive=False, jacobian=motion_slope)
 
     def measurement(self) -> MeasurementModel:
         """Sighting of one landmark (..., 2), of unit noise."""
         unit = Diagonal(torch.ones(2, dtype=torch.float64))
         if self.kind == "cartesian":
-            return MeasurementModel(self._seen_at, unit)
-        return MeasurementModel(self._distance_and_bearing, unit, residual=_wrapped_difference)
+            return MeasurementModel(self._seen_at, unit, jacobian=self._slope)
+        return MeasurementModel(self._distance_and_bearing, unit, residual=_wrapped_difference, jacobian=self._slope)
+
+    def slopes(self, state: Tensor, landmark: Tensor) -> tuple[Tensor, Tensor]:
+        """Derivatives of a sighting by the first ten components' tangents (..., 2, 10), and by the landmark."""
+        seen = self._seen_at(state, landmark)
+        by_state, by_landmark = sighting_slope(state, landmark, seen, self.lever)
+        if self.kind == "cartesian":
+            return by_state, by_landmark
+        polar = polar_slope(seen)
+        return polar @ by_state, polar @ by_landmark
+
+    def _slope(self, state: Tensor, landmark: Tensor) -> Tensor:
+        return self.slopes(state, landmark)[0]
 
     def variance(self, value: Tensor) -> Tensor:
         """Variances (..., 2) of sightings (..., 2), from the distance that was measured."""
@@ -108,6 +122,17 @@ class WheeledRobot:
             return (constant**2 + share**2 * squared).expand_as(value)
         distance = constant**2 + (share * value[..., 0]) ** 2
         return torch.stack([distance, torch.full_like(distance, self.noise.bearing**2)], dim=-1)
+
+    def place(self, state: Tensor, value: Tensor) -> Tensor:
+        """Where in the world (..., 2) a landmark is of which that was seen, the inverse of (9.45)."""
+        ahead, left = value[..., 0], value[..., 1]
+        if self.kind == "range-bearing":
+            ahead, left = value[..., 0] * torch.cos(value[..., 1]), value[..., 0] * torch.sin(value[..., 1])
+        scale = 1.0 / (1.0 + state[..., 9])
+        sine, cosine = torch.sin(state[..., 8]), torch.cos(state[..., 8])
+        ahead, left = scale * (cosine * ahead + sine * left) + self.lever, scale * (cosine * left - sine * ahead)
+        sine, cosine = torch.sin(state[..., 2]), torch.cos(state[..., 2])
+        return stack([state[..., 0] + cosine * ahead - sine * left, state[..., 1] + sine * ahead + cosine * left])
 
     def _seen_at(self, state: Tensor, landmark: Tensor) -> Tensor:
         """Metres ahead of the sensor and to its left (..., 2), (9.45)."""

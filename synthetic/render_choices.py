@@ -2,6 +2,7 @@
 
 PRESET_NAMES = ("room", "street", "drone", "colon", "organ", "tool", "rubble")
 SENSOR_NAMES = ("ideal", "normal", "harsh", "slow")
-MOTIONS = ("normal", "stops", "rotation", "loop", "rest", "shaken")
+MOTIONS = ("normal", "stops", "rotation", "loop", "rest", "shaken", "planar")
 CARRIED = ("room", "drone", "rubble")  # presets whose camera can be shaken: in a hand or on a drone
+ROLLING = ("room",)  # presets with a floor that a robot can drive on
 TRUTHS = ("dense", "sparse")

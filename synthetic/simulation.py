@@ -14,7 +14,7 @@ from sigmaslam.synthetic.camera.rig import Miscalibration, Rig
 from sigmaslam.synthetic.camera.sensor import Sensor, expose, exposure_gains
 from sigmaslam.synthetic.motion.paths import Path
 from sigmaslam.synthetic.presets import EXPOSURES, PRESETS, SENSORS, Layout
-from sigmaslam.synthetic.render_choices import CARRIED, MOTIONS
+from sigmaslam.synthetic.render_choices import CARRIED, MOTIONS, ROLLING
 from sigmaslam.synthetic.rendering.renderer import RenderedViews, Renderer
 from sigmaslam.synthetic.rendering.visibility import Eye
 from sigmaslam.synthetic.scene import Scene
@@ -78,6 +78,8 @@ class Recipe:
                 f"the motion shaken goes with {', '.join(CARRIED)}, whose camera is carried by hand or "
                 f"flies, not with {self.preset}"
             )
+        if self.motion == "planar" and self.preset not in ROLLING:
+            raise InputError(f"the motion planar goes with {', '.join(ROLLING)}, where there is a level floor")
         if self.profile is not None and self.preset != "street":
             raise InputError(f"a profile of real motion goes with the preset street, not with {self.preset}")
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import csv
+import io
+import time
+from collections.abc import Callable, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,7 +16,7 @@ from rich.table import Table
 
 from sigmaslam.cli.extras import need_train_extra
 from sigmaslam.errors import InputError
-from sigmaslam.files import check_new_folder, make_folder
+from sigmaslam.files import atomic_write_text, check_new_folder, make_folder
 
 
 class RecordingFormat(StrEnum):
@@ -34,12 +37,25 @@ class FilterKind(StrEnum):
     iterated = "iterated"
 
 
+class MapKind(StrEnum):
+    """Whether the places of the landmarks are known."""
+
+    known = "known"
+    unknown = "unknown"
+
+
 def localize(
     path: Annotated[Path, typer.Argument(help="Folder (MRCLAM or CSV) or .mat file of a recording.")],
     out: Annotated[Path, typer.Option(help="Folder, new or empty.")],
     format: Annotated[RecordingFormat, typer.Option(help="Kind of recording.")] = RecordingFormat["auto"],
     robot: Annotated[int | None, typer.Option(help="Number of a robot.", show_default="all, as one batch")] = None,
     filter: Annotated[FilterKind, typer.Option(help="Unscented, extended or iterated unscented.")] = FilterKind["ukf"],
+    map: Annotated[
+        MapKind, typer.Option(help="Places of the landmarks: as the recording has them, or to be found on the way.")
+    ] = MapKind["known"],
+    compare: Annotated[
+        bool, typer.Option("--compare", help="All filters one after the other, each in a folder of its name.")
+    ] = False,
     start: Annotated[
         str | None,
         typer.Option(metavar="X,Y,HEADING", help="First pose: metres, radians.", show_default="that of the truth"),
@@ -52,6 +68,9 @@ def localize(
 
     Writes trajectory.csv with covariance and belief, trajectory_first_pass.csv, innovations.csv, run.json, map.png and
     report.html. Noise, delay and systematic errors are found from the recording's innovations, not from its truth.
+    With --map unknown the landmarks are found as well, and landmarks.csv is written (SLAM; which landmark a sighting is
+    of is known). With --compare there is such a folder for each filter, and comparison.csv with errors, consistency and
+    time of all.
     """
     need_train_extra()
     from sigmaslam.localisation.formats import detect_format
@@ -61,16 +80,26 @@ def localize(
     if not path.exists():
         raise InputError(f"{path}: is not there: give the folder or the .mat file of a recording")
     kind = detect_format(path) if format is RecordingFormat.auto else format.value
-    settings = {"source": str(path), "format": kind, "filter": filter.value, "max_range": max_range, "start": start}
+    if kind == "starry" and (robot is not None or first_pose is not None or max_range is not None):
+        raise InputError("--robot, --start and --max-range are for robots in the plane: leave them out here")
+    if kind == "starry" and map is MapKind.unknown:
+        raise InputError("--map unknown is for robots in the plane: leave it out here")
+    settings = {"source": str(path), "format": kind, "max_range": max_range, "start": start, "map": map.value}
+    rows: list[_Row] = []
     with Console(stderr=True).status("reading") as status:
-        if kind == "starry":
-            if robot is not None or first_pose is not None or max_range is not None:
-                raise InputError("--robot, --start and --max-range are for robots in the plane: leave them out here")
-            summaries = _localise_body(path, out, settings, status.update)
-        else:
-            summaries = _localise_robots(path, out, kind, robot, first_pose, max_range, settings, status.update)
-    _print_summaries(summaries)
-    typer.echo(f"Report: {out / 'report.html'}")
+        for name in [each.value for each in FilterKind] if compare else [filter.value]:
+            folder, run = out / name if compare else out, {**settings, "filter": name}
+            if kind == "starry":
+                summaries = _localise_body(path, folder, run, status.update)
+            else:
+                summaries = _localise_robots(path, folder, kind, robot, first_pose, max_range, run, status.update)
+            rows += [(name, each, summary) for each, summary in summaries.items()]
+    _print_rows(rows)
+    if compare:
+        _write_rows(out / "comparison.csv", rows)
+        typer.echo(f"Comparison: {out / 'comparison.csv'}")
+    else:
+        typer.echo(f"Report: {out / 'report.html'}")
 
 
 def _localise_robots(
@@ -87,12 +116,17 @@ def _localise_robots(
     from sigmaslam.localisation.output import write_robots
     from sigmaslam.localisation.robots import localise_robots
 
-    recordings = read_recordings(path, kind, robot)
+    mapping = settings["map"] == MapKind.unknown
+    recordings = read_recordings(path, kind, robot, mapping)
     if max_range is not None:
         recordings = [recording.within(max_range) for recording in recordings]
-    first, second = localise_robots(recordings, settings["filter"], start, tell)
+    begin = time.process_time()
+    first, second = localise_robots(recordings, settings["filter"], start, tell, mapping)
+    seconds = time.process_time() - begin
     make_folder(out)
-    return write_robots(out, path.resolve().name, first, second, recordings[0].landmarks, settings)
+    summaries = write_robots(out, path.resolve().name, first, second, recordings, settings)
+    # The robots are one batch: each has the time of all.
+    return {name: {**summary, "cpu_seconds": seconds} for name, summary in summaries.items()}
 
 
 def _localise_body(
@@ -102,9 +136,12 @@ def _localise_body(
     from sigmaslam.localisation.starry import read_starry
 
     recording = read_starry(path)
+    begin = time.process_time()
     first, second = localise_body(recording, settings["filter"], tell)
+    seconds = time.process_time() - begin
     make_folder(out)
-    return write_body(out, recording, first, second, settings)
+    summaries = write_body(out, recording, first, second, settings)
+    return {name: {**summary, "cpu_seconds": seconds} for name, summary in summaries.items()}
 
 
 def _parse_pose(text: str) -> tuple[float, float, float]:
@@ -115,15 +152,42 @@ def _parse_pose(text: str) -> tuple[float, float, float]:
     return x, y, heading
 
 
-_SHOWN = ("position_rmse", "heading_rmse", "rotation_rmse", "nees_median", "nees_mean", "nis_per_dof", "delay")
+_Row = tuple[str, str, dict[str, Any]]
+"""Filter, robot and summary."""
+_SHOWN = (
+    "position_rmse",
+    "heading_rmse",
+    "rotation_rmse",
+    "nees_median",
+    "nees_mean",
+    "landmark_rmse",
+    "landmark_rmse_aligned",
+    "landmark_nees",
+    "nis_per_dof",
+    "delay",
+    "cpu_seconds",
+)
 
 
-def _print_summaries(summaries: dict[str, dict[str, Any]]) -> None:
-    shown = [label for label in _SHOWN if any(label in each for each in summaries.values())]
-    table = Table("", *(label.replace("_", " ") for label in shown))
-    for name, summary in summaries.items():
-        table.add_row(name, *(_cell(summary.get(label)) for label in shown))
+def _shown(rows: Sequence[_Row]) -> list[str]:
+    return [label for label in _SHOWN if any(label in summary for _, _, summary in rows)]
+
+
+def _print_rows(rows: Sequence[_Row]) -> None:
+    shown = _shown(rows)
+    table = Table("filter", "", *(label.replace("_", " ") for label in shown))
+    for name, robot, summary in rows:
+        table.add_row(name, robot, *(_cell(summary.get(label)) for label in shown))
     Console(highlight=False).print(table)
+
+
+def _write_rows(path: Path, rows: Sequence[_Row]) -> None:
+    shown = _shown(rows)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["filter", "robot", *shown])
+    writer.writerows([name, robot, *(summary.get(label, "") for label in shown)] for name, robot, summary in rows)
+    atomic_write_text(path, text.getvalue())
 
 
 def _cell(value: Any) -> str:

@@ -48,6 +48,7 @@ __all__ = [
     "insertion",
     "inspect",
     "pure_rotation",
+    "rolling",
     "tool",
     "with_stops",
 ]
@@ -369,6 +370,31 @@ def closed_loop(rng: np.random.Generator, duration: float, box: FreeSpace) -> Pa
     rotations = view_rotations(yaw, pitch, roll)
     position[-1], rotations[-1] = position[0], rotations[0]
     return path_through(t, position, rotations)
+
+
+def rolling(rng: np.random.Generator, duration: float, box: FreeSpace) -> Path:
+    """A level camera on a robot with wheels, which looks where it drives: round courses at 0.3-0.5 m/s.
+
+    Args:
+        rng: source of all randomness.
+        duration: seconds.
+        box: that the course fills, at the height of its centre.
+    """
+    t, inside = padded_clock(duration)
+    angle = np.linspace(0, 2 * np.pi, 2001)
+    # The first harmonic outweighs the second, so that the course never turns on the spot.
+    course = 0.97 * np.stack([0.85 * np.cos(angle), 0.85 * np.sin(angle)], axis=-1)
+    course += 0.97 * 0.12 * np.cos(2 * angle[:, None] + rng.uniform(0, 2 * np.pi, 2))
+    course = np.array(box.half[:2]) * course * [1.0, rng.choice([-1.0, 1.0])]
+    course[-1] = course[0]
+    arc = arc_length(course)
+    around = CubicSpline(arc, course, bc_type="periodic")
+    speed = rng.uniform(0.36, 0.44) + 0.06 / LARGEST_NOISE * noise(rng, t, 1, 0.05, 0.2)[:, 0]
+    place = np.mod(rng.uniform(0, arc[-1]) + integral(t, speed), arc[-1])
+    ahead = around(place, 1)
+    yaw, level = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0])), np.zeros_like(t)
+    position = np.column_stack([around(place), level]) + np.array(box.centre)
+    return path_through(t[inside], position[inside], view_rotations(yaw[inside], level[inside], level[inside]))
 
 
 def _direction(rng: np.random.Generator) -> np.ndarray:

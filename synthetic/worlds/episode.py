@@ -31,7 +31,8 @@ class Wish:
     Attributes:
         duration: seconds.
         motion: one of `MOTIONS`: the domain's own way of moving, with stops, turning on the spot, coming back to the
-            start (for loop closure), at rest, or shaken, which the worlds of `CARRIED` presets alone know.
+            start (for loop closure), at rest, shaken, which the worlds of `CARRIED` presets alone know, or planar, on a
+            robot with wheels, in those of `ROLLING`.
         movers: share of the image that independently moving bodies cover about, 0 to 0.5.
         profile: KITTI poses file whose motion a drive follows; none: random.
         first_texture, textures: range of the textures' seeds, so that many worlds can share a bank of them.

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sigmaslam.synthetic.motion.paths import Path, at_rest, with_stops
-from sigmaslam.synthetic.motion.random_motions import FreeSpace, closed_loop, hand_held, pure_rotation
+from sigmaslam.synthetic.motion.random_motions import FreeSpace, closed_loop, hand_held, pure_rotation, rolling
 from sigmaslam.synthetic.motion.shaken import shaken, slowed
 from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel, Shape
 from sigmaslam.synthetic.scene import Body, Lights, Material, Scene, Texture
@@ -68,6 +68,8 @@ def _carry(rng: np.random.Generator, wish: Wish, free: FreeSpace) -> Path:
         return pure_rotation(rng, wish.duration, _triple(free.centre + rng.uniform(-0.8, 0.8, 3) * free.half))
     if wish.motion == "rest":
         return at_rest(hand_held(rng, wish.duration, free).poses(0.5 * wish.duration), wish.duration)
+    if wish.motion == "planar":
+        return rolling(rng, wish.duration, free)
     if wish.motion == "shaken":
         inner = FreeSpace(free.centre, _triple(np.array(free.half) - _SHAKE))
         return slowed(hand_held(rng, 0.5 * wish.duration, inner), wish.duration)

@@ -1,11 +1,13 @@
 """Robots in a world that is known: accuracy, consistency, and faults that the filter must find or stand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from sigmaslam.errors import InputError
-from sigmaslam.localisation.robots import localise_robots
-from sigmaslam.localisation.scores import innovation_statistics, score
+from sigmaslam.localisation.robots import LandmarkMap, localise_robots
+from sigmaslam.localisation.scores import innovation_statistics, score, score_map
 from tests.support.wheeled_world import World, drive, started_wrong
 
 pytestmark = [pytest.mark.usefixtures("one_thread"), pytest.mark.timeout(300)]
@@ -26,6 +28,38 @@ def test_a_robot_with_faults_is_found_and_so_are_its_faults(kind):
         assert abs(value - true) < 3.5 * deviation
     assert 0.03 < innovation_statistics(estimate)["outliers"] < 0.25
     assert len(first[0].pose) == len(estimate.pose)
+
+
+def test_sightings_that_come_late_do_not_shift_the_poses_in_time():
+    """Taken for a robot that follows its controls late, the same recording gives the poses of a while before."""
+    recording = drive(World(seconds=40.0, late=0.3, seed=6))
+    right, wrong = (score(localise_robots([replace(recording, odometry=odometry)])[1][0]) for odometry in (True, False))
+    assert right["heading_rmse"] < 0.6 * wrong["heading_rmse"]
+    # The 90 % quantile of chi-square with three degrees of freedom, for the median.
+    assert right["nees_median"] < 6.25 < wrong["nees_median"]
+
+
+def test_landmarks_of_an_unknown_map_are_found():
+    """No place of a landmark is told: they are moved in the recording, and the estimate is the same."""
+    recording = drive(World(seconds=20.0, seed=8))
+    estimate = localise_robots([recording], mapping=True)[1][0]
+    moved = replace(recording, landmarks=recording.landmarks + 100.0)
+    np.testing.assert_array_equal(localise_robots([moved], mapping=True)[1][0].pose, estimate.pose)
+    found = score_map(estimate.map)
+    assert found["landmarks"] == len(recording.landmarks)
+    assert found["landmark_rmse_aligned"] < 0.15
+    assert found["landmark_nees"] < 6
+    assert score(estimate)["nees_mean"] < 9
+
+
+def test_a_map_that_is_turned_and_shifted_has_no_error_once_aligned():
+    true = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0]])
+    turn = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+    found = score_map(LandmarkMap(np.arange(3), true @ turn.T + [0.5, -0.2], 0.04 * np.eye(6), true))
+    assert found["landmark_rmse_aligned"] < 1e-12
+    error = true @ turn.T + [0.5, -0.2] - true
+    assert found["landmark_nees"] == pytest.approx(np.mean(np.sum(error**2, axis=1)) / 0.04)
+    assert found["map_nees_per_dof"] == pytest.approx(found["landmark_nees"] / 2)
 
 
 def test_filters_agree_on_a_gentle_problem():
@@ -55,8 +89,6 @@ def test_robots_of_a_batch_are_what_they_are_alone():
 
 
 def test_without_a_truth_a_start_is_asked_for():
-    from dataclasses import replace
-
     recording = replace(drive(World(seconds=5.0)), truth=None)
     with pytest.raises(InputError, match="--start X,Y,HEADING"):
         localise_robots([recording])

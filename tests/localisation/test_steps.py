@@ -45,6 +45,15 @@ def test_sightings_stand_at_the_end_of_their_step():
     np.testing.assert_allclose(steps.since[step, robot, slot], [np.inf, np.inf, 0.55])
 
 
+def test_a_delay_beside_odometry_is_that_of_the_sightings():
+    """Motions keep their times, and what was stamped 0.125 s late stands where it was seen."""
+    late, in_time = make_steps([recording(odometry=True)], [0.125]), make_steps([recording()], [0.0])
+    step, robot, slot = np.nonzero(np.isfinite(late.value[..., 0]))
+    np.testing.assert_allclose(late.seconds[step + 1, robot], [0.225, 0.225, 0.775])
+    np.testing.assert_allclose(late.since[step, robot, slot], [np.inf, np.inf, 0.55])
+    np.testing.assert_allclose(late.path.sum(axis=(0, 1)), in_time.path.sum(axis=(0, 1)))
+
+
 def test_what_is_seen_at_the_start_is_not_lost():
     steps = make_steps([recording(seconds=(0.0, 0.9), landmark=(0, 1))], [0.0])
     assert np.isfinite(steps.value[..., 0]).sum() == 2

@@ -20,6 +20,7 @@ class World:
         seconds: of the drive.
         kind: of its sightings.
         delay: by which it follows its controls.
+        late: seconds by which its sightings are stamped late, beside controls that are odometry.
         drift: direction of driving, seen from the heading.
         speed_scale: metres driven for each that the controls say, less 1.
         outliers: share of the sightings that are wrong by metres and radians.
@@ -29,6 +30,7 @@ class World:
     seconds: float = 60.0
     kind: str = "range-bearing"
     delay: float = 0.0
+    late: float = 0.0
     drift: float = 0.0
     speed_scale: float = 0.0
     outliers: float = 0.0
@@ -68,7 +70,10 @@ def drive(world: World) -> Recording:
     if world.kind == "cartesian":
         sightings = np.column_stack([distance * np.cos(bearing), distance * np.sin(bearing)])
     truth = PlanarTruth(np.append(times, world.seconds), poses, 1.0)
-    return Recording("robot", times, controls, seconds, landmark, sightings, world.kind, LANDMARKS, truth=truth)
+    stamps, odometry = seconds + world.late, world.late > 0
+    return Recording(
+        "robot", times, controls, stamps, landmark, sightings, world.kind, LANDMARKS, truth=truth, odometry=odometry
+    )
 
 
 def started_wrong(recording: Recording, shift: float) -> Recording:

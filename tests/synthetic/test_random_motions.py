@@ -19,9 +19,11 @@ from sigmaslam.synthetic.motion.random_motions import (
     insertion,
     inspect,
     pure_rotation,
+    rolling,
     tool,
     with_stops,
 )
+from sigmaslam.synthetic.simulation import Recipe
 
 Generator = Callable[[np.random.Generator], Path]
 
@@ -212,6 +214,28 @@ def test_a_closed_loop_ends_as_it_began(seed: int) -> None:
     np.testing.assert_allclose(rate[-1], rate[0], atol=2.0)
     assert (np.abs(T[:, :3, 3] - ROOM.centre) <= ROOM.half).all()
     assert largest(T[1500, :3, 3] - T[0, :3, 3]) > 1.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_robot_with_wheels_drives_where_it_looks_and_stays_level(seed: int) -> None:
+    path = rolling(np.random.default_rng(seed), 20, ROOM)
+    t = np.linspace(0.01, 19.99, 4000)
+    T = path.poses(t)
+    velocity = (path.poses(t + 1e-3)[:, :3, 3] - path.poses(t - 1e-3)[:, :3, 3]) / 2e-3
+    ahead = T[:, :3, 2]
+    np.testing.assert_allclose(T[:, 2, 3], ROOM.centre[2], atol=1e-9)
+    np.testing.assert_allclose(T[:, :3, 1], np.tile([0.0, 0.0, -1.0], (len(t), 1)), atol=1e-9)
+    speed = np.linalg.norm(velocity, axis=1)
+    assert speed.min() > 0.25
+    assert speed.max() < 0.55
+    # Wheels do not slide sideways: no more than the spline between the knots lets them.
+    assert np.abs(np.cross(velocity, ahead)[:, 2]).max() < 1e-3 * speed.max()
+    assert (np.abs(T[:, :2, 3] - ROOM.centre[:2]) <= ROOM.half[:2]).all()
+
+
+def test_only_a_room_has_a_floor_to_drive_on() -> None:
+    with pytest.raises(InputError, match=r"planar goes with room"):
+        Recipe("drone", 3, motion="planar").check()
 
 
 def test_stops_hold_a_walk_still() -> None:

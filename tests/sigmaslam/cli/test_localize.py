@@ -10,7 +10,7 @@ from tests.support.commands import assert_refused, run_here
 
 pytest.importorskip("torch")
 
-from tests.support.wheeled_world import World, drive, write_csv_folder
+from tests.support.wheeled_world import LANDMARKS, World, drive, write_csv_folder
 
 pytestmark = [pytest.mark.usefixtures("one_thread"), pytest.mark.timeout(300)]
 
@@ -47,3 +47,37 @@ def test_wrong_options_are_refused(folder, tmp_path):
     assert_refused(run_here("localize", tmp_path / "nowhere", "--out", out), "nowhere", "is not there")
     assert_refused(run_here("localize", folder, "--out", folder), "not an empty folder")
     assert not out.exists()
+
+
+def test_a_map_that_is_not_there_is_found(folder, tmp_path):
+    unmapped, out = tmp_path / "robot", tmp_path / "out"
+    unmapped.mkdir()
+    for name in ("controls.csv", "sightings.csv", "truth.csv"):
+        (unmapped / name).write_text((folder / name).read_text())
+    assert_refused(run_here("localize", unmapped, "--out", out), "landmarks.csv")
+    result = run_here("localize", unmapped, "--out", out, "--map", "unknown")
+    assert result.returncode == 0, result.stderr
+    with (out / "landmarks.csv").open() as file:
+        found = {row["landmark"]: (float(row["x"]), float(row["y"])) for row in csv.DictReader(file)}
+    seen = np.loadtxt(folder / "sightings.csv", delimiter=",", skiprows=1)[:, 1]
+    assert set(found) == {f"{name:g}" for name in seen}
+    for name, place in found.items():
+        assert np.hypot(*(np.array(place) - LANDMARKS[int(name)])) < 0.5
+
+
+def test_filters_are_compared_on_the_same_recording(folder, tmp_path):
+    out = tmp_path / "out"
+    result = run_here("localize", folder, "--out", out, "--compare")
+    assert result.returncode == 0, result.stderr
+    with (out / "comparison.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["filter"] for row in rows] == ["ukf", "ekf", "iterated"]
+    for row in rows:
+        run = json.loads((out / row["filter"] / "run.json").read_text())
+        assert run["filter"] == row["filter"]
+        (summary,) = run["robots"].values()
+        for label in ("position_rmse", "heading_rmse", "nees_mean", "nis_per_dof"):
+            assert float(row[label]) == summary[label]
+        assert float(row["cpu_seconds"]) > 0
+    # Three filters, not one under three names.
+    assert len({row["position_rmse"] for row in rows}) == 3
