@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from sigmaslam.filters import BayesFilter, Diagonal, Euclidean, Gaussian, MeasurementModel, MotionModel, Product
-from sigmaslam.filters.layout import concatenate
+from sigmaslam.filters.core.layout import concatenate
 from sigmaslam.localisation.wheeled_robot import BODY, CONSTANTS, WheeledRobot
 
 ROBOT_SIZE = BODY.point_size + len(CONSTANTS)

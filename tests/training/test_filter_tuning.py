@@ -15,7 +15,7 @@ from torch import Tensor
 from sigmaslam.errors import InputError
 from sigmaslam.estimation.chi_square import CHI_SQUARE_95
 from sigmaslam.evaluation.rendered_camera import open_rendered
-from sigmaslam.filters.onnx.exportable_se3 import exp_se3
+from sigmaslam.filters.manifolds.se3_matrices import exp_se3
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.inference.onnx_graph import shipped_weights
 from sigmaslam.models.onnx_export import load_verifier
