@@ -15,7 +15,7 @@ endif
 # What an installation is made of: when one of these changes, it is made again.
 BUILD := pyproject.toml setup.py requirements.lock sigmaslam/frontend/kernels.cpp sigmaslam/frontend/kernels.inc
 
-.PHONY: demo test test-slow lint dist wheel sbom clean
+.PHONY: demo test test-slow lint docs dist wheel sbom clean
 
 demo: $(VENV)/.runtime
 	$(VENV)/bin/sigmaslam demo
@@ -31,6 +31,10 @@ lint: $(VENV)/.dev
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
+
+# The pages and a reference of the packages as a site: build/site/index.html.
+docs: $(VENV)/.docs
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict
 
 # What is handed out, of the last commit: sdist, wheel without kernels, a wheel with kernels for each Python.
 dist: $(VENV)/bin/python
@@ -71,3 +75,8 @@ $(VENV)/.runtime: $(BUILD) | $(VENV)/bin/python
 $(VENV)/.dev: $(BUILD) | $(VENV)/bin/python
 	$(VENV)/bin/python -m pip install --quiet $(INSTALL_FLAGS) --editable ".[dev]"
 	touch $@ $(VENV)/.runtime
+
+# mkdocs reads the sources and imports nothing of them.
+$(VENV)/.docs: $(BUILD) | $(VENV)/bin/python
+	$(VENV)/bin/python -m pip install --quiet $(INSTALL_FLAGS) --editable ".[docs]"
+	touch $@

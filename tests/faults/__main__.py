@@ -94,7 +94,7 @@ def write_reliability(path: Path, results: list[Result], command: str) -> str:
         *header("group", "fault", "first trial", "verdict", "exit code", "what is said"),
     ]
     for result in results:
-        case, said = result.case, result.said.replace("|", "\\|").replace("<", "&lt;")
+        case, said = result.case, result.said.replace("|", "\\|").replace("<", "&lt;").replace("[", "\\[")
         lines.append(row(case.group, case.name, case.first or "", result.verdict, str(result.code), said))
     return write_page(path, "\n".join(lines) + "\n")
 
