@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "models" / "weights").glob("*.md")]
+PAGES = [*ROOT.glob("*.md"), *(path for name in ("docs", "examples", "models") for path in (ROOT / name).rglob("*.md"))]
 NOTEBOOK = ROOT / "docs" / "notebook"
 
 
