@@ -13,6 +13,7 @@ from rich.console import Console
 
 from sigmaslam.cli.extras import need_report_extra, need_train_extra
 from sigmaslam.errors import InputError
+from sigmaslam.source_commit import describe_source
 
 # Each runs one benchmark and returns its page. It is given where the page goes, the command that the page names, and,
 # as keywords of their names, the options that it serves.
@@ -279,6 +280,7 @@ def benchmark(
         need_train_extra()
     if name.value in _DRAWN:
         need_report_extra()
+    describe_source()  # now: the sources may change while it runs
     typer.echo(run(out, f"sigmaslam benchmark {name.value} --out {out}", **{each: values[each] for each in served}))
 
 
