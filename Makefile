@@ -15,7 +15,7 @@ endif
 # What an installation is made of: when one of these changes, it is made again.
 BUILD := pyproject.toml setup.py requirements.lock sigmaslam/frontend/kernels.cpp sigmaslam/frontend/kernels.inc
 
-.PHONY: demo test test-slow lint docs dist wheel sbom clean
+.PHONY: demo test test-slow lint docs results dist wheel sbom clean
 
 demo: $(VENV)/.runtime
 	$(VENV)/bin/sigmaslam demo
@@ -35,6 +35,10 @@ lint: $(VENV)/.dev
 # The pages and a reference of the packages as a site: build/site/index.html.
 docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict
+
+# Every page that a command makes, or those of PAGES, anew: hours. What lacks data or peers is skipped by name.
+results: $(VENV)/.dev
+	$(VENV)/bin/python release/remake_pages.py $(PAGES)
 
 # What is handed out, of the last commit: sdist, wheel without kernels, a wheel with kernels for each Python.
 dist: $(VENV)/bin/python

@@ -284,6 +284,11 @@ def benchmark(
     typer.echo(run(out, f"sigmaslam benchmark {name.value} --out {out}", **{each: values[each] for each in served}))
 
 
+def reads_data(name: str) -> bool:
+    """Whether a benchmark reads the real data sets, where there is one of that name."""
+    return name in _BENCHMARKS and "data" in inspect.signature(_BENCHMARKS[name]).parameters
+
+
 def _repeated(option: str, values: list[str] | list[Path] | None) -> str:
     """An option that may be given more than once, as it is typed."""
     return "".join(f" --{option} {value}" for value in values or [])
