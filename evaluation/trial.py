@@ -15,7 +15,8 @@ import numpy as np
 
 from sigmaslam import errors
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.run_evaluation import Evaluation, evaluate_run
+from sigmaslam.evaluation.evaluation_result import Evaluation
+from sigmaslam.evaluation.run_evaluation import evaluate_run
 from sigmaslam.files import atomic_write_text
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.inference.onnx_graph import shipped_weights
@@ -106,11 +107,13 @@ class Trial:
         source: what `open_sequence` opens, or a sequence that is open.
         truth: trajectory file; None: nothing is evaluated.
         method: tracks the sequence.
+        truth_sigmas: of the true poses, metres and degrees, as `evaluate_run` takes them; None: exact.
     """
 
     source: Path | StereoSequence
     truth: Path | None
     method: Method = track_sequence
+    truth_sigmas: tuple[float, float] | None = None
 
     def run(
         self, out: Path | None = None, lengths: Sequence[float] | None = None, step: int | None = None
@@ -126,11 +129,15 @@ class Trial:
                 return self.run(Path(scratch) / "run", lengths, step)
         sequence = open_sequence(self.source) if isinstance(self.source, Path) else self.source
         self.method(sequence, out)
-        return read_trial(out, self.truth, lengths, step)
+        return read_trial(out, self.truth, lengths, step, self.truth_sigmas)
 
 
 def read_trial(
-    run: Path, truth: Path | None, lengths: Sequence[float] | None = None, step: int | None = None
+    run: Path,
+    truth: Path | None,
+    lengths: Sequence[float] | None = None,
+    step: int | None = None,
+    truth_sigmas: tuple[float, float] | None = None,
 ) -> TrialResult:
     """The result of a trial whose run folder is there; arguments as `Trial` and `Trial.run` take them."""
     check_has_trajectory(run)
@@ -138,11 +145,23 @@ def read_trial(
     if (run / "map.npz").is_file():
         with np.load(run / "map.npz") as content:
             point_map = dict(content)
+    evaluated = None
+    if truth is not None:
+        position, rotation = truth_sigmas or (None, None)
+        evaluated = evaluate_run(
+            run,
+            truth,
+            lengths=lengths,
+            step=step,
+            plot=False,
+            truth_sigma_position=position,
+            truth_sigma_rotation=rotation,
+        )
     return TrialResult(
         read_trajectory(run / "trajectory.tum"),
         read_frames(run / "frames.csv") if (run / "frames.csv").is_file() else None,
         point_map,
-        None if truth is None else evaluate_run(run, truth, lengths=lengths, step=step, plot=False),
+        evaluated,
     )
 
 

@@ -27,6 +27,7 @@ RENDERS = "build/results"
 PEERS = {
     "filters": ("filterpy", "stonesoup", "dynamax", "pypose", "torch_kf"),
     "runtime": ("dim_odom", "pyorbslam3"),
+    "sequences": ("dim_odom",),
 }
 
 
@@ -71,9 +72,8 @@ def absent(words: list[str]) -> str:
     """What the command of a page lacks here; empty if nothing."""
     # `sigmaslam benchmark NAME ...`, `python -m NAME ...`
     name = words[2]
-    if (reads_data(name) or name == "tests.faults") and not Path(
-        os.environ.get("SIGMASLAM_DATA") or "/nowhere"
-    ).is_dir():
+    data = Path(os.environ.get("SIGMASLAM_DATA") or "/nowhere")
+    if (reads_data(name) or name == "tests.faults") and not data.is_dir():
         return "SIGMASLAM_DATA names no folder of the real data sets"
     modules = [module for module in PEERS.get(name, ()) if find_spec(module) is None]
     return f"{', '.join(modules)} not installed: pip install 'sigmaslam[peers]'" if modules else ""
@@ -82,10 +82,8 @@ def absent(words: list[str]) -> str:
 def runnable(words: list[str]) -> list[str]:
     """The command with this interpreter, its renders in a folder that git does not see."""
     program = {"sigmaslam": [sys.executable, "-m", "sigmaslam"], "python": [sys.executable]}[words[0]]
-    return [
-        *program,
-        *(f"{RENDERS}/{word}" if before == "--runs" else word for before, word in itertools.pairwise(words)),
-    ]
+    rest = (f"{RENDERS}/{word}" if before == "--runs" else word for before, word in itertools.pairwise(words))
+    return [*program, *rest]
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from sigmaslam.evaluation.benchmarks.page import header, opening, row, write_page
-from sigmaslam.evaluation.benchmarks.sequences import REAL
+from sigmaslam.evaluation.benchmarks.sequences import REAL, REAL_NAMES
 from sigmaslam.evaluation.rendered_camera import open_rendered
 from sigmaslam.evaluation.trial import Trial, render, rendered_truth
 from sigmaslam.readers import StereoSequence, open_sequence
@@ -61,7 +61,7 @@ def write_noise(
     Raises:
         InputError: a sequence is missing.
     """
-    for name, _ in REAL:
+    for name in REAL_NAMES:
         open_sequence(data / name)
     renders: dict[int, dict[str, tuple[Path, Path]]] = {}
     for seed in (_TUNING_SEED, _TEST_SEED):
@@ -78,7 +78,7 @@ def write_noise(
     results = {}
     with as_file(files("sigmaslam.synthetic") / "demo") as demo:
         sequences = {"demo (rendered)": (demo, demo / "poses.txt"), **renders[_TEST_SEED]}
-        sequences |= {name: (data / name, data / name / truth) for name, truth in REAL}
+        sequences |= {name: (data / name, data / name / truth) for name, truth, _ in REAL}
         for name, (source, truth) in sequences.items():
             note(name)
             opener = open_sequence if data in source.parents else open_rendered
@@ -134,7 +134,7 @@ def _page(
             f"{own.nis:.2f} / {same.nis:.2f}",
         ]
         lines.append(row(name, *cells))
-    for label, chosen_names in (("all", list(results)), ("renders", [n for n in results if n not in dict(REAL)])):
+    for label, chosen_names in (("all", list(results)), ("renders", [n for n in results if n not in REAL_NAMES])):
         pairs = [results[name] for name in chosen_names]
         ate, step, nees = (
             _geometric_mean([getattr(own, field) / getattr(same, field) for own, same in pairs])

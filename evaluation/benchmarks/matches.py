@@ -104,7 +104,8 @@ def _rows(data: Path, judge: ConfidenceEstimator) -> list[str]:
     lines = [
         "## Rows of real stereo pairs",
         "",
-        "The true row error is zero up to rectification. *within*: share of the matches with a row error within 1",
+        "Keypoints of the left image, searched for and aligned in the right one as the tracker does. The true row",
+        "error is zero up to rectification. *within*: share of the matches with a row error within 1",
         "and 2 sigma, as the images are rectified; *mended*: after a polynomial of second degree, one for all",
         "pairs of a set, is taken out; *constant*: mended, with 0.3 px for every match. A normal error has 68.3",
         "and 95.4 %.",

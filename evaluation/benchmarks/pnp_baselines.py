@@ -7,8 +7,6 @@ settings are common ones, the same for every sequence.
 
 from __future__ import annotations
 
-import csv
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -16,14 +14,11 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
-from sigmaslam.files import make_folder
+from sigmaslam.evaluation.benchmarks.peer_run import PeerStep, write_peer_run
 from sigmaslam.geometry.camera import RectifiedStereo, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import rotation_exp, se3_adjoint, se3_inverse, se3_log, skew
-from sigmaslam.geometry.trajectory import Trajectory
-from sigmaslam.readers import StereoSequence
-from sigmaslam.readers.trajectory_files import write_tum
-from sigmaslam.runs.frame_table import COLUMNS
+from sigmaslam.readers import StereoFrame, StereoSequence
 
 _KEYPOINTS = 1500  # as many as the tracker asks for
 _PIXEL_SIGMA = 1.0
@@ -218,21 +213,16 @@ def track_with_pnp(sequence: StereoSequence, out: Path, matcher: str) -> None:
         out: run folder.
         matcher: "sift" or "klt".
     """
-    make_folder(out)
     odometry = PnpOdometry(sequence.camera, matcher)
-    timestamps, steps = [], []
-    with (out / "frames.csv").open("w", newline="", encoding="utf-8") as table:
-        rows = csv.DictWriter(table, ["status", *COLUMNS, "ms_step"])
-        rows.writeheader()
-        for frame in sequence.frames():
-            began = time.perf_counter()
-            step = odometry.step(frame.left, frame.right)
-            row = {"status": step.status, "timestamp": frame.timestamp, "matches": step.matches}
-            rows.writerow(row | {"inliers": step.inliers, "ms_step": 1e3 * (time.perf_counter() - began)})
-            timestamps.append(frame.timestamp)
-            steps.append(step)
-    write_tum(out / "trajectory.tum", Trajectory(np.array(timestamps), np.stack([s.T_world_camera for s in steps])))
-    np.save(out / "covariance.npy", np.stack([step.covariance for step in steps]))
+    covariances = []
+
+    def step(frame: StereoFrame) -> PeerStep:
+        found = odometry.step(frame.left, frame.right)
+        covariances.append(found.covariance)
+        return PeerStep(found.T_world_camera, found.status, found.matches, found.inliers)
+
+    write_peer_run(sequence, out, step)
+    np.save(out / "covariance.npy", np.stack(covariances))
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,6 +21,7 @@ _LABELS = {
     "klt": "ours with KLT",
     "sift-pnp": "SIFT + PnP",
     "klt-pnp": "KLT + PnP",
+    "cuvslam": "cuVSLAM",
     "bundle": "bundle adjustment",
 }
 _STAGES = ("features", "match", "filter", "map")
@@ -39,6 +40,16 @@ _COLUMNS = (
     "frames/s",
 )
 _STAGE_COLUMNS = ("method", "inliers", "features ms", "matching ms", "filter ms", "map ms")
+_RELATIVE_COLUMNS = (
+    "span",
+    "pairs",
+    "NEES, mean",
+    "median",
+    "inside 95 %",
+    "rmse m",
+    "sigma m",
+    "truth's share %",
+)
 _WORDS = """\
 All methods in turn in one run, with {threads} threads in OpenCV and 2 in the network. Accuracy is the same in every run
 on one machine; times are wall milliseconds. No setting of any method differs between sequences.
@@ -47,6 +58,8 @@ on one machine; times are wall milliseconds. No setting of any method differs be
   Jacobians, linearised once. *Ours with*: other features under the same filter.
 - *SIFT + PnP*, *KLT + PnP*: from OpenCV alone (`evaluation/benchmarks/pnp_baselines.py`): points of a keyframe, found
   again by ratio test or Lucas-Kanade, RANSAC, least squares. Landmarks count as known, the noise as 1 px.
+- *cuVSLAM*: on the CPU, by the package dim-odom (extra `peers`), given rectified pairs; rectifying is in its
+  time. It gives no covariance here, and no pose where it is lost.
 - *bundle adjustment*: of the tracks of *ours* (`track --tracks`, then `refine`), all keyframes at once; frames in
   between move with them. Its time is that of the optimisation, on top of the tracking; its NEES that of the keyframes.
 - *tracked*: frames with a pose from the images, relocalised ones too; the first frame of a run is its origin.
@@ -55,6 +68,8 @@ on one machine; times are wall milliseconds. No setting of any method differs be
 - *step*: median error from frame to frame over tracked frames.
 - *NIS*, *NEES*: per degree of freedom, 1 is right, more is overconfident. NEES is given where the truth is exact: on
   renders.
+- *Relative poses*: of frames a span apart, which overlap. The covariance of a pair is the estimate's and the truth's
+  together; *truth's share* of it, in the median.
 - *offset*: measured minus true disparity, of the methods that estimate it.
 """
 
@@ -69,6 +84,7 @@ class SequenceResult:
         trial: run and evaluation; the bundle adjustment has no table of frames.
         nees: mean per degree of freedom; NaN where the truth is not exact.
         refined: what refine.json says; None but for the bundle adjustment.
+        truth_sigmas: of the true poses, metres and degrees; None where they are exact.
     """
 
     sequence: str
@@ -76,6 +92,7 @@ class SequenceResult:
     trial: TrialResult
     nees: float
     refined: Mapping[str, Any] | None = None
+    truth_sigmas: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +128,32 @@ def format_results(results: Sequence[SequenceResult | Omission], command: str, c
         staged = [each for each in of_sequence if each.trial.frames and "filter" in each.trial.frames.milliseconds]
         if staged:
             lines += [*table(_STAGE_COLUMNS, map(_stage_row, staged)), ""]
+        for result in of_sequence:
+            lines += _relative_lines(result)
     return "\n".join(lines)
+
+
+def _relative_lines(result: SequenceResult) -> list[str]:
+    """Consistency of relative poses of a method that says it, with the sigmas of the truth."""
+    spans = result.trial.evaluation.relative
+    if result.method != "ours" or not spans:
+        return []
+    sigmas = result.truth_sigmas
+    truth = "exact" if sigmas is None else f"{sigmas[0]:g} m and {sigmas[1]:g} degrees in each pose"
+    rows = (
+        [
+            each.span,
+            str(each.count),
+            f"{each.mean_nees:.2f}",
+            f"{each.median_nees:.2f}",
+            f"{100 * each.inside:.0f}",
+            f"{each.translation_rmse:.2g}",
+            f"{each.translation_sigma:.2g}",
+            _number(100 * each.truth_share, ".0f"),
+        ]
+        for each in spans
+    )
+    return [f"Relative poses of *ours*; sigmas of the truth: {truth}.", "", *table(_RELATIVE_COLUMNS, rows), ""]
 
 
 def ate_cell(result: SequenceResult) -> str:

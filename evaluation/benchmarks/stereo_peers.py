@@ -15,8 +15,11 @@ from typing import Any
 import numpy as np
 
 from sigmaslam.errors import SigmaSlamError
+from sigmaslam.evaluation.benchmarks.peer_run import PeerStep, write_peer_run
 from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import quaternion_to_matrix
+from sigmaslam.readers import StereoFrame, StereoSequence
 
 _NO_TURN = (0.0, 0.0, 0.0, 1.0)
 # As in ORB-SLAM3's own settings for EuRoC and for KITTI.
@@ -166,6 +169,31 @@ def orb_settings(camera: RectifiedStereo, rate: float) -> str:
         rate=float(rate),
         keypoints=keypoints,
     )
+
+
+def track_with_cuvslam(sequence: StereoSequence, out: Path) -> None:
+    """Tracks a sequence; leaves trajectory.tum, without frames that are lost, and frames.csv in the new folder `out`.
+
+    Raises:
+        MissingPeerError: see `CuvslamPeer`.
+    """
+    rectifier = StereoRectifier(sequence.camera)
+    peer = CuvslamPeer(rectifier.rectified)
+    T_rectified_left = np.eye(4)
+    T_rectified_left[:3, :3] = rectifier.R_rectified_left
+
+    has_started = False
+
+    def step(frame: StereoFrame) -> PeerStep:
+        nonlocal has_started
+        pose = peer.step(*rectifier.rectify(frame.left, frame.right), frame.timestamp)
+        if pose is None:
+            return PeerStep(None, "lost")
+        status, has_started = "tracking" if has_started else "starting", True
+        return PeerStep(T_rectified_left.T @ pose @ T_rectified_left, status)
+
+    write_peer_run(sequence, out, step)
+    peer.close()
 
 
 def _not_installed(module: str, error: ImportError) -> MissingPeerError:

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sigmaslam.evaluation.matching.eyes_by_descriptors import match_eyes
 from sigmaslam.evaluation.matching.stereo import StereoStep
 from sigmaslam.evaluation.metrics import probability_calibration as calibration
 from sigmaslam.evaluation.metrics.probability_calibration import RIGHT
-from sigmaslam.frontend.descriptor import match_stereo
 from sigmaslam.frontend.image_pair import match_features
 from sigmaslam.frontend.match_confidence import ConfidenceEstimator
 from sigmaslam.frontend.types import Features
@@ -108,7 +108,7 @@ def measure_renders(
 
 def _of_step(step: StereoStep, detect: Detect, judge: ConfidenceEstimator) -> MeasuredMatches:
     left, right, later = detect(step.left0), detect(step.right0), detect(step.left1)
-    eyes = match_stereo(judge, step.left0, step.right0, left, right)
+    eyes = match_eyes(judge, step.left0, step.right0, left, right)
     eyes = eyes.select(eyes.probability >= _SURE)
     disparity = np.full(len(left.keypoints), np.nan)
     disparity[eyes.index0] = left.keypoints[eyes.index0, 0] - eyes.places[:, 0]

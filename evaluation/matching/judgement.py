@@ -13,10 +13,12 @@ from sigmaslam.evaluation.matching.image_pairs import Homography, ImagePair, Sam
 from sigmaslam.evaluation.metrics import probability_calibration as calibration
 from sigmaslam.evaluation.metrics.probability_calibration import RIGHT
 from sigmaslam.frontend.affine_alignment import refine_by_neighbours
-from sigmaslam.frontend.descriptor import match_stereo
+from sigmaslam.frontend.descriptor import match_rows
 from sigmaslam.frontend.match_confidence import MIN_LOGIT, ConfidenceEstimator
 from sigmaslam.frontend.nearest_neighbours import nearest_anywhere
+from sigmaslam.frontend.row_search import search_rows
 from sigmaslam.frontend.types import Features
+from sigmaslam.frontend.verifier_inputs import PlaceSearch
 
 _CONSTANT_SIGMA = 0.3
 # Scale, in pixels, and iterations of the robust fit of the rectification error.
@@ -143,7 +145,7 @@ class RowJudgement:
 
 
 def judge_rows(pairs: Sequence[ImagePair], detect: Detect, judge: ConfidenceEstimator) -> RowJudgement:
-    """Judges the stereo matches that the tracker would use by the difference of their rows, which should be zero.
+    """Judges the stereo matches that the tracker uses by the difference of their rows, which should be zero.
 
     What is left of the rectification is common to all pairs of a set: a polynomial of second degree in the place, as a
     small rotation and another focal length give it, fitted robustly to all of them.
@@ -156,12 +158,16 @@ def judge_rows(pairs: Sequence[ImagePair], detect: Detect, judge: ConfidenceEsti
     rows = []
     for pair in pairs:
         assert isinstance(pair.truth, SameRows)
-        features0, features1 = detect(pair.image0), detect(pair.image1)
-        matches = match_stereo(judge, pair.image0, pair.image1, features0, features1)
-        points = features0.keypoints[matches.index0].astype(np.float64)
+        features = detect(pair.image0)
+        index, start = search_rows(pair.image0, pair.image1, features.keypoints)
+        points = features.keypoints[index].astype(np.float64)
+        found = match_rows(
+            judge, pair.image0, pair.image1, points, start, features.sigma[index], PlaceSearch.ALONG_ROWS
+        )
+        points = points[found.index]
         height, width = pair.image0.shape
         place = (points - (0.5 * width, 0.5 * height)) / (0.5 * width)
-        rows.append(np.column_stack([matches.places[:, 1] - points[:, 1], np.sqrt(matches.covariance[:, 1, 1]), place]))
+        rows.append(np.column_stack([found.places[:, 1] - points[:, 1], np.sqrt(found.covariance[:, 1, 1]), place]))
     error, sigma, u, v = np.concatenate(rows).T
     mended = error - _rectification(error, u, v)
     return RowJudgement(

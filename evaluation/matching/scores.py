@@ -8,8 +8,8 @@ from functools import cache
 import cv2
 import numpy as np
 
+from sigmaslam.evaluation.matching.eyes_by_descriptors import match_eyes
 from sigmaslam.evaluation.matching.image_pairs import Disparity, Homography, ImagePair, Motion, SameRows
-from sigmaslam.frontend.descriptor import match_stereo
 from sigmaslam.frontend.image_pair import Matches, match_features
 from sigmaslam.frontend.match_confidence import ConfidenceEstimator
 from sigmaslam.frontend.types import Features
@@ -51,7 +51,7 @@ def mutual_nearest(descriptors0: np.ndarray, descriptors1: np.ndarray) -> tuple[
 def match_rows_refined(
     left: np.ndarray, right: np.ndarray, features_left: KeypointsAndDescriptors, features_right: KeypointsAndDescriptors
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Stereo matches of a rectified pair as the tracker makes them (`match_stereo`).
+    """Stereo matches of a rectified pair from features of both eyes (`match_eyes`).
 
     Args:
         left, right: (H, W) uint8.
@@ -60,7 +60,7 @@ def match_rows_refined(
         Indices (K,) into the left keypoints and their places (K, 2) in the right image; what is more likely wrong
         than right is left out.
     """
-    found = match_stereo(_judge(), left, right, without_sigma(features_left), without_sigma(features_right))
+    found = match_eyes(_judge(), left, right, without_sigma(features_left), without_sigma(features_right))
     return found.index0, found.places
 
 

@@ -10,7 +10,8 @@ import numpy as np
 from sigmaslam.estimation.mahalanobis import squared_mahalanobis
 from sigmaslam.evaluation.metrics.map_consistency import coverage
 from sigmaslam.evaluation.metrics.trajectory_errors import associate, is_regular
-from sigmaslam.geometry.se3 import se3_inverse, se3_log, turn_covariance
+from sigmaslam.evaluation.metrics.truth_covariance import relative_truth_covariance
+from sigmaslam.geometry.se3 import se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.runs.relative_pose_file import FramePairs
 from sigmaslam.slam.relative_poses import SPANS
@@ -66,30 +67,6 @@ class SpanConsistency:
         An estimate that is too sure of itself leaves nearly all of the covariances to the truth; its errors tell.
         """
         return self.truth_share > 0.5 * max(1.0, self.mean_nees)
-
-
-def truth_covariance(position_sigma: float, rotation_sigma_deg: float) -> np.ndarray:
-    """(6, 6) of a true pose in its body frame.
-
-    Args:
-        position_sigma: standard deviation of each coordinate, metres.
-        rotation_sigma_deg: of the rotation about each axis, degrees.
-    """
-    return np.diag(np.repeat([position_sigma, math.radians(rotation_sigma_deg)], 3) ** 2)
-
-
-def relative_truth_covariance(relative: np.ndarray, earlier: np.ndarray, later: np.ndarray) -> np.ndarray:
-    """Covariances of true relative poses, errors of the two ends independent of each other.
-
-    The rotation of the earlier end has the way between the two as its lever.
-
-    Args:
-        relative: (M, 4, 4) T_earlier_later.
-        earlier, later: (M, 6, 6) of the true poses, each in its body frame.
-    Returns:
-        (M, 6, 6) in the frame of the later end.
-    """
-    return np.asarray(later + turn_covariance(se3_inverse(relative), earlier))
 
 
 def relative_consistency(

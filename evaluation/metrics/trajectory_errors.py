@@ -9,6 +9,7 @@ import numpy as np
 
 from sigmaslam.errors import InputError
 from sigmaslam.estimation.mahalanobis import squared_mahalanobis
+from sigmaslam.evaluation.metrics.truth_covariance import relative_truth_covariance
 from sigmaslam.geometry.se3 import rotation_log, se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.two_view.absolute_orientation import absolute_orientation
@@ -115,6 +116,7 @@ class PoseNees:
         median: over frames of the 6-dof value (a right covariance gives 0.89).
         timestamps: (M,) seconds of the frames that were used.
         per_frame: (M,) 6-dof value of each.
+        with_truth: whether errors of the truth are part of the covariances.
     """
 
     mean: float
@@ -123,6 +125,7 @@ class PoseNees:
     median: float
     timestamps: np.ndarray
     per_frame: np.ndarray
+    with_truth: bool = False
 
 
 def associate(
@@ -309,7 +312,9 @@ def pose_errors(estimate: Trajectory, truth: Trajectory) -> PoseErrors:
     return PoseErrors(estimate.timestamps[estimate_index], errors, estimate_index)
 
 
-def pose_nees(estimate: Trajectory, truth: Trajectory, covariance: np.ndarray) -> PoseNees:
+def pose_nees(
+    estimate: Trajectory, truth: Trajectory, covariance: np.ndarray, of_truth: np.ndarray | None = None
+) -> PoseNees:
     """NEES of poses relative to the first, per degree of freedom.
 
     The first associated frame, whose error is zero by construction, and frames with a singular or non-finite
@@ -318,6 +323,7 @@ def pose_nees(estimate: Trajectory, truth: Trajectory, covariance: np.ndarray) -
     Args:
         estimate: N poses; truth: any.
         covariance: (N, 6, 6) of the pose in its body frame, (translation, rotation), metres and radians.
+        of_truth: (6, 6) of each true pose in its body frame, independent of the others; None: they count as exact.
     Raises:
         ValueError: the covariance is not (N, 6, 6).
         InputError: no timestamps agree.
@@ -328,6 +334,10 @@ def pose_nees(estimate: Trajectory, truth: Trajectory, covariance: np.ndarray) -
     used = is_regular(covariance[result.index])
     used[0] = False
     errors, P = result.errors[used], covariance[result.index[used]]
+    if of_truth is not None:
+        true = truth.poses[associate(estimate, truth)[1]]
+        since_first = se3_inverse(true[:1]) @ true[used]
+        P = P + relative_truth_covariance(since_first, of_truth, of_truth)
     full = squared_mahalanobis(errors, P) / 6
     translation = squared_mahalanobis(errors[:, :3], P[:, :3, :3]) / 3
     rotation = squared_mahalanobis(errors[:, 3:], P[:, 3:, 3:]) / 3
@@ -339,6 +349,7 @@ def pose_nees(estimate: Trajectory, truth: Trajectory, covariance: np.ndarray) -
         median=float(np.median(full)) if some else math.nan,
         timestamps=result.timestamps[used],
         per_frame=full,
+        with_truth=of_truth is not None,
     )
 
 

@@ -67,10 +67,10 @@ for _command, _line in (
     (train, "Train the correspondence network (extra 'train')."),
     (train_scorer, "Train the probability of matches (extra 'train')."),
     (export, "Export trained weights to ONNX (extra 'train')."),
-    (benchmark, "Run a benchmark and write its page."),
 ):
     app.command(short_help=_line)(_command)
 app.add_typer(calibration)
+app.add_typer(benchmark)
 
 
 def main() -> None:

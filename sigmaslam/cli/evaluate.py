@@ -55,15 +55,16 @@ def evaluate(
     The picture needs the extra 'report'; the figures are the same without it.
 
     Poses of a run are also judged relative to earlier ones, 1, 10, 50, 100 m or 1, 5, 20 s back. Say how good the truth
-    is with --truth-sigma-position and --truth-sigma-rotation: it counts there, and you see where it is no better than
-    the estimate.
+    is with --truth-sigma-position and --truth-sigma-rotation: it counts in every NEES, and you see where it is no
+    better than the estimate.
 
     Where the truth would fit in another frame, order or unit, a line says so with the option that applies it; seconds,
     milli-, micro- and nanoseconds are found out.
 
     Of a run with --track-object the truth is T_camera_object of any frame that is fixed to the body.
     """
-    from sigmaslam.evaluation.run_evaluation import evaluate_run, format_evaluation
+    from sigmaslam.evaluation.evaluation_summary import format_evaluation
+    from sigmaslam.evaluation.run_evaluation import evaluate_run
     from sigmaslam.evaluation.truth_conventions import TruthConvention
 
     evaluation = evaluate_run(

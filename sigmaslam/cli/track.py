@@ -57,7 +57,8 @@ def demo(
     frontend: Annotated[Frontend, typer.Option(help="Where correspondences come from.")] = Frontend["learned"],
 ) -> None:
     """Track the rendered sequence that ships with the package and print the errors against its exact truth."""
-    from sigmaslam.evaluation.run_evaluation import evaluate_run, format_evaluation
+    from sigmaslam.evaluation.evaluation_summary import format_evaluation
+    from sigmaslam.evaluation.run_evaluation import evaluate_run
 
     folder = out or Path(tempfile.mkdtemp(prefix="sigmaslam-demo-"))
     with as_file(files("sigmaslam.synthetic") / "demo") as sequence:

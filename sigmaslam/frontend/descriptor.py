@@ -14,16 +14,13 @@ from sigmaslam.frontend.nearest_neighbours import (
     Putative,
     nearest_anywhere,
     nearest_in_ellipses,
-    nearest_in_rows,
     within_ellipses,
 )
 from sigmaslam.frontend.patch_evidence import Evidence, examine_patches
-from sigmaslam.frontend.plane_alignment import refine_in_rows, refine_on_planes
+from sigmaslam.frontend.plane_alignment import refine_on_planes
 from sigmaslam.frontend.row_search import (
-    MAX_DISPARITY,
     REACH_PREDICTED,
     REACH_SEARCHED,
-    ROW_TOLERANCE,
     align_in_rows,
     search_rows,
 )
@@ -33,8 +30,8 @@ from sigmaslam.table import Table
 
 # A little below zero, so that points at infinity survive a disparity offset.
 _LEAST_DISPARITY = -2.0
-# What is more likely wrong than right is left out.
-_LEAST_PROBABILITY = 0.5
+LEAST_PROBABILITY = 0.5
+"""What is more likely wrong than right is left out."""
 # Pixels from anywhere.
 _NOWHERE = 1e6
 
@@ -97,39 +94,49 @@ def refine_with_confidence(
     return RefinedMatches(index0, index1, refinement.places, probability, covariance)
 
 
-def match_stereo(
+@dataclass(frozen=True, slots=True)
+class RowMatches:
+    """Points of the left image of a rectified pair, found in the right one.
+
+    Attributes:
+        index: (M,) which of the points.
+        places: (M, 2) float64 in the right image, pixels.
+        covariance: (M, 2, 2) of the places given the points, pixels squared.
+    """
+
+    index: np.ndarray
+    places: np.ndarray
+    covariance: np.ndarray
+
+
+def match_rows(
     estimator: ConfidenceEstimator,
     left: np.ndarray,
     right: np.ndarray,
-    features_left: Features,
-    features_right: Features,
-) -> RefinedMatches:
-    """Stereo matches of a rectified pair: descriptors within a band of rows, then alignment.
+    points: np.ndarray,
+    start: np.ndarray,
+    sigma0: np.ndarray,
+    search: PlaceSearch,
+) -> RowMatches:
+    """Points of the left image aligned in the right one; what is more likely wrong than right is left out.
 
     Args:
         estimator: of the matches.
-        left, right: (H, W) uint8.
-        features_left, features_right: of these images.
+        left, right: (H, W) uint8, a rectified pair.
+        points, start: (M, 2) float64 in the left image, and about where they are in the right one, pixels.
+        sigma0: (M,) of the points, pixels.
+        search: where the start comes from, `ALONG_ROWS` or `PREDICTED_ALONG_ROWS`.
     """
-    putative = nearest_in_rows(
-        features_left.keypoints,
-        features_right.keypoints,
-        features_left.descriptors,
-        features_right.descriptors,
-        ROW_TOLERANCE,
-        (_LEAST_DISPARITY, MAX_DISPARITY * left.shape[1]),
-    )
-    found = refine_with_confidence(
-        estimator,
-        left,
-        right,
-        features_left,
-        features_right,
-        putative,
-        lambda points0, points1, *_: refine_in_rows(left, right, points0, points1)[0],
-    )
-    level = np.abs(found.places[:, 1] - features_left.keypoints[found.index0, 1]) <= ROW_TOLERANCE
-    return found.select(level & (found.probability >= _LEAST_PROBABILITY))
+    is_predicted = search is PlaceSearch.PREDICTED_ALONG_ROWS
+    reach = REACH_PREDICTED if is_predicted else REACH_SEARCHED
+    places, there, slope = align_in_rows(left, right, points, start, reach)
+    index = np.flatnonzero(there)
+    points, places = points[index], places[index]
+    evidence = examine_patches(left, right, points, places)
+    predicted, slopes = (start[index], None) if is_predicted else (points, slope[index])
+    probability, covariance = estimator.verify_places(places, predicted, evidence, sigma0[index], search, slopes)
+    likely = np.flatnonzero(probability >= LEAST_PROBABILITY)
+    return RowMatches(index[likely], places[likely], covariance[likely].astype(np.float64))
 
 
 class DescriptorFrontend:
@@ -177,7 +184,7 @@ class DescriptorFrontend:
             return refine(key.left, view.left, points0, points1)
 
         found = refine_with_confidence(self._estimator, key.left, view.left, wanted, view.features, putative, refined)
-        found = found.select(found.probability >= _LEAST_PROBABILITY)
+        found = found.select(found.probability >= LEAST_PROBABILITY)
         return TemporalMatches(
             search.index[found.index0],
             found.places,
@@ -204,7 +211,7 @@ class DescriptorFrontend:
         verified = self._estimator.verify_places(
             found.places, found.predicted, found.evidence, found.sigma0, PlaceSearch.IN_TIME
         )
-        likely = verified[0] >= _LEAST_PROBABILITY
+        likely = verified[0] >= LEAST_PROBABILITY
         found, probability, covariance = found.select(likely), verified[0][likely], verified[1][likely]
         start = found.places - np.column_stack([found.expected_disparity, np.zeros(len(found))])
         index, *measured = self._disparities(
@@ -226,17 +233,9 @@ class DescriptorFrontend:
         search: PlaceSearch,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Which of the points (M, 2) are found in the right image from a start, their disparities and sigmas."""
-        is_predicted = search is PlaceSearch.PREDICTED_ALONG_ROWS
-        reach = REACH_PREDICTED if is_predicted else REACH_SEARCHED
-        places, there, slope = align_in_rows(left, right, points, start, reach)
-        index = np.flatnonzero(there)
-        points, places = points[index], places[index]
-        evidence = examine_patches(left, right, points, places)
-        predicted, slopes = (start[index], None) if is_predicted else (points, slope[index])
-        judged = self._estimator.verify_places(places, predicted, evidence, sigma0[index], search, slopes)
-        likely = np.flatnonzero(judged[0] >= _LEAST_PROBABILITY)
-        disparity = points[likely, 0] - places[likely, 0]
-        return index[likely], disparity, np.sqrt(judged[1][likely, 0, 0].astype(np.float64))
+        found = match_rows(self._estimator, left, right, points, start, sigma0, search)
+        disparity = points[found.index, 0] - found.places[:, 0]
+        return found.index, disparity, np.sqrt(found.covariance[:, 0, 0])
 
 
 @dataclass(frozen=True, slots=True)

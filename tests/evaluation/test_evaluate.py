@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.run_evaluation import evaluate_run, format_evaluation
+from sigmaslam.evaluation.evaluation_summary import format_evaluation
+from sigmaslam.evaluation.run_evaluation import evaluate_run
 from sigmaslam.geometry.se3 import se3_adjoint, se3_exp, se3_inverse
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import read_kitti, read_trajectory, read_tum, write_kitti, write_tum

@@ -42,7 +42,7 @@ def test_matches_of_a_step_are_measured_from_where_stereo_and_the_motion_have_th
         index, index, first[:, :2] - first[:, 2:] * [1.0, 0.0], np.array([0.95, 0.99, 0.6]), covariance
     )
     matches = Matches(features.keypoints, second[:, :2].astype(np.float32), 0.8 * ones, covariance, index, index)
-    monkeypatch.setattr(forward_motion, "match_stereo", lambda *_: eyes)
+    monkeypatch.setattr(forward_motion, "match_eyes", lambda *_: eyes)
     monkeypatch.setattr(forward_motion, "match_features", lambda *_: matches)
     image = np.zeros((480, 640), np.uint8)
     measured = measure_steps([StereoStep("0 1", image, image, image, camera, T_1_0)], lambda image: features, None)

@@ -16,6 +16,7 @@ from sigmaslam.evaluation.metrics.trajectory_errors import (
     relative_pose_error,
     synchronise,
 )
+from sigmaslam.evaluation.metrics.truth_covariance import truth_covariance
 from sigmaslam.geometry.se3 import rotation_exp, se3_adjoint, se3_exp, se3_inverse
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import read_kitti
@@ -271,6 +272,21 @@ def test_nees_is_in_the_body_frame():
     assert nees.mean == pytest.approx(1 / 6)
     assert nees.mean_translation == pytest.approx(1 / 3)
     assert nees.mean_rotation == pytest.approx(0.0, abs=1e-20)
+
+
+def test_errors_of_the_truth_are_part_of_the_nees_where_they_are_known():
+    rng = np.random.default_rng(0)
+    of_truth, covariance = truth_covariance(0.05, 0.5), np.diag([1e-2, 1e-2, 4e-2, 1e-5, 4e-5, 1e-5])
+    values = []
+    for _ in range(400):
+        exact = se3_exp(np.stack([np.zeros(6), np.array([5.0, 1.0, 9.0, 0.3, -0.5, 0.1])]))
+        estimated = exact @ se3_exp(np.stack([np.zeros(6), rng.multivariate_normal(np.zeros(6), covariance)]))
+        measured = exact @ se3_exp(rng.multivariate_normal(np.zeros(6), of_truth, 2))
+        pair = Trajectory(np.arange(2.0), estimated), Trajectory(np.arange(2.0), measured), np.stack([covariance] * 2)
+        values.append([pose_nees(*pair, of_truth).mean, pose_nees(*pair).mean])
+    with_truth, without = np.mean(values, axis=0)
+    assert with_truth == pytest.approx(1.0, abs=0.1)  # four standard errors of chi-square with 6 dof are 0.12
+    assert without > 2.0
 
 
 def test_singular_covariances_are_left_out_whatever_the_units():

@@ -11,12 +11,10 @@ import numpy as np
 import pytest
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.metrics.relative_consistency import (
-    relative_consistency,
-    relative_truth_covariance,
-    truth_covariance,
-)
-from sigmaslam.evaluation.run_evaluation import evaluate_run, format_evaluation
+from sigmaslam.evaluation.evaluation_summary import format_evaluation
+from sigmaslam.evaluation.metrics.relative_consistency import relative_consistency
+from sigmaslam.evaluation.metrics.truth_covariance import relative_truth_covariance, truth_covariance
+from sigmaslam.evaluation.run_evaluation import evaluate_run
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import write_tum

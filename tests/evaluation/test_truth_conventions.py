@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.run_evaluation import evaluate_run, format_evaluation
+from sigmaslam.evaluation.evaluation_summary import format_evaluation
+from sigmaslam.evaluation.run_evaluation import evaluate_run
 from sigmaslam.evaluation.truth_conventions import TIME_UNITS, TruthConvention
 from sigmaslam.geometry.se3 import matrix_to_quaternion, se3_exp, se3_inverse
 from sigmaslam.geometry.trajectory import Trajectory

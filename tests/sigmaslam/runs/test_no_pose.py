@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from sigmaslam.bundle_adjustment.track_file import read_tracks
 from sigmaslam.checks.finding import Finding
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.run_evaluation import evaluate_run, format_evaluation
+from sigmaslam.evaluation.evaluation_summary import format_evaluation
+from sigmaslam.evaluation.run_evaluation import evaluate_run
 from sigmaslam.evaluation.trial import read_trial
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import open_sequence

@@ -11,7 +11,8 @@ from typer.testing import CliRunner
 
 from sigmaslam.cli import app
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.run_evaluation import Evaluation, evaluate_run
+from sigmaslam.evaluation.evaluation_result import Evaluation
+from sigmaslam.evaluation.run_evaluation import evaluate_run
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import open_sequence
