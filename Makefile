@@ -15,7 +15,7 @@ endif
 # What an installation is made of: when one of these changes, it is made again.
 BUILD := pyproject.toml setup.py requirements.lock sigmaslam/frontend/kernels.cpp sigmaslam/frontend/kernels.inc
 
-.PHONY: demo test test-slow lint dist wheel sbom clean
+.PHONY: demo test test-slow lint docs results dist wheel sbom clean
 
 demo: $(VENV)/.runtime
 	$(VENV)/bin/sigmaslam demo
@@ -31,6 +31,14 @@ lint: $(VENV)/.dev
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
+
+# The pages and a reference of the packages as a site: build/site/index.html.
+docs: $(VENV)/.docs
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict
+
+# Every page that a command makes, or those of PAGES, anew: hours. What lacks data or peers is skipped by name.
+results: $(VENV)/.dev
+	$(VENV)/bin/python release/remake_pages.py $(PAGES)
 
 # What is handed out, of the last commit: sdist, wheel without kernels, a wheel with kernels for each Python.
 dist: $(VENV)/bin/python
@@ -71,3 +79,8 @@ $(VENV)/.runtime: $(BUILD) | $(VENV)/bin/python
 $(VENV)/.dev: $(BUILD) | $(VENV)/bin/python
 	$(VENV)/bin/python -m pip install --quiet $(INSTALL_FLAGS) --editable ".[dev]"
 	touch $@ $(VENV)/.runtime
+
+# mkdocs reads the sources and imports nothing of them.
+$(VENV)/.docs: $(BUILD) | $(VENV)/bin/python
+	$(VENV)/bin/python -m pip install --quiet $(INSTALL_FLAGS) --editable ".[docs]"
+	touch $@

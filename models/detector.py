@@ -1,7 +1,8 @@
 """Blob detection as a graph: Hessian response, maxima, sub-pixel peaks, all exportable to ONNX.
 
 Published learned detectors localise worse than classical ones (repeatability within 1 px), so the network only says
-which keypoints are worth keeping. Of the classical ones the determinant of the Hessian repeats best (docs/network.md).
+which keypoints are worth keeping. Of the classical ones the determinant of the Hessian repeats best
+(docs/notebook/features.md).
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ NAMES = {f"sigmaslam.{name}" for name in ("training", "training.mixes", "synthet
 # The runtime from the ground up: a folder imports only from floors below its own.
 FLOORS = (
     ("errors", "table"),
-    ("bounded_files", "files", "progress", "plot_style"),
+    ("bounded_files", "files", "progress", "plot_style", "source_commit"),
     ("geometry",),
     ("inference",),
     ("estimation", "image_filtering", "readers"),

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from sigmaslam.source_commit import current_commit
 from sigmaslam.training.devices import Workplace, describe_hardware
 from sigmaslam.training.features.checkpoint import TrainingState
 from sigmaslam.training.mixes import MIXES
@@ -55,19 +55,3 @@ def make_card(state: TrainingState, place: Workplace) -> dict[str, Any]:
         "limits": _LIMITS,
         "metrics_on_held_out_renders": {k: round(v, 4) for k, v in state.metrics.items()},
     }
-
-
-def current_commit() -> str:
-    """The commit of the source tree, or 'unknown' when installed from a wheel."""
-    here = Path(__file__).resolve()
-    try:
-        # An installed package may lie inside of another repository.
-        _git(here.parent, "ls-files", "--error-unmatch", here.name)
-        return _git(here.parent, "rev-parse", "HEAD")
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-
-
-def _git(folder: Path, *arguments: str) -> str:
-    result = subprocess.run(["git", *arguments], cwd=folder, capture_output=True, text=True, check=True)
-    return result.stdout.strip()

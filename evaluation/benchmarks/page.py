@@ -10,6 +10,7 @@ from typing import TypeVar
 
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text
+from sigmaslam.source_commit import describe_source
 
 _MARK = "<!-- notes -->"
 
@@ -26,7 +27,7 @@ def write_page(path: Path, page: str) -> str:
 
 
 def opening(title: str, command: str, text: str, place: str = "") -> list[str]:
-    """The first lines of a page: its title, what it was made by and where.
+    """The first lines of a page: its title, what it was made by, of which sources, and where.
 
     Args:
         title: of the page.
@@ -34,7 +35,7 @@ def opening(title: str, command: str, text: str, place: str = "") -> list[str]:
         text: what follows the machine, with its punctuation; its further lines come after it.
         place: the machine, if it is described otherwise than by `machine`.
     """
-    return [f"# {title}", "", f"Made by `{command}` on {place or machine()}{text}"]
+    return [f"# {title}", "", f"Made by `{command}` {describe_source()} on {place or machine()}{text}"]
 
 
 def machine() -> str:

@@ -35,6 +35,7 @@ from sigmaslam.filters.manifolds import Space
 from sigmaslam.filters.systems import differential_drive
 from sigmaslam.plot_style import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION, style_axes
 from sigmaslam.runs.figures import save_png
+from sigmaslam.source_commit import describe_source
 
 # Number of independent groups of runs or samples; their scatter gives the intervals.
 _GROUPS = 20
@@ -219,7 +220,7 @@ def format_claims(bananas: Sequence[BananaRow], comparisons: Sequence[Comparison
         "",
         f"![Left: where a robot is after 10 m. Right: change of the position RMSE from EKF to UKF.]({figure})",
         "",
-        f"Made by `{command}` on {platform.machine()}.",
+        f"Made by `{command}` {describe_source()} on {platform.machine()}.",
         f"Random numbers are seeded. Intervals are 95 %, from the scatter of {_GROUPS} independent groups.",
         "",
         "## The banana (9.2.3.2)",

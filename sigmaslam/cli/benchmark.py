@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
 from typing import Annotated
 
@@ -10,6 +11,7 @@ from rich.console import Console
 
 from sigmaslam.cli.extras import need_report_extra, need_train_extra
 from sigmaslam.errors import InputError
+from sigmaslam.source_commit import describe_source
 
 benchmark = typer.Typer(name="benchmark", no_args_is_help=True, help="Run a benchmark and write its page.")
 
@@ -232,8 +234,15 @@ def runtime(
     typer.echo(write_runtime(out, data, command, methods, chosen, rounds, frames, runs, _note))
 
 
+def reads_data(name: str) -> bool:
+    """Whether there is a benchmark of that name that reads the real data sets."""
+    functions = [each.callback for each in benchmark.registered_commands if each.callback is not None]
+    return any(each.__name__ == name and "data" in inspect.signature(each).parameters for each in functions)
+
+
 def _command(name: str, out: Path, *flags: str) -> str:
     """What the page says it was made by."""
+    describe_source()  # the page names it, too; later the sources may have changed
     return " ".join(["sigmaslam benchmark", name, f"--out {out}", *flags])
 
 

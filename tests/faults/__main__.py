@@ -17,6 +17,7 @@ from pathlib import Path
 
 from sigmaslam.bounded_files import shorten
 from sigmaslam.evaluation.benchmarks.page import header, opening, row, write_page
+from sigmaslam.source_commit import describe_source
 from tests.faults.case import Case, Runner, Verdict, judge
 from tests.faults.running import attempt, run_in_process, run_in_this_process
 from tests.faults.table import CASES
@@ -94,7 +95,7 @@ def write_reliability(path: Path, results: list[Result], command: str) -> str:
         *header("group", "fault", "first trial", "verdict", "exit code", "what is said"),
     ]
     for result in results:
-        case, said = result.case, result.said.replace("|", "\\|").replace("<", "&lt;")
+        case, said = result.case, result.said.replace("|", "\\|").replace("<", "&lt;").replace("[", "\\[")
         lines.append(row(case.group, case.name, case.first or "", result.verdict, str(result.code), said))
     return write_page(path, "\n".join(lines) + "\n")
 
@@ -113,6 +114,7 @@ def main() -> int:
         and (case.data is None or (Path(os.environ.get("SIGMASLAM_DATA") or "/nowhere") / case.data).is_dir())
     ]
     results: list[Result] = []
+    describe_source()  # now: the sources may change while they run
     command = "python -m tests.faults" + (f" --out {arguments.out}" if arguments.out else "")
     command += " --processes" if arguments.processes else ""
     for case in chosen:

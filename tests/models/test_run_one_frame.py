@@ -1,20 +1,19 @@
 """The example that runs the graphs without the package finds the pose of a frame, and knows how well."""
 
-import importlib.util
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from tests.support.examples import load_example
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.parametrize("index", [3, 6])
 def test_the_pose_is_within_its_covariance_of_the_truth(index):
-    specification = importlib.util.spec_from_file_location("run_one_frame", ROOT / "examples" / "run_one_frame.py")
-    example = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(example)
+    example = load_example("run_one_frame")
     folder = ROOT / "synthetic" / "demo"
     pose, covariance = example.run(ROOT / "models" / "weights", folder, index)
     truth = np.vstack([np.loadtxt(folder / "poses.txt")[index].reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])

@@ -9,9 +9,10 @@ import torch
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation.matching import read_scores
 from sigmaslam.models.model_card import card_page, read_card
+from sigmaslam.source_commit import current_commit
 from sigmaslam.training.devices import Workplace
 from sigmaslam.training.features.checkpoint import TrainingState, begin
-from sigmaslam.training.run_card import current_commit, describe_origin, make_card
+from sigmaslam.training.run_card import describe_origin, make_card
 
 PLACE = Workplace(torch.device("cpu"))
 

@@ -1,0 +1,90 @@
+"""Remake the pages that commands make, each by the command that it names: hours for all of them.
+
+    python release/remake_pages.py [PAGE ...]
+
+A page whose data or peers are absent would lose rows: it is skipped, and said so. Renders go to build/results and are
+used again. Records of commands that are gone, or of work by hand, name no command and stay.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable, Iterable
+from importlib.util import find_spec
+from pathlib import Path
+
+from sigmaslam.cli.benchmark import reads_data
+
+ROOT = Path(__file__).resolve().parents[1]
+RENDERS = "build/results"
+# Modules beside which a benchmark measures.
+PEERS = {
+    "filters": ("filterpy", "stonesoup", "dynamax", "pypose", "torch_kf"),
+    "runtime": ("dim_odom", "pyorbslam3"),
+    "sequences": ("dim_odom",),
+}
+
+
+def main() -> None:
+    """Entry point; exit code 1 if a command failed."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("pages", nargs="*", type=Path, help="all by default")
+    chosen = [page.resolve() for page in parser.parse_args().pages] or sorted((ROOT / "docs").rglob("*.md"))
+    failed = remake(chosen, lambda words: subprocess.run(words, cwd=ROOT, check=False).returncode)
+    sys.exit(f"failed: {', '.join(failed)}" if failed else 0)
+
+
+def remake(pages: Iterable[Path], run: Callable[[list[str]], int]) -> list[str]:
+    """Runs the command of each page that has one.
+
+    Args:
+        pages: Markdown files.
+        run: runs the words of a command and returns its exit code.
+    Returns:
+        Names of the pages whose command failed.
+    """
+    failed = []
+    for page in pages:
+        words = command_of(page)
+        if not words:
+            continue
+        name = page.relative_to(ROOT).as_posix() if page.is_relative_to(ROOT) else str(page)
+        reason = absent(words)
+        print(f"{name}: " + (f"skipped, {reason}" if reason else shlex.join(words)), flush=True)
+        if not reason and run(runnable(words)):
+            failed.append(name)
+    return failed
+
+
+def command_of(page: Path) -> list[str]:
+    """Words of the command that a page was made by; none if it names none."""
+    found = re.search(r"^Made by `([^`]+)`", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return shlex.split(found[1]) if found else []
+
+
+def absent(words: list[str]) -> str:
+    """What the command of a page lacks here; empty if nothing."""
+    # `sigmaslam benchmark NAME ...`, `python -m NAME ...`
+    name = words[2]
+    data = Path(os.environ.get("SIGMASLAM_DATA") or "/nowhere")
+    if (reads_data(name) or name == "tests.faults") and not data.is_dir():
+        return "SIGMASLAM_DATA names no folder of the real data sets"
+    modules = [module for module in PEERS.get(name, ()) if find_spec(module) is None]
+    return f"{', '.join(modules)} not installed: pip install 'sigmaslam[peers]'" if modules else ""
+
+
+def runnable(words: list[str]) -> list[str]:
+    """The command with this interpreter, its renders in a folder that git does not see."""
+    program = {"sigmaslam": [sys.executable, "-m", "sigmaslam"], "python": [sys.executable]}[words[0]]
+    rest = (f"{RENDERS}/{word}" if before == "--runs" else word for before, word in itertools.pairwise(words))
+    return [*program, *rest]
+
+
+if __name__ == "__main__":
+    main()

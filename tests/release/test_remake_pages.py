@@ -1,0 +1,83 @@
+"""`make results` knows every page that a command makes, and says by name what it leaves out."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from release.remake_pages import PEERS, ROOT, absent, command_of, remake, runnable
+from sigmaslam.cli.benchmark import benchmark, reads_data
+from sigmaslam.evaluation.filters import peer_filters
+
+
+def write(folder: Path, name: str, command: str) -> Path:
+    page = folder / name
+    page.write_text(f"# Title\n\nMade by `{command}` at commit 1234567 on a machine.\n")
+    return page
+
+
+def test_pages_name_benchmarks_that_exist():
+    commands = [words for page in (ROOT / "docs").rglob("*.md") if (words := command_of(page))]
+    names = {words[2] for words in commands if words[:2] == ["sigmaslam", "benchmark"]}
+    assert (
+        {"sequences", "runtime", "filters", "claims"}
+        <= names
+        <= {each.callback.__name__ for each in benchmark.registered_commands}
+    )
+    others = {tuple(words[:3]) for words in commands if words[1] != "benchmark"}
+    assert others == {("sigmaslam", "export", "--page"), ("python", "-m", "tests.faults")}
+
+
+def test_benchmarks_that_take_data_and_peers_are_known():
+    assert reads_data("sequences")
+    assert not reads_data("claims")
+    pytest.importorskip("torch")
+    assert set(PEERS["filters"]) <= {module for peer in peer_filters.PEERS for module in peer.modules}
+
+
+def test_what_lacks_data_or_peers_is_skipped_by_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.delenv("SIGMASLAM_DATA", raising=False)
+    monkeypatch.setitem(PEERS, "filters", ("a_peer_that_is_not_there",))
+    pages = [
+        write(tmp_path, "results.md", "sigmaslam benchmark sequences --out docs/results.md"),
+        write(tmp_path, "filters.md", "sigmaslam benchmark filters --out docs/benchmarks/filters.md"),
+        write(tmp_path, "claims.md", "sigmaslam benchmark claims --out docs/benchmarks/claims.md"),
+    ]
+    (tmp_path / "hand.md").write_text("Made by hand at commit 1234567.\n")
+    ran: list[list[str]] = []
+    assert remake([*pages, tmp_path / "hand.md"], lambda words: len(ran.append(words) or "")) == []
+    assert ran == [
+        [sys.executable, "-m", "sigmaslam", "benchmark", "claims", "--out", "docs/benchmarks/claims.md"],
+    ]
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 3
+    assert lines[0].endswith("results.md: skipped, SIGMASLAM_DATA names no folder of the real data sets")
+    assert "filters.md: skipped, a_peer_that_is_not_there not installed" in lines[1]
+
+
+def test_with_data_nothing_lacks_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("SIGMASLAM_DATA", str(tmp_path))
+    assert absent(["sigmaslam", "benchmark", "matches"]) == ""
+    monkeypatch.setenv("SIGMASLAM_DATA", str(tmp_path / "typo"))
+    assert absent(["sigmaslam", "benchmark", "matches"])
+
+
+def test_a_page_that_fails_is_told_and_the_others_are_made(tmp_path: Path):
+    pages = [write(tmp_path, f"{name}.md", f"sigmaslam benchmark {name} --out x.md") for name in ("claims", "geometry")]
+    ran: list[str] = []
+
+    def run(words: list[str]) -> int:
+        ran.append(words[4])
+        return int(words[4] == "claims")
+
+    assert remake(pages, run) == [str(pages[0])]
+    assert ran == ["claims", "geometry"]
+
+
+def test_renders_go_where_git_does_not_see_them():
+    words = runnable(["sigmaslam", "benchmark", "shake", "--out", "docs/a.md", "--runs", "shk", "--seeds", "20"])
+    assert words[3:] == ["benchmark", "shake", "--out", "docs/a.md", "--runs", "build/results/shk", "--seeds", "20"]
+    assert words[:3] == [sys.executable, "-m", "sigmaslam"]
+    assert runnable(["python", "-m", "tests.faults", "--out", "a.md"])[1:] == ["-m", "tests.faults", "--out", "a.md"]

@@ -1,0 +1,78 @@
+"""Links between the Markdown pages lead somewhere, headings included; the notebook's index lists its entries."""
+
+import re
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [*ROOT.glob("*.md"), *(path for name in ("docs", "examples", "models") for path in (ROOT / name).rglob("*.md"))]
+NOTEBOOK = ROOT / "docs" / "notebook"
+
+
+@pytest.mark.parametrize("page", sorted(PAGES), ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_links_lead_to_files_and_headings(page: Path):
+    for target in links(page):
+        if re.match(r"[a-z]+:", target):
+            continue
+        name, _, anchor = target.partition("#")
+        path = (page.parent / name).resolve() if name else page
+        assert path.exists(), f"{page.name} links to {target}"
+        if anchor and path.suffix == ".md":
+            assert anchor in anchors(path), f"{page.name} links to {target}, where there is no such heading"
+
+
+def test_the_notebook_s_index_lists_every_entry_by_date():
+    entries = set()
+    for page in NOTEBOOK.glob("*.md"):
+        if page.name != "README.md":
+            headings = re.findall(r"^## (.*)\n\n(.*)", page.read_text(), re.MULTILINE)
+            assert [heading[:10] for heading, _ in headings] == sorted(heading[:10] for heading, _ in headings)
+            for heading, outcome in headings:
+                assert re.match(r"20\d\d-\d\d-\d\d: ", heading), f"{page.name}: {heading!r} begins with no date"
+                assert outcome.startswith("**"), f"{page.name}: {heading!r} does not say in bold what became of it"
+                entries.add(f"{page.name}#{anchor_of(heading)}")
+    rows = re.findall(r"^\| (\S+) \| \[[^]]+\]\(([^)]+)\)", (NOTEBOOK / "README.md").read_text(), re.MULTILINE)
+    assert len(rows) == len(entries)
+    assert {target for _, target in rows} == entries
+    assert [date for date, _ in rows] == sorted(target.partition("#")[2][:10] for _, target in rows)
+
+
+def test_headings_become_anchors_as_github_makes_them():
+    assert anchor_of("2026-11-22: one scale of sigma, from the 95 % ellipse?") == (
+        "2026-11-22-one-scale-of-sigma-from-the-95--ellipse"
+    )
+    assert anchor_of("Going on: `sigmaslam track INPUT --out run --resume`") == (
+        "going-on-sigmaslam-track-input---out-run---resume"
+    )
+    assert anchor_of("[results.md](results.md) of *ours*") == "resultsmd-of-ours"
+
+
+def links(page: Path) -> list[str]:
+    """Targets of a page's links and pictures, outside code."""
+    return re.findall(r"\]\(([^)\s]+)\)", re.sub(r"`[^`\n]*`", "", prose(page)))
+
+
+@cache
+def anchors(page: Path) -> set[str]:
+    """Anchors of a page's headings; those that stand twice are counted."""
+    found: set[str] = set()
+    for heading in re.findall(r"^#+ (.*)$", prose(page), re.MULTILINE):
+        anchor, count = anchor_of(heading), 0
+        while anchor in found:
+            count += 1
+            anchor = f"{anchor_of(heading)}-{count}"
+        found.add(anchor)
+    return found
+
+
+def anchor_of(heading: str) -> str:
+    """GitHub's anchor of a heading."""
+    text = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", heading).strip()
+    return re.sub(r"[^\w\- ]", "", text.lower()).replace(" ", "-")
+
+
+def prose(page: Path) -> str:
+    """A page without its blocks of code."""
+    return re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
