@@ -18,6 +18,7 @@ from sigmaslam.checks.check import SAMPLES_BEFORE_TRACKING, check_sequence
 from sigmaslam.checks.finding import Finding, wrong
 from sigmaslam.cli.extras import need_train_extra
 from sigmaslam.cli.run_summary import tell_summary
+from sigmaslam.cli.track_sinks import open_sinks
 from sigmaslam.errors import InputError
 from sigmaslam.files import check_new_folder, printable
 from sigmaslam.frontend import FRONTENDS
@@ -29,6 +30,7 @@ from sigmaslam.readers.selection import Selection
 from sigmaslam.runs.removal import remove_run
 
 if TYPE_CHECKING:
+    from sigmaslam.runs.frame_sink import FrameSink
     from sigmaslam.slam.config import TrackerConfig
 
 logger = logging.getLogger(__name__)
@@ -159,6 +161,13 @@ def track(
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with the run in the folder, of the same input, that was stopped.")
     ] = False,
+    stream: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TARGET",
+            help="Give out each pose when it is known, as a line of JSON: stdout, or udp://HOST:PORT (docs/live.md).",
+        ),
+    ] = None,
 ) -> None:
     """Track a stereo sequence, recorded or live: trajectory, covariance, map and report.
 
@@ -175,26 +184,28 @@ def track(
     sequence = _select(sequence, Selection(start, frames, every), scale)
     if not (overwrite or resume):
         check_new_folder(out)
-    findings = _check(sequence, strict, threads)
-    if overwrite:
-        remove_run(out)
-    summary = _track(
-        sequence,
-        out,
-        frontend,
-        backend,
-        settings,
-        map,
-        tracks,
-        track_object,
-        location,
-        realtime,
-        threads,
-        findings,
-        denoise,
-        resume,
-    )
-    tell_summary(summary, out)
+    with open_sinks(stream) as sinks:
+        findings = _check(sequence, strict, threads)
+        if overwrite:
+            remove_run(out)
+        summary = _track(
+            sequence,
+            out,
+            frontend,
+            backend,
+            settings,
+            map,
+            tracks,
+            track_object,
+            location,
+            realtime,
+            threads,
+            findings,
+            denoise,
+            resume,
+            sinks,
+        )
+        tell_summary(summary, out)
 
 
 def open_input(
@@ -263,6 +274,7 @@ def _track(
     findings: Sequence[Finding] = (),
     denoise: bool = False,
     resume: bool = False,
+    sinks: Sequence[FrameSink] = (),
 ) -> dict[str, Any]:
     import cv2
 
@@ -287,6 +299,7 @@ def _track(
             findings=findings,
             denoise=denoise,
             resume=resume,
+            sinks=sinks,
         )
     except Stopped as stop:
         with suppress(OSError):  # the terminal may be gone
