@@ -168,6 +168,10 @@ def track(
             help="Give out each pose when it is known, as a line of JSON: stdout, or udp://HOST:PORT (docs/live.md).",
         ),
     ] = None,
+    video: Annotated[
+        Path | None,
+        typer.Option(help="Also write an .mp4 of the left images with their tracks, and the path from above."),
+    ] = None,
 ) -> None:
     """Track a stereo sequence, recorded or live: trajectory, covariance, map and report.
 
@@ -179,12 +183,14 @@ def track(
         need_train_extra()
     if resume and overwrite:
         raise InputError("--resume goes on with the run in the folder, --overwrite removes it: give one of them")
+    if resume and video is not None:
+        raise InputError("--resume does not go with --video, which shows a whole run: leave one of them out")
     settings = _read_settings(config, estimate, track_object is not None)
     sequence = open_input(source, format, calibration, camera, seconds, (topic_left, topic_right))
     sequence = _select(sequence, Selection(start, frames, every), scale)
     if not (overwrite or resume):
         check_new_folder(out)
-    with open_sinks(stream) as sinks:
+    with open_sinks(stream, video, out, sequence.camera) as sinks:
         findings = _check(sequence, strict, threads)
         if overwrite:
             remove_run(out)
