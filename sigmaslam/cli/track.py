@@ -172,6 +172,13 @@ def track(
         Path | None,
         typer.Option(help="Also write an .mp4 of the left images with their tracks, and the path from above."),
     ] = None,
+    viewer: Annotated[
+        str | None,
+        typer.Option(
+            metavar="rerun[:FILE.rrd]",
+            help="Show the run in a window of Rerun while it goes on, or write what it would show (extra 'viewer').",
+        ),
+    ] = None,
 ) -> None:
     """Track a stereo sequence, recorded or live: trajectory, covariance, map and report.
 
@@ -183,14 +190,14 @@ def track(
         need_train_extra()
     if resume and overwrite:
         raise InputError("--resume goes on with the run in the folder, --overwrite removes it: give one of them")
-    if resume and video is not None:
-        raise InputError("--resume does not go with --video, which shows a whole run: leave one of them out")
+    if resume and (video or viewer):
+        raise InputError("--resume does not go with --video and --viewer, which show a whole run: leave them out")
     settings = _read_settings(config, estimate, track_object is not None)
     sequence = open_input(source, format, calibration, camera, seconds, (topic_left, topic_right))
     sequence = _select(sequence, Selection(start, frames, every), scale)
     if not (overwrite or resume):
         check_new_folder(out)
-    with open_sinks(stream, video, out, sequence.camera) as sinks:
+    with open_sinks(stream, video, viewer, out, sequence.camera) as sinks:
         findings = _check(sequence, strict, threads)
         if overwrite:
             remove_run(out)

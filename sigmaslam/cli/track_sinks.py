@@ -1,4 +1,4 @@
-"""What `track` gives its frames to beside the run folder: a stream, a video."""
+"""What `track` gives its frames to beside the run folder: a stream, a video, a viewer."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
+
+from sigmaslam.cli.extras import need_viewer_extra
+from sigmaslam.errors import InputError
 
 if TYPE_CHECKING:
     from sigmaslam.geometry.camera import StereoCamera
@@ -21,12 +24,15 @@ _PATIENCE = 5.0
 
 
 @contextmanager
-def open_sinks(stream: str | None, video: Path | None, out: Path, camera: StereoCamera) -> Iterator[list[FrameSink]]:
+def open_sinks(
+    stream: str | None, video: Path | None, viewer: str | None, out: Path, camera: StereoCamera
+) -> Iterator[list[FrameSink]]:
     """The sinks that the command line names; with a stream on the standard output all else goes to the standard error.
 
     Args:
         stream: `stdout` or `udp://HOST:PORT`.
         video: .mp4 to write.
+        viewer: `rerun`, or `rerun:FILE.rrd`.
         out: folder of the run.
         camera: of its images.
     Raises:
@@ -38,6 +44,8 @@ def open_sinks(stream: str | None, video: Path | None, out: Path, camera: Stereo
     sinks: list[FrameSink] = []
     if video is not None:
         sinks.append(_open_video(video, out, camera))
+    if viewer is not None:
+        sinks.append(_open_viewer(viewer, out, camera))
     if stream is None:
         yield sinks
         return
@@ -59,8 +67,25 @@ def open_sinks(stream: str | None, video: Path | None, out: Path, camera: Stereo
 
 
 def _open_video(path: Path, out: Path, camera: StereoCamera) -> FrameSink:
-    from sigmaslam.runs.frame_sink import ThreadedSink
-    from sigmaslam.runs.video import VideoSink, check_video_path
+    from sigmaslam.runs.frame_sink import ThreadedSink, check_sink_path
+    from sigmaslam.runs.run_folder import VIDEO_NAME
+    from sigmaslam.runs.video import VideoSink
 
-    check_video_path(path, out)
+    check_sink_path("--video", path, out, VIDEO_NAME)
     return ThreadedSink(VideoSink(path, camera))
+
+
+def _open_viewer(viewer: str, out: Path, camera: StereoCamera) -> FrameSink:
+    from sigmaslam.runs.frame_sink import ThreadedSink, check_sink_path
+    from sigmaslam.runs.run_folder import RERUN_NAME
+
+    name, colon, file = viewer.partition(":")
+    if name != "rerun" or (colon and not file):
+        raise InputError(f"--viewer {viewer}: is no viewer; give rerun for a window, or rerun:FILE.rrd")
+    need_viewer_extra()
+    from sigmaslam.runs.rerun_viewer import RerunSink
+
+    path = Path(file) if file else None
+    if path is not None:
+        check_sink_path("--viewer", path, out, RERUN_NAME)
+    return ThreadedSink(RerunSink(path, camera))

@@ -25,7 +25,7 @@ STATUS_COLOURS = {
 _BACKGROUND, _TEXT, _FAINT, _OUTLIER = bgr("#14181d"), bgr("#e6e9ec"), bgr("#7d8791"), bgr("#ff4d3d")
 _TRAIL = 8
 # Matches by their probability: colours from 0 to 1.
-_SHADES = cv2.applyColorMap(np.linspace(0, 255, 12).astype(np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)[:, 0].tolist()
+_SHADES = cv2.applyColorMap(np.linspace(0, 255, 12).astype(np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)[:, 0]
 _HEIGHT, _MAX_WIDTH = 480, 1280
 _LINES, _LINE = 5, 19  # of text, and pixels of each
 _DIMMED = 0.8
@@ -43,7 +43,7 @@ class FramePainter:
     """
 
     def __init__(self, camera: StereoCamera) -> None:
-        self._trails = _Trails()
+        self._trails = MatchTrails()
         self._plan = _Plan(KeyframePoints(camera))
 
     def draw(self, frame: TrackedFrame) -> np.ndarray:
@@ -52,7 +52,7 @@ class FramePainter:
         height, width = frame.seen.left.shape
         scale = min(_HEIGHT / height, _MAX_WIDTH / width)
         size = 2 * round(0.5 * scale * width), 2 * round(0.5 * scale * height)
-        image = self._trails.draw(frame.seen, size)
+        image = _draw_matches(frame.seen, self._trails, size)
         self._plan.add(frame)
         words = self._plan.describe(frame)
         panel = np.full((size[1], size[1], 3), _BACKGROUND, np.uint8)
@@ -62,19 +62,19 @@ class FramePainter:
         return np.hstack([image, panel])
 
 
-class _Trails:
+class MatchTrails:
     """Where the landmarks of an image were in those before."""
 
     def __init__(self) -> None:
         self._before: deque[MatchedFrame] = deque(maxlen=_TRAIL)
 
-    def draw(self, frame: MatchedFrame, size: tuple[int, int]) -> np.ndarray:
-        """The left image at another size (width, height), with trails coloured by probability, outliers as crosses."""
-        scale = size[0] / frame.left.shape[1]
-        grey = cv2.resize(frame.left, size, interpolation=cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC)
-        picture = cv2.cvtColor(cv2.convertScaleAbs(grey, alpha=_DIMMED), cv2.COLOR_GRAY2BGR)
-        inliers = frame.inliers
-        rows = np.flatnonzero(inliers)
+    def add(self, frame: MatchedFrame) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Takes a frame.
+
+        Returns:
+            (K,) rows of its matches that the pose agrees with, and of each the places (T, 2), the latest first.
+        """
+        rows = np.flatnonzero(frame.inliers)
         steps = np.full((_TRAIL + 1, len(rows), 2), np.nan)
         steps[0] = frame.pixels[rows]
         for k, before in enumerate(self._before, start=1):
@@ -83,21 +83,32 @@ class _Trails:
             steps[k, here] = np.where(np.isnan(steps[k - 1, here]), np.nan, before.pixels[there])
         self._before.appendleft(frame)
         length = np.isfinite(steps[..., 0]).sum(axis=0)
-        places = _fixed_point(scale * (np.nan_to_num(steps) + 0.5) - 0.5)
-        last = len(_SHADES) - 1
-        shade = np.rint(last * np.clip(frame.matches.probability[rows], 0.0, 1.0)).astype(np.int64)
-        for each, colour in enumerate(_SHADES):
-            of_shade = np.flatnonzero(shade == each)
-            trails = [places[: length[k], k] for k in of_shade]
-            _draw_lines(picture, trails, colour)
-            for u, v in places[0, of_shade].tolist():
-                cv2.circle(picture, (u, v), 5 << (_SHIFT - 1), colour, -1, cv2.LINE_AA, _SHIFT)
-        crosses = scale * (frame.pixels[~inliers] + 0.5) - 0.5
-        ends = np.array([[[-3.0, -3.0], [3.0, 3.0]], [[-3.0, 3.0], [3.0, -3.0]]])
-        strokes = _fixed_point(crosses[:, None, None] + ends).reshape(-1, 2, 2)
-        _draw_lines(picture, strokes, _OUTLIER)
-        _draw_legend(picture)
-        return np.asarray(picture)
+        return rows, [steps[: length[k], k] for k in range(len(rows))]
+
+
+def shade_matches(probability: np.ndarray) -> np.ndarray:
+    """(N, 3) uint8 colours, blue first, of probabilities (N,)."""
+    return _SHADES[np.rint((len(_SHADES) - 1) * np.clip(probability, 0.0, 1.0)).astype(np.int64)]
+
+
+def _draw_matches(frame: MatchedFrame, trails: MatchTrails, size: tuple[int, int]) -> np.ndarray:
+    """The left image at another size (width, height), with trails coloured by probability, outliers as crosses."""
+    scale = size[0] / frame.left.shape[1]
+
+    def place(pixels: np.ndarray) -> np.ndarray:
+        return scale * (pixels + 0.5) - 0.5
+
+    grey = cv2.resize(frame.left, size, interpolation=cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC)
+    picture = cv2.cvtColor(cv2.convertScaleAbs(grey, alpha=_DIMMED), cv2.COLOR_GRAY2BGR)
+    rows, steps = trails.add(frame)
+    for trail, colour in zip(steps, shade_matches(frame.matches.probability[rows]).tolist(), strict=True):
+        _draw_lines(picture, [_fixed_point(place(trail))], colour)
+        cv2.circle(picture, _pair(place(trail[0])), 5 << (_SHIFT - 1), colour, -1, cv2.LINE_AA, _SHIFT)
+    crosses = place(frame.pixels[~frame.inliers])
+    ends = np.array([[[-3.0, -3.0], [3.0, 3.0]], [[-3.0, 3.0], [3.0, -3.0]]])
+    _draw_lines(picture, _fixed_point(crosses[:, None, None] + ends).reshape(-1, 2, 2), _OUTLIER)
+    _draw_legend(picture)
+    return np.asarray(picture)
 
 
 class _Plan:
@@ -226,7 +237,7 @@ def _draw_legend(picture: np.ndarray) -> None:
     height, bar = picture.shape[0], 8 * len(_SHADES)
     cv2.rectangle(picture, (0, height - 24), (136 + bar, height), _BACKGROUND, -1)
     _write(picture, "probability 0", (8, height - 8), _TEXT)
-    for k, colour in enumerate(_SHADES):
+    for k, colour in enumerate(_SHADES.tolist()):
         cv2.rectangle(picture, (108 + 8 * k, height - 17), (115 + 8 * k, height - 8), colour, -1)
     _write(picture, "1", (114 + bar, height - 8), _TEXT)
 

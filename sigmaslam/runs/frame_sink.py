@@ -7,8 +7,10 @@ import queue
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
+from sigmaslam.errors import InputError
 from sigmaslam.slam.estimate import Estimate
 from sigmaslam.slam.matched_frame import MatchedFrame
 from sigmaslam.slam.object_tracker import ObjectEstimate
@@ -110,3 +112,26 @@ def close_all(sinks: Sequence[FrameSink]) -> list[str]:
             _LOGGER.error("%s is not written: %s", sink.name, error)
             failed.append(sink.name)
     return failed
+
+
+def check_sink_path(option: str, path: Path, out: Path, name: str) -> None:
+    """A file beside the results of a run can be written there.
+
+    Args:
+        option: of the command line, for messages.
+        path: of the file.
+        out: folder of the run, which may be still to make.
+        name: that the file has in the folder of a run, where `--overwrite` removes it; elsewhere its suffix counts.
+    Raises:
+        InputError: it has another suffix, its folder does not exist, or it is there already.
+    """
+    suffix = Path(name).suffix
+    if path.suffix.lower() != suffix:
+        raise InputError(f"{option} {path}: give a name that ends with {suffix}")
+    if path.parent.resolve() == out.resolve():
+        if path.name != name:
+            raise InputError(f"{option} {path}: call it {name} in the folder of the run, or put it elsewhere")
+    elif not path.parent.is_dir():
+        raise InputError(f"{option} {path}: there is no folder {path.parent}: make it, or choose another")
+    elif path.exists():
+        raise InputError(f"{option} {path}: exists: remove it, or choose another name")

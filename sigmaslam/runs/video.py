@@ -8,35 +8,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sigmaslam.errors import InputError, OutputError
+from sigmaslam.errors import OutputError
 from sigmaslam.files import atomic_path
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.runs.frame_drawing import FramePainter
 from sigmaslam.runs.frame_sink import TrackedFrame
-from sigmaslam.runs.run_folder import VIDEO_NAME
 
 # The rate is that of the first frames, and a player's at least and at most, frames a second.
 _FIRST, _MIN_RATE, _MAX_RATE = 10, 5.0, 60.0
-
-
-def check_video_path(path: Path, out: Path) -> None:
-    """A video can be written there.
-
-    Args:
-        path: of the video.
-        out: folder of the run, which may be still to make.
-    Raises:
-        InputError: it is no .mp4, its folder does not exist, or another video of the same name is there.
-    """
-    if path.suffix.lower() != ".mp4":
-        raise InputError(f"--video {path}: is written as MPEG-4: give a name that ends with .mp4")
-    inside = path.parent.resolve() == out.resolve()
-    if inside and path.name != VIDEO_NAME:
-        raise InputError(f"--video {path}: call it {VIDEO_NAME} in the folder of the run, or put it elsewhere")
-    if not inside and not path.parent.is_dir():
-        raise InputError(f"--video {path}: there is no folder {path.parent}: make it, or choose another")
-    if not inside and path.exists():
-        raise InputError(f"--video {path}: exists: remove it, or choose another name")
 
 
 class VideoSink:

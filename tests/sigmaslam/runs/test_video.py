@@ -13,9 +13,9 @@ from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.se3 import se3_exp
 from sigmaslam.readers import open_sequence
 from sigmaslam.runs.frame_drawing import STATUS_COLOURS, FramePainter
-from sigmaslam.runs.frame_sink import ThreadedSink, TrackedFrame
+from sigmaslam.runs.frame_sink import ThreadedSink, TrackedFrame, check_sink_path
 from sigmaslam.runs.keyframe_points import KeyframePoints
-from sigmaslam.runs.video import VideoSink, check_video_path, count_frames, frame_rate
+from sigmaslam.runs.video import VideoSink, count_frames, frame_rate
 from sigmaslam.slam.mapping import KeyframeTracks
 from sigmaslam.slam.object_tracker import ObjectEstimate
 from tests.support.commands import run_here
@@ -149,5 +149,5 @@ def test_the_rate_is_that_of_the_frames_within_what_players_show(interval: float
 def test_a_name_that_cannot_be_a_video_is_refused(tmp_path: Path, name: str):
     (tmp_path / "there.mp4").touch()
     with pytest.raises(InputError, match="--video"):
-        check_video_path(tmp_path / name, tmp_path / "run")
-    check_video_path(tmp_path / "run" / "video.mp4", tmp_path / "run")
+        check_sink_path("--video", tmp_path / name, tmp_path / "run", "video.mp4")
+    check_sink_path("--video", tmp_path / "run" / "video.mp4", tmp_path / "run", "video.mp4")
