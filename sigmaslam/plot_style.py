@@ -31,3 +31,9 @@ def style_axes(axes: Axes) -> None:
     axes.set_axisbelow(True)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
+
+
+def bgr(colour: str) -> tuple[int, int, int]:
+    """A colour `#RRGGBB` in OpenCV's order."""
+    red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
+    return blue, green, red

@@ -15,6 +15,14 @@ def need_train_extra() -> None:
         raise InputError(f"{error.name} is not installed: pip install 'sigmaslam[train]'") from error
 
 
+def need_viewer_extra() -> None:
+    """Refuses a viewer where rerun is missing."""
+    try:
+        import rerun  # noqa: F401
+    except ImportError as error:
+        raise InputError("rerun is not installed: pip install 'sigmaslam[viewer]'") from error
+
+
 def need_report_extra() -> None:
     """Refuses a command that only draws where matplotlib is missing."""
     if not has_matplotlib():

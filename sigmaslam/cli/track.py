@@ -18,6 +18,7 @@ from sigmaslam.checks.check import SAMPLES_BEFORE_TRACKING, check_sequence
 from sigmaslam.checks.finding import Finding, wrong
 from sigmaslam.cli.extras import need_train_extra
 from sigmaslam.cli.run_summary import tell_summary
+from sigmaslam.cli.track_sinks import open_sinks
 from sigmaslam.errors import InputError
 from sigmaslam.files import check_new_folder, printable
 from sigmaslam.frontend import FRONTENDS
@@ -30,6 +31,7 @@ from sigmaslam.readers.selection import Selection
 from sigmaslam.runs.removal import remove_run
 
 if TYPE_CHECKING:
+    from sigmaslam.runs.frame_sink import FrameSink
     from sigmaslam.slam.config import TrackerConfig
 
 logger = logging.getLogger(__name__)
@@ -166,6 +168,24 @@ def track(
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with the run in the folder, of the same input, that was stopped.")
     ] = False,
+    stream: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TARGET",
+            help="Give out each pose when it is known, as a line of JSON: stdout, or udp://HOST:PORT (docs/live.md).",
+        ),
+    ] = None,
+    video: Annotated[
+        Path | None,
+        typer.Option(help="Also write an .mp4 of the left images with their tracks, and the path from above."),
+    ] = None,
+    viewer: Annotated[
+        str | None,
+        typer.Option(
+            metavar="rerun[:FILE.rrd]",
+            help="Show the run in a window of Rerun while it goes on, or write what it would show (extra 'viewer').",
+        ),
+    ] = None,
 ) -> None:
     """Track a stereo sequence, recorded or live: trajectory, covariance, map and report.
 
@@ -178,32 +198,36 @@ def track(
     check_provider(provider.value, backend.value)
     if resume and overwrite:
         raise InputError("--resume goes on with the run in the folder, --overwrite removes it: give one of them")
+    if resume and (video or viewer):
+        raise InputError("--resume does not go with --video and --viewer, which show a whole run: leave them out")
     settings = _read_settings(config, estimate, track_object is not None)
     sequence = open_input(source, format, calibration, camera, seconds, (topic_left, topic_right))
     sequence = _select(sequence, Selection(start, frames, every), scale)
     if not (overwrite or resume):
         check_new_folder(out)
-    findings = _check(sequence, strict, threads)
-    if overwrite:
-        remove_run(out)
-    summary = _track(
-        sequence,
-        out,
-        frontend,
-        backend,
-        settings,
-        map,
-        tracks,
-        track_object,
-        location,
-        realtime,
-        threads,
-        findings,
-        denoise,
-        resume,
-        provider,
-    )
-    tell_summary(summary, out)
+    with open_sinks(stream, video, viewer, out, sequence.camera) as sinks:
+        findings = _check(sequence, strict, threads)
+        if overwrite:
+            remove_run(out)
+        summary = _track(
+            sequence,
+            out,
+            frontend,
+            backend,
+            settings,
+            map,
+            tracks,
+            track_object,
+            location,
+            realtime,
+            threads,
+            findings,
+            denoise,
+            resume,
+            provider,
+            sinks,
+        )
+        tell_summary(summary, out)
 
 
 def open_input(
@@ -273,6 +297,7 @@ def _track(
     denoise: bool = False,
     resume: bool = False,
     provider: Provider = Provider["cpu"],
+    sinks: Sequence[FrameSink] = (),
 ) -> dict[str, Any]:
     import cv2
 
@@ -298,6 +323,7 @@ def _track(
             denoise=denoise,
             resume=resume,
             provider=provider.value,
+            sinks=sinks,
         )
     except Stopped as stop:
         with suppress(OSError):  # the terminal may be gone

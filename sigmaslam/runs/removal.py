@@ -14,13 +14,14 @@ from sigmaslam.runs.pose_file import PARTIAL_POSES
 from sigmaslam.runs.pose_table import POSES_NAME
 from sigmaslam.runs.recorded_run import REFINE_NAME, REFINED_TRAJECTORY
 from sigmaslam.runs.relative_pose_file import PARTIAL_RELATIVE_POSES, RELATIVE_POSES_NAME
-from sigmaslam.runs.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY, RUN_NAME
+from sigmaslam.runs.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY, RERUN_NAME, RUN_NAME, VIDEO_NAME
 
 _NAMES = (
     *(FRAMES_NAME, PARTIAL_POSES, PARTIAL_RELATIVE_POSES, RELATIVE_POSES_NAME, POSES_NAME, PICTURES_NAME),
     *("trajectory.tum", "trajectory.kitti", "times.txt", "covariance.npy", "covariance_matching.npy"),
     *(FINAL_TRAJECTORY, FINAL_COVARIANCE, "trajectory_location.tum", "tracks.npz", "map.npz", "map.ply"),
     *(EVALUATION_NAME, EVALUATED_FRAMES_NAME, "evaluation.png", REFINE_NAME, REFINED_TRAJECTORY, "report.html"),
+    *(VIDEO_NAME, RERUN_NAME),
     RUN_NAME,  # the last one, by which the folder is known
 )
 

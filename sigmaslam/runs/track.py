@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from sigmaslam.checks.finding import Finding
-from sigmaslam.errors import InputError, SigmaSlamError
+from sigmaslam.errors import InputError, OutputError, SigmaSlamError
 from sigmaslam.files import printable
 from sigmaslam.fusion.location_filter import LocationFilter
 from sigmaslam.fusion.readings import Locations
@@ -20,6 +20,7 @@ from sigmaslam.readers import StereoFrame, StereoSequence
 from sigmaslam.readers.trajectory_files import write_tum
 from sigmaslam.runs.denoise import StereoFilter
 from sigmaslam.runs.frame_pictures import PictureRecorder
+from sigmaslam.runs.frame_sink import FrameSink, TrackedFrame, close_all
 from sigmaslam.runs.real_time import Latency, RealTimePlayer, describe_real_time
 from sigmaslam.runs.results import TrackerResults, output_error, write_results
 from sigmaslam.runs.resume import StoppedRun, read_stopped_run
@@ -28,7 +29,7 @@ from sigmaslam.runs.stop_signals import Stopped, StopSignals
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.estimate import Estimate
 from sigmaslam.slam.object_region import read_region
-from sigmaslam.slam.object_tracker import OBJECT_CONFIG, ObjectTracker
+from sigmaslam.slam.object_tracker import OBJECT_CONFIG, ObjectEstimate, ObjectTracker
 from sigmaslam.slam.start_pose import StartPose
 from sigmaslam.slam.tracker import StereoTracker
 
@@ -51,6 +52,8 @@ def track_sequence(
     denoise: bool = False,
     resume: bool = False,
     provider: str = "cpu",
+    on_estimate: Callable[[Estimate | ObjectEstimate], None] | None = None,
+    sinks: Sequence[FrameSink] = (),
 ) -> dict[str, Any]:
     """Tracks a sequence and writes the run folder; partial results are kept when it is stopped or fails.
 
@@ -69,6 +72,8 @@ def track_sequence(
         denoise: filter the images before they are tracked, see `sigmaslam.image_filtering.SequenceFilter`.
         resume: `out` holds a run of the same sequence that was stopped or killed, which goes on where it was. The map
             is then that of the frames from its last keyframe on, and there is no trajectory after the fact.
+        on_estimate: called with the estimate of each frame when it is on disk; an error that it raises ends the run.
+        sinks: take each frame after that, and are closed in the end.
     Returns:
         The summary in run.json, in which `failure` says why less than half of the frames were tracked, and is None
         where more were; with `locations` also the counts of the readings, under `location`, and in real time
@@ -118,6 +123,7 @@ def track_sequence(
     pictures = PictureRecorder(sequence.length)
     timing = _Timing(sequence, real_time)
     images = StereoFilter() if denoise else None
+    listeners = [*((lambda frame: on_estimate(frame.result),) if on_estimate else ()), *(sink.add for sink in sinks)]
     if timing.is_real:
         tracker.warm_up()
     stopped_by: BaseException | None = None
@@ -125,13 +131,15 @@ def track_sequence(
         try:
             # Cameras are released before the results are written, even after an error.
             with closing(sequence.frames()) as frames:
-                _track(sequence, timing.play(frames), tracker, writer, pictures, location, timing, images, stopped)
+                played = timing.play(frames)
+                _track(sequence, played, tracker, writer, pictures, location, timing, images, stopped, listeners)
             signals.hold()
         except BaseException as error:
             signals.hold()
             # Where the terminal is gone, showing the progress fails as well.
             stopped_by = error if signals.received is None else Stopped(signals.received)
         writer.close()
+        unfinished = close_all(sinks)
         run = {
             **writer.run,
             "ended": _describe_end(stopped_by),
@@ -152,6 +160,8 @@ def track_sequence(
         raise stopped_by
     if failed:
         raise output_error(out, failed)
+    if unfinished:
+        raise OutputError(f"{', '.join(unfinished)} could not be written, as said above; the run itself is in {out}")
     summary = {**summary, **timing.describe()}
     return summary if location is None else {**summary, "location": asdict(location.summary)}
 
@@ -292,9 +302,12 @@ def _track(
     timing: _Timing,
     images: StereoFilter | None,
     stopped: StoppedRun | None,
+    listeners: Sequence[Callable[[TrackedFrame], None]],
 ) -> None:
+    row = 0  # of frames.csv
     if stopped is not None:
         frames = stopped.frames(frames)
+        row = len(stopped.timestamps)
     with open_progress() as progress:
         task = progress.add_task("frames", total=sequence.length, note="")
         reported, done, lost = 0, 0, 0
@@ -305,6 +318,7 @@ def _track(
             while reported < len(sequence.skipped) and sequence.skipped[reported].timestamp < frame.timestamp:
                 if stopped is None or stopped.is_new(sequence.skipped[reported].timestamp):
                     writer.add_skipped(sequence.skipped[reported].timestamp)
+                    row += 1
                 reported += 1
             if images is not None:
                 frame = images.step(frame)
@@ -321,6 +335,9 @@ def _track(
                 writer.add(
                     estimate.camera, estimate.pose, estimate.pose_covariance, estimate.pose_matching_covariance, read_ms
                 )
+                for listener in listeners:
+                    listener(TrackedFrame(row, estimate, tracker.last_frame))
+                row += 1
             if tracker.last_frame is not None:
                 pictures.add(estimate.camera, tracker.last_frame)
             done += 1

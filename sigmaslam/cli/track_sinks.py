@@ -1,0 +1,91 @@
+"""What `track` gives its frames to beside the run folder: a stream, a video, a viewer."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from sigmaslam.cli.extras import need_viewer_extra
+from sigmaslam.errors import InputError
+
+if TYPE_CHECKING:
+    from sigmaslam.geometry.camera import StereoCamera
+    from sigmaslam.runs.frame_sink import FrameSink
+
+UNREAD = 1
+"""Exit code where nobody reads the output any more."""
+# How long a run that was stopped waits for the reader of its stream, seconds.
+_PATIENCE = 5.0
+
+
+@contextmanager
+def open_sinks(
+    stream: str | None, video: Path | None, viewer: str | None, out: Path, camera: StereoCamera
+) -> Iterator[list[FrameSink]]:
+    """The sinks that the command line names; with a stream on the standard output all else goes to the standard error.
+
+    Args:
+        stream: `stdout` or `udp://HOST:PORT`.
+        video: .mp4 to write.
+        viewer: `rerun`, or `rerun:FILE.rrd`.
+        out: folder of the run.
+        camera: of its images.
+    Raises:
+        InputError: a name is wrong.
+        typer.Exit: the run is whole, but nobody reads the stream any more.
+    """
+    from sigmaslam.runs.estimate_stream import PipeStream, open_stream
+
+    sinks: list[FrameSink] = []
+    if video is not None:
+        sinks.append(_open_video(video, out, camera))
+    if viewer is not None:
+        sinks.append(_open_viewer(viewer, out, camera))
+    if stream is None:
+        yield sinks
+        return
+    told = open_stream(stream)
+    sinks.insert(0, told)
+    if not isinstance(told, PipeStream):
+        yield sinks
+        return
+    with redirect_stdout(sys.stderr):
+        try:
+            yield sinks
+        except BaseException:
+            told.close()
+            told.wait(_PATIENCE)
+            raise
+        told.wait(None)
+    if told.is_broken:
+        raise typer.Exit(UNREAD)
+
+
+def _open_video(path: Path, out: Path, camera: StereoCamera) -> FrameSink:
+    from sigmaslam.runs.frame_sink import ThreadedSink, check_sink_path
+    from sigmaslam.runs.run_folder import VIDEO_NAME
+    from sigmaslam.runs.video import VideoSink
+
+    check_sink_path("--video", path, out, VIDEO_NAME)
+    return ThreadedSink(VideoSink(path, camera))
+
+
+def _open_viewer(viewer: str, out: Path, camera: StereoCamera) -> FrameSink:
+    from sigmaslam.runs.frame_sink import ThreadedSink, check_sink_path
+    from sigmaslam.runs.run_folder import RERUN_NAME
+
+    name, colon, file = viewer.partition(":")
+    if name != "rerun" or (colon and not file):
+        raise InputError(f"--viewer {viewer}: is no viewer; give rerun for a window, or rerun:FILE.rrd")
+    need_viewer_extra()
+    from sigmaslam.runs.rerun_viewer import RerunSink
+
+    path = Path(file) if file else None
+    if path is not None:
+        check_sink_path("--viewer", path, out, RERUN_NAME)
+    return ThreadedSink(RerunSink(path, camera))
