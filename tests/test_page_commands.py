@@ -43,7 +43,7 @@ def commands(lines: list[str]) -> list[str]:
     """Each command of the program in these lines, apart; `a|b` without spaces stands for either."""
     found = []
     for line in lines:
-        for command in re.split(r" && | \| ", line):
+        for command in re.split(r" && | \| | > \S+", line):
             if command.startswith(PROGRAM):
                 choices = [re.split(r"\|", word) for word in shlex.split(command.partition(" (")[0])]
                 found += [shlex.join(words) for words in itertools.product(*choices)]
@@ -65,9 +65,10 @@ def parse(command: str) -> None:
 
 
 def options() -> set[str]:
-    """All options of all commands, and of the scripts in examples/."""
+    """All options of all commands, of the scripts in examples/, and of modules that pages run by `python -m`."""
     pending, found = [COMMANDS], EAGER.copy()
-    for script in (ROOT / "examples").glob("*.py"):
+    modules = {name for page in PAGES for name in re.findall(r"python -m (sigmaslam\.[\w.]+)", page.read_text())}
+    for script in [*(ROOT / "examples").glob("*.py"), *(ROOT / f"{name.replace('.', '/')}.py" for name in modules)]:
         found |= set(OPTION.findall(script.read_text()))
     while pending:
         command = pending.pop()
