@@ -40,12 +40,13 @@ def parts(page: Path) -> tuple[list[str], list[str]]:
 
 
 def commands(lines: list[str]) -> list[str]:
-    """Each command of the program in these lines, apart; `a|b` without spaces stands for either."""
+    """Each command of the program in these lines, apart, without `> file`; `a|b` without spaces stands for either."""
     found = []
     for line in lines:
         for command in re.split(r" && | \| ", line):
             if command.startswith(PROGRAM):
-                choices = [re.split(r"\|", word) for word in shlex.split(command.partition(" (")[0])]
+                words = shlex.split(re.split(r" \(| > ", command)[0])
+                choices = [re.split(r"\|", word) for word in words]
                 found += [shlex.join(words) for words in itertools.product(*choices)]
     return found
 
@@ -65,9 +66,9 @@ def parse(command: str) -> None:
 
 
 def options() -> set[str]:
-    """All options of all commands, and of the scripts in examples/."""
+    """All options of all commands, and of the scripts in examples/ and training/."""
     pending, found = [COMMANDS], EAGER.copy()
-    for script in (ROOT / "examples").glob("*.py"):
+    for script in (*(ROOT / "examples").glob("*.py"), *(ROOT / "training").glob("*.py")):
         found |= set(OPTION.findall(script.read_text()))
     while pending:
         command = pending.pop()
