@@ -40,12 +40,13 @@ def parts(page: Path) -> tuple[list[str], list[str]]:
 
 
 def commands(lines: list[str]) -> list[str]:
-    """Each command of the program in these lines, apart; `a|b` without spaces stands for either."""
+    """Each command of the program in these lines, apart, without `> file`; `a|b` without spaces stands for either."""
     found = []
     for line in lines:
-        for command in re.split(r" && | \| | > \S+", line):
+        for command in re.split(r" && | \| ", line):
             if command.startswith(PROGRAM):
-                choices = [re.split(r"\|", word) for word in shlex.split(command.partition(" (")[0])]
+                words = shlex.split(re.split(r" \(| > ", command)[0])
+                choices = [re.split(r"\|", word) for word in words]
                 found += [shlex.join(words) for words in itertools.product(*choices)]
     return found
 
@@ -65,10 +66,9 @@ def parse(command: str) -> None:
 
 
 def options() -> set[str]:
-    """All options of all commands, of the scripts in examples/, and of modules that pages run by `python -m`."""
+    """All options of all commands, and of the scripts in examples/ and training/."""
     pending, found = [COMMANDS], EAGER.copy()
-    modules = {name for page in PAGES for name in re.findall(r"python -m (sigmaslam\.[\w.]+)", page.read_text())}
-    for script in [*(ROOT / "examples").glob("*.py"), *(ROOT / f"{name.replace('.', '/')}.py" for name in modules)]:
+    for script in (*(ROOT / "examples").glob("*.py"), *(ROOT / "training").glob("*.py")):
         found |= set(OPTION.findall(script.read_text()))
     while pending:
         command = pending.pop()

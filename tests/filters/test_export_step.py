@@ -140,9 +140,10 @@ def test_graph_of_a_robot_equals_torch_for_any_batch_and_number_of_landmarks(dty
         value = random_numbers(batch, count, 2, seed=5).to(dtype)
         value[0, 0, 0] = torch.nan
         feed = {"mean": prior.mean, held: getattr(prior, {"root": "factor"}.get(held, held))}
-        feed |= {"control": control, "value": value, "landmark": landmark}
+        time_step = 0.1 + random_numbers(batch, 1, seed=6).abs().to(dtype)
+        feed |= {"control": control, "time_step": time_step, "value": value, "landmark": landmark}
         found = session.run(None, {name: given.contiguous().numpy() for name, given in feed.items()})
-        moved = bayes.predict(prior, motion, control)
+        moved = bayes.predict(prior, motion, control, time_step)
         belief = moved.belief
         stacked = bayes.update(belief, several(see, count), value.flatten(-2), landmark)
         expected = (stacked.belief.mean, stacked.belief.held, stacked.healthy, stacked.log_likelihood, stacked.nis)
