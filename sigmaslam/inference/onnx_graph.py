@@ -46,7 +46,7 @@ class OnnxGraph:
             raise
         except Exception as error:  # onnxruntime raises its own types, none of them public
             raise InputError(
-                f"{path} is not a graph that ONNX Runtime {RUNTIME_VERSION} can load, or it is older than 1.29: {error}"
+                f"{path} is no graph that ONNX Runtime {RUNTIME_VERSION} can load (the shipped ones need 1.29): {error}"
             ) from error
         self.outputs: Sequence[str] = [output.name for output in self._session.get_outputs()]
 
