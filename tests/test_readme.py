@@ -20,10 +20,14 @@ PAGES = [
 ZOOM = 3
 
 
-def test_the_calibration_file_in_the_readme_can_be_read(tmp_path: Path):
-    block = re.search(r"```yaml\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+def _calibration_file() -> str:
+    block = re.search(r"```yaml\n(.*?)```", (ROOT / "docs" / "usage.md").read_text(), re.DOTALL)
     assert block
-    (tmp_path / "stereo.yaml").write_text(block.group(1))
+    return block.group(1)
+
+
+def test_the_calibration_file_on_the_page_can_be_read(tmp_path: Path):
+    (tmp_path / "stereo.yaml").write_text(_calibration_file())
     camera = StereoCamera.from_yaml(tmp_path / "stereo.yaml")
     np.testing.assert_allclose(camera.baseline, 0.11008, atol=1e-4)
     assert not camera.is_rectified
@@ -32,13 +36,13 @@ def test_the_calibration_file_in_the_readme_can_be_read(tmp_path: Path):
 def test_the_python_in_the_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     pytest.importorskip("torch")
     text = (ROOT / "README.md").read_text()
-    blocks = {name: re.findall(rf"```{name}\n(.*?)```", text, re.DOTALL) for name in ("python", "yaml")}
-    assert len(blocks["python"]) == 2
-    (tmp_path / "stereo.yaml").write_text(blocks["yaml"][0])
+    blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    assert len(blocks) == 2
+    (tmp_path / "stereo.yaml").write_text(_calibration_file())
     monkeypatch.chdir(tmp_path)
     image = np.random.default_rng(0).integers(0, 255, (480, 752), dtype=np.uint8)
     names: dict[str, object] = {"left": image, "right": image, "timestamp": 0.0}
-    for block in blocks["python"]:
+    for block in blocks:
         exec(compile(block, "README.md", "exec"), names)
     assert names["estimate"].covariance.shape == (6, 6)
     assert names["result"].belief.mean.shape == (1000, 2)
@@ -55,6 +59,7 @@ def test_the_python_on_a_page_runs(page: Path, demo_sequence: Path, tmp_path: Pa
     left, right = (cv2.resize(each, None, fx=ZOOM, fy=ZOOM) for each in (frame.left, frame.right))
     cv2.imwrite("one.jpg", left)
     cv2.imwrite("two.png", right)
+    Path("stereo.yaml").write_text(_calibration_file())
     for folder in ("drive", "tool1"):
         Path(folder).mkdir()
     shutil.copy(demo_sequence / "scene.json", "drive")

@@ -15,7 +15,7 @@ from sigmaslam.readers.trajectory_files import read_kitti, read_tum
 from tests.support.quantiles import WITHIN_3_SIGMA, squared_sigmas
 
 DEMO = Path(__file__).resolve().parents[2] / "synthetic" / "demo"
-# README's.
+# Of docs/usage.md.
 _EXIT_CODES = (0, 1, 2, 3, 129, 130, 143)
 # Of what is written to the terminal when an input is refused.
 _LONGEST_ERROR = 1000
@@ -86,7 +86,7 @@ class Case:
 def judge(case: Case, outcome: Outcome, folder: Path) -> tuple[Verdict, str]:
     """The verdict, and the reason for any but good.
 
-    - crash or loss: an unexpected error, no end, an exit code that README does not name, fewer poses than there were;
+    - crash or loss: an unexpected error, no end, an exit code that docs/usage.md does not name, fewer poses than there were;
     - silent wrong: a success (exit code 0) that should be none, or that does not name the fault, or poses beyond three
       of their own sigmas where the fault is said to do no harm; in any run, poses that are not finite, or without
       a covariance, or poses though no frame was tracked;
