@@ -174,11 +174,14 @@ def _shown(rows: Sequence[_Row]) -> list[str]:
 
 
 def _print_rows(rows: Sequence[_Row]) -> None:
-    shown = _shown(rows)
-    table = Table("filter", "", *(label.replace("_", " ") for label in shown))
-    for name, robot, summary in rows:
-        table.add_row(name, robot, *(_cell(summary.get(label)) for label in shown))
-    Console(highlight=False).print(table)
+    """A table for each filter, with a column for each robot: five fit into 80 characters."""
+    console = Console(highlight=False)
+    for name in dict.fromkeys(each for each, _, _ in rows):
+        robots = {robot: summary for each, robot, summary in rows if each == name}
+        table = Table(name, *robots)
+        for label in _shown(rows):
+            table.add_row(label.replace("_", " "), *(_cell(summary.get(label)) for summary in robots.values()))
+        console.print(table)
 
 
 def _write_rows(path: Path, rows: Sequence[_Row]) -> None:
