@@ -71,7 +71,7 @@ class Animation:
             cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) for picture in self.pictures
         ]
         milliseconds = round(1e3 / frame_rate(np.array(self.timestamps)))
-        animation.durations = np.full(len(self.pictures), milliseconds)
+        animation.durations = [milliseconds] * len(self.pictures)
         animation.loop_count = 0
         with atomic_path(path) as temporary:
             cv2.imwriteanimation(str(temporary), animation, [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])
