@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import cv2
@@ -17,6 +18,7 @@ from sigmaslam.runs.frame_sink import TrackedFrame
 from sigmaslam.runs.keyframe_points import KeyframePoints
 from sigmaslam.slam.matched_frame import MatchedFrame
 
+_LOGGER = logging.getLogger(__name__)
 IMAGE, PATH, SIGMA, PLOTS = "world/camera/image", "world/path", "world/sigma", "plots"
 CLOCK, FRAME = "time", "frame"
 """Timelines: of the recording, and numbers of frames."""
@@ -84,10 +86,15 @@ class RerunSink:
             self._plot("nis_per_dof", estimate.nis / estimate.dof)
 
     def close(self) -> None:
-        """No frame comes any more."""
-        if self._is_open:
-            self._recording.flush(timeout_sec=_PATIENCE)
-        self._recording.disconnect()
+        """No frame comes any more. A window that was closed before is no error; a file that is not whole is."""
+        try:
+            if self._is_open:
+                self._recording.flush(timeout_sec=_PATIENCE)
+            self._recording.disconnect()
+        except Exception as error:
+            if self._path is not None:
+                raise
+            _LOGGER.warning("the viewer has not got all frames: %s", error)
 
     def _begin(self) -> None:
         """What does not change: the axes of the first camera, and its lens."""
