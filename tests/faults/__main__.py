@@ -75,7 +75,7 @@ def write_reliability(path: Path, results: list[Result], command: str) -> str:
         *opening("Reliability", command, f": {counts[Verdict.GOOD]} of {len(results)} faults are survived."),
         "",
         "Each fault is put into a good input: the demo that ships with the package, or a real drive. The program",
-        "must name it, with the exit code that usage.md says, and lose no pose. The rules are in `tests/faults/case.py`:",
+        "must name it, with the exit code of usage.md, and lose no pose. The rules are in `tests/faults/case.py`:",
         "",
         "- **good**: exit code and words are as expected; where a fault does no harm, every pose is within three of",
         "  its own sigmas of the truth;",

@@ -86,7 +86,7 @@ class Case:
 def judge(case: Case, outcome: Outcome, folder: Path) -> tuple[Verdict, str]:
     """The verdict, and the reason for any but good.
 
-    - crash or loss: an unexpected error, no end, an exit code that docs/usage.md does not name, fewer poses than there were;
+    - crash or loss: an unexpected error, no end, an exit code that usage.md does not name, fewer poses than there were;
     - silent wrong: a success (exit code 0) that should be none, or that does not name the fault, or poses beyond three
       of their own sigmas where the fault is said to do no harm; in any run, poses that are not finite, or without
       a covariance, or poses though no frame was tracked;
