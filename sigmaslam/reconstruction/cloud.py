@@ -9,7 +9,7 @@ import numpy as np
 
 from sigmaslam.files import atomic_path
 from sigmaslam.geometry.camera import RectifiedStereo
-from sigmaslam.geometry.se3 import transform_points
+from sigmaslam.geometry.se3 import skew, transform_points
 from sigmaslam.table import Table
 
 # Rows and columns of the six numbers of a symmetric matrix.
@@ -27,7 +27,7 @@ class DenseCloud(Table):
         points: (N, 3) in the world, metres.
         covariances: (N, 6) of them, float32: xx, xy, xz, yy, yz, zz, metres squared.
         intensity: (N,) float32 grey values, 0 to 255.
-        views: (N,) int32 depths of pixels that were merged into the point.
+        views: (N,) int32 depths of keyframes that were merged into the point.
     """
 
     points: np.ndarray
@@ -54,48 +54,64 @@ def symmetric(six: np.ndarray) -> np.ndarray:
     return matrix
 
 
-def points_of_depth(
-    disparity: np.ndarray,
-    variance: np.ndarray,
-    chosen: np.ndarray,
-    image: np.ndarray,
-    camera: RectifiedStereo,
-    pose: np.ndarray,
-    pose_covariance: np.ndarray,
-) -> DenseCloud:
-    """Points of the chosen pixels of a keyframe, in the world.
+@dataclass(frozen=True, slots=True)
+class DepthPixels(Table):
+    """Pixels of a keyframe with a depth.
 
-    Args:
-        disparity, variance: (H, W) pixels and pixels squared.
-        chosen: (H, W) bool; disparities there are positive.
-        image: (H, W) uint8 rectified left image.
-        camera: the rectified pair.
-        pose, pose_covariance: (4, 4) T_world_rectified and its covariance (6, 6) in the rectified camera's frame,
-            translation (metres) before rotation (radians).
+    Attributes:
+        pixels: (N, 2) int64 (u, v).
+        disparity: (N,) inverse depth times focal length and baseline, pixels.
+        variance: (N,) of it, pixels squared.
+        intensity: (N,) uint8 grey value.
     """
-    v, u = np.nonzero(chosen)
-    d = disparity[v, u].astype(np.float64)
-    points = camera.triangulate(np.stack([u, v, d], axis=-1))
-    # (9.35): along the ray by the disparity, across it by the pixel, and with the camera.
-    along = points / d[:, None]
-    across = points[:, 2] ** 2 * (_PIXEL_VARIANCE / camera.fx**2)
-    X, Y, Z = points.T
-    zero = np.zeros_like(X)
-    turn = np.stack([zero, Z, -Y, -Z, zero, X, Y, -X, zero], axis=-1).reshape(-1, 3, 3)
-    T, R, M = (pose_covariance[:3, :3], pose_covariance[3:, 3:], pose_covariance[:3, 3:])
-    mixed = M @ turn.transpose(0, 2, 1)
-    covariance = T + mixed + mixed.transpose(0, 2, 1) + turn @ R @ turn.transpose(0, 2, 1)
-    covariance += variance[v, u].astype(np.float64)[:, None, None] * along[:, :, None] * along[:, None, :]
-    covariance[:, 0, 0] += across
-    covariance[:, 1, 1] += across
-    rotation = pose[:3, :3]
-    covariance = rotation @ covariance @ rotation.T
-    return DenseCloud(
-        transform_points(pose, points),
-        covariance[:, _ROWS, _COLUMNS].astype(np.float32),
-        image[v, u].astype(np.float32),
-        np.ones(len(u), np.int32),
-    )
+
+    pixels: np.ndarray
+    disparity: np.ndarray
+    variance: np.ndarray
+    intensity: np.ndarray
+
+    @classmethod
+    def of(cls, disparity: np.ndarray, variance: np.ndarray, image: np.ndarray, chosen: np.ndarray) -> DepthPixels:
+        """The chosen pixels, (H, W) bool, of such images (H, W); disparities there are positive."""
+        v, u = np.nonzero(chosen)
+        return cls(np.stack([u, v], axis=-1), disparity[v, u].astype(float), variance[v, u].astype(float), image[v, u])
+
+    def points(self, camera: RectifiedStereo) -> np.ndarray:
+        """(N, 3) in the rectified left camera, metres."""
+        return camera.triangulate(np.column_stack([self.pixels, self.disparity]))
+
+    def cloud(self, camera: RectifiedStereo, pose: np.ndarray, pose_covariance: np.ndarray) -> DenseCloud:
+        """Points in the world.
+
+        Args:
+            camera: the rectified pair.
+            pose, pose_covariance: (4, 4) T_world_rectified and its covariance (6, 6) in the rectified camera's frame,
+                translation (metres) before rotation (radians).
+        """
+        points = self.points(camera)
+        # (9.35): along the ray by the disparity, across it by the pixel, and with the camera.
+        along = points / self.disparity[:, None]
+        across = points[:, 2] ** 2 * (_PIXEL_VARIANCE / camera.fx**2)
+        lever = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -skew(points)], axis=2)
+        covariance = (lever.reshape(-1, 6) @ pose_covariance).reshape(-1, 3, 6) @ lever.transpose(0, 2, 1)
+        covariance += self.variance[:, None, None] * along[:, :, None] * along[:, None, :]
+        covariance[:, 0, 0] += across
+        covariance[:, 1, 1] += across
+        rotation = pose[:3, :3]
+        return DenseCloud(
+            transform_points(pose, points),
+            (rotation @ covariance @ rotation.T)[:, _ROWS, _COLUMNS].astype(np.float32),
+            self.intensity.astype(np.float32),
+            np.ones(len(points), np.int32),
+        )
+
+    def thinned(self, camera: RectifiedStereo, size: float) -> DepthPixels:
+        """The most certain pixel of each voxel of the camera's frame; those beside it have nearly the same errors."""
+        points = self.points(camera)
+        keys = np.floor(points / size).astype(np.int64) @ np.array([1, 1 << 21, 1 << 42])
+        order = np.argsort(self.variance / self.disparity**2, kind="stable")
+        _, first = np.unique(keys[order], return_index=True)
+        return self.select(order[first])
 
 
 class VoxelCloud:

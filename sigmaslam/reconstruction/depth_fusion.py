@@ -20,11 +20,13 @@ GATE = 6.635
 """99 % of chi-square with one degree of freedom: disparities that differ by more are of different surfaces."""
 # Of the variance of a disparity this share is the same in all keyframes that see the point, as texture and window are.
 # Fitted with the variance itself.
-SHARED = 0.5
+SHARED = 0.7
 # Slopes of the disparity are of a plane fitted over so many pixels.
 _SLOPE_RADIUS = 3
 # Points nearer to another camera's plane than this share of the baseline are behind it for all purposes.
 _MIN_DEPTH = 1e-2
+# The variances themselves count as so many measurements of their scale.
+_FREEDOM = np.float32(4.0)
 # Confirmations that a point needs.
 _MIN_SUPPORT = 1
 
@@ -114,20 +116,25 @@ def fuse_depth(
     common = np.float32(shared) * reference.variance.ravel()[known]
     variance = np.float32(1.0 - shared) * reference.variance.ravel()[known]
     support, contradictions = np.zeros((2, len(known)), np.uint8)
+    cost = np.zeros_like(mean)
     for view, pose, covariance in others:
         seen = _measure(view, pose, covariance, rays, mean, camera)
         noise = np.float32(1.0 - shared) * seen.noise + seen.pose
         # What is common does not cancel in the difference unless the views are alike: the gate allows for it.
         spread = seen.derivative**2 * variance + noise
-        limit = GATE * (spread + np.float32(shared) * (seen.noise + common))
+        expected = spread + np.float32(shared) * seen.noise + common
         squared = seen.innovation**2
-        agrees = squared <= limit
+        agrees = squared <= GATE * expected
+        cost += np.where(agrees, squared / expected, 0.0)
         support += agrees
-        contradictions += (squared > limit) & (seen.innovation < 0.0)
+        contradictions += (squared > GATE * expected) & (seen.innovation < 0.0)
         mean, variance = kalman_update(mean, variance, seen.innovation, seen.derivative, noise, agrees)
+    # Where the views differ by more than they should, or less, all variances are scaled: the mean of the posterior of a
+    # scale that has an inverse gamma distribution.
+    scale = (_FREEDOM + cost) / (_FREEDOM + support)
     return FusedDepth(
         _spread(mean, known, shape, np.nan),
-        _spread(variance + common, known, shape, np.nan),
+        _spread(scale * (variance + common), known, shape, np.nan),
         _spread(support, known, shape, 0),
         _spread(contradictions, known, shape, 0),
     )

@@ -27,6 +27,8 @@ _WIDEST, _NEARLY_ALL = 0.4, 99.8
 _RADIUS, _STEPS, _LONGEST = 3, 2, 0.5
 # Smoothing before each step: diameter, what disparities may differ by, and spread, all pixels.
 _DIAMETER, _SAME_SURFACE, _SPREAD = 7, 1.0, 3.0
+# A pixel this far from the mean of its window is at an edge, and farther makes no difference, pixels.
+_WIDEST_EDGE = 2.0
 # Squared gradients below this, grey values^2 / pixel^2, are quantisation.
 _NO_TEXTURE = 0.05
 # Marks pixels without a disparity where NaN would spread.
@@ -44,15 +46,17 @@ class DisparityModel:
         floor: variance of the best disparities, pixels squared.
         bound: factor of the Cramer-Rao bound.
         relief: factor of the variance of the disparities around the pixel about a smooth surface.
+        edge: factor of the squared distance from their mean, which is large where surfaces meet.
     """
 
     floor: float
     bound: float
     relief: float
+    edge: float
 
 
 # Fitted by maximum likelihood on renders of room, street and organ with seeds below 1000, see docs/reconstruction.md.
-FITTED = DisparityModel(floor=0.03**2, bound=4.0, relief=0.5)
+FITTED = DisparityModel(floor=0.01**2, bound=1.5, relief=2.6, edge=3.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,11 +80,13 @@ class Alignment:
         disparity: (H, W) float32 pixels, NaN where there was none.
         bound: (H, W) Cramer-Rao bound of its variance for independent noise in the window, pixels squared.
         relief: (H, W) variance of the disparities in the window about the smoothed ones, pixels squared.
+        edge: (H, W) squared difference of the disparity and the mean of the window, pixels squared.
     """
 
     disparity: np.ndarray
     bound: np.ndarray
     relief: np.ndarray
+    edge: np.ndarray
 
 
 def measure_disparity(left: np.ndarray, right: np.ndarray, match: Matcher, model: DisparityModel = FITTED) -> DisparityMap:
@@ -92,7 +98,12 @@ def measure_disparity(left: np.ndarray, right: np.ndarray, match: Matcher, model
         model: of the variance.
     """
     aligned = align_disparity(left, right, match(left, right))
-    variance = model.floor + model.bound * aligned.bound + model.relief * aligned.relief
+    variance = (
+        model.floor
+        + model.bound * aligned.bound
+        + model.relief * aligned.relief
+        + model.edge * aligned.edge
+    )
     missing = np.isnan(aligned.disparity)
     return DisparityMap(aligned.disparity, np.where(missing, np.nan, variance).astype(np.float32))
 
@@ -162,7 +173,11 @@ def align_disparity(left: np.ndarray, right: np.ndarray, disparity: np.ndarray) 
     pixels = (2 * _RADIUS + 1) ** 2 * share
     # Grey values are whole numbers: their rounding is noise where nothing else is.
     bound = (np.maximum(unexplained, 0.0) + 1.0 / 6.0) / (texture * pixels)
-    return Alignment(np.where(known, found, np.float32(np.nan)), bound, mean(relief.astype(np.float32)))
+    aligned = np.where(known, found, 0.0).astype(np.float32)
+    edge = np.minimum(np.abs(aligned - mean(aligned)), _WIDEST_EDGE) ** 2
+    return Alignment(
+        np.where(known, aligned, np.float32(np.nan)), bound, mean(relief.astype(np.float32)), edge.astype(np.float32)
+    )
 
 
 def pixel_grid(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:

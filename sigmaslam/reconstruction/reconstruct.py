@@ -18,7 +18,7 @@ from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.progress import open_progress
 from sigmaslam.readers import StereoSequence
-from sigmaslam.reconstruction.cloud import DenseCloud, VoxelCloud, points_of_depth, write_cloud
+from sigmaslam.reconstruction.cloud import DenseCloud, DepthPixels, VoxelCloud, write_cloud
 from sigmaslam.reconstruction.depth_fusion import DepthView, FusedDepth, fuse_depth
 from sigmaslam.reconstruction.disparity import DisparityMap, Matcher, measure_disparity, semi_global_disparity
 from sigmaslam.reconstruction.mesh import DepthVolume, need_open3d
@@ -28,11 +28,11 @@ from sigmaslam.runs.dense_points import DENSE_NAME, write_dense_points
 from sigmaslam.runs.report import write_report
 
 NEIGHBOURS = 2
-"""Keyframes before, and behind, that a keyframe's depths are fused with."""
+"""Views before, and behind, that a keyframe's depths are fused with."""
 # Points less certain than this share of their depth are left out.
 _MAX_SIGMA = 0.05
 # Side of a voxel, in pixels at the median depth of the first keyframe.
-_VOXEL_PIXELS = 3.0
+_VOXEL_PIXELS = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,12 +91,10 @@ class KeyframeDepth:
         certain = self.variance < (_MAX_SIGMA * self.fused.disparity) ** 2
         return np.asarray(self.fused.is_confirmed & certain)
 
-    def cloud(self, camera: RectifiedStereo) -> DenseCloud:
-        """The points in the world."""
-        disparity = self.fused.disparity
-        return points_of_depth(
-            disparity, self.variance, self.is_point, self.image, camera, self.pose, self.pose_covariance
-        )
+    def cloud(self, camera: RectifiedStereo, voxel: float) -> DenseCloud:
+        """The points in the world, about one a voxel of that side, metres."""
+        pixels = DepthPixels.of(self.fused.disparity, self.variance, self.image, self.is_point)
+        return pixels.thinned(camera, voxel).cloud(camera, self.pose, self.pose_covariance)
 
 
 def reconstruct_run(
@@ -115,7 +113,7 @@ def reconstruct_run(
         mesh: PLY file of a mesh; needs Open3D.
         moved_to: where the run's input is, if it has moved.
         network: ONNX file of a stereo network in place of semi-global matching.
-        voxel: side of the voxels that points are merged in, metres; None: three pixels at the median depth.
+        voxel: side of the voxels that points are merged in, metres; None: five pixels at the median depth.
     Raises:
         InputError: something is missing or wrong; all of that is looked for before the work begins.
     """
@@ -133,13 +131,13 @@ def reconstruct_run(
     measured = confirmed = 0
     began = time.perf_counter()
     with open_progress() as progress:
-        task = progress.add_task("keyframes", total=len(keyframes), note="")
+        task = progress.add_task("keyframes", total=keyframes.count, note="")
         for depth in fuse_keyframes(keyframes, sequence, rectifier, match):
             chosen = depth.is_point
             if cloud is None:
                 cloud = VoxelCloud(voxel or _default_voxel(depth, camera))
                 volume = None if mesh is None else DepthVolume(cloud.size, camera)
-            cloud.add(depth.cloud(camera))
+            cloud.add(depth.cloud(camera, cloud.size))
             if volume is not None:
                 z = np.where(chosen, camera.focal_baseline / np.where(chosen, depth.fused.disparity, 1.0), 0.0)
                 volume.integrate(z.astype(np.float32), depth.image, depth.pose)
@@ -152,15 +150,15 @@ def reconstruct_run(
     write_cloud(out, points)
     if mesh is not None and volume is not None:
         volume.write(mesh)
-    pixels = len(keyframes) * camera.width * camera.height
+    pixels = keyframes.count * camera.width * camera.height
     summary = ReconstructionSummary(
-        len(keyframes),
+        keyframes.count,
         len(points),
         cloud.size,
         measured / pixels,
         confirmed / max(measured, 1),
         float(np.median(points.sigma)) if len(points) else float("nan"),
-        seconds / len(keyframes),
+        seconds / keyframes.count,
     )
     _add_to_report(run, points, summary)
     return summary
@@ -212,11 +210,13 @@ def fuse_keyframes(
         if rectifier.valid_mask is not None:
             disparity[cv2.erode(rectifier.valid_mask, np.ones((7, 7), np.uint8)) == 0] = np.nan
         kept[number] = left, DepthView.of(DisparityMap(disparity, measured.variance))
-        if number >= NEIGHBOURS:
-            yield fuse(number - NEIGHBOURS)
-            kept.pop(number - 2 * NEIGHBOURS, None)
+        done = number - NEIGHBOURS
+        if done >= 0 and keyframes.is_keyframe[done]:
+            yield fuse(done)
+        kept.pop(done - NEIGHBOURS, None)
     for number in range(max(len(keyframes) - NEIGHBOURS, 0), len(keyframes)):
-        yield fuse(number)
+        if keyframes.is_keyframe[number]:
+            yield fuse(number)
 
 
 def _default_voxel(depth: KeyframeDepth, camera: RectifiedStereo) -> float:

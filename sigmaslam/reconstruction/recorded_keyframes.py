@@ -1,4 +1,7 @@
-"""Keyframes of a run folder: where they were, how well that is known, and their images from the run's input."""
+"""Keyframes of a run folder: where they were, how well that is known, and their images from the run's input.
+
+Where keyframes are far apart in time, as in slow motion, frames between them help to see what they saw.
+"""
 
 from __future__ import annotations
 
@@ -26,22 +29,25 @@ from sigmaslam.runs.frame_table import FRAMES_NAME, read_frames
 from sigmaslam.runs.relative_pose_file import RELATIVE_POSES_NAME, FramePairs, read_frame_pairs
 from sigmaslam.runs.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY, RUN_NAME, check_has_trajectory
 
+# At most so many frames from one view to the next.
+_MOST_FRAMES = 5
 # Time stamps of run and input agree to this, seconds; frames.csv and trajectory.tum round them.
 _SAME_TIME = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedKeyframes:
-    """The K keyframes of a run, in time.
+    """The keyframes of a run and frames between them: K views in time.
 
     Attributes:
         source, format: of the run's input.
         camera: its calibration.
+        is_keyframe: (K,) bool.
         timestamps: (K,) seconds.
         poses: (K, 4, 4) T_world_camera of the left camera, after the fact where the run has that.
         covariances: (K, 6, 6) of the poses in their own frames, translation (metres) before rotation (radians).
         disparity_offset, disparity_offset_sigma: measured minus true disparity as last estimated, pixels.
-        frames: (K,) rows of the keyframes in trajectory.tum.
+        frames: (K,) rows of the views in trajectory.tum.
         pairs: relative poses of the run.
         pair_times: (M, 2) time stamps of their earlier and later frames, seconds.
     """
@@ -49,6 +55,7 @@ class RecordedKeyframes:
     source: Path
     format: str
     camera: StereoCamera
+    is_keyframe: np.ndarray
     timestamps: np.ndarray
     poses: np.ndarray
     covariances: np.ndarray
@@ -61,8 +68,13 @@ class RecordedKeyframes:
     def __len__(self) -> int:
         return len(self.timestamps)
 
+    @property
+    def count(self) -> int:
+        """How many of the views are keyframes."""
+        return int(self.is_keyframe.sum())
+
     def step(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
-        """T_last_first (4, 4) of two keyframes and its covariance (6, 6), perturbed from the left in the last.
+        """T_last_first (4, 4) of two views and its covariance (6, 6), perturbed from the left in the last.
 
         The covariance is that of the pair in relative_poses.npz with the same later frame and the next larger
         distance in time, or of the largest one, grown with the square of time; that of a longer way is on the safe side.
@@ -90,7 +102,7 @@ class RecordedKeyframes:
         return np.asarray(growth * self.pairs.covariance[rows[chosen]])
 
     def images(self, sequence: StereoSequence) -> Iterator[tuple[int, StereoFrame]]:
-        """Number and images of each keyframe, in order.
+        """Number and images of each view, in order.
 
         Raises:
             InputError: the sequence lacks one of them.
@@ -106,7 +118,7 @@ class RecordedKeyframes:
                     if wanted == len(self):
                         return
         raise InputError(
-            f"{sequence.source}: has no frame at {self.timestamps[wanted]:.6f} s, which is a keyframe of the run: give "
+            f"{sequence.source}: has no frame at {self.timestamps[wanted]:.6f} s, which the run has: give "
             "the input of this run by --input"
         )
 
@@ -133,8 +145,10 @@ def read_recorded_keyframes(run: Path) -> RecordedKeyframes:
     times = frames.columns["timestamp"][frames.columns["keyframe"] == 1]
     rows = np.searchsorted(said.timestamps, times - _SAME_TIME).clip(0, len(said) - 1)
     rows = np.unique(rows[np.abs(said.timestamps[rows] - times) < _SAME_TIME])
+    keyframe_rows = rows
+    rows = _with_frames_between(rows, len(said))
     if len(rows) < 2:
-        raise InputError(f"{run}: has {len(rows)} keyframes with a pose, two are needed: track a camera that moves")
+        raise InputError(f"{run}: has {len(rows)} frame with a pose, two are needed: track a longer sequence")
     pairs = read_frame_pairs(run / RELATIVE_POSES_NAME, len(said))
     offset, sigma = (frames.columns[name] for name in ("disparity_offset", "disparity_offset_sigma"))
     last = np.flatnonzero(np.isfinite(offset) & np.isfinite(sigma))
@@ -142,6 +156,7 @@ def read_recorded_keyframes(run: Path) -> RecordedKeyframes:
         Path(str(entries["input"])),
         str(entries["format"]),
         _camera_of(run / RUN_NAME, entries["calibration"]),
+        np.isin(rows, keyframe_rows),
         said.timestamps[rows],
         trajectory.poses[rows],
         covariances[rows],
@@ -182,6 +197,21 @@ def open_input(keyframes: RecordedKeyframes, moved_to: Path | None = None) -> St
             f"{sizes[1][0]}x{sizes[1][1]}: give the input of this run by --input"
         )
     return sequence
+
+
+def _with_frames_between(keyframes: np.ndarray, count: int) -> np.ndarray:
+    """Rows of keyframes, and of frames that divide what lies between them evenly into short parts.
+
+    Args:
+        keyframes: (K,) rows, increasing.
+        count: of all rows.
+    """
+    ends = np.unique(np.r_[keyframes, count - 1])
+    parts = [
+        np.linspace(first, last, -(-(last - first) // _MOST_FRAMES) + 1).round().astype(np.int64)
+        for first, last in zip(ends[:-1], ends[1:], strict=True)
+    ]
+    return np.unique(np.concatenate([ends, *parts]))
 
 
 def _read_entries(path: Path) -> dict[str, Any]:
