@@ -136,6 +136,16 @@ def _shake(out: Path, command: str, *, runs: Path | None, seeds: int | None) -> 
 
 
 @_registered
+def _reconstruction(out: Path, command: str, *, runs: Path | None, seeds: int | None) -> str:
+    from sigmaslam.evaluation.benchmarks.reconstruction import write_reconstruction
+    from sigmaslam.synthetic.render_sequence import default_workers
+
+    folder, seeds = _need_runs(runs, "reconstruction", "renders and results"), seeds or 20
+    command += f" --runs {folder.name} --seeds {seeds}"
+    return write_reconstruction(out, folder, seeds, default_workers(), command, _note)
+
+
+@_registered
 def _denoising(out: Path, command: str, *, data: Path | None, runs: Path | None) -> str:
     from sigmaslam.evaluation.benchmarks.denoising import write_denoising
 
@@ -224,13 +234,17 @@ def benchmark(
     runs: Annotated[
         Path | None,
         typer.Option(
-            help="noise, consistency, shake, denoising, sequences, endurance, runtime: folder of the renders; what is "
+            help="noise, consistency, shake, reconstruction, denoising, sequences, endurance, runtime: folder of the renders; what is "
             "there is used again. sequences, endurance, runtime: a temporary one without it."
         ),
     ] = None,
     seeds: Annotated[
         int | None,
-        typer.Option(min=1, help="consistency: sequences a scale; shake: sequences.", show_default="30, shake 20"),
+        typer.Option(
+            min=1,
+            help="consistency, reconstruction: sequences a scale or world; shake: sequences.",
+            show_default="30, others 20",
+        ),
     ] = None,
     frames: Annotated[
         int | None,
@@ -263,6 +277,7 @@ def benchmark(
     consistency: whether poses and map are as sure as they say, on 90 rendered sequences (an hour). shake: whether
     frames of a shaken camera with a slow shutter are right when they are called tracked. endurance: memory,
     time and error over 10,000 frames of a lap over and over (ten minutes to render, then a quarter of an hour).
+    reconstruction: dense depths and their intervals on 60 rendered sequences (an hour).
     denoising: PSNR and time of the image filters beside OpenCV's, and the tracker in the dark (ten minutes).
     runtime: CPU and wall time, memory and start-up beside OpenCV's odometry, cuVSLAM and ORB-SLAM3 (extra 'peers').
     All but sequences and runtime need the extra 'train', claims and renders also 'report'.

@@ -25,7 +25,9 @@ def reconstruct(
     voxel: Annotated[
         float | None,
         typer.Option(
-            min=1e-6, help="Side of the voxels that points are merged in, metres.", show_default="5 pixels at the median"
+            min=1e-6,
+            help="Side of the voxels that points are merged in, metres.",
+            show_default="5 pixels at the median",
         ),
     ] = None,
 ) -> None:

@@ -137,9 +137,7 @@ class VoxelCloud:
         covariance = symmetric(cloud.covariances.astype(np.float64))
         information = np.linalg.inv(covariance)
         weighted = np.einsum("nab,nb->na", information, cloud.points)
-        sums = np.column_stack(
-            [information[:, _ROWS, _COLUMNS], weighted, cloud.intensity * cloud.views, cloud.views]
-        )
+        sums = np.column_stack([information[:, _ROWS, _COLUMNS], weighted, cloud.intensity * cloud.views, cloud.views])
         keys = np.floor(cloud.points / self.size).astype(np.int64)
         self._pending.append(_sum_by_key(keys, sums))
         # Amortised: each point is sorted about as many times as the cloud doubles.

@@ -27,6 +27,9 @@ _SLOPE_RADIUS = 3
 _MIN_DEPTH = 1e-2
 # The variances themselves count as so many measurements of their scale.
 _FREEDOM = np.float32(4.0)
+# Windows in which images are compared: side, variance of what resampling moves them by, pixels squared, and of the
+# rounding of two grey values.
+_WINDOW, _RESAMPLING, _ROUNDING = 7, np.float32(1.0 / 12.0), np.float32(1.0 / 6.0)
 # Confirmations that a point needs.
 _MIN_SUPPORT = 1
 
@@ -36,17 +39,19 @@ class DepthView:
     """A keyframe as others are measured by it.
 
     Attributes:
+        image: (H, W) float32 rectified left image.
         measured: disparities with the disparity offset taken off.
         slope: (H, W, 2) float32 derivatives of the disparity by u and v; zero where there are none.
     """
 
+    image: np.ndarray
     measured: DisparityMap
     slope: np.ndarray
 
     @classmethod
-    def of(cls, measured: DisparityMap) -> DepthView:
-        """The view of a keyframe with such disparities."""
-        return cls(measured, disparity_slope(measured.disparity))
+    def of(cls, image: np.ndarray, measured: DisparityMap) -> DepthView:
+        """The view of a keyframe with such an image (H, W) uint8 and disparities."""
+        return cls(image.astype(np.float32), measured, disparity_slope(measured.disparity))
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +99,7 @@ def disparity_slope(disparity: np.ndarray) -> np.ndarray:
 
 
 def fuse_depth(
+    image: np.ndarray,
     reference: DisparityMap,
     others: list[tuple[DepthView, np.ndarray, np.ndarray]],
     camera: RectifiedStereo,
@@ -102,7 +108,8 @@ def fuse_depth(
     """Fuses the disparities of a keyframe with those of others.
 
     Args:
-        reference: of the keyframe.
+        image: (H, W) uint8 rectified left image of the keyframe.
+        reference: its disparities.
         others: of each other keyframe its view, T_other_reference (4, 4), and the covariance (6, 6) of that,
             perturbed from the left: translation (metres) before rotation (radians).
         camera: the rectified pair.
@@ -117,14 +124,17 @@ def fuse_depth(
     variance = np.float32(1.0 - shared) * reference.variance.ravel()[known]
     support, contradictions = np.zeros((2, len(known)), np.uint8)
     cost = np.zeros_like(mean)
+    grey = image.astype(np.float32)
+    texture = _texture(grey)
     for view, pose, covariance in others:
-        seen = _measure(view, pose, covariance, rays, mean, camera)
+        seen = _measure(view, pose, covariance, rays, mean, variance, camera)
         noise = np.float32(1.0 - shared) * seen.noise + seen.pose
         # What is common does not cancel in the difference unless the views are alike: the gate allows for it.
         spread = seen.derivative**2 * variance + noise
         expected = spread + np.float32(shared) * seen.noise + common
         squared = seen.innovation**2
-        agrees = squared <= GATE * expected
+        looks_alike = _looks_alike(grey, texture, view.image, seen, known)
+        agrees = (squared <= GATE * expected) & looks_alike
         cost += np.where(agrees, squared / expected, 0.0)
         support += agrees
         contradictions += (squared > GATE * expected) & (seen.innovation < 0.0)
@@ -174,12 +184,17 @@ class _Seen:
         innovation: (N,) disparity seen there minus the predicted one, pixels.
         derivative: (N,) of the latter less the former by the state.
         noise, pose: (N,) variance of the disparity seen, and of what the pose between the views adds, pixels squared.
+        u, v: (N,) where the point appears, pixels.
+        place: (2, N) variance of u and v by the state and the pose, pixels squared.
     """
 
     innovation: np.ndarray
     derivative: np.ndarray
     noise: np.ndarray
     pose: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+    place: np.ndarray
 
 
 def _measure(
@@ -188,6 +203,7 @@ def _measure(
     covariance: np.ndarray,
     rays: np.ndarray,
     state: np.ndarray,
+    variance: np.ndarray,
     camera: RectifiedStereo,
 ) -> _Seen:
     focal_baseline = np.float32(camera.focal_baseline)
@@ -210,16 +226,59 @@ def _measure(
     # By the pose: a column of its root at a time moves the point (a, b, 1) by so much per depth.
     values, vectors = np.linalg.eigh(covariance)
     pose_variance = np.zeros_like(state)
+    place = np.stack([moves_u**2 * variance, moves_v**2 * variance])
     inverse_depth = predicted / focal_baseline
     for column in (vectors * np.sqrt(np.maximum(values, 0.0))).T.astype(np.float32):
         step, turn = column[:3], column[3:]
         dx = step[0] * inverse_depth + turn[1] - turn[2] * b
         dy = step[1] * inverse_depth + turn[2] * a - turn[0]
         dz = step[2] * inverse_depth + turn[0] * b - turn[1] * a
-        moved = -predicted * dz
-        moved -= slope_u * (np.float32(camera.fx) * (dx - a * dz)) + slope_v * (np.float32(camera.fy) * (dy - b * dz))
-        pose_variance += moved**2
-    return _Seen(disparity - predicted, derivative, noise, pose_variance)
+        du, dv = np.float32(camera.fx) * (dx - a * dz), np.float32(camera.fy) * (dy - b * dz)
+        pose_variance += (predicted * dz + slope_u * du + slope_v * dv) ** 2
+        place += np.stack([du**2, dv**2])
+    return _Seen(disparity - predicted, derivative, noise, pose_variance, u, v, place)
+
+
+def _looks_alike(
+    image: np.ndarray, texture: np.ndarray, other: np.ndarray, seen: _Seen, known: np.ndarray
+) -> np.ndarray:
+    """(N,) bool, pixels whose windows show the same where the points appear in the other image.
+
+    What moves along its own surface has the depth that is expected, and another texture. The variance of the difference
+    is held against what noise, the resampling and an uncertain place make of the texture, scaled by the median pixel.
+
+    Args:
+        image: (H, W) float32 of the reference.
+        texture: (2, H, W) as of `_texture`.
+        other: (H, W) float32.
+        seen: of the N points.
+        known: (N,) their flat indices in the reference.
+    """
+    shape = image.shape
+    inside = np.isfinite(seen.u) & np.isfinite(seen.v)
+    u, v = (_spread(np.where(inside, each, -1e4).astype(np.float32), known, shape, -1e4) for each in (seen.u, seen.v))
+    warped = cv2.remap(other, u, v, cv2.INTER_LINEAR, borderValue=np.nan)
+    there = np.isfinite(warped)
+    weight = there.astype(np.float32)
+    share = np.maximum(_mean(weight), 1e-3)
+    difference = np.where(there, image - warped, 0.0).astype(np.float32)
+    varies = (_mean(difference**2) / share - (_mean(difference) / share) ** 2).ravel()[known]
+    place = np.where(np.isfinite(seen.place), seen.place, 0.0) + _RESAMPLING
+    expected = _ROUNDING + (texture.reshape(2, -1)[:, known] * place).sum(axis=0)
+    ratio = np.where(there.ravel()[known], varies / expected, np.inf)
+    finite = ratio[np.isfinite(ratio)]
+    return np.asarray(ratio <= GATE * (float(np.median(finite)) if len(finite) else 0.0))
+
+
+def _texture(image: np.ndarray) -> np.ndarray:
+    """Mean squared derivatives by u and v in the window of each pixel, (2, H, W), grey values^2 / pixel^2."""
+    step = np.array([[-0.5, 0.0, 0.5]], np.float32)
+    return np.stack([_mean(cv2.filter2D(image, -1, kernel) ** 2) for kernel in (step, step.T)])
+
+
+def _mean(values: np.ndarray) -> np.ndarray:
+    """Means over the window of each pixel."""
+    return np.asarray(cv2.blur(values, (_WINDOW, _WINDOW)))
 
 
 def _sample(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -231,9 +290,7 @@ def _sample(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     for target, values in zip(maps, (u, v), strict=True):
         target[: len(u)] = np.where(np.isfinite(values), values, -1e4)
     nothing = (np.nan,) * 4
-    sampled = cv2.remap(
-        image, *(each.reshape(rows, columns) for each in maps), cv2.INTER_LINEAR, borderValue=nothing
-    )
+    sampled = cv2.remap(image, *(each.reshape(rows, columns) for each in maps), cv2.INTER_LINEAR, borderValue=nothing)
     return np.asarray(sampled.reshape(rows * columns, *image.shape[2:])[: len(u)])
 
 

@@ -89,7 +89,9 @@ class Alignment:
     edge: np.ndarray
 
 
-def measure_disparity(left: np.ndarray, right: np.ndarray, match: Matcher, model: DisparityModel = FITTED) -> DisparityMap:
+def measure_disparity(
+    left: np.ndarray, right: np.ndarray, match: Matcher, model: DisparityModel = FITTED
+) -> DisparityMap:
     """Disparities with their variances.
 
     Args:
@@ -98,12 +100,7 @@ def measure_disparity(left: np.ndarray, right: np.ndarray, match: Matcher, model
         model: of the variance.
     """
     aligned = align_disparity(left, right, match(left, right))
-    variance = (
-        model.floor
-        + model.bound * aligned.bound
-        + model.relief * aligned.relief
-        + model.edge * aligned.edge
-    )
+    variance = model.floor + model.bound * aligned.bound + model.relief * aligned.relief + model.edge * aligned.edge
     missing = np.isnan(aligned.disparity)
     return DisparityMap(aligned.disparity, np.where(missing, np.nan, variance).astype(np.float32))
 

@@ -197,7 +197,7 @@ def fuse_keyframes(
             number,
             image,
             view.measured,
-            fuse_depth(view.measured, others, rectifier.rectified),
+            fuse_depth(image, view.measured, others, rectifier.rectified),
             keyframes.poses[number] @ T_left_rectified,
             turn_covariance(rectifier.T_rectified_left, keyframes.covariances[number]),
             keyframes.disparity_offset_sigma,
@@ -209,7 +209,7 @@ def fuse_keyframes(
         disparity = measured.disparity - np.float32(keyframes.disparity_offset)
         if rectifier.valid_mask is not None:
             disparity[cv2.erode(rectifier.valid_mask, np.ones((7, 7), np.uint8)) == 0] = np.nan
-        kept[number] = left, DepthView.of(DisparityMap(disparity, measured.variance))
+        kept[number] = left, DepthView.of(left, DisparityMap(disparity, measured.variance))
         done = number - NEIGHBOURS
         if done >= 0 and keyframes.is_keyframe[done]:
             yield fuse(done)

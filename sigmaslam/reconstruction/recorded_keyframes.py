@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -209,7 +210,7 @@ def _with_frames_between(keyframes: np.ndarray, count: int) -> np.ndarray:
     ends = np.unique(np.r_[keyframes, count - 1])
     parts = [
         np.linspace(first, last, -(-(last - first) // _MOST_FRAMES) + 1).round().astype(np.int64)
-        for first, last in zip(ends[:-1], ends[1:], strict=True)
+        for first, last in pairwise(ends)
     ]
     return np.unique(np.concatenate([ends, *parts]))
 

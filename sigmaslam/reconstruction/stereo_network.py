@@ -63,8 +63,8 @@ class StereoNetwork:
             raise InputError(f"{self._path}: does not take images of {size[0]}x{size[1]} ({error})") from error
         if output.shape[-2:] != (size[1], size[0]) or output.size != size[0] * size[1]:
             raise InputError(
-                f"{self._path}: gives {output.shape} for images of {size[0]}x{size[1]} pixels, one disparity a pixel is "
-                "needed: wrap the graph so that its first output is that"
+                f"{self._path}: gives {output.shape} for images of {size[0]}x{size[1]} pixels, one disparity a pixel "
+                "is needed: wrap the graph so that its first output is that"
             )
         disparity = output.reshape(size[1], size[0])
         if size != (width, height):
