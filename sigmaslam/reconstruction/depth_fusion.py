@@ -1,9 +1,9 @@
 """Depths of a keyframe, fused with those of the keyframes around it: one filter a pixel.
 
 The state of a pixel is its inverse depth times focal length and baseline: the disparity that it has in truth, pixels.
-Another keyframe measures it where the point appears there. The measurement is the difference of the disparity seen there
-and the one predicted, both of which depend on the state and on the pose between the two keyframes; its update is the
-scalar form of the extended Kalman filter in `sigmaslam.filters`, to which a test holds it.
+Another keyframe measures it where the point appears there. The measurement is the difference of the disparity seen
+there and the one predicted, both of which depend on the state and on the pose between the two keyframes; its update is
+the scalar form of the Kalman filter in `sigmaslam.filters`, to which a test holds it.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from sigmaslam.reconstruction.disparity import DisparityMap, pixel_grid
 GATE = 6.635
 """99 % of chi-square with one degree of freedom: disparities that differ by more are of different surfaces."""
 # Of the variance of a disparity this share is the same in all keyframes that see the point, as texture and window are.
-# Fitted with the variance itself.
-SHARED = 0.7
+# Chosen on the same renders as the variance itself, by the coverage where one and where four other views agree.
+SHARED = 0.8
 # Slopes of the disparity are of a plane fitted over so many pixels.
 _SLOPE_RADIUS = 3
 # Points nearer to another camera's plane than this share of the baseline are behind it for all purposes.
@@ -62,7 +62,8 @@ class FusedDepth:
         disparity: (H, W) float32 inverse depth times focal length and baseline, pixels; NaN where there is none.
         variance: (H, W) float32 pixels squared, without the part of the disparity offset; NaN where there is none.
         support: (H, W) uint8 other keyframes that confirm it.
-        contradictions: (H, W) uint8 other keyframes that see something behind it, in its direction.
+        contradictions: (H, W) uint8 other keyframes that see something behind it, in its direction, or another
+            texture in its place.
     """
 
     disparity: np.ndarray
@@ -72,7 +73,7 @@ class FusedDepth:
 
     @property
     def is_confirmed(self) -> np.ndarray:
-        """(H, W) bool: more keyframes confirm the point than see through it. Where a body moved it is not."""
+        """(H, W) bool: more keyframes confirm the point than contradict it. Where a body moved it is not."""
         enough = (self.support >= _MIN_SUPPORT) & (self.support > self.contradictions)
         return np.asarray(enough & (self.disparity > 0.0))
 
@@ -133,11 +134,11 @@ def fuse_depth(
         spread = seen.derivative**2 * variance + noise
         expected = spread + np.float32(shared) * seen.noise + common
         squared = seen.innovation**2
-        looks_alike = _looks_alike(grey, texture, view.image, seen, known)
-        agrees = (squared <= GATE * expected) & looks_alike
+        there = squared <= GATE * expected
+        agrees = there & _looks_alike(grey, texture, view.image, seen, known)
         cost += np.where(agrees, squared / expected, 0.0)
         support += agrees
-        contradictions += (squared > GATE * expected) & (seen.innovation < 0.0)
+        contradictions += (there & ~agrees) | ((squared > GATE * expected) & (seen.innovation < 0.0))
         mean, variance = kalman_update(mean, variance, seen.innovation, seen.derivative, noise, agrees)
     # Where the views differ by more than they should, or less, all variances are scaled: the mean of the posterior of a
     # scale that has an inverse gamma distribution.

@@ -78,7 +78,8 @@ class RecordedKeyframes:
         """T_last_first (4, 4) of two views and its covariance (6, 6), perturbed from the left in the last.
 
         The covariance is that of the pair in relative_poses.npz with the same later frame and the next larger
-        distance in time, or of the largest one, grown with the square of time; that of a longer way is on the safe side.
+        distance in time, or of the largest one, grown with the square of time; that of a longer way is on the safe
+        side.
         """
         earlier, later = min(first, last), max(first, last)
         step = se3_inverse(self.poses[last]) @ self.poses[first]
