@@ -40,7 +40,7 @@ def format_page(sequences: Sequence[ReconstructedSequence], seeds: int, command:
         "odd seeds have bodies that move on their own. Disparities exceed what the calibration says by 0.3 px.",
         "",
         "A depth error is the median of the absolute errors of the points' depths, as shares of the depth; that of the",
-        "single view is of semi-global matching at the same pixels, with the same disparity offset taken off. Inside is",
+        "single view is of semi-global matching at the same pixels, with the same disparity offset taken off. Inside:",
         "the share of the points inside the 95 % interval of their inverse depth; complete the share of the pixels at",
         "rest, seen by both eyes, that became points; gross the share of points off by more than a tenth of the depth;",
         "ghosts the share of the pixels on moving bodies that became points. Rows of worlds are medians of sequences.",
@@ -81,9 +81,13 @@ def _world(world: str, sequences: Sequence[ReconstructedSequence]) -> str:
     figures = [each.figures for each in of_world]
     ghosts = [each.ghosts for each in figures if np.isfinite(each.ghosts)]
     medians = DepthFigures(
-        *(float(np.median([getattr(each, name) for each in figures])) for name in DepthFigures.__slots__[:5]),
-        float(np.median(ghosts)) if ghosts else float("nan"),
-        sum(each.keyframes for each in figures),
+        fused_error=_median(of_world, lambda each: each.fused_error),
+        single_error=_median(of_world, lambda each: each.single_error),
+        inside=_median(of_world, lambda each: each.inside),
+        completeness=_median(of_world, lambda each: each.completeness),
+        gross=_median(of_world, lambda each: each.gross),
+        ghosts=float(np.median(ghosts)) if ghosts else float("nan"),
+        keyframes=sum(each.keyframes for each in figures),
     )
     return row(world, str(len(of_world)), *_cells(medians))
 

@@ -234,8 +234,8 @@ def benchmark(
     runs: Annotated[
         Path | None,
         typer.Option(
-            help="noise, consistency, shake, reconstruction, denoising, sequences, endurance, runtime: folder of the renders; what is "
-            "there is used again. sequences, endurance, runtime: a temporary one without it."
+            help="noise, consistency, shake, reconstruction, denoising, sequences, endurance, runtime: folder of the "
+            "renders; what is there is used again. sequences, endurance, runtime: a temporary one without it."
         ),
     ] = None,
     seeds: Annotated[

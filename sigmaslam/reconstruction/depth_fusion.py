@@ -287,11 +287,11 @@ def _sample(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     # OpenCV takes maps of at most 32767 columns.
     columns = 1024
     rows = -(-len(u) // columns)
-    maps = [np.full(rows * columns, -1e4, np.float32) for _ in range(2)]
-    for target, values in zip(maps, (u, v), strict=True):
-        target[: len(u)] = np.where(np.isfinite(values), values, -1e4)
+    maps = np.full((2, rows * columns), -1e4, np.float32)
+    maps[:, : len(u)] = np.where(np.isfinite(u) & np.isfinite(v), [u, v], -1e4)
+    map_u, map_v = maps.reshape(2, rows, columns)
     nothing = (np.nan,) * 4
-    sampled = cv2.remap(image, *(each.reshape(rows, columns) for each in maps), cv2.INTER_LINEAR, borderValue=nothing)
+    sampled = cv2.remap(image, map_u, map_v, cv2.INTER_LINEAR, borderValue=nothing)
     return np.asarray(sampled.reshape(rows * columns, *image.shape[2:])[: len(u)])
 
 

@@ -24,7 +24,7 @@ from sigmaslam.reconstruction.disparity import DisparityMap, Matcher, measure_di
 from sigmaslam.reconstruction.mesh import DepthVolume, need_open3d
 from sigmaslam.reconstruction.recorded_keyframes import RecordedKeyframes, open_input, read_recorded_keyframes
 from sigmaslam.reconstruction.stereo_network import StereoNetwork
-from sigmaslam.runs.dense_points import DENSE_NAME, write_dense_points
+from sigmaslam.runs.dense_points import DENSE_NAME, RECONSTRUCTION_NAME, write_dense_points
 from sigmaslam.runs.report import write_report
 
 NEIGHBOURS = 2
@@ -241,5 +241,5 @@ def _check_writable(path: Path | None) -> None:
 def _add_to_report(run: Path, points: DenseCloud, summary: ReconstructionSummary) -> None:
     """Leaves an even selection of the points, and the summary, in the run's folder and writes its report anew."""
     write_dense_points(run / DENSE_NAME, points.points, points.sigma, points.intensity)
-    atomic_write_text(run / "reconstruction.json", json.dumps(asdict(summary), indent=2) + "\n")
+    atomic_write_text(run / RECONSTRUCTION_NAME, json.dumps(asdict(summary), indent=2) + "\n")
     write_report(run)

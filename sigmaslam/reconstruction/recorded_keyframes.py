@@ -231,7 +231,8 @@ def _read_entries(path: Path) -> dict[str, Any]:
 def _camera_of(path: Path, entries: dict[str, Any]) -> StereoCamera:
     """The calibration that run.json has; its measured covariance is not needed."""
     try:
-        eyes = [CameraModel(**entries[eye]) for eye in ("left", "right")]
-        return StereoCamera(*eyes, np.array(entries["T_left_right"], float), CalibrationSigmas(**entries["sigmas"]))
+        left, right = (CameraModel(**entries[eye]) for eye in ("left", "right"))
+        sigmas = CalibrationSigmas(**entries["sigmas"])
+        return StereoCamera(left, right, np.array(entries["T_left_right"], float), sigmas)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: calibration cannot be read ({error}): run `sigmaslam track` again") from error
