@@ -14,6 +14,8 @@ from sigmaslam.geometry.se3 import se3_inverse
 
 # Distances are truncated at so many voxels, and a voxel of the mesh is so many of the cloud's.
 _TRUNCATION, _COARSER = 4.0, 2.0
+# Blocks of voxels that are made room for at first, and of the depths that a voxel has seen the least that count.
+_BLOCKS, _LEAST_WEIGHT = 10_000, 0.5
 # Depths farther than so many voxels are left out: surfaces there are coarser than the voxels.
 _FARTHEST = 1000.0
 
@@ -32,7 +34,7 @@ def need_open3d() -> Any:
 
 
 class DepthVolume:
-    """Depth maps of a world, integrated into a sparse volume.
+    """Depth maps of a world, integrated into sparse blocks of voxels; Open3D's older volumes give no mesh in 0.20.
 
     Args:
         voxel: side of a voxel of the cloud, metres.
@@ -41,14 +43,18 @@ class DepthVolume:
 
     def __init__(self, voxel: float, camera: RectifiedStereo) -> None:
         self._library = need_open3d()
-        side = _COARSER * voxel
+        core = self._library.core
         self._farthest = _FARTHEST * voxel
-        integration = self._library.pipelines.integration
-        self._volume = integration.ScalableTSDFVolume(
-            voxel_length=side, sdf_trunc=_TRUNCATION * side, color_type=integration.TSDFVolumeColorType.RGB8
-        )
-        self._intrinsics = self._library.camera.PinholeCameraIntrinsic(
-            camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
+        self._is_empty = True
+        self._intrinsics = core.Tensor(camera.matrix)
+        self._grid = self._library.t.geometry.VoxelBlockGrid(
+            attr_names=("tsdf", "weight", "color"),
+            attr_dtypes=(core.float32, core.float32, core.float32),
+            attr_channels=((1), (1), (3)),
+            voxel_size=_COARSER * voxel,
+            block_resolution=16,
+            block_count=_BLOCKS,
+            device=core.Device("CPU:0"),
         )
 
     def integrate(self, depth: np.ndarray, image: np.ndarray, pose: np.ndarray) -> None:
@@ -59,20 +65,25 @@ class DepthVolume:
             image: (H, W) uint8 grey values.
             pose: (4, 4) T_world_camera.
         """
-        geometry = self._library.geometry
-        colour = np.ascontiguousarray(np.repeat(image[..., None], 3, axis=2))
-        picture = geometry.RGBDImage.create_from_color_and_depth(
-            geometry.Image(colour),
-            geometry.Image(np.ascontiguousarray(depth)),
-            depth_scale=1.0,
-            depth_trunc=self._farthest,
-            convert_rgb_to_intensity=False,
-        )
-        self._volume.integrate(picture, self._intrinsics, se3_inverse(pose))
+        if not ((depth > 0.0) & (depth < self._farthest)).any():
+            return
+        self._is_empty = False
+        core, picture = self._library.core, self._library.t.geometry.Image
+        depths = picture(core.Tensor(np.ascontiguousarray(depth)))
+        grey = picture(core.Tensor(np.repeat(image[..., None].astype(np.float32) / 255.0, 3, axis=2)))
+        view = self._intrinsics, core.Tensor(np.ascontiguousarray(se3_inverse(pose)))
+        blocks = self._grid.compute_unique_block_coordinates(depths, *view, 1.0, self._farthest, _TRUNCATION)
+        self._grid.integrate(blocks, depths, grey, *view, 1.0, self._farthest, _TRUNCATION)
 
     def write(self, path: Path) -> None:
-        """Writes the mesh as PLY, with normals and grey values."""
-        mesh = self._volume.extract_triangle_mesh()
+        """Writes the mesh as PLY, with normals and grey values.
+
+        Raises:
+            InputError: no surface was seen, or the file cannot be written.
+        """
+        if self._is_empty:
+            raise InputError(f"{path}: no point is near enough for a mesh: leave --mesh out, or give a larger --voxel")
+        mesh = self._grid.extract_triangle_mesh(weight_threshold=_LEAST_WEIGHT).to_legacy()
         mesh.compute_vertex_normals()
         with atomic_path(path) as temporary:
             if not self._library.io.write_triangle_mesh(str(temporary), mesh):

@@ -97,7 +97,7 @@ def test_what_moves_along_its_own_surface_is_not_confirmed():
 
 
 def test_the_derivative_and_the_pose_s_part_are_those_of_differences():
-    image, true = plane(np.eye(4))
+    _, true = plane(np.eye(4))
     seen, disparity = plane(STEP)
     exact = DisparityMap(disparity, np.full_like(disparity, NOISE))
     view, pose = DepthView.of(seen, exact), se3_inverse(STEP)
