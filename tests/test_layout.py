@@ -38,7 +38,7 @@ FLOORS = (
     ("slam",),
     ("calibration", "checks", "fusion"),
     ("runs",),
-    ("bundle_adjustment",),
+    ("bundle_adjustment", "reconstruction"),
     ("cli",),
     ("__main__", ""),
 )

@@ -182,6 +182,19 @@ def shake(out: Out, runs: Runs, seeds: Annotated[int, typer.Option(min=1, help="
     typer.echo(write_shake(out, runs, seeds, default_workers(), command, _note))
 
 
+@benchmark.command(short_help="Dense clouds beside exact depth.")
+def reconstruction(
+    out: Out, runs: Runs, seeds: Annotated[int, typer.Option(min=1, help="Sequences a world.")] = 20
+) -> None:
+    """Error, coverage, completeness and ghosts of dense clouds beside exact depth (extra 'train')."""
+    need_train_extra()
+    from sigmaslam.evaluation.benchmarks.reconstruction import write_reconstruction
+    from sigmaslam.synthetic.render_sequence import default_workers
+
+    command = _command("reconstruction", out, f"--runs {runs.name}", f"--seeds {seeds}")
+    typer.echo(write_reconstruction(out, runs, seeds, default_workers(), command, _note))
+
+
 @benchmark.command(short_help="Image filters beside OpenCV's, and the dark.")
 def denoising(out: Out, runs: Runs, data: Data = None) -> None:
     """PSNR and time of the image filters beside OpenCV's, and the tracker in the dark (ten minutes; extra 'train')."""

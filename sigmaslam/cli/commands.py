@@ -22,6 +22,7 @@ from sigmaslam.cli.finish import finish
 from sigmaslam.cli.geometry import geometry
 from sigmaslam.cli.localize import localize
 from sigmaslam.cli.match import match
+from sigmaslam.cli.reconstruct import reconstruct
 from sigmaslam.cli.rectify import rectify
 from sigmaslam.cli.refine import refine
 from sigmaslam.cli.render import render
@@ -57,6 +58,7 @@ for _command, _line in (
     (finish, "Make the results of a run that was killed."),
     (evaluate, "Compare a trajectory with the truth."),
     (refine, "Adjust all of a run at once (extra 'graph')."),
+    (reconstruct, "Make a dense cloud, and a mesh, of a run."),
     (localize, "Localise robots among known landmarks (extra 'train')."),
     (match, "Match two images."),
     (denoise, "Filter noise out of images."),

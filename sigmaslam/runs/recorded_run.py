@@ -14,6 +14,7 @@ from sigmaslam.bounded_files import TABLE_BYTES, check_columns, load_arrays, rea
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import read_covariances, read_tum
+from sigmaslam.runs.dense_points import DENSE_NAME, DensePoints, read_dense_points
 from sigmaslam.runs.evaluated_frames import (
     EVALUATED_FRAMES_NAME,
     EVALUATION_NAME,
@@ -55,6 +56,7 @@ class RecordedRun:
         pose_row: (N,) row in `frames` of each pose.
         final, refined: trajectories after the fact and after `sigmaslam refine`.
         map: the points.
+        dense: points of `sigmaslam reconstruct`.
         pictures: of some frames.
         entries: of run.json.
         evaluation, refinement: content of evaluation.json and refine.json.
@@ -69,6 +71,7 @@ class RecordedRun:
     final: Trajectory | None
     refined: Trajectory | None
     map: RecordedMap | None
+    dense: DensePoints | None
     pictures: FramePictures | None
     entries: dict[str, Any]
     evaluation: dict[str, Any]
@@ -122,6 +125,7 @@ def read_run(folder: Path) -> RecordedRun:
         final=_read_trajectory(folder / FINAL_TRAJECTORY),
         refined=_read_trajectory(folder / REFINED_TRAJECTORY),
         map=_read_map(folder / _MAP_NAME),
+        dense=read_dense_points(folder / DENSE_NAME) if (folder / DENSE_NAME).is_file() else None,
         pictures=read_pictures(folder / PICTURES_NAME) if (folder / PICTURES_NAME).is_file() else None,
         entries=_read_json(folder / RUN_NAME, "track"),
         evaluation=_read_json(folder / EVALUATION_NAME, "evaluate"),

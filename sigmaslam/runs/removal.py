@@ -7,6 +7,7 @@ from pathlib import Path
 from sigmaslam.errors import InputError
 from sigmaslam.files import check_new_folder
 from sigmaslam.runs.appended_file import check_not_in_use
+from sigmaslam.runs.dense_points import DENSE_NAME, RECONSTRUCTION_NAME
 from sigmaslam.runs.evaluated_frames import EVALUATED_FRAMES_NAME, EVALUATION_NAME
 from sigmaslam.runs.frame_pictures import PICTURES_NAME
 from sigmaslam.runs.frame_table import FRAMES_NAME
@@ -22,6 +23,7 @@ _NAMES = (
     *(FINAL_TRAJECTORY, FINAL_COVARIANCE, "trajectory_location.tum", "tracks.npz", "map.npz", "map.ply"),
     *(EVALUATION_NAME, EVALUATED_FRAMES_NAME, "evaluation.png", REFINE_NAME, REFINED_TRAJECTORY, "report.html"),
     *(VIDEO_NAME, RERUN_NAME),
+    *(DENSE_NAME, RECONSTRUCTION_NAME),
     RUN_NAME,  # the last one, by which the folder is known
 )
 

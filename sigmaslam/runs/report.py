@@ -47,6 +47,7 @@ _LINKED = (
     ("frames.csv", "a row for each frame"),
     ("map.ply", "points for viewers"),
     ("map.npz", "points and keyframes"),
+    ("dense.npz", "surfaces shown here"),
     ("pictures.npz", "the frames shown here"),
     ("run.json", "settings and summary"),
     ("evaluation.json", "errors"),

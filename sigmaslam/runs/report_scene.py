@@ -60,6 +60,8 @@ def build_scene(run: RecordedRun) -> dict[str, Any] | None:
         "loops": pack(loops),
         **_points(run),
     }
+    if run.dense is not None:
+        scene |= {"dense": pack(run.dense.points), "dense_grey": pack(run.dense.intensity)}
     others: dict[str, np.ndarray | None] = {
         "truth": None if run.evaluated is None else run.evaluated.truth,
         "final": _positions(run.final),

@@ -106,6 +106,17 @@ function ellipsoids(scene) {
   return group;
 }
 
+// Points of surfaces, in the grey values of the images.
+function surfaces(scene) {
+  const cloud = new THREE.BufferGeometry();
+  const colours = new Uint8Array(scene.dense.length);
+  for (let k = 0; k < colours.length; k++) colours[k] = scene.dense_grey[Math.floor(k / 3)];
+  cloud.setAttribute("position", new THREE.BufferAttribute(scene.dense, 3));
+  cloud.setAttribute("color", new THREE.BufferAttribute(colours, 3, true));
+  const size = scene.size / 400;
+  return new THREE.Points(cloud, new THREE.PointsMaterial({ size, vertexColors: true }));
+}
+
 function buildScene(box, scene, select) {
   let renderer;
   try {
@@ -134,6 +145,7 @@ function buildScene(box, scene, select) {
   colourBy(scene.point_grey ? "grey" : "sigma");
   layers.points = new THREE.Points(cloud, new THREE.PointsMaterial({ size: 2.6 * renderer.getPixelRatio(),
     sizeAttenuation: false, vertexColors: true }));
+  if (scene.dense) layers.dense = surfaces(scene);
   layers.keyframes = frustums(scene, scene.size / 130);
   layers.loops = lineSegments(scene.loops, null, { linewidth: 2, color: "#ffb000" });
   for (const [name, colour] of [["truth", "#00c08a"], ["final", "#f0e442"], ["refined", "#e0aaff"]]) {

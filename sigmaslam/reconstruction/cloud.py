@@ -1,0 +1,192 @@
+"""Points with covariances: from depths of keyframes, merged in voxels, and as a PLY file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sigmaslam.files import atomic_path
+from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam.geometry.se3 import skew, transform_points
+from sigmaslam.table import Table
+
+# Rows and columns of the six numbers of a symmetric matrix.
+_ROWS, _COLUMNS = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
+# Pixels are exact to half of one: a point is anywhere in its square.
+_PIXEL_VARIANCE = 1.0 / 12.0
+_COVARIANCE_NAMES = tuple(f"covariance_{'xyz'[a]}{'xyz'[b]}" for a, b in zip(_ROWS, _COLUMNS, strict=True))
+
+
+@dataclass(frozen=True, slots=True)
+class DenseCloud(Table):
+    """Points of surfaces.
+
+    Attributes:
+        points: (N, 3) in the world, metres.
+        covariances: (N, 6) of them, float32: xx, xy, xz, yy, yz, zz, metres squared.
+        intensity: (N,) float32 grey values, 0 to 255.
+        views: (N,) int32 depths of keyframes that were merged into the point.
+    """
+
+    points: np.ndarray
+    covariances: np.ndarray
+    intensity: np.ndarray
+    views: np.ndarray
+
+    @classmethod
+    def empty(cls) -> DenseCloud:
+        """No point."""
+        return cls(np.zeros((0, 3)), np.zeros((0, 6), np.float32), np.zeros(0, np.float32), np.zeros(0, np.int32))
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """(N,) root of the largest eigenvalue of the covariance, metres."""
+        return np.sqrt(np.maximum(np.linalg.eigvalsh(symmetric(self.covariances))[:, -1], 0.0))
+
+
+def symmetric(six: np.ndarray) -> np.ndarray:
+    """Matrices (..., 3, 3) of their numbers (..., 6)."""
+    matrix = np.empty((*six.shape[:-1], 3, 3), six.dtype)
+    matrix[..., _ROWS, _COLUMNS] = six
+    matrix[..., _COLUMNS, _ROWS] = six
+    return matrix
+
+
+@dataclass(frozen=True, slots=True)
+class DepthPixels(Table):
+    """Pixels of a keyframe with a depth.
+
+    Attributes:
+        pixels: (N, 2) int64 (u, v).
+        disparity: (N,) inverse depth times focal length and baseline, pixels.
+        variance: (N,) of it, pixels squared.
+        intensity: (N,) uint8 grey value.
+    """
+
+    pixels: np.ndarray
+    disparity: np.ndarray
+    variance: np.ndarray
+    intensity: np.ndarray
+
+    @classmethod
+    def of(cls, disparity: np.ndarray, variance: np.ndarray, image: np.ndarray, chosen: np.ndarray) -> DepthPixels:
+        """The chosen pixels, (H, W) bool, of such images (H, W); disparities there are positive."""
+        v, u = np.nonzero(chosen)
+        return cls(np.stack([u, v], axis=-1), disparity[v, u].astype(float), variance[v, u].astype(float), image[v, u])
+
+    def points(self, camera: RectifiedStereo) -> np.ndarray:
+        """(N, 3) in the rectified left camera, metres."""
+        return camera.triangulate(np.column_stack([self.pixels, self.disparity]))
+
+    def cloud(self, camera: RectifiedStereo, pose: np.ndarray, pose_covariance: np.ndarray) -> DenseCloud:
+        """Points in the world.
+
+        Args:
+            camera: the rectified pair.
+            pose, pose_covariance: (4, 4) T_world_rectified and its covariance (6, 6) in the rectified camera's frame,
+                translation (metres) before rotation (radians).
+        """
+        points = self.points(camera)
+        # (9.35): along the ray by the disparity, across it by the pixel, and with the camera.
+        along = points / self.disparity[:, None]
+        across = points[:, 2] ** 2 * (_PIXEL_VARIANCE / camera.fx**2)
+        lever = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -skew(points)], axis=2)
+        covariance = (lever.reshape(-1, 6) @ pose_covariance).reshape(-1, 3, 6) @ lever.transpose(0, 2, 1)
+        covariance += self.variance[:, None, None] * along[:, :, None] * along[:, None, :]
+        covariance[:, 0, 0] += across
+        covariance[:, 1, 1] += across
+        rotation = pose[:3, :3]
+        return DenseCloud(
+            transform_points(pose, points),
+            (rotation @ covariance @ rotation.T)[:, _ROWS, _COLUMNS].astype(np.float32),
+            self.intensity.astype(np.float32),
+            np.ones(len(points), np.int32),
+        )
+
+    def thinned(self, camera: RectifiedStereo, size: float) -> DepthPixels:
+        """The most certain pixel of each voxel of the camera's frame; those beside it have nearly the same errors."""
+        points = self.points(camera)
+        keys = np.floor(points / size).astype(np.int64) @ np.array([1, 1 << 21, 1 << 42])
+        order = np.argsort(self.variance / self.disparity**2, kind="stable")
+        _, first = np.unique(keys[order], return_index=True)
+        return self.select(order[first])
+
+
+class VoxelCloud:
+    """Points that come keyframe by keyframe, one kept per voxel.
+
+    What falls into a voxel has errors in common, of poses and of texture, in a degree that is not known. Covariance
+    intersection with equal weights is consistent whatever it is: the mean of the information, and the mean weighted by
+    it.
+
+    Args:
+        size: of a voxel, metres.
+    """
+
+    def __init__(self, size: float) -> None:
+        self.size = size
+        self._merged: tuple[np.ndarray, np.ndarray] = np.zeros((0, 3), np.int64), np.zeros((0, 11))
+        self._pending: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def add(self, cloud: DenseCloud) -> None:
+        """Takes the points of a keyframe."""
+        if not len(cloud):
+            return
+        covariance = symmetric(cloud.covariances.astype(np.float64))
+        information = np.linalg.inv(covariance)
+        weighted = np.einsum("nab,nb->na", information, cloud.points)
+        sums = np.column_stack([information[:, _ROWS, _COLUMNS], weighted, cloud.intensity * cloud.views, cloud.views])
+        keys = np.floor(cloud.points / self.size).astype(np.int64)
+        self._pending.append(_sum_by_key(keys, sums))
+        # Amortised: each point is sorted about as many times as the cloud doubles.
+        if sum(len(part[0]) for part in self._pending) > len(self._merged[0]):
+            self._merge()
+
+    def cloud(self) -> DenseCloud:
+        """The points so far."""
+        self._merge()
+        _, sums = self._merged
+        if not len(sums):
+            return DenseCloud.empty()
+        information, count = symmetric(sums[:, :6]), sums[:, 10]
+        covariance = np.linalg.inv(information / count[:, None, None])
+        points = np.linalg.solve(information, sums[:, 6:9, None])[..., 0]
+        return DenseCloud(
+            points,
+            covariance[:, _ROWS, _COLUMNS].astype(np.float32),
+            (sums[:, 9] / count).astype(np.float32),
+            count.astype(np.int32),
+        )
+
+    def _merge(self) -> None:
+        parts = [self._merged, *self._pending]
+        keys, sums = (np.concatenate([part[k] for part in parts]) for k in range(2))
+        self._merged, self._pending = _sum_by_key(keys, sums), []
+
+
+def write_cloud(path: Path, cloud: DenseCloud) -> None:
+    """A binary PLY: x, y, z, grey value as red, green and blue, sigma, six numbers of the covariance, and views."""
+    columns = {name: ("float", "<f4", cloud.points[:, axis]) for axis, name in enumerate("xyz")}
+    columns |= dict.fromkeys(("red", "green", "blue"), ("uchar", "u1", np.clip(np.rint(cloud.intensity), 0, 255)))
+    columns["sigma"] = ("float", "<f4", cloud.sigma)
+    columns |= {name: ("float", "<f4", cloud.covariances[:, k]) for k, name in enumerate(_COVARIANCE_NAMES)}
+    columns["views"] = ("int", "<i4", cloud.views)
+    vertices = np.zeros(len(cloud), [(name, kind) for name, (_, kind, _) in columns.items()])
+    for name, (_, _, values) in columns.items():
+        vertices[name] = values
+    names = "".join(f"property {kind} {name}\n" for name, (kind, _, _) in columns.items())
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{names}end_header\n"
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(header.encode("ascii") + vertices.tobytes())
+
+
+def _sum_by_key(keys: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows with the same key (N, 3) summed."""
+    if not len(keys):
+        return keys, sums
+    order = np.lexsort(keys.T)
+    keys, sums = keys[order], sums[order]
+    first = np.flatnonzero(np.r_[True, (keys[1:] != keys[:-1]).any(axis=1)])
+    return keys[first], np.add.reduceat(sums, first, axis=0)

@@ -1,0 +1,245 @@
+"""A run folder becomes a dense cloud, and a mesh: disparities of each keyframe, fused with its neighbours', merged."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from sigmaslam.errors import InputError
+from sigmaslam.files import atomic_write_text
+from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam.geometry.rectification import StereoRectifier
+from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
+from sigmaslam.progress import open_progress
+from sigmaslam.readers import StereoSequence
+from sigmaslam.reconstruction.cloud import DenseCloud, DepthPixels, VoxelCloud, write_cloud
+from sigmaslam.reconstruction.depth_fusion import DepthView, FusedDepth, fuse_depth
+from sigmaslam.reconstruction.disparity import DisparityMap, Matcher, measure_disparity, semi_global_disparity
+from sigmaslam.reconstruction.mesh import DepthVolume, need_open3d
+from sigmaslam.reconstruction.recorded_keyframes import RecordedKeyframes, open_input, read_recorded_keyframes
+from sigmaslam.reconstruction.stereo_network import StereoNetwork
+from sigmaslam.runs.dense_points import DENSE_NAME, RECONSTRUCTION_NAME, write_dense_points
+from sigmaslam.runs.report import write_report
+
+NEIGHBOURS = 2
+"""Views before, and behind, that a keyframe's depths are fused with."""
+# Points less certain than this share of their depth are left out.
+_MAX_SIGMA = 0.05
+# Side of a voxel, in pixels at the median depth of the first keyframe.
+_VOXEL_PIXELS = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class ReconstructionSummary:
+    """What was made.
+
+    Attributes:
+        keyframes: how many of the run.
+        points: of the cloud.
+        voxel: side, metres.
+        measured: share of the pixels that have a disparity.
+        confirmed: share of the pixels with a disparity that another keyframe confirms, and that became points.
+        median_sigma: of the points, root of the largest eigenvalue of their covariance, metres.
+        seconds_a_keyframe: wall time, reading images included.
+    """
+
+    keyframes: int
+    points: int
+    voxel: float
+    measured: float
+    confirmed: float
+    median_sigma: float
+    seconds_a_keyframe: float
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframeDepth:
+    """The depths of one keyframe.
+
+    Attributes:
+        number: of the keyframe in its run.
+        image: (H, W) uint8 rectified left image.
+        measured: its own disparities, with the disparity offset taken off.
+        fused: the same after fusion.
+        pose: (4, 4) T_world_rectified.
+        pose_covariance: (6, 6) in the rectified camera's frame, translation (metres) before rotation (radians).
+        offset_sigma: of the disparity offset, pixels: an error that all disparities have in common.
+    """
+
+    number: int
+    image: np.ndarray
+    measured: DisparityMap
+    fused: FusedDepth
+    pose: np.ndarray
+    pose_covariance: np.ndarray
+    offset_sigma: float
+
+    @property
+    def variance(self) -> np.ndarray:
+        """(H, W) of the fused disparities, that of the offset included; pixels squared."""
+        return np.asarray(self.fused.variance + np.float32(self.offset_sigma**2))
+
+    @property
+    def is_point(self) -> np.ndarray:
+        """(H, W) bool: confirmed and near enough to be certain."""
+        certain = self.variance < (_MAX_SIGMA * self.fused.disparity) ** 2
+        return np.asarray(self.fused.is_confirmed & certain)
+
+    def cloud(self, camera: RectifiedStereo, voxel: float) -> DenseCloud:
+        """The points in the world, about one a voxel of that side, metres."""
+        pixels = DepthPixels.of(self.fused.disparity, self.variance, self.image, self.is_point)
+        return pixels.thinned(camera, voxel).cloud(camera, self.pose, self.pose_covariance)
+
+
+def reconstruct_run(
+    run: Path,
+    out: Path,
+    mesh: Path | None = None,
+    moved_to: Path | None = None,
+    network: Path | None = None,
+    voxel: float | None = None,
+) -> ReconstructionSummary:
+    """Reconstructs what the keyframes of a run saw; the report of the run shows the cloud, too.
+
+    Args:
+        run: folder of `sigmaslam track`.
+        out: PLY file of the cloud.
+        mesh: PLY file of a mesh; needs Open3D.
+        moved_to: where the run's input is, if it has moved.
+        network: ONNX file of a stereo network in place of semi-global matching.
+        voxel: side of the voxels that points are merged in, metres; None: five pixels at the median depth.
+    Raises:
+        InputError: something is missing or wrong; all of that is looked for before the work begins.
+    """
+    for path in (out, mesh):
+        _check_writable(path)
+    if mesh is not None:
+        need_open3d()
+    keyframes = read_recorded_keyframes(run)
+    sequence = open_input(keyframes, moved_to)
+    match: Matcher = semi_global_disparity if network is None else StereoNetwork(network)
+    rectifier = StereoRectifier(keyframes.camera)
+    camera = rectifier.rectified
+    cloud: VoxelCloud | None = None
+    volume: DepthVolume | None = None
+    measured = confirmed = 0
+    began = time.perf_counter()
+    with open_progress() as progress:
+        task = progress.add_task("keyframes", total=keyframes.count, note="")
+        for depth in fuse_keyframes(keyframes, sequence, rectifier, match):
+            chosen = depth.is_point
+            if cloud is None:
+                cloud = VoxelCloud(voxel or _default_voxel(depth, camera))
+                volume = None if mesh is None else DepthVolume(cloud.size, camera)
+            cloud.add(depth.cloud(camera, cloud.size))
+            if volume is not None:
+                z = np.where(chosen, camera.focal_baseline / np.where(chosen, depth.fused.disparity, 1.0), 0.0)
+                volume.integrate(z.astype(np.float32), depth.image, depth.pose)
+            measured += int(np.isfinite(depth.measured.disparity).sum())
+            confirmed += int(chosen.sum())
+            progress.update(task, advance=1, note=f"{confirmed / max(measured, 1):.0%} confirmed")
+    seconds = time.perf_counter() - began
+    assert cloud is not None
+    points = cloud.cloud()
+    write_cloud(out, points)
+    if mesh is not None and volume is not None:
+        volume.write(mesh)
+    pixels = keyframes.count * camera.width * camera.height
+    summary = ReconstructionSummary(
+        keyframes.count,
+        len(points),
+        cloud.size,
+        measured / pixels,
+        confirmed / max(measured, 1),
+        float(np.median(points.sigma)) if len(points) else float("nan"),
+        seconds / keyframes.count,
+    )
+    _add_to_report(run, points, summary)
+    return summary
+
+
+def fuse_keyframes(
+    keyframes: RecordedKeyframes, sequence: StereoSequence, rectifier: StereoRectifier, match: Matcher
+) -> Iterator[KeyframeDepth]:
+    """Depths of the keyframes, in order; images and disparities of a few of them are in memory at a time.
+
+    Args:
+        keyframes: of a run.
+        sequence: its input.
+        rectifier: for the run's calibration.
+        match: finds disparities to a pixel.
+    """
+    T_left_rectified = se3_inverse(rectifier.T_rectified_left)
+    kept: dict[int, tuple[np.ndarray, DepthView]] = {}
+
+    def fuse(number: int) -> KeyframeDepth:
+        image, view = kept[number]
+        others = []
+        # The nearest first: it says most of what is seen, and sets what the others must agree with.
+        for other in sorted((k for k in kept if k != number), key=lambda k: (abs(k - number), k)):
+            if abs(other - number) > NEIGHBOURS:
+                continue
+            step, covariance = keyframes.step(number, other)
+            others.append(
+                (
+                    kept[other][1],
+                    rectifier.T_rectified_left @ step @ T_left_rectified,
+                    turn_covariance(rectifier.T_rectified_left, covariance),
+                )
+            )
+        return KeyframeDepth(
+            number,
+            image,
+            view.measured,
+            fuse_depth(image, view.measured, others, rectifier.rectified),
+            keyframes.poses[number] @ T_left_rectified,
+            turn_covariance(rectifier.T_rectified_left, keyframes.covariances[number]),
+            keyframes.disparity_offset_sigma,
+        )
+
+    for number, frame in keyframes.images(sequence):
+        left, right = rectifier.rectify(frame.left, frame.right)
+        measured = measure_disparity(left, right, match)
+        disparity = measured.disparity - np.float32(keyframes.disparity_offset)
+        if rectifier.valid_mask is not None:
+            disparity[cv2.erode(rectifier.valid_mask, np.ones((7, 7), np.uint8)) == 0] = np.nan
+        kept[number] = left, DepthView.of(left, DisparityMap(disparity, measured.variance))
+        done = number - NEIGHBOURS
+        if done >= 0 and keyframes.is_keyframe[done]:
+            yield fuse(done)
+        kept.pop(done - NEIGHBOURS, None)
+    for number in range(max(len(keyframes) - NEIGHBOURS, 0), len(keyframes)):
+        if keyframes.is_keyframe[number]:
+            yield fuse(number)
+
+
+def _default_voxel(depth: KeyframeDepth, camera: RectifiedStereo) -> float:
+    """A few pixels at the median depth of a keyframe, of two digits, metres."""
+    chosen = depth.is_point if depth.is_point.any() else depth.measured.disparity > 0.0
+    if not chosen.any():
+        raise InputError("nothing was matched between the eyes in the first keyframe: give --voxel, or check the input")
+    median = camera.focal_baseline / float(np.median(depth.fused.disparity[chosen]))
+    return float(f"{_VOXEL_PIXELS * median / camera.fx:.2g}")
+
+
+def _check_writable(path: Path | None) -> None:
+    """The file can be made, as far as that is known before."""
+    if path is None:
+        return
+    if path.suffix.lower() != ".ply":
+        raise InputError(f"{path}: clouds and meshes are PLY files: give a name that ends in .ply")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: the folder {path.parent} does not exist: create it, or choose another")
+
+
+def _add_to_report(run: Path, points: DenseCloud, summary: ReconstructionSummary) -> None:
+    """Leaves an even selection of the points, and the summary, in the run's folder and writes its report anew."""
+    write_dense_points(run / DENSE_NAME, points.points, points.sigma, points.intensity)
+    atomic_write_text(run / RECONSTRUCTION_NAME, json.dumps(asdict(summary), indent=2) + "\n")
+    write_report(run)

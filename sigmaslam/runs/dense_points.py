@@ -1,0 +1,61 @@
+"""dense.npz and reconstruction.json of a run: points of `sigmaslam reconstruct` that its report shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sigmaslam.bounded_files import check_columns, load_arrays
+from sigmaslam.files import atomic_path
+
+DENSE_NAME, RECONSTRUCTION_NAME = "dense.npz", "reconstruction.json"
+MAX_POINTS = 150_000
+"""Of a denser cloud an even selection is kept, so that the report has 2.6 MB of it."""
+_MEND = "run `sigmaslam reconstruct` again"
+
+
+@dataclass(frozen=True, slots=True)
+class DensePoints:
+    """Points of surfaces.
+
+    Attributes:
+        points: (N, 3) float32 in the world, metres.
+        sigma: (N,) float32 root of the largest eigenvalue of the covariance, metres.
+        intensity: (N,) uint8 grey value.
+    """
+
+    points: np.ndarray
+    sigma: np.ndarray
+    intensity: np.ndarray
+
+
+def write_dense_points(path: Path, points: np.ndarray, sigma: np.ndarray, intensity: np.ndarray) -> None:
+    """Writes an even selection of points.
+
+    Args:
+        path: of the file.
+        points, sigma, intensity: as of `DensePoints`, of any precision.
+    """
+    rows = np.unique(np.linspace(0, max(len(points) - 1, 0), min(len(points), MAX_POINTS)).astype(np.int64))
+    grey = np.clip(np.rint(intensity[rows]), 0, 255).astype(np.uint8)
+    with atomic_path(path) as temporary:
+        np.savez_compressed(
+            temporary,
+            points=points[rows].astype(np.float32),
+            sigma=sigma[rows].astype(np.float32),
+            intensity=grey,
+        )
+
+
+def read_dense_points(path: Path) -> DensePoints:
+    """The content of a dense.npz.
+
+    Raises:
+        InputError: it is no such file.
+    """
+    arrays = load_arrays(path, _MEND, DensePoints.__slots__)
+    shapes: dict[str, tuple[str | int, ...]] = {"points": ("N", 3), "sigma": ("N",), "intensity": ("N",)}
+    check_columns(path, arrays, shapes, {"intensity": "u"}, _MEND)
+    return DensePoints(**arrays)

@@ -1,0 +1,87 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam.geometry.se3 import se3_exp, transform_points
+from sigmaslam.reconstruction.cloud import DenseCloud, DepthPixels, VoxelCloud, symmetric, write_cloud
+
+CAMERA = RectifiedStereo(500.0, 500.0, 320.0, 240.0, 0.12, 640, 480)
+
+
+def test_covariances_of_points_are_those_of_drawn_poses_and_disparities():
+    rng = np.random.default_rng(1)
+    pose = se3_exp(np.array([1.0, -2.0, 0.5, 0.3, -0.2, 0.1]))
+    root = 1e-3 * rng.standard_normal((6, 6))
+    pixel = DepthPixels(np.array([[400, 100]]), np.array([12.0]), np.array([0.01]), np.array([90], np.uint8))
+    cloud = pixel.cloud(CAMERA, pose, root @ root.T)
+    count = 40_000
+    pixels = pixel.pixels + rng.uniform(-0.5, 0.5, (count, 2))
+    disparity = 12.0 + 0.1 * rng.standard_normal(count)
+    points = CAMERA.triangulate(np.column_stack([pixels, disparity]))
+    poses = pose @ se3_exp(rng.standard_normal((count, 6)) @ root.T)
+    drawn = np.einsum("nab,nb->na", poses[:, :3, :3], points) + poses[:, :3, 3]
+    expected = np.cov(drawn.T)
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    np.testing.assert_allclose(symmetric(cloud.covariances)[0] / scale, expected / scale, atol=0.04)
+    np.testing.assert_allclose(cloud.points[0], transform_points(pose, pixel.points(CAMERA))[0])
+
+
+def _points(points: list[list[float]], variances: list[float]) -> DenseCloud:
+    six = np.array([[each, 0, 0, each, 0, each] for each in variances], np.float32)
+    return DenseCloud(np.array(points), six, np.full(len(points), 100.0, np.float32), np.ones(len(points), np.int32))
+
+
+def test_points_of_a_voxel_are_weighted_by_information_and_gain_none():
+    voxels = VoxelCloud(1.0)
+    voxels.add(_points([[0.2, 0.5, 0.5], [3.5, 0.5, 0.5]], [1.0, 4.0]))
+    voxels.add(_points([[0.8, 0.5, 0.5]], [0.5]))
+    cloud = voxels.cloud()
+    assert cloud.views.tolist() == [2, 1]
+    np.testing.assert_allclose(cloud.points, [[0.6, 0.5, 0.5], [3.5, 0.5, 0.5]], rtol=1e-9)
+    # The mean information of 1 and 2, and not their sum.
+    np.testing.assert_allclose(cloud.covariances[:, 0], [1.0 / 1.5, 4.0], rtol=1e-6)
+
+
+def test_the_order_in_which_keyframes_come_does_not_matter():
+    rng = np.random.default_rng(2)
+    parts = [_points(rng.uniform(0, 4, (60, 3)).tolist(), rng.uniform(0.1, 1, 60).tolist()) for _ in range(4)]
+    clouds = []
+    for order in (parts, parts[::-1]):
+        voxels = VoxelCloud(0.7)
+        for part in order:
+            voxels.add(part)
+        clouds.append(voxels.cloud())
+    for first, second in zip(clouds[0].columns(), clouds[1].columns(), strict=True):
+        np.testing.assert_allclose(first, second, rtol=1e-5)
+
+
+def test_a_voxel_keeps_the_most_certain_pixel_of_a_keyframe():
+    pixels = DepthPixels(
+        np.array([[320, 240], [321, 240], [500, 240]]),
+        np.array([12.0, 12.0, 12.0]),
+        np.array([0.04, 0.01, 0.09]),
+        np.zeros(3, np.uint8),
+    )
+    kept = pixels.thinned(CAMERA, 0.5)
+    assert sorted(kept.variance.tolist()) == [0.01, 0.09]
+
+
+def test_the_file_holds_every_number(tmp_path: Path):
+    cloud = _points([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], [0.25, 4.0])
+    write_cloud(tmp_path / "cloud.ply", cloud)
+    header, _, body = (tmp_path / "cloud.ply").read_bytes().partition(b"end_header\n")
+    kinds = {"float": "<f4", "uchar": "u1", "int": "<i4"}
+    lines = [line.split() for line in header.decode().splitlines() if line.startswith("property")]
+    vertices = np.frombuffer(body, [(name, kinds[kind]) for _, kind, name in lines])
+    assert vertices["y"].tolist() == [2.0, 5.0]
+    assert vertices["sigma"].tolist() == [0.5, 2.0]
+    assert vertices["covariance_yy"].tolist() == [0.25, 4.0]
+    assert vertices["covariance_xy"].tolist() == [0.0, 0.0]
+
+
+def test_without_points_there_is_an_empty_cloud(tmp_path: Path):
+    write_cloud(tmp_path / "cloud.ply", VoxelCloud(1.0).cloud())
+    assert b"element vertex 0\n" in (tmp_path / "cloud.ply").read_bytes()

@@ -1,0 +1,120 @@
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from sigmaslam.filters import Gaussian, KalmanFilter, LinearMeasurement
+from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam.geometry.se3 import se3_exp, se3_inverse
+from sigmaslam.reconstruction import depth_fusion
+from sigmaslam.reconstruction.depth_fusion import DepthView, FusedDepth, fuse_depth, kalman_update
+from sigmaslam.reconstruction.disparity import DisparityMap
+
+CAMERA = RectifiedStereo(200.0, 200.0, 99.5, 59.5, 0.2, 200, 120)
+# A step to the side and ahead, and a small turn.
+STEP = se3_exp(np.array([0.05, 0.02, 0.3, 0.01, -0.02, 0.005]))
+NOISE = 0.04
+
+
+def plane(T_world_camera: np.ndarray, distance: float = 4.0) -> tuple[np.ndarray, np.ndarray]:
+    """Image and disparities of a textured wall z = distance + 0.3 x in the world, exact."""
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width].astype(float)
+    rays = CAMERA.rays(np.stack([u, v], axis=-1)) @ T_world_camera[:3, :3].T
+    centre, normal = T_world_camera[:3, 3], np.array([-0.3, 0.0, 1.0])
+    depth = (distance - normal @ centre) / (rays @ normal)
+    points = centre + depth[..., None] * rays
+    x, y = points[..., 0], points[..., 1]
+    image = 128 + 50 * np.sin(9 * x + 2) * np.cos(7 * y) + 40 * np.sin(23 * x + 11 * y)
+    return image.clip(0, 255).astype(np.uint8), (CAMERA.focal_baseline / depth).astype(np.float32)
+
+
+def measure(disparity: np.ndarray, seed: int) -> DisparityMap:
+    noisy = disparity + np.sqrt(NOISE) * np.random.default_rng(seed).standard_normal(disparity.shape)
+    return DisparityMap(noisy.astype(np.float32), np.full(disparity.shape, NOISE, np.float32))
+
+
+def fuse(distance_later: float = 4.0, covariance: float = 1e-12) -> tuple[FusedDepth, np.ndarray]:
+    image, true = plane(np.eye(4))
+    poses = [STEP, se3_inverse(STEP)]
+    others = []
+    for k, pose in enumerate(poses):
+        seen, disparity = plane(pose, distance_later)
+        others.append((DepthView.of(seen, measure(disparity, k + 1)), se3_inverse(pose), covariance * np.eye(6)))
+    return fuse_depth(image, measure(true, 0), others, CAMERA, shared=0.0), true
+
+
+def test_the_update_is_that_of_the_filter_library():
+    rng = np.random.default_rng(0)
+    mean, innovation, derivative = rng.standard_normal((3, 50))
+    variance, noise = rng.uniform(0.1, 2.0, (2, 50))
+    agrees = rng.random(50) < 0.7
+    found, spread = kalman_update(mean, variance, innovation, derivative, noise, agrees)
+    belief = Gaussian(torch.from_numpy(mean[:, None]), torch.from_numpy(variance[:, None, None]))
+    model = LinearMeasurement(torch.from_numpy(derivative[:, None, None]), torch.from_numpy(noise[:, None, None]))
+    value = torch.from_numpy((derivative * mean + innovation)[:, None])
+    posterior = KalmanFilter().update(belief, model, value).belief
+    expected = np.where(agrees, posterior.mean.numpy()[:, 0], mean)
+    np.testing.assert_allclose(found, expected, rtol=1e-10)
+    np.testing.assert_allclose(spread, np.where(agrees, posterior.covariance.numpy()[:, 0, 0], variance), rtol=1e-10)
+
+
+def test_fused_depths_are_better_than_those_of_a_view_and_know_it():
+    fused, true = fuse()
+    chosen = fused.is_confirmed & (fused.support == 2)
+    assert chosen.mean() > 0.6
+    error = (fused.disparity - true)[chosen]
+    assert error.std() < 0.72 * np.sqrt(NOISE)
+    assert abs(error.mean()) < 0.02
+    inside = np.abs(error) < 1.96 * np.sqrt(fused.variance[chosen])
+    # The gate leaves out the largest differences.
+    assert 0.93 < inside.mean() < 0.985
+
+
+def test_an_uncertain_pose_leaves_the_depth_of_the_view():
+    fused, _ = fuse(covariance=1.0)
+    seen = np.isfinite(fused.variance) & (fused.support > 0)
+    assert np.median(fused.variance[seen]) > 0.6 * NOISE
+
+
+def test_what_has_moved_is_not_confirmed():
+    fused, _ = fuse(distance_later=6.0)
+    assert np.isfinite(fused.disparity).any()
+    assert fused.is_confirmed.mean() < 0.02
+    assert (fused.contradictions > 0).mean() > 0.6
+
+
+def test_what_moves_along_its_own_surface_is_not_confirmed():
+    image, true = plane(np.eye(4))
+    rng = np.random.default_rng(4)
+    noisy = (image + 3.0 * rng.standard_normal(image.shape)).clip(0, 255).astype(np.uint8)
+    # Most of the view is at rest; the depths are everywhere as expected.
+    moved = np.where(np.arange(CAMERA.width) < 130, noisy, np.roll(noisy, 5, axis=1))
+    view = DepthView.of(moved, measure(true, 1))
+    fused = fuse_depth(image, measure(true, 0), [(view, np.eye(4), 1e-12 * np.eye(6))], CAMERA)
+    assert fused.is_confirmed[5:-5, 5:120].mean() > 0.9
+    assert fused.is_confirmed[5:-5, 140:-10].mean() < 0.2
+    assert (fused.contradictions[5:-5, 140:-10] == 1).mean() > 0.7
+
+
+def test_the_derivative_and_the_pose_s_part_are_those_of_differences():
+    _, true = plane(np.eye(4))
+    seen, disparity = plane(STEP)
+    exact = DisparityMap(disparity, np.full_like(disparity, NOISE))
+    view, pose = DepthView.of(seen, exact), se3_inverse(STEP)
+    v, u = np.mgrid[30:90:10, 40:160:10].reshape(2, -1)
+    rays = CAMERA.rays(np.stack([u, v], axis=-1).astype(float)).T.astype(np.float32)
+    state = true[v, u]
+    variance = np.full_like(state, NOISE)
+    root = np.random.default_rng(5).standard_normal((6, 6)) * 1e-3
+    covariance = root @ root.T
+
+    def innovation(state: np.ndarray, pose: np.ndarray) -> np.ndarray:
+        return depth_fusion._measure(view, pose, covariance, rays, state, variance, CAMERA).innovation.astype(float)
+
+    found = depth_fusion._measure(view, pose, covariance, rays, state, variance, CAMERA)
+    step = np.float32(0.2)
+    slope = (innovation(state + step, pose) - innovation(state - step, pose)) / (2 * step)
+    np.testing.assert_allclose(found.derivative, -slope, atol=0.02)
+    moved = np.stack([innovation(state, se3_exp(20 * column) @ pose) for column in root.T])
+    back = np.stack([innovation(state, se3_exp(-20 * column) @ pose) for column in root.T])
+    np.testing.assert_allclose(found.pose, (((moved - back) / 40) ** 2).sum(axis=0), rtol=0.1, atol=1e-6)

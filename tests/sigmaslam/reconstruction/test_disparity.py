@@ -1,0 +1,59 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from sigmaslam.reconstruction.disparity import align_disparity, measure_disparity, semi_global_disparity
+from tests.support.textured_pairs import textured_pair
+
+HEIGHT, WIDTH = 120, 200
+
+
+def test_alignment_finds_the_fraction_of_a_pixel_on_a_slanted_surface():
+    u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    true = (9.3 + 0.02 * u - 0.03 * v).astype(np.float32)
+    left, right = textured_pair(true, noise=0.0)
+    found = align_disparity(left, right, np.round(true)).disparity
+    inner = (slice(10, -10), slice(30, -10))
+    assert np.median(np.abs(found - true)[inner]) < 0.03
+    assert np.median(np.abs(np.round(true) - true)[inner]) > 0.2
+
+
+def test_brightness_that_differs_by_an_offset_changes_nothing():
+    true = np.full((HEIGHT, WIDTH), 7.4, np.float32)
+    left, right = textured_pair(true, noise=0.0)
+    dimmer = cv2.subtract(right, 20)
+    plain, offset = (align_disparity(left, each, np.round(true)).disparity for each in (right, dimmer))
+    assert np.median(np.abs(plain - offset)[10:-10, 30:-10]) < 0.01
+
+
+@pytest.mark.parametrize("noise", [2.0, 6.0])
+def test_noise_makes_the_errors_and_the_claimed_variance_grow_alike(noise: float):
+    true = np.full((HEIGHT, WIDTH), 7.4, np.float32)
+    measured = measure_disparity(*textured_pair(true, noise), semi_global_disparity)
+    inner = np.zeros_like(true, bool)
+    inner[10:-10, 30:-10] = True
+    inner &= np.isfinite(measured.disparity)
+    assert inner.mean() > 0.5
+    sigmas = np.abs(measured.disparity - true)[inner] / np.sqrt(measured.variance[inner])
+    assert np.mean(sigmas < 1.96) > 0.90
+    assert np.median(sigmas) > 0.15
+
+
+def test_more_noise_is_more_variance():
+    true = np.full((HEIGHT, WIDTH), 7.4, np.float32)
+    medians = [
+        np.nanmedian(measure_disparity(*textured_pair(true, noise), semi_global_disparity).variance)
+        for noise in (1.0, 4.0, 8.0)
+    ]
+    assert medians == sorted(medians)
+    assert medians[2] > 3.0 * medians[0]
+
+
+def test_without_a_match_there_is_neither_disparity_nor_variance():
+    rng = np.random.default_rng(3)
+    left, right = rng.integers(0, 255, (2, HEIGHT, WIDTH)).astype(np.uint8)
+    measured = measure_disparity(left, right, semi_global_disparity)
+    assert np.isnan(measured.disparity).mean() > 0.8
+    assert np.array_equal(np.isnan(measured.disparity), np.isnan(measured.variance))

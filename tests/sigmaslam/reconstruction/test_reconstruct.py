@@ -1,0 +1,125 @@
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper
+
+from sigmaslam.errors import InputError
+from sigmaslam.reconstruction.recorded_keyframes import _with_frames_between, read_recorded_keyframes
+from sigmaslam.reconstruction.stereo_network import StereoNetwork
+from sigmaslam.runs.dense_points import read_dense_points
+from sigmaslam.runs.recorded_run import read_run
+from tests.support.commands import run_here
+from tests.support.demo_parts import copy_frames
+
+
+@pytest.fixture(scope="module")
+def tracked(demo_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of the first frames of the demo, beside its input."""
+    folder = tmp_path_factory.mktemp("dense")
+    copy_frames(demo_sequence, folder / "input", 12)
+    assert run_here("track", folder / "input", "--out", folder / "run").returncode == 0
+    return folder
+
+
+def test_a_run_becomes_a_cloud_and_its_report_shows_it(tracked: Path):
+    done = run_here("reconstruct", tracked / "run", "--out", tracked / "cloud.ply")
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((tracked / "run" / "reconstruction.json").read_text())
+    assert f"{summary['points']} points of {summary['keyframes']} keyframes" in done.stdout
+    assert f"element vertex {summary['points']}\n".encode() in (tracked / "cloud.ply").read_bytes()
+    assert summary["points"] > 1000
+    dense = read_dense_points(tracked / "run" / "dense.npz")
+    assert len(dense.points) == summary["points"]
+    assert read_run(tracked / "run").dense is not None
+    report = (tracked / "run" / "report.html").read_text()
+    assert '"dense_grey"' in report
+    assert len(report) < 8_000_000
+
+
+def test_an_input_that_has_moved_is_asked_for_and_taken(tracked: Path, tmp_path: Path):
+    shutil.copytree(tracked / "run", tmp_path / "run")
+    entries = json.loads((tmp_path / "run" / "run.json").read_text())
+    (tmp_path / "run" / "run.json").write_text(json.dumps({**entries, "input": str(tmp_path / "gone")}))
+    refused = run_here("reconstruct", tmp_path / "run", "--out", tmp_path / "cloud.ply")
+    assert refused.returncode == 2
+    assert "gone" in refused.stderr
+    assert "--input" in refused.stderr
+    command = ("reconstruct", tmp_path / "run", "--out", tmp_path / "cloud.ply", "--input", tracked / "input")
+    assert run_here(*command).returncode == 0
+
+
+def test_another_input_is_refused(tracked: Path, demo_sequence: Path, tmp_path: Path):
+    other = copy_frames(demo_sequence, tmp_path / "other", 12, slower=3.0)
+    command = ("reconstruct", tracked / "run", "--out", tmp_path / "cloud.ply", "--input", other)
+    refused = run_here(*command)
+    assert refused.returncode == 2
+    assert "has no frame at" in refused.stderr
+    assert not (tmp_path / "cloud.ply").exists()
+
+
+@pytest.mark.parametrize("name", ["cloud.xyz", "missing/cloud.ply"])
+def test_a_place_that_cannot_be_written_is_refused_before_the_work(tracked: Path, tmp_path: Path, name: str):
+    refused = run_here("reconstruct", tracked / "run", "--out", tmp_path / name)
+    assert refused.returncode == 2
+    assert name.rpartition("/")[2] in refused.stderr
+
+
+def test_steps_between_keyframes_go_both_ways(tracked: Path):
+    keyframes = read_recorded_keyframes(tracked / "run")
+    there, covariance = keyframes.step(0, 2)
+    back, _ = keyframes.step(2, 0)
+    np.testing.assert_allclose(there @ back, np.eye(4), atol=1e-12)
+    assert np.linalg.eigvalsh(covariance)[0] > 0.0
+
+
+def test_long_ways_between_keyframes_are_divided():
+    assert _with_frames_between(np.array([0, 2, 14]), 18).tolist() == [0, 2, 6, 10, 14, 17]
+    assert _with_frames_between(np.array([0]), 1).tolist() == [0]
+
+
+def _network(path: Path, channels: int, inputs: int = 2, size: int | str = "side") -> Path:
+    """A graph whose disparity is the mean difference of the images."""
+    names = [f"image{k}" for k in range(inputs)]
+    shape = [1, channels, size, size]
+    nodes = [
+        helper.make_node("Sub", [names[0], names[-1]], ["difference"]),
+        helper.make_node("ReduceMean", ["difference", "axes"], ["disparity"], keepdims=1),
+    ]
+    graph = helper.make_graph(
+        nodes,
+        "stereo",
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name in names],
+        [helper.make_tensor_value_info("disparity", TensorProto.FLOAT, None)],
+        [helper.make_tensor("axes", TensorProto.INT64, [1], [1])],
+    )
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9), path)
+    return path
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_network_gives_the_disparity_of_the_first_image(tmp_path: Path, channels: int):
+    left, right = np.full((40, 40), 50, np.uint8), np.full((40, 40), 30, np.uint8)
+    right[:10] = 60
+    found = StereoNetwork(_network(tmp_path / "net.onnx", channels))(left, right)
+    assert np.isnan(found[:10]).all()
+    assert (found[10:] == 20.0).all()
+
+
+def test_a_network_of_one_size_gives_disparities_of_the_image_s_pixels(tmp_path: Path):
+    left, right = np.full((40, 80), 50, np.uint8), np.full((40, 80), 30, np.uint8)
+    found = StereoNetwork(_network(tmp_path / "net.onnx", 1, size=20))(left, right)
+    assert found.shape == (40, 80)
+    np.testing.assert_allclose(found, 80.0)
+
+
+def test_what_is_no_stereo_network_is_refused(tmp_path: Path):
+    with pytest.raises(InputError, match="two float32 images"):
+        StereoNetwork(_network(tmp_path / "one.onnx", 1, inputs=1))
+    with pytest.raises(InputError, match="no such file"):
+        StereoNetwork(tmp_path / "none.onnx")
