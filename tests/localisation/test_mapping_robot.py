@@ -8,7 +8,7 @@ import torch
 from scipy.stats import chi2
 
 from sigmaslam.filters import ExtendedKalmanFilter, Gaussian, UnscentedKalmanFilter, several
-from sigmaslam.filters.noise_covariance import Diagonal
+from sigmaslam.filters.core.noise_covariance import Diagonal
 from sigmaslam.localisation.mapping_robot import ROBOT_SIZE, MappingRobot
 from sigmaslam.localisation.wheeled_robot import BODY, WheeledRobot
 
