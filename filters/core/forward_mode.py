@@ -18,6 +18,8 @@ from torch.overrides import TorchFunctionMode
 from sigmaslam.filters.core.factors import is_mapped
 
 _aten = torch.ops.aten
+# `forward_ad.make_dual` and `unpack_dual` of the only level, without their checks, which take longer than they do.
+_torch = torch._C._VariableFunctions
 # By the name under which torch calls a function of a tensor and a number.
 _WITH_NUMBER: dict[str, Callable[..., Tensor]] = {
     name: operator
@@ -71,17 +73,23 @@ class _ZerosAsNumbers(TorchFunctionMode):
             if name in _WITH_NUMBER and args[0].is_floating_point():
                 return _WITH_NUMBER[name](*args)
         if sum(isinstance(each, Tensor) for each in args) > 1:
-            args = tuple(_with_derivative(each) for each in args)
+            has_one = [_has_derivative(each) for each in args]
+            # Where none has one there is nothing to differentiate.
+            if any(has_one):
+                pairs = zip(args, has_one, strict=True)
+                args = tuple(each if has else _with_zeros(each) for each, has in pairs)
         return func(*args, **(kwargs or {}))
 
 
-def _with_derivative(operand: Any) -> Any:
-    """An operand whose derivative is not known gets one of zeros."""
+def _has_derivative(operand: Any) -> bool:
+    return isinstance(operand, Tensor) and _torch._unpack_dual(operand, 0)[1] is not None
+
+
+def _with_zeros(operand: Any) -> Any:
+    """An operand that does not depend on the points gets a derivative of zeros."""
     if not isinstance(operand, Tensor) or not operand.is_floating_point():
         return operand
-    if forward_ad.unpack_dual(operand).tangent is not None:
-        return operand
-    return forward_ad.make_dual(_ordinary(operand), torch.zeros_like(operand))
+    return _torch._make_dual(_ordinary(operand), torch.zeros_like(operand), 0)
 
 
 def _ordinary(tensor: Tensor) -> Tensor:
