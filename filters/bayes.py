@@ -29,6 +29,7 @@ from sigmaslam.filters.core.transforms import Difference, Exact, Taylor, Transfo
 from sigmaslam.filters.gaussian_belief import Gaussian
 from sigmaslam.filters.linearisation import LinearisedMeasurement, linearise_measurement, linearise_motion, require_flat
 from sigmaslam.filters.manifolds import Space, is_flat
+from sigmaslam.filters.manifolds.tangent_maps import tangent_maps
 from sigmaslam.filters.models import AnyMeasurement, AnyMotion, LinearMeasurement, LinearMotion, is_additive
 from sigmaslam.filters.results import TimeUpdate, Update
 from sigmaslam.filters.robust import Blocks, Robust, WeightedPosterior
@@ -268,11 +269,18 @@ class BayesFilter:
     def carry(self, point: Tensor, shift: Tensor | None, root: Tensor, target: Tensor) -> list[Tensor]:
         """Deviations (..., n, c), in the chart at `target`, of a belief in the chart at `point` with mean `shift`.
 
-        In R^n they are the root itself.
+        In R^n they are the root itself. With a shift, the target is point [+] shift.
         """
         chart = self.chart
-        if chart is None:
+        if chart is None or self.space is None:
             return [root]
+        if isinstance(self.transform, Taylor):
+            maps, directions = tangent_maps(self.space), root.movedim(-1, 0)
+            if shift is None:
+                carried = maps.transport_back(target, self.space.local(target, point), directions)
+            else:
+                carried = maps.transport(point, shift, directions)
+            return [carried.movedim(0, -1)]
         return self.transform(
             lambda offsets: chart(self.retract(point, offsets if shift is None else shift + offsets), target),
             root,

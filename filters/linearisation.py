@@ -13,8 +13,16 @@ from sigmaslam.filters.core.columns import Columns, block_diagonal
 from sigmaslam.filters.core.factors import apply, multiply, solve_lower_transposed
 from sigmaslam.filters.core.noise_covariance import Noise
 from sigmaslam.filters.core.solve import Form, TangentPosterior
-from sigmaslam.filters.core.transforms import Taylor, Transformed, Unscented
-from sigmaslam.filters.models import AnyMeasurement, AnyMotion, LinearMeasurement, LinearMotion, MeasurementModel
+from sigmaslam.filters.core.transforms import Taylor, Transformed, Unscented, push_forward
+from sigmaslam.filters.manifolds.tangent_maps import tangent_maps
+from sigmaslam.filters.models import (
+    AnyMeasurement,
+    AnyMotion,
+    LinearMeasurement,
+    LinearMotion,
+    MeasurementModel,
+    NonlinearModel,
+)
 
 if TYPE_CHECKING:
     from sigmaslam.filters.bayes import BayesFilter
@@ -63,7 +71,14 @@ def linearise_motion(
         return Transformed(None, motion.function(mean, *inputs), Columns(multiply(motion.matrix, root)))
     size = root.shape[-1]
     transform = bayes.transform
-    if isinstance(transform, Taylor) and motion.jacobian is not None:
+    if isinstance(transform, Taylor):
+        if motion.jacobian is None:
+            columns = root if motion.additive else block_diagonal(root, noise.factor())
+            value, slopes = _differentiate(bayes, motion, mean, None, columns, size, inputs)
+            if bayes.space is None or bayes.chart is None:
+                return Transformed(None, value, Columns(slopes.movedim(0, -1)))
+            slopes = tangent_maps(bayes.space).push_local(value, slopes)
+            return Transformed(value, torch.zeros_like(slopes[0]), Columns(slopes.movedim(0, -1)))
         transform = Taylor(motion.jacobian(mean, *inputs))
 
     def evaluate(offsets: Tensor) -> Tensor:
@@ -110,7 +125,10 @@ def linearise_measurement(
         return measurement.function(state, offsets[..., size:], *inputs)
 
     offsets = columns if measurement.additive else block_diagonal(columns, noise.factor())
-    seen = transform(evaluate, offsets, measurement.residual)
+    if isinstance(transform, Taylor) and transform.jacobian is None:
+        seen = _see(bayes, measurement, mean, shift, offsets, size, inputs)
+    else:
+        seen = transform(evaluate, offsets, measurement.residual)
     if seen.mean.shape[-1] != value.shape[-1]:
         raise ValueError(
             f"the measurement's function returns {seen.mean.shape[-1]} components, the value has {value.shape[-1]}"
@@ -124,6 +142,60 @@ def linearise_measurement(
     return LinearisedMeasurement(
         innovation + apply(odd, previous.mean), Columns(odd, seen_columns.even, seen_columns.negative)
     )
+
+
+def _differentiate(
+    bayes: BayesFilter,
+    model: NonlinearModel,
+    mean: Tensor,
+    shift: Tensor | None,
+    columns: Tensor,
+    size: int,
+    inputs: tuple[Tensor, ...],
+) -> tuple[Tensor, Tensor]:
+    """A model's value (..., m) at mean [+] shift, and its changes (k, ..., m) along tangents, columns (..., ·, k).
+
+    Only the model's function is differentiated; the retraction has closed forms. Columns have the noise's rows, if the
+    noise is not additive, after the first `size`.
+    """
+    directions = columns.movedim(-1, 0)
+    along = directions[..., :size]
+    if bayes.chart is None or bayes.space is None:
+        point = mean if shift is None else mean + shift
+    else:
+        maps = tangent_maps(bayes.space)
+        if shift is not None:
+            along = maps.transport(mean, shift, along)
+        point = bayes.retract(mean, torch.zeros_like(along[0]) if shift is None else shift)
+        along = maps.push_retract(point, along)
+    # One copy of the point for each direction, in their memory order.
+    points = point + torch.zeros_like(along)
+    if model.additive:
+        values, slopes = push_forward(lambda x: model.function(x, *inputs), [points], [along])
+    else:
+        noise = directions[..., size:]
+        values, slopes = push_forward(
+            lambda x, w: model.function(x, w, *inputs), [points, torch.zeros_like(noise)], [along, noise]
+        )
+    return values[0], slopes
+
+
+def _see(
+    bayes: BayesFilter,
+    measurement: MeasurementModel,
+    mean: Tensor,
+    shift: Tensor | None,
+    columns: Tensor,
+    size: int,
+    inputs: tuple[Tensor, ...],
+) -> Transformed:
+    """What a measurement is expected to be, and its changes; arguments as `_differentiate`."""
+    value, slopes = _differentiate(bayes, measurement, mean, shift, columns, size, inputs)
+    residual = measurement.residual
+    if residual is None:
+        return Transformed(None, value, Columns(slopes.movedim(0, -1)))
+    offset, slopes = push_forward(lambda z: residual(z, value), [value + torch.zeros_like(slopes)], [slopes])
+    return Transformed(value, offset[0], Columns(slopes.movedim(0, -1)))
 
 
 def _error(bayes: BayesFilter, measurement: MeasurementModel, columns: Columns, size: int) -> _Error | None:

@@ -127,7 +127,7 @@ def format_page(rounds: int, compiled: bool, command: str) -> str:
         "Tests check that every contender gets the same result. Compiled: `compile_step`, after its first call.",
         "",
     ]
-    tables = len(POINTS) + 1 + len(KINDS) * len(BATCHES)
+    tables = len(POINTS) + 2 + len(KINDS) * len(BATCHES)
     with open_progress() as progress:
         task = progress.add_task("timing", total=tables, note="")
 
@@ -138,6 +138,8 @@ def format_page(rounds: int, compiled: bool, command: str) -> str:
         lines += _linear_cost_section(rounds, compiled, advance)
         for kind in KINDS:
             lines += _batch_section(kind, peers, rounds, compiled, advance)
+        lines += extended_section(rounds)
+        advance()
     return "\n".join(lines)
 
 
@@ -198,6 +200,30 @@ def _batch_section(
         "Filter steps a second, with the lowest and highest round; float32 where there is one.",
         "",
         *table(["", *(f"B = {batch:,}" for batch in BATCHES)], rows),
+        "",
+    ]
+
+
+def extended_section(rounds: int) -> list[str]:
+    """The extended filter's time over the unscented one's, for models without derivatives of their own."""
+    from sigmaslam.evaluation.filters import extended
+
+    rows = []
+    for name, make in extended.KINDS.items():
+        cells = []
+        for batch in extended.BATCHES:
+            contenders = [Contender(each, step) for each, step in make(batch).items()]
+            timings = time_interleaved(contenders, rounds)
+            milliseconds = ", ".join(f"{1e3 * timings[each.name].median:.3g} ms" for each in contenders)
+            cells.append(f"{_ratio(*timings['EKF'].ratio(timings['UKF']))}: {milliseconds}")
+        rows.append([name, *cells])
+    return [
+        "## Extended and unscented",
+        "",
+        "How many times longer the EKF takes than the UKF, and milliseconds of both; eager, float64, models without a",
+        "`jacobian` (`evaluation/filters/extended.py`).",
+        "",
+        *table(["", *(f"B = {batch:,}" for batch in extended.BATCHES)], rows),
         "",
     ]
 

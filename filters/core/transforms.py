@@ -7,7 +7,7 @@ the reference, and columns of deviations. KF, EKF and UKF differ in nothing else
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from sigmaslam.filters.core.columns import Columns
+from sigmaslam.filters.core.forward_mode import push_along
 from sigmaslam.filters.core.plain_factors import is_exporting
 from sigmaslam.filters.core.sigma_points import SigmaPoints, Symmetric
 
@@ -111,20 +112,21 @@ class Taylor:
             values = evaluate(offsets)
             return values if difference is None else difference(values, reference)
 
-        values, slopes = push_forward(local, torch.zeros_like(directions), directions)
+        values, slopes = push_forward(local, [torch.zeros_like(directions)], [directions])
         return Transformed(None if difference is None else reference, values[0], Columns(slopes.movedim(0, -1)))
 
 
-def push_forward(function: Evaluate, offsets: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-    """Values of a function, and its derivative along the directions, which have the offsets' shape."""
+def push_forward(
+    function: Callable[..., Tensor], points: Sequence[Tensor], directions: Sequence[Tensor]
+) -> tuple[Tensor, Tensor]:
+    """Values of a function of tensors, and its derivative along directions, which have the points' shapes."""
     if not is_exporting():
-        pushed = torch.func.jvp(function, (offsets,), (directions,))
-        return pushed[0], pushed[1]
+        return push_along(function, points, directions)
     # Forward derivatives cannot be traced, those of the backward pass, which is linear in its argument, can.
-    pulled = torch.func.vjp(function, offsets)
+    pulled = torch.func.vjp(function, *points)
     values, pull = pulled[0], pulled[1]
-    push = torch.func.vjp(lambda cotangent: pull(cotangent)[0], torch.zeros_like(values))[1]
-    return values, push(directions)[0]
+    push = torch.func.vjp(pull, torch.zeros_like(values))[1]
+    return values, push(tuple(directions))[0]
 
 
 @dataclass(frozen=True, slots=True)

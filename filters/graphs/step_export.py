@@ -22,7 +22,7 @@ from sigmaslam.filters.core.plain_factors import traced_for_export
 from sigmaslam.filters.core.transforms import Taylor
 from sigmaslam.filters.gaussian_belief import Gaussian
 from sigmaslam.filters.graphs.exact_operators import ExactOperators
-from sigmaslam.filters.graphs.graph_file import strip_origins
+from sigmaslam.filters.graphs.graph_file import simplify, strip_origins
 from sigmaslam.filters.models import AnyMeasurement, AnyMotion, NonlinearModel, several
 from sigmaslam.filters.robust import Robust
 
@@ -263,6 +263,7 @@ def _write(step: _Step, path: Path) -> None:
                 dynamic_shapes=(step.free(),) if isinstance(module, _Traced) else step.free(),
                 opset_version=_OPSET,
                 verbose=False,
+                optimize=False,
             )
         except torch.onnx.errors.OnnxExporterError as error:
             reason = str(error.__cause__ or error).strip().splitlines()[0]
@@ -271,6 +272,7 @@ def _write(step: _Step, path: Path) -> None:
                 "sine, cosine, roots and arc tangents"
             ) from error
     assert program is not None
+    simplify(program.model)
     program.save(path, external_data=False)
     strip_origins(path)
 

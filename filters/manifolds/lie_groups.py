@@ -95,6 +95,41 @@ def log_se3(translation: Vector, quaternion: Quaternion) -> tuple[Vector, Vector
     return _apply_v(translation, rotation, torch.full_like(coefficient, -0.5), coefficient), rotation
 
 
+def jacobian_so3(rotation: Vector, change: Vector) -> Vector:
+    """The left Jacobian J of SO(3) times a vector: Exp(v + u) = Exp(J u) Exp(v) to first order in u.
+
+    The right one is that of the negative rotation vector, for this group and the others.
+    """
+    _, sine, third = _exp_coefficients(_combine("+++", rotation, rotation))
+    return _apply_v(change, rotation, 2.0 * (sine * sine), third)
+
+
+def inverse_jacobian_so3(rotation: Vector, change: Vector) -> Vector:
+    """The inverse of the left Jacobian of SO(3) times a vector, for a rotation of pi at most."""
+    _, coefficient = _log_so3(exp_so3(rotation))
+    return _apply_v(change, rotation, torch.full_like(coefficient, -0.5), coefficient)
+
+
+def jacobian_se3(twist: tuple[Vector, Vector], change: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
+    """The left Jacobian of SE(3) times a twist, both (translation, rotation)."""
+    (translation, rotation), (moved, turned) = twist, change
+    _, sine, third = _exp_coefficients(_combine("+++", rotation, rotation))
+    second = 2.0 * (sine * sine)
+    across = _apply_v(turned, rotation, second, third)
+    coupled = _coupling(translation, rotation, turned, across, second, third)
+    return _plus(_apply_v(moved, rotation, second, third), coupled), across
+
+
+def inverse_jacobian_se3(twist: tuple[Vector, Vector], change: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
+    """The inverse of the left Jacobian of SE(3) times a twist, for a rotation of pi at most."""
+    (translation, rotation), (moved, turned) = twist, change
+    _, sine, third = _exp_coefficients(_combine("+++", rotation, rotation))
+    across = inverse_jacobian_so3(rotation, turned)
+    coupled = _coupling(translation, rotation, across, turned, 2.0 * (sine * sine), third)
+    x, y, z = (a - b for a, b in zip(moved, coupled, strict=True))
+    return inverse_jacobian_so3(rotation, (x, y, z)), across
+
+
 def turn(sine: Tensor, cosine: Tensor, vector: Pair) -> Pair:
     """A vector of the plane turned by an angle."""
     return _combine("+-", (cosine, sine), vector), _combine("++", (sine, cosine), vector)
@@ -111,6 +146,21 @@ def log_se2(translation: Pair, angle: Tensor) -> Pair:
     """Translation of the twist that ends there, for an angle of pi at most."""
     half = 0.5 * angle
     return turn(-half, torch.cos(half) / _sine_ratio(half), translation)
+
+
+def jacobian_se2(twist: tuple[Pair, Tensor], change: tuple[Pair, Tensor]) -> tuple[Pair, Tensor]:
+    """The left Jacobian of SE(2) times a twist, both (translation, angle)."""
+    (translation, angle), (moved, turned) = twist, change
+    a, b = exp_se2(moved, angle)
+    c, d = _bend(translation, angle)
+    return (a + turned * c, b + turned * d), turned
+
+
+def inverse_jacobian_se2(twist: tuple[Pair, Tensor], change: tuple[Pair, Tensor]) -> tuple[Pair, Tensor]:
+    """The inverse of the left Jacobian of SE(2) times a twist, for an angle of pi at most."""
+    (translation, angle), (moved, turned) = twist, change
+    c, d = _bend(translation, angle)
+    return log_se2((moved[0] - turned * c, moved[1] - turned * d), angle), turned
 
 
 def quaternion_from_matrix(matrix: Tensor) -> Quaternion:
@@ -169,6 +219,36 @@ def _apply_v(vector: Vector, rotation: Vector, second: Tensor, third: Tensor) ->
     return x, y, z
 
 
+def _plus(left: Vector, right: Vector) -> Vector:
+    return left[0] + right[0], left[1] + right[1], left[2] + right[2]
+
+
+def _coupling(
+    translation: Vector, rotation: Vector, turned: Vector, across: Vector, second: Tensor, third: Tensor
+) -> Vector:
+    """What a change of rotation does to the translation: d(V t) - (J u) x V t, with `across` = J u of `turned` = u."""
+    slope_second, slope_third = _slopes(_combine("+++", rotation, rotation), second, third)
+    once = cross(rotation, translation)
+    twice = cross(rotation, once)
+    spin = cross(turned, translation)
+    both = _plus(cross(rotation, spin), cross(turned, once))
+    end = _apply_v(translation, rotation, second, third)
+    away = cross(across, end)
+    along = 2.0 * _combine("+++", rotation, turned)  # change of the squared angle
+    first, last = along * slope_second, along * slope_third
+    x, y, z = (
+        second * a + third * b + first * c + last * d - e
+        for a, b, c, d, e in zip(spin, both, once, twice, away, strict=True)
+    )
+    return x, y, z
+
+
+def _bend(translation: Pair, angle: Tensor) -> Pair:
+    """(I - W) / a times a vector, of W that makes the translation of a twist of the plane."""
+    _, sine, third = _exp_coefficients(angle * angle)
+    return turn(-2.0 * (sine * sine), angle * third, translation)
+
+
 # Series have four terms. They end where the first one left out is half a unit of round-off, and no sooner, because the
 # derivatives of the closed forms lose digits long before the closed forms do. A clamp whose bound lies well inside the
 # other branch keeps the unused side finite. Numbers start sums only: `1.0 - tensor` takes twice as long.
@@ -189,6 +269,25 @@ def _exp_coefficients(squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     sine = 0.5 * torch.where(small, 1.0 + product, torch.sin(half) / half)
     third = torch.where(small, even + odd + even * product, (sine * cosine - 0.5) / (0.5 * large))
     return cosine, sine, -0.25 * third
+
+
+def _slopes(squared: Tensor, second: Tensor, third: Tensor) -> tuple[Tensor, Tensor]:
+    """Derivatives of (1 - cos(a)) / a^2 and (a - sin(a)) / a^3 by a^2, from a^2 and the two.
+
+    Six terms end at round-off in float64 for a^2 below 1/4, from where on the closed forms lose two digits at most.
+    """
+    small = squared < 0.25
+    y = squared.clamp_max(0.5)
+    series_second = torch.zeros_like(y)
+    series_third = torch.zeros_like(y)
+    for k in range(6, 0, -1):
+        series_second = series_second * y + (-1) ** k * k / math.factorial(2 * k + 2)
+        series_third = series_third * y + (-1) ** k * k / math.factorial(2 * k + 3)
+    large = squared.clamp_min(0.125)
+    # sin(a) / a is 1 - a^2 times the third coefficient.
+    closed_second = (1.0 - squared * third - 2.0 * second) / (2.0 * large)
+    closed_third = (second - 3.0 * third) / (2.0 * large)
+    return torch.where(small, series_second, closed_second), torch.where(small, series_third, closed_third)
 
 
 def _log_so3(quaternion: Quaternion) -> tuple[Vector, Tensor]:

@@ -27,6 +27,7 @@ from torch import Tensor
 from sigmaslam.filters.core.layout import concatenate, stack
 from sigmaslam.filters.manifolds import lie_groups
 from sigmaslam.filters.manifolds.lie_groups import Quaternion, Vector
+from sigmaslam.filters.manifolds.tangent_maps import TangentMaps, tangent_maps
 
 
 class Space(Protocol):
@@ -103,8 +104,28 @@ class Manifold(ABC):
             )
 
 
+class _Additive(Manifold):
+    """A space whose tangents add up, but for whole turns."""
+
+    def push_retract(self, point: Tensor, change: Tensor) -> Tensor:
+        """See `TangentMaps`; so the others."""
+        return change
+
+    def push_local(self, point: Tensor, change: Tensor) -> Tensor:
+        """See `TangentMaps`."""
+        return change
+
+    def transport(self, point: Tensor, tangent: Tensor, change: Tensor) -> Tensor:
+        """See `TangentMaps`."""
+        return change
+
+    def transport_back(self, point: Tensor, tangent: Tensor, change: Tensor) -> Tensor:
+        """See `TangentMaps`."""
+        return change
+
+
 @dataclass(frozen=True)
-class Euclidean(Manifold):
+class Euclidean(_Additive):
     """R^n: retract adds, local subtracts.
 
     Attributes:
@@ -133,7 +154,7 @@ class Euclidean(Manifold):
 
 
 @dataclass(frozen=True)
-class SO2(Manifold):
+class SO2(_Additive):
     """Angles, radians in (-pi, pi]."""
 
     point_size, tangent_size = 1, 1
@@ -162,6 +183,26 @@ class LieGroup(Manifold):
                 f"got {self.side!r}"
             )
 
+    def transport(self, point: Tensor, tangent: Tensor, change: Tensor) -> Tensor:
+        """The group's Jacobian; see `TangentMaps`."""
+        return self._jacobian(self._sided(tangent), change)
+
+    def transport_back(self, point: Tensor, tangent: Tensor, change: Tensor) -> Tensor:
+        """The inverse of the group's Jacobian; see `TangentMaps`."""
+        return self._inverse_jacobian(self._sided(tangent), change)
+
+    @abstractmethod
+    def _jacobian(self, tangent: Tensor, change: Tensor) -> Tensor:
+        """The left Jacobian of the group times a tangent."""
+
+    @abstractmethod
+    def _inverse_jacobian(self, tangent: Tensor, change: Tensor) -> Tensor:
+        """Its inverse."""
+
+    def _sided(self, tangent: Tensor) -> Tensor:
+        """The right Jacobian is the left one of the inverse."""
+        return -tangent if self.side == "right" else tangent
+
 
 @dataclass(frozen=True)
 class SE2(LieGroup):
@@ -189,6 +230,30 @@ class SE2(LieGroup):
             x, y = lie_groups.turn(torch.sin(between), torch.cos(between), (x, y))
             step = (a - x, b - y)
         return stack([*lie_groups.log_se2(step, between), between])
+
+    def push_retract(self, point: Tensor, change: Tensor) -> Tensor:
+        """See `TangentMaps`."""
+        x, y, angle = point.unbind(-1)
+        u, v, added = change.unbind(-1)
+        if self.side == "right":
+            return stack([*lie_groups.turn(torch.sin(angle), torch.cos(angle), (u, v)), added])
+        return stack([u - y * added, v + x * added, added])
+
+    def push_local(self, point: Tensor, change: Tensor) -> Tensor:
+        """See `TangentMaps`."""
+        x, y, angle = point.unbind(-1)
+        a, b, added = change.unbind(-1)
+        if self.side == "right":
+            return stack([*lie_groups.turn(-torch.sin(angle), torch.cos(angle), (a, b)), added])
+        return stack([a + y * added, b - x * added, added])
+
+    def _jacobian(self, tangent: Tensor, change: Tensor) -> Tensor:
+        moved, turned = lie_groups.jacobian_se2(_planar(tangent), _planar(change))
+        return stack([*moved, turned])
+
+    def _inverse_jacobian(self, tangent: Tensor, change: Tensor) -> Tensor:
+        moved, turned = lie_groups.inverse_jacobian_se2(_planar(tangent), _planar(change))
+        return stack([*moved, turned])
 
     def from_matrix(self, matrix: Tensor) -> Tensor:
         """Points (..., 3) of homogeneous matrices (..., 3, 3)."""
@@ -219,6 +284,20 @@ class SO3(LieGroup):
         return stack(
             lie_groups.log_so3(_product(self.side, lie_groups.conjugate(_quaternion(point)), _quaternion(other)))
         )
+
+    def push_retract(self, point: Tensor, change: Tensor) -> Tensor:
+        """See `TangentMaps`."""
+        return stack(_turned(self.side, _quaternion(point), _vector(change)))
+
+    def push_local(self, point: Tensor, change: Tensor) -> Tensor:
+        """See `TangentMaps`."""
+        return stack(_turning(self.side, _quaternion(point), _quaternion(change)))
+
+    def _jacobian(self, tangent: Tensor, change: Tensor) -> Tensor:
+        return stack(lie_groups.jacobian_so3(_vector(tangent), _vector(change)))
+
+    def _inverse_jacobian(self, tangent: Tensor, change: Tensor) -> Tensor:
+        return stack(lie_groups.inverse_jacobian_so3(_vector(tangent), _vector(change)))
 
     def from_matrix(self, matrix: Tensor) -> Tensor:
         """Points (..., 4), with w >= 0, of rotation matrices (..., 3, 3)."""
@@ -261,6 +340,30 @@ class SE3(LieGroup):
             step = _difference(end, lie_groups.rotate(between, start))
         translation, rotation = lie_groups.log_se3(step, between)
         return stack([*translation, *rotation])
+
+    def push_retract(self, point: Tensor, change: Tensor) -> Tensor:
+        """See `TangentMaps`."""
+        (start, turned), (moved, added) = _rigid(point), _twist(change)
+        step = lie_groups.rotate(turned, moved) if self.side == "right" else _sum(moved, lie_groups.cross(added, start))
+        return stack([*step, *_turned(self.side, turned, added)])
+
+    def push_local(self, point: Tensor, change: Tensor) -> Tensor:
+        """See `TangentMaps`."""
+        (start, turned), (moved, spun) = _rigid(point), _rigid(change)
+        rotation = _turning(self.side, turned, spun)
+        if self.side == "right":
+            step = lie_groups.rotate(lie_groups.conjugate(turned), moved)
+        else:
+            step = _difference(moved, lie_groups.cross(rotation, start))
+        return stack([*step, *rotation])
+
+    def _jacobian(self, tangent: Tensor, change: Tensor) -> Tensor:
+        moved, turned = lie_groups.jacobian_se3(_twist(tangent), _twist(change))
+        return stack([*moved, *turned])
+
+    def _inverse_jacobian(self, tangent: Tensor, change: Tensor) -> Tensor:
+        moved, turned = lie_groups.inverse_jacobian_se3(_twist(tangent), _twist(change))
+        return stack([*moved, *turned])
 
     def from_matrix(self, matrix: Tensor) -> Tensor:
         """Points (..., 7), with w >= 0, of homogeneous matrices (..., 4, 4)."""
@@ -320,6 +423,30 @@ class Product(Manifold):
         pieces = zip(self.parts, self._points(point), self._points(other), strict=True)
         return concatenate([part.local(x, y) for part, x, y in pieces])
 
+    def push_retract(self, point: Tensor, change: Tensor) -> Tensor:
+        """See `TangentMaps`."""
+        pieces = zip(self._maps, self._points(point), self._tangents(change), strict=True)
+        return concatenate([part.push_retract(x, u) for part, x, u in pieces])
+
+    def push_local(self, point: Tensor, change: Tensor) -> Tensor:
+        """See `TangentMaps`."""
+        pieces = zip(self._maps, self._points(point), self._points(change), strict=True)
+        return concatenate([part.push_local(x, y) for part, x, y in pieces])
+
+    def transport(self, point: Tensor, tangent: Tensor, change: Tensor) -> Tensor:
+        """See `TangentMaps`."""
+        pieces = zip(self._maps, self._points(point), self._tangents(tangent), self._tangents(change), strict=True)
+        return concatenate([part.transport(x, v, u) for part, x, v, u in pieces])
+
+    def transport_back(self, point: Tensor, tangent: Tensor, change: Tensor) -> Tensor:
+        """See `TangentMaps`."""
+        pieces = zip(self._maps, self._points(point), self._tangents(tangent), self._tangents(change), strict=True)
+        return concatenate([part.transport_back(x, v, u) for part, x, v, u in pieces])
+
+    @property
+    def _maps(self) -> list[TangentMaps]:
+        return [tangent_maps(part) for part in self.parts]
+
     def _points(self, point: Tensor) -> tuple[Tensor, ...]:
         return point.split([part.point_size for part in self.parts], dim=-1)
 
@@ -330,6 +457,29 @@ class Product(Manifold):
 def _check_matrix(manifold: Manifold, matrix: Tensor, size: int) -> None:
     if matrix.shape[-2:] != (size, size):
         raise ValueError(f"{manifold}: matrix must have shape (..., {size}, {size}), got {tuple(matrix.shape)}")
+
+
+def _turned(side: str, point: Quaternion, change: Vector) -> Quaternion:
+    """Change of a quaternion that is turned by a small rotation vector on the given side."""
+    x, y, z = (0.5 * each for each in change)
+    return _product(side, point, (x, y, z, torch.zeros_like(x)))
+
+
+def _turning(side: str, point: Quaternion, change: Quaternion) -> Vector:
+    """The small rotation vector, on the given side, of a change of a quaternion (of any length)."""
+    x, y, z, _ = _product(side, lie_groups.conjugate(point), change)
+    a, b, c, d = point
+    scale = 2.0 / (a * a + b * b + c * c + d * d)
+    return scale * x, scale * y, scale * z
+
+
+def _planar(tangent: Tensor) -> tuple[lie_groups.Pair, Tensor]:
+    u, v, angle = tangent.unbind(-1)
+    return (u, v), angle
+
+
+def _sum(left: Vector, right: Vector) -> Vector:
+    return left[0] + right[0], left[1] + right[1], left[2] + right[2]
 
 
 def _vector(tangent: Tensor) -> Vector:

@@ -5,10 +5,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from sigmaslam.evaluation.filters import extended
 from sigmaslam.evaluation.filters import ours as filter_ours
 from sigmaslam.evaluation.filters import work as filter_work
 from sigmaslam.evaluation.filters.peer_filters import PEERS
 from sigmaslam.evaluation.filters.speed import KINDS, Contender, Timing, batch_contenders, time_interleaved
+from sigmaslam.filters import SE3, Euclidean
 
 
 @pytest.mark.parametrize("points", [3, 30])
@@ -39,6 +41,17 @@ def test_numpy_has_a_row_that_steps_the_whole_batch_at_once(kind: str):
     sigma = np.sqrt(np.diagonal(expected[1], axis1=-2, axis2=-1))
     assert np.abs((mean - expected[0]) / sigma).max() < 1e-9
     assert np.abs((covariance - expected[1]) / (sigma[..., :, None] * sigma[..., None, :])).max() < 1e-9
+
+
+@pytest.mark.parametrize("kind", extended.KINDS)
+@pytest.mark.parametrize("batch", [1, 150])
+def test_extended_and_unscented_filters_do_the_same_work(kind: str, batch: int):
+    """With a prior of 0.1 their means are apart by a small part of it."""
+    found, expected = (step() for step in extended.KINDS[kind](batch).values())
+    assert found.mean.shape == expected.mean.shape
+    space = SE3() if kind == "SE(3)" else Euclidean(3)
+    moved = space.local(expected.mean, found.mean).abs()
+    assert 0.0 < float(moved.median()) < 0.01
 
 
 def check(work: filter_work.Work, expected: filter_work.Belief, dtype: str, tolerance: float) -> None:

@@ -178,9 +178,9 @@ def test_derivatives_through_the_backward_pass_are_the_forward_ones():
     def function(offsets):
         return torch.atan2(offsets, 1.0 + offsets * offsets)
 
-    expected = push_forward(function, x, along)
+    expected = push_forward(function, [x], [along])
     with plain_factors.traced_for_export():
-        found = push_forward(function, x, along)
+        found = push_forward(function, [x], [along])
     for a, b in zip(found, expected, strict=True):
         assert_close(a, b, 1e-15)
 
