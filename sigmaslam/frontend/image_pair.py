@@ -13,12 +13,14 @@ import numpy as np
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path, atomic_write_bytes
 from sigmaslam.frontend.affine_alignment import refine_by_neighbours
+from sigmaslam.frontend.build import own_networks
 from sigmaslam.frontend.classical import OrbDetector, SiftDetector
 from sigmaslam.frontend.descriptor import refine_with_confidence
 from sigmaslam.frontend.learned import LearnedDetector
 from sigmaslam.frontend.match_confidence import ConfidenceEstimator
 from sigmaslam.frontend.nearest_neighbours import nearest_anywhere
 from sigmaslam.frontend.types import Features
+from sigmaslam.inference.networks import WeightsFolder
 from sigmaslam.readers.images import check_grey, read_grey
 
 DETECTORS = {"learned": LearnedDetector, "sift": SiftDetector, "orb": OrbDetector}
@@ -63,6 +65,7 @@ def match_images(
     max_keypoints: int = 1024,
     min_probability: float = MIN_PROBABILITY,
     provider: str = "cpu",
+    weights: WeightsFolder = None,
 ) -> Matches:
     """Matches between two images of one scene.
 
@@ -72,14 +75,17 @@ def match_images(
         max_keypoints: most an image, from 4; the time and memory of matching grow with its square.
         min_probability: of a match; 0 keeps every mutual nearest neighbour that the scorer does not refuse.
         provider: where ONNX Runtime computes the networks, one of `sigmaslam.inference.session.PROVIDERS`.
+        weights: folder of networks of one's own, as `sigmaslam export` writes it; for those that it lacks, the ones
+            that ship.
     Raises:
-        InputError: an image has another shape or type or is too small, an option is out of range, or the provider is
-            not installed.
+        InputError: an image has another shape or type or is too small, an option is out of range, the provider is
+            not installed, or the folder holds no network of the front-end, or one that does not fit.
     """
-    detect = _detector(frontend, max_keypoints, provider)
+    detect = _detector(frontend, max_keypoints, provider, weights)
     _check_probability(min_probability)
     features0, features1 = detect(_checked(image0, "image0")), detect(_checked(image1, "image1"))
-    return match_features(ConfidenceEstimator(provider=provider), image0, image1, features0, features1, min_probability)
+    estimator = ConfidenceEstimator(provider=provider, weights=weights)
+    return match_features(estimator, image0, image1, features0, features1, min_probability)
 
 
 def match_features(
@@ -123,6 +129,7 @@ def match_files(
     min_probability: float = MIN_PROBABILITY,
     picture: Path | None = None,
     provider: str = "cpu",
+    weights: Path | None = None,
 ) -> str:
     """Matches two image files and writes the fields of `Matches` as .npz and optionally a picture; returns a summary.
 
@@ -134,9 +141,9 @@ def match_files(
             raise InputError(f"{option} {path} does not end in {suffix}: choose a name that does")
     if picture is not None and picture.resolve() in (path0.resolve(), path1.resolve()):
         raise InputError(f"--picture {picture} would overwrite an image that is to be matched: choose another name")
-    detect = _detector(frontend, max_keypoints, provider)
+    detect = _detector(frontend, max_keypoints, provider, weights)
     _check_probability(min_probability)
-    estimator = ConfidenceEstimator(provider=provider)
+    estimator = ConfidenceEstimator(provider=provider, weights=weights)
     image0, image1 = (_checked(read_grey(path), str(path)) for path in (path0, path1))
     start = time.perf_counter()
     features0, features1 = detect(image0), detect(image1)
@@ -192,13 +199,16 @@ def draw_lines(
     return canvas
 
 
-def _detector(frontend: str, max_keypoints: int, provider: str) -> Callable[[np.ndarray], Features]:
+def _detector(
+    frontend: str, max_keypoints: int, provider: str, weights: WeightsFolder
+) -> Callable[[np.ndarray], Features]:
     if not isinstance(frontend, str) or frontend not in DETECTORS:
         raise InputError(f"there is no front-end '{frontend}' for two images: choose one of {', '.join(DETECTORS)}")
     if not isinstance(max_keypoints, int | np.integer) or max_keypoints < _MIN_KEYPOINTS:
         raise InputError(f"--max-keypoints is {max_keypoints!r}: give a whole number of at least {_MIN_KEYPOINTS}")
+    own_networks(frontend, weights)
     if frontend == "learned":
-        return LearnedDetector(max_keypoints, provider=provider)
+        return LearnedDetector(max_keypoints, provider=provider, weights=weights)
     return DETECTORS[frontend](max_keypoints)
 
 
