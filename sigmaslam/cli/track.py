@@ -58,7 +58,7 @@ Weights = Annotated[
     Path | None,
     typer.Option(
         metavar="FOLDER",
-        help="Your own networks, as `sigmaslam export` writes them; of those that the folder lacks, the ones that ship.",
+        help="Your own networks, as `sigmaslam export` writes them; of those that it lacks, the ones that ship.",
         show_default="what ships",
     ),
 ]
