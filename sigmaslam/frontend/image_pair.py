@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 import cv2
@@ -27,6 +27,9 @@ DETECTORS = {"learned": LearnedDetector, "sift": SiftDetector, "orb": OrbDetecto
 # Matches with a smaller probability are dropped by default.
 MIN_PROBABILITY = 0.5
 _MIN_SIDE = 96
+# Larger images are shrunk to this long side, pixels: a network sees texture of few pixels, and photographs of many
+# are blurred and noisy at those.
+_LONGEST_SIDE = 1600
 _MIN_KEYPOINTS = 4
 _MAX_LINES = 60
 # Lines begin so far apart at least, as a share of the image's longer side.
@@ -41,7 +44,8 @@ class Matches:
         keypoints0, keypoints1: (M, 2) float32 pixel coordinates (u, v) in image 0 and 1, as the images are stored;
             keypoints1 refined to a fraction of a pixel.
         probability: (M,) float32, that keypoints1 is within 3 px of the true place of keypoints0 in image 1; calibrated
-            on renders: of matches near 0.8 about 80 per cent are right.
+            on renders: of matches near 0.8 about 80 per cent are right. If image 1 is larger than 1,600 px, pixels here
+            are those of the image shrunk to that long side, in which it is matched.
         covariance: (M, 2, 2) float32, pixels squared, of keypoints1 minus that true place, if the match is right.
         index0, index1: (M,) indices of the keypoints in either image, ordered by falling score.
     """
@@ -70,7 +74,8 @@ def match_images(
     """Matches between two images of one scene.
 
     Args:
-        image0, image1: (H, W) uint8 grey, of any two sizes from 96 pixels.
+        image0, image1: (H, W) uint8 grey, of any two sizes from 96 pixels; those whose long side exceeds 1,600 pixels
+            are shrunk to it, and the matches are said in the pixels of the images as they are given.
         frontend: "learned", "sift" or "orb".
         max_keypoints: most an image, from 4; the time and memory of matching grow with its square.
         min_probability: of a match; 0 keeps every mutual nearest neighbour that the scorer does not refuse.
@@ -83,9 +88,11 @@ def match_images(
     """
     detect = _detector(frontend, max_keypoints, provider, weights)
     _check_probability(min_probability)
-    features0, features1 = detect(_checked(image0, "image0")), detect(_checked(image1, "image1"))
+    (image0, pixels0), (image1, pixels1) = _shrunk(_checked(image0, "image0")), _shrunk(_checked(image1, "image1"))
+    features0, features1 = detect(image0), detect(image1)
     estimator = ConfidenceEstimator(provider=provider, weights=weights)
-    return match_features(estimator, image0, image1, features0, features1, min_probability)
+    matches = match_features(estimator, image0, image1, features0, features1, min_probability)
+    return _enlarged(matches, pixels0, pixels1)
 
 
 def match_features(
@@ -146,9 +153,11 @@ def match_files(
     estimator = ConfidenceEstimator(provider=provider, weights=weights)
     image0, image1 = (_checked(read_grey(path), str(path)) for path in (path0, path1))
     start = time.perf_counter()
-    features0, features1 = detect(image0), detect(image1)
+    (small0, pixels0), (small1, pixels1) = _shrunk(image0), _shrunk(image1)
+    features0, features1 = detect(small0), detect(small1)
     detected = time.perf_counter()
-    matches = match_features(estimator, image0, image1, features0, features1, min_probability)
+    matches = match_features(estimator, small0, small1, features0, features1, min_probability)
+    matches = _enlarged(matches, pixels0, pixels1)
     end = time.perf_counter()
     with atomic_path(out) as temporary:
         np.savez_compressed(temporary, **asdict(matches))
@@ -210,6 +219,26 @@ def _detector(
     if frontend == "learned":
         return LearnedDetector(max_keypoints, provider=provider, weights=weights)
     return DETECTORS[frontend](max_keypoints)
+
+
+def _shrunk(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The image with a long side of at most `_LONGEST_SIDE`, and how many of its pixels one of the result is, (2,)."""
+    size = np.array(image.shape[::-1])
+    if size.max() <= _LONGEST_SIDE:
+        return image, np.ones(2)
+    small = np.maximum(np.round(size * (_LONGEST_SIDE / size.max())).astype(int), min(_MIN_SIDE, size.min()))
+    return np.asarray(cv2.resize(image, small.tolist(), interpolation=cv2.INTER_AREA)), size / small
+
+
+def _enlarged(matches: Matches, pixels0: np.ndarray, pixels1: np.ndarray) -> Matches:
+    """Matches of shrunk images in the pixels of the images as they were; factors as of `_shrunk`."""
+    # The middle of the first pixel is at 0.
+    keypoints0, keypoints1 = (
+        ((keypoints + 0.5) * pixels - 0.5).astype(np.float32) if (pixels != 1.0).any() else keypoints
+        for keypoints, pixels in ((matches.keypoints0, pixels0), (matches.keypoints1, pixels1))
+    )
+    covariance = (matches.covariance * np.outer(pixels1, pixels1)).astype(np.float32)
+    return replace(matches, keypoints0=keypoints0, keypoints1=keypoints1, covariance=covariance)
 
 
 def _check_probability(min_probability: float) -> None:
