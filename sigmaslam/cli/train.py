@@ -89,7 +89,7 @@ def _tell_stop(out: Path, saved: int, steps: int) -> None:
     typer.echo(
         f"Stopped: {saved} of {steps} steps are saved in {printable(out)}; the same command with --resume goes on"
         if saved
-        else f"Stopped before the first of {steps} steps: nothing is saved; give the same command again",
+        else f"Stopped: none of {steps} steps is saved; give the same command again",
         err=True,
     )
 

@@ -47,6 +47,7 @@ def load_world(path: str) -> Generate:
     return generate
 
 
+@lru_cache(maxsize=8)
 def check_world(path: str) -> None:
     """Makes one world by a file, before long work relies on it.
 

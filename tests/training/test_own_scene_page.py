@@ -2,7 +2,6 @@
 
 import re
 import shlex
-import shutil
 from pathlib import Path
 
 import cv2
@@ -50,4 +49,3 @@ def test_the_commands_run_in_their_order(tmp_path: Path, monkeypatch: pytest.Mon
     assert picture.shape == (5 * 2 * size, 4 * size, 3)
     with np.load("matches.npz") as matches:
         assert len(matches["probability"]) > 20
-    shutil.rmtree(tmp_path / "my_features")
