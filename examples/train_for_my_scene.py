@@ -2,9 +2,10 @@
 
     python examples/train_for_my_scene.py my_features
 
-A mix names what pairs are made of: textures (`sigmaslam.synthetic.rendering.textures.KINDS`), "scenes" (streets, rooms)
-or "endoscopy". Leaves in turn keep the network from forgetting the rest. This run is tiny: give 800 steps and the sizes
-that are the defaults of `TrainingConfig`, then `sigmaslam export my_features --out graphs`.
+Shares say what pairs are made of: worlds and textures by name (`sigmaslam.training.sources.SOURCES`), Python files that
+make a world, folders of photographs. Leaves keep the network from forgetting the rest. This run is tiny: give 800 steps
+and the sizes that are the defaults of `TrainingConfig`, then `sigmaslam export my_features --out graphs`. The command
+line does the same: docs/own-scene.md.
 """
 
 import sys
@@ -19,11 +20,10 @@ from sigmaslam.inference.onnx_graph import shipped_weights
 from sigmaslam.models.torch_runtime import TorchFeatures
 from sigmaslam.training.features.loop import train
 from sigmaslam.training.features.recipes import TrainingConfig
-from sigmaslam.training.mixes import MIXES
 
-MIXES["brick walls"] = ("bricks", "leaves", "facade", "leaves")
+BRICK_WALLS = {"bricks": 0.25, "facade": 0.25, "leaves": 0.5}
 TINY = TrainingConfig(
-    steps=4, data="brick walls", batch_size=4, size=96, points=32, learning_rate=5e-4, validate_every=0
+    steps=4, shares=BRICK_WALLS, batch_size=4, size=96, points=32, learning_rate=5e-4, validate_every=0
 )
 
 

@@ -1,4 +1,4 @@
-"""The shipped graphs' torch twins behind the same call, for `--backend torch`."""
+"""The graphs' torch twins behind the same call, for `--backend torch`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import nn
 from sigmaslam.filters.graphs.pose_prediction import Predict
 from sigmaslam.filters.tracking.frame_update import GatedStep, PredictViews, RobustStep
 from sigmaslam.filters.tracking.window_solution import Condition, EliminateLandmarks, GateWindow
-from sigmaslam.inference.onnx_graph import shipped_weights
+from sigmaslam.inference.networks import WeightsFolder, network_path
 from sigmaslam.models.extractor import FeatureExtractor
 from sigmaslam.models.onnx_export import load_network, load_scorer, load_verifier
 from sigmaslam.models.scorer_network import ScoredMatches
@@ -39,13 +39,13 @@ class TorchFeatures(TorchModule):
         super().__init__(FeatureExtractor(load_network(weights)))
 
 
-def scoring_module(name: str) -> TorchModule:
-    """scorer, verifier or place_verifier."""
-    weights = shipped_weights(f"{name}.safetensors")
+def scoring_module(name: str, weights: WeightsFolder = None) -> TorchModule:
+    """scorer, verifier or place_verifier, of a folder or the one that ships."""
+    path = network_path(name, weights, "torch")
     if name == "scorer":
-        return TorchModule(ScoredMatches(load_scorer(weights)))
+        return TorchModule(ScoredMatches(load_scorer(path)))
     columns = PLACE_COLUMNS if name == "place_verifier" else VERIFIER_COLUMNS
-    return TorchModule(MatchCovariance(load_verifier(weights, columns)))
+    return TorchModule(MatchCovariance(load_verifier(path, columns)))
 
 
 def filter_module(name: str) -> TorchModule:

@@ -90,7 +90,8 @@ def prepare(out: Path, recipe: Recipe, truth: str) -> dict[str, Any]:
             content: dict[str, Any] = json.loads(scene.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
             raise InputError(f"{scene} cannot be read ({error}); remove it or choose another --out") from error
-        there = {key: content.get(key) for key in asked}
+        # Folders from before there were worlds of one's own lack the key.
+        there = {"recipe": {"world": None, **content.get("recipe", {})}, "truth": content.get("truth")}
         if there != asked:
             raise InputError(f"{scene} was made with {there}, not {asked}; choose another --out")
         return dict(content["simulation"])

@@ -23,7 +23,7 @@ class Texture:
     """A layer of texture.
 
     Attributes:
-        kind: one of `textures.KINDS`.
+        kind: as `textures.paint` takes it.
         seed: of the texture.
         tile: side of the square that the texture covers, metres; it is repeated by mirroring.
         contrast: factor on its deviation from grey.

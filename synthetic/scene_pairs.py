@@ -15,8 +15,9 @@ from sigmaslam.synthetic.geometry import rigid_motion
 from sigmaslam.synthetic.rendering.renderer import RenderedViews, Renderer
 from sigmaslam.synthetic.rendering.visibility import Eye
 from sigmaslam.synthetic.truth import at_pixels, transfer
-from sigmaslam.synthetic.worlds import colon, hall, organ, room, street
+from sigmaslam.synthetic.worlds import colon, hall, organ, room, rubble, street, tool
 from sigmaslam.synthetic.worlds.episode import Wish
+from sigmaslam.synthetic.worlds.own import SUFFIX, Generate, load_world
 
 DOMAINS = {
     "room": room.generate,
@@ -25,6 +26,8 @@ DOMAINS = {
     "colon": colon.generate,
     "organ": organ.generate,
 }
+# Worlds that the network that ships has not learned from.
+_OTHER_DOMAINS = {"tool": tool.generate, "rubble": rubble.generate}
 _SCENES = 8  # neighbouring pairs come from as many scenes ...
 _USES = 32  # ... each of which serves so many pairs before it is replaced; of forward motion, as it has views
 _VIEWS = 8  # of a scene
@@ -65,7 +68,7 @@ class ScenePairs:
     Args:
         seed: of the whole stream.
         size: side of the square images in pixels.
-        domains: keys of `DOMAINS`, drawn alike.
+        domains: keys of `DOMAINS`, "tool", "rubble", or Python files, see `worlds.own`; drawn alike.
         stereo: the two views are the eyes of a rectified stereo pair, through sensors of one kind.
         max_moving_share: share of the image that may move on its own in a scene.
         forward: the two views are of one camera that advances or retreats, as a car's or a drone's.
@@ -80,9 +83,9 @@ class ScenePairs:
         max_moving_share: float = _MAX_MOVING_SHARE,
         forward: bool = False,
     ) -> None:
-        unknown = set(domains) - set(DOMAINS)
-        if unknown or not domains:
-            raise ValueError(f"unknown domains {sorted(unknown)}; give one or more of {', '.join(DOMAINS)}")
+        if not domains:
+            raise ValueError(f"there are no domains; give one or more of {', '.join(DOMAINS)}")
+        self._generators = {domain: _generator(domain) for domain in domains}
         if stereo and forward:
             raise ValueError("pairs are of two eyes or of forward motion: give one of stereo and forward")
         self.seed, self.size, self.domains, self.stereo, self.forward = seed, size, domains, stereo, forward
@@ -132,7 +135,7 @@ class ScenePairs:
             first_texture=4 * (self.seed + scene // _SCENES_A_BANK),
             textures=4,
         )
-        episode = DOMAINS[domain](rng, wish)
+        episode = self._generators[domain](rng, wish)
         renderer = Renderer(episode.scene)
         middle = rng.uniform(1.0, _DURATION - 1.0)
         span = np.exp(rng.uniform(np.log(0.1), np.log(2.0)))
@@ -174,6 +177,15 @@ class ScenePairs:
         ticks = (np.arange(_RASTER) + 0.5) * self.size / _RASTER
         raster = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
         return float(_transfer(views0, views1, raster)[1].mean())
+
+
+def _generator(domain: str) -> Generate:
+    known = DOMAINS | _OTHER_DOMAINS
+    if domain in known:
+        return known[domain]
+    if domain.endswith(SUFFIX):
+        return load_world(domain)
+    raise ValueError(f"unknown domain {domain!r}; give one or more of {', '.join(known)}, or a Python file")
 
 
 def _expose(light: np.ndarray, sensor: Sensor, rng: np.random.Generator, flow: np.ndarray | None) -> np.ndarray:

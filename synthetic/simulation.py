@@ -20,6 +20,7 @@ from sigmaslam.synthetic.rendering.visibility import Eye
 from sigmaslam.synthetic.scene import Scene
 from sigmaslam.synthetic.truth import flow
 from sigmaslam.synthetic.worlds.episode import Wish
+from sigmaslam.synthetic.worlds.own import check_world, load_world
 
 _BRIGHTNESS = 0.48  # mean of the linear image that the exposure aims at
 _METERED = 5  # frames that are looked at for it
@@ -42,6 +43,7 @@ class Recipe:
         rotation_error: degrees by which the right camera is turned against its calibration, about a random axis.
         width, height: pixels; the preset's unless given.
         profile: KITTI poses file that a drive follows.
+        world: Python file that makes the world, see `worlds.own`, in place of the preset's, whose camera it is seen by.
     """
 
     preset: str
@@ -55,6 +57,7 @@ class Recipe:
     width: int | None = None
     height: int | None = None
     profile: str | None = None
+    world: str | None = None
 
     def check(self) -> None:
         """Raises InputError where a value is out of range."""
@@ -82,6 +85,8 @@ class Recipe:
             raise InputError(f"the motion planar goes with {', '.join(ROLLING)}, where there is a level floor")
         if self.profile is not None and self.preset != "street":
             raise InputError(f"a profile of real motion goes with the preset street, not with {self.preset}")
+        if self.world is not None:
+            check_world(self.world)
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +192,8 @@ def simulate(recipe: Recipe) -> Simulation:
         first_texture=16 * recipe.seed,
         textures=8,
     )
-    episode = preset.generate(rngs[_WORLD], wish)
+    generate = preset.generate if recipe.world is None else load_world(recipe.world)
+    episode = generate(rngs[_WORLD], wish)
     axis = rngs[_ERRORS].standard_normal(3)
     turn = np.deg2rad(recipe.rotation_error) * axis / np.linalg.norm(axis)
     errors = Miscalibration(recipe.disparity_offset, rotation=(float(turn[0]), float(turn[1]), float(turn[2])))

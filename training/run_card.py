@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from sigmaslam.source_commit import current_commit
+from sigmaslam.synthetic.worlds.own import SUFFIX
 from sigmaslam.training.devices import Workplace, describe_hardware
 from sigmaslam.training.features.checkpoint import TrainingState
-from sigmaslam.training.mixes import MIXES
+from sigmaslam.training.features.recipes import TrainingConfig
+from sigmaslam.training.sources import SOURCES, label, turns_of
 
 CARD_NAME = "features.json"
 _LIMITS = [
@@ -45,13 +48,27 @@ def make_card(state: TrainingState, place: Workplace) -> dict[str, Any]:
     return {
         "recipe": state.recipe,
         "started_from": state.started_from,
-        "config": asdict(state.config),
+        "config": {**asdict(state.config), "shares": _by_label(state.config.shares)},
         "seed": state.config.seed,
         **state.origin,
         "duration_s": round(state.seconds, 1),
         "hardware": describe_hardware(place),
         "parameters": sum(p.numel() for p in state.network.parameters()),
-        "data": f"renders alone, no photograph: {', '.join(MIXES[state.config.data])} in turn",
+        "data": _describe_data(state.config),
         "limits": _LIMITS,
         "metrics_on_held_out_renders": {k: round(v, 4) for k, v in state.metrics.items()},
     }
+
+
+def _describe_data(config: TrainingConfig) -> str:
+    turns = turns_of(config.mix)
+    own = any(source not in SOURCES and not source.endswith(SUFFIX) for source in turns)
+    kind = "renders and the user's photographs" if own else "renders alone, no photograph"
+    if isinstance(config.mix, str):
+        return f"{kind}: {', '.join(turns)} in turn"
+    shares = ", ".join(f"{share:g} {name}" for name, share in _by_label(config.shares).items())
+    return f"{kind}: {shares}"
+
+
+def _by_label(shares: Mapping[str, float]) -> dict[str, float]:
+    return {label(source): share for source, share in shares.items()}

@@ -21,6 +21,7 @@ from sigmaslam.evaluation.matching import check_sets, compare, format_scores, lo
 from sigmaslam.evaluation.matching.extractors import CLASSICAL, MAX_KEYPOINTS
 from sigmaslam.evaluation.matching.sets import ALL
 from sigmaslam.files import atomic_write_text
+from sigmaslam.inference.networks import network_path, networks_in
 from sigmaslam.inference.onnx_graph import OnnxGraph, shipped_weights
 
 ROUNDS = 15
@@ -66,7 +67,7 @@ def write_features(
     Args:
         path: Markdown page.
         data: folder of the real data sets.
-        weights: ours, .onnx or .safetensors; the shipped graph if there are none.
+        weights: ours, .onnx, .safetensors or the folder of an export; the shipped graph if there are none.
         peers: .onnx graphs of other people.
         command: what the page says it was made by.
         sets: to be scored.
@@ -75,7 +76,8 @@ def write_features(
     Raises:
         InputError: a file or set cannot be used.
     """
-    names = [*map(str, weights or [shipped_weights("features.onnx")]), *CLASSICAL, *map(str, peers)]
+    names = [str(_features_of(each)) for each in weights or [shipped_weights("features.onnx")]]
+    names += [*CLASSICAL, *map(str, peers)]
     if len(set(names)) < len(names):
         raise InputError(f"an extractor is given twice among {', '.join(names)}: leave one out")
     check_sets(sets, data)
@@ -86,6 +88,14 @@ def write_features(
     atomic_write_text(path.with_suffix(".json"), _public(json.dumps(scores, indent=1)) + "\n")
     page = "\n".join([*_introduction(command, rounds), *format_costs(costs, reference), "", format_scores(scores)])
     return write_page(path, _public(page))
+
+
+def _features_of(weights: Path) -> Path:
+    """The graph in a folder; a file is what it is."""
+    if not weights.is_dir():
+        return weights
+    networks_in(weights, names=("features",))
+    return network_path("features", weights)
 
 
 def _public(text: str) -> str:

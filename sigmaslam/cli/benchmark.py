@@ -118,7 +118,8 @@ def features(
     weights: Annotated[
         list[Path] | None,
         typer.Option(
-            help=".onnx or .safetensors of ours; may be given more than once.", show_default="the shipped graph"
+            help="Folder of an export, or .onnx or .safetensors of ours; may be given more than once.",
+            show_default="the shipped graph",
         ),
     ] = None,
     peer: Annotated[

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from sigmaslam.cli.track import Provider
+from sigmaslam.cli.track import Provider, Weights
 from sigmaslam.frontend.image_pair import DETECTORS, match_files
 
 # mypy reads the members of an enum from literals alone.
@@ -31,6 +31,7 @@ def match(
     provider: Annotated[
         Provider, typer.Option(help="Where ONNX Runtime computes the networks, if installed.")
     ] = Provider["cpu"],
+    weights: Weights = None,
 ) -> None:
     """Match two images: which points show the same, how probably and how exactly; prints one line.
 
@@ -38,5 +39,7 @@ def match(
     right to 3 px; covariance (M, 2, 2) of keypoints1 given keypoints0; index0, index1 (M,). numpy.load reads it.
     """
     typer.echo(
-        match_files(image0, image1, out, frontend.value, max_keypoints, min_probability, picture, provider.value)
+        match_files(
+            image0, image1, out, frontend.value, max_keypoints, min_probability, picture, provider.value, weights
+        )
     )

@@ -42,6 +42,10 @@ def render(
     profile: Annotated[
         Path | None, typer.Option(help="street: KITTI poses file whose motion the drive follows.")
     ] = None,
+    world: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.py", help="A world of your own, as examples/my_world.py, by the preset's camera."),
+    ] = None,
     width: Annotated[int | None, typer.Option(min=16, help="Pixels.", show_default="the preset's")] = None,
     height: Annotated[int | None, typer.Option(min=16, help="Pixels.", show_default="the preset's")] = None,
     truth: Annotated[
@@ -71,6 +75,7 @@ def render(
         width,
         height,
         None if profile is None else str(profile),
+        None if world is None else str(world.resolve()),
     )
     with open_progress() as progress:
         task = progress.add_task("making the world", total=frames, note="")

@@ -22,6 +22,7 @@ from sigmaslam.cli.track_sinks import open_sinks
 from sigmaslam.errors import InputError
 from sigmaslam.files import check_new_folder, printable
 from sigmaslam.frontend import FRONTENDS
+from sigmaslam.frontend.build import own_networks
 from sigmaslam.inference.onnx_graph import BACKENDS
 from sigmaslam.inference.session import PROVIDERS, check_provider
 from sigmaslam.plot_style import NO_MATPLOTLIB
@@ -52,6 +53,14 @@ TopicLeft = Annotated[
 ]
 TopicRight = Annotated[
     str | None, typer.Option(help="Image topic in a bag.", show_default="the one with 'right', cam1 or infra2")
+]
+Weights = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FOLDER",
+        help="Your own networks, as `sigmaslam export` writes them; of those that it lacks, the ones that ship.",
+        show_default="what ships",
+    ),
 ]
 
 
@@ -94,6 +103,7 @@ def track(
     provider: Annotated[
         Provider, typer.Option(help="Where ONNX Runtime computes the networks, if installed; the filter: on the CPU.")
     ] = Provider["cpu"],
+    weights: Weights = None,
     config: Annotated[
         Path | None, typer.Option(help="YAML of tracker settings, `name: value` (names: sigmaslam.TrackerConfig).")
     ] = None,
@@ -196,6 +206,7 @@ def track(
     if backend.value == "torch":
         need_train_extra()
     check_provider(provider.value, backend.value)
+    own_networks(frontend.value, weights, backend.value)
     if resume and overwrite:
         raise InputError("--resume goes on with the run in the folder, --overwrite removes it: give one of them")
     if resume and (video or viewer):
@@ -226,6 +237,7 @@ def track(
             resume,
             provider,
             sinks,
+            weights,
         )
         tell_summary(summary, out)
 
@@ -298,6 +310,7 @@ def _track(
     resume: bool = False,
     provider: Provider = Provider["cpu"],
     sinks: Sequence[FrameSink] = (),
+    weights: Path | None = None,
 ) -> dict[str, Any]:
     import cv2
 
@@ -323,6 +336,7 @@ def _track(
             denoise=denoise,
             resume=resume,
             provider=provider.value,
+            weights=weights,
             sinks=sinks,
         )
     except Stopped as stop:

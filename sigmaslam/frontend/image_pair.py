@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 import cv2
@@ -13,18 +13,23 @@ import numpy as np
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path, atomic_write_bytes
 from sigmaslam.frontend.affine_alignment import refine_by_neighbours
+from sigmaslam.frontend.build import own_networks
 from sigmaslam.frontend.classical import OrbDetector, SiftDetector
 from sigmaslam.frontend.descriptor import refine_with_confidence
 from sigmaslam.frontend.learned import LearnedDetector
 from sigmaslam.frontend.match_confidence import ConfidenceEstimator
 from sigmaslam.frontend.nearest_neighbours import nearest_anywhere
 from sigmaslam.frontend.types import Features
+from sigmaslam.inference.networks import WeightsFolder
 from sigmaslam.readers.images import check_grey, read_grey
 
 DETECTORS = {"learned": LearnedDetector, "sift": SiftDetector, "orb": OrbDetector}
 # Matches with a smaller probability are dropped by default.
 MIN_PROBABILITY = 0.5
 _MIN_SIDE = 96
+# Larger images are shrunk to this long side, pixels: a network sees texture of few pixels, and photographs of many
+# are blurred and noisy at those.
+_LONGEST_SIDE = 1600
 _MIN_KEYPOINTS = 4
 _MAX_LINES = 60
 # Lines begin so far apart at least, as a share of the image's longer side.
@@ -39,7 +44,8 @@ class Matches:
         keypoints0, keypoints1: (M, 2) float32 pixel coordinates (u, v) in image 0 and 1, as the images are stored;
             keypoints1 refined to a fraction of a pixel.
         probability: (M,) float32, that keypoints1 is within 3 px of the true place of keypoints0 in image 1; calibrated
-            on renders: of matches near 0.8 about 80 per cent are right.
+            on renders: of matches near 0.8 about 80 per cent are right. If image 1 is larger than 1,600 px, pixels here
+            are those of the image shrunk to that long side, in which it is matched.
         covariance: (M, 2, 2) float32, pixels squared, of keypoints1 minus that true place, if the match is right.
         index0, index1: (M,) indices of the keypoints in either image, ordered by falling score.
     """
@@ -63,23 +69,30 @@ def match_images(
     max_keypoints: int = 1024,
     min_probability: float = MIN_PROBABILITY,
     provider: str = "cpu",
+    weights: WeightsFolder = None,
 ) -> Matches:
     """Matches between two images of one scene.
 
     Args:
-        image0, image1: (H, W) uint8 grey, of any two sizes from 96 pixels.
+        image0, image1: (H, W) uint8 grey, of any two sizes from 96 pixels; those whose long side exceeds 1,600 pixels
+            are shrunk to it, and the matches are said in the pixels of the images as they are given.
         frontend: "learned", "sift" or "orb".
         max_keypoints: most an image, from 4; the time and memory of matching grow with its square.
         min_probability: of a match; 0 keeps every mutual nearest neighbour that the scorer does not refuse.
         provider: where ONNX Runtime computes the networks, one of `sigmaslam.inference.session.PROVIDERS`.
+        weights: folder of networks of one's own, as `sigmaslam export` writes it; for those that it lacks, the ones
+            that ship.
     Raises:
-        InputError: an image has another shape or type or is too small, an option is out of range, or the provider is
-            not installed.
+        InputError: an image has another shape or type or is too small, an option is out of range, the provider is
+            not installed, or the folder holds no network of the front-end, or one that does not fit.
     """
-    detect = _detector(frontend, max_keypoints, provider)
+    detect = _detector(frontend, max_keypoints, provider, weights)
     _check_probability(min_probability)
-    features0, features1 = detect(_checked(image0, "image0")), detect(_checked(image1, "image1"))
-    return match_features(ConfidenceEstimator(provider=provider), image0, image1, features0, features1, min_probability)
+    (image0, pixels0), (image1, pixels1) = _shrunk(_checked(image0, "image0")), _shrunk(_checked(image1, "image1"))
+    features0, features1 = detect(image0), detect(image1)
+    estimator = ConfidenceEstimator(provider=provider, weights=weights)
+    matches = match_features(estimator, image0, image1, features0, features1, min_probability)
+    return _enlarged(matches, pixels0, pixels1)
 
 
 def match_features(
@@ -123,6 +136,7 @@ def match_files(
     min_probability: float = MIN_PROBABILITY,
     picture: Path | None = None,
     provider: str = "cpu",
+    weights: Path | None = None,
 ) -> str:
     """Matches two image files and writes the fields of `Matches` as .npz and optionally a picture; returns a summary.
 
@@ -134,14 +148,16 @@ def match_files(
             raise InputError(f"{option} {path} does not end in {suffix}: choose a name that does")
     if picture is not None and picture.resolve() in (path0.resolve(), path1.resolve()):
         raise InputError(f"--picture {picture} would overwrite an image that is to be matched: choose another name")
-    detect = _detector(frontend, max_keypoints, provider)
+    detect = _detector(frontend, max_keypoints, provider, weights)
     _check_probability(min_probability)
-    estimator = ConfidenceEstimator(provider=provider)
+    estimator = ConfidenceEstimator(provider=provider, weights=weights)
     image0, image1 = (_checked(read_grey(path), str(path)) for path in (path0, path1))
     start = time.perf_counter()
-    features0, features1 = detect(image0), detect(image1)
+    (small0, pixels0), (small1, pixels1) = _shrunk(image0), _shrunk(image1)
+    features0, features1 = detect(small0), detect(small1)
     detected = time.perf_counter()
-    matches = match_features(estimator, image0, image1, features0, features1, min_probability)
+    matches = match_features(estimator, small0, small1, features0, features1, min_probability)
+    matches = _enlarged(matches, pixels0, pixels1)
     end = time.perf_counter()
     with atomic_path(out) as temporary:
         np.savez_compressed(temporary, **asdict(matches))
@@ -192,14 +208,37 @@ def draw_lines(
     return canvas
 
 
-def _detector(frontend: str, max_keypoints: int, provider: str) -> Callable[[np.ndarray], Features]:
+def _detector(
+    frontend: str, max_keypoints: int, provider: str, weights: WeightsFolder
+) -> Callable[[np.ndarray], Features]:
     if not isinstance(frontend, str) or frontend not in DETECTORS:
         raise InputError(f"there is no front-end '{frontend}' for two images: choose one of {', '.join(DETECTORS)}")
     if not isinstance(max_keypoints, int | np.integer) or max_keypoints < _MIN_KEYPOINTS:
         raise InputError(f"--max-keypoints is {max_keypoints!r}: give a whole number of at least {_MIN_KEYPOINTS}")
+    own_networks(frontend, weights)
     if frontend == "learned":
-        return LearnedDetector(max_keypoints, provider=provider)
+        return LearnedDetector(max_keypoints, provider=provider, weights=weights)
     return DETECTORS[frontend](max_keypoints)
+
+
+def _shrunk(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The image with a long side of at most `_LONGEST_SIDE`, and how many of its pixels one of the result is, (2,)."""
+    size = np.array(image.shape[::-1])
+    if size.max() <= _LONGEST_SIDE:
+        return image, np.ones(2)
+    small = np.maximum(np.round(size * (_LONGEST_SIDE / size.max())).astype(int), min(_MIN_SIDE, size.min()))
+    return np.asarray(cv2.resize(image, small.tolist(), interpolation=cv2.INTER_AREA)), size / small
+
+
+def _enlarged(matches: Matches, pixels0: np.ndarray, pixels1: np.ndarray) -> Matches:
+    """Matches of shrunk images in the pixels of the images as they were; factors as of `_shrunk`."""
+    # The middle of the first pixel is at 0.
+    keypoints0, keypoints1 = (
+        ((keypoints + 0.5) * pixels - 0.5).astype(np.float32) if (pixels != 1.0).any() else keypoints
+        for keypoints, pixels in ((matches.keypoints0, pixels0), (matches.keypoints1, pixels1))
+    )
+    covariance = (matches.covariance * np.outer(pixels1, pixels1)).astype(np.float32)
+    return replace(matches, keypoints0=keypoints0, keypoints1=keypoints1, covariance=covariance)
 
 
 def _check_probability(min_probability: float) -> None:

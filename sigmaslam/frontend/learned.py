@@ -1,4 +1,4 @@
-"""Our trained features: the shipped ONNX graph, or the same network in torch."""
+"""Our trained features: an ONNX graph, or the same network in torch."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 
 from sigmaslam.frontend.types import Features
-from sigmaslam.inference.onnx_graph import OnnxGraph, shipped_weights
+from sigmaslam.inference.networks import WeightsFolder, network_path, open_network
 
 Graph = Callable[[Mapping[str, np.ndarray]], list[np.ndarray]]
-"""A network as a function: an `OnnxGraph`, or the same network in torch."""
+"""A network as a function: a `sigmaslam.inference.onnx_graph.OnnxGraph`, or the same network in torch."""
 
 _SIZE_MULTIPLE = 32
 _BORDER = 8
@@ -27,16 +27,24 @@ class LearnedDetector:
         backend: "onnx", or "torch" (needs the extra `train`).
         threads: of ONNX Runtime.
         provider: where ONNX Runtime computes.
+        weights: folder of a network of one's own; None: the one that ships.
     """
 
-    def __init__(self, max_keypoints: int, backend: str = "onnx", threads: int = 2, provider: str = "cpu") -> None:
+    def __init__(
+        self,
+        max_keypoints: int,
+        backend: str = "onnx",
+        threads: int = 2,
+        provider: str = "cpu",
+        weights: WeightsFolder = None,
+    ) -> None:
         self._max_keypoints = max_keypoints
         if backend == "torch":
             from sigmaslam.models.torch_runtime import TorchFeatures
 
-            self._graph: Graph = TorchFeatures(shipped_weights("features.safetensors"))
+            self._graph: Graph = TorchFeatures(network_path("features", weights, backend))
         else:
-            self._graph = OnnxGraph(shipped_weights("features.onnx"), threads, provider)
+            self._graph = open_network("features", weights, threads, provider)
 
     def __call__(self, image: np.ndarray) -> Features:
         """Features of an (H, W) uint8 image of any size from 96 pixels."""

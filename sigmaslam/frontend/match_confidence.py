@@ -1,4 +1,4 @@
-"""Probability and covariance of matches, from the shipped graphs or the same networks in torch."""
+"""Probability and covariance of matches, from ONNX graphs or the same networks in torch."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sigmaslam.frontend.patch_evidence import Evidence, examine_patches
 from sigmaslam.frontend.scorer_inputs import nearest_matches, side_information
 from sigmaslam.frontend.types import Features, Refinement
 from sigmaslam.frontend.verifier_inputs import PlaceSearch, describe_matches, describe_places
-from sigmaslam.inference.onnx_graph import OnnxGraph, shipped_weights
+from sigmaslam.inference.networks import WeightsFolder, open_network
 
 MIN_LOGIT = -4.0
 """Matches with a smaller logit from the scorer are dropped; the verifier was trained without them."""
@@ -26,19 +26,20 @@ class ConfidenceEstimator:
     Args:
         backend: "onnx", or "torch" (needs the extra `train`).
         provider: where ONNX Runtime computes.
+        weights: folder of networks of one's own; None, and for those that it lacks: the ones that ship.
     """
 
-    def __init__(self, backend: str = "onnx", provider: str = "cpu") -> None:
+    def __init__(self, backend: str = "onnx", provider: str = "cpu", weights: WeightsFolder = None) -> None:
         if backend == "torch":
             from sigmaslam.models.torch_runtime import scoring_module
 
-            self._scorer: _Graph = scoring_module("scorer")
-            self._verifier: _Graph = scoring_module("verifier")
-            self._place_verifier: _Graph = scoring_module("place_verifier")
+            self._scorer: _Graph = scoring_module("scorer", weights)
+            self._verifier: _Graph = scoring_module("verifier", weights)
+            self._place_verifier: _Graph = scoring_module("place_verifier", weights)
         else:
-            self._scorer = OnnxGraph(shipped_weights("scorer.onnx"), provider=provider)
-            self._verifier = OnnxGraph(shipped_weights("verifier.onnx"), provider=provider)
-            self._place_verifier = OnnxGraph(shipped_weights("place_verifier.onnx"), provider=provider)
+            self._scorer = open_network("scorer", weights, provider=provider)
+            self._verifier = open_network("verifier", weights, provider=provider)
+            self._place_verifier = open_network("place_verifier", weights, provider=provider)
 
     def score(self, putative: Putative, features0: Features, features1: Features) -> np.ndarray:
         """Logit (M,) that each match is right, from its neighbours and its margins, without the images.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -22,6 +23,24 @@ Step = Callable[[Mapping[str, np.ndarray]], list[np.ndarray]]
 """What a loaded graph is called as: arrays by name, outputs in order."""
 
 
+@dataclass(frozen=True, slots=True)
+class GraphInput:
+    """An input of a graph.
+
+    Attributes:
+        name, type: as the graph has them, the type as `tensor(float)`.
+        shape: sizes; None for one that is free.
+    """
+
+    name: str
+    type: str
+    shape: tuple[int | None, ...]
+
+    def __str__(self) -> str:
+        sizes = ", ".join("any" if size is None else str(size) for size in self.shape)
+        return f"{self.name} {self.type} ({sizes})"
+
+
 class OnnxGraph:
     """A loaded graph that is called with named arrays.
 
@@ -29,6 +48,10 @@ class OnnxGraph:
         path: .onnx file.
         threads: within one operator; results are the same bit for bit as long as it does not change.
         provider: where it computes, one of `sigmaslam.inference.session.PROVIDERS`.
+
+    Attributes:
+        inputs: in the order of the graph.
+        outputs: their names, likewise.
     Raises:
         InputError: the file is missing, not the one that its manifest names, or no usable graph, or the provider is
             not installed.
@@ -48,6 +71,10 @@ class OnnxGraph:
             raise InputError(
                 f"{path} is no graph that ONNX Runtime {RUNTIME_VERSION} can load (the shipped ones need 1.29): {error}"
             ) from error
+        self.inputs = tuple(
+            GraphInput(each.name, each.type, tuple(size if isinstance(size, int) else None for size in each.shape))
+            for each in self._session.get_inputs()
+        )
         self.outputs: Sequence[str] = [output.name for output in self._session.get_outputs()]
 
     def __call__(self, feed: Mapping[str, np.ndarray]) -> list[np.ndarray]:

@@ -21,7 +21,9 @@ import numpy as np
 
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder, printable
+from sigmaslam.frontend.build import own_networks
 from sigmaslam.geometry.camera import StereoCamera
+from sigmaslam.inference.networks import WeightsFolder, network_path
 from sigmaslam.inference.onnx_graph import shipped_weights
 from sigmaslam.runs.appended_file import AppendedFile
 from sigmaslam.runs.frame_table import COLUMNS, FRAMES_NAME, KEYFRAME_COLUMNS
@@ -76,7 +78,7 @@ class RunWriter:
         goes_on = poses is not None
         if not goes_on:
             check_new_folder(out)
-        self.run = {**run, **_describe_start(), "versions": _versions(), "weights_sha256": _weight_hashes()}
+        self.run = {**run, **_describe_start(), "versions": _versions(), "weights_sha256": _weight_hashes(run)}
         self.calibration: CalibrationEstimate | None = None
         try:
             out.mkdir(parents=True, exist_ok=True)
@@ -217,6 +219,18 @@ def describe_camera(camera: StereoCamera) -> dict[str, Any]:
     }
 
 
+def describe_weights(frontend: str, backend: str, weights: WeightsFolder) -> dict[str, Any] | None:
+    """Folder of the user's networks, and SHA-256 of those that the front-end takes from it; None without a folder.
+
+    Raises:
+        InputError: as of `own_networks`.
+    """
+    paths = [network_path(name, weights, backend) for name in own_networks(frontend, weights, backend)]
+    if weights is None:
+        return None
+    return {"folder": printable(os.fspath(weights)), "sha256": {path.name: _sha256(path) for path in paths}}
+
+
 def _describe_start() -> dict[str, Any]:
     """The command, when it was given, and to what kind of machine."""
     program = Path(sys.argv[0]).name.replace("__main__.py", "sigmaslam")
@@ -244,5 +258,11 @@ def _versions() -> dict[str, str]:
     return {"python": platform.python_version(), **{name: version(name) for name in names}}
 
 
-def _weight_hashes() -> dict[str, str]:
-    return {name: hashlib.sha256(shipped_weights(name).read_bytes()).hexdigest() for name in _GRAPHS}
+def _weight_hashes(run: dict[str, Any]) -> dict[str, str]:
+    """SHA-256 of every file that the run computes with."""
+    own = (run.get("weights") or {}).get("sha256", {})
+    return {**{name: _sha256(shipped_weights(name)) for name in _GRAPHS}, **own}
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()

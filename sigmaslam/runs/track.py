@@ -15,6 +15,7 @@ from sigmaslam.errors import InputError, OutputError, SigmaSlamError
 from sigmaslam.files import printable
 from sigmaslam.fusion.location_filter import LocationFilter
 from sigmaslam.fusion.readings import Locations
+from sigmaslam.inference.networks import WeightsFolder
 from sigmaslam.progress import open_progress
 from sigmaslam.readers import StereoFrame, StereoSequence
 from sigmaslam.readers.trajectory_files import write_tum
@@ -24,7 +25,7 @@ from sigmaslam.runs.frame_sink import FrameSink, TrackedFrame, close_all
 from sigmaslam.runs.real_time import Latency, RealTimePlayer, describe_real_time
 from sigmaslam.runs.results import TrackerResults, output_error, write_results
 from sigmaslam.runs.resume import StoppedRun, read_stopped_run
-from sigmaslam.runs.run_folder import RunWriter, describe_camera
+from sigmaslam.runs.run_folder import RunWriter, describe_camera, describe_weights
 from sigmaslam.runs.stop_signals import Stopped, StopSignals
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.estimate import Estimate
@@ -52,6 +53,7 @@ def track_sequence(
     denoise: bool = False,
     resume: bool = False,
     provider: str = "cpu",
+    weights: WeightsFolder = None,
     on_estimate: Callable[[Estimate | ObjectEstimate], None] | None = None,
     sinks: Sequence[FrameSink] = (),
 ) -> dict[str, Any]:
@@ -60,7 +62,7 @@ def track_sequence(
     Args:
         sequence: opened by `sigmaslam.readers.open_sequence` or `open_cameras`.
         out: run folder, new or empty.
-        frontend, backend, config, threads, provider: of `StereoTracker`.
+        frontend, backend, config, threads, provider, weights: of `StereoTracker`.
         map_path: map.npz of an earlier run; poses are in its world.
         tracks: write tracks.npz, too, the observations of keyframes for `sigmaslam refine`.
         track_object: box or mask, see `read_region`: the camera is at rest and follows one body. Poses are then
@@ -94,6 +96,7 @@ def track_sequence(
         "frontend": frontend,
         "backend": backend,
         "provider": provider,
+        "weights": describe_weights(frontend, backend, weights),
         "map": None if map_path is None else printable(map_path),
         "configuration": asdict(config or (TrackerConfig() if track_object is None else OBJECT_CONFIG)),
         "calibration": describe_camera(sequence.camera),
@@ -102,7 +105,7 @@ def track_sequence(
     if stopped is not None:
         stopped.check_sequence(sequence)
     start = None if stopped is None else stopped.start
-    tracker = _build_tracker(sequence, frontend, backend, config, track_object, threads, start, provider)
+    tracker = _build_tracker(sequence, frontend, backend, config, track_object, threads, start, provider, weights)
     location = None if locations is None else LocationFilter(locations, track_object is not None)
     rectified = None
     if isinstance(tracker, StereoTracker):
@@ -240,13 +243,12 @@ def _build_tracker(
     threads: int,
     start: StartPose | None,
     provider: str,
+    weights: WeightsFolder,
 ) -> Tracker:
     if track_object is None:
-        return StereoTracker(
-            sequence.camera, frontend, backend, config, threads=threads, start=start, provider=provider
-        )
+        return StereoTracker(sequence.camera, frontend, backend, config, None, threads, start, provider, weights)
     region = read_region(track_object, sequence.camera.left.width, sequence.camera.left.height)
-    return ObjectTracker(sequence.camera, region, frontend, backend, config, threads, provider)
+    return ObjectTracker(sequence.camera, region, frontend, backend, config, threads, provider, weights)
 
 
 def _check_can_resume(

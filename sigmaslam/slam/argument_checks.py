@@ -19,7 +19,9 @@ _LONGEST_PAUSE = 1e5
 _FRONTEND_METHODS = ("name", "observe", "match", "follow")
 
 
-def check_tracker_arguments(camera: object, frontend: object, backend: object, config: object, threads: object) -> None:
+def check_tracker_arguments(
+    camera: object, frontend: object, backend: object, config: object, threads: object, weights: object = None
+) -> None:
     """The arguments with which a tracker is made.
 
     Raises:
@@ -35,6 +37,8 @@ def check_tracker_arguments(camera: object, frontend: object, backend: object, c
         raise _wrong("config", config, "a TrackerConfig, such as TrackerConfig(window=8)")
     if not isinstance(threads, int | np.integer) or isinstance(threads, bool) or threads < 1:
         raise _wrong("threads", threads, "a whole number from 1")
+    if weights is not None and not isinstance(frontend, str):
+        raise InputError(f"weights {weights} are for a front-end by name: give the networks to your own one instead")
 
 
 def check_region(region: Any, camera: StereoCamera) -> None:

@@ -18,6 +18,7 @@ from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.inference.networks import WeightsFolder
 from sigmaslam.slam.argument_checks import check_region, check_tracker_arguments
 from sigmaslam.slam.body_admission import BodyAdmission
 from sigmaslam.slam.config import TrackerConfig
@@ -104,7 +105,7 @@ class ObjectTracker:
     Args:
         camera: calibration of the raw images.
         region: (H, W) bool, where the body is in the first raw left image; background inside does little harm.
-        frontend, backend, threads, provider: of `StereoTracker`.
+        frontend, backend, threads, provider, weights: of `StereoTracker`.
         config: likewise; by default `OBJECT_CONFIG`, with more acceleration.
     Raises:
         InputError: an argument is of another type or size, or nothing is in the region.
@@ -119,14 +120,15 @@ class ObjectTracker:
         config: TrackerConfig | None = None,
         threads: int = 2,
         provider: str = "cpu",
+        weights: WeightsFolder = None,
     ) -> None:
-        check_tracker_arguments(camera, frontend, backend, config, threads)
+        check_tracker_arguments(camera, frontend, backend, config, threads, weights)
         check_region(region, camera)
         self.config = config = config or OBJECT_CONFIG
         rectifier = StereoRectifier(camera)
         self._T_left_rectified = se3_inverse(rectifier.T_rectified_left)
         if isinstance(frontend, str):
-            frontend = build_frontend(frontend, config.max_keypoints, backend, threads, provider)
+            frontend = build_frontend(frontend, config.max_keypoints, backend, threads, provider, weights)
         raw = region.astype(np.uint8) * 255
         rectified_region = rectifier.rectify(raw, raw)[0] > 127
         self._body = BodyAdmission(rectifier.rectified, rectified_region, frontend, config)

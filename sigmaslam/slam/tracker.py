@@ -20,6 +20,7 @@ from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.inference.networks import WeightsFolder
 from sigmaslam.slam.argument_checks import check_frame, check_tracker_arguments
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
@@ -66,12 +67,14 @@ class StereoTracker:
         start: pose of the first frame in the world of an earlier run, in which it was a keyframe; by default the left
             camera of the first frame is the world.
         provider: where ONNX Runtime computes the networks, "cpu", "cuda" or "openvino"; the estimator stays on the CPU.
+        weights: folder of networks of one's own, as `sigmaslam export` writes it; for those that it lacks, the ones
+            that ship.
 
     Attributes:
         last_frame: what the last frame saw, for pictures; None before the first.
     Raises:
-        InputError: an argument is of another type, or there is no such front-end or backend, or the provider is
-            not installed.
+        InputError: an argument is of another type, or there is no such front-end or backend, the provider is not
+            installed, or the folder of weights holds no network of the front-end, or one that does not fit.
     """
 
     def __init__(
@@ -84,14 +87,15 @@ class StereoTracker:
         threads: int = 2,
         start: StartPose | None = None,
         provider: str = "cpu",
+        weights: WeightsFolder = None,
     ) -> None:
-        check_tracker_arguments(camera, frontend, backend, config, threads)
+        check_tracker_arguments(camera, frontend, backend, config, threads, weights)
         self.config = config = config or TrackerConfig()
         self._rectifier = StereoRectifier(camera)
         self._camera = rectified = self._rectifier.rectified
         self._T_rectified_left = self._rectifier.T_rectified_left
         if isinstance(frontend, str):
-            frontend = build_frontend(frontend, config.max_keypoints, backend, threads, provider)
+            frontend = build_frontend(frontend, config.max_keypoints, backend, threads, provider, weights)
         self._frontend = frontend
         self._blas = ThreadpoolController()
         self._beside = ThreadPoolExecutor(1, "keyframe") if threads > 1 else None

@@ -6,7 +6,7 @@ from collections import OrderedDict
 
 import numpy as np
 
-from sigmaslam.synthetic.rendering.textures import KINDS, paint
+from sigmaslam.synthetic.rendering.textures import KINDS, check_kind, paint
 
 
 class TextureBank:
@@ -18,7 +18,8 @@ class TextureBank:
 
     Args:
         seed: of all textures.
-        kinds: names of `textures.KINDS`; each texture's is drawn at random. A name given twice is drawn twice as often.
+        kinds: as `textures.paint` takes them; each texture's is drawn at random. One given twice is drawn twice as
+            often.
         size: side of the square textures, pixels.
         count: places.
         uses: how often a texture is used before it is replaced (those of the beginning, less).
@@ -29,9 +30,10 @@ class TextureBank:
     def __init__(
         self, seed: int, kinds: tuple[str, ...] = ("leaves",), size: int = 448, count: int = 16, uses: int = 32
     ) -> None:
-        unknown = set(kinds) - set(KINDS)
-        if unknown or not kinds:
-            raise ValueError(f"unknown textures {sorted(unknown)}; give one or more of {', '.join(KINDS)}")
+        if not kinds:
+            raise ValueError(f"there are no kinds of textures: give one or more of {', '.join(KINDS)}")
+        for kind in kinds:
+            check_kind(kind)
         if count < 1 or uses < 1:
             raise ValueError(f"count is {count} and uses is {uses}; both must be at least 1")
         self.seed, self.kinds, self.size, self.count, self.uses = seed, kinds, size, count, uses

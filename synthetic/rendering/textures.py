@@ -7,8 +7,10 @@ edges of natural images; what fills a leaf varies, because the diversity of the 
 from __future__ import annotations
 
 import cmath
+import os
 import zlib
 from collections.abc import Callable
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -27,6 +29,7 @@ from sigmaslam.synthetic.rendering.fills import (
     strokes,
     vessels,
 )
+from sigmaslam.synthetic.rendering.photographs import cut
 
 _SMALLEST_LEAF = 3.0
 # The patterns of an image: small leaves are cut of small sheets, large leaves of sheets as large as the image.
@@ -39,19 +42,30 @@ def paint(kind: str, size: int, seed: int) -> np.ndarray:
     """A texture, a pure function of its arguments.
 
     Args:
-        kind: one of `KINDS`.
+        kind: one of `KINDS`, or a folder of photographs, a part of one of which is cut out.
         size: side in pixels.
         seed: not negative, below 2^64.
     Returns:
         (size, size) uint8, not writeable.
     """
-    if kind not in KINDS:
-        raise ValueError(f"unknown texture {kind!r}; choose one of {', '.join(KINDS)}")
+    check_kind(kind)
     # The kind's own number keeps equal seeds of two kinds apart, whatever the order of KINDS.
-    rng = np.random.default_rng((zlib.crc32(kind.encode()), seed))
-    image = _PAINTERS[kind]((size, size), rng) if kind in _PAINTERS else _pattern(kind, (size, size), rng)
+    rng = np.random.default_rng((zlib.crc32(Path(kind).name.encode()), seed))
+    if kind in _PAINTERS:
+        image = _PAINTERS[kind]((size, size), rng)
+    else:
+        image = _pattern(kind, (size, size), rng) if kind in KINDS else cut(kind, size, rng)
     image.flags.writeable = False
     return image
+
+
+def check_kind(kind: str) -> None:
+    """Raises ValueError where `paint` knows no such kind; a folder must have a separator in its path."""
+    if kind not in KINDS and not (os.sep in kind and Path(kind).is_dir()):
+        raise ValueError(
+            f"unknown texture {kind!r}; choose one of {', '.join(KINDS)}, or give the whole path of a folder of "
+            "photographs"
+        )
 
 
 def dead_leaves(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:

@@ -81,7 +81,7 @@ def test_a_mix_draws_among_its_kinds(painted):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"kinds": ("leaves", "marble")}, "unknown textures .'marble'"),
+        ({"kinds": ("leaves", "marble")}, "unknown texture 'marble'"),
         ({"kinds": ()}, "give one or more of leaves"),
         ({"count": 0}, "count is 0"),
         ({"uses": 0}, "uses is 0"),

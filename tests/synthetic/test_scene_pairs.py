@@ -99,7 +99,7 @@ def test_eyes_of_a_stereo_pair_see_the_same_on_one_row_the_right_one_further_lef
 
 
 def test_an_unknown_domain_is_refused() -> None:
-    with pytest.raises(ValueError, match="unknown domains"):
+    with pytest.raises(ValueError, match="unknown domain"):
         ScenePairs(0, 96, ("moon",))
 
 

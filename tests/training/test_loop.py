@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 import torch
 from safetensors import safe_open
@@ -95,7 +96,10 @@ def test_run_folder_holds_weights_card_log_curves_and_samples(finished, tiny):
     assert "mma_3_leaves" in card["metrics_on_held_out_renders"]
     assert logged_steps(finished) == [4]
     for step in (0, 4):
-        assert cv2.imread(str(finished / "samples" / f"step_{step:05d}.png")).shape == (192, 384, 3)
+        picture = cv2.imread(str(finished / "samples" / f"step_{step:05d}.png"))
+        # A pair of each source of the validation, one below the other: leaves, patterns and scenes.
+        assert picture.shape == (3 * 192, 384, 3)
+        assert len({row.tobytes() for row in np.split(picture, 3)}) == 3
     events = EventAccumulator(str(finished / "tensorboard")).Reload()
     scalars = set(events.Tags()["scalars"])
     assert scalars >= {f"train/{name}" for name in ("descriptor", "quality", "place", "recall", "learning_rate")}

@@ -113,7 +113,8 @@ def resume_checkpoint(
     """
     snapshot = read_snapshot(path)
     facts = snapshot.facts
-    check_same(path, "", {**asdict(config), "recipe": recipe}, {**facts["config"], "recipe": facts["recipe"]})
+    written = {"shares": {}, **facts["config"], "recipe": facts["recipe"]}  # no shares in those of earlier versions
+    check_same(path, "", {**asdict(config), "recipe": recipe}, written)
     if start is not None:
         check_same(path, "weights with ", _identify(start) or {}, facts["started_from"] or {})
     state = begin(config, recipe, None, place)

@@ -8,6 +8,7 @@ from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from safetensors.torch import save_file
 from torch import nn
@@ -31,7 +32,6 @@ from sigmaslam.training.features.stream import TrainingPair, open_stream, pair_l
 from sigmaslam.training.features.validation import held_out_seed, held_out_sources, matching_accuracy
 from sigmaslam.training.interruption import Interruption
 from sigmaslam.training.journal import Journal
-from sigmaslam.training.mixes import MIXES
 from sigmaslam.training.run_card import CARD_NAME, describe_origin, make_card
 
 WEIGHTS_NAME = "features.safetensors"
@@ -51,7 +51,7 @@ def train(
     """Trains the correspondence network on renders and writes weights and card into `out`.
 
     Under torchrun each process takes its share of every batch. Ctrl-C or SIGTERM: the step under way is finished and
-    saved, then KeyboardInterrupt is raised.
+    saved, then TrainingStopped, a KeyboardInterrupt, is raised.
 
     Args:
         out: run folder; gets checkpoint.safetensors, log.jsonl, tensorboard/, samples/, features.safetensors and
@@ -66,7 +66,7 @@ def train(
         The card: recipe, config, seed, commit, command, duration, metrics on held-out renders.
     Raises:
         InputError: the folder, the configuration, the device or the weights do not go together.
-        KeyboardInterrupt: the run was stopped; it can be resumed.
+        TrainingStopped: the run was stopped; it can be resumed.
     """
     check_config(config)
     check_run_folder(out, resume)
@@ -85,6 +85,19 @@ def train(
         if place.leads:
             _write_result(out, state, card)
     return card
+
+
+class TrainingStopped(KeyboardInterrupt):
+    """A run was stopped.
+
+    Attributes:
+        saved: steps that the checkpoint has; 0: there is none.
+        steps: of the whole run.
+    """
+
+    def __init__(self, saved: int, steps: int) -> None:
+        super().__init__(saved, steps)
+        self.saved, self.steps = saved, steps
 
 
 class _Run:
@@ -107,7 +120,7 @@ class _Run:
         self._progress = open_progress(hidden=not place.leads)
 
     def finish(self, workers: int) -> None:
-        """Trains to the end; stopped, it saves the last whole step and raises KeyboardInterrupt."""
+        """Trains to the end; stopped, it saves the last whole step and raises TrainingStopped."""
         interruption = Interruption(self._place)
         with interruption.listening():
             try:
@@ -116,7 +129,7 @@ class _Run:
             except KeyboardInterrupt:
                 if not interruption.torn and self._state.step > self._saved:
                     self._save()
-                raise
+                raise TrainingStopped(self._saved, self._state.config.steps) from None
 
     def _steps(self, workers: int, interruption: Interruption) -> None:
         state, config = self._state, self._state.config
@@ -140,7 +153,7 @@ class _Run:
     def _loader(self, workers: int) -> DataLoader[TrainingPair]:
         config, place = self._state.config, self._place
         return pair_loader(
-            config.data,
+            config.mix,
             config.seed,
             config.size,
             self._state.step * config.batch_size,
@@ -186,14 +199,14 @@ class _Run:
         due = state.step % config.validate_every == 0 or state.step == config.steps
         if not due or state.validated == state.step:
             return
-        seed, sources = held_out_seed(config.seed), held_out_sources(config.data)
+        seed, sources = held_out_seed(config.seed), held_out_sources(config.mix)
         if state.step:
             state.metrics = matching_accuracy(state.network, seed, sources)
             self._journal.write_metrics(state.step, state.metrics)
             metrics = ", ".join(f"{name} {value:.3f}" for name, value in state.metrics.items())
             self._progress.console.print(f"step {state.step}: {metrics}")
-        pair = open_stream(MIXES[config.data][0], seed, config.size).pair(0)
-        self._journal.write_sample(state.step, draw_sample(state.network, pair))
+        pairs = [open_stream(source, seed, config.size).pair(0) for source in sources]
+        self._journal.write_sample(state.step, np.concatenate([draw_sample(state.network, pair) for pair in pairs]))
         state.validated = state.step
 
     def _save(self) -> None:

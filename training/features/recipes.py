@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from sigmaslam.errors import InputError
 from sigmaslam.inference.onnx_graph import shipped_weights
-from sigmaslam.training.mixes import MIXES
+from sigmaslam.training.sources import Mix, check_sources, turns_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +27,7 @@ class TrainingConfig:
         seed: of the data, the initial weights and the sampling.
         validate_every: in steps, and at the end; 0: never.
         checkpoint_every: in steps.
+        shares: of the pairs by source, see `sources`, in place of `data`; none: as `data` says.
     """
 
     steps: int = 3400
@@ -40,6 +42,12 @@ class TrainingConfig:
     seed: int = 0
     validate_every: int = 1700
     checkpoint_every: int = 250
+    shares: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def mix(self) -> Mix:
+        """What the pairs are made of."""
+        return self.shares or self.data
 
 
 RECIPES = {
@@ -49,26 +57,38 @@ RECIPES = {
     "quick": TrainingConfig(steps=600, data="leaves", validate_every=600),
     # Goes on from trained weights, and keeps seeing leaves so that it forgets nothing.
     "endoscope": TrainingConfig(steps=800, data="endoscope", learning_rate=5e-4, validate_every=400),
+    # The same for a scene of one's own.
+    "fine-tune": TrainingConfig(steps=800, data="mix", learning_rate=5e-4, validate_every=400),
 }
 # These go on from the shipped weights unless others are given.
-_FINE_TUNING = ("endoscope",)
+_FINE_TUNING = ("endoscope", "fine-tune")
 
 
-def choose_config(recipe: str, steps: int | None = None, data: str | None = None, seed: int = 0) -> TrainingConfig:
+def choose_config(
+    recipe: str,
+    steps: int | None = None,
+    data: str | None = None,
+    seed: int = 0,
+    shares: Mapping[str, float] | None = None,
+) -> TrainingConfig:
     """The configuration of a recipe, with what was asked for instead of its own.
 
     Args:
         recipe: a key of `RECIPES`.
         steps, data: instead of the recipe's.
         seed: of everything.
+        shares: of sources, instead of the recipe's data.
     Raises:
-        InputError: the recipe or the data are unknown, or there are no steps.
+        InputError: the recipe, the data or a source are unknown, both are given, or there are no steps.
     """
     if recipe not in RECIPES:
         raise InputError(f"recipe {recipe!r} is unknown; choose one of {', '.join(RECIPES)}")
     config = replace(RECIPES[recipe], seed=seed)
     config = config if steps is None else replace(config, steps=steps)
     config = config if data is None else replace(config, data=data)
+    if shares and data is not None:
+        raise InputError(f"--data {data} and sources of one's own are given: leave one out")
+    config = config if not shares else replace(config, shares=shares)
     check_config(config)
     return config
 
@@ -79,8 +99,7 @@ def check_config(config: TrainingConfig) -> None:
     Raises:
         InputError: names the value and what is possible.
     """
-    if config.data not in MIXES:
-        raise InputError(f"data {config.data!r} is unknown; choose one of {', '.join(MIXES)}")
+    check_sources(turns_of(config.mix))
     for name in ("steps", "batch_size", "points", "checkpoint_every"):
         if getattr(config, name) < 1:
             raise InputError(f"{name} {getattr(config, name)} is too small: give 1 or more")

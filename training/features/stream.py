@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Subset
 
-from sigmaslam.errors import InputError
 from sigmaslam.models.detector import detect, to_cells
 from sigmaslam.synthetic.homography_pairs import HomographyPairs
 from sigmaslam.synthetic.rendering.textures import KINDS
 from sigmaslam.synthetic.scene_pairs import ScenePairs
-from sigmaslam.training.mixes import MIXES
+from sigmaslam.synthetic.worlds.own import SUFFIX
+from sigmaslam.training.sources import WORLDS, Mix, label, turns_of
 
 # image0 (1, H, W), image1 (1, H, W), keypoints0 (N, 2), places1 (N, 2), visible (N,), keypoints1 (2 N, 2)
 TrainingPair = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
@@ -50,15 +50,18 @@ class PairStream(Protocol):
 def open_stream(source: str, seed: int, size: int) -> PairStream:
     """A stream by name.
 
-    'scenes', 'endoscopy' (scenes inside a body), 'patterns' (every texture but leaves), a texture's kind under
-    homographies, or 'turned leaves', which are warped further: by up to 90 degrees and e^1 between the views.
+    'scenes', 'endoscopy' (scenes inside a body), the name of a world or a Python file that makes one, 'patterns' (every
+    texture but leaves), a texture's kind or a folder of photographs under homographies, or 'turned leaves', which are
+    warped further: by up to 90 degrees and e^1 between the views.
     """
     # Derive a seed for each source: sources with the same kind of texture must show different ones.
-    seed = int(np.random.SeedSequence((seed, *source.encode())).generate_state(1)[0])
+    seed = int(np.random.SeedSequence((seed, *label(source).encode())).generate_state(1)[0])
     if source == "scenes":
         return ScenePairs(seed, size)
     if source == "endoscopy":
         return ScenePairs(seed, size, ("colon", "organ"))
+    if source in WORLDS or source.endswith(SUFFIX):
+        return ScenePairs(seed, size, (source,))
     if source == "turned leaves":
         return HomographyPairs(seed, size, ("leaves",), (1.0, 1.25))
     kinds = tuple(kind for kind in KINDS if kind != "leaves") if source == "patterns" else (source,)
@@ -79,17 +82,15 @@ class MixedPairs:
     """Pairs of several sources in turn.
 
     Args:
-        mix: a key of `MIXES`.
+        mix: as `sources.turns_of` takes it.
         seed: of all sources.
         size: side of the square images, pixels.
     Raises:
         InputError: the mix is unknown.
     """
 
-    def __init__(self, mix: str, seed: int, size: int) -> None:
-        if mix not in MIXES:
-            raise InputError(f"data {mix!r} is unknown; choose one of {', '.join(MIXES)}")
-        self._turns = MIXES[mix]
+    def __init__(self, mix: Mix, seed: int, size: int) -> None:
+        self._turns = turns_of(mix)
         self._streams = {source: open_stream(source, seed, size) for source in set(self._turns)}
 
     def pair(self, index: int) -> Pair:
@@ -102,14 +103,14 @@ class PairDataset(Dataset[TrainingPair]):
     """Pairs `first` to `last` of a mix, each with N random keypoints of image 0 and the 2 N strongest of image 1.
 
     Args:
-        mix: a key of `MIXES`.
+        mix: as `sources.turns_of` takes it.
         seed: of the stream.
         size: side of the square images, pixels.
         first, last: range of indices, so that a resumed run goes on where it stopped.
         keypoints: N; random places fill up where an image has fewer, places far outside in image 1.
     """
 
-    def __init__(self, mix: str, seed: int, size: int, first: int, last: int, keypoints: int) -> None:
+    def __init__(self, mix: Mix, seed: int, size: int, first: int, last: int, keypoints: int) -> None:
         self._pairs = MixedPairs(mix, seed, size)
         self._seed, self._size = seed, size
         self._first, self._last = first, last
@@ -147,7 +148,7 @@ class PairDataset(Dataset[TrainingPair]):
 
 
 def pair_loader(
-    mix: str,
+    mix: Mix,
     seed: int,
     size: int,
     first: int,

@@ -12,13 +12,13 @@ from torch import Tensor
 from sigmaslam.models.extractor import FeatureExtractor
 from sigmaslam.models.feature_network import FeatureNetwork
 from sigmaslam.training.features.stream import Pair, open_stream
-from sigmaslam.training.mixes import MIXES
+from sigmaslam.training.sources import Mix, label, turns_of
 
 _PAIRS = 48
 _KEYPOINTS = 256
 _SEED_OFFSET = 1_000_003
 _SOURCES = ("leaves", "patterns", "scenes")
-# Sources that validate only the runs which train on them.
+# Sources that validate only the runs which train on them, as those of one's own do.
 _SPECIAL_SOURCES = ("endoscopy",)
 
 
@@ -52,9 +52,11 @@ def held_out_seed(seed: int) -> int:
     return seed + _SEED_OFFSET
 
 
-def held_out_sources(mix: str) -> tuple[str, ...]:
-    """What a run on that mix is validated on: what every run is, and what is special to it."""
-    return (*_SOURCES, *(source for source in _SPECIAL_SOURCES if source in MIXES[mix]))
+def held_out_sources(mix: Mix) -> tuple[str, ...]:
+    """What a run on that mix is validated on and shown with: what every run is, and what is special to it."""
+    turns = turns_of(mix)
+    special = _SPECIAL_SOURCES if isinstance(mix, str) else dict.fromkeys(turns)
+    return (*_SOURCES, *(source for source in special if source in turns and source not in _SOURCES))
 
 
 @torch.no_grad()
@@ -76,7 +78,7 @@ def matching_accuracy(
     overall = {name: sum(each[name] for each in pair_metrics) / pairs for name in pair_metrics[0]}
     for turn, source in enumerate(sources[:pairs]):
         of_source = pair_metrics[turn :: len(sources)]
-        overall[f"mma_3_{source}"] = sum(each["mma_3"] for each in of_source) / len(of_source)
+        overall[f"mma_3_{label(source)}"] = sum(each["mma_3"] for each in of_source) / len(of_source)
     return overall
 
 

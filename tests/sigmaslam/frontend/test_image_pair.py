@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import onnxruntime
 import pytest
+from scipy.stats import chi2
 
 import sigmaslam
 from sigmaslam import Matches
@@ -405,3 +406,55 @@ def test_the_help_names_files_and_options():
         "keypoints0",
     ):
         assert word in result.stdout
+
+
+# Large images
+
+
+def large_pair(long_side: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Leaves of that long side, the same turned and shifted, and the map (2, 3) between them."""
+    shape = (long_side * 3 // 4, long_side)
+    base = dead_leaves((360, 480), np.random.default_rng(5))
+    image0 = cv2.resize(base, shape[::-1], interpolation=cv2.INTER_CUBIC)
+    H = cv2.getRotationMatrix2D((0.5 * shape[1], 0.5 * shape[0]), 6.0, 1.05)
+    return image0, cv2.warpAffine(image0, H, shape[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT), H
+
+
+def test_matches_of_large_images_are_in_their_own_pixels():
+    image0, image1, H = large_pair(2400)
+    matches = sigmaslam.match_images(image0, image1, max_keypoints=400)
+    offset = matches.keypoints1 - (matches.keypoints0 @ H[:, :2].T + H[:, 2])
+    assert len(offset) > 100
+    assert matches.keypoints0.max() > 1700
+    assert np.median(np.abs(offset)) < 0.5
+    # A shift of half a pixel, of shrinking by corners, would show here.
+    assert np.abs(np.median(offset, axis=0)).max() < 0.2
+    squared = np.einsum("mi,mij,mj->m", offset, np.linalg.inv(matches.covariance), offset)
+    assert np.median(squared) < chi2.ppf(0.5, 2)  # on renders sigma is too large rather than too small
+
+
+def test_a_large_image_is_matched_as_the_same_shrunk():
+    """Against shrinking by hand: what the small pair gives, in larger pixels."""
+    image0, image1, _ = large_pair(3200)
+    small = [cv2.resize(image, (1600, 1200), interpolation=cv2.INTER_AREA) for image in (image0, image1)]
+    expected = sigmaslam.match_images(*small, max_keypoints=300)
+    found = sigmaslam.match_images(image0, image1, max_keypoints=300)
+    np.testing.assert_array_equal(found.probability, expected.probability)
+    np.testing.assert_allclose(found.keypoints0, 2.0 * expected.keypoints0 + 0.5, atol=1e-3)
+    np.testing.assert_allclose(found.keypoints1, 2.0 * expected.keypoints1 + 0.5, atol=1e-3)
+    np.testing.assert_allclose(found.covariance, 4.0 * expected.covariance, rtol=1e-6)
+
+
+def test_a_pair_of_two_sizes_shrinks_the_large_one_alone():
+    image0, image1, H = large_pair(2400)
+    small1 = cv2.resize(image1, (960, 720), interpolation=cv2.INTER_AREA)
+    matches = sigmaslam.match_images(image0, small1, max_keypoints=400)
+    places = (matches.keypoints0 @ H[:, :2].T + H[:, 2] + 0.5) * 0.4 - 0.5
+    assert len(places) > 100
+    assert (np.linalg.norm(matches.keypoints1 - places, axis=1) < 1.0).mean() > 0.9
+
+
+def test_a_strip_keeps_enough_pixels_to_be_matched():
+    strip = cv2.resize(dead_leaves((100, 500), np.random.default_rng(1)), (2500, 100))
+    matches = sigmaslam.match_images(strip, strip, max_keypoints=100)
+    np.testing.assert_allclose(matches.keypoints1, matches.keypoints0, atol=0.5)

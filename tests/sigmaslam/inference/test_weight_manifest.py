@@ -50,7 +50,7 @@ def test_another_graph_under_the_name_is_refused(folder: Path):
 
 def test_a_changed_shipped_graph_stops_the_front_end(folder: Path, monkeypatch: pytest.MonkeyPatch):
     shutil.copy(shipped_weights("verifier.onnx"), folder / "features.onnx")
-    monkeypatch.setattr("sigmaslam.frontend.learned.shipped_weights", lambda name: folder / name)
+    monkeypatch.setattr("sigmaslam.inference.networks.shipped_weights", lambda name: folder / name)
     with pytest.raises(InputError, match=r"features\.onnx: is not the file"):
         LearnedDetector(100)
 
