@@ -97,10 +97,10 @@ def _run_on_ray(
         local: dict[str, Any] = {"num_cpus": workers, "include_dashboard": False} if address == "local" else {}
         try:
             ray.init(address, log_to_driver=False, **local)
-        except (ConnectionError, ValueError) as error:
+        except Exception as error:  # Ray's own are bare ones, too
             raise InputError(
-                f"no Ray cluster at {address!r} ({error}): start one with 'ray start --head' and give its HOST:PORT, "
-                "or give 'local', which starts one here"
+                f"Ray at {address!r} cannot be used ({error}): give HOST:PORT of a cluster that 'ray start --head' has "
+                "started, or 'local', which starts one here"
             ) from error
     try:
         task = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=RETRIES)(_do)

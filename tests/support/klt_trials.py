@@ -17,7 +17,7 @@ METHODS = {"KLT + PnP": TrackerConfig()}
 
 @dataclass(frozen=True, slots=True)
 class ErrorFigures:
-    """Errors of a trial, metres and radians."""
+    """Errors of a trial, metres and degrees."""
 
     ate: float
     translations: list[float]
@@ -32,7 +32,7 @@ def judge_klt(source: Path, recipe: Recipe, method: str) -> ErrorFigures:
         open_rendered(source), rendered_truth(source), lambda sequence, out: track_with_pnp(sequence, out, "klt")
     )
     evaluation = trial.run().evaluation
-    return ErrorFigures(evaluation.ate.rmse, evaluation.rpe.translations.tolist(), evaluation.rpe.rotations.tolist())
+    return ErrorFigures(evaluation.ate.rmse, evaluation.rpe.translations.tolist(), evaluation.rpe.rotations_deg.tolist())
 
 
 def hash_nothing() -> str:
