@@ -32,7 +32,8 @@ def judge_klt(source: Path, recipe: Recipe, method: str) -> ErrorFigures:
         open_rendered(source), rendered_truth(source), lambda sequence, out: track_with_pnp(sequence, out, "klt")
     )
     evaluation = trial.run().evaluation
-    return ErrorFigures(evaluation.ate.rmse, evaluation.rpe.translations.tolist(), evaluation.rpe.rotations_deg.tolist())
+    steps = evaluation.rpe
+    return ErrorFigures(evaluation.ate.rmse, steps.translations.tolist(), steps.rotations_deg.tolist())
 
 
 def hash_nothing() -> str:
