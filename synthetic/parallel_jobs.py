@@ -103,11 +103,12 @@ def _run_on_ray(
                 "started, or 'local', which starts one here"
             ) from error
     try:
-        task = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=RETRIES)(_do)
+        get: Callable[[Any], Result] = ray.get
+        task: Any = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=RETRIES)(_do)
         pending = {task.remote(work, job): job for job in jobs}
         while pending:
             for reference in ray.wait(list(pending))[0]:
-                ended(pending.pop(reference), _outcome(partial(ray.get, reference)))
+                ended(pending.pop(reference), _outcome(partial(get, reference)))
     finally:
         if start:
             ray.shutdown()  # which also ends the tasks that are left
