@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -166,21 +165,14 @@ def read_trial(
 
 
 def render(folder: Path, recipe: Recipe, workers: int, done: Callable[[int], None] = lambda frames: None) -> Path:
-    """Renders a sequence with its landmarks into `<preset><seed>` of a folder, and returns where it is.
+    """Renders a sequence with its landmarks into a folder of its name, and returns where it is.
 
     Frames that are there are kept.
     """
-    from sigmaslam.synthetic.render_sequence import SCENE_NAME, write_sequence
+    from sigmaslam.synthetic.render_sequence import write_sequence
 
-    source = folder / f"{recipe.preset}{recipe.seed}"
-    was_there = source.exists()
-    try:
-        write_sequence(source, recipe, "sparse", workers, done=done)
-    except BaseException:
-        # A folder without the scene cannot be resumed.
-        if not was_there and not (source / SCENE_NAME).is_file():
-            shutil.rmtree(source, ignore_errors=True)
-        raise
+    source = folder / recipe.name
+    write_sequence(source, recipe, "sparse", workers, done=done)
     return source
 
 
@@ -225,7 +217,7 @@ class TrialCache:
 
     def _path(self, recipe: Recipe, method: str) -> Path:
         slug = "".join(letter if letter.isalnum() else "_" for letter in method)
-        return self.folder / f"{recipe.preset}{recipe.seed}-{slug}.json"
+        return self.folder / f"{recipe.name}-{slug}.json"
 
     def _made_from(self, recipe: Recipe, config: TrackerConfig) -> dict[str, Any]:
         return {"recipe": asdict(recipe), "configuration": asdict(config), "code": self.code}

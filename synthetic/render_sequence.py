@@ -9,11 +9,9 @@ from __future__ import annotations
 import json
 import os
 import zipfile
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
-from dataclasses import asdict
-from multiprocessing import get_context
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +19,16 @@ import cv2
 import numpy as np
 import torch
 
-from sigmaslam.errors import InputError
+from sigmaslam.errors import InputError, OutputError
 from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder
 from sigmaslam.synthetic.landmark_tracks import Landmarks, choose_landmarks, observe
 from sigmaslam.synthetic.layouts import image_paths, write_layout
+from sigmaslam.synthetic.parallel_jobs import list_failures, run_jobs
 from sigmaslam.synthetic.render_choices import TRUTHS
 from sigmaslam.synthetic.simulation import Frame, Recipe, Simulation, Studio, simulate
 
 SCENE_NAME, LANDMARKS_NAME = "scene.json", "landmarks.npz"
+_BEGUN_NAME = ".begun.json"
 _CHUNK = 8  # frames handed to a process at a time, at most
 _TRACK_KEYS = ("landmark", "left", "right", "left_visible", "right_visible", "depth")
 
@@ -39,7 +39,7 @@ def write_sequence(
     truth: str = "dense",
     workers: int = 1,
     device: str = "cpu",
-    ray: bool = False,
+    ray: str | None = None,
     done: Callable[[int], None] = lambda frames: None,
 ) -> int:
     """Renders a sequence into a folder; frames that are there already are kept.
@@ -51,7 +51,7 @@ def write_sequence(
             the landmarks alone.
         workers: processes.
         device: where frames are drawn.
-        ray: spread the frames over a Ray cluster instead; `out` must be a folder that all its machines share.
+        ray: address of a Ray cluster that renders instead, as `run_jobs` takes it; all its machines must share `out`.
         done: called with the number of frames that are there.
     Returns:
         How many frames were there before.
@@ -61,24 +61,72 @@ def write_sequence(
     if truth not in TRUTHS:
         raise InputError(f"truth {truth!r} is unknown; choose one of {', '.join(TRUTHS)}")
     recipe.check()
-    description = prepare(out, recipe, truth)
+    prepare(out, recipe, truth)
     missing = missing_frames(out, recipe.frames)
     before = recipe.frames - len(missing)
     done(before)
     size = int(np.clip(len(missing) // (4 * workers), 1, _CHUNK))
-    chunks = [missing[k : k + size] for k in range(0, len(missing), size)]
+    film = _Film(out.resolve(), truth, device)
+    chunks = [_Chunk(film, missing[k : k + size]) for k in range(0, len(missing), size)]
     count = before
-    crew = _ray_crew if ray else _film_crew
-    with crew(out, description, truth, min(workers, len(chunks)), device) as film:
-        for finished in film(chunks):
-            count += finished
-            done(count)
+
+    def ended(_: _Chunk, written: int | Exception) -> None:
+        nonlocal count
+        if isinstance(written, Exception):
+            raise written
+        count += written
+        done(count)
+
+    if ray is None and min(workers, len(chunks)) <= 1:
+        opened = film.open() if missing else None
+        for number in missing:
+            frame = _Chunk(film, [number])
+            ended(frame, _write_chunk(frame, opened))
+    else:
+        run_jobs(_write_chunk, chunks, workers, ended, ray, int(device != "cpu"))
     join_tracks(out, recipe.frames)
     return before
 
 
-def prepare(out: Path, recipe: Recipe, truth: str) -> dict[str, Any]:
-    """Makes the folder with all but its frames, or checks the one that is there; returns the simulation as JSON.
+def write_sequences(
+    out: Path,
+    recipes: Sequence[Recipe],
+    truth: str = "dense",
+    workers: int = 1,
+    device: str = "cpu",
+    ray: str | None = None,
+    done: Callable[[int], None] = lambda sequences: None,
+) -> None:
+    """Renders sequences into folders of their names, each in one worker.
+
+    Args:
+        out: the folder of these folders; arguments are else as of `write_sequence`.
+        recipes: what to render; their names differ.
+        done: called with the number of sequences that have ended.
+    Raises:
+        InputError: a recipe is wrong.
+        OutputError: sequences failed; the others are there.
+    """
+    for recipe in recipes:
+        recipe.check()
+    failed: dict[str, Exception] = {}
+    count = 0
+
+    def ended(job: _Rendering, outcome: int | Exception) -> None:
+        nonlocal count
+        if isinstance(outcome, Exception):
+            failed[job.recipe.name] = outcome
+        count += 1
+        done(count)
+
+    jobs = [_Rendering(out.resolve() / recipe.name, recipe, truth, device) for recipe in recipes]
+    run_jobs(_render, jobs, workers, ended, ray, int(device != "cpu"))
+    if failed:
+        raise OutputError(f"{out} lacks {list_failures(failed)}: the same command tries what is missing again")
+
+
+def prepare(out: Path, recipe: Recipe, truth: str) -> None:
+    """Makes the folder with all but its frames, or checks the one that is there.
 
     Raises:
         InputError: the folder holds something else.
@@ -94,18 +142,23 @@ def prepare(out: Path, recipe: Recipe, truth: str) -> dict[str, Any]:
         there = {"recipe": {"world": None, **content.get("recipe", {})}, "truth": content.get("truth")}
         if there != asked:
             raise InputError(f"{scene} was made with {there}, not {asked}; choose another --out")
-        return dict(content["simulation"])
-    check_new_folder(out)
+        return
+    # Where this process is killed before the scene is written, the same recipe may begin again.
+    begun, text = out / _BEGUN_NAME, json.dumps(asked)
+    again = begun.is_file() and begun.read_text(encoding="utf-8") == text
+    if not again:
+        check_new_folder(out)
     simulation = simulate(recipe)
-    description = simulation.to_json()
-    (out / "truth").mkdir(parents=True)
+    if not again:
+        out.mkdir(parents=True, exist_ok=True)
+        atomic_write_text(begun, text)
+    (out / "truth").mkdir(exist_ok=True)
     write_layout(out, simulation)
-    studio = Studio(simulation)
-    landmarks = choose_landmarks(studio)
-    _save(out / LANDMARKS_NAME, asdict(landmarks))
+    _save(out / LANDMARKS_NAME, asdict(choose_landmarks(Studio(simulation))))
     # The last to be written: a folder with scene.json is complete but for its frames.
-    atomic_write_text(scene, json.dumps({**asked, "command": command(recipe, truth), "simulation": description}) + "\n")
-    return description
+    content = {**asked, "command": command(recipe, truth), "simulation": simulation.to_json()}
+    atomic_write_text(scene, json.dumps(content) + "\n")
+    begun.unlink()
 
 
 def missing_frames(out: Path, frames: int) -> list[int]:
@@ -151,75 +204,55 @@ def command(recipe: Recipe, truth: str) -> str:
     return " ".join(words if truth == "dense" else [*words, "--truth", truth])
 
 
-@contextmanager
-def _film_crew(
-    out: Path, description: dict[str, Any], truth: str, workers: int, device: str
-) -> Iterator[Callable[[list[list[int]]], Iterable[int]]]:
-    """Something that films chunks of frames, here or in processes, and yields how many are done."""
-    if workers <= 1:
-        crew = _Crew(out, description, truth, device)
-        yield lambda chunks: (crew.film([number]) for chunk in chunks for number in chunk)
-        return
-    context = get_context("spawn")
-    with ProcessPoolExecutor(workers, context, _start_worker, (out, description, truth, device)) as pool:
-        try:
-            yield lambda chunks: pool.map(_work, chunks)
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+@dataclass(frozen=True, slots=True)
+class _Rendering:
+    """A sequence that one process writes."""
+
+    out: Path
+    recipe: Recipe
+    truth: str
+    device: str
 
 
-@contextmanager
-def _ray_crew(
-    out: Path, description: dict[str, Any], truth: str, workers: int, device: str
-) -> Iterator[Callable[[list[list[int]]], Iterable[int]]]:
-    """The same on a Ray cluster: the one that RAY_ADDRESS names, or this machine."""
-    try:
-        import ray
-        from ray.util import ActorPool
-    except ImportError as error:
-        raise InputError(f"{error.name} is not installed: pip install 'sigmaslam[scale]'") from error
-    if not ray.is_initialized():
-        ray.init(log_to_driver=False)
-    # Ray itself sees to it that an actor of one processor keeps to one thread.
-    actor = ray.remote(num_cpus=1, num_gpus=0 if device == "cpu" else 1)(_Crew)
-    resources: dict[str, float] = ray.cluster_resources()  # type: ignore[no-untyped-call, unused-ignore]
-    size = max(1, int(resources.get("CPU" if device == "cpu" else "GPU", 1)))
-    pool = ActorPool([actor.remote(out.resolve(), description, truth, device) for _ in range(size)])
-    try:
-        yield lambda chunks: pool.map(lambda crew, chunk: crew.film.remote(chunk), chunks)
-    finally:
-        ray.shutdown()
+def _render(job: _Rendering) -> int:
+    return write_sequence(job.out, job.recipe, job.truth, device=job.device)
 
 
-class _Crew:
-    """A studio with its landmarks, made once for many frames."""
+@dataclass(frozen=True, slots=True)
+class _Film:
+    """A sequence whose frames are to be written."""
 
-    def __init__(self, out: Path, description: dict[str, Any], truth: str, device: str) -> None:
-        self._out, self._truth = out, truth
-        self._studio = Studio(Simulation.from_json(description), device)
-        with np.load(out / LANDMARKS_NAME) as content:
-            self._landmarks = Landmarks(content["points"], content["facet"], content["body"])
+    out: Path
+    truth: str
+    device: str
 
-    def film(self, numbers: list[int]) -> int:
-        """Renders and writes these frames; returns how many."""
-        with torch.inference_mode():
-            return write_frames(self._out, self._studio, self._landmarks, self._truth, numbers)
-
-
-_crew: _Crew | None = None
+    def open(self) -> tuple[Studio, Landmarks]:
+        """What all frames are made with."""
+        content = json.loads((self.out / SCENE_NAME).read_text(encoding="utf-8"))
+        with np.load(self.out / LANDMARKS_NAME) as arrays:
+            landmarks = Landmarks(arrays["points"], arrays["facet"], arrays["body"])
+        return Studio(Simulation.from_json(content["simulation"]), self.device), landmarks
 
 
-def _start_worker(out: Path, description: dict[str, Any], truth: str, device: str) -> None:
-    global _crew
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
-    _crew = _Crew(out, description, truth, device)
+@dataclass(frozen=True, slots=True)
+class _Chunk:
+    """Frames that one process writes at a time."""
+
+    film: _Film
+    numbers: list[int]
 
 
-def _work(numbers: list[int]) -> int:
-    assert _crew is not None
-    return _crew.film(numbers)
+def _write_chunk(chunk: _Chunk, opened: tuple[Studio, Landmarks] | None = None) -> int:
+    film = chunk.film
+    with torch.inference_mode():
+        studio, landmarks = opened or _open_once(film)
+        return write_frames(film.out, studio, landmarks, film.truth, chunk.numbers)
+
+
+@lru_cache(maxsize=1)
+def _open_once(film: _Film) -> tuple[Studio, Landmarks]:
+    """Of a worker, which has many chunks of one sequence."""
+    return film.open()
 
 
 def _truth_of(observed: dict[str, np.ndarray], frame: Frame, truth: str) -> dict[str, np.ndarray]:

@@ -59,6 +59,11 @@ class Recipe:
     profile: str | None = None
     world: str | None = None
 
+    @property
+    def name(self) -> str:
+        """Of the sequence among others that differ in world and seed."""
+        return f"{self.preset}{self.seed}"
+
     def check(self) -> None:
         """Raises InputError where a value is out of range."""
         for name, value, choices in (

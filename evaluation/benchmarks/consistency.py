@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import json
 import os
-import time
 from collections.abc import Callable
 from contextlib import redirect_stderr
-from dataclasses import asdict, dataclass, replace
-from functools import partial
+from dataclasses import replace
+from functools import cache, lru_cache, partial
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from sigmaslam.evaluation.benchmarks.consistency_page import ConsistencyResult, Results, Scale, format_page
-from sigmaslam.evaluation.benchmarks.page import write_page
-from sigmaslam.evaluation.benchmarks.trial_pool import run_trials
+from sigmaslam.evaluation.benchmarks.consistency_page import ConsistencyResult, Scale, format_page
+from sigmaslam.evaluation.benchmarks.trial_pool import SequenceTrials, TrialKind, write_trials
 from sigmaslam.evaluation.metrics import map_consistency as consistency
 from sigmaslam.evaluation.rendered_camera import draw_calibration, open_rendered
-from sigmaslam.evaluation.trial import Trial, TrialCache, hash_code, render, rendered_truth
-from sigmaslam.files import make_folder
+from sigmaslam.evaluation.trial import Trial, hash_code, rendered_truth
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.readers.trajectory_files import read_trajectory
@@ -53,27 +50,14 @@ _FIRST_SEED = 1000  # seeds below were looked at while the tracker was made
 _GROSS = 5.0  # sigmas
 
 
-@dataclass(frozen=True, slots=True)
-class _ConsistencyTrials:
-    """One sequence, with all methods."""
-
-    cache: TrialCache
-    scale: Scale
-    seed: int
-
-    @property
-    def recipe(self) -> Recipe:
-        scale = self.scale
-        return Recipe(scale.preset, FRAMES, self.seed, disparity_offset=OFFSET, width=scale.width, height=scale.height)
-
-    def read(self, method: str) -> ConsistencyResult | None:
-        """The result that is kept, unless it is of something else."""
-        figures = self.cache.read(self.recipe, method, METHODS[method])
-        return None if figures is None else ConsistencyResult(**figures)
-
-
 def write_consistency(
-    path: Path, runs: Path, seeds: int, workers: int, command: str, note: Callable[[str], None] = lambda text: None
+    path: Path,
+    runs: Path,
+    seeds: int,
+    workers: int,
+    command: str,
+    ray: str | None = None,
+    note: Callable[[str], None] = lambda text: None,
 ) -> str:
     """Renders and tracks what is missing, writes the page and returns it; notes in it are kept.
 
@@ -85,38 +69,40 @@ def write_consistency(
         seeds: sequences of each scale.
         workers: processes; each takes a sequence at a time.
         command: what the page says it was made by.
+        ray: address of a Ray cluster, as `run_jobs` takes it.
         note: is told of progress.
+    Raises:
+        OutputError: as of `write_trials`.
     """
-    make_folder(runs)
-    cache = TrialCache(runs, hash_code(Path(__file__)))
+
+    def form(done: list[SequenceTrials], missing: list[str]) -> str:
+        results: dict[Scale, dict[str, list[ConsistencyResult]]] = {}
+        for scale in SCALES:
+            of_scale = [trials for trials in done if trials.recipe.preset == scale.preset]
+            if of_scale:
+                results[scale] = {
+                    method: [ConsistencyResult(**trials.read(method) or {}) for trials in of_scale]
+                    for method in METHODS
+                }
+        return format_page(results, OFFSET, FRAMES, (_FIRST_SEED, seeds), command, missing)
+
     # Run all scales of a seed before the next seed: an interrupted benchmark is balanced.
-    jobs = [_ConsistencyTrials(cache, scale, _FIRST_SEED + k) for k in range(seeds) for scale in SCALES]
-    missing = [job for job in jobs if any(job.read(method) is None for method in METHODS)]
-    run_trials(_make, missing, len(jobs), workers, note)
-    results: Results = {
-        scale: {
-            method: [result for job in jobs if job.scale == scale and (result := job.read(method))]
-            for method in METHODS
-        }
+    recipes = [
+        Recipe(scale.preset, FRAMES, seed, disparity_offset=OFFSET, width=scale.width, height=scale.height)
+        for seed in range(_FIRST_SEED, _FIRST_SEED + seeds)
         for scale in SCALES
-    }
-    return write_page(path, format_page(results, OFFSET, FRAMES, _FIRST_SEED, command))
+    ]
+    return write_trials(path, runs, TrialKind(METHODS, _track, _hash_code), recipes, form, workers, ray, note)
 
 
-def _make(job: _ConsistencyTrials) -> str:
-    """Renders and tracks what is missing of one sequence; says how long both took."""
-    began = time.perf_counter()
-    source = render(job.cache.folder, job.recipe, 1)
-    rendered = time.perf_counter()
-    scene = _open_scene(source)
-    missing = [method for method in METHODS if job.read(method) is None]
-    for method in missing:
-        job.cache.write(job.recipe, method, METHODS[method], asdict(_track(source, method, job.seed, scene)))
-    tracked = time.perf_counter()
-    return f"{source.name}, rendered in {rendered - began:.0f} s, {len(missing)} methods in {tracked - rendered:.0f} s"
+@cache
+def _hash_code() -> str:
+    return hash_code(Path(__file__))
 
 
+@lru_cache(maxsize=1)
 def _open_scene(source: Path) -> Studio:
+    """Of a sequence, whose methods are judged one after another."""
     content = json.loads((source / SCENE_NAME).read_text(encoding="utf-8"))
     return Studio(Simulation.from_json(content["simulation"]))
 
@@ -137,13 +123,13 @@ def depths_around(studio: Studio, frame: int, pixels: np.ndarray) -> np.ndarray:
         return np.asarray((1.0 / inverse).numpy().reshape(-1, 3, 3))
 
 
-def _track(source: Path, method: str, seed: int, scene: Studio) -> ConsistencyResult:
+def _track(source: Path, recipe: Recipe, method: str) -> ConsistencyResult:
     truth = rendered_truth(source)
     # The others are given what is right but for the offset, which is estimated.
     sequence, config = open_rendered(source), METHODS[method]
     if method == _DRAWN:
         uncertain = replace(sequence.camera, sigmas=CalibrationSigmas())
-        sequence.camera = draw_calibration(uncertain, np.random.default_rng(seed))
+        sequence.camera = draw_calibration(uncertain, np.random.default_rng(recipe.seed))
     with Path(os.devnull).open("w") as nowhere, redirect_stderr(nowhere):
         trial = Trial(sequence, truth, partial(track_sequence, config=config)).run()
     evaluation, tracked, point_map = trial.evaluation, trial.tracked, trial.point_map
@@ -157,7 +143,7 @@ def _track(source: Path, method: str, seed: int, scene: Studio) -> ConsistencyRe
     true = read_trajectory(truth)
     hosts = np.abs(point_map["timestamps"][:, None] - true.timestamps).argmin(axis=1)
     pixels = point_map["pixels"]
-    depths = np.zeros((len(pixels), 3, 3))
+    depths, scene = np.zeros((len(pixels), 3, 3)), _open_scene(source)
     for host in np.unique(hosts):
         depths[hosts == host] = depths_around(scene, int(host), pixels[hosts == host])
     clear = ~consistency.depth_edges(depths)

@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from sigmaslam.evaluation.benchmarks.page import header, opening, row
+from sigmaslam.evaluation.benchmarks.page import header, missing_sequences, opening, row
 from sigmaslam.evaluation.metrics.map_consistency import mean_with_error, ratio_with_error, root_mean_square_with_error
 from sigmaslam.slam.relative_poses import SPANS
 
@@ -120,12 +120,23 @@ _POSE_HEADER = (
 _MAP_HEADER = ("method", "points", "at edges", "NEES", "median", "inside 95 %", "beyond 5 sigma")
 
 
-def format_page(results: Results, offset: float, frames: int, first_seed: int, command: str) -> str:
-    """The page; the first method of each scale is the one that goals are for."""
-    seeds = max(len(of_method) for of_scale in results.values() for of_method in of_scale.values())
+def format_page(
+    results: Results, offset: float, frames: int, seeds: tuple[int, int], command: str, missing: Sequence[str] = ()
+) -> str:
+    """The page; the first method of each scale is the one that goals are for.
+
+    Args:
+        results: of the sequences that there are.
+        offset: of all disparities, pixels.
+        frames: of a sequence.
+        seeds: the first one, and how many of a scale were asked for.
+        command: that makes the page.
+        missing: names of sequences that failed.
+    """
+    first, count = seeds
     lines = [
-        *opening("Is it as sure as it says?", command, f". {seeds} rendered sequences a scale"),
-        f"(seeds {first_seed} to {first_seed + seeds - 1}, used for nothing else), {frames} frames each, exact truth.",
+        *opening("Is it as sure as it says?", command, f". {count} rendered sequences a scale"),
+        f"(seeds {first} to {first + count - 1}, used for nothing else), {frames} frames each, exact truth.",
         f"All disparities are {offset} px larger than the calibration says, and nobody tells the tracker. Images are",
         "reduced so that this can be afforded: "
         + ", ".join(f"{scale.name} ({scale.preset}) {scale.width}x{scale.height}" for scale in results)
@@ -134,6 +145,7 @@ def format_page(results: Results, offset: float, frames: int, first_seed: int, c
         "there the offset is the same in the whole image.",
         "The calibration is right but for that, and the tracker is told so (`sigmas: 0`). *Calibration drawn*: every",
         "number of it is off as the default sigmas say, anew for each sequence, and the tracker knows these sigmas.",
+        *missing_sequences(missing),
         "",
         "Mean ± standard error over sequences. NEES and NIS per degree of freedom: 1 is right, more is overconfident.",
         "",

@@ -57,8 +57,8 @@ def write_denoising(
     make_folder(runs)
     sources = {}
     for recipe in RECIPES:
-        sources[f"{recipe.preset}{recipe.seed}"] = render(runs, recipe, 1)
-        note(f"{recipe.preset}{recipe.seed} is there")
+        sources[recipe.name] = render(runs, recipe, 1)
+        note(f"{recipe.name} is there")
     lines = opening("Image filtering", command, ", one thread. PSNR in dB of the whole image, peak 255;")
     lines += ["seconds are of CPU time.", ""]
     page = ""

@@ -38,6 +38,11 @@ def opening(title: str, command: str, text: str, place: str = "") -> list[str]:
     return [f"# {title}", "", f"Made by `{command}` {describe_source()} on {place or machine()}{text}"]
 
 
+def missing_sequences(names: Sequence[str]) -> list[str]:
+    """What a page says of sequences that failed, as a paragraph after others."""
+    return ["", f"**Missing, because they failed: {', '.join(names)}.**"] if names else []
+
+
 def machine() -> str:
     """Kind of processor, and its cores."""
     return f"{platform.machine()}, {os.cpu_count()} cores"

@@ -5,22 +5,19 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-import time
 from collections.abc import Callable
 from contextlib import redirect_stderr
-from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.benchmarks.page import write_page
 from sigmaslam.evaluation.benchmarks.reconstruction_page import ReconstructedSequence, format_page
-from sigmaslam.evaluation.benchmarks.trial_pool import run_trials
+from sigmaslam.evaluation.benchmarks.trial_pool import SequenceTrials, TrialKind, write_trials
 from sigmaslam.evaluation.metrics.depth_accuracy import DepthFigures, JudgedPixels, judge_pixels, summarise
 from sigmaslam.evaluation.rendered_camera import open_rendered
-from sigmaslam.evaluation.trial import TrialCache, hash_code, render
-from sigmaslam.files import make_folder
+from sigmaslam.evaluation.trial import hash_code
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.reconstruction import reconstruct
 from sigmaslam.reconstruction.disparity import semi_global_disparity
@@ -41,21 +38,14 @@ MAX_KEYFRAMES = 6
 _METHOD = "reconstruction"
 
 
-@dataclass(frozen=True, slots=True)
-class _Reconstruction:
-    """One sequence."""
-
-    cache: TrialCache
-    recipe: Recipe
-
-    def read(self) -> DepthFigures | None:
-        """The figures that are kept, unless they are of something else."""
-        figures = self.cache.read(self.recipe, _METHOD, TrackerConfig())
-        return None if figures is None else DepthFigures(**figures)
-
-
 def write_reconstruction(
-    path: Path, runs: Path, seeds: int, workers: int, command: str, note: Callable[[str], None] = lambda text: None
+    path: Path,
+    runs: Path,
+    seeds: int,
+    workers: int,
+    command: str,
+    ray: str | None = None,
+    note: Callable[[str], None] = lambda text: None,
 ) -> str:
     """Renders, tracks and reconstructs what is missing, writes the page and returns it; notes in it are kept.
 
@@ -65,19 +55,32 @@ def write_reconstruction(
         seeds: sequences a world.
         workers: processes; each takes a sequence at a time.
         command: what the page says it was made by.
+        ray: address of a Ray cluster, as `run_jobs` takes it.
         note: is told of progress.
+    Raises:
+        OutputError: as of `write_trials`.
     """
-    make_folder(runs)
-    code = sorted(Path(reconstruct.__file__).parent.glob("*.py"))
-    cache = TrialCache(runs, hash_code(Path(__file__), *code))
-    jobs = [_Reconstruction(cache, recipe(world, FIRST_SEED + k)) for k in range(seeds) for world in SIZES]
-    run_trials(_make, [job for job in jobs if job.read() is None], len(jobs), workers, note)
-    found = [
-        ReconstructedSequence(job.recipe.preset, job.recipe.seed, job.recipe.movers, figures)
-        for job in jobs
-        if (figures := job.read()) is not None
-    ]
-    return write_page(path, format_page(found, seeds, command))
+
+    def form(done: list[SequenceTrials], missing: list[str]) -> str:
+        found = [
+            ReconstructedSequence(
+                trials.recipe.preset,
+                trials.recipe.seed,
+                trials.recipe.movers,
+                DepthFigures(**trials.read(_METHOD) or {}),
+            )
+            for trials in done
+        ]
+        return format_page(found, seeds, command, missing)
+
+    kind = TrialKind({_METHOD: TrackerConfig()}, _judge, _hash_code)
+    recipes = [recipe(world, FIRST_SEED + k) for k in range(seeds) for world in SIZES]
+    return write_trials(path, runs, kind, recipes, form, workers, ray, note)
+
+
+@cache
+def _hash_code() -> str:
+    return hash_code(Path(__file__), *sorted(Path(reconstruct.__file__).parent.glob("*.py")))
 
 
 def recipe(world: str, seed: int) -> Recipe:
@@ -125,10 +128,5 @@ def judge_reconstruction(source: Path) -> DepthFigures:
     return summarise(JudgedPixels.concatenate(judged), len(judged))
 
 
-def _make(job: _Reconstruction) -> str:
-    """Does one sequence; says how long it took."""
-    began = time.perf_counter()
-    source = render(job.cache.folder, job.recipe, 1)
-    rendered = time.perf_counter()
-    job.cache.write(job.recipe, _METHOD, TrackerConfig(), asdict(judge_reconstruction(source)))
-    return f"{source.name}, rendered in {rendered - began:.0f} s, judged in {time.perf_counter() - rendered:.0f} s"
+def _judge(source: Path, _: Recipe, __: str) -> DepthFigures:
+    return judge_reconstruction(source)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sigmaslam.evaluation.benchmarks.page import header, opening, row
+from sigmaslam.evaluation.benchmarks.page import header, missing_sequences, opening, row
 from sigmaslam.evaluation.metrics.depth_accuracy import DepthFigures
 
 MOST_RATIO, LEAST_COMPLETENESS, INSIDE = 0.6, 0.6, (0.90, 0.98)
@@ -32,8 +32,10 @@ class ReconstructedSequence:
     figures: DepthFigures
 
 
-def format_page(sequences: Sequence[ReconstructedSequence], seeds: int, command: str) -> str:
-    """The page."""
+def format_page(
+    sequences: Sequence[ReconstructedSequence], seeds: int, command: str, missing: Sequence[str] = ()
+) -> str:
+    """The page; `missing` are the names of sequences that failed."""
     lines = [
         *opening("Dense reconstruction", command, f". {len(sequences)} rendered sequences"),
         f"with exact depth, {seeds} of each world, seeds from 1002 on (those below were looked at while it was made);",
@@ -44,6 +46,7 @@ def format_page(sequences: Sequence[ReconstructedSequence], seeds: int, command:
         "the share of the points inside the 95 % interval of their inverse depth; complete the share of the pixels at",
         "rest, seen by both eyes, that became points; gross the share of points off by more than a tenth of the depth;",
         "ghosts the share of the pixels on moving bodies that became points. Rows of worlds are medians of sequences.",
+        *missing_sequences(missing),
         "",
         "## Goals",
         "",

@@ -4,26 +4,22 @@ from __future__ import annotations
 
 import os
 import tempfile
-import time
 from collections.abc import Callable
 from contextlib import redirect_stderr
-from dataclasses import asdict, dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
 
 from sigmaslam.evaluation.benchmarks import pnp_baselines
-from sigmaslam.evaluation.benchmarks.page import write_page
 from sigmaslam.evaluation.benchmarks.pnp_baselines import track_with_pnp
 from sigmaslam.evaluation.benchmarks.shake_page import GROSS, ShakenSequence, ShakeResult, format_page
-from sigmaslam.evaluation.benchmarks.trial_pool import run_trials
+from sigmaslam.evaluation.benchmarks.trial_pool import SequenceTrials, TrialKind, write_trials
 from sigmaslam.evaluation.metrics.claimed_errors import MotionErrors, motion_errors
 from sigmaslam.evaluation.metrics.image_motion import ImageMotion, read_image_motion
 from sigmaslam.evaluation.metrics.map_consistency import coverage
 from sigmaslam.evaluation.rendered_camera import open_rendered
-from sigmaslam.evaluation.trial import Method, Trial, TrialCache, hash_code, render, rendered_truth
-from sigmaslam.files import make_folder
+from sigmaslam.evaluation.trial import Method, Trial, hash_code, rendered_truth
 from sigmaslam.readers.trajectory_files import read_trajectory
 from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.tracker import TrackerConfig
@@ -43,36 +39,14 @@ _FIRST_SEED = 1000  # seeds below were looked at while the tracker was made
 _MOTION = "image motion"  # kept beside the methods' results
 
 
-@dataclass(frozen=True, slots=True)
-class _ShakeTrials:
-    """One sequence, with all methods."""
-
-    cache: TrialCache
-    recipe: Recipe
-
-    def read(self, method: str) -> ShakeResult | None:
-        """The result that is kept, unless it is of something else."""
-        figures = self.cache.read(self.recipe, method, TrackerConfig())
-        return None if figures is None else ShakeResult(**figures)
-
-    def sequence(self) -> ShakenSequence | None:
-        """What the page says of the sequence itself, if that is kept."""
-        figures = self.cache.read(self.recipe, _MOTION, TrackerConfig())
-        if figures is None:
-            return None
-        preset = PRESETS[self.recipe.preset]
-        size = (self.recipe.width or preset.width, self.recipe.height or preset.height)
-        name = f"{self.recipe.preset}{self.recipe.seed}"
-        return ShakenSequence(name, size, self.recipe.movers, ImageMotion(**figures))
-
-    @property
-    def complete(self) -> bool:
-        """Nothing is missing."""
-        return self.sequence() is not None and all(self.read(method) is not None for method in METHODS)
-
-
 def write_shake(
-    path: Path, runs: Path, seeds: int, workers: int, command: str, note: Callable[[str], None] = lambda text: None
+    path: Path,
+    runs: Path,
+    seeds: int,
+    workers: int,
+    command: str,
+    ray: str | None = None,
+    note: Callable[[str], None] = lambda text: None,
 ) -> str:
     """Renders and tracks what is missing, writes the page and returns it; notes in it are kept.
 
@@ -84,17 +58,35 @@ def write_shake(
         seeds: sequences, of the worlds in turn; every second one has movers.
         workers: processes; each takes a sequence at a time.
         command: what the page says it was made by.
+        ray: address of a Ray cluster, as `run_jobs` takes it.
         note: is told of progress.
+    Raises:
+        OutputError: as of `write_trials`.
     """
-    make_folder(runs)
-    cache = TrialCache(runs, hash_code(Path(__file__), Path(pnp_baselines.__file__)))
-    jobs = [_ShakeTrials(cache, recipe(k, _FIRST_SEED)) for k in range(seeds)]
-    run_trials(_make, [job for job in jobs if not job.complete], len(jobs), workers, note)
-    found = [(sequence, job) for job in jobs if (sequence := job.sequence())]
-    results = {
-        method: {sequence: result for sequence, job in found if (result := job.read(method))} for method in METHODS
-    }
-    return write_page(path, format_page(results, FRAMES, _FIRST_SEED, command))
+
+    def form(done: list[SequenceTrials], missing: list[str]) -> str:
+        sequences = {_describe(trials): trials for trials in done}
+        results = {
+            method: {sequence: ShakeResult(**trials.read(method) or {}) for sequence, trials in sequences.items()}
+            for method in METHODS
+        }
+        return format_page(results, FRAMES, (_FIRST_SEED, seeds), command, missing)
+
+    kind = TrialKind(dict.fromkeys([_MOTION, *METHODS], TrackerConfig()), _judge, _hash_code)
+    recipes = [recipe(k, _FIRST_SEED) for k in range(seeds)]
+    return write_trials(path, runs, kind, recipes, form, workers, ray, note)
+
+
+def _describe(trials: SequenceTrials) -> ShakenSequence:
+    """What the page says of a sequence itself."""
+    recipe, preset = trials.recipe, PRESETS[trials.recipe.preset]
+    size = (recipe.width or preset.width, recipe.height or preset.height)
+    return ShakenSequence(recipe.name, size, recipe.movers, ImageMotion(**trials.read(_MOTION) or {}))
+
+
+@cache
+def _hash_code() -> str:
+    return hash_code(Path(__file__), Path(pnp_baselines.__file__))
 
 
 def recipe(number: int, first_seed: int) -> Recipe:
@@ -135,17 +127,8 @@ def judge(source: Path, method: Method) -> ShakeResult:
     )
 
 
-def _make(job: _ShakeTrials) -> str:
-    """Renders and tracks what is missing of one sequence; says how long both took."""
-    began = time.perf_counter()
-    source = render(job.cache.folder, job.recipe, 1)
-    rendered = time.perf_counter()
-    job.cache.write(job.recipe, _MOTION, TrackerConfig(), asdict(read_image_motion(source)))
-    missing = [method for method in METHODS if job.read(method) is None]
-    for method in missing:
-        job.cache.write(job.recipe, method, TrackerConfig(), asdict(judge(source, METHODS[method])))
-    tracked = time.perf_counter()
-    return f"{source.name}, rendered in {rendered - began:.0f} s, {len(missing)} methods in {tracked - rendered:.0f} s"
+def _judge(source: Path, recipe: Recipe, method: str) -> ImageMotion | ShakeResult:
+    return read_image_motion(source) if method == _MOTION else judge(source, METHODS[method])
 
 
 def _wrong(errors: MotionErrors, tracked: np.ndarray) -> list[int]:

@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from sigmaslam.evaluation.benchmarks.page import header, opening, row
+from sigmaslam.evaluation.benchmarks.page import header, missing_sequences, opening, row
 from sigmaslam.evaluation.metrics.image_motion import ImageMotion
 from sigmaslam.evaluation.metrics.map_consistency import mean_with_error
 
@@ -87,17 +87,29 @@ _SEQUENCE = ("sequence", "movers", "method", "tracking", "lost", "ATE mm", "% of
              "worst, sigmas", "largest step error", "NEES", "inside 95 %")  # fmt: skip
 
 
-def format_page(results: Results, frames: int, first_seed: int, command: str) -> str:
-    """The page; the first method is the one that goals are for."""
+def format_page(
+    results: Results, frames: int, seeds: tuple[int, int], command: str, missing: Sequence[str] = ()
+) -> str:
+    """The page; the first method is the one that goals are for.
+
+    Args:
+        results: of the sequences that there are.
+        frames: of a sequence.
+        seeds: the first one, and how many were asked for.
+        command: that makes the page.
+        missing: names of sequences that failed.
+    """
     ours = next(iter(results.values()))
     sizes = sorted({f"{sequence.size[0]}x{sequence.size[1]}" for sequence in ours})
     moving = sum(sequence.movers > 0 for sequence in ours)
+    first, count = seeds
     lines = [
         *opening("Shaken by hand, blurred by the shutter", command, f". {len(ours)} rendered sequences"),
-        f"(seeds {first_seed} to {first_seed + len(ours) - 1}, used for nothing else), {frames} frames each at 20 Hz,",
+        f"(seeds {first} to {first + count - 1}, used for nothing else), {frames} frames each at 20 Hz,",
         f"{' and '.join(sizes)}, exact truth; {moving} of them with bodies that move on their own. Motion `shaken`,",
         "sensor `slow` ([synthetic.md](../synthetic.md)): the turning reverses within half a second, again and again,",
         "and half of it is blur.",
+        *missing_sequences(missing),
         "",
         "## Goals, for ours",
         "",

@@ -1,50 +1,120 @@
-"""Sequences of a benchmark in processes, one at a time each."""
+"""Rendered sequences of a benchmark, each with all its methods in a worker, and the page of those that are there."""
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from typing import TypeVar
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-import cv2
-import torch
+from sigmaslam.errors import InputError, OutputError
+from sigmaslam.evaluation.benchmarks.page import write_page
+from sigmaslam.evaluation.trial import TrialCache, render
+from sigmaslam.files import make_folder
+from sigmaslam.synthetic.parallel_jobs import list_failures, run_jobs
+from sigmaslam.synthetic.simulation import Recipe
 
-Job = TypeVar("Job")
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+    from sigmaslam.slam.tracker import TrackerConfig
 
 
-def run_trials(
-    make: Callable[[Job], str], missing: Sequence[Job], count: int, workers: int, note: Callable[[str], None]
-) -> None:
-    """Does what is missing, in processes of one thread each.
+@dataclass(frozen=True, slots=True)
+class TrialKind:
+    """What a benchmark does with every sequence. Its functions are functions of a module: workers receive them.
+
+    Attributes:
+        methods: the configuration of each, by which its figures are used again.
+        judge: figures of a method, from the rendered folder and its recipe.
+        hash_code: hash of all code that figures depend on.
+    """
+
+    methods: Mapping[str, TrackerConfig]
+    judge: Callable[[Path, Recipe, str], DataclassInstance]
+    hash_code: Callable[[], str]
+
+
+@dataclass(frozen=True, slots=True)
+class SequenceTrials:
+    """One sequence, with all methods."""
+
+    kind: TrialKind
+    cache: TrialCache
+    recipe: Recipe
+
+    def read(self, method: str) -> dict[str, Any] | None:
+        """The figures that are kept, unless they are of something else."""
+        return self.cache.read(self.recipe, method, self.kind.methods[method])
+
+    @property
+    def missing(self) -> list[str]:
+        """Methods without figures."""
+        return [method for method in self.kind.methods if self.read(method) is None]
+
+    def make(self) -> str:
+        """Renders and judges what is missing; says how long both took.
+
+        Raises:
+            InputError: the code here is not that of the process that reads the cache.
+        """
+        if self.kind.hash_code() != self.cache.code:
+            raise InputError("this worker has another state of SigmaSLAM: install the same commit wherever jobs run")
+        began = time.perf_counter()
+        source = render(self.cache.folder, self.recipe, 1)
+        rendered = time.perf_counter()
+        missing = self.missing
+        for method in missing:
+            figures = asdict(self.kind.judge(source, self.recipe, method))
+            self.cache.write(self.recipe, method, self.kind.methods[method], figures)
+        tracked = time.perf_counter() - rendered
+        return f"{source.name}, rendered in {rendered - began:.0f} s, {len(missing)} methods in {tracked:.0f} s"
+
+
+def write_trials(
+    path: Path,
+    runs: Path,
+    kind: TrialKind,
+    recipes: Sequence[Recipe],
+    form: Callable[[list[SequenceTrials], list[str]], str],
+    workers: int,
+    ray: str | None = None,
+    note: Callable[[str], None] = lambda text: None,
+) -> str:
+    """Does what is missing, writes the page and returns it; notes in it are kept.
 
     Args:
-        make: a function of a module, which does one job and says what it did.
-        missing: jobs to do.
-        count: of all jobs, those that are done included.
-        workers: processes.
+        path: Markdown page.
+        runs: folder for renders and figures; the machines of a Ray cluster must share it.
+        kind: what is done.
+        recipes: of the sequences, in the order in which they are begun.
+        form: the page, of the sequences that are complete and the names of those that failed.
+        workers, ray: as `run_jobs` takes them.
         note: is told of progress.
+    Raises:
+        OutputError: a sequence failed, of which the page says that it is missing; or all did, and there is no page.
     """
-    note(f"{count - len(missing)} of {count} sequences are there")
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, max(len(missing), 1)), context, _start_worker) as pool:
-        try:
-            futures = [pool.submit(_work, make, job) for job in missing]
-            for done, future in enumerate(as_completed(futures), start=1):
-                note(f"{done} of {len(missing)}: {future.result()}")
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+    make_folder(runs)
+    cache = TrialCache(runs.resolve(), kind.hash_code())
+    jobs = [SequenceTrials(kind, cache, recipe) for recipe in recipes]
+    missing = [job for job in jobs if job.missing]
+    note(f"{len(jobs) - len(missing)} of {len(jobs)} sequences are there")
+    failed: dict[str, Exception] = {}
+    count = 0
 
+    def ended(job: SequenceTrials, outcome: str | Exception) -> None:
+        nonlocal count
+        count += 1
+        if isinstance(outcome, Exception):
+            failed[job.recipe.name] = outcome
+            outcome = f"failed: {list_failures({job.recipe.name: outcome})}"
+        note(f"{count} of {len(missing)}: {outcome}")
 
-def _start_worker() -> None:
-    cv2.setNumThreads(1)
-    torch.set_num_threads(1)
-
-
-def _work(make: Callable[[Job], str], job: Job) -> str:
-    try:
-        return make(job)
-    except KeyboardInterrupt:
-        os._exit(130)  # or this process would begin with the next sequence
+    run_jobs(SequenceTrials.make, missing, workers, ended, ray)
+    complete = [job for job in jobs if job.recipe.name not in failed]
+    page = write_page(path, form(complete, sorted(failed))) if complete else ""
+    if failed:
+        state = "lacks" if complete else "is not written, for want of"
+        raise OutputError(f"{path} {state} {list_failures(failed)}: the same command tries what is missing again")
+    return page

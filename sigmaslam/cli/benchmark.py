@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from sigmaslam.cli.extras import need_report_extra, need_train_extra
+from sigmaslam.cli.extras import RayAddress, need_report_extra, need_train_extra
 from sigmaslam.errors import InputError
 from sigmaslam.source_commit import describe_source
 
@@ -161,7 +161,10 @@ def noise(out: Out, runs: Runs, data: Data = None) -> None:
 
 @benchmark.command(short_help="Whether poses and map are as sure as they say.")
 def consistency(
-    out: Out, runs: Runs, seeds: Annotated[int, typer.Option(min=1, help="Sequences a scale.")] = 30
+    out: Out,
+    runs: Runs,
+    seeds: Annotated[int, typer.Option(min=1, help="Sequences a scale.")] = 30,
+    ray: RayAddress = None,
 ) -> None:
     """Whether poses and map are as sure as they say, on 90 rendered sequences (an hour; extra 'train')."""
     need_train_extra()
@@ -169,23 +172,31 @@ def consistency(
     from sigmaslam.synthetic.render_sequence import default_workers
 
     command = _command("consistency", out, f"--runs {runs.name}", f"--seeds {seeds}")
-    typer.echo(write_consistency(out, runs, seeds, default_workers(), command, _note))
+    typer.echo(write_consistency(out, runs, seeds, default_workers(), command, ray, _note))
 
 
 @benchmark.command(short_help="A camera that is shaken, with a slow shutter.")
-def shake(out: Out, runs: Runs, seeds: Annotated[int, typer.Option(min=1, help="Sequences.")] = 20) -> None:
+def shake(
+    out: Out,
+    runs: Runs,
+    seeds: Annotated[int, typer.Option(min=1, help="Sequences.")] = 20,
+    ray: RayAddress = None,
+) -> None:
     """Whether frames of a shaken camera with a slow shutter are right when they are called tracked (extra 'train')."""
     need_train_extra()
     from sigmaslam.evaluation.benchmarks.shake import write_shake
     from sigmaslam.synthetic.render_sequence import default_workers
 
     command = _command("shake", out, f"--runs {runs.name}", f"--seeds {seeds}")
-    typer.echo(write_shake(out, runs, seeds, default_workers(), command, _note))
+    typer.echo(write_shake(out, runs, seeds, default_workers(), command, ray, _note))
 
 
 @benchmark.command(short_help="Dense clouds beside exact depth.")
 def reconstruction(
-    out: Out, runs: Runs, seeds: Annotated[int, typer.Option(min=1, help="Sequences a world.")] = 20
+    out: Out,
+    runs: Runs,
+    seeds: Annotated[int, typer.Option(min=1, help="Sequences a world.")] = 20,
+    ray: RayAddress = None,
 ) -> None:
     """Error, coverage, completeness and ghosts of dense clouds beside exact depth (extra 'train')."""
     need_train_extra()
@@ -193,7 +204,7 @@ def reconstruction(
     from sigmaslam.synthetic.render_sequence import default_workers
 
     command = _command("reconstruction", out, f"--runs {runs.name}", f"--seeds {seeds}")
-    typer.echo(write_reconstruction(out, runs, seeds, default_workers(), command, _note))
+    typer.echo(write_reconstruction(out, runs, seeds, default_workers(), command, ray, _note))
 
 
 @benchmark.command(short_help="Image filters beside OpenCV's, and the dark.")

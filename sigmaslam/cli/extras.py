@@ -1,9 +1,24 @@
-"""What a command says when an optional part of the package is not installed."""
+"""Optional parts of the package: what a command says when one is not installed, and the option of Ray."""
 
 from __future__ import annotations
 
+from typing import Annotated
+
+import typer
+
 from sigmaslam.errors import InputError
 from sigmaslam.plot_style import NO_MATPLOTLIB, has_matplotlib
+
+RayAddress = Annotated[
+    str | None,
+    typer.Option(
+        "--ray",
+        metavar="ADDRESS",
+        help="Work on the Ray cluster at HOST:PORT, on the one that this machine is in ('auto'), or on a Ray that is "
+        "started here ('local'); extra 'scale'.",
+        show_default="processes of this machine",
+    ),
+]
 
 
 def need_train_extra() -> None:

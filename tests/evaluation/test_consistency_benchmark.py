@@ -119,7 +119,7 @@ def test_the_page_names_the_goals_that_are_missed():
         Scale("driving", "street", 64, 48): {"ours": [GOOD, GOOD], "EKF": [bad, bad], "ours, drawn": [drawn, drawn]},
         Scale("endoscope", "organ", 64, 48): {"ours": [bad, bad], "EKF": [GOOD, GOOD], "ours, drawn": [GOOD, GOOD]},
     }
-    page = format_page(results, 0.3, 30, 1000, "the command")
+    page = format_page(results, 0.3, 30, (1000, 2), "the command")
     goals, goals_drawn = page.split("## Goals, for ours with a calibration that is drawn")
     assert "Missed: NEES of poses per dof in endoscope (2.40); NIS per dof in endoscope (0.50)." in goals
     assert goals.count("**missed**") == 2

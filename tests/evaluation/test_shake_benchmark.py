@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, norm
 
-from sigmaslam.evaluation.benchmarks import shake
+from sigmaslam.evaluation.benchmarks import shake, trial_pool
 from sigmaslam.evaluation.benchmarks.pnp_baselines import track_with_pnp
 from sigmaslam.evaluation.benchmarks.shake import FRAMES, MOVERS, judge, recipe
 from sigmaslam.evaluation.benchmarks.shake_page import ShakenSequence, ShakeResult, format_page
@@ -156,7 +156,9 @@ def test_a_method_that_is_right_has_no_wrong_frame_and_one_that_jumps_has(shaken
 
 def test_the_page_says_which_frames_are_wrong_and_what_is_missed():
     wrong = replace(GOOD, ate=0.02, wrong_step=[3, 4], wrong_second=[22], wrong_start=[22, 23, 24])
-    page = format_page({"ours": {STILL: GOOD, MOVING: wrong}, "KLT + PnP": {STILL: wrong, MOVING: GOOD}}, 60, 1000, "c")
+    page = format_page(
+        {"ours": {STILL: GOOD, MOVING: wrong}, "KLT + PnP": {STILL: wrong, MOVING: GOOD}}, 60, (1000, 2), "c"
+    )
     assert "Missed: frames wrong over a frame (2); frames wrong over 1 s (1); frames wrong since the start (3)" in page
     assert "median ATE (1.20 %)." in page
     assert "2 of 118, **missed**" in page
@@ -167,12 +169,16 @@ def test_the_page_says_which_frames_are_wrong_and_what_is_missed():
     assert "| with movers | ours | 59 | 0 | 2.00 | 2.00 - 2.00 | 2.00 | 2 | 1 | 3 |" in page
     tables = [line for line in page.splitlines() if line.startswith("|")]
     assert {line.count("|") for line in tables} == {4, 6, 13}
-    assert "All goals are met." in format_page({"ours": {STILL: GOOD}}, 60, 1000, "c")
+    assert "All goals are met." in format_page({"ours": {STILL: GOOD}}, 60, (1000, 2), "c")
 
 
 def test_what_was_found_is_kept_until_the_code_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(shake, "run_trials", lambda make, missing, count, workers, note: [make(job) for job in missing])
-    monkeypatch.setattr(shake, "render", lambda folder, recipe, workers: folder / f"{recipe.preset}{recipe.seed}")
+    def run_here(work, jobs, workers, ended, ray):
+        for job in jobs:
+            ended(job, work(job))
+
+    monkeypatch.setattr(trial_pool, "run_jobs", run_here)
+    monkeypatch.setattr(trial_pool, "render", lambda folder, recipe, workers: folder / recipe.name)
     monkeypatch.setattr(shake, "read_image_motion", lambda source: STILL.motion)
     judged = []
     monkeypatch.setattr(shake, "judge", lambda source, method: judged.append(source.name) or GOOD)

@@ -9,9 +9,8 @@ import pytest
 from sigmaslam.errors import InputError
 from sigmaslam.evaluation import trial
 from sigmaslam.evaluation.benchmarks.pnp_baselines import track_with_pnp
-from sigmaslam.evaluation.trial import Trial, TrialCache, hash_code, render
+from sigmaslam.evaluation.trial import Trial, TrialCache, hash_code
 from sigmaslam.slam.tracker import TrackerConfig
-from sigmaslam.synthetic import render_sequence
 from sigmaslam.synthetic.simulation import Recipe
 
 RECIPE, CONFIG = Recipe("room", 3, 7), TrackerConfig()
@@ -50,14 +49,3 @@ def test_the_hash_is_of_the_code_and_of_the_files_that_are_given(tmp_path: Path)
     assert before == hash_code(tmp_path / "benchmark.py") != hash_code()
     (tmp_path / "benchmark.py").write_text("a = 2")
     assert hash_code(tmp_path / "benchmark.py") != before
-
-
-def test_a_render_stopped_before_its_scene_is_written_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    def stop(out: Path, *_: object, **__: object) -> None:
-        out.mkdir()
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(render_sequence, "write_sequence", stop)
-    with pytest.raises(KeyboardInterrupt):
-        render(tmp_path, RECIPE, 1)
-    assert not (tmp_path / "room7").exists()

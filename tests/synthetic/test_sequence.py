@@ -12,6 +12,7 @@ import pytest
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.readers import open_sequence
+from sigmaslam.synthetic import render_sequence
 from sigmaslam.synthetic.presets import PRESETS
 from sigmaslam.synthetic.render_sequence import write_sequence
 from sigmaslam.synthetic.rendering import atlas
@@ -186,6 +187,22 @@ def test_a_stopped_sequence_goes_on_to_the_same_bytes(organ: Path, tmp_path: Pat
     assert len(list((tmp_path / "out" / "truth").iterdir())) == 2
     assert write_sequence(tmp_path / "out", RECIPE) == 2
     assert files_of(tmp_path / "out") == files_of(organ)
+
+
+def test_a_render_killed_before_its_scene_is_written_goes_on_to_the_same_bytes(
+    organ: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    with monkeypatch.context() as context:
+        context.setattr(render_sequence, "choose_landmarks", lambda studio: (_ for _ in ()).throw(SystemExit))
+        with pytest.raises(SystemExit):
+            write_sequence(out, RECIPE)
+    assert any(out.iterdir())
+    assert not (out / "scene.json").exists()
+    with pytest.raises(InputError, match="not an empty folder"):
+        write_sequence(out, replace(RECIPE, seed=6))
+    write_sequence(out, RECIPE)
+    assert files_of(out) == files_of(organ)
 
 
 def test_another_seed_is_another_sequence(organ: Path) -> None:
