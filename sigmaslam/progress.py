@@ -35,8 +35,8 @@ def open_progress(hidden: bool = False, console: Console | None = None, line_eve
 
         _said = time.monotonic()
 
-        def update(self, task_id: TaskID, *args: float, **fields: object) -> None:  # type: ignore[override]
-            super().update(task_id, *args, **fields)
+        def update(self, task_id: TaskID, *args: float, **fields: object) -> None:
+            super().update(task_id, *args, **fields)  # type: ignore[arg-type]
             now = time.monotonic()
             if hidden or self.console.is_terminal or self.console.is_jupyter or now - self._said < line_every:
                 return
