@@ -134,7 +134,7 @@ def features(
     from sigmaslam.evaluation.matching.sets import ALL
 
     flags = [*_repeated("weights", weights), *_repeated("peer", peer), *((f"--sets {sets}",) if sets else ())]
-    command = _command("features", out, *flags)
+    command = _command("features", out, *flags, f"--rounds {rounds}")
     chosen = sets.split(",") if sets else list(ALL)
     typer.echo(write_features(out, _need_data(data), weights or [], peer or [], command, chosen, rounds, _note))
 
