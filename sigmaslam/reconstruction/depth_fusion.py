@@ -30,6 +30,8 @@ _FREEDOM = np.float32(4.0)
 # Windows in which images are compared: side, variance of what resampling moves them by, pixels squared, and of the
 # rounding of two grey values.
 _WINDOW, _RESAMPLING, _ROUNDING = 7, np.float32(1.0 / 12.0), np.float32(1.0 / 6.0)
+# Variance of each component of dense optical flow, pixels squared, and 99 % of chi-square with two degrees of freedom.
+_FLOW_VARIANCE, _GATE_2D = np.float32(0.3**2), 9.21
 # Confirmations that a point needs.
 _MIN_SUPPORT = 1
 
@@ -268,7 +270,17 @@ def _looks_alike(
     expected = _ROUNDING + (texture.reshape(2, -1)[:, known] * place).sum(axis=0)
     ratio = np.where(there.ravel()[known], varies / expected, np.inf)
     finite = ratio[np.isfinite(ratio)]
-    return np.asarray(ratio <= GATE * (float(np.median(finite)) if len(finite) else 0.0))
+    alike = ratio <= GATE * (float(np.median(finite)) if len(finite) else 0.0)
+    # What the warp leaves of the motion: a window of a smooth texture looks alike after several pixels.
+    warped_grey = np.where(there, warped, image).clip(0, 255).astype(np.uint8)
+    flow = _optical_flow().calc(image.astype(np.uint8), warped_grey, None).reshape(-1, 2)[known]
+    rests = (flow.T**2 / (place + _FLOW_VARIANCE)).sum(axis=0) <= _GATE_2D
+    return np.asarray(alike & rests)
+
+
+def _optical_flow() -> cv2.DISOpticalFlow:
+    """Dense flow between an image and the warped other one, which differ by little where all is at rest."""
+    return cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
 
 
 def _texture(image: np.ndarray) -> np.ndarray:
