@@ -32,6 +32,8 @@ _FREEDOM = np.float32(4.0)
 _WINDOW, _RESAMPLING, _ROUNDING = 7, np.float32(1.0 / 12.0), np.float32(1.0 / 6.0)
 # Variance of each component of dense optical flow, pixels squared, and 99 % of chi-square with two degrees of freedom.
 _FLOW_VARIANCE, _GATE_2D = np.float32(0.3**2), 9.21
+# Of the pixels whose depth is as expected, at least this share must also be where the pose says.
+_LEAST_SHARE = 0.5
 # Confirmations that a point needs.
 _MIN_SUPPORT = 1
 
@@ -138,6 +140,9 @@ def fuse_depth(
         squared = seen.innovation**2
         there = squared <= GATE * expected
         agrees = there & _looks_alike(grey, texture, view.image, seen, known)
+        if np.count_nonzero(agrees) < _LEAST_SHARE * np.count_nonzero(there):
+            # Most of the image moves against the pose: it is that of a moving body, and confirms nothing at rest.
+            agrees[:] = False
         cost += np.where(agrees, squared / expected, 0.0)
         support += agrees
         contradictions += (there & ~agrees) | ((squared > GATE * expected) & (seen.innovation < 0.0))

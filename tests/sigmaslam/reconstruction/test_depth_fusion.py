@@ -110,6 +110,14 @@ def test_a_smooth_texture_that_moves_by_pixels_is_not_confirmed():
     assert fused.is_confirmed[8:-8, 145:-15].mean() < 0.1
 
 
+def test_a_pose_that_most_of_the_image_denies_confirms_nothing():
+    image, true = plane(np.eye(4))
+    moved = np.where(np.arange(CAMERA.width) < 60, image, np.roll(image, 5, axis=1))
+    view = DepthView.of(moved, measure(true, 1))
+    fused = fuse_depth(image, measure(true, 0), [(view, np.eye(4), 1e-12 * np.eye(6))], CAMERA)
+    assert not fused.is_confirmed.any()
+
+
 def test_the_derivative_and_the_pose_s_part_are_those_of_differences():
     _, true = plane(np.eye(4))
     seen, disparity = plane(STEP)
