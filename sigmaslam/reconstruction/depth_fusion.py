@@ -278,7 +278,8 @@ def _looks_alike(
     alike = ratio <= GATE * (float(np.median(finite)) if len(finite) else 0.0)
     # What the warp leaves of the motion: a window of a smooth texture looks alike after several pixels.
     warped_grey = np.where(there, warped, image).clip(0, 255).astype(np.uint8)
-    flow = _optical_flow().calc(image.astype(np.uint8), warped_grey, None).reshape(-1, 2)[known]
+    nothing = np.zeros((*shape, 2), np.float32)
+    flow = _optical_flow().calc(image.astype(np.uint8), warped_grey, nothing).reshape(-1, 2)[known]
     rests = (flow.T**2 / (place + _FLOW_VARIANCE)).sum(axis=0) <= _GATE_2D
     return np.asarray(alike & rests)
 
