@@ -30,6 +30,10 @@ _FREEDOM = np.float32(4.0)
 # Windows in which images are compared: side, variance of what resampling moves them by, pixels squared, and of the
 # rounding of two grey values.
 _WINDOW, _RESAMPLING, _ROUNDING = 7, np.float32(1.0 / 12.0), np.float32(1.0 / 6.0)
+# Variance of each component of dense optical flow, pixels squared, and 99 % of chi-square with two degrees of freedom.
+_FLOW_VARIANCE, _GATE_2D = np.float32(0.3**2), 9.21
+# Of the pixels whose depth is as expected, at least this share must also be where the pose says.
+_LEAST_SHARE = 0.5
 # Confirmations that a point needs.
 _MIN_SUPPORT = 1
 
@@ -136,6 +140,9 @@ def fuse_depth(
         squared = seen.innovation**2
         there = squared <= GATE * expected
         agrees = there & _looks_alike(grey, texture, view.image, seen, known)
+        if np.count_nonzero(agrees) < _LEAST_SHARE * np.count_nonzero(there):
+            # Most of the image moves against the pose: it is that of a moving body, and confirms nothing at rest.
+            agrees[:] = False
         cost += np.where(agrees, squared / expected, 0.0)
         support += agrees
         contradictions += (there & ~agrees) | ((squared > GATE * expected) & (seen.innovation < 0.0))
@@ -268,7 +275,18 @@ def _looks_alike(
     expected = _ROUNDING + (texture.reshape(2, -1)[:, known] * place).sum(axis=0)
     ratio = np.where(there.ravel()[known], varies / expected, np.inf)
     finite = ratio[np.isfinite(ratio)]
-    return np.asarray(ratio <= GATE * (float(np.median(finite)) if len(finite) else 0.0))
+    alike = ratio <= GATE * (float(np.median(finite)) if len(finite) else 0.0)
+    # What the warp leaves of the motion: a window of a smooth texture looks alike after several pixels.
+    warped_grey = np.where(there, warped, image).clip(0, 255).astype(np.uint8)
+    nothing = np.zeros((*shape, 2), np.float32)
+    flow = _optical_flow().calc(image.astype(np.uint8), warped_grey, nothing).reshape(-1, 2)[known]
+    rests = (flow.T**2 / (place + _FLOW_VARIANCE)).sum(axis=0) <= _GATE_2D
+    return np.asarray(alike & rests)
+
+
+def _optical_flow() -> cv2.DISOpticalFlow:
+    """Dense flow between an image and the warped other one, which differ by little where all is at rest."""
+    return cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
 
 
 def _texture(image: np.ndarray) -> np.ndarray:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import torch
 
@@ -94,6 +95,27 @@ def test_what_moves_along_its_own_surface_is_not_confirmed():
     assert fused.is_confirmed[5:-5, 5:120].mean() > 0.9
     assert fused.is_confirmed[5:-5, 140:-10].mean() < 0.2
     assert (fused.contradictions[5:-5, 140:-10] == 1).mean() > 0.7
+
+
+def test_a_smooth_texture_that_moves_by_pixels_is_not_confirmed():
+    _, true = plane(np.eye(4))
+    rng = np.random.default_rng(7)
+    smooth = 128 + 900 * cv2.GaussianBlur(rng.standard_normal(true.shape), None, 8.0)
+    image, other = (np.clip(smooth + rng.standard_normal(true.shape), 0, 255).astype(np.uint8) for _ in range(2))
+    # Three pixels, little beside the ten over which the grey value changes.
+    moved = np.where(np.arange(CAMERA.width) < 130, other, np.roll(other, 3, axis=1))
+    view = DepthView.of(moved, measure(true, 1))
+    fused = fuse_depth(image, measure(true, 0), [(view, np.eye(4), 1e-12 * np.eye(6))], CAMERA)
+    assert fused.is_confirmed[5:-5, 5:110].mean() > 0.9
+    assert fused.is_confirmed[8:-8, 145:-15].mean() < 0.1
+
+
+def test_a_pose_that_most_of_the_image_denies_confirms_nothing():
+    image, true = plane(np.eye(4))
+    moved = np.where(np.arange(CAMERA.width) < 60, image, np.roll(image, 5, axis=1))
+    view = DepthView.of(moved, measure(true, 1))
+    fused = fuse_depth(image, measure(true, 0), [(view, np.eye(4), 1e-12 * np.eye(6))], CAMERA)
+    assert not fused.is_confirmed.any()
 
 
 def test_the_derivative_and_the_pose_s_part_are_those_of_differences():

@@ -7,8 +7,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
+from sigmaslam.runs.dense_points import DENSE_NAME, write_dense_points
 from sigmaslam.runs.report import write_report
 from tests.support.recorded_runs import make_run
 
@@ -67,6 +70,32 @@ def test_the_scene_shows_something_and_can_be_turned(page: Any):
     assert max(abs(a - b) for a, b in zip(before, after, strict=True)) > 1.0
     page.wait_for_timeout(300)
     assert page.locator("#scene").screenshot() != picture
+
+
+def test_surfaces_are_shown_in_their_grey_values_and_can_be_hidden(browser: Any, tmp_path: Path):
+    make_run(tmp_path / "run", points=200)
+    # A wall before all that the run has.
+    x, y = np.meshgrid(np.linspace(-30.0, 30.0, 200), np.linspace(-30.0, 30.0, 200))
+    wall = np.stack([x.ravel(), y.ravel(), np.full(x.size, 5.0)], axis=-1)
+    write_dense_points(tmp_path / "run" / DENSE_NAME, wall, np.full(len(wall), 0.1), np.full(len(wall), 190.0))
+    opened = browser.new_page(viewport={"width": 1200, "height": 900}, offline=True)
+    opened.set_default_timeout(60_000)
+    complaints: list[str] = []
+    opened.on("pageerror", lambda error: complaints.append(str(error)))
+    opened.goto(write_report(tmp_path / "run").as_uri())
+    opened.wait_for_function("window.report !== undefined")
+    opened.locator("#scene").scroll_into_view_if_needed()
+
+    def count_grey() -> float:
+        opened.wait_for_timeout(300)
+        picture = cv2.imdecode(np.frombuffer(opened.locator("#scene").screenshot(), np.uint8), cv2.IMREAD_COLOR)
+        return float((np.abs(picture.astype(int) - picture[..., :1]).max(axis=2) < 3)[picture[..., 0] > 100].sum())
+
+    shown = count_grey()
+    opened.locator('[data-layer="dense"]').click()
+    assert shown > 2.0 * count_grey()
+    assert complaints == []
+    opened.close()
 
 
 def test_the_path_tells_its_sigma_under_the_mouse_and_shows_its_frame_on_a_click(page: Any):
