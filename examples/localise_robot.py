@@ -39,17 +39,16 @@ def read(folder: Path, robot: int, landmarks: dict[float, int], duration: float)
 def localise(folder: Path, duration: float, **options: Any) -> tuple[np.ndarray, ...]:
     """RMSE of each robot's position, metres, and heading, radians."""
     barcode_of = dict(np.loadtxt(folder / "Barcodes.dat"))
-    table = np.loadtxt(folder / "Landmark_Groundtruth.dat")
-    landmarks = {barcode_of[subject]: k for k, subject in enumerate(table[:, 0])}
+    subjects, *places = np.loadtxt(folder / "Landmark_Groundtruth.dat").T[:3]
+    landmarks = {barcode_of[subject]: k for k, subject in enumerate(subjects)}
     robots = [read(folder, robot, landmarks, duration) for robot in range(1, 6)]
-    controls, sightings, poses = (torch.tensor(np.stack(part, axis=1)) for part in zip(*robots, strict=True))
+    controls, seen, poses = (torch.tensor(np.stack(part, axis=1)) for part in zip(*robots, strict=True))
     motion = differential_drive(Diagonal(torch.tensor([0.05, 0.15], dtype=torch.double) ** 2 / STEP))
     see = several(range_and_bearing(Diagonal(torch.tensor([0.15, 0.02], dtype=torch.double) ** 2)), len(landmarks))
     prior = Gaussian(poses[0], torch.diag(torch.tensor([0.1, 0.1, 0.1], dtype=torch.double) ** 2))
-    places = torch.tensor(table[:, 1:3]).expand(len(poses), -1, -1)
-    ukf, values = UnscentedKalmanFilter(iterations=1), sightings.flatten(-2)
-    steps = torch.full((len(poses) - 1, 1), STEP, dtype=torch.double)
-    track = ukf.filter(prior, motion, see, values, [controls[:-1], steps], [places], **options)
+    where = torch.tensor(np.stack(places, axis=1)).expand(len(poses), -1, -1)
+    inputs = [controls[:-1], torch.full((len(poses) - 1, 1), STEP, dtype=torch.double)]
+    track = UnscentedKalmanFilter(iterations=1).filter(prior, motion, see, seen.flatten(-2), inputs, [where], **options)
     error = track.filtered.mean - poses
     error = torch.stack([error[..., :2].norm(dim=-1), wrap_angle(error[..., 2])])
     return tuple(error.square().nanmean(dim=1).sqrt().numpy())

@@ -13,7 +13,7 @@ from sigmaslam.readers.trajectory_files import read_kitti
 from tests.support.examples import EXAMPLES, load_example, run_notebook
 
 # What a stranger opens first.
-FIRST = ("match_two_images", "own_frontend", "track_folder", "train_for_my_scene")
+FIRST = ("localise_robot", "match_two_images", "own_frontend", "track_folder", "train_for_my_scene")
 
 
 def squared_sigmas(estimate, truth: np.ndarray) -> float:
