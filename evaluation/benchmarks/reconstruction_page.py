@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -45,7 +46,8 @@ def format_page(
         "single view is of semi-global matching at the same pixels, with the same disparity offset taken off. Inside:",
         "the share of the points inside the 95 % interval of their inverse depth; complete the share of the pixels at",
         "rest, seen by both eyes, that became points; gross the share of points off by more than a tenth of the depth;",
-        "ghosts the share of the pixels on moving bodies that became points. Rows of worlds are medians of sequences.",
+        "ghosts the share of the pixels on moving bodies that became points. Rows of worlds and the goals are medians of",
+        "sequences; errors of those that have points.",
         *missing_sequences(missing),
         "",
         "## Goals",
@@ -68,8 +70,8 @@ def format_page(
 
 
 def _goals(sequences: Sequence[ReconstructedSequence]) -> list[str]:
-    ratio = _median(sequences, lambda each: each.fused_error / each.single_error)
-    inside, complete = _median(sequences, lambda each: each.inside), _median(sequences, lambda each: each.completeness)
+    found = _medians(sequences)
+    ratio, inside, complete = found.fused_error / found.single_error, found.inside, found.completeness
     low, high = INSIDE
     goals = (
         (f"error at most {MOST_RATIO:g} of the single view's", f"{ratio:.2f}", ratio <= MOST_RATIO),
@@ -81,31 +83,31 @@ def _goals(sequences: Sequence[ReconstructedSequence]) -> list[str]:
 
 def _world(world: str, sequences: Sequence[ReconstructedSequence]) -> str:
     of_world = [each for each in sequences if each.world == world]
-    figures = [each.figures for each in of_world]
-    ghosts = [each.ghosts for each in figures if np.isfinite(each.ghosts)]
-    medians = DepthFigures(
-        fused_error=_median(of_world, lambda each: each.fused_error),
-        single_error=_median(of_world, lambda each: each.single_error),
-        inside=_median(of_world, lambda each: each.inside),
-        completeness=_median(of_world, lambda each: each.completeness),
-        gross=_median(of_world, lambda each: each.gross),
-        ghosts=float(np.median(ghosts)) if ghosts else float("nan"),
-        keyframes=sum(each.keyframes for each in figures),
-    )
-    return row(world, str(len(of_world)), *_cells(medians))
+    return row(world, str(len(of_world)), *_cells(_medians(of_world)))
+
+
+def _medians(sequences: Sequence[ReconstructedSequence]) -> DepthFigures:
+    """Of the sequences that have each figure; NaN where none has."""
+
+    def median(name: str) -> float:
+        values = np.array([getattr(each.figures, name) for each in sequences])
+        known = values[np.isfinite(values)]
+        return float(np.median(known)) if len(known) else math.nan
+
+    names = [each.name for each in fields(DepthFigures) if each.name != "keyframes"]
+    medians = {name: median(name) for name in names}
+    return DepthFigures(**medians, keyframes=sum(each.figures.keyframes for each in sequences))
 
 
 def _cells(figures: DepthFigures) -> list[str]:
-    return [
-        f"{figures.fused_error:.2%}",
-        f"{figures.single_error:.2%}",
-        f"{figures.fused_error / figures.single_error:.2f}",
-        f"{figures.inside:.1%}",
-        f"{figures.completeness:.0%}",
-        f"{figures.gross:.1%}",
-        "" if np.isnan(figures.ghosts) else f"{figures.ghosts:.0%}",
-    ]
-
-
-def _median(sequences: Sequence[ReconstructedSequence], figure: Callable[[DepthFigures], float]) -> float:
-    return float(np.median([figure(each.figures) for each in sequences])) if sequences else float("nan")
+    ratio = figures.fused_error / figures.single_error
+    forms = (
+        (figures.fused_error, ".2%"),
+        (figures.single_error, ".2%"),
+        (ratio, ".2f"),
+        (figures.inside, ".1%"),
+        (figures.completeness, ".0%"),
+        (figures.gross, ".1%"),
+        (figures.ghosts, ".0%"),
+    )
+    return [format(value, form) if math.isfinite(value) else "" for value, form in forms]
