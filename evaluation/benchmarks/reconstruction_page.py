@@ -46,7 +46,7 @@ def format_page(
         "single view is of semi-global matching at the same pixels, with the same disparity offset taken off. Inside:",
         "the share of the points inside the 95 % interval of their inverse depth; complete the share of the pixels at",
         "rest, seen by both eyes, that became points; gross the share of points off by more than a tenth of the depth;",
-        "ghosts the share of the pixels on moving bodies that became points. Rows of worlds and the goals are medians of",
+        "ghosts the share of the pixels on moving bodies that became points. Rows of worlds and goals are medians of",
         "sequences; errors of those that have points.",
         *missing_sequences(missing),
         "",

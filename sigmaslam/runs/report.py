@@ -28,6 +28,7 @@ from sigmaslam.runs.report_facts import (
 )
 from sigmaslam.runs.report_plots import build_plots, draw_step
 from sigmaslam.runs.report_scene import build_scene, pack
+from sigmaslam.runs.verdict import contradiction_verdict
 
 REPORT_NAME = "report.html"
 MAX_CONFIGURATION = 20_000
@@ -81,6 +82,7 @@ def write_report(run_dir: str | Path) -> Path:
         state=judge(run),
         facts=list_facts(run),
         statuses=list_statuses(run),
+        contradiction=contradiction_verdict(run.summary),
         verdict=run.summary.get("calibration_verdict"),
         calibration=list_calibration(run),
         scene=scene,

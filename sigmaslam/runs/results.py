@@ -242,8 +242,15 @@ def _summarise(
         "first_frame_with_pose": first,
         "median_inliers": float(np.median(inliers)) if len(inliers) else 0.0,
         "map_points": points,
+        "contradicted": 0 if frames is None else _count_contradicted(frames),
         "calibration_errors": {} if calibration is None else {k: list(v) for k, v in calibration.errors.items()},
     }
+
+
+def _count_contradicted(frames: FrameTable) -> int:
+    """Tracked frames whose pose fewer than half of the matches agree with."""
+    tracked = np.array(frames.status) == "tracking"
+    return int((tracked & (2.0 * frames.columns["inliers"] < frames.columns["matches"])).sum())
 
 
 def _describe_world(summary: dict[str, Any], run: dict[str, Any]) -> str | None:

@@ -1,4 +1,4 @@
-"""What a run says about the calibration, in words."""
+"""What a run says about the calibration and about what moves, in words."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ MIN_FRAMES, MIN_POINTS = 10, 45
 _MAX_SIGMA = 0.2
 # A smaller offset makes no difference to the tracker, pixels.
 _MIN_OFFSET = 0.1
+# Share of the tracked frames that most matches may contradict without a word.
+_MAX_CONTRADICTED = 0.1
 # Findings about the rig, which the disparity offset has its share of.
 _RIG = frozenset({"eyes", "mirrored", "rig", "distortion", "rows", "rotation", "scale", "infinity"})
 
@@ -29,6 +31,22 @@ def expected_offset(calibration: dict[str, Any]) -> float:
         calibration: as `sigmaslam.runs.run_folder.describe_camera` gives it.
     """
     return float(calibration["left"]["fx"] * calibration["sigmas"]["rotation"])
+
+
+def contradiction_verdict(summary: dict[str, Any]) -> str | None:
+    """That most matches contradict many poses, in words; None where they do not.
+
+    Args:
+        summary: of run.json: counts of frames that were tracked, and of those that fewer than half of their matches
+            agree with.
+    """
+    contradicted, tracked = summary.get("contradicted", 0), summary.get("tracking", 0)
+    if contradicted <= _MAX_CONTRADICTED * tracked:
+        return None
+    return (
+        f"In {contradicted} of {tracked} tracked frames fewer than half of the matches agree with the pose: something "
+        "large moves in the images, and the poses may follow it instead of the scene."
+    )
 
 
 def calibration_verdict(

@@ -112,6 +112,17 @@ def test_report_says_what_the_run_was(tmp_path):
     assert f"p99 {p50:.0f}, {p95:.0f}, {p99:.0f} ms" in text
 
 
+def test_poses_that_most_matches_contradict_are_told_of_at_first_sight(tmp_path):
+    make_run(tmp_path / "run")
+    path = tmp_path / "run/run.json"
+    content = json.loads(path.read_text())
+    assert "fewer than half of the matches" not in write_report(tmp_path / "run").read_text(encoding="utf-8")
+    content["summary"] |= {"tracking": 192, "contradicted": 90}
+    path.write_text(json.dumps(content))
+    text = write_report(tmp_path / "run").read_text(encoding="utf-8")
+    assert "In 90 of 192 tracked frames fewer than half of the matches" in text.partition("<noscript>")[0]
+
+
 def test_a_failed_run_looks_failed(tmp_path):
     make_run(tmp_path / "run")
     path = tmp_path / "run/run.json"

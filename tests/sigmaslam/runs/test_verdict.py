@@ -3,7 +3,7 @@
 import pytest
 
 from sigmaslam.checks.finding import Finding
-from sigmaslam.runs.verdict import calibration_verdict, expected_offset
+from sigmaslam.runs.verdict import calibration_verdict, contradiction_verdict, expected_offset
 from sigmaslam.slam.tracker import CalibrationEstimate
 
 EXPECTED = 0.1
@@ -25,6 +25,15 @@ def verdict(offset: float, sigma: float, *findings: Finding, frames: int = 100, 
 )
 def test_the_verdict_is_in_words(offset: float, sigma: float, words: str):
     assert words in verdict(offset, sigma)
+
+
+@pytest.mark.parametrize(
+    ("contradicted", "tracked", "told"), [(0, 29, False), (2, 29, False), (3, 29, True), (1, 1, True)]
+)
+def test_frames_that_most_matches_contradict_are_told_of(contradicted: int, tracked: int, told: bool):
+    words = contradiction_verdict({"contradicted": contradicted, "tracking": tracked})
+    assert (words is not None) == told
+    assert words is None or f"{contradicted} of {tracked} tracked frames" in words
 
 
 def test_a_calibration_without_errors_leaves_the_estimate_alone():
