@@ -145,6 +145,15 @@ def load_array(path: Path, mend: str) -> np.ndarray:
         raise InputError(f"{path}: is no numpy array, or is cut off ({reason}); {mend}") from problem
 
 
+def load_columns(
+    path: Path, mend: str, shapes: dict[str, tuple[str | int, ...]], kinds: dict[str, str]
+) -> dict[str, np.ndarray]:
+    """Arrays of a .npz file that go together; arguments and errors as of `load_arrays` and `check_columns`."""
+    arrays = load_arrays(path, mend, shapes)
+    check_columns(path, arrays, shapes, kinds, mend)
+    return arrays
+
+
 def check_columns(
     path: Path,
     arrays: dict[str, np.ndarray],

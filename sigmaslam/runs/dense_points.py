@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmaslam.bounded_files import check_columns, load_arrays
+from sigmaslam.bounded_files import load_columns
 from sigmaslam.files import atomic_path
 
 DENSE_NAME, RECONSTRUCTION_NAME = "dense.npz", "reconstruction.json"
@@ -55,7 +55,5 @@ def read_dense_points(path: Path) -> DensePoints:
     Raises:
         InputError: it is no such file.
     """
-    arrays = load_arrays(path, _MEND, DensePoints.__slots__)
     shapes: dict[str, tuple[str | int, ...]] = {"points": ("N", 3), "sigma": ("N",), "intensity": ("N",)}
-    check_columns(path, arrays, shapes, {"intensity": "u"}, _MEND)
-    return DensePoints(**arrays)
+    return DensePoints(**load_columns(path, _MEND, shapes, {"intensity": "u"}))

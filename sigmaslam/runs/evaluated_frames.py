@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sigmaslam.bounded_files import check_columns, load_arrays
+from sigmaslam.bounded_files import load_columns
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path, atomic_write_text
 from sigmaslam.table import Table
@@ -53,13 +53,11 @@ def read_evaluated_frames(path: Path, count: int) -> EvaluatedFrames:
         InputError: it is no such file, or of another run.
     """
     mend = "run `sigmaslam evaluate` again"
-    arrays = load_arrays(path, mend, EvaluatedFrames.__slots__)
     shapes: dict[str, tuple[str | int, ...]] = {
         **dict.fromkeys(EvaluatedFrames.__slots__, ("M",)),
         "truth": ("M", 3),
     }
-    check_columns(path, arrays, shapes, {"row": "iu"}, mend)
-    frames = EvaluatedFrames(**arrays)
+    frames = EvaluatedFrames(**load_columns(path, mend, shapes, {"row": "iu"}))
     if len(frames) and not (frames.row.min() >= 0 and frames.row.max() < count):
         raise InputError(f"{path}: is not of the {count} poses of trajectory.tum; {mend}")
     return frames

@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sigmaslam.bounded_files import check_columns, load_arrays
+from sigmaslam.bounded_files import load_columns
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path
 from sigmaslam.slam.estimate import Estimate
@@ -217,8 +217,7 @@ def read_pictures(path: Path) -> FramePictures:
         InputError: it is no such file.
     """
     mend = "run `sigmaslam track` again"
-    arrays = load_arrays(path, mend, FramePictures.__slots__)
-    check_columns(path, arrays, _SHAPES, _KINDS, mend)
+    arrays = load_columns(path, mend, _SHAPES, _KINDS)
     ends = (("left_end", "left"), ("right_end", "right"), ("match_end", "pixels"))
     for end, values in ((arrays[name], arrays[of]) for name, of in ends):
         if not (np.diff(end, prepend=0) >= 0).all() or (end[-1] if len(end) else 0) != len(values):

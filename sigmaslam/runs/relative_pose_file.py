@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmaslam.bounded_files import check_columns, load_arrays
+from sigmaslam.bounded_files import load_columns
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path
 from sigmaslam.runs.appended_file import AppendedFile, read_records
@@ -116,7 +116,6 @@ def read_frame_pairs(path: Path, count: int) -> FramePairs:
         InputError: it is no such file, or of another run.
     """
     mend = "run `sigmaslam track` again"
-    arrays = load_arrays(path, mend, FramePairs.__slots__)
     shapes: dict[str, tuple[str | int, ...]] = {
         "span": ("M",),
         "earlier": ("M",),
@@ -124,8 +123,7 @@ def read_frame_pairs(path: Path, count: int) -> FramePairs:
         "pose": ("M", 4, 4),
         "covariance": ("M", 6, 6),
     }
-    check_columns(path, arrays, shapes, {"span": "U", "earlier": "iu", "later": "iu"}, mend)
-    pairs = FramePairs(**arrays)
+    pairs = FramePairs(**load_columns(path, mend, shapes, {"span": "U", "earlier": "iu", "later": "iu"}))
     rows = len(pairs.span)
     frames = np.concatenate([pairs.earlier, pairs.later])
     if rows and not (frames.min() >= 0 and frames.max() < count):
