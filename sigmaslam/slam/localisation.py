@@ -20,8 +20,9 @@ from sigmaslam.slam.landmark_following import LandmarkFollower
 from sigmaslam.slam.stopwatch import Stopwatch
 from sigmaslam.slam.unguided_matching import UnguidedMatcher
 
-# Reject a pose that fewer of the guided matches agree with.
-_MIN_SHARE = 0.3
+# Of what was found near a prediction most must agree: what moves may have become the prediction. A pose without one
+# was told from what moves already.
+_MOST, _MIN_SHARE = 0.5, 0.3
 # A fit near the prediction with a larger NIS per degree of freedom may sit in a wrong place: it is compared with one
 # that does without the prediction.
 _DOUBTFUL_NIS = 2.0
@@ -133,7 +134,7 @@ class Localiser:
         if count < min_inliers:
             return None
         fit = self.update.fit(matches.views, pose, covariance, min_inliers)
-        return fit if fit is not None and fit.count >= _MIN_SHARE * count else None
+        return fit if fit is not None and fit.count >= _MOST * count else None
 
     def _localise_anywhere(
         self, view: StereoView, keyframes: list[StereoView], prediction: Prediction, clock: Stopwatch
