@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
@@ -14,29 +16,67 @@ _LEAST_MATCHES = 16
 _THRESHOLD, _SAMPLES, _CONFIDENCE = 1.0, 2000, 0.999
 # A keypoint is detected within about a pixel, in either image.
 _REACH = 2.0
+# What the matches leave uncertain of a line is allowed to so many standard deviations.
+_DEVIATIONS = 3.0
+# Of the solution of the eight-point equations.
+_UNKNOWNS = 8
+# Beyond this share of the largest eigenvalue a direction is not determined at all.
+_LEAST_EIGENVALUE = 1e-12
 
 
-def find_epipolar_geometry(points0: np.ndarray, points1: np.ndarray) -> np.ndarray | None:
-    """The fundamental matrix (3, 3), p1^T F p0 = 0, that most of the matched pixels (M, 2), (M, 2) agree on.
+@dataclass(frozen=True, slots=True)
+class UncertainGeometry:
+    """The fundamental matrix of two views, and what their matches leave uncertain of it.
 
-    None where they are fewer than 16 or the consensus fails.
+    Attributes:
+        F: (3, 3) with p1^T F p0 = 0 for homogeneous pixels of one point.
+        deviations: (8, 3, 3) one standard deviation of F along each of its independent directions.
+    """
+
+    F: np.ndarray
+    deviations: np.ndarray
+
+
+def find_epipolar_geometry(points0: np.ndarray, points1: np.ndarray) -> UncertainGeometry | None:
+    """The geometry that most of the matched pixels (M, 2), (M, 2) agree on, by a sampling consensus.
+
+    From its inliers by the normalised eight-point equations (Hartley 1997), weighted as Sampson's error is, without the
+    constraint of rank 2. If they lie on a plane, or the camera only turned, F is free in some directions, and their
+    deviations are large.
+
+    Returns:
+        None where fewer than 16 matches agree or the consensus fails.
     """
     if len(points0) < _LEAST_MATCHES:
         return None
-    F, _ = cv2.findFundamentalMat(
-        points0.astype(np.float64), points1.astype(np.float64), cv2.USAC_ACCURATE, _THRESHOLD, _CONFIDENCE, _SAMPLES
-    )
+    points0, points1 = points0.astype(np.float64), points1.astype(np.float64)
+    F, chosen = cv2.findFundamentalMat(points0, points1, cv2.USAC_ACCURATE, _THRESHOLD, _CONFIDENCE, _SAMPLES)
     # OpenCV returns None on failure, although its type hints exclude None.
-    return np.asarray(F) if np.shape(F) == (3, 3) else None
+    if np.shape(F) != (3, 3) or chosen.sum() < _LEAST_MATCHES:
+        return None
+    inliers = chosen.ravel().astype(bool)
+    to0, to1 = _normalisation(points0[inliers]), _normalisation(points1[inliers])
+    scaled0, scaled1 = _homogeneous(points0[inliers]) @ to0.T, _homogeneous(points1[inliers]) @ to1.T
+    start = np.linalg.inv(to1).T @ F @ np.linalg.inv(to0)
+    slopes = np.column_stack([(scaled0 @ start.T)[:, :2], (scaled1 @ start)[:, :2]])
+    weight = 1.0 / np.maximum(np.linalg.norm(slopes, axis=1), 1e-12)
+    equations = (weight[:, None, None] * scaled1[:, :, None] * scaled0[:, None, :]).reshape(-1, 9)
+    values, vectors = np.linalg.eigh(equations.T @ equations)
+    noise = max(values[0], 0.0) / max(len(equations) - _UNKNOWNS, 1)
+    deviation = np.sqrt(noise / np.maximum(values[1:], _LEAST_EIGENVALUE * values[-1]))
+    in_pixels = to1.T @ vectors.T.reshape(9, 3, 3) @ to0
+    return UncertainGeometry(in_pixels[0], in_pixels[1:] * deviation[:, None, None])
 
 
 def nearest_near_lines(
-    F: np.ndarray, features0: Features, features1: Features, settled0: np.ndarray, settled1: np.ndarray
+    geometry: UncertainGeometry, features0: Features, features1: Features, settled0: np.ndarray, settled1: np.ndarray
 ) -> Putative:
-    """Nearest neighbours among keypoints within 2 px of each other's epipolar lines.
+    """Nearest neighbours among keypoints near each other's epipolar lines.
+
+    Near is within 2 px, the keypoints' own error, and three standard deviations of the line.
 
     Args:
-        F: (3, 3) with p1^T F p0 = 0 for pixels of one point.
+        geometry: of the views.
         features0, features1: of either image.
         settled0, settled1: (K,) keypoints that are matched to each other and to nothing else.
     """
@@ -44,17 +84,26 @@ def nearest_near_lines(
         np.setdiff1d(np.arange(len(features.keypoints)), settled)
         for features, settled in ((features0, settled0), (features1, settled1))
     )
-    rays0, rays1 = (
-        np.column_stack([features.keypoints[free], np.ones(len(free), np.float32)])
-        for features, free in ((features0, free0), (features1, free1))
-    )
-    lines1, lines0 = rays0 @ F.T, rays1 @ F
+    pixels0, pixels1 = _homogeneous(features0.keypoints[free0]), _homogeneous(features1.keypoints[free1])
+    lines1, lines0 = pixels0 @ geometry.F.T, pixels1 @ geometry.F
     # p1^T F p0 over the length of a line's normal is the distance from that line.
-    product = np.abs(lines1 @ rays1.T)
-    near = product <= _REACH * np.hypot(lines1[:, 0], lines1[:, 1])[:, None]
-    near &= product <= _REACH * np.hypot(lines0[:, 0], lines0[:, 1])
-    row, column = np.nonzero(near)
+    shorter = np.minimum((lines1[:, :2] ** 2).sum(axis=1)[:, None], (lines0[:, :2] ** 2).sum(axis=1))
+    allowed = _REACH**2 * shorter
+    for deviation in geometry.deviations:
+        allowed += (_DEVIATIONS * (pixels0 @ deviation.T @ pixels1.T)) ** 2
+    row, column = np.nonzero((lines1 @ pixels1.T) ** 2 <= allowed)
     first = np.concatenate([settled0, free0[row]])
     second = np.concatenate([settled1, free1[column]])
     order = np.argsort(first, kind="stable")
     return nearest_among_pairs(features0.descriptors, features1.descriptors, first[order], second[order])
+
+
+def _normalisation(points: np.ndarray) -> np.ndarray:
+    """Similarity (3, 3) that takes points (M, 2) to mean zero and root mean square distance sqrt(2)."""
+    mean = points.mean(axis=0)
+    scale = np.sqrt(2.0 / max(((points - mean) ** 2).sum(axis=1).mean(), 1e-12))
+    return np.array([[scale, 0.0, -scale * mean[0]], [0.0, scale, -scale * mean[1]], [0.0, 0.0, 1.0]])
+
+
+def _homogeneous(points: np.ndarray) -> np.ndarray:
+    return np.column_stack([points.astype(np.float64), np.ones(len(points))])

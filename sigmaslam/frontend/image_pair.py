@@ -145,10 +145,10 @@ def match_twice(
     first = match_features(estimator, image0, image1, features0, features1, 0.0)
     probable = first.probability >= MIN_PROBABILITY
     settled = first.select(probable)
-    F = find_epipolar_geometry(settled.keypoints0, settled.keypoints1)
-    if F is None:
+    geometry = find_epipolar_geometry(settled.keypoints0, settled.keypoints1)
+    if geometry is None:
         return first.select(first.probability >= min_probability)
-    putative = nearest_near_lines(F, features0, features1, settled.index0, settled.index1)
+    putative = nearest_near_lines(geometry, features0, features1, settled.index0, settled.index1)
     second = _refined(estimator, image0, image1, features0, features1, putative)
     # Improbable matches stay where nothing took their keypoints.
     free = ~probable & ~np.isin(first.index0, second.index0) & ~np.isin(first.index1, second.index1)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sigmaslam.frontend.epipolar_search import find_epipolar_geometry, nearest_near_lines
+from sigmaslam.frontend.epipolar_search import UncertainGeometry, find_epipolar_geometry, nearest_near_lines
 from sigmaslam.frontend.types import Features
 
 K = np.array([[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]])
@@ -18,7 +18,8 @@ def cross(vector: np.ndarray) -> np.ndarray:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-F = np.linalg.inv(K).T @ cross(-R @ CENTRE) @ R @ np.linalg.inv(K)
+F_EXACT = np.linalg.inv(K).T @ cross(-R @ CENTRE) @ R @ np.linalg.inv(K)
+EXACT = UncertainGeometry(F_EXACT, np.zeros((8, 3, 3)))
 
 
 def views(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -54,8 +55,48 @@ def test_the_geometry_of_most_matches_is_found():
     noisy[wrong] = rng.uniform((0.0, 0.0), (640.0, 480.0), (int(wrong.sum()), 2))
     found = find_epipolar_geometry(points0.astype(np.float32), noisy.astype(np.float32))
     assert found is not None
-    assert np.median(np.diag(distances(found, points0, points1))) < 0.2
-    assert np.quantile(np.diag(distances(found, points0, points1))[~wrong], 0.95) < 1.0
+    assert np.median(np.diag(distances(found.F, points0, points1))) < 0.2
+    assert np.quantile(np.diag(distances(found.F, points0, points1))[~wrong], 0.95) < 1.0
+
+
+def test_deviations_are_those_of_many_draws_of_the_noise():
+    """Of the distances of pixels from lines of the points that they show, which are not among the matches."""
+    rng = np.random.default_rng(5)
+    points0, points1 = views(rng)
+    p0, p1 = (np.column_stack([each[:20], np.ones(20)]) for each in views(np.random.default_rng(9)))
+    drawn, claimed = [], []
+    for _ in range(200):
+        found = find_epipolar_geometry(points0, points1 + 0.2 * rng.standard_normal(points1.shape))
+        assert found is not None
+        # F is known but for its sign.
+        lines = np.sign((found.F * F_EXACT).sum()) * p0 @ found.F.T
+        length = np.linalg.norm(lines[:, :2], axis=1)
+        drawn.append((lines * p1).sum(axis=1) / length)
+        claimed.append(np.linalg.norm(np.einsum("ni,kji,nj->kn", p0, found.deviations, p1), axis=0) / length)
+    ratio = np.std(drawn, axis=0) / np.mean(claimed, axis=0)
+    assert ((ratio > 0.7) & (ratio < 1.4)).all(), ratio
+
+
+def test_points_of_a_plane_leave_lines_uncertain():
+    """Every F that a plane allows goes through the same pixels of the plane, and anywhere beside it."""
+    rng = np.random.default_rng(6)
+    normal, camera = np.array([0.1, -0.2, 0.2]), R @ (np.eye(3) - np.outer(CENTRE, [0.1, -0.2, 0.2]))
+    points0 = rng.uniform((0.0, 0.0), (640.0, 480.0), (COUNT, 2))
+    H = K @ camera @ np.linalg.inv(K)
+    assert normal @ [0.0, 0.0, 5.0] == 1.0
+    seen = np.column_stack([points0, np.ones(COUNT)]) @ H.T
+    plane1 = seen[:, :2] / seen[:, 2:] + 0.2 * rng.standard_normal((COUNT, 2))
+    deep1 = views(np.random.default_rng(0))[1]
+    found = [find_epipolar_geometry(*pair) for pair in ((points0, plane1), (views(np.random.default_rng(0))[0], deep1))]
+    counts = []
+    for geometry in found:
+        assert geometry is not None
+        grid = np.stack(np.meshgrid(np.arange(0.0, 640.0, 16.0), np.arange(0.0, 480.0, 16.0)), axis=-1).reshape(-1, 2)
+        one = features(np.array([[200.0, 150.0]]), rng)
+        none = np.zeros(0, np.int64)
+        near = [len(nearest_near_lines(geometry, one, features(place[None], rng), none, none).index0) for place in grid]
+        counts.append(sum(near))
+    assert counts[0] > 5 * counts[1] > 0
 
 
 @pytest.mark.parametrize("count", [0, 7, 15])
@@ -69,8 +110,8 @@ def test_the_nearest_near_a_line_are_those_of_a_loop():
     points0, points1 = views(rng)
     features0, features1 = features(points0, rng), features(points1, rng)
     none = np.zeros(0, np.int64)
-    found = nearest_near_lines(F, features0, features1, none, none)
-    allowed = (distances(F, points0, points1) <= 2.0) & (distances(F.T, points1, points0).T <= 2.0)
+    found = nearest_near_lines(EXACT, features0, features1, none, none)
+    allowed = (distances(F_EXACT, points0, points1) <= 2.0) & (distances(F_EXACT.T, points1, points0).T <= 2.0)
     similarity = np.where(allowed, features0.descriptors @ features1.descriptors.T, -np.inf)
     assert 2.0 < allowed.sum(axis=1).mean() < 20.0
     np.testing.assert_array_equal(found.index0, np.flatnonzero(allowed.any(axis=1)))
@@ -86,7 +127,7 @@ def test_settled_keypoints_have_no_other_partner_and_are_nobody_elses():
     points0, points1 = views(rng)
     features0, features1 = features(points0, rng), features(points1, rng)
     settled0, settled1 = np.arange(60)[::-1], rng.permutation(COUNT)[:60]
-    found = nearest_near_lines(F, features0, features1, settled0, settled1)
+    found = nearest_near_lines(EXACT, features0, features1, settled0, settled1)
     partner = dict(zip(found.index0.tolist(), found.index1.tolist(), strict=True))
     assert all(partner[i] == j for i, j in zip(settled0.tolist(), settled1.tolist(), strict=True))
     assert np.isin(found.index1[~np.isin(found.index0, settled0)], settled1).sum() == 0
