@@ -20,6 +20,8 @@ _REACH = 2.0
 _DEVIATIONS = 3.0
 # Of the solution of the eight-point equations.
 _UNKNOWNS = 8
+# Looked at together; bounds the memory.
+_PAIRS_AT_A_TIME = 1 << 22
 # Beyond this share of the largest eigenvalue a direction is not determined at all.
 _LEAST_EIGENVALUE = 1e-12
 
@@ -85,17 +87,26 @@ def nearest_near_lines(
         for features, settled in ((features0, settled0), (features1, settled1))
     )
     pixels0, pixels1 = _homogeneous(features0.keypoints[free0]), _homogeneous(features1.keypoints[free1])
+    parts = len(free0) * len(free1) // _PAIRS_AT_A_TIME + 1
+    pairs = [_near_lines(geometry, part, pixels1) for part in np.array_split(pixels0, parts)]
+    row = np.repeat(np.arange(len(free0)), np.concatenate([count for count, _ in pairs]))
+    column = np.concatenate([columns for _, columns in pairs])
+    first = np.concatenate([settled0, free0[row]])
+    second = np.concatenate([settled1, free1[column]])
+    order = np.argsort(first, kind="stable")
+    return nearest_among_pairs(features0.descriptors, features1.descriptors, first[order], second[order])
+
+
+def _near_lines(geometry: UncertainGeometry, pixels0: np.ndarray, pixels1: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of homogeneous pixels (N, 3), (M, 3): how many of image 1 are near each of image 0 (N,), and which, in a row."""
     lines1, lines0 = pixels0 @ geometry.F.T, pixels1 @ geometry.F
     # p1^T F p0 over the length of a line's normal is the distance from that line.
     shorter = np.minimum((lines1[:, :2] ** 2).sum(axis=1)[:, None], (lines0[:, :2] ** 2).sum(axis=1))
     allowed = _REACH**2 * shorter
     for deviation in geometry.deviations:
         allowed += (_DEVIATIONS * (pixels0 @ deviation.T @ pixels1.T)) ** 2
-    row, column = np.nonzero((lines1 @ pixels1.T) ** 2 <= allowed)
-    first = np.concatenate([settled0, free0[row]])
-    second = np.concatenate([settled1, free1[column]])
-    order = np.argsort(first, kind="stable")
-    return nearest_among_pairs(features0.descriptors, features1.descriptors, first[order], second[order])
+    near = (lines1 @ pixels1.T) ** 2 <= allowed
+    return near.sum(axis=1), np.nonzero(near)[1]
 
 
 def _normalisation(points: np.ndarray) -> np.ndarray:

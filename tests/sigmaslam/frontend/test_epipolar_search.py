@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sigmaslam.frontend import epipolar_search
 from sigmaslam.frontend.epipolar_search import UncertainGeometry, find_epipolar_geometry, nearest_near_lines
 from sigmaslam.frontend.types import Features
 
@@ -119,6 +120,18 @@ def test_the_nearest_near_a_line_are_those_of_a_loop():
     best = similarity[found.index0, found.index1]
     np.testing.assert_allclose(found.similarity, best, atol=1e-6)
     np.testing.assert_array_equal(found.mutual, best == similarity[:, found.index1].max(axis=0))
+
+
+@pytest.mark.parametrize("pairs", [1, 7000])
+def test_pairs_that_are_looked_at_part_by_part_are_the_same(pairs: int, monkeypatch: pytest.MonkeyPatch):
+    rng = np.random.default_rng(3)
+    points0, points1 = views(rng)
+    given = EXACT, features(points0, rng), features(points1[:200], rng), np.arange(5), np.arange(5)
+    expected = nearest_near_lines(*given)
+    monkeypatch.setattr(epipolar_search, "_PAIRS_AT_A_TIME", pairs)
+    found = nearest_near_lines(*given)
+    np.testing.assert_array_equal(found.index0, expected.index0)
+    np.testing.assert_array_equal(found.index1, expected.index1)
 
 
 def test_settled_keypoints_have_no_other_partner_and_are_nobody_elses():
