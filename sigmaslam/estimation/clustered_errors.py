@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-# Cells of the image, along its longer and its shorter side.
-_CELLS = (6, 4)
+from sigmaslam.geometry.image_cells import CELLS, image_cells
+
 # Nine frames of ten of quiet renders stay below it: what neighbours share there, the noise of landmarks knows.
 _USUAL = 2.0
 
@@ -23,11 +23,8 @@ def clustering(places: np.ndarray, size: tuple[int, int], scores: np.ndarray, in
         scores: (M, p) slopes of each view's log-likelihood by the pose, at the estimate; zero for those not used.
         information: (p, p) of the views.
     """
-    width, height = size
-    columns, rows = _CELLS if width >= height else _CELLS[::-1]
-    place = np.clip((places / size * (columns, rows)).astype(np.int64), 0, (columns - 1, rows - 1))
-    cell = place[:, 0] + columns * place[:, 1]
-    sums = np.zeros((columns * rows, scores.shape[1]))
+    cell = image_cells(places, *size)
+    sums = np.zeros((CELLS, scores.shape[1]))
     np.add.at(sums, cell, scores)
     used = len(np.unique(cell[(scores != 0.0).any(axis=1)]))
     alone, together = (float(np.trace(np.linalg.solve(information, each.T @ each))) for each in (scores, sums))

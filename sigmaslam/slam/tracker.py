@@ -103,7 +103,7 @@ class StereoTracker:
         graphs = EstimatorGraphs(rectified, backend, config.linearisation == "unscented")
         prior = CalibrationPrior.of(rectified, camera.sigmas, config.offset_sigma, config.estimate, camera.covariance)
         self._window = window = KeyframeWindow(rectified, prior, graphs)
-        self._noise = noise = MeasurementNoise(config)
+        self._noise = noise = MeasurementNoise(config, rectified, prior)
         self._motion = motion = MotionFilter(backend)
         self._course = course = Course()
         self._keyframes = keyframes = Keyframes(window, config.max_keyframes, config.max_points, self._beside)

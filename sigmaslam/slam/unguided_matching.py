@@ -11,7 +11,8 @@ from sigmaslam.frontend import Frontend, KeypointSearch, StereoView
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.measurement_noise import MeasurementNoise
-from sigmaslam.two_view.stereo_pose import RelativePose, estimate_relative_pose
+from sigmaslam.two_view.scene_pose import estimate_scene_pose
+from sigmaslam.two_view.stereo_pose import RelativePose
 
 # A pose from matches alone has no prediction to agree with. Where fewer than this share of the matches that should be
 # right by their probabilities agree with it, three times as many inliers are required: symmetric texture in a mirrored
@@ -46,7 +47,7 @@ class UnguidedMatcher:
         matches = self.frontend.match(KeypointSearch.anywhere(key, index), view)
         rows = matches.key_index
         place = np.full(len(rows), self.config.keyframe_sigma)
-        relative = estimate_relative_pose(
+        relative = estimate_scene_pose(
             self.camera,
             self.window.as_calibrated(key.measured(rows)),
             np.column_stack([place, place, key.disparity_sigma[rows]]),

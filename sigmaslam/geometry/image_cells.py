@@ -1,0 +1,16 @@
+"""Cells of an image, so that what is crowded in one place counts no more than what covers as much of the image."""
+
+from __future__ import annotations
+
+import numpy as np
+
+# Along the image's longer and its shorter side.
+_LONGER, _SHORTER = 6, 4
+CELLS = _LONGER * _SHORTER
+
+
+def image_cells(places: np.ndarray, width: int, height: int) -> np.ndarray:
+    """(M,) number of the cell, from 0 to `CELLS` - 1, that each of the places (M, 2), pixels, is in."""
+    columns, rows = (_LONGER, _SHORTER) if width >= height else (_SHORTER, _LONGER)
+    place = np.clip((places / (width, height) * (columns, rows)).astype(np.int64), 0, (columns - 1, rows - 1))
+    return np.asarray(place[:, 0] + columns * place[:, 1])

@@ -1,0 +1,95 @@
+"""The pose relative to what stands still, where a large part of the matches may be on something that moves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam.geometry.image_cells import CELLS, image_cells
+from sigmaslam.geometry.se3 import se3_inverse, transform_points
+from sigmaslam.two_view.stereo_pose import RelativePose, estimate_relative_pose
+
+# A motion that explains less than this share of what the other one explains is no rival.
+_RIVAL = 1 / 3
+# Of two rivals the scene is the one whose points are so many times as far away, in the median.
+_FARTHER = 1.25
+# Poses that see most points within so many pixels of each other say the same.
+_SAME = 2.0
+_MIN_POINTS = 8
+
+
+@dataclass(frozen=True, slots=True)
+class _Motion:
+    """A pose that explains a part of the matches.
+
+    Attributes:
+        pose: with inliers among all matches.
+        area: share of the image that they stand for: of each cell the share of its own matches.
+        disparity: median of them, pixels.
+    """
+
+    pose: RelativePose
+    area: float
+    disparity: float
+
+    @classmethod
+    def of(cls, pose: RelativePose, cells: np.ndarray, disparity: np.ndarray, probability: np.ndarray) -> _Motion:
+        """Of matches (M,) in these cells, each with the disparity of its point and the probability that it is right."""
+        agreeing, present = (np.bincount(cells, weight, CELLS) for weight in (probability * pose.inliers, probability))
+        seen = present > 0.0
+        area = float(np.mean(agreeing[seen] / present[seen])) if seen.any() else 0.0
+        return cls(pose, area, float(np.median(disparity[pose.inliers])))
+
+
+def estimate_scene_pose(
+    camera: RectifiedStereo,
+    landmarks: np.ndarray,
+    landmark_sigma: np.ndarray,
+    measurement: np.ndarray,
+    noise: np.ndarray,
+    probability: np.ndarray,
+) -> RelativePose | None:
+    """Pose of the current view in the keyframe, relative to what stands still; arguments as `estimate_relative_pose`.
+
+    Matches that disagree with the first pose are asked for a second one. A bus ahead has more texture than the road
+    around it, so of two motions not the one with more matches is the scene's but the one that explains more of the
+    image, cell by cell. Where both explain much, what is farther away is the scene: what moves stands before it. And
+    where that does not tell either, nobody knows.
+
+    Returns:
+        The pose; None where there is none, or two between which nothing decides.
+    """
+    matched = (landmarks, landmark_sigma, measurement, noise, probability)
+    pose = estimate_relative_pose(camera, *matched)
+    if pose is None:
+        return None
+    rest = np.flatnonzero(~pose.inliers)
+    if len(rest) < _MIN_POINTS:
+        return pose
+    other = estimate_relative_pose(camera, *(each[rest] for each in matched))
+    if other is None:
+        return pose
+    agreeing = np.zeros(len(landmarks), bool)
+    agreeing[rest[other.inliers]] = True
+    other = replace(other, inliers=agreeing)
+    cells = image_cells(landmarks[:, :2], camera.width, camera.height)
+    motions = [_Motion.of(each, cells, landmarks[:, 2], probability) for each in (pose, other)]
+    lesser, greater = sorted(motions, key=lambda motion: motion.area)
+    if lesser.area < _RIVAL * greater.area or _are_alike(camera, landmarks, pose, other):
+        return greater.pose
+    nearer, farther = sorted(motions, key=lambda motion: -motion.disparity)
+    return farther.pose if nearer.disparity > _FARTHER * farther.disparity else None
+
+
+def _are_alike(camera: RectifiedStereo, landmarks: np.ndarray, one: RelativePose, other: RelativePose) -> bool:
+    """Whether both poses see most points at the same places."""
+    near = landmarks[:, 2] > 0.0
+    points = camera.triangulate(landmarks[near])
+    first, second = (transform_points(se3_inverse(each.T_key_camera), points) for each in (one, other))
+    front = (first[:, 2] > 0.0) & (second[:, 2] > 0.0)
+    if not front.any():
+        return False
+    apart = camera.project(first[front])[:, :2] - camera.project(second[front])[:, :2]
+    return float(np.median(np.linalg.norm(apart, axis=1))) < _SAME
