@@ -135,9 +135,9 @@ def match_twice(
     """As `match_features`; keypoints without a probable match are then matched again, near their epipolar lines.
 
     Between wide baselines the descriptors of a point differ, so that another of a thousand keypoints resembles it more;
-    of the twenty near its line it is the most similar one far more often. Probable matches of the first round keep their
-    partners, also those that move on their own; all are scored together once more. Where too few matches agree on a
-    geometry there is no second round.
+    of the twenty near its line it is the most similar one far more often. Probable matches of the first round keep
+    their partners, also those that move on their own; all are scored together once more. Where too few matches agree
+    on a geometry there is no second round.
 
     Args:
         as of `match_features`.
