@@ -75,6 +75,9 @@ def absent(words: list[str]) -> str:
     data = Path(os.environ.get("SIGMASLAM_DATA") or "/nowhere")
     if (reads_data(name) or name == "tests.faults") and not data.is_dir():
         return "SIGMASLAM_DATA names no folder of the real data sets"
+    for option, graph in itertools.pairwise(words):
+        if option == "--peer" and not Path(graph).is_file():
+            return f"{graph} is missing: make it by python -m sigmaslam.evaluation.matching.peer_exports"
     modules = [module for module in PEERS.get(name, ()) if find_spec(module) is None]
     return f"{', '.join(modules)} not installed: pip install 'sigmaslam[peers]'" if modules else ""
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from sigmaslam.evaluation.matching.eyes_by_descriptors import match_eyes
 from sigmaslam.evaluation.matching.image_pairs import Disparity, Homography, ImagePair, Motion, SameRows
-from sigmaslam.frontend.image_pair import Matches, match_features
+from sigmaslam.frontend.image_pair import Matches, match_twice
 from sigmaslam.frontend.match_confidence import ConfidenceEstimator
 from sigmaslam.frontend.types import Features
 from sigmaslam.geometry.se3 import rotation_log
@@ -262,7 +262,7 @@ def match_judged(
     image0: np.ndarray, image1: np.ndarray, features0: KeypointsAndDescriptors, features1: KeypointsAndDescriptors
 ) -> Matches:
     """What `sigmaslam match` makes of anyone's keypoints and descriptors if all have the same score and sigma."""
-    return match_features(_judge(), image0, image1, without_sigma(features0), without_sigma(features1))
+    return match_twice(_judge(), image0, image1, without_sigma(features0), without_sigma(features1))
 
 
 def _unit(descriptors: np.ndarray) -> np.ndarray:

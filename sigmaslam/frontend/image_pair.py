@@ -16,9 +16,10 @@ from sigmaslam.frontend.affine_alignment import refine_by_neighbours
 from sigmaslam.frontend.build import own_networks
 from sigmaslam.frontend.classical import OrbDetector, SiftDetector
 from sigmaslam.frontend.descriptor import refine_with_confidence
+from sigmaslam.frontend.epipolar_search import find_epipolar_geometry, nearest_near_lines
 from sigmaslam.frontend.learned import LearnedDetector
 from sigmaslam.frontend.match_confidence import ConfidenceEstimator
-from sigmaslam.frontend.nearest_neighbours import nearest_anywhere
+from sigmaslam.frontend.nearest_neighbours import Putative, nearest_anywhere
 from sigmaslam.frontend.types import Features
 from sigmaslam.inference.networks import WeightsFolder
 from sigmaslam.readers.images import check_grey, read_grey
@@ -61,6 +62,12 @@ class Matches:
         """The matches of that index or mask."""
         return Matches(*(getattr(self, field.name)[index] for field in fields(self)))
 
+    def joined(self, other: Matches) -> Matches:
+        """These and the others, the most probable first."""
+        pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
+        both = Matches(*(np.concatenate(pair) for pair in pairs))
+        return both.select(np.argsort(-both.probability, kind="stable"))
+
 
 def match_images(
     image0: np.ndarray,
@@ -78,7 +85,8 @@ def match_images(
             are shrunk to it, and the matches are said in the pixels of the images as they are given.
         frontend: "learned", "sift" or "orb".
         max_keypoints: most an image, from 4; the time and memory of matching grow with its square.
-        min_probability: of a match; 0 keeps every mutual nearest neighbour that the scorer does not refuse.
+        min_probability: of a match; 0 keeps every mutual nearest neighbour, among all keypoints or among those near its
+            epipolar line, that the scorer does not refuse.
         provider: where ONNX Runtime computes the networks, one of `sigmaslam.inference.session.PROVIDERS`.
         weights: folder of networks of one's own, as `sigmaslam export` writes it; for those that it lacks, the ones
             that ship.
@@ -91,7 +99,7 @@ def match_images(
     (image0, pixels0), (image1, pixels1) = _shrunk(_checked(image0, "image0")), _shrunk(_checked(image1, "image1"))
     features0, features1 = detect(image0), detect(image1)
     estimator = ConfidenceEstimator(provider=provider, weights=weights)
-    matches = match_features(estimator, image0, image1, features0, features1, min_probability)
+    matches = match_twice(estimator, image0, image1, features0, features1, min_probability)
     return _enlarged(matches, pixels0, pixels1)
 
 
@@ -111,20 +119,64 @@ def match_features(
         features0, features1: of these.
         min_probability: as `match_images` takes it.
     """
+    putative = nearest_anywhere(features0.descriptors, features1.descriptors)
+    matches = _refined(estimator, image0, image1, features0, features1, putative)
+    return matches.select(matches.probability >= min_probability)
+
+
+def match_twice(
+    estimator: ConfidenceEstimator,
+    image0: np.ndarray,
+    image1: np.ndarray,
+    features0: Features,
+    features1: Features,
+    min_probability: float = MIN_PROBABILITY,
+) -> Matches:
+    """As `match_features`; keypoints without a probable match are then matched again, near their epipolar lines.
+
+    Between wide baselines the descriptors of a point differ, so that another of a thousand keypoints resembles it more;
+    of the twenty near its line it is the most similar one far more often. Probable matches of the first round keep
+    their partners, also those that move on their own; all are scored together once more. Where too few matches agree
+    on a geometry there is no second round.
+
+    Args:
+        as of `match_features`.
+    """
+    first = match_features(estimator, image0, image1, features0, features1, 0.0)
+    probable = first.probability >= MIN_PROBABILITY
+    settled = first.select(probable)
+    geometry = find_epipolar_geometry(settled.keypoints0, settled.keypoints1)
+    if geometry is None:
+        return first.select(first.probability >= min_probability)
+    putative = nearest_near_lines(geometry, features0, features1, settled.index0, settled.index1)
+    second = _refined(estimator, image0, image1, features0, features1, putative)
+    # Improbable matches stay where nothing took their keypoints.
+    free = ~probable & ~np.isin(first.index0, second.index0) & ~np.isin(first.index1, second.index1)
+    matches = second.joined(first.select(free))
+    return matches.select(matches.probability >= min_probability)
+
+
+def _refined(
+    estimator: ConfidenceEstimator,
+    image0: np.ndarray,
+    image1: np.ndarray,
+    features0: Features,
+    features1: Features,
+    putative: Putative,
+) -> Matches:
+    """Putative matches that the scorer does not refuse, aligned, the most probable first."""
     matches = refine_with_confidence(
         estimator,
         image0,
         image1,
         features0,
         features1,
-        nearest_anywhere(features0.descriptors, features1.descriptors),
+        putative,
         lambda points0, points1, _, logit: refine_by_neighbours(image0, image1, points0, points1, logit),
     )
-    order = np.argsort(-matches.probability, kind="stable")
-    order = order[matches.probability[order] >= min_probability]
     keypoints, places = features0.keypoints[matches.index0], matches.places.astype(np.float32)
     columns = keypoints, places, matches.probability, matches.covariance, matches.index0, matches.index1
-    return Matches(*columns).select(order)
+    return Matches(*columns).select(np.argsort(-matches.probability, kind="stable"))
 
 
 def match_files(
@@ -156,7 +208,7 @@ def match_files(
     (small0, pixels0), (small1, pixels1) = _shrunk(image0), _shrunk(image1)
     features0, features1 = detect(small0), detect(small1)
     detected = time.perf_counter()
-    matches = match_features(estimator, small0, small1, features0, features1, min_probability)
+    matches = match_twice(estimator, small0, small1, features0, features1, min_probability)
     matches = _enlarged(matches, pixels0, pixels1)
     end = time.perf_counter()
     with atomic_path(out) as temporary:

@@ -84,7 +84,7 @@ def nearest_in_rows(
     first, second = _pairs_in_band(left[:, 1], np.full(len(left), row_tolerance), right[:, 1])
     disparity = left[first, 0] - right[second, 0]
     allowed = (disparity >= disparity_range[0]) & (disparity <= disparity_range[1])
-    return _nearest(descriptors_left, descriptors_right, first[allowed], second[allowed])
+    return nearest_among_pairs(descriptors_left, descriptors_right, first[allowed], second[allowed])
 
 
 def nearest_in_ellipses(
@@ -109,7 +109,31 @@ def nearest_in_ellipses(
     close = np.abs(offset[:, 0]) <= np.sqrt(CHI_SQUARE_99_OF_2 * covariance[:, 0, 0])[first]
     first, second, offset = first[close], second[close], offset[close]
     inside = within_ellipses(offset, covariance[first])
-    return _nearest(descriptors0, descriptors1, first[inside], second[inside])
+    return nearest_among_pairs(descriptors0, descriptors1, first[inside], second[inside])
+
+
+def nearest_among_pairs(
+    descriptors0: np.ndarray, descriptors1: np.ndarray, first: np.ndarray, second: np.ndarray
+) -> Putative:
+    """Nearest neighbours where only some pairs of keypoints are allowed.
+
+    Args:
+        descriptors0, descriptors1: (N, D), (M, D) of unit length.
+        first, second: (K,), (K,) keypoints of the allowed pairs, the first in ascending order.
+    """
+    if len(first) == 0:
+        return _none()
+    if len(first) > _DENSE_FROM * len(descriptors0) * len(descriptors1):
+        similarity = (descriptors0 @ descriptors1.T)[first, second]
+    else:
+        similarity = np.einsum("kd,kd->k", descriptors0[first], descriptors1[second])
+    _, place0, runner_up0 = _two_best(similarity, first, len(descriptors0))
+    best1, place1, runner_up1 = _two_best(similarity, second, len(descriptors1))
+    index0 = np.flatnonzero(place0 >= 0)
+    place = place0[index0]
+    index1 = second[place]
+    other = np.where(place1[index1] == place, runner_up1[index1], best1[index1])
+    return Putative(index0, index1, similarity[place], runner_up0[index0], other)
 
 
 def within_ellipses(offset: np.ndarray, covariance: np.ndarray) -> np.ndarray:
@@ -128,23 +152,6 @@ def _pairs_in_band(row0: np.ndarray, tolerance: np.ndarray, row1: np.ndarray) ->
     first = np.repeat(np.arange(len(row0)), count)
     within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
     return first, order[np.repeat(begin, count) + within]
-
-
-def _nearest(descriptors0: np.ndarray, descriptors1: np.ndarray, first: np.ndarray, second: np.ndarray) -> Putative:
-    """Best and runner-up of every keypoint among the allowed pairs (K,), (K,), the first in ascending order."""
-    if len(first) == 0:
-        return _none()
-    if len(first) > _DENSE_FROM * len(descriptors0) * len(descriptors1):
-        similarity = (descriptors0 @ descriptors1.T)[first, second]
-    else:
-        similarity = np.einsum("kd,kd->k", descriptors0[first], descriptors1[second])
-    _, place0, runner_up0 = _two_best(similarity, first, len(descriptors0))
-    best1, place1, runner_up1 = _two_best(similarity, second, len(descriptors1))
-    index0 = np.flatnonzero(place0 >= 0)
-    place = place0[index0]
-    index1 = second[place]
-    other = np.where(place1[index1] == place, runner_up1[index1], best1[index1])
-    return Putative(index0, index1, similarity[place], runner_up0[index0], other)
 
 
 def _two_best(values: np.ndarray, group: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

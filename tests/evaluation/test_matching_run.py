@@ -16,7 +16,7 @@ from sigmaslam.evaluation.matching.score_sets import score_refined
 from sigmaslam.evaluation.matching.scores import score_points, summarize
 from sigmaslam.evaluation.matching.sequence_pairs import sequence_pairs, sequence_steps
 from sigmaslam.evaluation.matching.sets import ALL, REFINED, SELECTION, STEPS, TRACKS
-from sigmaslam.frontend.image_pair import match_features
+from sigmaslam.frontend.image_pair import match_twice
 from sigmaslam.frontend.match_confidence import ConfidenceEstimator
 from sigmaslam.frontend.types import Features
 from sigmaslam.readers import open_sequence
@@ -121,7 +121,7 @@ def test_refined_matches_are_those_of_the_command_for_features_without_scores_an
     for keypoints, descriptors in map(load_extractor("sift"), (pair.image0, pair.image1)):
         ones = np.ones(len(keypoints), np.float32)
         features.append(Features(keypoints, descriptors, ones, ones))
-    found = match_features(ConfidenceEstimator(), pair.image0, pair.image1, *features)
+    found = match_twice(ConfidenceEstimator(), pair.image0, pair.image1, *features)
     places = (points.astype(np.float64) for points in (found.keypoints0, found.keypoints1))
     expected = summarize([score_points(pair, *places)])
     assert score_refined(load_extractor("sift"), [pair]) == pytest.approx(expected)

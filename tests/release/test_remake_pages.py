@@ -64,6 +64,15 @@ def test_with_data_nothing_lacks_it(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert absent(["sigmaslam", "benchmark", "matches"])
 
 
+def test_a_page_whose_peers_graph_is_missing_is_skipped_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("SIGMASLAM_DATA", str(tmp_path))
+    graph = tmp_path / "xfeat.onnx"
+    command = ["sigmaslam", "benchmark", "features", "--peer", str(graph), "--out", "features.md"]
+    assert absent(command).startswith(f"{graph} is missing")
+    graph.touch()
+    assert absent(command) == ""
+
+
 def test_a_page_that_fails_is_told_and_the_others_are_made(tmp_path: Path):
     pages = [write(tmp_path, f"{name}.md", f"sigmaslam benchmark {name} --out x.md") for name in ("claims", "geometry")]
     ran: list[str] = []

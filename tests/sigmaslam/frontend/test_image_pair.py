@@ -12,7 +12,7 @@ import sigmaslam
 from sigmaslam import Matches
 from sigmaslam.errors import InputError
 from sigmaslam.frontend.classical import OrbDetector, SiftDetector
-from sigmaslam.frontend.image_pair import draw_matches, match_features
+from sigmaslam.frontend.image_pair import draw_matches, match_features, match_twice
 from sigmaslam.frontend.learned import LearnedDetector
 from sigmaslam.frontend.match_confidence import MIN_LOGIT, ConfidenceEstimator
 from sigmaslam.frontend.nearest_neighbours import nearest_anywhere
@@ -154,8 +154,9 @@ def test_covariances_are_positive_and_not_too_sure_of_right_matches(either: Matc
 
 
 def test_of_any_probability_all_mutual_neighbours_are_matches_but_hopeless_ones(
-    estimator: ConfidenceEstimator, features: tuple[Features, Features], everything: Matches
+    estimator: ConfidenceEstimator, pair: Pair, features: tuple[Features, Features]
 ):
+    everything = match_features(estimator, *pair, *features, min_probability=0.0)
     found, expected = set(pairs(everything)), set(mutual(features))
     assert found <= expected
     putative = nearest_anywhere(features[0].descriptors, features[1].descriptors)
@@ -169,7 +170,7 @@ def test_of_a_least_probability_the_matches_are_the_first_of_all(
     estimator: ConfidenceEstimator, pair: Pair, features: tuple[Features, Features], everything: Matches, share: float
 ):
     least = float(np.quantile(everything.probability, share))
-    found = match_features(estimator, *pair, *features, min_probability=least)
+    found = match_twice(estimator, *pair, *features, min_probability=least)
     expected = everything.select(everything.probability >= least)
     assert 0 < len(found.probability) < len(everything.probability)
     for name in FIELDS:
@@ -202,10 +203,11 @@ def test_refinement_moves_places_a_little_and_changes_nothing_else(
 
 
 def test_matches_whose_patches_do_not_fit_are_less_probable_and_less_exact(
-    estimator: ConfidenceEstimator, pair: Pair, features: tuple[Features, Features], everything: Matches
+    estimator: ConfidenceEstimator, pair: Pair, features: tuple[Features, Features]
 ):
     """Half of the second image is repainted, the features stay where they are, which is right to a few pixels."""
     image0, image1 = pair
+    everything = match_features(estimator, *pair, *features, min_probability=0.0)
     middle = image1.shape[1] // 2
     repainted = image1.copy()
     repainted[:, :middle] = np.random.default_rng(0).integers(0, 255, repainted.shape, np.uint8)[:, :middle]
@@ -250,6 +252,41 @@ def test_wrong_matches_among_right_ones_are_dropped(estimator: ConfidenceEstimat
     found = np.isin(np.arange(400), match_features(estimator, *pair, *alike(keypoints0, keypoints1)).index0)
     assert found[~wrong].mean() > 0.97
     assert found[wrong].mean() < 0.1
+
+
+def test_the_second_round_finds_what_looks_like_a_place_far_from_its_epipolar_line(
+    estimator: ConfidenceEstimator, pair: Pair
+):
+    """Of every fifth point image 1 has a twin, anywhere, which is a little more like the point of image 0."""
+    rng = np.random.default_rng(8)
+    keypoints0 = rng.uniform((120, 80), (400, 300), (400, 2))
+    features0, features1 = alike(keypoints0, warped(keypoints0))
+    doubled = np.arange(0, 400, 5)
+    twins = Features(
+        rng.uniform((20, 20), (480, 360), (len(doubled), 2)).astype(np.float32),
+        features0.descriptors[doubled],
+        features1.scores[doubled],
+        features1.sigma[doubled],
+    )
+    features1 = Features.concatenate([features1, twins])
+    once, twice = (match(estimator, *pair, features0, features1) for match in (match_features, match_twice))
+    right = [np.isin(doubled, each.index0[each.index0 == each.index1]).mean() for each in (once, twice)]
+    assert right[0] == 0.0
+    # An affine map leaves the lines uncertain, so that a twin may lie near one.
+    assert right[1] > 0.8
+    # Who had a match has it still.
+    assert set(pairs(once)) - set(pairs(twice)) == set()
+    distance = np.linalg.norm(errors(twice), axis=1)
+    assert (distance < 3.0).mean() > 0.98
+
+
+def test_without_a_geometry_there_is_one_round(
+    estimator: ConfidenceEstimator, pair: Pair, features: tuple[Features, Features]
+):
+    few = [each.select(np.arange(15)) for each in features]
+    once, twice = (match(estimator, *pair, *few, 0.0) for match in (match_features, match_twice))
+    for name in FIELDS:
+        np.testing.assert_array_equal(getattr(twice, name), getattr(once, name))
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])
