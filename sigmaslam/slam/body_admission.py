@@ -24,8 +24,6 @@ from sigmaslam.slam.unguided_matching import UnguidedMatcher
 
 # A landmark that moved so far in the image with the body, pixels, is the body's.
 _MOVED = 3.0
-# What stands still is found so far off beside its match's own error, pixels: tails of the errors are no motion.
-_PLACE_SIGMA = 0.25
 # A place where the background was and is again, to so many pixels, is background if the body would have moved it by
 # `_MOVED` more.
 _STILL = 2.0
@@ -183,7 +181,7 @@ class BodyAdmission:
         motion = matches.measured - before
         known = np.isfinite(motion[:, 2])
         noise = np.zeros((len(motion), 3, 3))
-        noise[:, :2, :2] = matches.covariance + _PLACE_SIGMA**2 * np.eye(2)
+        noise[:, :2, :2] = matches.covariance + self._config.keyframe_sigma**2 * np.eye(2)
         noise[:, 2, 2] = np.where(known, disparity_sigma**2 + np.nan_to_num(matches.disparity_sigma) ** 2, 1.0)
         motion[~known, 2] = 0.0
         return np.asarray(squared_mahalanobis(motion, noise) > CHI_SQUARE_999[2 + known])

@@ -9,16 +9,10 @@ from sigmaslam.slam.config import TrackerConfig
 
 # The noise of matches follows the NIS: bounds of its scale, and the exponent of one frame's part in it.
 _SCALES, _ADAPTATION = (0.25, 4.0), 0.1
-UNMODELLED = 0.1
-"""Standard deviation, pixels, of what no match knows of its place and disparity: what the calibration and the
-resampling of rectified images leave, which differs from place to place."""
 
 
 class MeasurementNoise:
     """Covariances of what is measured in images; owns their common scale.
-
-    To those of matches the variance of what no match knows is added. Patches are aligned to hundredths of a pixel, and
-    the sharpest ones would outweigh all others where the calibration is off by tenths.
 
     Args:
         config: settings.
@@ -40,7 +34,6 @@ class MeasurementNoise:
         if self._config.constant_sigma is None:
             noise[:, :2, :2] = matches.covariance
             noise[:, 2, 2] = np.where(np.isfinite(matches.disparity), matches.disparity_sigma, 1.0) ** 2
-            noise += UNMODELLED**2 * np.eye(3)
         else:
             place, disparity = self._config.constant_sigma
             noise[:] = np.diag([place, place, disparity]) ** 2
@@ -66,10 +59,7 @@ class MeasurementNoise:
     def of_keypoints(self, view: StereoView, index: np.ndarray) -> np.ndarray:
         """(K, 4) variances of (u, v, disparity) of a keyframe's features, and of what all their disparities share."""
         constant = self._config.constant_sigma
-        if constant is None:
-            disparity = view.disparity_sigma[index] ** 2 + UNMODELLED**2
-        else:
-            disparity = np.full(len(index), constant[1] ** 2)
+        disparity = view.disparity_sigma[index] if constant is None else np.full(len(index), constant[1])
         place = np.full(len(index), self._config.keyframe_sigma**2)
         shared = self._config.shared_disparity
-        return self._scale * np.column_stack([place, place, (1.0 - shared) * disparity, shared * disparity])
+        return self._scale * np.column_stack([place, place, (1.0 - shared) * disparity**2, shared * disparity**2])

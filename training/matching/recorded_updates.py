@@ -29,7 +29,6 @@ from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.estimate import Estimate
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.guided_matching import GuidedMatches
-from sigmaslam.slam.measurement_noise import UNMODELLED
 from sigmaslam.slam.tracker import StereoTracker
 
 # Pixels by which a place may differ between front-end and filter: right places are differences of copied numbers.
@@ -87,10 +86,8 @@ class RecordedUpdate:
 
     def views_noise(self, verifier: nn.Module) -> tuple[Tensor, Tensor]:
         """(M, 3, 3) noise of each view alone and (M, 3, 2) `common`, as `MeasurementNoise.split`, by this verifier."""
-        beside = UNMODELLED**2
-        whole = self.places.covariances(verifier)
-        whole = self.noise_scale * (whole + beside * torch.eye(2, dtype=whole.dtype))
-        of_disparity = self.noise_scale * (self.disparities.covariances(verifier)[:, 0, 0] + beside)
+        whole = self.noise_scale * self.places.covariances(verifier)
+        of_disparity = self.noise_scale * self.disparities.covariances(verifier)[:, 0, 0]
         known = torch.isfinite(self.measurement[:, 2])
         variance = torch.ones_like(self.measurement[:, 2]).masked_scatter(known, of_disparity)
         noise = torch.nn.functional.pad((1.0 - self.shared_place) * whole, (0, 1, 0, 1))
@@ -261,8 +258,8 @@ class RecordingTracker(StereoTracker):
         rows_right = along_rows.rows_of(measurement[known, :1] - measurement[known, 2:])
         if rows is None or rows_right is None:
             return None
-        of_place = made.views.covariance[:, :2, :2] / (in_time.covariance[rows] + UNMODELLED**2 * np.eye(2))
-        of_disparity = made.views.noise[known, 2, 2] / (along_rows.covariance[rows_right, 0, 0] + UNMODELLED**2)
+        of_place = made.views.covariance[:, :2, :2] / in_time.covariance[rows]
+        of_disparity = made.views.noise[known, 2, 2] / along_rows.covariance[rows_right, 0, 0]
         ratios = np.append(of_place[:, [0, 1], [0, 1]], of_disparity / (1.0 - self.config.shared_disparity))
         noise_scale = float(np.median(ratios))
         if np.abs(ratios / noise_scale - 1.0).max() > _SAME_COVARIANCE:
