@@ -2,6 +2,7 @@
 
 from sigmaslam.filters.adaptive import adapted_noise
 from sigmaslam.filters.bayes import BayesFilter, ExtendedKalmanFilter, KalmanFilter, UnscentedKalmanFilter
+from sigmaslam.filters.compiled_filter import compile_filter
 from sigmaslam.filters.core.compiled import compile_step
 from sigmaslam.filters.core.failure import FilterError
 from sigmaslam.filters.core.layout import stack
@@ -55,6 +56,7 @@ __all__ = [
     "UnscentedKalmanFilter",
     "Update",
     "adapted_noise",
+    "compile_filter",
     "compile_step",
     "cubature",
     "degree_of_belief",

@@ -183,6 +183,7 @@ def _quantiles(probability: float, count: Tensor, size: int, like: Tensor) -> Te
     return torch.tensor(_quantiles_up_to(probability, size), dtype=like.dtype, device=like.device)[count]
 
 
+@torch.compiler.assume_constant_result
 @lru_cache(maxsize=16)
 def _quantiles_up_to(probability: float, size: int) -> tuple[float, ...]:
     # Of no component the distance is zero, which any quantile but zero lies above.

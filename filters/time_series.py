@@ -101,14 +101,7 @@ def filter_sequence(
         FilterError: as `predict` and `update`; the message begins with the step.
         ValueError: lengths do not fit.
     """
-    require_tensor("values", values)
-    steps = values.shape[0] if values.ndim else 0
-    if values.ndim < 2 or steps == 0:
-        raise ValueError(f"values (T, ..., m) with T > 0 expected, got {tuple(values.shape)}")
-    for inputs, length, name in ((motion_inputs, steps - 1, "motion"), (measurement_inputs, steps, "measurement")):
-        if any(len(given) != length for given in inputs):
-            lengths = ", ".join(str(len(given)) for given in inputs)
-            raise ValueError(f"{steps} measurements need {name} inputs of length {length}, got {lengths}")
+    steps = count_steps(values, motion_inputs, measurement_inputs)
     first = Event(None, measurement, values[0], (), [given[0] for given in measurement_inputs], gate, robust)
     later = (
         Event(
@@ -123,6 +116,23 @@ def filter_sequence(
         for k in range(1, steps)
     )
     return filter_events(bayes, belief, [first, *later])
+
+
+def count_steps(values: Tensor, motion_inputs: Sequence[Tensor], measurement_inputs: Sequence[Tensor]) -> int:
+    """T of a sequence's values (T, ..., m).
+
+    Raises:
+        ValueError: there is none, or the inputs' lengths do not fit.
+    """
+    require_tensor("values", values)
+    steps = values.shape[0] if values.ndim else 0
+    if values.ndim < 2 or steps == 0:
+        raise ValueError(f"values (T, ..., m) with T > 0 expected, got {tuple(values.shape)}")
+    for inputs, length, name in ((motion_inputs, steps - 1, "motion"), (measurement_inputs, steps, "measurement")):
+        if any(len(given) != length for given in inputs):
+            lengths = ", ".join(str(len(given)) for given in inputs)
+            raise ValueError(f"{steps} measurements need {name} inputs of length {length}, got {lengths}")
+    return steps
 
 
 def filter_events(bayes: BayesFilter, belief: Gaussian, events: Sequence[Event]) -> Track:

@@ -14,7 +14,7 @@ from sigmaslam.filters.tracking.frame_update import GatedStep, PredictViews, Rob
 from sigmaslam.filters.tracking.window_solution import Condition, EliminateLandmarks, GateWindow
 from sigmaslam.inference.networks import WeightsFolder, network_path
 from sigmaslam.models.extractor import FeatureExtractor
-from sigmaslam.models.onnx_export import load_network, load_scorer, load_verifier
+from sigmaslam.models.network_export import load_network, load_scorer, load_verifier
 from sigmaslam.models.scorer_network import ScoredMatches
 from sigmaslam.models.verifier_network import PLACE_COLUMNS, VERIFIER_COLUMNS, MatchCovariance
 

@@ -33,7 +33,7 @@ from sigmaslam.frontend.learned import LearnedDetector
 from sigmaslam.frontend.match_confidence import ConfidenceEstimator
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.inference.onnx_graph import shipped_weights
-from sigmaslam.models.onnx_export import load_verifier
+from sigmaslam.models.network_export import load_verifier
 from sigmaslam.models.torch_runtime import TorchModule
 from sigmaslam.models.verifier_network import PLACE_COLUMNS, MatchCovariance, MatchVerifier
 from sigmaslam.progress import open_progress

@@ -171,7 +171,7 @@ def count_parameters(name: str) -> int | None:
     """Numbers in a network: those of weights that are trained, or all real constants of a graph."""
     path = Path(name)
     if path.suffix == ".safetensors":
-        from sigmaslam.models.onnx_export import load_network
+        from sigmaslam.models.network_export import load_network
 
         return sum(parameter.numel() for parameter in load_network(path).parameters())
     if path.suffix == ".onnx":

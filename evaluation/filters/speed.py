@@ -139,6 +139,8 @@ def format_page(rounds: int, compiled: bool, command: str) -> str:
         for kind in KINDS:
             lines += _batch_section(kind, peers, rounds, compiled, advance)
         lines += extended_section(rounds)
+        if compiled:
+            lines += sequence_section(rounds)
         advance()
     return "\n".join(lines)
 
@@ -224,6 +226,34 @@ def extended_section(rounds: int) -> list[str]:
         "`jacobian` (`evaluation/filters/extended.py`).",
         "",
         *table(["", *(f"B = {batch:,}" for batch in extended.BATCHES)], rows),
+        "",
+    ]
+
+
+def sequence_section(rounds: int) -> list[str]:
+    """Whole sequences, compiled and not."""
+    from sigmaslam.evaluation.filters import sequences
+
+    columns = []
+    for batch in sequences.BATCHES:
+        contenders = [Contender(each, step) for each, step in sequences.make(batch).items()]
+        timings = time_interleaved(contenders, rounds)
+        columns.append(timings)
+    count = sequences.STEPS
+    rows = []
+    for name in columns[0]:
+        cells = [
+            _rate([batch * count / seconds for seconds in timings[name].seconds])
+            for batch, timings in zip(sequences.BATCHES, columns, strict=True)
+        ]
+        rows.append([name, *cells])
+    return [
+        "## Sequences",
+        "",
+        f"Filter steps a second over {count} steps of a robot in R^3 that sees range and bearing, with the lowest and",
+        "highest round; float64 (`evaluation/filters/sequences.py`).",
+        "",
+        *table(["", *(f"B = {batch:,}" for batch in sequences.BATCHES)], rows),
         "",
     ]
 

@@ -116,6 +116,32 @@ def expand(batch: int, node: fx.Node, given: Entries, size: Any) -> Entries | No
     return Entries(np.broadcast_to(given.parts, (*shape[:axis], 1, *shape[axis + 1 :])), axis, given.dtype)
 
 
+def pad(batch: int, node: fx.Node, given: Entries, widths: Sequence[int], value: float = 0.0) -> Entries | None:
+    """aten.constant_pad_nd, of entries before and behind those of the last dimensions, the last first."""
+    pairs = [(0, 0)] * given.parts.ndim
+    for k in range(len(widths) // 2):
+        pairs[-1 - k] = widths[2 * k], widths[2 * k + 1]
+    if min(widths) < 0 or (given.axis is not None and pairs[given.axis] != (0, 0)):
+        return None
+    shape = [length + sum(pair) for length, pair in zip(given.parts.shape, pairs, strict=True)]
+    parts = np.full(shape, value, dtype=object)
+    parts[tuple(slice(first, first + length) for (first, _), length in zip(pairs, given.parts.shape, strict=True))] = (
+        given.parts
+    )
+    return Entries(parts, given.axis, given.dtype)
+
+
+def diagonal(
+    batch: int, node: fx.Node, given: Entries, offset: int = 0, dim1: int = 0, dim2: int = 1
+) -> Entries | None:
+    """aten.diagonal."""
+    dims = dim1 % given.parts.ndim, dim2 % given.parts.ndim
+    if given.axis in dims:
+        return None
+    axis = None if given.axis is None else given.axis - sum(dim < given.axis for dim in dims)
+    return Entries(np.diagonal(given.parts, offset, *dims), axis, given.dtype)
+
+
 def split(batch: int, node: fx.Node, given: Entries, sizes: Any, dim: int = 0) -> list[Entries] | None:
     """aten.split."""
     dim %= given.parts.ndim
@@ -156,6 +182,8 @@ MOVES: dict[Any, Callable[..., Any]] = {
     aten.squeeze.dim: reshape,
     aten.squeeze.dims: reshape,
     aten.expand.default: expand,
+    aten.constant_pad_nd.default: pad,
+    aten.diagonal.default: diagonal,
     aten.split.Tensor: split,
     aten.split_with_sizes.default: split,
     aten.unbind.int: unbind,

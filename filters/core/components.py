@@ -39,15 +39,16 @@ class InComponents(CustomInferenceAwareGraphPass):
 
         Where derivatives are asked for, it is left as well.
         """
+        _fill_symbolic_zeros(graph)
         batch = _batch_size(graph) if is_inference else None
         if batch is None:
             return
         nodes = list(graph.nodes)
-        rewriter = _Rewriter(graph, batch)
+        rewriter = _Rewriter(graph, batch, MOST_OPERATIONS)
         with graph.inserting_before(nodes[-1]):
             try:
                 nodes[-1].args = (rewriter.run(nodes),)
-            except _TooLongError:
+            except TooLongError:
                 rewriter.kept.update(nodes)
         for node in reversed(graph.nodes):
             if node.op == "call_function" and not node.users and node not in rewriter.kept:
@@ -58,8 +59,30 @@ class InComponents(CustomInferenceAwareGraphPass):
         return get_hash_for_files((__file__, component_moves.__file__))
 
 
-class _TooLongError(Exception):
+class TooLongError(Exception):
     """The program would take too long to compile."""
+
+
+def entries_of(graph: fx.Graph, batch: int, most: int) -> list[Any]:
+    """Rewrites a graph of functions of a batch in place; returns what it returns, by `Entries` where it has the batch.
+
+    Raises:
+        TooLongError: there are more operations than `most`.
+    """
+    _fill_symbolic_zeros(graph)
+    nodes = list(graph.nodes)
+    with graph.inserting_before(nodes[-1]):
+        return _Rewriter(graph, batch, most).results(nodes)
+
+
+def _fill_symbolic_zeros(graph: fx.Graph) -> None:
+    """Makes tensors of what forward derivatives know to be zero, which have no memory and crash in compiled code."""
+    for node in graph.nodes:
+        if node.target is aten._efficientzerotensor.default:
+            node.target, node.args = aten.full.default, (node.args[0], 0.0)
+            value = node.meta["val"]
+            with value.fake_mode:
+                node.meta["val"] = aten.full.default(*node.args, **node.kwargs)
 
 
 def _batch_size(graph: fx.Graph) -> int | None:
@@ -91,9 +114,10 @@ class _Rewriter:
         kept: operations of the graph that stay, though nothing may use them: a check raises.
     """
 
-    def __init__(self, graph: fx.Graph, batch: int) -> None:
+    def __init__(self, graph: fx.Graph, batch: int, most: int) -> None:
         self._graph = graph
         self._batch = batch
+        self._most = most
         self.kept: set[fx.Node] = set()
         self._made: dict[fx.Node, Any] = {}
         self._known: dict[Any, fx.Node] = {}
@@ -103,12 +127,16 @@ class _Rewriter:
         self._fake: FakeTensorMode = likes[0].fake_mode
 
     def run(self, nodes: Sequence[fx.Node]) -> Any:
-        """The arguments of the output node, written anew."""
-        for node in nodes:
-            if node.op == "output":
-                return fx.map_arg(node.args[0], lambda each: self._whole(self._made[each]))
+        """The arguments of the output node, which is the last, written anew."""
+        self.results(nodes)
+        return fx.map_arg(nodes[-1].args[0], lambda each: self._whole(self._made[each]))
+
+    def results(self, nodes: Sequence[fx.Node]) -> list[Any]:
+        """What the arguments of the output node have become."""
+        for node in nodes[:-1]:
             self._made[node] = self._value(node)
-        raise AssertionError("a graph ends with an output")
+        returned: Any = nodes[-1].args[0]
+        return [self._given(each) for each in returned]
 
     def _value(self, node: fx.Node) -> Any:
         if node.op != "call_function":
@@ -120,6 +148,8 @@ class _Rewriter:
             return given[0][index] if isinstance(given[0], list) else self._kept(node)
         if target is aten.full.default:
             return self._filled(node)
+        if target is aten.expand.default and isinstance(given[0], fx.Node) and self._batch in (shape_of(node) or ()):
+            return MOVES[target](self._batch, node, self._split(given[0]), *node.args[1:])
         if target in RESHAPES and isinstance(given[0], InRow):
             result = reshape(self._batch, node, given[0].stacked(), None)
             return self._kept(node) if result is None else result
@@ -168,8 +198,8 @@ class _Rewriter:
         assert shape is not None
         axis = shape.index(self._batch) if self._batch in shape else None
         parts = np.empty([1 if k == axis else length for k, length in enumerate(shape)], dtype=object)
-        if parts.size > MOST_OPERATIONS:
-            raise _TooLongError
+        if parts.size > self._most:
+            raise TooLongError
         for index in np.ndindex(*parts.shape):
             part = node
             for k in reversed(range(len(shape))):
@@ -225,8 +255,8 @@ class _Rewriter:
         if key in self._known:
             return self._known[key]
         self._count += 1
-        if self._count > MOST_OPERATIONS:
-            raise _TooLongError
+        if self._count > self._most:
+            raise TooLongError
         node = self._graph.call_function(target, arguments, named)
         values = fx.map_arg((arguments, named), lambda each: each.meta["val"])
         with self._fake:
@@ -290,8 +320,10 @@ class _Rewriter:
         dims = [wanted] if isinstance(wanted, int) else list(wanted or [])
         dims = sorted({dim % given.parts.ndim for dim in dims})
         dtype = node.meta["val"].dtype
-        if not dims or given.axis in dims or dtype != given.dtype:
+        if not dims or given.axis in dims:
             return self._kept(node)
+        if dtype != given.dtype:  # a count
+            given = self._converted(given, dtype)
         keep = len(node.args) > 2 and bool(node.args[2])
         parts, axis = given.parts, given.axis
         for dim in reversed(dims):
@@ -307,6 +339,13 @@ class _Rewriter:
                 parts = np.squeeze(parts, dim)
                 axis = axis - 1 if axis is not None and dim < axis else axis
         return Entries(parts, axis, dtype)
+
+    def _converted(self, given: Entries, dtype: torch.dtype) -> Entries:
+        parts = np.empty(given.parts.shape, dtype=object)
+        for index in np.ndindex(*parts.shape):
+            part = self._node(given.parts[index], given.dtype)
+            parts[index] = self._call(torch.ops.prims.convert_element_type.default, part, dtype)
+        return Entries(parts, given.axis, dtype)
 
     # Moves
 

@@ -14,7 +14,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.inference.session import check_provider
 
 if TYPE_CHECKING:
-    from sigmaslam.models.onnx_export import CallTime
+    from sigmaslam.models.network_export import CallTime
 
 
 def export(
@@ -50,7 +50,8 @@ def export(
     if run is None or out is None:
         raise InputError("give the folder of a run and --out, or --check, or --page")
     from sigmaslam.evaluation.matching import read_scores
-    from sigmaslam.models.onnx_export import export_all, export_scoring
+    from sigmaslam.models.network_export import export_scoring
+    from sigmaslam.models.onnx_export import export_all
     from sigmaslam.training.features.loop import WEIGHTS_NAME
     from sigmaslam.training.matching.scoring import SCORER_NAME
     from sigmaslam.training.run_card import CARD_NAME
@@ -73,7 +74,8 @@ def _tell_of_shipped(check: bool, page: Path | None, provider: str) -> None:
     from sigmaslam.files import atomic_write_text
     from sigmaslam.inference.onnx_graph import shipped_weights
     from sigmaslam.models.graph_page import PAGE_COMMAND, graph_page
-    from sigmaslam.models.onnx_export import check_graphs, check_networks
+    from sigmaslam.models.network_export import check_networks
+    from sigmaslam.models.onnx_export import check_graphs
 
     folder = shipped_weights("features.onnx").parent
     if page is not None:

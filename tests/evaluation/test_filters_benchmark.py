@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sigmaslam.evaluation.filters import extended
+from sigmaslam.evaluation.filters import extended, sequences
 from sigmaslam.evaluation.filters import ours as filter_ours
 from sigmaslam.evaluation.filters import work as filter_work
 from sigmaslam.evaluation.filters.peer_filters import PEERS
@@ -52,6 +52,16 @@ def test_extended_and_unscented_filters_do_the_same_work(kind: str, batch: int):
     space = SE3() if kind == "SE(3)" else Euclidean(3)
     moved = space.local(expected.mean, found.mean).abs()
     assert 0.0 < float(moved.median()) < 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("batch", [1, 70])
+def test_sequences_are_filtered_alike_however_they_are_compiled(batch: int):
+    expected, *others = (filtered() for filtered in sequences.make(batch, steps=5).values())
+    assert expected[0].shape == ((5, 3) if batch == 1 else (5, 70, 3))
+    for found in others:
+        for a, b in zip(found, expected, strict=True):
+            np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
 
 
 def check(work: filter_work.Work, expected: filter_work.Belief, dtype: str, tolerance: float) -> None:

@@ -155,6 +155,10 @@ def test_a_filter_on_a_manifold_is_rewritten():
         lambda x, y: x.flip(-1).mT.reshape(-1, 3) @ y[0],
         lambda x, y: torch.where(x[:, :1] > 0, x, 0.5) * torch.tensor([1.0, 0.0, 2.0]),
         lambda x, y: x.split([1, 2], dim=-1)[1] + y.unbind(-1)[0].unsqueeze(-1).expand(-1, -1, 2),
+        lambda x, y: torch.nn.functional.pad(x, (1, 2, 0, 1), value=2.0) @ torch.ones(6, 2) + y.mean(),
+        lambda x, y: torch.nn.functional.pad(x, (0, 0, 0, 0, 1, 1))[1:-1] - torch.nn.functional.pad(y, (-1, 1)),
+        lambda x, y: x + torch.arange(3.0)[:, None].expand(len(x), 3, 3) * y.diagonal(dim1=-2, dim2=-1)[:, None],
+        lambda x, y: ((x > y).sum(dim=-1), x.diagonal(1, 1, 2), y.diagonal(dim1=0, dim2=1)),
         lambda x, y: (x.to(torch.int64) + 1, x.isnan(), x.isfinite(), x.clamp(-0.5, 0.5), torch.zeros_like(y)),
     ],
 )

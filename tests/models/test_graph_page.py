@@ -9,9 +9,10 @@ import pytest
 
 from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.inference.onnx_graph import shipped_weights
-from sigmaslam.models import onnx_export
+from sigmaslam.models import network_export
 from sigmaslam.models.graph_page import PAGE_COMMAND, TEXTS, graph_page
-from sigmaslam.models.onnx_export import check_graphs, check_networks
+from sigmaslam.models.network_export import check_networks
+from sigmaslam.models.onnx_export import check_graphs
 
 WEIGHTS = shipped_weights("features.onnx").parent
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "onnx.md"
@@ -65,13 +66,13 @@ def test_the_cpu_is_checked_against_itself():
 
 def test_a_provider_that_computes_something_else_is_found(monkeypatch):
     calls = []
-    right = onnx_export._timed
+    right = network_export._timed
 
     def wrong_on_the_provider(graph, feed):
         outputs, times = right(graph, feed)
         calls.append(graph)
         return [each * (1.0 + 1e-3 * (len(calls) % 2 == 0)) for each in outputs], times
 
-    monkeypatch.setattr(onnx_export, "_timed", wrong_on_the_provider)
+    monkeypatch.setattr(network_export, "_timed", wrong_on_the_provider)
     with pytest.raises(SigmaSlamError, match=r"features\.onnx on the provider cpu differs from the CPU by"):
         check_networks(WEIGHTS, "cpu")

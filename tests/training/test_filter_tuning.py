@@ -18,7 +18,7 @@ from sigmaslam.evaluation.rendered_camera import open_rendered
 from sigmaslam.filters.manifolds.se3_matrices import exp_se3
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.inference.onnx_graph import shipped_weights
-from sigmaslam.models.onnx_export import load_verifier
+from sigmaslam.models.network_export import load_verifier
 from sigmaslam.models.verifier_network import PLACE_COLUMNS, MatchCovariance, MatchVerifier
 from sigmaslam.readers.trajectory_files import read_trajectory
 from sigmaslam.training import filter_tuning

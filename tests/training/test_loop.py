@@ -14,7 +14,7 @@ from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sigmaslam.errors import InputError
-from sigmaslam.models.onnx_export import load_network
+from sigmaslam.models.network_export import load_network
 from sigmaslam.training import devices
 from sigmaslam.training.features.checkpoint import CHECKPOINT_NAME
 from sigmaslam.training.features.loop import WEIGHTS_NAME, train

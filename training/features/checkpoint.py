@@ -10,7 +10,7 @@ import torch
 
 from sigmaslam.errors import InputError
 from sigmaslam.models.feature_network import FeatureNetwork
-from sigmaslam.models.onnx_export import load_network
+from sigmaslam.models.network_export import load_network
 from sigmaslam.training.devices import Workplace, place_network
 from sigmaslam.training.features.recipes import TrainingConfig
 from sigmaslam.training.snapshot import check_same, read_snapshot, restore, write_snapshot

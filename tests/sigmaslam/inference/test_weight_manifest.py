@@ -56,7 +56,7 @@ def test_a_changed_shipped_graph_stops_the_front_end(folder: Path, monkeypatch: 
 
 
 def test_weights_of_torch_are_compared_as_well(folder: Path):
-    from sigmaslam.models.onnx_export import load_verifier  # torch takes seconds to import
+    from sigmaslam.models.network_export import load_verifier  # torch takes seconds to import
 
     content = bytearray(shipped_weights("verifier.safetensors").read_bytes())
     content[-1] ^= 1

@@ -11,26 +11,21 @@ from safetensors.torch import save_file
 from sigmaslam.errors import InputError
 from sigmaslam.inference.onnx_graph import OnnxGraph, shipped_weights
 from sigmaslam.inference.weight_manifest import read_manifest
-from sigmaslam.models import onnx_export
+from sigmaslam.models import network_export
 from sigmaslam.models.extractor import FeatureExtractor
 from sigmaslam.models.feature_network import FeatureNetwork
-from sigmaslam.models.onnx_export import (
+from sigmaslam.models.network_export import (
     export_features,
-    export_filter,
     export_scoring,
+    feature_difference,
     load_network,
     load_scorer,
     load_verifier,
 )
 from sigmaslam.models.scorer_network import MatchScorer
-from sigmaslam.models.torch_runtime import TorchFeatures, filter_module, scoring_module
-from sigmaslam.models.tracking_graphs import condition_example, frame_example, window_example
+from sigmaslam.models.torch_runtime import TorchFeatures, scoring_module
 from sigmaslam.models.verifier_network import PLACE_COLUMNS, VERIFIER_COLUMNS, MatchVerifier
 from sigmaslam.synthetic.rendering.textures import dead_leaves
-
-FRAME_STEPS = ("frame_predict", "frame_robust", "frame_gated")
-WINDOW_STEPS = ("window_eliminate", "window_gate")
-FILTERS = ("pose_predict", *FRAME_STEPS, *WINDOW_STEPS, "window_condition")
 
 
 def untrained_networks() -> dict[str, torch.nn.Module]:
@@ -95,54 +90,16 @@ def test_exported_features_equal_torch_at_other_sizes_and_counts(weights, tmp_pa
         assert_same_features(found, twin(given))
 
 
-@pytest.mark.slow
-def test_exported_filter_equals_torch(tmp_path):
-    differences = export_filter(tmp_path)
-    assert set(differences) == set(FILTERS)
-    assert max(differences.values()) < 1e-9
-    assert_filter_graphs_equal_torch(tmp_path)
-
-
-@pytest.mark.parametrize("name", FILTERS)
-def test_shipped_filter_equals_torch(name):
-    shipped(f"{name}.onnx")
-    assert_filter_graphs_equal_torch(shipped(f"{name}.onnx").parent, (name,))
-
-
-def assert_filter_graphs_equal_torch(folder: Path, names: tuple[str, ...] = FILTERS) -> None:
-    """On states and numbers of keyframes, landmarks and views that the export neither traced nor checked."""
-    graphs = onnx_export._filter_graphs()
-    for name in names:
-        inputs = graphs[name].inputs
-        if name in FRAME_STEPS:
-            # Two views of one keyframe's landmarks, and a full window.
-            examples = [
-                frame_example(seed, *sizes, *inputs) for seed, sizes in ((5, (1, 2)), (6, (6, 211)), (7, (7, 40)))
-            ]
-        elif name in WINDOW_STEPS:
-            examples = [window_example(seed, *sizes, *inputs) for seed, sizes in ((5, (2, 3)), (6, (7, 120)))]
-        elif name == "window_condition":
-            examples = [condition_example(5, 12, 1), condition_example(6, 54, 43)]
-        else:
-            examples = [onnx_export._predict_example(seed) for seed in (5, 6)]
-        for example in examples:
-            feed = {key: value.numpy() for key, value in zip(inputs, example, strict=True)}
-            found, expected = OnnxGraph(folder / f"{name}.onnx")(feed), filter_module(name)(feed)
-            for a, b in zip(found, expected, strict=True):
-                size = max(1.0, float(np.abs(b).max()))
-                np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * size, err_msg=name)
-
-
 @pytest.mark.parametrize("name", ["scorer", "verifier", "place_verifier"])
 def test_shipped_scorer_and_verifiers_equal_torch(name):
     """On numbers of matches that the export neither traced (300) nor checked (77)."""
     graph, twin = OnnxGraph(shipped(f"{name}.onnx")), scoring_module(name)
     shipped(f"{name}.safetensors")
-    inputs = onnx_export._scoring_graphs(*untrained_networks().values())[name].inputs
+    inputs = network_export._scoring_graphs(*untrained_networks().values())[name].inputs
     example = {
-        "scorer": onnx_export._matches_example,
-        "verifier": partial(onnx_export._columns_example, columns=VERIFIER_COLUMNS),
-        "place_verifier": partial(onnx_export._columns_example, columns=PLACE_COLUMNS),
+        "scorer": network_export._matches_example,
+        "verifier": partial(network_export._columns_example, columns=VERIFIER_COLUMNS),
+        "place_verifier": partial(network_export._columns_example, columns=PLACE_COLUMNS),
     }[name]
     for seed, count in ((5, 1), (6, 13), (7, 1500)):
         given = {key: value.numpy() for key, value in zip(inputs, example(seed, count), strict=True)}
@@ -252,11 +209,11 @@ def test_an_output_that_is_off_shows_in_the_difference(output):
     rng = np.random.default_rng(0)
     expected = [100 * rng.random((20, 2)), rng.random(20), rng.random((20, 8)), rng.random(20)]
     swapped = [np.concatenate([values[1::-1], values[2:]]) for values in expected]
-    assert onnx_export._feature_difference(swapped, expected) == 0.0
+    assert feature_difference(swapped, expected) == 0.0
     found = [values.copy() for values in swapped]
     found[output][7] += 2e-3
-    assert onnx_export._feature_difference(found, expected) == pytest.approx(2e-3)
-    assert onnx_export._feature_difference([values[:15] for values in expected], expected) == np.inf
+    assert feature_difference(found, expected) == pytest.approx(2e-3)
+    assert feature_difference([values[:15] for values in expected], expected) == np.inf
 
 
 def test_a_broken_graph_is_refused(tmp_path):
