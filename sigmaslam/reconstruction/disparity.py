@@ -124,7 +124,8 @@ def _seen_by_both(left: np.ndarray, right: np.ndarray, largest: float) -> np.nda
     Skies and plain walls match anywhere, mostly far off, and would make the search several times as long.
     """
     there = _semi_global(left, right, largest)
-    back = _semi_global(*(np.ascontiguousarray(image[:, ::-1]) for image in (right, left)), largest)[:, ::-1]
+    mirrored_left, mirrored_right = (np.ascontiguousarray(image[:, ::-1]) for image in (left, right))
+    back = _semi_global(mirrored_right, mirrored_left, largest)[:, ::-1]
     v, u = np.nonzero(np.isfinite(there))
     found = there[v, u]
     u_right = np.rint(u - found).astype(np.int64).clip(0, left.shape[1] - 1)

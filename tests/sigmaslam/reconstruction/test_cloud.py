@@ -6,7 +6,15 @@ import numpy as np
 
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import se3_exp, transform_points
-from sigmaslam.reconstruction.cloud import DenseCloud, DepthPixels, VoxelCloud, inverse, largest_eigenvalue, symmetric, write_cloud
+from sigmaslam.reconstruction.cloud import (
+    DenseCloud,
+    DepthPixels,
+    VoxelCloud,
+    inverse,
+    largest_eigenvalue,
+    symmetric,
+    write_cloud,
+)
 
 CAMERA = RectifiedStereo(500.0, 500.0, 320.0, 240.0, 0.12, 640, 480)
 
