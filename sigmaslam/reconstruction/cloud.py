@@ -16,6 +16,8 @@ from sigmaslam.table import Table
 _ROWS, _COLUMNS = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
 # Pixels are exact to half of one: a point is anywhere in its square.
 _PIXEL_VARIANCE = 1.0 / 12.0
+# One number for the three of a voxel: different ones of voxels fewer than two million apart.
+_ONE_KEY = np.array([1, 1 << 21, 1 << 42])
 _COVARIANCE_NAMES = tuple(f"covariance_{'xyz'[a]}{'xyz'[b]}" for a, b in zip(_ROWS, _COLUMNS, strict=True))
 
 
@@ -43,7 +45,7 @@ class DenseCloud(Table):
     @property
     def sigma(self) -> np.ndarray:
         """(N,) root of the largest eigenvalue of the covariance, metres."""
-        return np.sqrt(np.maximum(np.linalg.eigvalsh(symmetric(self.covariances))[:, -1], 0.0))
+        return np.sqrt(np.maximum(largest_eigenvalue(self.covariances.astype(np.float64)), 0.0)).astype(np.float32)
 
 
 def symmetric(six: np.ndarray) -> np.ndarray:
@@ -52,6 +54,33 @@ def symmetric(six: np.ndarray) -> np.ndarray:
     matrix[..., _ROWS, _COLUMNS] = six
     matrix[..., _COLUMNS, _ROWS] = six
     return matrix
+
+
+def inverse(six: np.ndarray) -> np.ndarray:
+    """The six numbers (..., 6) of the inverses of positive definite matrices of such, from their cofactors."""
+    xx, xy, xz, yy, yz, zz = np.moveaxis(six, -1, 0)
+    cofactors = (
+        yy * zz - yz * yz,
+        xz * yz - xy * zz,
+        xy * yz - xz * yy,
+        xx * zz - xz * xz,
+        xy * xz - xx * yz,
+        xx * yy - xy * xy,
+    )
+    determinant = xx * cofactors[0] + xy * cofactors[1] + xz * cofactors[2]
+    return np.stack(cofactors, axis=-1) / determinant[..., None]
+
+
+def largest_eigenvalue(six: np.ndarray) -> np.ndarray:
+    """(...) of symmetric matrices of such numbers (..., 6): the trigonometric root of their characteristic equation."""
+    xx, xy, xz, yy, yz, zz = np.moveaxis(six, -1, 0)
+    mean = (xx + yy + zz) / 3.0
+    x, y, z = xx - mean, yy - mean, zz - mean
+    spread = np.sqrt((x * x + y * y + z * z + 2.0 * (xy * xy + xz * xz + yz * yz)) / 6.0)
+    determinant = x * (y * z - yz * yz) - xy * (xy * z - yz * xz) + xz * (xy * yz - y * xz)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cosine = np.where(spread > 0.0, determinant / (2.0 * spread**3), 1.0)
+    return np.asarray(mean + 2.0 * spread * np.cos(np.arccos(np.clip(cosine, -1.0, 1.0)) / 3.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +137,7 @@ class DepthPixels(Table):
     def thinned(self, camera: RectifiedStereo, size: float) -> DepthPixels:
         """The most certain pixel of each voxel of the camera's frame; those beside it have nearly the same errors."""
         points = self.points(camera)
-        keys = np.floor(points / size).astype(np.int64) @ np.array([1, 1 << 21, 1 << 42])
+        keys = np.floor(points / size).astype(np.int64) @ _ONE_KEY
         order = np.argsort(self.variance / self.disparity**2, kind="stable")
         _, first = np.unique(keys[order], return_index=True)
         return self.select(order[first])
@@ -134,10 +163,9 @@ class VoxelCloud:
         """Takes the points of a keyframe."""
         if not len(cloud):
             return
-        covariance = symmetric(cloud.covariances.astype(np.float64))
-        information = np.linalg.inv(covariance)
-        weighted = np.einsum("nab,nb->na", information, cloud.points)
-        sums = np.column_stack([information[:, _ROWS, _COLUMNS], weighted, cloud.intensity * cloud.views, cloud.views])
+        information = inverse(cloud.covariances.astype(np.float64))
+        weighted = _times(information, cloud.points)
+        sums = np.column_stack([information, weighted, cloud.intensity * cloud.views, cloud.views])
         keys = np.floor(cloud.points / self.size).astype(np.int64)
         self._pending.append(_sum_by_key(keys, sums))
         # Amortised: each point is sorted about as many times as the cloud doubles.
@@ -150,12 +178,11 @@ class VoxelCloud:
         _, sums = self._merged
         if not len(sums):
             return DenseCloud.empty()
-        information, count = symmetric(sums[:, :6]), sums[:, 10]
-        covariance = np.linalg.inv(information / count[:, None, None])
-        points = np.linalg.solve(information, sums[:, 6:9, None])[..., 0]
+        information, count = sums[:, :6], sums[:, 10]
+        covariance = inverse(information)
         return DenseCloud(
-            points,
-            covariance[:, _ROWS, _COLUMNS].astype(np.float32),
+            _times(covariance, sums[:, 6:9]),
+            (covariance * count[:, None]).astype(np.float32),
             (sums[:, 9] / count).astype(np.float32),
             count.astype(np.int32),
         )
@@ -182,11 +209,18 @@ def write_cloud(path: Path, cloud: DenseCloud) -> None:
         temporary.write_bytes(header.encode("ascii") + vertices.tobytes())
 
 
+def _times(six: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Products (N, 3) of symmetric matrices of such numbers (N, 6) and vectors (N, 3)."""
+    xx, xy, xz, yy, yz, zz = six.T
+    x, y, z = vectors.T
+    return np.stack([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z], axis=-1)
+
+
 def _sum_by_key(keys: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows with the same key (N, 3) summed."""
     if not len(keys):
         return keys, sums
-    order = np.lexsort(keys.T)
+    order = np.argsort(keys @ _ONE_KEY)
     keys, sums = keys[order], sums[order]
     first = np.flatnonzero(np.r_[True, (keys[1:] != keys[:-1]).any(axis=1)])
     return keys[first], np.add.reduceat(sums, first, axis=0)

@@ -34,6 +34,8 @@ _WINDOW, _RESAMPLING, _ROUNDING = 7, np.float32(1.0 / 12.0), np.float32(1.0 / 6.
 _FLOW_VARIANCE, _GATE_2D = np.float32(0.3**2), 9.21
 # Of the pixels whose depth is as expected, at least this share must also be where the pose says.
 _LEAST_SHARE = 0.5
+# Pixels whose derivatives by a pose are computed at a time.
+_PART = 8192
 # Confirmations that a point needs.
 _MIN_SUPPORT = 1
 
@@ -231,20 +233,52 @@ def _measure(
     moves_u = np.float32(camera.fx) * (shift[0] - a * shift[2]) * inverse
     moves_v = np.float32(camera.fy) * (shift[1] - b * shift[2]) * inverse
     derivative = turned[2] * inverse**2 - slope_u * moves_u - slope_v * moves_v
-    # By the pose: a column of its root at a time moves the point (a, b, 1) by so much per depth.
-    values, vectors = np.linalg.eigh(covariance)
-    pose_variance = np.zeros_like(state)
     place = np.stack([moves_u**2 * variance, moves_v**2 * variance])
-    inverse_depth = predicted / focal_baseline
-    for column in (vectors * np.sqrt(np.maximum(values, 0.0))).T.astype(np.float32):
-        step, turn = column[:3], column[3:]
-        dx = step[0] * inverse_depth + turn[1] - turn[2] * b
-        dy = step[1] * inverse_depth + turn[2] * a - turn[0]
-        dz = step[2] * inverse_depth + turn[0] * b - turn[1] * a
-        du, dv = np.float32(camera.fx) * (dx - a * dz), np.float32(camera.fy) * (dy - b * dz)
-        pose_variance += (predicted * dz + slope_u * du + slope_v * dv) ** 2
-        place += np.stack([du**2, dv**2])
+    values, vectors = np.linalg.eigh(covariance)
+    root = (vectors * np.sqrt(np.maximum(values, 0.0))).T.astype(np.float32)
+    pose_variance = np.empty_like(state)
+    for part in _parts(len(state)):
+        by_pose, du, dv = _moved_by_pose(a[part], b[part], predicted[part], slope_u[part], slope_v[part], camera)
+        pose_variance[part] = _squared_length(root @ by_pose)
+        place[0, part] += _squared_length(root @ du)
+        place[1, part] += _squared_length(root @ dv)
     return _Seen(disparity - predicted, derivative, noise, pose_variance, u, v, place)
+
+
+def _moved_by_pose(
+    a: np.ndarray,
+    b: np.ndarray,
+    disparity: np.ndarray,
+    slope_u: np.ndarray,
+    slope_v: np.ndarray,
+    camera: RectifiedStereo,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Derivatives (6, N) of an innovation and of the place (u, v) by the step, translation before rotation.
+
+    Args:
+        a, b: (N,) normalised coordinates of the place.
+        disparity: (N,) predicted there.
+        slope_u, slope_v: (N,) of the disparities seen there.
+        camera: the rectified pair.
+    """
+    inverse_depth = disparity / np.float32(camera.focal_baseline)
+    none, product = np.zeros_like(a), a * b
+    dz = np.stack([none, none, inverse_depth, b, -a, none])
+    du = np.stack([inverse_depth, none, -a * inverse_depth, -product, 1.0 + a * a, -b])
+    dv = np.stack([none, inverse_depth, -b * inverse_depth, -1.0 - b * b, product, a])
+    du *= np.float32(camera.fx)
+    dv *= np.float32(camera.fy)
+    return disparity * dz + slope_u * du + slope_v * dv, du, dv
+
+
+def _squared_length(vectors: np.ndarray) -> np.ndarray:
+    """(N,) of the columns (K, N)."""
+    return np.asarray(np.einsum("kn,kn->n", vectors, vectors))
+
+
+def _parts(count: int) -> list[slice]:
+    """Slices of so many pixels that temporary arrays of them stay in the cache of a core."""
+    return [slice(first, first + _PART) for first in range(0, count, _PART)]
 
 
 def _looks_alike(

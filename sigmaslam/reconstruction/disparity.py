@@ -113,10 +113,23 @@ def semi_global_disparity(left: np.ndarray, right: np.ndarray) -> np.ndarray:
         left, right: (H, W) uint8 rectified images.
     """
     halves = [cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for image in (left, right)]
-    coarse = _semi_global(halves[0], halves[1], _WIDEST * halves[0].shape[1])
-    known = coarse[np.isfinite(coarse)]
+    known = _seen_by_both(halves[0], halves[1], _WIDEST * halves[0].shape[1])
     largest = 2.0 * float(np.percentile(known, _NEARLY_ALL)) + _BEYOND if len(known) else 0.0
     return _semi_global(left, right, max(largest, _BEYOND))
+
+
+def _seen_by_both(left: np.ndarray, right: np.ndarray, largest: float) -> np.ndarray:
+    """(N,) disparities that matching from the right image to the left one finds, too, within a pixel.
+
+    Skies and plain walls match anywhere, mostly far off, and would make the search several times as long.
+    """
+    there = _semi_global(left, right, largest)
+    mirrored_left, mirrored_right = (np.ascontiguousarray(image[:, ::-1]) for image in (left, right))
+    back = _semi_global(mirrored_right, mirrored_left, largest)[:, ::-1]
+    v, u = np.nonzero(np.isfinite(there))
+    found = there[v, u]
+    u_right = np.rint(u - found).astype(np.int64).clip(0, left.shape[1] - 1)
+    return np.asarray(found[np.abs(back[v, u_right] - found) <= 1.0])
 
 
 def _semi_global(left: np.ndarray, right: np.ndarray, largest: float) -> np.ndarray:
@@ -135,8 +148,10 @@ def _semi_global(left: np.ndarray, right: np.ndarray, largest: float) -> np.ndar
     )
     # It gives none to columns that the whole range of disparities would leave.
     wide = [cv2.copyMakeBorder(image, 0, 0, levels, 0, cv2.BORDER_REPLICATE) for image in (left, right)]
-    sixteenths = matcher.compute(*wide)[:, levels:]
-    return np.where(sixteenths >= 16 * _LEAST, sixteenths / np.float32(16.0), np.float32(np.nan))
+    disparity = matcher.compute(*wide)[:, levels:] / np.float32(16.0)
+    # What would lie left of the right image matches its repeated border.
+    inside = disparity <= np.arange(left.shape[1], dtype=np.float32)
+    return np.where((disparity >= _LEAST) & inside, disparity, np.float32(np.nan))
 
 
 def align_disparity(left: np.ndarray, right: np.ndarray, disparity: np.ndarray) -> Alignment:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -33,6 +34,7 @@ NEIGHBOURS = 2
 _MAX_SIGMA = 0.05
 # Side of a voxel, in pixels at the median depth of the first keyframe.
 _VOXEL_PIXELS = 5.0
+_NumberedView = tuple[int, np.ndarray, DepthView]
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,13 +205,8 @@ def fuse_keyframes(
             keyframes.disparity_offset_sigma,
         )
 
-    for number, frame in keyframes.images(sequence):
-        left, right = rectifier.rectify(frame.left, frame.right)
-        measured = measure_disparity(left, right, match)
-        disparity = measured.disparity - np.float32(keyframes.disparity_offset)
-        if rectifier.valid_mask is not None:
-            disparity[cv2.erode(rectifier.valid_mask, np.ones((7, 7), np.uint8)) == 0] = np.nan
-        kept[number] = left, DepthView.of(left, DisparityMap(disparity, measured.variance))
+    for number, left, view in _prefetched(_views(keyframes, sequence, rectifier, match)):
+        kept[number] = left, view
         done = number - NEIGHBOURS
         if done >= 0 and keyframes.is_keyframe[done]:
             yield fuse(done)
@@ -217,6 +214,29 @@ def fuse_keyframes(
     for number in range(max(len(keyframes) - NEIGHBOURS, 0), len(keyframes)):
         if keyframes.is_keyframe[number]:
             yield fuse(number)
+
+
+def _views(
+    keyframes: RecordedKeyframes, sequence: StereoSequence, rectifier: StereoRectifier, match: Matcher
+) -> Iterator[_NumberedView]:
+    """Number of each view, its rectified left image and its disparities, the disparity offset taken off; in order."""
+    valid = None if rectifier.valid_mask is None else cv2.erode(rectifier.valid_mask, np.ones((7, 7), np.uint8))
+    for number, frame in keyframes.images(sequence):
+        left, right = rectifier.rectify(frame.left, frame.right)
+        measured = measure_disparity(left, right, match)
+        disparity = measured.disparity - np.float32(keyframes.disparity_offset)
+        if valid is not None:
+            disparity[valid == 0] = np.nan
+        yield number, left, DepthView.of(left, DisparityMap(disparity, measured.variance))
+
+
+def _prefetched(views: Iterator[_NumberedView]) -> Iterator[_NumberedView]:
+    """The same views; a thread makes the next one while the caller uses this one."""
+    with ThreadPoolExecutor(1) as thread:
+        coming = thread.submit(next, views, None)
+        while (view := coming.result()) is not None:
+            coming = thread.submit(next, views, None)
+            yield view
 
 
 def _default_voxel(depth: KeyframeDepth, camera: RectifiedStereo) -> float:

@@ -6,7 +6,15 @@ import numpy as np
 
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import se3_exp, transform_points
-from sigmaslam.reconstruction.cloud import DenseCloud, DepthPixels, VoxelCloud, symmetric, write_cloud
+from sigmaslam.reconstruction.cloud import (
+    DenseCloud,
+    DepthPixels,
+    VoxelCloud,
+    inverse,
+    largest_eigenvalue,
+    symmetric,
+    write_cloud,
+)
 
 CAMERA = RectifiedStereo(500.0, 500.0, 320.0, 240.0, 0.12, 640, 480)
 
@@ -27,6 +35,16 @@ def test_covariances_of_points_are_those_of_drawn_poses_and_disparities():
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
     np.testing.assert_allclose(symmetric(cloud.covariances)[0] / scale, expected / scale, atol=0.04)
     np.testing.assert_allclose(cloud.points[0], transform_points(pose, pixel.points(CAMERA))[0])
+
+
+def test_closed_forms_of_three_by_three_matrices_are_those_of_the_library():
+    rng = np.random.default_rng(3)
+    turns = np.linalg.qr(rng.standard_normal((500, 3, 3)))[0]
+    roots = np.concatenate([turns * np.array([1e-3, 0.1, 1.0]), np.eye(3)[None], np.diag([1.0, 1.0, 2.0])[None]])
+    matrices = roots @ roots.transpose(0, 2, 1)
+    six = matrices[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)]
+    np.testing.assert_allclose(largest_eigenvalue(six), np.linalg.eigvalsh(matrices)[:, -1], rtol=1e-9)
+    np.testing.assert_allclose(symmetric(inverse(six)) @ matrices, np.broadcast_to(np.eye(3), (502, 3, 3)), atol=1e-6)
 
 
 def _points(points: list[list[float]], variances: list[float]) -> DenseCloud:

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from sigmaslam.reconstruction import disparity
 from sigmaslam.reconstruction.disparity import align_disparity, measure_disparity, semi_global_disparity
 from tests.support.textured_pairs import textured_pair
 
@@ -57,3 +58,22 @@ def test_without_a_match_there_is_neither_disparity_nor_variance():
     measured = measure_disparity(left, right, semi_global_disparity)
     assert np.isnan(measured.disparity).mean() > 0.8
     assert np.array_equal(np.isnan(measured.disparity), np.isnan(measured.variance))
+
+
+def test_what_the_right_image_does_not_show_has_no_disparity():
+    true = np.full((HEIGHT, WIDTH), 20.0, np.float32)
+    found = semi_global_disparity(*textured_pair(true, noise=1.0))
+    assert np.nanmin(np.arange(WIDTH) - found) >= 0.0
+    assert np.isfinite(found[10:-10, 30:-10]).mean() > 0.9
+
+
+def test_chance_matches_of_one_direction_do_not_widen_the_search():
+    rng = np.random.default_rng(3)
+    left, right = rng.integers(0, 255, (2, HEIGHT, 2 * WIDTH)).astype(np.uint8)
+    one_way = np.isfinite(disparity._semi_global(left, right, 150.0)).sum()
+    assert one_way > 200
+    assert len(disparity._seen_by_both(left, right, 150.0)) < 0.5 * one_way
+    true = np.full((HEIGHT, 2 * WIDTH), 12.0, np.float32)
+    found = disparity._seen_by_both(*textured_pair(true, noise=1.0), 150.0)
+    assert len(found) > 0.8 * true.size
+    np.testing.assert_allclose(np.percentile(found, 99.8), 12.0, atol=0.5)
