@@ -184,7 +184,12 @@ def _quantiles(probability: float, count: Tensor, size: int, like: Tensor) -> Te
 
 
 @torch.compiler.assume_constant_result
-@lru_cache(maxsize=16)
 def _quantiles_up_to(probability: float, size: int) -> tuple[float, ...]:
+    # A compiler looks through the cache, but takes the function around it for a constant.
+    return _cached_quantiles(probability, size)
+
+
+@lru_cache(maxsize=16)
+def _cached_quantiles(probability: float, size: int) -> tuple[float, ...]:
     # Of no component the distance is zero, which any quantile but zero lies above.
     return (1.0, *(float(chdtri(dof, 1.0 - probability)) for dof in range(1, size + 1)))

@@ -10,7 +10,7 @@ from torch import Tensor
 from sigmaslam import filters
 from sigmaslam.filters.systems import range_and_bearing
 
-BATCHES = (1, 10)
+BATCHES = (1, 10, 100, 10_000)
 STEPS = 100
 _SEED = 0
 Beliefs = tuple[Tensor, Tensor]
