@@ -93,7 +93,7 @@ def _kalibr_cameras(rig: StereoCamera) -> dict[str, dict[str, object]]:
             "distortion_coeffs": list(eye.distortion) or [0.0] * 4,
             "distortion_model": "equidistant" if eye.distortion_model == "equidistant" else "radtan",
             "intrinsics": [eye.fx, eye.fy, eye.cx, eye.cy],
-            "resolution": list(SIZE),
+            "resolution": [eye.width, eye.height],
             "rostopic": f"/cam{k}/image_raw",
         }
         for k, (name, eye) in enumerate((("cam0", rig.left), ("cam1", rig.right)))
@@ -201,8 +201,8 @@ def write_ros(rig: StereoCamera, folder: Path) -> Path:
 
     for name, eye, R, P in (("left", rig.left, R1, P1), ("right", rig.right, R2, P2)):
         content = {
-            "image_width": SIZE[0],
-            "image_height": SIZE[1],
+            "image_width": eye.width,
+            "image_height": eye.height,
             "camera_name": f"narrow_stereo/{name}",
             "camera_matrix": matrix(np.array(_intrinsics(eye)), 3),
             "distortion_model": model,

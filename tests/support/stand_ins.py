@@ -9,17 +9,28 @@ from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 
 from sigmaslam.geometry.camera import StereoCamera
+from sigmaslam.geometry.se3 import se3_inverse
+from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import open_sequence
+from sigmaslam.readers.trajectory_files import write_tum
+from tests.support.calibration_forms import write_kalibr, write_ros
 from tests.support.calibration_yaml import write_calibration
+from tests.support.simulated_board import CHESSBOARD, board_poses, draw_board, stereo_rig
 from tests.support.videos import write_video
+from tests.support.wheeled_world import World, drive, write_csv_folder
 
 FRAMES, SECONDS = 10, 0.5
 # The demo, enlarged until the box on the pages lies in its images.
 ZOOM = 3
+# Axes of a body, x ahead and z up, in a camera.
+AHEAD = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
 
 def write_stand_ins(demo: Path, folder: Path) -> None:
-    """Writes the recording in the forms that `sigmaslam track` reads, truth, masks, readings, settings, two images."""
+    """Writes the recording in the forms that `sigmaslam track` reads, truth, masks, readings, settings, two images.
+
+    And a board before two cameras, calibrations in other forms, photographs, a film and a robot of one's own.
+    """
     sequence = open_sequence(demo, "kitti")
     pairs = [(frame.left, frame.right) for frame, _ in zip(sequence.frames(), range(FRAMES), strict=False)]
     pairs = [tuple(cv2.resize(eye, None, fx=ZOOM, fy=ZOOM, interpolation=cv2.INTER_CUBIC) for eye in p) for p in pairs]
@@ -27,7 +38,7 @@ def write_stand_ins(demo: Path, folder: Path) -> None:
     times = SECONDS * np.arange(FRAMES)
     projections = [_enlarge(line) for line in (demo / "calib.txt").read_text().splitlines() if line.startswith("P")]
     calibration = "".join(f"P{number}: {line}\n" for number, line in enumerate(projections))
-    for name in ("KITTI_OR_EUROC_FOLDER", "FOLDER"):
+    for name in ("KITTI_OR_EUROC_FOLDER", "FOLDER", "INPUT", "RECORDING"):
         _write_images(folder / name, ("image_0", "image_1"), pairs)
         (folder / name / "calib.txt").write_text(calibration)
         np.savetxt(folder / name / "times.txt", times)
@@ -35,6 +46,9 @@ def write_stand_ins(demo: Path, folder: Path) -> None:
     np.savetxt(folder / "my_folder" / "times.txt", times)
     np.savetxt(folder / "times.txt", times)
     np.savetxt(folder / "poses.txt", poses)
+    matrices = np.tile(np.eye(4), (FRAMES, 1, 1))
+    matrices[:, :3] = poses.reshape(-1, 3, 4)
+    write_tum(folder / "gt.tum", Trajectory(times, AHEAD.T @ matrices @ AHEAD))
     camera = open_sequence(folder / "FOLDER", "kitti").camera
     write_calibration(camera, folder / "stereo.yaml")
     write_video(folder / "side_by_side.mp4", [np.hstack(pair) for pair in pairs], 1 / SECONDS)
@@ -46,8 +60,25 @@ def write_stand_ins(demo: Path, folder: Path) -> None:
     mask = np.zeros_like(pairs[0][0])
     mask[200:500, 300:700] = 255
     cv2.imwrite(str(folder / "mask.png"), mask)
+    write_kalibr(camera, folder).rename(folder / "camchain.yaml")
+    write_ros(camera, folder)
+    _write_board(folder / "IMAGES")
+    write_csv_folder(folder / "my_robot", drive(World()))
+    write_video(folder / "film.mp4", [left for left, _ in pairs], 1 / SECONDS)
+    _write_images(folder / "folder_of_frames", (".",), pairs)
+    cv2.imwrite(str(folder / "photo.png"), pairs[0][0])
     cv2.imwrite(str(folder / "one.jpg"), pairs[0][0])
     cv2.imwrite(str(folder / "two.png"), pairs[-1][0])
+
+
+def _write_board(folder: Path) -> None:
+    """A chessboard in both eyes."""
+    folder.mkdir()
+    rig = stereo_rig()
+    for k, pose in enumerate(board_poses(CHESSBOARD, 12, seed=11, depth=0.5)):
+        cv2.imwrite(str(folder / f"left{k:02d}.png"), draw_board(CHESSBOARD, rig.eyes[0], pose))
+        in_right = se3_inverse(rig.T_left_right) @ pose
+        cv2.imwrite(str(folder / f"right{k:02d}.png"), draw_board(CHESSBOARD, rig.eyes[1], in_right))
 
 
 def _enlarge(line: str) -> str:
@@ -58,9 +89,9 @@ def _enlarge(line: str) -> str:
     return " ".join(map(repr, (scale @ projection).ravel().tolist()))
 
 
-def _write_images(folder: Path, names: tuple[str, str], pairs: list) -> None:
+def _write_images(folder: Path, names: tuple[str, ...], pairs: list) -> None:
     for eye, name in enumerate(names):
-        (folder / name).mkdir(parents=True)
+        (folder / name).mkdir(parents=True, exist_ok=True)
         for number, pair in enumerate(pairs):
             cv2.imwrite(str(folder / name / f"{number:06d}.png"), pair[eye])
 
