@@ -26,8 +26,6 @@ _MOST, _MIN_SHARE = 0.5, 0.3
 # A fit near the prediction with a larger NIS per degree of freedom may sit in a wrong place: it is compared with one
 # that does without the prediction.
 _DOUBTFUL_NIS = 2.0
-# So does one that a smaller share of the matches agrees with: what moves may have become the prediction.
-_OUTVOTED = 0.5
 # With so large a NIS a pose needs so many times the least number of inliers.
 _DOUBTFUL_INLIERS = 3
 # Without a prediction the view is compared with so many of the last keyframes.
@@ -96,7 +94,7 @@ class Localiser:
         clock.lap("match")
         fit = self._fit_near(matches, prediction)
         clock.lap("filter")
-        if fit is None or _is_doubtful(fit) or self.follower.has_fallen(matches, fit.inliers):
+        if fit is None or fit.nis_per_dof > _DOUBTFUL_NIS or self.follower.has_fallen(matches, fit.inliers):
             return None
         return matches, fit
 
@@ -118,9 +116,9 @@ class Localiser:
             clock.lap("match")
             fit = self._fit_near(matches, prediction)
             clock.lap("filter")
-        if fit is None or _is_doubtful(fit):
+        if fit is None or fit.nis_per_dof > _DOUBTFUL_NIS:
             other_matches, other = self._localise_anywhere(view, keyframes, prediction, clock)
-            if fit is None or (other is not None and (_is_outvoted(fit) or other.nis_per_dof < fit.nis_per_dof)):
+            if fit is None or (other is not None and other.nis_per_dof < fit.nis_per_dof):
                 matches, fit = other_matches, other
         min_inliers = _DOUBTFUL_INLIERS * self.config.min_inliers
         if fit is not None and fit.nis_before_scaling > _DOUBTFUL_NIS and fit.count < min_inliers:
@@ -158,13 +156,3 @@ class Localiser:
             if fit is not None and fit.count >= _MIN_SHARE * len(matches.probability):
                 return matches, fit
         return matches, None
-
-
-def _is_doubtful(fit: FrameFit) -> bool:
-    """Whether a fit near the prediction may sit in a wrong place."""
-    return fit.nis_per_dof > _DOUBTFUL_NIS or _is_outvoted(fit)
-
-
-def _is_outvoted(fit: FrameFit) -> bool:
-    """Whether most of the matches contradict a pose."""
-    return fit.count < _OUTVOTED * len(fit.inliers)
