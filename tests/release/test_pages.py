@@ -25,6 +25,7 @@ NOT_RUN = {
     "sigmaslam train": "half an hour and more",
     "sigmaslam export": "needs what `train` makes",
     "sigmaslam benchmark": "an hour and more",
+    "sigmaslam track FOLDER --out run --start 100": "the stand-in has ten pairs",
     "sigmaslam render street --seeds": "ten drives",
     "sigmaslam render street --out drives": "ten drives",
     "sigmaslam calibrate IMAGES --board charuco": "the stand-in is a chessboard",
