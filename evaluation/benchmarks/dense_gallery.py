@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sigmaslam.evaluation.benchmarks.tracking_gallery import RECIPES
+from sigmaslam.evaluation.benchmarks.tracking_gallery import RECIPES, run_gallery
 from sigmaslam.evaluation.trial import render
 from sigmaslam.files import atomic_path
 from sigmaslam.geometry.se3 import rotation_exp, se3_inverse, transform_points
@@ -121,14 +120,7 @@ def write_dense_gallery(out: Path, work: Path, recipes: Sequence[Recipe] = RECIP
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m sigmaslam.evaluation.benchmarks.dense_gallery", description=__doc__
-    )
-    parser.add_argument("--out", type=Path, required=True, help="folder of the pictures")
-    parser.add_argument("--work", type=Path, required=True, help="folder for renders, kept for the next time, and runs")
-    given = parser.parse_args(arguments)
-    for path in write_dense_gallery(given.out, given.work):
-        print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")
+    run_gallery("dense_gallery", __doc__, write_dense_gallery, arguments)
 
 
 if __name__ == "__main__":

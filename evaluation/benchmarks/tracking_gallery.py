@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -100,16 +100,23 @@ def write_tracking_gallery(out: Path, work: Path, recipes: Sequence[Recipe] = RE
     return written
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Command line."""
+def run_gallery(
+    module: str, description: str | None, write: Callable[[Path, Path], list[Path]], arguments: Sequence[str] | None
+) -> None:
+    """Command line of a gallery: says how large the pictures are that `write(out, work)` has written."""
     parser = argparse.ArgumentParser(
-        prog="python -m sigmaslam.evaluation.benchmarks.tracking_gallery", description=__doc__
+        prog=f"python -m sigmaslam.evaluation.benchmarks.{module}", description=description
     )
-    parser.add_argument("--out", type=Path, required=True, help="folder of the animations")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the pictures")
     parser.add_argument("--work", type=Path, required=True, help="folder for renders, kept for the next time, and runs")
     given = parser.parse_args(arguments)
-    for path in write_tracking_gallery(given.out, given.work):
+    for path in write(given.out, given.work):
         print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Command line."""
+    run_gallery("tracking_gallery", __doc__, write_tracking_gallery, arguments)
 
 
 if __name__ == "__main__":
