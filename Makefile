@@ -13,7 +13,7 @@ endif
 endif
 
 # What an installation is made of: when one of these changes, it is made again.
-BUILD := pyproject.toml setup.py requirements.lock sigmaslam/frontend/kernels.cpp sigmaslam/frontend/kernels.inc
+BUILD := pyproject.toml evaluation/pyproject.toml setup.py requirements.lock sigmaslam/frontend/kernels.cpp sigmaslam/frontend/kernels.inc
 
 .PHONY: demo test test-slow lint docs results dist wheel sbom clean
 
@@ -77,7 +77,7 @@ $(VENV)/.runtime: $(BUILD) | $(VENV)/bin/python
 	touch $@
 
 $(VENV)/.dev: $(BUILD) | $(VENV)/bin/python
-	$(VENV)/bin/python -m pip install --quiet $(INSTALL_FLAGS) --editable ".[dev]"
+	$(VENV)/bin/python -m pip install --quiet $(INSTALL_FLAGS) --editable ".[dev]" --editable evaluation
 	touch $@ $(VENV)/.runtime
 
 # mkdocs reads the sources and imports nothing of them.

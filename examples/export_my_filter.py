@@ -14,7 +14,7 @@ import onnxruntime
 import torch
 from torch import Tensor
 
-from sigmaslam.filters import (
+from sigmaslam_filters import (
     Diagonal,
     Gaussian,
     MeasurementModel,

@@ -21,11 +21,11 @@ import torch
 from scipy.ndimage import map_coordinates
 
 from sigmaslam import match_images
-from sigmaslam.filters import SE2, BlockDiagonal, Gaussian, UnscentedKalmanFilter, several
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.uncertainty import propagate
-from sigmaslam.localisation.sighting_noise import repetition
-from sigmaslam.localisation.wheeled_robot import SPACE, WheeledRobot
+from sigmaslam_filters import SE2, BlockDiagonal, Gaussian, UnscentedKalmanFilter, several
+from sigmaslam_localisation.sighting_noise import repetition
+from sigmaslam_localisation.wheeled_robot import SPACE, WheeledRobot
 
 SURVEY, STEP = 20, 5  # frames from one survey to the next, and from one update to the next
 FLATTEST = 0.05  # relative change of depth around a keypoint, above which it is at an edge and no landmark

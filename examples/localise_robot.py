@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from sigmaslam.filters import Diagonal, Gaussian, UnscentedKalmanFilter, several, wrap_angle
-from sigmaslam.filters.systems import differential_drive, range_and_bearing
+from sigmaslam_filters import Diagonal, Gaussian, UnscentedKalmanFilter, several, wrap_angle
+from sigmaslam_filters.systems import differential_drive, range_and_bearing
 
 STEP = 0.1  # seconds; commands are averaged over a step, sightings are taken at its end
 

@@ -1,6 +1,7 @@
 """Matches between two images, each with a probability and a covariance.
 
-    python examples/match_two_images.py synthetic/demo/image_0/000000.png synthetic/demo/image_1/000000.png
+    demo=synthetic/sigmaslam_synthetic/demo
+    python examples/match_two_images.py $demo/image_0/000000.png $demo/image_1/000000.png
 
 The images may have any sizes. `min_probability` leaves out what is more likely wrong than that.
 """

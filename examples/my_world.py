@@ -5,8 +5,8 @@
     sigmaslam render organ --world examples/my_world.py --out bench --frames 20
 
 The program calls `generate` with a generator of random numbers and a wish, once for every scene. What it returns is a
-scene, bodies of a few shapes with materials (`sigmaslam.synthetic.scene`, `.rendering.shapes`), and the camera's path
-through it (`.motion.random_motions`). A texture is one of `sigmaslam.synthetic.rendering.textures.KINDS`, or the whole
+scene, bodies of a few shapes with materials (`sigmaslam_synthetic.scene`, `.rendering.shapes`), and the camera's path
+through it (`.motion.random_motions`). A texture is one of `sigmaslam_synthetic.rendering.textures.KINDS`, or the whole
 path of a folder of photographs.
 """
 
@@ -15,11 +15,11 @@ import sys
 import cv2
 import numpy as np
 
-from sigmaslam.synthetic.motion.random_motions import inspect
-from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Panel
-from sigmaslam.synthetic.scene import Body, Lights, Material, Scene
-from sigmaslam.synthetic.simulation import Recipe, Studio, simulate
-from sigmaslam.synthetic.worlds.episode import Episode, Wish
+from sigmaslam_synthetic.motion.random_motions import inspect
+from sigmaslam_synthetic.rendering.shapes import Box, Cylinder, Panel
+from sigmaslam_synthetic.scene import Body, Lights, Material, Scene
+from sigmaslam_synthetic.simulation import Recipe, Studio, simulate
+from sigmaslam_synthetic.worlds.episode import Episode, Wish
 
 DISTANCE = 0.2
 """Metres from the camera to the bench."""

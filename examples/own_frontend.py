@@ -1,6 +1,6 @@
 """The tracker with features of one's own: corners, described by the grey values around them.
 
-    python examples/own_frontend.py synthetic/demo
+    python examples/own_frontend.py synthetic/sigmaslam_synthetic/demo
 
 A detector is a function of an image. `DescriptorFrontend` makes a front-end of it: matching, alignment, probability and
 covariance are the same as for the learned features. A front-end without descriptors has the methods of

@@ -1,7 +1,7 @@
 // One frame by the graphs that ship, in C++ and ONNX Runtime's C API alone: run_one_frame.py in another language.
 //
 //     g++ -std=c++17 -O2 -I INCLUDE run_one_frame.cpp -o run_one_frame LIBRARY    (LIBRARY: libonnxruntime.so)
-//     ./run_one_frame models/weights FOLDER 4
+//     ./run_one_frame models/sigmaslam_weights FOLDER 4
 //
 // INCLUDE is the folder of onnxruntime_c_api.h, which releases of ONNX Runtime have; the wheel has the library alone.
 // FOLDER has KITTI's layout, but images 0 and 4 of image_0 and image_1 as PGM (P5, 8 bits), which needs no library.

@@ -1,6 +1,6 @@
 """One frame by the graphs that ship, in numpy and onnxruntime: from two stereo pairs to a pose and its covariance.
 
-    python examples/run_one_frame.py models/weights synthetic/demo 4
+    python examples/run_one_frame.py models/sigmaslam_weights synthetic/sigmaslam_synthetic/demo 4
 
 The pairs are images 0 and 4 of a folder in KITTI's layout; OpenCV only reads them. docs/onnx.md says what each graph
 takes. The tracker does more: it follows keypoints from image to image, and keeps a window of keyframes and a map.

@@ -1,6 +1,6 @@
 """Where the camera is in each stereo pair of a recording, and how sure that is: three sigma.
 
-    python examples/track_folder.py synthetic/demo
+    python examples/track_folder.py synthetic/sigmaslam_synthetic/demo
 
 Any recording that `sigmaslam track` reads; a folder of plain images needs a calibration file as second argument.
 """

@@ -2,7 +2,7 @@
 
     python examples/train_for_my_scene.py my_features
 
-Shares say what pairs are made of: worlds and textures by name (`sigmaslam.training.sources.SOURCES`), Python files that
+Shares say what pairs are made of: worlds and textures by name (`sigmaslam_training.sources.SOURCES`), Python files that
 make a world, folders of photographs. Leaves keep the network from forgetting the rest. This run is tiny: give 800 steps
 and the sizes that are the defaults of `TrainingConfig`, then `sigmaslam export my_features --out graphs`. The command
 line does the same: docs/own-scene.md.
@@ -17,9 +17,9 @@ import numpy as np
 from sigmaslam.frontend.learned import extract
 from sigmaslam.frontend.types import Features
 from sigmaslam.inference.onnx_graph import shipped_weights
-from sigmaslam.models.torch_runtime import TorchFeatures
-from sigmaslam.training.features.loop import train
-from sigmaslam.training.features.recipes import TrainingConfig
+from sigmaslam_models.torch_runtime import TorchFeatures
+from sigmaslam_training.features.loop import train
+from sigmaslam_training.features.recipes import TrainingConfig
 
 BRICK_WALLS = {"bricks": 0.25, "facade": 0.25, "leaves": 0.5}
 TINY = TrainingConfig(
@@ -40,5 +40,7 @@ def features_of(weights: Path, image: np.ndarray) -> Features:
 
 if __name__ == "__main__":
     weights = run(Path(sys.argv[1]))
-    image = cv2.imread(str(Path(__file__).parents[1] / "synthetic/demo/image_0/000000.png"), cv2.IMREAD_GRAYSCALE)
+    image = cv2.imread(
+        str(Path(__file__).parents[1] / "synthetic/sigmaslam_synthetic/demo/image_0/000000.png"), cv2.IMREAD_GRAYSCALE
+    )
     print(f"{weights} finds {len(features_of(weights, image).keypoints)} keypoints in the first image of the demo")

@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterable
 from importlib.util import find_spec
 from pathlib import Path
 
-from sigmaslam.cli.benchmark import reads_data
+from sigmaslam_benchmarks.commands import reads_data
 
 ROOT = Path(__file__).resolve().parents[1]
 RENDERS = "build/results"
@@ -77,7 +77,7 @@ def absent(words: list[str]) -> str:
         return "SIGMASLAM_DATA names no folder of the real data sets"
     for option, graph in itertools.pairwise(words):
         if option == "--peer" and not Path(graph).is_file():
-            return f"{graph} is missing: make it by python -m sigmaslam.evaluation.matching.peer_exports"
+            return f"{graph} is missing: make it by python -m sigmaslam_benchmarks.matching.peer_exports"
     modules = [module for module in PEERS.get(name, ()) if find_spec(module) is None]
     return f"{', '.join(modules)} not installed: pip install 'sigmaslam[peers]'" if modules else ""
 

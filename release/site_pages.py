@@ -20,11 +20,11 @@ LINK = re.compile(r"(?<=\]\()([^)\s#]+)")
 # Packages that have a page of reference each.
 PACKAGES = (
     "sigmaslam",
-    "sigmaslam.filters",
-    "sigmaslam.filters.consistency",
-    "sigmaslam.localisation",
-    "sigmaslam.models",
-    "sigmaslam.synthetic",
+    "sigmaslam_filters",
+    "sigmaslam_filters.consistency",
+    "sigmaslam_localisation",
+    "sigmaslam_models",
+    "sigmaslam_synthetic",
 )
 
 
@@ -41,7 +41,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
             pending += [each for each in linked if each.is_file() and not files.get_file_from_path(site_path(each))]
     for name in PACKAGES:
         # A package without public names of its own shows its modules; `sigmaslam` would show the whole tree.
-        init = (ROOT / name.replace(".", "/") / "__init__.py").read_text(encoding="utf-8")
+        folder = next(ROOT.glob(f"*/{name.replace('.', '/')}"), ROOT / name)
+        init = (folder / "__init__.py").read_text(encoding="utf-8")
         members = "" if "__all__" not in init else "\n    options:\n      show_submodules: false"
         files.append(File.generated(config, f"reference/{name}.md", content=f"# {name}\n\n::: {name}{members}\n"))
     return files

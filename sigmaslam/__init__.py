@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 else:
     from importlib import import_module
 
-    # Loaded when asked for (PEP 562): `import sigmaslam.filters` needs neither OpenCV nor ONNX Runtime.
+    # Loaded when asked for (PEP 562): `import sigmaslam_filters` needs neither OpenCV nor ONNX Runtime.
     _MODULES = {
         "Estimate": "slam.estimate",
         "LocationFilter": "fusion.location_filter",

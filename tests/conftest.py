@@ -31,7 +31,7 @@ def real_data() -> Path:
 @pytest.fixture(scope="session")
 def demo_sequence() -> Path:
     """The rendered sequence that ships with the package."""
-    return Path(__file__).resolve().parents[1] / "synthetic" / "demo"
+    return Path(__file__).resolve().parents[1] / "synthetic" / "sigmaslam_synthetic" / "demo"
 
 
 @pytest.fixture

@@ -1,119 +1,139 @@
-"""The package list, the folders and the links agree; lower layers and tests import what they may."""
+"""Folders import only what stands below them, lazily or not; tests import what they may."""
 
 import ast
 import re
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 import sigmaslam
+import sigmaslam.filters
+import sigmaslam_filters
 
 ROOT = Path(__file__).resolve().parents[1]
-MAPPED = ("evaluation", "filters", "localisation", "models", "synthetic", "training")
-# What a layer must never import, nor anything that it imports: names of modules or of folders outside the layer.
+CONFIGURATION = tomllib.loads((ROOT / "pyproject.toml").read_text())
+# What a package must never import at its first lines, nor anything that it imports so: parts of names of modules.
 FORBIDDEN = {
-    "filters": ("models", "training", "synthetic", "evaluation", "tracker", "frontend", "camera"),
-    "localisation": ("training", "synthetic", "evaluation", "tracker", "frontend"),
-    "synthetic": ("models", "training", "evaluation", "tracker", "filters"),
-    "models": ("training", "evaluation", "tracker", "frontend"),
-    "sigmaslam": ("training", "synthetic", "torch"),
+    "sigmaslam_filters": ("sigmaslam", "cv2", "onnxruntime"),
+    "sigmaslam_localisation": ("sigmaslam_training", "sigmaslam_synthetic", "tracker", "frontend"),
+    "sigmaslam_synthetic": ("sigmaslam_models", "tracker", "sigmaslam_filters"),
+    "sigmaslam_models": ("tracker", "frontend"),
+    "sigmaslam": ("sigmaslam_training", "sigmaslam_synthetic", "torch"),
 }
 
 # Tables of names that the command line offers, and their packages: they import nothing.
-NAMES = {f"sigmaslam.{name}" for name in ("training", "training.mixes", "synthetic", "synthetic.render_choices")}
-# The runtime from the ground up: a folder imports only from floors below its own.
+NAMES = {"sigmaslam_training", "sigmaslam_training.mixes", "sigmaslam_synthetic", "sigmaslam_synthetic.render_choices"}
+# All rooms from the ground up: a room imports only from floors below its own. A room is a folder of the run time, or
+# a package beside it.
 FLOORS = (
-    ("errors", "table"),
-    ("bounded_files", "files", "progress", "plot_style", "source_commit"),
+    ("sigmaslam", "errors", "table", "sigmaslam_filters", "sigmaslam_weights"),
+    ("bounded_files", "files", "progress", "plot_style", "source_commit", "filters"),
     ("geometry",),
     ("inference",),
     ("estimation", "image_filtering", "readers"),
-    ("frontend",),
-    ("two_view",),
+    ("frontend", "sigmaslam_synthetic"),
+    ("two_view", "sigmaslam_models"),
     ("slam",),
     ("calibration", "checks", "fusion"),
     ("runs",),
-    ("bundle_adjustment", "reconstruction"),
+    ("bundle_adjustment", "reconstruction", "sigmaslam_localisation"),
+    ("sigmaslam_evaluation",),
+    ("sigmaslam_training",),
     ("cli",),
-    ("__main__", ""),
+    ("__main__", "sigmaslam_benchmarks"),
 )
 # The filters likewise, from the ground up; "" is the files that users read first.
-FILTER_FLOORS = (("core", "consistency"), ("manifolds",), ("",), ("graphs",), ("tracking",))
+FILTER_FLOORS = (("core", "consistency"), ("manifolds",), ("",), ("graphs",))
 # Of the tracker.
 MAX_LINES, MAX_METHODS = 300, 12
 
 
-def test_the_package_list_names_every_folder_with_modules():
-    configuration = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
-    directories = {"sigmaslam": "sigmaslam", **configuration["package-dir"]}
-    found = set()
-    for name in ("sigmaslam", *MAPPED):
-        for init in (ROOT / name).rglob("__init__.py"):
-            package = init.parent.relative_to(ROOT)
-            if any((ROOT / parent).is_symlink() for parent in [package, *package.parents]):
-                continue
-            dotted = ".".join(package.parts)
-            found.add(dotted if name == "sigmaslam" else f"sigmaslam.{dotted}")
-    assert found == set(configuration["packages"])
-    assert all((ROOT / directory / "__init__.py").is_file() for directory in directories.values())
+def test_every_folder_with_modules_ships_but_the_benchmarks():
+    found = CONFIGURATION["tool"]["setuptools"]["packages"]["find"]
+    assert {path.name for where in found["where"] for path in (ROOT / where).glob("sigmaslam*/")} == {
+        *(module for module in _files() if "." not in module),
+        *(path.name for path in ROOT.glob("sigmaslam*.egg-info")),
+    }
+    assert found["exclude"] == ["sigmaslam_benchmarks*"]
+    folders = {path.parent for path in _files().values()}
+    assert all((folder / "__init__.py").is_file() for folder in folders)
 
 
-@pytest.mark.parametrize("name", MAPPED)
-def test_the_link_inside_the_package_leads_to_the_folder(name: str):
-    link = ROOT / "sigmaslam" / name
-    assert link.is_symlink()
-    assert link.resolve() == ROOT / name
+def test_there_are_no_links():
+    """A clone without links, as on Windows or from a zip file, is the same."""
+    listed = subprocess.run(["git", "ls-files", "--stage"], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert not [line for line in listed.stdout.splitlines() if line.startswith("120000")]
+
+
+def test_no_rooms_and_no_modules_import_each_other_in_a_circle():
+    for name_of in (_room, str):
+        graph: dict[str, set[str]] = {}
+        for module in _files():
+            graph.setdefault(name_of(module), set()).update(map(name_of, _named(module, _all_imports)))
+        try:
+            TopologicalSorter({name: names - {name} for name, names in graph.items()}).prepare()
+        except CycleError as error:
+            pytest.fail(" -> ".join(error.args[1]))
+
+
+def test_rooms_import_only_what_stands_below_them():
+    floor = {room: k for k, rooms in enumerate(FLOORS) for room in rooms}
+    assert {_room(module) for module in _files()} == floor.keys()
+    for module in _files():
+        for imported in _named(module, _all_imports):
+            if (other := _room(imported)) != (room := _room(module)):
+                assert floor[other] < floor[room], f"{module} imports {imported}"
+
+
+def test_the_run_time_names_no_package_beside_it():
+    """Back ends and commands of other packages register themselves; the weights are no code."""
+    for module in _modules_of("sigmaslam"):
+        if _room(module) not in ("cli", "filters", "__main__"):
+            beside = {name.split(".")[0] for name in _named(module, _all_imports)} - {"sigmaslam", "sigmaslam_weights"}
+            assert not beside, f"{module} imports {beside}"
+
+
+def test_the_filters_have_their_former_name_besides():
+    for name in sigmaslam_filters.__all__:
+        assert getattr(sigmaslam.filters, name) is getattr(sigmaslam_filters, name)
 
 
 @pytest.mark.parametrize("layer", FORBIDDEN)
 def test_lower_layers_do_not_import_upper_ones(layer: str):
     importer: dict[str, str] = {}
-    pending = _modules_of(layer)
+    # The former name of the filters stands in the run time and is loaded by nobody there.
+    pending = [module for module in _modules_of(layer) if module != "sigmaslam.filters"]
     while pending:
         module = pending.pop()
         for imported in _imports(module) - importer.keys():
             importer[imported] = module
             pending.append(imported)
     for module in importer:
-        if f"{module}.".startswith(f"sigmaslam.{layer}.") or module in NAMES:
+        if f"{module}.".startswith(f"{layer}.") or module in NAMES:
             continue
         parts = module.split(".")
         # Of others' modules only the package counts.
-        if set(parts if parts[0] == "sigmaslam" else parts[:1]) & set(FORBIDDEN[layer]):
+        if set(parts if module in _files() else parts[:1]) & set(FORBIDDEN[layer]):
             chain = [module]
             while chain[0] in importer and importer[chain[0]] not in chain:
                 chain.insert(0, importer[chain[0]])
             pytest.fail(f"{layer} imports {module}: {' -> '.join(chain)}")
 
 
-def test_folders_of_the_runtime_import_only_what_stands_below_them():
-    floor = {room: k for k, rooms in enumerate(FLOORS) for room in rooms}
-    for module in _modules_of("sigmaslam"):
-        room = _room(module)
-        for imported in _imports(module):
-            other = _room(imported)
-            if other and other in floor and other != room:
-                assert floor[other] < floor[room], f"{module} imports {imported}"
-
-
 def test_folders_of_the_filters_import_only_what_stands_below_them():
     floor = {folder: k for k, folders in enumerate(FILTER_FLOORS) for folder in folders}
-    assert floor.keys() == {_folder_of_filters(module) for module in _modules_of("filters")}
-    for module in set(_modules_of("filters")) - {"sigmaslam.filters"}:
+    assert floor.keys() == {_folder_of_filters(module) for module in _modules_of("sigmaslam_filters")}
+    for module in set(_modules_of("sigmaslam_filters")) - {"sigmaslam_filters"}:
         folder = _folder_of_filters(module)
         for imported in _imports(module):
-            if imported.startswith("sigmaslam.filters.") and (other := _folder_of_filters(imported)) != folder:
+            if imported.startswith("sigmaslam_filters.") and (other := _folder_of_filters(imported)) != folder:
                 assert floor[other] < floor[folder], f"{module} imports {imported}"
-
-
-def test_every_module_of_the_runtime_has_its_floor():
-    rooms = {room for rooms in FLOORS for room in rooms}
-    assert {_room(module) for module in _modules_of("sigmaslam")} == rooms
 
 
 @pytest.mark.parametrize("room", ["estimation", "slam"])
@@ -128,7 +148,7 @@ def test_the_tracker_s_modules_and_classes_stay_small(room: str):
                     assert len(methods) <= MAX_METHODS, f"{module}.{node.name}"
 
 
-def test_imports_for_type_checking_and_inside_functions_do_not_count():
+def test_imports_for_type_checking_do_not_count_and_those_inside_functions_apart():
     source = """
 import a
 from typing import TYPE_CHECKING
@@ -145,25 +165,18 @@ except ImportError:
 class Class:
     from g import h
 """
-    assert set(_top_level_imports(ast.parse(source))) == {
-        "a",
-        "typing",
-        "typing.TYPE_CHECKING",
-        "c",
-        "e",
-        "e.f",
-        "g",
-        "g.h",
-    }
+    first = {"a", "typing", "typing.TYPE_CHECKING", "c", "e", "e.f", "g", "g.h"}
+    assert set(_top_level_imports(ast.parse(source))) == first
+    assert set(_all_imports(ast.parse(source))) == {*first, "d"}
 
 
-@pytest.mark.parametrize("module", ["sigmaslam.filters", "sigmaslam.filters.consistency.plots"])
+@pytest.mark.parametrize("module", ["sigmaslam_filters", "sigmaslam_filters.consistency.plots"])
 def test_the_filters_load_neither_opencv_nor_onnxruntime(module: str):
     code = f"import sys, {module}; print(*sorted({{name.split('.')[0] for name in sys.modules}}))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     loaded = set(done.stdout.split())
-    assert {"sigmaslam", "torch"} <= loaded
-    assert not loaded & {"cv2", "onnxruntime"}
+    assert {"sigmaslam_filters", "torch"} <= loaded
+    assert not loaded & {"cv2", "onnxruntime", "sigmaslam"}
 
 
 def test_every_public_name_of_the_package_is_there():
@@ -199,35 +212,30 @@ def test_tests_share_through_the_support_package_alone(path: Path):
 
 
 def _room(module: str) -> str:
-    """The folder or file of a module in the runtime package."""
+    """The folder or file of a module in the runtime package; of others the package."""
     parts = module.split(".")
-    return parts[1] if len(parts) > 1 else ""
+    return parts[1] if parts[0] == "sigmaslam" and len(parts) > 1 else parts[0]
 
 
 def _folder_of_filters(module: str) -> str:
     """The folder of a module of the filters; "" for the files beside the folders."""
     package = module if _files()[module].name == "__init__.py" else module.rpartition(".")[0]
-    return ".".join(package.split(".")[2:])
+    return ".".join(package.split(".")[1:])
 
 
 @cache
 def _files() -> dict[str, Path]:
     """The file of each module of the project, by its dotted name."""
     files = {}
-    for name in ("sigmaslam", *MAPPED):
-        for path in (ROOT / name).rglob("*.py"):
-            inner = path.relative_to(ROOT)
-            if any((ROOT / parent).is_symlink() for parent in inner.parents):
-                continue
-            parts = inner.with_suffix("").parts
-            if parts[-1] == "__init__":
-                parts = parts[:-1]
-            files[".".join(parts if name == "sigmaslam" else ("sigmaslam", *parts))] = path
+    for where in CONFIGURATION["tool"]["setuptools"]["packages"]["find"]["where"]:
+        for path in (ROOT / where).glob("sigmaslam*/**/*.py"):
+            parts = path.relative_to(ROOT / where).with_suffix("").parts
+            files[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
     return files
 
 
-def _modules_of(layer: str) -> list[str]:
-    return [module for module, path in _files().items() if path.relative_to(ROOT).parts[0] == layer]
+def _modules_of(package: str) -> list[str]:
+    return [module for module in _files() if module.split(".")[0] == package]
 
 
 @cache
@@ -238,16 +246,28 @@ def _imports(module: str) -> frozenset[str]:
     """
     if module not in _files():
         return frozenset()
-    named = set(_top_level_imports(ast.parse(_files()[module].read_text())))
-    # `from package import name` names a module only if there is one.
-    imported = {name for name in named if not name.startswith("sigmaslam") or name in _files()}
+    imported = _named(module, _top_level_imports, others=True)
     for name in [module, *imported]:
         parts = name.split(".")
         imported |= {".".join(parts[:count]) for count in range(1, len(parts))}
     return frozenset(imported - {module})
 
 
-def _top_level_imports(tree: ast.AST) -> Iterator[str]:
+def _named(module: str, imports: Callable[[ast.AST], Iterator[str]], others: bool = False) -> set[str]:
+    """Modules that a module of the project names: those of the project, or of others as well."""
+    named = set(imports(ast.parse(_files()[module].read_text())))
+    # `from package import name` names a module only if there is one; a package that only passes names on is not meant.
+    inner = {name for name in named if name in _files()}
+    inner -= {name for name in inner if any(each.startswith(f"{name}.") for each in inner)} - {"sigmaslam"}
+    return (inner | {name for name in named if not name.startswith("sigmaslam")} if others else inner) - {module}
+
+
+def _all_imports(tree: ast.AST) -> Iterator[str]:
+    """As `_top_level_imports`, those inside functions too."""
+    yield from _top_level_imports(tree, lazy=True)
+
+
+def _top_level_imports(tree: ast.AST, lazy: bool = False) -> Iterator[str]:
     """Names of modules, and of what is imported from them, outside functions and `if TYPE_CHECKING:`."""
     for node in ast.iter_child_nodes(tree):
         if isinstance(node, ast.Import):
@@ -258,6 +278,6 @@ def _top_level_imports(tree: ast.AST) -> Iterator[str]:
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
         elif isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
             for other in node.orelse:
-                yield from _top_level_imports(ast.Module([other], []))
-        elif not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
-            yield from _top_level_imports(node)
+                yield from _top_level_imports(ast.Module([other], []), lazy)
+        elif lazy or not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            yield from _top_level_imports(node, lazy)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import logging
 import sys
-from importlib.metadata import version
+from importlib.metadata import entry_points, version
 from typing import Annotated
 
 import typer
 from rich.console import Console
 from rich.logging import RichHandler
 
-from sigmaslam.cli.benchmark import benchmark
 from sigmaslam.cli.calibrate import calibrate
 from sigmaslam.cli.calibration import calibration
 from sigmaslam.cli.check import check
@@ -72,7 +71,9 @@ for _command, _line in (
 ):
     app.command(short_help=_line)(_command)
 app.add_typer(calibration)
-app.add_typer(benchmark)
+# Commands of packages that are installed beside this one: `benchmark`, in a checkout.
+for _entry in entry_points(group="sigmaslam.commands"):
+    app.add_typer(_entry.load())
 
 
 def main() -> None:

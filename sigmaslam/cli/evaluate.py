@@ -63,9 +63,9 @@ def evaluate(
 
     Of a run with --track-object the truth is T_camera_object of any frame that is fixed to the body.
     """
-    from sigmaslam.evaluation.evaluation_summary import format_evaluation
-    from sigmaslam.evaluation.run_evaluation import evaluate_run
-    from sigmaslam.evaluation.truth_conventions import TruthConvention
+    from sigmaslam_evaluation.evaluation_summary import format_evaluation
+    from sigmaslam_evaluation.run_evaluation import evaluate_run
+    from sigmaslam_evaluation.truth_conventions import TruthConvention
 
     evaluation = evaluate_run(
         run,

@@ -14,7 +14,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.inference.session import check_provider
 
 if TYPE_CHECKING:
-    from sigmaslam.models.network_export import CallTime
+    from sigmaslam_models.network_export import CallTime
 
 
 def export(
@@ -49,12 +49,12 @@ def export(
         return
     if run is None or out is None:
         raise InputError("give the folder of a run and --out, or --check, or --page")
-    from sigmaslam.evaluation.matching import read_scores
-    from sigmaslam.models.network_export import export_scoring
-    from sigmaslam.models.onnx_export import export_all
-    from sigmaslam.training.features.loop import WEIGHTS_NAME
-    from sigmaslam.training.matching.scoring import SCORER_NAME
-    from sigmaslam.training.run_card import CARD_NAME
+    from sigmaslam_models.model_card import read_scores
+    from sigmaslam_models.network_export import export_scoring
+    from sigmaslam_models.onnx_export import export_all
+    from sigmaslam_training.features.loop import WEIGHTS_NAME
+    from sigmaslam_training.matching.scoring import SCORER_NAME
+    from sigmaslam_training.run_card import CARD_NAME
 
     if (run / SCORER_NAME).is_file():
         if scores is not None:
@@ -73,9 +73,9 @@ def export(
 def _tell_of_shipped(check: bool, page: Path | None, provider: str) -> None:
     from sigmaslam.files import atomic_write_text
     from sigmaslam.inference.onnx_graph import shipped_weights
-    from sigmaslam.models.graph_page import PAGE_COMMAND, graph_page
-    from sigmaslam.models.network_export import check_networks
-    from sigmaslam.models.onnx_export import check_graphs
+    from sigmaslam_models.graph_page import PAGE_COMMAND, graph_page
+    from sigmaslam_models.network_export import check_networks
+    from sigmaslam_models.onnx_export import check_graphs
 
     folder = shipped_weights("features.onnx").parent
     if page is not None:

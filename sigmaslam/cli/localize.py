@@ -73,7 +73,8 @@ def localize(
     time of all.
     """
     need_train_extra()
-    from sigmaslam.localisation.formats import detect_format
+    from sigmaslam_filters import FilterError
+    from sigmaslam_localisation.formats import detect_format
 
     check_new_folder(out)
     first_pose = None if start is None else _parse_pose(start)
@@ -89,10 +90,13 @@ def localize(
     with Console(stderr=True).status("reading") as status:
         for name in [each.value for each in FilterKind] if compare else [filter.value]:
             folder, run = out / name if compare else out, {**settings, "filter": name}
-            if kind == "starry":
-                summaries = _localise_body(path, folder, run, status.update)
-            else:
-                summaries = _localise_robots(path, folder, kind, robot, first_pose, max_range, run, status.update)
+            try:
+                if kind == "starry":
+                    summaries = _localise_body(path, folder, run, status.update)
+                else:
+                    summaries = _localise_robots(path, folder, kind, robot, first_pose, max_range, run, status.update)
+            except FilterError as error:
+                raise InputError(f"{path}: the filter {name} cannot go on: {error}") from error
             rows += [(name, each, summary) for each, summary in summaries.items()]
     _print_rows(rows)
     if compare:
@@ -112,9 +116,9 @@ def _localise_robots(
     settings: dict[str, Any],
     tell: Callable[[str], None],
 ) -> dict[str, dict[str, Any]]:
-    from sigmaslam.localisation.formats import read_recordings
-    from sigmaslam.localisation.output import write_robots
-    from sigmaslam.localisation.robots import localise_robots
+    from sigmaslam_localisation.formats import read_recordings
+    from sigmaslam_localisation.output import write_robots
+    from sigmaslam_localisation.robots import localise_robots
 
     mapping = settings["map"] == MapKind.unknown
     recordings = read_recordings(path, kind, robot, mapping)
@@ -132,8 +136,8 @@ def _localise_robots(
 def _localise_body(
     path: Path, out: Path, settings: dict[str, Any], tell: Callable[[str], None]
 ) -> dict[str, dict[str, Any]]:
-    from sigmaslam.localisation.body import localise_body, write_body
-    from sigmaslam.localisation.starry import read_starry
+    from sigmaslam_localisation.body import localise_body, write_body
+    from sigmaslam_localisation.starry import read_starry
 
     recording = read_starry(path)
     begin = time.process_time()

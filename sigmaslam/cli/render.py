@@ -13,7 +13,7 @@ import typer
 from sigmaslam.cli.extras import RayAddress, need_train_extra
 from sigmaslam.errors import InputError
 from sigmaslam.progress import open_progress
-from sigmaslam.synthetic.render_choices import MOTIONS, PRESET_NAMES, SENSOR_NAMES, TRUTHS
+from sigmaslam_synthetic.render_choices import MOTIONS, PRESET_NAMES, SENSOR_NAMES, TRUTHS
 
 # mypy reads the members of an enum from literals alone.
 RenderPreset = StrEnum("RenderPreset", PRESET_NAMES)  # type: ignore[misc]
@@ -67,8 +67,8 @@ def render(
     Writes a KITTI folder (drone and colon: EuRoC, unrectified), poses, truth/NNNNNN.npz, landmarks.npz, scene.json.
     """
     need_train_extra()
-    from sigmaslam.synthetic.render_sequence import default_workers, write_sequence, write_sequences
-    from sigmaslam.synthetic.simulation import Recipe
+    from sigmaslam_synthetic.render_sequence import default_workers, write_sequence, write_sequences
+    from sigmaslam_synthetic.simulation import Recipe
 
     numbers = _seeds(seeds) if seeds is not None else range(0)
     if numbers and seed:

@@ -23,7 +23,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.files import check_new_folder, printable
 from sigmaslam.frontend import FRONTENDS
 from sigmaslam.frontend.build import own_networks
-from sigmaslam.inference.onnx_graph import BACKENDS
+from sigmaslam.inference.backends import backend_names
 from sigmaslam.inference.session import PROVIDERS, check_provider
 from sigmaslam.plot_style import NO_MATPLOTLIB
 from sigmaslam.readers import StereoSequence, open_cameras, open_sequence
@@ -40,7 +40,7 @@ logger = logging.getLogger(__name__)
 # mypy reads the members of an enum from literals alone.
 Frontend = StrEnum("Frontend", FRONTENDS)  # type: ignore[misc]
 """Where correspondences come from."""
-Backend = StrEnum("Backend", BACKENDS)  # type: ignore[misc]
+Backend = StrEnum("Backend", backend_names())  # type: ignore[misc]
 """What runs the network and the filter."""
 Provider = StrEnum("Provider", list(PROVIDERS))  # type: ignore[misc]
 """Where ONNX Runtime computes the networks."""
@@ -71,11 +71,11 @@ def demo(
     frontend: Annotated[Frontend, typer.Option(help="Where correspondences come from.")] = Frontend["learned"],
 ) -> None:
     """Track the rendered sequence that ships with the package and print the errors against its exact truth."""
-    from sigmaslam.evaluation.evaluation_summary import format_evaluation
-    from sigmaslam.evaluation.run_evaluation import evaluate_run
+    from sigmaslam_evaluation.evaluation_summary import format_evaluation
+    from sigmaslam_evaluation.run_evaluation import evaluate_run
 
     folder = out or Path(tempfile.mkdtemp(prefix="sigmaslam-demo-"))
-    with as_file(files("sigmaslam.synthetic") / "demo") as sequence:
+    with as_file(files("sigmaslam_synthetic") / "demo") as sequence:
         _track(open_sequence(sequence, "kitti"), folder, frontend, Backend["onnx"])
         evaluation = evaluate_run(folder, sequence / "poses.txt")
     picture = f"Picture: {evaluation.figure_path}" if evaluation.figure_path else f"No picture: {NO_MATPLOTLIB}"

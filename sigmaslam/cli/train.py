@@ -11,7 +11,7 @@ import typer
 
 from sigmaslam.cli.extras import need_train_extra
 from sigmaslam.files import printable
-from sigmaslam.training.mixes import MIXES, RECIPE_NAMES
+from sigmaslam_training.mixes import MIXES, RECIPE_NAMES
 
 # mypy reads the members of an enum from literals alone.
 Data = StrEnum("Data", list(MIXES))  # type: ignore[misc]
@@ -64,11 +64,11 @@ def train(
     -m sigmaslam train ...
     """
     need_train_extra()
-    from sigmaslam.training.devices import leads
-    from sigmaslam.training.features.loop import TrainingStopped
-    from sigmaslam.training.features.loop import train as run_training
-    from sigmaslam.training.features.recipes import choose_config, starting_weights
-    from sigmaslam.training.sources import choose_shares
+    from sigmaslam_training.devices import leads
+    from sigmaslam_training.features.loop import TrainingStopped
+    from sigmaslam_training.features.loop import train as run_training
+    from sigmaslam_training.features.recipes import choose_config, starting_weights
+    from sigmaslam_training.sources import choose_shares
 
     shares = choose_shares(worlds, world, textures, mix)
     config = choose_config(recipe.value, steps, None if data is None else data.value, seed, shares)
@@ -110,7 +110,7 @@ def train_scorer(
     hour on 2 cores; stopped by Ctrl-C, the same command goes on.
     """
     need_train_extra()
-    from sigmaslam.training.matching.scoring import ScoringConfig, train_scoring
+    from sigmaslam_training.matching.scoring import ScoringConfig, train_scoring
 
     card = train_scoring(out, ScoringConfig(pairs, steps, verifier_steps, seed), workers)
     typer.echo(json.dumps(card, indent=2))

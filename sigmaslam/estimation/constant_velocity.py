@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from sigmaslam.geometry.se3 import nearest_rigid, se3_inverse, se3_log
-from sigmaslam.inference.onnx_graph import load_step
+from sigmaslam.inference.backends import load_step
 
-# Order of the graph's error state, see sigmaslam.filters.graphs.pose_prediction.
+# Order of the graph's error state, see sigmaslam_models.estimator.pose_prediction.
 _POSE, _TWIST, _STATE_SIZE = slice(0, 6), slice(6, 12), 12
 
 

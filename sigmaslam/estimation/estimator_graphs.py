@@ -1,11 +1,11 @@
-"""The estimator's equations as graphs: the torch modules of `sigmaslam.filters.tracking`, exported."""
+"""The estimator's equations as graphs: the torch modules of `sigmaslam_models.estimator`, exported."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from sigmaslam.geometry.camera import RectifiedStereo
-from sigmaslam.inference.onnx_graph import load_step
+from sigmaslam.inference.backends import load_step
 
 
 class EstimatorGraphs:
@@ -17,8 +17,8 @@ class EstimatorGraphs:
         unscented: linearise by sigma points; else by first derivatives.
 
     Attributes:
-        predict_views, robust_step, gated_step: of a frame, see `sigmaslam.filters.tracking.frame_update`.
-        eliminate_landmarks, gate_window, condition: of a window, see `sigmaslam.filters.tracking.window_solution`.
+        predict_views, robust_step, gated_step: of a frame, see `sigmaslam_models.estimator.frame_update`.
+        eliminate_landmarks, gate_window, condition: of a window, see `sigmaslam_models.estimator.window_solution`.
     """
 
     def __init__(self, camera: RectifiedStereo, backend: str, unscented: bool) -> None:

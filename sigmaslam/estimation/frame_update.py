@@ -1,7 +1,7 @@
 """The update of one frame's pose against a window of keyframes.
 
 A frame that is no keyframe is estimated from the window's posterior and its own views alone, and then forgotten but for
-the velocity: nothing of it can be counted twice. The equations are `sigmaslam.filters.tracking.frame_update`, which
+the velocity: nothing of it can be counted twice. The equations are `sigmaslam_models.estimator.frame_update`, which
 runs as graphs; here is what decides.
 """
 
@@ -144,7 +144,7 @@ class FrameUpdate:
     def _views(
         self, rows: np.ndarray, common: np.ndarray, pose: np.ndarray, factor: np.ndarray
     ) -> dict[str, np.ndarray]:
-        """The fields of `sigmaslam.filters.tracking.frame_update.FrameViews` for landmarks (M,) by row."""
+        """The fields of `sigmaslam_models.estimator.frame_update.FrameViews` for landmarks (M,) by row."""
         window, state, landmarks = self._window, self._window.posterior, self._window.landmarks
         dependence = np.zeros((len(rows), LANDMARK_SIZE, len(factor)))
         dependence[:, :, :-6] = landmarks.dependence[rows]

@@ -43,7 +43,7 @@ def gate_views(window: KeyframeWindow, observations: KeyframeViews) -> np.ndarra
 def _views(
     window: KeyframeWindow, observations: KeyframeViews, rows: np.ndarray, owner: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """The fields of `sigmaslam.filters.tracking.window_solution.WindowViews`: views of landmarks (K,) by row.
+    """The fields of `sigmaslam_models.estimator.window_solution.WindowViews`: views of landmarks (K,) by row.
 
     Args:
         window: at its posterior.

@@ -74,7 +74,7 @@ class WindowState:
 
         Args:
             information, vector: (n, n), (n,).
-            condition: `sigmaslam.filters.tracking.window_solution.Condition`.
+            condition: `sigmaslam_models.estimator.window_solution.Condition`.
         """
         past = self.past.given(self.covariance, self.common, information, vector)
         factor = matrix_root(self.covariance)

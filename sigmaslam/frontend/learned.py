@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 
 from sigmaslam.frontend.types import Features
-from sigmaslam.inference.networks import WeightsFolder, network_path, open_network
+from sigmaslam.inference.backends import open_network
+from sigmaslam.inference.networks import WeightsFolder
 
 Graph = Callable[[Mapping[str, np.ndarray]], list[np.ndarray]]
 """A network as a function: a `sigmaslam.inference.onnx_graph.OnnxGraph`, or the same network in torch."""
@@ -39,12 +40,7 @@ class LearnedDetector:
         weights: WeightsFolder = None,
     ) -> None:
         self._max_keypoints = max_keypoints
-        if backend == "torch":
-            from sigmaslam.models.torch_runtime import TorchFeatures
-
-            self._graph: Graph = TorchFeatures(network_path("features", weights, backend))
-        else:
-            self._graph = open_network("features", weights, threads, provider)
+        self._graph: Graph = open_network("features", weights, threads, provider, backend)
 
     def __call__(self, image: np.ndarray) -> Features:
         """Features of an (H, W) uint8 image of any size from 96 pixels."""

@@ -12,7 +12,8 @@ from sigmaslam.frontend.patch_evidence import Evidence, examine_patches
 from sigmaslam.frontend.scorer_inputs import nearest_matches, side_information
 from sigmaslam.frontend.types import Features, Refinement
 from sigmaslam.frontend.verifier_inputs import PlaceSearch, describe_matches, describe_places
-from sigmaslam.inference.networks import WeightsFolder, open_network
+from sigmaslam.inference.backends import open_network
+from sigmaslam.inference.networks import WeightsFolder
 
 MIN_LOGIT = -4.0
 """Matches with a smaller logit from the scorer are dropped; the verifier was trained without them."""
@@ -30,16 +31,9 @@ class ConfidenceEstimator:
     """
 
     def __init__(self, backend: str = "onnx", provider: str = "cpu", weights: WeightsFolder = None) -> None:
-        if backend == "torch":
-            from sigmaslam.models.torch_runtime import scoring_module
-
-            self._scorer: _Graph = scoring_module("scorer", weights)
-            self._verifier: _Graph = scoring_module("verifier", weights)
-            self._place_verifier: _Graph = scoring_module("place_verifier", weights)
-        else:
-            self._scorer = open_network("scorer", weights, provider=provider)
-            self._verifier = open_network("verifier", weights, provider=provider)
-            self._place_verifier = open_network("place_verifier", weights, provider=provider)
+        self._scorer: _Graph = open_network("scorer", weights, provider=provider, backend=backend)
+        self._verifier: _Graph = open_network("verifier", weights, provider=provider, backend=backend)
+        self._place_verifier: _Graph = open_network("place_verifier", weights, provider=provider, backend=backend)
 
     def score(self, putative: Putative, features0: Features, features1: Features) -> np.ndarray:
         """Logit (M,) that each match is right, from its neighbours and its margins, without the images.

@@ -67,7 +67,7 @@ def networks_in(weights: WeightsFolder, backend: str = "onnx", names: Sequence[s
     return found
 
 
-def open_network(name: str, weights: WeightsFolder = None, threads: int = 1, provider: str = "cpu") -> OnnxGraph:
+def open_graph(name: str, weights: WeightsFolder = None, threads: int = 1, provider: str = "cpu") -> OnnxGraph:
     """The graph of a network.
 
     Args:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from importlib.resources import as_file, files
 from pathlib import Path
 
@@ -15,7 +14,6 @@ from sigmaslam.errors import InputError
 from sigmaslam.inference.session import RUNTIME_VERSION, open_session
 from sigmaslam.inference.weight_manifest import check_weights
 
-BACKENDS = ("onnx", "torch")
 _GRAPH_BYTES = 1 << 31
 
 
@@ -91,18 +89,5 @@ class OnnxGraph:
 
 def shipped_weights(name: str) -> Path:
     """Path of a file in the package's folder of weights and graphs."""
-    with as_file(files("sigmaslam.models.weights") / name) as path:
+    with as_file(files("sigmaslam_weights") / name) as path:
         return Path(path)
-
-
-@cache
-def load_step(name: str, backend: str) -> Step:
-    """A step of the filter by the name of its graph, with one of `BACKENDS`; "torch" is the same step in torch.
-
-    It has no state, and is loaded once in a process.
-    """
-    if backend == "torch":
-        from sigmaslam.models.torch_runtime import filter_module
-
-        return filter_module(name)
-    return OnnxGraph(shipped_weights(f"{name}.onnx"))

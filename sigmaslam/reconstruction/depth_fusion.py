@@ -3,7 +3,7 @@
 The state of a pixel is its inverse depth times focal length and baseline: the disparity that it has in truth, pixels.
 Another keyframe measures it where the point appears there. The measurement is the difference of the disparity seen
 there and the one predicted, both of which depend on the state and on the pose between the two keyframes; its update is
-the scalar form of the Kalman filter in `sigmaslam.filters`, to which a test holds it.
+the scalar form of the Kalman filter in `sigmaslam_filters`, to which a test holds it.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ import numpy as np
 from sigmaslam.bounded_files import shorten
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.camera import StereoCamera
-from sigmaslam.inference.onnx_graph import BACKENDS
+from sigmaslam.inference.backends import ONNX, backend_names
 from sigmaslam.readers.images import check_grey
 from sigmaslam.slam.config import TrackerConfig
 
@@ -31,8 +31,8 @@ def check_tracker_arguments(
         raise _wrong("camera", camera, "a StereoCamera, such as StereoCamera.from_yaml('stereo.yaml')")
     if not isinstance(frontend, str) and not _has_methods(frontend):
         raise _wrong("frontend", frontend, f"a name, or an object with {', '.join(_FRONTEND_METHODS)}")
-    if backend not in BACKENDS:
-        raise _wrong("backend", backend, f"one of {', '.join(BACKENDS)}")
+    if backend != ONNX and backend not in backend_names():
+        raise _wrong("backend", backend, f"one of {', '.join(backend_names())}")
     if config is not None and not isinstance(config, TrackerConfig):
         raise _wrong("config", config, "a TrackerConfig, such as TrackerConfig(window=8)")
     if not isinstance(threads, int | np.integer) or isinstance(threads, bool) or threads < 1:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sigmaslam.evaluation.metrics.probability_calibration import (
+from sigmaslam_evaluation.metrics.probability_calibration import (
     auroc,
     average_precision,
     best_half,

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from sigmaslam.evaluation.benchmarks.consistency import depths_around
-from sigmaslam.evaluation.benchmarks.consistency_page import ConsistencyResult, Scale, format_page
-from sigmaslam.evaluation.metrics.map_consistency import (
+from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam_benchmarks.tracking.consistency import depths_around
+from sigmaslam_benchmarks.tracking.consistency_page import ConsistencyResult, Scale, format_page
+from sigmaslam_evaluation.metrics.map_consistency import (
     coverage,
     depth_edges,
     mean_with_error,
@@ -18,8 +19,7 @@ from sigmaslam.evaluation.metrics.map_consistency import (
     ratio_with_error,
     root_mean_square_with_error,
 )
-from sigmaslam.geometry.camera import RectifiedStereo
-from sigmaslam.synthetic.simulation import Recipe, Studio, simulate
+from sigmaslam_synthetic.simulation import Recipe, Studio, simulate
 
 CAMERA = RectifiedStereo(fx=100.0, fy=100.0, cx=31.5, cy=23.5, baseline=0.1, width=64, height=48)
 GOOD = ConsistencyResult(

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sigmaslam.evaluation.benchmarks.dense_gallery import draw_points
+from sigmaslam_benchmarks.tracking.dense_gallery import draw_points
 
 
 def test_the_nearer_point_hides_the_farther_and_what_is_behind_is_not_drawn():

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from sigmaslam import open_sequence
-from sigmaslam.evaluation.benchmarks import endurance
-from sigmaslam.evaluation.benchmarks.endurance import LappedPairs, write_endurance
-from sigmaslam.evaluation.benchmarks.endurance_page import Block, Endurance, Lap, format_endurance
-from sigmaslam.synthetic.simulation import Recipe
+from sigmaslam_benchmarks.tracking import endurance
+from sigmaslam_benchmarks.tracking.endurance import LappedPairs, write_endurance
+from sigmaslam_benchmarks.tracking.endurance_page import Block, Endurance, Lap, format_endurance
+from sigmaslam_synthetic.simulation import Recipe
 
 LAP = Recipe("room", 40)
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.evaluation_summary import format_evaluation
-from sigmaslam.evaluation.run_evaluation import evaluate_run
 from sigmaslam.geometry.se3 import se3_adjoint, se3_exp, se3_inverse
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import read_kitti, read_trajectory, read_tum, write_kitti, write_tum
 from sigmaslam.runs.evaluated_frames import read_evaluated_frames
+from sigmaslam_evaluation.evaluation_summary import format_evaluation
+from sigmaslam_evaluation.run_evaluation import evaluate_run
 
 
 def make_run(folder: Path, truth: Trajectory, seed: int = 0) -> None:

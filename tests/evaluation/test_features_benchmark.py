@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 
 from sigmaslam.cli import app
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.benchmarks import features
-from sigmaslam.evaluation.filters.speed import Timing
-from sigmaslam.models.feature_network import FeatureNetwork
+from sigmaslam_benchmarks.filters.speed import Timing
+from sigmaslam_benchmarks.tracking import features
+from sigmaslam_models.feature_network import FeatureNetwork
 
 
 def test_costs_are_compared_round_by_round_with_the_reference():

@@ -7,10 +7,10 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from sigmaslam.evaluation.filters import peer_filters as filter_peers
-from sigmaslam.evaluation.filters import work as filter_work
-from sigmaslam.evaluation.filters.peer_filters import PEERS, Peer
-from sigmaslam.evaluation.filters.work import Belief, StereoWork, Work
+from sigmaslam_benchmarks.filters import peer_filters as filter_peers
+from sigmaslam_benchmarks.filters import work as filter_work
+from sigmaslam_benchmarks.filters.peer_filters import PEERS, Peer
+from sigmaslam_benchmarks.filters.work import Belief, StereoWork, Work
 
 WORKS: tuple[Work, ...] = (
     filter_work.stereo(4, seed=1),

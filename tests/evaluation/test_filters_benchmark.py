@@ -5,12 +5,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sigmaslam.evaluation.filters import extended, sequences
-from sigmaslam.evaluation.filters import ours as filter_ours
-from sigmaslam.evaluation.filters import work as filter_work
-from sigmaslam.evaluation.filters.peer_filters import PEERS
-from sigmaslam.evaluation.filters.speed import KINDS, Contender, Timing, batch_contenders, time_interleaved
-from sigmaslam.filters import SE3, Euclidean
+from sigmaslam_benchmarks.filters import extended, sequences
+from sigmaslam_benchmarks.filters import ours as filter_ours
+from sigmaslam_benchmarks.filters import work as filter_work
+from sigmaslam_benchmarks.filters.peer_filters import PEERS
+from sigmaslam_benchmarks.filters.speed import KINDS, Contender, Timing, batch_contenders, time_interleaved
+from sigmaslam_filters import SE3, Euclidean
 
 
 @pytest.mark.parametrize("points", [3, 30])

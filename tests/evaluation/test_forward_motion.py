@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from sigmaslam.evaluation.matching import forward_motion
-from sigmaslam.evaluation.matching.forward_motion import MeasuredMatches, judge_probability, measure_steps
-from sigmaslam.evaluation.matching.stereo import StereoStep
 from sigmaslam.frontend.descriptor import RefinedMatches
 from sigmaslam.frontend.image_pair import Matches
 from sigmaslam.frontend.types import Features
 from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam_benchmarks.matching import forward_motion
+from sigmaslam_benchmarks.matching.forward_motion import MeasuredMatches, judge_probability, measure_steps
+from sigmaslam_benchmarks.matching.stereo import StereoStep
 
 
 def test_claimed_and_right_shares_are_counted_by_bins():

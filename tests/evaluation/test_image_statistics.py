@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sigmaslam.evaluation.benchmarks import image_statistics as statistics
-from sigmaslam.evaluation.benchmarks.renders import compare, gaps
+from sigmaslam_benchmarks.tracking import image_statistics as statistics
+from sigmaslam_benchmarks.tracking.renders import compare, gaps
 
 
 def power_law(side: int, slope: float, seed: int = 0) -> np.ndarray:

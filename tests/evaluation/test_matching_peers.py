@@ -9,8 +9,8 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from sigmaslam.errors import FrameError, InputError
-from sigmaslam.evaluation.matching import LearnedExtractor, PeerExtractor, compare, load_extractor
-from sigmaslam.evaluation.matching.peer_extractors import recognise_outputs
+from sigmaslam_benchmarks.matching import LearnedExtractor, PeerExtractor, compare, load_extractor
+from sigmaslam_benchmarks.matching.peer_extractors import recognise_outputs
 
 KEYPOINTS = np.array([[5.0, 6.0], [100.0, 40.0], [20.0, 30.0], [7.0, 8.0], [90.0, 99.0]], np.float32)
 SCORES = np.array([0.2, 0.5, 0.9, 0.0, 0.3], np.float32)

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.matching import compare, comparison, format_scores, load_extractor, score_pairs
-from sigmaslam.evaluation.matching.image_pairs import Homography, ImagePair, SameRows
-from sigmaslam.evaluation.matching.peer_extractors import read_signature
-from sigmaslam.evaluation.matching.score_sets import score_refined
-from sigmaslam.evaluation.matching.scores import score_points, summarize
-from sigmaslam.evaluation.matching.sequence_pairs import sequence_pairs, sequence_steps
-from sigmaslam.evaluation.matching.sets import ALL, REFINED, SELECTION, STEPS, TRACKS
 from sigmaslam.frontend.image_pair import match_twice
 from sigmaslam.frontend.match_confidence import ConfidenceEstimator
 from sigmaslam.frontend.types import Features
 from sigmaslam.readers import open_sequence
-from sigmaslam.synthetic.rendering.textures import dead_leaves
+from sigmaslam_benchmarks.matching import compare, comparison, format_scores, load_extractor, score_pairs
+from sigmaslam_benchmarks.matching.image_pairs import Homography, ImagePair, SameRows
+from sigmaslam_benchmarks.matching.peer_extractors import read_signature
+from sigmaslam_benchmarks.matching.score_sets import score_refined
+from sigmaslam_benchmarks.matching.scores import score_points, summarize
+from sigmaslam_benchmarks.matching.sequence_pairs import sequence_pairs, sequence_steps
+from sigmaslam_benchmarks.matching.sets import ALL, REFINED, SELECTION, STEPS, TRACKS
+from sigmaslam_synthetic.rendering.textures import dead_leaves
 
 
 @pytest.fixture(scope="module")
@@ -30,10 +30,12 @@ def image() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def weights() -> Iterator[Path]:
-    with as_file(files("sigmaslam.models.weights")) as folder:
+    with as_file(files("sigmaslam_weights")) as folder:
         graph = folder / "features.onnx"
         if not graph.is_file() or "count" not in read_signature(graph).inputs:
-            pytest.skip("models/weights/features.onnx is missing or of the previous network: it has no input `count`")
+            pytest.skip(
+                "models/sigmaslam_weights/features.onnx is missing or of the previous network: it has no input `count`"
+            )
         yield folder
 
 

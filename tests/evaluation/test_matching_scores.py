@@ -4,8 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from sigmaslam.evaluation.matching.image_pairs import Disparity, Homography, ImagePair, Motion, SameRows, Truth
-from sigmaslam.evaluation.matching.scores import (
+from sigmaslam.geometry.se3 import rotation_exp
+from sigmaslam_benchmarks.matching.image_pairs import Disparity, Homography, ImagePair, Motion, SameRows, Truth
+from sigmaslam_benchmarks.matching.scores import (
     area_under_curve,
     corner_error,
     mutual_nearest,
@@ -14,7 +15,6 @@ from sigmaslam.evaluation.matching.scores import (
     score_points,
     summarize,
 )
-from sigmaslam.geometry.se3 import rotation_exp
 
 IMAGE = np.zeros((480, 640), np.uint8)
 K = np.array([[570.0, 0.0, 320.0], [0.0, 560.0, 240.0], [0.0, 0.0, 1.0]])

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.matching import FINAL, SELECTION, load_extractor, load_set, score_pairs
-from sigmaslam.evaluation.matching.image_pairs import Disparity, Homography, Motion, resize
-from sigmaslam.evaluation.matching.photographs import find_occluded, middlebury, warped_pair
-from sigmaslam.evaluation.matching.sequence_pairs import sequence_pairs
 from sigmaslam.readers import open_sequence
-from sigmaslam.synthetic.rendering.textures import dead_leaves
+from sigmaslam_benchmarks.matching import FINAL, SELECTION, load_extractor, load_set, score_pairs
+from sigmaslam_benchmarks.matching.image_pairs import Disparity, Homography, Motion, resize
+from sigmaslam_benchmarks.matching.photographs import find_occluded, middlebury, warped_pair
+from sigmaslam_benchmarks.matching.sequence_pairs import sequence_pairs
+from sigmaslam_synthetic.rendering.textures import dead_leaves
 
 
 def _spot(height: int, width: int, place: np.ndarray) -> np.ndarray:

@@ -6,16 +6,16 @@ import cv2
 import numpy as np
 import pytest
 
-from sigmaslam.evaluation.matching import load_extractor, score_pairs
-from sigmaslam.evaluation.matching.image_pairs import Homography, ImagePair, Motion, SameRows
-from sigmaslam.evaluation.matching.klt_tracks import TRACKED_KEYPOINTS, follow_corners, score_klt
-from sigmaslam.evaluation.matching.scores import match_rows_refined, score_pair
-from sigmaslam.evaluation.matching.sequence_pairs import sequence_pairs, sequence_steps
-from sigmaslam.evaluation.matching.stereo import StereoStep, estimate_step, is_good, score_steps
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import rotation_exp, se3_exp
 from sigmaslam.readers import open_sequence
-from sigmaslam.synthetic.rendering.textures import dead_leaves
+from sigmaslam_benchmarks.matching import load_extractor, score_pairs
+from sigmaslam_benchmarks.matching.image_pairs import Homography, ImagePair, Motion, SameRows
+from sigmaslam_benchmarks.matching.klt_tracks import TRACKED_KEYPOINTS, follow_corners, score_klt
+from sigmaslam_benchmarks.matching.scores import match_rows_refined, score_pair
+from sigmaslam_benchmarks.matching.sequence_pairs import sequence_pairs, sequence_steps
+from sigmaslam_benchmarks.matching.stereo import StereoStep, estimate_step, is_good, score_steps
+from sigmaslam_synthetic.rendering.textures import dead_leaves
 
 SHIFT = 7.3
 

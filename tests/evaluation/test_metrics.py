@@ -7,7 +7,10 @@ from evo.core import sync as evo_sync
 from evo.core.trajectory import PoseTrajectory3D
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.metrics.trajectory_errors import (
+from sigmaslam.geometry.se3 import rotation_exp, se3_adjoint, se3_exp, se3_inverse
+from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.readers.trajectory_files import read_kitti
+from sigmaslam_evaluation.metrics.trajectory_errors import (
     absolute_trajectory_error,
     associate,
     is_regular,
@@ -16,10 +19,7 @@ from sigmaslam.evaluation.metrics.trajectory_errors import (
     relative_pose_error,
     synchronise,
 )
-from sigmaslam.evaluation.metrics.truth_covariance import truth_covariance
-from sigmaslam.geometry.se3 import rotation_exp, se3_adjoint, se3_exp, se3_inverse
-from sigmaslam.geometry.trajectory import Trajectory
-from sigmaslam.readers.trajectory_files import read_kitti
+from sigmaslam_evaluation.metrics.truth_covariance import truth_covariance
 
 
 @pytest.fixture(scope="module")

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from sigmaslam.evaluation.benchmarks.page import opening, write_page
 from sigmaslam.source_commit import describe_source
+from sigmaslam_benchmarks.tracking.page import opening, write_page
 
 
 def test_a_page_says_which_command_and_commit_made_it():

@@ -10,8 +10,8 @@ from torch import nn
 from torch.nn import functional
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.matching import PeerExtractor
-from sigmaslam.evaluation.matching.peer_exports import export_peer, load_edgepoint2, load_xfeat
+from sigmaslam_benchmarks.matching import PeerExtractor
+from sigmaslam_benchmarks.matching.peer_exports import export_peer, load_edgepoint2, load_xfeat
 
 EDGEPOINT2 = """
 import torch

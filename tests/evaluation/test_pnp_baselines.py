@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sigmaslam.evaluation.benchmarks.pnp_baselines import PnpOdometry, pose_from_points
-from sigmaslam.evaluation.metrics.trajectory_errors import absolute_trajectory_error
 from sigmaslam.geometry.camera import CameraModel, RectifiedStereo, StereoCamera
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import open_sequence
 from sigmaslam.readers.trajectory_files import read_trajectory
+from sigmaslam_benchmarks.tracking.pnp_baselines import PnpOdometry, pose_from_points
+from sigmaslam_evaluation.metrics.trajectory_errors import absolute_trajectory_error
 
 CAMERA = RectifiedStereo(500.0, 510.0, 320.0, 240.0, 0.1, 640, 480)
 T_KEY_CAMERA = se3_exp(np.array([0.3, -0.1, 0.5, 0.05, -0.1, 0.02]))

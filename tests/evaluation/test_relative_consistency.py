@@ -11,10 +11,6 @@ import numpy as np
 import pytest
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.evaluation_summary import format_evaluation
-from sigmaslam.evaluation.metrics.relative_consistency import relative_consistency
-from sigmaslam.evaluation.metrics.truth_covariance import relative_truth_covariance, truth_covariance
-from sigmaslam.evaluation.run_evaluation import evaluate_run
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import write_tum
@@ -26,6 +22,10 @@ from sigmaslam.runs.relative_pose_file import (
     write_frame_pairs,
 )
 from sigmaslam.slam.relative_poses import SPANS, RelativePoses
+from sigmaslam_evaluation.evaluation_summary import format_evaluation
+from sigmaslam_evaluation.metrics.relative_consistency import relative_consistency
+from sigmaslam_evaluation.metrics.truth_covariance import relative_truth_covariance, truth_covariance
+from sigmaslam_evaluation.run_evaluation import evaluate_run
 from tests.support.commands import run_here
 
 COUNT = 400

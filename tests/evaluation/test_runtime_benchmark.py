@@ -10,21 +10,21 @@ import numpy as np
 import pytest
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.benchmarks import runtime
-from sigmaslam.evaluation.benchmarks.decoded_pairs import DecodedPairs, open_pairs, write_pairs
-from sigmaslam.evaluation.benchmarks.runtime import time_everything, write_runtime
-from sigmaslam.evaluation.benchmarks.runtime_page import SEQUENCE, SIZE, TimedRun, format_runtime
-from sigmaslam.evaluation.benchmarks.sequences_page import Omission
-from sigmaslam.evaluation.benchmarks.stereo_peers import CuvslamPeer, MissingPeerError, OrbSlamPeer, orb_settings
-from sigmaslam.evaluation.benchmarks.time_method import (
+from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam.readers import open_sequence
+from sigmaslam_benchmarks.tracking import runtime
+from sigmaslam_benchmarks.tracking.decoded_pairs import DecodedPairs, open_pairs, write_pairs
+from sigmaslam_benchmarks.tracking.runtime import time_everything, write_runtime
+from sigmaslam_benchmarks.tracking.runtime_page import SEQUENCE, SIZE, TimedRun, format_runtime
+from sigmaslam_benchmarks.tracking.sequences_page import Omission
+from sigmaslam_benchmarks.tracking.stereo_peers import CuvslamPeer, MissingPeerError, OrbSlamPeer, orb_settings
+from sigmaslam_benchmarks.tracking.time_method import (
     METHODS,
     FailedMethodError,
     MethodTiming,
     TimingJob,
     time_method,
 )
-from sigmaslam.geometry.camera import RectifiedStereo
-from sigmaslam.readers import open_sequence
 from tests.support.commands import run_here
 
 FRAMES = 6

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.benchmarks import sequences
-from sigmaslam.evaluation.benchmarks.sequences import METHODS, run_sequences, write_results
-from sigmaslam.evaluation.benchmarks.sequences_page import method_label
+from sigmaslam_benchmarks.tracking import sequences
+from sigmaslam_benchmarks.tracking.sequences import METHODS, run_sequences, write_results
+from sigmaslam_benchmarks.tracking.sequences_page import method_label
 
 
 def _rows(page: str, method: str) -> list[list[str]]:

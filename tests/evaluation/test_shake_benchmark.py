@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, norm
 
-from sigmaslam.evaluation.benchmarks import shake, trial_pool
-from sigmaslam.evaluation.benchmarks.pnp_baselines import track_with_pnp
-from sigmaslam.evaluation.benchmarks.shake import FRAMES, MOVERS, judge, recipe
-from sigmaslam.evaluation.benchmarks.shake_page import ShakenSequence, ShakeResult, format_page
-from sigmaslam.evaluation.metrics.claimed_errors import motion_errors, sigmas_of_pose
-from sigmaslam.evaluation.metrics.image_motion import ImageMotion, largest_reversal, read_image_motion
-from sigmaslam.evaluation.trial import render
 from sigmaslam.geometry.se3 import se3_adjoint, se3_exp, se3_inverse
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import StereoSequence
-from sigmaslam.synthetic.simulation import Recipe
+from sigmaslam_benchmarks.tracking import shake, trial_pool
+from sigmaslam_benchmarks.tracking.pnp_baselines import track_with_pnp
+from sigmaslam_benchmarks.tracking.shake import FRAMES, MOVERS, judge, recipe
+from sigmaslam_benchmarks.tracking.shake_page import ShakenSequence, ShakeResult, format_page
+from sigmaslam_benchmarks.trial import render
+from sigmaslam_evaluation.metrics.claimed_errors import motion_errors, sigmas_of_pose
+from sigmaslam_evaluation.metrics.image_motion import ImageMotion, largest_reversal, read_image_motion
+from sigmaslam_synthetic.simulation import Recipe
 
 GOOD = ShakeResult(
     tracking=59,
@@ -124,7 +124,7 @@ def shaken_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_flow_and_blur_of_a_render_are_those_of_its_dense_truth(shaken_folder: Path, tmp_path: Path):
-    from sigmaslam.synthetic.simulation import Studio, simulate
+    from sigmaslam_synthetic.simulation import Studio, simulate
 
     recipe = Recipe("room", 8, 7, "shaken", sensor="slow", width=240, height=180)
     studio = Studio(simulate(recipe))

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from sigmaslam.evaluation.benchmarks.tracking_gallery import MAX_BYTES, RECIPES, Animation
 from sigmaslam.readers import open_sequence
+from sigmaslam_benchmarks.tracking.tracking_gallery import MAX_BYTES, RECIPES, Animation
 
 IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation import trial
-from sigmaslam.evaluation.benchmarks.pnp_baselines import track_with_pnp
-from sigmaslam.evaluation.trial import Trial, TrialCache, hash_code
 from sigmaslam.slam.tracker import TrackerConfig
-from sigmaslam.synthetic.simulation import Recipe
+from sigmaslam_benchmarks.tracking.pnp_baselines import track_with_pnp
+from sigmaslam_benchmarks.trial import Trial, TrialCache, hash_code
+from sigmaslam_evaluation import trial
+from sigmaslam_synthetic.simulation import Recipe
 
 RECIPE, CONFIG = Recipe("room", 3, 7), TrackerConfig()
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from sigmaslam.errors import OutputError
-from sigmaslam.evaluation.benchmarks.page import missing_sequences
-from sigmaslam.evaluation.benchmarks.trial_pool import SequenceTrials, TrialKind, write_trials
-from sigmaslam.synthetic.simulation import Recipe
+from sigmaslam_benchmarks.tracking.page import missing_sequences
+from sigmaslam_benchmarks.tracking.trial_pool import SequenceTrials, TrialKind, write_trials
+from sigmaslam_synthetic.simulation import Recipe
 from tests.support.klt_trials import METHODS, hash_nothing, hash_process, judge_klt
 
 KIND = TrialKind(METHODS, judge_klt, hash_nothing)

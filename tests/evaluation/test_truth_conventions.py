@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.evaluation_summary import format_evaluation
-from sigmaslam.evaluation.run_evaluation import evaluate_run
-from sigmaslam.evaluation.truth_conventions import TIME_UNITS, TruthConvention
 from sigmaslam.geometry.se3 import matrix_to_quaternion, se3_exp, se3_inverse
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import read_kitti, read_trajectory, write_kitti, write_tum
+from sigmaslam_evaluation.evaluation_summary import format_evaluation
+from sigmaslam_evaluation.run_evaluation import evaluate_run
+from sigmaslam_evaluation.truth_conventions import TIME_UNITS, TruthConvention
 from tests.support.commands import assert_refused, run_here
 
 KITTI = ("04", "05", "07", "10")

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sigmaslam.bounded_files import shorten
-from sigmaslam.evaluation.benchmarks.page import header, opening, row, write_page
 from sigmaslam.source_commit import describe_source
+from sigmaslam_benchmarks.tracking.page import header, opening, row, write_page
 from tests.faults.case import Case, Runner, Verdict, judge
 from tests.faults.running import attempt, run_in_process, run_in_this_process
 from tests.faults.table import CASES
@@ -54,7 +54,7 @@ def run_case(case: Case, runner: Runner) -> Result:
 
 def _without_folders(text: str) -> str:
     """The text without the folders of this machine."""
-    return re.sub(r"/\S*?(?:sigmaslam-faults?-[^/\s]*|synthetic/demo)(?:/|(?=[\s:]))", "", text)
+    return re.sub(r"/\S*?(?:sigmaslam-faults?-[^/\s]*|synthetic/sigmaslam_synthetic/demo)(?:/|(?=[\s:]))", "", text)
 
 
 def _excerpt(text: str, words: tuple[str, ...]) -> str:

@@ -14,7 +14,7 @@ from sigmaslam.geometry.se3 import se3_inverse, se3_log
 from sigmaslam.readers.trajectory_files import read_kitti, read_tum
 from tests.support.quantiles import WITHIN_3_SIGMA, squared_sigmas
 
-DEMO = Path(__file__).resolve().parents[2] / "synthetic" / "demo"
+DEMO = Path(__file__).resolve().parents[2] / "synthetic" / "sigmaslam_synthetic" / "demo"
 # Of docs/usage.md.
 _EXIT_CODES = (0, 1, 2, 3, 129, 130, 143)
 # Of what is written to the terminal when an input is refused.

@@ -15,11 +15,11 @@ from tempfile import mkdtemp
 import cv2
 import numpy as np
 
-from sigmaslam.evaluation.truth_conventions import R_BODY_CAMERA, TIME_UNITS
 from sigmaslam.geometry.se3 import matrix_to_quaternion, se3_inverse
 from sigmaslam.readers import open_sequence
 from sigmaslam.readers.trajectory_files import read_kitti
 from sigmaslam.runs.track import track_sequence
+from sigmaslam_evaluation.truth_conventions import R_BODY_CAMERA, TIME_UNITS
 from tests.faults.case import DEMO, Case, Outcome, Runner, Verdict
 from tests.faults.inputs import KLT, good, track
 from tests.support.calibration_yaml import write_calibration

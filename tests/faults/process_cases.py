@@ -31,7 +31,7 @@ def _weights(change: Callable[[Path], object], *options: str) -> Callable[..., O
     """Tracks with a package whose weights are changed."""
 
     def attempt(folder: Path, run: Runner) -> Outcome:
-        weights = _link_package(folder / "installed")
+        weights = _copy_weights(folder / "installed")
         change(weights)
         good(folder, 2)
         return run("track", folder / "sequence", "--out", folder / "run", *options, folder=folder / "installed")
@@ -39,19 +39,9 @@ def _weights(change: Callable[[Path], object], *options: str) -> Callable[..., O
     return attempt
 
 
-def _link_package(folder: Path) -> Path:
-    """A package of links to this one, with weights of its own; returns their folder."""
-    package = folder / "sigmaslam"
-    (package / "models").mkdir(parents=True)
-    for entry in (ROOT / "sigmaslam").iterdir():
-        if entry.name != "models":
-            (package / entry.name).symlink_to(entry.resolve())
-    for entry in (ROOT / "models").iterdir():
-        if entry.name == "weights":
-            shutil.copytree(entry, package / "models" / "weights")
-        else:
-            (package / "models" / entry.name).symlink_to(entry)
-    return package / "models" / "weights"
+def _copy_weights(folder: Path) -> Path:
+    """The package of the weights, to be changed: Python finds it before the one that is installed."""
+    return shutil.copytree(ROOT / "models" / "sigmaslam_weights", folder / "sigmaslam_weights")
 
 
 def _flip(name: str, weights: Path) -> None:

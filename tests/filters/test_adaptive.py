@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sigmaslam import filters
+import sigmaslam_filters as filters
 from tests.support.filter_assertions import assert_close
 from tests.support.filter_builders import covariances, random_numbers, tensor
 

@@ -6,8 +6,8 @@ import torch
 from scipy.stats import multivariate_normal
 from torch import Tensor
 
-from sigmaslam import filters
-from sigmaslam.filters.core.solve import FORMS
+import sigmaslam_filters as filters
+from sigmaslam_filters.core.solve import FORMS
 from tests.support.filter_assertions import assert_close, assert_same_belief, assert_same_update
 from tests.support.filter_builders import (
     beliefs,

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sigmaslam import filters
+import sigmaslam_filters as filters
 
 
 def make_step(scale: float):

@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmaslam import filters
-from sigmaslam.filters import compiled_filter, systems
-from sigmaslam.filters.core.scalar_loop import ScalarLoop, ScalarLoopError
+import sigmaslam_filters as filters
+from sigmaslam_filters import compiled_filter, systems
+from sigmaslam_filters.core.scalar_loop import ScalarLoop, ScalarLoopError
 from tests.support.filter_assertions import assert_close
 from tests.support.filter_builders import beliefs, bent_measurement, bent_motion, covariances, random_numbers, tensor
 
@@ -166,7 +166,7 @@ def test_what_is_no_small_arithmetic_is_a_loop_around_compiled_steps(case, caplo
     ukf = filters.UnscentedKalmanFilter(iterations=1)
     prior, values = beliefs(batch, size, scale=0.1), random_numbers(4, batch, 2)
     run = filters.compile_filter(ukf, motion, see)
-    with caplog.at_level(logging.INFO, "sigmaslam.filters"):
+    with caplog.at_level(logging.INFO, "sigmaslam_filters"):
         assert_same_track(run(prior, values), ukf.filter(prior, motion, see, values), 1e-11)
     assert run._steps
     assert ("a loop around compiled steps" in caplog.text) == (case != "large batch")

@@ -7,8 +7,8 @@ import torch
 from torch._dynamo.backends.common import aot_autograd
 from torch._inductor.decomposition import select_decomp_table
 
-from sigmaslam import filters
-from sigmaslam.filters.core import components
+import sigmaslam_filters as filters
+from sigmaslam_filters.core import components
 
 BATCH = 200
 

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from scipy.stats import binomtest, chi2, norm, t
 from torch import Tensor
 
-from sigmaslam.filters import consistency
-from sigmaslam.filters.consistency.plots import plot_coverage, plot_nees, plot_whiteness
+from sigmaslam_filters import consistency
+from sigmaslam_filters.consistency.plots import plot_coverage, plot_nees, plot_whiteness
 from tests.support.filter_builders import covariances, random_numbers
 
 axis_coverage = partial(consistency.coverage, by_axis=True)

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from sigmaslam.filters.gaussian_belief import degree_of_belief
+from sigmaslam_filters.gaussian_belief import degree_of_belief
 
 
 def covariances(*shape: int, scale: float = 0.1, seed: int = 0) -> Tensor:

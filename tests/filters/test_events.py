@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from sigmaslam import filters
-from sigmaslam.filters import Event
+import sigmaslam_filters as filters
+from sigmaslam_filters import Event
 from tests.support.filter_assertions import assert_same_belief
 from tests.support.filter_builders import beliefs, bent_measurement, bent_motion, covariances, random_numbers, tensor
 

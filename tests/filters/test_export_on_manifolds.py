@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmaslam import filters
-from sigmaslam.filters import systems
-from sigmaslam.filters.models import several
+import sigmaslam_filters as filters
+from sigmaslam_filters import systems
+from sigmaslam_filters.models import several
 from tests.support.filter_builders import covariances, random_numbers, tensor
 
 PLANE, RIGID = filters.SE2("right"), filters.SE3("right")

@@ -9,13 +9,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmaslam import filters
-from sigmaslam.filters import systems
-from sigmaslam.filters.core import factors, plain_factors
-from sigmaslam.filters.core.transforms import push_forward
-from sigmaslam.filters.graphs.exact_operators import ExactOperators
-from sigmaslam.filters.graphs.step_export import _Step
-from sigmaslam.filters.models import several
+import sigmaslam_filters as filters
+from sigmaslam_filters import systems
+from sigmaslam_filters.core import factors, plain_factors
+from sigmaslam_filters.core.transforms import push_forward
+from sigmaslam_filters.graphs.exact_operators import ExactOperators
+from sigmaslam_filters.graphs.step_export import _Step
+from sigmaslam_filters.models import several
 from tests.support.filter_assertions import assert_close, assert_same_update
 from tests.support.filter_builders import beliefs, bent_measurement, bent_motion, covariances, random_numbers, tensor
 

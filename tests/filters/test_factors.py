@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmaslam import filters
-from sigmaslam.filters.core import factors, unrolled_factors
-from sigmaslam.filters.core.noise_covariance import Noise
+import sigmaslam_filters as filters
+from sigmaslam_filters.core import factors, unrolled_factors
+from sigmaslam_filters.core.noise_covariance import Noise
 from tests.support.filter_assertions import assert_close
 from tests.support.filter_builders import beliefs, bent_measurement, bent_motion, covariances, random_numbers, tensor
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmaslam import filters
+import sigmaslam_filters as filters
 from tests.support.filter_builders import random_numbers, tensor
 
 RUNS = 64

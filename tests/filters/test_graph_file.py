@@ -6,7 +6,7 @@ import onnxruntime
 import pytest
 from onnx import parser
 
-from sigmaslam.filters.graphs.graph_file import simplify
+from sigmaslam_filters.graphs.graph_file import simplify
 
 SMALL, NEAR_ONE = 8.2e-9, 1.0 + 1e-6
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sigmaslam import filters
+import sigmaslam_filters as filters
 from tests.support.filter_assertions import assert_close, assert_same_belief
 from tests.support.filter_builders import beliefs, bent_measurement, bent_motion, covariances, random_numbers, tensor
 

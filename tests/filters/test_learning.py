@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmaslam import filters
+import sigmaslam_filters as filters
 from tests.support.filter_assertions import assert_close
 from tests.support.filter_builders import covariances, random_numbers, tensor
 

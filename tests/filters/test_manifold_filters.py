@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmaslam import filters
+import sigmaslam_filters as filters
 from tests.support.filter_assertions import assert_close, assert_same_belief
 from tests.support.filter_builders import covariances, random_numbers, tensor
 

@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.func import jacfwd, jacrev, jvp, vmap
 
-from sigmaslam.filters.core.layout import concatenate, stack
-from sigmaslam.filters.manifolds import SE2, SE3, SO2, SO3, Euclidean, Manifold, Product
-from sigmaslam.filters.manifolds.se3_matrices import adjoint_se3, exp_se3, log_se3, skew
+from sigmaslam_filters.core.layout import concatenate, stack
+from sigmaslam_filters.manifolds import SE2, SE3, SO2, SO3, Euclidean, Manifold, Product
+from sigmaslam_filters.manifolds.se3_matrices import adjoint_se3, exp_se3, log_se3, skew
 from tests.support.filter_builders import random_numbers
 
 Group = SE2 | SO3 | SE3

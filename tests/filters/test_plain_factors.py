@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from sigmaslam.filters.core import plain_factors
+from sigmaslam_filters.core import plain_factors
 
 
 def cholesky(matrix: Tensor) -> Tensor:

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 from torch import Tensor
 
-from sigmaslam import filters
-from sigmaslam.filters.point_estimates import Observation, PointEstimate, maximum_a_posteriori, maximum_likelihood
+import sigmaslam_filters as filters
+from sigmaslam_filters.point_estimates import Observation, PointEstimate, maximum_a_posteriori, maximum_likelihood
 from tests.support.filter_builders import covariances, random_numbers, tensor
 
 BEACONS = torch.tensor([[0.0, 0.0], [4.0, -1.0], [1.0, 5.0]], dtype=torch.float64)

@@ -9,10 +9,10 @@ import torch
 from scipy.stats import chi2
 from torch import Tensor
 
-from sigmaslam import filters
-from sigmaslam.filters import systems
-from sigmaslam.filters.core.solve import FORMS
-from sigmaslam.filters.robust import ROBUST
+import sigmaslam_filters as filters
+from sigmaslam_filters import systems
+from sigmaslam_filters.core.solve import FORMS
+from sigmaslam_filters.robust import ROBUST
 from tests.support.filter_assertions import assert_close, assert_same_belief, assert_same_update
 from tests.support.filter_builders import beliefs, bent_measurement, covariances, random_numbers, tensor
 

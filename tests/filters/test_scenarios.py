@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Generator, Tensor
 
-from sigmaslam import filters
-from sigmaslam.evaluation.filters import work as filter_work
-from sigmaslam.evaluation.filters.scenarios import (
+import sigmaslam_filters as filters
+from sigmaslam_benchmarks.filters import work as filter_work
+from sigmaslam_benchmarks.filters.scenarios import (
     CAMERA,
     Outcome,
     Scenario,
@@ -21,8 +21,8 @@ from sigmaslam.evaluation.filters.scenarios import (
     stereo_pose,
     vague_prior,
 )
-from sigmaslam.filters.consistency import check_nees, nees
-from sigmaslam.filters.systems import (
+from sigmaslam_filters.consistency import check_nees, nees
+from sigmaslam_filters.systems import (
     constant_velocity,
     constant_velocity_over,
     differential_drive,

@@ -6,8 +6,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.func import jacrev
 
-from sigmaslam.filters.manifolds.se3_matrices import adjoint_se3, exp_se3, invert_se3, log_se3, skew
 from sigmaslam.geometry import se3 as rotation
+from sigmaslam_filters.manifolds.se3_matrices import adjoint_se3, exp_se3, invert_se3, log_se3, skew
 
 
 def twists(count: int, angles: Tensor, seed: int = 0) -> Tensor:

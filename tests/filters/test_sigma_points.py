@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmaslam import filters
-from sigmaslam.filters.core.sigma_points import SigmaPoints
-from sigmaslam.filters.core.transforms import Unscented
+import sigmaslam_filters as filters
+from sigmaslam_filters.core.sigma_points import SigmaPoints
+from sigmaslam_filters.core.transforms import Unscented
 from tests.support.filter_assertions import assert_close
 from tests.support.filter_builders import beliefs, covariances, random_numbers, tensor
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sigmaslam import filters
-from sigmaslam.filters.core.solve import FORMS
+import sigmaslam_filters as filters
+from sigmaslam_filters.core.solve import FORMS
 from tests.support.filter_assertions import assert_close, assert_same_belief, assert_same_update
 from tests.support.filter_builders import beliefs, bent_measurement, bent_motion, covariances, noises, random_numbers
 

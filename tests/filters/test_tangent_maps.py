@@ -4,10 +4,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmaslam import filters
-from sigmaslam.filters.core.forward_mode import push_along
-from sigmaslam.filters.manifolds import SE2, SE3, SO2, SO3, Euclidean, Manifold, Product
-from sigmaslam.filters.manifolds.tangent_maps import Differentiated, TangentMaps, tangent_maps
+import sigmaslam_filters as filters
+from sigmaslam_filters.core.forward_mode import push_along
+from sigmaslam_filters.manifolds import SE2, SE3, SO2, SO3, Euclidean, Manifold, Product
+from sigmaslam_filters.manifolds.tangent_maps import Differentiated, TangentMaps, tangent_maps
 from tests.support.filter_assertions import assert_close
 from tests.support.filter_builders import covariances, random_numbers, tensor
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from sigmaslam.filters import ExtendedKalmanFilter, Gaussian, several
-from sigmaslam.localisation.mapping_robot import MappingRobot
-from sigmaslam.localisation.wheeled_robot import SPACE, WheeledRobot
+from sigmaslam_filters import ExtendedKalmanFilter, Gaussian, several
+from sigmaslam_localisation.mapping_robot import MappingRobot
+from sigmaslam_localisation.wheeled_robot import SPACE, WheeledRobot
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

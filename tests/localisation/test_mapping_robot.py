@@ -7,10 +7,10 @@ import pytest
 import torch
 from scipy.stats import chi2
 
-from sigmaslam.filters import ExtendedKalmanFilter, Gaussian, UnscentedKalmanFilter, several
-from sigmaslam.filters.core.noise_covariance import Diagonal
-from sigmaslam.localisation.mapping_robot import ROBOT_SIZE, MappingRobot
-from sigmaslam.localisation.wheeled_robot import BODY, WheeledRobot
+from sigmaslam_filters import ExtendedKalmanFilter, Gaussian, UnscentedKalmanFilter, several
+from sigmaslam_filters.core.noise_covariance import Diagonal
+from sigmaslam_localisation.mapping_robot import ROBOT_SIZE, MappingRobot
+from sigmaslam_localisation.wheeled_robot import BODY, WheeledRobot
 
 pytestmark = [pytest.mark.usefixtures("one_thread"), pytest.mark.timeout(300)]
 

@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from sigmaslam.errors import InputError
-from sigmaslam.localisation.csv_folder import read_csv_folder
-from sigmaslam.localisation.formats import detect_format, read_recordings
-from sigmaslam.localisation.mrclam import read_mrclam
-from sigmaslam.localisation.starry import read_starry
-from sigmaslam.localisation.stereo_points import StereoBody
-from sigmaslam.localisation.tubes import read_tubes
-from sigmaslam.localisation.wheeled_robot import WheeledRobot
+from sigmaslam_localisation.csv_folder import read_csv_folder
+from sigmaslam_localisation.formats import detect_format, read_recordings
+from sigmaslam_localisation.mrclam import read_mrclam
+from sigmaslam_localisation.starry import read_starry
+from sigmaslam_localisation.stereo_points import StereoBody
+from sigmaslam_localisation.tubes import read_tubes
+from sigmaslam_localisation.wheeled_robot import WheeledRobot
 from tests.support.wheeled_world import World, drive, write_csv_folder
 
 

@@ -9,8 +9,8 @@ import pytest
 from scipy.stats import chi2
 
 from sigmaslam.geometry.camera import RectifiedStereo
-from sigmaslam.synthetic.render_sequence import write_sequence
-from sigmaslam.synthetic.simulation import Recipe
+from sigmaslam_synthetic.render_sequence import write_sequence
+from sigmaslam_synthetic.simulation import Recipe
 
 pytestmark = [pytest.mark.usefixtures("one_thread"), pytest.mark.timeout(600)]
 

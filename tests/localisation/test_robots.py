@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sigmaslam.errors import InputError
-from sigmaslam.localisation.robots import LandmarkMap, localise_robots
-from sigmaslam.localisation.scores import innovation_statistics, score, score_map
+from sigmaslam_localisation.robots import LandmarkMap, localise_robots
+from sigmaslam_localisation.scores import innovation_statistics, score, score_map
 from tests.support.wheeled_world import World, drive, started_wrong
 
 pytestmark = [pytest.mark.usefixtures("one_thread"), pytest.mark.timeout(300)]

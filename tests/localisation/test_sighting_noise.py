@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from sigmaslam.localisation.sighting_noise import CORRELATION_SECONDS, NoiseScale, repetition
+from sigmaslam_localisation.sighting_noise import CORRELATION_SECONDS, NoiseScale, repetition
 
 
 def test_repetitions_tell_together_what_a_markov_process_tells():

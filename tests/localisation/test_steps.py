@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sigmaslam.localisation.recording import PlanarTruth, Recording
-from sigmaslam.localisation.steps import LONGEST_STEP, make_steps
+from sigmaslam_localisation.recording import PlanarTruth, Recording
+from sigmaslam_localisation.steps import LONGEST_STEP, make_steps
 
 LANDMARKS = np.array([[1.0, 0.0], [0.0, 2.0]])
 

@@ -8,7 +8,7 @@ from scipy import ndimage
 from torch import Tensor
 from torch.nn import functional
 
-from sigmaslam.models.detector import (
+from sigmaslam_models.detector import (
     BORDER,
     CELL,
     detect,
@@ -16,7 +16,7 @@ from sigmaslam.models.detector import (
     to_cells,
     to_half_cells,
 )
-from sigmaslam.synthetic.rendering.textures import dead_leaves
+from sigmaslam_synthetic.rendering.textures import dead_leaves
 
 SIGMA = 1.4
 INNER = (slice(BORDER, -BORDER), slice(BORDER, -BORDER))

@@ -6,10 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmaslam.models.detector import BORDER, detect, to_cells
-from sigmaslam.models.extractor import FeatureExtractor
-from sigmaslam.models.feature_network import DESCRIPTOR_SIZE, FeatureNetwork
-from sigmaslam.synthetic.rendering.textures import dead_leaves
+from sigmaslam_models.detector import BORDER, detect, to_cells
+from sigmaslam_models.extractor import FeatureExtractor
+from sigmaslam_models.feature_network import DESCRIPTOR_SIZE, FeatureNetwork
+from sigmaslam_synthetic.rendering.textures import dead_leaves
 
 
 @pytest.fixture(scope="module")

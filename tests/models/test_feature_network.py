@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from sigmaslam.models.detector import to_cells
-from sigmaslam.models.feature_network import (
+from sigmaslam_models.detector import to_cells
+from sigmaslam_models.feature_network import (
     DESCRIPTOR_SIZE,
     SIZE_MULTIPLE,
     FeatureMaps,
@@ -16,7 +16,7 @@ from sigmaslam.models.feature_network import (
     sample_map,
     sample_window,
 )
-from sigmaslam.synthetic.rendering.textures import dead_leaves
+from sigmaslam_synthetic.rendering.textures import dead_leaves
 
 
 @pytest.fixture(scope="module")

@@ -9,10 +9,10 @@ import pytest
 
 from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.inference.onnx_graph import shipped_weights
-from sigmaslam.models import network_export
-from sigmaslam.models.graph_page import PAGE_COMMAND, TEXTS, graph_page
-from sigmaslam.models.network_export import check_networks
-from sigmaslam.models.onnx_export import check_graphs
+from sigmaslam_models import network_export
+from sigmaslam_models.graph_page import PAGE_COMMAND, TEXTS, graph_page
+from sigmaslam_models.network_export import check_networks
+from sigmaslam_models.onnx_export import check_graphs
 
 WEIGHTS = shipped_weights("features.onnx").parent
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "onnx.md"

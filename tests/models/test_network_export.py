@@ -11,10 +11,10 @@ from safetensors.torch import save_file
 from sigmaslam.errors import InputError
 from sigmaslam.inference.onnx_graph import OnnxGraph, shipped_weights
 from sigmaslam.inference.weight_manifest import read_manifest
-from sigmaslam.models import network_export
-from sigmaslam.models.extractor import FeatureExtractor
-from sigmaslam.models.feature_network import FeatureNetwork
-from sigmaslam.models.network_export import (
+from sigmaslam_models import network_export
+from sigmaslam_models.extractor import FeatureExtractor
+from sigmaslam_models.feature_network import FeatureNetwork
+from sigmaslam_models.network_export import (
     export_features,
     export_scoring,
     feature_difference,
@@ -22,10 +22,10 @@ from sigmaslam.models.network_export import (
     load_scorer,
     load_verifier,
 )
-from sigmaslam.models.scorer_network import MatchScorer
-from sigmaslam.models.torch_runtime import TorchFeatures, scoring_module
-from sigmaslam.models.verifier_network import PLACE_COLUMNS, VERIFIER_COLUMNS, MatchVerifier
-from sigmaslam.synthetic.rendering.textures import dead_leaves
+from sigmaslam_models.scorer_network import MatchScorer
+from sigmaslam_models.torch_runtime import TorchFeatures, open_network
+from sigmaslam_models.verifier_network import PLACE_COLUMNS, VERIFIER_COLUMNS, MatchVerifier
+from sigmaslam_synthetic.rendering.textures import dead_leaves
 
 
 def untrained_networks() -> dict[str, torch.nn.Module]:
@@ -40,7 +40,7 @@ def untrained_networks() -> dict[str, torch.nn.Module]:
 def shipped(name: str) -> Path:
     path = shipped_weights(name)
     if not path.is_file():
-        pytest.skip(f"{name} is not in models/weights")
+        pytest.skip(f"{name} is not in models/sigmaslam_weights")
     return path
 
 
@@ -93,7 +93,7 @@ def test_exported_features_equal_torch_at_other_sizes_and_counts(weights, tmp_pa
 @pytest.mark.parametrize("name", ["scorer", "verifier", "place_verifier"])
 def test_shipped_scorer_and_verifiers_equal_torch(name):
     """On numbers of matches that the export neither traced (300) nor checked (77)."""
-    graph, twin = OnnxGraph(shipped(f"{name}.onnx")), scoring_module(name)
+    graph, twin = OnnxGraph(shipped(f"{name}.onnx")), open_network(name)
     shipped(f"{name}.safetensors")
     inputs = network_export._scoring_graphs(*untrained_networks().values())[name].inputs
     example = {

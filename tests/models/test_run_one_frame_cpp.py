@@ -50,7 +50,7 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The demo's files that the example reads, images as PGM."""
-    source, folder = ROOT / "synthetic" / "demo", tmp_path_factory.mktemp("demo")
+    source, folder = ROOT / "synthetic" / "sigmaslam_synthetic" / "demo", tmp_path_factory.mktemp("demo")
     for name in ("calib.txt", "times.txt"):
         shutil.copy(source / name, folder)
     for eye in (0, 1):
@@ -66,9 +66,11 @@ def test_it_finds_the_pose_and_covariance_of_the_example_in_python(program: Path
     specification = importlib.util.spec_from_file_location("run_one_frame", ROOT / "examples" / "run_one_frame.py")
     example = importlib.util.module_from_spec(specification)
     specification.loader.exec_module(example)
-    pose, covariance = example.run(ROOT / "models" / "weights", ROOT / "synthetic" / "demo", index)
+    pose, covariance = example.run(
+        ROOT / "models" / "sigmaslam_weights", ROOT / "synthetic" / "sigmaslam_synthetic" / "demo", index
+    )
     done = subprocess.run(
-        [program, ROOT / "models" / "weights", demo, str(index)], capture_output=True, text=True, check=True
+        [program, ROOT / "models" / "sigmaslam_weights", demo, str(index)], capture_output=True, text=True, check=True
     )
     numbers = np.array(done.stdout.split(), float)
     np.testing.assert_allclose(numbers[:16].reshape(4, 4), pose, rtol=0, atol=1e-9)

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from sigmaslam.evaluation.metrics.probability_calibration import auroc
 from sigmaslam.frontend.scorer_inputs import nearest_matches
-from sigmaslam.models.scorer_network import SIDE_CHANNELS, MatchScorer, ScoredMatches
+from sigmaslam_evaluation.metrics.probability_calibration import auroc
+from sigmaslam_models.scorer_network import SIDE_CHANNELS, MatchScorer, ScoredMatches
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 # points0 (B, M, 2), points1 (B, M, 2), side (B, M, 9), near (B, M, K), weight (B, M)

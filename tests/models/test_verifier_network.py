@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmaslam.models.verifier_network import VERIFIER_COLUMNS, MatchCovariance, MatchVerifier
+from sigmaslam_models.verifier_network import VERIFIER_COLUMNS, MatchCovariance, MatchVerifier
 
 
 @pytest.fixture

@@ -59,3 +59,25 @@ def test_two_folders_give_the_same_archives(tmp_path: Path):
                 assert any(each.endswith("licenses/LICENSE") for each in wheel.namelist())
                 assert any(each.endswith("docs/object.md") for each in wheel.namelist())
             assert str(tmp_path).encode() not in content
+
+
+@pytest.mark.slow
+def test_the_filters_are_a_wheel_of_their_own(tmp_path: Path):
+    """It loads and filters without the rest of the project; torch comes from this environment."""
+    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(tmp_path)]
+    subprocess.run([*command, str(ROOT / "filters")], check=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as content:
+        assert {name.split("/")[0].split("-")[0] for name in content.namelist()} == {"sigmaslam_filters"}
+    code = (
+        "import sys, torch\n"
+        "sys.meta_path = [each for each in sys.meta_path if 'editable' not in type(each).__module__ + repr(each)]\n"
+        f"sys.path.insert(0, {str(wheel)!r})\n"
+        "from sigmaslam_filters import *\n"
+        "polar = MeasurementModel(lambda x: x[..., :1] ** 2, Diagonal(torch.tensor([0.01])))\n"
+        "belief = Gaussian(torch.ones(5, 2), torch.eye(2))\n"
+        "result = UnscentedKalmanFilter().update(belief, polar, torch.tensor([1.5]))\n"
+        "assert result.belief.mean.shape == (5, 2)\n"
+        "assert not {name for name in sys.modules if name.split('.')[0] in ('sigmaslam', 'cv2', 'onnxruntime')}\n"
+    )
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True)

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from release.remake_pages import PEERS, ROOT, absent, command_of, remake, runnable
-from sigmaslam.cli.benchmark import benchmark, reads_data
-from sigmaslam.evaluation.filters import peer_filters
+from sigmaslam_benchmarks.commands import benchmark, reads_data
+from sigmaslam_benchmarks.filters import peer_filters
 
 
 def write(folder: Path, name: str, command: str) -> Path:

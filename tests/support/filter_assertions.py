@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sigmaslam.filters import Gaussian, Update
+from sigmaslam_filters import Gaussian, Update
 
 
 def assert_close(actual: Tensor, expected: Tensor, tolerance: float) -> None:

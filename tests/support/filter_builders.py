@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sigmaslam.filters import BlockDiagonal, Dense, Diagonal, Gaussian, MeasurementModel, MotionModel
-from sigmaslam.filters.core.noise_covariance import Noise
+from sigmaslam_filters import BlockDiagonal, Dense, Diagonal, Gaussian, MeasurementModel, MotionModel
+from sigmaslam_filters.core.noise_covariance import Noise
 
 
 def random_numbers(*shape: int, seed: int = 0) -> Tensor:

@@ -6,11 +6,11 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from sigmaslam.evaluation.benchmarks.pnp_baselines import track_with_pnp
-from sigmaslam.evaluation.rendered_camera import open_rendered
-from sigmaslam.evaluation.trial import Trial, rendered_truth
 from sigmaslam.slam.tracker import TrackerConfig
-from sigmaslam.synthetic.simulation import Recipe
+from sigmaslam_benchmarks.tracking.pnp_baselines import track_with_pnp
+from sigmaslam_benchmarks.trial import Trial, rendered_truth
+from sigmaslam_evaluation.rendered_camera import open_rendered
+from sigmaslam_synthetic.simulation import Recipe
 
 METHODS = {"KLT + PnP": TrackerConfig()}
 

@@ -3,9 +3,9 @@
 import numpy as np
 
 from sigmaslam.geometry.camera import CameraModel
-from sigmaslam.synthetic.motion.paths import Path
-from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel, Sheet
-from sigmaslam.synthetic.scene import Body, Lights, Material, Scene, Texture
+from sigmaslam_synthetic.motion.paths import Path
+from sigmaslam_synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel, Sheet
+from sigmaslam_synthetic.scene import Body, Lights, Material, Scene, Texture
 
 CAMERA = CameraModel(160, 120, 130.0, 130.0, 79.5, 59.5)
 RADTAN = CameraModel(160, 120, 110.0, 112.0, 80.3, 58.9, 0.0, "radtan", (-0.28, 0.07, 0.0002, 0.00002))

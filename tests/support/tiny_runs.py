@@ -4,9 +4,9 @@ import functools
 
 import pytest
 
-from sigmaslam.synthetic import homography_pairs
-from sigmaslam.training.features import loop
-from sigmaslam.training.features.validation import matching_accuracy
+from sigmaslam_synthetic import homography_pairs
+from sigmaslam_training.features import loop
+from sigmaslam_training.features.validation import matching_accuracy
 
 
 def make_small(monkeypatch: pytest.MonkeyPatch) -> None:

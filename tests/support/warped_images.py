@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from sigmaslam.frontend.types import PatchMaps
-from sigmaslam.synthetic.rendering.textures import dead_leaves
+from sigmaslam_synthetic.rendering.textures import dead_leaves
 
 WIDTH, HEIGHT = 640, 480
 

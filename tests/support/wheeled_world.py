@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmaslam.localisation.recording import PlanarTruth, Recording
+from sigmaslam_localisation.recording import PlanarTruth, Recording
 
 LANDMARKS = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0], [2.0, 5.5]])
 

@@ -3,8 +3,8 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from sigmaslam.synthetic.rendering import bank as bank_module
-from sigmaslam.synthetic.rendering.bank import TextureBank
+from sigmaslam_synthetic.rendering import bank as bank_module
+from sigmaslam_synthetic.rendering.bank import TextureBank
 
 
 @pytest.fixture

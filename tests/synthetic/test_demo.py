@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from sigmaslam.synthetic.render_sequence import write_sequence
-from sigmaslam.synthetic.simulation import Recipe, Simulation, Studio
+from sigmaslam_synthetic.render_sequence import write_sequence
+from sigmaslam_synthetic.simulation import Recipe, Simulation, Studio
 
 
 def test_shipped_demo_is_what_its_scene_renders(demo_sequence: Path) -> None:

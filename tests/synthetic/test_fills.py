@@ -3,7 +3,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sigmaslam.synthetic.rendering.fills import FILLS, bricks, cells, checker, glyphs, noise, stripes, strokes, vessels
+from sigmaslam_synthetic.rendering.fills import FILLS, bricks, cells, checker, glyphs, noise, stripes, strokes, vessels
 
 TEXTURED = [name for name in FILLS if name != "flat"]
 SEEDS = range(8)

@@ -2,10 +2,10 @@ import cv2
 import numpy as np
 import pytest
 
-from sigmaslam.synthetic import homography_pairs
-from sigmaslam.synthetic.homography_pairs import HomographyPair, HomographyPairs
-from sigmaslam.synthetic.rendering import bank
-from sigmaslam.synthetic.rendering.textures import paint
+from sigmaslam_synthetic import homography_pairs
+from sigmaslam_synthetic.homography_pairs import HomographyPair, HomographyPairs
+from sigmaslam_synthetic.rendering import bank
+from sigmaslam_synthetic.rendering.textures import paint
 
 
 @pytest.fixture(autouse=True)

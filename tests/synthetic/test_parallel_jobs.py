@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from sigmaslam.errors import InputError
-from sigmaslam.synthetic.parallel_jobs import RETRIES, list_failures, run_jobs
-from sigmaslam.synthetic.render_sequence import write_sequence, write_sequences
-from sigmaslam.synthetic.simulation import Recipe
+from sigmaslam_synthetic.parallel_jobs import RETRIES, list_failures, run_jobs
+from sigmaslam_synthetic.render_sequence import write_sequence, write_sequences
+from sigmaslam_synthetic.simulation import Recipe
 from tests.support.parallel_work import die, die_once, sleep_beside_another, square
 
 TINY = Recipe("organ", 3, 5, width=48, height=36)

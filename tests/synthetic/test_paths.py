@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from sigmaslam.geometry.se3 import rotation_exp, rotation_log
-from sigmaslam.synthetic.geometry import arc_length
-from sigmaslam.synthetic.motion.paths import (
+from sigmaslam_synthetic.geometry import arc_length
+from sigmaslam_synthetic.motion.paths import (
     LARGEST_NOISE,
     Path,
     Stop,

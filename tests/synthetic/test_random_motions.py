@@ -7,7 +7,7 @@ import pytest
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.se3 import rotation_log
 from sigmaslam.readers.trajectory_files import read_kitti
-from sigmaslam.synthetic.motion.random_motions import (
+from sigmaslam_synthetic.motion.random_motions import (
     CAMERA_HEIGHT,
     FreeSpace,
     Path,
@@ -23,7 +23,7 @@ from sigmaslam.synthetic.motion.random_motions import (
     tool,
     with_stops,
 )
-from sigmaslam.synthetic.simulation import Recipe
+from sigmaslam_synthetic.simulation import Recipe
 
 Generator = Callable[[np.random.Generator], Path]
 

@@ -1,5 +1,5 @@
-from sigmaslam.synthetic.presets import EXPOSURES, PRESETS, SENSORS
-from sigmaslam.synthetic.render_choices import PRESET_NAMES, SENSOR_NAMES
+from sigmaslam_synthetic.presets import EXPOSURES, PRESETS, SENSORS
+from sigmaslam_synthetic.render_choices import PRESET_NAMES, SENSOR_NAMES
 
 
 def test_the_names_that_are_offered_are_those_of_the_registries():

@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from sigmaslam.geometry.camera import CameraModel
-from sigmaslam.synthetic.rendering.facets import Facets, join
-from sigmaslam.synthetic.rendering.renderer import RenderedViews, Renderer
-from sigmaslam.synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel, Tube
-from sigmaslam.synthetic.rendering.visibility import Eye
-from sigmaslam.synthetic.scene import Body, Lights, Material, Scene, Texture
-from sigmaslam.synthetic.truth import at_pixels, flow, transfer
+from sigmaslam_synthetic.rendering.facets import Facets, join
+from sigmaslam_synthetic.rendering.renderer import RenderedViews, Renderer
+from sigmaslam_synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel, Tube
+from sigmaslam_synthetic.rendering.visibility import Eye
+from sigmaslam_synthetic.scene import Body, Lights, Material, Scene, Texture
+from sigmaslam_synthetic.truth import at_pixels, flow, transfer
 from tests.support.small_worlds import CAMERA, FISHEYE, RADTAN, camera_pose, small_scene
 
 CAMERAS = pytest.mark.parametrize("camera", [CAMERA, RADTAN, FISHEYE], ids=["pinhole", "radtan", "fisheye"])

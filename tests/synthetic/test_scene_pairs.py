@@ -4,11 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
-from sigmaslam.synthetic import scene_pairs
-from sigmaslam.synthetic.camera.sensor import Sensor
-from sigmaslam.synthetic.motion.paths import Path
-from sigmaslam.synthetic.scene_pairs import ScenePair, ScenePairs
-from sigmaslam.synthetic.worlds.episode import Episode, Wish
+from sigmaslam_synthetic import scene_pairs
+from sigmaslam_synthetic.camera.sensor import Sensor
+from sigmaslam_synthetic.motion.paths import Path
+from sigmaslam_synthetic.scene_pairs import ScenePair, ScenePairs
+from sigmaslam_synthetic.worlds.episode import Episode, Wish
 from tests.support.small_worlds import camera_pose, small_scene
 
 

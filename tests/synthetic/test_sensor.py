@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sigmaslam.synthetic.camera.sensor import Sensor, expose, exposure_gains, random_sensor
+from sigmaslam_synthetic.camera.sensor import Sensor, expose, exposure_gains, random_sensor
 
 QUIET = Sensor(blur=0.0, photons_at_white=1e18, read_noise=0.0)
 

@@ -12,11 +12,11 @@ import pytest
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.readers import open_sequence
-from sigmaslam.synthetic import render_sequence
-from sigmaslam.synthetic.presets import PRESETS
-from sigmaslam.synthetic.render_sequence import write_sequence
-from sigmaslam.synthetic.rendering import atlas
-from sigmaslam.synthetic.simulation import Recipe, Simulation, Studio, simulate
+from sigmaslam_synthetic import render_sequence
+from sigmaslam_synthetic.presets import PRESETS
+from sigmaslam_synthetic.render_sequence import write_sequence
+from sigmaslam_synthetic.rendering import atlas
+from sigmaslam_synthetic.simulation import Recipe, Simulation, Studio, simulate
 
 SIZE = {"width": 96, "height": 72}
 FAULTS = {"disparity_offset": 1.5, "rotation_error": 0.3}

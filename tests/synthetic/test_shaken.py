@@ -9,12 +9,12 @@ import pytest
 
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.se3 import rotation_log
-from sigmaslam.synthetic.motion.random_motions import FreeSpace, Path, drone, hand_held
-from sigmaslam.synthetic.motion.shaken import shaken, slowed
-from sigmaslam.synthetic.presets import PRESETS
-from sigmaslam.synthetic.render_choices import CARRIED, PRESET_NAMES
-from sigmaslam.synthetic.simulation import Recipe, Studio, simulate
-from sigmaslam.synthetic.worlds.episode import Wish
+from sigmaslam_synthetic.motion.random_motions import FreeSpace, Path, drone, hand_held
+from sigmaslam_synthetic.motion.shaken import shaken, slowed
+from sigmaslam_synthetic.presets import PRESETS
+from sigmaslam_synthetic.render_choices import CARRIED, PRESET_NAMES
+from sigmaslam_synthetic.simulation import Recipe, Studio, simulate
+from sigmaslam_synthetic.worlds.episode import Wish
 
 DURATION, REACH = 6.0, 0.05
 FOCAL, FPS = 460.0, 20.0

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sigmaslam.synthetic.rendering.textures import KINDS, dead_leaves, leaf_outline, leaf_radii, paint
+from sigmaslam_synthetic.rendering.textures import KINDS, dead_leaves, leaf_outline, leaf_radii, paint
 
 NAMED = {"leaves", "noise", "stripes", "bricks", "cells", "strokes", "glyphs", "vessels", "facade", "asphalt"}
 

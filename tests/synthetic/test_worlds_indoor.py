@@ -13,12 +13,12 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from sigmaslam.geometry.camera import CameraModel
-from sigmaslam.synthetic.render_choices import MOTIONS
-from sigmaslam.synthetic.rendering.renderer import Renderer
-from sigmaslam.synthetic.rendering.visibility import Eye
-from sigmaslam.synthetic.scene import Scene, Texture
-from sigmaslam.synthetic.worlds import colon, organ, room, tool
-from sigmaslam.synthetic.worlds.episode import Episode, Wish
+from sigmaslam_synthetic.render_choices import MOTIONS
+from sigmaslam_synthetic.rendering.renderer import Renderer
+from sigmaslam_synthetic.rendering.visibility import Eye
+from sigmaslam_synthetic.scene import Scene, Texture
+from sigmaslam_synthetic.worlds import colon, organ, room, tool
+from sigmaslam_synthetic.worlds.episode import Episode, Wish
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 WORLDS = [room, colon, organ, tool]

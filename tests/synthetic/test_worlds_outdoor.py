@@ -7,12 +7,12 @@ import torch
 from scipy.spatial import cKDTree
 
 from sigmaslam.geometry.camera import CameraModel
-from sigmaslam.synthetic.motion import random_motions
-from sigmaslam.synthetic.rendering.renderer import Renderer
-from sigmaslam.synthetic.rendering.visibility import Eye
-from sigmaslam.synthetic.scene import Scene
-from sigmaslam.synthetic.worlds import hall, rubble, street
-from sigmaslam.synthetic.worlds.episode import Episode, Wish
+from sigmaslam_synthetic.motion import random_motions
+from sigmaslam_synthetic.rendering.renderer import Renderer
+from sigmaslam_synthetic.rendering.visibility import Eye
+from sigmaslam_synthetic.scene import Scene
+from sigmaslam_synthetic.worlds import hall, rubble, street
+from sigmaslam_synthetic.worlds.episode import Episode, Wish
 
 DOMAINS = {"street": street.generate, "hall": hall.generate, "rubble": rubble.generate}
 DURATION, SHARE = 4.0, 0.2

@@ -6,8 +6,8 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from sigmaslam.models.feature_network import FeatureNetwork
-from sigmaslam.training.features.recipes import TrainingConfig
+from sigmaslam_models.feature_network import FeatureNetwork
+from sigmaslam_training.features.recipes import TrainingConfig
 from tests.support.tiny_runs import make_small
 
 

@@ -7,12 +7,11 @@ import pytest
 import torch
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.matching import read_scores
-from sigmaslam.models.model_card import card_page, read_card
 from sigmaslam.source_commit import current_commit
-from sigmaslam.training.devices import Workplace
-from sigmaslam.training.features.checkpoint import TrainingState, begin
-from sigmaslam.training.run_card import describe_origin, make_card
+from sigmaslam_models.model_card import card_page, read_card, read_scores
+from sigmaslam_training.devices import Workplace
+from sigmaslam_training.features.checkpoint import TrainingState, begin
+from sigmaslam_training.run_card import describe_origin, make_card
 
 PLACE = Workplace(torch.device("cpu"))
 

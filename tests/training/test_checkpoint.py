@@ -6,8 +6,8 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from sigmaslam.errors import InputError
-from sigmaslam.training.devices import Workplace
-from sigmaslam.training.features.checkpoint import TrainingState, begin, resume_checkpoint, save_checkpoint
+from sigmaslam_training.devices import Workplace
+from sigmaslam_training.features.checkpoint import TrainingState, begin, resume_checkpoint, save_checkpoint
 
 PLACE = Workplace(torch.device("cpu"))
 

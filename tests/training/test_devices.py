@@ -9,10 +9,10 @@ import torch
 from safetensors.torch import load_file
 
 from sigmaslam.errors import InputError
-from sigmaslam.models.feature_network import FeatureNetwork
-from sigmaslam.training.devices import Bfloat16Network, NetworkLoss, Workplace, open_workplace
-from sigmaslam.training.features.loop import WEIGHTS_NAME
-from sigmaslam.training.features.stream import pair_loader
+from sigmaslam_models.feature_network import FeatureNetwork
+from sigmaslam_training.devices import Bfloat16Network, NetworkLoss, Workplace, open_workplace
+from sigmaslam_training.features.loop import WEIGHTS_NAME
+from sigmaslam_training.features.stream import pair_loader
 
 # One process of two: trains, then writes what it has come to, and the gradient of the first step.
 PROCESS = """
@@ -20,9 +20,9 @@ import json, sys
 import torch
 from pathlib import Path
 from safetensors.torch import save_file
-from sigmaslam.synthetic import homography_pairs
-from sigmaslam.training.features import loop
-from sigmaslam.training.features.recipes import TrainingConfig
+from sigmaslam_synthetic import homography_pairs
+from sigmaslam_training.features import loop
+from sigmaslam_training.features.recipes import TrainingConfig
 
 pairs._TEXTURE_SIZE = 128
 out, config = Path(sys.argv[1]), TrainingConfig(**json.loads(sys.argv[2]))
@@ -62,7 +62,7 @@ def test_two_processes_end_with_the_same_weights_and_share_their_gradients(tiny,
     shipped = load_file(tmp_path / "run" / WEIGHTS_NAME)
     assert torch.equal(shipped["describer.2.bias"], one[f"weight.{len(one) // 2 - 1}"])
 
-    monkeypatch.setattr("sigmaslam.synthetic.homography_pairs._TEXTURE_SIZE", 128)
+    monkeypatch.setattr("sigmaslam_synthetic.homography_pairs._TEXTURE_SIZE", 128)
     shares = [first_gradient(config, rank, 2) for rank in range(2)]
     for index, values in enumerate(zip(*shares, strict=True)):
         torch.testing.assert_close(one[f"gradient.{index}"], sum(values) / 2, rtol=1e-4, atol=1e-5)

@@ -14,13 +14,13 @@ from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sigmaslam.errors import InputError
-from sigmaslam.models.network_export import load_network
-from sigmaslam.training import devices
-from sigmaslam.training.features.checkpoint import CHECKPOINT_NAME
-from sigmaslam.training.features.loop import WEIGHTS_NAME, train
-from sigmaslam.training.features.recipes import TrainingConfig
-from sigmaslam.training.journal import Journal
-from sigmaslam.training.run_card import CARD_NAME
+from sigmaslam_models.network_export import load_network
+from sigmaslam_training import devices
+from sigmaslam_training.features.checkpoint import CHECKPOINT_NAME
+from sigmaslam_training.features.loop import WEIGHTS_NAME, train
+from sigmaslam_training.features.recipes import TrainingConfig
+from sigmaslam_training.journal import Journal
+from sigmaslam_training.run_card import CARD_NAME
 from tests.support.tiny_runs import make_small
 
 pytestmark = pytest.mark.usefixtures("small")

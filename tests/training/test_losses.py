@@ -7,11 +7,11 @@ from scipy import stats
 from torch import Tensor
 from torch.nn import functional
 
-from sigmaslam.models.feature_network import FeatureNetwork
-from sigmaslam.training.features import batch_loss
-from sigmaslam.training.features.batch_loss import _zoom, pair_loss
-from sigmaslam.training.features.losses import MatchLoss, match_loss, place_loss
-from sigmaslam.training.features.stream import NOWHERE
+from sigmaslam_models.feature_network import FeatureNetwork
+from sigmaslam_training.features import batch_loss
+from sigmaslam_training.features.batch_loss import _zoom, pair_loss
+from sigmaslam_training.features.losses import MatchLoss, match_loss, place_loss
+from sigmaslam_training.features.stream import NOWHERE
 
 
 def unit(*shape: int, seed: int = 0) -> Tensor:

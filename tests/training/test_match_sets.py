@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from sigmaslam.errors import SigmaSlamError
-from sigmaslam.training.matching import match_sets
-from sigmaslam.training.matching.match_sets import (
+from sigmaslam_training.matching import match_sets
+from sigmaslam_training.matching.match_sets import (
     DETECTORS,
     SIZE,
     MatchSet,

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sigmaslam.training.features.recipes import RECIPES
+from sigmaslam_training.features.recipes import RECIPES
 from tests.support.commands import ROOT, run_here
 
 PAGE = ROOT / "docs" / "own-scene.md"

@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 import torch
 
-from sigmaslam.models.feature_network import FeatureNetwork
-from sigmaslam.training.features import pictures
-from sigmaslam.training.features.pictures import draw_sample
-from sigmaslam.training.features.stream import open_stream
-from sigmaslam.training.features.validation import PairMatches
+from sigmaslam_models.feature_network import FeatureNetwork
+from sigmaslam_training.features import pictures
+from sigmaslam_training.features.pictures import draw_sample
+from sigmaslam_training.features.stream import open_stream
+from sigmaslam_training.features.validation import PairMatches
 
 
 def coloured(picture: np.ndarray, channel: int) -> np.ndarray:

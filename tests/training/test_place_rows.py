@@ -10,12 +10,12 @@ import pytest
 
 from sigmaslam.frontend.nearest_neighbours import Putative
 from sigmaslam.frontend.types import Features
-from sigmaslam.models.verifier_network import PLACE_COLUMNS
-from sigmaslam.synthetic.rendering.textures import dead_leaves
-from sigmaslam.training.matching import place_rows
-from sigmaslam.training.matching.match_sets import MatchSet, PairRecord
-from sigmaslam.training.matching.place_rows import collect_place_rows
-from sigmaslam.training.matching.verifier_training import VerifierRows
+from sigmaslam_models.verifier_network import PLACE_COLUMNS
+from sigmaslam_synthetic.rendering.textures import dead_leaves
+from sigmaslam_training.matching import place_rows
+from sigmaslam_training.matching.match_sets import MatchSet, PairRecord
+from sigmaslam_training.matching.place_rows import collect_place_rows
+from sigmaslam_training.matching.verifier_training import VerifierRows
 
 COUNT, HIDDEN, SIDE, MARGIN = 200, 50, 300, 20
 TEMPORAL = 8

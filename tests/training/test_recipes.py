@@ -4,8 +4,8 @@ import pytest
 
 from sigmaslam.cli.train import Data, TrainingRecipe
 from sigmaslam.errors import InputError
-from sigmaslam.training.features.recipes import RECIPES, TrainingConfig, check_config, choose_config, starting_weights
-from sigmaslam.training.mixes import MIXES
+from sigmaslam_training.features.recipes import RECIPES, TrainingConfig, check_config, choose_config, starting_weights
+from sigmaslam_training.mixes import MIXES
 
 
 def test_the_command_line_offers_every_recipe_and_mix():

@@ -14,11 +14,11 @@ from sigmaslam.errors import InputError
 from sigmaslam.frontend.nearest_neighbours import Putative
 from sigmaslam.frontend.scorer_inputs import NEIGHBOURS, nearest_matches
 from sigmaslam.frontend.types import Features
-from sigmaslam.models.scorer_network import MatchScorer
-from sigmaslam.training import small_loop
-from sigmaslam.training.matching import scorer_training as scorer_training
-from sigmaslam.training.matching.match_sets import MatchSet
-from sigmaslam.training.matching.scorer_training import (
+from sigmaslam_models.scorer_network import MatchScorer
+from sigmaslam_training import small_loop
+from sigmaslam_training.matching import scorer_training as scorer_training
+from sigmaslam_training.matching.match_sets import MatchSet
+from sigmaslam_training.matching.scorer_training import (
     Sample,
     collate,
     make_sample,
@@ -27,7 +27,7 @@ from sigmaslam.training.matching.scorer_training import (
     train_scorer,
     vary_sample,
 )
-from sigmaslam.training.snapshot import read_snapshot
+from sigmaslam_training.snapshot import read_snapshot
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

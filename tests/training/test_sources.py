@@ -10,15 +10,15 @@ import pytest
 
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text
-from sigmaslam.synthetic.rendering.textures import dead_leaves, paint
-from sigmaslam.synthetic.scene_pairs import ScenePairs
-from sigmaslam.synthetic.simulation import Recipe, simulate
-from sigmaslam.training.features.loop import TrainingStopped
-from sigmaslam.training.features.recipes import TrainingConfig, choose_config
-from sigmaslam.training.features.stream import MixedPairs, open_stream
-from sigmaslam.training.features.validation import held_out_sources
-from sigmaslam.training.mixes import MIXES
-from sigmaslam.training.sources import SOURCES, choose_shares, label, turns_of
+from sigmaslam_synthetic.rendering.textures import dead_leaves, paint
+from sigmaslam_synthetic.scene_pairs import ScenePairs
+from sigmaslam_synthetic.simulation import Recipe, simulate
+from sigmaslam_training.features.loop import TrainingStopped
+from sigmaslam_training.features.recipes import TrainingConfig, choose_config
+from sigmaslam_training.features.stream import MixedPairs, open_stream
+from sigmaslam_training.features.validation import held_out_sources
+from sigmaslam_training.mixes import MIXES
+from sigmaslam_training.sources import SOURCES, choose_shares, label, turns_of
 from tests.support.commands import assert_refused, run_here
 
 BENCH = Path(__file__).resolve().parents[2] / "examples" / "my_world.py"
@@ -182,7 +182,7 @@ def test_a_stopped_run_says_what_is_saved_and_how_to_go_on(
     def stop(*arguments: object) -> None:
         raise TrainingStopped(saved, 8)
 
-    monkeypatch.setattr("sigmaslam.training.features.loop.train", stop)
+    monkeypatch.setattr("sigmaslam_training.features.loop.train", stop)
     result = run_here("train", "--out", tmp_path / "run", "--steps", "8")
     assert result.returncode == 130
     for each in words:

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from sigmaslam.errors import InputError
-from sigmaslam.synthetic import homography_pairs
-from sigmaslam.training.features import stream
-from sigmaslam.training.features.stream import MixedPairs, PairDataset, open_stream, pair_loader
-from sigmaslam.training.mixes import MIXES
+from sigmaslam_synthetic import homography_pairs
+from sigmaslam_training.features import stream
+from sigmaslam_training.features.stream import MixedPairs, PairDataset, open_stream, pair_loader
+from sigmaslam_training.mixes import MIXES
 
 
 @pytest.fixture(autouse=True)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from sigmaslam.models.feature_network import FeatureNetwork
-from sigmaslam.training.features import validation
-from sigmaslam.training.features.validation import PairMatches, held_out_sources, match_pair, matching_accuracy
-from sigmaslam.training.mixes import MIXES
+from sigmaslam_models.feature_network import FeatureNetwork
+from sigmaslam_training.features import validation
+from sigmaslam_training.features.validation import PairMatches, held_out_sources, match_pair, matching_accuracy
+from sigmaslam_training.mixes import MIXES
 
 
 @dataclass(frozen=True)

@@ -9,15 +9,15 @@ from scipy import stats
 from torch import Tensor
 
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.metrics.probability_calibration import calibration_error
 from sigmaslam.frontend.nearest_neighbours import Putative
 from sigmaslam.frontend.types import Features
-from sigmaslam.models.scorer_network import MatchScorer
-from sigmaslam.models.verifier_network import VERIFIER_COLUMNS, MatchVerifier
-from sigmaslam.synthetic.rendering.textures import dead_leaves
-from sigmaslam.training.matching import verifier_training as verifier_training
-from sigmaslam.training.matching.match_sets import MatchSet, PairRecord
-from sigmaslam.training.matching.verifier_training import (
+from sigmaslam_evaluation.metrics.probability_calibration import calibration_error
+from sigmaslam_models.scorer_network import MatchScorer
+from sigmaslam_models.verifier_network import VERIFIER_COLUMNS, MatchVerifier
+from sigmaslam_synthetic.rendering.textures import dead_leaves
+from sigmaslam_training.matching import verifier_training as verifier_training
+from sigmaslam_training.matching.match_sets import MatchSet, PairRecord
+from sigmaslam_training.matching.verifier_training import (
     VerifierRows,
     calibrate,
     collect_rows,

@@ -17,10 +17,10 @@ from sigmaslam.bundle_adjustment.refine_run import spread_corrections
 from sigmaslam.bundle_adjustment.structure import collect, fit_structure, point_covariances
 from sigmaslam.cli import app
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.run_evaluation import evaluate_run
 from sigmaslam.geometry.se3 import nearest_rotation, se3_exp, se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import read_tum, write_tum
+from sigmaslam_evaluation.run_evaluation import evaluate_run
 from tests.support.quantiles import squared_sigmas
 from tests.support.simulated_run import INTRINSICS, OFFSET, Simulation, simulate
 

@@ -229,7 +229,7 @@ def test_the_runtime_needs_no_extra(demo_sequence: Path):
         "        if name.partition('.')[0] in extras:\n"
         "            raise ModuleNotFoundError(name)\n"
         "sys.meta_path.insert(0, Absent())\n"
-        "import sigmaslam.cli, sigmaslam.evaluation.run_evaluation\n"
+        "import sigmaslam.cli, sigmaslam_evaluation.run_evaluation\n"
         "from sigmaslam import StereoTracker, open_sequence\n"
         f"sequence = open_sequence({str(demo_sequence)!r})\n"
         "tracker = StereoTracker(sequence.camera)\n"

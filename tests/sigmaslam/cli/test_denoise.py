@@ -13,7 +13,7 @@ from sigmaslam.runs.track import track_sequence
 from tests.support.commands import assert_refused, run_here
 
 ROOT = Path(__file__).resolve().parents[3]
-DEMO = ROOT / "synthetic" / "demo"
+DEMO = ROOT / "synthetic" / "sigmaslam_synthetic" / "demo"
 SIGMA = 20.0
 
 

@@ -12,7 +12,7 @@ from sigmaslam.cli.commands import app
 from sigmaslam.errors import InputError
 from sigmaslam.two_view.image_geometry import estimate_geometry
 
-DEMO = Path(str(files("sigmaslam.synthetic") / "demo"))
+DEMO = Path(str(files("sigmaslam_synthetic") / "demo"))
 IMAGES = sorted((DEMO / "image_0").glob("*.png")), sorted((DEMO / "image_1").glob("*.png"))
 
 

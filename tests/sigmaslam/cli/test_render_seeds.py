@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from sigmaslam.synthetic import render_sequence
+from sigmaslam_synthetic import render_sequence
 from tests.support.commands import run_here
 
 

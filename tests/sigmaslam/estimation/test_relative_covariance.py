@@ -13,7 +13,7 @@ from sigmaslam.estimation.landmark_table import LandmarkViews
 from sigmaslam.estimation.relative_covariance import frame_relative_to, last_relative_to
 from sigmaslam.estimation.state_layout import CALIBRATION_SIZE
 from sigmaslam.geometry.se3 import se3_inverse, se3_log
-from sigmaslam.inference.onnx_graph import load_step
+from sigmaslam.inference.backends import load_step
 from tests.support.dense_window import (
     ITERATIONS,
     KEYFRAMES,

@@ -14,7 +14,7 @@ from sigmaslam.estimation.relative_covariance import relative_to_first
 from sigmaslam.estimation.state_layout import CALIBRATION, CALIBRATION_SIZE, pose_slice
 from sigmaslam.estimation.window_state import WindowState
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log, turn_covariance
-from sigmaslam.inference.onnx_graph import load_step
+from sigmaslam.inference.backends import load_step
 
 POSES, PAST = 3, 2
 NO_WALK = np.zeros(CALIBRATION_SIZE)

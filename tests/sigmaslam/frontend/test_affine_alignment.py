@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sigmaslam.frontend.affine_alignment import align_patches, local_maps
-from sigmaslam.synthetic.rendering.textures import dead_leaves
+from sigmaslam_synthetic.rendering.textures import dead_leaves
 
 WIDTH, HEIGHT = 640, 480
 FIELDS = {

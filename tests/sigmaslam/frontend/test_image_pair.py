@@ -18,7 +18,7 @@ from sigmaslam.frontend.match_confidence import MIN_LOGIT, ConfidenceEstimator
 from sigmaslam.frontend.nearest_neighbours import nearest_anywhere
 from sigmaslam.frontend.types import Features
 from sigmaslam.inference.onnx_graph import shipped_weights
-from sigmaslam.synthetic.rendering.textures import dead_leaves
+from sigmaslam_synthetic.rendering.textures import dead_leaves
 from tests.support.commands import assert_refused, run_here, run_process
 
 FIELDS = ("keypoints0", "keypoints1", "probability", "covariance", "index0", "index1")
@@ -43,7 +43,7 @@ def frontend(request: pytest.FixtureRequest) -> str:
     if request.param == "learned":
         path = shipped_weights("features.onnx")
         if not path.is_file():
-            pytest.skip("features.onnx is not in models/weights")
+            pytest.skip("features.onnx is not in models/sigmaslam_weights")
         if "count" not in [entry.name for entry in onnxruntime.InferenceSession(path).get_inputs()]:
             pytest.skip("the shipped features.onnx is of the old kind: it has no input 'count'")
     return str(request.param)

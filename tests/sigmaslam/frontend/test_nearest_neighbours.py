@@ -15,7 +15,7 @@ from sigmaslam.frontend.nearest_neighbours import Putative, nearest_anywhere, ne
 from sigmaslam.frontend.types import KeypointSearch
 from sigmaslam.inference import onnx_graph as session
 from sigmaslam.readers import open_sequence
-from sigmaslam.synthetic.simulation import Simulation, Studio
+from sigmaslam_synthetic.simulation import Simulation, Studio
 
 # Of two degrees of freedom, whose distribution is exponential.
 CHI_SQUARE_99 = -2.0 * np.log(0.01)
@@ -257,7 +257,7 @@ def test_refinement_of_no_points_is_no_points():
 
 def frontend(name: str) -> Frontend:
     if name == "learned" and not session.shipped_weights("features.onnx").is_file():
-        pytest.skip("features.onnx is not in models/weights")
+        pytest.skip("features.onnx is not in models/sigmaslam_weights")
     return build_frontend(name, 600)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sigmaslam.frontend.patch_evidence import Evidence, examine_patches
-from sigmaslam.synthetic.rendering.textures import dead_leaves
+from sigmaslam_synthetic.rendering.textures import dead_leaves
 
 SIDE = 240
 IDENTITY = np.eye(2)

@@ -10,12 +10,12 @@ from typer.testing import CliRunner
 
 from sigmaslam.cli import app
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.run_evaluation import evaluate_run
 from sigmaslam.fusion.location_filter import LocationFilter
 from sigmaslam.fusion.readings import Locations, read_locations
 from sigmaslam.geometry.se3 import matrix_to_quaternion, se3_exp, se3_inverse, se3_log
 from sigmaslam.readers.trajectory_files import read_kitti, read_tum
 from sigmaslam.slam.tracker import Estimate
+from sigmaslam_evaluation.run_evaluation import evaluate_run
 from tests.support.quantiles import WITHIN_3_SIGMA, squared_sigmas
 from tests.support.simulated_location import FRAME, Drive, drifting_estimates, estimate_of, sense
 

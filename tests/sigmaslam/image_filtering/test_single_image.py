@@ -12,7 +12,7 @@ from sigmaslam.image_filtering import group_filter as groups
 from sigmaslam.image_filtering.patch_filter import filter_patches
 from sigmaslam.readers.images import read_grey
 
-DEMO = Path(__file__).resolve().parents[3] / "synthetic" / "demo" / "image_0"
+DEMO = Path(__file__).resolve().parents[3] / "synthetic" / "sigmaslam_synthetic" / "demo" / "image_0"
 
 
 @pytest.fixture(scope="module")

@@ -14,18 +14,18 @@ from typer.testing import CliRunner
 import sigmaslam
 from sigmaslam.cli import app
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.benchmarks.features import write_features
 from sigmaslam.frontend.build import build_frontend, own_networks
 from sigmaslam.frontend.learned import LearnedDetector
 from sigmaslam.frontend.match_confidence import ConfidenceEstimator
-from sigmaslam.inference.networks import NETWORKS, network_path, networks_in, open_network
+from sigmaslam.inference.networks import NETWORKS, network_path, networks_in, open_graph
 from sigmaslam.inference.onnx_graph import OnnxGraph, shipped_weights
 from sigmaslam.inference.weight_manifest import MANIFEST_NAME, update_manifest
 from sigmaslam.readers import open_sequence
-from sigmaslam.synthetic.rendering.textures import dead_leaves
+from sigmaslam_benchmarks.tracking.features import write_features
+from sigmaslam_synthetic.rendering.textures import dead_leaves
 from tests.support.commands import assert_refused, run_here
 
-DEMO = Path(__file__).resolve().parents[3] / "synthetic" / "demo"
+DEMO = Path(__file__).resolve().parents[3] / "synthetic" / "sigmaslam_synthetic" / "demo"
 PAIR = [str(DEMO / "image_0" / f"00000{k}.png") for k in (0, 1)]
 
 
@@ -127,27 +127,27 @@ def test_the_tracker_takes_a_folder_as_text(folder: Path):
 def test_every_shipped_network_passes_its_own_check(tmp_path: Path):
     for name in NETWORKS:
         shutil.copy(shipped_weights(f"{name}.onnx"), tmp_path)
-        assert open_network(name, tmp_path).inputs == OnnxGraph(shipped_weights(f"{name}.onnx")).inputs
+        assert open_graph(name, tmp_path).inputs == OnnxGraph(shipped_weights(f"{name}.onnx")).inputs
 
 
 def test_a_graph_with_other_inputs_is_refused_when_it_is_opened(tmp_path: Path):
     # The two verifiers differ in the number of columns alone.
     shutil.copy(shipped_weights("verifier.onnx"), tmp_path / "place_verifier.onnx")
     with pytest.raises(InputError, match=r"place_verifier\.onnx: takes columns tensor\(float\) \(any, \d+\).*export"):
-        open_network("place_verifier", tmp_path)
+        open_graph("place_verifier", tmp_path)
     rename("features.onnx", tmp_path / "features.onnx", "count", "number")
     with pytest.raises(InputError, match=r"features\.onnx: takes .*number.*and not .*count"):
-        open_network("features", tmp_path)
+        open_graph("features", tmp_path)
     rename("features.onnx", tmp_path / "features.onnx", "sigma", "scale")
     with pytest.raises(InputError, match=r"features\.onnx: gives .*scale, and not .*sigma"):
-        open_network("features", tmp_path)
+        open_graph("features", tmp_path)
 
 
 def test_a_graph_that_is_not_the_manifest_s_is_refused(folder: Path, tmp_path: Path):
     shutil.copy(folder / MANIFEST_NAME, tmp_path)
     shutil.copy(shipped_weights("features.onnx"), tmp_path)
     with pytest.raises(InputError, match=r"features\.onnx: is not the file that was exported"):
-        open_network("features", tmp_path)
+        open_graph("features", tmp_path)
 
 
 @pytest.mark.parametrize(

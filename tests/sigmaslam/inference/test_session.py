@@ -14,7 +14,7 @@ from sigmaslam.inference import session
 from sigmaslam.inference.onnx_graph import OnnxGraph, shipped_weights
 from sigmaslam.inference.session import PROVIDERS, check_provider, installed_providers
 
-DEMO = Path(__file__).resolve().parents[3] / "synthetic" / "demo"
+DEMO = Path(__file__).resolve().parents[3] / "synthetic" / "sigmaslam_synthetic" / "demo"
 VERIFIER = shipped_weights("place_verifier.onnx")
 
 

@@ -23,7 +23,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_the_manifest_is_of_the_shipped_files():
-    """After an export into models/weights: `update_manifest` has been called for what changed."""
+    """After an export into models/sigmaslam_weights: `update_manifest` has been called for what changed."""
     shipped = shipped_weights(MANIFEST_NAME)
     files = [path for path in shipped.parent.iterdir() if path.suffix in (".onnx", ".safetensors")]
     assert set(read_manifest(shipped)) == {path.name for path in files}
@@ -56,7 +56,7 @@ def test_a_changed_shipped_graph_stops_the_front_end(folder: Path, monkeypatch: 
 
 
 def test_weights_of_torch_are_compared_as_well(folder: Path):
-    from sigmaslam.models.network_export import load_verifier  # torch takes seconds to import
+    from sigmaslam_models.network_export import load_verifier  # torch takes seconds to import
 
     content = bytearray(shipped_weights("verifier.safetensors").read_bytes())
     content[-1] ^= 1

@@ -4,12 +4,12 @@ import cv2
 import numpy as np
 import torch
 
-from sigmaslam.filters import Gaussian, KalmanFilter, LinearMeasurement
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse
 from sigmaslam.reconstruction import depth_fusion
 from sigmaslam.reconstruction.depth_fusion import DepthView, FusedDepth, fuse_depth, kalman_update
 from sigmaslam.reconstruction.disparity import DisparityMap
+from sigmaslam_filters import Gaussian, KalmanFilter, LinearMeasurement
 
 CAMERA = RectifiedStereo(200.0, 200.0, 99.5, 59.5, 0.2, 200, 120)
 # A step to the side and ahead, and a small turn.

@@ -12,9 +12,6 @@ from matplotlib.figure import Figure
 from sigmaslam.bundle_adjustment.track_file import read_tracks
 from sigmaslam.checks.finding import Finding
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.evaluation_summary import format_evaluation
-from sigmaslam.evaluation.run_evaluation import evaluate_run
-from sigmaslam.evaluation.trial import read_trial
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import open_sequence
 from sigmaslam.readers.trajectory_files import read_kitti, read_tum, write_kitti
@@ -23,6 +20,9 @@ from sigmaslam.runs.figures import plot_trajectory
 from sigmaslam.runs.frame_table import predicted_poses, read_frames
 from sigmaslam.runs.relative_pose_file import read_frame_pairs
 from sigmaslam.runs.track import track_sequence
+from sigmaslam_benchmarks.trial import read_trial
+from sigmaslam_evaluation.evaluation_summary import format_evaluation
+from sigmaslam_evaluation.run_evaluation import evaluate_run
 from tests.support.demo_parts import copy_frames
 
 FRAMES, DARK = 12, 4

@@ -16,9 +16,9 @@ torch = pytest.importorskip("torch")
 from sigmaslam.geometry.se3 import se3_inverse  # noqa: E402
 from sigmaslam.readers import StereoFrame  # noqa: E402
 from sigmaslam.slam.tracker import Estimate, StereoTracker  # noqa: E402
-from sigmaslam.synthetic.camera.sensor import expose  # noqa: E402
-from sigmaslam.synthetic.motion.paths import Path  # noqa: E402
-from sigmaslam.synthetic.simulation import Recipe, Simulation, Studio, simulate  # noqa: E402
+from sigmaslam_synthetic.camera.sensor import expose  # noqa: E402
+from sigmaslam_synthetic.motion.paths import Path  # noqa: E402
+from sigmaslam_synthetic.simulation import Recipe, Simulation, Studio, simulate  # noqa: E402
 
 
 def filmed(simulation: Simulation) -> tuple[list[StereoFrame], np.ndarray]:

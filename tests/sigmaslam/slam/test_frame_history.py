@@ -9,12 +9,6 @@ import pytest
 
 from sigmaslam.estimation.constant_velocity import MotionState
 from sigmaslam.estimation.state_layout import pose_slice
-from sigmaslam.evaluation.metrics.trajectory_errors import (
-    absolute_trajectory_error,
-    is_regular,
-    pose_nees,
-    relative_pose_error,
-)
 from sigmaslam.frontend.types import StereoView
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
@@ -22,6 +16,12 @@ from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.slam.frame_history import FrameHistory
 from sigmaslam.slam.keyframes import Keyframes
 from sigmaslam.slam.tracker import StereoTracker, TrackerConfig
+from sigmaslam_evaluation.metrics.trajectory_errors import (
+    absolute_trajectory_error,
+    is_regular,
+    pose_nees,
+    relative_pose_error,
+)
 from tests.support.dense_window import NO_WALK, make_window
 from tests.support.simulated_frontend import SCALES, Scale, SimulatedFrontend, frame_of, run_simulated
 

@@ -11,14 +11,14 @@ from typer.testing import CliRunner
 
 from sigmaslam.cli import app
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.evaluation_result import Evaluation
-from sigmaslam.evaluation.run_evaluation import evaluate_run
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import open_sequence
 from sigmaslam.readers.trajectory_files import read_kitti, write_kitti
 from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.object_region import read_region
+from sigmaslam_evaluation.evaluation_result import Evaluation
+from sigmaslam_evaluation.run_evaluation import evaluate_run
 from tests.support.quantiles import WITHIN_3_SIGMA
 from tests.support.simulated_body import (
     RADIUS,
@@ -200,8 +200,8 @@ def test_a_rendered_tool_is_followed_and_a_sensor_on_it_takes_drift_away(tmp_pat
     Means of five draws: noise of one grey level in 5 % of the pixels moves the rotation between 0.2 and 0.3 degrees.
     """
     pytest.importorskip("torch")
-    from sigmaslam.synthetic.render_sequence import write_sequence
-    from sigmaslam.synthetic.simulation import Recipe, simulate
+    from sigmaslam_synthetic.render_sequence import write_sequence
+    from sigmaslam_synthetic.simulation import Recipe, simulate
 
     folder, recipe = tmp_path / "tool", Recipe("tool", 75, 1)
     write_sequence(folder, recipe, "sparse", workers=2)

@@ -8,12 +8,12 @@ import pytest
 
 from sigmaslam import StereoTracker, open_sequence
 from sigmaslam.errors import InputError
-from sigmaslam.evaluation.metrics.trajectory_errors import absolute_trajectory_error, kitti_errors
 from sigmaslam.geometry.se3 import se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import StereoFrame
 from sigmaslam.readers.trajectory_files import read_kitti
 from sigmaslam.slam.tracker import Estimate
+from sigmaslam_evaluation.metrics.trajectory_errors import absolute_trajectory_error, kitti_errors
 from tests.support.estimates import Demo, mirrored, position_sigma, squared_error, track
 from tests.support.faults import broken
 from tests.support.quantiles import WITHIN_3_SIGMA

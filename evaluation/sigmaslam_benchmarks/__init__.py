@@ -1,0 +1,1 @@
+"""What measures the product: pages, peers and trials, run from a checkout."""

@@ -1,0 +1,334 @@
+"""Speed of the filters beside other people's: the same work, interleaved, one thread, in process CPU time."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import numpy as np
+
+from sigmaslam.progress import open_progress
+from sigmaslam_benchmarks.filters import work as filter_work
+from sigmaslam_benchmarks.filters.peer_filters import Peer, available, single_thread_environment
+from sigmaslam_benchmarks.filters.work import BatchedWork, StereoWork
+from sigmaslam_benchmarks.tracking.page import opening, table, write_page
+
+POINTS = (10, 50, 100, 200, 500)
+MANY_POINTS = (1000, 2000, 5000)
+BATCHES = (1, 100, 10_000, 100_000)
+KINDS = ("localisation", "position", "landmark", "linear")
+_SEED = 0
+# A round times each contender for about this long, and at least once; what takes longer than the limit gets one round.
+_ROUND_SECONDS = 0.1
+_SLOW_SECONDS = 2.0
+_LOOP_LIMIT = 1000  # filters in a Python loop; the rate of such a loop does not depend on their number
+
+
+@dataclass(frozen=True, slots=True)
+class Contender:
+    """A row of a table: its name, and the function that does one step of all filters of a work."""
+
+    name: str
+    step: Callable[[], object]
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """Seconds of CPU time a step, one figure a round."""
+
+    seconds: list[float]
+
+    @property
+    def median(self) -> float:
+        """The middle round."""
+        return statistics.median(self.seconds)
+
+    def ratio(self, other: Timing) -> tuple[float, float, float]:
+        """How many times longer this takes than the other: median, lowest and highest over the rounds they share."""
+        ratios = [a / b for a, b in zip(self.seconds, other.seconds, strict=False)]
+        return statistics.median(ratios), min(ratios), max(ratios)
+
+
+def time_interleaved(contenders: Sequence[Contender], rounds: int) -> dict[str, Timing]:
+    """Times all contenders in turn, round after round, so that a busy moment hits them alike."""
+    counts = {}
+    for contender in contenders:
+        contender.step()  # compiles, allocates
+        start = time.process_time()
+        contender.step()
+        counts[contender.name] = time.process_time() - start
+    seconds: dict[str, list[float]] = {contender.name: [] for contender in contenders}
+    for k in range(rounds):
+        for contender in contenders:
+            once = max(counts[contender.name], 1e-6)
+            if k > 0 and once > _SLOW_SECONDS:
+                continue
+            repeats = max(1, int(_ROUND_SECONDS / once))
+            start = time.process_time()
+            for _ in range(repeats):
+                contender.step()
+            seconds[contender.name].append((time.process_time() - start) / repeats)
+    return {name: Timing(values) for name, values in seconds.items()}
+
+
+def stereo_contenders(work: StereoWork, peers: Sequence[Peer], compiled: bool) -> list[Contender]:
+    """Everyone who does the 12-state stereo problem in float64; the plain numpy reference comes first."""
+    from sigmaslam_benchmarks.filters import ours as filter_ours
+
+    contenders = [Contender(_REFERENCE, lambda: filter_work.step_stereo_low_rank(work))]
+    contenders.append(Contender(_EAGER, filter_ours.make(work)))
+    if compiled:
+        contenders.append(Contender(_COMPILED, filter_ours.make(work, compiled=True)))
+    contenders += [Contender(peer.name, peer.make(work, "float64")) for peer in peers if StereoWork in peer.works]
+    return contenders
+
+
+def batch_contenders(kind: str, batch: int, peers: Sequence[Peer], compiled: bool) -> list[tuple[Contender, int]]:
+    """Everyone who does a kind of small filter, with the number of filters in a step; in float32 where there is one."""
+    from sigmaslam_benchmarks.filters import ours as filter_ours
+
+    work: BatchedWork = getattr(filter_work, kind)(batch, _SEED)
+    looped: BatchedWork = work if batch <= _LOOP_LIMIT else getattr(filter_work, kind)(_LOOP_LIMIT, _SEED)
+    size = min(batch, _LOOP_LIMIT)
+    contenders = [(Contender(_REFERENCE, lambda: filter_work.step_loop(looped)), size)]
+    contenders.append((Contender(_EAGER, filter_ours.make(work, "float32")), batch))
+    if compiled:
+        contenders.append((Contender(_COMPILED, filter_ours.make(work, "float32", compiled=True)), batch))
+    for peer in peers:
+        if type(work) in peer.works:
+            step = peer.make(work if peer.batched else looped, peer.dtypes[-1])
+            contenders.append((Contender(peer.name, step), batch if peer.batched else size))
+    return contenders
+
+
+_REFERENCE = "plain numpy"
+_EAGER = "SigmaSLAM"
+_COMPILED = "SigmaSLAM, compiled"
+
+
+def format_page(rounds: int, compiled: bool, command: str) -> str:
+    """Runs the benchmark and makes the page."""
+    peers = available()
+    versions = ", ".join(f"{name} {_version(name)}" for name in _PACKAGES)
+    lines = [
+        *opening("Speed of the filters", command, ", one"),
+        f"thread; process CPU time, contenders in turn, {rounds} rounds. {versions}.",
+        "",
+        "Work: one prediction and one update of an unscented filter with the cubature set, one linearisation, sigma",
+        "points drawn anew after the process noise; the same models for all",
+        "(`evaluation/sigmaslam_benchmarks/filters/work.py`).",
+        "Tests check that every contender gets the same result. Compiled: `compile_step`, after its first call.",
+        "",
+    ]
+    tables = len(POINTS) + 2 + len(KINDS) * len(BATCHES)
+    with open_progress() as progress:
+        task = progress.add_task("timing", total=tables, note="")
+
+        def advance() -> None:
+            progress.advance(task)
+
+        lines += _stereo_section(peers, rounds, compiled, advance)
+        lines += _linear_cost_section(rounds, compiled, advance)
+        for kind in KINDS:
+            lines += _batch_section(kind, peers, rounds, compiled, advance)
+        lines += extended_section(rounds)
+        if compiled:
+            lines += sequence_section(rounds)
+        advance()
+    return "\n".join(lines)
+
+
+def _stereo_section(peers: Sequence[Peer], rounds: int, compiled: bool, advance: Callable[[], None]) -> list[str]:
+    results = []
+    for points in POINTS:
+        results.append(time_interleaved(stereo_contenders(filter_work.stereo(points, _SEED), peers, compiled), rounds))
+        advance()
+
+    def cells(name: str) -> list[str]:
+        if name == _REFERENCE:
+            return [f"{1e3 * result[name].median:.3g} ms" for result in results]
+        return [_ratio(*result[name].ratio(result[_REFERENCE])) for result in results]
+
+    lines = [
+        "## One 12-state stereo pose, m points (4m rows), float64",
+        "",
+        "Milliseconds for plain numpy, which has the low-rank form; for the others how many times longer they take,",
+        "with the lowest and highest round. Below 1 is faster.",
+        "",
+        *table(["", *(f"m = {points}" for points in POINTS)], ([name, *cells(name)] for name in results[0])),
+    ]
+    best = _COMPILED if compiled else _EAGER
+    if "filterpy" in results[-1]:
+        middle, low, high = results[-1]["filterpy"].ratio(results[-1][best])
+        lines += ["", f"At m = {POINTS[-1]} {best} is {middle:.0f} times as fast as filterpy ({low:.0f} - {high:.0f})."]
+    return [*lines, ""]
+
+
+def _linear_cost_section(rounds: int, compiled: bool, advance: Callable[[], None]) -> list[str]:
+    counts, cells = (POINTS[-1], *MANY_POINTS), []
+    for points in counts:
+        results = time_interleaved(stereo_contenders(filter_work.stereo(points, _SEED), [], compiled), rounds)
+        cells.append([1e6 * timing.median / points for timing in results.values()])
+    advance()
+    rows = [[name, *(f"{column[i]:.2f}" for column in cells)] for i, name in enumerate(results)]
+    return [
+        "Microseconds a point, for many points:",
+        "",
+        *table(["", *(f"m = {count}" for count in counts)], rows),
+        "",
+    ]
+
+
+def _batch_section(
+    kind: str, peers: Sequence[Peer], rounds: int, compiled: bool, advance: Callable[[], None]
+) -> list[str]:
+    columns = []
+    for batch in BATCHES:
+        contenders = batch_contenders(kind, batch, peers, compiled)
+        timings = time_interleaved([contender for contender, _ in contenders], rounds)
+        columns.append({c.name: [size / s for s in timings[c.name].seconds] for c, size in contenders})
+        advance()
+    rows = [[name, *(_rate(column[name]) for column in columns)] for name in columns[0]]
+    return [
+        f"## {_TITLES[kind]}",
+        "",
+        "Filter steps a second, with the lowest and highest round; float32 where there is one.",
+        "",
+        *table(["", *(f"B = {batch:,}" for batch in BATCHES)], rows),
+        "",
+    ]
+
+
+def extended_section(rounds: int) -> list[str]:
+    """The extended filter's time over the unscented one's, for models without derivatives of their own."""
+    from sigmaslam_benchmarks.filters import extended
+
+    rows = []
+    for name, make in extended.KINDS.items():
+        cells = []
+        for batch in extended.BATCHES:
+            contenders = [Contender(each, step) for each, step in make(batch).items()]
+            timings = time_interleaved(contenders, rounds)
+            milliseconds = ", ".join(f"{1e3 * timings[each.name].median:.3g} ms" for each in contenders)
+            cells.append(f"{_ratio(*timings['EKF'].ratio(timings['UKF']))}: {milliseconds}")
+        rows.append([name, *cells])
+    return [
+        "## Extended and unscented",
+        "",
+        "How many times longer the EKF takes than the UKF, and milliseconds of both; eager, float64, models without a",
+        "`jacobian` (`evaluation/sigmaslam_benchmarks/filters/extended.py`).",
+        "",
+        *table(["", *(f"B = {batch:,}" for batch in extended.BATCHES)], rows),
+        "",
+    ]
+
+
+def sequence_section(rounds: int) -> list[str]:
+    """Whole sequences, compiled and not."""
+    from sigmaslam_benchmarks.filters import sequences
+
+    columns = []
+    for batch in sequences.BATCHES:
+        contenders = [Contender(each, step) for each, step in sequences.make(batch).items()]
+        timings = time_interleaved(contenders, rounds)
+        columns.append(timings)
+    count = sequences.STEPS
+    rows = []
+    for name in columns[0]:
+        cells = [
+            _rate([batch * count / seconds for seconds in timings[name].seconds])
+            for batch, timings in zip(sequences.BATCHES, columns, strict=True)
+        ]
+        rows.append([name, *cells])
+    return [
+        "## Sequences",
+        "",
+        f"Filter steps a second over {count} steps of a robot in R^3 that sees range and bearing, with the lowest and",
+        "highest round; float64 (`evaluation/sigmaslam_benchmarks/filters/sequences.py`).",
+        "",
+        *table(["", *(f"B = {batch:,}" for batch in sequences.BATCHES)], rows),
+        "",
+    ]
+
+
+_TITLES = {
+    "localisation": "Localisation in the plane: 3 states, unicycle, range and bearing of a landmark",
+    "position": "Localisation in the plane: 3 states, unicycle, position fix",
+    "landmark": "Landmarks: 3 states, stereo measurement of 3 rows",
+    "linear": "Linear: 4 states, constant velocity, Kalman filter",
+}
+_PACKAGES = ("torch", "numpy", "filterpy", "stonesoup", "dynamax", "jax", "pypose", "torch-kf")
+
+
+def _ratio(middle: float, low: float, high: float) -> str:
+    return f"x{middle:.3g} ({low:.3g} - {high:.3g})"
+
+
+def _rate(rates: list[float]) -> str:
+    return f"{_thousands(statistics.median(rates))} ({_thousands(min(rates))} - {_thousands(max(rates))})"
+
+
+def _thousands(value: float) -> str:
+    return f"{value / 1e6:.2f} M" if value >= 1e6 else f"{value / 1e3:.3g} k"
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def write_in_one_thread(path: Path, rounds: int, compiled: bool, command: str) -> str:
+    """Runs the benchmark in a process of one thread, writes the page and returns it.
+
+    What is below a line `<!-- notes -->` in the page is kept.
+    """
+    arguments = [
+        sys.executable,
+        "-m",
+        "sigmaslam_benchmarks.filters.speed",
+        "--out",
+        str(path),
+        "--rounds",
+        str(rounds),
+        "--command",
+        command,
+    ]
+    if not compiled:
+        arguments.append("--eager")
+    # BLAS reads its number of threads when it is loaded: hence another process.
+    subprocess.run(arguments, env={**os.environ, **single_thread_environment()}, check=True)
+    return path.read_text(encoding="utf-8")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Command line of the measuring process."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("docs/benchmarks/filters.md"), help="page to write")
+    parser.add_argument("--rounds", type=int, default=7, help="rounds in which every contender is timed")
+    parser.add_argument("--eager", action="store_true", help="leave out the compiled filters (minutes to compile)")
+    parser.add_argument("--command", help="what the page says it was made by")
+    options = parser.parse_args(arguments)
+    command = options.command or "python -m evaluation.benchmarks.filters"
+    if os.environ.get("OMP_NUM_THREADS") != "1":
+        write_in_one_thread(options.out, options.rounds, not options.eager, command)
+        return
+    import torch
+
+    torch.set_num_threads(1)
+    np.seterr(all="ignore")
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    write_page(options.out, format_page(options.rounds, not options.eager, command))
+
+
+if __name__ == "__main__":
+    main()

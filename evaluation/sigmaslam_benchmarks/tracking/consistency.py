@@ -1,0 +1,175 @@
+"""Whether poses and map are as sure as they say: on renders with exact truth, many seeds, five filters."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from contextlib import redirect_stderr
+from dataclasses import replace
+from functools import cache, lru_cache, partial
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
+from sigmaslam.geometry.rectification import StereoRectifier
+from sigmaslam.readers.trajectory_files import read_trajectory
+from sigmaslam.runs.track import track_sequence
+from sigmaslam.slam.point_map import PointMap
+from sigmaslam.slam.tracker import TrackerConfig
+from sigmaslam_benchmarks.tracking.consistency_page import ConsistencyResult, Scale, format_page
+from sigmaslam_benchmarks.tracking.trial_pool import SequenceTrials, TrialKind, write_trials
+from sigmaslam_benchmarks.trial import Trial, hash_code, rendered_truth
+from sigmaslam_evaluation.metrics import map_consistency as consistency
+from sigmaslam_evaluation.rendered_camera import draw_calibration, open_rendered
+from sigmaslam_synthetic.render_sequence import SCENE_NAME
+from sigmaslam_synthetic.simulation import Recipe, Simulation, Studio
+
+# The images of all three are rectified, so that the injected offset shifts all disparities alike.
+SCALES = (
+    Scale("driving", "street", 576, 176),
+    Scale("indoors", "room", 360, 270),
+    Scale("endoscope", "organ", 360, 288),
+)
+_DRAWN = "ours, calibration drawn"
+METHODS = {
+    "ours": TrackerConfig(linearisation="unscented"),
+    "UKF, one iteration": TrackerConfig(linearisation="unscented", iterations=1),
+    "EKF, iterated": TrackerConfig(linearisation="extended"),
+    "EKF, one iteration": TrackerConfig(linearisation="extended", iterations=1),
+    "ours, offset not estimated": TrackerConfig(linearisation="unscented", offset_sigma=0.0, offset_walk=0.0),
+    _DRAWN: TrackerConfig(linearisation="unscented"),
+}
+"""The first is what `sigmaslam track` does, and what the others are compared with."""
+OFFSET = 0.3
+"""Pixels by which the rendered disparities exceed what the calibration says."""
+FRAMES = 30
+_FIRST_SEED = 1000  # seeds below were looked at while the tracker was made
+_GROSS = 5.0  # sigmas
+
+
+def write_consistency(
+    path: Path,
+    runs: Path,
+    seeds: int,
+    workers: int,
+    command: str,
+    ray: str | None = None,
+    note: Callable[[str], None] = lambda text: None,
+) -> str:
+    """Renders and tracks what is missing, writes the page and returns it; notes in it are kept.
+
+    A result is used again when it comes from the same recipe, configuration and code.
+
+    Args:
+        path: Markdown page.
+        runs: folder for renders and results.
+        seeds: sequences of each scale.
+        workers: processes; each takes a sequence at a time.
+        command: what the page says it was made by.
+        ray: address of a Ray cluster, as `run_jobs` takes it.
+        note: is told of progress.
+    Raises:
+        OutputError: as of `write_trials`.
+    """
+
+    def form(done: list[SequenceTrials], missing: list[str]) -> str:
+        results: dict[Scale, dict[str, list[ConsistencyResult]]] = {}
+        for scale in SCALES:
+            of_scale = [trials for trials in done if trials.recipe.preset == scale.preset]
+            if of_scale:
+                results[scale] = {
+                    method: [ConsistencyResult(**trials.read(method) or {}) for trials in of_scale]
+                    for method in METHODS
+                }
+        return format_page(results, OFFSET, FRAMES, (_FIRST_SEED, seeds), command, missing)
+
+    # Run all scales of a seed before the next seed: an interrupted benchmark is balanced.
+    recipes = [
+        Recipe(scale.preset, FRAMES, seed, disparity_offset=OFFSET, width=scale.width, height=scale.height)
+        for seed in range(_FIRST_SEED, _FIRST_SEED + seeds)
+        for scale in SCALES
+    ]
+    return write_trials(path, runs, TrialKind(METHODS, _track, _hash_code), recipes, form, workers, ray, note)
+
+
+@cache
+def _hash_code() -> str:
+    return hash_code(Path(__file__))
+
+
+@lru_cache(maxsize=1)
+def _open_scene(source: Path) -> Studio:
+    """Of a sequence, whose methods are judged one after another."""
+    content = json.loads((source / SCENE_NAME).read_text(encoding="utf-8"))
+    return Studio(Simulation.from_json(content["simulation"]))
+
+
+def depths_around(studio: Studio, frame: int, pixels: np.ndarray) -> np.ndarray:
+    """(M, 3, 3) z at pixels (M, 2) of an undistorted left image and one pixel around them; inf where nothing is."""
+    times = np.array([frame / studio.simulation.fps])
+    with torch.inference_mode():
+        sight = studio.renderer.look(studio.left, studio.simulation.path.poses(times), times)
+        v, u = np.mgrid[-1:2, -1:2]
+        around = pixels[:, None, None] + np.stack([u, v], axis=-1)
+        places = torch.from_numpy(around.reshape(-1, 2).T.copy())
+        view = torch.zeros(places.shape[1], dtype=torch.int64)
+        facet = sight.resolve(view, places)
+        seen = facet >= 0
+        inverse = torch.zeros(len(facet), dtype=torch.float64)
+        inverse[seen] = sight.evaluate(view[seen], facet[seen], places[:, seen])[2]
+        return np.asarray((1.0 / inverse).numpy().reshape(-1, 3, 3))
+
+
+def _track(source: Path, recipe: Recipe, method: str) -> ConsistencyResult:
+    truth = rendered_truth(source)
+    # The others are given what is right but for the offset, which is estimated.
+    sequence, config = open_rendered(source), METHODS[method]
+    if method == _DRAWN:
+        uncertain = replace(sequence.camera, sigmas=CalibrationSigmas())
+        sequence.camera = draw_calibration(uncertain, np.random.default_rng(recipe.seed))
+    with Path(os.devnull).open("w") as nowhere, redirect_stderr(nowhere):
+        trial = Trial(sequence, truth, partial(track_sequence, config=config)).run()
+    evaluation, tracked, point_map = trial.evaluation, trial.tracked, trial.point_map
+    assert evaluation.nees is not None
+    columns = trial.table.columns
+    offset, sigma = columns["disparity_offset"][-1], columns["disparity_offset_sigma"][-1]
+    if method == _DRAWN:
+        sigma = 0.0  # the angle between its eyes changes disparities, too
+        # Its pixels are those of another camera than the one that the true depths are known of.
+        point_map = {name: point_map[name][:0] for name in PointMap.__slots__}
+    true = read_trajectory(truth)
+    hosts = np.abs(point_map["timestamps"][:, None] - true.timestamps).argmin(axis=1)
+    pixels = point_map["pixels"]
+    depths, scene = np.zeros((len(pixels), 3, 3)), _open_scene(source)
+    for host in np.unique(hosts):
+        depths[hosts == host] = depths_around(scene, int(host), pixels[hosts == host])
+    clear = ~consistency.depth_edges(depths)
+    camera = StereoRectifier(sequence.camera).rectified
+    true_points = consistency.points_of_depth(pixels[clear], depths[clear, 1, 1], camera, true.poses[hosts[clear]])
+    nees = consistency.point_nees(point_map["points"][clear], point_map["covariances"][clear], true_points)
+    per_frame = evaluation.nees.per_frame
+    some, dof = len(nees) > 0, columns["dof"][tracked].sum()
+    nan = float("nan")
+    return ConsistencyResult(
+        nees=evaluation.nees.mean,
+        nees_last=float(per_frame[-1]) if len(per_frame) else nan,
+        inside=consistency.coverage(per_frame, 6),
+        nis=float(columns["nis"][tracked].sum() / dof) if dof else nan,
+        ate=evaluation.ate.rmse,
+        path_length=evaluation.path_length,
+        offset_error=float(offset - OFFSET),
+        offset_z=float((offset - OFFSET) / sigma) if sigma > 0 else nan,
+        lost=int((~tracked[1:]).sum()),
+        filter_ms=float(np.median(trial.table.milliseconds["filter"])),
+        total_ms=float(np.median(trial.table.total_milliseconds)),
+        points=int(clear.sum()),
+        edges=int((~clear).sum()),
+        point_nees=float(nees.mean()) if some else nan,
+        point_median=float(np.median(nees)) if some else nan,
+        point_inside=consistency.coverage(nees, 3),
+        point_gross=float((3.0 * nees > _GROSS**2).mean()) if some else nan,
+        relative={span.span: (span.mean_nees, span.inside) for span in evaluation.relative or ()},
+    )

@@ -1,0 +1,270 @@
+"""The page of image filtering: Set12, other noise, sequences, and the tracker in the dark."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from sigmaslam.errors import InputError
+from sigmaslam.files import atomic_path, make_folder
+from sigmaslam.image_filtering import NoiseModel, SequenceFilter, denoise_image, estimate_noise
+from sigmaslam.readers.images import read_grey
+from sigmaslam.readers.pairing import list_images
+from sigmaslam.runs.track import track_sequence
+from sigmaslam_benchmarks.tracking.page import header, opening, row, write_page
+from sigmaslam_benchmarks.trial import Trial, render, rendered_truth
+from sigmaslam_synthetic.camera.sensor import Sensor, expose
+from sigmaslam_synthetic.simulation import Recipe
+
+SIGMAS = (15.0, 25.0, 50.0)
+RECIPES = tuple(Recipe(preset, 30, 1000, width=400, height=300) for preset in ("room", "street"))
+"""Seeds from 1000 on are used for nothing but pages."""
+NIGHTS = {
+    "as rendered": None,
+    "photons at white 100, read noise 5": Sensor(blur=0.0, photons_at_white=100.0, read_noise=5.0),
+    "photons at white 10, read noise 20": Sensor(blur=0.0, photons_at_white=10.0, read_noise=20.0),
+    "a twentieth of the light, read noise 1.5": Sensor(blur=0.0, gain=0.05, photons_at_white=2000.0, read_noise=1.5),
+}
+"""Sensors before which a rendered sequence is shown again."""
+_REAL = ("kitti_raw_0926_0039_a", "euroc_mh01_f000_099")
+_SEQUENCE_FRAMES, _FIRST = 12, 4
+
+Filter = Callable[[np.ndarray, NoiseModel], np.ndarray]
+Spoil = Callable[[np.ndarray, np.random.Generator], np.ndarray]
+
+
+def write_denoising(
+    path: Path, data: Path, runs: Path, command: str, note: Callable[[str], None] = lambda text: None
+) -> str:
+    """Writes the page and returns it; notes in it are kept. A picture goes beside it.
+
+    Args:
+        path: Markdown page.
+        data: folder of the real data sets.
+        runs: folder of the renders; those that are there are used again.
+        command: that makes the page.
+        note: tells of progress.
+    Raises:
+        InputError: a data set is missing.
+    """
+    images = [read_grey(each) for each in list_images(data / "denoising" / "Set12")]
+    make_folder(runs)
+    sources = {}
+    for recipe in RECIPES:
+        sources[recipe.name] = render(runs, recipe, 1)
+        note(f"{recipe.name} is there")
+    lines = opening("Image filtering", command, ", one thread. PSNR in dB of the whole image, peak 255;")
+    lines += ["seconds are of CPU time.", ""]
+    page = ""
+    parts: tuple[Callable[[], list[str]], ...] = (
+        partial(_gaussian, images),
+        partial(_others, images),
+        partial(_sequences, data, sources),
+        partial(_night, sources, runs),
+    )
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        for part in parts:
+            lines += [*part(), ""]
+            note(lines[-2])
+            page = write_page(path, "\n".join(lines))
+        picture = path.with_suffix(".jpg")
+        draw_sequences(picture, [data / _REAL[0], *sources.values()])
+        lines += [f"![A frame of three sequences]({picture.name})", ""]
+        lines += ["*Noise of sigma 25, the frame filtered by itself, and over time; the last frame of the table.*", ""]
+        page = write_page(path, "\n".join(lines))
+    finally:
+        cv2.setNumThreads(threads)
+    return page
+
+
+def psnr(estimate: np.ndarray, truth: np.ndarray) -> float:
+    """Peak signal-to-noise ratio of grey levels of 255, dB; infinite where both are the same."""
+    square = float(np.mean((estimate.astype(np.float64) - truth) ** 2))
+    return float("inf") if square == 0 else 10 * float(np.log10(255.0**2 / square))
+
+
+def non_local_means(image: np.ndarray, noise: NoiseModel) -> np.ndarray:
+    """OpenCV's, for the mean variance of the noise: 7 x 7 patches in 21 x 21 pixels, h = 0.9 sigma."""
+    sigma = float(np.sqrt(noise.variance(image).mean()))
+    return np.asarray(cv2.fastNlMeansDenoising(to_bytes(image), None, 0.9 * sigma, 7, 21))
+
+
+def to_bytes(image: np.ndarray) -> np.ndarray:
+    """Grey levels as an 8-bit image stores them."""
+    return np.asarray(np.clip(np.rint(image), 0, 255), np.uint8)
+
+
+_FILTERS: dict[str, Filter] = {
+    "noisy": lambda image, noise: image,
+    "median 3 x 3": lambda image, noise: cv2.medianBlur(to_bytes(image), 3),
+    "OpenCV non-local means": non_local_means,
+    "ours": denoise_image,
+    "ours, thorough": partial(denoise_image, thorough=True),
+}
+
+
+def _gaussian(images: list[np.ndarray]) -> list[str]:
+    lines = [
+        "## Set12, Gaussian noise",
+        "",
+        "Mean PSNR of the twelve images; noise of one generator a sigma, not clipped and not rounded. Sigma is given.",
+        "Seconds are the median of an image of 256 x 256.",
+        "",
+        *header("filter", *(f"sigma {sigma:.0f}" for sigma in SIGMAS), "seconds", numbers_from=1),
+    ]
+    scores: dict[str, list[list[float]]] = {name: [] for name in _FILTERS}
+    seconds: dict[str, list[float]] = {name: [] for name in _FILTERS}
+    for sigma in SIGMAS:
+        rng = np.random.default_rng(0)
+        noisy = [image + rng.normal(0.0, sigma, image.shape) for image in images]
+        for name, filter_one in _FILTERS.items():
+            found = []
+            for image, truth in zip(noisy, images, strict=True):
+                began = time.process_time()
+                found.append(psnr(filter_one(image, NoiseModel(sigma)), truth))
+                if truth.shape == (256, 256):
+                    seconds[name].append(time.process_time() - began)
+            scores[name].append(found)
+    for name, rows in scores.items():
+        taken = "" if name == "noisy" else f"{np.median(seconds[name]):.3f}"
+        lines.append(row(name, *(f"{np.mean(each):.2f}" for each in rows), taken))
+    return lines
+
+
+def _others(images: list[np.ndarray]) -> list[str]:
+    lines = [
+        "## Set12, other noise",
+        "",
+        "Images of 8 bits; ours estimates the noise, non-local means is told the variance that was estimated.",
+        "",
+        *header("noise", *(name for name in _FILTERS if "thorough" not in name), numbers_from=1),
+    ]
+    kinds: dict[str, Spoil] = {
+        "Gaussian, sigma 25, clipped": lambda image, rng: image + rng.normal(0.0, 25.0, image.shape),
+        "Poisson, 30 photons at white": lambda image, rng: rng.poisson(image * (30 / 255)) * (255 / 30),
+        "quantised to 4 bits": lambda image, rng: np.rint(image / 17.0) * 17.0,
+        "salt and pepper, 10 %": partial(_salt_and_pepper, share=0.1),
+        "salt and pepper, 30 %": partial(_salt_and_pepper, share=0.3),
+    }
+    for kind, spoil in kinds.items():
+        rng = np.random.default_rng(0)
+        noisy = [to_bytes(spoil(image, rng)) for image in images]
+        pairs = [(image, estimate_noise(image)) for image in noisy]
+        cells = [
+            np.mean([psnr(one(*each), truth) for each, truth in zip(pairs, images, strict=True)])
+            for name, one in _FILTERS.items()
+            if "thorough" not in name
+        ]
+        lines.append(row(kind, *(f"{each:.2f}" for each in cells)))
+    return lines
+
+
+def _salt_and_pepper(image: np.ndarray, rng: np.random.Generator, share: float) -> np.ndarray:
+    drawn = rng.random(image.shape)
+    return np.where(drawn < share / 2, 0, np.where(drawn > 1 - share / 2, 255, image))
+
+
+def _sequences(data: Path, sources: dict[str, Path]) -> list[str]:
+    lines = [
+        "## Sequences, Gaussian noise of sigma 25",
+        "",
+        f"Left images {_FIRST} to {_SEQUENCE_FRAMES - 1}, mean PSNR. The state is what the filter over time makes of",
+        "them before the patches take out what noise is left. The truth of real images has noise of its own.",
+        "",
+        *header("sequence", "noisy", "each by itself", "state", "over time", "gain", "seconds a frame", numbers_from=1),
+    ]
+    chosen = {**sources, **{name: data / name for name in _REAL}}
+    for name, source in chosen.items():
+        rng, noise = np.random.default_rng(0), NoiseModel(25.0)
+        follow, found, seconds = SequenceFilter(noise), [], 0.0
+        for truth in _left_images(source):
+            image = truth + rng.normal(0.0, 25.0, truth.shape)
+            began = time.process_time()
+            result = follow.step(image)
+            seconds += time.process_time() - began
+            state, _ = follow.state
+            found.append([psnr(each, truth) for each in (image, denoise_image(image, noise), state, result)])
+        mean = np.mean(found[_FIRST:], axis=0)
+        cells = [f"{each:.2f}" for each in (*mean, mean[3] - mean[0])]
+        lines.append(row(name, *cells, f"{seconds / len(found):.3f}"))
+    return lines
+
+
+def draw_sequences(path: Path, sources: list[Path]) -> None:
+    """Writes a picture: for each sequence a part of its last frame noisy, filtered by itself, and over time."""
+    rows = []
+    for source in sources:
+        rng, noise = np.random.default_rng(0), NoiseModel(25.0)
+        follow = SequenceFilter(noise)
+        for truth in _left_images(source):
+            image = truth + rng.normal(0.0, 25.0, truth.shape)
+            result = follow.step(image)
+        top, left = (image.shape[0] - 200) // 2, (image.shape[1] - 300) // 2
+        part = slice(top, top + 200), slice(left, left + 300)
+        rows.append(np.hstack([to_bytes(each[part]) for each in (image, denoise_image(image, noise), result)]))
+    with atomic_path(path) as temporary:
+        cv2.imwrite(str(temporary), np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, 80])
+
+
+def _left_images(source: Path) -> Iterator[np.ndarray]:
+    for folder in ("image_0", "image_l", "image_00/data", "mav0/cam0/data"):
+        if (source / folder).is_dir():
+            return (read_grey(path) for path in list_images(source / folder)[:_SEQUENCE_FRAMES])
+    raise InputError(f"{source}: no folder of left images; fetch the data set again")
+
+
+def _night(sources: dict[str, Path], runs: Path) -> list[str]:
+    lines = [
+        "## The tracker in the dark",
+        "",
+        f"{RECIPES[0].frames} rendered pairs, shown again to darker sensors. Root mean square error of the position",
+        "after alignment, millimetres, and frames with a pose from the images.",
+        "",
+        *header("sequence", "sensor", "`track`", "tracked", "`track --denoise`", "tracked", numbers_from=2),
+    ]
+    for name, source in sources.items():
+        for night, sensor in NIGHTS.items():
+            shown = source
+            if sensor is not None:
+                shown = runs / "dark"
+                show_again(source, shown, sensor)
+            cells: list[str] = []
+            for denoise in (False, True):
+                cells += _track(shown, denoise)
+            if sensor is not None:
+                shutil.rmtree(shown)
+            lines.append(row(name, night, *cells))
+    return lines
+
+
+def _track(source: Path, denoise: bool) -> list[str]:
+    """Error and frames that were tracked."""
+    method = partial(track_sequence, threads=1, denoise=denoise)
+    try:
+        result = Trial(source, rendered_truth(source), method).run()
+    except InputError:
+        return ["lost", "0"]
+    return [f"{1e3 * result.evaluation.ate.rmse:.1f}", str(int(result.tracked.sum()))]
+
+
+def show_again(source: Path, out: Path, sensor: Sensor) -> None:
+    """Writes a rendered KITTI folder as another sensor would have seen it, grey levels of the first taken for light.
+
+    Args:
+        source: rendered with a gamma of 1.
+        out: new folder.
+        sensor: that sees the images.
+    """
+    shutil.copytree(source, out, ignore=shutil.ignore_patterns("truth", "landmarks.npz"))
+    rng = np.random.default_rng(0)
+    for eye in ("image_0", "image_1"):
+        for path in list_images(out / eye):
+            cv2.imwrite(str(path), expose(read_grey(path) / np.float32(255.0), sensor, rng))

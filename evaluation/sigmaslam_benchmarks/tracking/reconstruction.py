@@ -1,0 +1,132 @@
+"""Dense reconstruction on renders with exact depth: errors, their intervals, completeness, ghosts of moving bodies."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Callable
+from contextlib import redirect_stderr
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from sigmaslam.errors import InputError
+from sigmaslam.geometry.rectification import StereoRectifier
+from sigmaslam.reconstruction import reconstruct
+from sigmaslam.reconstruction.disparity import semi_global_disparity
+from sigmaslam.reconstruction.reconstruct import fuse_keyframes
+from sigmaslam.reconstruction.recorded_keyframes import open_input, read_recorded_keyframes
+from sigmaslam.runs.track import track_sequence
+from sigmaslam.slam.config import TrackerConfig
+from sigmaslam_benchmarks.tracking.reconstruction_page import ReconstructedSequence, format_page
+from sigmaslam_benchmarks.tracking.trial_pool import SequenceTrials, TrialKind, write_trials
+from sigmaslam_benchmarks.trial import hash_code
+from sigmaslam_evaluation.metrics.depth_accuracy import DepthFigures, JudgedPixels, judge_pixels, summarise
+from sigmaslam_evaluation.rendered_camera import open_rendered
+from sigmaslam_synthetic.render_sequence import SCENE_NAME
+from sigmaslam_synthetic.simulation import Recipe, Simulation, Studio
+
+SIZES = {"street": (576, 176), "room": (360, 270), "organ": (360, 288)}
+"""Worlds, and the size of their images: those of the benchmark `consistency`, whose renders may be copied."""
+FRAMES, OFFSET, MOVERS = 30, 0.3, 0.2
+"""Of each sequence; disparities exceed what the calibration says by so many pixels; in every second one bodies move."""
+FIRST_SEED = 1002  # seeds below were looked at while the reconstruction was made
+MAX_KEYFRAMES = 6
+"""Of each sequence so many are judged, spread evenly: their exact depths take most of the time."""
+_METHOD = "reconstruction"
+
+
+def write_reconstruction(
+    path: Path,
+    runs: Path,
+    seeds: int,
+    workers: int,
+    command: str,
+    ray: str | None = None,
+    note: Callable[[str], None] = lambda text: None,
+) -> str:
+    """Renders, tracks and reconstructs what is missing, writes the page and returns it; notes in it are kept.
+
+    Args:
+        path: Markdown page.
+        runs: folder for renders and results.
+        seeds: sequences a world.
+        workers: processes; each takes a sequence at a time.
+        command: what the page says it was made by.
+        ray: address of a Ray cluster, as `run_jobs` takes it.
+        note: is told of progress.
+    Raises:
+        OutputError: as of `write_trials`.
+    """
+
+    def form(done: list[SequenceTrials], missing: list[str]) -> str:
+        found = [
+            ReconstructedSequence(
+                trials.recipe.preset,
+                trials.recipe.seed,
+                trials.recipe.movers,
+                DepthFigures(**trials.read(_METHOD) or {}),
+            )
+            for trials in done
+        ]
+        return format_page(found, seeds, command, missing)
+
+    kind = TrialKind({_METHOD: TrackerConfig()}, _judge, _hash_code)
+    recipes = [recipe(world, FIRST_SEED + k) for k in range(seeds) for world in SIZES]
+    return write_trials(path, runs, kind, recipes, form, workers, ray, note)
+
+
+@cache
+def _hash_code() -> str:
+    return hash_code(Path(__file__), *sorted(Path(reconstruct.__file__).parent.glob("*.py")))
+
+
+def recipe(world: str, seed: int) -> Recipe:
+    """Of a sequence; those of odd seeds have movers."""
+    width, height = SIZES[world]
+    movers = MOVERS * (seed % 2)
+    return Recipe(world, FRAMES, seed, movers=movers, disparity_offset=OFFSET, width=width, height=height)
+
+
+def judge_reconstruction(source: Path) -> DepthFigures:
+    """Tracks a rendered folder, fuses the depths of its keyframes and holds them against the exact ones."""
+    content = json.loads((source / SCENE_NAME).read_text(encoding="utf-8"))
+    simulation = Simulation.from_json(content["simulation"])
+    studio = Studio(simulation, device="cpu")
+    moving = np.array([body.path is not None for body in simulation.scene.bodies] + [False])
+    with tempfile.TemporaryDirectory() as scratch:
+        run = Path(scratch) / "run"
+        with Path(os.devnull).open("w") as nowhere, redirect_stderr(nowhere):
+            sequence = open_rendered(source)
+            track_sequence(sequence, run, threads=1)
+        keyframes = read_recorded_keyframes(run)
+        rectifier = StereoRectifier(keyframes.camera)
+        pairs: list[np.ndarray] = []
+
+        def match(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+            pairs.append(semi_global_disparity(left, right))
+            return pairs[-1]
+
+        assert sequence.timestamps is not None
+        times = np.asarray(sequence.timestamps)
+        numbers = np.flatnonzero(keyframes.is_keyframe)
+        spread = np.linspace(0, len(numbers) - 1, min(len(numbers), MAX_KEYFRAMES)).round().astype(np.int64)
+        judged = []
+        for depth in fuse_keyframes(keyframes, open_input(keyframes), rectifier, match):
+            if depth.number not in numbers[spread]:
+                continue
+            index = int(np.abs(times - keyframes.timestamps[depth.number]).argmin())
+            truth = studio.frames(np.array([index]))[0]
+            single = pairs[depth.number] - np.float32(keyframes.disparity_offset)
+            # A body of -1 is the sky, and the last one of the table.
+            moves = moving[truth.body]
+            judged.append(judge_pixels(depth, single, truth.depth, truth.stereo_visible, moves, rectifier.rectified))
+    if not judged:
+        raise InputError(f"{source}: no keyframe could be judged: render it again")
+    return summarise(JudgedPixels.concatenate(judged), len(judged))
+
+
+def _judge(source: Path, _: Recipe, __: str) -> DepthFigures:
+    return judge_reconstruction(source)

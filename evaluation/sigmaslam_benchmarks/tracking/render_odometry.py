@@ -1,0 +1,227 @@
+"""SIFT odometry on rendered drives beside the same on a real one: is what a tracker meets there alike?"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from sigmaslam.errors import InputError
+from sigmaslam.frontend.classical import SiftDetector
+from sigmaslam.geometry.se3 import rotation_log
+from sigmaslam.readers import open_sequence
+from sigmaslam.readers.trajectory_files import read_trajectory
+from sigmaslam.runs.track import track_sequence
+from sigmaslam.slam.tracker import TrackerConfig
+from sigmaslam_benchmarks.matching.scores import mutual_nearest
+from sigmaslam_benchmarks.tracking.page import row
+from sigmaslam_benchmarks.trial import Trial, render
+
+REAL_DRIVE = "kitti_raw_0926_0039_a"
+PROFILE = "kitti_gt_trajectories/07.txt"
+"""The drive whose motion the renders have, at about the speed of the real one."""
+SEEDS = (0, 1, 2)
+FRAMES = 70
+WIDTH, HEIGHT = 1242, 376
+LIMIT = 2.0
+"""Ratio of render to real, either way, up to which the two behave alike."""
+_LENGTHS = (10.0, 20.0, 30.0, 40.0, 50.0)  # metres, fit into every drive
+_STEREO_STEP = 5  # every so many frames the eyes are matched without the tracker's help
+_ROW_GATE = 3.0  # pixels; matches whose rows differ by more are wrong
+_FITS = 6  # of the quadratic, without the outliers of the one before
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """What SIFT and the tracker make of a drive.
+
+    Attributes:
+        name: of the sequence.
+        step: distance a frame, metres, mean.
+        turn: rotation a frame, degrees, mean.
+        keypoints: SIFT keypoints of a left image, at most what the tracker asks for; median.
+        stereo_matches: mutual nearest neighbours of the two eyes' keypoints whose rows differ by less than 3 pixels
+            and whose disparity is positive; median of the frames.
+        stereo_share: their share among all mutual nearest neighbours, median.
+        row_error: median |v_left - v_right| of them, pixels.
+        row_noise: the same after a quadratic of (u, v), fitted robustly to the whole drive, is taken off: what is left
+            when the calibration of the pair is mended.
+        disparity: their median disparity, pixels.
+        inliers: points that carry the pose of a frame, median.
+        inlier_share: inliers over points matched to the keyframe, median.
+        nis: normalised innovation squared per degree of freedom, median.
+        t_rel: translation error of segments of 10 to 50 m, percent.
+        r_rel: rotation error of the same, degrees per 100 m.
+        step_error: median error of the motion from frame to frame, percent of the mean distance a frame.
+        roughness: median distance of a step's estimated length from the mean of its two neighbours, percent of the mean
+            distance a frame; needs no truth.
+        offset: disparity offset that the tracker found in the end, pixels.
+        tracked: share of the frames with a pose from the images; the first is the origin.
+    """
+
+    name: str
+    step: float
+    turn: float
+    keypoints: float
+    stereo_matches: float
+    stereo_share: float
+    row_error: float
+    row_noise: float
+    disparity: float
+    inliers: float
+    inlier_share: float
+    nis: float
+    t_rel: float
+    r_rel: float
+    step_error: float
+    roughness: float
+    offset: float
+    tracked: float
+
+
+# Attribute, title, format, and whether the ratio must be within LIMIT.
+_ROWS: tuple[tuple[str, str, str, bool], ...] = (
+    ("inliers", "inliers a frame", ".0f", True),
+    ("stereo_matches", "stereo matches of raw SIFT", ".0f", True),
+    ("row_error", "their row error px", ".3f", True),
+    ("row_noise", "row error px without calibration error", ".3f", True),
+    ("t_rel", "t_rel %, 10 to 50 m", ".2f", True),
+    ("step_error", "error of a step against the truth, % of its length", ".2f", True),
+    ("roughness", "roughness of the steps, % of their length", ".2f", True),
+    ("step", "metres a frame", ".2f", False),
+    ("turn", "degrees a frame", ".2f", False),
+    ("keypoints", "keypoints", ".0f", False),
+    ("stereo_share", "stereo matches with equal rows, share", ".2f", False),
+    ("disparity", "disparity px", ".1f", False),
+    ("inlier_share", "inliers of the matches in time, share", ".2f", False),
+    ("nis", "NIS per degree of freedom", ".2f", False),
+    ("r_rel", "r_rel deg/100 m", ".2f", False),
+    ("tracked", "frames tracked, share", ".2f", False),
+)
+
+
+def render_drives(folder: Path, data: Path, note: Callable[[str], None] = lambda text: None) -> list[Path]:
+    """Renders the drives, one a seed; what the folder holds of them already is kept.
+
+    Args:
+        folder: for the sequences, one folder each.
+        data: folder of the real data sets.
+        note: told what is being done.
+    """
+    from sigmaslam_synthetic.render_sequence import default_workers
+    from sigmaslam_synthetic.simulation import Recipe
+
+    drives = []
+    for seed in SEEDS:
+        recipe = Recipe("street", FRAMES, seed, width=WIDTH, height=HEIGHT, profile=str(data / PROFILE))
+
+        def done(count: int, seed: int = seed) -> None:
+            note(f"rendering street{seed}: {count} of {FRAMES} frames")
+
+        drives.append(render(folder, recipe, default_workers(), done))
+    return drives
+
+
+def follow(name: str, sequence: Path, truth: Path) -> Drive:
+    """Tracks a sequence with SIFT and compares it with the truth."""
+    result = Trial(sequence, truth, partial(track_sequence, frontend="sift")).run(lengths=_LENGTHS, step=1)
+    evaluation, tracked, columns = result.evaluation, result.tracked, result.table.columns
+    if not tracked.any():
+        raise InputError(f"{sequence}: SIFT tracked none of its frames, there is nothing to compare")
+    step = evaluation.path_length / (evaluation.matched - 1)
+    lengths = np.linalg.norm(np.diff(result.trajectory.positions, axis=0), axis=1)
+    bend = lengths[1:-1] - 0.5 * (lengths[:-2] + lengths[2:])
+    counts, rows = _match_eyes(sequence)
+    return Drive(
+        name=name,
+        step=step,
+        turn=_mean_turn(truth),
+        keypoints=float(np.median(counts[:, 0])),
+        stereo_matches=float(np.median(counts[:, 1])),
+        stereo_share=float(np.median(counts[:, 2])),
+        row_error=float(np.median(np.abs(rows[:, 3]))),
+        row_noise=row_noise(rows[:, 0], rows[:, 1], rows[:, 3]),
+        disparity=float(np.median(rows[:, 2])),
+        inliers=float(np.median(columns["inliers"][tracked])),
+        inlier_share=float(np.median(columns["inliers"][tracked] / np.maximum(columns["matches"][tracked], 1))),
+        nis=float(np.median(result.nis)),
+        t_rel=evaluation.kitti.mean_translation_percent,
+        r_rel=evaluation.kitti.mean_rotation_deg_per_100m,
+        step_error=100 * evaluation.rpe.translation_median / step,
+        roughness=100 * float(np.median(np.abs(bend))) / step,
+        offset=float(columns["disparity_offset"][-1]),
+        tracked=float(tracked.sum() / max(len(tracked) - 1, 1)),
+    )
+
+
+def format_odometry(real: Drive, renders: Sequence[Drive]) -> list[str]:
+    """A table with a row a quantity, and a sentence on what is off by more than the limit."""
+    lines = [
+        f"| | {real.name} | " + " | ".join(render.name for render in renders) + " | ratio | within |",
+        "|---|" + "---:|" * (len(renders) + 3),
+    ]
+    off = []
+    for key, title, form, required in _ROWS:
+        truth = getattr(real, key)
+        values = [getattr(render, key) for render in renders]
+        ratio = float(np.median(values)) / truth
+        alike = 1 / LIMIT <= ratio <= LIMIT
+        if required and not alike:
+            off.append(f"{title} (x{ratio:.2f})")
+        cells = [title, *(format(value, form) for value in (truth, *values)), f"{ratio:.2f}"]
+        lines.append(row(*cells, ("yes" if alike else "**no**") if required else ""))
+    # The offset is near zero, where a ratio is undefined.
+    cells = ["disparity offset px", *(f"{drive.offset:+.2f}" for drive in (real, *renders))]
+    lines.append(row(*cells, "", ""))
+    verdict = f"Off by more than a factor of {LIMIT:g}: {', '.join(off)}." if off else "Every one is within the limit."
+    return [*lines, "", verdict]
+
+
+def row_noise(u: np.ndarray, v: np.ndarray, difference: np.ndarray) -> float:
+    """Median |row difference| after a quadratic of the place is taken off.
+
+    Args:
+        u, v: (N,) pixels of the left image.
+        difference: (N,) v_left - v_right, pixels.
+    """
+    x, y = ((values - values.mean()) / max(float(values.std()), 1e-9) for values in (u, v))
+    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+    kept = np.ones(len(x), dtype=bool)
+    residual = difference
+    for _ in range(_FITS):
+        solution, *_ = np.linalg.lstsq(terms[kept], difference[kept], rcond=None)
+        residual = np.abs(difference - terms @ solution)
+        kept = residual <= 4.0 * np.median(residual)
+    return float(np.median(residual))
+
+
+def _match_eyes(sequence: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Raw SIFT between the eyes.
+
+    Returns:
+        (F, 3) keypoints, matches and their share of all mutual ones in each frame looked at; (N, 4) u and v of the left
+        image, u_left - u_right and v_left - v_right of the matches of all of them.
+    """
+    detect = SiftDetector(TrackerConfig().max_keypoints)
+    counts, rows = [], []
+    for frame in open_sequence(sequence).frames():
+        if frame.index % _STEREO_STEP:
+            continue
+        left, right = detect(frame.left), detect(frame.right)
+        index0, index1 = mutual_nearest(left.descriptors, right.descriptors)
+        places = left.keypoints[index0].astype(np.float64)
+        difference = places - right.keypoints[index1]
+        good = (np.abs(difference[:, 1]) < _ROW_GATE) & (difference[:, 0] > 0)
+        counts.append((len(left.keypoints), good.sum(), good.mean() if len(good) else 0.0))
+        rows.append(np.concatenate([places[good], difference[good]], axis=1))
+    return np.array(counts, dtype=np.float64), np.concatenate(rows)
+
+
+def _mean_turn(truth: Path) -> float:
+    rotations = read_trajectory(truth).rotations
+    turns = [np.linalg.norm(rotation_log(a.T @ b)) for a, b in pairwise(rotations)]
+    return float(np.degrees(np.mean(turns)))

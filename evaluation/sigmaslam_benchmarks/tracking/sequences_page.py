@@ -1,0 +1,231 @@
+"""The page of the benchmark `sequences`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from sigmaslam.runs.frame_table import FrameTable
+from sigmaslam_benchmarks.tracking.page import opening, table
+from sigmaslam_benchmarks.trial import TrialResult
+
+_LABELS = {
+    "ours": "ours",
+    "ekf": "our EKF",
+    "sift": "ours with SIFT",
+    "orb": "ours with ORB",
+    "klt": "ours with KLT",
+    "sift-pnp": "SIFT + PnP",
+    "klt-pnp": "KLT + PnP",
+    "cuvslam": "cuVSLAM",
+    "bundle": "bundle adjustment",
+}
+_STAGES = ("features", "match", "filter", "map")
+_COLUMNS = (
+    "method",
+    "tracked",
+    "ATE m",
+    "t_rel %",
+    "r_rel deg/100 m",
+    "step mm",
+    "step deg",
+    "NIS",
+    "NEES",
+    "offset px",
+    "ms, median (p10 - p90)",
+    "frames/s",
+)
+_STAGE_COLUMNS = ("method", "inliers", "features ms", "matching ms", "filter ms", "map ms")
+_RELATIVE_COLUMNS = (
+    "span",
+    "pairs",
+    "NEES, mean",
+    "median",
+    "inside 95 %",
+    "rmse m",
+    "sigma m",
+    "truth's share %",
+)
+_WORDS = """\
+All methods in turn in one run, with {threads} threads in OpenCV and 2 in the network. Accuracy is the same in every run
+on one machine; times are wall milliseconds. No setting of any method differs between sequences.
+
+- *ours*: learned features, unscented updates, two linearisations: what `sigmaslam track` does. *Our EKF*: the same with
+  Jacobians, linearised once. *Ours with*: other features under the same filter.
+- *SIFT + PnP*, *KLT + PnP*: from OpenCV alone (`sigmaslam_benchmarks.tracking.pnp_baselines`): points of a keyframe,
+  found again by ratio test or Lucas-Kanade, RANSAC, least squares. Landmarks count as known, the noise as 1 px.
+- *cuVSLAM*: on the CPU, by the package dim-odom (extra `peers`), given rectified pairs; rectifying is in its
+  time. It gives no covariance here, and no pose where it is lost.
+- *bundle adjustment*: of the tracks of *ours* (`track --tracks`, then `refine`), all keyframes at once; frames in
+  between move with them. Its time is that of the optimisation, on top of the tracking; its NEES that of the keyframes.
+- *tracked*: frames with a pose from the images, relocalised ones too; the first frame of a run is its origin.
+- *ATE*: root mean square position error after the best rigid alignment, metres.
+- *t_rel*, *r_rel*: KITTI segments, of 100 m where the path allows, else of 10 to 50 m.
+- *step*: median error from frame to frame over tracked frames.
+- *NIS*, *NEES*: per degree of freedom, 1 is right, more is overconfident. NEES is given where the truth is exact: on
+  renders.
+- *Relative poses*: of frames a span apart, which overlap. The covariance of a pair is the estimate's and the truth's
+  together; *truth's share* of it, in the median.
+- *offset*: measured minus true disparity, of the methods that estimate it.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class SequenceResult:
+    """One method on one sequence.
+
+    Attributes:
+        sequence: name.
+        method: key.
+        trial: run and evaluation; the bundle adjustment has no table of frames.
+        nees: mean per degree of freedom; NaN where the truth is not exact.
+        refined: what refine.json says; None but for the bundle adjustment.
+        truth_sigmas: of the true poses, metres and degrees; None where they are exact.
+    """
+
+    sequence: str
+    method: str
+    trial: TrialResult
+    nees: float
+    refined: Mapping[str, Any] | None = None
+    truth_sigmas: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Omission:
+    """What could not be run, and why; without a method the whole sequence."""
+
+    sequence: str
+    method: str
+    reason: str
+
+
+def method_label(method: str) -> str:
+    """A method as the page calls it."""
+    return _LABELS[method]
+
+
+def format_results(results: Sequence[SequenceResult | Omission], command: str, complete: bool = True) -> str:
+    """The results as a Markdown page."""
+    lines = [*opening("Results", command, "."), _WORDS.format(threads=cv2.getNumThreads())]
+    if not complete:
+        lines += ["**Stopped before the end: what is missing was not run.**", ""]
+    for missing in results:
+        if isinstance(missing, Omission) and not missing.method:
+            lines += [f"{missing.sequence} is left out: {missing.reason}", ""]
+    for sequence in dict.fromkeys(result.sequence for result in results if isinstance(result, SequenceResult)):
+        of_sequence = [
+            result for result in results if isinstance(result, SequenceResult) and result.sequence == sequence
+        ]
+        lines += [f"## {sequence}", "", *table(_COLUMNS, (_row(result) for result in of_sequence)), ""]
+        for missing in results:
+            if isinstance(missing, Omission) and missing.method and missing.sequence == sequence:
+                lines += [f"The row *{_LABELS[missing.method]}* is left out: {missing.reason}", ""]
+        staged = [each for each in of_sequence if each.trial.frames and "filter" in each.trial.frames.milliseconds]
+        if staged:
+            lines += [*table(_STAGE_COLUMNS, map(_stage_row, staged)), ""]
+        for result in of_sequence:
+            lines += _relative_lines(result)
+    return "\n".join(lines)
+
+
+def _relative_lines(result: SequenceResult) -> list[str]:
+    """Consistency of relative poses of a method that says it, with the sigmas of the truth."""
+    spans = result.trial.evaluation.relative
+    if result.method != "ours" or not spans:
+        return []
+    sigmas = result.truth_sigmas
+    truth = "exact" if sigmas is None else f"{sigmas[0]:g} m and {sigmas[1]:g} degrees in each pose"
+    rows = (
+        [
+            each.span,
+            str(each.count),
+            f"{each.mean_nees:.2f}",
+            f"{each.median_nees:.2f}",
+            f"{100 * each.inside:.0f}",
+            f"{each.translation_rmse:.2g}",
+            f"{each.translation_sigma:.2g}",
+            _number(100 * each.truth_share, ".0f"),
+        ]
+        for each in spans
+    )
+    return [f"Relative poses of *ours*; sigmas of the truth: {truth}.", "", *table(_RELATIVE_COLUMNS, rows), ""]
+
+
+def ate_cell(result: SequenceResult) -> str:
+    """Metres; more digits inside a body."""
+    rmse = result.trial.evaluation.ate.rmse
+    return f"{rmse:.4f}" if rmse >= 1e-3 else f"{rmse:.6f}"
+
+
+def total_cell(result: SequenceResult) -> str:
+    """Milliseconds a frame, and their spread where there is one."""
+    if result.trial.frames is None:
+        seconds, share = _seconds_adjusting(result)
+        return f"{share:.0f} (whole: {seconds:.1f} s)"
+    low, middle, high = np.percentile(_totals(result.trial.frames), [10, 50, 90])
+    return f"{middle:.0f} ({low:.0f} - {high:.0f})"
+
+
+def _row(result: SequenceResult) -> list[str]:
+    evaluation, frames, refined = result.trial.evaluation, result.trial.frames, result.refined
+    translations, rotations = evaluation.rpe.translations, evaluation.rpe.rotations_deg
+    ends_tracked, nis = np.ones(len(translations), bool), np.nan
+    if frames is not None:
+        tracked = np.isin(frames.status, ("tracking", "relocalised"))
+        count = f"{tracked.sum()} of {len(frames) - 1}"
+        # Frame k ends step k - 1; frames that were skipped, or before the start, have no pose and no step.
+        ends = tracked[np.isfinite(frames.columns["inliers"])][1:]
+        ends_tracked = ends if len(ends) == len(translations) else ends_tracked
+        if tracked.any():
+            updated = frames.columns["dof"] > 0  # a relocalised frame is not
+            nis = float(np.median(frames.columns["nis"][updated] / frames.columns["dof"][updated]))
+        offset, sigma = (float(frames.columns[name][-1]) for name in ("disparity_offset", "disparity_offset_sigma"))
+        pace = float(np.median(_totals(frames)))
+    else:
+        assert refined is not None
+        count = f"{refined['keyframes']} keyframes"
+        offset, sigma = refined["disparity_offset"], refined["disparity_offset_sigma"]
+        _, pace = _seconds_adjusting(result)
+    return [
+        _LABELS[result.method],
+        count,
+        ate_cell(result),
+        _number(evaluation.kitti.mean_translation_percent, ".2f"),
+        _number(evaluation.kitti.mean_rotation_deg_per_100m, ".2f"),
+        _number(1e3 * float(np.median(translations[ends_tracked])) if ends_tracked.any() else np.nan, ".2f"),
+        _number(float(np.median(rotations[ends_tracked])) if ends_tracked.any() else np.nan, ".3f"),
+        _number(nis, ".2f"),
+        _number(result.nees, ".2f"),
+        f"{offset:+.2f} ± {sigma:.2f}" if np.isfinite(offset) else "-",
+        total_cell(result),
+        f"{1e3 / pace:.1f}",
+    ]
+
+
+def _stage_row(result: SequenceResult) -> list[str]:
+    frames, tracked = result.trial.table, result.trial.tracked
+    inliers = float(np.median(frames.columns["inliers"][tracked])) if tracked.any() else np.nan
+    stages = (f"{np.nanmedian(frames.milliseconds[stage]):.1f}" for stage in _STAGES)
+    return [_LABELS[result.method], _number(inliers, ".0f"), *stages]
+
+
+def _totals(frames: FrameTable) -> np.ndarray:
+    """Milliseconds of each frame without the reading of files, which the baselines leave out too."""
+    stages = np.array([values for stage, values in frames.milliseconds.items() if stage != "read"])
+    return np.asarray(np.nansum(stages, axis=0)[np.isfinite(stages).any(axis=0)])
+
+
+def _seconds_adjusting(result: SequenceResult) -> tuple[float, float]:
+    """Of the whole optimisation, and milliseconds a frame."""
+    assert result.refined is not None
+    seconds = float(result.refined["seconds_adjust"])
+    return seconds, 1e3 * seconds / result.refined["frames"]
+
+
+def _number(value: float, form: str) -> str:
+    return "-" if not np.isfinite(value) else format(value, form)

@@ -1,0 +1,140 @@
+"""A shaken camera with a slow shutter: whether frames that are called tracked are right, beside KLT + PnP."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable
+from contextlib import redirect_stderr
+from functools import cache, partial
+from pathlib import Path
+
+import numpy as np
+
+from sigmaslam.readers.trajectory_files import read_trajectory
+from sigmaslam.runs.track import track_sequence
+from sigmaslam.slam.tracker import TrackerConfig
+from sigmaslam_benchmarks.tracking import pnp_baselines
+from sigmaslam_benchmarks.tracking.pnp_baselines import track_with_pnp
+from sigmaslam_benchmarks.tracking.shake_page import GROSS, ShakenSequence, ShakeResult, format_page
+from sigmaslam_benchmarks.tracking.trial_pool import SequenceTrials, TrialKind, write_trials
+from sigmaslam_benchmarks.trial import Method, Trial, hash_code, rendered_truth
+from sigmaslam_evaluation.metrics.claimed_errors import MotionErrors, motion_errors
+from sigmaslam_evaluation.metrics.image_motion import ImageMotion, read_image_motion
+from sigmaslam_evaluation.metrics.map_consistency import coverage
+from sigmaslam_evaluation.rendered_camera import open_rendered
+from sigmaslam_synthetic.presets import PRESETS
+from sigmaslam_synthetic.render_choices import CARRIED
+from sigmaslam_synthetic.simulation import Recipe
+
+METHODS: dict[str, Method] = {
+    "ours": partial(track_sequence, threads=1),
+    "KLT + PnP": partial(track_with_pnp, matcher="klt"),
+}
+"""The first is what goals are for."""
+FRAMES = 60
+MOVERS = 0.3
+"""Share of the image that moves on its own in every second sequence."""
+_FIRST_SEED = 1000  # seeds below were looked at while the tracker was made
+_MOTION = "image motion"  # kept beside the methods' results
+
+
+def write_shake(
+    path: Path,
+    runs: Path,
+    seeds: int,
+    workers: int,
+    command: str,
+    ray: str | None = None,
+    note: Callable[[str], None] = lambda text: None,
+) -> str:
+    """Renders and tracks what is missing, writes the page and returns it; notes in it are kept.
+
+    A result is used again when it comes from the same recipe and code.
+
+    Args:
+        path: Markdown page.
+        runs: folder for renders and results.
+        seeds: sequences, of the worlds in turn; every second one has movers.
+        workers: processes; each takes a sequence at a time.
+        command: what the page says it was made by.
+        ray: address of a Ray cluster, as `run_jobs` takes it.
+        note: is told of progress.
+    Raises:
+        OutputError: as of `write_trials`.
+    """
+
+    def form(done: list[SequenceTrials], missing: list[str]) -> str:
+        sequences = {_describe(trials): trials for trials in done}
+        results = {
+            method: {sequence: ShakeResult(**trials.read(method) or {}) for sequence, trials in sequences.items()}
+            for method in METHODS
+        }
+        return format_page(results, FRAMES, (_FIRST_SEED, seeds), command, missing)
+
+    kind = TrialKind(dict.fromkeys([_MOTION, *METHODS], TrackerConfig()), _judge, _hash_code)
+    recipes = [recipe(k, _FIRST_SEED) for k in range(seeds)]
+    return write_trials(path, runs, kind, recipes, form, workers, ray, note)
+
+
+def _describe(trials: SequenceTrials) -> ShakenSequence:
+    """What the page says of a sequence itself."""
+    recipe, preset = trials.recipe, PRESETS[trials.recipe.preset]
+    size = (recipe.width or preset.width, recipe.height or preset.height)
+    return ShakenSequence(recipe.name, size, recipe.movers, ImageMotion(**trials.read(_MOTION) or {}))
+
+
+@cache
+def _hash_code() -> str:
+    return hash_code(Path(__file__), Path(pnp_baselines.__file__))
+
+
+def recipe(number: int, first_seed: int) -> Recipe:
+    """Of a sequence by its number from 0 on: two of each world, the second with movers."""
+    preset, movers = CARRIED[number // 2 % len(CARRIED)], MOVERS * (number % 2)
+    return Recipe(preset, FRAMES, first_seed + number, "shaken", movers, "slow")
+
+
+def judge(source: Path, method: Method) -> ShakeResult:
+    """Tracks a rendered folder and holds it against its truth."""
+    truth = rendered_truth(source)
+    with tempfile.TemporaryDirectory() as scratch:
+        run = Path(scratch) / "run"
+        with Path(os.devnull).open("w") as nowhere, redirect_stderr(nowhere):
+            trial = Trial(open_rendered(source), truth, method).run(run)
+        covariance = np.load(run / "covariance.npy")
+    evaluation, estimate, true = trial.evaluation, trial.trajectory, read_trajectory(truth)
+    assert evaluation.nees is not None
+    rate = round(1.0 / float(np.median(np.diff(estimate.timestamps))))
+    step, second, start = (motion_errors(estimate, true, covariance, frames) for frames in (1, rate, None))
+    tracked = trial.tracked_poses
+    tracked[0] = False
+    return ShakeResult(
+        tracking=int(tracked.sum()),
+        lost=len(trial.table) - 1 - int(tracked.sum()),
+        ate=evaluation.ate.rmse,
+        path_length=evaluation.path_length,
+        nees=evaluation.nees.mean,
+        inside=coverage(evaluation.nees.per_frame, 6),
+        wrong_step=_wrong(step, tracked),
+        wrong_second=_wrong(second, tracked),
+        wrong_start=_wrong(start, tracked),
+        worst_step=_largest(step.sigmas[tracked]),
+        worst_second=_largest(second.sigmas[tracked]),
+        worst_start=_largest(start.sigmas[tracked]),
+        step_metres=_largest(step.metres[tracked]),
+        step_degrees=_largest(step.degrees[tracked]),
+    )
+
+
+def _judge(source: Path, recipe: Recipe, method: str) -> ImageMotion | ShakeResult:
+    return read_image_motion(source) if method == _MOTION else judge(source, METHODS[method])
+
+
+def _wrong(errors: MotionErrors, tracked: np.ndarray) -> list[int]:
+    return np.flatnonzero((errors.sigmas > GROSS) & tracked).tolist()
+
+
+def _largest(values: np.ndarray) -> float:
+    values = values[np.isfinite(values)]
+    return float(values.max()) if len(values) else float("nan")

@@ -1,0 +1,203 @@
+"""Other people's stereo odometry, driven as its documentation has it, on rectified pairs.
+
+cuVSLAM by the package `dim-odom`, on the CPU; ORB-SLAM3 by the package `pyorbslam3`. ORB-SLAM3 is under the GPL and
+cuVSLAM under NVIDIA's Community License: both are peers to compare with while SigmaSLAM is developed, nothing else
+imports them. They come with the extra `peers`.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sigmaslam.errors import SigmaSlamError
+from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam.geometry.rectification import StereoRectifier
+from sigmaslam.geometry.se3 import quaternion_to_matrix
+from sigmaslam.readers import StereoFrame, StereoSequence
+from sigmaslam_benchmarks.tracking.peer_run import PeerStep, write_peer_run
+
+_NO_TURN = (0.0, 0.0, 0.0, 1.0)
+# As in ORB-SLAM3's own settings for EuRoC and for KITTI.
+_WIDE, _ORB_KEYPOINTS, _ORB_KEYPOINTS_WIDE = 1000, 1200, 2000
+_ORB_SETTINGS = """\
+%YAML:1.0
+Camera.type: "PinHole"
+Camera.fx: {fx}
+Camera.fy: {fy}
+Camera.cx: {cx}
+Camera.cy: {cy}
+Camera.k1: 0.0
+Camera.k2: 0.0
+Camera.p1: 0.0
+Camera.p2: 0.0
+Camera.bf: {focal_baseline}
+Camera.width: {width}
+Camera.height: {height}
+Camera.fps: {rate}
+Camera.RGB: 1
+ThDepth: 35.0
+ORBextractor.nFeatures: {keypoints}
+ORBextractor.scaleFactor: 1.2
+ORBextractor.nLevels: 8
+ORBextractor.iniThFAST: 20
+ORBextractor.minThFAST: 7
+Viewer.KeyFrameSize: 0.05
+Viewer.KeyFrameLineWidth: 1.0
+Viewer.GraphLineWidth: 0.9
+Viewer.PointSize: 2.0
+Viewer.CameraSize: 0.08
+Viewer.CameraLineWidth: 3.0
+Viewer.ViewpointX: 0.0
+Viewer.ViewpointY: -0.7
+Viewer.ViewpointZ: -1.8
+Viewer.ViewpointF: 500.0
+"""
+
+
+class MissingPeerError(SigmaSlamError):
+    """A peer, or something that it needs, is not installed."""
+
+
+class CuvslamPeer:
+    """cuVSLAM, stereo, without a GPU.
+
+    Args:
+        camera: of the rectified pairs.
+    Raises:
+        MissingPeerError: the package or a library that it loads is not installed.
+    """
+
+    def __init__(self, camera: RectifiedStereo) -> None:
+        try:
+            import dim_odom
+        except ImportError as error:
+            raise _not_installed("dim_odom", error) from error
+        self.version = f"dim-odom {version('dim-odom')}"
+        self._package, self._camera = dim_odom, camera
+        # The body frame that it asks for is the left camera's.
+        self._places = {"base_link": 0.0, "left": 0.0, "right": camera.baseline}
+        self._tracker = dim_odom.CuvslamOdometry({"camera_mode": "stereo", "use_gpu": False}, tf=self._mount)
+        matrix = camera.matrix.ravel().tolist()
+        for eye in ("left", "right"):
+            self._tracker.handle_camera_info(
+                dim_odom.CameraModel(0, eye, camera.width, camera.height, [0.0] * 5, matrix)
+            )
+
+    def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> np.ndarray | None:
+        """T_world_camera (4, 4) of a rectified pair (H, W) uint8; None when it is lost."""
+        estimate = None
+        for eye, image in (("left", left), ("right", right)):
+            height, width = image.shape
+            frame = self._package.ImageFrame(
+                round(1e9 * timestamp), eye, width, height, "mono8", width, image.tobytes()
+            )
+            estimate = self._tracker.handle_image(frame)
+        if estimate is None:
+            return None
+        pose = np.eye(4)
+        pose[:3, :3] = quaternion_to_matrix(np.array(estimate.rotation_xyzw))
+        pose[:3, 3] = estimate.translation
+        return pose
+
+    def close(self) -> None:
+        """It needs no end."""
+
+    def _mount(self, parent: str, child: str) -> tuple[tuple[float, float, float], tuple[float, ...]] | None:
+        if parent not in self._places or child not in self._places:
+            return None
+        return (self._places[child] - self._places[parent], 0.0, 0.0), _NO_TURN
+
+
+class OrbSlamPeer:
+    """ORB-SLAM3, stereo, without a viewer; its mapping and loop closure run in threads of their own.
+
+    Args:
+        camera: of the rectified pairs.
+        rate: frames per second.
+    Raises:
+        MissingPeerError: the package or its vocabulary is not there.
+    """
+
+    def __init__(self, camera: RectifiedStereo, rate: float) -> None:
+        try:
+            import pyorbslam3
+        except ImportError as error:
+            raise _not_installed("pyorbslam3", error) from error
+        self.version = f"pyorbslam3 {version('pyorbslam3')}"
+        try:
+            vocabulary = pyorbslam3.vocabulary_path(download=False)
+        except FileNotFoundError as error:
+            raise MissingPeerError(
+                "its vocabulary is not here: call `pyorbslam3.vocabulary_path()` once, which downloads it, or set "
+                "PYORBSLAM3_VOCAB to an ORBvoc.txt"
+            ) from error
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "settings.yaml"
+            path.write_text(orb_settings(camera, rate), encoding="utf-8")
+            self._slam: Any = pyorbslam3.Slam(vocabulary, path, pyorbslam3.Sensor.STEREO, use_viewer=False)
+
+    def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> np.ndarray | None:
+        """T_world_camera (4, 4) of a rectified pair (H, W) uint8; None when it is lost."""
+        result = self._slam.track_stereo(left, right, timestamp)
+        return np.array(result.pose_wc, np.float64) if result.pose_valid else None
+
+    def close(self) -> None:
+        """Ends its threads."""
+        self._slam.shutdown()
+
+
+def orb_settings(camera: RectifiedStereo, rate: float) -> str:
+    """The settings file of ORB-SLAM3 for rectified pairs.
+
+    It is in the older of its two forms: with the newer one, `Camera.type: "Rectified"`, pyorbslam3 0.1.1 crashes.
+    It asks for the viewer's settings also where there is no viewer.
+    """
+    keypoints = _ORB_KEYPOINTS_WIDE if camera.width > _WIDE else _ORB_KEYPOINTS
+    return _ORB_SETTINGS.format(
+        fx=float(camera.fx),
+        fy=float(camera.fy),
+        cx=float(camera.cx),
+        cy=float(camera.cy),
+        focal_baseline=float(camera.focal_baseline),
+        width=camera.width,
+        height=camera.height,
+        rate=float(rate),
+        keypoints=keypoints,
+    )
+
+
+def track_with_cuvslam(sequence: StereoSequence, out: Path) -> None:
+    """Tracks a sequence; leaves trajectory.tum, without frames that are lost, and frames.csv in the new folder `out`.
+
+    Raises:
+        MissingPeerError: see `CuvslamPeer`.
+    """
+    rectifier = StereoRectifier(sequence.camera)
+    peer = CuvslamPeer(rectifier.rectified)
+    T_rectified_left = np.eye(4)
+    T_rectified_left[:3, :3] = rectifier.R_rectified_left
+
+    has_started = False
+
+    def step(frame: StereoFrame) -> PeerStep:
+        nonlocal has_started
+        pose = peer.step(*rectifier.rectify(frame.left, frame.right), frame.timestamp)
+        if pose is None:
+            return PeerStep(None, "lost")
+        status, has_started = "tracking" if has_started else "starting", True
+        return PeerStep(T_rectified_left.T @ pose @ T_rectified_left, status)
+
+    write_peer_run(sequence, out, step)
+    peer.close()
+
+
+def _not_installed(module: str, error: ImportError) -> MissingPeerError:
+    """Says what is missing: the package, or a library that it loads."""
+    if isinstance(error, ModuleNotFoundError) and error.name == module:
+        return MissingPeerError(f"{module} is not installed: pip install 'sigmaslam[peers]'")
+    return MissingPeerError(f"{module} cannot be imported ({error}): pip install 'sigmaslam[peers]'")

@@ -1,0 +1,285 @@
+"""One method over decoded pairs, in a process of its own, so that its start-up, memory and CPU time are its own.
+
+`python -m sigmaslam_benchmarks.tracking.time_method JOB` prints one JSON object; JOB is a `TimingJob` as JSON. What
+only some methods need is imported by them alone: start-up counts it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+import sigmaslam
+from sigmaslam.errors import SigmaSlamError
+from sigmaslam_benchmarks.tracking.decoded_pairs import DecodedPairs, open_pairs
+from sigmaslam_benchmarks.tracking.stereo_peers import CuvslamPeer, MissingPeerError, OrbSlamPeer
+
+WARM_UP = 2
+"""Frames that are not counted: they build what later ones use."""
+OURS = {"ours": "learned", "sift": "sift", "orb": "orb", "klt": "klt"}
+"""The tracker's front-end by method."""
+PNP = {"klt-pnp": "klt", "sift-pnp": "sift"}
+"""The matcher of the odometry from OpenCV by method."""
+PEERS = ("cuvslam", "orbslam3")
+METHODS = (*OURS, *PNP, *PEERS)
+"""In the order of the page."""
+
+
+@dataclass(frozen=True, slots=True)
+class TimingJob:
+    """What is timed.
+
+    Attributes:
+        pairs: folder of `write_pairs`.
+        method: of `METHODS`.
+        threads: of every library; the process is held on so many cores.
+        settings: of `TrackerConfig` that differ from the defaults; ours alone.
+    """
+
+    pairs: str
+    method: str
+    threads: int = 1
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class MethodTiming:
+    """What a method took for N frames after the warm-up, and the poses of all that it tracked.
+
+    Attributes:
+        cpu_ms: (N,) CPU time of all threads of the process from one frame to the next, without the reading of pairs.
+        wall_ms: (N,).
+        stages_ms: (N,) wall time by stage; empty but for ours.
+        keyframe: (N,) whether the frame became a keyframe; False but for ours.
+        landmarks: (N,) matched; 0 for the peers.
+        frames: of the sequence.
+        timestamps, poses: (M,) and (M, 4, 4) T_world_camera, of the frames with a pose.
+        first_pose_s: from the start of the process to the pose of the second frame; NaN without one.
+        peak_mib: largest resident memory.
+        version: of a peer's package.
+    """
+
+    cpu_ms: list[float]
+    wall_ms: list[float]
+    stages_ms: dict[str, list[float]]
+    keyframe: list[bool]
+    landmarks: list[int]
+    frames: int
+    timestamps: list[float]
+    poses: list[list[list[float]]]
+    first_pose_s: float
+    peak_mib: float
+    version: str = ""
+
+
+class FailedMethodError(SigmaSlamError):
+    """A method's process ended without a result."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    pose: np.ndarray | None
+    landmarks: int = 0
+    keyframe: bool = False
+    stages_ms: dict[str, float] = field(default_factory=dict)
+
+
+class _Method(Protocol):
+    """Steps through the pairs."""
+
+    rectified: bool
+    version: str
+
+    def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> _Step: ...
+
+    def close(self) -> None: ...
+
+
+def time_method(job: TimingJob) -> MethodTiming:
+    """Times a method in a process of its own.
+
+    Raises:
+        MissingPeerError: it is not installed.
+        FailedMethodError: the process ended otherwise than with a result.
+    """
+    package = Path(sigmaslam.__file__).parents[1]
+    paths = [str(package), *filter(None, [os.environ.get("PYTHONPATH")])]
+    # Libraries read their number of threads when they are loaded.
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), str(job.threads))
+    done = subprocess.run(
+        [sys.executable, "-m", __spec__.name, json.dumps({"started": time.time(), "job": asdict(job)})],
+        env={**os.environ, **threads, "PYTHONPATH": os.pathsep.join(paths)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode:
+        last = [line for line in re.sub(r"\x1b\[[0-9;]*m", "", done.stderr).splitlines() if line.strip()][-1:]
+        raise FailedMethodError(": ".join([f"its process ended with code {done.returncode}", *last]))
+    content = json.loads(done.stdout)
+    if "missing" in content:
+        raise MissingPeerError(content["missing"])
+    return MethodTiming(**content)
+
+
+def run_job(job: TimingJob, started: float) -> MethodTiming:
+    """Times a method in this process.
+
+    Args:
+        job: what is timed.
+        started: time.time() when the process was started.
+    """
+    _hold_on_cores(job.threads)
+    pairs = open_pairs(Path(job.pairs))
+    method = _open(job, pairs)
+    steps, walls, own, others = [], [], [], []
+    first_pose = float("nan")
+    for index, timestamp in enumerate(pairs.timestamps):
+        left, right = pairs.read(index, method.rectified)
+        others.append(_other_threads())
+        cpu, wall = time.thread_time(), time.perf_counter()
+        step = method.step(left, right, timestamp)
+        own.append(time.thread_time() - cpu)
+        walls.append(time.perf_counter() - wall)
+        if index and step.pose is not None and np.isnan(first_pose):
+            first_pose = time.time() - started
+        steps.append(step)
+    # Threads in the background go on while the next pair is read.
+    cpus = np.array(own) + np.diff([*others, _other_threads()])
+    peak = _peak_mib()
+    method.close()
+    counted = steps[WARM_UP:]
+    tracked = [(time, step.pose) for time, step in zip(pairs.timestamps, steps, strict=True) if step.pose is not None]
+    return MethodTiming(
+        cpu_ms=_milliseconds(cpus[WARM_UP:]),
+        wall_ms=_milliseconds(walls[WARM_UP:]),
+        stages_ms={stage: [step.stages_ms[stage] for step in counted] for stage in steps[-1].stages_ms},
+        keyframe=[step.keyframe for step in counted],
+        landmarks=[step.landmarks for step in counted],
+        frames=len(steps),
+        timestamps=[time for time, _ in tracked],
+        poses=[pose.tolist() for _, pose in tracked],
+        first_pose_s=first_pose,
+        peak_mib=peak,
+        version=method.version,
+    )
+
+
+def _open(job: TimingJob, pairs: DecodedPairs) -> _Method:
+    if job.method in PEERS:
+        return _Peer(job.method, pairs)
+    import cv2
+
+    cv2.setNumThreads(job.threads)
+    if job.method in PNP:
+        return _Pnp(PNP[job.method], pairs)
+    return _Ours(job, pairs)
+
+
+class _Ours:
+    rectified = False
+
+    def __init__(self, job: TimingJob, pairs: DecodedPairs) -> None:
+        from sigmaslam.slam.tracker import StereoTracker, TrackerConfig
+
+        self.version = ""
+        config = TrackerConfig(**job.settings)
+        self._tracker = StereoTracker(pairs.camera, OURS[job.method], config=config, threads=job.threads)
+
+    def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> _Step:
+        estimate = self._tracker.step(left, right, timestamp)
+        pose = estimate.T_world_camera if estimate.has_pose and estimate.status != "lost" else None
+        return _Step(pose, estimate.inliers, estimate.tracks is not None, estimate.milliseconds)
+
+    def close(self) -> None:
+        """It needs no end."""
+
+
+class _Pnp:
+    rectified = False
+
+    def __init__(self, matcher: str, pairs: DecodedPairs) -> None:
+        from sigmaslam_benchmarks.tracking.pnp_baselines import PnpOdometry
+
+        self.version = ""
+        self._odometry = PnpOdometry(pairs.camera, matcher)
+
+    def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> _Step:
+        step = self._odometry.step(left, right)
+        return _Step(None if step.status == "lost" else step.T_world_camera, step.inliers)
+
+    def close(self) -> None:
+        """It needs no end."""
+
+
+class _Peer:
+    rectified = True
+
+    def __init__(self, name: str, pairs: DecodedPairs) -> None:
+        peer: CuvslamPeer | OrbSlamPeer
+        if name == "cuvslam":
+            peer = CuvslamPeer(pairs.rectified)
+        else:
+            peer = OrbSlamPeer(pairs.rectified, 1.0 / float(np.median(np.diff(pairs.timestamps))))
+        self._peer, self.version = peer, peer.version
+
+    def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> _Step:
+        return _Step(self._peer.step(left, right, timestamp))
+
+    def close(self) -> None:
+        self._peer.close()
+
+
+def _hold_on_cores(count: int) -> None:
+    """Keeps this process on the first cores that it may use, where the system can."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:count])
+
+
+def _other_threads() -> float:
+    """CPU seconds so far of all threads but this one."""
+    return time.process_time() - time.thread_time()
+
+
+def _milliseconds(seconds: Iterable[float]) -> list[float]:
+    return [round(1e3 * float(each), 3) for each in seconds]
+
+
+def _peak_mib() -> float:
+    """Largest resident memory of this process."""
+    status = Path("/proc/self/status")
+    if status.exists():
+        # getrusage has the peak of the parent, too, from before this process was its own.
+        (line,) = (line for line in status.read_text(encoding="ascii").splitlines() if line.startswith("VmHWM:"))
+        return int(line.split()[1]) / 1024.0
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1024.0**2 if sys.platform == "darwin" else 1024.0)
+
+
+def main() -> None:
+    """Does the job of the command line."""
+    # What libraries print goes to the standard error: the standard output is the result's alone.
+    result = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    content = json.loads(sys.argv[1])
+    try:
+        answer = asdict(run_job(TimingJob(**content["job"]), content["started"]))
+    except MissingPeerError as error:
+        answer = {"missing": str(error)}
+    with result:
+        json.dump(answer, result)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,234 @@
+"""A trial: a sequence is rendered or opened, tracked by one method, evaluated, and its run folder read back."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sigmaslam import errors
+from sigmaslam.errors import InputError
+from sigmaslam.files import atomic_write_text
+from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.inference.onnx_graph import shipped_weights
+from sigmaslam.readers import StereoSequence, open_sequence
+from sigmaslam.readers.trajectory_files import read_trajectory
+from sigmaslam.runs.frame_table import FrameTable, read_frames
+from sigmaslam.runs.run_folder import check_has_trajectory
+from sigmaslam.runs.track import track_sequence
+from sigmaslam_evaluation.evaluation_result import Evaluation
+from sigmaslam_evaluation.run_evaluation import evaluate_run
+
+if TYPE_CHECKING:
+    from sigmaslam.slam.tracker import TrackerConfig
+    from sigmaslam_synthetic.simulation import Recipe
+
+# Folders of the package whose code a result depends on, beside the graphs.
+_CODE = (
+    ".",
+    "estimation",
+    "evaluation",
+    "evaluation/metrics",
+    "frontend",
+    "fusion",
+    "geometry",
+    "image_filtering",
+    "inference",
+    "readers",
+    "runs",
+    "slam",
+    "two_view",
+)
+
+_EUROC_TRUTH = Path("mav0") / "state_groundtruth_estimate0" / "data.csv"
+
+Method = Callable[[StereoSequence, Path], object]
+"""Writes what it makes of a sequence into a new run folder: `track_sequence`, or another one with its arguments."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrialResult:
+    """What a run folder holds, and its evaluation.
+
+    Attributes:
+        trajectory: estimated poses.
+        frames: the rows of frames.csv; None for a method that does not write it.
+        point_map: the arrays of map.npz; empty for a method that does not write it.
+        evaluated: against the truth; None for a trial without truth.
+    """
+
+    trajectory: Trajectory
+    frames: FrameTable | None
+    point_map: dict[str, np.ndarray]
+    evaluated: Evaluation | None
+
+    @property
+    def table(self) -> FrameTable:
+        """Every frame, of a method that writes frames.csv."""
+        assert self.frames is not None
+        return self.frames
+
+    @property
+    def evaluation(self) -> Evaluation:
+        """The evaluation of a trial with truth."""
+        assert self.evaluated is not None
+        return self.evaluated
+
+    @property
+    def tracked(self) -> np.ndarray:
+        """(N,) bool, frames with a pose from the images, without the first and relocalised ones."""
+        return np.array(self.table.status) == "tracking"
+
+    @property
+    def tracked_poses(self) -> np.ndarray:
+        """(M,) bool, `tracked` of the frames of the trajectory, in which frames before the start have no row."""
+        rows = np.searchsorted(self.table.columns["timestamp"], self.trajectory.timestamps - 1e-6)
+        return self.tracked[rows]
+
+    @property
+    def nis(self) -> np.ndarray:
+        """(M,) normalised innovation squared per degree of freedom of the tracked frames."""
+        columns = self.table.columns
+        return np.asarray(columns["nis"][self.tracked] / columns["dof"][self.tracked])
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One method on one sequence.
+
+    Attributes:
+        source: what `open_sequence` opens, or a sequence that is open.
+        truth: trajectory file; None: nothing is evaluated.
+        method: tracks the sequence.
+        truth_sigmas: of the true poses, metres and degrees, as `evaluate_run` takes them; None: exact.
+    """
+
+    source: Path | StereoSequence
+    truth: Path | None
+    method: Method = track_sequence
+    truth_sigmas: tuple[float, float] | None = None
+
+    def run(
+        self, out: Path | None = None, lengths: Sequence[float] | None = None, step: int | None = None
+    ) -> TrialResult:
+        """Tracks and evaluates.
+
+        Args:
+            out: run folder; a temporary one unless given.
+            lengths, step: KITTI segments, as `evaluate_run` takes them.
+        """
+        if out is None:
+            with tempfile.TemporaryDirectory() as scratch:
+                return self.run(Path(scratch) / "run", lengths, step)
+        sequence = open_sequence(self.source) if isinstance(self.source, Path) else self.source
+        self.method(sequence, out)
+        return read_trial(out, self.truth, lengths, step, self.truth_sigmas)
+
+
+def read_trial(
+    run: Path,
+    truth: Path | None,
+    lengths: Sequence[float] | None = None,
+    step: int | None = None,
+    truth_sigmas: tuple[float, float] | None = None,
+) -> TrialResult:
+    """The result of a trial whose run folder is there; arguments as `Trial` and `Trial.run` take them."""
+    check_has_trajectory(run)
+    point_map = {}
+    if (run / "map.npz").is_file():
+        with np.load(run / "map.npz") as content:
+            point_map = dict(content)
+    evaluated = None
+    if truth is not None:
+        position, rotation = truth_sigmas or (None, None)
+        evaluated = evaluate_run(
+            run,
+            truth,
+            lengths=lengths,
+            step=step,
+            plot=False,
+            truth_sigma_position=position,
+            truth_sigma_rotation=rotation,
+        )
+    return TrialResult(
+        read_trajectory(run / "trajectory.tum"),
+        read_frames(run / "frames.csv") if (run / "frames.csv").is_file() else None,
+        point_map,
+        evaluated,
+    )
+
+
+def render(folder: Path, recipe: Recipe, workers: int, done: Callable[[int], None] = lambda frames: None) -> Path:
+    """Renders a sequence with its landmarks into a folder of its name, and returns where it is.
+
+    Frames that are there are kept.
+    """
+    from sigmaslam_synthetic.render_sequence import write_sequence
+
+    source = folder / recipe.name
+    write_sequence(source, recipe, "sparse", workers, done=done)
+    return source
+
+
+def rendered_truth(source: Path) -> Path:
+    """The file of the true poses in a rendered folder, of either layout."""
+    truth = source / _EUROC_TRUTH
+    return truth if truth.is_file() else source / "poses.txt"
+
+
+@dataclass(frozen=True, slots=True)
+class TrialCache:
+    """Figures of trials as JSON files, used again while recipe, configuration and code are the same.
+
+    Attributes:
+        folder: of the files.
+        code: hash of the code, see `hash_code`.
+    """
+
+    folder: Path
+    code: str
+
+    def read(self, recipe: Recipe, method: str, config: TrackerConfig) -> dict[str, Any] | None:
+        """The figures of a method on a rendered sequence; None where there are none, or of something else.
+
+        Raises:
+            InputError: the file is not of this cache.
+        """
+        path = self._path(recipe, method)
+        if not path.is_file():
+            return None
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise InputError(f"{path} is no result of this benchmark ({error}): remove it") from error
+        asked = json.loads(json.dumps(self._made_from(recipe, config)))
+        return dict(content["result"]) if content.get("made_from") == asked else None
+
+    def write(self, recipe: Recipe, method: str, config: TrackerConfig, figures: dict[str, Any]) -> None:
+        """Keeps the figures of a method on a rendered sequence."""
+        content = {"made_from": self._made_from(recipe, config), "result": figures}
+        atomic_write_text(self._path(recipe, method), json.dumps(content, indent=1) + "\n")
+
+    def _path(self, recipe: Recipe, method: str) -> Path:
+        slug = "".join(letter if letter.isalnum() else "_" for letter in method)
+        return self.folder / f"{recipe.name}-{slug}.json"
+
+    def _made_from(self, recipe: Recipe, config: TrackerConfig) -> dict[str, Any]:
+        return {"recipe": asdict(recipe), "configuration": asdict(config), "code": self.code}
+
+
+def hash_code(*others: Path) -> str:
+    """Hash of everything between the images and a result: the tracker, its graphs, the evaluation, and other files."""
+    package = Path(errors.__file__).parent
+    sources = [path for folder in _CODE for path in (package / folder).glob("*.py")]
+    sources += [*shipped_weights("features.onnx").parent.glob("*.onnx"), *others]
+    digest = hashlib.sha256()
+    for path in sorted(sources):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()

@@ -1,0 +1,239 @@
+"""Evaluate a run, or a trajectory of any origin, against the truth."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from sigmaslam.bounded_files import TABLE_BYTES, read_text
+from sigmaslam.errors import InputError
+from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
+from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.plot_style import has_matplotlib
+from sigmaslam.readers.trajectory_files import kitti_times_path, read_covariances, read_trajectory, trajectory_format
+from sigmaslam.runs.figures import save_png
+from sigmaslam.runs.frame_table import FRAMES_NAME, FrameTable, predicted_poses, read_frames
+from sigmaslam.runs.relative_pose_file import RELATIVE_POSES_NAME, read_frame_pairs
+from sigmaslam.runs.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY, check_has_trajectory
+from sigmaslam_evaluation.evaluation_figure import draw_evaluation
+from sigmaslam_evaluation.evaluation_result import Evaluation, FinalErrors
+from sigmaslam_evaluation.kept_evaluation import keep_evaluation
+from sigmaslam_evaluation.metrics.relative_consistency import SpanConsistency, relative_consistency
+from sigmaslam_evaluation.metrics.trajectory_errors import (
+    MAX_DIFFERENCE,
+    absolute_trajectory_error,
+    associate,
+    kitti_errors,
+    pose_nees,
+    relative_pose_error,
+    synchronise,
+)
+from sigmaslam_evaluation.metrics.truth_covariance import truth_covariance
+from sigmaslam_evaluation.truth_conventions import TruthConvention, find_convention, find_time_unit, scale_times
+
+_LOGGER = logging.getLogger(__name__)
+# An error is of poses relative to others.
+_FEWEST_PAIRS = 2
+
+
+def evaluate_run(
+    run_or_trajectory: Path,
+    truth: Path,
+    *,
+    lengths: Sequence[float] | None = None,
+    step: int | None = None,
+    plot: bool = True,
+    truth_sigma_position: float | None = None,
+    truth_sigma_rotation: float | None = None,
+    truth_convention: TruthConvention | None = None,
+) -> Evaluation:
+    """Compare a run folder or a trajectory file with the truth.
+
+    Frames are paired by time. Where either file is KITTI without times.txt and both have as many poses, or a run has as
+    many frames, they are paired by index; else the 10 Hz of KITTI are assumed and every time must then agree.
+    Of a run with `--track-object` the truth is T_camera_object of any frame that is fixed to the body.
+    The frames of a run are those of its `frames.csv` that have a truth; for a file alone they are as many as fit into
+    the time of the truth at the estimate's rate, and never more than there are true poses. Where the truth would fit in
+    another convention the evaluation says so, and is not changed.
+
+    Args:
+        run_or_trajectory: a folder with `trajectory.tum` (and `covariance.npy`, (N, 6, 6) in the body frame;
+            `trajectory_final.tum` and its covariance are evaluated beside them), or a TUM or KITTI file. Poses
+            relative to earlier ones are judged where it holds `relative_poses.npz`.
+        truth: TUM, KITTI, or EuRoC ground truth.
+        lengths, step: segments of the KITTI errors (see `kitti_errors`).
+        plot: write `evaluation.png` into the run folder or beside the trajectory, where matplotlib is installed; of a
+            run also `evaluation.json` and `evaluation.npz`, with which its report is written anew.
+        truth_sigma_position, truth_sigma_rotation: standard deviations of each true pose, of each coordinate (metres)
+            and about each axis (degrees): part of every NEES; where one alone is given the other is zero.
+        truth_convention: how the truth is to be read; None: as T_world_camera in metres, x before w.
+    Raises:
+        InputError: a file is missing or wrong, no frame has a pose, or the timestamps do not meet.
+    """
+    run_or_trajectory, truth = Path(run_or_trajectory), Path(truth)
+    is_run = run_or_trajectory.is_dir()
+    estimate_path = run_or_trajectory / "trajectory.tum" if is_run else run_or_trajectory
+    frames = None
+    if is_run:
+        check_has_trajectory(run_or_trajectory)
+        if (run_or_trajectory / FRAMES_NAME).is_file():
+            frames = read_frames(run_or_trajectory / FRAMES_NAME)
+    estimate, true, association = _same_clock(estimate_path, truth, frames)
+    paired, _ = associate(estimate, true, 1e-3 if association == "time at 10 Hz" else MAX_DIFFERENCE)
+    if len(paired) < _FEWEST_PAIRS:
+        raise InputError(
+            f"{truth}: one of its {len(true)} poses alone is of the time of a pose of {estimate_path}; two are needed. "
+            "Is it the truth of this run, and are both in the same clock?"
+        )
+    if association == "time at 10 Hz" and len(paired) < len(estimate):
+        raise InputError(
+            f"{truth}: a KITTI file without times.txt beside it is taken as 10 Hz, but only "
+            f"{len(paired)} of the {len(estimate)} poses of {estimate_path} have such times: put the "
+            "times.txt of the images beside the pose file"
+        )
+    follows_object = is_run and _follows_object(run_or_trajectory)
+    convention, has_quaternions = truth_convention or TruthConvention(), trajectory_format(truth) == "tum"
+    if convention.quaternion != "xyzw" and not has_quaternions:
+        raise InputError(f"{truth}: the order of quaternions can be chosen for TUM files alone, and this is none")
+    other = None if follows_object else find_convention(estimate, true, convention, has_quaternions)
+    true = convention.apply(true)
+    of_truth = None
+    if truth_sigma_position is not None or truth_sigma_rotation is not None:
+        of_truth = truth_covariance(truth_sigma_position or 0.0, truth_sigma_rotation or 0.0)
+    relative = _judge_relative_poses(run_or_trajectory, estimate, true, of_truth, follows_object) if is_run else None
+    if follows_object:
+        T_body_followed = _followed_frame(estimate, true)
+        true = Trajectory(true.timestamps, true.poses @ T_body_followed)
+        of_truth = None if of_truth is None else turn_covariance(se3_inverse(T_body_followed), of_truth)
+    covariance = _read_covariance(run_or_trajectory / "covariance.npy", len(estimate)) if is_run else None
+    matched_estimate, matched_truth = synchronise(estimate, true)
+    predicted = np.zeros(len(estimate), bool) if frames is None else predicted_poses(frames, estimate.timestamps)
+    evaluation = Evaluation(
+        estimate_path=estimate_path,
+        truth_path=truth,
+        association=association,
+        matched=len(matched_estimate),
+        frames=_frame_count(frames, estimate, true, len(matched_estimate)),
+        path_length=matched_truth.path_length,
+        estimate_path_length=matched_estimate.path_length,
+        ate=absolute_trajectory_error(estimate, true, "se3"),
+        ate_origin=absolute_trajectory_error(estimate, true, "origin"),
+        rpe=relative_pose_error(estimate, true),
+        kitti=kitti_errors(estimate, true, lengths, step),
+        nees=pose_nees(estimate, true, covariance, of_truth) if covariance is not None else None,
+        relative=relative,
+        figure_path=estimate_path.parent / "evaluation.png" if plot and has_matplotlib() else None,
+        final=_evaluate_final(run_or_trajectory, estimate, true, of_truth) if is_run else None,
+        predicted=int(predicted[associate(estimate, true)[0]].sum()),
+        truth_hint=None if other is None else other.describe(),
+    )
+    if plot and is_run:
+        keep_evaluation(run_or_trajectory, evaluation.to_dict(), estimate, true, evaluation.nees)
+    if evaluation.figure_path:
+        figure = draw_evaluation(evaluation, estimate, true, covariance, predicted)
+        try:
+            save_png(figure, evaluation.figure_path)
+        except (OSError, InputError) as error:
+            _LOGGER.warning("evaluation.png is not written: %s", getattr(error, "strerror", None) or error)
+            return replace(evaluation, figure_path=None)
+    return evaluation
+
+
+def _judge_relative_poses(
+    run: Path,
+    estimate: Trajectory,
+    truth: Trajectory,
+    of_truth: np.ndarray | None,
+    follows_object: bool,
+) -> tuple[SpanConsistency, ...] | None:
+    """Consistency of the camera's poses relative to earlier ones; of a followed body's run in the body's frame."""
+    path = run / RELATIVE_POSES_NAME
+    if not path.is_file():
+        return None
+    pairs = read_frame_pairs(path, len(estimate))
+    covariances = None if of_truth is None else np.tile(of_truth, (len(truth), 1, 1))
+    if follows_object:
+        covariances = covariances if covariances is None else turn_covariance(truth.poses, covariances)
+        truth = Trajectory(truth.timestamps, se3_inverse(truth.poses))
+    return relative_consistency(pairs, estimate, truth, covariances)
+
+
+def _evaluate_final(
+    run: Path, estimate: Trajectory, truth: Trajectory, of_truth: np.ndarray | None
+) -> FinalErrors | None:
+    """The errors after the fact, of a run that has them; the trajectories are in the clock of the truth."""
+    path = run / FINAL_TRAJECTORY
+    if not path.is_file():
+        return None
+    final = read_trajectory(path)
+    if len(final) != len(estimate):
+        raise InputError(
+            f"{path}: has {len(final)} poses, but trajectory.tum beside it {len(estimate)}: both must come from the "
+            "same run"
+        )
+    final = Trajectory(estimate.timestamps, final.poses)
+    covariance = _read_covariance(run / FINAL_COVARIANCE, len(final))
+    return FinalErrors(
+        absolute_trajectory_error(final, truth, "se3"),
+        absolute_trajectory_error(final, truth, "origin"),
+        relative_pose_error(final, truth),
+        None if covariance is None else pose_nees(final, truth, covariance, of_truth),
+    )
+
+
+def _same_clock(estimate_path: Path, truth_path: Path, frames: FrameTable | None) -> tuple[Trajectory, Trajectory, str]:
+    """Both trajectories, in one clock, and how that was reached; with all frames of a run, with a pose or without."""
+    estimate, truth = read_trajectory(estimate_path), read_trajectory(truth_path)
+    untimed = any(
+        trajectory_format(path) == "kitti" and kitti_times_path(path) is None for path in (estimate_path, truth_path)
+    )
+    if not untimed:
+        unit = find_time_unit(estimate, truth)
+        if unit is None:
+            return estimate, truth, "time"
+        return estimate, scale_times(truth, unit), f"time, that of the truth in {unit}"
+    if len(estimate) == len(truth):
+        return estimate, Trajectory(estimate.timestamps, truth.poses), "index"
+    if frames is not None and len(frames) == len(truth):
+        return estimate, Trajectory(frames.columns["timestamp"], truth.poses), "index"
+    return estimate, truth, "time at 10 Hz"
+
+
+def _follows_object(run: Path) -> bool:
+    """Whether a run's poses are those of a body before a camera at rest."""
+    try:
+        return "object" in json.loads(read_text(run / "run.json", TABLE_BYTES, "the run"))
+    except (InputError, ValueError, RecursionError, TypeError):
+        return False
+
+
+def _followed_frame(estimate: Trajectory, truth: Trajectory) -> np.ndarray:
+    """T_body_followed (4, 4): the frame that the run follows, in that on the body whose poses are the truth.
+
+    The first pair of poses has them to each other. The fixed frame is the camera's in both.
+    """
+    estimate_index, truth_index = associate(estimate, truth)
+    return np.asarray(se3_inverse(truth.poses[truth_index[0]]) @ estimate.poses[estimate_index[0]])
+
+
+def _read_covariance(path: Path, count: int) -> np.ndarray | None:
+    if not path.is_file():
+        return None
+    return read_covariances(path, count)
+
+
+def _frame_count(frames: FrameTable | None, estimate: Trajectory, truth: Trajectory, matched: int) -> int:
+    if frames is not None:
+        times = frames.columns["timestamp"]
+        everywhere = Trajectory(times, np.tile(np.eye(4), (len(times), 1, 1)))
+        return max(len(associate(everywhere, truth)[0]), matched)
+    if len(estimate) < 2:
+        return max(len(truth), matched)
+    interval = float(np.median(np.diff(estimate.timestamps)))
+    fitting = round(float(truth.timestamps[-1] - truth.timestamps[0]) / interval) + 1
+    return max(matched, min(len(truth), max(len(estimate), fitting)))

@@ -1,0 +1,126 @@
+"""Conventions of truth files: applies the one that is said, and finds the one that makes the error collapse."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from itertools import product
+from typing import Literal
+
+import numpy as np
+
+from sigmaslam.errors import InputError
+from sigmaslam.geometry.se3 import matrix_to_quaternion, quaternion_to_matrix, se3_inverse
+from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam_evaluation.metrics.trajectory_errors import MAX_DIFFERENCE, absolute_trajectory_error, associate
+
+# Another convention is the right one where it leaves less than this share of the error.
+COLLAPSE = 0.1
+# Of conventions whose errors differ by less than this factor, the one with the fewest changes is taken.
+_ALIKE = 2.0
+# The axes of a camera (x right, y down, z ahead) in a body with x ahead, y left and z up.
+R_BODY_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+TIME_UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
+
+
+@dataclass(frozen=True, slots=True)
+class TruthConvention:
+    """How a truth file is to be read; the defaults are the project's own.
+
+    Attributes:
+        frame: whose poses they are: of the camera (z ahead), or of a body (x ahead, z up) in the camera's place.
+        inverse: they take points of the world into that frame.
+        quaternion: order of TUM's last four columns.
+        unit: of positions.
+    """
+
+    frame: Literal["camera", "body"] = "camera"
+    inverse: bool = False
+    quaternion: Literal["xyzw", "wxyz"] = "xyzw"
+    unit: Literal["m", "mm"] = "m"
+
+    @property
+    def changes(self) -> int:
+        """In how many things it differs from the defaults."""
+        return sum(getattr(self, field.name) != field.default for field in fields(self))
+
+    def apply(self, truth: Trajectory) -> Trajectory:
+        """T_world_camera in metres, of a file that was read with the defaults."""
+        poses = truth.poses.copy()
+        if self.unit == "mm":
+            poses[:, :3, 3] *= 1e-3
+        if self.quaternion == "wxyz":
+            poses[:, :3, :3] = quaternion_to_matrix(np.roll(matrix_to_quaternion(poses[:, :3, :3]), -1, axis=-1))
+        if self.inverse:
+            poses = se3_inverse(poses)
+        if self.frame == "body":
+            poses[:, :3, :3] = poses[:, :3, :3] @ R_BODY_CAMERA
+        return Trajectory(truth.timestamps, poses)
+
+    def describe(self) -> str:
+        """In words and as options, as `poses of a body ...: --truth-frame body`."""
+        words = [
+            (self.frame == "body", "poses of a body with x ahead", "--truth-frame body"),
+            (self.inverse, "T_camera_world", "--truth-inverse"),
+            (self.quaternion == "wxyz", "quaternions with w first", "--truth-quaternion wxyz"),
+            (self.unit == "mm", "millimetres", "--truth-unit mm"),
+        ]
+        if self.frame == "body" and self.inverse:
+            words[1] = (True, "T_body_world", "--truth-inverse")
+        chosen = [(name, option) for wanted, name, option in words if wanted]
+        return f"{', '.join(name for name, _ in chosen)}: {' '.join(option for _, option in chosen)}"
+
+
+def find_convention(
+    estimate: Trajectory, truth: Trajectory, given: TruthConvention, has_quaternions: bool
+) -> TruthConvention | None:
+    """The convention that makes the error collapse.
+
+    Errors are of poses relative to the first, so every convention but the right one turns or bends the path. The
+    position error must be less than a tenth of the given one's, and the rotation error no larger.
+
+    Args:
+        estimate: N poses.
+        truth: as it was read from the file, with the default convention.
+        given: how it is read.
+        has_quaternions: the file has quaternions whose order can be wrong.
+    Returns:
+        None where no other makes the error collapse.
+    """
+    now = absolute_trajectory_error(estimate, given.apply(truth), "origin")
+    candidates = [
+        replace(given, frame=frame, inverse=inverse, quaternion=quaternion, unit=unit)  # type: ignore[arg-type]
+        for frame, inverse, quaternion, unit in product(
+            ("camera", "body"), (False, True), ("xyzw", "wxyz") if has_quaternions else ("xyzw",), ("m", "mm")
+        )
+    ]
+    found: list[tuple[float, TruthConvention]] = []
+    for candidate in candidates:
+        error = absolute_trajectory_error(estimate, candidate.apply(truth), "origin")
+        if error.rmse < COLLAPSE * now.rmse and error.rotation_rmse_deg <= now.rotation_rmse_deg:
+            found.append((error.rmse, candidate))
+    least = min((rmse for rmse, _ in found), default=0.0)
+    alike = [(candidate.changes, rmse, candidate) for rmse, candidate in found if rmse <= _ALIKE * least]
+    return min(alike, key=lambda each: each[:2])[2] if alike else None
+
+
+def find_time_unit(estimate: Trajectory, truth: Trajectory) -> str | None:
+    """The unit of the truth's times, one of `TIME_UNITS`; None for seconds.
+
+    More poses must pair with it than with seconds, and more than half of all.
+    """
+    counts = {unit: _count_pairs(estimate, scale_times(truth, unit)) for unit in TIME_UNITS}
+    best = max(counts, key=lambda unit: counts[unit])
+    enough = max(_count_pairs(estimate, truth), min(len(estimate), len(truth)) // 2)
+    return best if counts[best] > enough else None
+
+
+def scale_times(truth: Trajectory, unit: str) -> Trajectory:
+    """The truth with its times, which are in `unit`, as seconds."""
+    return Trajectory(truth.timestamps * TIME_UNITS[unit], truth.poses)
+
+
+def _count_pairs(estimate: Trajectory, truth: Trajectory) -> int:
+    try:
+        return len(associate(estimate, truth, MAX_DIFFERENCE)[0])
+    except InputError:
+        return 0

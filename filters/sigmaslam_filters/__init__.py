@@ -1,0 +1,72 @@
+"""Batched Bayesian filters and inference in torch: see docs/filters.md."""
+
+from sigmaslam_filters.adaptive import adapted_noise
+from sigmaslam_filters.bayes import BayesFilter, ExtendedKalmanFilter, KalmanFilter, UnscentedKalmanFilter
+from sigmaslam_filters.compiled_filter import compile_filter
+from sigmaslam_filters.core.compiled import compile_step
+from sigmaslam_filters.core.failure import FilterError
+from sigmaslam_filters.core.layout import stack
+from sigmaslam_filters.core.noise_covariance import BlockDiagonal, Dense, Diagonal
+from sigmaslam_filters.core.sigma_points import Simplex, cubature, julier, merwe
+from sigmaslam_filters.gaussian_belief import Gaussian, degree_of_belief
+from sigmaslam_filters.graphs.step_export import ExportError, StepExample, export_step
+from sigmaslam_filters.interacting import InteractingMultipleModels, Mixture
+from sigmaslam_filters.learning import FittedNoise, fit_noise
+from sigmaslam_filters.manifolds import SE2, SE3, SO2, SO3, Euclidean, Manifold, Product
+from sigmaslam_filters.manifolds.lie_groups import wrap_angle
+from sigmaslam_filters.models import LinearMeasurement, LinearMotion, MeasurementModel, MotionModel, several
+from sigmaslam_filters.particles import ParticleFilter, Particles
+from sigmaslam_filters.point_estimates import Observation, PointEstimate, maximum_a_posteriori, maximum_likelihood
+from sigmaslam_filters.results import TimeUpdate, Update
+from sigmaslam_filters.time_series import Event, Track
+
+__all__ = [
+    "SE2",
+    "SE3",
+    "SO2",
+    "SO3",
+    "BayesFilter",
+    "BlockDiagonal",
+    "Dense",
+    "Diagonal",
+    "Euclidean",
+    "Event",
+    "ExportError",
+    "ExtendedKalmanFilter",
+    "FilterError",
+    "FittedNoise",
+    "Gaussian",
+    "InteractingMultipleModels",
+    "KalmanFilter",
+    "LinearMeasurement",
+    "LinearMotion",
+    "Manifold",
+    "MeasurementModel",
+    "Mixture",
+    "MotionModel",
+    "Observation",
+    "ParticleFilter",
+    "Particles",
+    "PointEstimate",
+    "Product",
+    "Simplex",
+    "StepExample",
+    "TimeUpdate",
+    "Track",
+    "UnscentedKalmanFilter",
+    "Update",
+    "adapted_noise",
+    "compile_filter",
+    "compile_step",
+    "cubature",
+    "degree_of_belief",
+    "export_step",
+    "fit_noise",
+    "julier",
+    "maximum_a_posteriori",
+    "maximum_likelihood",
+    "merwe",
+    "several",
+    "stack",
+    "wrap_angle",
+]

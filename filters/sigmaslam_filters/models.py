@@ -1,0 +1,185 @@
+"""Motions and measurements as objects: a function, its noise, and how its values are compared."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from sigmaslam_filters.core.factors import apply
+from sigmaslam_filters.core.noise_covariance import BlockDiagonal, Diagonal, Noise, as_noise
+
+Function = Callable[..., Tensor]
+Residual = Callable[[Tensor, Tensor], Tensor]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NonlinearModel:
+    """What `MotionModel` and `MeasurementModel` have in common: y = f(x, *inputs) + w, or y = f(x, w, *inputs).
+
+    The function is called once for all sigma points: with states (k, ..., p) and, if the noise is not additive, noise
+    (k, ..., q), while inputs have the batch shape (..., ·) and broadcast. Components are read as `x[..., i]`.
+
+    Attributes:
+        function: f, to (k, ..., m) of states or measurements.
+        noise: covariance (..., q, q) of w, or a `Noise`.
+        additive: whether w is added to f(x).
+        jacobian: derivative of f (and of w, side by side) in tangent coordinates, called like the function at one
+            point, (..., m, n) or (..., m, n + q); None: by automatic differentiation. Only the EKF asks for it.
+    """
+
+    function: Function
+    noise: Noise | Tensor
+    additive: bool = True
+    jacobian: Function | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionModel(NonlinearModel):
+    """How a state moves: x' = f(x, *inputs) [+] w, or x' = f(x, w, *inputs); see `NonlinearModel`.
+
+    Attributes:
+        noise_matrix: B2 (..., n, q) of (9.22): additive noise enters as B2 w, in the tangent at f(x); None: w.
+    """
+
+    noise_matrix: Tensor | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasurementModel(NonlinearModel):
+    """What a sensor sees: z = h(x, *inputs) + v, or z = h(x, v, *inputs); see `NonlinearModel`.
+
+    A component that is NaN in the measured value, or False in the mask, has weight zero. A `Diagonal` or
+    `BlockDiagonal` noise keeps the cost of an update linear in m.
+
+    Attributes:
+        residual: (measured (..., m), predicted (..., m)) -> their difference, where that is not a plain difference
+            (an angle, see `wrap_angle`); None: subtraction.
+        mask: (..., m) bool, True for components that take part; None: all.
+        block_size: components that are right or wrong together, side by side, for gates and robust weights; None: the
+            blocks of a `BlockDiagonal` noise, else all components.
+    """
+
+    residual: Residual | None = None
+    mask: Tensor | None = None
+    block_size: int | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearMotion:
+    """x' = A x + B1 u + B2 w, (9.22); on R^n. `predict` takes u as its input when there is a B1.
+
+    Attributes:
+        matrix: A (..., n, n).
+        noise: covariance Q (..., q, q) of w, or a `Noise`.
+        control_matrix: B1 (..., n, c).
+        noise_matrix: B2 (..., n, q); None: the identity.
+    """
+
+    matrix: Tensor
+    noise: Noise | Tensor
+    control_matrix: Tensor | None = None
+    noise_matrix: Tensor | None = None
+
+    def function(self, state: Tensor, *inputs: Tensor) -> Tensor:
+        """A x + B1 u for (..., n) and (..., c)."""
+        moved = apply(self.matrix, state)
+        if self.control_matrix is not None:
+            if len(inputs) != 1:
+                raise ValueError("this motion has a control matrix: give predict the control (..., c)")
+            moved = moved + apply(self.control_matrix, inputs[0])
+        elif inputs:
+            raise ValueError("an input was given, but this motion has no control matrix")
+        return moved
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearMeasurement:
+    """z = H x + v, (9.22); on R^n.
+
+    Attributes:
+        matrix: H (..., m, n).
+        noise: covariance R (..., m, m) of v, or a `Noise`.
+        mask: (..., m) bool, True for components that take part; None: all.
+        block_size: as `MeasurementModel`.
+    """
+
+    matrix: Tensor
+    noise: Noise | Tensor
+    mask: Tensor | None = None
+    block_size: int | None = None
+
+    def function(self, state: Tensor) -> Tensor:
+        """H x for (..., n)."""
+        return apply(self.matrix, state)
+
+
+def is_additive(model: AnyMotion | AnyMeasurement) -> bool:
+    """Whether the model's noise is added to what its function returns."""
+    return isinstance(model, LinearMotion | LinearMeasurement) or model.additive
+
+
+def several(measurement: AnyMeasurement, count: int) -> AnyMeasurement:
+    """The measurement taken `count` times at one time, of what its inputs name: landmarks, beacons.
+
+    Values are (..., count m), end to end, and inputs (..., count, ·); each has the noise of its own, independent of
+    the others', and is a block to gates and robust weights.
+
+    Args:
+        measurement: of m components.
+        count: how many.
+    Raises:
+        ValueError: the noise is not additive, which would be noise of all in each.
+    """
+    one = as_noise(measurement.noise)
+    noise, block_size = _repeated(one, count), measurement.block_size
+    if block_size is None:
+        block_size = one.block_size if isinstance(one, BlockDiagonal) else one.variance().shape[-1]
+    mask = measurement.mask
+    if mask is not None:
+        mask = mask.unsqueeze(-2).expand(*mask.shape[:-1], count, mask.shape[-1]).flatten(-2)
+    if isinstance(measurement, LinearMeasurement):
+        matrix = measurement.matrix
+        rows = matrix.unsqueeze(-3).expand(*matrix.shape[:-2], count, *matrix.shape[-2:])
+        return LinearMeasurement(rows.flatten(-3, -2), noise, mask, block_size)
+    if not measurement.additive:
+        raise ValueError("several measurements at one time need additive noise")
+
+    residual, see, slope = measurement.residual, measurement.function, measurement.jacobian
+
+    def values(state: Tensor, *inputs: Tensor) -> Tensor:
+        each = see(state.unsqueeze(-2), *inputs)
+        return each.expand(*each.shape[:-2], count, each.shape[-1]).flatten(-2)
+
+    def slopes(state: Tensor, *inputs: Tensor) -> Tensor:
+        assert slope is not None
+        each = slope(state.unsqueeze(-2), *inputs)
+        return each.expand(*each.shape[:-3], count, *each.shape[-2:]).flatten(-3, -2)
+
+    def differences(measured: Tensor, predicted: Tensor) -> Tensor:
+        assert residual is not None
+        measured, predicted = (each.unflatten(-1, (count, -1)) for each in (measured, predicted))
+        return residual(measured, predicted).flatten(-2)
+
+    return MeasurementModel(
+        values,
+        noise,
+        jacobian=None if slope is None else slopes,
+        residual=None if residual is None else differences,
+        mask=mask,
+        block_size=block_size,
+    )
+
+
+def _repeated(noise: Noise, count: int) -> Noise:
+    """Independent noises of one covariance."""
+    if isinstance(noise, Diagonal):
+        variance = noise.variance().unsqueeze(-2)
+        return Diagonal(variance.expand(*variance.shape[:-2], count, variance.shape[-1]).flatten(-2))
+    block = noise.covariance().unsqueeze(-3)
+    return BlockDiagonal(block.expand(*block.shape[:-3], count, *block.shape[-2:]))
+
+
+AnyMotion = MotionModel | LinearMotion
+AnyMeasurement = MeasurementModel | LinearMeasurement

@@ -1,0 +1,135 @@
+"""The Bayes filter (9.21) in its general form, by samples: the bootstrap particle filter (Gordon et al. 1993)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sigmaslam_filters.core.factors import apply
+from sigmaslam_filters.core.noise_covariance import as_noise
+from sigmaslam_filters.gaussian_belief import Gaussian
+from sigmaslam_filters.manifolds import Space, is_flat
+from sigmaslam_filters.models import AnyMeasurement, AnyMotion, LinearMeasurement, LinearMotion
+
+# Share of the particles below which the effective number makes a resampling.
+_RESAMPLED_BELOW = 0.5
+_ROUNDS_OF_THE_MEAN = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Particles:
+    """A belief by N weighted samples, for any batch (...,).
+
+    Attributes:
+        states: (N, ..., p), as the models' functions take them.
+        log_weights: (N, ...) whose exponentials add up to 1.
+    """
+
+    states: Tensor
+    log_weights: Tensor
+
+    @property
+    def effective_number(self) -> Tensor:
+        """1 / sum w^2, (...,), from 1 to N."""
+        return torch.exp(-torch.logsumexp(2.0 * self.log_weights, dim=0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ParticleFilter:
+    """Moves samples by the motion, noise included, and weighs them by the likelihood of what is measured.
+
+    For beliefs that are no Gaussian: several peaks, bounds, long tails. The error falls with the root of the number of
+    particles, and the number needed grows quickly with the dimensions: beyond 4 or so take another filter.
+
+    Attributes:
+        generator: of the random numbers; on the states' device.
+        space: manifold of the state; None: R^n.
+    """
+
+    generator: torch.Generator
+    space: Space | None = None
+
+    def sample(self, belief: Gaussian, number: int) -> Particles:
+        """Particles of equal weight from a Gaussian belief (...,)."""
+        offsets = apply(belief.factor, self._normal((number, *belief.batch_shape, belief.size), belief.mean))
+        states = self._retract(belief.mean.expand(number, *belief.mean.shape), offsets)
+        return Particles(states, torch.full_like(states[..., 0], -math.log(number)))
+
+    def predict(self, particles: Particles, motion: AnyMotion, *inputs: Tensor) -> Particles:
+        """The particles after a motion, each with noise of its own."""
+        states = particles.states
+        factor = as_noise(motion.noise).factor()
+        noise = apply(factor, self._normal((*states.shape[:-1], factor.shape[-1]), states))
+        if not isinstance(motion, LinearMotion) and not motion.additive:
+            return Particles(motion.function(states, noise, *inputs), particles.log_weights)
+        if motion.noise_matrix is not None:
+            noise = apply(motion.noise_matrix, noise)
+        return Particles(self._retract(motion.function(states, *inputs), noise), particles.log_weights)
+
+    def update(
+        self, particles: Particles, measurement: AnyMeasurement, value: Tensor, *inputs: Tensor
+    ) -> tuple[Particles, Tensor]:
+        """The particles after a measurement, resampled where few carry the weight, and its log-likelihood (...,).
+
+        Args:
+            particles: batch (...,).
+            measurement: with additive noise.
+            value: (..., m); NaN for a component that is missing.
+            inputs: passed on to the measurement's function.
+        Raises:
+            ValueError: the noise is not additive, so that its density is not known.
+        """
+        if not isinstance(measurement, LinearMeasurement) and not measurement.additive:
+            raise ValueError("particles need the density of the measurement's noise: declare it additive")
+        present = ~torch.isnan(value)
+        if measurement.mask is not None:
+            present = present & measurement.mask
+        noise = as_noise(measurement.noise).masked(present)
+        residual = None if isinstance(measurement, LinearMeasurement) else measurement.residual
+        seen = measurement.function(particles.states, *inputs)
+        filled = torch.where(present, value, 0.0)
+        difference = filled - seen if residual is None else residual(filled, seen)
+        white = noise.whitened(torch.where(present, difference, 0.0).unsqueeze(-1)).squeeze(-1)
+        constant = noise.log_determinant() + present.sum(dim=-1) * math.log(2.0 * math.pi)
+        log_weights = particles.log_weights - 0.5 * (white.square().sum(dim=-1) + constant)
+        likelihood = torch.logsumexp(log_weights, dim=0)
+        return self._resampled(Particles(particles.states, log_weights - likelihood)), likelihood
+
+    def gaussian(self, particles: Particles) -> Gaussian:
+        """Mean and covariance of the particles, in the chart at the mean."""
+        weights, states = torch.exp(particles.log_weights).unsqueeze(-1), particles.states
+        if self.space is None or is_flat(self.space):
+            mean = (weights * states).sum(dim=0)
+            offsets = states - mean
+        else:
+            mean = states[0]
+            for _ in range(_ROUNDS_OF_THE_MEAN):
+                offsets = self.space.local(mean.expand_as(states), states)
+                mean = self.space.retract(mean, (weights * offsets).sum(dim=0))
+            offsets = self.space.local(mean.expand_as(states), states)
+        weighted = (weights.sqrt() * offsets).movedim(0, -1)
+        return Gaussian(mean, weighted @ weighted.mT)
+
+    def _resampled(self, particles: Particles) -> Particles:
+        """Systematic resampling (Kitagawa 1996) of the elements whose effective number is low."""
+        number = particles.states.shape[0]
+        poor = particles.effective_number < _RESAMPLED_BELOW * number
+        total = torch.exp(particles.log_weights).cumsum(dim=0).movedim(0, -1).contiguous()
+        first = torch.rand(poor.shape, generator=self.generator, dtype=total.dtype, device=total.device)
+        steps = torch.arange(number, dtype=total.dtype, device=total.device)
+        at = ((steps + first.unsqueeze(-1)) / number * total[..., -1:]).contiguous()
+        drawn = torch.searchsorted(total, at).clamp_max(number - 1).movedim(-1, 0)
+        states = particles.states.gather(0, drawn.unsqueeze(-1).expand_as(particles.states))
+        equal = torch.full_like(particles.log_weights, -math.log(number))
+        return Particles(
+            torch.where(poor.unsqueeze(-1), states, particles.states), torch.where(poor, equal, particles.log_weights)
+        )
+
+    def _normal(self, shape: tuple[int, ...], like: Tensor) -> Tensor:
+        return torch.randn(shape, generator=self.generator, dtype=like.dtype, device=like.device)
+
+    def _retract(self, points: Tensor, tangents: Tensor) -> Tensor:
+        return points + tangents if self.space is None else self.space.retract(points, tangents)

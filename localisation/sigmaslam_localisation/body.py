@@ -1,0 +1,182 @@
+"""A body with a stereo camera among known points: localised, scored and written."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from sigmaslam.errors import InputError
+from sigmaslam.files import atomic_write_text
+from sigmaslam.plot_style import BLUE, GREY, has_matplotlib, style_axes
+from sigmaslam.runs.figures import save_png
+from sigmaslam_filters import SO3, Gaussian, degree_of_belief
+from sigmaslam_localisation.localise import FilterName, Localisation, localise, make_filter
+from sigmaslam_localisation.output import write_lines
+from sigmaslam_localisation.page import write_page
+from sigmaslam_localisation.starry import StereoRecording
+from sigmaslam_localisation.steps import Steps
+from sigmaslam_localisation.stereo_points import BODY, CONSTANTS, SPACE, StereoBody
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BodyEstimate:
+    """Where a body was.
+
+    Attributes:
+        seconds: (K + 1,).
+        pose: (K + 1, 7) translation in metres and quaternion x, y, z, w of the body in the world.
+        covariance: (K + 1, 6, 6) of twists in the body's frame, translation before rotation.
+        belief: (K + 1,) degree of belief in the position, in metres.
+        seen: (K + 1,) points that were seen.
+        nis: (K, L) of each point, of four degrees of freedom; NaN for none.
+        weight: (K, L) by robust weights.
+        scale: (4,) standard deviation of the pixels over the nominal one, at the end.
+        truth: (K + 1, 7), or None.
+    """
+
+    seconds: np.ndarray
+    pose: np.ndarray
+    covariance: np.ndarray
+    belief: np.ndarray
+    seen: np.ndarray
+    nis: np.ndarray
+    weight: np.ndarray
+    scale: np.ndarray
+    truth: np.ndarray | None
+
+
+def localise_body(
+    recording: StereoRecording, filter_name: FilterName = "ukf", tell: Callable[[str], None] = lambda _: None
+) -> tuple[BodyEstimate, BodyEstimate]:
+    """The body's poses, in two passes as those of `localise_robots`: the second begins with the constants of the first.
+
+    Raises:
+        InputError: there is no true pose to start from.
+    """
+    if recording.truth is None:
+        raise InputError(f"{recording.name}: has no true pose to start from: add theta_vk_i and r_i_vk_i")
+    body, steps, bayes = StereoBody(recording.rig), recording.steps, make_filter(filter_name, SPACE)
+    prior = body.prior(torch.from_numpy(recording.truth[:1]))
+    first = localise(bayes, body, prior, steps, tell=lambda done: tell(f"first pass: {done:.0%}"))
+    mean, covariance_of_prior = prior.mean.clone(), prior.covariance.clone()
+    # A point has one number more than its tangent.
+    mean[:, CONSTANTS.start + 1 : CONSTANTS.stop + 1] = first.final.mean[:, CONSTANTS.start + 1 : CONSTANTS.stop + 1]
+    covariance_of_prior[:, CONSTANTS, CONSTANTS] = first.final.covariance[:, CONSTANTS, CONSTANTS]
+    prior = Gaussian(mean, covariance_of_prior)
+    scale = torch.from_numpy(first.scale[-1])
+    result = localise(bayes, body, prior, steps, scale, lambda done: tell(f"second pass: {done:.0%}"))
+    return _estimate(recording, steps, first), _estimate(recording, steps, result)
+
+
+def _estimate(recording: StereoRecording, steps: Steps, result: Localisation) -> BodyEstimate:
+    covariance = result.covariance[:, 0, :6, :6]
+    nis = result.nis[:, 0]
+    return BodyEstimate(
+        steps.seconds[:, 0],
+        result.mean[:, 0, :7],
+        covariance,
+        degree_of_belief(torch.from_numpy(covariance[:, :3, :3])).numpy(),
+        np.append(0, np.isfinite(nis).sum(axis=1)),
+        nis,
+        result.weight[:, 0],
+        np.sqrt(result.scale[-1, 0]),
+        recording.truth,
+    )
+
+
+def score_body(estimate: BodyEstimate) -> dict[str, float]:
+    """Root mean square errors over all steps, NEES of six degrees of freedom, NIS of the points."""
+    there = np.isfinite(estimate.nis)
+    scores = {
+        "points_seen": int(there.sum()),
+        "nis_per_dof": float(estimate.nis[there].mean() / 4),
+        "nis_per_dof_median": float(np.median(estimate.nis[there]) / 4),
+        "outliers": float(np.mean(estimate.weight[there] < 0.5)),
+        **{f"noise_scale_{index}": float(value) for index, value in enumerate(estimate.scale)},
+    }
+    if estimate.truth is None:
+        return scores
+    found, true = torch.from_numpy(estimate.pose), torch.from_numpy(estimate.truth)
+    twist = BODY.local(found, true).numpy()
+    rotation = SO3().local(found[:, 3:], true[:, 3:]).numpy()
+    nees = np.einsum("ni,ni->n", twist, np.linalg.solve(estimate.covariance, twist[..., None])[..., 0])
+    return {
+        "position_rmse": float(np.sqrt(np.mean(np.sum((estimate.pose - estimate.truth)[:, :3] ** 2, axis=1)))),
+        "rotation_rmse": float(np.sqrt(np.mean(np.sum(rotation**2, axis=1)))),
+        "nees_median": float(np.median(nees)),
+        "nees_mean": float(np.mean(nees)),
+        **scores,
+    }
+
+
+def write_body(
+    folder: Path,
+    recording: StereoRecording,
+    first: BodyEstimate,
+    estimate: BodyEstimate,
+    settings: Mapping[str, Any],
+) -> dict[str, dict[str, Any]]:
+    """Write trajectory.csv, trajectory_first_pass.csv, run.json, map.png and report.html into a folder that is there.
+
+    Returns:
+        The summary by name, as in run.json.
+    """
+    write_lines(folder / "trajectory.csv", _lines(recording.name, estimate))
+    write_lines(folder / "trajectory_first_pass.csv", _lines(recording.name, first))
+    summaries, at_first = ({recording.name: score_body(each)} for each in (estimate, first))
+    atomic_write_text(
+        folder / "run.json", json.dumps({**settings, "robots": summaries, "first_pass": at_first}, indent=2) + "\n"
+    )
+    write_page(folder / "report.html", recording.name, summaries, _draw(recording, estimate, folder / "map.png"))
+    return summaries
+
+
+def _lines(name: str, estimate: BodyEstimate) -> Iterable[str]:
+    """Poses, the upper triangle of the covariance row by row, belief and count of points."""
+    rows, columns = np.triu_indices(6)
+    cells = ",".join(f"cov_{row}{column}" for row, column in zip(rows, columns, strict=True))
+    yield f"robot,time,x,y,z,qx,qy,qz,qw,{cells},belief,sightings"
+    table = np.column_stack([estimate.pose, estimate.covariance[:, rows, columns], estimate.belief])
+    for second, numbers, seen in zip(estimate.seconds, table, estimate.seen, strict=True):
+        yield f"{name},{second:.6f},{','.join(f'{number:.9g}' for number in numbers)},{seen}"
+
+
+def _draw(recording: StereoRecording, estimate: BodyEstimate, png: Path) -> list[tuple[str, str, Figure]]:
+    if not has_matplotlib():
+        return []
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 6), layout="constrained")
+    axes = figure.add_subplot()
+    if estimate.truth is not None:
+        axes.plot(*estimate.truth[:, :2].T, color=GREY, lw=0.6)
+    axes.plot(*estimate.pose[:, :2].T, color=BLUE, lw=1.0)
+    axes.plot(*recording.points[:, :2].T, "x", ms=6, color=GREY)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("y [m]")
+    style_axes(axes)
+    save_png(figure, png)
+    drawn = [("Map", "From above; points are crosses, the truth is thin and grey.", figure)]
+    figure = Figure(figsize=(8, 2.6), layout="constrained")
+    axes = figure.add_subplot()
+    deviation = np.sqrt(np.diagonal(estimate.covariance, axis1=1, axis2=2))
+    seconds = estimate.seconds - estimate.seconds[0]
+    for index, label in enumerate(("x", "y", "z")):
+        axes.plot(seconds, deviation[:, index], lw=1.0, label=label)
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel("sigma [m]")
+    axes.set_yscale("log")
+    axes.legend(fontsize=8)
+    style_axes(axes)
+    drawn.append(("Claimed uncertainty", "Standard deviations along the axes of the body.", figure))
+    return drawn

@@ -1,0 +1,101 @@
+"""Recordings of one's own: a folder of CSV files with a header."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from sigmaslam.errors import InputError
+from sigmaslam_localisation.recording import PlanarTruth, Recording
+
+KINDS = {"range-bearing": ["range", "bearing"], "cartesian": ["ahead", "left"]}
+LONGEST_GAP = 0.5
+"""Seconds between poses of the truth above which nothing is interpolated."""
+
+
+def read_csv_folder(folder: Path, mapping: bool = False) -> Recording:
+    """One robot's recording.
+
+    The files are landmarks.csv (landmark,x,y), controls.csv (time,speed,turn_rate), sightings.csv
+    (time,landmark,range,bearing or time,landmark,ahead,left) and, if there is a truth, truth.csv (time,x,y,heading):
+    seconds, metres, radians.
+
+    Args:
+        folder: of the files.
+        mapping: the landmarks are to be found, so landmarks.csv need not be there, nor name them all.
+    Raises:
+        InputError: a file is missing, or has other columns, or names a landmark that is not in the map.
+    """
+    names: list[str] = []
+    places = np.zeros((0, 2))
+    if not mapping or (folder / "landmarks.csv").is_file():
+        names, places = _read(folder / "landmarks.csv", ["landmark", "x", "y"], named=0)
+    _, controls = _read(folder / "controls.csv", ["time", "speed", "turn_rate"])
+    path = folder / "sightings.csv"
+    kind = next((kind for kind, columns in KINDS.items() if columns == _header(path)[2:]), None)
+    if kind is None:
+        raise InputError(
+            f"{path}: the header is {','.join(_header(path))}, not time,landmark,range,bearing or ..,ahead,left"
+        )
+    seen, sightings = _read(path, ["time", "landmark", *KINDS[kind]], named=1)
+    unknown = sorted(set(seen) - set(names))
+    if unknown and not mapping:
+        raise InputError(
+            f"{path}: landmark {unknown[0]} is not in landmarks.csv: add it there, leave it out here, or find the map"
+            " by --map unknown"
+        )
+    names, places = names + unknown, np.vstack([places, np.full((len(unknown), 2), np.nan)])
+    index = {name: place for place, name in enumerate(names)}
+    controls = controls[np.argsort(controls[:, 0], kind="stable")]
+    controls = controls[np.append(np.diff(controls[:, 0]) > 0, True)]
+    order = np.argsort(sightings[:, 0], kind="stable")
+    truth = None
+    if (folder / "truth.csv").is_file():
+        _, poses = _read(folder / "truth.csv", ["time", "x", "y", "heading"])
+        poses = poses[np.append(True, np.diff(poses[:, 0]) > 0)]
+        truth = PlanarTruth(poses[:, 0], np.column_stack([poses[:, 1:3], np.unwrap(poses[:, 3])]), LONGEST_GAP)
+    return Recording(
+        folder.resolve().name,
+        controls[:, 0],
+        controls[:, 1:],
+        sightings[order, 0],
+        np.array([index[seen[place]] for place in order], int),
+        sightings[order, 1:],
+        kind,
+        places,
+        truth=truth,
+        names=tuple(names),
+    )
+
+
+def _header(path: Path) -> list[str]:
+    try:
+        with path.open(newline="") as file:
+            return [name.strip() for name in next(csv.reader(file), [])]
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read ({error})") from error
+
+
+def _read(path: Path, columns: list[str], named: int | None = None) -> tuple[list[str], np.ndarray]:
+    """Names in one column, and the numbers (N, ·) in the others."""
+    if _header(path) != columns:
+        raise InputError(f"{path}: the header is {','.join(_header(path))}, not {','.join(columns)}")
+    names, numbers = [], []
+    with path.open(newline="") as file:
+        for line, row in enumerate(csv.reader(file), start=1):
+            if line == 1 or not row:
+                continue
+            try:
+                if len(row) != len(columns):
+                    raise ValueError(f"{len(row)} columns")
+                numbers.append([float(cell) for column, cell in enumerate(row) if column != named])
+            except ValueError as error:
+                raise InputError(f"{path}: line {line} is not {','.join(columns)} ({error})") from error
+            if named is not None:
+                names.append(row[named].strip())
+    table = np.array(numbers).reshape(len(numbers), len(columns) - (named is not None))
+    if not len(table) or not np.isfinite(table).all():
+        raise InputError(f"{path}: has no rows, or a number that is not finite")
+    return names, table

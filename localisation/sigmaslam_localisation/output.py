@@ -1,0 +1,122 @@
+"""Files that a localisation leaves: trajectories, innovations, a summary, a map and a report."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sigmaslam.files import atomic_path, atomic_write_text
+from sigmaslam_localisation.page import draw_robots, write_page
+from sigmaslam_localisation.recording import Recording
+from sigmaslam_localisation.robots import RobotEstimate
+from sigmaslam_localisation.scores import innovation_statistics, score, score_map
+
+TRAJECTORY_COLUMNS = "robot,time,x,y,heading,cov_xx,cov_xy,cov_xh,cov_yy,cov_yh,cov_hh,belief,sightings"
+
+
+def write_robots(
+    folder: Path,
+    name: str,
+    first: Sequence[RobotEstimate],
+    second: Sequence[RobotEstimate],
+    recordings: Sequence[Recording],
+    settings: Mapping[str, Any],
+) -> dict[str, dict[str, Any]]:
+    """Write all files into a folder that is there.
+
+    Returns:
+        The summary of the second pass by robot, as in run.json.
+    """
+    names = recordings[0].landmark_names
+    write_trajectories(folder / "trajectory.csv", second)
+    write_trajectories(folder / "trajectory_first_pass.csv", first)
+    _write_innovations(folder / "innovations.csv", second)
+    if any(estimate.map is not None for estimate in second):
+        _write_maps(folder / "landmarks.csv", second, names)
+    summaries = {estimate.name: summarise(estimate) for estimate in second}
+    at_first = {estimate.name: summarise(estimate) for estimate in first}
+    run = {**settings, "robots": summaries, "first_pass": at_first}
+    atomic_write_text(folder / "run.json", json.dumps(run, indent=2) + "\n")
+    write_page(
+        folder / "report.html", name, summaries, draw_robots(second, recordings[0].landmarks, folder / "map.png")
+    )
+    return summaries
+
+
+def summarise(estimate: RobotEstimate) -> dict[str, Any]:
+    """Scores if there is a truth, statistics of the innovations, and what was found of the robot."""
+    constants = {
+        f"{name.replace(' ', '_')}{suffix}": value
+        for name, pair in estimate.constants.items()
+        for suffix, value in zip(("", "_sigma"), pair, strict=True)
+    }
+    scale = {f"noise_scale_{index}": float(value) for index, value in enumerate(estimate.scale)}
+    of_map = {} if estimate.map is None else score_map(estimate.map)
+    return {
+        **score(estimate),
+        **of_map,
+        **innovation_statistics(estimate),
+        "delay": estimate.delay,
+        **scale,
+        **constants,
+    }
+
+
+def write_trajectories(path: Path, estimates: Sequence[RobotEstimate]) -> None:
+    """Poses in metres and radians, the covariance of x, y and heading in the world, and the belief in the position."""
+    rows, columns = np.triu_indices(3)
+
+    def lines() -> Iterable[str]:
+        yield TRAJECTORY_COLUMNS
+        for estimate in estimates:
+            heading = np.arctan2(np.sin(estimate.pose[:, 2]), np.cos(estimate.pose[:, 2]))
+            table = np.column_stack(
+                [estimate.pose[:, :2], heading, estimate.covariance[:, rows, columns], estimate.belief]
+            )
+            count = (estimate.seen >= 0).sum(axis=1)
+            for second, numbers, seen in zip(estimate.seconds, table, count, strict=True):
+                yield f"{estimate.name},{second:.6f},{','.join(f'{number:.9g}' for number in numbers)},{seen}"
+
+    write_lines(path, lines())
+
+
+def _write_innovations(path: Path, estimates: Sequence[RobotEstimate]) -> None:
+    """Each sighting: the index of the landmark, the innovation's components, its NIS and its robust weight."""
+    components = estimates[0].innovation.shape[-1]
+
+    def lines() -> Iterable[str]:
+        yield f"robot,time,landmark,{','.join(f'innovation_{i}' for i in range(components))},nis,weight"
+        for estimate in estimates:
+            for row, slot in zip(*np.nonzero(np.isfinite(estimate.nis)), strict=True):
+                numbers = [*estimate.innovation[row, slot], estimate.nis[row, slot], estimate.weight[row, slot]]
+                yield (
+                    f"{estimate.name},{estimate.seconds[row]:.6f},{estimate.seen[row, slot]},"
+                    f"{','.join(f'{number:.6g}' for number in numbers)}"
+                )
+
+    write_lines(path, lines())
+
+
+def _write_maps(path: Path, estimates: Sequence[RobotEstimate], names: Sequence[str]) -> None:
+    """Places that the robots found, metres, and their covariances."""
+
+    def lines() -> Iterable[str]:
+        yield "robot,landmark,x,y,cov_xx,cov_xy,cov_yy"
+        for estimate in estimates:
+            found = estimate.map
+            assert found is not None
+            for row, (landmark, (x, y)) in enumerate(zip(found.landmark, found.place, strict=True)):
+                (xx, xy), (_, yy) = found.covariance[2 * row : 2 * row + 2, 2 * row : 2 * row + 2]
+                yield f"{estimate.name},{names[landmark]},{','.join(f'{each:.9g}' for each in (x, y, xx, xy, yy))}"
+
+    write_lines(path, lines())
+
+
+def write_lines(path: Path, lines: Iterable[str]) -> None:
+    """Write lines of text, whole or not at all."""
+    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        file.writelines(f"{line}\n" for line in lines)

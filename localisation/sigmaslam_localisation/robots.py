@@ -1,0 +1,206 @@
+"""Robots of a recording, localised in two passes: the first finds delay, constants and noise, the second uses them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sigmaslam.errors import InputError
+from sigmaslam_filters import Gaussian, degree_of_belief
+from sigmaslam_localisation.localise import FilterName, Localisation, Platform, localise, make_filter
+from sigmaslam_localisation.mapping_robot import ROBOT_SIZE, MappingRobot
+from sigmaslam_localisation.recording import PlanarTruth, Recording
+from sigmaslam_localisation.steps import Steps, make_steps
+from sigmaslam_localisation.wheeled_robot import BODY, CONSTANTS, SPACE, WheeledRobot
+
+DELAYS = (0.0, 0.1, 0.2, 0.3, 0.4)
+"""Seconds by which a robot may follow its commands, or sightings its odometry; the most likely one is taken."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LandmarkMap:
+    """Landmarks that a robot found on its way.
+
+    Attributes:
+        landmark: (M,) indices of those that it saw.
+        place: (M, 2) x, y in the world, metres.
+        covariance: (2 M, 2 M) of x, y of the first, x, y of the second, and so on.
+        true: (M, 2) where they are, NaN where that is not known; for scores alone.
+    """
+
+    landmark: np.ndarray
+    place: np.ndarray
+    covariance: np.ndarray
+    true: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RobotEstimate:
+    """What is known of one robot.
+
+    Attributes:
+        name: of the robot.
+        seconds: (K + 1,).
+        pose: (K + 1, 3) x, y in metres, heading in radians.
+        covariance: (K + 1, 3, 3) of the same, in the world.
+        belief: (K + 1,) degree of belief in the position, in metres.
+        seen: (K + 1, L) landmarks that were seen then, -1 for none.
+        innovation: (K + 1, L, m), NaN for none.
+        nis: (K + 1, L) of each sighting, of m degrees of freedom.
+        weight: (K + 1, L) by robust weights.
+        delay: seconds by which the robot follows its commands, or the sightings its odometry.
+        constants: value and standard deviation of each by its name, at the end.
+        scale: (m,) standard deviation of the sightings over the nominal one, at the end.
+        truth: None if there is none.
+        map: landmarks at the end; None if their places were given.
+    """
+
+    name: str
+    seconds: np.ndarray
+    pose: np.ndarray
+    covariance: np.ndarray
+    belief: np.ndarray
+    seen: np.ndarray
+    innovation: np.ndarray
+    nis: np.ndarray
+    weight: np.ndarray
+    delay: float
+    constants: dict[str, tuple[float, float]]
+    scale: np.ndarray
+    truth: PlanarTruth | None
+    map: LandmarkMap | None = None
+
+
+def localise_robots(
+    recordings: Sequence[Recording],
+    filter_name: FilterName = "ukf",
+    start: tuple[float, float, float] | None = None,
+    tell: Callable[[str], None] = lambda _: None,
+    mapping: bool = False,
+) -> tuple[list[RobotEstimate], list[RobotEstimate]]:
+    """Estimates of each robot: of the first pass, and of the second.
+
+    The first pass filters each robot under every one of `DELAYS` and keeps the most likely. Its poses depend on what
+    was seen until then alone, but for that choice. The second begins with the constants and the noise that the first
+    ended with, so its poses depend on the whole recording through these few numbers.
+
+    Args:
+        recordings: of robots of one kind.
+        filter_name: see `make_filter`.
+        start: x, y, heading of all robots; None: the first pose of the truth.
+        tell: takes a line of progress.
+        mapping: find the places of the landmarks too, each robot for itself; the recordings' are not looked at but for
+            scores. The second pass begins without a map, as the first.
+    Raises:
+        InputError: there is no pose to start from.
+    """
+    robot = WheeledRobot.of(recordings[0])
+    mapper = MappingRobot(robot, max(len(each.landmarks) for each in recordings)) if mapping else None
+    platform: Platform = robot if mapper is None else mapper
+    admit = None if mapper is None else mapper.admit
+    bayes = make_filter(filter_name, SPACE if mapper is None else mapper.space)
+    count = len(DELAYS)
+    steps = make_steps([each for each in recordings for _ in DELAYS], [*DELAYS] * len(recordings))
+    prior = (robot if mapper is None else mapper).prior(_starts(recordings, steps.seconds[0, ::count], start))
+    repeated = _pick(prior, torch.arange(len(recordings)).repeat_interleave(count))
+    first = localise(
+        bayes, platform, repeated, steps, None, lambda done: tell(f"first pass: {done:.0%}"), admit, ROBOT_SIZE
+    )
+    best = first.log_likelihood.reshape(-1, count).argmax(axis=1)
+    chosen = np.arange(len(recordings)) * count + best
+    delays = [DELAYS[index] for index in best]
+    at_first = _estimates(recordings, delays, steps, first, chosen)
+
+    steps = make_steps(recordings, delays)
+    prior = _with_constants(prior, _pick(first.final, torch.from_numpy(chosen)))
+    scale = torch.from_numpy(first.scale[-1, chosen])
+    second = localise(
+        bayes, platform, prior, steps, scale, lambda done: tell(f"second pass: {done:.0%}"), admit, ROBOT_SIZE
+    )
+    return at_first, _estimates(recordings, delays, steps, second, np.arange(len(recordings)))
+
+
+def _starts(recordings: Sequence[Recording], seconds: np.ndarray, start: tuple[float, float, float] | None) -> Tensor:
+    if start is not None:
+        return torch.tensor(start, dtype=torch.float64).expand(len(recordings), 3)
+    poses = []
+    for recording, second in zip(recordings, seconds, strict=True):
+        pose = None if recording.truth is None else recording.truth.at(np.array([second]))[0]
+        if pose is None or not np.isfinite(pose).all():
+            raise InputError(f"{recording.name}: there is no true pose to start from: give --start X,Y,HEADING")
+        poses.append(pose)
+    return torch.from_numpy(np.stack(poses))
+
+
+def _pick(belief: Gaussian, index: Tensor) -> Gaussian:
+    return Gaussian(belief.mean[index], belief.covariance[index])
+
+
+def _with_constants(prior: Gaussian, known: Gaussian) -> Gaussian:
+    """The prior's poses, and the constants as they are known."""
+    mean, covariance = prior.mean.clone(), prior.covariance.clone()
+    constants = slice(BODY.point_size, ROBOT_SIZE)
+    mean[:, constants], covariance[:, constants, constants] = (
+        known.mean[:, constants],
+        known.covariance[:, constants, constants],
+    )
+    return Gaussian(mean, covariance)
+
+
+def _estimates(
+    recordings: Sequence[Recording], delays: Sequence[float], steps: Steps, result: Localisation, chosen: np.ndarray
+) -> list[RobotEstimate]:
+    estimates = []
+    for recording, delay, b in zip(recordings, delays, chosen, strict=True):
+        K = int(steps.count[b])
+        pose = result.mean[: K + 1, b, :3]
+        covariance = _in_world(pose, result.covariance[: K + 1, b, :3, :3])
+        belief = degree_of_belief(torch.from_numpy(covariance[:, :2, :2])).numpy()
+        final, deviation = result.mean[K, b], np.sqrt(np.diagonal(result.covariance[K, b]))
+        nis = result.nis[:K, b]
+
+        def after_start(column: np.ndarray, fill: float) -> np.ndarray:
+            """With a row for the start, at which nothing was seen."""
+            return np.concatenate([np.full_like(column[:1], fill), column])
+
+        estimates.append(
+            RobotEstimate(
+                recording.name,
+                steps.seconds[: K + 1, b],
+                pose,
+                covariance,
+                belief,
+                after_start(np.where(np.isnan(nis), -1, steps.landmark[:K, b]), -1),
+                after_start(result.innovation[:K, b], np.nan),
+                after_start(nis, np.nan),
+                after_start(result.weight[:K, b], 1.0),
+                delay,
+                {name: (float(final[i]), float(deviation[i])) for i, name in enumerate(CONSTANTS, start=3)},
+                np.sqrt(result.scale[K - 1, b]),
+                recording.truth,
+                _map(recording, result.final[int(b)], steps.landmark[:K, b][~np.isnan(steps.value[:K, b, :, 0])]),
+            )
+        )
+    return estimates
+
+
+def _map(recording: Recording, final: Gaussian, seen: np.ndarray) -> LandmarkMap | None:
+    """What the belief at the end says of the landmarks that were seen; None if they are no part of the state."""
+    if final.mean.shape[-1] == ROBOT_SIZE:
+        return None
+    landmark = np.unique(seen)
+    rows = (ROBOT_SIZE + 2 * landmark[:, None] + [0, 1]).ravel()
+    covariance = final.covariance.numpy()[np.ix_(rows, rows)]
+    return LandmarkMap(landmark, final.mean.numpy()[rows].reshape(-1, 2), covariance, recording.landmarks[landmark])
+
+
+def _in_world(pose: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Covariances (K, 3, 3) of x, y, heading from those of twists in the robot's frame."""
+    sine, cosine, zero, one = np.sin(pose[:, 2]), np.cos(pose[:, 2]), np.zeros(len(pose)), np.ones(len(pose))
+    turn = np.stack([cosine, -sine, zero, sine, cosine, zero, zero, zero, one], axis=1).reshape(-1, 3, 3)
+    turned: np.ndarray = turn @ covariance @ turn.transpose(0, 2, 1)
+    return turned

@@ -1,0 +1,104 @@
+"""The tracker's estimator as ONNX graphs: its modules, with examples of what they are called with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from sigmaslam.inference.weight_manifest import update_manifest
+from sigmaslam_filters.manifolds.se3_matrices import exp_se3
+from sigmaslam_models.estimator.frame_update import FrameViews, GatedStep, PredictViews, RobustStep
+from sigmaslam_models.estimator.graph_examples import (
+    GATED_INPUTS,
+    GATED_OUTPUTS,
+    PREDICTED,
+    ROBUST_INPUTS,
+    ROBUST_OUTPUTS,
+    WINDOW_INPUTS,
+    WINDOW_OUTPUTS,
+    condition_example,
+    frame_axes,
+    frame_example,
+    window_axes,
+    window_example,
+)
+from sigmaslam_models.estimator.pose_prediction import STATE_SIZE, Predict
+from sigmaslam_models.estimator.window_solution import Condition, EliminateLandmarks, GateWindow, WindowViews
+from sigmaslam_models.graph_export import TracedModule, export_graph
+
+# ONNX Runtime and torch may order sums differently; more than this is a wrong graph.
+ESTIMATOR_TOLERANCE = 1e-9
+
+
+def export_estimator(folder: Path) -> dict[str, float]:
+    """Writes the estimator's graphs and returns the largest difference of each from torch."""
+    differences = {
+        name: export_graph(graph, folder / f"{name}.onnx", ESTIMATOR_TOLERANCE)
+        for name, graph in estimator_graphs().items()
+    }
+    update_manifest(folder, [f"{name}.onnx" for name in differences])
+    return differences
+
+
+def estimator_graphs() -> dict[str, TracedModule]:
+    """All of them, by name."""
+    fixed: dict[int, Any] = {}
+    state, columns = (torch.export.Dim(name, min=1, max=10_000) for name in ("state", "columns"))
+    return {
+        "pose_predict": TracedModule(
+            Predict(),
+            _predict_example(0),
+            _predict_example(1),
+            ["pose", "twist", "covariance", "step", "densities"],
+            ["predicted_pose", "predicted_covariance"],
+            (fixed,) * 5,
+        ),
+        "frame_predict": _frame_graph(PredictViews(), (), PREDICTED),
+        "frame_robust": _frame_graph(RobustStep(), ROBUST_INPUTS, ROBUST_OUTPUTS),
+        "frame_gated": _frame_graph(GatedStep(), GATED_INPUTS, GATED_OUTPUTS),
+        "window_eliminate": _window_graph(EliminateLandmarks(), WINDOW_INPUTS, WINDOW_OUTPUTS),
+        "window_gate": _window_graph(GateWindow(), (), ("agree",)),
+        "window_condition": TracedModule(
+            Condition(),
+            condition_example(0, 18, 7),
+            condition_example(1, 30, 25),
+            ["factor", "information", "vector", "common"],
+            ["mean", "covariance", "common_after"],
+            ({0: state, 1: columns}, {0: state, 1: state}, {0: state}, {0: state}),
+        ),
+    }
+
+
+def _frame_graph(module: nn.Module, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> TracedModule:
+    """A step of a frame's update with inputs of its own, before the fields of `FrameViews`."""
+    fields = FrameViews._fields
+    traced, checked = (
+        frame_example(seed, keyframes, count, *inputs, *fields) for seed, keyframes, count in ((0, 3, 40), (1, 5, 77))
+    )
+    axes = (*frame_axes(*inputs), frame_axes(*fields))
+    return TracedModule(module, traced, checked, [*inputs, *fields], list(outputs), axes)
+
+
+def _window_graph(module: nn.Module, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> TracedModule:
+    """A step of a window's solution with inputs of its own, before the fields of `WindowViews`."""
+    fields = WindowViews._fields
+    traced, checked = (
+        window_example(seed, keyframes, count, *inputs, *fields) for seed, keyframes, count in ((0, 4, 30), (1, 5, 50))
+    )
+    axes = (*window_axes(*inputs), window_axes(*fields))
+    return TracedModule(module, traced, checked, [*inputs, *fields], list(outputs), axes)
+
+
+def _predict_example(seed: int) -> tuple[Tensor, ...]:
+    generator = torch.Generator().manual_seed(seed)
+
+    def random(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    root = 0.004 * random(STATE_SIZE, STATE_SIZE)
+    densities = 0.1 + random(2).abs()
+    step = torch.tensor(0.1 + 0.2 * seed, dtype=torch.float64)
+    return exp_se3(0.3 * random(6)), random(6), root @ root.T, step, densities

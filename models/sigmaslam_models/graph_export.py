@@ -1,0 +1,99 @@
+"""A module as an ONNX graph: written, and compared with torch on inputs of other sizes than it was traced with."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from sigmaslam.errors import SigmaSlamError
+from sigmaslam.files import atomic_path
+from sigmaslam.inference.onnx_graph import OnnxGraph
+from sigmaslam_filters.graphs.graph_file import simplify, strip_origins
+from sigmaslam_models.runtime_operators import inverse_operator
+
+_OPSET = 20
+Compare = Callable[[list[np.ndarray], list[np.ndarray]], float]
+
+
+@dataclass(frozen=True, slots=True)
+class TracedModule:
+    """A module with inputs to trace it, others to check it, and which axes are free.
+
+    Attributes:
+        traced, checked: arguments of the module, of other sizes.
+        inputs, outputs: names in the graph.
+        dynamic: of each argument the free axes, as `torch.onnx.export` takes them.
+    """
+
+    module: nn.Module
+    traced: tuple[Tensor, ...]
+    checked: tuple[Tensor, ...]
+    inputs: list[str]
+    outputs: list[str]
+    dynamic: tuple[Any, ...]
+
+
+def export_graph(
+    graph: TracedModule,
+    out: Path,
+    tolerance: float,
+    compare: Compare | None = None,
+) -> float:
+    """Writes a graph and returns its difference from torch.
+
+    Raises:
+        SigmaSlamError: it is larger than the tolerance. Nothing is written.
+    """
+    with warnings.catch_warnings(), atomic_path(out) as path:
+        warnings.simplefilter("ignore")
+        logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+        program = torch.onnx.export(
+            graph.module.eval(),
+            graph.traced,
+            dynamo=True,
+            input_names=graph.inputs,
+            output_names=graph.outputs,
+            dynamic_shapes=graph.dynamic,
+            opset_version=_OPSET,
+            verbose=False,
+            optimize=False,
+            custom_translation_table={torch.ops.aten.linalg_inv_ex.default: inverse_operator()},
+        )
+        assert program is not None
+        simplify(program.model)
+        program.save(path, external_data=False)
+        strip_origins(path)
+        difference = graph_difference(graph, path, compare or relative_difference)
+        if not difference <= tolerance:
+            raise SigmaSlamError(
+                f"{out.name} differs from torch by {difference:.2e}, more than {tolerance:.0e}: not written"
+            )
+    return difference
+
+
+def graph_difference(graph: TracedModule, path: Path, compare: Compare) -> float:
+    """Of a written graph from its module, on inputs that it was not traced with."""
+    actual = OnnxGraph(path)(feed_of(graph))
+    with torch.no_grad():
+        outputs = graph.module(*graph.checked)
+    expected = [value.numpy() for value in (outputs if isinstance(outputs, tuple) else (outputs,))]
+    return compare(actual, expected)
+
+
+def feed_of(graph: TracedModule) -> dict[str, np.ndarray]:
+    """The inputs by which it is checked."""
+    return {name: np.asarray(value) for name, value in zip(graph.inputs, graph.checked, strict=True)}
+
+
+def relative_difference(actual: list[np.ndarray], expected: list[np.ndarray]) -> float:
+    """Largest difference over all outputs, relative to an output's largest value where that exceeds 1."""
+    pairs = [(np.asarray(a, np.float64), np.asarray(b, np.float64)) for a, b in zip(actual, expected, strict=True)]
+    return max(float(np.abs(a - b).max() / max(1.0, float(np.abs(b).max()))) for a, b in pairs)

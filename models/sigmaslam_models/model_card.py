@@ -1,0 +1,127 @@
+"""The model card that ships with weights: read, and as a page for people."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from sigmaslam.bounded_files import read_text, shorten
+from sigmaslam.errors import InputError
+from sigmaslam_models.feature_network import DESCRIPTOR_SIZE
+
+_CARD_FIELDS = (
+    *("config", "metrics_on_held_out_renders", "parameters", "data", "command", "commit", "seed"),
+    *("duration_s", "hardware"),
+)
+_CARD_BYTES = 1 << 24
+REFINED_NAME = " + sigmaslam match"
+"""Follows the name of an extractor in the row of what `sigmaslam match` makes of its features."""
+PEER_NAMES = ("sift", "orb", "klt")
+"""Rows of `sigmaslam benchmark features` that are always beside ours."""
+
+
+def read_card(card: Path) -> dict[str, Any]:
+    """What a training run says of its weights.
+
+    Raises:
+        InputError: the file is missing or says too little.
+    """
+    if not card.is_file():
+        raise InputError(f"{card} does not exist: weights ship only with the card of the run that made them")
+    try:
+        content: Any = json.loads(read_text(card, _CARD_BYTES, "the card"))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{card} is no card of a training run ({shorten(str(error))}): train again") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{card} is no card of a training run: it is a {type(content).__name__}: train again")
+    missing = [name for name in _CARD_FIELDS if name not in content]
+    if missing:
+        raise InputError(f"{card} is no card of a training run: it says nothing of {', '.join(missing)}")
+    return content
+
+
+def read_scores(path: Path) -> dict[str, dict[str, float]]:
+    """Scores of one extractor by set, as `sigmaslam benchmark features` writes them beside its page.
+
+    Those of SIFT, ORB and KLT are left out; those with what `sigmaslam match` makes of the features get its name.
+
+    Raises:
+        InputError: the file cannot be read, or holds the scores of no or several extractors.
+    """
+    try:
+        everyone: dict[str, dict[str, dict[str, float]]] = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path} cannot be read ({error}): give the .json of `sigmaslam benchmark features`"
+        ) from error
+    names = [name for name in everyone if name not in PEER_NAMES and not name.endswith(REFINED_NAME)]
+    if len(names) != 1:
+        raise InputError(f"{path} holds the scores of {', '.join(names) or 'nobody'}: one extractor is needed")
+    refined = everyone.get(names[0] + REFINED_NAME, {})
+    return {
+        label: {name: round(value, 4) for name, value in scores.items()}
+        for of_set in everyone[names[0]]
+        for label, scores in ((of_set, everyone[names[0]][of_set]), (of_set + REFINED_NAME, refined.get(of_set, {})))
+        if scores
+    }
+
+
+def card_page(card: dict[str, Any]) -> str:
+    """The model card for people, in Markdown."""
+    started = card.get("started_from")
+    origin = "random weights" if started is None else f"{started['name']} (sha256 {started['sha256']})"
+    sections = [
+        _table("setting", "", card["config"]),
+        _table("held-out renders (48 pairs, 256 keypoints)", "", card["metrics_on_held_out_renders"]),
+    ]
+    real = card.get("metrics_on_real_sets", {})
+    if real:
+        rows = {f"{name} {metric}": value for name, values in real.items() for metric, value in values.items()}
+        sections.append("## Real sets\n\nNone of them was used in training.\n\n" + _table("set, metric", "", rows))
+    if card.get("limits"):
+        sections.append("## Limits\n\n" + "".join(f"- {limit}\n" for limit in card["limits"]))
+    sections.append(_graphs_section(card))
+    return f"""# Model card: features
+
+Keypoints (blobs of two scales, ranked by a learned quality), {DESCRIPTOR_SIZE}-D descriptors, a sigma of each place;
+{card["parameters"]} parameters.
+
+- Recipe: {card.get("recipe") or "none"}, started from {origin}.
+- Data: {card["data"]}.
+- Command: `{card["command"]}`, commit {card["commit"]}, seed {card["seed"]}.
+- Duration: {card["duration_s"] / 60:.0f} minutes on {card["hardware"]}.
+- Figures on real sequences: docs/results.md; none of them was used in training.
+
+""" + "\n".join(sections)
+
+
+def scoring_page(card: dict[str, Any]) -> str:
+    """The card of the scorer and both verifiers for people, in Markdown."""
+    sections = [
+        _table("setting", "", card["config"]),
+        _table("held-out renders", "", card["metrics_on_held_out_renders"]),
+        "## Limits\n\n" + "".join(f"- {limit}\n" for limit in card.get("limits", [])),
+        _graphs_section(card),
+    ]
+    counts = card["parameters"]
+    return f"""# Model card: match scorer and verifiers
+
+Probability that a match is right, and covariance of its place: scorer, {counts["scorer"]} parameters; verifiers of
+matches, {counts["verifier"]}, and of places found without features, {counts["place_verifier"]} (figures `place_`).
+
+- Data: {card["data"]}.
+- Command: `{card["command"]}`, commit {card["commit"]}, seed {card["seed"]}.
+- Duration: {card["duration_s"] / 60:.0f} minutes on {card["hardware"]}.
+- Figures on real images: docs/matching.md; none of them was used in training.
+
+""" + "\n".join(sections)
+
+
+def _graphs_section(card: dict[str, Any]) -> str:
+    differences = {f"{name}.onnx": f"{value:.1e}" for name, value in card["onnx_minus_torch"].items()}
+    return "## Graphs\n\n" + _table("ONNX minus torch", "largest difference", differences)
+
+
+def _table(left: str, right: str, rows: dict[str, Any]) -> str:
+    return f"| {left} | {right} |\n|---|---|\n" + "".join(f"| {name} | {value} |\n" for name, value in rows.items())

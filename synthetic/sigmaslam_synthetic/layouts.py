@@ -1,0 +1,106 @@
+"""Folders that our readers and other people's tools read: KITTI odometry and EuRoC's ASL format."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import yaml
+from scipy.spatial.transform import Rotation
+
+from sigmaslam.files import atomic_write_text
+from sigmaslam.geometry.camera import CameraModel
+from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.readers.trajectory_files import write_kitti
+from sigmaslam_synthetic.simulation import Simulation
+
+_FIRST_STAMP = 1_600_000_000_000_000_000  # nanoseconds; EuRoC's stamps count from 1970
+_DISTORTION_NAMES = {"none": "radial-tangential", "radtan": "radial-tangential", "equidistant": "equidistant"}
+
+
+def image_paths(out: Path, simulation: Simulation, frame: int) -> tuple[Path, Path]:
+    """Where the left and the right image of a frame go."""
+    if simulation.layout == "kitti":
+        return out / "image_0" / f"{frame:06d}.png", out / "image_1" / f"{frame:06d}.png"
+    name = f"{_stamp(simulation, frame)}.png"
+    return out / "mav0" / "cam0" / "data" / name, out / "mav0" / "cam1" / "data" / name
+
+
+def write_layout(out: Path, simulation: Simulation) -> None:
+    """Folders, calibration, times and the true poses of all frames."""
+    for path in image_paths(out, simulation, 0):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    poses = simulation.path.poses(simulation.times)
+    if simulation.layout == "kitti":
+        _write_kitti(out, simulation, poses)
+    else:
+        _write_euroc(out / "mav0", simulation, poses)
+
+
+def _write_kitti(out: Path, simulation: Simulation, poses: np.ndarray) -> None:
+    camera, baseline = simulation.rig.left, simulation.rig.calibrated.baseline
+    projection = np.concatenate([camera.matrix, np.zeros((3, 1))], axis=1)
+    right = projection.copy()
+    right[0, 3] = -camera.fx * baseline
+    atomic_write_text(out / "calib.txt", f"P0: {_row(projection)}\nP1: {_row(right)}\n")
+    atomic_write_text(out / "times.txt", "".join(f"{t:.6e}\n" for t in simulation.times))
+    relative = np.linalg.inv(poses[0]) @ poses
+    relative[0] = np.eye(4)
+    write_kitti(out / "poses.txt", Trajectory(simulation.times, relative))
+    if simulation.scene.moving.any() and np.ptp(poses, axis=0).max() == 0.0:
+        # The camera is at rest, and what moves is to be followed: the first of what moves, T_camera_object.
+        body = simulation.scene.bodies[int(np.flatnonzero(simulation.scene.moving)[0])]
+        moved = np.stack([np.linalg.inv(poses[0]) @ body.pose(time) for time in simulation.times])
+        write_kitti(out / "poses_object.txt", Trajectory(simulation.times, moved))
+
+
+def _write_euroc(root: Path, simulation: Simulation, poses: np.ndarray) -> None:
+    """The body of the ASL format is the left camera."""
+    stamps = [_stamp(simulation, k) for k in range(simulation.frames)]
+    placed = ((simulation.rig.left, np.eye(4)), (simulation.rig.right, np.array(simulation.rig.T_left_right)))
+    for k, (camera, T_body_camera) in enumerate(placed):
+        folder = root / f"cam{k}"
+        atomic_write_text(folder / "sensor.yaml", _sensor_yaml(camera, T_body_camera, simulation.fps))
+        rows = [[stamp, f"{stamp}.png"] for stamp in stamps]
+        atomic_write_text(folder / "data.csv", _table(["#timestamp [ns]", "filename"], rows))
+    truth = root / "state_groundtruth_estimate0"
+    truth.mkdir(exist_ok=True)
+    orientation = Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=True)
+    header = ["#timestamp", *(f"p_RS_R_{axis} [m]" for axis in "xyz"), *(f"q_RS_{part} []" for part in "wxyz")]
+    rows = [
+        [stamp, *(f"{value:.12f}" for value in (*T[:3, 3], *q))]
+        for stamp, T, q in zip(stamps, poses, orientation, strict=True)
+    ]
+    atomic_write_text(truth / "data.csv", _table(header, rows))
+
+
+def _sensor_yaml(camera: CameraModel, T_body_camera: np.ndarray, fps: float) -> str:
+    content = {
+        "sensor_type": "camera",
+        "comment": "rendered",
+        "T_BS": {"cols": 4, "rows": 4, "data": [float(value) for value in T_body_camera.ravel()]},
+        "rate_hz": fps,
+        "resolution": [camera.width, camera.height],
+        "camera_model": "pinhole",
+        "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
+        "distortion_model": _DISTORTION_NAMES[camera.distortion_model],
+        "distortion_coefficients": list(camera.distortion) or [0.0] * 4,
+    }
+    return yaml.safe_dump(content, sort_keys=False)
+
+
+def _stamp(simulation: Simulation, frame: int) -> int:
+    return _FIRST_STAMP + round(1e9 * frame / simulation.fps)
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([header, *rows])
+    return text.getvalue()
+
+
+def _row(matrix: np.ndarray) -> str:
+    return " ".join(f"{value:.12e}" for value in matrix.ravel())

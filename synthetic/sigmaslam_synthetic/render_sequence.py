@@ -1,0 +1,293 @@
+"""Writes rendered stereo sequences with exact truth: in parallel, and again from where it stopped.
+
+A folder holds the images in KITTI's or EuRoC's layout with calibration, times and true poses; `scene.json`, from which
+everything can be made again; `truth/NNNNNN.npz` for each frame; and `landmarks.npz`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from sigmaslam.errors import InputError, OutputError
+from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder
+from sigmaslam_synthetic.landmark_tracks import Landmarks, choose_landmarks, observe
+from sigmaslam_synthetic.layouts import image_paths, write_layout
+from sigmaslam_synthetic.parallel_jobs import list_failures, run_jobs
+from sigmaslam_synthetic.render_choices import TRUTHS
+from sigmaslam_synthetic.simulation import Frame, Recipe, Simulation, Studio, simulate
+
+SCENE_NAME, LANDMARKS_NAME = "scene.json", "landmarks.npz"
+_BEGUN_NAME = ".begun.json"
+_CHUNK = 8  # frames handed to a process at a time, at most
+_TRACK_KEYS = ("landmark", "left", "right", "left_visible", "right_visible", "depth")
+
+
+def write_sequence(
+    out: Path,
+    recipe: Recipe,
+    truth: str = "dense",
+    workers: int = 1,
+    device: str = "cpu",
+    ray: str | None = None,
+    done: Callable[[int], None] = lambda frames: None,
+) -> int:
+    """Renders a sequence into a folder; frames that are there already are kept.
+
+    Args:
+        out: new, empty, or left from the same recipe.
+        recipe: what to render.
+        truth: 'dense' for depth, instance ids, flow and occlusion of every pixel beside the landmarks; 'sparse' for
+            the landmarks alone.
+        workers: processes.
+        device: where frames are drawn.
+        ray: address of a Ray cluster that renders instead, as `run_jobs` takes it; all its machines must share `out`.
+        done: called with the number of frames that are there.
+    Returns:
+        How many frames were there before.
+    Raises:
+        InputError: the recipe is wrong, or the folder holds something else.
+    """
+    if truth not in TRUTHS:
+        raise InputError(f"truth {truth!r} is unknown; choose one of {', '.join(TRUTHS)}")
+    recipe.check()
+    prepare(out, recipe, truth)
+    missing = missing_frames(out, recipe.frames)
+    before = recipe.frames - len(missing)
+    done(before)
+    size = int(np.clip(len(missing) // (4 * workers), 1, _CHUNK))
+    film = _Film(out.resolve(), truth, device)
+    chunks = [_Chunk(film, missing[k : k + size]) for k in range(0, len(missing), size)]
+    count = before
+
+    def ended(_: _Chunk, written: int | Exception) -> None:
+        nonlocal count
+        if isinstance(written, Exception):
+            raise written
+        count += written
+        done(count)
+
+    if ray is None and min(workers, len(chunks)) <= 1:
+        opened = film.open() if missing else None
+        for number in missing:
+            frame = _Chunk(film, [number])
+            ended(frame, _write_chunk(frame, opened))
+    else:
+        run_jobs(_write_chunk, chunks, workers, ended, ray, int(device != "cpu"))
+    join_tracks(out, recipe.frames)
+    return before
+
+
+def write_sequences(
+    out: Path,
+    recipes: Sequence[Recipe],
+    truth: str = "dense",
+    workers: int = 1,
+    device: str = "cpu",
+    ray: str | None = None,
+    done: Callable[[int], None] = lambda sequences: None,
+) -> None:
+    """Renders sequences into folders of their names, each in one worker.
+
+    Args:
+        out: the folder of these folders; arguments are else as of `write_sequence`.
+        recipes: what to render; their names differ.
+        done: called with the number of sequences that have ended.
+    Raises:
+        InputError: a recipe is wrong.
+        OutputError: sequences failed; the others are there.
+    """
+    for recipe in recipes:
+        recipe.check()
+    failed: dict[str, Exception] = {}
+    count = 0
+
+    def ended(job: _Rendering, outcome: int | Exception) -> None:
+        nonlocal count
+        if isinstance(outcome, Exception):
+            failed[job.recipe.name] = outcome
+        count += 1
+        done(count)
+
+    jobs = [_Rendering(out.resolve() / recipe.name, recipe, truth, device) for recipe in recipes]
+    run_jobs(_render, jobs, workers, ended, ray, int(device != "cpu"))
+    if failed:
+        raise OutputError(f"{out} lacks {list_failures(failed)}: the same command tries what is missing again")
+
+
+def prepare(out: Path, recipe: Recipe, truth: str) -> None:
+    """Makes the folder with all but its frames, or checks the one that is there.
+
+    Raises:
+        InputError: the folder holds something else.
+    """
+    asked = {"recipe": asdict(recipe), "truth": truth}
+    scene = out / SCENE_NAME
+    if scene.is_file():
+        try:
+            content: dict[str, Any] = json.loads(scene.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise InputError(f"{scene} cannot be read ({error}); remove it or choose another --out") from error
+        # Folders from before there were worlds of one's own lack the key.
+        there = {"recipe": {"world": None, **content.get("recipe", {})}, "truth": content.get("truth")}
+        if there != asked:
+            raise InputError(f"{scene} was made with {there}, not {asked}; choose another --out")
+        return
+    # Where this process is killed before the scene is written, the same recipe may begin again.
+    begun, text = out / _BEGUN_NAME, json.dumps(asked)
+    again = begun.is_file() and begun.read_text(encoding="utf-8") == text
+    if not again:
+        check_new_folder(out)
+    simulation = simulate(recipe)
+    if not again:
+        out.mkdir(parents=True, exist_ok=True)
+        atomic_write_text(begun, text)
+    (out / "truth").mkdir(exist_ok=True)
+    write_layout(out, simulation)
+    _save(out / LANDMARKS_NAME, asdict(choose_landmarks(Studio(simulation))))
+    # The last to be written: a folder with scene.json is complete but for its frames.
+    content = {**asked, "command": command(recipe, truth), "simulation": simulation.to_json()}
+    atomic_write_text(scene, json.dumps(content) + "\n")
+    begun.unlink()
+
+
+def missing_frames(out: Path, frames: int) -> list[int]:
+    """Numbers of the frames whose truth, the last of their files, is not there."""
+    return [k for k in range(frames) if not _truth_path(out, k).is_file()]
+
+
+def write_frames(out: Path, studio: Studio, landmarks: Landmarks, truth: str, numbers: list[int]) -> int:
+    """Renders and writes these frames; returns how many."""
+    batch = 1 if studio.renderer.device.type == "cpu" else _CHUNK
+    for start in range(0, len(numbers), batch):
+        part = numbers[start : start + batch]
+        left, right = studio.views(np.array(part))
+        frames = studio.frames(np.array(part), (left, right))
+        for view, (number, frame) in enumerate(zip(part, frames, strict=True)):
+            for path, image in zip(image_paths(out, studio.simulation, number), (frame.left, frame.right), strict=True):
+                _write_image(path, image)
+            tracks = observe(landmarks, left.sight, right.sight, view)
+            _save(_truth_path(out, number), _truth_of(tracks, frame, truth))
+    return len(numbers)
+
+
+def join_tracks(out: Path, frames: int) -> None:
+    """Adds the observations of all frames to landmarks.npz, one row a landmark and frame."""
+    with np.load(out / LANDMARKS_NAME) as content:
+        landmarks = {key: content[key] for key in ("points", "facet", "body")}
+    rows: dict[str, list[np.ndarray]] = {key: [] for key in ("frame", *_TRACK_KEYS)}
+    for k in range(frames):
+        with np.load(_truth_path(out, k)) as content:
+            for key in _TRACK_KEYS:
+                rows[key].append(content[f"track_{key}"])
+        rows["frame"].append(np.full(len(rows["landmark"][-1]), k))
+    _save(out / LANDMARKS_NAME, {**landmarks, **{f"track_{key}": np.concatenate(v) for key, v in rows.items()}})
+
+
+def command(recipe: Recipe, truth: str) -> str:
+    """The command line that writes the same folder again."""
+    plain = Recipe(recipe.preset, recipe.frames)
+    words = ["sigmaslam", "render", recipe.preset, "--out", "DIR", "--frames", str(recipe.frames)]
+    for name, value in asdict(recipe).items():
+        if name not in ("preset", "frames") and (value != getattr(plain, name) or name == "seed"):
+            words += [f"--{name.replace('_', '-')}", str(value)]
+    return " ".join(words if truth == "dense" else [*words, "--truth", truth])
+
+
+@dataclass(frozen=True, slots=True)
+class _Rendering:
+    """A sequence that one process writes."""
+
+    out: Path
+    recipe: Recipe
+    truth: str
+    device: str
+
+
+def _render(job: _Rendering) -> int:
+    return write_sequence(job.out, job.recipe, job.truth, device=job.device)
+
+
+@dataclass(frozen=True, slots=True)
+class _Film:
+    """A sequence whose frames are to be written."""
+
+    out: Path
+    truth: str
+    device: str
+
+    def open(self) -> tuple[Studio, Landmarks]:
+        """What all frames are made with."""
+        content = json.loads((self.out / SCENE_NAME).read_text(encoding="utf-8"))
+        with np.load(self.out / LANDMARKS_NAME) as arrays:
+            landmarks = Landmarks(arrays["points"], arrays["facet"], arrays["body"])
+        return Studio(Simulation.from_json(content["simulation"]), self.device), landmarks
+
+
+@dataclass(frozen=True, slots=True)
+class _Chunk:
+    """Frames that one process writes at a time."""
+
+    film: _Film
+    numbers: list[int]
+
+
+def _write_chunk(chunk: _Chunk, opened: tuple[Studio, Landmarks] | None = None) -> int:
+    film = chunk.film
+    with torch.inference_mode():
+        studio, landmarks = opened or _open_once(film)
+        return write_frames(film.out, studio, landmarks, film.truth, chunk.numbers)
+
+
+@lru_cache(maxsize=1)
+def _open_once(film: _Film) -> tuple[Studio, Landmarks]:
+    """Of a worker, which has many chunks of one sequence."""
+    return film.open()
+
+
+def _truth_of(observed: dict[str, np.ndarray], frame: Frame, truth: str) -> dict[str, np.ndarray]:
+    tracks = {f"track_{key}": value for key, value in observed.items()}
+    if truth == "sparse":
+        return tracks
+    images = {key: value for key, value in asdict(frame).items() if key not in ("left", "right")}
+    return {**images, **tracks}
+
+
+def _truth_path(out: Path, frame: int) -> Path:
+    return out / "truth" / f"{frame:06d}.npz"
+
+
+def _save(path: Path, arrays: dict[str, Any]) -> None:
+    """A .npz like numpy's compressed ones, at the fastest level: numpy's own takes as long as the rendering."""
+    with (
+        atomic_path(path) as temporary,
+        zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
+    ):
+        for name, array in arrays.items():
+            info = zipfile.ZipInfo(f"{name}.npy")  # with a fixed date: the same arrays are the same bytes
+            info.compress_type = zipfile.ZIP_DEFLATED
+            with archive.open(info, "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.ascontiguousarray(array), allow_pickle=False)
+
+
+def _write_image(path: Path, image: np.ndarray) -> None:
+    ok, encoded = cv2.imencode(".png", image)
+    if not ok:
+        raise InputError(f"{path} cannot be encoded as PNG")
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(encoded.tobytes())
+
+
+def default_workers() -> int:
+    """One process a core."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,0 +1,178 @@
+"""What the verifier of places learns from: patches of rendered pairs found without features of the second image."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from sigmaslam.errors import SigmaSlamError
+from sigmaslam.frontend.affine_alignment import local_maps
+from sigmaslam.frontend.followed_patches import (
+    FLOW_LEVELS,
+    FLOW_WINDOW,
+    PatchTargets,
+    compare_with_neighbours,
+    correct_by_neighbours,
+    find_patches,
+    shrink,
+)
+from sigmaslam.frontend.lucas_kanade import lucas_kanade
+from sigmaslam.frontend.nearest_neighbours import within_ellipses
+from sigmaslam.frontend.patch_evidence import examine_patches
+from sigmaslam.frontend.row_search import REACH_PREDICTED, REACH_SEARCHED, align_in_rows, search_rows
+from sigmaslam.frontend.types import PatchMaps
+from sigmaslam.frontend.verifier_inputs import PlaceSearch, describe_places
+from sigmaslam_training.matching.match_sets import MatchSet, PairRecord
+from sigmaslam_training.matching.verifier_training import VerifierRows, error_along_axes
+
+# Of predictions, pixels: what all are off by, drawn evenly in the logarithm, and what they claim beside it.
+_SIGMAS, _OWN_SIGMA = (0.5, 15.0), 1.0
+# Their error grows by so much a pixel from the middle of the image; so many have the wrong depth and err on their own.
+_STRETCH, _WRONG_DEPTH = 0.01, 0.1
+# Places of the last frame carried on are off by so much; hidden ones drift away from where they were.
+_CARRIED, _DRIFT, _FORGOTTEN = 0.3, 2.0, 0.1
+# Relative error of the patches' maps.
+_MAP_ERROR = 0.03
+# Pairs whose second image shows another place.
+_FOREIGN = 0.15
+# Of predicted disparities, pixels, drawn evenly in the logarithm.
+_DISPARITY_SIGMAS = (0.1, 1.5)
+_MIN_ROWS = 16
+
+
+def collect_place_rows(records: Iterable[PairRecord], seed: int, note: Callable[[int], None]) -> VerifierRows:
+    """Finds the keypoints of all records as the run time does without features of the second image.
+
+    Args:
+        records: pairs with their sets.
+        seed: of predictions and starts.
+        note: is told how many records are done.
+    """
+    parts = []
+    for number, record in enumerate(records):
+        rng = np.random.default_rng((seed, 5, number))
+        for found in record.sets.values():
+            image1, truth = record.image1, np.where(found.visible[:, None], found.expected, np.inf)
+            if rng.random() < _FOREIGN:
+                image1, truth = (
+                    np.roll(image1, [side // 2 for side in image1.shape], (0, 1)),
+                    np.full_like(truth, np.inf),
+                )
+            pair = record.image0, image1
+            if found.source == "stereo":
+                drawn = [_along_rows(pair, found, truth), _followed_along_rows(pair, found, truth, rng)]
+            else:
+                drawn = [_followed(pair, found, truth, rng)]
+            for columns, error in drawn:
+                if len(columns) >= _MIN_ROWS:
+                    parts.append(VerifierRows(columns, error, np.full(len(columns), number)))
+        note(number + 1)
+    if not parts:
+        raise SigmaSlamError("no keypoint is found again in any pair: train on more pairs")
+    return VerifierRows.concatenate(parts)
+
+
+_Pair = tuple[np.ndarray, np.ndarray]
+
+
+def _followed(
+    pair: _Pair, found: MatchSet, truth: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Columns and errors of keypoints followed near a prediction."""
+    size = np.array(pair[1].shape[::-1])
+    sigma = np.exp(rng.uniform(*np.log(_SIGMAS)))
+    points = found.features0.keypoints.astype(np.float64)
+    stretch = _STRETCH * rng.standard_normal((2, 2))
+    predicted = found.expected + sigma * rng.standard_normal(2) + (points - 0.5 * size) @ stretch
+    alone = rng.random(len(points)) < _WRONG_DEPTH
+    predicted[alone] += sigma * rng.standard_normal((int(alone.sum()), 2))
+    usable = np.flatnonzero(((predicted >= 0) & (predicted < size)).all(axis=1))
+    points, predicted, expected = points[usable], predicted[usable], found.expected[usable]
+    covariance = np.tile((sigma**2 + _OWN_SIGMA**2) * np.eye(2), (len(points), 1, 1))
+    start = _starts(pair, points, predicted, expected, found.visible[usable], rng)
+    start[~within_ellipses(np.nan_to_num(start, nan=1e6) - predicted, covariance)] = np.nan
+    A, _ = local_maps(points, expected, np.ones(len(points)))
+    A = A @ (np.eye(2) + _MAP_ERROR * rng.standard_normal((len(points), 2, 2)))
+    maps = PatchMaps(A, np.zeros_like(points))
+    targets = PatchTargets(points, maps, predicted, covariance, start, correct_by_neighbours(predicted, start))
+    small0, small1 = (shrink(image) for image in pair)
+    places, there = find_patches(*pair, small0, small1, targets)
+    kept = usable[there]
+    return _describe(
+        pair, points[there], places[there], predicted[there], A[there], found, kept, truth, PlaceSearch.IN_TIME
+    )
+
+
+def _starts(
+    pair: _Pair,
+    points: np.ndarray,
+    predicted: np.ndarray,
+    expected: np.ndarray,
+    visible: np.ndarray,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Where keypoints were followed to: by Lucas-Kanade over the whole way, or carried on from a frame before."""
+    if rng.random() < 0.5:
+        places, found = lucas_kanade(*pair, points, predicted, FLOW_WINDOW, FLOW_LEVELS)
+    else:
+        noise = np.where(visible, _CARRIED, _DRIFT)[:, None] * rng.standard_normal(points.shape)
+        places, found = expected + noise, rng.random(len(points)) > _FORGOTTEN
+    return np.where(found[:, None], places, np.nan)
+
+
+def _along_rows(pair: _Pair, found: MatchSet, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Columns and errors of keypoints searched for along the rows of a stereo pair."""
+    index, start = search_rows(*pair, found.features0.keypoints)
+    points = found.features0.keypoints[index].astype(np.float64)
+    places, there, slope = align_in_rows(*pair, points, start, REACH_SEARCHED)
+    points = points[there]
+    return _describe(
+        pair, points, places[there], points, None, found, index[there], truth, PlaceSearch.ALONG_ROWS, slope[there]
+    )
+
+
+def _followed_along_rows(
+    pair: _Pair, found: MatchSet, truth: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Columns and errors of keypoints whose disparity is predicted."""
+    points = found.features0.keypoints.astype(np.float64)
+    low, high = np.log(_DISPARITY_SIGMAS)
+    sigmas = np.exp(rng.uniform(low, high, 2))
+    start = points.copy()
+    start[:, 0] = (
+        found.expected[:, 0] + sigmas[0] * rng.standard_normal() + sigmas[1] * rng.standard_normal(len(points))
+    )
+    usable = np.flatnonzero((start[:, 0] >= 0) & (start[:, 0] < pair[1].shape[1]))
+    points, start = points[usable], start[usable]
+    places, there, _ = align_in_rows(*pair, points, start, REACH_PREDICTED)
+    return _describe(
+        pair,
+        points[there],
+        places[there],
+        start[there],
+        None,
+        found,
+        usable[there],
+        truth,
+        PlaceSearch.PREDICTED_ALONG_ROWS,
+    )
+
+
+def _describe(
+    pair: _Pair,
+    points: np.ndarray,
+    places: np.ndarray,
+    predicted: np.ndarray,
+    A: np.ndarray | None,
+    found: MatchSet,
+    index: np.ndarray,
+    truth: np.ndarray,
+    search: PlaceSearch,
+    slope: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Columns and errors of places of the keypoints of that index."""
+    evidence = examine_patches(*pair, points, places, A)
+    sigma = found.features0.sigma[index]
+    columns = describe_places(*compare_with_neighbours(places, predicted, slope), evidence, sigma, search)
+    return columns, error_along_axes(evidence, places, truth[index])
