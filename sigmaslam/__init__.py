@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from sigmaslam.bodies.object_tracker import ObjectTracker
     from sigmaslam.errors import SigmaSlamError
     from sigmaslam.frontend.image_pair import Matches, match_images
     from sigmaslam.fusion.location_filter import LocationFilter
@@ -10,7 +11,6 @@ if TYPE_CHECKING:
     from sigmaslam.readers import open_sequence
     from sigmaslam.slam.config import TrackerConfig
     from sigmaslam.slam.estimate import Estimate
-    from sigmaslam.slam.object_tracker import ObjectTracker
     from sigmaslam.slam.tracker import StereoTracker
 else:
     from importlib import import_module
@@ -20,7 +20,7 @@ else:
         "Estimate": "slam.estimate",
         "LocationFilter": "fusion.location_filter",
         "Matches": "frontend.image_pair",
-        "ObjectTracker": "slam.object_tracker",
+        "ObjectTracker": "bodies.object_tracker",
         "SigmaSlamError": "errors",
         "StereoCamera": "geometry.camera",
         "StereoTracker": "slam.tracker",

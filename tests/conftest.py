@@ -47,4 +47,4 @@ def one_thread() -> Iterator[None]:
 @pytest.fixture
 def without_report(monkeypatch: pytest.MonkeyPatch) -> None:
     """Runs in this process write no report, which would take longer than to track a few frames."""
-    monkeypatch.setattr("sigmaslam.runs.report.write_report", lambda run_dir: None)
+    monkeypatch.setattr("sigmaslam.report.report.write_report", lambda run_dir: None)

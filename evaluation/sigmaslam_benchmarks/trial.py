@@ -19,8 +19,8 @@ from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.inference.onnx_graph import shipped_weights
 from sigmaslam.readers import StereoSequence, open_sequence
 from sigmaslam.readers.trajectory_files import read_trajectory
-from sigmaslam.runs.frame_table import FrameTable, read_frames
-from sigmaslam.runs.run_folder import check_has_trajectory
+from sigmaslam.run_record.frame_table import FrameTable, read_frames
+from sigmaslam.run_record.run_folder import check_has_trajectory
 from sigmaslam.runs.track import track_sequence
 from sigmaslam_evaluation.evaluation_result import Evaluation
 from sigmaslam_evaluation.run_evaluation import evaluate_run

@@ -9,7 +9,7 @@ import numpy as np
 
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.plot_style import BLUE, VERMILLION, style_axes
-from sigmaslam.runs.figures import AXIS_NAMES, plot_trajectory
+from sigmaslam.report.figures import AXIS_NAMES, plot_trajectory
 from sigmaslam_evaluation.evaluation_result import Evaluation
 from sigmaslam_evaluation.metrics.trajectory_errors import (
     align,

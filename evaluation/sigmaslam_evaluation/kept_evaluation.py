@@ -10,9 +10,9 @@ import numpy as np
 
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.trajectory import Trajectory
-from sigmaslam.runs.evaluated_frames import EvaluatedFrames, write_evaluation
-from sigmaslam.runs.frame_table import FRAMES_NAME
-from sigmaslam.runs.report import write_report
+from sigmaslam.report.report import write_report
+from sigmaslam.run_record.evaluated_frames import EvaluatedFrames, write_evaluation
+from sigmaslam.run_record.frame_table import FRAMES_NAME
 from sigmaslam_evaluation.metrics.trajectory_errors import PoseNees, align, pose_errors, synchronise
 
 _LOGGER = logging.getLogger(__name__)

@@ -10,7 +10,7 @@ import numpy as np
 
 from sigmaslam.estimation.chi_square import CHI_SQUARE_BAND_OF_6
 from sigmaslam.plot_style import BLUE, SKY, VERMILLION
-from sigmaslam.runs.relative_pose_file import RELATIVE_POSES_NAME
+from sigmaslam.run_record.relative_pose_file import RELATIVE_POSES_NAME
 from sigmaslam_evaluation.metrics.relative_consistency import SpanConsistency
 
 if TYPE_CHECKING:

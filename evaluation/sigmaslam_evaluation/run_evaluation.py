@@ -16,10 +16,10 @@ from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.plot_style import has_matplotlib
 from sigmaslam.readers.trajectory_files import kitti_times_path, read_covariances, read_trajectory, trajectory_format
-from sigmaslam.runs.figures import save_png
-from sigmaslam.runs.frame_table import FRAMES_NAME, FrameTable, predicted_poses, read_frames
-from sigmaslam.runs.relative_pose_file import RELATIVE_POSES_NAME, read_frame_pairs
-from sigmaslam.runs.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY, check_has_trajectory
+from sigmaslam.report.figures import save_png
+from sigmaslam.run_record.frame_table import FRAMES_NAME, FrameTable, predicted_poses, read_frames
+from sigmaslam.run_record.relative_pose_file import RELATIVE_POSES_NAME, read_frame_pairs
+from sigmaslam.run_record.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY, check_has_trajectory
 from sigmaslam_evaluation.evaluation_figure import draw_evaluation
 from sigmaslam_evaluation.evaluation_result import Evaluation, FinalErrors
 from sigmaslam_evaluation.kept_evaluation import keep_evaluation

@@ -14,7 +14,7 @@ import torch
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text
 from sigmaslam.plot_style import BLUE, GREY, has_matplotlib, style_axes
-from sigmaslam.runs.figures import save_png
+from sigmaslam.report.figures import save_png
 from sigmaslam_filters import SO3, Gaussian, degree_of_belief
 from sigmaslam_localisation.localise import FilterName, Localisation, localise, make_filter
 from sigmaslam_localisation.output import write_lines

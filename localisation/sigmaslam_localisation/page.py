@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from sigmaslam.files import atomic_write_text, printable
 from sigmaslam.plot_style import BLUE, GREEN, GREY, NO_MATPLOTLIB, SERIES, has_matplotlib, style_axes
-from sigmaslam.runs.figures import save_png, to_svg
+from sigmaslam.report.figures import save_png, to_svg
 from sigmaslam_localisation.robots import RobotEstimate
 
 if TYPE_CHECKING:

@@ -22,10 +22,10 @@ from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder, ma
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import read_covariances, read_tum, write_kitti, write_tum
-from sigmaslam.runs.frame_table import FRAMES_NAME
-from sigmaslam.runs.recorded_run import REFINE_NAME, REFINED_TRAJECTORY
-from sigmaslam.runs.report import write_report
-from sigmaslam.runs.run_folder import FINAL_TRAJECTORY, check_has_trajectory, write_ply
+from sigmaslam.report.report import write_report
+from sigmaslam.run_record.frame_table import FRAMES_NAME
+from sigmaslam.run_record.recorded_run import REFINE_NAME, REFINED_TRAJECTORY
+from sigmaslam.run_record.run_folder import FINAL_TRAJECTORY, check_has_trajectory, write_ply
 from sigmaslam.slam.point_map import PointMap
 
 _LOGGER = logging.getLogger(__name__)

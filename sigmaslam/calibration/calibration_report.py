@@ -11,10 +11,10 @@ import yaml
 from sigmaslam.calibration.board_bundle import INTRINSICS
 from sigmaslam.calibration.calibrate import BoardCalibration
 from sigmaslam.calibration.tracker_covariance import tracker_covariance
+from sigmaslam.calibration_files.calibration_writer import camera_entries, write_calibration
 from sigmaslam.files import atomic_path, atomic_write_text
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.plot_style import BLUE, GREY, VERMILLION, style_axes
-from sigmaslam.readers.calibration_writer import camera_entries, write_calibration
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,10 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from sigmaslam.calibration_files.calibration_writer import write_calibration
 from sigmaslam.files import atomic_write_bytes, atomic_write_text, check_new_folder, make_folder
 from sigmaslam.geometry.camera import CameraModel, RectifiedStereo, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
-from sigmaslam.readers.calibration_writer import write_calibration
 from sigmaslam.readers.stereo_sequence import StereoSequence
 
 

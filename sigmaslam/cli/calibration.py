@@ -8,10 +8,10 @@ from typing import Annotated
 
 import typer
 
+from sigmaslam.calibration_files.calibration import read_calibration
+from sigmaslam.calibration_files.calibration_writer import describe_calibration, write_calibration
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.camera import StereoCamera
-from sigmaslam.readers.calibration import read_calibration
-from sigmaslam.readers.calibration_writer import describe_calibration, write_calibration
 
 calibration = typer.Typer(name="calibration", no_args_is_help=True, help="Show or convert a stereo calibration.")
 

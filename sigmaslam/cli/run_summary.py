@@ -8,7 +8,7 @@ from typing import Any
 import typer
 
 from sigmaslam.files import printable
-from sigmaslam.runs.verdict import contradiction_verdict
+from sigmaslam.run_record.verdict import contradiction_verdict
 
 NOT_TRACKED = 3
 """Exit code where less than half of the frames were tracked."""
@@ -65,7 +65,7 @@ def _real_time_verdict(summary: dict[str, Any]) -> str:
     """A line about dropped frames and latency; empty where frames were tracked as fast as they could be."""
     if "real_time" not in summary:
         return ""
-    from sigmaslam.runs.real_time import format_latency
+    from sigmaslam.run_record.real_time import format_latency
 
     figures = format_latency(summary["real_time"]["latency_ms"])
     return f"In real time: {summary['real_time']['dropped']} frames dropped; latency in ms: {figures}.\n"

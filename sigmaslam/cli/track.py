@@ -29,10 +29,10 @@ from sigmaslam.plot_style import NO_MATPLOTLIB
 from sigmaslam.readers import StereoSequence, open_cameras, open_sequence
 from sigmaslam.readers.open import FORMATS
 from sigmaslam.readers.selection import Selection
-from sigmaslam.runs.removal import remove_run
+from sigmaslam.run_record.removal import remove_run
 
 if TYPE_CHECKING:
-    from sigmaslam.runs.frame_sink import FrameSink
+    from sigmaslam.live.frame_sink import FrameSink
     from sigmaslam.slam.config import TrackerConfig
 
 logger = logging.getLogger(__name__)
@@ -280,8 +280,8 @@ def _select(sequence: StereoSequence, selection: Selection, scale: float) -> Ste
 
 def _read_settings(path: Path | None, estimate: str | None, track_object: bool) -> TrackerConfig | None:
     """Settings of a file and of the command line; None where neither says anything."""
+    from sigmaslam.bodies.object_tracker import OBJECT_CONFIG
     from sigmaslam.slam.config import TrackerConfig, check_estimated, read_config
-    from sigmaslam.slam.object_tracker import OBJECT_CONFIG
 
     if path is None and estimate is None:
         return None

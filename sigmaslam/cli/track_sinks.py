@@ -15,7 +15,7 @@ from sigmaslam.errors import InputError
 
 if TYPE_CHECKING:
     from sigmaslam.geometry.camera import StereoCamera
-    from sigmaslam.runs.frame_sink import FrameSink
+    from sigmaslam.live.frame_sink import FrameSink
 
 UNREAD = 1
 """Exit code where nobody reads the output any more."""
@@ -39,7 +39,7 @@ def open_sinks(
         InputError: a name is wrong.
         typer.Exit: the run is whole, but nobody reads the stream any more.
     """
-    from sigmaslam.runs.estimate_stream import PipeStream, open_stream
+    from sigmaslam.live.estimate_stream import PipeStream, open_stream
 
     sinks: list[FrameSink] = []
     if video is not None:
@@ -67,23 +67,23 @@ def open_sinks(
 
 
 def _open_video(path: Path, out: Path, camera: StereoCamera) -> FrameSink:
-    from sigmaslam.runs.frame_sink import ThreadedSink, check_sink_path
-    from sigmaslam.runs.run_folder import VIDEO_NAME
-    from sigmaslam.runs.video import VideoSink
+    from sigmaslam.live.frame_sink import ThreadedSink, check_sink_path
+    from sigmaslam.live.video import VideoSink
+    from sigmaslam.run_record.run_folder import VIDEO_NAME
 
     check_sink_path("--video", path, out, VIDEO_NAME)
     return ThreadedSink(VideoSink(path, camera))
 
 
 def _open_viewer(viewer: str, out: Path, camera: StereoCamera) -> FrameSink:
-    from sigmaslam.runs.frame_sink import ThreadedSink, check_sink_path
-    from sigmaslam.runs.run_folder import RERUN_NAME
+    from sigmaslam.live.frame_sink import ThreadedSink, check_sink_path
+    from sigmaslam.run_record.run_folder import RERUN_NAME
 
     name, colon, file = viewer.partition(":")
     if name != "rerun" or (colon and not file):
         raise InputError(f"--viewer {viewer}: is no viewer; give rerun for a window, or rerun:FILE.rrd")
     need_viewer_extra()
-    from sigmaslam.runs.rerun_viewer import RerunSink
+    from sigmaslam.live.rerun_viewer import RerunSink
 
     path = Path(file) if file else None
     if path is not None:

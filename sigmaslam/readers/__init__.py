@@ -1,6 +1,6 @@
 """Readers of stereo sequences."""
 
-from sigmaslam.readers.calibration import read_calibration
+from sigmaslam.calibration_files.calibration import read_calibration
 from sigmaslam.readers.live import open_cameras
 from sigmaslam.readers.open import open_sequence
 from sigmaslam.readers.stereo_sequence import StereoFrame, StereoSequence

@@ -10,9 +10,9 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from sigmaslam.bounded_files import shorten
+from sigmaslam.calibration_files.calibration import read_calibration
 from sigmaslam.errors import CalibrationError, FrameError, InputError, SigmaSlamError
 from sigmaslam.geometry.camera import StereoCamera
-from sigmaslam.readers.calibration import read_calibration
 from sigmaslam.readers.images import RawPair, SkippedFrame, first_readable
 from sigmaslam.readers.kitti import common_size
 from sigmaslam.readers.pairing import STAMP_TOLERANCE_NS, Stamped, pair_streams

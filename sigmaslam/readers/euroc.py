@@ -4,9 +4,9 @@ import csv
 from pathlib import Path
 
 from sigmaslam.bounded_files import TABLE_BYTES, read_text, shorten
+from sigmaslam.calibration_files.calibration import find_calibration, read_calibration
+from sigmaslam.calibration_files.euroc_calibration import read_sensors
 from sigmaslam.errors import InputError
-from sigmaslam.readers.calibration import find_calibration, read_calibration
-from sigmaslam.readers.euroc_calibration import read_sensors
 from sigmaslam.readers.images import ImagePairs
 from sigmaslam.readers.kitti import common_size
 from sigmaslam.readers.pairing import is_stamp, list_images, pair_by_stamp

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
+from sigmaslam.calibration_files.calibration import read_calibration
+from sigmaslam.calibration_files.four_seasons_calibration import UNDISTORTED
 from sigmaslam.errors import CalibrationError, InputError
-from sigmaslam.readers.calibration import read_calibration
-from sigmaslam.readers.four_seasons_calibration import UNDISTORTED
 from sigmaslam.readers.images import ImagePairs
 from sigmaslam.readers.kitti import common_size
 from sigmaslam.readers.pairing import is_stamp, list_images, pair_by_stamp

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
+from sigmaslam.calibration_files.calibration import read_calibration
 from sigmaslam.errors import CalibrationError, InputError
-from sigmaslam.readers.calibration import read_calibration
 from sigmaslam.readers.images import ImagePairs, RawPair
 from sigmaslam.readers.pairing import default_times, frame_numbers, pair_by_name, read_times
 from sigmaslam.readers.stereo_sequence import StereoSequence

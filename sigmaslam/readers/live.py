@@ -9,9 +9,9 @@ from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
+from sigmaslam.calibration_files.calibration import calibrated_size, read_calibration
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.camera import StereoCamera
-from sigmaslam.readers.calibration import calibrated_size, read_calibration
 from sigmaslam.readers.capture import Capture, StereoCapture, open_capture
 from sigmaslam.readers.images import MAX_FAILURES, RawPair, SkippedFrame
 from sigmaslam.readers.kitti import common_size

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 
 from sigmaslam.bounded_files import shorten
+from sigmaslam.calibration_files.camera_infos import CameraInfo, stereo_from_infos
 from sigmaslam.errors import CalibrationError, FrameError, InputError
 from sigmaslam.geometry.camera import StereoCamera
-from sigmaslam.readers.camera_infos import CameraInfo, stereo_from_infos
 from sigmaslam.readers.images import decode_image
 
 logger = logging.getLogger(__name__)

@@ -10,10 +10,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from sigmaslam.calibration_files.calibration import find_calibration, read_calibration
+from sigmaslam.calibration_files.calibration_size import ImageSize
 from sigmaslam.errors import CalibrationError, InputError
 from sigmaslam.geometry.camera import StereoCamera
-from sigmaslam.readers.calibration import find_calibration, read_calibration
-from sigmaslam.readers.calibration_size import ImageSize
 from sigmaslam.readers.images import IMAGE_SUFFIXES, RawPair
 from sigmaslam.readers.kitti import common_size
 from sigmaslam.readers.stereo_sequence import StereoSequence

@@ -25,8 +25,8 @@ from sigmaslam.reconstruction.disparity import DisparityMap, Matcher, measure_di
 from sigmaslam.reconstruction.mesh import DepthVolume, need_open3d
 from sigmaslam.reconstruction.recorded_keyframes import RecordedKeyframes, open_input, read_recorded_keyframes
 from sigmaslam.reconstruction.stereo_network import StereoNetwork
-from sigmaslam.runs.dense_points import DENSE_NAME, RECONSTRUCTION_NAME, write_dense_points
-from sigmaslam.runs.report import write_report
+from sigmaslam.report.report import write_report
+from sigmaslam.run_record.dense_points import DENSE_NAME, RECONSTRUCTION_NAME, write_dense_points
 
 NEIGHBOURS = 2
 """Views before, and behind, that a keyframe's depths are fused with."""

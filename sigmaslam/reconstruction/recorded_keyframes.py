@@ -17,18 +17,18 @@ from typing import Any
 import numpy as np
 
 from sigmaslam.bounded_files import TABLE_BYTES, read_text, shorten
+from sigmaslam.calibration_files.calibration_writer import write_calibration
 from sigmaslam.errors import CalibrationError, InputError
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.geometry.se3 import se3_adjoint, se3_inverse
 from sigmaslam.readers import StereoFrame, StereoSequence, open_sequence
-from sigmaslam.readers.calibration_writer import write_calibration
 from sigmaslam.readers.open import FORMATS
 from sigmaslam.readers.selection import Selection
 from sigmaslam.readers.trajectory_files import read_covariances, read_tum
-from sigmaslam.runs.frame_table import FRAMES_NAME, read_frames
-from sigmaslam.runs.relative_pose_file import RELATIVE_POSES_NAME, FramePairs, read_frame_pairs
-from sigmaslam.runs.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY, RUN_NAME, check_has_trajectory
+from sigmaslam.run_record.frame_table import FRAMES_NAME, read_frames
+from sigmaslam.run_record.relative_pose_file import RELATIVE_POSES_NAME, FramePairs, read_frame_pairs
+from sigmaslam.run_record.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY, RUN_NAME, check_has_trajectory
 
 # At most so many frames from one view to the next.
 _MOST_FRAMES = 5

@@ -12,12 +12,12 @@ from typing import Any
 import cv2
 import numpy as np
 
+from sigmaslam.calibration_files.calibration_writer import write_calibration
 from sigmaslam.errors import FrameError, InputError
 from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder, make_folder
 from sigmaslam.image_filtering import NoiseModel, SequenceFilter, denoise_image, estimate_noise
 from sigmaslam.progress import open_progress
 from sigmaslam.readers import StereoFrame, StereoSequence
-from sigmaslam.readers.calibration_writer import write_calibration
 from sigmaslam.readers.images import IMAGE_SUFFIXES, read_grey
 from sigmaslam.readers.pairing import list_images
 from sigmaslam.readers.video import read_frames

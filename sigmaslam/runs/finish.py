@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from sigmaslam.errors import InputError
-from sigmaslam.runs.appended_file import check_not_in_use
-from sigmaslam.runs.frame_table import FRAMES_NAME
-from sigmaslam.runs.pose_file import PARTIAL_POSES
-from sigmaslam.runs.relative_pose_file import PARTIAL_RELATIVE_POSES
+from sigmaslam.run_record.appended_file import check_not_in_use
+from sigmaslam.run_record.frame_table import FRAMES_NAME
+from sigmaslam.run_record.pose_file import PARTIAL_POSES
+from sigmaslam.run_record.relative_pose_file import PARTIAL_RELATIVE_POSES
+from sigmaslam.run_record.run_folder import RUN_NAME, UNFINISHED
 from sigmaslam.runs.results import output_error, write_results
-from sigmaslam.runs.run_folder import RUN_NAME, UNFINISHED
 
 
 def finish_run(run: Path) -> dict[str, Any] | None:

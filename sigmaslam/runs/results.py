@@ -16,19 +16,19 @@ from sigmaslam.errors import OutputError, SigmaSlamError
 from sigmaslam.files import atomic_path, atomic_write_text
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import write_kitti, write_tum
-from sigmaslam.runs.failure import explain_failure
-from sigmaslam.runs.frame_pictures import PICTURES_NAME
-from sigmaslam.runs.frame_table import FRAMES_NAME, STATUSES, FrameTable, read_frames
-from sigmaslam.runs.pose_file import PARTIAL_POSES, PoseRecords, read_pose_records
-from sigmaslam.runs.pose_table import POSES_NAME, write_pose_table
-from sigmaslam.runs.relative_pose_file import (
+from sigmaslam.run_record.failure import explain_failure
+from sigmaslam.run_record.frame_pictures import PICTURES_NAME
+from sigmaslam.run_record.frame_table import FRAMES_NAME, STATUSES, FrameTable, read_frames
+from sigmaslam.run_record.pose_file import PARTIAL_POSES, PoseRecords, read_pose_records
+from sigmaslam.run_record.pose_table import POSES_NAME, write_pose_table
+from sigmaslam.run_record.relative_pose_file import (
     PARTIAL_RELATIVE_POSES,
     RELATIVE_POSES_NAME,
     collect_frame_pairs,
     write_frame_pairs,
 )
-from sigmaslam.runs.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY, RUN_NAME, write_ply
-from sigmaslam.runs.verdict import calibration_verdict, expected_offset
+from sigmaslam.run_record.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY, RUN_NAME, write_ply
+from sigmaslam.run_record.verdict import calibration_verdict, expected_offset
 from sigmaslam.slam.estimate import CalibrationEstimate
 from sigmaslam.slam.point_map import PointMap
 
@@ -221,7 +221,7 @@ def _write_map(files: _Files, tracker: TrackerResults) -> int:
 
 
 def _write_report(path: Path) -> None:
-    from sigmaslam.runs.report import write_report  # not needed before the run has ended
+    from sigmaslam.report.report import write_report  # not needed before the run has ended
 
     write_report(path.parent)
 

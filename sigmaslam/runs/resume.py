@@ -19,10 +19,10 @@ from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text
 from sigmaslam.readers import StereoFrame, StereoSequence
 from sigmaslam.readers.trajectory_files import read_tum
-from sigmaslam.runs.appended_file import check_not_in_use
-from sigmaslam.runs.frame_table import FRAMES_NAME, read_frames
-from sigmaslam.runs.pose_file import PARTIAL_POSES, PoseRecords, read_pose_records, write_pose_records
-from sigmaslam.runs.relative_pose_file import (
+from sigmaslam.run_record.appended_file import check_not_in_use
+from sigmaslam.run_record.frame_table import FRAMES_NAME, read_frames
+from sigmaslam.run_record.pose_file import PARTIAL_POSES, PoseRecords, read_pose_records, write_pose_records
+from sigmaslam.run_record.relative_pose_file import (
     PARTIAL_RELATIVE_POSES,
     RELATIVE_POSES_NAME,
     FramePairs,
@@ -30,8 +30,8 @@ from sigmaslam.runs.relative_pose_file import (
     read_frame_pairs,
     write_partial_frame_pairs,
 )
-from sigmaslam.runs.removal import remove_results
-from sigmaslam.runs.run_folder import RUN_NAME
+from sigmaslam.run_record.removal import remove_results
+from sigmaslam.run_record.run_folder import RUN_NAME
 from sigmaslam.slam.start_pose import StartPose
 
 # What must be as it was; paths and settings of the command line.

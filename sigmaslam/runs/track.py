@@ -10,27 +10,27 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from sigmaslam.bodies.object_region import read_region
+from sigmaslam.bodies.object_tracker import OBJECT_CONFIG, ObjectEstimate, ObjectTracker
 from sigmaslam.checks.finding import Finding
 from sigmaslam.errors import InputError, OutputError, SigmaSlamError
 from sigmaslam.files import printable
 from sigmaslam.fusion.location_filter import LocationFilter
 from sigmaslam.fusion.readings import Locations
 from sigmaslam.inference.networks import WeightsFolder
+from sigmaslam.live.frame_sink import FrameSink, TrackedFrame, close_all
 from sigmaslam.progress import open_progress
 from sigmaslam.readers import StereoFrame, StereoSequence
 from sigmaslam.readers.trajectory_files import write_tum
+from sigmaslam.run_record.frame_pictures import PictureRecorder
+from sigmaslam.run_record.real_time import Latency, RealTimePlayer, describe_real_time
+from sigmaslam.run_record.run_folder import RunWriter, describe_camera, describe_weights
 from sigmaslam.runs.denoise import StereoFilter
-from sigmaslam.runs.frame_pictures import PictureRecorder
-from sigmaslam.runs.frame_sink import FrameSink, TrackedFrame, close_all
-from sigmaslam.runs.real_time import Latency, RealTimePlayer, describe_real_time
 from sigmaslam.runs.results import TrackerResults, output_error, write_results
 from sigmaslam.runs.resume import StoppedRun, read_stopped_run
-from sigmaslam.runs.run_folder import RunWriter, describe_camera, describe_weights
 from sigmaslam.runs.stop_signals import Stopped, StopSignals
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.estimate import Estimate
-from sigmaslam.slam.object_region import read_region
-from sigmaslam.slam.object_tracker import OBJECT_CONFIG, ObjectEstimate, ObjectTracker
 from sigmaslam.slam.start_pose import StartPose
 from sigmaslam.slam.tracker import StereoTracker
 

@@ -10,7 +10,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.geometry.se3 import se3_adjoint, se3_exp, se3_inverse
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import read_kitti, read_trajectory, read_tum, write_kitti, write_tum
-from sigmaslam.runs.evaluated_frames import read_evaluated_frames
+from sigmaslam.run_record.evaluated_frames import read_evaluated_frames
 from sigmaslam_evaluation.evaluation_summary import format_evaluation
 from sigmaslam_evaluation.run_evaluation import evaluate_run
 
@@ -132,7 +132,7 @@ def test_a_picture_that_cannot_be_written_costs_a_warning_alone(drive, monkeypat
     def full(path: Path) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("sigmaslam.runs.figures.atomic_path", full)
+    monkeypatch.setattr("sigmaslam.report.figures.atomic_path", full)
     evaluation = evaluate_run(*drive)
     assert evaluation.figure_path is None
     assert evaluation.matched == 186

@@ -14,7 +14,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import write_tum
-from sigmaslam.runs.relative_pose_file import (
+from sigmaslam.run_record.relative_pose_file import (
     FramePairs,
     RelativePoseWriter,
     collect_frame_pairs,

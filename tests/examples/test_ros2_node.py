@@ -9,10 +9,10 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from sigmaslam.bodies.object_tracker import ObjectEstimate
 from sigmaslam.geometry.se3 import quaternion_to_matrix, rotation_log, se3_exp
-from sigmaslam.runs.estimate_stream import describe_estimate, format_estimate
-from sigmaslam.runs.frame_sink import TrackedFrame
-from sigmaslam.slam.object_tracker import ObjectEstimate
+from sigmaslam.live.estimate_stream import describe_estimate, format_estimate
+from sigmaslam.live.frame_sink import TrackedFrame
 from tests.support.recorded_runs import some_estimate
 
 ROOT = Path(__file__).resolve().parents[2]

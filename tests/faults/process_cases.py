@@ -119,7 +119,7 @@ def _run_script(folder: Path, script: str, *arguments: str) -> Outcome:
 # What a run writes before its first frame fits.
 _FULL_DISK = """
 import resource
-from sigmaslam.runs.run_folder import RunWriter
+from sigmaslam.run_record.run_folder import RunWriter
 begin = RunWriter.__init__
 def fill(*arguments):
     begin(*arguments)
@@ -138,7 +138,7 @@ StereoTracker.step = fail
 """
 _SMALL_MEMORY = """
 import resource
-from sigmaslam.runs.run_folder import RunWriter
+from sigmaslam.run_record.run_folder import RunWriter
 begin = RunWriter.__init__
 def fill(*arguments):
     begin(*arguments)

@@ -55,7 +55,7 @@ def run_in_this_process(*arguments: str | Path, folder: Path | None = None) -> O
         return run_in_process(*arguments, folder=folder)
     with (
         mock.patch.dict(os.environ, _WIDE),
-        mock.patch("sigmaslam.runs.report.write_report"),
+        mock.patch("sigmaslam.report.report.write_report"),
         limited_time(_HERE_SECONDS),
     ):
         done = run_here(*arguments)

@@ -14,7 +14,10 @@ from random import Random
 import cv2
 import numpy as np
 
+from sigmaslam.bodies.object_region import read_region
 from sigmaslam.bundle_adjustment.track_file import read_tracks
+from sigmaslam.calibration_files.euroc_calibration import read_sensors
+from sigmaslam.calibration_files.kitti_calibration import read_kitti_calibration
 from sigmaslam.errors import SigmaSlamError
 from sigmaslam.estimation.marginalised_poses import PastPoses
 from sigmaslam.estimation.state_layout import CALIBRATION_SIZE
@@ -24,17 +27,14 @@ from sigmaslam.geometry.camera import RectifiedStereo, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.inference.weight_manifest import read_manifest
 from sigmaslam.readers import open_sequence
-from sigmaslam.readers.euroc_calibration import read_sensors
 from sigmaslam.readers.images import read_grey
-from sigmaslam.readers.kitti_calibration import read_kitti_calibration
 from sigmaslam.readers.pairing import read_times
 from sigmaslam.readers.trajectory_files import read_covariances, read_trajectory
-from sigmaslam.runs.frame_table import COLUMNS, read_frames
-from sigmaslam.runs.relative_pose_file import FramePairs, read_frame_pairs, write_frame_pairs
+from sigmaslam.run_record.frame_table import COLUMNS, read_frames
+from sigmaslam.run_record.relative_pose_file import FramePairs, read_frame_pairs, write_frame_pairs
 from sigmaslam.slam.config import read_config
 from sigmaslam.slam.keyframe import Keyframe
 from sigmaslam.slam.map_file import pack_keyframes, read_keyframes
-from sigmaslam.slam.object_region import read_region
 from tests.support.mutation import mutate, mutate_archive, mutate_array
 from tests.support.time_limit import HangError, limited_time
 

@@ -9,7 +9,7 @@ from sigmaslam.estimation.landmark_table import LandmarkViews
 from sigmaslam.geometry.se3 import rotation_exp
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import write_tum
-from sigmaslam.runs.frame_pictures import PICTURES_NAME, PictureRecorder
+from sigmaslam.run_record.frame_pictures import PICTURES_NAME, PictureRecorder
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.mapping import KeyframeTracks

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from sigmaslam.bodies.object_tracker import ObjectEstimate, ObjectTracker
 from sigmaslam.frontend.types import KeypointSearch, StereoView, TemporalMatches
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
-from sigmaslam.slam.object_tracker import ObjectEstimate, ObjectTracker
 from tests.support.quantiles import chi_square_quantile, squared_sigmas
 from tests.support.simulated_stereo import SimulatedErrors, frame_of, image_of, parallel_camera
 

@@ -18,7 +18,7 @@ from scipy.stats import chi2, t
 from torch import Generator, Tensor
 
 from sigmaslam.plot_style import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION, style_axes
-from sigmaslam.runs.figures import save_png
+from sigmaslam.report.figures import save_png
 from sigmaslam.source_commit import describe_source
 from sigmaslam_benchmarks.filters import scenarios
 from sigmaslam_benchmarks.filters.scenarios import Outcome, Scenario, run

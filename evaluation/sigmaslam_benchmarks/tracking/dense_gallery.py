@@ -17,8 +17,8 @@ from sigmaslam.geometry.se3 import rotation_exp, se3_inverse, transform_points
 from sigmaslam.readers import open_sequence
 from sigmaslam.readers.trajectory_files import read_tum
 from sigmaslam.reconstruction.reconstruct import reconstruct_run
-from sigmaslam.runs.dense_points import DENSE_NAME, RECONSTRUCTION_NAME, read_dense_points
-from sigmaslam.runs.removal import remove_run
+from sigmaslam.run_record.dense_points import DENSE_NAME, RECONSTRUCTION_NAME, read_dense_points
+from sigmaslam.run_record.removal import remove_run
 from sigmaslam.runs.track import track_sequence
 from sigmaslam_benchmarks.tracking.tracking_gallery import RECIPES, run_gallery
 from sigmaslam_benchmarks.trial import render

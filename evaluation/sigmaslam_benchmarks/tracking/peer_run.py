@@ -14,7 +14,7 @@ from sigmaslam.files import make_folder
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import StereoFrame, StereoSequence
 from sigmaslam.readers.trajectory_files import write_tum
-from sigmaslam.runs.frame_table import COLUMNS
+from sigmaslam.run_record.frame_table import COLUMNS
 
 
 @dataclass(frozen=True, slots=True)

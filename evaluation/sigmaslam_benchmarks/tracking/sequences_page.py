@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sigmaslam.runs.frame_table import FrameTable
+from sigmaslam.run_record.frame_table import FrameTable
 from sigmaslam_benchmarks.tracking.page import opening, table
 from sigmaslam_benchmarks.trial import TrialResult
 

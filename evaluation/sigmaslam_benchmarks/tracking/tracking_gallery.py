@@ -15,12 +15,12 @@ import numpy as np
 
 from sigmaslam.files import atomic_path
 from sigmaslam.geometry.camera import StereoCamera
+from sigmaslam.live.frame_drawing import FramePainter
+from sigmaslam.live.frame_sink import TrackedFrame
+from sigmaslam.live.video import frame_rate
 from sigmaslam.readers import open_sequence
-from sigmaslam.runs.frame_drawing import FramePainter
-from sigmaslam.runs.frame_sink import TrackedFrame
-from sigmaslam.runs.removal import remove_run
+from sigmaslam.run_record.removal import remove_run
 from sigmaslam.runs.track import track_sequence
-from sigmaslam.runs.video import frame_rate
 from sigmaslam_benchmarks.trial import render
 from sigmaslam_synthetic.simulation import Recipe
 

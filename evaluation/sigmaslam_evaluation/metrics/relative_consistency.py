@@ -10,7 +10,7 @@ import numpy as np
 from sigmaslam.estimation.mahalanobis import squared_mahalanobis
 from sigmaslam.geometry.se3 import se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory
-from sigmaslam.runs.relative_pose_file import FramePairs
+from sigmaslam.run_record.relative_pose_file import FramePairs
 from sigmaslam.slam.relative_poses import SPANS
 from sigmaslam_evaluation.metrics.map_consistency import coverage
 from sigmaslam_evaluation.metrics.trajectory_errors import associate, is_regular

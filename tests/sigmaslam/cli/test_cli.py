@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from sigmaslam.readers.trajectory_files import read_tum
-from sigmaslam.runs.relative_pose_file import read_frame_pairs
+from sigmaslam.run_record.relative_pose_file import read_frame_pairs
 from tests.support.commands import Finished, assert_refused, command_line, environment, run_here, run_process
 
 FRAMES = 8

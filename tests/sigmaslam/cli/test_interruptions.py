@@ -18,9 +18,9 @@ import pytest
 
 from sigmaslam.readers import open_sequence
 from sigmaslam.readers.trajectory_files import read_tum
+from sigmaslam.run_record.frame_table import read_frames
+from sigmaslam.run_record.relative_pose_file import read_frame_pairs
 from sigmaslam.runs.finish import finish_run
-from sigmaslam.runs.frame_table import read_frames
-from sigmaslam.runs.relative_pose_file import read_frame_pairs
 from sigmaslam.runs.track import track_sequence
 from tests.support.commands import assert_refused, environment, run_here, run_process
 from tests.support.demo_parts import copy_frames
@@ -205,7 +205,7 @@ def test_a_file_without_room_costs_a_message_and_not_the_others(
         for module in ("files", "runs.results", "runs.relative_pose_file", "runs.run_folder"):
             disk.setattr(f"sigmaslam.{module}.atomic_path", full_for({name}))
         if name == "run.json":  # there was room for it when the run began
-            disk.setattr("sigmaslam.runs.run_folder.atomic_write_text", lambda path, text: path.write_text(text))
+            disk.setattr("sigmaslam.run_record.run_folder.atomic_write_text", lambda path, text: path.write_text(text))
         result = run_here("track", sequence, "--out", tmp_path / "run", "--frontend", "klt")
     assert_refused(result, f"could not write {name}; make room", "No space left on device")
     lost = {name} | ({"covariance_final.npy"} if name == "trajectory_final.tum" else set())
@@ -229,7 +229,7 @@ def test_a_disk_that_is_full_in_the_midst_of_a_run_keeps_what_was_said(sequence:
         "import resource\n"
         "from sigmaslam.cli import main\n"
         "from sigmaslam.slam.tracker import StereoTracker\n"
-        "from sigmaslam.runs.run_folder import RunWriter\n"
+        "from sigmaslam.run_record.run_folder import RunWriter\n"
         "begin = RunWriter.__init__\n"
         "def fill(*arguments):\n"
         "    begin(*arguments)\n"

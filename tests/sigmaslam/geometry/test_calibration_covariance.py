@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import yaml
 
+from sigmaslam.calibration_files.calibration_writer import write_calibration
 from sigmaslam.errors import CalibrationError
 from sigmaslam.estimation.calibration_errors import ERRORS, CalibrationPrior
 from sigmaslam.geometry.calibration_covariance import CalibrationCovariance
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.geometry.camera import StereoCamera
-from sigmaslam.readers.calibration_writer import write_calibration
 from tests.support.dense_window import CAMERA as RECTIFIED
 from tests.support.simulated_stereo import parallel_camera
 

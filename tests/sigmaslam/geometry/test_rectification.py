@@ -4,11 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
+from sigmaslam.calibration_files.kitti_calibration import read_kitti_calibration
 from sigmaslam.errors import CalibrationError, FrameError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.readers import open_sequence
-from sigmaslam.readers.kitti_calibration import read_kitti_calibration
 
 RADTAN = (-0.28, 0.07, 2e-4, 2e-5)
 

@@ -11,12 +11,12 @@ from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 from typer.testing import CliRunner
 
+from sigmaslam.calibration_files.calibration_writer import write_calibration
 from sigmaslam.cli import app
 from sigmaslam.errors import CalibrationError, InputError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.readers import open_sequence
-from sigmaslam.readers.calibration_writer import write_calibration
 from sigmaslam.readers.pairing import MAX_WAITING, Stamped, pair_streams
 from sigmaslam.readers.ros_messages import image_array
 from sigmaslam.readers.trajectory_files import read_tum

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
+from sigmaslam.bodies.object_region import read_region
 from sigmaslam.errors import FrameError, InputError
 from sigmaslam.readers import open_sequence
 from sigmaslam.readers.image_size import image_size
 from sigmaslam.readers.images import decode_image, read_image
-from sigmaslam.slam.object_region import read_region
 
 KINDS = [
     *((suffix, 1, np.uint8) for suffix in (".png", ".jpg", ".bmp", ".tiff", ".pgm")),

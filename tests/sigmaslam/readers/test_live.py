@@ -21,7 +21,7 @@ from sigmaslam.readers import live as camera_module
 from sigmaslam.readers.capture import SYNCHRONY_PAIRS, StereoCapture, open_capture
 from sigmaslam.readers.live import LivePairs, LiveSequence
 from sigmaslam.readers.trajectory_files import read_tum
-from sigmaslam.runs.frame_table import read_frames
+from sigmaslam.run_record.frame_table import read_frames
 from sigmaslam.runs.track import track_sequence
 from tests.support.calibration_yaml import write_calibration
 from tests.support.commands import command_line, environment, run_process

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import yaml
 
+from sigmaslam.calibration_files.calibration import FOLDER_FILES, calibrated_size, find_calibration, read_calibration
+from sigmaslam.calibration_files.calibration_writer import describe_calibration, write_calibration
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
-from sigmaslam.readers.calibration import FOLDER_FILES, calibrated_size, find_calibration, read_calibration
-from sigmaslam.readers.calibration_writer import describe_calibration, write_calibration
 from tests.support import calibration_forms as forms
 from tests.support.calibration_forms import RAW_FORMS, RECTIFIED_FORMS, SIZE, assert_same_rig, raw_rig, rectified_rig
 

@@ -12,8 +12,8 @@ from onnx import TensorProto, helper
 from sigmaslam.errors import InputError
 from sigmaslam.reconstruction.recorded_keyframes import _with_frames_between, read_recorded_keyframes
 from sigmaslam.reconstruction.stereo_network import StereoNetwork
-from sigmaslam.runs.dense_points import read_dense_points
-from sigmaslam.runs.recorded_run import read_run
+from sigmaslam.run_record.dense_points import read_dense_points
+from sigmaslam.run_record.recorded_run import read_run
 from tests.support.commands import run_here
 from tests.support.demo_parts import copy_frames
 

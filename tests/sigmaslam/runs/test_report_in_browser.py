@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
-from sigmaslam.runs.dense_points import DENSE_NAME, write_dense_points
-from sigmaslam.runs.report import write_report
+from sigmaslam.report.report import write_report
+from sigmaslam.run_record.dense_points import DENSE_NAME, write_dense_points
 from tests.support.recorded_runs import make_run
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright, of the extra dev")

@@ -15,8 +15,8 @@ from sigmaslam.geometry.se3 import se3_inverse, se3_log
 from sigmaslam.readers import open_sequence
 from sigmaslam.readers.selection import Selection
 from sigmaslam.readers.trajectory_files import read_tum
-from sigmaslam.runs.frame_table import read_frames
-from sigmaslam.runs.relative_pose_file import read_frame_pairs
+from sigmaslam.run_record.frame_table import read_frames
+from sigmaslam.run_record.relative_pose_file import read_frame_pairs
 from sigmaslam.runs.track import track_sequence
 from tests.support.commands import assert_refused, run_here
 from tests.support.demo_parts import copy_frames

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import sigmaslam
+from sigmaslam.bodies.object_tracker import ObjectTracker
 from sigmaslam.errors import FrameError, InputError
 from sigmaslam.readers import open_sequence
 from sigmaslam.readers.stereo_sequence import StereoFrame
 from sigmaslam.slam.argument_checks import check_frame
-from sigmaslam.slam.object_tracker import ObjectTracker
 from sigmaslam.slam.tracker import StereoTracker
 
 

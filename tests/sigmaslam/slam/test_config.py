@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 import yaml
 
+from sigmaslam.bodies.object_tracker import OBJECT_CONFIG
 from sigmaslam.errors import InputError
 from sigmaslam.slam.config import TrackerConfig, read_config
-from sigmaslam.slam.object_tracker import OBJECT_CONFIG
 
 
 def written(folder: Path, text: str) -> Path:

@@ -1,0 +1,1 @@
+"""Rigid bodies that a camera at rest follows."""

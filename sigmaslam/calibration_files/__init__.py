@@ -1,0 +1,1 @@
+"""Calibrations of every form, read and written."""

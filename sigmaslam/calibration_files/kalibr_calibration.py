@@ -1,0 +1,61 @@
+"""Kalibr's camchain.yaml, which TUM-VI and 4Seasons have, too."""
+
+import numpy as np
+
+from sigmaslam.calibration_files.lens_models import read_lens, reject_unsupported
+from sigmaslam.errors import CalibrationError
+from sigmaslam.geometry.camera import CameraModel, StereoCamera
+from sigmaslam.geometry.checked_yaml import CalibrationYaml
+
+
+def is_kalibr(content: CalibrationYaml) -> bool:
+    """Whether a YAML file is a camchain of two cameras or more."""
+    return isinstance(content.entries.get("cam0"), dict) and isinstance(content.entries.get("cam1"), dict)
+
+
+def read_kalibr(content: CalibrationYaml) -> StereoCamera:
+    """Stereo camera of cam0 (left) and cam1 (right).
+
+    T_cn_cnm1 of cam1 takes points of cam0 into cam1; without it T_cam_imu of both is used.
+
+    Raises:
+        CalibrationError: names file, key and what was expected.
+    """
+    left, right = (content.section(name) for name in ("cam0", "cam1"))
+    if "T_cn_cnm1" in right.entries:
+        T_right_left = right.numbers("T_cn_cnm1", (4, 4))
+    elif "T_cam_imu" in left.entries and "T_cam_imu" in right.entries:
+        T_left_imu, T_right_imu = (camera.numbers("T_cam_imu", (4, 4)) for camera in (left, right))
+        T_right_left = T_right_imu @ _inverse(left, "T_cam_imu", T_left_imu)
+    else:
+        raise right.error(
+            "T_cn_cnm1 is missing: the cameras were calibrated one by one; give both topics to kalibr_calibrate_cameras"
+        )
+    models = [_camera_model(camera) for camera in (left, right)]
+    try:
+        return StereoCamera(models[0], models[1], _inverse(right, "T_cn_cnm1", T_right_left))
+    except CalibrationError as error:
+        raise content.error(f"T_cn_cnm1 of cam1: {error}") from None
+
+
+def _inverse(section: CalibrationYaml, key: str, T: np.ndarray) -> np.ndarray:
+    try:
+        return np.asarray(np.linalg.inv(T))
+    except np.linalg.LinAlgError:
+        raise section.error(f"{key} has no inverse: {T.tolist()}") from None
+
+
+def _camera_model(camera: CalibrationYaml) -> CameraModel:
+    where = f"{camera.path}: {camera.prefix}"
+    projection = camera.text("camera_model")
+    reject_unsupported(projection, f"{where}camera_model")
+    if projection != "pinhole":
+        raise camera.error(f"camera_model is {projection!r}; only pinhole is supported")
+    width, height = camera.numbers("resolution", (2,)).tolist()
+    fx, fy, cx, cy = camera.numbers("intrinsics", (4,)).tolist()
+    coefficients = camera.numbers("distortion_coeffs", (None,), []).tolist()
+    model, distortion = read_lens(camera.text("distortion_model"), coefficients, f"{where}distortion_model")
+    try:
+        return CameraModel(int(width), int(height), fx, fy, cx, cy, 0.0, model, distortion)
+    except CalibrationError as error:
+        raise camera.error(str(error)) from None

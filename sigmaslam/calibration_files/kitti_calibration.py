@@ -1,0 +1,152 @@
+"""KITTI's calibration files: calib.txt and calib_cam_to_cam.txt."""
+
+from pathlib import Path
+
+import numpy as np
+
+from sigmaslam.bounded_files import CALIBRATION_BYTES, read_text, shorten
+from sigmaslam.calibration_files.calibration_size import ImageSize, UnknownImageSizeError, need_image_size
+from sigmaslam.calibration_files.camera_infos import right_position
+from sigmaslam.errors import CalibrationError
+from sigmaslam.geometry.camera import CameraModel, StereoCamera
+
+GREY_PAIR = (0, 1)
+
+
+def read_kitti_calibration(path: Path, image_size: ImageSize | None, cameras: tuple[int, int]) -> StereoCamera:
+    """Read KITTI's calib.txt ('P0: ' and 12 numbers, or bare lines of 12) or calib_cam_to_cam.txt.
+
+    With calib_cam_to_cam.txt the image size decides: P_rect for rectified images (S_rect), else K, D, R, T of
+    the original ones (S). The cameras of a colour pair keep their measured offset in y and z (a few mm),
+    which `StereoRectifier` then removes.
+
+    Raises:
+        CalibrationError: a matrix is missing or incomplete, or the image size fits neither S_rect nor S.
+    """
+    entries = _read_entries(path, cameras)
+    left, right = cameras
+    if f"P{left}" in entries or f"P_rect_{left:02d}" not in entries:
+        return _from_projections(path, entries, (f"P{left}", f"P{right}"), image_size)
+    sizes = {
+        name: tuple(int(n) for n in _matrix(path, entries, f"{name}_{left:02d}", (2,)))
+        for name in ("S_rect", "S")
+        if f"{name}_{left:02d}" in entries
+    }
+    known = ", ".join(f"{name}_{left:02d} {size[0]}x{size[1]}" for name, size in sizes.items())
+    if image_size is None:
+        raise UnknownImageSizeError(f"{path}: is for {known or 'images of a size it does not name'}; give --size")
+    if not sizes or sizes.get("S_rect") == image_size:
+        return _from_projections(path, entries, (f"P_rect_{left:02d}", f"P_rect_{right:02d}"), image_size)
+    if sizes.get("S") == image_size:
+        return _from_originals(path, entries, cameras, image_size)
+    raise CalibrationError(
+        f"{path}: images are {image_size[0]}x{image_size[1]}, the calibration is for {known}; "
+        "use the calibration that belongs to these images"
+    )
+
+
+def _read_entries(path: Path, cameras: tuple[int, int]) -> dict[str, str]:
+    text = read_text(path, CALIBRATION_BYTES, "the calibration", CalibrationError)
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    if any(":" in line for line in lines):
+        return _without_doubles(path, lines)
+    if len(lines) == 2:
+        return {f"P{camera}": line for camera, line in zip(cameras, lines, strict=True)}
+    if len(lines) == 4:
+        return {f"P{camera}": line for camera, line in enumerate(lines)}
+    raise CalibrationError(
+        f"{path}: expected lines 'P{cameras[0]}: ' and 'P{cameras[1]}: ' with 12 numbers each, or two bare "
+        f"lines of 12 numbers (left, right); found {len(lines)} lines without a key"
+    )
+
+
+def _without_doubles(path: Path, lines: list[str]) -> dict[str, str]:
+    """Values by key of lines `key: value`; others are left out."""
+    entries: dict[str, str] = {}
+    for line in lines:
+        key, colon, value = line.partition(":")
+        if colon and key.strip() in entries:
+            raise CalibrationError(f"{path}: key '{shorten(key.strip())}' stands twice: remove the wrong line")
+        if colon:
+            entries[key.strip()] = value
+    return entries
+
+
+def _matrix(path: Path, entries: dict[str, str], key: str, shape: tuple[int, ...]) -> np.ndarray:
+    count = int(np.prod(shape))
+    if key not in entries:
+        raise CalibrationError(f"{path}: key '{key}' is missing; expected '{key}: ' and {count} numbers")
+    words = entries[key].split()
+    try:
+        values = np.array([float(word) for word in words])
+    except ValueError as error:
+        raise CalibrationError(f"{path}: key '{key}' must be {count} numbers: {shorten(str(error))}") from None
+    if len(values) != count or not np.all(np.isfinite(values)):
+        raise CalibrationError(
+            f"{path}: key '{key}' must be {count} finite numbers, got {len(values)}: {shorten(entries[key])}"
+        )
+    return values.reshape(shape)
+
+
+def _stereo(path: Path, left: CameraModel, right: CameraModel, T_left_right: np.ndarray) -> StereoCamera:
+    try:
+        return StereoCamera(left, right, T_left_right)
+    except CalibrationError as error:
+        raise CalibrationError(f"{path}: {error}") from None
+
+
+def _model(
+    path: Path, key: str, K: np.ndarray, image_size: ImageSize, distortion: tuple[float, ...] = ()
+) -> CameraModel:
+    if not np.allclose([K[1, 0], *K[2]], [0, 0, 0, 1]):
+        raise CalibrationError(f"{path}: key '{key}' must begin with an upper triangular K with K[2, 2] = 1, got\n{K}")
+    try:
+        return CameraModel(
+            *image_size,
+            fx=float(K[0, 0]),
+            fy=float(K[1, 1]),
+            cx=float(K[0, 2]),
+            cy=float(K[1, 2]),
+            skew=float(K[0, 1]),
+            distortion_model="radtan" if distortion else "none",
+            distortion=distortion,
+        )
+    except CalibrationError as error:
+        raise CalibrationError(f"{path}: {key}: {error}") from None
+
+
+def _from_projections(
+    path: Path, entries: dict[str, str], keys: tuple[str, str], image_size: ImageSize | None
+) -> StereoCamera:
+    """From P = K [I | t], where t is the position of camera 0 in this camera's frame."""
+    image_size = need_image_size(str(path), image_size)
+    left, right = (_matrix(path, entries, key, (3, 4)) for key in keys)
+    models = [_model(path, key, P[:, :3], image_size) for key, P in zip(keys, (left, right), strict=True)]
+    T_left_right = np.eye(4)
+    try:
+        T_left_right[:3, 3] = right_position(left, right)
+    except np.linalg.LinAlgError:
+        raise CalibrationError(
+            f"{path}: keys '{keys[0]}' and '{keys[1]}': K has no inverse; correct the numbers"
+        ) from None
+    return _stereo(path, models[0], models[1], T_left_right)
+
+
+def _from_originals(
+    path: Path, entries: dict[str, str], cameras: tuple[int, int], image_size: ImageSize
+) -> StereoCamera:
+    """From K, D and the pose R, T of camera 0 in each camera's frame."""
+    models, poses = [], []
+    for camera in cameras:
+        distortion = tuple(_matrix(path, entries, f"D_{camera:02d}", (5,)).tolist())
+        K = _matrix(path, entries, f"K_{camera:02d}", (3, 3))
+        models.append(_model(path, f"K_{camera:02d}", K, image_size, distortion))
+        T_camera_camera0 = np.eye(4)
+        T_camera_camera0[:3, :3] = _matrix(path, entries, f"R_{camera:02d}", (3, 3))
+        T_camera_camera0[:3, 3] = _matrix(path, entries, f"T_{camera:02d}", (3,))
+        poses.append(T_camera_camera0)
+    try:
+        T_left_right = poses[0] @ np.linalg.inv(poses[1])
+    except np.linalg.LinAlgError:
+        raise CalibrationError(f"{path}: key 'R_{cameras[1]:02d}' is no rotation; correct the numbers") from None
+    return _stereo(path, models[0], models[1], T_left_right)

@@ -1,0 +1,184 @@
+"""The report of a run: one HTML file that needs nothing outside it."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+from markupsafe import Markup
+
+from sigmaslam.files import atomic_write_text, printable
+from sigmaslam.report.report_facts import (
+    judge,
+    list_calibration,
+    list_evaluation,
+    list_facts,
+    list_machine,
+    list_refinement,
+    list_statuses,
+)
+from sigmaslam.report.report_plots import build_plots, draw_step
+from sigmaslam.report.report_scene import build_scene, pack
+from sigmaslam.run_record.frame_pictures import FramePictures
+from sigmaslam.run_record.frame_table import STATUSES, FrameTable
+from sigmaslam.run_record.recorded_run import RecordedRun, read_run
+from sigmaslam.run_record.verdict import contradiction_verdict
+
+REPORT_NAME = "report.html"
+MAX_CONFIGURATION = 20_000
+"""The report shows at most so many characters of run.json."""
+PICTURE_MAGNIFICATION = 4
+"""Ellipses of matches are drawn so many times as large; most are smaller than a pixel of the pictures."""
+_SCRIPTS = ("three-0.170.0.min.js", "uplot-1.6.32.min.js", "scene.js", "plots.js", "frames.js", "page.js")
+_STYLES = ("uplot-1.6.32.min.css", "report.css")
+_LINKED = (
+    ("trajectory.tum", "poses as they were said"),
+    ("trajectory_final.tum", "after the fact"),
+    ("trajectory_refined.tum", "after `refine`"),
+    ("trajectory.kitti", "KITTI's form"),
+    ("poses.csv", "time, pose, status, covariance"),
+    ("covariance.npy", "of each pose"),
+    ("relative_poses.npz", "relative to earlier keyframes"),
+    ("frames.csv", "a row for each frame"),
+    ("map.ply", "points for viewers"),
+    ("map.npz", "points and keyframes"),
+    ("dense.npz", "surfaces shown here"),
+    ("pictures.npz", "the frames shown here"),
+    ("run.json", "settings and summary"),
+    ("evaluation.json", "errors"),
+    ("evaluation.png", "plots of errors"),
+)
+
+
+def write_report(run_dir: str | Path) -> Path:
+    """Write `report.html` from the files of a run folder, those of `evaluate` and `refine` included.
+
+    Returns:
+        The path of the report.
+    Raises:
+        InputError: frames.csv is missing, or a file is wrong.
+    """
+    folder = Path(run_dir)
+    run = read_run(folder)
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("sigmaslam.report", "templates"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    assets = files("sigmaslam.report") / "assets"
+    plots, scene = build_plots(run), build_scene(run)
+    pictures = _pictures(run)
+    head, rows = list_evaluation(run)
+    text = environment.get_template("report.html").render(
+        name=printable(folder.resolve().name),
+        state=judge(run),
+        facts=list_facts(run),
+        statuses=list_statuses(run),
+        contradiction=contradiction_verdict(run.summary),
+        verdict=run.summary.get("calibration_verdict"),
+        calibration=list_calibration(run),
+        scene=scene,
+        plots=plots,
+        pictures=pictures,
+        evaluation_head=head,
+        evaluation_rows=rows,
+        truth_hint=run.evaluation.get("truth_hint"),
+        refinement=list_refinement(run),
+        machine=list_machine(run),
+        links=[(name, words) for name, words in _LINKED if (folder / name).is_file()],
+        configuration=_configuration(run.entries),
+        styles=Markup("\n".join((assets / name).read_text(encoding="utf-8") for name in _STYLES)),
+        scripts=[Markup((assets / name).read_text(encoding="utf-8")) for name in _SCRIPTS],
+        page=_to_json(
+            {
+                "seconds": pack(run.frames.seconds[:: draw_step(len(run.frames))]),
+                "intervals": _intervals(run.frames),
+                "statuses": STATUSES,
+                "plots": plots,
+                "scene": scene,
+                "pictures": pictures,
+                "picture_size": [] if run.pictures is None else run.pictures.size.tolist(),
+                "picture_magnification": PICTURE_MAGNIFICATION,
+            }
+        ),
+    )
+    path = folder / REPORT_NAME
+    atomic_write_text(path, text)
+    return path
+
+
+def _to_json(page: dict[str, Any]) -> Markup:
+    """JSON that cannot end the script element it stands in."""
+    return Markup(json.dumps(page, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"))
+
+
+def _configuration(entries: dict[str, Any]) -> str | None:
+    if not entries:
+        return None
+    text = json.dumps(entries, indent=2, ensure_ascii=False)
+    return text if len(text) <= MAX_CONFIGURATION else text[:MAX_CONFIGURATION] + "\n… (run.json has more)"
+
+
+def _intervals(frames: FrameTable) -> list[dict[str, Any]]:
+    """Times of frames in a row that have the same status, but for those that are tracked."""
+    seconds, status = frames.seconds, np.array(frames.status)
+    half = 0.5 * float(np.median(np.diff(seconds))) if len(frames) > 1 else 0.5
+    begins = np.flatnonzero(np.r_[True, status[1:] != status[:-1]])
+    ends = np.r_[begins[1:], len(frames)] - 1
+    return [
+        {"first": float(seconds[first]) - half, "last": float(seconds[last]) + half, "status": str(status[first])}
+        for first, last in zip(begins, ends, strict=True)
+        if status[first] != "tracking"
+    ]
+
+
+def _pictures(run: RecordedRun) -> list[dict[str, Any]]:
+    """The frames to look at, with what was matched in them."""
+    pictures = run.pictures
+    if pictures is None:
+        return []
+    timestamps = run.frames.columns["timestamp"]
+    rows = np.searchsorted(timestamps, pictures.timestamp - 1e-6).clip(0, len(timestamps) - 1)
+    worst = np.flatnonzero(pictures.worst)
+    by_score = worst[np.argsort(-pictures.score[worst], kind="stable")].tolist()
+    return [_picture(run, pictures, k, int(rows[k]), by_score) for k in range(len(pictures))]
+
+
+def _picture(run: RecordedRun, pictures: FramePictures, index: int, row: int, worst: Sequence[int]) -> dict[str, Any]:
+    """One of them; `row` in the table of frames, `worst` the indices of the worst ones in order."""
+    frames = run.frames
+    seconds, status, score = frames.seconds[row], frames.status[row], float(pictures.score[index])
+    inliers, matches = (frames.columns[name][row] for name in ("inliers", "matches"))
+    label = f"{seconds:.2f} s, frame {row}, {status}"
+    if np.isfinite(matches):
+        label += f", {inliers:.0f} of {matches:.0f} matches used"
+    if np.isfinite(score):
+        label += f", NIS {score:+.1f} sigma"
+    part = pictures.matches(index)
+    left, right = pictures.jpegs(index)
+    return {
+        "seconds": float(seconds),
+        "label": label,
+        "is_lost": status in ("lost", "starting") and index in worst,
+        "rank": worst.index(index) if index in worst else None,
+        "why": f"{status}, {seconds:.2f} s" if not np.isfinite(score) else f"NIS {score:+.1f} σ, {seconds:.2f} s",
+        "left": _data_url(left),
+        "right": _data_url(right) if right else None,
+        "pixels": pack(pictures.pixels[part]),
+        "covariance": pack(pictures.covariance[part]),
+        "probability": pack(pictures.probability[part]),
+        "inlier": pack(pictures.inlier[part]),
+        "trail": pack(pictures.trail[part]),
+    }
+
+
+def _data_url(jpeg: bytes) -> str:
+    return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()

@@ -1,0 +1,215 @@
+"""What a report says in words and figures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sigmaslam.checks.finding import Finding, wrong
+from sigmaslam.report.report_plots import frame_interval, nis_per_dof
+from sigmaslam.run_record.frame_table import STATUSES
+from sigmaslam.run_record.real_time import format_latency
+from sigmaslam.run_record.recorded_run import RecordedRun
+
+Facts = list[tuple[str, str]]
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """How a run went, at first sight.
+
+    Attributes:
+        kind: "good", "warn" or "bad".
+        word: one or two.
+        notices: kind and text of what is to be said before all figures.
+    """
+
+    kind: str
+    word: str
+    notices: list[tuple[str, str]]
+
+
+def judge(run: RecordedRun) -> State:
+    """Failed, stopped, with losses, or good."""
+    notices: list[tuple[str, str]] = []
+    failure, ended = run.summary.get("failure"), run.entries.get("ended", "complete")
+    tracked = {"tracking", "relocalised"} & set(run.frames.status)
+    lost = run.frames.status.count("lost")
+    if failure or not tracked:
+        notices.append(("bad", failure or "No frame was tracked."))
+    if ended != "complete":
+        notices.append(("warn", f"The run did not come to its end: {ended}."))
+    if lost and tracked:
+        share = 100 * lost / len(run.frames)
+        notices.append(
+            (
+                "warn",
+                f"Tracking was lost in {lost} frames ({share:.1f} %): poses there are predicted by the motion alone.",
+            )
+        )
+    findings = wrong([Finding(**each) for each in run.entries.get("checks", ())])
+    notices += [("warn", f"{each.name}: {each.message}") for each in findings if each.message not in (failure or "")]
+    if failure or not tracked:
+        return State("bad", "failed", notices)
+    if ended != "complete":
+        return State("warn", "stopped", notices)
+    return State("warn" if notices else "good", "with losses" if lost else "tracked", notices)
+
+
+def list_facts(run: RecordedRun) -> Facts:
+    """Label and value of the summary."""
+    frames = run.frames
+    tracked = frames.status.count("tracking") + frames.status.count("relocalised")
+    facts = [
+        ("frames", f"{len(frames)}"),
+        ("tracked", f"{tracked} ({100 * tracked / len(frames):.0f} %)"),
+        ("lost", f"{frames.status.count('lost')}"),
+        ("poses", f"{len(run.trajectory)}"),
+        ("duration", f"{frames.seconds[-1]:.1f} s"),
+        ("path length", f"{run.trajectory.path_length:.2f} m"),
+    ]
+    position, rotation = run.sigmas
+    if len(position) and np.isfinite(position[-1]):
+        facts.append(("sigma at the end", f"{_length(position[-1])}, {np.degrees(rotation[-1]):.2g}°"))
+    facts += _errors(run)
+    keyframes = frames.columns["keyframe"]
+    if np.isfinite(keyframes).any():
+        facts.append(("keyframes", f"{np.nansum(keyframes):.0f}"))
+        facts.append(("loops", f"{np.isfinite(frames.columns['loop']).sum()}"))
+    facts += [
+        ("median inliers", _number(_median(_positive(frames.columns["inliers"])), ".0f")),
+        ("median NIS per dof", _number(_median(nis_per_dof(frames)), ".2f")),
+    ]
+    if run.map is not None:
+        facts.append(("map points", f"{len(run.map.points)}"))
+    return [*facts, *_speed(run)]
+
+
+def list_statuses(run: RecordedRun) -> list[tuple[str, int]]:
+    """Counts of frames."""
+    return [(status, run.frames.status.count(status)) for status in STATUSES]
+
+
+def list_calibration(run: RecordedRun) -> list[tuple[str, str, str]]:
+    """Name, value and standard deviation of the errors of the calibration in the end."""
+    offset, sigma = (run.frames.columns[name] for name in ("disparity_offset", "disparity_offset_sigma"))
+    known = np.flatnonzero(np.isfinite(offset))
+    rows = []
+    if len(known) and len(run.trajectory):
+        rows.append(("disparity offset [px]", f"{offset[known[-1]]:+.3f}", f"{sigma[known[-1]]:.3f}"))
+    errors = run.summary.get("calibration_errors") or {}
+    return rows + [(name.replace("_", " "), f"{value:+.5g}", f"{sigma:.2g}") for name, (value, sigma) in errors.items()]
+
+
+def list_machine(run: RecordedRun) -> Facts:
+    """How the run was made, as far as run.json says."""
+    entries = run.entries
+    machine, versions = entries.get("machine") or {}, entries.get("versions") or {}
+    rows = [
+        ("command", entries.get("command")),
+        ("started", entries.get("started")),
+        ("ended", entries.get("ended")),
+        ("input", entries.get("input")),
+        ("front-end, back-end", ", ".join(str(entries[name]) for name in ("frontend", "backend") if name in entries)),
+        ("world", run.summary.get("world")),
+        ("machine", ", ".join(f"{value}" for value in (machine.get("processor"), machine.get("system")) if value)),
+        ("cores", machine.get("cores")),
+        ("versions", ", ".join(f"{name} {number}" for name, number in versions.items())),
+    ]
+    return [(label, f"{value}") for label, value in rows if value]
+
+
+def list_evaluation(run: RecordedRun) -> tuple[list[str], list[list[str]]]:
+    """Head and rows of the table of errors; no rows without an evaluation."""
+    head = ["", "ATE [m]", "ATE, first pose [m]", "rotation [deg]", "RPE [m]", "NEES / dof", "inside 95 %"]
+    rows = []
+    for label, errors in (("as it was said", run.evaluation), ("after the fact", run.evaluation.get("final"))):
+        if not errors:
+            continue
+        nees = errors.get("nees") or {}
+        inside = nees.get("inside")
+        rows.append(
+            [
+                label,
+                _number(errors["ate"]["rmse"], ".4g"),
+                _number(errors["ate_origin"]["rmse"], ".4g"),
+                _number(errors["ate_origin"]["rotation_rmse_deg"], ".3g"),
+                _number(errors["rpe"]["translation_rmse"], ".4g"),
+                _number(nees.get("mean"), ".2f"),
+                "–" if inside is None else f"{100 * inside:.0f} %",
+            ]
+        )
+    return head, rows
+
+
+def list_refinement(run: RecordedRun) -> Facts:
+    """Label and value of what `sigmaslam refine` found."""
+    found = run.refinement
+    if not found:
+        return []
+    before, after = (found.get(f"cost_per_dof_{name}") for name in ("before", "after"))
+    return [
+        ("keyframes", f"{found.get('keyframes')}"),
+        ("landmarks", f"{found.get('landmarks')}"),
+        ("observations", f"{found.get('observations')}"),
+        ("cost per dof", f"{_number(before, '.3g')} → {_number(after, '.3g')}"),
+        ("converged", "yes" if found.get("converged") else "no"),
+        ("disparity offset", f"{found['disparity_offset']:+.3f} ± {found['disparity_offset_sigma']:.3f} px"),
+    ]
+
+
+def _errors(run: RecordedRun) -> Facts:
+    if not run.evaluation:
+        return []
+    facts = [("ATE, best alignment", _length(run.evaluation["ate"]["rmse"]))]
+    nees = run.evaluation.get("nees") or {}
+    if nees.get("mean") is not None:
+        facts.append(("NEES per dof", f"{nees['mean']:.2f}"))
+    return facts
+
+
+def _speed(run: RecordedRun) -> Facts:
+    """Speed against that of the recording, and percentiles of latency, or of the time that frames took."""
+    total = run.frames.total_milliseconds
+    total = total[np.isfinite(total)]
+    facts = []
+    if len(total):
+        # The first frame includes the time of loading.
+        milliseconds = float(np.median(total))
+        facts.append(("speed", f"{1000 / milliseconds:.1f} frames/s"))
+        interval = frame_interval(run.frames)
+        if interval:
+            ratio = 1e3 * interval / milliseconds
+            facts.append(("real time", f"{ratio:.2g} × {1 / interval:.3g} frames/s"))
+    timing = run.entries.get("real_time")
+    if isinstance(timing, dict):
+        return [
+            *facts,
+            ("dropped", f"{timing['dropped']}"),
+            ("latency", f"{format_latency(timing['latency_ms'])} ms"),
+        ]
+    if len(total):
+        values = np.percentile(total, (50, 95, 99))
+        facts.append(("time per frame, p50, p95, p99", ", ".join(f"{value:.0f}" for value in values) + " ms"))
+    return facts
+
+
+def _length(metres: float) -> str:
+    for unit, size in (("m", 1.0), ("cm", 0.01)):
+        if metres >= size:
+            return f"{metres / size:.3g} {unit}"
+    return f"{1000 * metres:.3g} mm"
+
+
+def _positive(values: np.ndarray) -> np.ndarray:
+    return values[values > 0]
+
+
+def _median(values: np.ndarray) -> float | None:
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) else None
+
+
+def _number(value: float | None, form: str) -> str:
+    return "–" if value is None or not np.isfinite(value) else format(value, form)

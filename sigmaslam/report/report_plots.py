@@ -1,0 +1,177 @@
+"""The plots of a report, over the time of all frames."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from sigmaslam.estimation.chi_square import CHI_SQUARE_BAND_OF_6
+from sigmaslam.plot_style import BLUE, GREEN, GREY, SERIES, VERMILLION
+from sigmaslam.report.report_scene import pack
+from sigmaslam.run_record.frame_table import FrameTable
+from sigmaslam.run_record.recorded_run import RecordedRun
+
+MAX_FRAMES = 20_000
+"""With more frames an even selection is drawn."""
+# A scale is logarithmic where the largest value is so many times the median.
+_WIDE = 100.0
+
+
+def draw_step(count: int) -> int:
+    """One frame of so many is drawn."""
+    return max(1, -(-count // MAX_FRAMES))
+
+
+def nis_per_dof(frames: FrameTable) -> np.ndarray:
+    """(F,) NIS per degree of freedom; NaN where there is none."""
+    nis, dof = frames.columns["nis"], frames.columns["dof"]
+    return np.where(dof > 0, nis / np.where(dof > 0, dof, 1.0), np.nan)
+
+
+def build_plots(run: RecordedRun) -> list[dict[str, Any]]:
+    """Title, caption, series and bands of each plot that has data."""
+    plots = [
+        *_sigmas(run),
+        _nees(run),
+        _nis(run.frames),
+        _inliers(run.frames),
+        _offset(run.frames),
+        _times(run.frames),
+        _belief(run.frames),
+    ]
+    return [plot for plot in plots if plot is not None]
+
+
+def _line(label: str, values: np.ndarray, colour: str, **style: Any) -> dict[str, Any]:
+    return {"label": label, "colour": colour, "values": pack(values[:: draw_step(len(values))]), **style}
+
+
+def _plot(title: str, caption: str, series: list[dict[str, Any]], **options: Any) -> dict[str, Any]:
+    return {"title": title, "caption": caption, "series": series, **options}
+
+
+def _has_numbers(*values: np.ndarray) -> bool:
+    return any(bool(np.isfinite(each).any()) for each in values)
+
+
+def _is_wide(values: np.ndarray) -> bool:
+    """Whether the values need a logarithmic scale."""
+    values = values[np.isfinite(values) & (values > 0)]
+    return bool(len(values) and values.max() > _WIDE * np.median(values))
+
+
+def _sigmas(run: RecordedRun) -> list[dict[str, Any] | None]:
+    """3 sigma of position and rotation, with their errors where there is a truth."""
+    plots: list[dict[str, Any] | None] = []
+    errors = run.evaluated
+    kinds = (("Position", "m", 1.0), ("Rotation", "deg", float(np.degrees(1.0))))
+    for (kind, unit, scale), sigma in zip(kinds, run.sigmas, strict=True):
+        claimed = run.of_frames(3.0 * scale * sigma)
+        title, caption = f"{kind}: 3 sigma [{unit}]", "Of the pose in the world, as it was said with the frame."
+        series = [_line("3 sigma", claimed, BLUE, width=2)]
+        values = claimed
+        if errors is not None:
+            error = scale * (errors.position_error if kind == "Position" else errors.rotation_error)
+            found = run.of_frames(error, errors.row)
+            title = f"{kind}: error and 3 sigma [{unit}]"
+            caption += " The error is that of the pose relative to the first one with a truth."
+            series.append(_line("error", found, VERMILLION, width=2))
+            values = np.concatenate([claimed, found])
+        is_log = _is_wide(values)
+        if is_log:  # which has no zero
+            series = [{**each} for each in series]
+            for each, line in zip(series, (claimed, values[len(claimed) :]), strict=False):
+                each["values"] = pack(np.where(line > 0, line, np.nan)[:: draw_step(len(line))])
+        plots.append(_plot(title, caption, series, log=is_log) if _has_numbers(claimed) else None)
+    return plots
+
+
+def _band(low: np.ndarray, high: np.ndarray, label: str) -> list[dict[str, Any]]:
+    return [_line(label, high, GREEN, width=0.5), _line("", low, GREEN, width=0.5)]
+
+
+_BANDS = [{"series": [1, 2], "fill": "rgb(0 158 115 / 20%)"}]
+
+
+def _nees(run: RecordedRun) -> dict[str, Any] | None:
+    if run.evaluated is None or not _has_numbers(run.evaluated.nees):
+        return None
+    ratio = run.of_frames(run.evaluated.nees, run.evaluated.row)
+    low, high = (np.full(len(ratio), bound) for bound in CHI_SQUARE_BAND_OF_6 / 6.0)
+    caption = (
+        "Normalised estimation error squared, per degree of freedom: 1 is right, above the band the covariance is too "
+        "small. The band holds 95 % of a right one's."
+    )
+    series = [*_band(low, high, "95 %"), _line("NEES / dof", np.where(ratio > 0, ratio, np.nan), BLUE, dots=True)]
+    return _plot("NEES", caption, series, log=True, bands=_BANDS)
+
+
+def _nis(frames: FrameTable) -> dict[str, Any] | None:
+    ratio = nis_per_dof(frames)
+    ratio = np.where(ratio > 0, ratio, np.nan)
+    if not _has_numbers(ratio):
+        return None
+    # (chi2 / dof)^(1/3) is nearly normal (Wilson and Hilferty).
+    dof = np.where(frames.columns["dof"] > 0, frames.columns["dof"], np.nan)
+    spread = np.sqrt(2 / (9 * dof))
+    low, high = (np.maximum(1 - 2 / (9 * dof) + sign * 1.96 * spread, 1e-3) ** 3 for sign in (-1, 1))
+    caption = (
+        "Normalised innovation squared, per degree of freedom: about 1 where the claimed uncertainty is right, above "
+        "the band where it is too small. The band holds 95 % of the frames of a consistent filter."
+    )
+    series = [*_band(low, high, "95 %"), _line("NIS / dof", ratio, BLUE, dots=True)]
+    return _plot("NIS", caption, series, log=True, bands=_BANDS)
+
+
+def _inliers(frames: FrameTable) -> dict[str, Any] | None:
+    matches, inliers = frames.columns["matches"], frames.columns["inliers"]
+    if not _has_numbers(matches, inliers):
+        return None
+    series = [_line("matches", matches, BLUE), _line("inliers", inliers, VERMILLION)]
+    return _plot("Matches and inliers", "Inliers are the matches that the filter used.", series)
+
+
+def _offset(frames: FrameTable) -> dict[str, Any] | None:
+    offset, sigma = frames.columns["disparity_offset"], frames.columns["disparity_offset_sigma"]
+    if not _has_numbers(offset):
+        return None
+    series = [
+        _line("+ 2 sigma", offset + 2 * sigma, GREY, width=0.5),
+        _line("- 2 sigma", offset - 2 * sigma, GREY, width=0.5),
+        _line("offset", offset, BLUE, width=2),
+    ]
+    bands = [{"series": [1, 2], "fill": "rgb(0 114 178 / 18%)"}]
+    return _plot("Disparity offset [px]", "Estimated error of the calibration.", series, bands=bands)
+
+
+def _belief(frames: FrameTable) -> dict[str, Any] | None:
+    belief = frames.columns["belief"]
+    if not _has_numbers(belief):
+        return None
+    caption = "How far the tracker believes each of its poses, 0 to 1."
+    return _plot("Belief", caption, [_line("belief", belief, BLUE)], range=[-0.03, 1.03])
+
+
+def _times(frames: FrameTable) -> dict[str, Any] | None:
+    if not _has_numbers(frames.total_milliseconds):
+        return None
+    names = list(frames.milliseconds)
+    stacked = np.cumsum(np.nan_to_num(np.array([frames.milliseconds[name] for name in names])), axis=0)
+    stacked[:, ~np.isfinite(frames.total_milliseconds)] = np.nan
+    # The tallest first, so that each covers those above it down to its own.
+    series = [
+        _line(f"to {names[k].replace('_', ' ')}", stacked[k], SERIES[k % 6], width=1, fill=f"{SERIES[k % 6]}66")
+        for k in reversed(range(len(names)))
+    ]
+    caption = "Stages one upon the other."
+    interval = frame_interval(frames)
+    if interval is not None:
+        series.append(_line("real time", np.full(len(frames), 1e3 * interval), GREY, width=1.5, dash=[6, 4]))
+        caption += f" Frames come every {1e3 * interval:.0f} ms."
+    return _plot("Time spent [ms]", caption, series)
+
+
+def frame_interval(frames: FrameTable) -> float | None:
+    """Median time between frames, seconds; None for a single one."""
+    return float(np.median(np.diff(frames.columns["timestamp"]))) if len(frames) > 1 else None

@@ -1,0 +1,156 @@
+"""The 3D view of a report: what stands where."""
+
+from __future__ import annotations
+
+import base64
+from typing import Any
+
+import numpy as np
+
+from sigmaslam.geometry.se3 import transform_points
+from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.run_record.frame_table import STATUSES
+from sigmaslam.run_record.recorded_run import RecordedRun
+
+MAX_POSES, MAX_POINTS, MAX_ELLIPSOIDS, MAX_KEYFRAMES = 20_000, 40_000, 40, 400
+"""With more of them an even selection is shown."""
+MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
+"""Ellipsoids may be drawn so many times as large."""
+# At first such that the median one of 3 sigma is this share of the view, or as they are.
+_VISIBLE = 0.02
+
+
+def pack(array: np.ndarray) -> dict[str, str]:
+    """An array for the JSON of a page; numbers become float32, and truth values and bytes uint8."""
+    kind = "|u1" if array.dtype in (np.uint8, np.bool_) else "<f4"
+    return {"dtype": kind, "base64": base64.b64encode(np.ascontiguousarray(array).astype(kind).tobytes()).decode()}
+
+
+def build_scene(run: RecordedRun) -> dict[str, Any] | None:
+    """Path, ellipsoids, map points, keyframes and loops; None where no frame has a pose.
+
+    Of a run that follows a body the path is the body's, and its points are where it was last.
+    """
+    if not len(run.trajectory):
+        return None
+    positions = run.trajectory.positions
+    shown = _even(len(positions), MAX_POSES)
+    # A short loss stays visible in a selection.
+    lost = np.flatnonzero(np.array(run.pose_status) == "lost")
+    shown = np.union1d(shown, lost[_even(len(lost), MAX_POSES)])
+    seconds = run.trajectory.timestamps - run.frames.columns["timestamp"][0]
+    status = np.array([STATUSES.index(each) for each in run.pose_status], np.uint8)
+    low, high = _extent(run)
+    size = max(float(np.linalg.norm(high - low)), 1e-3)
+    keyframes, loops = _keyframes(run)
+    ellipsoids, chosen = _ellipsoids(run)
+    scene = {
+        "centre": (0.5 * (low + high)).tolist(),
+        "extent": (high - low).tolist(),
+        "size": size,
+        "path": pack(positions[shown]),
+        "path_seconds": pack(seconds[shown]),
+        "path_status": pack(status[shown]),
+        "labels": _labels(run, seconds, shown),
+        "ellipsoids": pack(ellipsoids),
+        "ellipsoid_status": pack(status[chosen]),
+        "magnification": _magnification(run, size),
+        "magnifications": MAGNIFICATIONS,
+        "keyframes": pack(keyframes),
+        "loops": pack(loops),
+        **_points(run),
+    }
+    if run.dense is not None:
+        scene |= {"dense": pack(run.dense.points), "dense_grey": pack(run.dense.intensity)}
+    others: dict[str, np.ndarray | None] = {
+        "truth": None if run.evaluated is None else run.evaluated.truth,
+        "final": _positions(run.final),
+        "refined": _positions(run.refined),
+    }
+    return scene | {name: pack(line[_even(len(line), MAX_POSES)]) for name, line in others.items() if line is not None}
+
+
+def _even(count: int, most: int) -> np.ndarray:
+    """Indices of an even selection, the last one included."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64)) if count else np.zeros(0, np.int64)
+
+
+def _positions(trajectory: Trajectory | None) -> np.ndarray | None:
+    return None if trajectory is None else trajectory.positions
+
+
+def _extent(run: RecordedRun) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (3,), (3,) of what the view shows: the path, and the map as far as it is near."""
+    low, high = run.trajectory.positions.min(axis=0), run.trajectory.positions.max(axis=0)
+    if run.map is not None and len(run.map.points):
+        # Far points are the least certain ones.
+        points = _placed_points(run)
+        distance = float(np.median(np.linalg.norm(points - 0.5 * (low + high), axis=1)))
+        margin = max(0.3 * float(np.max(high - low)), distance)
+        near_low, near_high = np.percentile(points, (10, 90), axis=0)
+        low = np.minimum(low, np.maximum(near_low, low - margin))
+        high = np.maximum(high, np.minimum(near_high, high + margin))
+    return low, high
+
+
+def _placed_points(run: RecordedRun) -> np.ndarray:
+    assert run.map is not None
+    return transform_points(run.trajectory.poses[-1], run.map.points) if "object" in run.entries else run.map.points
+
+
+def _points(run: RecordedRun) -> dict[str, Any]:
+    """Map points, their sigmas, and their grey values where they are known."""
+    if run.map is None:
+        return {"points": pack(np.zeros((0, 3))), "point_sigma": pack(np.zeros(0)), "point_grey": None}
+    shown = _even(len(run.map.points), MAX_POINTS)
+    grey = run.map.intensity[shown]
+    known = np.isfinite(grey).all()
+    return {
+        "points": pack(_placed_points(run)[shown]),
+        "point_sigma": pack(run.map.sigma[shown]),
+        "point_grey": pack(grey.astype(np.uint8)) if known else None,
+    }
+
+
+def _keyframes(run: RecordedRun) -> tuple[np.ndarray, np.ndarray]:
+    """Poses (K, 4, 4) of keyframes, and segments (L, 2, 3) from where a loop was closed to where it began."""
+    of_poses = {name: run.frames.columns[name][run.pose_row] for name in ("keyframe", "loop")}
+    rows = np.flatnonzero(of_poses["keyframe"] == 1)
+    closing = np.flatnonzero(np.isfinite(of_poses["loop"]))
+    # The keyframe may be one of an earlier run, whose map was given.
+    last = len(run.trajectory) - 1
+    began = np.searchsorted(run.trajectory.timestamps, of_poses["loop"][closing] - 1e-6).clip(0, last)
+    same = np.abs(run.trajectory.timestamps[began] - of_poses["loop"][closing]) < 1e-3
+    positions = run.trajectory.positions
+    loops = np.stack([positions[closing[same]], positions[began[same]]], axis=1)
+    return run.trajectory.poses[rows[_even(len(rows), MAX_KEYFRAMES)]], loops
+
+
+def _ellipsoids(run: RecordedRun) -> tuple[np.ndarray, np.ndarray]:
+    """Transforms (E, 4, 4) of the unit sphere into 1-sigma ellipsoids of positions, and the poses (E,) they are of."""
+    known = np.flatnonzero(np.isfinite(run.covariances).all(axis=(1, 2)))
+    rows = known[_even(len(known), MAX_ELLIPSOIDS)]
+    variances, axes = np.linalg.eigh(run.covariances[rows, :3, :3])
+    transforms = run.trajectory.poses[rows].copy()
+    half_axes = axes * np.sqrt(np.maximum(variances, 0.0))[:, None, :]
+    transforms[:, :3, :3] = run.trajectory.rotations[rows] @ half_axes
+    return transforms, rows
+
+
+def _magnification(run: RecordedRun, size: float) -> int:
+    """One of `MAGNIFICATIONS` by which ellipsoids can be seen."""
+    sigma = run.sigmas[0]
+    sigma = sigma[np.isfinite(sigma) & (sigma > 0)]
+    if not len(sigma):
+        return 1
+    wanted = _VISIBLE * size / (3.0 * float(np.median(sigma)))
+    return int(MAGNIFICATIONS[np.abs(np.log(np.array(MAGNIFICATIONS) / wanted)).argmin()])
+
+
+def _labels(run: RecordedRun, seconds: np.ndarray, shown: np.ndarray) -> list[str]:
+    """What is said of each pose where the mouse is on it."""
+    position, rotation = run.sigmas
+    status = run.pose_status
+    return [
+        f"{seconds[k]:.2f} s, {status[k]}\nsigma {position[k]:.3g} m, {np.degrees(rotation[k]):.3g} deg" for k in shown
+    ]

@@ -1,0 +1,1 @@
+"""What a run folder holds: each file, written as a run goes on and read back."""

@@ -1,0 +1,174 @@
+"""What a run folder holds, read back."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sigmaslam.bounded_files import TABLE_BYTES, check_columns, load_arrays, read_text, shorten
+from sigmaslam.errors import InputError
+from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.readers.trajectory_files import read_covariances, read_tum
+from sigmaslam.run_record.dense_points import DENSE_NAME, DensePoints, read_dense_points
+from sigmaslam.run_record.evaluated_frames import (
+    EVALUATED_FRAMES_NAME,
+    EVALUATION_NAME,
+    EvaluatedFrames,
+    read_evaluated_frames,
+)
+from sigmaslam.run_record.frame_pictures import PICTURES_NAME, FramePictures, read_pictures
+from sigmaslam.run_record.frame_table import FRAMES_NAME, FrameTable, read_frames
+from sigmaslam.run_record.run_folder import FINAL_TRAJECTORY, RUN_NAME
+
+REFINED_TRAJECTORY, REFINE_NAME = "trajectory_refined.tum", "refine.json"
+_MAP_NAME = "map.npz"
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedMap:
+    """Points of a map.
+
+    Attributes:
+        points: (M, 3) in the world, metres.
+        sigma: (M,) root of the largest eigenvalue of the covariance, metres; NaN where it is not known.
+        intensity: (M,) grey value in the images, 0 to 255; NaN where it is not known.
+    """
+
+    points: np.ndarray
+    sigma: np.ndarray
+    intensity: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedRun:
+    """The files of a run folder; what is not there is None, or empty.
+
+    Attributes:
+        folder: the run.
+        frames: all F of them.
+        trajectory: N poses, as they were said.
+        covariances: (N, 6, 6) in their own frames, translation (metres) before rotation (radians); NaN without them.
+        pose_row: (N,) row in `frames` of each pose.
+        final, refined: trajectories after the fact and after `sigmaslam refine`.
+        map: the points.
+        dense: points of `sigmaslam reconstruct`.
+        pictures: of some frames.
+        entries: of run.json.
+        evaluation, refinement: content of evaluation.json and refine.json.
+        evaluated: errors of frames.
+    """
+
+    folder: Path
+    frames: FrameTable
+    trajectory: Trajectory
+    covariances: np.ndarray
+    pose_row: np.ndarray
+    final: Trajectory | None
+    refined: Trajectory | None
+    map: RecordedMap | None
+    dense: DensePoints | None
+    pictures: FramePictures | None
+    entries: dict[str, Any]
+    evaluation: dict[str, Any]
+    refinement: dict[str, Any]
+    evaluated: EvaluatedFrames | None
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """Of run.json."""
+        summary = self.entries.get("summary")
+        return summary if isinstance(summary, dict) else {}
+
+    @property
+    def pose_status(self) -> list[str]:
+        """(N,) status of each pose's frame."""
+        return [self.frames.status[row] for row in self.pose_row]
+
+    @property
+    def sigmas(self) -> tuple[np.ndarray, np.ndarray]:
+        """(N,), (N,) standard deviation of the position (metres) and of the rotation (radians), each as a whole."""
+        variances = np.diagonal(self.covariances, axis1=1, axis2=2)
+        position, rotation = (np.sqrt(variances[:, part].sum(axis=1)) for part in (slice(0, 3), slice(3, 6)))
+        return position, rotation
+
+    def of_frames(self, values: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+        """Numbers of poses (all, or those of the given rows) as numbers of all frames (F,); NaN for the others."""
+        spread = np.full(len(self.frames), np.nan)
+        spread[self.pose_row if rows is None else self.pose_row[rows]] = values
+        return spread
+
+
+def read_run(folder: Path) -> RecordedRun:
+    """Reads a run folder.
+
+    Raises:
+        InputError: frames.csv is missing, or a file is wrong.
+    """
+    frames = read_frames(folder / FRAMES_NAME)
+    trajectory = _read_trajectory(folder / "trajectory.tum") or Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
+    # trajectory.tum and frames.csv may round differently.
+    pose_row = np.searchsorted(frames.columns["timestamp"], trajectory.timestamps - 1e-6)
+    if len(pose_row) and pose_row.max() >= len(frames):
+        raise InputError(f"{folder / FRAMES_NAME}: ends before trajectory.tum: both must come from the same run")
+    errors = folder / EVALUATED_FRAMES_NAME
+    return RecordedRun(
+        folder=folder,
+        frames=frames,
+        trajectory=trajectory,
+        covariances=_read_covariances(folder / "covariance.npy", len(trajectory)),
+        pose_row=pose_row,
+        final=_read_trajectory(folder / FINAL_TRAJECTORY),
+        refined=_read_trajectory(folder / REFINED_TRAJECTORY),
+        map=_read_map(folder / _MAP_NAME),
+        dense=read_dense_points(folder / DENSE_NAME) if (folder / DENSE_NAME).is_file() else None,
+        pictures=read_pictures(folder / PICTURES_NAME) if (folder / PICTURES_NAME).is_file() else None,
+        entries=_read_json(folder / RUN_NAME, "track"),
+        evaluation=_read_json(folder / EVALUATION_NAME, "evaluate"),
+        refinement=_read_json(folder / REFINE_NAME, "refine"),
+        evaluated=read_evaluated_frames(errors, len(trajectory)) if errors.is_file() else None,
+    )
+
+
+def _read_trajectory(path: Path) -> Trajectory | None:
+    return read_tum(path) if path.is_file() else None
+
+
+def _read_covariances(path: Path, count: int) -> np.ndarray:
+    return read_covariances(path, count) if path.is_file() else np.full((count, 6, 6), np.nan)
+
+
+def _read_map(path: Path) -> RecordedMap | None:
+    """None where there is no map. Maps of earlier versions have no grey values."""
+    if not path.is_file():
+        return None
+    mend = "run `sigmaslam track` again"
+    # The whole archive has the images of all keyframes, too.
+    arrays = load_arrays(path, mend, ("points",))
+    with zipfile.ZipFile(path) as archive:
+        there = {name.removesuffix(".npy") for name in archive.namelist()}
+    arrays |= load_arrays(path, mend, [name for name in ("covariances", "intensity") if name in there])
+    unknown = np.full(len(arrays["points"]), np.nan)
+    arrays = {"covariances": unknown[:, None, None] * np.eye(3), "intensity": unknown, **arrays}
+    shapes: dict[str, tuple[str | int, ...]] = {"points": ("M", 3), "covariances": ("M", 3, 3), "intensity": ("M",)}
+    check_columns(path, arrays, shapes, {}, mend)
+    points, covariances = (arrays[name].astype(np.float64) for name in ("points", "covariances"))
+    kept, known = np.isfinite(points).all(axis=1), np.isfinite(covariances).all(axis=(1, 2))
+    largest = np.full(len(points), np.nan)
+    if known.any():
+        largest[known] = np.linalg.eigvalsh(covariances[known])[:, -1]
+    return RecordedMap(points[kept], np.sqrt(np.maximum(largest, 0.0))[kept], arrays["intensity"][kept])
+
+
+def _read_json(path: Path, command: str) -> dict[str, Any]:
+    if not path.is_file():
+        return {}
+    try:
+        content = json.loads(read_text(path, TABLE_BYTES, "the run"))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: is no JSON ({shorten(str(error))}); run `sigmaslam {command}` again") from error
+    return content if isinstance(content, dict) else {}

@@ -1,0 +1,100 @@
+"""What a run says about the calibration and about what moves, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from sigmaslam.checks.finding import Finding, wrong
+from sigmaslam.slam.estimate import CalibrationEstimate
+
+MIN_FRAMES, MIN_POINTS = 10, 45
+"""With fewer tracked frames or map points nothing is said: one false match may move the offset then."""
+# A disparity offset is told from other errors and from the scene when it is known this well, pixels.
+_MAX_SIGMA = 0.2
+# A smaller offset makes no difference to the tracker, pixels.
+_MIN_OFFSET = 0.1
+# Share of the tracked frames that most matches may contradict without a word.
+_MAX_CONTRADICTED = 0.1
+# Findings about the rig, which the disparity offset has its share of.
+_RIG = frozenset({"eyes", "mirrored", "rig", "distortion", "rows", "rotation", "scale", "infinity"})
+
+
+def expected_offset(calibration: dict[str, Any]) -> float:
+    """Standard deviation of the disparity offset between calibrations of one rig, pixels.
+
+    The right camera's yaw moves all disparities, and is not known better than the calibration says.
+
+    Args:
+        calibration: as `sigmaslam.run_record.run_folder.describe_camera` gives it.
+    """
+    return float(calibration["left"]["fx"] * calibration["sigmas"]["rotation"])
+
+
+def contradiction_verdict(summary: dict[str, Any]) -> str | None:
+    """That most matches contradict many poses, in words; None where they do not.
+
+    Args:
+        summary: of run.json: counts of frames that were tracked, and of those that fewer than half of their matches
+            agree with.
+    """
+    contradicted, tracked = summary.get("contradicted", 0), summary.get("tracking", 0)
+    if contradicted <= _MAX_CONTRADICTED * tracked:
+        return None
+    return (
+        f"In {contradicted} of {tracked} tracked frames fewer than half of the matches agree with the pose: something "
+        "large moves in the images, and the poses may follow it instead of the scene."
+    )
+
+
+def calibration_verdict(
+    calibration: CalibrationEstimate,
+    frames: int,
+    points: int,
+    expected: float,
+    findings: Sequence[Finding] = (),
+) -> str:
+    """The estimated disparity offset, and what a check found about the rig, in words.
+
+    One sequence gets the same verdict at any length, or that it is too early to say: an offset counts as wrong where it
+    is more than three standard deviations of calibrations of one rig, as it wanders by about one within a drive.
+
+    Args:
+        calibration: as it is estimated in the last frame.
+        frames: that were tracked.
+        points: in the map.
+        expected: as of `expected_offset`.
+        findings: of a check of the input.
+    """
+    faults = wrong(findings)
+    delays = [each.message for each in faults if each.name == "synchronisation"]
+    if delays:
+        return (
+            f"Nothing can be said about the calibration, as the eyes are not synchronised: {delays[0]}. Depth and "
+            "poses are wrong while the camera moves."
+        )
+    causes = [each.message for each in faults if each.name in _RIG]
+    if causes:
+        return "The images do not fit the calibration: " + "; ".join(causes) + "."
+    offset, sigma = calibration.disparity_offset, calibration.disparity_offset_sigma
+    if calibration.refused_offset:
+        return (
+            f"The images ask for a disparity offset of {calibration.refused_offset:+.1f} px, which is more than "
+            "calibrations are off by: nothing was corrected. A lens, the baseline or the right camera is wrong: "
+            "calibrate again."
+        )
+    known = float(np.hypot(sigma, expected))
+    figure = f"{offset:+.2f} ± {known:.2f} px"
+    if sigma > _MAX_SIGMA or frames < MIN_FRAMES or points < MIN_POINTS:
+        return (
+            f"It is too early to say whether the rectification is right (disparity offset {figure} from {frames} "
+            f"tracked frames and {points} map points): more frames, or things nearer and farther, would tell."
+        )
+    if abs(offset) > max(3.0 * known, _MIN_OFFSET):
+        return (
+            f"The rectification is off by {figure} of disparity. The poses are corrected for it; depth measured with "
+            "this calibration elsewhere is not: calibrate again."
+        )
+    return f"The disparity offset is {figure}: nothing wrong with the rectification can be seen."

@@ -1,0 +1,335 @@
+import base64
+import json
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sigmaslam.errors import InputError
+from sigmaslam.readers.trajectory_files import read_tum
+from sigmaslam.report.report import write_report
+from sigmaslam.run_record.evaluated_frames import EvaluatedFrames, write_evaluation
+from sigmaslam.run_record.frame_table import STATUSES, read_frames
+from sigmaslam.run_record.recorded_run import read_run
+from tests.support.recorded_runs import HEADER, STAGES, make_run
+
+MOST_BYTES = 8_000_000
+
+
+class _Page(HTMLParser):
+    """Checks that tags close and collects text, links and identifiers."""
+
+    def __init__(self, content: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.text: list[str] = []
+        self.links: list[str] = []
+        self.identifiers: list[str] = []
+        self.data: dict[str, Any] = {}
+        self.feed(content)
+
+    def handle_starttag(self, tag, attrs):
+        if tag not in ("meta", "br", "link", "input"):
+            self.open.append(tag)
+        self._attributes(attrs)
+
+    def handle_startendtag(self, tag, attrs):
+        self._attributes(attrs)
+
+    def _attributes(self, attrs):
+        self.links += [value for name, value in attrs if name in ("src", "href", "xlink:href")]
+        self.identifiers += [value for name, value in attrs if name == "id"]
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] in ("script", "style"):
+            if data.startswith('{"seconds"'):
+                self.data = json.loads(data)
+            return
+        self.text.append(data)
+
+
+def _page(run: Path) -> _Page:
+    return _Page(write_report(run).read_text(encoding="utf-8"))
+
+
+def _text(run: Path) -> str:
+    return " ".join(" ".join(_page(run).text).split())
+
+
+def _unpack(packed: dict[str, str], *shape: int) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(packed["base64"]), packed["dtype"]).reshape(-1, *shape)
+
+
+def _values(page: _Page, title: str, label: str) -> np.ndarray:
+    """The numbers of a series in a plot."""
+    plot = next(plot for plot in page.data["plots"] if plot["title"].startswith(title))
+    return _unpack(next(each for each in plot["series"] if each["label"] == label)["values"])
+
+
+@pytest.mark.parametrize("count", [12, 1100, 30_000])
+def test_report_is_one_file_that_needs_no_other(tmp_path, count):
+    make_run(tmp_path / "run", count, pictures=count < 2000)
+    weights = {f"network_{k}": {"file": "features.onnx", "sha256": "0" * 64} for k in range(500)}
+    (tmp_path / "run/run.json").write_text(json.dumps({"weights": weights}))
+    path = write_report(tmp_path / "run")
+    assert path.stat().st_size <= MOST_BYTES
+    page = _Page(path.read_text(encoding="utf-8"))
+    assert page.open == []
+    assert all(link.startswith("data:") or (tmp_path / "run" / link).is_file() for link in page.links)
+    assert len(page.identifiers) == len(set(page.identifiers))
+    titles = [plot["title"] for plot in page.data["plots"]]
+    assert titles == [
+        "Position: 3 sigma [m]",
+        "Rotation: 3 sigma [deg]",
+        "NIS",
+        "Matches and inliers",
+        "Disparity offset [px]",
+        "Time spent [ms]",
+        "Belief",
+    ]
+
+
+def test_report_says_what_the_run_was(tmp_path):
+    make_run(tmp_path / "run")
+    text = _text(tmp_path / "run")
+    assert "frames 200" in text
+    assert "poses 199" in text
+    assert "map points 20000" in text
+    assert "keyframes 19 loops 1" in text
+    assert "1 starting, 192 tracking, 5 lost, 1 relocalised, 1 skipped." in text
+    assert "disparity is 0.30 px <too small>; depth reads 1 % long" in text
+    assert "<too small>" not in write_report(tmp_path / "run").read_text(encoding="utf-8")
+    assert "sigmaslam track x" in text
+    assert "Run run with losses" in text
+    total = read_frames(tmp_path / "run/frames.csv").total_milliseconds
+    assert f"speed {1000 / np.nanmedian(total):.1f} frames/s" in text
+    p50, p95, p99 = np.nanpercentile(total, (50, 95, 99))
+    assert f"p99 {p50:.0f}, {p95:.0f}, {p99:.0f} ms" in text
+
+
+def test_poses_that_most_matches_contradict_are_told_of_at_first_sight(tmp_path):
+    make_run(tmp_path / "run")
+    path = tmp_path / "run/run.json"
+    content = json.loads(path.read_text())
+    assert "fewer than half of the matches" not in write_report(tmp_path / "run").read_text(encoding="utf-8")
+    content["summary"] |= {"tracking": 192, "contradicted": 90}
+    path.write_text(json.dumps(content))
+    text = write_report(tmp_path / "run").read_text(encoding="utf-8")
+    assert "In 90 of 192 tracked frames fewer than half of the matches" in text.partition("<noscript>")[0]
+
+
+def test_a_failed_run_looks_failed(tmp_path):
+    make_run(tmp_path / "run")
+    path = tmp_path / "run/run.json"
+    path.write_text(json.dumps({"summary": {"failure": "Nothing was tracked: swap the eyes."}, "ended": "complete"}))
+    content = write_report(tmp_path / "run").read_text(encoding="utf-8")
+    assert "<title>FAILED: run" in content
+    assert '<body class="bad">' in content
+    assert '<p class="notice bad">Nothing was tracked: swap the eyes.</p>' in content
+    assert "Run run failed" in _text(tmp_path / "run")
+
+
+def test_a_run_that_was_stopped_says_so(tmp_path):
+    make_run(tmp_path / "run")
+    (tmp_path / "run/run.json").write_text(json.dumps({"ended": "interrupted by SIGTERM"}))
+    assert "did not come to its end: interrupted by SIGTERM." in _text(tmp_path / "run")
+
+
+def test_ellipsoids_are_the_covariances_of_positions_in_the_world(tmp_path):
+    make_run(tmp_path / "run")
+    scene = _page(tmp_path / "run").data["scene"]
+    transforms = _unpack(scene["ellipsoids"], 4, 4).astype(float)
+    run = read_run(tmp_path / "run")
+    rows = [np.linalg.norm(run.trajectory.positions - T[:3, 3], axis=1).argmin() for T in transforms]
+    assert len(set(rows)) == len(transforms) == 40
+    R = run.trajectory.rotations[rows]
+    expected = R @ run.covariances[rows, :3, :3] @ R.transpose(0, 2, 1)
+    found = transforms[:, :3, :3] @ transforms[:, :3, :3].transpose(0, 2, 1)
+    np.testing.assert_allclose(found, expected, atol=1e-6 * expected.max())
+
+
+def test_the_view_shows_path_keyframes_loop_and_points(tmp_path):
+    make_run(tmp_path / "run", points=500)
+    scene = _page(tmp_path / "run").data["scene"]
+    trajectory = read_tum(tmp_path / "run/trajectory.tum")
+    np.testing.assert_allclose(_unpack(scene["path"], 3), trajectory.positions, atol=1e-4)
+    assert [STATUSES[k] for k in _unpack(scene["path_status"])].count("lost") == 5
+    # Every tenth frame is a keyframe; the skipped one, 50, has no pose.
+    np.testing.assert_allclose(_unpack(scene["keyframes"], 4, 4)[1], trajectory.poses[10], atol=1e-4)
+    assert len(_unpack(scene["keyframes"], 4, 4)) == 19
+    np.testing.assert_allclose(_unpack(scene["loops"], 2, 3), [trajectory.positions[[-1, 1]]], atol=1e-4)
+    with np.load(tmp_path / "run/map.npz") as content:
+        np.testing.assert_allclose(_unpack(scene["points"], 3), content["points"], atol=1e-4)
+        np.testing.assert_array_equal(_unpack(scene["point_grey"]), content["intensity"])
+    np.testing.assert_allclose(_unpack(scene["point_sigma"]), 1.0)
+
+
+def test_points_of_a_followed_body_are_where_it_was_last(tmp_path):
+    make_run(tmp_path / "run", points=50)
+    (tmp_path / "run/run.json").write_text(json.dumps({"object": {"region": "1,2,3,4", "origin": [0, 0, 1]}}))
+    last = read_tum(tmp_path / "run/trajectory.tum").poses[-1]
+    with np.load(tmp_path / "run/map.npz") as content:
+        expected = content["points"] @ last[:3, :3].T + last[:3, 3]
+    found = _unpack(_page(tmp_path / "run").data["scene"]["points"], 3)
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+
+
+def test_a_loss_of_one_frame_is_seen_in_a_long_run(tmp_path):
+    make_run(tmp_path / "run", 45_000)
+    path = tmp_path / "run/frames.csv"
+    lines = path.read_text().splitlines()
+    lines[7001] = lines[7001].replace("tracking", "lost")
+    path.write_text("\n".join(lines) + "\n")
+    scene = _page(tmp_path / "run").data["scene"]
+    assert [STATUSES[k] for k in _unpack(scene["path_status"])].count("lost") == 6
+
+
+def test_sigmas_are_those_of_the_covariance(tmp_path):
+    make_run(tmp_path / "run")
+    page = _page(tmp_path / "run")
+    variances = np.diagonal(np.load(tmp_path / "run/covariance.npy"), axis1=1, axis2=2)
+    for title, part, unit in (("Position", slice(0, 3), 1.0), ("Rotation", slice(3, 6), 180 / np.pi)):
+        drawn = _values(page, title, "3 sigma")
+        assert np.flatnonzero(np.isnan(drawn)).tolist() == [50]
+        np.testing.assert_allclose(np.delete(drawn, 50), 3 * unit * np.sqrt(variances[:, part].sum(axis=1)), rtol=1e-5)
+
+
+def test_an_evaluation_is_in_the_report(tmp_path):
+    make_run(tmp_path / "run")
+    run, count = tmp_path / "run", 100
+    row, line = np.arange(60, 60 + count), np.linspace(0, 1, count)
+    frames = EvaluatedFrames(row, line, 0.1 * line, 2 * line + 0.1, np.column_stack([line, line, line]))
+    ate = {"rmse": 0.1234, "rotation_rmse_deg": 0.5}
+    errors = {"ate": ate, "ate_origin": ate, "rpe": {"translation_rmse": 0.01}, "nees": {"mean": 2.5, "inside": 0.4}}
+    write_evaluation(run, {**errors, "final": None, "truth_hint": None}, frames)
+    page = _page(run)
+    text = " ".join(" ".join(page.text).split())
+    assert "as it was said 0.1234 0.1234 0.5 0.01 2.50 40 %" in text
+    assert "NEES per dof 2.50" in text
+    # A frame is skipped before the first of them.
+    np.testing.assert_allclose(_values(page, "Position", "error")[61 : 61 + count], line, atol=1e-6)
+    np.testing.assert_allclose(_values(page, "Rotation", "error")[61 : 61 + count], np.degrees(0.1 * line), rtol=1e-5)
+    np.testing.assert_allclose(_values(page, "NEES", "NEES / dof")[61 : 61 + count], 2 * line + 0.1, rtol=1e-5)
+    np.testing.assert_allclose(_unpack(page.data["scene"]["truth"], 3)[:, 0], line, atol=1e-6)
+
+
+def test_a_refinement_is_in_the_report(tmp_path):
+    make_run(tmp_path / "run")
+    found = {"keyframes": 7, "landmarks": 80, "observations": 900, "converged": True, "disparity_offset": 0.1}
+    found |= {"disparity_offset_sigma": 0.02, "cost_per_dof_before": 3.0, "cost_per_dof_after": 1.25}
+    (tmp_path / "run/refine.json").write_text(json.dumps(found))
+    (tmp_path / "run/trajectory_refined.tum").write_text((tmp_path / "run/trajectory.tum").read_text())
+    page = _page(tmp_path / "run")
+    text = " ".join(" ".join(page.text).split())
+    assert "landmarks 80" in text
+    assert "cost per dof 3 → 1.25" in text
+    np.testing.assert_array_equal(_unpack(page.data["scene"]["refined"], 3), _unpack(page.data["scene"]["path"], 3))
+
+
+def test_runs_of_earlier_versions_have_a_report(tmp_path):
+    make_run(tmp_path / "run", points=50)
+    path = tmp_path / "run/frames.csv"
+    rows = [line.split(",") for line in path.read_text().splitlines()]
+    keep = [k for k, name in enumerate(rows[0]) if name not in ("keyframe", "loop")]
+    path.write_text("\n".join(",".join(row[k] for k in keep) for row in rows) + "\n")
+    np.savez(tmp_path / "run/map.npz", points=np.ones((4, 3)))
+    (tmp_path / "run/covariance.npy").unlink()
+    page = _page(tmp_path / "run")
+    assert page.data["scene"]["point_grey"] is None
+    assert page.data["scene"]["ellipsoids"]["base64"] == ""
+    assert "keyframes" not in _text(tmp_path / "run").partition("Frames by status")[0]
+
+
+def test_same_run_gives_the_same_report(tmp_path):
+    make_run(tmp_path / "run")
+    first = write_report(tmp_path / "run").read_bytes()
+    assert write_report(tmp_path / "run").read_bytes() == first
+
+
+def test_names_of_folders_are_escaped(tmp_path):
+    make_run(tmp_path / "a<b>&c")
+    content = write_report(tmp_path / "a<b>&c").read_text(encoding="utf-8")
+    assert "a&lt;b&gt;&amp;c" in content
+    assert "a<b>" not in content
+
+
+def test_empty_fields_are_unknown_not_zero(tmp_path):
+    make_run(tmp_path / "run")
+    frames = read_frames(tmp_path / "run/frames.csv")
+    skipped = frames.status.index("skipped")
+    assert np.isnan(frames.columns["inliers"][skipped])
+    assert np.isnan(frames.total_milliseconds[skipped])
+    assert tuple(frames.milliseconds) == STAGES
+    assert frames.seconds[-1] == pytest.approx(19.9)
+
+
+def test_run_without_map_and_configuration_has_a_report(tmp_path):
+    make_run(tmp_path / "run")
+    (tmp_path / "run/map.npz").unlink()
+    (tmp_path / "run/run.json").unlink()
+    page = _page(tmp_path / "run")
+    assert page.data["scene"]["points"]["base64"] == ""
+    assert "map.npz" not in page.links
+    assert "run.json" not in _text(tmp_path / "run")
+
+
+def test_run_with_only_skipped_frames_has_a_report(tmp_path):
+    make_run(tmp_path / "run")
+    empty = "," * (HEADER.count(",") - 1)
+    (tmp_path / "run/frames.csv").write_text(f"{HEADER}\n0.0,skipped{empty}\n0.1,skipped{empty}\n")
+    for name in ("trajectory.tum", "covariance.npy", "map.npz"):
+        (tmp_path / "run" / name).unlink()
+    page = _page(tmp_path / "run")
+    assert page.data["plots"] == []
+    assert page.data["scene"] is None
+    assert "2 skipped." in _text(tmp_path / "run")
+    assert "Run run failed" in _text(tmp_path / "run")
+
+
+def test_empty_map_has_a_report(tmp_path):
+    make_run(tmp_path / "run")
+    np.savez(tmp_path / "run/map.npz", points=np.zeros((0, 3)))
+    write_report(tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("0.000,starting", "0.000,dreaming", "line 2: status 'dreaming'"),
+        (",belief,", ",faith,", "has no column belief"),
+        ("1403715273.459999800,tracking,", "1403715273.459999800,tracking,x", "line 4: matches is 'x"),
+        ("1403715273.459999800,", ",", "line 4: has no timestamp"),
+    ],
+)
+def test_bad_frames_are_named_with_line_and_value(tmp_path, old, new, message):
+    make_run(tmp_path / "run")
+    path = tmp_path / "run/frames.csv"
+    lines = path.read_text().splitlines()
+    lines[1] = "0.000" + lines[1][lines[1].index(",") :]
+    lines[3] = "1403715273.459999800" + lines[3][lines[3].index(",") :]
+    text = "\n".join(lines)
+    assert old in text
+    path.write_text(text.replace(old, new))
+    with pytest.raises(InputError, match=r"frames\.csv: " + message):
+        write_report(tmp_path / "run")
+
+
+def test_missing_and_broken_files_are_named(tmp_path):
+    with pytest.raises(InputError, match=r"frames\.csv: cannot read the frames: no such file"):
+        write_report(tmp_path)
+    make_run(tmp_path / "run")
+    (tmp_path / "run/map.npz").write_text("none")
+    with pytest.raises(InputError, match=r"map\.npz: is no numpy archive"):
+        write_report(tmp_path / "run")
+    (tmp_path / "run/map.npz").unlink()
+    (tmp_path / "run/run.json").write_text("{")
+    with pytest.raises(InputError, match=r"run\.json: is no JSON"):
+        write_report(tmp_path / "run")
+    (tmp_path / "run/frames.csv").unlink()
+    with pytest.raises(InputError, match=r"frames\.csv: cannot read the frames"):
+        write_report(tmp_path / "run")

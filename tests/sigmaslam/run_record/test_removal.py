@@ -1,0 +1,62 @@
+"""A run is removed whole, and nothing else ever."""
+
+from pathlib import Path
+
+import pytest
+
+from sigmaslam.errors import InputError
+from sigmaslam.report.report import write_report
+from sigmaslam.run_record.pose_file import PARTIAL_POSES, PoseWriter
+from sigmaslam.run_record.removal import remove_run
+from tests.support.recorded_runs import make_run
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    folder = tmp_path / "run"
+    make_run(folder, 12, points=10, pictures=True)
+    write_report(folder)
+    return folder
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_a_run_is_removed_whole(run: Path):
+    remove_run(run)
+    assert not any(run.iterdir())
+
+
+def test_no_folder_or_an_empty_one_is_left_alone(tmp_path: Path):
+    remove_run(tmp_path / "none")
+    remove_run(tmp_path)
+    assert tmp_path.is_dir()
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "image_0"])
+def test_a_file_that_no_run_writes_saves_all(run: Path, name: str):
+    (run / name).write_text("mine")
+    before = contents(run)
+    with pytest.raises(InputError, match=rf"holds {name}, which no run has written"):
+        remove_run(run)
+    assert contents(run) == before
+
+
+def test_what_is_no_run_is_not_removed(run: Path):
+    (run / "run.json").unlink()
+    before = contents(run)
+    with pytest.raises(InputError, match=r"holds no run\.json"):
+        remove_run(run)
+    assert contents(run) == before
+
+
+def test_a_run_that_goes_on_is_not_removed(run: Path):
+    writer = PoseWriter(run)
+    with pytest.raises(InputError, match="still goes on"):
+        remove_run(run)
+    assert (run / PARTIAL_POSES).is_file()
+    assert (run / "frames.csv").is_file()
+    writer.close()
+    remove_run(run)
+    assert not any(run.iterdir())

@@ -1,0 +1,83 @@
+"""What a run says about the calibration."""
+
+import pytest
+
+from sigmaslam.checks.finding import Finding
+from sigmaslam.run_record.verdict import calibration_verdict, contradiction_verdict, expected_offset
+from sigmaslam.slam.tracker import CalibrationEstimate
+
+EXPECTED = 0.1
+
+
+def verdict(offset: float, sigma: float, *findings: Finding, frames: int = 100, points: int = 1000) -> str:
+    return calibration_verdict(CalibrationEstimate(offset, sigma), frames, points, EXPECTED, findings)
+
+
+@pytest.mark.parametrize(
+    ("offset", "sigma", "words"),
+    [
+        (0.01, 0.03, "nothing wrong"),
+        (0.45, 0.04, "off by +0.45 ± 0.11 px"),
+        (-0.45, 0.04, "off by -0.45 ± 0.11 px"),
+        (0.27, 0.01, "nothing wrong"),  # certain, but no more than calibrations of one rig differ by
+        (0.3, 0.25, "too early to say"),
+    ],
+)
+def test_the_verdict_is_in_words(offset: float, sigma: float, words: str):
+    assert words in verdict(offset, sigma)
+
+
+@pytest.mark.parametrize(
+    ("contradicted", "tracked", "told"), [(0, 29, False), (2, 29, False), (3, 29, True), (1, 1, True)]
+)
+def test_frames_that_most_matches_contradict_are_told_of(contradicted: int, tracked: int, told: bool):
+    words = contradiction_verdict({"contradicted": contradicted, "tracking": tracked})
+    assert (words is not None) == told
+    assert words is None or f"{contradicted} of {tracked} tracked frames" in words
+
+
+def test_a_calibration_without_errors_leaves_the_estimate_alone():
+    exact = {"left": {"fx": 500.0}, "sigmas": {"rotation": 0.0}}
+    assert expected_offset(exact) == 0.0
+    assert "off by +0.12 ± 0.01" in calibration_verdict(CalibrationEstimate(0.12, 0.01), 100, 1000, 0.0)
+    # Too small to matter, however well known.
+    assert "nothing wrong" in calibration_verdict(CalibrationEstimate(0.09, 0.01), 100, 1000, 0.0)
+
+
+def test_the_verdict_names_an_offset_that_was_refused():
+    refused = CalibrationEstimate(0.0, 0.5, 2.4)
+    assert "ask for a disparity offset of +2.4 px" in calibration_verdict(refused, 100, 1000, EXPECTED)
+
+
+@pytest.mark.parametrize(("frames", "points"), [(3, 1000), (100, 22)])
+def test_few_frames_or_points_say_nothing(frames: int, points: int):
+    assert "too early" in verdict(0.9, 0.04, frames=frames, points=points)
+
+
+def test_one_drive_gets_one_verdict_at_any_length():
+    """Offsets of KITTI's drive 39 after 20, 60, 100 and 186 frames, in two versions of the tracker."""
+    expected = expected_offset({"left": {"fx": 721.5}, "sigmas": {"rotation": 0.0003}})
+    for offsets in (
+        ((-0.158, 0.024), (0.088, 0.014), (0.036, 0.016), (0.129, 0.012)),
+        ((-0.044, 0.244), (0.074, 0.033), (0.060, 0.036), (0.104, 0.039)),
+    ):
+        words = [calibration_verdict(CalibrationEstimate(*each), 20, 1000, expected) for each in offsets]
+        assert all("nothing wrong" in each or "too early" in each for each in words)
+
+
+LATE = Finding("synchronisation", "warning", "the right images are 100 ms later: trigger both", 1.0)
+ROWS = Finding("rows", "error", "right rows are +3.00 px from the left ones: crop both images alike", 3.0)
+GOOD = Finding("eyes", "ok", "left is left", 1.0)
+
+
+def test_unsynchronised_eyes_are_not_blamed_on_the_calibration():
+    said = verdict(0.44, 0.08, ROWS, LATE, GOOD)
+    assert "calibrate" not in said
+    assert LATE.message in said
+
+
+def test_what_the_images_show_comes_before_the_offset():
+    said = verdict(0.0, 0.03, GOOD, ROWS)
+    assert "do not fit the calibration" in said
+    assert ROWS.message in said
+    assert "left is left" not in said
