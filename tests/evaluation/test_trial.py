@@ -8,9 +8,9 @@ import pytest
 
 from sigmaslam.errors import InputError
 from sigmaslam.slam.tracker import TrackerConfig
+from sigmaslam_benchmarks import trial
 from sigmaslam_benchmarks.tracking.pnp_baselines import track_with_pnp
 from sigmaslam_benchmarks.trial import Trial, TrialCache, hash_code
-from sigmaslam_benchmarks import trial
 from sigmaslam_synthetic.simulation import Recipe
 
 RECIPE, CONFIG = Recipe("room", 3, 7), TrackerConfig()
