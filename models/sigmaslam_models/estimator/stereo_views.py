@@ -14,7 +14,7 @@ from sigmaslam_models.estimator.calibration_errors import unmodelled_errors
 from sigmaslam_models.estimator.stereo_window import StereoTransfer
 
 # Least spread of sigma points: share of the scene's depth, radians, pixels; with it alone slopes are derivatives.
-_MIN_SPREAD = 1e-6
+LEAST_SPREAD = 1e-6
 # Largest standard deviation that sigma points are drawn from: share of the scene's depth and radians.
 _MAX_SPREAD = 0.05
 
@@ -76,7 +76,7 @@ def linearise(scene: Scene, poses: Tensor, calibration: Tensor, covariance: Tens
     T_view_world = invert_se3(poses.index_select(0, scene.views))
     chain = _chain(scene, adjoint_se3(T_view_world), poses.shape[0])
     units = torch.cat([scene.depth.expand(3), torch.ones_like(covariance[0, :6])])
-    least = torch.tensor(_MIN_SPREAD, dtype=poses.dtype, device=poses.device)
+    least = torch.tensor(LEAST_SPREAD, dtype=poses.dtype, device=poses.device)
     joint = scene.unscented * (chain @ covariance @ chain.mT)
     spread = regular_factors.cholesky(_limited((joint + joint.mT) / 2.0, scene.depth) + torch.diag(units * least) ** 2)
     own = scene.unscented * scene.covariance[:, :MODELLED, :MODELLED]
