@@ -51,7 +51,7 @@ FLOORS = (
     ("__main__", "sigmaslam_benchmarks"),
 )
 # The filters likewise, from the ground up; "" is the files that users read first.
-FILTER_FLOORS = (("core", "consistency"), ("manifolds",), ("",), ("graphs",))
+FILTER_FLOORS = (("core", "consistency"), ("manifolds",), ("",), ("compiler", "graphs"))
 # Of the tracker.
 MAX_LINES, MAX_METHODS = 300, 12
 

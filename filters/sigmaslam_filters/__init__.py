@@ -2,8 +2,7 @@
 
 from sigmaslam_filters.adaptive import adapted_noise
 from sigmaslam_filters.bayes import BayesFilter, ExtendedKalmanFilter, KalmanFilter, UnscentedKalmanFilter
-from sigmaslam_filters.compiled_filter import compile_filter
-from sigmaslam_filters.core.compiled import compile_step
+from sigmaslam_filters.compiler import compile_filter, compile_step
 from sigmaslam_filters.core.failure import FilterError
 from sigmaslam_filters.core.layout import stack
 from sigmaslam_filters.core.noise_covariance import BlockDiagonal, Dense, Diagonal

@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 import sigmaslam_filters as filters
-from sigmaslam_filters import compiled_filter, systems
-from sigmaslam_filters.core.scalar_loop import ScalarLoop, ScalarLoopError
+from sigmaslam_filters import systems
+from sigmaslam_filters.compiler import compiled_filter
+from sigmaslam_filters.compiler.scalar_loop import ScalarLoop, ScalarLoopError
 from tests.support.filter_assertions import assert_close
 from tests.support.filter_builders import beliefs, bent_measurement, bent_motion, covariances, random_numbers, tensor
 

@@ -8,7 +8,7 @@ from torch._dynamo.backends.common import aot_autograd
 from torch._inductor.decomposition import select_decomp_table
 
 import sigmaslam_filters as filters
-from sigmaslam_filters.core import components
+from sigmaslam_filters.compiler import components
 
 BATCH = 200
 

@@ -21,7 +21,7 @@ def compile_step(step: F) -> F:
     """The step made into machine code for the shapes and dtypes that it is called with.
 
     A step is a function of tensors that calls `predict` and `update` and returns tensors. Batches of small filters
-    become one loop over the batch, see `sigmaslam_filters.core.components`; others are fused into a few; of a single
+    become one loop over the batch, see `sigmaslam_filters.compiler.components`; others are fused into a few; of one
     filter most of the overhead goes. The first call for each set of shapes takes from ten seconds to a minute. Filters
     and models that the step refers to are taken as they are then: compile anew after changing one. A filter with
     iterations="auto" always linearises twice in compiled code. One with on_failure="raise" raises as it does elsewhere;
@@ -39,7 +39,7 @@ def compile_step(step: F) -> F:
     # refer to is not checked, each needs code of its own.
     copy = FunctionType(step.__code__.replace(), step.__globals__, step.__name__, step.__defaults__, step.__closure__)
     # The compiler takes a second to load, which only this function has a use for.
-    from sigmaslam_filters.core.components import InComponents
+    from sigmaslam_filters.compiler.components import InComponents
 
     options: dict[str, object] = {
         "post_grad_custom_pre_pass": InComponents(),

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from sigmaslam_filters.bayes import BayesFilter
-from sigmaslam_filters.core.compiled import compile_step
+from sigmaslam_filters.compiler.compiled_step import compile_step
 from sigmaslam_filters.gaussian_belief import Gaussian
 from sigmaslam_filters.models import AnyMeasurement, AnyMotion
 from sigmaslam_filters.results import TimeUpdate
@@ -35,7 +35,7 @@ def compile_filter(
     """`BayesFilter.filter` of a motion and a measurement as machine code, for any number of steps.
 
     For up to `LARGEST_SCALAR_BATCH` filters of up to 8 states a sequence is one call of a function of scalars, see
-    `sigmaslam_filters.core.scalar_loop`; otherwise it is a loop around a step from `compile_step`.
+    `sigmaslam_filters.compiler.scalar_loop`; otherwise it is a loop around a step from `compile_step`.
 
     Args:
         bayes: a Kalman, extended or unscented filter.
@@ -136,7 +136,7 @@ class CompiledFilter:
     ) -> Callable[..., list[Tensor]] | None:
         """The sequence as one function, if the step can be written so."""
         # It brings the compiler with it, which takes a second to load.
-        from sigmaslam_filters.core.scalar_loop import ScalarLoop, ScalarLoopError
+        from sigmaslam_filters.compiler.scalar_loop import ScalarLoop, ScalarLoopError
 
         step = self._step(start.is_square_root, motions)
         step(start.mean, start.held, *(given[0] for given in inputs))  # says what does not fit

@@ -1,8 +1,8 @@
 """A step over small states as machine code that runs a whole sequence: time is its inner loop, numbers its variables.
 
 A call of a compiled step takes tens of microseconds before anything is computed, which for a few small filters is
-nearly all of it. Here the step is traced as `compile_step` traces it, rewritten in components
-(`sigmaslam_filters.core.components`), and written out as a C++ function of scalars, one statement for each operation.
+nearly all of it. Here the step is traced as `compile_step` traces it, rewritten in components (see
+`sigmaslam_filters.compiler.components`), and written out as a C++ function of scalars, one statement an operation.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from torch._dynamo.exc import TorchDynamoException
 from torch._inductor.codecache import CppCodeCache
 from torch._inductor.decomposition import select_decomp_table
 
-from sigmaslam_filters.core.component_moves import Entries, shape_of
-from sigmaslam_filters.core.components import TooLongError, entries_of
+from sigmaslam_filters.compiler.component_moves import Entries, shape_of
+from sigmaslam_filters.compiler.components import TooLongError, entries_of
 
 aten, prims = torch.ops.aten, torch.ops.prims
 

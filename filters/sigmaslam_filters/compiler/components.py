@@ -20,8 +20,8 @@ from torch import fx
 from torch._inductor.custom_graph_pass import CustomInferenceAwareGraphPass, get_hash_for_files
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from sigmaslam_filters.core import component_moves
-from sigmaslam_filters.core.component_moves import MOVES, RESHAPES, Entries, InRow, reshape, shape_of
+from sigmaslam_filters.compiler import component_moves
+from sigmaslam_filters.compiler.component_moves import MOVES, RESHAPES, Entries, InRow, reshape, shape_of
 
 aten = torch.ops.aten
 
