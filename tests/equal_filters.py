@@ -72,7 +72,7 @@ def _settings() -> Iterator[tuple[str, str]]:
         "ekf": filters.ExtendedKalmanFilter(),
         "ukf": filters.UnscentedKalmanFilter(),
         "simplex": filters.UnscentedKalmanFilter(points=filters.Simplex()),
-        "merwe": filters.UnscentedKalmanFilter(points=filters.merwe(alpha=0.5), form="dense"),
+        "julier": filters.UnscentedKalmanFilter(points=filters.julier(-1.0, allow_negative=True), form="dense"),
     }
     within = filters.MeasurementModel(
         lambda x, v: x[..., :2].sin() + x[..., 1:3] * v,
