@@ -259,6 +259,48 @@ def runtime(
     typer.echo(write_runtime(out, data, command, methods, chosen, rounds, frames, runs, _note))
 
 
+@benchmark.command(short_help="Faults of live cameras: what is silently wrong.")
+def live(
+    out: Out,
+    runs: Runs,
+    data: DataIfAny = None,
+    case: Annotated[
+        str | None,
+        typer.Option("--cases", help="Names of faults, with commas: none, jitter_20, ...", show_default="all"),
+    ] = None,
+    sequence: Annotated[
+        str | None,
+        typer.Option("--sequences", help="room, street, drive or mh01, with commas.", show_default="all"),
+    ] = None,
+    method: Annotated[
+        str | None,
+        typer.Option("--methods", help="ours, klt-pnp, cuvslam or orbslam3, with commas.", show_default="ours"),
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Renders of each kind.")] = 3,
+    first_seed: Annotated[
+        int | None,
+        typer.Option(min=0, help="Of the renders; with that of a page its command goes on.", show_default="fresh"),
+    ] = None,
+    frames: Annotated[int, typer.Option(min=20, help="Of each recording, at most.")] = 60,
+    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+) -> None:
+    """What drivers do to stamps, images and rig, and how many poses are silently wrong then (extra 'train')."""
+    need_train_extra()
+    from sigmaslam_benchmarks.live.live_benchmark import draw_first_seed, write_live
+
+    first = draw_first_seed() if first_seed is None else first_seed
+    chosen = {"cases": case, "sequences": sequence, "methods": method}
+    cases, sequences, methods = (names.split(",") if names else None for names in chosen.values())
+    flags = [f"--{option} {names}" for option, names in chosen.items() if names]
+    flags += [f"--runs {runs.name}", f"--seeds {seeds}", f"--first-seed {first}", f"--frames {frames}"]
+    command = _command("live", out, *flags)
+    _note(f"seeds {first} to {first + seeds - 1}")
+    page = write_live(
+        out, data, runs, command, first, seeds, frames, cases, sequences, methods or ["ours"], workers, _note
+    )
+    typer.echo(page)
+
+
 def reads_data(name: str) -> bool:
     """Whether there is a benchmark of that name that reads the real data sets."""
     functions = [each.callback for each in benchmark.registered_commands if each.callback is not None]

@@ -1,0 +1,185 @@
+"""Faulty frames tracked in this process: what each method says of each frame, and in words."""
+
+from __future__ import annotations
+
+import io
+import logging
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import typer
+
+from sigmaslam.bodies.object_tracker import ObjectEstimate
+from sigmaslam.checks.check import SAMPLES_BEFORE_TRACKING, check_sequence
+from sigmaslam.checks.finding import wrong
+from sigmaslam.cli.run_summary import tell_summary
+from sigmaslam.errors import SigmaSlamError
+from sigmaslam.geometry.camera import StereoCamera
+from sigmaslam.geometry.rectification import StereoRectifier
+from sigmaslam.readers import StereoFrame, StereoSequence
+from sigmaslam.readers.images import RawPair
+from sigmaslam.runs.track import track_sequence
+from sigmaslam.slam.estimate import Estimate
+from sigmaslam_benchmarks.live.driver_faults import DrivenFrame
+from sigmaslam_benchmarks.live.judge import DrivenPose
+from sigmaslam_benchmarks.tracking.pnp_baselines import PnpOdometry
+from sigmaslam_benchmarks.tracking.stereo_peers import CuvslamPeer, OrbSlamPeer
+
+
+@dataclass(frozen=True, slots=True)
+class DrivenRun:
+    """What a method says.
+
+    Attributes:
+        poses: of the frames that it was given, in order.
+        said: sentences about the run.
+        refused: why it broke off; empty where it did not.
+    """
+
+    poses: list[DrivenPose]
+    said: list[str]
+    refused: str = ""
+
+
+Method = Callable[[Sequence[DrivenFrame], StereoCamera, Path], DrivenRun]
+"""Tracks frames; a run folder may be written to the path, which does not exist."""
+
+
+class DrivenPairs:
+    """Delivered frames as a source of pairs."""
+
+    def __init__(self, frames: Sequence[DrivenFrame]) -> None:
+        self.timestamps: list[float] | None = [frame.timestamp for frame in frames]
+        self.length: int | None = len(frames)
+        self._frames = frames
+
+    @property
+    def first_pair(self) -> RawPair:
+        """The first pair."""
+        return next(iter(self))
+
+    def __iter__(self) -> Iterator[RawPair]:
+        for index, frame in enumerate(self._frames):
+            yield RawPair(index, frame.timestamp, frame.left, frame.right, "left image", "right image")
+
+
+class DrivenSequence(StereoSequence):
+    """Delivered frames as a sequence that remembers which of them was read last.
+
+    Attributes:
+        latest: number of that frame; a consumer looks up what it says of a frame by it, not by the stamp.
+    """
+
+    def __init__(self, frames: Sequence[DrivenFrame], camera: StereoCamera) -> None:
+        super().__init__(DrivenPairs(frames), camera, "driver", "memory")
+        self.latest = -1
+
+    def frames(self) -> Iterator[StereoFrame]:  # type: ignore[override]
+        """The frames in order."""
+        with closing(super().frames()) as frames:
+            for frame in frames:
+                self.latest = frame.index
+                yield frame
+
+
+def track_ours(frames: Sequence[DrivenFrame], camera: StereoCamera, out: Path) -> DrivenRun:
+    """What `sigmaslam track` does and says, in one thread."""
+    by_frame: dict[int, DrivenPose] = {}
+
+    def keep(result: Estimate | ObjectEstimate) -> None:
+        estimate, moment = result.camera, frames[sequence.latest].moment
+        by_frame[sequence.latest] = DrivenPose(moment, estimate.status, estimate.T_world_camera, estimate.covariance)
+
+    warnings, refused, told = _Warnings(), "", io.StringIO()
+    logger = logging.getLogger("sigmaslam")
+    logger.addHandler(warnings)
+    try:
+        sequence = DrivenSequence(frames, camera)
+        with Path(os.devnull).open("w") as nowhere, redirect_stderr(nowhere):
+            findings = check_sequence(sequence, SAMPLES_BEFORE_TRACKING, 1).findings
+            summary = track_sequence(sequence, out, threads=1, findings=findings, on_estimate=keep)
+        told.write("".join(f"{each.message}\n" for each in wrong(findings)))
+        _tell(summary, out, told)
+    except SigmaSlamError as error:
+        refused = str(error)
+    finally:
+        logger.removeHandler(warnings)
+    missing = [
+        DrivenPose(frame.moment, "refused" if refused else "skipped", np.full((4, 4), np.nan), None) for frame in frames
+    ]
+    poses = [by_frame.get(number, none) for number, none in enumerate(missing)]
+    words = [*warnings.words, *(line.strip() for line in told.getvalue().splitlines())]
+    return DrivenRun(poses, [line for line in dict.fromkeys(words) if line and not line.startswith("Report:")], refused)
+
+
+def _tell(summary: dict[str, Any], out: Path, told: io.StringIO) -> None:
+    """What the command prints in the end."""
+    with redirect_stdout(told), redirect_stderr(told):
+        try:
+            tell_summary(summary, out)
+        except typer.Exit:
+            return
+
+
+class _Warnings(logging.Handler):
+    """Keeps the words of warnings and errors."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.words: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.words.append(record.getMessage())
+
+
+def track_with_klt_pnp(frames: Sequence[DrivenFrame], camera: StereoCamera, out: Path) -> DrivenRun:
+    """KLT + PnP of OpenCV, which knows no time and says nothing in words."""
+    odometry = PnpOdometry(camera, "klt")
+    poses = []
+    for frame in frames:
+        step = odometry.step(frame.left, frame.right)
+        poses.append(DrivenPose(frame.moment, step.status, step.T_world_camera, step.covariance))
+    return DrivenRun(poses, [])
+
+
+def track_with_cuvslam(frames: Sequence[DrivenFrame], camera: StereoCamera, out: Path) -> DrivenRun:
+    """cuVSLAM on the CPU; MissingPeerError where it is not installed."""
+    return _track_with_peer(frames, camera, lambda rectifier: CuvslamPeer(rectifier.rectified))
+
+
+def track_with_orbslam(frames: Sequence[DrivenFrame], camera: StereoCamera, out: Path) -> DrivenRun:
+    """ORB-SLAM3; MissingPeerError where it is not installed."""
+    rate = 1.0 / float(np.median(np.diff([frame.timestamp for frame in frames])))
+    return _track_with_peer(frames, camera, lambda rectifier: OrbSlamPeer(rectifier.rectified, rate))
+
+
+def _track_with_peer(
+    frames: Sequence[DrivenFrame],
+    camera: StereoCamera,
+    make: Callable[[StereoRectifier], CuvslamPeer | OrbSlamPeer],
+) -> DrivenRun:
+    """A peer that says poses alone; they count as tracked, and are judged in metres."""
+    rectifier = StereoRectifier(camera)
+    T_rectified_left = np.eye(4)
+    T_rectified_left[:3, :3] = rectifier.R_rectified_left
+    poses = []
+    with closing(make(rectifier)) as peer:
+        for frame in frames:
+            found = peer.step(*rectifier.rectify(frame.left, frame.right), frame.timestamp)
+            pose = np.full((4, 4), np.nan) if found is None else T_rectified_left.T @ found @ T_rectified_left
+            poses.append(DrivenPose(frame.moment, "lost" if found is None else "tracking", pose, None))
+    return DrivenRun(poses, [])
+
+
+METHODS: dict[str, Method] = {
+    "ours": track_ours,
+    "klt-pnp": track_with_klt_pnp,
+    "cuvslam": track_with_cuvslam,
+    "orbslam3": track_with_orbslam,
+}
+"""The first is what goals are for."""
