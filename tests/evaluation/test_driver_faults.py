@@ -20,7 +20,7 @@ STAMPS = [*(name for name in FAULTS if name.startswith(("alternate", "jitter", "
 
 
 def good(count: int = COUNT) -> Frames:
-    """Frames whose images tell their number below a hundred: as grey value of the left one, and 100 more of the right one."""
+    """Frames whose images tell their number below a hundred: grey value of the left one, 100 more of the right one."""
     shape = (24, 32)
     return [
         DrivenFrame(k, INTERVAL * k, np.full(shape, k % 100, np.uint8), np.full(shape, 100 + k % 100, np.uint8))
