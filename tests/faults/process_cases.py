@@ -65,8 +65,8 @@ _WEIGHT_CASES = [
         ("100 bytes changed", partial(_flip, "features.onnx"), "features.onnx", "SHA-256", Verdict.SILENT),
         (
             "100 bytes changed in the filter",
-            partial(_flip, "stereo_transfer.onnx"),
-            "stereo_transfer.onnx",
+            partial(_flip, "frame_predict.onnx"),
+            "frame_predict.onnx",
             "SHA-256",
             None,
         ),
