@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from sigmaslam.cli import app
+from sigmaslam.cli.commands import app
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [page for folder in (ROOT, ROOT / "docs", ROOT / "examples") for page in sorted(folder.glob("*.md"))]

@@ -9,7 +9,7 @@ import torch
 from safetensors.torch import save_file
 from typer.testing import CliRunner
 
-from sigmaslam.cli import app
+from sigmaslam.cli.commands import app
 from sigmaslam.errors import InputError
 from sigmaslam_benchmarks.filters.speed import Timing
 from sigmaslam_benchmarks.tracking import features

@@ -1,5 +1,6 @@
 """`make results` knows every page that a command makes, and says by name what it leaves out."""
 
+import subprocess
 import sys
 from pathlib import Path
 
@@ -90,3 +91,7 @@ def test_renders_go_where_git_does_not_see_them():
     assert words[3:] == ["benchmark", "shake", "--out", "docs/a.md", "--runs", "build/results/shk", "--seeds", "20"]
     assert words[:3] == [sys.executable, "-m", "sigmaslam"]
     assert runnable(["python", "-m", "tests.faults", "--out", "a.md"])[1:] == ["-m", "tests.faults", "--out", "a.md"]
+
+
+def test_the_benchmarks_can_be_imported_before_the_command_line():
+    subprocess.run([sys.executable, "-c", "import sigmaslam_benchmarks.commands"], cwd=ROOT, check=True)

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from sigmaslam.bodies.object_region import read_region
-from sigmaslam.cli import app
+from sigmaslam.cli.commands import app
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from sigmaslam.bundle_adjustment import Adjustment, RefineConfig, Tracks, adjust, refine_run
 from sigmaslam.bundle_adjustment.refine_run import spread_corrections
 from sigmaslam.bundle_adjustment.structure import collect, fit_structure, point_covariances
-from sigmaslam.cli import app
+from sigmaslam.cli.commands import app
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.se3 import nearest_rotation, se3_exp, se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sigmaslam.cli import app
+from sigmaslam.cli.commands import app
 from sigmaslam.errors import InputError
 from sigmaslam.fusion.location_filter import LocationFilter
 from sigmaslam.fusion.readings import Locations, read_locations

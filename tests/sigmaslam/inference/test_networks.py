@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 import sigmaslam
-from sigmaslam.cli import app
+from sigmaslam.cli.commands import app
 from sigmaslam.errors import InputError
 from sigmaslam.frontend.build import build_frontend, own_networks
 from sigmaslam.frontend.learned import LearnedDetector

@@ -7,7 +7,7 @@ import onnxruntime
 import pytest
 from typer.testing import CliRunner
 
-from sigmaslam.cli import app
+from sigmaslam.cli.commands import app
 from sigmaslam.errors import InputError
 from sigmaslam.frontend.build import build_frontend
 from sigmaslam.inference import session

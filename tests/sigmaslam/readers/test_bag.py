@@ -12,7 +12,7 @@ from rosbags.typesys import Stores, get_typestore
 from typer.testing import CliRunner
 
 from sigmaslam.calibration_files.calibration_writer import write_calibration
-from sigmaslam.cli import app
+from sigmaslam.cli.commands import app
 from sigmaslam.errors import CalibrationError, InputError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
