@@ -39,7 +39,7 @@ def start(source: Path, run: Path, *options: str, rows: int = 4) -> subprocess.P
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
-        preexec_fn=_hear_signals,
+        preexec_fn=hear_signals,
     )
     deadline = time.monotonic() + 60
     while len(statuses(run)) < rows:
@@ -49,7 +49,7 @@ def start(source: Path, run: Path, *options: str, rows: int = 4) -> subprocess.P
     return process
 
 
-def _hear_signals() -> None:
+def hear_signals() -> None:
     """Under nohup, and in the background of a shell, signals are ignored, and so by the program."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)

@@ -16,6 +16,7 @@ import pytest
 from sigmaslam.readers.trajectory_files import read_tum
 from sigmaslam.run_record.relative_pose_file import read_frame_pairs
 from tests.support.commands import Finished, assert_refused, command_line, environment, run_here, run_process
+from tests.support.stopped_runs import hear_signals
 
 FRAMES = 8
 
@@ -203,7 +204,9 @@ def test_an_unknown_option_value_is_refused(short_sequence: Path, tmp_path: Path
 def test_ctrl_c_leaves_a_usable_run(demo_sequence: Path, tmp_path: Path):
     out = tmp_path / "run"
     command = command_line("track", demo_sequence, "--out", out)
-    process = subprocess.Popen(command, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        command, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, preexec_fn=hear_signals
+    )
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline and not ((out / "frames.csv").exists() and len(rows(out)) >= 3):
         time.sleep(0.05)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sigmaslam.cli import app
+from sigmaslam.cli.commands import app
 from sigmaslam.errors import CalibrationError, InputError
 from sigmaslam.readers import StereoFrame, open_cameras
 from sigmaslam.readers import live as camera_module
@@ -26,6 +26,7 @@ from sigmaslam.runs.track import track_sequence
 from tests.support.calibration_yaml import write_calibration
 from tests.support.commands import command_line, environment, run_process
 from tests.support.simulated_stereo import parallel_camera
+from tests.support.stopped_runs import hear_signals
 from tests.support.videos import write_video
 
 WIDTH, HEIGHT = 64, 48
@@ -362,7 +363,14 @@ def test_ctrl_c_leaves_a_usable_run(demo_video: Path, demo_sequence: Path, tmp_p
     out = tmp_path / "run"
     options = ["--camera", f"side-by-side:{demo_video}", "--calibration", str(demo_sequence / "calib.txt")]
     command = command_line("track", *options, "--out", out)
-    process = subprocess.Popen(command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    process = subprocess.Popen(
+        command,
+        env=environment(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        preexec_fn=hear_signals,
+    )
     table = out / "frames.csv"
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline and not (table.exists() and len(table.read_text().splitlines()) > 3):
