@@ -27,6 +27,7 @@ from sigmaslam_benchmarks.trial import hash_code
 from sigmaslam_synthetic.parallel_jobs import list_failures, run_jobs
 
 _GOOD = "none"
+_JUDGING = ("driver_faults.py", "driven_runs.py", "judge.py", "recordings.py")  # the page may change without a new run
 
 
 def draw_first_seed() -> int:
@@ -48,7 +49,7 @@ def write_live(
     workers: int = 1,
     note: Callable[[str], None] = lambda text: None,
 ) -> str:
-    """Tracks what is missing, writes the page after each recording and returns it; notes in it are kept.
+    """Tracks what is missing, writes the page, at first of what is there, and returns it; notes in it are kept.
 
     Args:
         path: Markdown page.
@@ -83,6 +84,8 @@ def write_live(
         note(f"{job.recording.name}: {outcome}")
         form()
 
+    if _collect(jobs):
+        form()
     run_jobs(LiveJob.make, [job for job in jobs if job.missing], workers, ended)
     page = form()
     if failed:
@@ -93,7 +96,9 @@ def write_live(
 @cache
 def _hash_code() -> str:
     """Everything between the images and what is said, and the simulator."""
-    return hash_code(*Path(errors.__file__).parent.rglob("*.py"), *Path(__file__).parent.glob("*.py"))
+    return hash_code(
+        *Path(errors.__file__).parent.rglob("*.py"), *(Path(__file__).with_name(name) for name in _JUDGING)
+    )
 
 
 @dataclass(frozen=True, slots=True)
