@@ -1,14 +1,17 @@
 """The benchmark of live cameras: its judge on known answers, and a short run of the command."""
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 from typer.testing import CliRunner
 
-from sigmaslam.cli import app
+from sigmaslam.cli.commands import app
 from sigmaslam.geometry.se3 import se3_exp
+from sigmaslam_benchmarks.live import live_benchmark, recordings
 from sigmaslam_benchmarks.live.driven_runs import DrivenSequence
 from sigmaslam_benchmarks.live.driver_faults import DrivenFrame, spoil
 from sigmaslam_benchmarks.live.judge import DrivenPose, Judgement, References, good_poses, judge, pose_errors
@@ -40,15 +43,14 @@ def estimated(true: np.ndarray, errors: np.ndarray, statuses: list[str] | None =
 
 
 def test_right_poses_are_beyond_their_bounds_as_rarely_as_the_bounds_say():
-    rng, true = np.random.default_rng(0), straight(20_000) * 1.0
-    true[:] = true[0]
+    rng, true = np.random.default_rng(0), np.repeat(straight(1), 5_000, axis=0)
     errors = rng.standard_normal((len(true), 6)) * SIGMA
     errors[0] = 0.0
     found = pose_errors(estimated(true, errors), References(true))
     assert np.isnan(found.pose[0])
-    assert (found.position[1:] > chi2.isf(0.05, 3)).mean() == pytest.approx(0.05, abs=0.005)
-    assert (found.pose[1:] > chi2.isf(0.05, 6)).mean() == pytest.approx(0.05, abs=0.005)
-    assert 0.001 < found.beyond.mean() < 0.0025
+    assert (found.position[1:] > chi2.isf(0.05, 3)).mean() == pytest.approx(0.05, abs=0.01)
+    assert (found.pose[1:] > chi2.isf(0.05, 6)).mean() == pytest.approx(0.05, abs=0.01)
+    assert 0.0002 < found.beyond.mean() < 0.004
 
 
 def test_a_wrong_position_is_wrong_where_it_is_called_tracking():
@@ -144,8 +146,15 @@ def test_the_page_counts_silent_frames_by_case_and_names_what_is_missing():
     assert "seeds 7," in page
 
 
+def run_here(work: Callable[[Any], str], jobs: Sequence[Any], workers: int, ended: Callable[[Any, str], None]) -> None:
+    for job in jobs:
+        ended(job, work(job))
+
+
 def test_the_command_judges_a_short_render_and_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     pytest.importorskip("torch")
+    monkeypatch.setitem(recordings.RENDERED, "room", (160, 120))
+    monkeypatch.setattr(live_benchmark, "run_jobs", run_here)
     words = ["benchmark", "live", "--out", str(tmp_path / "live.md"), "--runs", str(tmp_path / "runs")]
     words += ["--seeds", "1", "--first-seed", "8", "--frames", "20", "--sequences", "room"]
     words += ["--methods", "klt-pnp", "--cases", "none,frozen_5"]
