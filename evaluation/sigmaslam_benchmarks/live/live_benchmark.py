@@ -73,10 +73,11 @@ def write_live(
     jobs = [
         LiveJob(recording, tuple(wanted), tuple(methods), runs.resolve(), data, _hash_code()) for recording in chosen
     ]
+    asked = sum(len(job.pairs) for job in jobs)
     failed: dict[str, Exception] = {}
 
     def form() -> str:
-        return write_page(path, format_page(LivePage(command, wanted, list(methods), _collect(jobs), frames)))
+        return write_page(path, format_page(LivePage(command, wanted, list(methods), _collect(jobs), frames, asked)))
 
     def ended(job: LiveJob, outcome: str | Exception) -> None:
         if isinstance(outcome, Exception):

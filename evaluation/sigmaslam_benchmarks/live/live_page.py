@@ -28,6 +28,7 @@ class LivePage:
         cases, methods: in the order of the page.
         found: a judgement, or why there is none, by recording, method and case; what is missing is left out.
         frames: of each recording that were asked for.
+        asked: number of runs that were asked for.
     """
 
     command: str
@@ -35,6 +36,7 @@ class LivePage:
     methods: Sequence[str]
     found: Mapping[tuple[Recording, str, str], Judgement | str]
     frames: int
+    asked: int
 
     @property
     def recordings(self) -> list[Recording]:
@@ -59,7 +61,6 @@ def format_page(page: LivePage) -> str:
     )
     recordings = page.recordings
     rendered = [recording for recording in recordings if recording.exact]
-    total = len(recordings) * len(page.cases) * len(page.methods)
     return environment.get_template("live.md").render(
         command=page.command,
         source=describe_source(),
@@ -67,7 +68,7 @@ def format_page(page: LivePage) -> str:
         frames=page.frames,
         seeds=sorted({recording.seed for recording in rendered}),
         recordings=[recording.name for recording in recordings],
-        open=total - len(page.found),
+        open=page.asked - len(page.found),
         methods=[(method, *_totals(page, method)) for method in page.methods],
         tables=[(method, list(_case_rows(page, method))) for method in page.methods],
         details=[(recording.name, list(_recording_rows(page, recording))) for recording in recordings],
