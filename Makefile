@@ -15,7 +15,7 @@ endif
 # What an installation is made of: when one of these changes, it is made again.
 BUILD := pyproject.toml evaluation/pyproject.toml setup.py requirements.lock sigmaslam/frontend/kernels.cpp sigmaslam/frontend/kernels.inc
 
-.PHONY: demo test test-slow lint docs results dist wheel sbom clean
+.PHONY: demo test test-long test-slow lint docs results dist wheel sbom clean
 
 demo: $(VENV)/.runtime
 	$(VENV)/bin/sigmaslam demo
@@ -23,6 +23,9 @@ demo: $(VENV)/.runtime
 # One process a core, one thread each.
 test: $(VENV)/.dev
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest --numprocesses auto --dist loadscope --durations 20
+
+test-long: $(VENV)/.dev
+	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -m "long and not slow" --numprocesses auto --dist loadscope
 
 test-slow: $(VENV)/.dev
 	$(VENV)/bin/python -m pytest -m slow

@@ -239,6 +239,7 @@ _SIGNAL_CASES = [
         ("3 of 4 frames tracked",),
         poses=_ROWS,
         right=True,
+        slow=True,
         first=Verdict.LOSS,
     ),
     Case("signals", "a second run into the folder", _two_runs, 2, ("run", "--out"), slow=True, first=Verdict.GOOD),

@@ -14,7 +14,7 @@ from tests.faults.table import CASES
 
 
 def _parameter(case: Case) -> object:
-    marks = [pytest.mark.slow] if case.slow else []
+    marks = [pytest.mark.long] if case.slow and case.data is None else []
     return pytest.param(case, id=f"{case.group}: {case.name}", marks=marks)
 
 
