@@ -103,6 +103,7 @@ def test_steps_of_depth_and_the_sky_are_edges():
     assert depth_edges(depths).tolist() == [False, True, True, True]
 
 
+@pytest.mark.long
 def test_depths_around_pixels_are_those_of_the_image():
     simulation = simulate(Recipe("room", 2, 3, width=64, height=48))
     studio = Studio(simulation)

@@ -32,6 +32,7 @@ def test_repeats_go_on_in_time_as_the_path_does(demo_sequence: Path):
     np.testing.assert_array_equal(pairs[41].left, pairs[1].left)
 
 
+@pytest.mark.long
 def test_the_page_tells_of_every_block(renders: Path):
     text = write_endurance(renders / "page.md", 6, "the command", renders, recipe=LAP, block=2)
     assert text == (renders / "page.md").read_text()
@@ -42,6 +43,7 @@ def test_the_page_tells_of_every_block(renders: Path):
     assert "Stopped" not in text
 
 
+@pytest.mark.long
 def test_stopped_it_tells_what_was_measured(renders: Path, monkeypatch: pytest.MonkeyPatch):
     calls = []
 

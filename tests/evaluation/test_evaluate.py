@@ -38,6 +38,7 @@ def drive(real_data: Path, tmp_path) -> tuple[Path, Path]:
     return tmp_path / "run", source / "poses.txt"
 
 
+@pytest.mark.long
 def test_run_folder_gives_every_number(drive):
     run, truth = drive
     evaluation = evaluate_run(run, truth)
@@ -139,6 +140,7 @@ def test_a_picture_that_cannot_be_written_costs_a_warning_alone(drive, monkeypat
     assert "evaluation.png is not written: No space left on device" in caplog.text
 
 
+@pytest.mark.long
 def test_kitti_truth_without_times_is_paired_by_index_when_counts_agree(real_data: Path, tmp_path):
     truth = read_kitti(real_data / "kitti_gt_trajectories" / "04.txt")
     write_kitti(tmp_path / "truth.txt", truth)
@@ -162,6 +164,7 @@ def test_kitti_truth_without_times_never_pairs_wrong_frames(real_data: Path, tmp
         evaluate_run(tmp_path / "drifting.tum", tmp_path / "truth.txt", plot=False)
 
 
+@pytest.mark.long
 def test_euroc_truth_at_its_own_rate(real_data: Path, tmp_path):
     truth_path = real_data / "euroc_v1_01_keyframes_a" / "groundtruth.csv"
     write_tum(tmp_path / "estimate.tum", read_trajectory(truth_path))

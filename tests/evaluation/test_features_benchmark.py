@@ -26,6 +26,7 @@ def test_costs_are_compared_round_by_round_with_the_reference():
     assert "| orb | 20.0 (20.0 - 20.0) | 1 | 1000 |  |  |" in lines
 
 
+@pytest.mark.long
 def test_the_picture_is_the_same_every_time_and_has_keypoints_for_everyone():
     image = features.photograph_like((240, 320))
     np.testing.assert_array_equal(image, features.photograph_like((240, 320)))
@@ -55,6 +56,7 @@ def test_parameters_of_weights_and_graphs_are_counted(tmp_path: Path):
     assert features.count_parameters("orb") is None
 
 
+@pytest.mark.long
 def test_the_command_writes_costs_and_scores_and_keeps_notes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     torch.manual_seed(0)
     weights, page = tmp_path / "ours.safetensors", tmp_path / "features.md"

@@ -172,6 +172,7 @@ def test_available_lists_what_is_installed() -> None:
     assert ("torch.linalg batched" in names) == (find_spec("torch") is not None)
 
 
+@pytest.mark.long
 def test_environment_leaves_torch_one_thread() -> None:
     pytest.importorskip("torch")
     printed = subprocess.run(

@@ -158,6 +158,7 @@ def test_a_score_that_others_do_not_have_is_left_open():
     assert "| klt | - | 100 |" in page
 
 
+@pytest.mark.long
 def test_all_extractors_are_scored_and_progress_is_told(real_data: Path, weights: Path):
     graph = str(weights / "features.onnx")
     names, notes = ["sift", "orb", graph], []

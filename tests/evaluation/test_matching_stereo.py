@@ -100,6 +100,7 @@ def test_steps_without_features_are_not_good(texture: np.ndarray):
         assert score_steps(blind, [step], judged) == {"steps_good": 0.0, "steps": 1.0, "pnp_inliers": 0.0}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("judged", [False, True], ids=["mutual", "judged"])
 @pytest.mark.parametrize("name", ["sift", "orb"])
 def test_steps_of_the_rendered_sequence_are_found(demo_sequence: Path, name: str, judged: bool):

@@ -108,6 +108,7 @@ def peaks(response: np.ndarray, border: int) -> set[tuple[int, int]]:
     }
 
 
+@pytest.mark.long
 def test_edgepoint2_gives_all_peaks_with_the_descriptors_around_them(tmp_path: Path):
     extractor = load_edgepoint2(edgepoint2(tmp_path))
     export_peer(extractor, tmp_path / "peer.onnx")
@@ -136,6 +137,7 @@ def test_xfeat_has_the_weights_of_the_graph(tmp_path: Path):
             torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-4)
 
 
+@pytest.mark.long
 def test_xfeat_ranks_peaks_by_probability_times_reliability(tmp_path: Path):
     checkout, network = xfeat(tmp_path)
     export_peer(load_xfeat(checkout), tmp_path / "peer.onnx")

@@ -60,6 +60,7 @@ def test_too_few_points_give_no_pose():
     assert pose_from_points(points, pixels, CAMERA) is None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("matcher", ["sift", "klt"])
 def test_the_demo_is_followed_to_a_centimetre(demo_sequence: Path, matcher: str):
     opened = open_sequence(demo_sequence)

@@ -223,6 +223,7 @@ def run(tmp_path: Path) -> tuple[Path, Path]:
     return tmp_path / "run", tmp_path / "truth.tum"
 
 
+@pytest.mark.long
 def test_table_dictionary_and_figure_show_relative_poses(run: tuple[Path, Path]):
     evaluation = evaluate_run(*run)
     assert evaluation.relative is not None
@@ -240,6 +241,7 @@ def test_table_dictionary_and_figure_show_relative_poses(run: tuple[Path, Path])
     assert evaluation.figure_path.stat().st_size > 10_000
 
 
+@pytest.mark.long
 def test_options_of_the_command_line_are_the_truth_s_sigmas(run: tuple[Path, Path]):
     folder, truth = run
     arguments = ("evaluate", folder, "--truth", truth)

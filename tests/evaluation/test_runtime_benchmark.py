@@ -78,6 +78,7 @@ def test_a_resized_camera_sees_the_same_rays(pairs: DecodedPairs, tmp_path: Path
     assert half.rectified.focal_baseline == pytest.approx(0.5 * pairs.rectified.focal_baseline)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["klt-pnp", "klt"])
 def test_a_process_of_its_own_tells_what_a_method_took(pairs: DecodedPairs, method: str):
     timing = time_method(TimingJob(str(pairs.folder), method))

@@ -18,6 +18,7 @@ def _rows(page: str, method: str) -> list[list[str]]:
     return [row for row in cells if row[0] == method_label(method)]
 
 
+@pytest.mark.long
 def test_the_page_has_a_row_for_each_method_and_keeps_the_notes(tmp_path: Path):
     page = tmp_path / "results.md"
     page.write_text("old table\n<!-- notes -->\nkept words\n")
@@ -68,6 +69,7 @@ def test_a_peer_that_is_not_installed_is_left_out_with_a_note(tmp_path: Path, mo
     assert len(_rows(text, "klt-pnp")) == 1
 
 
+@pytest.mark.long
 def test_ours_says_how_consistent_its_relative_poses_are(tmp_path: Path):
     text = write_results(tmp_path / "results.md", None, "the command", ("ours", "klt-pnp"), ["demo"])
     assert text.count("Relative poses of *ours*; sigmas of the truth: exact.") == 1

@@ -123,6 +123,7 @@ def shaken_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return render(tmp_path_factory.mktemp("renders"), recipe, 1)
 
 
+@pytest.mark.long
 def test_flow_and_blur_of_a_render_are_those_of_its_dense_truth(shaken_folder: Path, tmp_path: Path):
     from sigmaslam_synthetic.simulation import Studio, simulate
 

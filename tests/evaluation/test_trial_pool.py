@@ -19,6 +19,7 @@ def form(done: list[SequenceTrials], missing: list[str]) -> str:
     return "\n".join([*figures, *missing_sequences(missing), ""])
 
 
+@pytest.mark.long
 def test_the_page_lacks_what_failed_by_name_and_what_is_there_is_used_again(tmp_path: Path):
     page, notes = tmp_path / "page.md", []
     for _ in range(2):
@@ -35,12 +36,14 @@ def test_the_page_lacks_what_failed_by_name_and_what_is_there_is_used_again(tmp_
     assert "1 of 1: failed: room13 (ValueError: 13 is unlucky)" in notes
 
 
+@pytest.mark.long
 def test_where_all_fail_there_is_no_page(tmp_path: Path):
     with pytest.raises(OutputError, match=r"page\.md is not written, for want of room13"):
         write_trials(tmp_path / "page.md", tmp_path / "runs", KIND, RECIPES[1:2], form, 1)
     assert not (tmp_path / "page.md").exists()
 
 
+@pytest.mark.long
 def test_a_worker_with_other_code_is_refused(tmp_path: Path):
     kind = TrialKind(METHODS, judge_klt, hash_process)
     with pytest.raises(OutputError, match="install the same commit wherever jobs run"):

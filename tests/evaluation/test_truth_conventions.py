@@ -139,6 +139,7 @@ def test_the_order_of_quaternions_is_refused_where_there_are_none(demo_sequence:
         )
 
 
+@pytest.mark.long
 def test_the_command_says_and_takes_the_options(demo_sequence: Path, tmp_path: Path):
     truth = read_kitti(demo_sequence / "poses.txt")
     write_estimate(tmp_path / "estimate.tum", truth)

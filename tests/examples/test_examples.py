@@ -43,6 +43,7 @@ def test_matches_of_a_rectified_pair_lie_in_one_row(demo_sequence: Path):
     assert matches.probability[inside].sum() > 0.95 * matches.probability.sum()
 
 
+@pytest.mark.long
 def test_the_folder_s_poses_are_within_their_covariance_of_the_truth(demo_sequence: Path):
     example = load_example("track_folder")
     estimates, truth = list(example.run(demo_sequence)), read_kitti(demo_sequence / "poses.txt")
@@ -56,6 +57,7 @@ def test_the_folder_s_poses_are_within_their_covariance_of_the_truth(demo_sequen
         assert rotation.shape == (3,)
 
 
+@pytest.mark.long
 def test_corners_of_one_s_own_track_the_demo(demo_sequence: Path):
     estimates, truth = load_example("own_frontend").run(demo_sequence), read_kitti(demo_sequence / "poses.txt")
     assert all(estimate.status == "tracking" for estimate in estimates[1:])

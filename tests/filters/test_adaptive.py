@@ -12,6 +12,7 @@ WALK = filters.LinearMotion(EYE, 0.01 * EYE)
 PRIOR = filters.Gaussian(tensor(0.0, 0.0), EYE)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["diagonal", "dense"])
 @pytest.mark.parametrize("robust", [None, "student_t"])
 def test_noise_that_adapts_finds_the_noise_there_is(kind, robust):

@@ -94,6 +94,7 @@ def localisation(bayes):
     return step, (mean, root, control, value, landmark)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "bayes",
     [
@@ -111,6 +112,7 @@ def test_rewritten_steps_equal_the_library(bayes):
     assert {shape for shape in shapes if BATCH in shape} == {torch.Size([BATCH])}, "only components are multiplied"
 
 
+@pytest.mark.long
 def test_a_rewritten_step_raises_as_it_did():
     step, arguments = localisation(filters.UnscentedKalmanFilter(iterations=1, on_failure="raise"))
     arguments = [torch.where(torch.isfinite(each), each, 0.0) for each in arguments]
@@ -120,6 +122,7 @@ def test_a_rewritten_step_raises_as_it_did():
         run(*arguments)
 
 
+@pytest.mark.long
 def test_a_filter_on_a_manifold_is_rewritten():
     space = filters.SE2()
     ukf = filters.UnscentedKalmanFilter(space, iterations=1, on_failure="hold")

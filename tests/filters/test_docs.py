@@ -16,6 +16,7 @@ def default_dtype():
     torch.set_default_dtype(before)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("default_dtype")
 def test_every_block_of_the_page_runs():
     blocks = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)

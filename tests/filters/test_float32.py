@@ -130,6 +130,7 @@ def runs_lost(case: Case, exact: Case, steps: int) -> int:
 CASES = {"precise stereo": precise_stereo, "vague prior": vague_prior, "nearly singular": nearly_singular_prior}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", CASES)
 def test_float32_default_loses_no_run(name):
     case = CASES[name]

@@ -27,6 +27,7 @@ def sequences(steps: int, batch: int) -> Tensor:
     return torch.stack(values)
 
 
+@pytest.mark.long
 def test_expectation_maximisation_finds_the_noise_and_never_loses_likelihood():
     values = sequences(60, 100)
     values[7, 3] = torch.nan
@@ -42,6 +43,7 @@ def test_expectation_maximisation_finds_the_noise_and_never_loses_likelihood():
     assert float(best) > float(true.log_likelihood.sum()) - 5.0
 
 
+@pytest.mark.long
 def test_a_step_of_expectation_maximisation_ascends_as_the_gradient_does():
     """At the noise that EM stays at, the likelihood's derivatives vanish."""
     values = sequences(30, 20)

@@ -376,6 +376,7 @@ def assert_compiled_equals_eager(manifold: Manifold, backend: str) -> None:
     torch.testing.assert_close(run(x, v), there_and_back(manifold, x)(v), rtol=0, atol=1e-14)
 
 
+@pytest.mark.long
 def test_all_is_one_graph():
     assert_compiled_equals_eager(Product(SE3(), SE2("left"), SO2(), Euclidean(2)), backend="eager")
 

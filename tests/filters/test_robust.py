@@ -147,6 +147,7 @@ def refuse_always(update: filters.Update, value: Tensor, size: int) -> Tensor:
     return torch.where(inside.repeat_interleave(size, dim=-1), value, torch.nan)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("options", [*OPTIONS, None], ids=str)
 def test_a_belief_that_is_wrong_and_too_sure_is_pulled_back(options):
     """A robot whose wheels slipped by 3 m, its belief sure of 0.05 m; a gate that always refuses is lost."""

@@ -157,6 +157,7 @@ def assert_stereo_pose_is_consistent(groups: int) -> None:
     assert check.nan_count == 0
 
 
+@pytest.mark.long
 def test_stereo_pose_filter_is_consistent() -> None:
     assert_stereo_pose_is_consistent(5)
 
@@ -193,6 +194,7 @@ def rmse_of_experiments(outcome: Outcome) -> Tensor:
     return torch.stack([part.square().mean().sqrt() for part in outcome.rmse_by_run.split(100)])
 
 
+@pytest.mark.long
 def test_se2_filter_localises_and_is_consistent() -> None:
     rate = 10
     outcome = run(localisation(400, seeded(), rate), filters.UnscentedKalmanFilter(filters.SE2()))
@@ -225,6 +227,7 @@ def test_localisation_at_100_hz_reproduces_the_published_order() -> None:
 # Literature
 
 
+@pytest.mark.long
 def test_growth_mse_is_that_of_the_literature() -> None:
     scenario = growth(200, seeded())
     assert_reproduces(run(scenario, KAPPA_2).rmse_by_run.square(), 51.7, 0.3)

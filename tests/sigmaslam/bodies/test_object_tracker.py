@@ -81,6 +81,7 @@ def test_a_wrong_mask_is_refused(tmp_path: Path):
         read_region(str(path), 64, 48)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("grown", "wall", "rest"),
     [(1.0, 300, 0), (1.6, 300, 10), (1.6, 1500, 10)],
@@ -121,6 +122,7 @@ def test_the_body_is_followed_and_its_covariance_is_right(grown: float, wall: in
     assert tracker.origin[2] < WALL
 
 
+@pytest.mark.long
 def test_new_landmarks_lie_on_the_body():
     """Half a turn: what was seen first is gone at the end, and there is wall all around."""
     poses = wandering(80, seed=1)
@@ -134,6 +136,7 @@ def test_new_landmarks_lie_on_the_body():
     assert nees_of(errors_of(body, estimates), estimates).mean() < 2.5
 
 
+@pytest.mark.long
 def test_a_body_that_goes_is_lost_and_is_found_where_it_comes_back():
     hidden = range(30, 50)
     body = SimulatedBody(wandering(65, seed=1, rest=5), hidden=hidden)
@@ -157,6 +160,7 @@ def test_a_region_with_nothing_to_follow_is_refused_at_once():
         follow(body, box_around(body.poses[0], 0.2))
 
 
+@pytest.mark.long
 def test_a_scene_that_is_the_body_gives_the_inverse_of_the_camera_s_poses(demo_sequence: Path, tmp_path: Path):
     """A moving camera, and a box around all of the image, by the command line."""
     run = tmp_path / "run"

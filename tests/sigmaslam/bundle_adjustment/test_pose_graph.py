@@ -85,6 +85,7 @@ def test_without_a_loop_the_poses_are_those_of_dead_reckoning():
     np.testing.assert_allclose(optimise_pose_graph(reckoned, steps).poses, reckoned, atol=1e-9)
 
 
+@pytest.mark.long
 def test_a_loop_takes_as_much_error_from_the_end_as_the_covariances_say():
     before, after, expected = [], [], []
     for seed in range(40):
@@ -101,6 +102,7 @@ def test_a_loop_takes_as_much_error_from_the_end_as_the_covariances_say():
     assert np.mean(expected) / 1.5 < factor < 1.5 * np.mean(expected)
 
 
+@pytest.mark.long
 def test_errors_are_as_large_as_the_covariances_say():
     ratios = []
     for seed in range(40):

@@ -52,6 +52,7 @@ def test_without_noise_the_trajectory_is_exact(without_disparity: float):
     assert adjustment.cost_after < 1e-6 < 1.0 < adjustment.cost_before
 
 
+@pytest.mark.long
 def test_errors_are_as_large_as_the_covariances_say():
     pose, offset, cost = [], [], []
     for seed in range(20):
@@ -68,6 +69,7 @@ def test_errors_are_as_large_as_the_covariances_say():
     assert 0.97 < np.mean(cost) < 1.03
 
 
+@pytest.mark.long
 def test_points_at_infinity_and_a_lack_of_disparities_do_no_harm():
     ratios, far = [], 0
     for seed in range(8):

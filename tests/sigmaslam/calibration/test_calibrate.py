@@ -46,6 +46,7 @@ def run(rig: Rig, corners: Corners, lens: str) -> BoardCalibration:
     return calibrate(names, views, CHESSBOARD.points, [SIZE] * len(rig.eyes), lens)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("eye", "lens", "depth"), [(RADTAN, "radtan5", 0.45), (FISHEYE, "equidistant", 0.3)], ids=["radtan", "fisheye"]
 )
@@ -108,6 +109,7 @@ def simulated_nees(common: float, runs: int, images: int = 20) -> tuple[np.ndarr
     return np.array(squares), effects
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("common", [0.0, 1e-3], ids=["independent", "stretched boards"])
 def test_errors_are_as_large_as_the_covariance_says(common: float):
     squares, effects = simulated_nees(common, 12)
@@ -118,6 +120,7 @@ def test_errors_are_as_large_as_the_covariance_says(common: float):
         assert np.median(effects) < 1.3
 
 
+@pytest.mark.long
 def test_a_misread_image_is_named_and_does_not_count():
     rig = stereo_rig()
     corners = seen_corners(rig, CHESSBOARD, board_poses(CHESSBOARD, 12, seed=5))
@@ -149,6 +152,7 @@ def test_single_wrong_corners_are_left_out():
     assert np.all(np.linalg.norm(result.outlier_residuals, axis=1) > 0.4)
 
 
+@pytest.mark.long
 def test_a_board_in_one_eye_alone_counts():
     rig = stereo_rig()
     corners = seen_corners(rig, CHESSBOARD, board_poses(CHESSBOARD, 8, seed=7))
@@ -160,6 +164,7 @@ def test_a_board_in_one_eye_alone_counts():
     np.testing.assert_allclose(result.rig.T_left_right, rig.T_left_right, atol=1e-6)
 
 
+@pytest.mark.long
 def test_a_chessboard_may_be_counted_from_either_end():
     rig = stereo_rig()
     views = views_of(rig, CHESSBOARD, seen_corners(rig, CHESSBOARD, board_poses(CHESSBOARD, 8, seed=8)))
@@ -172,6 +177,7 @@ def test_a_chessboard_may_be_counted_from_either_end():
     assert not result.outlier_images
 
 
+@pytest.mark.long
 def test_images_without_a_board_are_named():
     rig = stereo_rig()
     views = views_of(rig, CHESSBOARD, seen_corners(rig, CHESSBOARD, board_poses(CHESSBOARD, 6, seed=9)))

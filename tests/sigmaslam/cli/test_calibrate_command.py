@@ -40,6 +40,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_a_rendered_pair_is_calibrated_and_rectified(rendered: Path, tmp_path: Path):
     out, picture = tmp_path / "stereo.yaml", tmp_path / "corners.png"
     result = run_here("calibrate", rendered, "--board", BOARD, "--out", out, "--picture", picture)
@@ -85,6 +86,7 @@ def test_one_camera_is_calibrated(rendered: Path, tmp_path: Path):
     assert len(camera["distortion"]) == 4
 
 
+@pytest.mark.long
 def test_bad_requests_are_refused(rendered: Path, tmp_path: Path):
     out = tmp_path / "stereo.yaml"
     assert_refused(run_here("calibrate", rendered, "--board", "grid", "--out", out), "--board is 'grid'")

@@ -47,6 +47,7 @@ def test_bad_requests_are_refused(tmp_path: Path):
     assert_refused(run_here("calibration", "show", tmp_path / "none.yaml"), "none.yaml", "cannot read")
 
 
+@pytest.mark.long
 def test_tracking_with_a_converted_calibration_gives_the_same_trajectory(
     tmp_path: Path, demo_sequence: Path, without_report: None, monkeypatch
 ):

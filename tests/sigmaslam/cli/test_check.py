@@ -30,6 +30,7 @@ def swapped(demo_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return copy_demo(demo_sequence, tmp_path_factory.mktemp("eyes") / "[b]swapped<i>", "image_1", "image_0")
 
 
+@pytest.mark.long
 def test_check_prints_every_finding_and_writes_a_page_that_stands_alone(demo_sequence: Path, tmp_path: Path):
     result = run_here("check", demo_sequence, "--out", tmp_path / "page.html")
     assert result.returncode == 0, result.stderr
@@ -42,6 +43,7 @@ def test_check_prints_every_finding_and_writes_a_page_that_stands_alone(demo_seq
     assert len(page) < 1_000_000
 
 
+@pytest.mark.long
 def test_check_ends_with_code_1_where_the_eyes_are_exchanged(swapped: Path, tmp_path: Path):
     result = run_here("check", swapped, "--out", tmp_path / "page.html")
     assert result.returncode == 1, result.stderr
@@ -55,6 +57,7 @@ def test_check_of_what_cannot_be_read_ends_with_code_2(tmp_path: Path):
     assert_refused(run_here("check", tmp_path), "no stereo sequence of a known format")
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("without_report")
 def test_track_warns_before_it_starts_and_keeps_the_findings(swapped: Path, tmp_path: Path):
     result = run_here("track", swapped, "--out", tmp_path / "run")

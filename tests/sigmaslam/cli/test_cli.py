@@ -53,6 +53,7 @@ def rows(run: Path) -> list[list[str]]:
     return [line.split(",") for line in (run / "frames.csv").read_text().splitlines()[1:]]
 
 
+@pytest.mark.long
 def test_track_writes_every_output_and_evaluate_reads_them(whole_sequence: Path, tracked: tuple[Path, Finished]):
     out, result = tracked
     assert result.returncode == 0, result.stderr
@@ -81,6 +82,7 @@ def test_track_writes_every_output_and_evaluate_reads_them(whole_sequence: Path,
     assert json.loads(result.stdout)["matched"] == FRAMES
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("without_report")
 def test_errors_of_the_calibration_are_estimated_where_they_are_named(short_sequence: Path, tmp_path: Path):
     result = run_here("track", short_sequence, "--out", tmp_path / "run", "--estimate", "yaw,focal")
@@ -92,6 +94,7 @@ def test_errors_of_the_calibration_are_estimated_where_they_are_named(short_sequ
     assert_refused(refused, "--estimate", "yow", "yaw, pitch")
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("without_report")
 def test_a_part_of_a_recording_is_tracked_in_small_and_may_replace_an_earlier_run(whole_sequence: Path, tmp_path: Path):
     out = tmp_path / "run"
@@ -111,12 +114,14 @@ def test_a_part_of_a_recording_is_tracked_in_small_and_may_replace_an_earlier_ru
     assert len(rows(out)) == 2
 
 
+@pytest.mark.long
 def test_two_runs_are_identical_to_the_bit(whole_sequence: Path, tracked: tuple[Path, Finished], tmp_path: Path):
     assert run_process("track", whole_sequence, "--out", tmp_path / "again").returncode == 0
     for name in ("trajectory.tum", "trajectory.kitti", "covariance.npy", "map.ply"):
         assert (tracked[0] / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
 
 
+@pytest.mark.long
 def test_a_missing_folder_is_refused(tmp_path: Path):
     assert_refused(run_process("track", tmp_path / "nowhere", "--out", tmp_path / "run"), "nowhere")
     assert not (tmp_path / "run").exists()
@@ -127,6 +132,7 @@ def test_unequal_counts_are_refused_with_both_numbers(short_sequence: Path, tmp_
     assert_refused(run_here("track", short_sequence, "--out", tmp_path / "run"), str(FRAMES), str(FRAMES - 1))
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("without_report")
 @pytest.mark.parametrize("content", [b"", b"no image at all"])
 def test_an_unreadable_image_costs_one_frame_and_a_warning(short_sequence: Path, tmp_path: Path, content: bytes):
@@ -172,6 +178,7 @@ def test_a_calibration_for_another_image_size_is_refused(short_sequence: Path, t
     assert_refused(result, "640x480", "320x240")
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("without_report")
 @pytest.mark.parametrize("kind", ["colour", "16-bit"])
 def test_colour_and_16_bit_images_are_converted_with_a_warning(short_sequence: Path, tmp_path: Path, kind: str):
@@ -195,12 +202,14 @@ def test_an_output_folder_that_holds_something_is_refused_untouched(short_sequen
     assert [path.name for path in out.iterdir()] == ["precious.txt"]
 
 
+@pytest.mark.long
 def test_an_unknown_option_value_is_refused(short_sequence: Path, tmp_path: Path):
     assert_refused(
         run_process("track", short_sequence, "--out", tmp_path / "run", "--frontend", "surf"), "surf", "sift"
     )
 
 
+@pytest.mark.long
 def test_ctrl_c_leaves_a_usable_run(demo_sequence: Path, tmp_path: Path):
     out = tmp_path / "run"
     command = command_line("track", demo_sequence, "--out", out)
@@ -221,6 +230,7 @@ def test_ctrl_c_leaves_a_usable_run(demo_sequence: Path, tmp_path: Path):
     assert np.load(out / "covariance_final.npy").shape == (count, 6, 6)
 
 
+@pytest.mark.long
 def test_the_runtime_needs_no_extra(demo_sequence: Path):
     """The whole path but training runs where only the runtime is installed."""
     script = (
@@ -256,6 +266,7 @@ def without_matplotlib(tmp_path: Path) -> dict[str, str]:
     return environment(absent)
 
 
+@pytest.mark.long
 def test_track_and_evaluate_need_no_matplotlib(
     whole_sequence: Path, tracked: tuple[Path, Finished], tmp_path: Path, without_matplotlib: dict[str, str]
 ):
@@ -274,12 +285,14 @@ def test_track_and_evaluate_need_no_matplotlib(
         assert (out / name).read_bytes() == (tracked[0] / name).read_bytes()
 
 
+@pytest.mark.long
 def test_a_benchmark_that_draws_asks_for_matplotlib(tmp_path: Path, without_matplotlib: dict[str, str]):
     command = command_line("benchmark", "claims", "--out", tmp_path / "page.md")
     result = subprocess.run(command, env=without_matplotlib, capture_output=True, text=True, check=False, timeout=120)
     assert_refused(result, "matplotlib", "sigmaslam[report]")
 
 
+@pytest.mark.long
 def test_training_without_its_extra_says_how_to_install_it(tmp_path: Path):
     (tmp_path / "torch.py").write_text("raise ModuleNotFoundError(\"No module named 'torch'\", name='torch')\n")
     command = command_line("train", "--out", tmp_path / "run")
@@ -332,6 +345,7 @@ def test_the_list_of_columns_is_whole_in_80_columns(monkeypatch: pytest.MonkeyPa
     assert {"timestamp", "qx", "qy", "qz", "qw", "sigma_position", "sigma_rotation"} <= set(words)
 
 
+@pytest.mark.long
 def test_tab_completes_commands_options_and_choices():
     for typed, expected in (
         ("sigmaslam tr", {"track", "train", "train-scorer"}),

@@ -68,6 +68,7 @@ def test_a_stereo_sequence_becomes_one_that_can_be_tracked(noisy_pairs: Path, tm
         assert rmse(tmp_path / "out" / eye / "000002.png", DEMO / original / "000002.png") < 0.5 * SIGMA
 
 
+@pytest.mark.long
 def test_the_tracker_sees_filtered_images_and_the_run_says_so(noisy_pairs: Path, tmp_path: Path):
     track_sequence(open_sequence(noisy_pairs), tmp_path / "run", "orb", threads=1, denoise=True)
     noise = json.loads((tmp_path / "run" / "run.json").read_text())["noise"]
@@ -76,6 +77,7 @@ def test_the_tracker_sees_filtered_images_and_the_run_says_so(noisy_pairs: Path,
         assert np.sqrt(eye["sigma"] ** 2 + eye["gain"] * 100) == pytest.approx(SIGMA, rel=0.25)
 
 
+@pytest.mark.long
 def test_what_cannot_be_filtered_is_refused(noisy_pairs: Path, tmp_path: Path):
     images = noisy_pairs / "image_0"
     cv2.imwrite(str(images / "000003.png"), np.zeros((64, 64), np.uint8))

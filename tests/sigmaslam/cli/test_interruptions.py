@@ -67,6 +67,7 @@ def assert_first_poses_of(whole: Path, run: Path, count: int) -> None:
     np.testing.assert_array_equal(pairs.earlier, first.earlier)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129), (signal.SIGINT, 130)])
 def test_a_signal_ends_a_run_with_its_results(
     sequence: Path, whole: Path, tmp_path: Path, number: signal.Signals, code: int
@@ -89,6 +90,7 @@ def test_a_signal_ends_a_run_with_its_results(
     assert "nothing to do" in run_here("finish", run).stdout
 
 
+@pytest.mark.long
 def test_finish_makes_the_results_of_a_killed_run(sequence: Path, whole: Path, tmp_path: Path):
     run = tmp_path / "run"
     process = start(sequence, run)
@@ -130,6 +132,7 @@ def killed(sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
     return run
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("without_report")
 @pytest.mark.parametrize(
     ("name", "cut", "poses"),
@@ -152,6 +155,7 @@ def test_a_last_record_that_is_cut_off_is_left_out(killed: Path, whole: Path, na
     assert len(read_frames(killed / "frames.csv")) >= poses
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("without_report")
 def test_finish_of_a_run_that_did_not_track_ends_like_it(demo_sequence: Path, tmp_path: Path):
     swapped = copy_frames(demo_sequence, tmp_path / "sequence", 3, lambda k, left, right: (right, left))
@@ -168,6 +172,7 @@ def test_finish_of_a_run_that_did_not_track_ends_like_it(demo_sequence: Path, tm
     assert "left and right are exchanged" in finished.stderr
 
 
+@pytest.mark.long
 def test_finish_of_a_run_without_a_frame_says_so(killed: Path):
     for name in ("frames.csv", *PARTIAL):
         content = (killed / name).read_bytes()
@@ -223,6 +228,7 @@ def test_a_file_without_room_costs_a_message_and_not_the_others(
         assert (tmp_path / "run" / each).read_bytes() == (whole / each).read_bytes(), each
 
 
+@pytest.mark.long
 def test_a_disk_that_is_full_in_the_midst_of_a_run_keeps_what_was_said(sequence: Path, whole: Path, tmp_path: Path):
     """No file may grow beyond 5 kB: some poses fit, and no result does."""
     script = (
@@ -251,6 +257,7 @@ def test_a_disk_that_is_full_in_the_midst_of_a_run_keeps_what_was_said(sequence:
 # ---- names
 
 
+@pytest.mark.long
 def test_an_input_whose_name_is_no_text_is_tracked(sequence: Path, tmp_path: Path):
     """Bytes that are no UTF-8, in the names of input and output."""
     source = Path(os.fsdecode(os.fsencode(tmp_path) + b"/in\xff"))

@@ -20,6 +20,7 @@ def folder(tmp_path_factory):
     return write_csv_folder(tmp_path_factory.mktemp("robot"), drive(World(seconds=10.0)))
 
 
+@pytest.mark.long
 def test_a_robot_is_localised_and_everything_is_written(folder, tmp_path):
     out = tmp_path / "out"
     result = run_here("localize", folder, "--out", out)
@@ -49,6 +50,7 @@ def test_wrong_options_are_refused(folder, tmp_path):
     assert not out.exists()
 
 
+@pytest.mark.long
 def test_a_map_that_is_not_there_is_found(folder, tmp_path):
     unmapped, out = tmp_path / "robot", tmp_path / "out"
     unmapped.mkdir()
@@ -65,6 +67,7 @@ def test_a_map_that_is_not_there_is_found(folder, tmp_path):
         assert np.hypot(*(np.array(place) - LANDMARKS[int(name)])) < 0.5
 
 
+@pytest.mark.long
 def test_filters_are_compared_on_the_same_recording(folder, tmp_path):
     out = tmp_path / "out"
     result = run_here("localize", folder, "--out", out, "--compare")

@@ -240,6 +240,7 @@ class Squared:
     freedom: int
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("linearisation", ["extended", "unscented"])
 @pytest.mark.parametrize("build", BUILDS)
 def test_errors_are_as_large_as_the_whole_covariance_says(build: str, linearisation: str):

@@ -176,6 +176,7 @@ def test_views_that_do_not_fit_are_forgotten():
 # ---- the frame
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("scale", "tolerance"), [(NARROW, 1e-3), (0.1, 2e-2), (1.0, 0.2)])
 def test_a_frame_equals_one_more_pose_in_dense_least_squares(scale: float, tolerance: float):
     """Pose, covariance, also relative to the last keyframe, calibration; and the NIS is what it adds to the cost."""
@@ -271,6 +272,7 @@ def test_predictions_are_where_the_frame_then_sees_the_landmarks():
     assert 0.6 < np.mean(values) < 1.5
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("linearisation", ["extended", "unscented"])
 def test_errors_are_as_large_as_the_covariance_says(linearisation: str):
     """40 worlds from the prior: NEES of frame, window and calibration, and NIS, within 99.9 % of their chi-square."""
@@ -333,6 +335,7 @@ def test_a_retired_keyframe_changes_nothing_of_what_is_known_of_the_rest(lineari
     assert np.abs(error / np.sqrt(np.diag(covariance)[3:])).max() < 1e-3
 
 
+@pytest.mark.long
 def test_a_window_that_moves_on_equals_the_whole_problem():
     """The first keyframe retires and the frame becomes a keyframe, which sees landmarks of the others."""
     given = world(1, NARROW, count=30)
@@ -347,6 +350,7 @@ def test_a_window_that_moves_on_equals_the_whole_problem():
     )
 
 
+@pytest.mark.long
 def test_a_long_chain_of_windows_stays_rigid():
     """100 keyframes, each from the last by products with inverses by transposition: defects that double would show."""
     given = world(0, count=30)

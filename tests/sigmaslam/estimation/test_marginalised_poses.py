@@ -118,6 +118,7 @@ def test_a_loop_corrects_all_poses_as_a_pose_graph_does(seed: int):
         assert np.trace(window.posterior.past.covariance) < second_window
 
 
+@pytest.mark.long
 def test_errors_are_as_large_as_the_covariance_says_after_a_loop():
     ratios = []
     for seed in range(30):

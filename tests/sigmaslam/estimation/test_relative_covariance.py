@@ -66,6 +66,7 @@ def test_the_last_keyframe_relative_to_past_and_window_is_the_dense_solution(see
         assert_same(se3_inverse(pose) @ window.posterior.poses[-1], covariance, dense, i, KEYFRAMES - 1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_a_frame_relative_to_past_and_window_is_the_dense_solution(seed: int):
     """Also relative to a keyframe whose landmarks it does not see: what it says of the others moves that one, too."""
@@ -124,6 +125,7 @@ def test_relating_a_frame_changes_nothing():
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.long
 def test_errors_of_a_frame_relative_to_the_past_are_as_large_as_the_covariance_says():
     ratios = []
     for seed in range(60):

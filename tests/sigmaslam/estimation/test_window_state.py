@@ -167,6 +167,7 @@ def test_a_new_pose_has_the_considered_errors_of_the_one_it_is_relative_to():
         np.testing.assert_array_equal(empty.grow(np.eye(4), step, NO_WALK, origin).common[-6:], expected)
 
 
+@pytest.mark.long
 def test_considered_errors_are_part_of_the_whole_covariance():
     """Draws of the state's errors, and of considered ones of variance one that enter them."""
     state, rng, count = random_state(3), np.random.default_rng(0), 200_000

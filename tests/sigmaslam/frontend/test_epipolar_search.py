@@ -122,6 +122,7 @@ def test_the_nearest_near_a_line_are_those_of_a_loop():
     np.testing.assert_array_equal(found.mutual, best == similarity[:, found.index1].max(axis=0))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("pairs", [1, 7000])
 def test_pairs_that_are_looked_at_part_by_part_are_the_same(pairs: int, monkeypatch: pytest.MonkeyPatch):
     rng = np.random.default_rng(3)

@@ -333,6 +333,7 @@ def test_the_picture_shows_both_images_whatever_their_sizes(pair: Pair):
 # The command
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("option", "least"), [([], 0.5), (["--min-probability", "0"], 0.0)], ids=["default", "any"])
 def test_the_command_writes_what_the_library_finds(pair: Pair, tmp_path: Path, option: list[str], least: float):
     files = [write(tmp_path / name, image) for name, image in zip(("a.png", "b.pgm"), pair, strict=True)]
@@ -353,6 +354,7 @@ def test_the_command_writes_what_the_library_finds(pair: Pair, tmp_path: Path, o
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.png", "b.pgm", "matches.npz", "matches.png"]
 
 
+@pytest.mark.long
 def test_no_matches_are_no_error(tmp_path: Path):
     black = write(tmp_path / "black.png", np.zeros((100, 120), np.uint8))
     result = run_process(
@@ -364,6 +366,7 @@ def test_no_matches_are_no_error(tmp_path: Path):
         assert archive["covariance"].shape == (0, 2, 2)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["colour", "alpha", "16-bit"])
 def test_colours_and_depths_match_as_their_grey_image(pair: Pair, tmp_path: Path, kind: str):
     grey = pair[0]
@@ -457,6 +460,7 @@ def large_pair(long_side: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return image0, cv2.warpAffine(image0, H, shape[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT), H
 
 
+@pytest.mark.long
 def test_matches_of_large_images_are_in_their_own_pixels():
     image0, image1, H = large_pair(2400)
     matches = sigmaslam.match_images(image0, image1, max_keypoints=400)
@@ -470,6 +474,7 @@ def test_matches_of_large_images_are_in_their_own_pixels():
     assert np.median(squared) < chi2.ppf(0.5, 2)  # on renders sigma is too large rather than too small
 
 
+@pytest.mark.long
 def test_a_large_image_is_matched_as_the_same_shrunk():
     """Against shrinking by hand: what the small pair gives, in larger pixels."""
     image0, image1, _ = large_pair(3200)

@@ -283,6 +283,7 @@ def at(values: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.asarray(values[v, u])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", FRONTENDS)
 def test_disparity_of_the_demo_is_within_a_pixel_of_the_truth(demo, name):
     view = frontend(name).observe(*demo["images"][0])

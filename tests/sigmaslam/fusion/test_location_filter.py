@@ -109,6 +109,7 @@ def rms(errors: np.ndarray, part: slice) -> float:
     return float(np.sqrt(np.mean(np.sum(errors[:, part] ** 2, axis=1))))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("turn", "on_object"), [(None, False), (0.01, True)], ids=["positions of the camera", "poses of the body"]
 )
@@ -133,6 +134,7 @@ def test_drift_is_less_and_the_covariance_is_right(turn: float | None, on_object
     assert 0.5 < np.mean(nees) < 2.0
 
 
+@pytest.mark.long
 def test_the_sensor_s_world_is_found_and_poses_are_given_in_it():
     drive = Drive(2)
     estimates = drifting_estimates(drive, 300, SIGMA, 2)
@@ -153,6 +155,7 @@ def test_the_sensor_s_world_is_found_and_poses_are_given_in_it():
     np.testing.assert_allclose(trajectory.positions, (A @ drive.pose(trajectory.timestamps))[:, :3, 3], atol=0.1)
 
 
+@pytest.mark.long
 def test_wrong_readings_are_weakened():
     drive = Drive(3)
     estimates = drifting_estimates(drive, 300, SIGMA, 3)
@@ -178,6 +181,7 @@ def test_nothing_is_fused_while_the_body_rests_and_poses_stay_as_they_are():
     assert location.trajectory() is None
 
 
+@pytest.mark.long
 def test_frames_before_the_first_pose_come_back_as_they_are_and_their_readings_are_not_used():
     drive = Drive(3)
     estimates = drifting_estimates(drive, 60, SIGMA, 3)
@@ -192,6 +196,7 @@ def test_frames_before_the_first_pose_come_back_as_they_are_and_their_readings_a
     assert (late.summary.used, late.summary.unused) == (location.summary.used, 5)
 
 
+@pytest.mark.long
 def test_after_a_loss_the_error_is_what_it_was_before():
     """The tracker predicts for two seconds and finds its way back: nothing of the prediction's error stays."""
     drive = Drive(3)
@@ -217,6 +222,7 @@ def test_readings_of_another_clock_are_refused_at_the_first_frame():
         location.fuse(estimate_of(100.0, np.eye(4), np.zeros((6, 6))))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("sigma", "most"), [(0.001, 1.0), (0.00025, 1.15)])
 def test_on_a_rendered_sequence_single_frames_do_not_become_drift(
     demo_sequence: Path, demo_estimates: Callable[[str], list[Estimate]], sigma: float, most: float
@@ -237,6 +243,7 @@ def test_on_a_rendered_sequence_single_frames_do_not_become_drift(
     assert 0.4 < np.mean(nees) < 2.0
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("without_report")
 def test_the_command_line_fuses_and_says_what_became_of_the_readings(demo_sequence: Path, tmp_path: Path):
     truth = read_kitti(demo_sequence / "poses.txt")

@@ -133,6 +133,7 @@ def test_euroc_rows_align(real_data: Path):
     assert rectifier.valid_mask.mean() > 0.9 * 255
 
 
+@pytest.mark.long
 def test_kitti_raw_agrees_with_the_published_rectification(real_data: Path):
     folder = real_data / "kitti_raw_0926_0039_a"
     camera = read_kitti_calibration(folder / "calib_cam_to_cam.txt", (1392, 512), (0, 1))

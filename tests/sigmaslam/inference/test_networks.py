@@ -89,6 +89,7 @@ def test_a_copy_of_what_ships_matches_as_it_does(tmp_path: Path, image: np.ndarr
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
 
 
+@pytest.mark.long
 def test_match_says_other_covariances_with_other_weights(folder: Path, image: np.ndarray, tmp_path: Path):
     for k, each in enumerate((image, np.roll(image, 5, axis=1))):
         cv2.imwrite(str(tmp_path / f"{k}.png"), each)
@@ -99,6 +100,7 @@ def test_match_says_other_covariances_with_other_weights(folder: Path, image: np
     assert not np.array_equal(own["probability"], shipped["probability"])
 
 
+@pytest.mark.long
 def test_track_uses_them_and_run_json_names_folder_and_hash(folder: Path, tmp_path: Path):
     run_here("track", DEMO, "--out", tmp_path / "run", "--weights", folder, "--frames", "3")
     run = json.loads((tmp_path / "run" / "run.json").read_text())
@@ -109,6 +111,7 @@ def test_track_uses_them_and_run_json_names_folder_and_hash(folder: Path, tmp_pa
     assert run["weights_sha256"]["scorer.onnx"] == shipped
 
 
+@pytest.mark.long
 def test_resume_wants_the_same_weights(folder: Path, tmp_path: Path):
     out = tmp_path / "run"
     run_here("track", DEMO, "--out", out, "--weights", folder, "--frames", "3")

@@ -44,6 +44,7 @@ def assert_equals_pose_table(lines: list[str], run: Path) -> None:
         assert [f"{said['time']:.9f}", said["status"], *(f"{each:.9g}" for each in numbers)] == row
 
 
+@pytest.mark.long
 def test_lines_on_the_standard_output_are_the_rows_of_the_pose_table(sequence: Path, tmp_path: Path):
     done = run_process("track", sequence, "--out", tmp_path / "run", "--frontend", "klt", "--stream", "stdout")
     assert done.returncode == 0, done.stderr
@@ -66,6 +67,7 @@ def test_datagrams_that_nobody_receives_do_not_matter(sequence: Path, tmp_path: 
     assert summary["poses"] == FRAMES
 
 
+@pytest.mark.long
 def test_a_reader_that_has_gone_ends_a_whole_run_with_code_1(sequence: Path, tmp_path: Path):
     reader, writer = os.pipe()
     os.close(reader)

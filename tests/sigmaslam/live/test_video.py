@@ -41,6 +41,7 @@ def frame_at(number: int, pose: np.ndarray, status: str = "tracking") -> Tracked
     return TrackedFrame(number, estimate, some_frame(np.random.default_rng(number), 30))
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("without_report")
 def test_the_video_of_a_run_has_its_frames_and_its_rate(sequence: Path, tmp_path: Path):
     run = tmp_path / "run"
@@ -63,6 +64,7 @@ def test_the_video_of_a_run_has_its_frames_and_its_rate(sequence: Path, tmp_path
     assert count_frames(run / "video.mp4") == FRAMES
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("without_report")
 def test_a_video_that_fails_leaves_a_whole_run(sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     drawn = FramePainter.draw

@@ -389,6 +389,7 @@ def test_a_rectified_and_a_raw_topic_are_refused(tmp_path: Path, pictures, demo_
         open_sequence(path)
 
 
+@pytest.mark.long
 def test_track_takes_topics(tmp_path: Path, pictures, demo_camera: StereoCamera):
     path = record("mcap file", pictures, demo_camera, "/a/image_rect", "/b/image_rect").write(tmp_path)
     out = tmp_path / "run"

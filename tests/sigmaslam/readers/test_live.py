@@ -324,6 +324,7 @@ def demo_video(demo_sequence: Path, tmp_path_factory: pytest.TempPathFactory) ->
     return write_video(tmp_path_factory.mktemp("demo") / "both.avi", 2 * (images + images[::-1]), 10.0)
 
 
+@pytest.mark.long
 def test_track_writes_what_a_camera_saw(demo_video: Path, demo_sequence: Path, tmp_path: Path):
     out = tmp_path / "run"
     calibration = demo_sequence / "calib.txt"
@@ -359,6 +360,7 @@ def test_an_unplugged_camera_leaves_what_was_tracked(tmp_path: Path):
     assert not (out / "trajectory.tum").exists()
 
 
+@pytest.mark.long
 def test_ctrl_c_leaves_a_usable_run(demo_video: Path, demo_sequence: Path, tmp_path: Path):
     out = tmp_path / "run"
     options = ["--camera", f"side-by-side:{demo_video}", "--calibration", str(demo_sequence / "calib.txt")]

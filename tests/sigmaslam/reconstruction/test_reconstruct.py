@@ -27,6 +27,7 @@ def tracked(demo_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return folder
 
 
+@pytest.mark.long
 def test_a_run_becomes_a_cloud_and_its_report_shows_it(tracked: Path):
     done = run_here("reconstruct", tracked / "run", "--out", tracked / "cloud.ply")
     assert done.returncode == 0, done.stderr

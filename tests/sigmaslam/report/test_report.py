@@ -71,6 +71,7 @@ def _values(page: _Page, title: str, label: str) -> np.ndarray:
     return _unpack(next(each for each in plot["series"] if each["label"] == label)["values"])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("count", [12, 1100, 30_000])
 def test_report_is_one_file_that_needs_no_other(tmp_path, count):
     make_run(tmp_path / "run", count, pictures=count < 2000)
@@ -179,6 +180,7 @@ def test_points_of_a_followed_body_are_where_it_was_last(tmp_path):
     np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
+@pytest.mark.long
 def test_a_loss_of_one_frame_is_seen_in_a_long_run(tmp_path):
     make_run(tmp_path / "run", 45_000)
     path = tmp_path / "run/frames.csv"

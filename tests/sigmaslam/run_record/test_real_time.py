@@ -150,6 +150,7 @@ def test_the_latency_of_a_slow_consumer_has_the_time_that_frames_waited(clock: C
 # Runs
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("haste")
 def test_a_run_in_real_time_tells_what_was_dropped_and_the_latency(demo_sequence: Path, tmp_path: Path):
     summary = track_sequence(open_sequence(demo_sequence), tmp_path / "run", "klt", real_time=True, threads=1)
@@ -168,6 +169,7 @@ def test_a_run_in_real_time_tells_what_was_dropped_and_the_latency(demo_sequence
     assert f"p50 {latency['p50']:.0f}, p95 {latency['p95']:.0f}, p99 {latency['p99']:.0f}" in report
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("without_report")
 def test_a_recording_that_is_not_played_drops_nothing_and_tells_no_latency(demo_sequence: Path, tmp_path: Path):
     summary = track_sequence(open_sequence(demo_sequence), tmp_path / "run", "klt", threads=1)
@@ -178,6 +180,7 @@ def test_a_recording_that_is_not_played_drops_nothing_and_tells_no_latency(demo_
     assert "real_time" not in summary
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("clock", "without_report")
 def test_a_frame_that_cannot_be_read_has_its_row_where_its_time_is(demo_sequence: Path, tmp_path: Path):
     """As it has in a run that is not in real time."""
@@ -198,6 +201,7 @@ def test_a_frame_that_cannot_be_read_has_its_row_where_its_time_is(demo_sequence
         assert (np.diff(frames.seconds) > 0).all()
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("haste", "without_report")
 def test_the_command_line_plays_in_real_time(demo_sequence: Path, tmp_path: Path):
     options = ["--out", tmp_path / "run", "--frontend", "klt", "--realtime", "--threads", "1"]

@@ -68,6 +68,7 @@ def assert_goes_on(run: Path, whole: Path, at: list[int]) -> None:
     assert json.loads((run / "run.json").read_text())["resumed_at"] == at
 
 
+@pytest.mark.long
 def test_a_killed_run_goes_on_and_is_killed_again_and_goes_on(sequence: Path, whole: Path, tmp_path: Path):
     run = tmp_path / "run"
     kill(sequence, run, 13)
@@ -89,6 +90,7 @@ def test_a_killed_run_goes_on_and_is_killed_again_and_goes_on(sequence: Path, wh
     assert json.loads(evaluated.stdout)["matched"] == FRAMES
 
 
+@pytest.mark.long
 def test_the_covariance_is_no_smaller_than_where_it_goes_on(sequence: Path, tmp_path: Path):
     run = tmp_path / "run"
     kill(sequence, run, 20)
@@ -100,6 +102,7 @@ def test_the_covariance_is_no_smaller_than_where_it_goes_on(sequence: Path, tmp_
     assert (position[20:] > position[keyframe]).all()
 
 
+@pytest.mark.long
 def test_a_stopped_run_goes_on_from_its_results(sequence: Path, whole: Path, tmp_path: Path):
     run = tmp_path / "run"
     process = start(sequence, run, rows=17)
@@ -112,6 +115,7 @@ def test_a_stopped_run_goes_on_from_its_results(sequence: Path, whole: Path, tmp
     assert_goes_on(run, whole, [17])
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("without_report")
 @pytest.mark.parametrize(("name", "cut"), [("poses.partial", 5), ("relative_poses.partial", 5), ("frames.csv", 3)])
 def test_files_that_end_at_different_frames_are_cut_off_at_the_first(
@@ -124,6 +128,7 @@ def test_files_that_end_at_different_frames_are_cut_off_at_the_first(
     assert_goes_on(run, whole, [16 if name == "relative_poses.partial" else 15])
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("without_report")
 def test_another_input_or_other_settings_are_refused_and_change_nothing(
     sequence: Path, demo_sequence: Path, tmp_path: Path
@@ -141,6 +146,7 @@ def test_another_input_or_other_settings_are_refused_and_change_nothing(
     assert {path.name: path.read_bytes() for path in run.iterdir()} == before
 
 
+@pytest.mark.long
 def test_what_cannot_go_on_is_refused(sequence: Path, whole: Path, tmp_path: Path):
     command = ("track", sequence, "--frontend", "klt", "--resume", "--out")
     assert_refused(run_here(*command, tmp_path / "none"), "holds no run that could go on")

@@ -65,6 +65,7 @@ def test_noise_only_images_are_lost(demo: Demo, texture: Callable[..., np.ndarra
     assert_honest(estimates, truth)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("texture", [noise, clouds, covered])
 def test_noise_from_the_start_is_no_start(demo: Demo, texture: Callable[..., np.ndarray]):
     camera, frames, truth = demo
@@ -95,6 +96,7 @@ def test_a_third_of_the_frames_may_drop_out(demo: Demo, seed: int):
     assert_honest(estimates, se3_inverse(truth[kept[0]]) @ truth[kept])
 
 
+@pytest.mark.long
 def test_time_going_backwards_is_refused_and_the_next_good_frame_tracked(demo: Demo):
     camera, frames, truth = demo
     tracker = StereoTracker(camera)

@@ -71,6 +71,7 @@ def live_and_final(frontend: SimulatedFrontend, scale: Scale, config: TrackerCon
     return [errors_of(live, said, frontend.poses), errors_of(final, covariances, frontend.poses)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", SCALES)
 def test_without_a_loop_the_end_knows_better(kind: str):
     runs = [live_and_final(SimulatedFrontend(SCALES[kind], seed, 45, offset=0.3), SCALES[kind]) for seed in range(2)]
@@ -91,6 +92,7 @@ class ThereAndBack(SimulatedFrontend):
         return np.array([se3_exp(k * step) for k in range(frames)])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("max_keyframes", [60, 12], ids=["all remembered", "most forgotten"])
 def test_a_loop_corrects_the_frames_of_the_way_round(max_keyframes: int):
     config = TrackerConfig(max_keyframes=max_keyframes)
@@ -115,6 +117,7 @@ class Blinded(SimulatedFrontend):
         return found.select(np.zeros(0, np.int64)) if frame_of(view.left) in self.blind else found
 
 
+@pytest.mark.long
 def test_lost_frames_lie_between_those_before_and_after():
     scale = SCALES["drone"]
     frontend = Blinded(scale, 0, 50, offset=0.3)
@@ -273,6 +276,7 @@ def test_the_frame_of_a_keyframe_has_its_covariance():
     np.testing.assert_allclose(spread[6], expected, atol=1e-9)
 
 
+@pytest.mark.long
 def test_a_history_takes_few_bytes_a_frame():
     walk = walked(4, 200)
     frames = [interval.frames for interval in walk.history._intervals]

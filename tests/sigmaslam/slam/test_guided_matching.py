@@ -174,6 +174,7 @@ def shaken(seed: int) -> FlowingFrontend:
     return FlowingFrontend(seed, len(turns) + 1, turns, range(12, 100))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_a_camera_that_turns_back_at_once_is_followed(seed: int, monkeypatch: pytest.MonkeyPatch, widened: list[float]):
     frontend = shaken(seed)
@@ -191,6 +192,7 @@ def test_without_flow_it_would_be_lost(monkeypatch: pytest.MonkeyPatch):
     assert "lost" in statuses(tracked(shaken(0), monkeypatch))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_what_moves_on_its_own_does_not_widen_the_prediction(
     seed: int, monkeypatch: pytest.MonkeyPatch, widened: list[float]

@@ -227,6 +227,7 @@ def test_what_goes_wrong_beside_the_tracking_is_raised_where_the_view_is_asked_f
 # The tracker
 
 
+@pytest.mark.long
 def test_poses_do_not_depend_on_which_keyframes_are_foreseen(demo: Demo, monkeypatch: pytest.MonkeyPatch):
     """To the bit, with as many threads of the network: all frames foreseen against none."""
     camera, frames, _ = demo
@@ -255,6 +256,7 @@ def test_one_thread_foresees_nothing(demo: Demo, monkeypatch: pytest.MonkeyPatch
     track(StereoTracker(demo[0], threads=1), demo[1][:4])
 
 
+@pytest.mark.long
 def test_features_are_made_of_keyframes_only_once_the_camera_has_started(demo: Demo, learned: Frontend):
     camera, frames, _ = demo
     frontend = CountingFrontend(learned)

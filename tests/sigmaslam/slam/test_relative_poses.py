@@ -45,6 +45,7 @@ def nees_by_span(run: SimulatedRun, interval: float) -> dict[str, list[float]]:
     return nees
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("kind", "spans"), [("driving", ("10 m", "1 s")), ("drone", ("1 m", "1 s"))])
 def test_errors_are_as_large_as_the_relative_covariance_says(kind: str, spans: tuple[str, str]):
     nees: dict[str, list[float]] = {}
@@ -56,6 +57,7 @@ def test_errors_are_as_large_as_the_relative_covariance_says(kind: str, spans: t
         assert 0.7 < np.mean(nees[span]) < 1.3, (span, nees[span])
 
 
+@pytest.mark.long
 def test_rows_are_of_keyframes_about_as_far_back_as_the_span_says():
     run = simulate("driving", 1, 120)
     interval = SCALES["driving"].interval
@@ -90,6 +92,7 @@ def test_covariances_are_symmetric_and_sharper_than_those_of_absolute_poses():
     assert np.trace(last.relative_poses.covariance[short][0][:3, :3]) < 0.1 * np.trace(last.covariance[:3, :3])
 
 
+@pytest.mark.long
 def test_a_lost_frame_is_related_with_the_uncertainty_of_its_prediction():
     scale = SCALES["drone"]
     frontend = BlindFrontend(scale, 0, 41, 100)

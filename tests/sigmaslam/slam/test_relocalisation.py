@@ -297,6 +297,7 @@ def test_black_frames_and_a_jump_back_are_survived(demo: Demo):
         assert each.status == "lost" or squared_error(each, truth[k]) < WITHIN_3_SIGMA
 
 
+@pytest.mark.long
 def test_poses_are_in_the_world_of_the_map(demo: Demo, demo_run: Path):
     """Beginning in mid-run, where the map knows the place from elsewhere."""
     camera, frames, truth = demo
@@ -323,6 +324,7 @@ def test_a_run_in_its_own_map_stays_in_its_world(demo_sequence: Path, demo_run: 
     assert not (tmp_path / "run" / "tracks.npz").exists()  # nobody asked for it
 
 
+@pytest.mark.long
 def test_a_view_that_is_nowhere_in_the_map_has_no_pose(demo: Demo, demo_run: Path):
     camera, frames, _ = demo
     tracker = StereoTracker(camera)

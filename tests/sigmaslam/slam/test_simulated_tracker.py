@@ -30,6 +30,7 @@ def offset_in_sigmas(run: SimulatedRun) -> float:
     return (calibration.disparity_offset - OFFSET) / calibration.disparity_offset_sigma
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", SCALES)
 def test_errors_are_as_large_as_the_covariance_says_at_every_scale(kind: str):
     """NEES and NIS per degree of freedom, and a disparity offset that is found: its prior is 0 ± 0.5 px."""
@@ -47,6 +48,7 @@ def test_errors_are_as_large_as_the_covariance_says_at_every_scale(kind: str):
     assert 0.4 < np.mean(nees) < 1.8, nees
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("offset", "refused"), [(1.5, False), (3.0, True)])
 def test_an_offset_that_no_calibration_has_is_refused(offset: float, refused: bool):
     """1.5 px are three sigma of its prior, 3 px six: then it is not estimated any more."""
@@ -61,6 +63,7 @@ def test_an_offset_that_no_calibration_has_is_refused(offset: float, refused: bo
         assert abs(calibration.disparity_offset - offset) < 3 * calibration.disparity_offset_sigma
 
 
+@pytest.mark.long
 def test_wrong_matches_cost_little():
     """One in five is up to 20 px off."""
     run = simulate("drone", 0, 30, outliers=0.2)
@@ -70,6 +73,7 @@ def test_wrong_matches_cost_little():
     assert abs(offset_in_sigmas(run)) < 3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("frames", [120, pytest.param(300, marks=pytest.mark.slow)])
 def test_rotations_stay_orthonormal(frames: int):
     """An inverse by transposition doubles what a rotation is off by: once a drive was lost after 70 frames for it."""
@@ -95,6 +99,7 @@ def test_coverage_over_sixty_worlds(kind: str):
     assert 0.6 < np.sqrt(np.mean([offset_in_sigmas(run) ** 2 for run in runs])) < 1.4
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", SCALES)
 def test_errors_of_the_calibration_widen_the_covariance_and_nothing_else(kind: str):
     """The same frames by a calibration without errors, and by one as good as most."""

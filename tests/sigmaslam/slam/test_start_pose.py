@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from sigmaslam.geometry.se3 import se3_exp
 from sigmaslam.slam.start_pose import StartPose
@@ -27,6 +28,7 @@ def test_the_first_estimate_is_the_start_also_where_images_are_turned_to_be_rect
     np.testing.assert_allclose(estimate.covariance, root @ root.T, atol=1e-7)
 
 
+@pytest.mark.long
 def test_a_run_in_a_moved_world_is_the_run_moved(demo: Demo):
     """With a start that is certain, all poses are those of a run in its own world, turned and shifted."""
     camera, frames, _ = demo

@@ -33,6 +33,7 @@ def position_error(estimates: list[Estimate], demo: Demo) -> float:
     return absolute_trajectory_error(trajectory_of(estimates), Trajectory(times, truth)).rmse
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("frontend", ["learned", "sift", "orb", "klt"])
 def test_every_front_end_follows_the_rendered_camera(demo: Demo, demo_estimates: Tracked, frontend: str):
     """Within two centimetres and half a degree over 1.1 m and 2 s."""
@@ -54,6 +55,7 @@ def test_the_covariance_is_positive_definite_and_grows_along_the_way(demo_estima
     assert sigma[-1] > sigma[3] > 0
 
 
+@pytest.mark.long
 def test_onnx_and_torch_give_the_same_poses(demo: Demo):
     pytest.importorskip("torch")
     camera, frames, _ = demo
@@ -62,6 +64,7 @@ def test_onnx_and_torch_give_the_same_poses(demo: Demo):
     np.testing.assert_allclose(onnx.poses, torch.poses, atol=1e-9)
 
 
+@pytest.mark.long
 def test_frames_without_texture_are_lost_not_wrong_and_the_tracker_comes_back(demo: Demo):
     """Three black frames: lost, more and more uncertain, true pose inside three sigma; then tracking again."""
     camera, frames, truth = demo
@@ -76,6 +79,7 @@ def test_frames_without_texture_are_lost_not_wrong_and_the_tracker_comes_back(de
         assert squared_error(estimates[k], truth[k]) < WITHIN_3_SIGMA
 
 
+@pytest.mark.long
 def test_a_new_start_after_a_long_loss_is_accurate_from_there_and_uncertain_from_before(demo: Demo):
     """The world turns into its mirror image for good, five seconds pass: nothing matches, tracking starts anew.
 
@@ -100,6 +104,7 @@ def test_a_new_start_after_a_long_loss_is_accurate_from_there_and_uncertain_from
     assert np.rad2deg(np.linalg.norm(error[3:])) < 0.3
 
 
+@pytest.mark.long
 def test_dropped_frames_are_bridged_by_their_time(demo: Demo):
     camera, frames, _ = demo
     kept = [k for k in range(len(frames)) if k not in (7, 8, 15, 16, 17, 30)]
@@ -124,6 +129,7 @@ def test_time_that_does_not_go_forward_is_refused(demo: Demo):
         tracker.step(frames[1].left, frames[1].right, 1.0)
 
 
+@pytest.mark.long
 def test_the_map_lies_in_the_room(demo: Demo):
     """Map points reproject near where the first camera would see them: in front of it and within the room."""
     camera, frames, _ = demo

@@ -103,6 +103,7 @@ def test_wrong_matches_do_not_move_it():
     assert found.inliers[~wrong].mean() > 0.97
 
 
+@pytest.mark.long
 def test_the_covariance_is_right():
     true, squared = unit(pair().fundamental).ravel(), []
     for seed in range(150):

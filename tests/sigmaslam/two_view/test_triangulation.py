@@ -85,6 +85,7 @@ def test_noise_that_differs_moves_the_optimal_point():
     assert error[0] < 0.2 * error[1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", METHODS)
 def test_the_covariance_is_what_monte_carlo_finds(method: str):
     pair = parallel() if method == "parallel" else views()
