@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
 from torch import Tensor
 
-from sigmaslam_filters.checks import check_belief, check_entering, check_inputs, check_measurement, check_motion
+from sigmaslam_filters.checks import check_belief, check_entering, check_inputs, check_motion, check_update
 from sigmaslam_filters.core.columns import Columns, noise_entering, predicted_covariance, predicted_factor
 from sigmaslam_filters.core.factors import (
+    both,
     finite,
     may_look,
     multiply,
@@ -23,17 +24,16 @@ from sigmaslam_filters.core.failure import POLICIES, OnFailure, Suspects, jitter
 from sigmaslam_filters.core.noise_covariance import Noise, as_noise
 from sigmaslam_filters.core.plain_factors import PIVOT_TOLERANCES
 from sigmaslam_filters.core.sigma_points import SigmaPoints, cubature
-from sigmaslam_filters.core.solve import FORMS, Form, TangentPosterior, choose_form, solve
-from sigmaslam_filters.core.tensors import require_tensor
-from sigmaslam_filters.core.transforms import Difference, Exact, Taylor, Transform, Unscented
+from sigmaslam_filters.core.solve import FORMS, Form, TangentPosterior, choose_form
+from sigmaslam_filters.core.transforms import Exact, Taylor, Transform, Unscented
 from sigmaslam_filters.gaussian_belief import Gaussian
-from sigmaslam_filters.linearisation import LinearisedMeasurement, linearise_measurement, linearise_motion, require_flat
-from sigmaslam_filters.manifolds import Space, is_flat
-from sigmaslam_filters.manifolds.tangent_maps import tangent_maps
+from sigmaslam_filters.linearisation import Linearisation, LinearisedMeasurement
+from sigmaslam_filters.manifolds import Space
 from sigmaslam_filters.models import AnyMeasurement, AnyMotion, LinearMeasurement, LinearMotion, is_additive
 from sigmaslam_filters.results import TimeUpdate, Update
-from sigmaslam_filters.robust import Blocks, Robust, WeightedPosterior
-from sigmaslam_filters.time_series import filter_events, filter_sequence, smooth
+from sigmaslam_filters.robust import Robust
+from sigmaslam_filters.sight import Sight
+from sigmaslam_filters.time_series import SequenceFilter
 
 # Squared linearisation error of a whole measurement, in units of its noise's variance, from which on an update is worth
 # a second linearisation.
@@ -41,7 +41,7 @@ TOLERATED_ERROR = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class BayesFilter:
+class BayesFilter(SequenceFilter):
     """Predict and correct, for any number of filters at once.
 
     Made by `KalmanFilter`, `ExtendedKalmanFilter` and `UnscentedKalmanFilter`.
@@ -63,8 +63,10 @@ class BayesFilter:
     form: Form | Literal["auto"] = "auto"
     iterations: int | Literal["auto"] = "auto"
     on_failure: OnFailure = "raise"
+    linearisation: Linearisation = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "linearisation", Linearisation(self.transform, self.space))
         if self.form != "auto" and self.form not in FORMS:
             raise ValueError(f"form is {self.form!r}; choose auto, {', '.join(FORMS)}")
         if self.on_failure not in POLICIES:
@@ -90,11 +92,11 @@ class BayesFilter:
         if isinstance(motion, LinearMotion) and not self.goes_on_with_roots(belief):
             return self._predict_linear(belief, motion, noise, inputs)
         root, usable, sound = self._root(belief)
-        usable = _both(usable, nonnegative(noise.variance()))
-        moved = linearise_motion(self, belief.mean, root, motion, noise, inputs)
+        usable = both(usable, nonnegative(noise.variance()))
+        moved = self.linearisation.motion(belief.mean, root, motion, noise, inputs)
         mean = moved.mean if moved.reference is None else moved.reference
         columns, entering, noise_matrix = moved.columns, None, None
-        usable = _both(usable, finite(mean, columns.odd))
+        usable = both(usable, finite(mean, columns.odd))
         if usable is not None:
             columns = columns.where(usable)
         if is_additive(motion):
@@ -107,20 +109,20 @@ class BayesFilter:
             predicted = Gaussian(mean, factor=factor, factor_is_lower=True)
         else:
             predicted = Gaussian(mean, predicted_covariance(columns, entering, noise_matrix))
-        usable = _both(_both(finite(mean, predicted.held), usable), _sound_variances(predicted))
+        usable = both(both(finite(mean, predicted.held), usable), _sound_variances(predicted))
         predicted = self._deal_with(usable, predicted, belief, "predict", _suspects(noise, predicted))
-        return TimeUpdate(predicted, _both(usable, sound), usable, lambda: (root, columns), entering, noise_matrix)
+        return TimeUpdate(predicted, both(usable, sound), usable, lambda: (root, columns), entering, noise_matrix)
 
     def _predict_linear(
         self, belief: Gaussian, motion: LinearMotion, noise: Noise, inputs: tuple[Tensor, ...]
     ) -> TimeUpdate:
         """A P A^T + B2 Q B2^T, (9.22): no root is needed, so a covariance is not checked for being semidefinite."""
-        require_flat(self, "LinearMotion")
+        self.linearisation.require_flat("LinearMotion")
         mean = motion.function(belief.mean, *inputs)
         covariance = multiply(multiply(motion.matrix, belief.covariance), motion.matrix.mT)
         predicted = Gaussian(mean, covariance + noise_entering(noise, motion.noise_matrix))
-        healthy = _both(finite(mean, predicted.held), nonnegative(noise.variance()))
-        healthy = _both(healthy, _sound_variances(predicted))
+        healthy = both(finite(mean, predicted.held), nonnegative(noise.variance()))
+        healthy = both(healthy, _sound_variances(predicted))
         predicted = self._deal_with(healthy, predicted, belief, "predict", _suspects(noise, predicted))
 
         def joint() -> tuple[Tensor, Columns]:
@@ -153,81 +155,57 @@ class BayesFilter:
                 and on_failure is "raise".
             ValueError: shapes do not fit.
         """
-        require_tensor("the value", value)
-        noise = as_noise(measurement.noise, f"{type(measurement).__name__}.noise")
-        check_belief(belief, self.space)
-        check_inputs(inputs)
-        check_measurement(measurement, noise, value, belief)
-        if belief.batch_shape != value.shape[:-1]:
-            belief = belief.expand(torch.broadcast_shapes(belief.batch_shape, value.shape[:-1]))
-        root, usable, sound = self._root(belief)
-        value, mask, count, measured = _without_missing(value, measurement.mask)
-        usable = _both(usable, measured)
-        added = None
-        if is_additive(measurement):
-            added = noise = noise if mask is None else noise.masked(mask)
-        usable = _both(usable, nonnegative(noise.variance()))
-
-        def look(previous: TangentPosterior | None) -> LinearisedMeasurement:
-            seen = linearise_measurement(self, belief.mean, root, measurement, noise, value, inputs, previous)
-            innovation, columns = seen.innovation, seen.columns
-            if mask is not None:
-                innovation, columns = torch.where(mask, innovation, 0.0), columns.masked(mask, added is None)
-            # What cannot be used is not looked at, so that it harms no derivative either.
-            used = _both(usable, finite(innovation, columns.odd))
-            if used is not None:
-                innovation, columns = torch.where(used[..., None], innovation, 0.0), columns.where(used)
-            form = self._form(belief, columns, innovation.shape[-1], added is not None)
-            return replace(seen, innovation=innovation, columns=columns, form=form, usable=used)
-
-        blocks = None
-        if gate is not None or robust is not None:
-            blocks = Blocks.of(measurement, noise, value, mask, robust)
-        if gate is not None and blocks is not None:
-            seen = look(None)
-            blocks = blocks.gated(gate, seen.innovation, seen.columns, noise)
-            mask = blocks.masked(mask)
-            count = mask.sum(dim=-1)
-            noise = added = blocks.weighted(noise.masked(mask))
-
-        def linearise(previous: TangentPosterior | None) -> tuple[LinearisedMeasurement, WeightedPosterior]:
-            seen = look(previous)
-
-            def posterior(noise: Noise | None) -> TangentPosterior:
-                return solve(seen.form, seen.innovation, seen.columns, noise, root)
-
-            if blocks is None or added is None:
-                return seen, WeightedPosterior(posterior(added), added)
-            return seen, blocks.solve(posterior, seen.innovation, seen.columns, added)
-
-        seen, at_prior = linearise(None)
-        usable, solution = seen.usable, at_prior.solution
-        if self.iterations != "auto":
-            for _ in range(0 if isinstance(measurement, LinearMeasurement) else self.iterations - 1):
-                last, weighted = linearise(solution)
-                solution = weighted.solution
-                usable = _both(usable, last.usable)
-        elif seen.error is not None:
-            bent = seen.error(mask, noise) > TOLERATED_ERROR
-            if not may_look(bent) or bool(bent.any()):
-                last, again = linearise(solution)
-                solution = again.solution.where(bent, solution)
-                usable = _both(usable, None if last.usable is None else last.usable | ~bent)
+        sight, sound, belief = self._sight(belief, measurement, value, inputs)
+        seen = sight.look()
+        sight, seen = sight.gated(seen, gate, robust)
+        form = self._form(belief, seen.columns, seen.innovation.shape[-1], sight.added is not None)
+        at_prior = sight.solve(form, seen)
+        solution, usable = self._relinearised(form, seen, sight, at_prior.solution)
         posterior = self._correct(belief, solution)
-        usable = _both(_both(finite(posterior.mean, posterior.held), solution.healthy), usable)
-        usable = _both(usable, _sound_variances(posterior))
-        suspects: dict[str, Callable[[], Tensor]] = {"measurement noise": noise.covariance}
+        usable = both(both(finite(posterior.mean, posterior.held), solution.healthy), usable)
+        usable = both(usable, _sound_variances(posterior))
+        suspects: dict[str, Callable[[], Tensor]] = {"measurement noise": sight.noise.covariance}
         if (factored := solution.matrix) is not None:
             suspects["innovation covariance"] = lambda: factored
         posterior = self._deal_with(usable, posterior, belief, "update", suspects)
-        if usable is not None:
-            count = torch.where(usable, count, 0)
-        healthy = _both(usable, sound)
-        return Update(posterior, seen.innovation, seen.form, count, healthy, usable, at_prior, seen.columns, root)
+        count = sight.count if usable is None else torch.where(usable, sight.count, 0)
+        healthy = both(usable, sound)
+        return Update(posterior, seen.innovation, form, count, healthy, usable, at_prior, seen.columns, sight.root)
 
-    filter = filter_sequence
-    filter_events = filter_events
-    smooth = smooth
+    def _sight(
+        self, belief: Gaussian, measurement: AnyMeasurement, value: Tensor, inputs: tuple[Tensor, ...]
+    ) -> tuple[Sight, Tensor | None, Gaussian]:
+        """What an update looks at, whether its belief needed no mending (...,), and the belief in the value's batch."""
+        noise = as_noise(measurement.noise, f"{type(measurement).__name__}.noise")
+        batch = check_update(belief, self.space, measurement, noise, value, inputs)
+        if belief.batch_shape != batch:
+            belief = belief.expand(batch)
+        root, usable, sound = self._root(belief)
+        value, mask, count, measured = _without_missing(value, measurement.mask)
+        usable = both(usable, measured)
+        if mask is not None and is_additive(measurement):
+            noise = noise.masked(mask)
+        usable = both(usable, nonnegative(noise.variance()))
+        sight = Sight(self.linearisation, measurement, inputs, value, belief.mean, root, noise, mask, count, usable)
+        return sight, sound, belief
+
+    def _relinearised(
+        self, form: Form, seen: LinearisedMeasurement, sight: Sight, solution: TangentPosterior
+    ) -> tuple[TangentPosterior, Tensor | None]:
+        """The solution of the last linearisation that is asked for, and whether it is usable (...,)."""
+        usable = seen.usable
+        if self.iterations != "auto":
+            for _ in range(0 if isinstance(sight.measurement, LinearMeasurement) else self.iterations - 1):
+                last = sight.look(solution)
+                solution = sight.solve(form, last).solution
+                usable = both(usable, last.usable)
+        elif seen.error is not None:
+            bent = seen.error(sight.mask, sight.noise) > TOLERATED_ERROR
+            if not may_look(bent) or bool(bent.any()):
+                last = sight.look(solution)
+                solution = sight.solve(form, last).solution.where(bent, solution)
+                usable = both(usable, None if last.usable is None else last.usable | ~bent)
+        return solution, usable
 
     def goes_on_with_roots(self, belief: Gaussian) -> bool:
         """Whether the belief after a step is held by a root."""
@@ -251,50 +229,14 @@ class BayesFilter:
             root = torch.where(usable[..., None, None], root, 0.0)
         return root, usable, sound
 
-    @property
-    def chart(self) -> Difference | None:
-        """(points, reference) -> tangent at the reference; None in R^n, where it is their difference."""
-        space = self.space
-        if space is None or is_flat(space):
-            return None
-        return lambda points, reference: space.local(reference, points)
-
-    def retract(self, point: Tensor, tangent: Tensor) -> Tensor:
-        """point [+] tangent."""
-        if self.space is not None:
-            return self.space.retract(point, tangent)
-        # Components before the batch, so that what is computed is batch-last in memory.
-        return (point.mT + tangent.mT).mT if point.ndim > 1 else point + tangent
-
-    def carry(self, point: Tensor, shift: Tensor | None, root: Tensor, target: Tensor) -> list[Tensor]:
-        """Deviations (..., n, c), in the chart at `target`, of a belief in the chart at `point` with mean `shift`.
-
-        In R^n they are the root itself. With a shift, the target is point [+] shift.
-        """
-        chart = self.chart
-        if chart is None or self.space is None:
-            return [root]
-        if isinstance(self.transform, Taylor):
-            maps, directions = tangent_maps(self.space), root.movedim(-1, 0)
-            if shift is None:
-                carried = maps.transport_back(target, self.space.local(target, point), directions)
-            else:
-                carried = maps.transport(point, shift, directions)
-            return [carried.movedim(0, -1)]
-        return self.transform(
-            lambda offsets: chart(self.retract(point, offsets if shift is None else shift + offsets), target),
-            root,
-            None,
-        ).columns.all()
-
     def _correct(self, belief: Gaussian, solution: TangentPosterior) -> Gaussian:
         """The posterior of the state, with its covariance in the chart at the new mean."""
-        mean = self.retract(belief.mean, solution.shift)
-        if self.chart is None:
+        mean = self.linearisation.retract(belief.mean, solution.shift)
+        if self.linearisation.chart is None:
             if solution.root is not None:
                 return Gaussian(mean, factor=solution.root, factor_is_lower=True)
             return Gaussian(mean, solution.covariance)
-        carried = self.carry(belief.mean, solution.shift, solution.factor(), mean)
+        carried = self.linearisation.carry(belief.mean, solution.shift, solution.factor(), mean)
         if solution.root is not None:
             return Gaussian(mean, factor=triangularise(carried), factor_is_lower=True)
         return Gaussian(mean, square(carried))
@@ -351,13 +293,6 @@ def _sound_variances(belief: Gaussian) -> Tensor | None:
         return None
     variance = torch.diagonal(belief.held, dim1=-2, dim2=-1)
     return nonnegative(variance, PIVOT_TOLERANCES[variance.dtype])
-
-
-def _both(first: Tensor | None, second: Tensor | None) -> Tensor | None:
-    """Conjunction of flags (...,), of which None is all true."""
-    if first is None or second is None:
-        return second if first is None else first
-    return first & second
 
 
 def _without_missing(value: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None, Tensor | int, Tensor | None]:

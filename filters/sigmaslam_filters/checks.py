@@ -75,12 +75,25 @@ def check_entering(motion: AnyMotion, noise: Noise, components: int) -> None:
         )
 
 
-def check_measurement(measurement: AnyMeasurement, noise: Noise, value: Tensor, belief: Gaussian) -> None:
-    """Sizes of what a measurement is made of, as far as they show before its function is called.
+def check_update(
+    belief: Gaussian,
+    space: Space | None,
+    measurement: AnyMeasurement,
+    noise: Noise,
+    value: Tensor,
+    inputs: tuple[Tensor, ...],
+) -> torch.Size:
+    """Sizes of what an update is given, as far as they show before the model's function is called.
 
+    Returns:
+        the batch of the belief and the value together.
     Raises:
-        ValueError: the value, the noise, the mask or the matrix does not fit.
+        TypeError: the value or an input is no tensor.
+        ValueError: the belief, the value, the noise, the mask or the matrix does not fit.
     """
+    require_tensor("the value", value)
+    check_belief(belief, space)
+    check_inputs(inputs)
     kind, m = type(measurement).__name__, value.shape[-1]
     require_dtype("the value", value, belief.mean.dtype)
     if isinstance(measurement, LinearMeasurement):
@@ -100,7 +113,13 @@ def check_measurement(measurement: AnyMeasurement, noise: Noise, value: Tensor, 
     if measurement.mask is not None and measurement.mask.shape[-1] != m:
         raise ValueError(f"{kind}.mask is {tuple(measurement.mask.shape)}, but the value has {m} components")
     _check_batch("the value", value.shape[:-1], belief.batch_shape)
-    _check_batch(f"{kind}.noise", variance.shape[:-1], torch.broadcast_shapes(value.shape[:-1], belief.batch_shape))
+    batch = belief.batch_shape if value.shape[:-1] == belief.batch_shape else _joined(value, belief)
+    _check_batch(f"{kind}.noise", variance.shape[:-1], batch)
+    return batch
+
+
+def _joined(value: Tensor, belief: Gaussian) -> torch.Size:
+    return torch.broadcast_shapes(belief.batch_shape, value.shape[:-1])
 
 
 def _check_batch(name: str, given: torch.Size, expected: torch.Size) -> None:

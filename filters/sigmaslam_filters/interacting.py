@@ -98,7 +98,7 @@ class InteractingMultipleModels:
 
     def _mixed(self, beliefs: Sequence[Gaussian], weight: Tensor, first: int) -> Gaussian:
         """The Gaussian with the moments of a mixture of weights (..., M), on a manifold in the chart at its mean."""
-        chart = self.bayes.chart
+        chart = self.bayes.linearisation.chart
         reference = beliefs[first].mean
         parts = weight.unbind(dim=-1)
 
@@ -106,7 +106,7 @@ class InteractingMultipleModels:
             return belief.mean - point if chart is None else chart(belief.mean, point)
 
         shifts = [part.unsqueeze(-1) * offset(belief, reference) for part, belief in zip(parts, beliefs, strict=True)]
-        mean = self.bayes.retract(reference, torch.stack(shifts).sum(dim=0))
+        mean = self.bayes.linearisation.retract(reference, torch.stack(shifts).sum(dim=0))
         covariance = torch.zeros_like(beliefs[first].covariance)
         for part, belief in zip(parts, beliefs, strict=True):
             apart = offset(belief, mean).unsqueeze(-1)
@@ -114,7 +114,7 @@ class InteractingMultipleModels:
                 inside = belief.covariance
             else:
                 # About its own mean, but seen from the mixture's.
-                columns = self.bayes.carry(belief.mean, None, belief.factor, mean)
+                columns = self.bayes.linearisation.carry(belief.mean, None, belief.factor, mean)
                 inside = square(columns)
             covariance = covariance + part[..., None, None] * (inside + apart @ apart.mT)
         return Gaussian(mean, covariance)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -13,12 +13,10 @@ from sigmaslam_filters.core.factors import apply, multiply, solve_lower_transpos
 from sigmaslam_filters.core.failure import FilterError
 from sigmaslam_filters.core.tensors import require_tensor
 from sigmaslam_filters.gaussian_belief import Gaussian
+from sigmaslam_filters.linearisation import Linearisation
 from sigmaslam_filters.models import AnyMeasurement, AnyMotion
 from sigmaslam_filters.results import TimeUpdate, Update
 from sigmaslam_filters.robust import Robust
-
-if TYPE_CHECKING:
-    from sigmaslam_filters.bayes import BayesFilter
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,49 +71,174 @@ class Track:
     _predictions: Sequence[TimeUpdate | None] = field(repr=False)
 
 
-def filter_sequence(
-    bayes: BayesFilter,
-    belief: Gaussian,
-    motion: AnyMotion,
-    measurement: AnyMeasurement,
-    values: Tensor,
-    motion_inputs: Sequence[Tensor] = (),
-    measurement_inputs: Sequence[Tensor] = (),
-    *,
-    gate: float | None = None,
-    robust: Robust | None = None,
-) -> Track:
-    """Update, predict, update, ...: T measurements and the T - 1 motions between them.
+class SequenceFilter(ABC):
+    """What a filter of single steps does with whole sequences."""
 
-    Args:
-        bayes: a Kalman, extended or unscented filter.
-        belief: at the time of the first measurement, before it; batch (...,), to which that of the values broadcasts,
-            or the other way round.
-        motion: the same for all steps, but for its inputs.
-        measurement: the same for all steps, but for its inputs.
-        values: (T, ..., m); NaN for what is missing.
-        motion_inputs: (T - 1, ...) each: element k moves step k to k + 1.
-        measurement_inputs: (T, ...) each.
-        gate, robust: as `update`.
-    Raises:
-        FilterError: as `predict` and `update`; the message begins with the step.
-        ValueError: lengths do not fit.
-    """
-    steps = count_steps(values, motion_inputs, measurement_inputs)
-    first = Event(None, measurement, values[0], (), [given[0] for given in measurement_inputs], gate, robust)
-    later = (
-        Event(
-            motion,
-            measurement,
-            values[k],
-            [given[k - 1] for given in motion_inputs],
-            [given[k] for given in measurement_inputs],
-            gate,
-            robust,
+    __slots__ = ()
+
+    linearisation: Linearisation
+
+    @abstractmethod
+    def predict(self, belief: Gaussian, motion: AnyMotion, *inputs: Tensor) -> TimeUpdate:
+        """The belief after a motion."""
+
+    @abstractmethod
+    def update(
+        self,
+        belief: Gaussian,
+        measurement: AnyMeasurement,
+        value: Tensor,
+        *inputs: Tensor,
+        gate: float | None = None,
+        robust: Robust | None = None,
+    ) -> Update:
+        """The belief after a measurement."""
+
+    def filter(
+        self,
+        belief: Gaussian,
+        motion: AnyMotion,
+        measurement: AnyMeasurement,
+        values: Tensor,
+        motion_inputs: Sequence[Tensor] = (),
+        measurement_inputs: Sequence[Tensor] = (),
+        *,
+        gate: float | None = None,
+        robust: Robust | None = None,
+    ) -> Track:
+        """Update, predict, update, ...: T measurements and the T - 1 motions between them.
+
+        Args:
+            belief: at the time of the first measurement, before it; batch (...,), to which that of the values
+                broadcasts, or the other way round.
+            motion: the same for all steps, but for its inputs.
+            measurement: the same for all steps, but for its inputs.
+            values: (T, ..., m); NaN for what is missing.
+            motion_inputs: (T - 1, ...) each: element k moves step k to k + 1.
+            measurement_inputs: (T, ...) each.
+            gate, robust: as `update`.
+        Raises:
+            FilterError: as `predict` and `update`; the message begins with the step.
+            ValueError: lengths do not fit.
+        """
+        steps = count_steps(values, motion_inputs, measurement_inputs)
+        first = Event(None, measurement, values[0], (), [given[0] for given in measurement_inputs], gate, robust)
+        later = (
+            Event(
+                motion,
+                measurement,
+                values[k],
+                [given[k - 1] for given in motion_inputs],
+                [given[k] for given in measurement_inputs],
+                gate,
+                robust,
+            )
+            for k in range(1, steps)
         )
-        for k in range(1, steps)
-    )
-    return filter_events(bayes, belief, [first, *later])
+        return self.filter_events(belief, [first, *later])
+
+    def filter_events(self, belief: Gaussian, events: Sequence[Event]) -> Track:
+        """Predict and update, event by event; the track has one entry for each and can be smoothed.
+
+        Args:
+            belief: before the first event; batch (...,), to which those of the values broadcast, or the other way
+                round.
+            events: in the order of time.
+        Raises:
+            FilterError: as `predict` and `update`; the message begins with the step.
+            ValueError: there is no event, or shapes do not fit.
+        """
+        if not events:
+            raise ValueError("a sequence needs one event at least")
+        batch = torch.broadcast_shapes(
+            belief.batch_shape, *(event.value.shape[:-1] for event in events if isinstance(event.value, Tensor))
+        )
+        if belief.batch_shape != batch:
+            belief = belief.expand(batch)
+        predictions: list[TimeUpdate | None] = []
+        predicted: list[Gaussian] = []
+        filtered: list[Gaussian] = []
+        updates: list[Update | None] = []
+        for k, event in enumerate(events):
+            moved, seen = None, None
+            try:
+                if event.motion is not None:
+                    moved = self.predict(belief, event.motion, *event.motion_inputs)
+                    belief = moved.belief
+                predictions.append(moved)
+                predicted.append(belief)
+                if event.measurement is not None and event.value is not None:
+                    seen = self.update(
+                        belief,
+                        event.measurement,
+                        event.value,
+                        *event.measurement_inputs,
+                        gate=event.gate,
+                        robust=event.robust,
+                    )
+                    belief = seen.belief
+            except FilterError as error:
+                raise FilterError(f"step {k} of {len(events)}: {error}") from error
+            updates.append(seen)
+            filtered.append(belief)
+        return _track(predicted, filtered, predictions, updates)
+
+    def smooth(self, track: Track, lag: int | None = None) -> Gaussian:
+        """Beliefs given all measurements, (T, ...), by the RTS recursion.
+
+        Rauch et al. 1965; Särkkä 2008 for sigma points.
+
+        The backward gain and the covariance of a state given the next come from one triangularisation of their joint
+        deviations, so nothing is subtracted: the result is positive semidefinite in any dtype.
+
+        Args:
+            track: from `filter` or `filter_events`.
+            lag: fixed-lag smoothing: each belief is given the measurements of as many later steps at most, at a cost
+                of as many recursions; None: of all.
+        Raises:
+            ValueError: the lag is negative.
+        """
+        if lag is not None and lag < 0:
+            raise ValueError(f"lag is {lag} steps; it must not be negative")
+        last = len(track.filtered.mean) - 1
+        if lag is None or lag >= last:
+            later = track.filtered[last]
+            smoothed = [later]
+            for k in reversed(range(last)):
+                later = self._smooth_step(track.filtered[k], track._predictions[k + 1], later)
+                smoothed.append(later)
+            return _stack(smoothed[::-1])
+        smoothed = []
+        for k in range(last + 1):
+            later = track.filtered[min(k + lag, last)]
+            for j in reversed(range(k, min(k + lag, last))):
+                later = self._smooth_step(track.filtered[j], track._predictions[j + 1], later)
+            smoothed.append(later)
+        return _stack(smoothed)
+
+    def _smooth_step(self, filtered: Gaussian, prediction: TimeUpdate | None, later: Gaussian) -> Gaussian:
+        if prediction is None:
+            return later
+        odd, others, root = prediction.joint_root()
+        size = root.shape[-1]
+        pieces = [torch.cat([odd, root], dim=-2)]
+        pieces += [torch.nn.functional.pad(other, (0, 0, 0, size)) for other in others]
+        joint = triangularise(pieces)
+        marginal, cross, conditional = joint[..., :size, :size], joint[..., size:, :size], joint[..., size:, size:]
+        gain = solve_lower_transposed(marginal, cross.mT).mT
+        expected = prediction.belief.mean
+        chart = self.linearisation.chart
+        difference = later.mean - expected if chart is None else chart(later.mean, expected)
+        # The later belief's deviations, seen from the predicted mean instead of its own.
+        deviations = self.linearisation.carry(later.mean, None, later.factor, expected)
+        shift = apply(gain, difference)
+        columns = triangularise([*(multiply(gain, part) for part in deviations), conditional])
+        mean = self.linearisation.retract(filtered.mean, shift)
+        carried = self.linearisation.carry(filtered.mean, shift, columns, mean)
+        if filtered.is_square_root:
+            lower = columns if chart is None else triangularise(carried)
+            return Gaussian(mean, factor=lower, factor_is_lower=True)
+        return Gaussian(mean, square(carried))
 
 
 def count_steps(values: Tensor, motion_inputs: Sequence[Tensor], measurement_inputs: Sequence[Tensor]) -> int:
@@ -133,53 +256,6 @@ def count_steps(values: Tensor, motion_inputs: Sequence[Tensor], measurement_inp
             lengths = ", ".join(str(len(given)) for given in inputs)
             raise ValueError(f"{steps} measurements need {name} inputs of length {length}, got {lengths}")
     return steps
-
-
-def filter_events(bayes: BayesFilter, belief: Gaussian, events: Sequence[Event]) -> Track:
-    """Predict and update, event by event; the track has one entry for each and can be smoothed.
-
-    Args:
-        bayes: a Kalman, extended or unscented filter.
-        belief: before the first event; batch (...,), to which those of the values broadcast, or the other way round.
-        events: in the order of time.
-    Raises:
-        FilterError: as `predict` and `update`; the message begins with the step.
-        ValueError: there is no event, or shapes do not fit.
-    """
-    if not events:
-        raise ValueError("a sequence needs one event at least")
-    batch = torch.broadcast_shapes(
-        belief.batch_shape, *(event.value.shape[:-1] for event in events if isinstance(event.value, Tensor))
-    )
-    if belief.batch_shape != batch:
-        belief = belief.expand(batch)
-    predictions: list[TimeUpdate | None] = []
-    predicted: list[Gaussian] = []
-    filtered: list[Gaussian] = []
-    updates: list[Update | None] = []
-    for k, event in enumerate(events):
-        moved, seen = None, None
-        try:
-            if event.motion is not None:
-                moved = bayes.predict(belief, event.motion, *event.motion_inputs)
-                belief = moved.belief
-            predictions.append(moved)
-            predicted.append(belief)
-            if event.measurement is not None and event.value is not None:
-                seen = bayes.update(
-                    belief,
-                    event.measurement,
-                    event.value,
-                    *event.measurement_inputs,
-                    gate=event.gate,
-                    robust=event.robust,
-                )
-                belief = seen.belief
-        except FilterError as error:
-            raise FilterError(f"step {k} of {len(events)}: {error}") from error
-        updates.append(seen)
-        filtered.append(belief)
-    return _track(predicted, filtered, predictions, updates)
 
 
 def _track(
@@ -217,64 +293,6 @@ def _track(
         torch.stack(healthy),
         predictions,
     )
-
-
-def smooth(bayes: BayesFilter, track: Track, lag: int | None = None) -> Gaussian:
-    """Beliefs given all measurements, (T, ...), by the RTS recursion (Rauch et al. 1965; Särkkä 2008 for sigma points).
-
-    The backward gain and the covariance of a state given the next come from one triangularisation of their joint
-    deviations, so nothing is subtracted: the result is positive semidefinite in any dtype.
-
-    Args:
-        bayes: the filter that made the track.
-        track: from `filter_sequence` or `filter_events`.
-        lag: fixed-lag smoothing: each belief is given the measurements of as many later steps at most, at a cost of as
-            many recursions; None: of all.
-    Raises:
-        ValueError: the lag is negative.
-    """
-    if lag is not None and lag < 0:
-        raise ValueError(f"lag is {lag} steps; it must not be negative")
-    last = len(track.filtered.mean) - 1
-    if lag is None or lag >= last:
-        later = track.filtered[last]
-        smoothed = [later]
-        for k in reversed(range(last)):
-            later = _smooth_step(bayes, track.filtered[k], track._predictions[k + 1], later)
-            smoothed.append(later)
-        return _stack(smoothed[::-1])
-    smoothed = []
-    for k in range(last + 1):
-        later = track.filtered[min(k + lag, last)]
-        for j in reversed(range(k, min(k + lag, last))):
-            later = _smooth_step(bayes, track.filtered[j], track._predictions[j + 1], later)
-        smoothed.append(later)
-    return _stack(smoothed)
-
-
-def _smooth_step(bayes: BayesFilter, filtered: Gaussian, prediction: TimeUpdate | None, later: Gaussian) -> Gaussian:
-    if prediction is None:
-        return later
-    odd, others, root = prediction.joint_root()
-    size = root.shape[-1]
-    pieces = [torch.cat([odd, root], dim=-2)]
-    pieces += [torch.nn.functional.pad(other, (0, 0, 0, size)) for other in others]
-    joint = triangularise(pieces)
-    marginal, cross, conditional = joint[..., :size, :size], joint[..., size:, :size], joint[..., size:, size:]
-    gain = solve_lower_transposed(marginal, cross.mT).mT
-    expected = prediction.belief.mean
-    chart = bayes.chart
-    difference = later.mean - expected if chart is None else chart(later.mean, expected)
-    # The later belief's deviations, seen from the predicted mean instead of its own.
-    deviations = bayes.carry(later.mean, None, later.factor, expected)
-    shift = apply(gain, difference)
-    columns = triangularise([*(multiply(gain, part) for part in deviations), conditional])
-    mean = bayes.retract(filtered.mean, shift)
-    carried = bayes.carry(filtered.mean, shift, columns, mean)
-    if filtered.is_square_root:
-        lower = columns if chart is None else triangularise(carried)
-        return Gaussian(mean, factor=lower, factor_is_lower=True)
-    return Gaussian(mean, square(carried))
 
 
 def _stack(beliefs: Sequence[Gaussian]) -> Gaussian:

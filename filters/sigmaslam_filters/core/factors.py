@@ -165,6 +165,13 @@ def nonnegative(variance: Tensor, tolerance: float = 0.0) -> Tensor | None:
     return (variance >= floor).all(dim=-1)
 
 
+def both(first: Tensor | None, second: Tensor | None) -> Tensor | None:
+    """Conjunction of flags (...,), of which None is all true."""
+    if first is None or second is None:
+        return second if first is None else first
+    return first & second
+
+
 def log_diagonal(factor: Tensor) -> Tensor:
     """Logarithm of the determinant of L L^T, (..., n, n) -> (...,)."""
     return 2.0 * torch.log(torch.diagonal(factor, dim1=-2, dim2=-1)).sum(dim=-1)

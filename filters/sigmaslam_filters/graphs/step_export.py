@@ -331,7 +331,7 @@ def _moved(step: _Step, given: list[Tensor], generator: torch.Generator) -> list
 
     name = "root" if step.by_root else "covariance"
     root = named[name] if step.by_root else Gaussian(named["mean"], named[name]).factor
-    named["mean"] = step.bayes.retract(named["mean"], (root @ (0.3 * normal(root[..., :1]))).squeeze(-1))
+    named["mean"] = step.bayes.linearisation.retract(named["mean"], (root @ (0.3 * normal(root[..., :1]))).squeeze(-1))
     # A lower triangle times another is one.
     mixed = root @ (torch.eye(root.shape[-1], dtype=root.dtype) + 0.2 * normal(root).tril())
     named[name] = mixed if step.by_root else mixed @ mixed.mT
