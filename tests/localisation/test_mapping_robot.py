@@ -94,6 +94,7 @@ def test_a_robot_that_sees_nothing_new_keeps_its_belief():
     assert not torch.equal(admitted.mean[0], belief.mean[0])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("make", [ExtendedKalmanFilter, UnscentedKalmanFilter])
 def test_robot_and_map_are_as_uncertain_as_they_are_wrong(make):
     """Fifty robots drawn from their own models drive a loop: NEES of pose and map within 99.9 % of chi-square."""

@@ -36,6 +36,7 @@ def test_the_laser_of_the_tubes_sees_what_the_truth_says(real_data):
     np.testing.assert_allclose(found.std(axis=0), [0.033, 0.0255], atol=0.0015)
 
 
+@pytest.mark.long
 def test_the_cameras_of_mrclam_see_what_the_truth_says(real_data):
     """Known figures: range 0.12 to 0.21 m, bearing in the middle 0.006 to 0.011 rad, an offset of robot 4."""
     folder = real_data / "mrclam" / "MRCLAM_Dataset6"

@@ -35,6 +35,7 @@ def folder(tmp_path_factory):
     return out
 
 
+@pytest.mark.long
 def test_places_before_the_robot_are_as_uncertain_as_they_are_wrong(example):
     """Of many measurements of one point, mean and covariance are those of (9.34)-(9.36)."""
     generator = np.random.default_rng(0)
@@ -51,6 +52,7 @@ def test_places_before_the_robot_are_as_uncertain_as_they_are_wrong(example):
     np.testing.assert_allclose(np.cov(places.T), spread[0], rtol=0.05, atol=1e-5)
 
 
+@pytest.mark.long
 def test_known_places_are_where_the_render_has_them(example, folder):
     """A landmark of the render is at the same place, whichever frame it is seen from."""
     render = example.Render.of(folder)
@@ -68,6 +70,7 @@ def test_known_places_are_where_the_render_has_them(example, folder):
     assert np.median(off) < 0.005
 
 
+@pytest.mark.long
 def test_a_robot_among_rendered_landmarks_is_localised(example, folder):
     found = example.localise(folder)
     render = example.Render.of(folder)

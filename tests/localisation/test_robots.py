@@ -13,6 +13,7 @@ from tests.support.wheeled_world import World, drive, started_wrong
 pytestmark = [pytest.mark.usefixtures("one_thread"), pytest.mark.timeout(300)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["range-bearing", "cartesian"])
 def test_a_robot_with_faults_is_found_and_so_are_its_faults(kind):
     world = World(seconds=40.0, kind=kind, delay=0.2, drift=0.06, speed_scale=0.05, outliers=0.1, seed=1)
@@ -30,6 +31,7 @@ def test_a_robot_with_faults_is_found_and_so_are_its_faults(kind):
     assert len(first[0].pose) == len(estimate.pose)
 
 
+@pytest.mark.long
 def test_sightings_that_come_late_do_not_shift_the_poses_in_time():
     """Taken for a robot that follows its controls late, the same recording gives the poses of a while before."""
     recording = drive(World(seconds=40.0, late=0.3, seed=6))
@@ -39,6 +41,7 @@ def test_sightings_that_come_late_do_not_shift_the_poses_in_time():
     assert right["nees_median"] < 6.25 < wrong["nees_median"]
 
 
+@pytest.mark.long
 def test_landmarks_of_an_unknown_map_are_found():
     """No place of a landmark is told: they are moved in the recording, and the estimate is the same."""
     recording = drive(World(seconds=20.0, seed=8))
@@ -62,6 +65,7 @@ def test_a_map_that_is_turned_and_shifted_has_no_error_once_aligned():
     assert found["map_nees_per_dof"] == pytest.approx(found["landmark_nees"] / 2)
 
 
+@pytest.mark.long
 def test_filters_agree_on_a_gentle_problem():
     recording = drive(World(seconds=8.0, seed=2))
     poses = [localise_robots([recording], name)[1][0].pose for name in ("ukf", "ekf", "iterated")]
@@ -69,6 +73,7 @@ def test_filters_agree_on_a_gentle_problem():
         assert np.abs(pose - poses[0]).max() < 0.03
 
 
+@pytest.mark.long
 def test_a_belief_that_is_wrong_and_too_sure_does_not_lock_the_sightings_out():
     """The start is 0.7 m off, 70 of its sigmas: a gate at three sigma would refuse every sighting for ever."""
     recording = started_wrong(drive(World(seconds=30.0, seed=3)), 0.5)
@@ -79,6 +84,7 @@ def test_a_belief_that_is_wrong_and_too_sure_does_not_lock_the_sightings_out():
     assert error[len(error) // 2 :].max() < 0.2
 
 
+@pytest.mark.long
 def test_robots_of_a_batch_are_what_they_are_alone():
     robots = [drive(World(seconds=5.0, seed=seed)) for seed in (4, 5)]
     together = localise_robots(robots)[1]

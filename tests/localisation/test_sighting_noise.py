@@ -1,11 +1,13 @@
 """What a repeated sighting tells, and noise that is learned."""
 
 import numpy as np
+import pytest
 import torch
 
 from sigmaslam_localisation.sighting_noise import CORRELATION_SECONDS, NoiseScale, repetition
 
 
+@pytest.mark.long
 def test_repetitions_tell_together_what_a_markov_process_tells():
     """The variance of the best mean of correlated errors, by their full covariance."""
     for spacing in (0.2, 1.0, 10.0):
@@ -24,6 +26,7 @@ def test_a_first_sighting_is_not_inflated():
     assert torch.isfinite(repetition(torch.zeros(1))).all()
 
 
+@pytest.mark.long
 def test_the_scale_finds_the_variance_of_each_component():
     generator = torch.Generator().manual_seed(3)
     noise, true = NoiseScale(torch.ones(1, 2, dtype=torch.float64)), torch.tensor([4.0, 0.04], dtype=torch.float64)

@@ -32,6 +32,7 @@ def test_there_is_no_text_of_a_graph_that_does_not_ship():
     assert set(TEXTS) == {path.stem for path in WEIGHTS.glob("*.onnx")}
 
 
+@pytest.mark.long
 def test_the_graphs_that_ship_are_what_torch_computes():
     differences = check_graphs(WEIGHTS)
     assert set(differences) == {path.stem for path in WEIGHTS.glob("*.onnx")}
@@ -56,6 +57,7 @@ def test_a_graph_that_nobody_knows_is_named(tmp_path):
     assert "## other.onnx" in graph_page(tmp_path, "command")
 
 
+@pytest.mark.long
 def test_the_cpu_is_checked_against_itself():
     checks = check_networks(WEIGHTS, "cpu")
     assert set(checks) == {"features", "scorer", "verifier", "place_verifier"}
@@ -64,6 +66,7 @@ def test_the_cpu_is_checked_against_itself():
         assert min(check.on_cpu.wall_ms, check.on_provider.process_ms) > 0.0
 
 
+@pytest.mark.long
 def test_a_provider_that_computes_something_else_is_found(monkeypatch):
     calls = []
     right = network_export._timed

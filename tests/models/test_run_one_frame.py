@@ -11,6 +11,7 @@ from tests.support.examples import load_example
 ROOT = Path(__file__).resolve().parents[2]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("index", [3, 6])
 def test_the_pose_is_within_its_covariance_of_the_truth(index):
     example = load_example("run_one_frame")

@@ -12,6 +12,7 @@ from sigmaslam_synthetic.render_sequence import write_sequence
 from sigmaslam_synthetic.simulation import Recipe, Simulation, Studio
 
 
+@pytest.mark.long
 def test_shipped_demo_is_what_its_scene_renders(demo_sequence: Path) -> None:
     content = json.loads((demo_sequence / "scene.json").read_text())
     assert sum(p.stat().st_size for p in demo_sequence.rglob("*") if p.is_file()) <= 4_500_000

@@ -95,6 +95,7 @@ def test_homography_carries_image_0_onto_image_1(monkeypatch):
     assert compared >= 9
 
 
+@pytest.mark.long
 def test_what_the_camera_sees_agrees_where_there_is_texture():
     """With sensor, light and occluders on, textured patches correlate under the homography and not beside it."""
     stream, right, beside = HomographyPairs(2, size=160), [], []

@@ -41,6 +41,7 @@ def test_a_cluster_that_is_not_there_is_named():
         outcomes(square, [0], "nowhere")
 
 
+@pytest.mark.long
 def test_a_job_that_fails_is_handed_over_and_the_others_go_on(ray_address: str | None):
     ended = dict(outcomes(square, [0, 1, 2, 4], ray_address))
     assert {job: ended[job] for job in (0, 2, 4)} == {0: 0, 2: 4, 4: 16}
@@ -48,6 +49,7 @@ def test_a_job_that_fails_is_handed_over_and_the_others_go_on(ray_address: str |
     assert list_failures({"first": ended[1]}) == "first (ValueError: 1 is odd)"
 
 
+@pytest.mark.long
 def test_the_job_of_a_killed_worker_is_done_again_and_each_job_ends_once(ray_address: str | None, tmp_path: Path):
     jobs = [tmp_path / name for name in ("a", "killed", "b", "c")]
     ended = outcomes(die_once, jobs, ray_address)
@@ -62,6 +64,7 @@ def test_a_job_that_kills_every_worker_ends_with_an_error(ray_address: str | Non
     assert len(job.read_text()) == 1 + RETRIES
 
 
+@pytest.mark.long
 def test_two_workers_sleep_at_the_same_time(ray_address: str | None, tmp_path: Path):
     """So that jobs that compute alone on their processors are done 1.7 times as fast or more."""
     spans = [outcome for _, outcome in outcomes(sleep_beside_another, [tmp_path] * 12, ray_address)]
@@ -70,6 +73,7 @@ def test_two_workers_sleep_at_the_same_time(ray_address: str | None, tmp_path: P
     assert len(list(tmp_path.iterdir())) == 2
 
 
+@pytest.mark.long
 def test_frames_and_sequences_are_the_same_bytes_wherever_they_are_rendered(ray_address: str | None, tmp_path: Path):
     write_sequence(tmp_path / "alone" / "organ5", TINY, "sparse")
     write_sequence(tmp_path / "frames" / "organ5", TINY, "sparse", 2, ray=ray_address)
@@ -83,6 +87,7 @@ def test_nothing_is_started_for_no_jobs():
     assert outcomes(square, [], "an address without a cluster") == []
 
 
+@pytest.mark.long
 def test_what_the_caller_raises_stops_all(tmp_path: Path):
     def stop(job: Path, outcome: object) -> None:
         raise KeyboardInterrupt

@@ -45,6 +45,7 @@ def test_the_true_place_shows_what_is_seen_and_so_does_any_period_beside_it():
             assert np.abs(back - pair.image0)[seen].mean() < 0.02, (index, periods)
 
 
+@pytest.mark.long
 def test_shifts_by_whole_periods_other_shifts_and_warps_are_all_drawn():
     kinds = {"warped": 0, "shifted": 0}
     for index in range(40):

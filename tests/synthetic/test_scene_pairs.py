@@ -32,6 +32,7 @@ def assert_equal(a: ScenePair, b: ScenePair) -> None:
     np.testing.assert_array_equal(a.image1, b.image1)
 
 
+@pytest.mark.long
 def test_a_pair_does_not_depend_on_what_was_asked_before() -> None:
     forward, backward = stream(), stream()
     indices = [0, 1, 8, 600, 1]
@@ -64,6 +65,7 @@ def test_neighbours_see_other_scenes_and_every_scene_is_replaced() -> None:
     assert np.diff(first_seen[8:]).min() > 20
 
 
+@pytest.mark.long
 def test_points_move_to_where_the_same_thing_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     clean = Sensor(blur=0.0, read_noise=0.0, photons_at_white=1e9)
     monkeypatch.setattr(scene_pairs, "random_sensor", lambda rng: clean)
@@ -86,6 +88,7 @@ def test_points_move_to_where_the_same_thing_is_seen(monkeypatch: pytest.MonkeyP
     assert hidden > 50
 
 
+@pytest.mark.long
 def test_eyes_of_a_stereo_pair_see_the_same_on_one_row_the_right_one_further_left() -> None:
     pairs = ScenePairs(3, 96, ("small",), stereo=True)
     for index in range(4):
@@ -103,6 +106,7 @@ def test_an_unknown_domain_is_refused() -> None:
         ScenePairs(0, 96, ("moon",))
 
 
+@pytest.mark.long
 def test_forward_motion_is_along_the_axis_through_one_camera_and_back() -> None:
     pairs = ScenePairs(3, 96, ("small",), forward=True)
     steps = []

@@ -73,6 +73,7 @@ def carry(points: np.ndarray, body: np.ndarray, simulation: Simulation, T_from: 
     return result
 
 
+@pytest.mark.long
 def test_reprojected_depth_is_the_flow_and_the_other_eye(rendered: Path) -> None:
     simulation, truth = simulation_of(rendered), truth_of(rendered, 0)
     rig, times = simulation.rig, (0.0, 1.0 / simulation.fps)
@@ -174,6 +175,7 @@ def files_of(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+@pytest.mark.long
 def test_a_stopped_sequence_goes_on_to_the_same_bytes(organ: Path, tmp_path: Path) -> None:
     stops: list[int] = []
 
@@ -189,6 +191,7 @@ def test_a_stopped_sequence_goes_on_to_the_same_bytes(organ: Path, tmp_path: Pat
     assert files_of(tmp_path / "out") == files_of(organ)
 
 
+@pytest.mark.long
 def test_a_render_killed_before_its_scene_is_written_goes_on_to_the_same_bytes(
     organ: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

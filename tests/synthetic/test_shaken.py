@@ -113,6 +113,7 @@ def test_a_camera_that_nobody_carries_is_not_shaken(preset: str) -> None:
         Recipe(preset, 3, motion="shaken").check()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("preset", CARRIED)
 def test_the_slow_shutter_blurs_by_5_to_25_pixels_in_both_eyes_at_the_peak(preset: str) -> None:
     simulation = simulate(Recipe(preset, 12, 5, "shaken", sensor="slow"))

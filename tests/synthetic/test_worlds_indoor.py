@@ -54,6 +54,7 @@ def look(renderer: Renderer, poses: np.ndarray, times: np.ndarray, focal: float)
     return depth.reshape(-1, 30, 40).numpy(), body.reshape(-1, 30, 40).numpy()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("world", WORLDS)
 def test_world_is_a_function_of_its_seed(world: ModuleType) -> None:
     wish = Wish(DURATION, movers=0.2, textures=1)

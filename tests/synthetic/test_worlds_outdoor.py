@@ -31,6 +31,7 @@ def shown(request: pytest.FixtureRequest) -> tuple[str, Episode, Renderer]:
     return request.param, episode, Renderer(episode.scene)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("domain", DOMAINS)
 def test_the_seed_alone_makes_the_scene(domain: str):
     first, again, other = (make(domain, seed).scene.to_json() for seed in (0, 0, 1))
@@ -38,6 +39,7 @@ def test_the_seed_alone_makes_the_scene(domain: str):
     assert first != other
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("domain", DOMAINS)
 def test_the_scene_survives_json(domain: str):
     content = make(domain, 2, movers=SHARE).scene.to_json()
@@ -53,6 +55,7 @@ def test_textures_are_few_and_of_the_bank(domain: str):
     assert all(40 <= seed < 43 for _, seed in textures)
 
 
+@pytest.mark.long
 def test_nothing_is_nearer_than_0_3_m(shown: tuple[str, Episode, Renderer]):
     _, episode, renderer = shown
     eye = Eye(CameraModel(40, 30, 20.0, 20.0, 19.5, 14.5))
@@ -104,6 +107,7 @@ def test_the_lane_is_free_and_the_camera_is_1_65_m_above_it(shown: tuple[str, Ep
     assert height.numpy() == pytest.approx(1.65, abs=0.1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("domain", DOMAINS)
 def test_motions_do_what_they_say(domain: str):
     times = np.linspace(0, DURATION, 401)

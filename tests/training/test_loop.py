@@ -56,6 +56,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory, tiny: TrainingConfig) -> 
     return out
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("happens", "saved"),
     [

@@ -66,6 +66,7 @@ def errors(found: MatchSet) -> np.ndarray:
 # What a record is
 
 
+@pytest.mark.long
 def test_a_record_is_the_same_whenever_it_is_asked_for(planes: PairRecord):
     sets = MatchSets(0)
     sets.record(VIDEO)

@@ -99,6 +99,7 @@ def test_of_a_pair_of_another_place_all_that_is_found_is_wrong(source: str, monk
     assert np.median(foreign.inputs[:, 1]) > np.median(true.inputs[:, 1]) + 1.0
 
 
+@pytest.mark.long
 def test_so_many_pairs_are_foreign():
     """About one in seven."""
     records = [record("scenes")] * 60

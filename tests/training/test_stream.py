@@ -69,6 +69,7 @@ def test_an_unknown_mix_is_refused():
         MixedPairs("photographs", 0, 96)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("ranks", [2, 4])
 def test_shares_of_the_processes_make_up_the_batches_of_one(ranks):
     whole = list(pair_loader("leaves", 0, 96, 4, 12, 16, 4, workers=0))

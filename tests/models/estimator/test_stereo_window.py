@@ -158,6 +158,7 @@ def test_what_the_slope_leaves_grows_with_the_fourth_power_of_the_spread():
     torch.testing.assert_close(narrow, wide / 16, rtol=0, atol=2e-3 * float(wide.abs().max()))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scale", [0.3, 1.0])
 def test_mean_and_covariance_agree_with_monte_carlo(scale):
     landmarks, relative = some_landmarks(4, seed=5), exp_se3(0.1 * random_numbers(6, seed=3))
