@@ -30,6 +30,7 @@ def targets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, FuzzTarget]:
     return make_targets(tmp_path_factory.mktemp("targets"))
 
 
+@pytest.mark.long
 def test_every_target_is_tested(targets: dict[str, FuzzTarget]):
     assert tuple(targets) == NAMES
 
@@ -71,6 +72,7 @@ CONTENTS = st.recursive(
 )
 
 
+@pytest.mark.long
 @settings(max_examples=40, deadline=None)
 @given(content=CONTENTS)
 def test_any_yaml_is_read_or_refused_by_name(content: object):

@@ -73,6 +73,7 @@ def test_there_are_no_links():
     assert not [line for line in listed.stdout.splitlines() if line.startswith("120000")]
 
 
+@pytest.mark.long
 def test_no_rooms_and_no_modules_import_each_other_in_a_circle():
     for name_of in (_room, str):
         graph: dict[str, set[str]] = {}
@@ -84,6 +85,7 @@ def test_no_rooms_and_no_modules_import_each_other_in_a_circle():
             pytest.fail(" -> ".join(error.args[1]))
 
 
+@pytest.mark.long
 def test_rooms_import_only_what_stands_below_them():
     floor = {room: k for k, rooms in enumerate(FLOORS) for room in rooms}
     assert {_room(module) for module in _files()} == floor.keys()
@@ -93,6 +95,7 @@ def test_rooms_import_only_what_stands_below_them():
                 assert floor[other] < floor[room], f"{module} imports {imported}"
 
 
+@pytest.mark.long
 def test_the_run_time_names_no_package_beside_it():
     """Back ends and commands of other packages register themselves; the weights are no code."""
     for module in _modules_of("sigmaslam"):
@@ -106,6 +109,7 @@ def test_the_filters_have_their_former_name_besides():
         assert getattr(sigmaslam.filters, name) is getattr(sigmaslam_filters, name)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("layer", FORBIDDEN)
 def test_lower_layers_do_not_import_upper_ones(layer: str):
     importer: dict[str, str] = {}
@@ -172,6 +176,7 @@ class Class:
     assert set(_all_imports(ast.parse(source))) == {*first, "d"}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("module", ["sigmaslam_filters", "sigmaslam_filters.consistency.plots"])
 def test_the_filters_load_neither_opencv_nor_onnxruntime(module: str):
     code = f"import sys, {module}; print(*sorted({{name.split('.')[0] for name in sys.modules}}))"

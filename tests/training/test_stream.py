@@ -80,6 +80,7 @@ def test_shares_of_the_processes_make_up_the_batches_of_one(ranks):
             assert torch.equal(found, expected)
 
 
+@pytest.mark.long
 def test_turned_leaves_are_turned_further():
     def turns(source: str) -> np.ndarray:
         """Degrees by which the middle of the second view is turned against the first."""
