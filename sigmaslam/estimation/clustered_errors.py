@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.geometry.image_cells import CELLS, image_cells
-
-# Nine frames of ten of quiet renders stay below it: what neighbours share there, the noise of landmarks knows.
-_USUAL = 2.0
 
 
 def clustering(places: np.ndarray, size: tuple[int, int], scores: np.ndarray, information: np.ndarray) -> float:
@@ -31,4 +29,4 @@ def clustering(places: np.ndarray, size: tuple[int, int], scores: np.ndarray, in
     if used < 2 or alone <= 0.0:
         return 1.0
     factor = together / alone * used / (used - 1)
-    return factor if factor > _USUAL else 1.0
+    return factor if factor > ACCEPTANCE.usual_clustering else 1.0

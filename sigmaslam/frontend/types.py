@@ -7,11 +7,8 @@ from typing import Protocol
 
 import numpy as np
 
+from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.table import Table
-
-# Of a pair with the eyes swapped, more than this share of the disparities is negative by more than a pixel, which no
-# disparity offset explains.
-_MAX_NEGATIVE = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +70,9 @@ class StereoView:
         False with fewer than `min_to_judge` disparities.
         """
         known = self.disparity[np.isfinite(self.disparity)]
-        count, negative = len(known) + self.behind, int((known < -1.0).sum()) + self.behind
-        return count >= min_to_judge and negative > _MAX_NEGATIVE * count
+        behind = int((known < ACCEPTANCE.swapped_disparity).sum()) + self.behind
+        count = len(known) + self.behind
+        return count >= min_to_judge and behind > ACCEPTANCE.swapped_share * count
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.frontend import StereoView
 from sigmaslam.frontend.image_sharpness import sharpness
@@ -27,12 +28,6 @@ from sigmaslam.slam.point_map import (
     points_in_world,
     window_points,
 )
-
-# A view less sharp by this factor than the sharpest of the keyframes is blurred: in drives 0.9 to 1.1 are common from
-# frame to frame and 0.8 half a second later; motion blur over 11 px gives 0.6 to 0.75.
-_BLURRED = 0.75
-# A view counts as no less sharp than this share of the sharpest.
-_MIN_SHARPNESS = 0.1
 
 
 class Keyframes:
@@ -84,7 +79,9 @@ class Keyframes:
     def blur(self, left: np.ndarray) -> float:
         """How many times as sharp as an image the sharpest keyframe is; 1 where what is seen may be the reason."""
         here, sharpest = sharpness(left), max(keyframe.sharpness for keyframe in self.active)
-        return sharpest / max(here, _MIN_SHARPNESS * sharpest) if here < _BLURRED * sharpest else 1.0
+        if here >= ACCEPTANCE.sharpness * sharpest:
+            return 1.0
+        return sharpest / max(here, ACCEPTANCE.least_sharpness * sharpest)
 
     def marginalise_oldest(self, spare: Keyframe | None = None) -> np.ndarray:
         """Moves the oldest keyframe to the past, and its landmarks to the map.

@@ -6,6 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
+from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
 from sigmaslam.frontend import StereoView
@@ -47,7 +48,7 @@ class AdmitAll:
     restarts_anywhere = True
 
     def __init__(self, min_inliers: int) -> None:
-        self.min_points = 2 * min_inliers
+        self.min_points = ACCEPTANCE.keyframe_points * min_inliers
 
     def admit(self, view: StereoView, pose: np.ndarray, window: KeyframeWindow) -> np.ndarray:
         """All of them."""

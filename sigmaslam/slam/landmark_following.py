@@ -4,17 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.frontend.followed_patches import FLOW_LEVELS, FLOW_WINDOW
 from sigmaslam.frontend.lucas_kanade import lucas_kanade
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.guided_matching import GuidedMatcher, GuidedMatches
 from sigmaslam.slam.keyframe import Keyframe
-
-# With a smaller share of the landmarks seen by both eyes than so much of the usual one, something has happened that
-# following cannot judge: the eyes are swapped, say.
-_FALLEN = 0.6
-# How fast the usual share follows that of a frame.
-_ADAPTATION = 0.2
 
 
 class LandmarkFollower:
@@ -77,8 +72,8 @@ class LandmarkFollower:
         share = float(stereo.mean()) if len(stereo) else 0.0
         usual = share if self._usual is None else self._usual
         # Also after a fall, so that what stays so becomes usual.
-        self._usual = usual + _ADAPTATION * (share - usual)
-        return share < _FALLEN * usual
+        self._usual = usual + ACCEPTANCE.stereo_usual_gain * (share - usual)
+        return share < ACCEPTANCE.stereo_fall * usual
 
     def _carry(self, left: np.ndarray, landmark_id: np.ndarray, predicted: np.ndarray) -> np.ndarray:
         """(K, 2) where optical flow takes landmarks; NaN for those that the last frame did not see."""

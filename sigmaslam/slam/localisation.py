@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.frame_update import FrameUpdate
@@ -19,20 +20,6 @@ from sigmaslam.slam.keyframe import Keyframe
 from sigmaslam.slam.landmark_following import LandmarkFollower
 from sigmaslam.slam.stopwatch import Stopwatch
 from sigmaslam.slam.unguided_matching import UnguidedMatcher
-
-# Of what was found near a prediction most must agree: what moves may have become the prediction. A pose without one
-# was told from what moves already.
-_MOST, _MIN_SHARE = 0.5, 0.3
-# A fit near the prediction with a larger NIS per degree of freedom may sit in a wrong place: it is compared with one
-# that does without the prediction.
-_DOUBTFUL_NIS = 2.0
-# With so large a NIS a pose needs so many times the least number of inliers.
-_DOUBTFUL_INLIERS = 3
-# Without a prediction the view is compared with so many of the last keyframes.
-_LAST_KEYFRAMES = 3
-# How far the landmarks of other keyframes may be from where an unguided pose expects them: share of the scene's depth,
-# and radians.
-_MARGIN = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +81,7 @@ class Localiser:
         clock.lap("match")
         fit = self._fit_near(matches, prediction)
         clock.lap("filter")
-        if fit is None or fit.nis_per_dof > _DOUBTFUL_NIS or self.follower.has_fallen(matches, fit.inliers):
+        if fit is None or fit.nis_per_dof > ACCEPTANCE.doubtful_nis or self.follower.has_fallen(matches, fit.inliers):
             return None
         return matches, fit
 
@@ -116,12 +103,12 @@ class Localiser:
             clock.lap("match")
             fit = self._fit_near(matches, prediction)
             clock.lap("filter")
-        if fit is None or fit.nis_per_dof > _DOUBTFUL_NIS:
+        if fit is None or fit.nis_per_dof > ACCEPTANCE.doubtful_nis:
             other_matches, other = self._localise_anywhere(view, keyframes, prediction, clock)
             if fit is None or (other is not None and other.nis_per_dof < fit.nis_per_dof):
                 matches, fit = other_matches, other
-        min_inliers = _DOUBTFUL_INLIERS * self.config.min_inliers
-        if fit is not None and fit.nis_before_scaling > _DOUBTFUL_NIS and fit.count < min_inliers:
+        min_inliers = ACCEPTANCE.doubtful_inliers * self.config.min_inliers
+        if fit is not None and fit.nis_before_scaling > ACCEPTANCE.doubtful_nis and fit.count < min_inliers:
             return matches, None  # chance agreement of a few
         return matches, fit
 
@@ -132,20 +119,21 @@ class Localiser:
         if count < min_inliers:
             return None
         fit = self.update.fit(matches.views, pose, covariance, min_inliers)
-        return fit if fit is not None and fit.count >= _MOST * count else None
+        return fit if fit is not None and fit.count >= ACCEPTANCE.guided_share * count else None
 
     def _localise_anywhere(
         self, view: StereoView, keyframes: list[StereoView], prediction: Prediction, clock: Stopwatch
     ) -> tuple[GuidedMatches, FrameFit | None]:
         """Without a prediction: the pose relative to one of the last keyframes, then landmarks near there."""
         matches = GuidedMatches.empty()
-        for back in range(1, min(_LAST_KEYFRAMES, len(keyframes)) + 1):
+        for back in range(1, min(ACCEPTANCE.last_keyframes, len(keyframes)) + 1):
             relative = self.unguided.relative_pose_to(keyframes[-back], view)
             clock.lap("match")
             if relative is None:
                 continue
             start = self.window.posterior.poses[-back] @ relative.T_key_camera
-            margin = np.diag(np.repeat([_MARGIN * self.window.depth, _MARGIN], 3) ** 2)
+            share = ACCEPTANCE.unguided_margin
+            margin = np.diag(np.repeat([share * self.window.depth, share], 3) ** 2)
             uncertain = turn_covariance(start, relative.covariance + margin)
             matches = self.guided.match_guided(view, keyframes, start, uncertain, -back, alone=True)
             clock.lap("match")
@@ -153,6 +141,6 @@ class Localiser:
                 matches.views, prediction.pose, prediction.covariance, self.config.min_inliers, start, relative.scale
             )
             clock.lap("filter")
-            if fit is not None and fit.count >= _MIN_SHARE * len(matches.probability):
+            if fit is not None and fit.count >= ACCEPTANCE.unguided_share * len(matches.probability):
                 return matches, fit
         return matches, None

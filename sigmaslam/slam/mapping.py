@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
@@ -24,9 +25,6 @@ from sigmaslam.slam.landmark_admission import LandmarkAdmission
 from sigmaslam.slam.measurement_noise import MeasurementNoise
 from sigmaslam.table import Table
 
-# A blurred view whose matches scatter by so many times the variance that they claim is no keyframe. A sharp one is: no
-# keyframes at all for 20 frames lost the KITTI drive.
-_SCATTERED = 1.6
 # Images of fewer pixels have landmarks closer together than the setting says, down to this share of it.
 _FULL_SPACING_FROM, _LEAST_SPACING = 640 * 480, 2 / 3
 # How fast the landmarks that a frame loses follow those of the last one.
@@ -122,9 +120,10 @@ class Mapper:
         """
         self._loss += _LOSS_ADAPTATION * (self._last_count - fit.count - self._loss)
         self._last_count = fit.count
-        # A scale beyond the NIS is that of blur: such a keyframe would spoil what comes after it.
+        # A scale beyond the NIS is that of blur: such a keyframe would spoil what comes after it. A sharp view that
+        # scatters is one: no keyframes at all for 20 frames lost the KITTI drive.
         inflation = fit.inflation / fit.clustering
-        blurred = inflation > fit.nis_before_scaling > _SCATTERED
+        blurred = inflation > fit.nis_before_scaling > ACCEPTANCE.scattered_nis
         if fit.count >= self.config.keyframe_ratio * self._landmarks_in_keyframe or blurred:
             return None
         view = frame.view

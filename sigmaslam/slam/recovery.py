@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.frontend import StereoView
@@ -21,9 +22,6 @@ from sigmaslam.slam.phase import Course, Phase
 from sigmaslam.slam.relocalisation import Relocalisation
 
 _LOGGER = logging.getLogger(__name__)
-
-# Tracking starts from a view of which this share of the keypoints is seen by both eyes.
-_MIN_STEREO_SHARE = 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +58,8 @@ class Recovery:
             seen_by_both = np.isfinite(view.disparity).mean()
             # Of an earlier run it was a keyframe.
             known = self.start is not None
-            return self._start(view, timestamp) if known or seen_by_both >= _MIN_STEREO_SHARE else None
+            accepted = known or seen_by_both >= ACCEPTANCE.start_stereo_share
+            return self._start(view, timestamp) if accepted else None
         since = timestamp - course.tracked_at
         if since <= self.config.lost_seconds or not self.admission.restarts_anywhere:
             return None

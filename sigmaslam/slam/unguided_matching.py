@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.frontend import Frontend, KeypointSearch, StereoView
 from sigmaslam.geometry.camera import RectifiedStereo
@@ -13,12 +14,6 @@ from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.measurement_noise import MeasurementNoise
 from sigmaslam.two_view.scene_pose import estimate_scene_pose
 from sigmaslam.two_view.stereo_pose import RelativePose
-
-# A pose from matches alone has no prediction to agree with. Where fewer than this share of the matches that should be
-# right by their probabilities agree with it, three times as many inliers are required: symmetric texture in a mirrored
-# image once gave 41 inliers, 31 by their probabilities, where 66 should be right. Half of the right ones may be on
-# movers.
-_MIN_SHARE, _FEW_AGREE = 0.5, 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,5 +54,6 @@ class UnguidedMatcher:
             return None
         # Each by its probability: many doubtful ones are few.
         agreeing = float(matches.probability[relative.inliers].sum())
-        fair = agreeing >= _MIN_SHARE * matches.probability.sum()
-        return relative if agreeing >= self.config.min_inliers * (1 if fair else _FEW_AGREE) else None
+        fair = agreeing >= ACCEPTANCE.probable_share * matches.probability.sum()
+        least = self.config.min_inliers * (1 if fair else ACCEPTANCE.improbable_inliers)
+        return relative if agreeing >= least else None

@@ -6,18 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.image_cells import CELLS, image_cells
 from sigmaslam.geometry.se3 import se3_inverse, transform_points
-from sigmaslam.two_view.stereo_pose import RelativePose, estimate_relative_pose
-
-# A motion that explains less than this share of what the other one explains is no rival.
-_RIVAL = 1 / 3
-# Of two rivals the scene is the one whose points are so many times as far away, in the median.
-_FARTHER = 1.25
-# Poses that see most points within so many pixels of each other say the same.
-_SAME = 2.0
-_MIN_POINTS = 8
+from sigmaslam.two_view.stereo_pose import MIN_POINTS, RelativePose, estimate_relative_pose
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +59,7 @@ def estimate_scene_pose(
     if pose is None:
         return None
     rest = np.flatnonzero(~pose.inliers)
-    if len(rest) < _MIN_POINTS:
+    if len(rest) < MIN_POINTS:
         return pose
     other = estimate_relative_pose(camera, *(each[rest] for each in matched))
     if other is None:
@@ -77,10 +70,10 @@ def estimate_scene_pose(
     cells = image_cells(landmarks[:, :2], camera.width, camera.height)
     motions = [_Motion.of(each, cells, landmarks[:, 2], probability) for each in (pose, other)]
     lesser, greater = sorted(motions, key=lambda motion: motion.area)
-    if lesser.area < _RIVAL * greater.area or _are_alike(camera, landmarks, pose, other):
+    if lesser.area < ACCEPTANCE.rival_area * greater.area or _are_alike(camera, landmarks, pose, other):
         return greater.pose
     nearer, farther = sorted(motions, key=lambda motion: -motion.disparity)
-    return farther.pose if nearer.disparity > _FARTHER * farther.disparity else None
+    return farther.pose if nearer.disparity > ACCEPTANCE.scene_farther * farther.disparity else None
 
 
 def _are_alike(camera: RectifiedStereo, landmarks: np.ndarray, one: RelativePose, other: RelativePose) -> bool:
@@ -92,4 +85,4 @@ def _are_alike(camera: RectifiedStereo, landmarks: np.ndarray, one: RelativePose
     if not front.any():
         return False
     apart = camera.project(first[front])[:, :2] - camera.project(second[front])[:, :2]
-    return float(np.median(np.linalg.norm(apart, axis=1))) < _SAME
+    return float(np.median(np.linalg.norm(apart, axis=1))) < ACCEPTANCE.same_motion

@@ -16,9 +16,11 @@ from sigmaslam.two_view.epipolar import estimate_epipolar_pose
 _THRESHOLDS = (2.0, 0.5)
 # The true variances may be smaller than the claimed ones by this factor.
 _MIN_SCALE = 1.0 / 16.0
-_MIN_POINTS = 8
+MIN_POINTS = 8
+"""Fewer agree with a pose by chance: three fix it."""
 # Gauss-Newton takes so many steps. The scale of its robust loss, standard deviations, shrinks by a factor each step.
 _STEPS, _FIRST_SCALE, _NARROWING, _LAST_SCALE = 10, 8.0, 0.75, 2.0
+# Beyond this condition number float64 inverts noise: the points leave something free.
 _MAX_CONDITION = 1e14
 # A smaller disparity gives no scale, pixels.
 _MIN_DISPARITY = 1.0
@@ -68,7 +70,7 @@ def estimate_relative_pose(
         The pose; None when fewer than eight points agree with either candidate.
     """
     near = landmarks[:, 2] >= _MIN_DISPARITY
-    if near.sum() < _MIN_POINTS:
+    if near.sum() < MIN_POINTS:
         return None
     points = camera.triangulate(np.where(near[:, None], landmarks, [0.0, 0.0, 1.0]))
     matches = _StereoMatches(camera, landmarks, landmark_sigma, measurement, noise, near * probability)
@@ -107,7 +109,7 @@ def _from_essential(
         return None
     R, direction = pose.R, pose.direction
     used = near & pose.inliers
-    if used.sum() < _MIN_POINTS:
+    if used.sum() < MIN_POINTS:
         return None
     # x ~ R X + s t: the cross product with the ray leaves one unknown per point, s. Its median is robust.
     rays = np.linalg.solve(camera.matrix, np.c_[pixels[used], np.ones(used.sum())].T).T
@@ -230,7 +232,7 @@ def _pose_with_inliers(
 ) -> RelativePose | None:
     """The pose with its inliers by the squared errors (M,), and its covariance from the claimed variances."""
     inliers = (matches.weight > 0) & (squared < scale * CHI_SQUARE_999[3])
-    if inliers.sum() < _MIN_POINTS:
+    if inliers.sum() < MIN_POINTS:
         return None
     _, by_pose, information = matches.linearise(T_camera_key)
     jacobian = by_pose[inliers]

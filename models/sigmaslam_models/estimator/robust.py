@@ -5,14 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999, CHI_SQUARE_MEDIAN
 
 # A disparity that is not there: its variance, pixels squared.
 UNKNOWN_VARIANCE = 1e12
-# What so many agree on is no matter of a few outliers.
-_NEARLY_ALL = 0.95
-# Right matches are not worse than three times the standard deviation that they claim, all together.
-_MAX_SCALE = 9.0
 
 
 def mask_missing(measurement: Tensor, mean: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -51,8 +48,8 @@ def common_scale(squared: Tensor, components: Tensor, usable: Tensor) -> Tensor:
     # Half of them are expected above 1; by chance no more than three standard deviations of that count besides.
     scattered = ((ratio > 1.0).to(squared.dtype) * counts).sum() > 0.5 * count + 1.5 * torch.sqrt(count)
     agrees = (squared <= factor * chi_square(CHI_SQUARE_999, components)).to(squared.dtype)
-    nearly_all = torch.tensor(_NEARLY_ALL, dtype=squared.dtype, device=squared.device)
-    believed = scattered & (factor <= _MAX_SCALE) & ((agrees * counts).sum() >= nearly_all * count)
+    nearly_all = torch.tensor(ACCEPTANCE.scaled_agreement, dtype=squared.dtype, device=squared.device)
+    believed = scattered & (factor <= ACCEPTANCE.max_noise_scale) & ((agrees * counts).sum() >= nearly_all * count)
     return torch.where(believed, factor, torch.ones_like(factor))
 
 

@@ -1,0 +1,66 @@
+"""The rules of acceptance: what lets a pose be said. `docs/acceptance.md` says where each acts and who measured it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Acceptance:
+    """Bounds by which poses, and what they are made from, are believed. Least inliers are of `TrackerConfig`.
+
+    Attributes:
+        stereo_fall: share of the usual share of followed landmarks that have a disparity; with less the eyes may be
+            swapped, which following cannot tell.
+        stereo_usual_gain: per frame, by which the usual share follows; after a fall, too, so that what stays becomes
+            usual.
+        guided_share: of the matches near a prediction; fewer agree where the prediction has become a mover's.
+        unguided_share: of the matches near a pose without a prediction; fewer suffice, it was told from movers before.
+        doubtful_nis: NIS per degree of freedom; a fit above it may sit in a wrong place.
+        doubtful_inliers: times the least inliers above that NIS; so large a noise excuses chance agreement of a few.
+        last_keyframes: number compared without a prediction; one of them may be blurred or covered.
+        unguided_margin: share of the scene's depth, and radians, that an unguided pose is off by beyond its covariance.
+        probable_share: of the matches that should be right by their probabilities; symmetric texture gives less.
+        improbable_inliers: times the least inliers below that share; half of the right matches may be on movers.
+        rival_area: share of the image that the greater motion explains; a lesser one is a wrong lens or chance.
+        scene_farther: ratio of median disparities; of two rivals the scene lies behind what moves.
+        same_motion: pixels between what two poses see, in the median; nearer ones say the same.
+        scaled_agreement: share of the views that agree at the frame's own noise scale; with fewer they are outliers.
+        max_noise_scale: of variances; right matches err by no more than three times what they claim, all together.
+        sharpness: share of the sharpest keyframe's; drives give 0.8 to 1.1, motion blur over 11 px 0.6 to 0.75.
+        least_sharpness: share of the sharpest keyframe's; bounds by how much a blurred frame is less certain.
+        usual_clustering: factor on variances; nine of ten quiet frames stay below, the noise of landmarks covers it.
+        scattered_nis: NIS per degree of freedom; a blurred view above it would spoil what comes after, as a keyframe.
+        keyframe_points: times the least inliers, of stereo points; most of them are lost until the next keyframe.
+        start_stereo_share: of the keypoints seen by both eyes; with less a first keyframe may be of one eye alone.
+        swapped_share: of the disparities behind infinity; no offset puts more there, swapped eyes do.
+        swapped_disparity: pixels; a lesser disparity is behind infinity whatever the offset.
+    """
+
+    stereo_fall: float = 0.6
+    stereo_usual_gain: float = 0.2
+    guided_share: float = 0.5
+    unguided_share: float = 0.3
+    doubtful_nis: float = 2.0
+    doubtful_inliers: int = 3
+    last_keyframes: int = 3
+    unguided_margin: float = 0.01
+    probable_share: float = 0.5
+    improbable_inliers: int = 3
+    rival_area: float = 1 / 3
+    scene_farther: float = 1.25
+    same_motion: float = 2.0
+    scaled_agreement: float = 0.95
+    max_noise_scale: float = 9.0
+    sharpness: float = 0.75
+    least_sharpness: float = 0.1
+    usual_clustering: float = 2.0
+    scattered_nis: float = 1.6
+    keyframe_points: int = 2
+    start_stereo_share: float = 0.25
+    swapped_share: float = 0.1
+    swapped_disparity: float = -1.0
+
+
+ACCEPTANCE = Acceptance()
+"""The one of the tracker."""
