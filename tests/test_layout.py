@@ -52,6 +52,8 @@ FLOORS = (
 )
 # The filters likewise, from the ground up; "" is the files that users read first.
 FILTER_FLOORS = (("core", "consistency"), ("manifolds",), ("",), ("compiler", "graphs"))
+# Rooms whose numbers decide what a pose is.
+EXPLAINED = ("frontend", "two_view", "estimation", "slam")
 # Of the tracker.
 MAX_LINES, MAX_METHODS = 300, 12
 
@@ -154,6 +156,32 @@ def test_the_tracker_s_modules_and_classes_stay_small(room: str):
                     assert len(methods) <= MAX_METHODS, f"{module}.{node.name}"
 
 
+def test_every_number_between_images_and_poses_has_a_reason():
+    """Each on its own: a comment above it or behind it, or a docstring below."""
+    bare = [
+        f"{module}: {name}"
+        for module, path in _files().items()
+        if module.startswith("sigmaslam.") and _room(module) in EXPLAINED
+        for name in _numbers_without_a_word(path.read_text())
+    ]
+    assert not bare, "\n".join(bare)
+
+
+def test_a_number_is_explained_by_a_comment_or_a_docstring_of_its_own():
+    source = """
+# Pixels.
+EXPLAINED = 3.0
+BARE = 4.0
+BEHIND = 5.0  # pixels
+BELOW, BESIDE = 6, 7
+\"\"\"Metres.\"\"\"
+NAMES = ("one", "two")
+_COMPUTED: float = -2.0 * np.log(0.7)
+lower = 8
+"""
+    assert list(_numbers_without_a_word(source)) == ["BARE", "_COMPUTED"]
+
+
 def test_imports_for_type_checking_do_not_count_and_those_inside_functions_apart():
     source = """
 import a
@@ -216,6 +244,22 @@ def test_tests_share_through_the_support_package_alone(path: Path):
             assert parts[0] not in siblings, f"line {node.lineno} imports {module}, a file beside it: use tests.support"
             parts = parts[1:] if parts[0] == "tests" else parts[:1]
             assert not any(part.startswith("test_") for part in parts), f"line {node.lineno} imports the test {module}"
+
+
+def _numbers_without_a_word(source: str) -> Iterator[str]:
+    """Names of constants at the head of a module that hold a number and no reason for it."""
+    lines, nodes = source.splitlines(), ast.parse(source).body
+    for node, after in zip(nodes, [*nodes[1:], None], strict=True):
+        if not isinstance(node, ast.Assign | ast.AnnAssign) or node.value is None:
+            continue
+        names = ast.unparse(node.targets[0] if isinstance(node, ast.Assign) else node.target)
+        values = [each.value for each in ast.walk(node.value) if isinstance(each, ast.Constant)]
+        if names != names.upper() or not any(type(value) in (int, float) for value in values):
+            continue
+        documented = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+        commented = "#" in lines[node.lineno - 1] or lines[node.lineno - 2].startswith("#")
+        if not documented and not commented:
+            yield names
 
 
 def _room(module: str) -> str:

@@ -4,8 +4,9 @@ import numpy as np
 
 # Share of a normal distribution within two standard deviations.
 NORMAL_WITHIN_2 = 0.9544997361036416
-# 68 and 99 % with 2 degrees of freedom.
+# 68 % with 2 degrees of freedom.
 CHI_SQUARE_68_OF_2 = 2.27886856637673
+# 99 % with 2 degrees of freedom.
 CHI_SQUARE_99_OF_2 = 9.21034037197618
 # Medians with 0, 1, 2 and 3 degrees of freedom; of nothing no share is larger.
 CHI_SQUARE_MEDIAN = np.array([np.inf, 0.454936423119572, 1.3862943611198906, 2.3659738843753377])

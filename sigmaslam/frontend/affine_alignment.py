@@ -11,21 +11,25 @@ from typing import NamedTuple
 import numpy as np
 
 from sigmaslam.frontend.knn import nearest_points
-from sigmaslam.frontend.patch_kernels import align
+from sigmaslam.frontend.patch_kernels import MAX_ZOOM, align
 from sigmaslam.frontend.types import Refinement
 
+# Three matches fix a map. Where 60 % are wrong, 24 find 0.60 of the maps, 12 only 0.40 (docs/notebook/following.md).
 _NEIGHBOURS = 24
 # Scale of the robust weight, pixels: from the first fit to the last.
 _FIRST_SCALE, _LAST_SCALE = 12.0, 2.0
+# The scale, times 0.7 each time, has come down after six; 12 fits find no more maps than eight.
 _FITS = 8
 # What holds a map back that its neighbours leave undetermined.
 _PRIOR = 1.0
+# The largest patch that the kernels take, 15 samples; five in place of seven leave 1.65 times the error.
 _RADIUS = 7
+# From a pixel off: after three steps 0.13 px are left in the median, after six 0.10, after twelve 0.09.
 _ITERATIONS = 6
+# A wider window is better where the map is exact (0.86 times the error with 1.0), and worse where it is off by 10 %.
 _TAPER = 0.6
+# Patches that agree less show something else; the verifier judges the others, by their correlation too.
 _MIN_CORRELATION = 0.5
-# Between the images around a match.
-_MAX_ZOOM = 5.0
 
 
 class AlignedPatches(NamedTuple):
@@ -106,7 +110,7 @@ def align_patches(
         np.isfinite(A).all(axis=(1, 2)), np.linalg.det(np.nan_to_num(A, posinf=0.0, neginf=0.0)), 0.0
     )
     zoom = np.sqrt(np.maximum(determinant, 0.0))
-    usable = (zoom > 1.0 / _MAX_ZOOM) & (zoom < _MAX_ZOOM) & _inside(image0, points0) & _inside(image1, points1)
+    usable = (zoom > 1.0 / MAX_ZOOM) & (zoom < MAX_ZOOM) & _inside(image0, points0) & _inside(image1, points1)
     rows = np.flatnonzero(usable)
     # The finer image is smoothed as much as the coarser one's pixels do, in steps of half an octave.
     half_octaves = np.round(2.0 * np.log2(zoom[rows])).astype(int)

@@ -9,9 +9,9 @@ import numpy as np
 
 from sigmaslam.frontend.types import Features
 
-# Standard deviation of a keypoint's place, relative to the diameter from OpenCV. It is half a pixel of the octave for
-# ORB's patches of 31 pixels, and less for SIFT, which interpolates.
+# Standard deviation of a keypoint's place, relative to the diameter from OpenCV: SIFT interpolates it.
 _SIFT_SIGMA = 0.1
+# Likewise, half a pixel of the octave: patches have 31 pixels.
 _ORB_SIGMA = 0.5 / 31
 
 

@@ -17,8 +17,9 @@ FLOW_WINDOW, FLOW_LEVELS = 15, 3
 """Of the optical flow that gives starts: side of its patches, pixels, and levels above the image itself."""
 # Patches in samples, Gauss-Newton steps, and the window's standard deviation in radii.
 _RADIUS, _ITERATIONS, _TAPER = 5, 5, 1.0
-# A patch that agrees less than this where it was followed to is searched for again, first in images so much smaller.
+# A patch that agrees less than this where it was followed to is searched for again.
 _MIN_AGREEMENT = 0.9
+# First in images so much smaller: alignment moves a patch by 3 pixels, there by 12 and 6 of the image.
 _SCALES = (4, 2)
 # A prediction is corrected by so many neighbours, where there are enough.
 _CORRECTING, _MIN_CORRECTING = 7, 8

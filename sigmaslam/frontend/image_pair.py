@@ -27,11 +27,14 @@ from sigmaslam.readers.images import check_grey, read_grey
 DETECTORS = {"learned": LearnedDetector, "sift": SiftDetector, "orb": OrbDetector}
 # Matches with a smaller probability are dropped by default.
 MIN_PROBABILITY = 0.5
+# Pixels; three cells of the coarsest map of the network, a 32nd of the image.
 _MIN_SIDE = 96
 # Larger images are shrunk to this long side, pixels: a network sees texture of few pixels, and photographs of many
 # are blurred and noisy at those.
 _LONGEST_SIDE = 1600
+# With fewer matches there is no map of neighbours.
 _MIN_KEYPOINTS = 4
+# More lines hide the images that they are drawn on.
 _MAX_LINES = 60
 # Lines begin so far apart at least, as a share of the image's longer side.
 _LINE_SPACING = 0.04

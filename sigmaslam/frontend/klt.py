@@ -7,13 +7,18 @@ import numpy as np
 
 from sigmaslam.frontend.lucas_kanade import lucas_kanade
 from sigmaslam.frontend.nearest_neighbours import within_ellipses
+from sigmaslam.frontend.row_search import ROW_TOLERANCE
 from sigmaslam.frontend.types import Features, KeypointSearch, StereoView, TemporalMatches
 
+# Side of a patch, pixels, that of the flow that gives starts: larger ones straddle depths, smaller ones slide on edges.
 _WINDOW = 15
+# Above the image itself: in the smallest one half a patch is 112 pixels, as much as most disparities.
 _LEVELS = 4
-_ROW_TOLERANCE = 2.0
+# Pixels that the way back may miss by: more keeps corners that slid along an edge, less loses those on slopes.
 _FORWARD_BACKWARD = 0.7
+# Of a followed corner, pixels per axis, for all alike; the tracker scales it as the NIS asks.
 _SIGMA = 0.3
+# Both eyes' places err: the root of two times as much, about.
 _DISPARITY_SIGMA = 0.4
 
 
@@ -89,5 +94,5 @@ def _follow(
 def _disparity(left: np.ndarray, right: np.ndarray, points: np.ndarray) -> np.ndarray:
     places, tracked = _follow(left, right, points, points)
     disparity = points[:, 0] - places[:, 0]
-    level = tracked & (np.abs(places[:, 1] - points[:, 1]) <= _ROW_TOLERANCE) & (disparity > -2.0)
+    level = tracked & (np.abs(places[:, 1] - points[:, 1]) <= ROW_TOLERANCE) & (disparity > -2.0)
     return np.where(level, disparity, np.nan)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-# FLANN_INDEX_KDTREE_SINGLE with unlimited checks is exact.
+# FLANN_INDEX_KDTREE_SINGLE, with OpenCV's own size of a leaf.
 _TREE: dict[str, bool | int | float | str] = {"algorithm": 4, "leaf_max_size": 10}
+# Without a limit: the neighbours are exact.
 _SEARCH: dict[str, bool | int | float | str] = {"checks": -1}
 
 

@@ -14,7 +14,9 @@ from sigmaslam.inference.networks import WeightsFolder
 Graph = Callable[[Mapping[str, np.ndarray]], list[np.ndarray]]
 """A network as a function: a `sigmaslam.inference.onnx_graph.OnnxGraph`, or the same network in torch."""
 
+# Of the image's sides: the network's coarsest map is a 16th of the image at half the scale.
 _SIZE_MULTIPLE = 32
+# Pixels from the padding where its seam may look like a keypoint.
 _BORDER = 8
 # The graph describes twice as many candidates; one in four comes from an image with a quarter of the pixels.
 _PIXELS_PER_KEYPOINT = 8

@@ -15,10 +15,11 @@ from sigmaslam.frontend.types import StereoView
 # All below at half the resolution, which is five times as fast and nearly as good.
 # Of the patches that are aligned, 11 pixels wide, with what is smoothed into them.
 _RADIUS = 3
-# Semi-global matching: side of its blocks, what steps of disparity cost by OpenCV's own rule, by how many percent the
-# best must win, and how large what departs by more than a pixel must be to be believed.
+# Of semi-global matching, the side of its blocks: the smallest that OpenCV recommends, for edges that stay sharp.
 _BLOCK = 3
+# What steps of disparity by one, and by more, cost: OpenCV's own rule for grey images.
 _SMALL_STEP, _LARGE_STEP = 8 * _BLOCK**2, 32 * _BLOCK**2
+# By how many percent the best must win, and how many pixels must depart together to be believed: OpenCV's advice.
 _UNIQUE, _SPECKLE = 10, 50
 # Disparities searched: from behind infinity, for the sake of a disparity offset, to nearer than all keypoints.
 _LEAST, _BEYOND = -4, 16

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sigmaslam.frontend.patch_kernels import examine
+from sigmaslam.frontend.patch_kernels import MAX_ZOOM, examine
 from sigmaslam.table import Table
 
-# Of a patch in samples, and of its Gaussian window in radii.
+# Of a patch in samples, and of its Gaussian window in radii: those that the verifiers were trained on.
 _RADIUS, _TAPER = 5, 0.6
-_MAX_ZOOM = 5.0
 # Variance of grey values that a flat patch is taken to have.
 _MIN_VARIANCE = 1.0
 
@@ -55,7 +54,7 @@ def examine_patches(
     if A is not None:
         A = np.where(np.isfinite(A).all(axis=(1, 2))[:, None, None], A, np.eye(2))
         determinant = np.linalg.det(A)
-        sane = (determinant > _MAX_ZOOM**-2) & (determinant < _MAX_ZOOM**2)
+        sane = (determinant > MAX_ZOOM**-2) & (determinant < MAX_ZOOM**2)
         back = np.linalg.inv(np.where(sane[:, None, None], A, np.eye(2)))
         zoom = np.sqrt(np.where(sane, determinant, 1.0))
     # The finer image is smoothed as the coarser one's pixels do it.

@@ -26,8 +26,10 @@ _LOGGER = logging.getLogger(__name__)
 _BLUR, _REACH = 0.7, 4.0
 # Steps of a pixel for which the kernel is tabulated.
 _FRACTIONS = 256
-# The largest zoom between two patches, in half octaves.
+MAX_ZOOM = 5.0
+"""Between two patches; neighbours whose map has more are wrong."""
 MAX_HALF_OCTAVES = 5
+"""The same zoom, rounded: images are smoothed in such steps."""
 # No part of a patch of a plane seen from elsewhere is nearer than this share of its centre's distance.
 _MIN_DEPTH = 0.2
 # Variance of grey values that is added to a patch's before it is normalised, and to the normal equations.

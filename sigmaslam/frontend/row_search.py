@@ -22,6 +22,7 @@ _ABOVE, _TALL, _BEFORE, _BROAD = 5, 11, 8, 16
 _MAX_RATIO = 0.9
 # Disparities that count as neighbours of the best one, and by how many the way back may miss.
 _NEIGHBOURS, _MAX_MISS = 2, 1
+# Stands for no disparity: below all that are searched in images narrower than 8,000 pixels.
 _NOWHERE = -1000
 ROW_TOLERANCE = 2.0
 """Rows that the eyes of a rectified pair may be off by, pixels."""

@@ -9,7 +9,9 @@ import numpy as np
 from sigmaslam.frontend.patch_evidence import Evidence
 from sigmaslam.frontend.types import Refinement
 
+# There the scorer errs once in 3,000: more is no better. The verifier was trained within it.
 _MAX_LOGIT = 8.0
+# Pixels from where the neighbours have a match: more is no worse, and infinite where there are none.
 _MAX_DISTANCE = 50.0
 
 

@@ -20,9 +20,9 @@ from sigmaslam.slam.measurement_noise import MeasurementNoise
 
 # A landmark that so many views have confirmed stands still: something that moves is a landmark for a frame, too.
 _CONFIRMED = 2
-# The prediction holds where so many of them are where it says: the others may be covered by what moves. The quantile of
-# the chi-square distribution with two degrees of freedom is that of an exponential one.
+# The prediction holds where so many of them are where it says: the others may be covered by what moves.
 _RIGHT = 0.3
+# The quantile of the chi-square distribution with two degrees of freedom is that of an exponential one.
 _CHI_SQUARE_RIGHT = -2.0 * np.log1p(-_RIGHT)
 # A keyframe of which fewer landmarks are in view is not searched for.
 _MIN_LANDMARKS = 8

@@ -18,6 +18,7 @@ from sigmaslam.slam.keyframe import Keyframe
 _PER_FEATURE = ("keypoints", "descriptors", "scores", "sigma")
 _ARRAYS = ("poses", "covariance", "timestamps", "images", "counts", *_PER_FEATURE, "disparity", "disparity_sigma")
 _PREFIX = "keyframe_"
+# Of keyframes K, their features N, descriptors D, the state S, images H x W; the camera has seven numbers.
 _SHAPES: dict[str, tuple[str | int, ...]] = {
     _PREFIX + "poses": ("K", 4, 4),
     _PREFIX + "covariance": ("S", "S"),
@@ -35,6 +36,7 @@ _SHAPES: dict[str, tuple[str | int, ...]] = {
 }
 _KINDS = {_PREFIX + "images": "u", _PREFIX + "counts": "iu", "frontend": "U"}
 _MEND = "map the place again with `sigmaslam track`"
+# Round-off leaves rotations, and covariances relative to their variances, better than this.
 _ORTHONORMAL, _SYMMETRY = 1e-6, 1e-3
 
 
@@ -135,7 +137,6 @@ def _check(path: Path, arrays: dict[str, np.ndarray]) -> None:
     defect = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max()
     rigid = defect < _ORTHONORMAL and bool((np.linalg.det(rotation) > 0).all())
     refuse(not rigid or not np.array_equal(poses[:, 3], np.tile([0.0, 0, 0, 1], (count, 1))), "poses", "are not rigid")
-    # Round-off of a long run leaves a covariance symmetric to far better than this.
     scale = np.sqrt(np.abs(np.diagonal(covariance)))
     lopsided = np.abs(covariance - covariance.T) > _SYMMETRY * np.outer(scale, scale)
     refuse(bool((np.diagonal(covariance) < 0).any() or lopsided.any()), "covariance", "is no covariance")

@@ -20,6 +20,7 @@ from sigmaslam.slam.keyframes import Keyframes
 from sigmaslam.slam.localisation import Prediction
 from sigmaslam.table import Table
 
+# Metres and seconds, from a hand's reach to the length of a street.
 DISTANCES, DURATIONS = (1.0, 10.0, 50.0, 100.0), (1.0, 5.0, 20.0)
 SPANS = (*(f"{metres:g} m" for metres in DISTANCES), *(f"{seconds:g} s" for seconds in DURATIONS))
 """Names of the distances travelled, and of the times, over which poses are related."""

@@ -11,10 +11,13 @@ import numpy as np
 from sigmaslam.geometry.se3 import rotation_exp, skew
 from sigmaslam.two_view.epipolar import MatchedRays, robust_weight
 
+# Matches that the 7-point and the 8-point method take.
 _SEVEN, _EIGHT = 7, 8
+# What is more likely wrong than right has no vote.
 _MIN_PROBABILITY = 0.5
 # The sampling consensus accepts this epipolar distance, pixels, and draws this many samples.
 _THRESHOLD, _SAMPLES = 1.0, 2000
+# Gauss-Newton stops after so many steps, or at one below this, radians: far less than matches can tell.
 _ITERATIONS, _CONVERGED = 20, 1e-9
 # An inlier is nearer than so many standard deviations.
 _INLIER = 3.0

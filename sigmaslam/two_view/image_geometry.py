@@ -20,6 +20,7 @@ from sigmaslam.two_view.fundamental import FundamentalMatrix, epipolar_lines, ep
 EYES = ("left", "right")
 # A homography is that of a plane, or of a turn, if this share of the inliers follow it within so many pixels.
 _PLANE_SHARE, _PLANE_THRESHOLD = 0.8, 1.0
+# More lines and points hide the image; between so many samples a line bent by a lens looks round.
 _DRAWN_LINES, _DRAWN_MATCHES, _LINE_SAMPLES = 12, 100, 200
 
 
