@@ -7,6 +7,7 @@ from typing import Any, Literal, Self, get_args
 
 import numpy as np
 
+from sigmaslam.bounded_files import shorten
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.calibration_covariance import CalibrationCovariance
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
@@ -23,6 +24,8 @@ RECTIFIED_ANGLE = 1e-5
 RECTIFIED_OFFSET = 1e-4
 # Pixels; OpenCV's maps address no more.
 MAX_SIDE = 32_767
+# Pixels, of focal lengths, principal point and skew: squares of larger ones overflow in the end.
+_MAX_PIXELS = 1e9
 
 _NEWTON_STEPS = 50
 _NEWTON_RESIDUAL = 1e-11
@@ -55,6 +58,8 @@ class CameraModel:
     distortion: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
+        _check_numbers((self.width, self.height, self.fx, self.fy, self.cx, self.cy, self.skew), "width to skew")
+        _check_numbers(self.distortion, "distortion")
         object.__setattr__(self, "distortion", tuple(float(value) for value in self.distortion))
         if not (0 < self.width <= MAX_SIDE and 0 < self.height <= MAX_SIDE):
             raise CalibrationError(
@@ -66,7 +71,9 @@ class CameraModel:
             raise CalibrationError(f"fx, fy, cx, cy, skew, distortion must be finite numbers, got {numbers}")
         if self.fx <= 0 or self.fy <= 0:
             raise CalibrationError(f"focal lengths must be positive pixels, got fx={self.fx}, fy={self.fy}")
-        if self.distortion_model not in COEFFICIENT_COUNTS:
+        if max(map(abs, numbers[:5])) > _MAX_PIXELS:
+            raise CalibrationError(f"fx, fy, cx, cy, skew must be at most {_MAX_PIXELS:g} pixels, got {numbers[:5]}")
+        if not isinstance(self.distortion_model, str) or self.distortion_model not in COEFFICIENT_COUNTS:
             names = ", ".join(get_args(DistortionModel))
             raise CalibrationError(f"distortion_model is {self.distortion_model!r}; use one of {names}")
         counts = COEFFICIENT_COUNTS[self.distortion_model]
@@ -145,6 +152,15 @@ class CameraModel:
         if self.distortion_model == "radtan":
             x, y, _ = _distort_radtan(x, y, self.distortion)
         return x, y
+
+
+def _check_numbers(values: Any, name: str) -> None:
+    if not isinstance(values, Sequence | np.ndarray) or not all(_is_number(value) for value in values):
+        raise CalibrationError(f"{name} must be numbers, got {shorten(repr(values))}")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
 
 
 def _as_float64(array: np.ndarray, last: int, name: str) -> tuple[np.ndarray, np.dtype]:
@@ -242,7 +258,11 @@ class StereoCamera:
     covariance: CalibrationCovariance | None = None
 
     def __post_init__(self) -> None:
-        T = np.array(self.T_left_right, dtype=np.float64)
+        try:
+            T = np.array(self.T_left_right, dtype=np.float64)
+        except (TypeError, ValueError):
+            text = shorten(repr(self.T_left_right))
+            raise CalibrationError(f"T_left_right must be a 4x4 matrix of numbers, got {text}") from None
         if T.shape != (4, 4):
             raise CalibrationError(f"T_left_right must be a 4x4 matrix, got shape {T.shape}")
         if not np.all(np.isfinite(T)):

@@ -102,7 +102,7 @@ class CalibrationYaml:
 
 
 def _floats(value: Any) -> Any:
-    """Nested lists of floats; text counts where it is a number, as YAML 1.1 reads 1e-5 as text.
+    """Nested lists of floats; text counts where it is a number in quotes.
 
     Raises:
         ValueError, OverflowError: an item is something else, or too large.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,10 @@ def parse_yaml(text: str, path: Path, error: type[InputError] = InputError) -> A
         raise error(f"{path}: {problem}") from None
     except yaml.YAMLError as problem:
         raise error(f"{path}: not valid YAML: {' '.join(str(problem).split())}") from None
+
+
+# Numbers with an exponent as everybody else writes them: YAML 1.1 takes `1e-3` and `1.0e3` for text.
+_EXPONENT = re.compile(r"^[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$")
 
 
 class _RefusedError(Exception):
@@ -126,3 +131,6 @@ def _step(parent: yaml.Node | None, index: Any) -> str:
     if isinstance(index, yaml.ScalarNode):
         return shorten(index.value, 40)
     return str(index) if isinstance(index, int) else ""
+
+
+_RestrictedLoader.add_implicit_resolver("tag:yaml.org,2002:float", _EXPONENT, list("-+.0123456789"))

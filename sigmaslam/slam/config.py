@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import Field, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from sigmaslam.bounded_files import CALIBRATION_BYTES, read_text, shorten
 from sigmaslam.errors import InputError
@@ -12,6 +14,23 @@ from sigmaslam.estimation.calibration_errors import ERRORS
 from sigmaslam.geometry.restricted_yaml import parse_yaml
 
 LINEARISATIONS = ("unscented", "extended")
+# More is a slip of the keyboard: it takes memory or time without end, or the filter's numbers overflow.
+_MOST = {
+    "max_keypoints": 100_000,
+    "iterations": 100,
+    "window": 100,
+    "max_points": 1_000_000_000,
+    "max_keyframes": 10_000,
+    "min_inliers": 100_000,
+    "keyframe_ratio": 1.0,
+    # Nothing would be a view's own.
+    "shared_disparity": 0.99,
+    "shared_place": 0.99,
+}
+# Of all others, in their units.
+_MOST_ELSE = 1_000_000
+# Not zero: the filter divides by it.
+_POSITIVE = ("keyframe_sigma",)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +67,8 @@ class TrackerConfig:
         keyframe_ratio: a new keyframe is taken when the inliers fall below this share of the landmarks in the last one.
         search_limit: with a predicted place less certain than this (pixels, one sigma) the search is not guided.
         lost_seconds: after this long without a pose, tracking starts anew from the current view.
+    Raises:
+        InputError: a value is of the wrong kind, no finite number, or out of range; names the setting.
     """
 
     max_keypoints: int = 1500
@@ -74,6 +95,12 @@ class TrackerConfig:
     search_limit: float = 40.0
     lost_seconds: float = 0.5
 
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            value = getattr(self, each.name)
+            if value is not each.default:
+                object.__setattr__(self, each.name, _checked("TrackerConfig", each, value))
+
 
 def read_config(path: Path, base: TrackerConfig | None = None) -> TrackerConfig:
     """Settings of a YAML file, `name: value` line by line; those that it does not name stay as in `base`.
@@ -85,11 +112,11 @@ def read_config(path: Path, base: TrackerConfig | None = None) -> TrackerConfig:
     entries = parse_yaml(read_text(path, CALIBRATION_BYTES, "the settings"), path)
     if not isinstance(entries, dict):
         raise InputError(f"{path}: expected lines like `keyframe_ratio: 0.75`, found {type(entries).__name__}")
-    known = {field.name: getattr(base, field.name) for field in fields(base)}
+    known = {each.name: each for each in fields(base)}
     for name, value in entries.items():
         if name not in known:
             raise InputError(f"{path}: there is no setting '{shorten(name)}': choose among {', '.join(known)}")
-        entries[name] = _checked(f"{path}: {name}", value, known[name])
+        entries[name] = _checked(str(path), known[name], value)
     return replace(base, **entries)
 
 
@@ -100,32 +127,43 @@ def check_estimated(place: str, names: list[str]) -> tuple[str, ...]:
         InputError: there is no such error; the message begins with `place`.
     """
     for name in names:
-        if name not in ERRORS:
+        if not isinstance(name, str) or name not in ERRORS:
             raise InputError(
                 f"{place}: a calibration has no error {shorten(repr(name))}: choose among {', '.join(ERRORS)}"
             )
     return tuple(names)
 
 
-def _checked(place: str, value: Any, default: Any) -> Any:
-    """The value in the kind of the default one."""
+def _checked(source: str, setting: Field[Any], value: Any) -> Any:
+    """The value of a setting in the kind of its default; numbers of NumPy become Python's."""
+    place, default = f"{source}: {setting.name}", setting.default
+    value = value.item() if isinstance(value, np.generic) else value
     if default is None:
-        if isinstance(value, list) and len(value) == 2 and all(_is_positive(each) for each in value):
-            return float(value[0]), float(value[1])
+        if isinstance(value, list | tuple) and len(value) == 2 and all(_is_positive(each) for each in value):
+            return _at_most(place, _MOST_ELSE, float(value[0])), _at_most(place, _MOST_ELSE, float(value[1]))
         raise InputError(f"{place}: expected two positive numbers in a list, found {shorten(repr(value))}")
     if isinstance(default, tuple):
-        return check_estimated(place, value if isinstance(value, list) else [value])
+        return check_estimated(place, list(value) if isinstance(value, list | tuple) else [value])
     if isinstance(default, str):
-        if value in LINEARISATIONS:
+        if isinstance(value, str) and value in LINEARISATIONS:
             return value
         raise InputError(f"{place}: expected one of {', '.join(LINEARISATIONS)}, found {shorten(repr(value))}")
+    most = _MOST.get(setting.name, _MOST_ELSE)
     if isinstance(default, int) and isinstance(value, int) and _is_positive(value):
-        return value
-    if isinstance(default, float) and (value == 0 or _is_positive(value)) and not isinstance(value, bool):
-        return float(value)
-    kind = "a whole number above zero" if isinstance(default, int) else "a number, zero or more"
+        return _at_most(place, most, value)
+    zero = setting.name not in _POSITIVE
+    if isinstance(default, float) and (_is_positive(value) or (zero and type(value) in (int, float) and value == 0)):
+        return float(_at_most(place, most, value))
+    above = "a number, zero or more" if zero else "a number above zero"
+    kind = "a whole number above zero" if isinstance(default, int) else above
     raise InputError(f"{place}: expected {kind}, found {shorten(repr(value))}")
 
 
 def _is_positive(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < float("inf")
+
+
+def _at_most(place: str, most: float, value: float) -> float:
+    if value > most:
+        raise InputError(f"{place}: expected at most {most:g}, found {shorten(repr(value))}")
+    return value

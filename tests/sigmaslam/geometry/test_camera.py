@@ -326,3 +326,24 @@ def test_disparities_that_are_not_positive_are_counted():
     with pytest.raises(ValueError, match=r"1 of 3 .* at index 2"):
         STEREO.triangulate(uvd[0])
     assert STEREO.triangulate(np.ones((4, 3), np.float32)).dtype == np.float32
+
+
+@pytest.mark.parametrize("name", ["width", "height", "fx", "fy", "cx", "cy", "skew", "distortion"])
+@pytest.mark.parametrize("value", ["700", None, ("a", "b", "c", "d")], ids=repr)
+def test_text_for_a_number_of_a_camera_is_refused(name: str, value: object):
+    values = {"width": 640, "height": 480, "fx": 700.0, "fy": 700.0, "cx": 320.0, "cy": 240.0} | {name: value}
+    with pytest.raises(CalibrationError, match="must be numbers, got"):
+        CameraModel(**values)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["fx", "fy", "cx", "cy", "skew"])
+def test_pixels_whose_squares_overflow_are_refused(name: str):
+    values = {"fx": 700.0, "fy": 700.0, "cx": 320.0, "cy": 240.0} | {name: 1e300}
+    with pytest.raises(CalibrationError, match=r"must be at most 1e\+09 pixels"):
+        CameraModel(640, 480, **values)
+
+
+def test_text_for_the_pose_of_the_right_camera_is_refused():
+    eye = CameraModel(640, 480, 700.0, 700.0, 320.0, 240.0)
+    with pytest.raises(CalibrationError, match="T_left_right must be a 4x4 matrix of numbers, got 'there'"):
+        StereoCamera(eye, eye, "there")  # type: ignore[arg-type]

@@ -77,7 +77,7 @@ def test_what_people_write_is_read(tmp_path: Path):
     assert content["both"] == [eye, eye]
     assert content["made"] == "2026-02-30"
     assert content["none"] is content["empty"] is None
-    assert content["flat"] == [1, "1e-3", 1.5e-3, True]
+    assert content["flat"] == [1, 1e-3, 1.5e-3, True]
 
 
 def test_eyes_may_share_their_numbers_by_an_alias(tmp_path: Path):

@@ -1,8 +1,9 @@
 """Settings from a file."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
@@ -40,6 +41,9 @@ def test_every_setting_can_be_written_and_read(tmp_path: Path):
         ("constant_sigma: 1", ("constant_sigma: expected two positive numbers in a list, found 1",)),
         ("linearisation: cubature", ("expected one of unscented, extended",)),
         ("- 1", ("expected lines like", "found list")),
+        ("keyframe_sigma: 0", ("keyframe_sigma: expected a number above zero, found 0",)),
+        ("keyframe_ratio: 1.5", ("keyframe_ratio: expected at most 1, found 1.5",)),
+        ("search_limit: 1e+300", ("search_limit: expected at most 1e+06, found 1e+300",)),
         ("a: [", ("not valid YAML",)),
     ],
 )
@@ -54,3 +58,19 @@ def test_a_bad_file_is_refused_by_name(tmp_path: Path, text: str, words: tuple[s
 def test_a_missing_file_is_refused(tmp_path: Path):
     with pytest.raises(InputError, match="cannot read the settings: no such file"):
         read_config(tmp_path / "nothing.yaml")
+
+
+@pytest.mark.parametrize("name", asdict(TrackerConfig()))
+@pytest.mark.parametrize("value", ["moon", -1, float("nan"), float("inf"), 1e300, True, {}, np.zeros(3)], ids=repr)
+def test_nonsense_in_python_is_refused_by_the_setting_s_name(name: str, value: object):
+    with pytest.raises(InputError, match=f"^TrackerConfig: {name}: (expected|a calibration has no error)"):
+        TrackerConfig(**{name: value})
+
+
+def test_values_in_python_are_as_those_of_a_file(tmp_path: Path):
+    path = written(tmp_path, "acceleration: 1e-3\nconstant_sigma: [1, 2.5e-1]\nestimate: [yaw]\n")
+    given = TrackerConfig(acceleration=np.float32(1e-3), constant_sigma=[1, 0.25], estimate=["yaw"])  # type: ignore[arg-type]
+    assert read_config(path, TrackerConfig(constant_sigma=(1.0, 1.0))) == replace(given, acceleration=1e-3)
+    assert type(given.acceleration) is float
+    assert given.constant_sigma == (1.0, 0.25)
+    assert given.estimate == ("yaw",)
