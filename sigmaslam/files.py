@@ -1,6 +1,7 @@
 """Files that appear whole or not at all."""
 
 import os
+import re
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -43,6 +44,11 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         raise
 
 
+def left_behind(folder: Path) -> list[Path]:
+    """Temporary files of `atomic_path` in a folder, by whose name a killed process is known."""
+    return [path for path in folder.iterdir() if re.fullmatch(r"\..+\.[0-9a-f]{12}(\.\w+)?", path.name)]
+
+
 def printable(name: str | Path) -> str:
     """A name that can be written as UTF-8: bytes of a path that are none become `\\udc..`."""
     return str(name).encode("utf-8", "backslashreplace").decode("utf-8")
@@ -64,13 +70,15 @@ def check_new_folder(path: Path) -> None:
     """Nothing that is there is written over.
 
     Raises:
-        InputError: `path` is a file, a folder that holds something, or no possible name.
+        InputError: `path` is a file, a folder that holds something, a link to nothing, or no possible name.
     """
     try:
         holds_something = path.exists() and (not path.is_dir() or any(path.iterdir()))
     except (OSError, ValueError) as error:  # a name that is too long, a folder that may not be read
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{path}: cannot be a new folder ({reason}): choose another --out") from None
+    if path.is_symlink() and not path.exists():
+        raise InputError(f"{path}: is a link to {path.readlink()}, which is not there: choose another --out")
     if holds_something:
         raise InputError(f"{path} exists and is not an empty folder: choose another --out, or remove it")
 

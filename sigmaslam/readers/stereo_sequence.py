@@ -60,6 +60,10 @@ class PairSource(Protocol):
     def __iter__(self) -> Iterator[RawPair | SkippedFrame]: ...
 
 
+# Pixels that images may be shrunk to: one cell of the coarsest map of the features.
+_MIN_SIDE = 32
+
+
 class StereoSequence:
     """Stereo pairs with their calibration.
 
@@ -80,6 +84,12 @@ class StereoSequence:
         self, pairs: PairSource, camera: StereoCamera, source: Path | str, format: str, scale: float = 1.0
     ) -> None:
         self.camera = camera if scale == 1.0 else camera.scaled(scale)
+        sides = self.camera.left.width, self.camera.left.height
+        if scale < 1.0 and min(sides) < _MIN_SIDE:
+            least = _MIN_SIDE / min(camera.left.width, camera.left.height)
+            raise InputError(
+                f"--scale {scale:g} leaves {sides[0]}x{sides[1]} pixels, too few to track: give at least {least:.2g}"
+            )
         self._stored = camera
         self.source = source
         self.format = format

@@ -58,12 +58,19 @@ def check_not_in_use(path: Path) -> None:
     Raises:
         InputError: one does.
     """
+    if is_in_use(path):
+        raise InputError(f"{path}: a run that still goes on writes it; stop that one first")
+
+
+def is_in_use(path: Path) -> bool:
+    """Whether another process appends to the file; False where the system has no locks."""
     if sys.platform != "win32":
         with path.open("rb") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise InputError(f"{path}: a run that still goes on writes it; stop that one first") from error
+            except BlockingIOError:
+                return True
+    return False
 
 
 def read_records(path: Path, width: int) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from sigmaslam.errors import InputError
-from sigmaslam.files import check_new_folder
+from sigmaslam.files import check_new_folder, left_behind
 from sigmaslam.run_record.appended_file import check_not_in_use
 from sigmaslam.run_record.dense_points import DENSE_NAME, RECONSTRUCTION_NAME
 from sigmaslam.run_record.evaluated_frames import EVALUATED_FRAMES_NAME, EVALUATION_NAME
@@ -39,11 +39,15 @@ def remove_run(folder: Path) -> None:
         return
     if not (folder / RUN_NAME).is_file():
         raise InputError(f"{folder}: holds no {RUN_NAME}, so it is no run that could be removed: choose another --out")
-    others = sorted(path.name for path in folder.iterdir() if path.name not in _NAMES)
+    leftovers = left_behind(folder)
+    ours = {*_NAMES, *(path.name for path in leftovers)}
+    others = sorted(path.name for path in folder.iterdir() if path.name not in ours)
     if others:
         raise InputError(f"{folder}: holds {others[0]}, which no run has written: move it, or choose another --out")
     if (folder / PARTIAL_POSES).is_file():
         check_not_in_use(folder / PARTIAL_POSES)
+    for path in leftovers:
+        path.unlink(missing_ok=True)
     for name in _NAMES:
         (folder / name).unlink(missing_ok=True)
 

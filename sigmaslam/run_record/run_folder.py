@@ -25,7 +25,7 @@ from sigmaslam.frontend.build import own_networks
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.inference.networks import WeightsFolder, network_path
 from sigmaslam.inference.onnx_graph import shipped_weights
-from sigmaslam.run_record.appended_file import AppendedFile
+from sigmaslam.run_record.appended_file import AppendedFile, is_in_use
 from sigmaslam.run_record.frame_table import COLUMNS, FRAMES_NAME, KEYFRAME_COLUMNS
 from sigmaslam.run_record.pose_file import PARTIAL_POSES, PoseWriter
 from sigmaslam.run_record.relative_pose_file import RelativePoseWriter
@@ -177,7 +177,9 @@ def check_has_trajectory(run: Path) -> None:
     """
     if (run / "trajectory.tum").is_file():
         return
-    if (run / PARTIAL_POSES).is_file():
+    if (run / PARTIAL_POSES).is_file() and is_in_use(run / PARTIAL_POSES):
+        reason = "it still goes on; wait for its end, or stop it"
+    elif (run / PARTIAL_POSES).is_file():
         reason = f"it was stopped before its results were written; `sigmaslam finish {run}` writes them"
     elif (run / FRAMES_NAME).is_file():
         reason = "none of its frames has a pose, so there is nothing to compare; its report.html says why"

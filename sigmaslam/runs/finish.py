@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sigmaslam.errors import InputError
+from sigmaslam.files import left_behind
 from sigmaslam.run_record.appended_file import check_not_in_use
 from sigmaslam.run_record.frame_table import FRAMES_NAME
 from sigmaslam.run_record.pose_file import PARTIAL_POSES
@@ -36,6 +37,8 @@ def finish_run(run: Path) -> dict[str, Any] | None:
     if not (partial.is_file() and (run / PARTIAL_RELATIVE_POSES).is_file()):
         return None
     check_not_in_use(partial)
+    for path in left_behind(run):
+        path.unlink(missing_ok=True)
     try:
         entries = json.loads((run / RUN_NAME).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

@@ -96,9 +96,11 @@ def test_finish_makes_the_results_of_a_killed_run(sequence: Path, whole: Path, t
     process = start(sequence, run)
     refused = run_here("finish", run)
     assert_refused(refused, "still goes on")
+    assert_refused(run_here("evaluate", run, "--truth", sequence / "poses.txt"), "it still goes on")
     process.kill()
     assert end(process)[0] == -signal.SIGKILL
     assert not (run / "trajectory.tum").exists()
+    (run / ".poses.0123456789ab.csv").write_text("cut off")
     assert_refused(run_here("evaluate", run, "--truth", sequence / "poses.txt"), f"`sigmaslam finish {run}`")
 
     result = run_here("finish", run)
@@ -110,7 +112,7 @@ def test_finish_makes_the_results_of_a_killed_run(sequence: Path, whole: Path, t
     for name in ("input", "frontend", "configuration", "calibration", "weights_sha256"):
         assert described[name] == undisturbed[name]
     assert "window.report" in (run / "report.html").read_text()
-    assert not any((run / name).exists() for name in PARTIAL)
+    assert not any((run / name).exists() for name in (*PARTIAL, ".poses.0123456789ab.csv"))
     evaluated = run_here("evaluate", run, "--truth", sequence / "poses.txt", "--json")
     assert json.loads(evaluated.stdout)["matched"] == 4
 

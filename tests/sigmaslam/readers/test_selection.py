@@ -47,6 +47,13 @@ def test_a_selection_of_nothing_is_refused(demo_sequence: Path):
         open_sequence(demo_sequence).select(Selection(start=40))
 
 
+def test_images_too_small_to_track_are_refused(demo_sequence: Path):
+    sequence = open_sequence(demo_sequence)
+    scale = 20 / min(sequence.camera.left.width, sequence.camera.left.height)
+    with pytest.raises(InputError, match=r"--scale .* leaves \d+x20 pixels, too few to track: give at least"):
+        sequence.select(Selection(), scale)
+
+
 @pytest.mark.parametrize("scale", [0.5, 0.37])
 def test_smaller_images_show_things_where_the_smaller_camera_sees_them(demo_sequence: Path, scale: float):
     sequence = open_sequence(demo_sequence)

@@ -28,6 +28,18 @@ def test_a_run_is_removed_whole(run: Path):
     assert not any(run.iterdir())
 
 
+def test_what_a_killed_run_left_behind_is_removed_with_it(run: Path):
+    (run / ".poses.0123456789ab.csv").write_text("cut off")
+    remove_run(run)
+    assert not any(run.iterdir())
+
+
+def test_a_link_to_nothing_is_named(tmp_path: Path):
+    (tmp_path / "out").symlink_to(tmp_path / "gone")
+    with pytest.raises(InputError, match=r"out: is a link to .*gone, which is not there"):
+        remove_run(tmp_path / "out")
+
+
 def test_no_folder_or_an_empty_one_is_left_alone(tmp_path: Path):
     remove_run(tmp_path / "none")
     remove_run(tmp_path)
