@@ -34,7 +34,13 @@ from sigmaslam_evaluation.metrics.trajectory_errors import (
     synchronise,
 )
 from sigmaslam_evaluation.metrics.truth_covariance import truth_covariance
-from sigmaslam_evaluation.truth_conventions import TruthConvention, find_convention, find_time_unit, scale_times
+from sigmaslam_evaluation.truth_conventions import (
+    TruthConvention,
+    describe_mirror,
+    find_convention,
+    find_time_unit,
+    scale_times,
+)
 
 _LOGGER = logging.getLogger(__name__)
 # An error is of poses relative to others.
@@ -102,6 +108,9 @@ def evaluate_run(
         raise InputError(f"{truth}: the order of quaternions can be chosen for TUM files alone, and this is none")
     other = None if follows_object else find_convention(estimate, true, convention, has_quaternions)
     true = convention.apply(true)
+    hint = None if other is None else other.describe()
+    if other is None and not follows_object:
+        hint = describe_mirror(estimate, true)
     of_truth = None
     if truth_sigma_position is not None or truth_sigma_rotation is not None:
         of_truth = truth_covariance(truth_sigma_position or 0.0, truth_sigma_rotation or 0.0)
@@ -130,7 +139,7 @@ def evaluate_run(
         figure_path=estimate_path.parent / "evaluation.png" if plot and has_matplotlib() else None,
         final=_evaluate_final(run_or_trajectory, estimate, true, of_truth) if is_run else None,
         predicted=int(predicted[associate(estimate, true)[0]].sum()),
-        truth_hint=None if other is None else other.describe(),
+        truth_hint=hint,
     )
     if plot and is_run:
         keep_evaluation(run_or_trajectory, evaluation.to_dict(), estimate, true, evaluation.nees)

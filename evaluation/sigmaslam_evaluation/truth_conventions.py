@@ -103,6 +103,32 @@ def find_convention(
     return min(alike, key=lambda each: each[:2])[2] if alike else None
 
 
+def describe_mirror(estimate: Trajectory, truth: Trajectory) -> str | None:
+    """In words, the axis along which positions of the truth have the wrong sign; None where no mirror fits it.
+
+    Rotations may be mirrored alike, or be right. What counts is as of `find_convention`.
+
+    Args:
+        estimate: N poses.
+        truth: T_world_camera in metres.
+    """
+    now = absolute_trajectory_error(estimate, truth, "origin")
+    for axis, name in enumerate("xyz"):
+        mirror = np.ones(3)
+        mirror[axis] = -1.0
+        for both in (True, False):
+            poses = truth.poses.copy()
+            poses[:, :3, 3] *= mirror
+            if both:
+                poses[:, :3, :3] *= mirror[:, None] * mirror
+            error = absolute_trajectory_error(estimate, Trajectory(truth.timestamps, poses), "origin")
+            if error.rmse < COLLAPSE * now.rmse and error.rotation_rmse_deg <= now.rotation_rmse_deg:
+                return (
+                    f"a mirror image: change the sign of {name} in the file{', also of its rotations' if both else ''}"
+                )
+    return None
+
+
 def find_time_unit(estimate: Trajectory, truth: Trajectory) -> str | None:
     """The unit of the truth's times, one of `TIME_UNITS`; None for seconds.
 

@@ -19,6 +19,8 @@ from sigmaslam.readers.images import IMAGE_SUFFIXES
 logger = logging.getLogger(__name__)
 
 DEFAULT_RATE_HZ = 10.0
+# Images that are not read: among others they are a frame that misses.
+_UNREAD = frozenset({".gif", ".webp", ".heic", ".avif", ".jp2", ".exr", ".svg"})
 STAMP_TOLERANCE_NS = 5_000_000
 # Nanoseconds since 1970 have 19 digits; 16 also admit clocks with another origin.
 STAMP_DIGITS = 16
@@ -34,14 +36,19 @@ T = TypeVar("T")
 
 
 def list_images(folder: Path) -> list[Path]:
-    """Image files of a folder by name; hidden files are left out.
+    """Image files of a folder by name; hidden files are left out, and with a warning images of other types.
 
     Raises:
         InputError: the folder is missing, may not be read, or has no image.
     """
-    files = [
-        path for path in list_folder(folder) if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
-    ]
+    visible = [path for path in list_folder(folder) if not path.name.startswith(".")]
+    files = [path for path in visible if path.suffix.lower() in IMAGE_SUFFIXES]
+    unread = [path for path in visible if path.suffix.lower() in _UNREAD]
+    if unread:
+        logger.warning(
+            "%s: %d images are of a type that is not read (first: %s): convert them to PNG",
+            *(folder, len(unread), shorten(unread[0].name, 60)),
+        )
     if not files:
         raise InputError(f"{folder}: no image files ({' '.join(sorted(IMAGE_SUFFIXES))})")
     return files

@@ -167,7 +167,7 @@ def read_euroc_truth(path: str | Path) -> Trajectory:
 
     Two forms are known: `timestamp_ns, p (3), q as w x y z, ...` (state_groundtruth_estimate0/data.csv) and
     the same with a second timestamp after the first. T_BS is taken from `cam0/sensor.yaml` or
-    `cam0_sensor.yaml` in the folder of the file or one of the two above it.
+    `cam0_sensor.yaml` in the folder of the file or one of the two above it, or in a folder `mav0` beside it.
 
     Raises:
         InputError: the file cannot be read, a line is wrong, or T_BS is not found.
@@ -198,12 +198,13 @@ def read_euroc_truth(path: str | Path) -> Trajectory:
 def _camera_in_body(truth: Path) -> np.ndarray:
     """T_body_camera (4, 4) of camera 0 from the sensor file near the ground truth."""
     folders = [truth.resolve().parent, *list(truth.resolve().parents)[1:3]]
+    folders.append(folders[0] / "mav0")
     candidates = [folder / name for folder in folders for name in ("cam0/sensor.yaml", "cam0_sensor.yaml")]
     sensor = next((candidate for candidate in candidates if candidate.is_file()), None)
     if sensor is None:
         raise InputError(
             f"{truth}: EuRoC truth is of the body, and no cam0/sensor.yaml or cam0_sensor.yaml with T_BS is "
-            f"in {folders[0]} or the two folders above: put it there, or convert the truth to TUM form"
+            f"in {folders[0]}, its folder mav0 or the two folders above: put it there, or convert the truth to TUM form"
         )
     T_body_camera = CalibrationYaml.read(sensor).section("T_BS").numbers("data", (16,)).reshape(4, 4)
     T_body_camera[:3, :3] = nearest_rotation(T_body_camera[:3, :3])

@@ -83,6 +83,28 @@ def test_a_convention_is_named_and_its_options_undo_it(truth: Trajectory, tmp_pa
     assert mended.ate_origin.rotation_rmse_deg == pytest.approx(right.ate_origin.rotation_rmse_deg, rel=1e-4, abs=1e-5)
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("both", [True, False], ids=["with rotations", "positions alone"])
+def test_a_mirrored_truth_is_named(tmp_path: Path, axis: int, both: bool):
+    angle = np.linspace(0.0, 3.0, 200)
+    turned = np.column_stack([0.3 * np.sin(2 * angle), angle, 0.2 * np.cos(3 * angle)])
+    poses = se3_exp(np.column_stack([np.zeros((200, 3)), turned]))
+    poses[:, :3, 3] = np.column_stack([5 * np.sin(angle), 2 * np.sin(2 * angle), 5 - 5 * np.cos(angle)])
+    truth = Trajectory(0.1 * np.arange(200), poses)
+    write_estimate(tmp_path / "estimate.tum", truth)
+    sign = np.ones(3)
+    sign[axis] = -1.0
+    mirrored = poses.copy()
+    mirrored[:, :3, 3] *= sign
+    if both:
+        mirrored[:, :3, :3] = np.diag(sign) @ mirrored[:, :3, :3] @ np.diag(sign)
+    write_tum(tmp_path / "truth.tum", Trajectory(truth.timestamps, mirrored))
+    hint = evaluate_run(tmp_path / "estimate.tum", tmp_path / "truth.tum", plot=False).truth_hint
+    assert hint is not None
+    assert hint.startswith(f"a mirror image: change the sign of {'xyz'[axis]} in the file")
+    assert hint.endswith("rotations") == both
+
+
 def test_the_right_truth_gives_no_hint(truth: Trajectory, tmp_path: Path):
     write_estimate(tmp_path / "estimate.tum", truth)
     for name, write in (("truth.tum", write_tum), ("truth.txt", write_kitti)):

@@ -10,6 +10,7 @@ import yaml
 from sigmaslam.errors import CalibrationError, InputError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.readers import StereoFrame, open_sequence
+from sigmaslam.readers.pairing import list_images
 from sigmaslam.readers.stereo_sequence import READ_AHEAD, read_ahead
 from tests.support.calibration_yaml import write_calibration
 from tests.support.videos import write_video
@@ -296,6 +297,13 @@ def test_colour_is_converted_and_warned_once(tmp_path, caplog, channels):
     expected = cv2.cvtColor(picture(2, 0, channels)[..., :3].copy(), cv2.COLOR_BGR2GRAY)
     np.testing.assert_array_equal(frames[2].left, expected)
     assert sum("colour image" in message for message in messages(caplog)) == 1
+
+
+def test_images_of_a_type_that_is_not_read_are_named(tmp_path, caplog):
+    for name in ("0.png", "1.WEBP", "2.gif", ".3.gif", "notes.txt"):
+        (tmp_path / name).touch()
+    assert [path.name for path in list_images(tmp_path)] == ["0.png"]
+    assert "2 images are of a type that is not read (first: 1.WEBP)" in caplog.text
 
 
 def test_16_bit_is_scaled_by_one_factor(tmp_path, caplog):

@@ -110,6 +110,8 @@ def test_official_euroc_layout_equals_the_excerpt(real_data: Path, tmp_path):
     (state / "data.csv").write_text(header + "\n".join(official) + "\n")
     again = read_trajectory(state / "data.csv")
     np.testing.assert_array_equal(again.poses, read_euroc_truth(source / "groundtruth.csv").poses)
+    beside = shutil.copy(state / "data.csv", tmp_path / "groundtruth_body.csv")
+    np.testing.assert_array_equal(read_trajectory(beside).poses, again.poses)
 
 
 def test_euroc_truth_without_sensor_file_says_what_to_do(tmp_path):
