@@ -151,6 +151,7 @@ def run_here(work: Callable[[Any], str], jobs: Sequence[Any], workers: int, ende
         ended(job, work(job))
 
 
+@pytest.mark.long
 def test_the_command_judges_a_short_render_and_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     pytest.importorskip("torch")
     monkeypatch.setitem(recordings.RENDERED, "room", (160, 120))

@@ -203,6 +203,7 @@ def full_for(names: set[str]) -> Callable[[Path], object]:
     return limited
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("without_report")
 @pytest.mark.parametrize("name", ["trajectory.tum", "covariance.npy", "trajectory_final.tum", "map.npz", "run.json"])
 def test_a_file_without_room_costs_a_message_and_not_the_others(

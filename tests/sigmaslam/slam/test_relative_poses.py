@@ -80,6 +80,7 @@ def test_rows_are_of_keyframes_about_as_far_back_as_the_span_says():
     assert seen == {"1 m", "10 m", "50 m", "100 m", "1 s", "5 s"}
 
 
+@pytest.mark.long
 def test_covariances_are_symmetric_and_sharper_than_those_of_absolute_poses():
     """Errors of before the earlier keyframe are not in them."""
     run = simulate("driving", 1, 120)

@@ -46,6 +46,7 @@ def test_every_front_end_follows_the_rendered_camera(demo: Demo, demo_estimates:
     assert np.rad2deg(np.linalg.norm(last[3:])) < 0.5
 
 
+@pytest.mark.long
 def test_the_covariance_is_positive_definite_and_grows_along_the_way(demo_estimates: Tracked):
     estimates = demo_estimates("klt")
     smallest = [np.linalg.eigvalsh(e.covariance)[0] for e in estimates[1:]]
