@@ -24,7 +24,7 @@ from sigmaslam_synthetic import homography_pairs
 from sigmaslam_training.features import loop
 from sigmaslam_training.features.recipes import TrainingConfig
 
-pairs._TEXTURE_SIZE = 128
+homography_pairs._TEXTURE_SIZE = 128
 out, config = Path(sys.argv[1]), TrainingConfig(**json.loads(sys.argv[2]))
 written, finish, clip = {}, loop._Run.finish, loop.nn.utils.clip_grad_norm_
 
