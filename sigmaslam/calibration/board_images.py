@@ -16,6 +16,8 @@ from sigmaslam.readers.pairing import list_images
 _EYES = (("left", "right"), ("cam0", "cam1"), ("infra1", "infra2"))
 # At the end of a file's name.
 _ENDINGS = (("_0", "_1"), ("_l", "_r"))
+# Before the number at its end, as in OpenCV's `imageL01`.
+_LETTERS = ("l", "r")
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,9 +57,10 @@ def find_board_images(paths: Sequence[Path]) -> list[BoardImages]:
         paths: files, or folders of them; a folder with the folders of both eyes counts as both.
 
     Raises:
-        InputError: a path is missing or holds no image.
+        InputError: a path is missing or holds no image, or two folders hold as many and nothing tells the eyes apart.
     """
-    files = [file for path in paths for file in _files_of(path)]
+    groups = [_files_of(path) for path in paths]
+    files = [file for group in groups for file in group]
     for tell in _tells():
         told = [tell(file) for file in files]
         if not all(told):
@@ -73,6 +76,11 @@ def find_board_images(paths: Sequence[Path]) -> list[BoardImages]:
                 BoardImages(" + ".join(file.name for file in eyes if file), tuple(eyes))
                 for _, eyes in sorted(moments.items(), key=lambda moment: _by_number(moment[0]))
             ]
+    if len(paths) == 2 and all(path.is_dir() for path in paths) and len(groups[0]) == len(groups[1]):
+        raise InputError(
+            f"{paths[0]} and {paths[1]} hold {len(groups[0])} images each, and no name says which eye they are of: "
+            "call the folders left and right, or put the images of one camera into one folder"
+        )
     return [BoardImages(file.name, (file,)) for file in files]
 
 
@@ -129,6 +137,9 @@ def _tells() -> Iterable[Callable[[Path], tuple[str, int] | None]]:
         yield lambda file, words=words: _in_folder(file, words)  # type: ignore[misc]
     for endings in _ENDINGS:
         yield lambda file, endings=endings: _word(file.stem, endings, "$")  # type: ignore[misc]
+    yield lambda file: _word(file.stem, _LETTERS, r"(?=\d+$)")
+    for words in _EYES:
+        yield lambda file, words=words: _inside_folder_name(file, words)  # type: ignore[misc]
 
 
 def _word(name: str, words: tuple[str, str], behind: str = "") -> tuple[str, int] | None:
@@ -147,3 +158,9 @@ def _in_folder(file: Path, words: tuple[str, str]) -> tuple[str, int] | None:
         if folder.name.lower() in words:
             return file.stem, words.index(folder.name.lower())
     return None
+
+
+def _inside_folder_name(file: Path, words: tuple[str, str]) -> tuple[str, int] | None:
+    """Names of folders such as `stereoLeft`; the numbers in a file's name are those of its moment."""
+    told = _word(file.parent.name, words)
+    return told and ("-".join(re.findall(r"\d+", file.stem)) or file.stem, told[1])

@@ -1,0 +1,45 @@
+"""Which images are a pair, by the names of files and folders."""
+
+from pathlib import Path
+
+import pytest
+
+from sigmaslam.calibration.board_images import find_board_images
+from sigmaslam.errors import InputError
+
+
+def written(folder: Path, *names: str) -> Path:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("left", "right"),
+    [
+        ("stereoLeft/imageL{}.png", "stereoRight/imageR{}.png"),
+        ("stereoLeft/{}.png", "stereoRight/{}.png"),
+        ("LEFT_eye/board{}.png", "RIGHT_eye/shot{}.png"),
+        ("one/imageL{}.png", "other/imageR{}.png"),
+        ("left/{}.png", "right/{}.png"),
+    ],
+)
+def test_two_folders_of_two_eyes_are_pairs(tmp_path: Path, left: str, right: str):
+    written(tmp_path, *(name.format(k) for name in (left, right) for k in ("1", "2", "10")))
+    folders = [tmp_path / Path(name).parent for name in (left, right)]
+    found = find_board_images(folders)
+    expected = [tuple(tmp_path / name.format(k) for name in (left, right)) for k in ("1", "2", "10")]
+    assert [moment.files for moment in found] == expected
+
+
+def test_two_folders_of_equal_length_whose_eyes_no_name_tells_are_refused(tmp_path: Path):
+    written(tmp_path, "a/1.png", "a/2.png", "b/1.png", "b/2.png", "b2/1.png")
+    with pytest.raises(InputError, match="2 images each, and no name says which eye"):
+        find_board_images([tmp_path / "a", tmp_path / "b"])
+    assert [len(moment.files) for moment in find_board_images([tmp_path / "a", tmp_path / "b2"])] == [1, 1, 1]
+
+
+def test_a_letter_before_the_number_is_no_eye_where_there_is_but_one(tmp_path: Path):
+    folder = written(tmp_path / "images", "cal1.png", "cal2.png")
+    assert [len(moment.files) for moment in find_board_images([folder])] == [1, 1]
