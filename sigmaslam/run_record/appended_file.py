@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
+import logging
+import os
 import sys
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +17,15 @@ if sys.platform != "win32":
     import fcntl
 
 
+_LOGGER = logging.getLogger(__name__)
+
+
 class AppendedFile:
     """A file to which pieces are appended; the operating system has each one when `append` returns.
 
     Args:
-        path: of the file; it must not exist. It stays locked until it is closed, or the process ends.
+        path: of the file; it must not exist. It stays locked until it is closed, or the process ends. Where it is
+            removed before, with its folder, say, it is made again with all that it had.
         goes_on: the file exists, and pieces are appended to those that it has.
     Raises:
         OSError: it cannot be made.
@@ -26,10 +33,7 @@ class AppendedFile:
 
     def __init__(self, path: Path, goes_on: bool = False) -> None:
         self._path = path
-        self._file = path.open("ab" if goes_on else "xb", buffering=0)
-        if sys.platform != "win32":
-            with suppress(OSError):  # a file system without locks
-                fcntl.flock(self._file, fcntl.LOCK_EX)
+        self._open("a+" if goes_on else "x+")
 
     def append(self, content: bytes) -> None:
         """Writes a piece.
@@ -37,10 +41,9 @@ class AppendedFile:
         Raises:
             OutputError: it could not be written whole, as on a full disk.
         """
-        left = memoryview(content)
+        self._make_again()
         try:
-            while left:
-                left = left[self._file.write(left) :]
+            self._write(content)
         except OSError as error:
             raise OutputError(
                 f"{self._path}: cannot be written ({error.strerror}): make room on the disk; "
@@ -48,8 +51,44 @@ class AppendedFile:
             ) from error
 
     def close(self) -> None:
-        """Nothing can be appended any more."""
-        self._file.close()
+        """Nothing can be appended any more.
+
+        Raises:
+            OutputError: the file was removed, and cannot be made again.
+        """
+        if not self._file.closed:
+            try:
+                self._make_again()
+            finally:
+                self._file.close()
+
+    def _open(self, mode: str) -> None:
+        self._file = io.FileIO(self._path, mode)
+        if sys.platform != "win32":
+            with suppress(OSError):  # a file system without locks
+                fcntl.flock(self._file, fcntl.LOCK_EX)
+
+    def _write(self, content: bytes) -> None:
+        left = memoryview(content)
+        while left:
+            left = left[self._file.write(left) :]
+
+    def _make_again(self) -> None:
+        """The file of a removed name still holds what was written, until it is closed."""
+        if os.fstat(self._file.fileno()).st_nlink:
+            return
+        _LOGGER.warning("%s: was removed while the run goes on: it is made again", self._path)
+        self._file.seek(0)
+        with closing(self._file) as removed:
+            content = removed.readall()
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._open("x+")
+            self._write(content)
+        except OSError as error:
+            raise OutputError(
+                f"{self._path}: was removed while the run goes on, and cannot be made again ({error.strerror})"
+            ) from error
 
 
 def check_not_in_use(path: Path) -> None:

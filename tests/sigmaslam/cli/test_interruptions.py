@@ -91,6 +91,20 @@ def test_a_signal_ends_a_run_with_its_results(
 
 
 @pytest.mark.long
+def test_poses_of_a_run_whose_folder_is_removed_are_kept(sequence: Path, whole: Path, tmp_path: Path):
+    run = tmp_path / "run"
+    process = start(sequence, run)
+    shutil.rmtree(run)
+    process.send_signal(signal.SIGTERM)
+    returned, _, errors = end(process)
+    assert returned == 143, errors
+    assert "Traceback" not in errors
+    assert "was removed while the run goes on" in " ".join(errors.split())
+    assert_first_poses_of(whole, run, 4)
+    assert {path.name for path in whole.iterdir()} == {path.name for path in run.iterdir()}
+
+
+@pytest.mark.long
 def test_finish_makes_the_results_of_a_killed_run(sequence: Path, whole: Path, tmp_path: Path):
     run = tmp_path / "run"
     process = start(sequence, run)
