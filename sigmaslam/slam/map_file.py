@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ from sigmaslam.estimation.state_layout import CALIBRATION_SIZE
 from sigmaslam.frontend import Features, StereoView
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.slam.keyframe import Keyframe
+
+_LOGGER = logging.getLogger(__name__)
 
 _PER_FEATURE = ("keypoints", "descriptors", "scores", "sigma")
 _ARRAYS = ("poses", "covariance", "timestamps", "images", "counts", *_PER_FEATURE, "disparity", "disparity_sigma")
@@ -92,6 +95,12 @@ def read_keyframes(path: Path, frontend: str, camera: RectifiedStereo) -> tuple[
             f"one {expected.tolist()}; a map serves the camera that made it"
         )
     _check(path, arrays)
+    if not arrays[_PREFIX + "descriptors"].shape[1]:
+        _LOGGER.warning(
+            "%s: maps of the front-end %s have no descriptors: a view is looked for near the last keyframes alone; map "
+            "with --frontend learned to be found anywhere",
+            *(path, frontend),
+        )
     ends = np.cumsum(arrays[_PREFIX + "counts"].astype(np.int64))
     keyframes = []
     for k, (begin, end) in enumerate(zip(np.r_[0, ends[:-1]], ends, strict=True)):

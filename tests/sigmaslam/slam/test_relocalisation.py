@@ -160,6 +160,16 @@ def test_keyframes_round_trip_through_a_file(tmp_path: Path):
             assert stored.dtype == expected.dtype
 
 
+def test_a_map_without_descriptors_says_that_it_is_weak(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    bare = keyframe(0, 40)
+    features = replace(bare.view.features, descriptors=np.zeros((40, 0), np.float32))
+    past = PastPoses(looking(0.0)[None], np.eye(6), np.zeros((6, CALIBRATION_SIZE)), np.zeros((6, CALIBRATION_SIZE)))
+    arrays = pack_keyframes([replace(bare, view=replace(bare.view, features=features))], past, "klt", CAMERA)
+    np.savez_compressed(tmp_path / "map.npz", **arrays)
+    read_keyframes(tmp_path / "map.npz", "klt", CAMERA)
+    assert "maps of the front-end klt have no descriptors" in caplog.text
+
+
 def test_no_keyframes_pack_to_no_arrays():
     assert pack_keyframes([], PastPoses.empty(), "learned", CAMERA) == {}
 
