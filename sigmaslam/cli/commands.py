@@ -27,7 +27,7 @@ from sigmaslam.cli.refine import refine
 from sigmaslam.cli.render import render
 from sigmaslam.cli.track import demo, track
 from sigmaslam.cli.train import train, train_scorer
-from sigmaslam.errors import SigmaSlamError, is_out_of_memory
+from sigmaslam.errors import SigmaSlamError
 from sigmaslam.files import printable
 
 # Plain help: rich's tables cut long words and give flags a type.
@@ -95,13 +95,3 @@ def main() -> None:
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)
-    except Exception as error:
-        if not is_out_of_memory(error):
-            raise
-        Console(stderr=True).print(
-            "error: there is not enough memory: end other programs, or use smaller images; what was tracked until then "
-            "is in the run folder",
-            style="red",
-            soft_wrap=True,
-        )
-        sys.exit(2)
