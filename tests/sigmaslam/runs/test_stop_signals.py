@@ -14,8 +14,10 @@ NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 @pytest.fixture(autouse=True)
 def handlers() -> Iterator[None]:
-    """Handlers are as before, even after a failure."""
+    """Handlers are the default ones, also where the parent ignores a signal, and as before after a test."""
     before = [signal.getsignal(number) for number in NUMBERS]
+    for number in NUMBERS:
+        signal.signal(number, signal.SIG_DFL)
     yield
     for number, handler in zip(NUMBERS, before, strict=True):
         signal.signal(number, handler)
