@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import tempfile
 from collections.abc import Callable, Sequence
@@ -12,39 +11,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sigmaslam import errors
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text
 from sigmaslam.geometry.trajectory import Trajectory
-from sigmaslam.inference.onnx_graph import shipped_weights
 from sigmaslam.readers import StereoSequence, open_sequence
 from sigmaslam.readers.trajectory_files import read_trajectory
 from sigmaslam.run_record.frame_table import FrameTable, read_frames
 from sigmaslam.run_record.run_folder import check_has_trajectory
 from sigmaslam.runs.track import track_sequence
+from sigmaslam_benchmarks.code_hash import hash_renderer
 from sigmaslam_evaluation.evaluation_result import Evaluation
 from sigmaslam_evaluation.run_evaluation import evaluate_run
 
 if TYPE_CHECKING:
     from sigmaslam.slam.tracker import TrackerConfig
     from sigmaslam_synthetic.simulation import Recipe
-
-# Folders of the package whose code a result depends on, beside the graphs.
-_CODE = (
-    ".",
-    "estimation",
-    "evaluation",
-    "evaluation/metrics",
-    "frontend",
-    "fusion",
-    "geometry",
-    "image_filtering",
-    "inference",
-    "readers",
-    "runs",
-    "slam",
-    "two_view",
-)
 
 _EUROC_TRUTH = Path("mav0") / "state_groundtruth_estimate0" / "data.csv"
 
@@ -167,11 +148,11 @@ def read_trial(
 def render(folder: Path, recipe: Recipe, workers: int, done: Callable[[int], None] = lambda frames: None) -> Path:
     """Renders a sequence with its landmarks into a folder of its name, and returns where it is.
 
-    Frames that are there are kept.
+    Frames that are there are kept, of the same recipe and the same renderer: the folder's name has both.
     """
     from sigmaslam_synthetic.render_sequence import write_sequence
 
-    source = folder / recipe.name
+    source = folder / f"{recipe.name}-{hash_renderer()[:8]}"
     write_sequence(source, recipe, "sparse", workers, done=done)
     return source
 
@@ -221,14 +202,3 @@ class TrialCache:
 
     def _made_from(self, recipe: Recipe, config: TrackerConfig) -> dict[str, Any]:
         return {"recipe": asdict(recipe), "configuration": asdict(config), "code": self.code}
-
-
-def hash_code(*others: Path) -> str:
-    """Hash of everything between the images and a result: the tracker, its graphs, the evaluation, and other files."""
-    package = Path(errors.__file__).parent
-    sources = [path for folder in _CODE for path in (package / folder).glob("*.py")]
-    sources += [*shipped_weights("features.onnx").parent.glob("*.onnx"), *others]
-    digest = hashlib.sha256()
-    for path in sorted(sources):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()

@@ -10,7 +10,8 @@ from sigmaslam.errors import InputError
 from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam_benchmarks import trial
 from sigmaslam_benchmarks.tracking.pnp_baselines import track_with_pnp
-from sigmaslam_benchmarks.trial import Trial, TrialCache, hash_code
+from sigmaslam_benchmarks.trial import Trial, TrialCache
+from sigmaslam_synthetic import render_sequence
 from sigmaslam_synthetic.simulation import Recipe
 
 RECIPE, CONFIG = Recipe("room", 3, 7), TrackerConfig()
@@ -43,9 +44,11 @@ def test_a_file_that_is_no_result_is_named(tmp_path: Path):
         TrialCache(tmp_path, "code").read(RECIPE, "ours", CONFIG)
 
 
-def test_the_hash_is_of_the_code_and_of_the_files_that_are_given(tmp_path: Path):
-    (tmp_path / "benchmark.py").write_text("a = 1")
-    before = hash_code(tmp_path / "benchmark.py")
-    assert before == hash_code(tmp_path / "benchmark.py") != hash_code()
-    (tmp_path / "benchmark.py").write_text("a = 2")
-    assert hash_code(tmp_path / "benchmark.py") != before
+def test_a_render_is_kept_for_the_same_recipe_and_renderer_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    rendered = []
+    monkeypatch.setattr(render_sequence, "write_sequence", lambda out, *_, **__: rendered.append(out))
+    first = trial.render(tmp_path, RECIPE, 1)
+    assert trial.render(tmp_path, RECIPE, 1) == first != trial.render(tmp_path, Recipe("room", 3, 8), 1)
+    monkeypatch.setattr(trial, "hash_renderer", lambda: "another renderer")
+    assert trial.render(tmp_path, RECIPE, 1) != first
+    assert len(set(rendered)) == 3

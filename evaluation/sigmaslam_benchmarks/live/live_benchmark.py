@@ -16,6 +16,7 @@ import numpy as np
 from sigmaslam import errors
 from sigmaslam.errors import InputError, OutputError
 from sigmaslam.files import atomic_write_text, make_folder
+from sigmaslam_benchmarks.code_hash import hash_code
 from sigmaslam_benchmarks.live.driven_runs import METHODS, DrivenRun
 from sigmaslam_benchmarks.live.driver_faults import FAULTS, spoil
 from sigmaslam_benchmarks.live.judge import Judgement, References, good_poses, judge
@@ -23,7 +24,6 @@ from sigmaslam_benchmarks.live.live_page import LivePage, format_page
 from sigmaslam_benchmarks.live.recordings import GoodFrames, Recording, choose_recordings
 from sigmaslam_benchmarks.tracking.page import check_names, write_page
 from sigmaslam_benchmarks.tracking.stereo_peers import MissingPeerError
-from sigmaslam_benchmarks.trial import hash_code
 from sigmaslam_synthetic.parallel_jobs import list_failures, run_jobs
 
 _GOOD = "none"

@@ -14,15 +14,14 @@ import numpy as np
 
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.rectification import StereoRectifier
-from sigmaslam.reconstruction import reconstruct
 from sigmaslam.reconstruction.disparity import semi_global_disparity
 from sigmaslam.reconstruction.reconstruct import fuse_keyframes
 from sigmaslam.reconstruction.recorded_keyframes import open_input, read_recorded_keyframes
 from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.config import TrackerConfig
+from sigmaslam_benchmarks.code_hash import hash_code
 from sigmaslam_benchmarks.tracking.reconstruction_page import ReconstructedSequence, format_page
 from sigmaslam_benchmarks.tracking.trial_pool import SequenceTrials, TrialKind, write_trials
-from sigmaslam_benchmarks.trial import hash_code
 from sigmaslam_evaluation.metrics.depth_accuracy import DepthFigures, JudgedPixels, judge_pixels, summarise
 from sigmaslam_evaluation.rendered_camera import open_rendered
 from sigmaslam_synthetic.render_sequence import SCENE_NAME
@@ -80,7 +79,7 @@ def write_reconstruction(
 
 @cache
 def _hash_code() -> str:
-    return hash_code(Path(__file__), *sorted(Path(reconstruct.__file__).parent.glob("*.py")))
+    return hash_code(Path(__file__))
 
 
 def recipe(world: str, seed: int) -> Recipe:

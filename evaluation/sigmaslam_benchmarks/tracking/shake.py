@@ -14,11 +14,11 @@ import numpy as np
 from sigmaslam.readers.trajectory_files import read_trajectory
 from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.tracker import TrackerConfig
-from sigmaslam_benchmarks.tracking import pnp_baselines
+from sigmaslam_benchmarks.code_hash import hash_code
 from sigmaslam_benchmarks.tracking.pnp_baselines import track_with_pnp
 from sigmaslam_benchmarks.tracking.shake_page import GROSS, ShakenSequence, ShakeResult, format_page
 from sigmaslam_benchmarks.tracking.trial_pool import SequenceTrials, TrialKind, write_trials
-from sigmaslam_benchmarks.trial import Method, Trial, hash_code, rendered_truth
+from sigmaslam_benchmarks.trial import Method, Trial, rendered_truth
 from sigmaslam_evaluation.metrics.claimed_errors import MotionErrors, motion_errors
 from sigmaslam_evaluation.metrics.image_motion import ImageMotion, read_image_motion
 from sigmaslam_evaluation.metrics.map_consistency import coverage
@@ -86,7 +86,7 @@ def _describe(trials: SequenceTrials) -> ShakenSequence:
 
 @cache
 def _hash_code() -> str:
-    return hash_code(Path(__file__), Path(pnp_baselines.__file__))
+    return hash_code(Path(__file__))
 
 
 def recipe(number: int, first_seed: int) -> Recipe:
