@@ -164,6 +164,55 @@ class Blocks:
         return blocks.unsqueeze(-1).expand(*blocks.shape, self.size).flatten(-2)
 
 
+def student_weight(
+    distance: Tensor, count: Tensor | float, freedom: Tensor | float, consistent: bool = False
+) -> Tensor:
+    """Weights (...,) that make least squares the fit of Student's noise, which no distance makes zero.
+
+    Args:
+        distance: (...,) squared lengths of whitened residuals.
+        count: (...,) how many components each has.
+        freedom: degrees of freedom, (...,) or ().
+        consistent: whether the weighted information shall be the estimate's precision. That of the plain weights is
+            (nu + k + 2) / (nu + k) times as much; weights that much smaller hardly move the estimate.
+    """
+    whole = freedom + count
+    if consistent:
+        return whole * whole / ((whole + 2.0) * (freedom + distance))
+    return whole / (freedom + distance)
+
+
+def common_scale(
+    distance: Tensor, median: Tensor, largest: Tensor, usable: Tensor, agreement: float = 0.95, most: float = 9.0
+) -> Tensor:
+    """Factor (), 1 or more, by which all variances together are too small: of a blurred image, say.
+
+    The median tells how far the residuals scatter before any gate. It is believed where nearly all agree once their
+    variances are scaled by it; where they do not, the errors are those of a part: outliers among good matches. Where
+    it is large nothing fits.
+
+    Args:
+        distance: (M,) squared lengths of whitened residuals.
+        median, largest: (M,) quantiles of chi-square for the components that each has: the median, and a gate.
+        usable: (M,) bool, those that count.
+        agreement: share of those that count that must agree once scaled; with fewer they are outliers.
+        most: largest factor that is believed; right measurements err by no more than its root times what they claim.
+    """
+    counts = usable.to(distance.dtype)
+    count = counts.sum()
+    ratio = distance / median
+    ordered = torch.sort(torch.where(usable, ratio, torch.full_like(ratio, float("inf")))).values
+    number = usable.to(torch.int64).sum()
+    middle = torch.stack([(number - 1).clamp_min(0) // 2, number // 2])
+    factor = ordered.index_select(0, middle).sum() / 2.0
+    # Half of them are expected above 1; by chance no more than three standard deviations of that count besides.
+    scattered = ((ratio > 1.0).to(distance.dtype) * counts).sum() > 0.5 * count + 1.5 * torch.sqrt(count)
+    agrees = (distance <= factor * largest).to(distance.dtype)
+    nearly_all = torch.tensor(agreement, dtype=distance.dtype, device=distance.device)
+    believed = scattered & (factor <= most) & ((agrees * counts).sum() >= nearly_all * count)
+    return torch.where(believed, factor, torch.ones_like(factor))
+
+
 def _distance(deviations: Sequence[Tensor], columns: Sequence[Tensor], noise: Noise, size: int) -> Tensor:
     """Sum of d^T C^-1 d over deviations d (..., m, ·), for C of columns (..., m, ·) and the noise; (..., b)."""
     blocks = noise.blocks(size)
@@ -174,8 +223,8 @@ def _distance(deviations: Sequence[Tensor], columns: Sequence[Tensor], noise: No
 
 
 def _student(distance: Tensor, count: Tensor) -> Tensor:
-    """Expected precision of a block of Student's noise, at most 1, which no distance makes zero."""
-    return ((_STUDENT_DOF + count) / (_STUDENT_DOF + distance)).clamp_max(1.0)
+    """Expected precision of a block of Student's noise, at most 1."""
+    return student_weight(distance, count, _STUDENT_DOF).clamp_max(1.0)
 
 
 def _quantiles(probability: float, count: Tensor, size: int, like: Tensor) -> Tensor:

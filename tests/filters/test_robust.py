@@ -12,7 +12,7 @@ from torch import Tensor
 import sigmaslam_filters as filters
 from sigmaslam_filters import systems
 from sigmaslam_filters.core.solve import FORMS
-from sigmaslam_filters.robust import ROBUST
+from sigmaslam_filters.robust import ROBUST, common_scale, student_weight
 from tests.support.filter_assertions import assert_close, assert_same_belief, assert_same_update
 from tests.support.filter_builders import beliefs, bent_measurement, covariances, random_numbers, tensor
 
@@ -229,3 +229,47 @@ def test_a_graph_gates_and_weighs_as_torch_does(options, tmp_path):
     )
     ukf = filters.UnscentedKalmanFilter(iterations=1)
     assert filters.export_step(ukf, None, see, example, tmp_path / "robust.onnx", **options) < 1e-9
+
+
+def squared_lengths(factor: float, count: int = 200, outliers: int = 0) -> Tensor:
+    """Of residuals with `factor` times the variance that they claim; the outliers are a hundred times as long."""
+    generator = torch.Generator().manual_seed(1)
+    residual = torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    squared = factor * (residual * residual).sum(dim=1)
+    squared[:outliers] *= 1e4
+    return squared
+
+
+def scale_of(squared: Tensor, usable: Tensor) -> float:
+    """`common_scale` of residuals with three components each."""
+    median, largest = (torch.full_like(squared, chi2.ppf(share, 3)) for share in (0.5, 0.999))
+    return float(common_scale(squared, median, largest, usable))
+
+
+@pytest.mark.parametrize(
+    ("factor", "outliers", "expected"),
+    [(1.0, 0, 1.0), (4.0, 0, 4.0), (4.0, 60, 1.0), (100.0, 0, 1.0)],
+    ids=["as claimed", "all of them blurred", "a part is wrong", "nothing fits"],
+)
+def test_common_scale_tells_blur_from_outliers(factor, outliers, expected):
+    found = scale_of(squared_lengths(factor, outliers=outliers), torch.ones(200, dtype=torch.bool))
+    assert found == pytest.approx(expected, rel=0.15 if expected > 1 else 0)
+
+
+def test_common_scale_is_the_median_of_the_usable_ones():
+    squared = squared_lengths(4.0)
+    usable = torch.arange(200) % 3 != 0
+    ratio = (squared / chi2.ppf(0.5, 3))[usable]
+    found = scale_of(torch.where(usable, squared, squared * 1e3), usable)
+    assert found == pytest.approx(float(ratio.quantile(0.5)), rel=1e-12)
+    assert scale_of(squared, torch.zeros(200, dtype=torch.bool)) == 1.0
+
+
+def test_weights_of_a_student_are_those_of_its_likelihood_but_for_one_factor():
+    """The derivative of -log p by half the squared length is (nu + p) / (nu + s)."""
+    squared = torch.linspace(0, 50, 11, dtype=torch.float64).requires_grad_()
+    likelihood = -(2.0 + 3.0) / 2.0 * torch.log(1.0 + squared / 2.0)
+    (slope,) = torch.autograd.grad(likelihood.sum(), squared)
+    torch.testing.assert_close(student_weight(squared, 3.0, 2.0), -2.0 * slope)
+    found = student_weight(squared, 3.0, 2.0, consistent=True)
+    torch.testing.assert_close(found, -2.0 * slope * (2.0 + 3.0) / (2.0 + 3.0 + 2.0))

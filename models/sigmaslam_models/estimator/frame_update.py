@@ -11,11 +11,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from sigmaslam.estimation.chi_square import CHI_SQUARE_999
+from sigmaslam.estimation.acceptance import ACCEPTANCE
+from sigmaslam.estimation.chi_square import CHI_SQUARE_999, CHI_SQUARE_MEDIAN
 from sigmaslam.estimation.state_layout import CALIBRATION, CALIBRATION_SIZE, LANDMARK_SIZE, MODELLED
 from sigmaslam_filters.core import regular_factors
 from sigmaslam_filters.manifolds.se3_matrices import exp_se3, invert_se3, log_se3
-from sigmaslam_models.estimator.robust import UNKNOWN_VARIANCE, chi_square, common_scale, mask_missing, student_weight
+from sigmaslam_filters.robust import common_scale, student_weight
+from sigmaslam_models.estimator.residuals import UNKNOWN_VARIANCE, chi_square, mask_missing
 from sigmaslam_models.estimator.stereo_views import Scene, Slopes, by_state, linearise
 
 # Scales of the robust loss by which a frame's pose is first found, in standard deviations: it narrows.
@@ -184,12 +186,14 @@ class GatedStep(nn.Module):
         """The gate before the step, which the caller takes or leaves."""
         frame = FrameViews(*views)
         seen = _linearised(frame, measurement, noise, offset, spread, moved)
-        found = common_scale(seen.squared, seen.components, seen.usable)
+        median, largest = (chi_square(table, seen.components) for table in (CHI_SQUARE_MEDIAN, CHI_SQUARE_999))
+        rules = ACCEPTANCE.scaled_agreement, ACCEPTANCE.max_noise_scale
+        found = common_scale(seen.squared, median, largest, seen.usable, *rules)
         noise_scale = torch.where(noise_scale > 0.0, noise_scale, found)
         squared = seen.squared / noise_scale
-        agree = seen.usable & (squared <= scale * chi_square(CHI_SQUARE_999, seen.components))
+        agree = seen.usable & (squared <= scale * largest)
         passed = agree.to(noise.dtype)
-        weight = passed * student_weight(squared, seen.components, freedom) / noise_scale
+        weight = passed * student_weight(squared, seen.components, freedom, consistent=True) / noise_scale
         z, inverse = _solve(seen, weight)
         posterior = frame.factor @ inverse @ frame.factor.mT
         after = seen.beyond - seen.by_prior @ z

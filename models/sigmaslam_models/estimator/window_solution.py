@@ -14,7 +14,8 @@ from torch import Tensor, nn
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999
 from sigmaslam.estimation.state_layout import LANDMARK_SIZE, MODELLED
 from sigmaslam_filters.core import regular_factors
-from sigmaslam_models.estimator.robust import UNKNOWN_VARIANCE, chi_square, mask_missing, student_weight
+from sigmaslam_filters.robust import student_weight
+from sigmaslam_models.estimator.residuals import UNKNOWN_VARIANCE, chi_square, mask_missing
 from sigmaslam_models.estimator.stereo_views import Scene, Slopes, by_state, linearise
 
 
@@ -91,7 +92,8 @@ class EliminateLandmarks(nn.Module):
         pieces = [linear.by_pair, linear.by_landmark, residual[..., None]]
         stacked = regular_factors.whiten(torch.cat(pieces, dim=2), noise)
         squared = (stacked[..., -1] * stacked[..., -1]).sum(dim=1)
-        stacked = stacked * torch.sqrt(student_weight(squared, components, freedom))[:, None, None]
+        weight = student_weight(squared, components, freedom, consistent=True)
+        stacked = stacked * torch.sqrt(weight)[:, None, None]
         rows = by_state(stacked[..., :18], linear.chain, window.pair)
         size = rows.shape[1]
         rows = torch.cat([rows, stacked[..., 24].flatten()[:, None]], dim=1)
@@ -137,7 +139,7 @@ def _prior_precision(departure: Tensor, variance: Tensor, freedom: Tensor) -> Te
     """
     precision = 1.0 / variance
     squared = departure * departure * precision
-    disparity = student_weight(squared[:, 3:MODELLED].sum(dim=1), 1.0, freedom)
-    place = student_weight(squared[:, MODELLED:].sum(dim=1), 2.0, freedom)
+    disparity = student_weight(squared[:, 3:MODELLED].sum(dim=1), 1.0, freedom, consistent=True)
+    place = student_weight(squared[:, MODELLED:].sum(dim=1), 2.0, freedom, consistent=True)
     weights = [torch.ones_like(precision[:, :3]), disparity[:, None], place[:, None].expand(-1, 2)]
     return precision * torch.cat(weights, dim=1)

@@ -7,13 +7,12 @@ from torch import Tensor
 from torch.func import vmap
 
 from sigmaslam.estimation.calibration_errors import measured_errors
-from sigmaslam.estimation.chi_square import CHI_SQUARE_MEDIAN
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam_filters.core import regular_factors
 from sigmaslam_models.estimator.calibration_errors import unmodelled_errors
 from sigmaslam_models.estimator.frame_update import FrameEstimate, FrameViews, RobustStep, update_frame
 from sigmaslam_models.estimator.graph_examples import ROBUST_INPUTS, WINDOW_INPUTS, frame_example, window_example
-from sigmaslam_models.estimator.robust import common_scale, mask_missing, student_weight
+from sigmaslam_models.estimator.residuals import mask_missing
 from sigmaslam_models.estimator.window_solution import Condition, EliminateLandmarks, WindowViews
 from tests.support.filter_builders import tensor
 
@@ -60,44 +59,6 @@ def test_a_missing_disparity_says_nothing():
     assert components.tolist() == [2.0]
     torch.testing.assert_close(masked[:, :2, :2], noise[:, :2, :2])
     assert masked[0, 2].tolist() == [0.0, 0.0, 1e12]
-
-
-def squared_lengths(factor: float, count: int = 200, outliers: int = 0) -> tuple[Tensor, Tensor]:
-    """Of residuals with `factor` times the variance that they claim; the outliers are a hundred times as long."""
-    generator = torch.Generator().manual_seed(1)
-    residual = torch.randn(count, 3, generator=generator, dtype=torch.float64)
-    squared = factor * (residual * residual).sum(dim=1)
-    squared[:outliers] *= 1e4
-    return squared, torch.full((count,), 3.0, dtype=torch.float64)
-
-
-@pytest.mark.parametrize(
-    ("factor", "outliers", "expected"),
-    [(1.0, 0, 1.0), (4.0, 0, 4.0), (4.0, 60, 1.0), (100.0, 0, 1.0)],
-    ids=["as claimed", "all of them blurred", "a part is wrong", "nothing fits"],
-)
-def test_common_scale_tells_blur_from_outliers(factor, outliers, expected):
-    squared, components = squared_lengths(factor, outliers=outliers)
-    found = float(common_scale(squared, components, torch.ones(200, dtype=torch.bool)))
-    assert found == pytest.approx(expected, rel=0.15 if expected > 1 else 0)
-
-
-def test_common_scale_is_the_median_of_the_usable_ones():
-    squared, components = squared_lengths(4.0)
-    usable = torch.arange(200) % 3 != 0
-    ratio = (squared / CHI_SQUARE_MEDIAN[3])[usable]
-    found = common_scale(torch.where(usable, squared, squared * 1e3), components, usable)
-    assert float(found) == pytest.approx(float(np.median(ratio.numpy())), rel=1e-12)
-    assert float(common_scale(squared, components, torch.zeros(200, dtype=torch.bool))) == 1.0
-
-
-def test_weights_of_a_student_are_those_of_its_likelihood_but_for_one_factor():
-    """The derivative of -log p by half the squared length is (nu + p) / (nu + s)."""
-    squared = torch.linspace(0, 50, 11, dtype=torch.float64).requires_grad_()
-    likelihood = -(2.0 + 3.0) / 2.0 * torch.log(1.0 + squared / 2.0)
-    (slope,) = torch.autograd.grad(likelihood.sum(), squared)
-    found = student_weight(squared, 3.0, FREEDOM)
-    torch.testing.assert_close(found, -2.0 * slope * (2.0 + 3.0) / (2.0 + 3.0 + 2.0))
 
 
 def some_frames(count: int) -> list[tuple[Tensor, ...]]:
