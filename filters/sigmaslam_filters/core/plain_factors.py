@@ -6,6 +6,8 @@ length is the number of rows, does as well, for any batch.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -45,30 +47,47 @@ def cholesky(matrix: Tensor) -> tuple[Tensor, Tensor]:
         (..., n, n) lower triangular, with zero columns where a pivot vanishes; (...,) bool, whether the matrix is
         positive semidefinite.
     """
-    size = matrix.shape[-1]
-    remainder = matrix
-    columns = []
     tolerance = torch.tensor(PIVOT_TOLERANCES[matrix.dtype], dtype=matrix.dtype, device=matrix.device)
     diagonal = torch.diagonal(matrix, dim1=-2, dim2=-1)
-    below = torch.ones(size, size, dtype=matrix.dtype, device=matrix.device).tril()
+    magnitude = diagonal.abs()
     healthy = torch.ones_like(diagonal[..., 0], dtype=torch.bool)
-    for j in range(size):
-        pivot = remainder[..., j, j]
-        kept = pivot > tolerance * diagonal[..., j]
-        scale = torch.where(
-            kept, torch.rsqrt(torch.where(kept, pivot, torch.ones_like(pivot))), torch.zeros_like(pivot)
-        )
-        # What a dropped pivot leaves below it must vanish too, else the matrix is indefinite.
-        magnitude = diagonal.abs()
-        left = remainder[..., :, j] * below[:, j]
-        allowed = tolerance * magnitude * magnitude[..., j : j + 1]
-        vanishes = (pivot >= -tolerance * magnitude[..., j]) & (left * left <= allowed).all(dim=-1)
+
+    def scaled(j: int, pivot: Tensor, below: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        nonlocal healthy
+        length = pivot[..., 0, 0]
+        kept = length > tolerance * diagonal[..., j]
+        vanishes = length >= -tolerance * magnitude[..., j]
+        if below is not None:
+            # What a dropped pivot leaves below it must vanish too, else the matrix is indefinite.
+            allowed = tolerance * magnitude[..., j + 1 :] * magnitude[..., j : j + 1]
+            vanishes = vanishes & (below[..., 0] * below[..., 0] <= allowed).all(dim=-1)
         healthy = healthy & (kept | vanishes)
-        column = remainder[..., :, j] * below[:, j] * scale.unsqueeze(-1)
-        columns.append(column)
-        if j + 1 < size:
-            remainder = remainder - column.unsqueeze(-1) * column.unsqueeze(-2)
-    return torch.stack(columns, dim=-1), healthy
+        scale = torch.where(
+            kept, torch.rsqrt(torch.where(kept, length, torch.ones_like(length))), torch.zeros_like(length)
+        )
+        scale = scale[..., None, None]
+        return pivot * scale, None if below is None else below * scale
+
+    return _by_columns(matrix, scaled), healthy
+
+
+def definite_cholesky(matrix: Tensor) -> Tensor:
+    """Lower factor (..., n, n) of positive definite matrices, in fewer operations: nothing is checked."""
+
+    def scaled(j: int, pivot: Tensor, below: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        root = torch.sqrt(pivot)
+        return root, None if below is None else below / root
+
+    return _by_columns(matrix, scaled)
+
+
+def invert(matrix: Tensor) -> Tensor:
+    """Inverses of positive definite matrices (..., n, n), symmetric; ONNX Runtime has an operator for them."""
+    # With a diagonal of one, rounding errors are those of a Cholesky factorisation.
+    root = torch.rsqrt(torch.diagonal(matrix, dim1=-2, dim2=-1))
+    scale = root.unsqueeze(-1) * root.unsqueeze(-2)
+    inverse = torch.linalg.inv_ex(matrix * scale).inverse * scale
+    return (inverse + inverse.mT) / 2.0
 
 
 def triangularise(matrix: Tensor) -> Tensor:
@@ -117,3 +136,24 @@ def _reciprocal(pivot: Tensor) -> Tensor:
     """1 / pivot, and 0 for a pivot that is exactly 0."""
     zero = pivot == 0
     return torch.where(zero, torch.zeros_like(pivot), 1.0 / torch.where(zero, torch.ones_like(pivot), pivot))
+
+
+def _by_columns(matrix: Tensor, scaled: Callable[[int, Tensor, Tensor | None], tuple[Tensor, Tensor | None]]) -> Tensor:
+    """Lower factor (..., n, n), column by column.
+
+    Args:
+        matrix: (..., n, n); the lower triangle is read.
+        scaled: makes of the number of a column, its pivot (..., 1, 1) and what is below it (..., c, 1), None in the
+            last, the same of the factor.
+    """
+    size = matrix.shape[-1]
+    columns, remainder = [], matrix
+    for j in range(size - 1):
+        first, others = remainder.split([1, size - j - 1], dim=-1)
+        root, below = scaled(j, *first.split([1, size - j - 1], dim=-2))
+        assert below is not None
+        columns.append(torch.nn.functional.pad(torch.cat([root, below], dim=-2), (0, 0, j, 0)))
+        remainder = others[..., 1:, :] - below @ below.mT
+    root, _ = scaled(size - 1, remainder, None)
+    columns.append(torch.nn.functional.pad(root, (0, 0, size - 1, 0)))
+    return torch.cat(columns, dim=-1)

@@ -9,7 +9,7 @@ is contiguous.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -68,24 +68,36 @@ def cholesky(matrix: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
     """
     size = matrix.shape[-1]
     healthy = torch.ones_like(matrix[..., 0, 0], dtype=torch.bool)
-    remainder = [[matrix[..., i, j] for j in range(i + 1)] for i in range(size)]
-    for j in range(size):
-        pivot = remainder[j][j]
+
+    def scaled(j: int, column: list[Tensor]) -> list[Tensor]:
+        nonlocal healthy
+        pivot = column[0]
         floor = tolerance * matrix[..., j, j].abs()
         kept = pivot > floor
         healthy = healthy & (pivot >= -floor)  # False for NaN as well
         dropped = ~kept
         inverse = torch.rsqrt(pivot.masked_fill(dropped, 1.0)).masked_fill(dropped, 0.0)
-        remainder[j][j] = pivot * inverse
-        for i in range(j + 1, size):
+        for i, entry in enumerate(column[1:], start=j + 1):
             # What a dropped pivot leaves below it must vanish too, else the matrix is indefinite.
             allowed = tolerance * (matrix[..., i, i] * matrix[..., j, j]).abs()
-            healthy = healthy & (kept | (remainder[i][j] * remainder[i][j] <= allowed))
-            remainder[i][j] = remainder[i][j] * inverse
-        for i in range(j + 1, size):
-            for k in range(j + 1, i + 1):
-                remainder[i][k] = remainder[i][k] - remainder[i][j] * remainder[k][j]
-    return _from_lower(remainder), healthy
+            healthy = healthy & (kept | (entry * entry <= allowed))
+        return [entry * inverse for entry in column]
+
+    entries = [[matrix[..., i, j] for j in range(i + 1)] for i in range(size)]
+    return _from_lower(_factored(entries, scaled)), healthy
+
+
+def whiten(stacked: Tensor, noise: Tensor) -> Tensor:
+    """L^-1 stacked (..., n, k), for the lower factor L of positive definite noise (..., n, n); nothing is checked."""
+    size = noise.shape[-1]
+    entries = noise.flatten(-2).unsqueeze(-1).split(1, dim=-2)
+
+    def scaled(j: int, column: list[Tensor]) -> list[Tensor]:
+        root = torch.sqrt(column[0])
+        return [root, *(entry / root for entry in column[1:])]
+
+    lower = _factored([[entries[size * i + j] for j in range(i + 1)] for i in range(size)], scaled)
+    return torch.cat(_substituted(lower, list(stacked.split(1, dim=-2)), regular=True), dim=-2)
 
 
 def triangularise(pieces: Sequence[Tensor], diagonal: Tensor | None) -> Tensor:
@@ -158,14 +170,9 @@ def solve_lower(factor: Tensor, right: Tensor, regular: bool) -> Tensor:
         factor: (..., n, n) lower triangular.
         right: (..., n, c).
     """
-    rows: list[Tensor] = []
-    for i in range(factor.shape[-1]):
-        row = right[..., i, :]
-        for k in range(i):
-            row = row - factor[..., i, k, None] * rows[k]
-        pivot = factor[..., i, i, None]
-        rows.append(row / pivot if regular else row * _reciprocal(pivot))
-    return assemble(rows)
+    size = range(factor.shape[-1])
+    lower = [[factor[..., i, k, None] for k in range(i + 1)] for i in size]
+    return assemble(_substituted(lower, [right[..., i, :] for i in size], regular))
 
 
 def solve_lower_transposed(factor: Tensor, right: Tensor) -> Tensor:
@@ -217,6 +224,34 @@ def _orthogonalise(rows: list[_Row]) -> list[list[Tensor]]:
             factor[i].append(length)
             rows[i] = [_minus(part, length, direction) for part, direction in zip(rows[i], unit, strict=True)]
     return factor
+
+
+def _factored(entries: list[list[Tensor]], scaled: Callable[[int, list[Tensor]], list[Tensor]]) -> list[list[Tensor]]:
+    """Entries of the lower factor.
+
+    Args:
+        entries: of the lower triangle of a matrix, row by row, of any shape.
+        scaled: makes of the number of a column and its entries, from the pivot on, those of the factor.
+    """
+    size = len(entries)
+    remainder = [list(row) for row in entries]
+    for j in range(size):
+        for i, entry in enumerate(scaled(j, [row[j] for row in remainder[j:]]), start=j):
+            remainder[i][j] = entry
+        for i in range(j + 1, size):
+            for k in range(j + 1, i + 1):
+                remainder[i][k] = remainder[i][k] - remainder[i][j] * remainder[k][j]
+    return remainder
+
+
+def _substituted(lower: list[list[Tensor]], rows: list[Tensor], regular: bool) -> list[Tensor]:
+    """Rows of L^-1 B, from entries of L that broadcast against the rows of B; see `solve_lower`."""
+    solved: list[Tensor] = []
+    for row, (*known, pivot) in zip(rows, lower, strict=True):
+        for left, above in zip(known, solved, strict=True):
+            row = row - left * above
+        solved.append(row / pivot if regular else row * _reciprocal(pivot))
+    return solved
 
 
 def _dot(left: _Row, right: _Row) -> Tensor:

@@ -14,7 +14,8 @@ from torch import Tensor, nn
 from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999, CHI_SQUARE_MEDIAN
 from sigmaslam.estimation.state_layout import CALIBRATION, CALIBRATION_SIZE, LANDMARK_SIZE, MODELLED
-from sigmaslam_filters.core import regular_factors
+from sigmaslam_filters.core.plain_factors import invert
+from sigmaslam_filters.core.unrolled_factors import whiten
 from sigmaslam_filters.manifolds.se3_matrices import exp_se3, invert_se3, log_se3
 from sigmaslam_filters.robust import common_scale, student_weight
 from sigmaslam_models.estimator.residuals import UNKNOWN_VARIANCE, chi_square, mask_missing
@@ -139,7 +140,7 @@ class RobustStep(nn.Module):
         # About what the prior expects.
         slopes = seen.by_prior.unflatten(0, (-1, 3))
         innovation = slopes @ slopes.mT + torch.eye(3, dtype=noise.dtype, device=noise.device)
-        whitened = regular_factors.whiten(seen.residual[..., None], innovation)
+        whitened = whiten(seen.residual[..., None], innovation)
         squared = torch.where(gated > 0.0, _lengths(whitened[..., 0]), seen.squared)
         usable = seen.usable.to(noise.dtype)
         z, inverse, after = seen.beyond, spread, seen.residual
@@ -294,7 +295,7 @@ def _linearised(
     through = linear.by_landmark @ frame.covariance @ linear.by_landmark.mT
     residual, noise, components = mask_missing(measurement, linear.mean, noise + linear.nonlinearity + through)
     pieces = [linear.by_pair, linear.by_landmark, residual[..., None]]
-    stacked = regular_factors.whiten(torch.cat(pieces, dim=2), noise)
+    stacked = whiten(torch.cat(pieces, dim=2), noise)
     by_pair, by_landmark, residual = stacked[..., :18], stacked[..., 18:24], stacked[..., 24]
     derivatives = frame.by_state(by_pair, by_landmark, linear.chain)
     squared = _lengths(residual)
@@ -309,7 +310,7 @@ def _solve(seen: _Whitened, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Mean (k, 1) and covariance (k, k) of z ~ N(0, I) given the views, weighted (M,)."""
     weighted = seen.by_prior * _each_row(weight)
     identity = torch.eye(seen.by_prior.shape[1], dtype=weight.dtype, device=weight.device)
-    inverse = regular_factors.invert(weighted.mT @ seen.by_prior + identity)
+    inverse = invert(weighted.mT @ seen.by_prior + identity)
     return inverse @ (weighted.mT @ seen.beyond), inverse
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from sigmaslam.estimation.state_layout import CALIBRATION_MODELLED, CALIBRATION_SIZE, MODELLED
-from sigmaslam_filters.core import regular_factors
+from sigmaslam_filters.core.plain_factors import definite_cholesky
 from sigmaslam_filters.manifolds.se3_matrices import adjoint_se3, invert_se3
 from sigmaslam_models.estimator.calibration_errors import unmodelled_errors
 from sigmaslam_models.estimator.stereo_window import StereoTransfer
@@ -78,10 +78,10 @@ def linearise(scene: Scene, poses: Tensor, calibration: Tensor, covariance: Tens
     units = torch.cat([scene.depth.expand(3), torch.ones_like(covariance[0, :6])])
     least = torch.tensor(LEAST_SPREAD, dtype=poses.dtype, device=poses.device)
     joint = scene.unscented * (chain @ covariance @ chain.mT)
-    spread = regular_factors.cholesky(_limited((joint + joint.mT) / 2.0, scene.depth) + torch.diag(units * least) ** 2)
+    spread = definite_cholesky(_limited((joint + joint.mT) / 2.0, scene.depth) + torch.diag(units * least) ** 2)
     own = scene.unscented * scene.covariance[:, :MODELLED, :MODELLED]
     identity = torch.eye(MODELLED, dtype=poses.dtype, device=poses.device)
-    landmark_spread = regular_factors.cholesky(own + identity * (least * least))
+    landmark_spread = definite_cholesky(own + identity * (least * least))
     mean, slopes, nonlinearity, in_front = StereoTransfer()(
         T_view_world @ poses.index_select(0, scene.anchors),
         spread,

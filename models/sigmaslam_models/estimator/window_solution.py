@@ -13,7 +13,8 @@ from torch import Tensor, nn
 
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999
 from sigmaslam.estimation.state_layout import LANDMARK_SIZE, MODELLED
-from sigmaslam_filters.core import regular_factors
+from sigmaslam_filters.core.plain_factors import invert
+from sigmaslam_filters.core.unrolled_factors import whiten
 from sigmaslam_filters.robust import student_weight
 from sigmaslam_models.estimator.residuals import UNKNOWN_VARIANCE, chi_square, mask_missing
 from sigmaslam_models.estimator.stereo_views import Scene, Slopes, by_state, linearise
@@ -68,7 +69,7 @@ class GateWindow(nn.Module):
     def forward(self, *views: Tensor) -> Tensor:
         """By the length of each view's residual."""
         linear, residual, noise, components = WindowViews(*views).linearise()
-        whitened = regular_factors.whiten(residual[..., None], noise)[..., 0]
+        whitened = whiten(residual[..., None], noise)[..., 0]
         return linear.in_front & ((whitened * whitened).sum(dim=1) <= chi_square(CHI_SQUARE_999, components))
 
 
@@ -90,7 +91,7 @@ class EliminateLandmarks(nn.Module):
         unknown = torch.tensor(UNKNOWN_VARIANCE, dtype=noise.dtype, device=noise.device)
         noise = torch.where(linear.in_front[:, None, None], noise, unknown * identity)
         pieces = [linear.by_pair, linear.by_landmark, residual[..., None]]
-        stacked = regular_factors.whiten(torch.cat(pieces, dim=2), noise)
+        stacked = whiten(torch.cat(pieces, dim=2), noise)
         squared = (stacked[..., -1] * stacked[..., -1]).sum(dim=1)
         weight = student_weight(squared, components, freedom, consistent=True)
         stacked = stacked * torch.sqrt(weight)[:, None, None]
@@ -104,7 +105,7 @@ class EliminateLandmarks(nn.Module):
         sums = sums.index_put((window.owner,), products, accumulate=True)
         departure = measured - window.estimate
         precision = _prior_precision(departure, variance, freedom)
-        inverse = regular_factors.invert(sums[:, :, :LANDMARK_SIZE] + torch.diag_embed(precision))
+        inverse = invert(sums[:, :, :LANDMARK_SIZE] + torch.diag_embed(precision))
         prior = torch.nn.functional.pad((departure * precision)[..., None], (size, 0))
         sums = sums[:, :, LANDMARK_SIZE:] + prior
         solved = inverse @ sums
@@ -125,7 +126,7 @@ class Condition(nn.Module):
         """In units of the prior."""
         identity = torch.eye(factor.shape[1], dtype=factor.dtype, device=factor.device)
         whole = identity + factor.mT @ information @ factor
-        covariance = factor @ regular_factors.invert((whole + whole.mT) / 2.0) @ factor.mT
+        covariance = factor @ invert((whole + whole.mT) / 2.0) @ factor.mT
         learned = torch.cat([vector[:, None], -information @ common], dim=1)
         moved = covariance @ learned
         return moved[:, 0], covariance, common + moved[:, 1:]

@@ -8,7 +8,7 @@ from torch.func import vmap
 
 from sigmaslam.estimation.calibration_errors import measured_errors
 from sigmaslam.geometry.camera import RectifiedStereo
-from sigmaslam_filters.core import regular_factors
+from sigmaslam_filters.core import plain_factors, unrolled_factors
 from sigmaslam_models.estimator.calibration_errors import unmodelled_errors
 from sigmaslam_models.estimator.frame_update import FrameEstimate, FrameViews, RobustStep, update_frame
 from sigmaslam_models.estimator.graph_examples import ROBUST_INPUTS, WINDOW_INPUTS, frame_example, window_example
@@ -32,10 +32,10 @@ def test_factors_and_inverses_are_those_of_lapack(shape):
     matrix = spd(*shape)
     right = torch.randn(*shape, 5, dtype=torch.float64)
     factor = torch.linalg.cholesky(matrix)
-    torch.testing.assert_close(regular_factors.cholesky(matrix), factor, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(plain_factors.definite_cholesky(matrix), factor, rtol=1e-9, atol=1e-12)
     expected = torch.linalg.solve_triangular(factor, right, upper=False)
-    torch.testing.assert_close(regular_factors.whiten(right, matrix), expected, rtol=1e-8, atol=1e-9)
-    inverse = regular_factors.invert(matrix)
+    torch.testing.assert_close(unrolled_factors.whiten(right, matrix), expected, rtol=1e-8, atol=1e-9)
+    inverse = plain_factors.invert(matrix)
     torch.testing.assert_close(inverse, inverse.mT, rtol=0, atol=0)
     # In units of each unknown's deviation: no digit is lost to the scales.
     sigma = torch.diagonal(torch.cholesky_inverse(factor), dim1=-2, dim2=-1).sqrt()
