@@ -62,15 +62,24 @@ class Symmetric:
 
     sees_error: ClassVar[bool] = True
 
+    def spread(self, size: int) -> float:
+        """n + lambda for n = size: the points of a pair are its root times a column away, and weigh half its inverse.
+
+        Raises:
+            ValueError: the points are imaginary.
+        """
+        spread = self.alpha**2 * (size + self.kappa)
+        if spread <= 0:
+            raise ValueError(f"no sigma points for n = {size}: alpha^2 (n + kappa) = {spread:g} must be positive")
+        return spread
+
     def weights(self, size: int) -> tuple[float, float, float]:
         """Of each pair's points, and the centre's for mean and covariance, for n = size.
 
         Raises:
             ValueError: the points are imaginary, or the centre's covariance weight is negative and not asked for.
         """
-        spread = self.alpha**2 * (size + self.kappa)  # n + lambda
-        if spread <= 0:
-            raise ValueError(f"no sigma points for n = {size}: alpha^2 (n + kappa) = {spread:g} must be positive")
+        spread = self.spread(size)
         centre = (spread - size) / spread
         centre_covariance = centre + 1.0 - self.alpha**2 + self.beta
         if centre_covariance < -1e-12 and not self.allow_negative:
@@ -112,9 +121,8 @@ class Symmetric:
         weight, _, centre_covariance = self.weights(size)
         scale = math.sqrt(0.5 * weight)
         first = values.movedim(-1, 1)
-        plus, minus = first[:size], first[size : 2 * size]
-        odd = ((plus - minus) * scale).movedim((0, 1), (-1, -2))
-        even = ((plus + minus - 2.0 * mean.movedim(-1, 0)) * scale).movedim((0, 1), (-1, -2))
+        halves = odd_and_even(first[:size], first[size : 2 * size], mean.movedim(-1, 0))
+        odd, even = ((half * scale).movedim((0, 1), (-1, -2)) for half in halves)
         if not with_centre or centre_covariance == 0.0:
             return Columns(odd, even)
         centre = ((values[-1] - mean) * math.sqrt(abs(centre_covariance))).unsqueeze(-1)
@@ -151,6 +159,11 @@ class Simplex:
         used = values[: size + 1]
         odd = (used - mean).movedim(0, -1) @ corners.mT / math.sqrt(size + 1)
         return Columns(odd, (used.mean(dim=0) - mean).unsqueeze(-1))
+
+
+def odd_and_even(plus: Tensor, minus: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
+    """What pairs of values say of a function, any shape that broadcasts; divided by 2 sqrt(n + lambda), columns."""
+    return plus - minus, plus + minus - 2.0 * mean
 
 
 def cubature() -> Symmetric:

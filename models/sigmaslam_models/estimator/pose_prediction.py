@@ -11,8 +11,10 @@ import torch
 from torch import Tensor, nn
 
 from sigmaslam_filters.core.plain_factors import cholesky
+from sigmaslam_filters.core.sigma_points import cubature
+from sigmaslam_filters.core.transforms import Unscented
+from sigmaslam_filters.graphs.exact_operators import ExactOperators
 from sigmaslam_filters.manifolds.se3_matrices import adjoint_se3, exp_se3, invert_se3, log_se3
-from sigmaslam_models.estimator.cubature_transform import covariance_of, sigma_offsets
 
 POSE = slice(0, 6)
 TWIST = slice(6, 12)
@@ -32,11 +34,16 @@ class Predict(nn.Module):
         self, pose: Tensor, twist: Tensor, covariance: Tensor, step: Tensor, densities: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Sigma points through T Exp(twist dt); noise is added after."""
-        offsets = sigma_offsets(cholesky(covariance)[0])
         predicted = pose @ exp_se3(twist * step)
-        moved = exp_se3(offsets[:, POSE]) @ pose @ exp_se3((twist + offsets[:, TWIST]) * step)
-        error = log_se3(moved @ invert_se3(predicted))
-        mean, spread = covariance_of(torch.cat([error, offsets[:, TWIST]], dim=-1))
+        back = invert_se3(predicted)
+
+        def moved(offsets: Tensor) -> Tensor:
+            after = exp_se3(offsets[:, POSE]) @ pose @ exp_se3((twist + offsets[:, TWIST]) * step)
+            return torch.cat([log_se3(after @ back), offsets[:, TWIST]], dim=-1)
+
+        with ExactOperators():
+            state = Unscented(cubature())(moved, cholesky(covariance)[0], None)
+            mean, spread = state.mean, state.columns.covariance()
         return exp_se3(mean[POSE]) @ predicted, spread + _process_noise(predicted, step, densities)
 
 

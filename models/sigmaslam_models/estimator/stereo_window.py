@@ -22,12 +22,14 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from sigmaslam_filters.core.sigma_points import cubature, odd_and_even
 from sigmaslam_filters.manifolds.se3_matrices import exp_se3
 
 POSE = slice(0, 6)
 CALIBRATION = slice(6, 9)
 LANDMARK = slice(9, 13)
 SIZE = 13
+_SPREAD = cubature().spread(SIZE)
 
 # A point whose depth along the view's optical axis is below this share of its depth in the host is not used: it is
 # behind the camera, or about to be. A power of two is exact in float32, through which the exporter takes scalars.
@@ -56,7 +58,7 @@ class StereoTransfer(nn.Module):
         landmark_spread: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The unscented transform (steps 4 and 5 of Table 9.2), landmark by landmark."""
-        root = torch.sqrt(torch.tensor(float(SIZE), dtype=relative.dtype, device=relative.device))
+        root = torch.sqrt(torch.tensor(_SPREAD, dtype=relative.dtype, device=relative.device))
         steps = root * spread.movedim(-1, 0)
         six, nine = CALIBRATION.start, LANDMARK.start
         # The last three columns of a lower factor do not move the pose.
@@ -85,10 +87,8 @@ class StereoTransfer(nn.Module):
         three, four = nine - six, SIZE - nine
         plus = torch.cat([by_pose[:, :six], others[:, :three], others[:, count : count + four]], dim=1)
         minus = torch.cat([by_pose[:, six:], others[:, three : count - 1], others[:, count + four :]], dim=1)
-        total = plus + minus
-        mean = total.sum(dim=1) / (2.0 * SIZE)
-        even = ((total - 2.0 * mean[:, None]) / (2.0 * root)).permute(2, 0, 1)
-        odd = ((plus - minus) / (2.0 * root)).permute(2, 0, 1)
+        mean = (plus + minus).sum(dim=1) / (2.0 * _SPREAD)
+        odd, even = ((half / (2.0 * root)).permute(2, 0, 1) for half in odd_and_even(plus, minus, mean[:, None]))
         return mean.mT, odd, even @ even.mT, (depth[count - 1] > _NEAREST).to(mean.dtype)
 
 
