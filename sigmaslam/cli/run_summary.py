@@ -8,7 +8,7 @@ from typing import Any
 import typer
 
 from sigmaslam.files import printable
-from sigmaslam.run_record.verdict import contradiction_verdict
+from sigmaslam.run_record.verdict import contradiction_verdict, times_verdict
 
 NOT_TRACKED = 3
 """Exit code where less than half of the frames were tracked."""
@@ -24,7 +24,7 @@ def tell_summary(summary: dict[str, Any], out: Path) -> None:
         f"{summary['tracking'] + summary['relocalised']} of {summary['frames']} frames tracked, "
         f"{summary['starting']} starting, {summary['lost']} lost, {summary['skipped']} skipped; "
         f"{summary['median_inliers']:.0f} inliers in the median frame, {summary['map_points']} map points.\n"
-        f"{_world(summary)}{_contradiction(summary)}{summary['calibration_verdict']}\n"
+        f"{_world(summary)}{_times(summary)}{_contradiction(summary)}{summary['calibration_verdict']}\n"
         f"{_location_verdict(summary)}{_real_time_verdict(summary)}Report: {printable(out / 'report.html')}"
     )
     if summary["failure"] is not None:
@@ -37,6 +37,12 @@ def _world(summary: dict[str, Any]) -> str:
     if not summary["first_frame_with_pose"] or summary["world"] is None:
         return ""
     return f"The world is {summary['world']}; frames before it have no pose.\n"
+
+
+def _times(summary: dict[str, Any]) -> str:
+    """A line where stamps jitter or images repeat."""
+    verdict = times_verdict(summary)
+    return "" if verdict is None else f"{verdict}\n"
 
 
 def _contradiction(summary: dict[str, Any]) -> str:

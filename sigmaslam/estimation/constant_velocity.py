@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sigmaslam.geometry.se3 import nearest_rigid, se3_inverse, se3_log
+from sigmaslam.geometry.se3 import nearest_rigid, se3_adjoint, se3_inverse, se3_log
 from sigmaslam.inference.backends import load_step
 
 # Order of the graph's error state, see sigmaslam_models.estimator.pose_prediction.
@@ -66,8 +66,14 @@ class MotionFilter:
         self._covariance[:, _TWIST] = 0.0
         self._covariance[_TWIST, _TWIST] = np.diag(sigma**2)
 
-    def predict(self, seconds: float, densities: np.ndarray) -> None:
-        """Moves on; densities (2,): power spectra of the accelerations, m^2/s^3 and rad^2/s^3."""
+    def predict(self, seconds: float, densities: np.ndarray, sigma: float = 0.0) -> None:
+        """Moves on.
+
+        Args:
+            seconds: since the last frame.
+            densities: (2,) power spectra of the accelerations, m^2/s^3 and rad^2/s^3.
+            sigma: standard deviation of the seconds; along the velocity the pose is that much less certain.
+        """
         self.step, covariance = self._predict(
             {
                 "pose": self.step,
@@ -78,6 +84,9 @@ class MotionFilter:
             }
         )
         self._covariance = 0.5 * (covariance + covariance.T)
+        if sigma > 0.0:
+            along = sigma * (se3_adjoint(self.step) @ self.twist)
+            self._covariance[_POSE, _POSE] += np.outer(along, along)
 
     def widen(self, factor: float) -> None:
         """The prediction is off by more than it claims: all its variances are so many times as large."""

@@ -154,7 +154,7 @@ class LocationFilter:
             self.summary.unused += len(self._due_readings(estimate.timestamp))
             return estimate
         # Before its first pose the tracker counts as tracked: its world has no error yet.
-        tracked = estimate.status != "lost"
+        tracked = estimate.status not in ("lost", "skipped")
         relocalised = tracked and not self._was_tracked
         if relocalised:
             # The tracker's error is that of before the loss; the drift since then does not count.

@@ -19,6 +19,7 @@ STATUS_COLOURS = {
     "starting": bgr("#9aa3ad"),
     "tracking": bgr("#3fa7f0"),
     "lost": bgr("#ff6a3d"),
+    "skipped": bgr("#c8a24a"),
     "relocalised": bgr("#e08bc0"),
 }
 """Those of the report."""

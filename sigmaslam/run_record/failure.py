@@ -27,7 +27,7 @@ def explain_failure(summary: dict[str, Any], in_map: bool, started: bool, findin
     if tracked:
         counts = (
             f"Less than half of the frames were tracked: of {frames}, {summary['lost']} are lost, "
-            f"{summary['starting']} were before or at the start, {skipped} could not be read."
+            f"{summary['starting']} were before or at the start, {skipped} could not be read or show an image again."
         )
         return f"{counts} {reasons}".rstrip()
     if reasons:

@@ -63,14 +63,14 @@ class FrameTable:
 
 
 def predicted_poses(frames: FrameTable, timestamps: np.ndarray) -> np.ndarray:
-    """(N,) bool, which poses the motion alone predicts: of frames that are lost, or start without success.
+    """(N,) bool, which poses the motion alone predicts: of frames that are lost or skipped, or start without success.
 
     Args:
         frames: of the run.
         timestamps: (N,) of its poses, seconds.
     """
     status = np.array(frames.status)
-    without_images = frames.columns["timestamp"][(status == "lost") | (status == "starting")]
+    without_images = frames.columns["timestamp"][np.isin(status, ("lost", "skipped", "starting"))]
     predicted = np.isin(np.round(timestamps, 6), np.round(without_images, 6))
     predicted[:1] = False
     return np.asarray(predicted)

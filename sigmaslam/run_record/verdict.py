@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from sigmaslam.checks.finding import Finding, wrong
+from sigmaslam.checks.time_stamps import jitter_words
 from sigmaslam.slam.estimate import CalibrationEstimate
 
 MIN_FRAMES, MIN_POINTS = 10, 45
@@ -47,6 +48,22 @@ def contradiction_verdict(summary: dict[str, Any]) -> str | None:
         f"In {contradicted} of {tracked} tracked frames fewer than half of the matches agree with the pose: something "
         "large moves in the images, and the poses may follow it instead of the scene."
     )
+
+
+def times_verdict(summary: dict[str, Any]) -> str | None:
+    """What drivers did to stamps and images, in words; None where nothing can be seen.
+
+    Args:
+        summary: of run.json: the noise of stamps, seconds, and how many frames showed an image again.
+    """
+    noise, repeated = summary.get("stamp_noise", 0.0), summary.get("repeated", 0)
+    words = [f"Time {jitter_words(noise)}."] if noise > 0.0 else []
+    if repeated:
+        words.append(
+            f"{repeated} frames show the left or right image of the frame before, to the byte: they were skipped (same "
+            "image), and their poses are predicted. Does the driver freeze?"
+        )
+    return " ".join(words) or None
 
 
 def calibration_verdict(

@@ -13,6 +13,7 @@ import numpy as np
 
 from sigmaslam.checks.finding import Finding, wrong
 from sigmaslam.errors import OutputError, SigmaSlamError
+from sigmaslam.estimation.frame_clock import stamp_noise
 from sigmaslam.files import atomic_path, atomic_write_text
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import write_kitti, write_tum
@@ -243,6 +244,8 @@ def _summarise(
         "median_inliers": float(np.median(inliers)) if len(inliers) else 0.0,
         "map_points": points,
         "contradicted": 0 if frames is None else _count_contradicted(frames),
+        "stamp_noise": 0.0 if frames is None else stamp_noise(np.diff(frames.columns["timestamp"])),
+        "repeated": 0 if frames is None else _count_repeated(frames),
         "calibration_errors": {} if calibration is None else {k: list(v) for k, v in calibration.errors.items()},
     }
 
@@ -251,6 +254,12 @@ def _count_contradicted(frames: FrameTable) -> int:
     """Tracked frames whose pose fewer than half of the matches agree with."""
     tracked = np.array(frames.status) == "tracking"
     return int((tracked & (2.0 * frames.columns["inliers"] < frames.columns["matches"])).sum())
+
+
+def _count_repeated(frames: FrameTable) -> int:
+    """Frames that were skipped though they could be read: one of their images is that of the frame before."""
+    skipped = np.array(frames.status) == "skipped"
+    return int((skipped & np.isfinite(frames.columns["belief"])).sum())
 
 
 def _describe_world(summary: dict[str, Any], run: dict[str, Any]) -> str | None:

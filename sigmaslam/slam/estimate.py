@@ -42,7 +42,8 @@ class Estimate:
             in the frame that defines the world, infinite variances before it.
         matching_covariance: (6, 6) the part of the covariance that comes from matches and motion; the rest comes from
             errors of the calibration.
-        status: "starting", "tracking", "lost", or "relocalised": found again among keyframes that had left the window,
+        status: "starting", "tracking", "lost", "skipped": one of the images is that of the frame before, the pose is
+            predicted, or "relocalised": found again among keyframes that had left the window,
             or in the map.
         belief: 1 - sqrt of the largest eigenvalue of the covariance of the pose relative to the keyframe (metres and
             radians together), clipped to [0, 1] (Tables 9.1, 9.2); 0 without a pose.

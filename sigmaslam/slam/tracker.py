@@ -12,6 +12,7 @@ from threadpoolctl import ThreadpoolController
 from sigmaslam.estimation.calibration_errors import CalibrationPrior
 from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.estimator_graphs import EstimatorGraphs
+from sigmaslam.estimation.frame_clock import FrameClock
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.frame_update import FrameUpdate
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
@@ -26,6 +27,7 @@ from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.frame_history import FrameHistory
+from sigmaslam.slam.frozen_images import LastPair
 from sigmaslam.slam.guided_matching import GuidedMatcher, GuidedMatches
 from sigmaslam.slam.keyframes import Keyframes
 from sigmaslam.slam.landmark_admission import AdmitAll, LandmarkAdmission
@@ -106,6 +108,7 @@ class StereoTracker:
         self._noise = noise = MeasurementNoise(config)
         self._motion = motion = MotionFilter(backend)
         self._course = course = Course()
+        self._clock, self._last_pair = FrameClock(), LastPair()
         self._keyframes = keyframes = Keyframes(window, config.max_keyframes, config.max_points, self._beside)
         update = FrameUpdate(window, config.iterations)
         guided = GuidedMatcher(rectified, frontend, window, update, noise, config)
@@ -152,8 +155,10 @@ class StereoTracker:
         clock.lap("rectify")
         if self._course.timestamp is not None:
             # Constant velocity since the last frame.
-            self._motion.predict(timestamp - self._course.timestamp, densities(self.config, self._window.depth))
-        matches, fit = self._localise(frame, timestamp, clock)
+            seconds, sigma = self._clock.tick(timestamp - self._course.timestamp)
+            self._motion.predict(seconds, densities(self.config, self._window.depth), sigma)
+        is_repeated = self._last_pair.is_repeated(left, right)
+        matches, fit = (GuidedMatches.empty(), None) if is_repeated else self._localise(frame, timestamp, clock)
         landmarks = self._window.landmarks.id[matches.views.landmark]
         self.last_frame = MatchedFrame(
             frame.left, frame.right, landmarks, matches, None if fit is None else fit.inliers
@@ -165,13 +170,16 @@ class StereoTracker:
             fit = self._correct(fit, matches, frame, timestamp)
             filtered = self._motion.state
             tracks = self._mapper.insert_if_due(frame, timestamp, fit, matches, expected)
+        elif is_repeated:
+            status, tracks = "skipped", None
         elif (found := self._relocaliser.relocalise(frame.view)) is not None:
             status = "relocalised"
             tracks = self._recovery.resume(found, timestamp)
         else:
             status = "lost" if self._course.has_moved else "starting"
             tracks = self._recovery.start_or_recover(frame.view, timestamp)
-        self._remember(frame, matches, fit, tracks)
+        if not is_repeated:
+            self._remember(frame, matches, fit, tracks)
         frame.finish()
         loop = self._loops.close() if tracks is not None else None
         clock.lap("map")

@@ -199,7 +199,7 @@ class _Ours:
 
     def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> _Step:
         estimate = self._tracker.step(left, right, timestamp)
-        pose = estimate.T_world_camera if estimate.has_pose and estimate.status != "lost" else None
+        pose = estimate.T_world_camera if estimate.has_pose and estimate.status not in ("lost", "skipped") else None
         return _Step(pose, estimate.inliers, estimate.tracks is not None, estimate.milliseconds)
 
     def close(self) -> None:

@@ -109,3 +109,11 @@ def test_images_that_differ_by_less_than_noise_are_the_same():
     noisy = np.clip(left + rng.normal(scale=3.0, size=left.shape), 0, 255).astype(np.uint8)
     assert {each.name: each.severity for each in check_images([(left, left.copy())])}["same image"] == "error"
     assert {each.name: each.severity for each in check_images([(left, noisy)])}["same image"] == "ok"
+
+
+def test_stamps_of_a_host_are_named():
+    stamps = 0.05 * np.arange(60) + np.random.default_rng(0).normal(0.0, 0.01, 60)
+    finding = check_time_stamps(np.diff(stamps).tolist())
+    assert finding.severity == "warning"
+    assert "host stamps" in finding.message
+    assert finding.figure == pytest.approx(0.01, rel=0.3)

@@ -3,7 +3,7 @@
 import pytest
 
 from sigmaslam.checks.finding import Finding
-from sigmaslam.run_record.verdict import calibration_verdict, contradiction_verdict, expected_offset
+from sigmaslam.run_record.verdict import calibration_verdict, contradiction_verdict, expected_offset, times_verdict
 from sigmaslam.slam.tracker import CalibrationEstimate
 
 EXPECTED = 0.1
@@ -81,3 +81,9 @@ def test_what_the_images_show_comes_before_the_offset():
     assert "do not fit the calibration" in said
     assert ROWS.message in said
     assert "left is left" not in said
+
+
+def test_stamps_that_jitter_and_images_that_repeat_are_said():
+    assert times_verdict({"stamp_noise": 0.0, "repeated": 0}) is None
+    assert "jitter by 31 ms" in times_verdict({"stamp_noise": 0.031, "repeated": 0})
+    assert "10 frames" in times_verdict({"stamp_noise": 0.0, "repeated": 10})

@@ -1,0 +1,86 @@
+"""When frames were taken: time stamps are an observation of a clock, and their noise is in their intervals."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+
+# Intervals that are remembered, and so many must be there before they are judged: a moment needs a few.
+_REMEMBERED, _LEAST = 20, 4
+# Share of the mean interval up to which stamps are believed as they are: recordings that a sensor has stamped stay
+# below 0.02, and the motion's own noise covers more than this.
+_BELIEVED = 0.05
+# Intervals of up to so many frames are drops of a regular camera; a longer one alone is a pause, and stamps that
+# alternate by two fifths of an interval are nine times as far apart as they are close.
+_MOST_DROPPED = 4
+# Seconds. A slower camera's frames were chosen, and a host is late by less; the motion in between is unknown anyway.
+_SLOWEST = 0.5
+# Of the mean interval: no two frames of a camera are closer.
+_LEAST_STEP = 0.1
+
+
+def stamp_noise(intervals: Sequence[float] | np.ndarray) -> float:
+    """Standard deviation of time stamps, seconds: zero where they can be believed.
+
+    The noise of a stamp lengthens one interval and shortens the next one: its variance is the negative covariance of
+    successive intervals, of a camera whose own intervals are independent of each other (a moving average of order 1).
+
+    Args:
+        intervals: seconds between successive stamps, in order.
+    """
+    steps = np.asarray(intervals, float)
+    if len(steps) > _LEAST and steps.max() > 3.0 * np.median(steps):
+        # One long interval is a pause; several with short ones between them are bursts.
+        steps = np.delete(steps, np.argmax(steps))
+    if len(steps) < _LEAST or np.median(steps) > _SLOWEST or _are_multiples(steps):
+        return 0.0
+    departure = steps - steps.mean()
+    variance = -float(np.sum(departure[1:] * departure[:-1])) / len(steps)
+    sigma = float(np.sqrt(max(variance, 0.0)))
+    return sigma if sigma > _BELIEVED * steps.mean() else 0.0
+
+
+class FrameClock:
+    """Tells how long it is since the last frame, and how well that is known.
+
+    A Kalman filter of the frame's time: it moves on by the mean interval, with the variance that intervals have beside
+    the noise of stamps, and a stamp is measured with that noise. Where stamps can be believed they are taken as they
+    are, to the bit.
+    """
+
+    def __init__(self) -> None:
+        self._intervals: deque[float] = deque(maxlen=_REMEMBERED)
+
+    def tick(self, interval: float) -> tuple[float, float]:
+        """Takes the interval between two stamps, seconds.
+
+        Returns:
+            The time between the two frames, and its standard deviation, seconds.
+        """
+        self._intervals.append(interval)
+        steps = np.array(self._intervals)
+        noise = stamp_noise(steps)
+        if noise == 0.0:
+            return interval, 0.0
+        mean = float(steps.mean())
+        own = max(float(steps.var()) - 2.0 * noise**2, 0.0)
+        # Times relative to a regular clock that starts with the first stamp.
+        stamp = ahead = before = 0.0
+        variance = noise**2
+        for step in steps:
+            stamp, before = stamp + step - mean, ahead
+            variance += own
+            gain = variance / (variance + noise**2)
+            ahead, variance = ahead + gain * (stamp - ahead), (1.0 - gain) * variance
+        return max(mean + ahead - before, _LEAST_STEP * mean), noise
+
+
+def _are_multiples(steps: np.ndarray) -> bool:
+    """Whether all intervals are some few times one of a regular camera."""
+    frames = np.round(steps / max(float(steps.min()), np.finfo(float).tiny))
+    if frames.max() > _MOST_DROPPED:
+        return False
+    departure = steps * frames.sum() / steps.sum() - frames
+    return float(np.sqrt(np.mean(departure**2))) <= _BELIEVED

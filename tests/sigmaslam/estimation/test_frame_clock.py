@@ -1,0 +1,62 @@
+"""The clock of frames against stamps whose noise is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sigmaslam.estimation.frame_clock import FrameClock, stamp_noise
+
+FRAMES = 40
+REGULAR = 0.1 * np.arange(FRAMES)
+
+
+def steps_of(stamps: np.ndarray) -> list[tuple[float, float]]:
+    clock = FrameClock()
+    return [clock.tick(step) for step in np.diff(stamps)]
+
+
+@pytest.mark.parametrize(
+    "stamps",
+    [
+        REGULAR,
+        REGULAR + np.random.default_rng(1).normal(0.0, 2e-3, FRAMES),
+        np.delete(REGULAR, [5, 6, 15, 20, 21, 22]),
+        np.cumsum(0.05 * np.random.default_rng(2).integers(1, 5, FRAMES)),
+        REGULAR + 7.0 * (np.arange(FRAMES) > 20),
+        np.cumsum(np.random.default_rng(3).uniform(1.0, 4.0, FRAMES)),
+    ],
+    ids=["exact", "a sensor's own noise", "drops", "chosen frames", "a pause", "keyframes"],
+)
+def test_stamps_that_can_be_believed_are_taken_to_the_bit(stamps: np.ndarray):
+    assert steps_of(stamps) == [(step, 0.0) for step in np.diff(stamps)]
+
+
+def test_the_noise_of_stamps_is_found():
+    for seed in range(5):
+        stamps = 0.1 * np.arange(2000) + np.random.default_rng(seed).normal(0.0, 0.02, 2000)
+        assert stamp_noise(np.diff(stamps)) == pytest.approx(0.02, rel=0.1)
+
+
+def test_intervals_that_vary_by_themselves_are_no_noise_of_stamps():
+    """Neighbours do not depend on each other: the covariance is within three of its standard deviations of zero."""
+    intervals = np.random.default_rng(0).uniform(0.08, 0.12, 5000)
+    assert stamp_noise(intervals) == 0.0
+
+
+@pytest.mark.parametrize(
+    "noise",
+    [
+        0.04 * (-1.0) ** np.arange(FRAMES),
+        np.random.default_rng(4).normal(0.0, 0.02, FRAMES),
+        -0.096 * (np.arange(FRAMES) % 3) + 0.096,
+    ],
+    ids=["alternating", "Gaussian", "bursts of three"],
+)
+def test_jitter_is_smoothed_and_said(noise: np.ndarray):
+    """From the second burst on the step is nearer to the camera's than the stamps', and three sigma hold the truth."""
+    stamps = REGULAR + noise
+    found = np.array(steps_of(stamps))[8:]
+    assert (found[:, 1] > 0.0).mean() > 0.9
+    assert np.abs(found[:, 0] - 0.1).mean() < 0.5 * np.abs(np.diff(stamps)[8:] - 0.1).mean()
+    assert (np.abs(found[:, 0] - 0.1) < 3.0 * found[:, 1] + 1e-9).mean() > 0.9

@@ -1,0 +1,43 @@
+"""A driver that delivers an image again."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sigmaslam.slam.frozen_images import LastPair
+from sigmaslam.slam.tracker import StereoTracker
+from tests.support.estimates import Demo
+
+
+def test_one_repeated_image_is_enough_and_a_grey_one_says_nothing():
+    noise = np.random.default_rng(0).integers(0, 256, (4, 8, 9), np.uint8)
+    pair, grey = LastPair(), np.full((8, 9), 7, np.uint8)
+    assert not pair.is_repeated(noise[0], noise[1])
+    assert pair.is_repeated(noise[0], noise[2])
+    assert not pair.is_repeated(noise[3], noise[0])
+    assert pair.is_repeated(noise[1], noise[0])
+    assert not pair.is_repeated(grey, grey)
+    assert not pair.is_repeated(grey, grey)
+
+
+def test_the_same_array_filled_again_is_another_image():
+    buffer = np.random.default_rng(0).integers(0, 256, (8, 9), np.uint8)
+    pair = LastPair()
+    pair.is_repeated(buffer, buffer)
+    buffer[3, 3] ^= 1
+    assert not pair.is_repeated(buffer, buffer)
+
+
+@pytest.mark.long
+def test_frozen_frames_are_skipped_and_tracking_goes_on_where_the_camera_is(demo: Demo):
+    camera, frames, _ = demo
+    tracker, moving = StereoTracker(camera), StereoTracker(camera)
+    for k, frame in enumerate(frames[:20]):
+        shown = frames[11] if 12 <= k < 16 else frame
+        estimate = tracker.step(shown.left, shown.right, frame.timestamp)
+        right = moving.step(frame.left, frame.right, frame.timestamp)
+        away = np.linalg.inv(estimate.T_world_camera)[:3] @ right.T_world_camera[:, 3]
+        sigma = np.sqrt(np.linalg.eigvalsh(estimate.covariance[:3, :3])[-1])
+        assert k == 0 or np.linalg.norm(away) < 4.0 * sigma + 1e-9
+        assert estimate.status == ("starting" if k == 0 else "skipped" if 12 <= k < 16 else "tracking")
