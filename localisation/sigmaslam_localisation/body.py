@@ -16,9 +16,9 @@ from sigmaslam.files import atomic_write_text
 from sigmaslam.plot_style import BLUE, GREY, has_matplotlib, style_axes
 from sigmaslam.report.figures import save_png
 from sigmaslam_filters import SO3, Gaussian, degree_of_belief
+from sigmaslam_localisation.localisation_page import write_page
 from sigmaslam_localisation.localise import FilterName, Localisation, localise, make_filter
 from sigmaslam_localisation.output import write_lines
-from sigmaslam_localisation.page import write_page
 from sigmaslam_localisation.starry import StereoRecording
 from sigmaslam_localisation.steps import Steps
 from sigmaslam_localisation.stereo_points import BODY, CONSTANTS, SPACE, StereoBody

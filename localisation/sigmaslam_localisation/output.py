@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sigmaslam.files import atomic_path, atomic_write_text
-from sigmaslam_localisation.page import draw_robots, write_page
+from sigmaslam_localisation.localisation_page import draw_robots, write_page
 from sigmaslam_localisation.recording import Recording
 from sigmaslam_localisation.robots import RobotEstimate
 from sigmaslam_localisation.scores import innovation_statistics, score, score_map

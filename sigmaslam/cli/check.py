@@ -42,7 +42,7 @@ def check(
     result = check_sequence(sequence)
     _print_table(result.findings)
     if out is not None:
-        from sigmaslam.checks.page import write_page  # loads jinja2
+        from sigmaslam.checks.check_page import write_page  # loads jinja2
 
         write_page(out, result, str(sequence.source))
         typer.echo(f"Page: {out}")

@@ -17,7 +17,6 @@ from sigmaslam.estimation.frame_clock import stamp_noise
 from sigmaslam.files import atomic_path, atomic_write_text
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import write_kitti, write_tum
-from sigmaslam.run_record.failure import explain_failure
 from sigmaslam.run_record.frame_pictures import PICTURES_NAME
 from sigmaslam.run_record.frame_table import FRAMES_NAME, STATUSES, FrameTable, read_frames
 from sigmaslam.run_record.pose_file import PARTIAL_POSES, PoseRecords, read_pose_records
@@ -28,6 +27,7 @@ from sigmaslam.run_record.relative_pose_file import (
     collect_frame_pairs,
     write_frame_pairs,
 )
+from sigmaslam.run_record.run_failure import explain_failure
 from sigmaslam.run_record.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY, RUN_NAME, write_ply
 from sigmaslam.run_record.verdict import calibration_verdict, expected_offset
 from sigmaslam.slam.estimate import CalibrationEstimate

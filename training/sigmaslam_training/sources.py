@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sigmaslam.errors import InputError
 from sigmaslam_synthetic.render_choices import PRESET_NAMES
-from sigmaslam_synthetic.rendering.photographs import photographs
+from sigmaslam_synthetic.rendering.photograph_textures import photographs
 from sigmaslam_synthetic.rendering.textures import KINDS
 from sigmaslam_synthetic.worlds.own import SUFFIX, check_world
 from sigmaslam_training.mixes import MIXES

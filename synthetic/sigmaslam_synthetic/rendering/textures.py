@@ -29,7 +29,7 @@ from sigmaslam_synthetic.rendering.fills import (
     strokes,
     vessels,
 )
-from sigmaslam_synthetic.rendering.photographs import cut
+from sigmaslam_synthetic.rendering.photograph_textures import cut
 
 _SMALLEST_LEAF = 3.0
 # The patterns of an image: small leaves are cut of small sheets, large leaves of sheets as large as the image.

@@ -16,9 +16,9 @@ from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import open_sequence
 from sigmaslam.readers.trajectory_files import read_kitti, read_tum, write_kitti
 from sigmaslam.report.figures import plot_trajectory
-from sigmaslam.run_record.failure import explain_failure
 from sigmaslam.run_record.frame_table import predicted_poses, read_frames
 from sigmaslam.run_record.relative_pose_file import read_frame_pairs
+from sigmaslam.run_record.run_failure import explain_failure
 from sigmaslam.runs.track import track_sequence
 from sigmaslam_benchmarks.trial import read_trial
 from sigmaslam_evaluation.evaluation_summary import format_evaluation
