@@ -147,7 +147,7 @@ def test_a_peer_that_is_missing_is_left_out_with_a_note_once(tmp_path: Path, mon
     assert sum("cuVSLAM is left out" in each for each in notes) == 1
     assert _rows(text, "cuVSLAM") == []
     (row, sizes) = _rows(text, "KLT + PnP")
-    assert row[3] == "10.0 (10.0 - 10.0)"
+    assert row[3] == "12.5 (12.5 - 12.5)"
     assert len(sizes) == 1 + len(runtime.SCALES)
 
 
@@ -174,10 +174,10 @@ def test_what_was_measured_is_written_when_it_is_stopped(tmp_path: Path, monkeyp
         write_runtime(page, None, "the command", ("klt-pnp",), ["demo"], 1, 5)
     assert "Stopped before the end" in page.read_text()
     ((_, _, _, cpu, _, ratio, wall, *_),) = _rows(page.read_text(), "KLT + PnP")
-    assert (cpu, ratio, wall) == ("10.0", "-", "-")
+    assert (cpu, ratio, wall) == ("12.5", "-", "-")
 
 
-def test_the_page_has_medians_over_rounds_and_ratios_within_them():
+def test_the_page_has_means_over_frames_medians_over_rounds_and_ratios_within_them():
     runs: list[TimedRun | Omission] = []
     for turn, slowness in enumerate((1.0, 2.0, 10.0)):  # the machine was busy
         for threads in (1, 2):
@@ -189,12 +189,12 @@ def test_the_page_has_medians_over_rounds_and_ratios_within_them():
     assert "3 rounds" in page
     assert "Peers: dim-odom 1.0." in page
     table, keyframes, others, size = _rows(page, "ours")
-    assert table[1:7] == ["0 of 6", "0.0123", "60.0 (30.0 - 300.0)", "111.0", "3.00", "60.0 (30.0 - 300.0)"]
+    assert table[1:7] == ["0 of 6", "0.0123", "75.0 (37.5 - 375.0)", "111.0", "3.00", "75.0 (37.5 - 375.0)"]
     assert table[8:] == ["13.3", "100", "0.50"]  # 1 / (60 + 60 + 60 + 120) ms * 4
     assert keyframes[1:3] == ["keyframes", "1"]
     assert others[1:3] == ["others", "3"]
     assert float(keyframes[-1]) == 2 * float(others[-1]) == 120.0
-    assert size == ["ours", "30.0"]
+    assert size == ["ours", "37.5"]
     assert _rows(page, "cuVSLAM")[0][5] == "1.00"
 
 

@@ -69,7 +69,8 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     subprocess.run([*pip, str(wheel)], check=True)
     packages = next(venv.glob("lib/python*/site-packages"))
     # A folder that a .pth file names is searched last, and .pth files in it, of an editable installation, are not read.
-    (packages / "others.pth").write_text("\n".join(site.getsitepackages()))
+    # The benchmarks are in no wheel: their commands run from the checkout.
+    (packages / "others.pth").write_text("\n".join([*site.getsitepackages(), str(ROOT / "evaluation")]))
     environment = {**os.environ, "PATH": f"{venv / 'bin'}{os.pathsep}{os.environ['PATH']}"}
     environment.pop("PYTHONPATH", None)
     return environment

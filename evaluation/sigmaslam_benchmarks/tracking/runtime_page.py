@@ -33,8 +33,8 @@ Every method runs in a process of its own, once held on one core and once on two
 methods take turns, {rounds}. Figures are medians over the rounds, with the lowest and highest round in brackets.
 
 - *CPU ms*: CPU time of all threads of the process from one frame to the next. *Wall ms*: time until the pose of a frame
-  is there. Medians over the frames but the first {warm_up}; *p95*: 95 % of the frames take less. Images are decoded
-  before, and reading them is not counted.
+  is there. Means over the frames but the first {warm_up}, keyframes in them; *p95*: 95 % of the frames take less.
+  Images are decoded before, and reading them is not counted.
 - *times cuVSLAM's*: ratio of the CPU times of the same round.
 - *frames/s*: frames by the sum of their wall times, two threads.
 - *peak MiB*: largest resident memory of the process, two threads, with Python and all libraries.
@@ -80,7 +80,7 @@ def runtime_label(method: str) -> str:
 def progress(run: TimedRun) -> str:
     """A run in a line."""
     threads = "1 thread" if run.threads == 1 else f"{run.threads} threads"
-    cpu, wall = np.median(run.timing.cpu_ms), np.median(run.timing.wall_ms)
+    cpu, wall = np.mean(run.timing.cpu_ms), np.mean(run.timing.wall_ms)
     return (
         f"{run.sequence}, {run.variant}: {runtime_label(run.method)}, {threads}, {cpu:.1f} ms CPU, {wall:.1f} ms wall, "
         f"{run.timing.peak_mib:.0f} MiB, ATE {_number(run.ate, '.4f')} m"
@@ -130,16 +130,16 @@ def _row(method: str, runs: Sequence[TimedRun]) -> list[str]:
     of_method = [run for run in runs if run.method == method]
     one, two = ([run for run in of_method if run.threads == threads] for threads in (1, 2))
     tracked = int(np.median([len(run.timing.poses) for run in of_method]))
-    cuvslam = {run.round: np.median(run.timing.cpu_ms) for run in runs if (run.method, run.threads) == ("cuvslam", 1)}
-    ratios = [np.median(run.timing.cpu_ms) / cuvslam[run.round] for run in one if run.round in cuvslam]
+    cuvslam = {run.round: np.mean(run.timing.cpu_ms) for run in runs if (run.method, run.threads) == ("cuvslam", 1)}
+    ratios = [np.mean(run.timing.cpu_ms) / cuvslam[run.round] for run in one if run.round in cuvslam]
     return [
         runtime_label(method),
         f"{tracked} of {of_method[0].timing.frames}",
         _number(float(np.median([run.ate for run in of_method])), ".4f"),
-        _spread(one, _median_cpu, ".1f"),
+        _spread(one, _mean_cpu, ".1f"),
         _middle(one, lambda run: float(np.percentile(run.timing.cpu_ms, 95)), ".1f"),
         _number(float(np.median(ratios)) if ratios else np.nan, ".2f"),
-        _spread(two, lambda run: float(np.median(run.timing.wall_ms)), ".1f"),
+        _spread(two, lambda run: float(np.mean(run.timing.wall_ms)), ".1f"),
         _middle(two, lambda run: float(np.percentile(run.timing.wall_ms, 95)), ".1f"),
         _middle(two, lambda run: 1e3 / float(np.mean(run.timing.wall_ms)), ".1f"),
         _middle(two, lambda run: run.timing.peak_mib, ".0f"),
@@ -168,7 +168,7 @@ def _size_lines(runs: list[TimedRun]) -> list[str]:
     for method in METHODS:
         of_method = [run for run in runs if run.method == method]
         if of_method:
-            cells = [_spread([run for run in of_method if run.variant == size], _median_cpu, ".1f") for size in sizes]
+            cells = [_spread([run for run in of_method if run.variant == size], _mean_cpu, ".1f") for size in sizes]
             rows.append([runtime_label(method), *cells])
     return [
         "## Cost and image size",
@@ -189,7 +189,7 @@ def _landmark_lines(runs: list[TimedRun]) -> list[str]:
                 *variant.split(", "),
                 runtime_label(method),
                 _middle(chosen, lambda run: float(np.median(run.timing.landmarks)), ".0f"),
-                _spread(chosen, _median_cpu, ".1f"),
+                _spread(chosen, _mean_cpu, ".1f"),
                 _middle(chosen, lambda run: float(np.median(run.timing.stages_ms["filter"])), ".1f"),
                 _middle(chosen, lambda run: run.ate, ".4f"),
             ]
@@ -205,8 +205,8 @@ def _landmark_lines(runs: list[TimedRun]) -> list[str]:
     ]
 
 
-def _median_cpu(run: TimedRun) -> float:
-    return float(np.median(run.timing.cpu_ms))
+def _mean_cpu(run: TimedRun) -> float:
+    return float(np.mean(run.timing.cpu_ms))
 
 
 def _middle(runs: Sequence[TimedRun], measure: Callable[[TimedRun], float], form: str) -> str:
