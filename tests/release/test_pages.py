@@ -37,19 +37,20 @@ NOT_RUN = {
 }
 
 
-def commands() -> list[tuple[str, str]]:
-    """Page and line of every command in a block without a language."""
-    found = []
-    for page in PAGES:
-        blocks = re.findall(r"^```(\w*)\n(.*?)^```$", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
-        for block in [content for language, content in blocks if not language]:
-            lines = [line.partition("  #")[0].strip() for line in block.splitlines()]
-            found += [(page.name, line) for line in lines if line.startswith("sigmaslam ")]
-    return found
+def commands(page: Path) -> list[str]:
+    """Every command in a block without a language, in their order."""
+    blocks = re.findall(r"^```(\w*)\n(.*?)^```$", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    lines = [
+        line.partition("  #")[0].strip()
+        for language, content in blocks
+        if not language
+        for line in content.splitlines()
+    ]
+    return [line for line in lines if line.startswith("sigmaslam ")]
 
 
 def test_the_pages_have_commands():
-    lines = [line for _, line in commands()]
+    lines = [line for page in PAGES for line in commands(page)]
     assert len(lines) > 30
     assert all(any(line.startswith(start) for line in lines) for start in NOT_RUN)
 
@@ -77,8 +78,8 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 
 @pytest.fixture(scope="module")
-def folder(installed: dict[str, str], demo_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Stand-ins for what the commands read, and a run; what one command renders is there for the next."""
+def stand_ins(installed: dict[str, str], demo_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Stand-ins for what the commands read, and a run."""
     folder = tmp_path_factory.mktemp("empty")
     write_stand_ins(demo_sequence, folder)
     shutil.copy(folder / CALIBRATION, folder / "kept.yaml")
@@ -89,21 +90,24 @@ def folder(installed: dict[str, str], demo_sequence: Path, tmp_path_factory: pyt
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-@pytest.mark.parametrize(("page", "command"), commands())
-def test_a_command_runs_as_it_stands(installed: dict[str, str], folder: Path, page: str, command: str):
-    for start, reason in NOT_RUN.items():
-        if command.startswith(start):
-            pytest.skip(reason)
-    # Lines that write the same folder are alternatives; a map is read from a run with the same front-end.
-    for out in re.findall(r"--out (\S+)", command):
-        shutil.rmtree(folder / out, ignore_errors=True)
-    (folder / CALIBRATION).unlink(missing_ok=True)
-    if not re.search(rf"(--out|convert \S+) {CALIBRATION}", command):
-        shutil.copy(folder / "kept.yaml", folder / CALIBRATION)
-    if "run/map.npz" in command:
-        shutil.rmtree(folder / "run", ignore_errors=True)
-        shutil.copytree(folder / "tracked", folder / "run")
-    done = subprocess.run(
-        command, shell=True, cwd=folder, env=installed, capture_output=True, text=True, check=False, timeout=3600
-    )
-    assert done.returncode == 0, f"{page}: {command}\n{done.stdout}\n{done.stderr}"
+@pytest.mark.parametrize("page", [page for page in PAGES if commands(page)], ids=lambda page: page.stem)
+def test_commands_of_a_page_run_as_they_stand(installed: dict[str, str], stand_ins: Path, tmp_path: Path, page: Path):
+    """One after another: what one command writes is there for the next."""
+    folder = tmp_path / "empty"
+    shutil.copytree(stand_ins, folder, symlinks=True)
+    for command in commands(page):
+        if command.startswith(tuple(NOT_RUN)):
+            continue
+        # Lines that write the same folder are alternatives; a map is read from a run with the same front-end.
+        for out in re.findall(r"--out (\S+)", command):
+            shutil.rmtree(folder / out, ignore_errors=True)
+        (folder / CALIBRATION).unlink(missing_ok=True)
+        if not re.search(rf"(--out|convert \S+) {CALIBRATION}", command):
+            shutil.copy(folder / "kept.yaml", folder / CALIBRATION)
+        if "run/map.npz" in command:
+            shutil.rmtree(folder / "run", ignore_errors=True)
+            shutil.copytree(folder / "tracked", folder / "run")
+        done = subprocess.run(
+            command, shell=True, cwd=folder, env=installed, capture_output=True, text=True, check=False, timeout=3600
+        )
+        assert done.returncode == 0, f"{page.name}: {command}\n{done.stdout}\n{done.stderr}"
