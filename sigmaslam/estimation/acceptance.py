@@ -27,10 +27,12 @@ class Acceptance:
         same_motion: pixels between what two poses see, in the median; nearer ones say the same.
         scaled_agreement: share of the views that agree at the frame's own noise scale; with fewer they are outliers.
         max_noise_scale: of variances; right matches err by no more than three times what they claim, all together.
-        sharpness: share of the sharpest keyframe's; drives give 0.8 to 1.1, motion blur over 11 px 0.6 to 0.75.
-        least_sharpness: share of the sharpest keyframe's; bounds by how much a blurred frame is less certain.
+        sharpness: share of what keyframes saw of the same landmarks; drives give 0.86 to 1.2, motion blur over 11 px
+            0.6 to 0.78.
+        least_sharpness: likewise; bounds by how much a blurred frame is less certain.
         usual_clustering: factor on variances; nine of ten quiet frames stay below, the noise of landmarks covers it.
         scattered_nis: NIS per degree of freedom; a blurred view above it would spoil what comes after, as a keyframe.
+        blurred_landmarks: share of the last keyframe's; below it a blurred view is better than none.
         keyframe_points: times the least inliers, of stereo points; most of them are lost until the next keyframe.
         start_stereo_share: of the keypoints seen by both eyes; with less a first keyframe may be of one eye alone.
         swapped_share: of the disparities behind infinity; no offset puts more there, swapped eyes do.
@@ -52,10 +54,11 @@ class Acceptance:
     same_motion: float = 2.0
     scaled_agreement: float = 0.95
     max_noise_scale: float = 9.0
-    sharpness: float = 0.75
+    sharpness: float = 0.8
     least_sharpness: float = 0.1
     usual_clustering: float = 2.0
     scattered_nis: float = 1.6
+    blurred_landmarks: float = 0.5
     keyframe_points: int = 2
     start_stereo_share: float = 0.25
     swapped_share: float = 0.1

@@ -7,6 +7,8 @@ import numpy as np
 
 # Smoothing before derivatives are taken: standard deviation and reach, pixels.
 _BLUR, _REACH = 0.7, 3
+# Half the side of patches that are compared, as those that are aligned, and what derivatives need beside them, pixels.
+_RADIUS, _MARGIN = 7, _REACH + 1
 
 
 def sharpness(image: np.ndarray) -> float:
@@ -17,6 +19,30 @@ def sharpness(image: np.ndarray) -> float:
     smooth = cv2.sepFilter2D(image, cv2.CV_32F, _KERNEL, _KERNEL)
     first = sum(cv2.norm(cv2.Sobel(smooth, cv2.CV_32F, *axes, ksize=1)) ** 2 for axes in ((1, 0), (0, 1)))
     return float(cv2.norm(cv2.Laplacian(smooth, cv2.CV_32F)) ** 2 / max(first, 1.0))
+
+
+def patch_energies(image: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """(M, 2) energies of the first and second derivatives in patches of an image, grey values squared.
+
+    The sum of the second over that of the first is the sharpness of all patches together.
+
+    Args:
+        image: (H, W) uint8.
+        places: (M, 2) centres of the patches, pixels.
+    """
+    if not len(places):
+        return np.zeros((0, 2))
+    reach = _RADIUS + _MARGIN
+    corner = np.rint(places).astype(np.int64)[:, ::-1]
+    framed = cv2.copyMakeBorder(image, *(4 * [reach]), cv2.BORDER_REPLICATE)
+    windows = np.lib.stride_tricks.sliding_window_view(framed, (2 * reach + 1, 2 * reach + 1))
+    patches = windows[tuple(np.clip(corner, 0, np.array(image.shape) - 1).T)]
+    # One below the other, so that one call filters all; what their margins share is cut off.
+    smooth = cv2.sepFilter2D(patches.reshape(-1, 2 * reach + 1), cv2.CV_32F, _KERNEL, _KERNEL)
+    across, down = (cv2.Sobel(smooth, cv2.CV_32F, *axes, ksize=1) for axes in ((1, 0), (0, 1)))
+    maps = across * across + down * down, cv2.Laplacian(smooth, cv2.CV_32F) ** 2
+    inner = slice(_MARGIN, -_MARGIN)
+    return np.column_stack([each.reshape(patches.shape)[:, inner, inner].mean(axis=(1, 2)) for each in maps])
 
 
 def _gaussian() -> np.ndarray:

@@ -21,7 +21,8 @@ class Keyframe:
         id: number that no other keyframe of the tracker has.
         timestamp: seconds.
         view: what it saw; the right image is given up with the window.
-        sharpness: of its left image.
+        energies: (N, 2) of its features' patches, as of `patch_energies`; none once it has left the window.
+        blur: of its image, as of `Keyframes.blur`.
         dense: disparities as of `dense_disparity`, while it is in the window; None where there are none.
         points: landmarks that it was the anchor of, in its frame, once it has left the window.
     """
@@ -29,14 +30,15 @@ class Keyframe:
     id: int
     timestamp: float
     view: StereoView
-    sharpness: float = 0.0
+    energies: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    blur: float = 1.0
     dense: Deferred[np.ndarray] | None = None
     points: PointMap = field(default_factory=PointMap.empty)
 
     def leave_window(self, points: PointMap) -> Keyframe:
         """The keyframe as it is remembered, with the points (in its frame) that leave with it."""
         view = replace(self.view, right=np.zeros((0, 0), np.uint8), small=())
-        return replace(self, view=view, dense=None, points=points)
+        return replace(self, view=view, energies=np.zeros((0, 2)), dense=None, points=points)
 
     def measure_surfaces(self, landmarks: LandmarkTable, anchor: int) -> None:
         """Notes in the table how much the surfaces around the landmarks of this keyframe vary; `anchor`: its number."""

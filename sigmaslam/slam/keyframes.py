@@ -11,8 +11,9 @@ import numpy as np
 
 from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
+from sigmaslam.estimation.landmark_table import LandmarkViews
 from sigmaslam.frontend import StereoView
-from sigmaslam.frontend.image_sharpness import sharpness
+from sigmaslam.frontend.image_sharpness import patch_energies
 from sigmaslam.frontend.patch_disparity_range import dense_disparity
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.slam.deferred import Deferred
@@ -28,6 +29,9 @@ from sigmaslam.slam.point_map import (
     points_in_world,
     window_points,
 )
+
+# Patches that are compared for blur: in the mean of so many what single ones show of the scene evens out.
+_COMPARED = 30
 
 
 class Keyframes:
@@ -68,20 +72,37 @@ class Keyframes:
         recent = max(self._first_id, self.active[0].id - count)
         return [keyframe for keyframe in self.remembered if keyframe.id < recent]
 
-    def append(self, view: StereoView, timestamp: float) -> None:
-        """Takes the newest keyframe of the window."""
+    def append(self, view: StereoView, timestamp: float, blur: float = 1.0) -> None:
+        """Takes the newest keyframe of the window, with its blur."""
         dense = Deferred(lambda: dense_disparity(view))
         if self._executor is not None:
             dense.begin(self._executor)
-        self.active.append(Keyframe(self._next_id, timestamp, view, sharpness(view.left), dense))
+        energies = patch_energies(view.left, view.features.keypoints)
+        self.active.append(Keyframe(self._next_id, timestamp, view, energies, blur, dense))
         self._next_id += 1
 
-    def blur(self, left: np.ndarray) -> float:
-        """How many times as sharp as an image the sharpest keyframe is; 1 where what is seen may be the reason."""
-        here, sharpest = sharpness(left), max(keyframe.sharpness for keyframe in self.active)
-        if here >= ACCEPTANCE.sharpness * sharpest:
-            return 1.0
-        return sharpest / max(here, ACCEPTANCE.least_sharpness * sharpest)
+    def blur(self, left: np.ndarray, seen: LandmarkViews) -> tuple[float, float]:
+        """By how much blur makes places in an image less certain, and by how much its matches; 1 where sharp.
+
+        The first is how many times as sharp as the image the keyframes saw the same landmarks, where chance is not
+        the reason. A match has the errors of both images.
+
+        Args:
+            left: (H, W) uint8.
+            seen: landmarks of the window in it.
+        """
+        landmarks = self._window.landmarks
+        anchor, feature = landmarks.anchor[seen.landmark], landmarks.feature[seen.landmark]
+        blurs = np.array([keyframe.blur for keyframe in self.active])[anchor]
+        # Compared with the sharpest keyframes that share enough with the image.
+        by_sharpness = np.argsort(blurs, kind="stable")
+        sharp = np.flatnonzero(blurs <= blurs[by_sharpness[:_COMPARED]].max())
+        energies = np.array([self.active[anchor[k]].energies[feature[k]] for k in sharp]).sum(axis=0)
+        here = patch_energies(left, seen.measurement[sharp, :2]).sum(axis=0)
+        # Without derivatives there is nothing to compare.
+        share = here[1] * energies[0] / max(here[0] * energies[1] * blurs[sharp].mean(), np.finfo(float).tiny)
+        own = 1.0 if share >= ACCEPTANCE.sharpness else 1.0 / max(float(share), ACCEPTANCE.least_sharpness)
+        return own, own + float(blurs.mean()) - 1.0
 
     def marginalise_oldest(self, spare: Keyframe | None = None) -> np.ndarray:
         """Moves the oldest keyframe to the past, and its landmarks to the map.

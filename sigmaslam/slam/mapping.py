@@ -60,6 +60,7 @@ class NewKeyframe:
         step_covariance: (6, 6) of that, perturbed from the left in the last keyframe.
         views: of the window's landmarks.
         origin: of the first one, the past pose relative to which `step_covariance` is.
+        blur: of its image, as of `Keyframes.blur`.
     """
 
     view: StereoView
@@ -69,6 +70,7 @@ class NewKeyframe:
     step_covariance: np.ndarray
     views: LandmarkViews = field(default_factory=LandmarkViews.empty)
     origin: int | None = None
+    blur: float = 1.0
 
 
 @dataclass(slots=True)
@@ -106,6 +108,7 @@ class Mapper:
         frame: Frame,
         timestamp: float,
         fit: FrameFit,
+        blur: float,
         matches: GuidedMatches,
         expected: tuple[np.ndarray, np.ndarray],
     ) -> KeyframeTracks | None:
@@ -115,24 +118,27 @@ class Mapper:
             frame: the tracked one.
             timestamp: seconds.
             fit: its pose.
+            blur: of its image, as of `Keyframes.blur`.
             matches: with the window's landmarks.
             expected: step (4, 4) from the last keyframe without its images, and its covariance (6, 6).
         """
         self._loss += _LOSS_ADAPTATION * (self._last_count - fit.count - self._loss)
         self._last_count = fit.count
-        # A scale beyond the NIS is that of blur: such a keyframe would spoil what comes after it. A sharp view that
-        # scatters is one: no keyframes at all for 20 frames lost the KITTI drive.
-        inflation = fit.inflation / fit.clustering
-        blurred = inflation > fit.nis_before_scaling > ACCEPTANCE.scattered_nis
-        if fit.count >= self.config.keyframe_ratio * self._landmarks_in_keyframe or blurred:
+        share = fit.count / max(self._landmarks_in_keyframe, 1)
+        if share >= self.config.keyframe_ratio:
+            return None
+        # A blurred keyframe would spoil what comes after it, too few landmarks spoil more. A sharp view that scatters
+        # is one: no keyframes at all for 20 frames lost the KITTI drive.
+        scatters = fit.nis_before_scaling > ACCEPTANCE.scattered_nis
+        if blur > 1.0 and scatters and share >= ACCEPTANCE.blurred_landmarks:
             return None
         view = frame.view
         admitted = view.only(self.admission.admit(view, fit.pose, self.window))
         if not admitted.has_stereo(self.admission.min_points, self.config.min_inliers):
             return None
         # With what neighbours share counted here, too, the truth is missed by more where the calibration is off.
-        views = matches.views.select(fit.inliers).inflated(inflation)
-        return self.insert(NewKeyframe(admitted, timestamp, fit.pose, *expected, views))
+        views = matches.views.select(fit.inliers).inflated(fit.noise_scale * fit.inflation / fit.clustering)
+        return self.insert(NewKeyframe(admitted, timestamp, fit.pose, *expected, views, blur=blur))
 
     def insert(self, new: NewKeyframe) -> KeyframeTracks:
         """Makes a view a keyframe: what it has in stereo beside the views of known landmarks is new.
@@ -153,21 +159,21 @@ class Mapper:
         depth = self.camera.focal_baseline / disparity
         window.add_keyframe(new.pose, new.step, step_covariance, walk, depth, new.origin)
         view = replace(new.view, slope=disparity_slopes(new.view.features.keypoints, new.view.disparity))
-        keyframes.append(view, new.timestamp)
+        keyframes.append(view, new.timestamp, new.blur)
         window.add_views(views)
-        self._add_landmarks(view, views)
+        self._add_landmarks(view, views, new.blur)
         seen = LandmarkViews.concatenate([views, window.landmarks.anchor_views(len(window) - 1)])
         window.solve()
         self.motion.start_keyframe()
         self._landmarks_in_keyframe = self._last_count = len(seen)
         return KeyframeTracks(window.landmarks.id[seen.landmark], seen.measurement, seen.covariance)
 
-    def _add_landmarks(self, view: StereoView, views: LandmarkViews) -> None:
-        """Makes landmarks of the stereo points that no landmark has been found at."""
+    def _add_landmarks(self, view: StereoView, views: LandmarkViews, blur: float) -> None:
+        """Makes landmarks of the stereo points that no landmark has been found at, less certain where it is blurred."""
         index = np.flatnonzero(np.isfinite(view.disparity))
         taken = views.measurement[:, :2]
         scale = np.clip(np.sqrt(view.left.size / _FULL_SPACING_FROM), _LEAST_SPACING, 1.0)
         spacing = float(scale) * self.config.spacing
         index = index[select_spaced(view.features.select(index), taken, spacing, view.left.shape)]
         measured = view.measured(index)
-        self.window.add_landmarks(index, measured, self.noise.of_keypoints(view, index))
+        self.window.add_landmarks(index, measured, blur * self.noise.of_keypoints(view, index))

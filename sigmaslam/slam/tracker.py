@@ -167,9 +167,10 @@ class StereoTracker:
         if fit is not None:
             status = "tracking"
             expected = self._motion.step, self._motion.step_covariance
-            fit = self._correct(fit, matches, frame, timestamp)
+            blur, of_matches = self._keyframes.blur(frame.left, matches.views.select(fit.inliers))
+            fit = self._correct(fit, of_matches, matches, timestamp)
             filtered = self._motion.state
-            tracks = self._mapper.insert_if_due(frame, timestamp, fit, matches, expected)
+            tracks = self._mapper.insert_if_due(frame, timestamp, fit, blur, matches, expected)
         elif is_repeated:
             status, tracks = "skipped", None
         elif (found := self._relocaliser.relocalise(frame.view)) is not None:
@@ -236,11 +237,11 @@ class StereoTracker:
         keyframes = [keyframe.view for keyframe in self._keyframes.active]
         return self._localiser.localise(view, keyframes, prediction, guided, clock)
 
-    def _correct(self, fit: FrameFit, matches: GuidedMatches, frame: Frame, timestamp: float) -> FrameFit:
+    def _correct(self, fit: FrameFit, blur: float, matches: GuidedMatches, timestamp: float) -> FrameFit:
         """Takes a pose over, less certain where the frame is blurred."""
         # Patches that are blurred are misplaced alike, along the blur and towards where they were expected: many of
         # them say no more than a few. So do those of a body that moves on its own.
-        fit = fit.inflated(max(fit.nis_before_scaling, 1.0) * self._keyframes.blur(frame.left) * fit.clustering)
+        fit = fit.inflated(max(fit.nis_before_scaling, 1.0) * blur * fit.clustering)
         seen = matches.views.select(fit.inliers)
         self._admission.confirm(seen, self._window)
         self._window.count_sightings(matches.searched, seen.landmark)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sigmaslam.frontend.affine_alignment import align_patches
-from sigmaslam.frontend.image_sharpness import sharpness
+from sigmaslam.frontend.image_sharpness import patch_energies, sharpness
 from sigmaslam.frontend.lucas_kanade import refine
 from sigmaslam.frontend.plane_alignment import disparity_slopes, plane_maps, refine_in_rows, refine_on_planes
 from sigmaslam.geometry.camera import RectifiedStereo
@@ -144,3 +144,28 @@ def test_blur_is_less_sharp_and_darkness_is_not(kernel, least, most):
     assert least <= sharpness(cv2.blur(image, kernel)) / whole <= most
     assert sharpness((0.5 * image + 20.0).astype(np.uint8)) == pytest.approx(whole, rel=0.02)
     assert sharpness(np.full_like(image, 7)) == 0.0
+
+
+def test_energies_of_patches_are_those_of_the_image_cut_out():
+    image = digitised(textured(), 3)
+    places = np.array([[60.2, 40.0], [100.0, 71.4]])
+    for place, (first, second) in zip(places, patch_energies(image, places), strict=True):
+        u, v = np.rint(place).astype(int)
+        # The derivatives need a margin, which the mean leaves out; its own border is that of the whole image.
+        cut = image[v - 30 : v + 31, u - 30 : u + 31]
+        alone = patch_energies(cut, np.array([[30.0, 30.0]]))[0]
+        np.testing.assert_allclose((first, second), alone, rtol=1e-6)
+    # All over the image they say what it does.
+    grid = np.stack(np.meshgrid(*(np.arange(11, side - 11, 15) for side in image.shape[::-1])), axis=-1).reshape(-1, 2)
+    sharp, blurred = (patch_energies(each, grid).sum(axis=0) for each in (image, cv2.blur(image, (11, 1))))
+    expected = sharpness(cv2.blur(image, (11, 1))) / sharpness(image)
+    assert blurred[1] / blurred[0] / (sharp[1] / sharp[0]) == pytest.approx(expected, rel=0.05)
+    assert not patch_energies(np.full_like(image, 7), places).any()
+    assert patch_energies(image, np.zeros((0, 2))).shape == (0, 2)
+
+
+def test_energies_outside_the_image_are_those_at_its_edge():
+    image = digitised(textured(), 3)
+    height, width = image.shape
+    outside, edge = np.array([[-5.0, height + 9.0]]), np.array([[0.0, height - 1.0]])
+    np.testing.assert_array_equal(patch_energies(image, outside), patch_energies(image, edge))
