@@ -34,7 +34,7 @@ def patch_energies(image: np.ndarray, places: np.ndarray) -> np.ndarray:
         return np.zeros((0, 2))
     reach = _RADIUS + _MARGIN
     corner = np.rint(places).astype(np.int64)[:, ::-1]
-    framed = cv2.copyMakeBorder(image, *(4 * [reach]), cv2.BORDER_REPLICATE)
+    framed = np.pad(image, reach, mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(framed, (2 * reach + 1, 2 * reach + 1))
     patches = windows[tuple(np.clip(corner, 0, np.array(image.shape) - 1).T)]
     # One below the other, so that one call filters all; what their margins share is cut off.

@@ -166,6 +166,6 @@ def test_energies_of_patches_are_those_of_the_image_cut_out():
 
 def test_energies_outside_the_image_are_those_at_its_edge():
     image = digitised(textured(), 3)
-    height, width = image.shape
+    height = len(image)
     outside, edge = np.array([[-5.0, height + 9.0]]), np.array([[0.0, height - 1.0]])
     np.testing.assert_array_equal(patch_energies(image, outside), patch_energies(image, edge))
