@@ -99,9 +99,10 @@ class Keyframes:
         sharp = np.flatnonzero(blurs <= blurs[by_sharpness[:_COMPARED]].max())
         energies = np.array([self.active[anchor[k]].energies[feature[k]] for k in sharp]).sum(axis=0)
         here = patch_energies(left, seen.measurement[sharp, :2]).sum(axis=0)
-        # Without derivatives there is nothing to compare.
-        share = here[1] * energies[0] / max(here[0] * energies[1] * blurs[sharp].mean(), np.finfo(float).tiny)
-        own = 1.0 if share >= ACCEPTANCE.sharpness else 1.0 / max(float(share), ACCEPTANCE.least_sharpness)
+        reference = here[0] * energies[1] * blurs[sharp].mean()
+        # Where nothing varies there is nothing to compare.
+        share = float(here[1] * energies[0] / reference) if reference > 0.0 else 1.0
+        own = 1.0 if share >= ACCEPTANCE.sharpness else 1.0 / max(share, ACCEPTANCE.least_sharpness)
         return own, own + float(blurs.mean()) - 1.0
 
     def marginalise_oldest(self, spare: Keyframe | None = None) -> np.ndarray:
