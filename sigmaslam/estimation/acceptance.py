@@ -18,6 +18,7 @@ class Acceptance:
         unguided_share: of the matches near a pose without a prediction; fewer suffice, it was told from movers before.
         doubtful_nis: NIS per degree of freedom; a fit above it may sit in a wrong place.
         doubtful_inliers: times the least inliers above that NIS; so large a noise excuses chance agreement of a few.
+        left_over: share of the landmarks of the last frame; what covers the view leaves more from frame to frame.
         last_keyframes: number compared without a prediction; one of them may be blurred or covered.
         unguided_margin: share of the scene's depth, and radians, that an unguided pose is off by beyond its covariance.
         probable_share: of the matches that should be right by their probabilities; symmetric texture gives less.
@@ -27,12 +28,17 @@ class Acceptance:
         same_motion: pixels between what two poses see, in the median; nearer ones say the same.
         scaled_agreement: share of the views that agree at the frame's own noise scale; with fewer they are outliers.
         max_noise_scale: of variances; right matches err by no more than three times what they claim, all together.
+        second_motion: share of the image that another motion explains, of what both do; from there on nobody knows.
+        time_error: frames by which an image is another moment's; drives that brake stay below a tenth.
+        time_share: of a pose's departure that goes as the velocity does, where the stamp is wrong and not the pose.
+        jump: sigmas of the prediction by which a pose that was found without it departs.
+        jump_support: share of the landmarks of earlier keyframes in view that must confirm such a pose.
         sharpness: share of what keyframes saw of the same landmarks; drives give 0.86 to 1.2, motion blur over 11 px
             0.6 to 0.78.
         least_sharpness: likewise; bounds by how much a blurred frame is less certain.
         usual_clustering: factor on variances; nine of ten quiet frames stay below, the noise of landmarks covers it.
         scattered_nis: NIS per degree of freedom; a blurred view above it would spoil what comes after, as a keyframe.
-        blurred_landmarks: share of the last keyframe's; below it a blurred view is better than none.
+        bad_keyframe_landmarks: share of the last keyframe's; below it a blurred view is better than none.
         keyframe_points: times the least inliers, of stereo points; most of them are lost until the next keyframe.
         start_stereo_share: of the keypoints seen by both eyes; with less a first keyframe may be of one eye alone.
         swapped_share: of the disparities behind infinity; no offset puts more there, swapped eyes do.
@@ -45,6 +51,7 @@ class Acceptance:
     unguided_share: float = 0.3
     doubtful_nis: float = 2.0
     doubtful_inliers: int = 3
+    left_over: float = 0.25
     last_keyframes: int = 3
     unguided_margin: float = 0.01
     probable_share: float = 0.5
@@ -54,11 +61,16 @@ class Acceptance:
     same_motion: float = 2.0
     scaled_agreement: float = 0.95
     max_noise_scale: float = 9.0
+    second_motion: float = 0.1
+    time_error: float = 0.5
+    time_share: float = 0.8
+    jump: float = 10.0
+    jump_support: float = 0.5
     sharpness: float = 0.8
     least_sharpness: float = 0.1
     usual_clustering: float = 2.0
     scattered_nis: float = 1.6
-    blurred_landmarks: float = 0.5
+    bad_keyframe_landmarks: float = 0.5
     keyframe_points: int = 2
     start_stereo_share: float = 0.25
     swapped_share: float = 0.1

@@ -34,8 +34,11 @@ def stamp_noise(intervals: Sequence[float] | np.ndarray) -> float:
     if len(steps) > _LEAST and steps.max() > 3.0 * np.median(steps):
         # One long interval is a pause; several with short ones between them are bursts.
         steps = np.delete(steps, np.argmax(steps))
-    if len(steps) < _LEAST or np.median(steps) > _SLOWEST or _are_multiples(steps):
+    if len(steps) < 2 or np.median(steps) > _SLOWEST or _are_multiples(steps):
         return 0.0
+    if len(steps) < _LEAST:
+        # Too few for a moment, but bursts show at once.
+        return float(steps.std()) if steps.max() > _MOST_DROPPED * steps.min() else 0.0
     departure = steps - steps.mean()
     variance = -float(np.sum(departure[1:] * departure[:-1])) / len(steps)
     sigma = float(np.sqrt(max(variance, 0.0)))
@@ -48,10 +51,19 @@ class FrameClock:
     A Kalman filter of the frame's time: it moves on by the mean interval, with the variance that intervals have beside
     the noise of stamps, and a stamp is measured with that noise. Where stamps can be believed they are taken as they
     are, to the bit.
+
+    Attributes:
+        was_believed: stamps before the last one were taken as they are.
     """
 
     def __init__(self) -> None:
         self._intervals: deque[float] = deque(maxlen=_REMEMBERED)
+        self.was_believed, self._is_believed = True, True
+
+    @property
+    def interval(self) -> float:
+        """Mean of the last ones, seconds; 0 before the first."""
+        return float(np.mean(self._intervals)) if self._intervals else 0.0
 
     def tick(self, interval: float) -> tuple[float, float]:
         """Takes the interval between two stamps, seconds.
@@ -62,6 +74,7 @@ class FrameClock:
         self._intervals.append(interval)
         steps = np.array(self._intervals)
         noise = stamp_noise(steps)
+        self.was_believed, self._is_believed = self._is_believed, noise == 0.0
         if noise == 0.0:
             return interval, 0.0
         mean = float(steps.mean())

@@ -236,7 +236,8 @@ def _refuse_errors(window: KeyframeWindow) -> bool:
     for index in indices:
         window.refused[index] = estimate[index]
         window.calibration = window.calibration.considering(index)
+        # Whatever they stand for, it is as large as they are.
         window.prior, window.posterior = (
-            state.without_estimate(index, prior.sigma[index]) for state in (window.prior, window.posterior)
+            state.without_estimate(index, abs(estimate[index])) for state in (window.prior, window.posterior)
         )
     return bool(indices)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from sigmaslam.slam.doubt import Doubt
 from sigmaslam.slam.mapping import KeyframeTracks
 from sigmaslam.slam.relative_poses import RelativePoses
 
@@ -42,9 +43,10 @@ class Estimate:
             in the frame that defines the world, infinite variances before it.
         matching_covariance: (6, 6) the part of the covariance that comes from matches and motion; the rest comes from
             errors of the calibration.
-        status: "starting", "tracking", "lost", "skipped": one of the images is that of the frame before, the pose is
-            predicted, or "relocalised": found again among keyframes that had left the window,
-            or in the map.
+        status: "starting"; "tracking"; "doubtful": tracked, but `doubts` speak against the pose, and the covariance
+            holds what they may make of it; "ambiguous": likewise, and another pose explains the image about as well;
+            "lost"; "skipped": one of the images has been delivered before, the pose is predicted; or "relocalised":
+            found again among keyframes that had left the window, or in the map.
         belief: 1 - sqrt of the largest eigenvalue of the covariance of the pose relative to the keyframe (metres and
             radians together), clipped to [0, 1] (Tables 9.1, 9.2); 0 without a pose.
         matches, inliers: points matched to the keyframe, and those that passed the gate.
@@ -55,6 +57,7 @@ class Estimate:
             without them.
         tracks: what the frame saw, where it became a keyframe.
         relative_poses: relative to keyframes some way and some time back.
+        doubts: what speaks against the pose.
         loop: time stamp of the keyframe of long ago that the frame, a keyframe, closes a loop with, seconds.
     """
 
@@ -73,6 +76,7 @@ class Estimate:
     frame_covariance: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
     tracks: KeyframeTracks | None = None
     relative_poses: RelativePoses = field(default_factory=RelativePoses.empty)
+    doubts: tuple[Doubt, ...] = ()
     loop: float | None = None
 
     @property

@@ -18,8 +18,8 @@ from sigmaslam.geometry.se3 import se3_inverse
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.measurement_noise import MeasurementNoise
 
-# A landmark that so many views have confirmed stands still: something that moves is a landmark for a frame, too.
-_CONFIRMED = 2
+CONFIRMED = 2
+"""A landmark that so many views agree with stands still: something that moves is a landmark for a frame, too."""
 # The prediction holds where so many of them are where it says: the others may be covered by what moves.
 _RIGHT = 0.3
 # The quantile of the chi-square distribution with two degrees of freedom is that of an exponential one.
@@ -136,7 +136,7 @@ class GuidedMatcher:
         predicted = np.concatenate([search.predicted for _, search in searches])
         start = carry(left, self.window.landmarks.id[rows], predicted)
         covariances = [search.covariance for _, search in searches if search.covariance is not None]
-        confirmed = self.window.landmarks.views[rows] >= _CONFIRMED
+        confirmed = self.window.landmarks.views[rows] >= CONFIRMED
         excess = _excess((start - predicted)[confirmed], np.concatenate(covariances)[confirmed])
         searches = [(each, search.widened(excess)) for each, search in searches]
         starts = np.split(start, np.cumsum([len(each) for each, _ in searches])[:-1])

@@ -29,6 +29,11 @@ class LandmarkFollower:
         """There is a last frame with a pose."""
         return self._left is not None
 
+    @property
+    def count(self) -> int:
+        """Landmarks that were seen in the last frame; 0 where it had no pose."""
+        return 0 if self._left is None else len(self._id)
+
     def forget(self) -> None:
         """There is no last frame with a pose."""
         self._left = None

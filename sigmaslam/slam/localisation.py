@@ -81,7 +81,7 @@ class Localiser:
         clock.lap("match")
         fit = self._fit_near(matches, prediction)
         clock.lap("filter")
-        if fit is None or fit.nis_per_dof > ACCEPTANCE.doubtful_nis or self.follower.has_fallen(matches, fit.inliers):
+        if fit is None or self._is_doubtful(fit) or self.follower.has_fallen(matches, fit.inliers):
             return None
         return matches, fit
 
@@ -103,14 +103,29 @@ class Localiser:
             clock.lap("match")
             fit = self._fit_near(matches, prediction)
             clock.lap("filter")
-        if fit is None or fit.nis_per_dof > ACCEPTANCE.doubtful_nis:
+        if fit is None or self._is_doubtful(fit):
             other_matches, other = self._localise_anywhere(view, keyframes, prediction, clock)
-            if fit is None or (other is not None and other.nis_per_dof < fit.nis_per_dof):
+            if fit is None or (other is not None and self._is_better(other, fit)):
                 matches, fit = other_matches, other
         min_inliers = ACCEPTANCE.doubtful_inliers * self.config.min_inliers
         if fit is not None and fit.nis_before_scaling > ACCEPTANCE.doubtful_nis and fit.count < min_inliers:
             return matches, None  # chance agreement of a few
         return matches, fit
+
+    def _is_doubtful(self, fit: FrameFit) -> bool:
+        """Whether the pose may sit in a wrong place, or so little is left of the last frame that the search was off."""
+        return fit.nis_per_dof > ACCEPTANCE.doubtful_nis or fit.count < ACCEPTANCE.left_over * self.follower.count
+
+    def _is_better(self, other: FrameFit, fit: FrameFit) -> bool:
+        """Whether another pose fits better than a doubtful one, or more agrees with it."""
+        if fit.nis_per_dof > ACCEPTANCE.doubtful_nis:
+            return other.nis_per_dof < fit.nis_per_dof
+        return other.nis_per_dof <= ACCEPTANCE.doubtful_nis and other.count > fit.count
+
+    def fit_again(self, matches: GuidedMatches, fit: FrameFit, prediction: Prediction) -> FrameFit:
+        """The pose of the same matches by a prediction that has become less certain; `fit` where there is none."""
+        pose, covariance = prediction.pose, prediction.covariance
+        return self.update.fit(matches.views, pose, covariance, self.config.min_inliers, fit.pose) or fit
 
     def _fit_near(self, matches: GuidedMatches, prediction: Prediction) -> FrameFit | None:
         """Update from the prediction; most of what was found near it must agree."""

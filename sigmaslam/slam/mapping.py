@@ -111,6 +111,7 @@ class Mapper:
         blur: float,
         matches: GuidedMatches,
         expected: tuple[np.ndarray, np.ndarray],
+        is_ambiguous: bool = False,
     ) -> KeyframeTracks | None:
         """Makes a tracked frame a keyframe when the landmarks of the last one fade, and the frame can replace it.
 
@@ -121,16 +122,17 @@ class Mapper:
             blur: of its image, as of `Keyframes.blur`.
             matches: with the window's landmarks.
             expected: step (4, 4) from the last keyframe without its images, and its covariance (6, 6).
+            is_ambiguous: another pose explains the frame about as well.
         """
         self._loss += _LOSS_ADAPTATION * (self._last_count - fit.count - self._loss)
         self._last_count = fit.count
         share = fit.count / max(self._landmarks_in_keyframe, 1)
         if share >= self.config.keyframe_ratio:
             return None
-        # A blurred keyframe would spoil what comes after it, too few landmarks spoil more. A sharp view that scatters
-        # is one: no keyframes at all for 20 frames lost the KITTI drive.
-        scatters = fit.nis_before_scaling > ACCEPTANCE.scattered_nis
-        if blur > 1.0 and scatters and share >= ACCEPTANCE.blurred_landmarks:
+        # A blurred or ambiguous keyframe would spoil what comes after it, too few landmarks spoil more. A sharp view
+        # that scatters is one: no keyframes at all for 20 frames lost the KITTI drive.
+        is_blurred = blur > 1.0 and fit.nis_before_scaling > ACCEPTANCE.scattered_nis
+        if (is_blurred or is_ambiguous) and share >= ACCEPTANCE.bad_keyframe_landmarks:
             return None
         view = frame.view
         admitted = view.only(self.admission.admit(view, fit.pose, self.window))

@@ -12,6 +12,7 @@ from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.state_layout import CALIBRATION, CALIBRATION_SIZE, pose_slice
 from sigmaslam.geometry.se3 import se3_adjoint, se3_inverse, turn_covariance
+from sigmaslam.slam.doubt import Doubts
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.localisation import Prediction
@@ -43,6 +44,7 @@ class Reporter:
         tracks: KeyframeTracks | None,
         loop: float | None,
         milliseconds: dict[str, float],
+        doubts: Doubts,
     ) -> Estimate:
         """What is known after a frame; without a fit by the prediction, without a keyframe nothing."""
         state = self.window.posterior
@@ -55,6 +57,7 @@ class Reporter:
         )
         by_error = np.zeros((6, CALIBRATION_SIZE))
         if fit is not None:
+            fit = fit.spread_by(np.outer(doubts.way, doubts.way)) if doubts.way.any() else fit
             pose, absolute, relative = fit.pose, fit.covariance, fit.relative
             calibration, spread = fit.calibration, fit.calibration_covariance
             on_calibration, by_error = fit.joint.common[CALIBRATION], fit.joint.common[-6:]
@@ -88,6 +91,7 @@ class Reporter:
             tracks=tracks,
             # A keyframe is the window's by now, which has learned from it.
             relative_poses=self.relative_poses.report(timestamp, fit if tracks is None else None),
+            doubts=tuple(doubts.reasons),
             loop=loop,
         )
 

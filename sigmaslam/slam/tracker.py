@@ -24,10 +24,11 @@ from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.inference.networks import WeightsFolder
 from sigmaslam.slam.argument_checks import check_frame, check_tracker_arguments
 from sigmaslam.slam.config import TrackerConfig
+from sigmaslam.slam.doubt import Doubts
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.frame_history import FrameHistory
-from sigmaslam.slam.frozen_images import LastPair
+from sigmaslam.slam.frozen_images import LastPairs
 from sigmaslam.slam.guided_matching import GuidedMatcher, GuidedMatches
 from sigmaslam.slam.keyframes import Keyframes
 from sigmaslam.slam.landmark_admission import AdmitAll, LandmarkAdmission
@@ -37,13 +38,14 @@ from sigmaslam.slam.loop_closure import LoopCloser
 from sigmaslam.slam.mapping import KeyframeTracks, Mapper
 from sigmaslam.slam.matched_frame import MatchedFrame
 from sigmaslam.slam.measurement_noise import MeasurementNoise
-from sigmaslam.slam.motion_prior import densities
+from sigmaslam.slam.motion_prior import densities, initial_twist_sigma
 from sigmaslam.slam.phase import Course, Phase
 from sigmaslam.slam.point_map import PointMap
 from sigmaslam.slam.recovery import Recovery
 from sigmaslam.slam.relative_poses import RelativePoseReporter
 from sigmaslam.slam.relocalisation import Relocaliser
 from sigmaslam.slam.reporting import Reporter
+from sigmaslam.slam.scrutiny import Scrutiny
 from sigmaslam.slam.start_pose import StartPose
 from sigmaslam.slam.stopwatch import Stopwatch
 from sigmaslam.slam.unguided_matching import UnguidedMatcher
@@ -108,8 +110,9 @@ class StereoTracker:
         self._noise = noise = MeasurementNoise(config)
         self._motion = motion = MotionFilter(backend)
         self._course = course = Course()
-        self._clock, self._last_pair = FrameClock(), LastPair()
+        self._clock, self._last_pairs = FrameClock(), LastPairs()
         self._keyframes = keyframes = Keyframes(window, config.max_keyframes, config.max_points, self._beside)
+        self._scrutiny = Scrutiny(window, motion, self._clock)
         update = FrameUpdate(window, config.iterations)
         guided = GuidedMatcher(rectified, frontend, window, update, noise, config)
         self._unguided = unguided = UnguidedMatcher(rectified, frontend, window, noise, config)
@@ -156,21 +159,28 @@ class StereoTracker:
         if self._course.timestamp is not None:
             # Constant velocity since the last frame.
             seconds, sigma = self._clock.tick(timestamp - self._course.timestamp)
+            if sigma > 0.0 and self._clock.was_believed:
+                # It was learned by wrong times.
+                self._motion.forget_twist(initial_twist_sigma(self.config, self._window.depth))
             self._motion.predict(seconds, densities(self.config, self._window.depth), sigma)
-        is_repeated = self._last_pair.is_repeated(left, right)
+        is_repeated = self._last_pairs.is_repeated(left, right)
         matches, fit = (GuidedMatches.empty(), None) if is_repeated else self._localise(frame, timestamp, clock)
         landmarks = self._window.landmarks.id[matches.views.landmark]
         self.last_frame = MatchedFrame(
             frame.left, frame.right, landmarks, matches, None if fit is None else fit.inliers
         )
         predicted = filtered = self._motion.state
+        doubts = Doubts()
         if fit is not None:
-            status = "tracking"
+            doubts = self._scrutiny.doubt(matches, fit)
+            if doubts.prediction_is_wrong:
+                fit = self._localiser.fit_again(matches, fit, Prediction.of(self._window, self._motion))
+            status = doubts.status
             expected = self._motion.step, self._motion.step_covariance
             blur, of_matches = self._keyframes.blur(frame.left, matches.views.select(fit.inliers))
-            fit = self._correct(fit, of_matches, matches, timestamp)
+            fit = self._correct(fit, of_matches, doubts, matches, timestamp)
             filtered = self._motion.state
-            tracks = self._mapper.insert_if_due(frame, timestamp, fit, blur, matches, expected)
+            tracks = self._mapper.insert_if_due(frame, timestamp, fit, blur, matches, expected, doubts.is_ambiguous)
         elif is_repeated:
             status, tracks = "skipped", None
         elif (found := self._relocaliser.relocalise(frame.view)) is not None:
@@ -185,7 +195,7 @@ class StereoTracker:
         loop = self._loops.close() if tracks is not None else None
         clock.lap("map")
         self._course.timestamp = timestamp
-        estimate = self._reporter.report(timestamp, status, matches, fit, tracks, loop, clock.milliseconds)
+        estimate = self._reporter.report(timestamp, status, matches, fit, tracks, loop, clock.milliseconds, doubts)
         self._history.append(estimate, predicted, filtered)
         return estimate
 
@@ -237,11 +247,15 @@ class StereoTracker:
         keyframes = [keyframe.view for keyframe in self._keyframes.active]
         return self._localiser.localise(view, keyframes, prediction, guided, clock)
 
-    def _correct(self, fit: FrameFit, blur: float, matches: GuidedMatches, timestamp: float) -> FrameFit:
-        """Takes a pose over, less certain where the frame is blurred."""
+    def _correct(
+        self, fit: FrameFit, blur: float, doubts: Doubts, matches: GuidedMatches, timestamp: float
+    ) -> FrameFit:
+        """Takes a pose over, less certain where the frame is blurred, or there are doubts."""
         # Patches that are blurred are misplaced alike, along the blur and towards where they were expected: many of
         # them say no more than a few. So do those of a body that moves on its own.
         fit = fit.inflated(max(fit.nis_before_scaling, 1.0) * blur * fit.clustering)
+        if doubts.spread.any():
+            fit = fit.spread_by(doubts.spread)
         seen = matches.views.select(fit.inliers)
         self._admission.confirm(seen, self._window)
         self._window.count_sightings(matches.searched, seen.landmark)

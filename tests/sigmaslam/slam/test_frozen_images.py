@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sigmaslam.slam.frozen_images import LastPair
+from sigmaslam.slam.frozen_images import LastPairs
 from sigmaslam.slam.tracker import StereoTracker
 from tests.support.estimates import Demo
 
 
 def test_one_repeated_image_is_enough_and_a_grey_one_says_nothing():
     noise = np.random.default_rng(0).integers(0, 256, (4, 8, 9), np.uint8)
-    pair, grey = LastPair(), np.full((8, 9), 7, np.uint8)
+    pair, grey = LastPairs(), np.full((8, 9), 7, np.uint8)
     assert not pair.is_repeated(noise[0], noise[1])
     assert pair.is_repeated(noise[0], noise[2])
     assert not pair.is_repeated(noise[3], noise[0])
@@ -23,7 +23,7 @@ def test_one_repeated_image_is_enough_and_a_grey_one_says_nothing():
 
 def test_the_same_array_filled_again_is_another_image():
     buffer = np.random.default_rng(0).integers(0, 256, (8, 9), np.uint8)
-    pair = LastPair()
+    pair = LastPairs()
     pair.is_repeated(buffer, buffer)
     buffer[3, 3] ^= 1
     assert not pair.is_repeated(buffer, buffer)

@@ -1,0 +1,48 @@
+"""What speaks against a pose that images gave, and by how much it may be off."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+
+class Doubt(StrEnum):
+    """Reasons why a pose may be wrong; the words stand in frames.csv."""
+
+    INPUT = "eyes do not fit"
+    OFFSET = "offset refused"
+    RIG = "rig changed"
+    TIME = "image of another time"
+    MOTIONS = "two motions"
+
+
+@dataclass(slots=True)
+class Doubts:
+    """Of one pose.
+
+    Attributes:
+        reasons: each once, in the order in which they were found.
+        spread: (6, 6) by what they make the pose less certain, perturbed from the left in the world.
+        way: (6,) between the moments of the stamp and of the image, likewise; zero where they are the same.
+        prediction_is_wrong: it was made less certain, so that the same matches give another pose.
+        is_ambiguous: another pose explains the image about as well.
+    """
+
+    reasons: list[Doubt] = field(default_factory=list)
+    spread: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
+    way: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    prediction_is_wrong: bool = False
+    is_ambiguous: bool = False
+
+    def add(self, reason: Doubt, error: np.ndarray | None = None) -> None:
+        """One more; `error` (6,) is how far off the pose is if it is right, as `spread` is perturbed."""
+        self.reasons.append(reason)
+        if error is not None:
+            self.spread = self.spread + np.outer(error, error)
+
+    @property
+    def status(self) -> str:
+        """Of a frame with such a pose."""
+        return "ambiguous" if self.is_ambiguous else "doubtful" if self.reasons else "tracking"

@@ -1,0 +1,64 @@
+"""Looks at a pose that images gave for what speaks against it."""
+
+from __future__ import annotations
+
+from sigmaslam.estimation.acceptance import ACCEPTANCE
+from sigmaslam.estimation.constant_velocity import MotionFilter
+from sigmaslam.estimation.frame_clock import FrameClock
+from sigmaslam.estimation.frame_fit import FrameFit
+from sigmaslam.estimation.keyframe_window import KeyframeWindow
+from sigmaslam.geometry.se3 import se3_adjoint, se3_inverse, se3_log
+from sigmaslam.slam.doubt import Doubt, Doubts
+from sigmaslam.slam.guided_matching import GuidedMatches
+from sigmaslam.slam.second_motion import SecondMotion, find_second_motion
+
+
+class Scrutiny:
+    """Collects doubts in poses, frame by frame.
+
+    Args:
+        window, motion, clock: of the tracker.
+
+    Attributes:
+        input_is_wrong: a check of the input found that the eyes do not fit.
+    """
+
+    def __init__(self, window: KeyframeWindow, motion: MotionFilter, clock: FrameClock) -> None:
+        self._window, self._motion, self._clock = window, motion, clock
+        self._last_error = 0.0
+        self.input_is_wrong = False
+
+    def doubt(self, matches: GuidedMatches, fit: FrameFit) -> Doubts:
+        """What speaks against a pose, before motion and map learn from it; the prediction becomes less certain by a
+        wrong time."""
+        doubts = Doubts()
+        if self.input_is_wrong:
+            doubts.add(Doubt.INPUT)
+        if self._window.refused.any():
+            doubts.add(Doubt.OFFSET)
+        self._doubt_prediction(doubts, fit)
+        second = find_second_motion(self._window, matches, fit)
+        if second is not None and _is_rival(second):
+            doubts.add(Doubt.MOTIONS, se3_log(second.pose @ se3_inverse(fit.pose)))
+            doubts.is_ambiguous = True
+        return doubts
+
+    def _doubt_prediction(self, doubts: Doubts, fit: FrameFit) -> None:
+        key = self._window.posterior.poses[-1]
+        step = se3_inverse(key) @ fit.pose
+        error = self._motion.time_error(step, self._clock.interval)
+        # What goes on is an acceleration: images out of order jump to and fro.
+        if error * self._last_error < 0.0 or (error != 0.0 and self._last_error == 0.0):
+            doubts.add(Doubt.TIME)
+            doubts.prediction_is_wrong = True
+            doubts.way = se3_adjoint(key) @ self._motion.doubt_time(error * self._clock.interval)
+        elif (surprise := self._motion.surprise(step)) > 1.0:
+            self._motion.widen(surprise)
+            doubts.prediction_is_wrong = True
+        self._last_error = error
+
+
+def _is_rival(second: SecondMotion) -> bool:
+    """Whether it may be the scene's: it explains a good part, and is no body before it that never stood still."""
+    is_body = second.disparity_ratio > ACCEPTANCE.scene_farther and not second.stood_still
+    return second.area >= ACCEPTANCE.second_motion and not is_body

@@ -1,0 +1,84 @@
+"""Whether the matches that disagree with a pose agree with another one: something else moves, or the image is torn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sigmaslam.estimation.acceptance import ACCEPTANCE
+from sigmaslam.estimation.frame_fit import FrameFit
+from sigmaslam.estimation.keyframe_window import KeyframeWindow
+from sigmaslam.geometry.image_cells import CELLS, image_cells
+from sigmaslam.geometry.se3 import se3_inverse
+from sigmaslam.slam.guided_matching import CONFIRMED, GuidedMatches
+from sigmaslam.two_view.stereo_pose import MIN_POINTS, estimate_relative_pose
+
+
+@dataclass(frozen=True, slots=True)
+class SecondMotion:
+    """Another pose that a part of the matches asks for.
+
+    Attributes:
+        pose: (4, 4) T_world_camera as if these landmarks stood still.
+        area: share of the image that they stand for, of what the first pose and they explain together.
+        disparity_ratio: of their median disparity to that of the first pose's.
+        stood_still: most of them agreed with earlier poses.
+    """
+
+    pose: np.ndarray
+    area: float
+    disparity_ratio: float
+    stood_still: bool
+
+
+def find_second_motion(window: KeyframeWindow, matches: GuidedMatches, fit: FrameFit) -> SecondMotion | None:
+    """The pose of most matches that disagree with `fit`; None where they have none in common, or one like that of it.
+
+    They are held against where the fit's pose sees the landmarks, as if that were a keyframe: `estimate_relative_pose`.
+    """
+    views, camera = matches.views, window.camera
+    rows = views.landmark
+    if len(rows) - fit.count < MIN_POINTS:
+        return None
+    expected = _seen_from(window, rows, fit.pose)
+    others = np.flatnonzero(~fit.inliers & np.isfinite(expected).all(axis=1))
+    if len(others) < MIN_POINTS:
+        return None
+    covariance = window.landmarks.covariance[rows[others], :3, :3]
+    relative = estimate_relative_pose(
+        camera,
+        expected[others],
+        np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)),
+        views.measurement[others],
+        views.covariance[others],
+        matches.probability[others],
+    )
+    if relative is None:
+        return None
+    agreeing = others[relative.inliers]
+    apart = np.linalg.norm(views.measurement[agreeing, :2] - expected[agreeing, :2], axis=1)
+    if np.median(apart) < ACCEPTANCE.same_motion:
+        return None
+    cells = image_cells(views.measurement[:, :2], camera.width, camera.height)
+    present = np.bincount(cells, minlength=CELLS)
+    first, second = (
+        float(np.mean(np.bincount(cells[chosen], minlength=CELLS)[present > 0] / present[present > 0]))
+        for chosen in (fit.inliers, agreeing)
+    )
+    ratio = float(np.median(expected[agreeing, 2]) / max(np.median(expected[fit.inliers, 2]), np.finfo(float).tiny))
+    stood_still = bool(np.median(window.landmarks.views[rows[agreeing]]) >= CONFIRMED)
+    return SecondMotion(fit.pose @ relative.T_key_camera, second / (first + second), ratio, stood_still)
+
+
+def _seen_from(window: KeyframeWindow, rows: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """(K, 3) (u, v, disparity) of landmarks as a pose (4, 4) sees them; NaN of those that are behind it or far away."""
+    landmarks, camera = window.landmarks, window.camera
+    measured = window.as_calibrated(landmarks.estimate[rows])
+    near = measured[:, 2] > 0.0
+    points = camera.triangulate(np.where(near[:, None], measured, [0.0, 0.0, 1.0]))
+    T = (se3_inverse(pose) @ window.posterior.poses)[landmarks.anchor[rows]]
+    here = np.einsum("kij,kj->ki", T[:, :3, :3], points) + T[:, :3, 3]
+    front = near & (here[:, 2] > 0.0)
+    seen = camera.project(np.where(front[:, None], here, [0.0, 0.0, 1.0]))
+    return np.where(front[:, None], seen, np.nan)
