@@ -17,6 +17,7 @@ from sigmaslam_evaluation.metrics.trajectory_errors import (
     PoseNees,
     RelativeError,
 )
+from sigmaslam_evaluation.nees_verdict import judge_nees
 from sigmaslam_evaluation.relative_summary import span_to_dict
 
 
@@ -51,6 +52,7 @@ class Evaluation:
         final: of the trajectory after the fact; None where there is none.
         truth_hint: the convention in which the truth would fit, in words and as options; None where it fits as it was
             read, or in no way.
+        truth_notes: what is said of its errors: the kind that is guessed, and poses that are left out.
     """
 
     estimate_path: Path
@@ -70,6 +72,7 @@ class Evaluation:
     final: FinalErrors | None = None
     predicted: int = 0
     truth_hint: str | None = None
+    truth_notes: tuple[str, ...] = ()
 
     @property
     def coverage(self) -> float:
@@ -83,6 +86,8 @@ class Evaluation:
             "truth": str(self.truth_path),
             "association": self.association,
             "truth_hint": self.truth_hint,
+            "truth_notes": list(self.truth_notes),
+            "nees_verdict": judge_nees(self.nees, self.relative),
             "matched": self.matched,
             "frames": self.frames,
             "coverage": self.coverage,

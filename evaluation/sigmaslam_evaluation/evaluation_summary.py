@@ -7,6 +7,7 @@ from sigmaslam_evaluation.metrics.map_consistency import coverage
 from sigmaslam_evaluation.metrics.trajectory_errors import (
     PoseNees,
 )
+from sigmaslam_evaluation.nees_verdict import judge_nees
 from sigmaslam_evaluation.relative_summary import format_relative
 
 
@@ -20,6 +21,7 @@ def format_evaluation(evaluation: Evaluation) -> str:
         + (f", {e.predicted} of them while lost, from the motion alone" if e.predicted else ""),
         f"path      {e.path_length:.2f} m true, {e.estimate_path_length:.2f} m estimated",
         *([f"The truth looks like {e.truth_hint}"] if e.truth_hint else []),
+        *(f"The truth {note}" for note in e.truth_notes),
         "",
         f"{'':<24}{'rmse [m]':>11}{'mean [m]':>11}{'median [m]':>12}{'max [m]':>11}{'rotation [deg]':>16}",
         *_error_rows(e),
@@ -41,7 +43,9 @@ def format_evaluation(evaluation: Evaluation) -> str:
     if e.final is not None:
         lines += ["", "After the fact, with loops and smoothing (trajectory_final.tum):", *_error_rows(e.final)]
         lines.append(_nees_line(e.final.nees))
-    return "\n".join([*lines, "", *format_relative(e.relative)]) + "\n"
+    verdict = judge_nees(e.nees, e.relative)
+    words = ["", verdict["text"]] if verdict else []
+    return "\n".join([*lines, "", *format_relative(e.relative), *words]) + "\n"
 
 
 def _error_rows(errors: Evaluation | FinalErrors) -> list[str]:

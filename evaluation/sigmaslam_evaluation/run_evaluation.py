@@ -41,6 +41,13 @@ from sigmaslam_evaluation.truth_conventions import (
     find_time_unit,
     scale_times,
 )
+from sigmaslam_evaluation.truth_errors import (
+    KIND_WORDS,
+    TRUTH_SIGMAS,
+    TruthKind,
+    guess_truth_kind,
+    leave_out_interpolated,
+)
 
 _LOGGER = logging.getLogger(__name__)
 # An error is of poses relative to others.
@@ -57,6 +64,7 @@ def evaluate_run(
     truth_sigma_position: float | None = None,
     truth_sigma_rotation: float | None = None,
     truth_convention: TruthConvention | None = None,
+    truth_kind: TruthKind | None = "exact",
 ) -> Evaluation:
     """Compare a run folder or a trajectory file with the truth.
 
@@ -76,8 +84,10 @@ def evaluate_run(
         plot: write `evaluation.png` into the run folder or beside the trajectory, where matplotlib is installed; of a
             run also `evaluation.json` and `evaluation.npz`, with which its report is written anew.
         truth_sigma_position, truth_sigma_rotation: standard deviations of each true pose, of each coordinate (metres)
-            and about each axis (degrees): part of every NEES; where one alone is given the other is zero.
+            and about each axis (degrees): part of every NEES; None: that of the kind.
         truth_convention: how the truth is to be read; None: as T_world_camera in metres, x before w.
+        truth_kind: what measured it, which says how good it is (see `TRUTH_SIGMAS`); None: as it is guessed, and said.
+            Poses of a truth with errors that are interpolated are left out.
     Raises:
         InputError: a file is missing or wrong, no frame has a pose, or the timestamps do not meet.
     """
@@ -111,9 +121,10 @@ def evaluate_run(
     hint = None if other is None else other.describe()
     if other is None and not follows_object:
         hint = describe_mirror(estimate, true)
-    of_truth = None
-    if truth_sigma_position is not None or truth_sigma_rotation is not None:
-        of_truth = truth_covariance(truth_sigma_position or 0.0, truth_sigma_rotation or 0.0)
+    sigmas, guess = _truth_sigmas(truth, true, truth_kind, (truth_sigma_position, truth_sigma_rotation))
+    exact = max(sigmas) == 0.0
+    of_truth = None if exact else truth_covariance(*sigmas)
+    true, left_out = (true, None) if exact else leave_out_interpolated(estimate, true)
     relative = _judge_relative_poses(run_or_trajectory, estimate, true, of_truth, follows_object) if is_run else None
     if follows_object:
         T_body_followed = _followed_frame(estimate, true)
@@ -140,6 +151,7 @@ def evaluate_run(
         final=_evaluate_final(run_or_trajectory, estimate, true, of_truth) if is_run else None,
         predicted=int(predicted[associate(estimate, true)[0]].sum()),
         truth_hint=hint,
+        truth_notes=tuple(note for note in (guess, left_out) if note),
     )
     if plot and is_run:
         keep_evaluation(run_or_trajectory, evaluation.to_dict(), estimate, true, evaluation.nees)
@@ -151,6 +163,23 @@ def evaluate_run(
             _LOGGER.warning("evaluation.png is not written: %s", getattr(error, "strerror", None) or error)
             return replace(evaluation, figure_path=None)
     return evaluation
+
+
+def _truth_sigmas(
+    path: Path, truth: Trajectory, kind: TruthKind | None, given: tuple[float | None, float | None]
+) -> tuple[tuple[float, float], str | None]:
+    """Metres and degrees, and what is said where the kind is guessed."""
+    if given[0] is not None and given[1] is not None:
+        return (given[0], given[1]), None
+    known, reason = (kind, "") if kind else guess_truth_kind(path, truth)
+    position, rotation = (own if said is None else said for own, said in zip(TRUTH_SIGMAS[known], given, strict=True))
+    if kind:
+        return (position, rotation), None
+    errors = f"sigma {position:g} m and {rotation:g} deg" if known != "exact" else "without errors"
+    return (position, rotation), (
+        f"is taken for {KIND_WORDS[known]}, {errors}, as {reason}: --truth-kind, or --truth-sigma-position and "
+        "--truth-sigma-rotation, say it better"
+    )
 
 
 def _judge_relative_poses(

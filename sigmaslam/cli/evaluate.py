@@ -26,6 +26,14 @@ class Quaternion(StrEnum):
     wxyz = "wxyz"
 
 
+class Kind(StrEnum):
+    """What measured a truth."""
+
+    gps = "gps"
+    mocap = "mocap"
+    exact = "exact"
+
+
 class Unit(StrEnum):
     """Of lengths."""
 
@@ -36,6 +44,10 @@ class Unit(StrEnum):
 def evaluate(
     run: Annotated[Path, typer.Argument(metavar="RUN_OR_TRAJECTORY", help="Run folder, or a TUM or KITTI file.")],
     truth: Annotated[Path, typer.Option(help="Ground truth: TUM, KITTI (with times.txt beside it) or EuRoC csv.")],
+    truth_kind: Annotated[
+        Kind | None,
+        typer.Option(help="What measured the truth: GPS/INS, motion capture, or nothing, as a render's is exact."),
+    ] = None,
     truth_sigma_position: Annotated[
         float | None, typer.Option(metavar="M", min=0.0, help="Of each coordinate of the true positions, metres.")
     ] = None,
@@ -55,8 +67,8 @@ def evaluate(
     The picture needs the extra 'report'; the figures are the same without it.
 
     Poses of a run are also judged relative to earlier ones, 1, 10, 50, 100 m or 1, 5, 20 s back. Say how good the truth
-    is with --truth-sigma-position and --truth-sigma-rotation: it counts in every NEES, and you see where it is no
-    better than the estimate.
+    is with --truth-kind, or --truth-sigma-position and --truth-sigma-rotation: it counts in every NEES, and you see
+    where it is no better than the estimate. What you do not say is guessed and printed.
 
     Where the truth would fit in another frame, order or unit, a line says so with the option that applies it; seconds,
     milli-, micro- and nanoseconds are found out.
@@ -73,6 +85,7 @@ def evaluate(
         truth_sigma_position=truth_sigma_position,
         truth_sigma_rotation=truth_sigma_rotation,
         truth_convention=TruthConvention(truth_frame.value, truth_inverse, truth_quaternion.value, truth_unit.value),
+        truth_kind=None if truth_kind is None else truth_kind.value,
     )
     typer.echo(json.dumps(evaluation.to_dict(), indent=2) if as_json else format_evaluation(evaluation))
     if evaluation.figure_path is None:

@@ -91,6 +91,8 @@ def write_report(run_dir: str | Path) -> Path:
         evaluation_head=head,
         evaluation_rows=rows,
         truth_hint=run.evaluation.get("truth_hint"),
+        truth_notes=run.evaluation.get("truth_notes", ()),
+        nees_verdict=run.evaluation.get("nees_verdict"),
         refinement=list_refinement(run),
         machine=list_machine(run),
         links=[(name, words) for name, words in _LINKED if (folder / name).is_file()],

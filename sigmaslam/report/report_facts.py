@@ -50,6 +50,9 @@ def judge(run: RecordedRun) -> State:
         )
     findings = wrong([Finding(**each) for each in run.entries.get("checks", ())])
     notices += [("warn", f"{each.name}: {each.message}") for each in findings if each.message not in (failure or "")]
+    verdict = run.evaluation.get("nees_verdict")
+    if verdict and verdict["kind"] == "warn":
+        notices.append(("warn", verdict["text"]))
     if failure or not tracked:
         return State("bad", "failed", notices)
     if ended != "complete":

@@ -208,9 +208,14 @@ def test_an_evaluation_is_in_the_report(tmp_path):
     frames = EvaluatedFrames(row, line, 0.1 * line, 2 * line + 0.1, np.column_stack([line, line, line]))
     ate = {"rmse": 0.1234, "rotation_rmse_deg": 0.5}
     errors = {"ate": ate, "ate_origin": ate, "rpe": {"translation_rmse": 0.01}, "nees": {"mean": 2.5, "inside": 0.4}}
-    write_evaluation(run, {**errors, "final": None, "truth_hint": None}, frames)
+    verdict = {"kind": "warn", "text": "NEES over 20 s is 16: so it is."}
+    write_evaluation(run, {**errors, "final": None, "truth_hint": None, "nees_verdict": verdict}, frames)
     page = _page(run)
     text = " ".join(" ".join(page.text).split())
+    html = (run / "report.html").read_text()
+    assert '<div class="warn"><dt>NEES per dof' in html
+    assert '<span class="state warn">' in html
+    assert text.count(verdict["text"]) == 2
     assert "as it was said 0.1234 0.1234 0.5 0.01 2.50 40 %" in text
     assert "NEES per dof 2.50" in text
     # A frame is skipped before the first of them.
