@@ -12,12 +12,12 @@ from sigmaslam.geometry.se3 import se3_adjoint, se3_exp, se3_inverse
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import StereoSequence
 from sigmaslam_benchmarks.tracking import shake, trial_pool
+from sigmaslam_benchmarks.tracking.claimed_errors import motion_errors, sigmas_of_pose
+from sigmaslam_benchmarks.tracking.image_motion import ImageMotion, largest_reversal, read_image_motion
 from sigmaslam_benchmarks.tracking.pnp_baselines import track_with_pnp
 from sigmaslam_benchmarks.tracking.shake import FRAMES, MOVERS, judge, recipe
 from sigmaslam_benchmarks.tracking.shake_page import ShakenSequence, ShakeResult, format_page
 from sigmaslam_benchmarks.trial import render
-from sigmaslam_evaluation.metrics.claimed_errors import motion_errors, sigmas_of_pose
-from sigmaslam_evaluation.metrics.image_motion import ImageMotion, largest_reversal, read_image_motion
 from sigmaslam_synthetic.simulation import Recipe
 
 GOOD = ShakeResult(

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sigmaslam.slam.tracker import TrackerConfig
+from sigmaslam_benchmarks.rendered_camera import open_rendered
 from sigmaslam_benchmarks.tracking.pnp_baselines import track_with_pnp
 from sigmaslam_benchmarks.trial import Trial, rendered_truth
-from sigmaslam_evaluation.rendered_camera import open_rendered
 from sigmaslam_synthetic.simulation import Recipe
 
 METHODS = {"KLT + PnP": TrackerConfig()}

@@ -17,11 +17,11 @@ from sigmaslam.readers.selection import Selection
 from sigmaslam.readers.trajectory_files import read_trajectory
 from sigmaslam_benchmarks.live.driver_faults import DrivenFrame
 from sigmaslam_benchmarks.live.judge import References
+from sigmaslam_benchmarks.rendered_camera import open_rendered
 from sigmaslam_benchmarks.tracking.page import check_names
 from sigmaslam_benchmarks.trial import render, rendered_truth
 from sigmaslam_evaluation.metrics.trajectory_errors import associate
 from sigmaslam_evaluation.metrics.truth_covariance import truth_covariance
-from sigmaslam_evaluation.rendered_camera import open_rendered
 
 if TYPE_CHECKING:
     from sigmaslam_synthetic.simulation import Recipe

@@ -20,11 +20,11 @@ from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.point_map import PointMap
 from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam_benchmarks.code_hash import hash_code
+from sigmaslam_benchmarks.rendered_camera import draw_calibration, open_rendered
 from sigmaslam_benchmarks.tracking.consistency_page import ConsistencyResult, Scale, format_page
 from sigmaslam_benchmarks.tracking.trial_pool import SequenceTrials, TrialKind, write_trials
 from sigmaslam_benchmarks.trial import Trial, rendered_truth
 from sigmaslam_evaluation.metrics import map_consistency as consistency
-from sigmaslam_evaluation.rendered_camera import draw_calibration, open_rendered
 from sigmaslam_synthetic.render_sequence import SCENE_NAME
 from sigmaslam_synthetic.simulation import Recipe, Simulation, Studio
 

@@ -20,10 +20,10 @@ from sigmaslam.readers.images import RawPair
 from sigmaslam.readers.trajectory_files import read_trajectory
 from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.tracker import TrackerConfig
+from sigmaslam_benchmarks.rendered_camera import open_rendered
 from sigmaslam_benchmarks.tracking.endurance_page import Block, Endurance, Lap, format_endurance
 from sigmaslam_benchmarks.tracking.page import write_page
 from sigmaslam_benchmarks.trial import Trial, TrialResult, read_trial, render
-from sigmaslam_evaluation.rendered_camera import open_rendered
 from sigmaslam_synthetic.render_sequence import default_workers
 from sigmaslam_synthetic.simulation import Recipe
 

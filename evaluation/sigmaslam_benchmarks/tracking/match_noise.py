@@ -13,10 +13,10 @@ import numpy as np
 from sigmaslam.readers import StereoSequence, open_sequence
 from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.tracker import TrackerConfig
+from sigmaslam_benchmarks.rendered_camera import open_rendered
 from sigmaslam_benchmarks.tracking.page import header, opening, row, write_page
 from sigmaslam_benchmarks.tracking.sequences import REAL, REAL_NAMES
 from sigmaslam_benchmarks.trial import Trial, render, rendered_truth
-from sigmaslam_evaluation.rendered_camera import open_rendered
 from sigmaslam_synthetic.simulation import Recipe
 
 CONSTANTS = ((0.15, 0.2), (0.2, 0.3), (0.3, 0.4), (0.5, 0.6))

@@ -20,10 +20,10 @@ from sigmaslam.reconstruction.recorded_keyframes import open_input, read_recorde
 from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam_benchmarks.code_hash import hash_code
+from sigmaslam_benchmarks.rendered_camera import open_rendered
+from sigmaslam_benchmarks.tracking.depth_accuracy import DepthFigures, JudgedPixels, judge_pixels, summarise
 from sigmaslam_benchmarks.tracking.reconstruction_page import ReconstructedSequence, format_page
 from sigmaslam_benchmarks.tracking.trial_pool import SequenceTrials, TrialKind, write_trials
-from sigmaslam_evaluation.metrics.depth_accuracy import DepthFigures, JudgedPixels, judge_pixels, summarise
-from sigmaslam_evaluation.rendered_camera import open_rendered
 from sigmaslam_synthetic.render_sequence import SCENE_NAME
 from sigmaslam_synthetic.simulation import Recipe, Simulation, Studio
 

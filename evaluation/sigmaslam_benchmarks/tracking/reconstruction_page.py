@@ -8,8 +8,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from sigmaslam_benchmarks.tracking.depth_accuracy import DepthFigures
 from sigmaslam_benchmarks.tracking.page import header, missing_sequences, opening, row
-from sigmaslam_evaluation.metrics.depth_accuracy import DepthFigures
 
 MOST_RATIO, LEAST_COMPLETENESS, INSIDE = 0.6, 0.6, (0.90, 0.98)
 """Goals: error over the single view's, share of the pixels at rest, share inside the 95 % interval."""

@@ -19,6 +19,7 @@ from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.readers import StereoSequence, open_sequence
 from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.tracker import TrackerConfig
+from sigmaslam_benchmarks.rendered_camera import open_rendered
 from sigmaslam_benchmarks.tracking.page import check_names, write_results_page
 from sigmaslam_benchmarks.tracking.pnp_baselines import track_with_pnp
 from sigmaslam_benchmarks.tracking.sequences_page import (
@@ -31,7 +32,6 @@ from sigmaslam_benchmarks.tracking.sequences_page import (
 )
 from sigmaslam_benchmarks.tracking.stereo_peers import MissingPeerError, track_with_cuvslam
 from sigmaslam_benchmarks.trial import Method, Trial, TrialResult, read_trial, render
-from sigmaslam_evaluation.rendered_camera import open_rendered
 
 REAL = (
     ("kitti_raw_0926_0039_a", "poses.txt", (0.21, 0.05)),

@@ -15,14 +15,14 @@ from sigmaslam.readers.trajectory_files import read_trajectory
 from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam_benchmarks.code_hash import hash_code
+from sigmaslam_benchmarks.rendered_camera import open_rendered
+from sigmaslam_benchmarks.tracking.claimed_errors import MotionErrors, motion_errors
+from sigmaslam_benchmarks.tracking.image_motion import ImageMotion, read_image_motion
 from sigmaslam_benchmarks.tracking.pnp_baselines import track_with_pnp
 from sigmaslam_benchmarks.tracking.shake_page import GROSS, ShakenSequence, ShakeResult, format_page
 from sigmaslam_benchmarks.tracking.trial_pool import SequenceTrials, TrialKind, write_trials
 from sigmaslam_benchmarks.trial import Method, Trial, rendered_truth
-from sigmaslam_evaluation.metrics.claimed_errors import MotionErrors, motion_errors
-from sigmaslam_evaluation.metrics.image_motion import ImageMotion, read_image_motion
 from sigmaslam_evaluation.metrics.map_consistency import coverage
-from sigmaslam_evaluation.rendered_camera import open_rendered
 from sigmaslam_synthetic.presets import PRESETS
 from sigmaslam_synthetic.render_choices import CARRIED
 from sigmaslam_synthetic.simulation import Recipe

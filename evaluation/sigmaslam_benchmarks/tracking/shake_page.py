@@ -8,8 +8,8 @@ from typing import TypeAlias
 
 import numpy as np
 
+from sigmaslam_benchmarks.tracking.image_motion import ImageMotion
 from sigmaslam_benchmarks.tracking.page import header, missing_sequences, opening, row
-from sigmaslam_evaluation.metrics.image_motion import ImageMotion
 from sigmaslam_evaluation.metrics.map_consistency import mean_with_error
 
 GROSS = 5.0
