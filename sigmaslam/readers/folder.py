@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import numpy as np
+
 from sigmaslam.errors import InputError
 from sigmaslam.readers.images import IMAGE_SUFFIXES, ImagePairs
 from sigmaslam.readers.kitti import common_size
@@ -58,8 +60,11 @@ def open_folder(folder: Path, calibration: Path | None = None) -> StereoSequence
         stamps = [{int(path.stem): path for path in side} for side in images]
         files, timestamps = pair_by_stamp(stamps[0], stamps[1], folder)
     else:
-        files = pair_by_name(left, right, prefixes)
-        timestamps = read_times(times, len(files)) if times.is_file() else default_times(range(len(files)), folder)
+        files, whole = pair_by_name(left, right, prefixes)
+        if times.is_file():
+            timestamps = read_times(times, len(files), whole=whole)
+        else:
+            timestamps = default_times(np.flatnonzero(whole).tolist(), folder)
     pairs = ImagePairs(files, timestamps, folder)
     camera = beside_calibration(folder, calibration, common_size(pairs.first_pair), zed_export=left == right)
     return StereoSequence(pairs, camera, folder, "folder")

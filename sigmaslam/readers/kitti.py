@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import numpy as np
+
 from sigmaslam.calibration_files.calibration import read_calibration
 from sigmaslam.errors import CalibrationError, InputError
 from sigmaslam.readers.images import ImagePairs, RawPair
@@ -52,8 +54,8 @@ def open_kitti(folder: Path, calibration: Path | None = None) -> StereoSequence:
     if layout is None:
         raise InputError(f"{folder}: not a KITTI folder; looked for {LOOKED_FOR}")
     left_folder, right_folder, cameras = layout
-    files = pair_by_name(left_folder, right_folder)
-    pairs = ImagePairs(files, _timestamps(folder, left_folder, files), folder)
+    files, whole = pair_by_name(left_folder, right_folder)
+    pairs = ImagePairs(files, _timestamps(folder, left_folder, files, whole), folder)
     image_size = common_size(pairs.first_pair)
     camera = read_calibration(calibration or _find_calibration(folder), image_size, cameras)
     return StereoSequence(pairs, camera, folder, "kitti")
@@ -74,12 +76,12 @@ def common_size(pair: RawPair) -> tuple[int, int]:
     return left
 
 
-def _timestamps(folder: Path, left_folder: Path, files: list[tuple[Path, Path]]) -> list[float]:
+def _timestamps(folder: Path, left_folder: Path, files: list[tuple[Path, Path]], whole: np.ndarray) -> list[float]:
     numbers = frame_numbers(files)
     for path in (folder / "times.txt", left_folder / "timestamps.txt", left_folder.parent / "timestamps.txt"):
         if path.is_file():
-            return read_times(path, len(files), numbers)
-    return default_times(numbers or range(len(files)), folder)
+            return read_times(path, len(files), numbers, whole)
+    return default_times(numbers or np.flatnonzero(whole).tolist(), folder)
 
 
 def _find_calibration(folder: Path) -> Path:

@@ -22,6 +22,8 @@ DEFAULT_RATE_HZ = 10.0
 # Images that are not read: among others they are a frame that misses.
 _UNREAD = frozenset({".gif", ".webp", ".heic", ".avif", ".jp2", ".exr", ".svg"})
 STAMP_TOLERANCE_NS = 5_000_000
+# A driver drops single images; where more than this share has no partner, folders or names are wrong.
+_MAX_ALONE = 0.1
 # Nanoseconds since 1970 have 19 digits; 16 also admit clocks with another origin.
 STAMP_DIGITS = 16
 _STAMPS = range(-(2**63), 2**63)
@@ -56,17 +58,21 @@ def list_images(folder: Path) -> list[Path]:
 
 def pair_by_name(
     left_folder: Path, right_folder: Path, prefixes: tuple[str, str] = ("", "")
-) -> list[tuple[Path, Path]]:
+) -> tuple[list[tuple[Path, Path]], np.ndarray]:
     """Pairs of equal frame numbers (all the numbers in a name), in their order.
 
-    Where a name has no number, or a folder has the same numbers twice, whole names are compared.
+    Where a name has no number, or a folder has the same numbers twice, whole names are compared. Images without partner
+    are left out with one warning.
 
     Args:
         left_folder, right_folder: may be the same.
         prefixes: what the names of left and right images begin with; others are left out.
 
+    Returns:
+        The pairs, and which of all frames they are, (N,) bool.
+
     Raises:
-        InputError: an image has no partner; the message gives both counts and the first names.
+        InputError: more than a tenth of the frames lack an image; the message gives both counts and the first names.
     """
     folders = (left_folder, right_folder)
     files = [
@@ -78,17 +84,23 @@ def pair_by_name(
         keys = [[path.stem for path in side] for side in files]
     left, right = (dict(zip(side_keys, side, strict=True)) for side_keys, side in zip(keys, files, strict=True))
     alone = [sorted(path.name for key, path in a.items() if key not in b) for a, b in ((left, right), (right, left))]
-    if any(alone):
+    frames = sorted(left.keys() | right.keys())
+    whole = np.array([key in left and key in right for key in frames])
+    if not whole.all():
         parts = [
             f"{len(names)} in {folder.name} without partner (first: {', '.join(names[:3])})"
             for names, folder in zip(alone, folders, strict=True)
             if names
         ]
-        raise InputError(
-            f"unequal left and right images: {len(left)} in {left_folder}, {len(right)} in {right_folder}; "
-            f"{'; '.join(parts)}; images of a pair must have the same number in their names"
-        )
-    return [(left[key], right[key]) for key in sorted(left)]
+        # Where one eye begins earlier and the other ends later, the same frames may have other numbers.
+        shifted = not (whole[0] or whole[-1]) and (frames[0] in left) != (frames[-1] in left)
+        if shifted or (~whole).sum() > _MAX_ALONE * len(frames):
+            raise InputError(
+                f"unequal left and right images: {len(left)} in {left_folder}, {len(right)} in {right_folder}; "
+                f"{'; '.join(parts)}; images of a pair must have the same number in their names"
+            )
+        logger.warning("%s: %d frames are left out: %s", left_folder.parent, (~whole).sum(), "; ".join(parts))
+    return [(left[key], right[key]) for key in frames if key in left and key in right], whole
 
 
 def _numbers(path: Path) -> tuple[int, ...]:
@@ -121,7 +133,7 @@ def pair_by_stamp(
     Raises:
         InputError: the counts differ by more than 10 %, or nothing pairs.
     """
-    if abs(len(left) - len(right)) > 0.1 * max(len(left), len(right)):
+    if abs(len(left) - len(right)) > _MAX_ALONE * max(len(left), len(right)):
         raise InputError(
             f"{source}: unequal left and right images: {len(left)} left, {len(right)} right; copy the missing files"
         )
@@ -204,13 +216,16 @@ def _nearest(stamps: np.ndarray, others: np.ndarray) -> np.ndarray:
     return np.where(np.abs(others[before] - stamps) <= np.abs(others[after] - stamps), before, after)
 
 
-def read_times(path: Path, count: int, numbers: Collection[int] | None = None) -> list[float]:
+def read_times(
+    path: Path, count: int, numbers: Collection[int] | None = None, whole: np.ndarray | None = None
+) -> list[float]:
     """Timestamps of a times file: seconds, or KITTI raw's dates, one a line.
 
     Args:
         path: text file.
         count: number of pairs.
         numbers: frame numbers of the pairs; a file of a whole recording is then indexed by them.
+        whole: which of all frames are pairs, (N,) bool; a file may have a line for each.
 
     Returns:
         Seconds, one per pair.
@@ -229,6 +244,8 @@ def read_times(path: Path, count: int, numbers: Collection[int] | None = None) -
         except (ValueError, OverflowError):
             raise InputError(f"{path}: line {number} is not a time in seconds: {shorten(repr(line))}") from None
         rows.append(number)
+    if len(times) != count and whole is not None and len(times) == len(whole):
+        numbers = np.flatnonzero(whole).tolist()
     if len(times) != count:
         if numbers is None or len(times) <= max(numbers):
             raise InputError(f"{path}: {len(times)} timestamps for {count} image pairs; one line per pair is needed")

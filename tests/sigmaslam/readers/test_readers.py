@@ -380,6 +380,35 @@ def test_equal_counts_with_different_frames_are_refused(tmp_path):
         open_sequence(tmp_path)
 
 
+@pytest.mark.parametrize("make", [make_folder, make_kitti])
+def test_pairs_of_which_one_image_is_missing_are_left_out_with_a_warning(tmp_path, caplog, make):
+    """The others keep their times, from a line for each frame, a line for each pair, or none at all."""
+    make(tmp_path, count=22)
+    left, right = ("left", "right") if make is make_folder else ("image_0", "image_1")
+    (tmp_path / right / "000003.png").unlink()
+    (tmp_path / left / "000009.png").unlink()
+    kept = np.delete(np.arange(22), [3, 9])
+    times = tmp_path / "times.txt"
+    for lines in (0.1 * np.arange(22), 0.1 * kept, None):
+        times.unlink(missing_ok=True)
+        if lines is not None:
+            np.savetxt(times, lines)
+        caplog.clear()
+        sequence = open_sequence(tmp_path)
+        np.testing.assert_allclose(sequence.timestamps, 0.1 * kept)
+        assert "2 frames are left out: 1 in" in caplog.text
+        assert "000003.png" in caplog.text
+    np.testing.assert_array_equal(list(open_sequence(tmp_path).frames())[3].right, picture(4, 1))
+
+
+def test_frames_numbered_from_0_and_from_1_are_refused(tmp_path):
+    make_folder(tmp_path, count=22)
+    for path in sorted((tmp_path / "right").iterdir(), reverse=True):
+        path.rename(path.with_name(f"{int(path.stem) + 1:06d}.png"))
+    with pytest.raises(InputError, match=r"1 in left without partner \(first: 000000.png\); 1 in right .*000022.png"):
+        open_sequence(tmp_path)
+
+
 def test_empty_image_folder(tmp_path):
     (tmp_path / "left").mkdir()
     (tmp_path / "right").mkdir()
