@@ -10,8 +10,8 @@ import numpy as np
 from sigmaslam.checks.calibration import check_calibration
 from sigmaslam.checks.eye_matches import EyeMatcher, EyeMatches
 from sigmaslam.checks.finding import Finding, has_errors, wrong
-from sigmaslam.checks.images import check_images
-from sigmaslam.checks.rig import TOO_FEW, check_pairing, check_rig, suspect_pairing, unknown_rig
+from sigmaslam.checks.images import check_images, check_light, describe_frames
+from sigmaslam.checks.rig import TOO_FEW, check_pairing, check_rig, find_exchanged, suspect_pairing, unknown_rig
 from sigmaslam.checks.row_fit import MIN_INLIERS, MIN_MATCHES
 from sigmaslam.checks.time_stamps import check_time_stamps
 from sigmaslam.geometry.rectification import StereoRectifier
@@ -70,7 +70,7 @@ def check_sequence(sequence: StereoSequence, samples: int = SAMPLES, threads: in
     if not steps:
         return Check(findings, [], [], EyeMatches.empty())
     images = check_images([(frame.left, frame.right) for frame, _ in steps])
-    findings += images
+    findings += [*images, check_light([frame for frame, _ in steps])]
     matches = EyeMatches.empty()
     if has_errors(images):
         # Features of such images would tell nothing, or the same once more.
@@ -98,6 +98,14 @@ def _check_rig(
     if wrong_calibration & _INTRINSICS:
         # Lenses that are undistorted wrongly move rows as a delay does.
         return check_rig(matches.unfollowed(), rectifier, interval)
+    exchanged = find_exchanged(matches, rectifier)
+    if 0 < len(exchanged) < len(np.unique(matches.pair)):
+        when = describe_frames([frame for frame, _ in steps], exchanged)
+        message = f"left and right are exchanged in {when}, and not in the others: what wrote them mixes up the cameras"
+        rest = matches.select(~np.isin(matches.pair, exchanged))
+        findings = _check_rig(rest, steps, matcher, interval, wrong_calibration)
+        swap = Finding("eyes", "error", message, len(exchanged) / len(steps))
+        return [swap, *(each for each in findings if each.name != swap.name)]
     pairing = None
     if suspect_pairing(matches, rectifier):
         pairing = check_pairing(matches, _shift_frames(steps, matcher), rectifier, interval)

@@ -13,6 +13,7 @@ _CAUSES_FIRST = (
     "principal point",
     "focal length",
     "exposure",
+    "light",
     "sharpness",
     "same image",
     "mirrored",

@@ -8,6 +8,7 @@ import numpy as np
 
 from sigmaslam.checks.finding import Finding
 from sigmaslam.frontend.image_sharpness import sharpness
+from sigmaslam.readers.stereo_sequence import StereoFrame
 
 # Grey values at which a camera clips, and the shares of the pixels that may.
 _DARK, _BRIGHT = 5, 250
@@ -17,6 +18,8 @@ _MIN_CONTRAST = 10
 # Standard deviation of the blur of edges, pixels: from here on rows of matches scatter twice as much as in sharp ones,
 # in renders of rooms that are blurred by a Gaussian of 3 px. Matches remain.
 _WARN_BLUR = 2.0
+# Mean grey values of good pairs differ by up to 1.2 times (KITTI, EuRoC); at 3 times poses of KITTI are wrong.
+_MAX_LIGHT = 2.0
 # Images are one and the same where they differ by less than the noise of two cameras, grey values.
 _SAME = 0.5
 EYES = ("left", "right")
@@ -75,6 +78,30 @@ def blur_radius(image: np.ndarray) -> float:
     the first derivative twice as large.
     """
     return float(1.0 / np.sqrt(8.0 * max(sharpness(image), 1e-6)))
+
+
+def check_light(frames: Sequence[StereoFrame]) -> Finding:
+    """Whether one eye is darker than the other, in all frames or in some."""
+    ratios = np.array([(1.0 + frame.left.mean()) / (1.0 + frame.right.mean()) for frame in frames])
+    uneven = np.flatnonzero(np.maximum(ratios, 1.0 / ratios) > _MAX_LIGHT)
+    if not len(uneven):
+        ratio = float(np.median(ratios))
+        return Finding("light", "ok", f"left images are {ratio:.2f} times as bright as right ones", ratio)
+    ratio = float(np.median(ratios[uneven]))
+    dark, times = ("right", ratio) if ratio > 1.0 else ("left", 1.0 / ratio)
+    return Finding(
+        "light",
+        "warning",
+        f"the {dark} eye is {times:.1f} times darker than the other in {describe_frames(frames, uneven)}: give both "
+        "the same exposure, gain and aperture",
+        ratio,
+    )
+
+
+def describe_frames(frames: Sequence[StereoFrame], chosen: np.ndarray) -> str:
+    """How many frames of those that were looked at are meant, and when, by their indices."""
+    first, last = (frames[k].timestamp - frames[0].timestamp for k in chosen[[0, -1]])
+    return f"{len(chosen)} of {len(frames)} frames that were looked at ({first:.1f} to {last:.1f} s)"
 
 
 def _check_sharpness(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Finding:

@@ -75,6 +75,15 @@ def check_rig(matches: EyeMatches, rectifier: StereoRectifier, frame_interval: f
     return [*findings, _check_shift(given), rotation, _check_scale(given, view.fy), infinity]
 
 
+def find_exchanged(matches: EyeMatches, rectifier: StereoRectifier) -> np.ndarray:
+    """Numbers of the pairs whose matches follow the calibration once the eyes are exchanged, and hardly as given."""
+    exchanged = exchange_eyes(matches, rectifier)
+    numbers = np.unique(matches.pair)
+    follow = [[_follows(each.select(each.pair == number)) for number in numbers] for each in (matches, exchanged)]
+    given, swapped = np.array(follow).reshape(2, -1)
+    return np.asarray(numbers[swapped > np.maximum(_EXPLAINED, _BETTER * given)])
+
+
 def _check_eyes(matches: EyeMatches, given: float, swapped: float, exchanged: bool) -> Finding:
     if exchanged:
         return Finding(

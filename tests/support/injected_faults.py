@@ -71,6 +71,14 @@ def of_images(change: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.nd
     return apply
 
 
+def _from_a_third_on(change: Callable[..., Frames]) -> Callable[..., Frames]:
+    def apply(frames: Frames, camera: StereoCamera) -> Frames:
+        third = len(frames) // 3
+        return frames[:third] + change(frames[third:], camera)
+
+    return apply
+
+
 def _turned(degrees: float, axis: tuple[float, float, float]) -> Callable[..., Frames]:
     """The right camera turned against its calibration."""
 
@@ -156,6 +164,15 @@ FAULTS = {
     "eyes exchanged": Fault("eyes", "swap the two", of_images(lambda left, right: (right, left))),
     "both eyes mirrored": Fault(
         "eyes", "do not mirror", of_images(lambda left, right: (left[:, ::-1], right[:, ::-1]))
+    ),
+    "eyes exchanged in mid-run": Fault(
+        "eyes", "in 1 of 2 frames", _from_a_third_on(of_images(lambda left, right: (right, left)))
+    ),
+    "right eye at a third of its light": Fault(
+        "light", "the right eye is", of_images(lambda left, right: (left, right // 3))
+    ),
+    "left eye dark in mid-run": Fault(
+        "light", "the left eye is", _from_a_third_on(of_images(lambda left, right: (left // 3, right)))
     ),
     "one image for both eyes": Fault("same image", "both cameras", of_images(lambda left, right: (left, left))),
     "rows off by 3": Fault("rows", "+", _moved([[1, 0, 0], [0, 1, 3.0]])),
