@@ -1,5 +1,6 @@
 """Links between the Markdown pages lead somewhere, headings included; the notebook's index lists its entries."""
 
+import ast
 import re
 from functools import cache
 from pathlib import Path
@@ -47,6 +48,16 @@ def test_headings_become_anchors_as_github_makes_them():
         "going-on-sigmaslam-track-input---out-run---resume"
     )
     assert anchor_of("[results.md](results.md) of *ours*") == "resultsmd-of-ours"
+
+
+def test_messages_and_help_name_no_page_that_an_installed_package_lacks():
+    named = []
+    for path in (ROOT / "sigmaslam").rglob("*.py"):
+        nodes = list(ast.walk(ast.parse(path.read_text())))
+        docstrings = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+        texts = [node for node in nodes if isinstance(node, ast.Constant) and id(node) not in docstrings]
+        named += [f"{path.name}: {text.value}" for text in texts if re.search(r"docs/|README", str(text.value))]
+    assert not named
 
 
 def links(page: Path) -> list[str]:

@@ -85,7 +85,8 @@ def read_calibration(
     if not content.entries.keys() & {"left", "right", "T_left_right"}:
         raise content.error(
             f"no stereo calibration of a known form (keys: {', '.join(map(str, content.entries))}); looked for left + "
-            "right + T_left_right, for cam0 + cam1 of Kalibr, and for OpenCV's matrices (docs/input.md)"
+            "right + T_left_right, for cam0 + cam1 of Kalibr, and for OpenCV's matrices (all forms: "
+            "sigmaslam calibration show --help)"
         )
     return StereoCamera.from_yaml(path)
 

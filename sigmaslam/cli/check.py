@@ -22,7 +22,7 @@ def check(
     ] = None,
     format: Annotated[InputFormat, typer.Option(help="Kind of input.")] = InputFormat["auto"],
     calibration: Annotated[
-        Path | None, typer.Option(help="Calibration YAML (or KITTI calib.txt) instead of the input's own.")
+        Path | None, typer.Option(help="Calibration of any form instead of the input's own.")
     ] = None,
     camera: Annotated[
         str | None, typer.Option(metavar="LEFT,RIGHT", help="Live cameras in place of INPUT, as `track` takes them.")

@@ -30,7 +30,7 @@ def export(
         Provider, typer.Option(help="With --check: compare the networks on it with the CPU instead.")
     ] = Provider["cpu"],
     page: Annotated[
-        Path | None, typer.Option(help="Write the page of the graphs that ship, docs/onnx.md; without RUN.")
+        Path | None, typer.Option(help="Write a page (Markdown) of the graphs that ship; without RUN.")
     ] = None,
 ) -> None:
     """Export what a run made to ONNX and check the graphs against torch (needs the extra 'train').

@@ -17,7 +17,7 @@ def rectify(
     out: Annotated[Path, typer.Option(help="Folder, new or empty.")],
     format: Annotated[InputFormat, typer.Option(help="Kind of input.")] = InputFormat["auto"],
     calibration: Annotated[
-        Path | None, typer.Option(help="Calibration YAML (or KITTI calib.txt) instead of the input's own.")
+        Path | None, typer.Option(help="Calibration of any form instead of the input's own.")
     ] = None,
 ) -> None:
     """Write rectified pairs without distortion: left/, right/, times.txt, calibration.yaml."""

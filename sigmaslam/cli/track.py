@@ -92,7 +92,8 @@ def track(
     calibration: Annotated[
         Path | None,
         typer.Option(
-            help="Calibration of any form (docs/input.md), or two as left.yaml,right.yaml, instead of the input's own."
+            help="Calibration of any form (sigmaslam calibration show --help), or two as left.yaml,right.yaml, instead "
+            "of the input's own."
         ),
     ] = None,
     frontend: Annotated[Frontend, typer.Option(help="Where correspondences come from.")] = Frontend["learned"],
@@ -182,7 +183,7 @@ def track(
         str | None,
         typer.Option(
             metavar="TARGET",
-            help="Give out each pose when it is known, as a line of JSON: stdout, or udp://HOST:PORT (docs/live.md).",
+            help="Give out each pose when it is known, as a line of JSON: stdout, or udp://HOST:PORT.",
         ),
     ] = None,
     video: Annotated[
@@ -263,7 +264,7 @@ def open_input(
         return open_sequence(source, format.value, calibration, topics)
     assert camera is not None
     if calibration is None:
-        raise InputError("--camera needs --calibration: the stereo pair as YAML, in the form that the README shows")
+        raise InputError("--camera needs --calibration: any file that `sigmaslam calibration show` reads")
     if format.value != "auto" or topics != (None, None):
         raise InputError("--format, --topic-left and --topic-right go with INPUT, not with --camera")
     return open_cameras(camera, calibration, seconds)
