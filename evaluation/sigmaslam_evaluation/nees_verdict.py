@@ -10,6 +10,8 @@ from sigmaslam_evaluation.metrics.trajectory_errors import PoseNees
 
 # Errors of one run are correlated: a mean within this factor of 1 is no reason for a word.
 _FAR = 3.0
+# Fewer pairs overlap so much that they are one motion.
+_FEWEST_PAIRS = 10
 # Drift grows at least with the square root of time, from a span to one five times as long; the truth's noise does not.
 _GROWS = 2.0
 
@@ -19,12 +21,13 @@ def judge_nees(nees: PoseNees | None, spans: Sequence[SpanConsistency] | None) -
 
     Args:
         nees: of poses relative to the first.
-        spans: of poses relative to earlier ones; those that only show the truth's errors do not count.
+        spans: of poses relative to earlier ones; what shows only the truth's errors, or has few pairs, does not count.
     Returns:
         "kind" ("warn": errors are larger than the sigmas say, "note": smaller) and "text"; None where all are near 1.
     """
     means = [] if nees is None else [("since the first pose", nees.mean, nees.median)]
-    means += [(f"over {each.span}", each.mean_nees, each.median_nees) for each in spans or () if not each.truth_rules]
+    counted = [each for each in spans or () if each.count >= _FEWEST_PAIRS and not each.truth_rules]
+    means += [(f"over {each.span}", each.mean_nees, each.median_nees) for each in counted]
     means = [each for each in means if each[1] > 0.0]
     if not means:
         return None

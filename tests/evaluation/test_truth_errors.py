@@ -1,6 +1,7 @@
 """The kind of a truth, poses of it that nobody measured, and the sentence about a NEES far from 1."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -140,8 +141,8 @@ def test_the_command_says_what_it_takes_the_truth_for(run: tuple[Path, Path]):
 
 
 def span(name: str, nees: float, error: float, share: float = 0.2, median: float | None = None) -> SpanConsistency:
-    values = np.full(9, nees if median is None else median)
-    values[0] = 9 * nees - values[1:].sum()
+    values = np.full(12, nees if median is None else median)
+    values[0] = 12 * nees - values[1:].sum()
     return SpanConsistency(name, values, nees, 0.1, 0.5, error, error, 0.1, 0.1, share)
 
 
@@ -154,6 +155,8 @@ def test_a_nees_near_one_is_not_worth_a_word():
     assert judge_nees(nees(2.9), (span("1 s", 0.4, 0.1),)) is None
     # A span that shows nothing but the truth's errors is said to do so already.
     assert judge_nees(nees(1.0), (span("1 s", 0.01, 0.1, share=0.99),)) is None
+    # Nine pairs are too few.
+    assert judge_nees(None, (replace(span("1 s", 99.0, 0.1), nees=np.full(9, 99.0)),)) is None
 
 
 @pytest.mark.parametrize(
