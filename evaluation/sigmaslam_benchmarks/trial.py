@@ -18,6 +18,7 @@ from sigmaslam.readers import StereoSequence, open_sequence
 from sigmaslam.readers.trajectory_files import read_trajectory
 from sigmaslam.run_record.frame_table import FrameTable, read_frames
 from sigmaslam.run_record.run_folder import check_has_trajectory
+from sigmaslam.runs.request import InputOptions, OutputOptions, TrackerOptions, TrackRequest
 from sigmaslam.runs.track import track_sequence
 from sigmaslam_benchmarks.code_hash import hash_renderer
 from sigmaslam_evaluation.evaluation_result import Evaluation
@@ -30,7 +31,15 @@ if TYPE_CHECKING:
 _EUROC_TRUTH = Path("mav0") / "state_groundtruth_estimate0" / "data.csv"
 
 Method = Callable[[StereoSequence, Path], object]
-"""Writes what it makes of a sequence into a new run folder: `track_sequence`, or another one with its arguments."""
+"""Writes what it makes of a sequence into a new run folder: `track_ours`, or another one with its arguments."""
+_DEFAULT = TrackerOptions()
+
+
+def track_ours(
+    sequence: StereoSequence, out: Path, tracker: TrackerOptions = _DEFAULT, tracks: bool = False
+) -> dict[str, Any]:
+    """What `sigmaslam track` does, with --tracks or without; its summary."""
+    return track_sequence(TrackRequest(InputOptions(sequence), OutputOptions(out, tracks), tracker))
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +101,7 @@ class Trial:
 
     source: Path | StereoSequence
     truth: Path | None
-    method: Method = track_sequence
+    method: Method = track_ours
     truth_sigmas: tuple[float, float] | None = None
 
     def run(

@@ -10,7 +10,8 @@ from rich.console import Console
 from rich.table import Table
 
 from sigmaslam.checks import Finding, check_sequence, has_errors
-from sigmaslam.cli.track import InputFormat, TopicLeft, TopicRight, open_input
+from sigmaslam.cli.track import InputFormat, TopicLeft, TopicRight
+from sigmaslam.runs.request import InputOptions
 
 _STYLES = {"ok": "green", "unknown": "dim", "warning": "yellow", "error": "bold red"}
 
@@ -38,7 +39,10 @@ def check(
     Finds exchanged, mirrored or unsynchronised eyes, rows that do not agree, a turned camera, a wrong calibration, dark
     or blurred images and wrong units. Exit code 1 where tracking would fail or be wrong.
     """
-    sequence = open_input(source, format, calibration, camera, None, (topic_left, topic_right))
+    options = InputOptions(
+        source, format.value, calibration, camera=camera, topic_left=topic_left, topic_right=topic_right
+    )
+    sequence = options.open()
     result = check_sequence(sequence)
     _print_table(result.findings)
     if out is not None:

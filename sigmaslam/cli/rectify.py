@@ -8,8 +8,9 @@ from typing import Annotated
 import typer
 
 from sigmaslam.calibration.rectified_folder import write_rectified
-from sigmaslam.cli.track import InputFormat, open_input
+from sigmaslam.cli.track import InputFormat
 from sigmaslam.progress import open_progress
+from sigmaslam.readers import open_sequence
 
 
 def rectify(
@@ -21,7 +22,7 @@ def rectify(
     ] = None,
 ) -> None:
     """Write rectified pairs without distortion: left/, right/, times.txt, calibration.yaml."""
-    sequence = open_input(source, format, calibration, None, None, (None, None))
+    sequence = open_sequence(source, format.value, calibration)
     with open_progress() as progress:
         task = progress.add_task("pairs", total=sequence.length, note="")
         count = write_rectified(sequence, out, lambda done: progress.update(task, completed=done))

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import logging
 import tempfile
-from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import fields, replace
 from enum import StrEnum
 from importlib.resources import as_file, files
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
@@ -26,16 +25,17 @@ from sigmaslam.frontend.build import own_networks
 from sigmaslam.inference.backends import backend_names
 from sigmaslam.inference.session import PROVIDERS, check_provider
 from sigmaslam.plot_style import NO_MATPLOTLIB
-from sigmaslam.readers import StereoSequence, open_cameras, open_sequence
+from sigmaslam.readers import StereoSequence
 from sigmaslam.readers.open import FORMATS
-from sigmaslam.readers.selection import Selection
 from sigmaslam.run_record.removal import remove_run
+from sigmaslam.runs.request import InputOptions, LiveOptions, OutputOptions, TrackerOptions, TrackRequest
 
 if TYPE_CHECKING:
-    from sigmaslam.live.frame_sink import FrameSink
     from sigmaslam.slam.config import TrackerConfig
 
 logger = logging.getLogger(__name__)
+
+_Part = TypeVar("_Part", InputOptions, OutputOptions, TrackerOptions, LiveOptions)
 
 # mypy reads the members of an enum from literals alone.
 Frontend = StrEnum("Frontend", FRONTENDS)  # type: ignore[misc]
@@ -76,7 +76,7 @@ def demo(
 
     folder = out or Path(tempfile.mkdtemp(prefix="sigmaslam-demo-"))
     with as_file(files("sigmaslam_synthetic") / "demo") as sequence:
-        _track(open_sequence(sequence, "kitti"), folder, frontend, Backend["onnx"])
+        _track(TrackRequest(InputOptions(sequence, "kitti"), OutputOptions(folder), TrackerOptions(frontend.value)))
         evaluation = evaluate_run(folder, sequence / "poses.txt")
     picture = f"Picture: {evaluation.figure_path}" if evaluation.figure_path else f"No picture: {NO_MATPLOTLIB}"
     typer.echo(f"{format_evaluation(evaluation)}\nReport: {folder / 'report.html'}\n{picture}")
@@ -204,79 +204,35 @@ def track(
     `sigmaslam finish` makes the results, and --resume goes on with the run. Exit code 3: less than half of the frames
     were tracked, and the last line says why. 2: the input cannot be used, or a result not be written.
     """
-    if backend.value == "torch":
+    request = _read_request(locals())
+    if request.tracker.backend == "torch":
         need_train_extra()
-    check_provider(provider.value, backend.value)
-    own_networks(frontend.value, weights, backend.value)
-    if resume and overwrite:
-        raise InputError("--resume goes on with the run in the folder, --overwrite removes it: give one of them")
-    if resume and (video or viewer):
-        raise InputError("--resume does not go with --video and --viewer, which show a whole run: leave them out")
-    settings = _read_settings(config, estimate, track_object is not None)
-    sequence = open_input(source, format, calibration, camera, seconds, (topic_left, topic_right))
-    sequence = _select(sequence, Selection(start, frames, every), scale)
+    check_provider(request.tracker.provider, request.tracker.backend)
+    own_networks(request.tracker.frontend, weights, request.tracker.backend)
+    sequence = request.input.open()
     if not (overwrite or resume):
         check_new_folder(out)
-    with open_sinks(stream, video, viewer, out, sequence.camera) as sinks:
+    with open_sinks(request.live, out, sequence.camera) as sinks:
         findings = _check(sequence, strict, threads)
         if overwrite:
             remove_run(out)
-        summary = _track(
-            sequence,
-            out,
-            frontend,
-            backend,
-            settings,
-            map,
-            tracks,
-            track_object,
-            location,
-            realtime,
-            threads,
-            findings,
-            denoise,
-            resume,
-            provider,
-            sinks,
-            weights,
-        )
-        tell_summary(summary, out)
+        opened = InputOptions(sequence, findings=findings)
+        tell_summary(_track(replace(request, input=opened, live=LiveOptions(sinks=sinks))), out)
 
 
-def open_input(
-    source: Path | None,
-    format: InputFormat,
-    calibration: Path | None,
-    camera: str | None,
-    seconds: float | None,
-    topics: tuple[str | None, str | None],
-) -> StereoSequence:
-    """The recording or the live cameras that the command line names.
+def _read_request(options: dict[str, Any]) -> TrackRequest:
+    """The request of a command line, whose options have the names of the fields."""
+    from sigmaslam.fusion.readings import read_locations
 
-    Raises:
-        InputError: neither or both are named, or options do not fit.
-    """
-    if (source is None) == (camera is None):
-        raise InputError("give either INPUT, a recording, or --camera, live cameras" + (", not both" if source else ""))
-    if source is not None:
-        if seconds is not None:
-            raise InputError("--seconds goes with --camera; a recording is tracked to its end")
-        return open_sequence(source, format.value, calibration, topics)
-    assert camera is not None
-    if calibration is None:
-        raise InputError("--camera needs --calibration: any file that `sigmaslam calibration show` reads")
-    if format.value != "auto" or topics != (None, None):
-        raise InputError("--format, --topic-left and --topic-right go with INPUT, not with --camera")
-    return open_cameras(camera, calibration, seconds)
+    options = {name: each.value if isinstance(each, StrEnum) else each for name, each in options.items()}
+    options["config"] = _read_settings(options["config"], options["estimate"], options["track_object"] is not None)
+    if options["location"] is not None:
+        options["location"] = read_locations(options["location"])
 
+    def build(part: type[_Part]) -> _Part:
+        return part(**{each.name: options[each.name] for each in fields(part) if each.name in options})
 
-def _select(sequence: StereoSequence, selection: Selection, scale: float) -> StereoSequence:
-    """The part of a recording that the command line asks for."""
-    if selection == Selection() and scale == 1.0:
-        return sequence
-    if sequence.format == "camera":
-        raise InputError("--start, --frames, --every and --scale go with INPUT, not with --camera")
-    return sequence.select(selection, scale)
+    return TrackRequest(build(InputOptions), build(OutputOptions), build(TrackerOptions), build(LiveOptions))
 
 
 def _read_settings(path: Path | None, estimate: str | None, track_object: bool) -> TrackerConfig | None:
@@ -294,55 +250,18 @@ def _read_settings(path: Path | None, estimate: str | None, track_object: bool) 
     return settings
 
 
-def _track(
-    sequence: StereoSequence,
-    out: Path,
-    frontend: Frontend,
-    backend: Backend,
-    config: TrackerConfig | None = None,
-    map_path: Path | None = None,
-    tracks: bool = False,
-    track_object: str | None = None,
-    location: Path | None = None,
-    realtime: bool = False,
-    threads: int = 2,
-    findings: Sequence[Finding] = (),
-    denoise: bool = False,
-    resume: bool = False,
-    provider: Provider = Provider["cpu"],
-    sinks: Sequence[FrameSink] = (),
-    weights: Path | None = None,
-) -> dict[str, Any]:
+def _track(request: TrackRequest) -> dict[str, Any]:
     import cv2
 
-    from sigmaslam.fusion.readings import read_locations
     from sigmaslam.runs.stop_signals import Stopped
     from sigmaslam.runs.track import track_sequence
 
-    cv2.setNumThreads(threads)
+    cv2.setNumThreads(request.tracker.threads)
     try:
-        return track_sequence(
-            sequence,
-            out,
-            frontend.value,
-            backend.value,
-            config,
-            map_path=map_path,
-            tracks=tracks,
-            track_object=track_object,
-            locations=None if location is None else read_locations(location),
-            real_time=realtime,
-            threads=threads,
-            findings=findings,
-            denoise=denoise,
-            resume=resume,
-            provider=provider.value,
-            weights=weights,
-            sinks=sinks,
-        )
+        return track_sequence(request)
     except Stopped as stop:
         with suppress(OSError):  # the terminal may be gone
-            typer.echo(f"Stopped; what was tracked until then is in {printable(out)}")
+            typer.echo(f"Stopped; what was tracked until then is in {printable(request.outputs.out)}")
         raise typer.Exit(stop.exit_code) from stop
 
 

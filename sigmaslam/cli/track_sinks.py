@@ -16,6 +16,7 @@ from sigmaslam.errors import InputError
 if TYPE_CHECKING:
     from sigmaslam.geometry.camera import StereoCamera
     from sigmaslam.live.frame_sink import FrameSink
+    from sigmaslam.runs.request import LiveOptions
 
 UNREAD = 1
 """Exit code where nobody reads the output any more."""
@@ -24,15 +25,11 @@ _PATIENCE = 5.0
 
 
 @contextmanager
-def open_sinks(
-    stream: str | None, video: Path | None, viewer: str | None, out: Path, camera: StereoCamera
-) -> Iterator[list[FrameSink]]:
+def open_sinks(options: LiveOptions, out: Path, camera: StereoCamera) -> Iterator[list[FrameSink]]:
     """The sinks that the command line names; with a stream on the standard output all else goes to the standard error.
 
     Args:
-        stream: `stdout` or `udp://HOST:PORT`.
-        video: .mp4 to write.
-        viewer: `rerun`, or `rerun:FILE.rrd`.
+        options: stream, video and viewer.
         out: folder of the run.
         camera: of its images.
     Raises:
@@ -42,14 +39,14 @@ def open_sinks(
     from sigmaslam.live.estimate_stream import PipeStream, open_stream
 
     sinks: list[FrameSink] = []
-    if video is not None:
-        sinks.append(_open_video(video, out, camera))
-    if viewer is not None:
-        sinks.append(_open_viewer(viewer, out, camera))
-    if stream is None:
+    if options.video is not None:
+        sinks.append(_open_video(options.video, out, camera))
+    if options.viewer is not None:
+        sinks.append(_open_viewer(options.viewer, out, camera))
+    if options.stream is None:
         yield sinks
         return
-    told = open_stream(stream)
+    told = open_stream(options.stream)
     sinks.insert(0, told)
     if not isinstance(told, PipeStream):
         yield sinks

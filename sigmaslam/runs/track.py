@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from sigmaslam.bodies.object_region import read_region
 from sigmaslam.bodies.object_tracker import OBJECT_CONFIG, ObjectEstimate, ObjectTracker
-from sigmaslam.checks.finding import Finding
 from sigmaslam.errors import InputError, OutputError, SigmaSlamError
 from sigmaslam.files import printable
 from sigmaslam.fusion.location_filter import LocationFilter
-from sigmaslam.fusion.readings import Locations
-from sigmaslam.inference.networks import WeightsFolder
-from sigmaslam.live.frame_sink import FrameSink, TrackedFrame, close_all
+from sigmaslam.live.frame_sink import TrackedFrame, close_all
 from sigmaslam.progress import open_progress
 from sigmaslam.readers import StereoFrame, StereoSequence
 from sigmaslam.readers.trajectory_files import write_tum
@@ -26,129 +24,85 @@ from sigmaslam.run_record.frame_pictures import PictureRecorder
 from sigmaslam.run_record.real_time import Latency, RealTimePlayer, describe_real_time
 from sigmaslam.run_record.run_folder import RunWriter, describe_camera, describe_weights
 from sigmaslam.runs.denoise import StereoFilter
+from sigmaslam.runs.request import TrackerOptions, TrackRequest
 from sigmaslam.runs.results import TrackerResults, output_error, write_results
 from sigmaslam.runs.resume import StoppedRun, read_stopped_run
 from sigmaslam.runs.stop_signals import Stopped, StopSignals
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.estimate import Estimate
+from sigmaslam.slam.matched_frame import MatchedFrame
 from sigmaslam.slam.start_pose import StartPose
 from sigmaslam.slam.tracker import StereoTracker
 
 Tracker = StereoTracker | ObjectTracker
 
 
-def track_sequence(
-    sequence: StereoSequence,
-    out: Path,
-    frontend: str = "learned",
-    backend: str = "onnx",
-    config: TrackerConfig | None = None,
-    map_path: Path | None = None,
-    tracks: bool = False,
-    track_object: str | None = None,
-    locations: Locations | None = None,
-    real_time: bool = False,
-    threads: int = 2,
-    findings: Sequence[Finding] = (),
-    denoise: bool = False,
-    resume: bool = False,
-    provider: str = "cpu",
-    weights: WeightsFolder = None,
-    on_estimate: Callable[[Estimate | ObjectEstimate], None] | None = None,
-    sinks: Sequence[FrameSink] = (),
-) -> dict[str, Any]:
+def track_sequence(request: TrackRequest) -> dict[str, Any]:
     """Tracks a sequence and writes the run folder; partial results are kept when it is stopped or fails.
 
-    Args:
-        sequence: opened by `sigmaslam.readers.open_sequence` or `open_cameras`.
-        out: run folder, new or empty.
-        frontend, backend, config, threads, provider, weights: of `StereoTracker`.
-        map_path: map.npz of an earlier run; poses are in its world.
-        tracks: write tracks.npz, too, the observations of keyframes for `sigmaslam refine`.
-        track_object: box or mask, see `read_region`: the camera is at rest and follows one body. Poses are then
-            T_camera_object, their covariances in the body's frame, and the map that of the body in its own frame.
-        locations: readings to fuse of a sensor on the moving camera or body; writes trajectory_location.tum, too, the
-            poses in the sensor's world.
-        real_time: play a recording at its time stamps; frames are dropped when tracking falls behind.
-        findings: what a check of the input found; they are kept in run.json, and explain a run that fails.
-        denoise: filter the images before they are tracked, see `sigmaslam.image_filtering.SequenceFilter`.
-        resume: `out` holds a run of the same sequence that was stopped or killed, which goes on where it was. The map
-            is then that of the frames from its last keyframe on, and there is no trajectory after the fact.
-        on_estimate: called with the estimate of each frame when it is on disk; an error that it raises ends the run.
-        sinks: take each frame after that, and are closed in the end.
     Returns:
         The summary in run.json, in which `failure` says why less than half of the frames were tracked, and is None
-        where more were; with `locations` also the counts of the readings, under `location`, and in real time
+        where more were; with a location sensor also the counts of the readings, under `location`, and in real time
         what was dropped and the latency, under `real_time`.
     Raises:
-        InputError: the folder is not empty, or holds no run that could go on, an argument is wrong, or the sequence
+        InputError: the folder is not empty, or holds no run that could go on, an option is wrong, or the sequence
             breaks off; what was computed is on disk then.
         OutputError: results could not be written, the others are; what was said of each frame is on disk.
         Stopped: by Ctrl-C, SIGTERM or SIGHUP, after the partial results are written.
     """
-    if track_object is not None and (map_path is not None or tracks):
-        raise InputError("--map and --tracks are of a moving camera's world: leave them out with --track-object")
-    if resume:
-        _check_can_resume(sequence, map_path, tracks, track_object, locations, real_time)
-    settings: dict[str, Any] = {
-        "input": printable(sequence.source),
-        "format": sequence.format,
-        "frontend": frontend,
-        "backend": backend,
-        "provider": provider,
-        "weights": describe_weights(frontend, backend, weights),
-        "map": None if map_path is None else printable(map_path),
-        "configuration": asdict(config or (TrackerConfig() if track_object is None else OBJECT_CONFIG)),
-        "calibration": describe_camera(sequence.camera),
-    }
-    stopped = read_stopped_run(out, settings) if resume else None
-    if stopped is not None:
+    sequence, options, live, out = request.input.open(), request.tracker, request.live, request.outputs.out
+    settings = _describe_settings(sequence, options)
+    stopped = None
+    if request.outputs.resume:
+        stopped = read_stopped_run(out, settings)
         stopped.check_sequence(sequence)
-    start = None if stopped is None else stopped.start
-    tracker = _build_tracker(sequence, frontend, backend, config, track_object, threads, start, provider, weights)
-    location = None if locations is None else LocationFilter(locations, track_object is not None)
+    tracker = _build_tracker(sequence, options, None if stopped is None else stopped.start)
+    location = None
+    if options.location is not None:
+        location = LocationFilter(options.location, options.track_object is not None)
     rectified = None
     if isinstance(tracker, StereoTracker):
-        if map_path is not None:
-            tracker.load_map(map_path)
-        rectified = tracker.describe_rectified() if tracks else None
+        if options.map is not None:
+            tracker.load_map(options.map)
+        rectified = tracker.describe_rectified() if request.outputs.tracks else None
     run = {
         **settings,
-        "checks": [asdict(each) for each in findings],
+        "checks": [asdict(each) for each in request.input.findings],
         **({} if stopped is None else {"resumed_at": stopped.resumed_at}),
     }
     run |= _describe_location(location)
-    if track_object is not None:
-        run["object"] = {"region": track_object, "origin": None}  # which the first frame gives
+    if options.track_object is not None:
+        run["object"] = {"region": options.track_object, "origin": None}  # which the first frame gives
     if stopped is not None:
         stopped.make_ready()
     writer = RunWriter(out, run, rectified, None if stopped is None else len(stopped.records))
     pictures = PictureRecorder(sequence.length)
-    timing = _Timing(sequence, real_time)
-    images = StereoFilter() if denoise else None
-    listeners = [*((lambda frame: on_estimate(frame.result),) if on_estimate else ()), *(sink.add for sink in sinks)]
-    if timing.is_real:
+    images = StereoFilter() if options.denoise else None
+    steps = _FrameSteps(images, tracker, _Timing(sequence, options.realtime), location)
+    on_estimate = live.on_estimate
+    listeners = [(lambda frame: on_estimate(frame.result))] if on_estimate else []
+    listeners += [sink.add for sink in live.sinks]
+    if steps.timing.is_real:
         tracker.warm_up()
     stopped_by: BaseException | None = None
     with StopSignals() as signals:
         try:
             # Cameras are released before the results are written, even after an error.
             with closing(sequence.frames()) as frames:
-                played = timing.play(frames)
-                _track(sequence, played, tracker, writer, pictures, location, timing, images, stopped, listeners)
+                _track(steps.timing.play(frames), steps, _Rows(sequence, writer, stopped, listeners), pictures)
             signals.hold()
         except BaseException as error:
             signals.hold()
             # Where the terminal is gone, showing the progress fails as well.
             stopped_by = error if signals.received is None else Stopped(signals.received)
         writer.close()
-        unfinished = close_all(sinks)
+        unfinished = close_all(live.sinks)
         run = {
             **writer.run,
             "ended": _describe_end(stopped_by),
-            "dropped": timing.dropped,
-            **timing.describe(),
-            **_describe_object(tracker, track_object),
+            "dropped": steps.timing.dropped,
+            **steps.timing.describe(),
+            **_describe_object(tracker, options.track_object),
             **_describe_location(location),
             **({} if images is None else {"noise": images.describe()}),
         }
@@ -165,8 +119,24 @@ def track_sequence(
         raise output_error(out, failed)
     if unfinished:
         raise OutputError(f"{', '.join(unfinished)} could not be written, as said above; the run itself is in {out}")
-    summary = {**summary, **timing.describe()}
+    summary = {**summary, **steps.timing.describe()}
     return summary if location is None else {**summary, "location": asdict(location.summary)}
+
+
+def _describe_settings(sequence: StereoSequence, options: TrackerOptions) -> dict[str, Any]:
+    """Entries of run.json for what is tracked, and how."""
+    config = options.config or (TrackerConfig() if options.track_object is None else OBJECT_CONFIG)
+    return {
+        "input": printable(sequence.source),
+        "format": sequence.format,
+        "frontend": options.frontend,
+        "backend": options.backend,
+        "provider": options.provider,
+        "weights": describe_weights(options.frontend, options.backend, options.weights),
+        "map": None if options.map is None else printable(options.map),
+        "configuration": asdict(config),
+        "calibration": describe_camera(sequence.camera),
+    }
 
 
 def _write_location(path: Path, location: LocationFilter) -> None:
@@ -234,43 +204,13 @@ class _Timing:
         return {} if self._latency is None else describe_real_time(self._latency, self.dropped)
 
 
-def _build_tracker(
-    sequence: StereoSequence,
-    frontend: str,
-    backend: str,
-    config: TrackerConfig | None,
-    track_object: str | None,
-    threads: int,
-    start: StartPose | None,
-    provider: str,
-    weights: WeightsFolder,
-) -> Tracker:
-    if track_object is None:
-        return StereoTracker(sequence.camera, frontend, backend, config, None, threads, start, provider, weights)
-    region = read_region(track_object, sequence.camera.left.width, sequence.camera.left.height)
-    return ObjectTracker(sequence.camera, region, frontend, backend, config, threads, provider, weights)
-
-
-def _check_can_resume(
-    sequence: StereoSequence,
-    map_path: Path | None,
-    tracks: bool,
-    track_object: str | None,
-    locations: Locations | None,
-    real_time: bool,
-) -> None:
-    """What needs what was in memory when the run was stopped, or frames that do not come again, is refused."""
-    refused = {
-        "--camera": sequence.format == "camera",
-        "--map": map_path is not None,
-        "--tracks": tracks,
-        "--track-object": track_object is not None,
-        "--location": locations is not None,
-        "--realtime": real_time,
-    }
-    for option, given in refused.items():
-        if given:
-            raise InputError(f"--resume does not go with {option}: leave one of them out")
+def _build_tracker(sequence: StereoSequence, options: TrackerOptions, start: StartPose | None) -> Tracker:
+    camera, frontend, backend, config = sequence.camera, options.frontend, options.backend, options.config
+    threads, provider, weights = options.threads, options.provider, options.weights
+    if options.track_object is None:
+        return StereoTracker(camera, frontend, backend, config, None, threads, start, provider, weights)
+    region = read_region(options.track_object, camera.left.width, camera.left.height)
+    return ObjectTracker(camera, region, frontend, backend, config, threads, provider, weights)
 
 
 def _describe_object(tracker: Tracker, track_object: str | None) -> dict[str, Any]:
@@ -294,63 +234,96 @@ def _describe_location(location: LocationFilter | None) -> dict[str, Any]:
     }
 
 
-def _track(
-    sequence: StereoSequence,
-    frames: Iterator[StereoFrame],
-    tracker: Tracker,
-    writer: RunWriter,
-    pictures: PictureRecorder,
-    location: LocationFilter | None,
-    timing: _Timing,
-    images: StereoFilter | None,
-    stopped: StoppedRun | None,
-    listeners: Sequence[Callable[[TrackedFrame], None]],
-) -> None:
-    row = 0  # of frames.csv
-    if stopped is not None:
-        frames = stopped.frames(frames)
-        row = len(stopped.timestamps)
+@dataclass(frozen=True, slots=True)
+class _FrameSteps:
+    """What each frame goes through."""
+
+    images: StereoFilter | None
+    tracker: Tracker
+    timing: _Timing
+    location: LocationFilter | None
+
+    def step(self, frame: StereoFrame) -> Estimate | ObjectEstimate:
+        """What is said of the frame."""
+        if self.images is not None:
+            frame = self.images.step(frame)
+        estimate = self.tracker.step(frame.left, frame.right, frame.timestamp)
+        self.timing.note(frame.timestamp)
+        return estimate if self.location is None else estimate.map_camera(self.location.fuse)
+
+
+class _Rows:
+    """Rows of frames.csv, and who is told of them; of a run that goes on none is written twice."""
+
+    def __init__(
+        self,
+        sequence: StereoSequence,
+        writer: RunWriter,
+        stopped: StoppedRun | None,
+        listeners: Sequence[Callable[[TrackedFrame], None]],
+    ) -> None:
+        self.sequence, self._writer, self._stopped, self._listeners = sequence, writer, stopped, listeners
+        self._count = 0 if stopped is None else len(stopped.timestamps)
+        self.skipped = 0
+        """Frames that could not be read, so far."""
+
+    def frames(self, frames: Iterator[StereoFrame]) -> Iterator[StereoFrame]:
+        """Those of the sequence from which the run goes on."""
+        return frames if self._stopped is None else self._stopped.frames(frames)
+
+    def add_skipped(self, before: float = math.inf) -> None:
+        """Skipped frames are reported together with a later readable one, at `before`, or at the end."""
+        for skipped in self.sequence.skipped[self.skipped :]:
+            if skipped.timestamp >= before:
+                break
+            if self._is_new(skipped.timestamp):
+                self._writer.add_skipped(skipped.timestamp)
+                self._count += 1
+            self.skipped += 1
+
+    def add(self, result: Estimate | ObjectEstimate, seen: MatchedFrame | None, read_ms: float) -> None:
+        """Takes what was said of a frame."""
+        if self._is_new(result.camera.timestamp):
+            covariances = result.pose_covariance, result.pose_matching_covariance
+            self._writer.add(result.camera, result.pose, *covariances, read_ms)
+            for listener in self._listeners:
+                listener(TrackedFrame(self._count, result, seen))
+            self._count += 1
+
+    def check_first(self, result: Estimate | ObjectEstimate) -> None:
+        """InputError where the first frame of a run that goes on is no keyframe again."""
+        if self._stopped is not None and result.camera.tracks is None:
+            raise InputError(
+                f"{self.sequence.source}: the frame at {result.camera.timestamp:.6f} s, the last keyframe of the run, "
+                "is none any more: track anew with --overwrite"
+            )
+
+    def _is_new(self, timestamp: float) -> bool:
+        return self._stopped is None or self._stopped.is_new(timestamp)
+
+
+def _track(frames: Iterator[StereoFrame], steps: _FrameSteps, rows: _Rows, pictures: PictureRecorder) -> None:
+    timing, tracker = steps.timing, steps.tracker
     with open_progress() as progress:
-        task = progress.add_task("frames", total=sequence.length, note="")
-        reported, done, lost = 0, 0, 0
+        task = progress.add_task("frames", total=rows.sequence.length, note="")
+        done, lost = 0, 0
         began = since = time.perf_counter()
-        for frame in frames:
+        for frame in rows.frames(frames):
             read_ms = 1e3 * (time.perf_counter() - since - timing.waited)
-            # Skipped frames are reported together with a later readable one.
-            while reported < len(sequence.skipped) and sequence.skipped[reported].timestamp < frame.timestamp:
-                if stopped is None or stopped.is_new(sequence.skipped[reported].timestamp):
-                    writer.add_skipped(sequence.skipped[reported].timestamp)
-                    row += 1
-                reported += 1
-            if images is not None:
-                frame = images.step(frame)
-            estimate = tracker.step(frame.left, frame.right, frame.timestamp)
-            timing.note(frame.timestamp)
-            if location is not None:
-                estimate = estimate.map_camera(location.fuse)
-            if stopped is not None and not done and estimate.camera.tracks is None:
-                raise InputError(
-                    f"{sequence.source}: the frame at {frame.timestamp:.6f} s, the last keyframe of the run, "
-                    "is none any more: track anew with --overwrite"
-                )
-            if stopped is None or stopped.is_new(frame.timestamp):
-                writer.add(
-                    estimate.camera, estimate.pose, estimate.pose_covariance, estimate.pose_matching_covariance, read_ms
-                )
-                for listener in listeners:
-                    listener(TrackedFrame(row, estimate, tracker.last_frame))
-                row += 1
+            rows.add_skipped(frame.timestamp)
+            result = steps.step(frame)
+            if not done:
+                rows.check_first(result)
+            rows.add(result, tracker.last_frame, read_ms)
             if tracker.last_frame is not None:
-                pictures.add(estimate.camera, tracker.last_frame)
+                pictures.add(result.camera, tracker.last_frame)
             done += 1
-            lost += estimate.status == "lost"
+            lost += result.status == "lost"
             since = time.perf_counter()
-            note = _note(estimate.camera, lost, done / (since - began))
-            progress.update(task, completed=done + reported + timing.dropped, note=note)
-        for skipped in sequence.skipped[reported:]:
-            if stopped is None or stopped.is_new(skipped.timestamp):
-                writer.add_skipped(skipped.timestamp)
-        progress.update(task, completed=done + len(sequence.skipped) + timing.dropped)
+            note = _note(result.camera, lost, done / (since - began))
+            progress.update(task, completed=done + rows.skipped + timing.dropped, note=note)
+        rows.add_skipped()
+        progress.update(task, completed=done + rows.skipped + timing.dropped)
 
 
 def _note(estimate: Estimate, lost: int, rate: float) -> str:

@@ -18,10 +18,10 @@ import numpy as np
 from sigmaslam.geometry.se3 import matrix_to_quaternion, se3_inverse
 from sigmaslam.readers import open_sequence
 from sigmaslam.readers.trajectory_files import read_kitti
-from sigmaslam.runs.track import track_sequence
 from sigmaslam_evaluation.truth_conventions import R_BODY_CAMERA, TIME_UNITS
 from tests.faults.case import DEMO, Case, Outcome, Runner, Verdict
 from tests.faults.inputs import KLT, good, track
+from tests.support import tracked
 from tests.support.calibration_yaml import write_calibration
 from tests.support.demo_parts import copy_frames
 from tests.support.small_bags import write_bag
@@ -35,7 +35,7 @@ def good_run() -> Path:
 
     folder = Path(mkdtemp(prefix="sigmaslam-faults-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    track_sequence(open_sequence(copy_frames(DEMO, folder / "sequence", 14)), folder / "run", "klt")
+    tracked.track(copy_frames(DEMO, folder / "sequence", 14), folder / "run", "klt")
     return folder / "run"
 
 

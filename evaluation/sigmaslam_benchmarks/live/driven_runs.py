@@ -23,6 +23,7 @@ from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.readers import StereoFrame, StereoSequence
 from sigmaslam.readers.images import RawPair
+from sigmaslam.runs.request import InputOptions, LiveOptions, OutputOptions, TrackerOptions, TrackRequest
 from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.estimate import Estimate
 from sigmaslam_benchmarks.live.driver_faults import DrivenFrame
@@ -102,7 +103,8 @@ def track_ours(frames: Sequence[DrivenFrame], camera: StereoCamera, out: Path) -
         sequence = DrivenSequence(frames, camera)
         with Path(os.devnull).open("w") as nowhere, redirect_stderr(nowhere):
             findings = check_sequence(sequence, SAMPLES_BEFORE_TRACKING, 1).findings
-            summary = track_sequence(sequence, out, threads=1, findings=findings, on_estimate=keep)
+            source, live = InputOptions(sequence, findings=findings), LiveOptions(on_estimate=keep)
+            summary = track_sequence(TrackRequest(source, OutputOptions(out), TrackerOptions(threads=1), live))
         told.write("".join(f"{each.message}\n" for each in wrong(findings)))
         _tell(summary, out, told)
     except SigmaSlamError as error:

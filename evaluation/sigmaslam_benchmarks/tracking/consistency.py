@@ -16,14 +16,14 @@ import torch
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.readers.trajectory_files import read_trajectory
-from sigmaslam.runs.track import track_sequence
+from sigmaslam.runs.request import TrackerOptions
 from sigmaslam.slam.point_map import PointMap
 from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam_benchmarks.code_hash import hash_code
 from sigmaslam_benchmarks.rendered_camera import draw_calibration, open_rendered
 from sigmaslam_benchmarks.tracking.consistency_page import ConsistencyResult, Scale, format_page
 from sigmaslam_benchmarks.tracking.trial_pool import SequenceTrials, TrialKind, write_trials
-from sigmaslam_benchmarks.trial import Trial, rendered_truth
+from sigmaslam_benchmarks.trial import Trial, rendered_truth, track_ours
 from sigmaslam_evaluation.metrics import map_consistency as consistency
 from sigmaslam_synthetic.render_sequence import SCENE_NAME
 from sigmaslam_synthetic.simulation import Recipe, Simulation, Studio
@@ -132,7 +132,7 @@ def _track(source: Path, recipe: Recipe, method: str) -> ConsistencyResult:
         uncertain = replace(sequence.camera, sigmas=CalibrationSigmas())
         sequence.camera = draw_calibration(uncertain, np.random.default_rng(recipe.seed))
     with Path(os.devnull).open("w") as nowhere, redirect_stderr(nowhere):
-        trial = Trial(sequence, truth, partial(track_sequence, config=config)).run()
+        trial = Trial(sequence, truth, partial(track_ours, tracker=TrackerOptions(config=config))).run()
     evaluation, tracked, point_map = trial.evaluation, trial.tracked, trial.point_map
     assert evaluation.nees is not None
     columns = trial.table.columns

@@ -16,9 +16,9 @@ from sigmaslam.files import atomic_path, make_folder
 from sigmaslam.image_filtering import NoiseModel, SequenceFilter, denoise_image, estimate_noise
 from sigmaslam.readers.images import read_grey
 from sigmaslam.readers.pairing import list_images
-from sigmaslam.runs.track import track_sequence
+from sigmaslam.runs.request import TrackerOptions
 from sigmaslam_benchmarks.tracking.page import header, opening, row, write_page
-from sigmaslam_benchmarks.trial import Trial, render, rendered_truth
+from sigmaslam_benchmarks.trial import Trial, render, rendered_truth, track_ours
 from sigmaslam_synthetic.camera.sensor import Sensor, expose
 from sigmaslam_synthetic.simulation import Recipe
 
@@ -247,7 +247,7 @@ def _night(sources: dict[str, Path], runs: Path) -> list[str]:
 
 def _track(source: Path, denoise: bool) -> list[str]:
     """Error and frames that were tracked."""
-    method = partial(track_sequence, threads=1, denoise=denoise)
+    method = partial(track_ours, tracker=TrackerOptions(threads=1, denoise=denoise))
     try:
         result = Trial(source, rendered_truth(source), method).run()
     except InputError:

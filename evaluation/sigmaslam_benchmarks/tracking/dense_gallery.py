@@ -19,9 +19,8 @@ from sigmaslam.readers.trajectory_files import read_tum
 from sigmaslam.reconstruction.reconstruct import reconstruct_run
 from sigmaslam.run_record.dense_points import DENSE_NAME, RECONSTRUCTION_NAME, read_dense_points
 from sigmaslam.run_record.removal import remove_run
-from sigmaslam.runs.track import track_sequence
 from sigmaslam_benchmarks.tracking.tracking_gallery import RECIPES, run_gallery
-from sigmaslam_benchmarks.trial import render
+from sigmaslam_benchmarks.trial import render, track_ours
 from sigmaslam_synthetic.simulation import Recipe
 
 # Of a picture: width and height, pixels, and focal length in widths.
@@ -109,7 +108,7 @@ def write_dense_gallery(out: Path, work: Path, recipes: Sequence[Recipe] = RECIP
     for recipe in recipes:
         run = work / f"dense_{recipe.preset}{recipe.seed}"
         remove_run(run)
-        track_sequence(open_sequence(render(work, recipe, workers=1)), run)
+        track_ours(open_sequence(render(work, recipe, workers=1)), run)
         reconstruct_run(run, run / "cloud.ply")
         path = out / f"dense_{recipe.preset}.webp"
         with atomic_path(path) as temporary:

@@ -18,12 +18,12 @@ from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import StereoFrame, StereoSequence
 from sigmaslam.readers.images import RawPair
 from sigmaslam.readers.trajectory_files import read_trajectory
-from sigmaslam.runs.track import track_sequence
+from sigmaslam.runs.request import TrackerOptions
 from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam_benchmarks.rendered_camera import open_rendered
 from sigmaslam_benchmarks.tracking.endurance_page import Block, Endurance, Lap, format_endurance
 from sigmaslam_benchmarks.tracking.page import write_page
-from sigmaslam_benchmarks.trial import Trial, TrialResult, read_trial, render
+from sigmaslam_benchmarks.trial import Trial, TrialResult, read_trial, render, track_ours
 from sigmaslam_synthetic.render_sequence import default_workers
 from sigmaslam_synthetic.simulation import Recipe
 
@@ -137,7 +137,7 @@ def write_endurance(
         # With ten keyframes in memory all are recent and none closes a loop.
         without = Path(scratch) / "without"
         some = min(frames, recipe.frames + _BEYOND)
-        without_loops = partial(track_sequence, config=TrackerConfig(max_keyframes=10), tracks=True)
+        without_loops = partial(track_ours, tracker=TrackerOptions(config=TrackerConfig(max_keyframes=10)), tracks=True)
         open_run = Trial(WatchedSequence(LappedPairs(lap, some), lap, block), None, without_loops).run(without)
         with np.load(without / TRACKS_NAME) as tracks:
             names = ("frame", "landmark", "measurement", "covariance")

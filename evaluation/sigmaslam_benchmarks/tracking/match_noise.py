@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from sigmaslam.readers import StereoSequence, open_sequence
-from sigmaslam.runs.track import track_sequence
+from sigmaslam.runs.request import TrackerOptions
 from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam_benchmarks.rendered_camera import open_rendered
 from sigmaslam_benchmarks.tracking.page import header, opening, row, write_page
 from sigmaslam_benchmarks.tracking.sequences import REAL, REAL_NAMES
-from sigmaslam_benchmarks.trial import Trial, render, rendered_truth
+from sigmaslam_benchmarks.trial import Trial, render, rendered_truth, track_ours
 from sigmaslam_synthetic.simulation import Recipe
 
 CONSTANTS = ((0.15, 0.2), (0.2, 0.3), (0.3, 0.4), (0.5, 0.6))
@@ -87,7 +87,8 @@ def write_noise(
 
 
 def _track(source: StereoSequence, truth: Path, constant: tuple[float, float] | None) -> NoiseResult:
-    result = Trial(source, truth, partial(track_sequence, config=TrackerConfig(constant_sigma=constant))).run()
+    tracker = TrackerOptions(config=TrackerConfig(constant_sigma=constant))
+    result = Trial(source, truth, partial(track_ours, tracker=tracker)).run()
     evaluation = result.evaluation
     assert evaluation.nees is not None
     return NoiseResult(

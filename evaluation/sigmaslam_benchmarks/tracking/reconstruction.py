@@ -17,13 +17,14 @@ from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.reconstruction.disparity import semi_global_disparity
 from sigmaslam.reconstruction.reconstruct import fuse_keyframes
 from sigmaslam.reconstruction.recorded_keyframes import open_input, read_recorded_keyframes
-from sigmaslam.runs.track import track_sequence
+from sigmaslam.runs.request import TrackerOptions
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam_benchmarks.code_hash import hash_code
 from sigmaslam_benchmarks.rendered_camera import open_rendered
 from sigmaslam_benchmarks.tracking.depth_accuracy import DepthFigures, JudgedPixels, judge_pixels, summarise
 from sigmaslam_benchmarks.tracking.reconstruction_page import ReconstructedSequence, format_page
 from sigmaslam_benchmarks.tracking.trial_pool import SequenceTrials, TrialKind, write_trials
+from sigmaslam_benchmarks.trial import track_ours
 from sigmaslam_synthetic.render_sequence import SCENE_NAME
 from sigmaslam_synthetic.simulation import Recipe, Simulation, Studio
 
@@ -99,7 +100,7 @@ def judge_reconstruction(source: Path) -> DepthFigures:
         run = Path(scratch) / "run"
         with Path(os.devnull).open("w") as nowhere, redirect_stderr(nowhere):
             sequence = open_rendered(source)
-            track_sequence(sequence, run, threads=1)
+            track_ours(sequence, run, TrackerOptions(threads=1))
         keyframes = read_recorded_keyframes(run)
         rectifier = StereoRectifier(keyframes.camera)
         pairs: list[np.ndarray] = []

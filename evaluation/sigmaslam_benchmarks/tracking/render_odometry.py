@@ -15,11 +15,11 @@ from sigmaslam.frontend.classical import SiftDetector
 from sigmaslam.geometry.se3 import rotation_log
 from sigmaslam.readers import open_sequence
 from sigmaslam.readers.trajectory_files import read_trajectory
-from sigmaslam.runs.track import track_sequence
+from sigmaslam.runs.request import TrackerOptions
 from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam_benchmarks.matching.scores import mutual_nearest
 from sigmaslam_benchmarks.tracking.page import row
-from sigmaslam_benchmarks.trial import Trial, render
+from sigmaslam_benchmarks.trial import Trial, render, track_ours
 
 REAL_DRIVE = "kitti_raw_0926_0039_a"
 PROFILE = "kitti_gt_trajectories/07.txt"
@@ -128,7 +128,7 @@ def render_drives(folder: Path, data: Path, note: Callable[[str], None] = lambda
 
 def follow(name: str, sequence: Path, truth: Path) -> Drive:
     """Tracks a sequence with SIFT and compares it with the truth."""
-    result = Trial(sequence, truth, partial(track_sequence, frontend="sift")).run(lengths=_LENGTHS, step=1)
+    result = Trial(sequence, truth, partial(track_ours, tracker=TrackerOptions("sift"))).run(lengths=_LENGTHS, step=1)
     evaluation, tracked, columns = result.evaluation, result.tracked, result.table.columns
     if not tracked.any():
         raise InputError(f"{sequence}: SIFT tracked none of its frames, there is nothing to compare")

@@ -17,7 +17,7 @@ from sigmaslam.bundle_adjustment.refine_run import refine_run
 from sigmaslam.bundle_adjustment.track_file import TRACKS_NAME
 from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.readers import StereoSequence, open_sequence
-from sigmaslam.runs.track import track_sequence
+from sigmaslam.runs.request import TrackerOptions
 from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam_benchmarks.rendered_camera import open_rendered
 from sigmaslam_benchmarks.tracking.page import check_names, write_results_page
@@ -31,7 +31,7 @@ from sigmaslam_benchmarks.tracking.sequences_page import (
     total_cell,
 )
 from sigmaslam_benchmarks.tracking.stereo_peers import MissingPeerError, track_with_cuvslam
-from sigmaslam_benchmarks.trial import Method, Trial, TrialResult, read_trial, render
+from sigmaslam_benchmarks.trial import Method, Trial, TrialResult, read_trial, render, track_ours
 
 REAL = (
     ("kitti_raw_0926_0039_a", "poses.txt", (0.21, 0.05)),
@@ -49,14 +49,13 @@ SEQUENCES = ("demo", *RENDERED, *REAL_NAMES)
 FRAMES = 40
 _SEED = 2000  # seeds below 1000 were looked at while the tracker was made; consistency counts from there
 
-track_ours = partial(track_sequence, tracks=True)
-"""What `sigmaslam track --tracks` does."""
+_track_ours = partial(track_ours, tracks=True)
 _TRIED: dict[str, Method] = {
-    "ours": track_ours,
-    "ekf": partial(track_sequence, config=TrackerConfig(linearisation="extended", iterations=1)),
-    "sift": partial(track_sequence, frontend="sift"),
-    "orb": partial(track_sequence, frontend="orb"),
-    "klt": partial(track_sequence, frontend="klt"),
+    "ours": _track_ours,
+    "ekf": partial(track_ours, tracker=TrackerOptions(config=TrackerConfig(linearisation="extended", iterations=1))),
+    "sift": partial(track_ours, tracker=TrackerOptions("sift")),
+    "orb": partial(track_ours, tracker=TrackerOptions("orb")),
+    "klt": partial(track_ours, tracker=TrackerOptions("klt")),
     "sift-pnp": partial(track_with_pnp, matcher="sift"),
     "klt-pnp": partial(track_with_pnp, matcher="klt"),
     "cuvslam": track_with_cuvslam,
@@ -187,7 +186,7 @@ def _adjust(job: _BenchmarkSequence, runs: Path) -> SequenceResult | Omission:
     """Bundle adjustment of the tracks of ours."""
     run, out = runs / "ours", runs / "bundle"
     if not run.is_dir():
-        track_ours(job.open(), run)
+        _track_ours(job.open(), run)
     try:
         refined = refine_run(run, out)
     except SigmaSlamError as error:

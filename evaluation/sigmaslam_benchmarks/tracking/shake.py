@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from sigmaslam.readers.trajectory_files import read_trajectory
-from sigmaslam.runs.track import track_sequence
+from sigmaslam.runs.request import TrackerOptions
 from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam_benchmarks.code_hash import hash_code
 from sigmaslam_benchmarks.rendered_camera import open_rendered
@@ -21,14 +21,14 @@ from sigmaslam_benchmarks.tracking.image_motion import ImageMotion, read_image_m
 from sigmaslam_benchmarks.tracking.pnp_baselines import track_with_pnp
 from sigmaslam_benchmarks.tracking.shake_page import GROSS, ShakenSequence, ShakeResult, format_page
 from sigmaslam_benchmarks.tracking.trial_pool import SequenceTrials, TrialKind, write_trials
-from sigmaslam_benchmarks.trial import Method, Trial, rendered_truth
+from sigmaslam_benchmarks.trial import Method, Trial, rendered_truth, track_ours
 from sigmaslam_evaluation.metrics.map_consistency import coverage
 from sigmaslam_synthetic.presets import PRESETS
 from sigmaslam_synthetic.render_choices import CARRIED
 from sigmaslam_synthetic.simulation import Recipe
 
 METHODS: dict[str, Method] = {
-    "ours": partial(track_sequence, threads=1),
+    "ours": partial(track_ours, tracker=TrackerOptions(threads=1)),
     "KLT + PnP": partial(track_with_pnp, matcher="klt"),
 }
 """The first is what goals are for."""

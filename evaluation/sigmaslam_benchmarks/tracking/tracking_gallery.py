@@ -20,6 +20,7 @@ from sigmaslam.live.frame_sink import TrackedFrame
 from sigmaslam.live.video import frame_rate
 from sigmaslam.readers import open_sequence
 from sigmaslam.run_record.removal import remove_run
+from sigmaslam.runs.request import InputOptions, LiveOptions, OutputOptions, TrackRequest
 from sigmaslam.runs.track import track_sequence
 from sigmaslam_benchmarks.trial import render
 from sigmaslam_synthetic.simulation import Recipe
@@ -93,7 +94,7 @@ def write_tracking_gallery(out: Path, work: Path, recipes: Sequence[Recipe] = RE
         animation = Animation.of(recipe.preset, sequence.camera)
         run = work / f"run_{recipe.preset}{recipe.seed}"
         remove_run(run)
-        track_sequence(sequence, run, sinks=[animation])
+        track_sequence(TrackRequest(InputOptions(sequence), OutputOptions(run), live=LiveOptions(sinks=[animation])))
         path = out / f"track_{recipe.preset}.webp"
         animation.write(path)
         written.append(path)

@@ -16,7 +16,6 @@ from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import open_sequence
 from sigmaslam.readers.trajectory_files import read_kitti, write_kitti
-from sigmaslam.runs.track import track_sequence
 from sigmaslam_evaluation.evaluation_result import Evaluation
 from sigmaslam_evaluation.run_evaluation import evaluate_run
 from tests.support.quantiles import WITHIN_3_SIGMA
@@ -31,6 +30,7 @@ from tests.support.simulated_body import (
     wandering,
 )
 from tests.support.simulated_location import sense
+from tests.support.tracked import track
 
 # Per degree of freedom.
 NEES_999 = WITHIN_3_SIGMA / 6
@@ -220,9 +220,9 @@ def test_a_rendered_tool_is_followed_and_a_sensor_on_it_takes_drift_away(tmp_pat
         add_noise(folder, draw)
         sequence = open_sequence(folder, "kitti")
         out = tmp_path / f"alone{draw}", tmp_path / f"fused{draw}"
-        assert track_sequence(sequence, out[0], track_object=BOX)["lost"] == 0
+        assert track(sequence, out[0], track_object=BOX)["lost"] == 0
         readings = sense(truth, times, draw, 1e-4, 2e-3)
-        summary = track_sequence(sequence, out[1], track_object=BOX, locations=readings)
+        summary = track(sequence, out[1], track_object=BOX, location=readings)
         assert summary["location"]["ready"] is not None
         for run, results in zip(out, (alone, fused), strict=True):
             results.append(evaluate_run(run, folder / "poses_object.txt", plot=False))

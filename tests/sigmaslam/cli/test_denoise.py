@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from sigmaslam.readers import open_sequence
-from sigmaslam.runs.track import track_sequence
 from tests.support.commands import assert_refused, run_here
+from tests.support.tracked import track
 
 ROOT = Path(__file__).resolve().parents[3]
 DEMO = ROOT / "synthetic" / "sigmaslam_synthetic" / "demo"
@@ -70,7 +70,7 @@ def test_a_stereo_sequence_becomes_one_that_can_be_tracked(noisy_pairs: Path, tm
 
 @pytest.mark.long
 def test_the_tracker_sees_filtered_images_and_the_run_says_so(noisy_pairs: Path, tmp_path: Path):
-    track_sequence(open_sequence(noisy_pairs), tmp_path / "run", "orb", threads=1, denoise=True)
+    track(noisy_pairs, tmp_path / "run", "orb", threads=1, denoise=True)
     noise = json.loads((tmp_path / "run" / "run.json").read_text())["noise"]
     assert len(noise) == 2
     for eye in noise:

@@ -16,15 +16,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sigmaslam.readers import open_sequence
 from sigmaslam.readers.trajectory_files import read_tum
 from sigmaslam.run_record.frame_table import read_frames
 from sigmaslam.run_record.relative_pose_file import read_frame_pairs
 from sigmaslam.runs.finish import finish_run
-from sigmaslam.runs.track import track_sequence
 from tests.support.commands import assert_refused, environment, run_here, run_process
 from tests.support.demo_parts import copy_frames
 from tests.support.stopped_runs import end, start, statuses
+from tests.support.tracked import track
 
 FRAMES = 12
 PARTIAL = ("poses.partial", "relative_poses.partial")
@@ -48,7 +47,7 @@ def sequence(demo_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> P
 def whole(sequence: Path) -> Path:
     """The run that nobody disturbed."""
     run = sequence.with_name("whole")
-    track_sequence(open_sequence(sequence), run, "klt")
+    track(sequence, run, "klt")
     return run
 
 
@@ -144,7 +143,7 @@ def killed(sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
     run = tmp_path / "killed"
     monkeypatch.setattr("sigmaslam.runs.track.write_results", killed)
     with pytest.raises(SystemExit):
-        track_sequence(open_sequence(sequence), run, "klt")
+        track(sequence, run, "klt")
     return run
 
 

@@ -18,10 +18,11 @@ from sigmaslam.live.estimate_stream import PipeStream, format_estimate, open_str
 from sigmaslam.live.frame_sink import TrackedFrame
 from sigmaslam.readers import open_sequence
 from sigmaslam.run_record.pose_table import COLUMNS
-from sigmaslam.runs.track import track_sequence
+from sigmaslam.runs.request import LiveOptions
 from tests.support.commands import command_line, environment, run_process
 from tests.support.demo_parts import copy_frames
 from tests.support.recorded_runs import some_estimate
+from tests.support.tracked import track
 
 FRAMES = 6
 
@@ -57,13 +58,13 @@ def test_datagrams_are_the_rows_of_the_pose_table(sequence: Path, tmp_path: Path
         receiver.bind(("127.0.0.1", 0))
         receiver.settimeout(5.0)
         stream = open_stream(f"udp://127.0.0.1:{receiver.getsockname()[1]}")
-        track_sequence(open_sequence(sequence), tmp_path / "run", "klt", sinks=[stream])
+        track(sequence, tmp_path / "run", "klt", live=LiveOptions(sinks=[stream]))
         assert_equals_pose_table([receiver.recv(65536).decode() for _ in range(FRAMES)], tmp_path / "run")
 
 
 def test_datagrams_that_nobody_receives_do_not_matter(sequence: Path, tmp_path: Path):
     stream = open_stream("udp://127.0.0.1:9")
-    summary = track_sequence(open_sequence(sequence), tmp_path / "run", "klt", sinks=[stream])
+    summary = track(sequence, tmp_path / "run", "klt", live=LiveOptions(sinks=[stream]))
     assert summary["poses"] == FRAMES
 
 
@@ -133,7 +134,7 @@ def test_a_callback_gets_every_estimate_once_it_is_on_disk(sequence: Path, tmp_p
         rows.append(len((tmp_path / "run" / "frames.csv").read_text().splitlines()) - 1)
         times.append(estimate.timestamp)
 
-    track_sequence(open_sequence(sequence), tmp_path / "run", "klt", on_estimate=note)
+    track(sequence, tmp_path / "run", "klt", live=LiveOptions(on_estimate=note))
     assert rows == list(range(1, FRAMES + 1))
     assert times == [frame.timestamp for frame in open_sequence(sequence).frames()]
 

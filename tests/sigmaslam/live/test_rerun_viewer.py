@@ -13,9 +13,10 @@ from sigmaslam.live.keyframe_points import KeyframePoints
 from sigmaslam.readers import open_sequence
 from sigmaslam.readers.trajectory_files import read_tum
 from sigmaslam.run_record.frame_table import read_frames
-from sigmaslam.runs.track import track_sequence
+from sigmaslam.runs.request import LiveOptions
 from tests.support.commands import assert_refused, run_here
 from tests.support.demo_parts import copy_frames
+from tests.support.tracked import track
 
 FRAMES = 8
 
@@ -29,7 +30,7 @@ def run(demo_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("some")
     sequence = open_sequence(copy_frames(demo_sequence, folder / "sequence", FRAMES))
     sink = ThreadedSink(RerunSink(folder / "run" / "rerun.rrd", sequence.camera))
-    track_sequence(sequence, folder / "run", "klt", sinks=[sink])
+    track(sequence, folder / "run", "klt", live=LiveOptions(sinks=[sink]))
     return folder / "run"
 
 

@@ -22,11 +22,11 @@ from sigmaslam.readers.capture import SYNCHRONY_PAIRS, StereoCapture, open_captu
 from sigmaslam.readers.live import LivePairs, LiveSequence
 from sigmaslam.readers.trajectory_files import read_tum
 from sigmaslam.run_record.frame_table import read_frames
-from sigmaslam.runs.track import track_sequence
 from tests.support.calibration_yaml import write_calibration
 from tests.support.commands import command_line, environment, run_process
 from tests.support.simulated_stereo import parallel_camera
 from tests.support.stopped_runs import hear_signals
+from tests.support.tracked import track
 from tests.support.videos import write_video
 
 WIDTH, HEIGHT = 64, 48
@@ -352,7 +352,7 @@ def test_track_writes_what_a_camera_saw(demo_video: Path, demo_sequence: Path, t
 def test_an_unplugged_camera_leaves_what_was_tracked(tmp_path: Path):
     out = tmp_path / "run"
     with pytest.raises(InputError, match="camera 1 gives no more images"):
-        track_sequence(live(FakeCamera(), FakeCamera(unplugged_after=60)), out, "klt")
+        track(live(FakeCamera(), FakeCamera(unplugged_after=60)), out, "klt")
     run = json.loads((out / "run.json").read_text())
     assert run["ended"].startswith("failed: camera 1 gives no more images: unplugged?")
     # Grey images have no points, so no frame has a pose.

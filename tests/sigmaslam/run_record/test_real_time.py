@@ -12,12 +12,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sigmaslam.readers import StereoFrame, open_sequence
+from sigmaslam.readers import StereoFrame
 from sigmaslam.run_record import real_time
 from sigmaslam.run_record.frame_table import read_frames
 from sigmaslam.run_record.real_time import POLICY, Latency, RealTimePlayer, describe_real_time
-from sigmaslam.runs.track import track_sequence
 from tests.support.commands import run_here
+from tests.support.tracked import track
 
 FRAMES = 40
 # The clock of the demo, which takes two seconds, runs so many times as fast: nothing can keep up with it.
@@ -153,7 +153,7 @@ def test_the_latency_of_a_slow_consumer_has_the_time_that_frames_waited(clock: C
 @pytest.mark.long
 @pytest.mark.usefixtures("haste")
 def test_a_run_in_real_time_tells_what_was_dropped_and_the_latency(demo_sequence: Path, tmp_path: Path):
-    summary = track_sequence(open_sequence(demo_sequence), tmp_path / "run", "klt", real_time=True, threads=1)
+    summary = track(demo_sequence, tmp_path / "run", "klt", realtime=True, threads=1)
     run, frames = json.loads((tmp_path / "run/run.json").read_text()), read_frames(tmp_path / "run/frames.csv")
     timing = run["real_time"]
     assert summary["real_time"] == timing
@@ -172,7 +172,7 @@ def test_a_run_in_real_time_tells_what_was_dropped_and_the_latency(demo_sequence
 @pytest.mark.long
 @pytest.mark.usefixtures("without_report")
 def test_a_recording_that_is_not_played_drops_nothing_and_tells_no_latency(demo_sequence: Path, tmp_path: Path):
-    summary = track_sequence(open_sequence(demo_sequence), tmp_path / "run", "klt", threads=1)
+    summary = track(demo_sequence, tmp_path / "run", "klt", threads=1)
     run = json.loads((tmp_path / "run/run.json").read_text())
     assert summary["frames"] == FRAMES
     assert run["dropped"] == 0
@@ -194,7 +194,7 @@ def test_a_frame_that_cannot_be_read_has_its_row_where_its_time_is(demo_sequence
     (folder / "times.txt").write_text("\n".join(times) + "\n")
     sorted((folder / "image_0").iterdir())[2].write_bytes(b"no image")
     for name, in_real_time in (("as fast as it goes", False), ("in real time", True)):
-        track_sequence(open_sequence(folder), tmp_path / name, "klt", real_time=in_real_time, threads=1)
+        track(folder, tmp_path / name, "klt", realtime=in_real_time, threads=1)
         frames = read_frames(tmp_path / name / "frames.csv")
         assert len(frames) == 4
         assert frames.status.index("skipped") == 2, name

@@ -13,17 +13,16 @@ from sigmaslam.bundle_adjustment.track_file import read_tracks
 from sigmaslam.checks.finding import Finding
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.trajectory import Trajectory
-from sigmaslam.readers import open_sequence
 from sigmaslam.readers.trajectory_files import read_kitti, read_tum, write_kitti
 from sigmaslam.report.figures import plot_trajectory
 from sigmaslam.run_record.frame_table import predicted_poses, read_frames
 from sigmaslam.run_record.relative_pose_file import read_frame_pairs
 from sigmaslam.run_record.run_failure import explain_failure
-from sigmaslam.runs.track import track_sequence
 from sigmaslam_benchmarks.trial import read_trial
 from sigmaslam_evaluation.evaluation_summary import format_evaluation
 from sigmaslam_evaluation.run_evaluation import evaluate_run
 from tests.support.demo_parts import copy_frames
+from tests.support.tracked import track
 
 FRAMES, DARK = 12, 4
 
@@ -36,7 +35,7 @@ def dark_at_first(k: int, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarr
 def late(demo_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A sequence whose light comes on late, and its run."""
     source = copy_frames(demo_sequence, tmp_path_factory.mktemp("late") / "sequence", FRAMES, dark_at_first, 4.0)
-    track_sequence(open_sequence(source), source.with_name("run"), "klt", tracks=True)
+    track(source, source.with_name("run"), "klt", tracks=True)
     return source, source.with_name("run")
 
 
@@ -134,7 +133,7 @@ def test_a_run_that_tracked_nothing_has_no_pose_and_says_why(demo_sequence: Path
     changes = {"swapped": lambda k, left, right: (right, left), "black": lambda k, left, right: (0 * left, 0 * right)}
     source = copy_frames(demo_sequence, tmp_path / "sequence", 1 if fault == "one frame" else 3, changes.get(fault))
     run = tmp_path / "run"
-    summary = track_sequence(open_sequence(source), run, "klt")
+    summary = track(source, run, "klt")
     assert summary["tracking"] == summary["poses"] == summary["map_points"] == 0
     assert summary["first_frame_with_pose"] is summary["world"] is None
     assert ("single frame" if fault == "one frame" else "never started") in summary["failure"]
@@ -149,7 +148,7 @@ def test_a_place_that_is_not_in_the_map_is_said_to_be_there_not(late: tuple[Path
     mirrored = copy_frames(
         source, tmp_path / "sequence", 7, lambda k, left, right: (np.fliplr(right).copy(), np.fliplr(left).copy())
     )
-    summary = track_sequence(open_sequence(mirrored), tmp_path / "run", "klt", map_path=run / "map.npz")
+    summary = track(mirrored, tmp_path / "run", "klt", map=run / "map.npz")
     assert summary["poses"] == 0
     assert "not found in the map" in summary["failure"]
 

@@ -17,10 +17,10 @@ from sigmaslam.readers.selection import Selection
 from sigmaslam.readers.trajectory_files import read_tum
 from sigmaslam.run_record.frame_table import read_frames
 from sigmaslam.run_record.relative_pose_file import read_frame_pairs
-from sigmaslam.runs.track import track_sequence
 from tests.support.commands import assert_refused, run_here
 from tests.support.demo_parts import copy_frames
 from tests.support.stopped_runs import end, start, statuses
+from tests.support.tracked import track
 
 FRAMES = 30
 
@@ -35,7 +35,7 @@ def sequence(demo_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> P
 def whole(sequence: Path) -> Path:
     """The run that nobody disturbed."""
     run = sequence.with_name("whole")
-    track_sequence(open_sequence(sequence), run, "klt")
+    track(sequence, run, "klt")
     return run
 
 
@@ -94,7 +94,7 @@ def test_a_killed_run_goes_on_and_is_killed_again_and_goes_on(sequence: Path, wh
 def test_the_covariance_is_no_smaller_than_where_it_goes_on(sequence: Path, tmp_path: Path):
     run = tmp_path / "run"
     kill(sequence, run, 20)
-    track_sequence(open_sequence(sequence), run, "klt", resume=True)
+    track(sequence, run, "klt", resume=True)
     position = np.trace(np.load(run / "covariance.npy")[:, :3, :3], axis1=1, axis2=2)
     table = read_frames(run / "frames.csv")
     keyframe = np.flatnonzero(table.columns["keyframe"][:20] == 1)[-1]
@@ -111,7 +111,7 @@ def test_a_stopped_run_goes_on_from_its_results(sequence: Path, whole: Path, tmp
     process.send_signal(signal.SIGTERM)
     assert end(process)[0] == 143
     assert not (run / "poses.partial").exists()
-    track_sequence(open_sequence(sequence), run, "klt", resume=True)
+    track(sequence, run, "klt", resume=True)
     assert_goes_on(run, whole, [17])
 
 
@@ -124,7 +124,7 @@ def test_files_that_end_at_different_frames_are_cut_off_at_the_first(
     run = tmp_path / "run"
     kill(sequence, run, 16)
     os.truncate(run / name, (run / name).stat().st_size - cut)
-    track_sequence(open_sequence(sequence), run, "klt", resume=True)
+    track(sequence, run, "klt", resume=True)
     assert_goes_on(run, whole, [16 if name == "relative_poses.partial" else 15])
 
 
@@ -137,12 +137,12 @@ def test_another_input_or_other_settings_are_refused_and_change_nothing(
     kill(sequence, run, 8)
     before = {path.name: path.read_bytes() for path in run.iterdir()}
     with pytest.raises(InputError, match="had another input"):
-        track_sequence(open_sequence(demo_sequence), run, "klt", resume=True)
+        track(demo_sequence, run, "klt", resume=True)
     with pytest.raises(InputError, match="had another frontend \\(klt, now orb\\)"):
-        track_sequence(open_sequence(sequence), run, "orb", resume=True)
+        track(sequence, run, "orb", resume=True)
     for selection in (Selection(start=1), Selection(every=2), Selection(count=5)):
         with pytest.raises(InputError, match="run of other frames"):
-            track_sequence(open_sequence(sequence).select(selection), run, "klt", resume=True)
+            track(open_sequence(sequence).select(selection), run, "klt", resume=True)
     assert {path.name: path.read_bytes() for path in run.iterdir()} == before
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sigmaslam import StereoTracker, open_sequence
+from sigmaslam import StereoTracker
 from sigmaslam.bundle_adjustment.track_file import read_tracks
 from sigmaslam.errors import InputError
 from sigmaslam.estimation.marginalised_poses import PastPoses
@@ -16,7 +16,6 @@ from sigmaslam.frontend import Features, StereoView
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import se3_inverse, se3_log
 from sigmaslam.readers.trajectory_files import read_kitti
-from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.keyframe import Keyframe
 from sigmaslam.slam.keyframes import Keyframes
 from sigmaslam.slam.map_file import pack_keyframes, read_keyframes
@@ -26,6 +25,7 @@ from tests.support.dense_window import NO_WALK, make_window
 from tests.support.estimates import Demo, error_of, mirrored, squared_error
 from tests.support.faults import assert_no_pose
 from tests.support.quantiles import WITHIN_3_SIGMA, squared_sigmas
+from tests.support.tracked import track
 
 CAMERA = RectifiedStereo(fx=200.0, fy=201.0, cx=32.0, cy=24.0, baseline=0.1, width=64, height=48)
 
@@ -267,7 +267,7 @@ def test_an_array_in_place_of_a_map_is_refused_without_advice_to_unpickle(tmp_pa
 def demo_run(demo_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run folder of the whole demo, with tracks."""
     out = tmp_path_factory.mktemp("demo") / "run"
-    track_sequence(open_sequence(demo_sequence), out, tracks=True)
+    track(demo_sequence, out, tracks=True)
     return out
 
 
@@ -326,7 +326,7 @@ def test_poses_are_in_the_world_of_the_map(demo: Demo, demo_run: Path):
 
 @pytest.mark.slow
 def test_a_run_in_its_own_map_stays_in_its_world(demo_sequence: Path, demo_run: Path, tmp_path: Path):
-    summary = track_sequence(open_sequence(demo_sequence), tmp_path / "run", map_path=demo_run / "map.npz")
+    summary = track(demo_sequence, tmp_path / "run", map=demo_run / "map.npz")
     assert (summary["starting"], summary["relocalised"], summary["tracking"]) == (0, 1, 39)
     truth = read_kitti(demo_sequence / "poses.txt").poses
     found = read_kitti(tmp_path / "run" / "trajectory.kitti").poses
