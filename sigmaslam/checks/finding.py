@@ -38,12 +38,25 @@ class Finding:
         severity: "ok"; "unknown", the input does not show it; "warning"; or "error", tracking will fail or be wrong.
         message: one line; names the value, and for warnings and errors the cure.
         figure: the value that was judged, None where there is none.
+        pixels: by how much disparities may be off for it; None where that is not known.
     """
 
     name: str
     severity: Severity
     message: str
     figure: float | None = None
+    pixels: float | None = None
+
+
+# Faults that bend disparities, and by how many pixels where the check does not tell: what is searched across rows.
+_OF_THE_EYES = frozenset({"mirrored", "distortion", "synchronisation", "eyes", "rig", "rotation", "scale", "infinity"})
+_UNKNOWN_PIXELS = 2.0
+
+
+def disparity_error(findings: Sequence[Finding]) -> float | None:
+    """By how many pixels disparities may be off for faults of the eyes that were found; None where none was."""
+    faults = [each for each in findings if each.severity in ("warning", "error") and each.name in _OF_THE_EYES]
+    return max((_UNKNOWN_PIXELS if each.pixels is None else each.pixels for each in faults), default=None)
 
 
 def wrong(findings: Sequence[Finding]) -> list[Finding]:

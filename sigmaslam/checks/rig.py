@@ -177,6 +177,7 @@ def _check_synchronisation(fit: RowFit, frame_interval: float | None) -> Finding
         f"the right images are {figure} {_when(fit.lag)} than the left ones, which moves them by {fit.lag_shift:.1f} "
         "px in the median: trigger both cameras together",
         fit.lag,
+        fit.lag_shift,
     )
 
 
@@ -218,7 +219,13 @@ def check_pairing(
         f"matches scatter by {scatter[best]:.1f} px with the right image one {'after' if best > 0 else 'before'}, by "
         f"{scatter[0]:.1f} px as given: pair them so, or trigger both cameras together",
         lag,
+        abs(lag) * _median_flow(matches),
     )
+
+
+def _median_flow(matches: EyeMatches) -> float:
+    followed = matches.flow[np.isfinite(matches.flow).all(axis=1)]
+    return float(np.median(np.linalg.norm(followed, axis=1))) if len(followed) else 0.0
 
 
 def _milliseconds(lag: float, frame_interval: float | None) -> str:
@@ -271,7 +278,7 @@ def _judge_place(name: str, rows: np.ndarray, what: str, cure: str, good: str) -
     if most <= _WARN_ROWS:
         return Finding(name, "ok", f"{good}: rows move by {most:.2f} px in a tenth of the places", most)
     severity: Severity = "error" if most > ROW_TOLERANCE else "warning"
-    return Finding(name, severity, f"{what}: rows move by {most:.1f} px in a tenth of the places: {cure}", most)
+    return Finding(name, severity, f"{what}: rows move by {most:.1f} px in a tenth of the places: {cure}", most, most)
 
 
 def _check_infinity(fit: RowFit) -> Finding:

@@ -8,7 +8,7 @@ from typing import Any
 import typer
 
 from sigmaslam.files import printable
-from sigmaslam.run_record.verdict import contradiction_verdict, times_verdict
+from sigmaslam.run_record.verdict import contradiction_verdict, doubts_verdict, times_verdict
 
 NOT_TRACKED = 3
 """Exit code where less than half of the frames were tracked."""
@@ -21,10 +21,10 @@ def tell_summary(summary: dict[str, Any], out: Path) -> None:
         typer.Exit: less than half of the frames were tracked; the last line says why.
     """
     typer.echo(
-        f"{summary['tracking'] + summary['relocalised']} of {summary['frames']} frames tracked, "
+        f"{summary['tracked']} of {summary['frames']} frames tracked{_doubted(summary)}, "
         f"{summary['starting']} starting, {summary['lost']} lost, {summary['skipped']} skipped; "
         f"{summary['median_inliers']:.0f} inliers in the median frame, {summary['map_points']} map points.\n"
-        f"{_world(summary)}{_times(summary)}{_contradiction(summary)}{summary['calibration_verdict']}\n"
+        f"{_world(summary)}{_times(summary)}{_contradiction(summary)}{_doubts(summary)}{summary['calibration_verdict']}\n"
         f"{_location_verdict(summary)}{_real_time_verdict(summary)}Report: {printable(out / 'report.html')}"
     )
     if summary["failure"] is not None:
@@ -49,6 +49,17 @@ def _contradiction(summary: dict[str, Any]) -> str:
     """A line where most matches contradict many poses."""
     verdict = contradiction_verdict(summary)
     return "" if verdict is None else f"{verdict}\n"
+
+
+def _doubted(summary: dict[str, Any]) -> str:
+    """How many of the poses are in doubt; empty where none is."""
+    counts = [f"{summary[status]} {status}" for status in ("doubtful", "ambiguous") if summary[status]]
+    return f" ({', '.join(counts)})" if counts else ""
+
+
+def _doubts(summary: dict[str, Any]) -> str:
+    """Lines about what speaks against poses."""
+    return "".join(f"{each}\n" for each in doubts_verdict(summary))
 
 
 def _location_verdict(summary: dict[str, Any]) -> str:

@@ -63,6 +63,10 @@ class CalibrationPrior:
         estimated[index] = False
         return replace(self, estimated=estimated)
 
+    def widened(self, names: tuple[str, ...], sigma: float) -> CalibrationPrior:
+        """The same with independent errors more, of that standard deviation, by their names."""
+        return replace(self, covariance=self.covariance + np.diag(np.isin(ERRORS, names) * sigma**2))
+
     @property
     def estimated_covariance(self) -> np.ndarray:
         """(12, 12) of those that are estimated, zero for the others."""

@@ -34,11 +34,8 @@ def stamp_noise(intervals: Sequence[float] | np.ndarray) -> float:
     if len(steps) > _LEAST and steps.max() > 3.0 * np.median(steps):
         # One long interval is a pause; several with short ones between them are bursts.
         steps = np.delete(steps, np.argmax(steps))
-    if len(steps) < 2 or np.median(steps) > _SLOWEST or _are_multiples(steps):
+    if len(steps) < _LEAST or np.median(steps) > _SLOWEST or _are_multiples(steps):
         return 0.0
-    if len(steps) < _LEAST:
-        # Too few for a moment, but bursts show at once.
-        return float(steps.std()) if steps.max() > _MOST_DROPPED * steps.min() else 0.0
     departure = steps - steps.mean()
     variance = -float(np.sum(departure[1:] * departure[:-1])) / len(steps)
     sigma = float(np.sqrt(max(variance, 0.0)))
@@ -73,7 +70,7 @@ class FrameClock:
         """
         self._intervals.append(interval)
         steps = np.array(self._intervals)
-        noise = stamp_noise(steps)
+        noise = stamp_noise(steps) if len(steps) >= _LEAST else _first_noise(steps)
         self.was_believed, self._is_believed = self._is_believed, noise == 0.0
         if noise == 0.0:
             return interval, 0.0
@@ -88,6 +85,13 @@ class FrameClock:
             gain = variance / (variance + noise**2)
             ahead, variance = ahead + gain * (stamp - ahead), (1.0 - gain) * variance
         return max(mean + ahead - before, _LEAST_STEP * mean), noise
+
+
+def _first_noise(steps: np.ndarray) -> float:
+    """Of too few intervals for a moment: bursts show at once."""
+    if len(steps) < 2 or steps.mean() > _SLOWEST or steps.max() <= _MOST_DROPPED * steps.min():
+        return 0.0
+    return float(steps.std())
 
 
 def _are_multiples(steps: np.ndarray) -> bool:

@@ -82,6 +82,11 @@ class KeyframeWindow:
         self.landmarks = LandmarkTable.empty(CALIBRATION_SIZE)
         self._observations = KeyframeViews()
 
+    def distrust_eyes(self, pixels: float) -> None:
+        """Before the first keyframe: disparities may be off by so much, by an offset or a turned eye."""
+        self.calibration = self.calibration.widened(("offset", "yaw", "pitch", "roll"), pixels)
+        self.prior = self.posterior = WindowState.initial(self.calibration)
+
     def add_keyframe(
         self,
         pose: np.ndarray,

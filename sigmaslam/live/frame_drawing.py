@@ -21,6 +21,8 @@ STATUS_COLOURS = {
     "lost": bgr("#ff6a3d"),
     "skipped": bgr("#c8a24a"),
     "relocalised": bgr("#e08bc0"),
+    "doubtful": bgr("#f0d03f"),
+    "ambiguous": bgr("#b57bff"),
 }
 """Those of the report."""
 _BACKGROUND, _TEXT, _FAINT, _OUTLIER = bgr("#14181d"), bgr("#e6e9ec"), bgr("#7d8791"), bgr("#ff4d3d")

@@ -8,9 +8,10 @@ import numpy as np
 
 from sigmaslam.checks.finding import Finding, wrong
 from sigmaslam.report.report_plots import frame_interval, nis_per_dof
-from sigmaslam.run_record.frame_table import STATUSES
+from sigmaslam.run_record.frame_table import STATUSES, TRACKED
 from sigmaslam.run_record.real_time import format_latency
 from sigmaslam.run_record.recorded_run import RecordedRun
+from sigmaslam.run_record.verdict import doubts_verdict
 
 Facts = list[tuple[str, str]]
 
@@ -34,7 +35,7 @@ def judge(run: RecordedRun) -> State:
     """Failed, stopped, with losses, or good."""
     notices: list[tuple[str, str]] = []
     failure, ended = run.summary.get("failure"), run.entries.get("ended", "complete")
-    tracked = {"tracking", "relocalised"} & set(run.frames.status)
+    tracked = run.frames.count(TRACKED)
     lost = run.frames.status.count("lost")
     if failure or not tracked:
         notices.append(("bad", failure or "No frame was tracked."))
@@ -48,6 +49,7 @@ def judge(run: RecordedRun) -> State:
                 f"Tracking was lost in {lost} frames ({share:.1f} %): poses there are predicted by the motion alone.",
             )
         )
+    notices += [("warn", each) for each in doubts_verdict(run.summary)]
     findings = wrong([Finding(**each) for each in run.entries.get("checks", ())])
     notices += [("warn", f"{each.name}: {each.message}") for each in findings if each.message not in (failure or "")]
     verdict = run.evaluation.get("nees_verdict")
@@ -63,7 +65,7 @@ def judge(run: RecordedRun) -> State:
 def list_facts(run: RecordedRun) -> Facts:
     """Label and value of the summary."""
     frames = run.frames
-    tracked = frames.status.count("tracking") + frames.status.count("relocalised")
+    tracked = frames.count(TRACKED)
     facts = [
         ("frames", f"{len(frames)}"),
         ("tracked", f"{tracked} ({100 * tracked / len(frames):.0f} %)"),

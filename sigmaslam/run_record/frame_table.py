@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,7 +29,10 @@ COLUMNS = (
 KEYFRAME_COLUMNS = ("keyframe", "loop")
 """Columns that runs of earlier versions lack: 1 where the frame became a keyframe, and the time stamp of the one of
 long ago with which it closed a loop."""
-STATUSES = ("starting", "tracking", "lost", "relocalised", "skipped")
+STATUSES = ("starting", "tracking", "lost", "relocalised", "skipped", "doubtful", "ambiguous")
+TRACKED = ("tracking", "relocalised", "doubtful", "ambiguous")
+"""Of frames with a pose from their images."""
+DOUBTS_SEPARATOR = "; "
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,16 +41,22 @@ class FrameTable:
 
     Attributes:
         status: one of `STATUSES` for each of N frames.
+        doubts: what speaks against the pose of each frame, none in runs of earlier versions.
         columns: by name of `COLUMNS` and `KEYFRAME_COLUMNS`, (N,) float64; NaN where the field is empty.
         milliseconds: by stage ("read", "features", ...), (N,) float64; NaN where the field is empty.
     """
 
     status: list[str]
+    doubts: list[list[str]]
     columns: dict[str, np.ndarray]
     milliseconds: dict[str, np.ndarray]
 
     def __len__(self) -> int:
         return len(self.status)
+
+    def count(self, statuses: Sequence[str]) -> int:
+        """How many frames have one of these."""
+        return int(np.isin(self.status, statuses).sum())
 
     @property
     def seconds(self) -> np.ndarray:
@@ -101,6 +111,7 @@ def read_frames(path: Path) -> FrameTable:
     stages = [name for name in names if re.fullmatch(r"ms_[a-z0-9_]+", name)]
     return FrameTable(
         status=[row["status"] for row in rows],
+        doubts=[[each for each in (row.get("doubts") or "").split(DOUBTS_SEPARATOR) if each] for row in rows],
         columns={name: _column(path, rows, name) for name in (*COLUMNS, *KEYFRAME_COLUMNS)},
         milliseconds={name.removeprefix("ms_"): _column(path, rows, name) for name in stages},
     )

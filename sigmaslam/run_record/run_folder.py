@@ -26,7 +26,7 @@ from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.inference.networks import WeightsFolder, network_path
 from sigmaslam.inference.onnx_graph import shipped_weights
 from sigmaslam.run_record.appended_file import AppendedFile, is_in_use
-from sigmaslam.run_record.frame_table import COLUMNS, FRAMES_NAME, KEYFRAME_COLUMNS
+from sigmaslam.run_record.frame_table import COLUMNS, DOUBTS_SEPARATOR, FRAMES_NAME, KEYFRAME_COLUMNS
 from sigmaslam.run_record.pose_file import PARTIAL_POSES, PoseWriter
 from sigmaslam.run_record.relative_pose_file import RelativePoseWriter
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
@@ -40,7 +40,7 @@ VIDEO_NAME, RERUN_NAME = "video.mp4", "rerun.rrd"
 UNFINISHED = "not yet"
 """What run.json has under `ended` while a run goes on, and after it was killed."""
 STAGES = ("read", "rectify", "features", "match", "filter", "map")
-_COLUMNS = (COLUMNS[0], "status", *COLUMNS[1:], *KEYFRAME_COLUMNS, *(f"ms_{stage}" for stage in STAGES))
+_COLUMNS = (COLUMNS[0], "status", "doubts", *COLUMNS[1:], *KEYFRAME_COLUMNS, *(f"ms_{stage}" for stage in STAGES))
 _GRAPHS = (
     "features.onnx",
     "scorer.onnx",
@@ -123,6 +123,7 @@ class RunWriter:
             [
                 f"{estimate.timestamp:.9f}",
                 estimate.status,
+                DOUBTS_SEPARATOR.join(estimate.doubts),
                 *of_pose,
                 f"{estimate.belief:.6f}",
                 f"{estimate.calibration.disparity_offset:.5f}",

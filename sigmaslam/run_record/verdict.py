@@ -9,6 +9,7 @@ import numpy as np
 
 from sigmaslam.checks.finding import Finding, wrong
 from sigmaslam.checks.time_stamps import jitter_words
+from sigmaslam.slam.doubt import Doubt
 from sigmaslam.slam.estimate import CalibrationEstimate
 
 MIN_FRAMES, MIN_POINTS = 10, 45
@@ -41,13 +42,33 @@ def contradiction_verdict(summary: dict[str, Any]) -> str | None:
         summary: of run.json: counts of frames that were tracked, and of those that fewer than half of their matches
             agree with.
     """
-    contradicted, tracked = summary.get("contradicted", 0), summary.get("tracking", 0)
+    contradicted, tracked = summary.get("contradicted", 0), summary.get("tracked", 0)
     if contradicted <= _MAX_CONTRADICTED * tracked:
         return None
     return (
         f"In {contradicted} of {tracked} tracked frames fewer than half of the matches agree with the pose: something "
         "large moves in the images, and the poses may follow it instead of the scene."
     )
+
+
+def doubts_verdict(summary: dict[str, Any]) -> list[str]:
+    """What spoke against poses, a sentence for each reason.
+
+    Args:
+        summary: of run.json: by reason in how many frames, and when first, in seconds.
+    """
+    words = {
+        Doubt.INPUT: "a check of the input found that the eyes do not fit",
+        Doubt.OFFSET: "the images asked for a disparity offset beyond what calibrations are off by",
+        Doubt.RIG: "the rig changed: the right camera was bumped, turned or exchanged",
+        Doubt.TIME: "the image shows another moment than its stamp says: does the driver deliver frames out of order?",
+        Doubt.MOTIONS: "two motions explain the image about as well: a torn image, or something large that moves",
+    }
+    return [
+        f"From {found['first']:.1f} s on, in {found['frames']} frames: {words.get(reason, reason)}. The covariances of "
+        "these poses hold what that may make of them."
+        for reason, found in summary.get("doubts", {}).items()
+    ]
 
 
 def times_verdict(summary: dict[str, Any]) -> str | None:

@@ -18,7 +18,7 @@ from sigmaslam.files import atomic_path, atomic_write_text
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import write_kitti, write_tum
 from sigmaslam.run_record.frame_pictures import PICTURES_NAME
-from sigmaslam.run_record.frame_table import FRAMES_NAME, STATUSES, FrameTable, read_frames
+from sigmaslam.run_record.frame_table import FRAMES_NAME, STATUSES, TRACKED, FrameTable, read_frames
 from sigmaslam.run_record.pose_file import PARTIAL_POSES, PoseRecords, read_pose_records
 from sigmaslam.run_record.pose_table import POSES_NAME, write_pose_table
 from sigmaslam.run_record.relative_pose_file import (
@@ -82,7 +82,7 @@ def write_results(
     else:
         records = records.select(records.timestamp <= frames.columns["timestamp"][-1] + 1e-9)
     started = len(records) > 0
-    if frames is None or not {"tracking", "relocalised"} & set(frames.status):
+    if frames is None or not frames.count(TRACKED):
         # A start that no second frame confirms is none.
         records = records.select(np.zeros(0, np.int64))
     calibration = calibration or _last_calibration(frames, records)
@@ -102,7 +102,7 @@ def write_results(
     findings = [Finding(**each) for each in run.get("checks", ())]
     verdict = "Nothing is known of the calibration: no frame was tracked."
     if calibration is not None and (len(records) or wrong(findings)):
-        tracked = frames.status.count("tracking") if frames is not None else 0
+        tracked = frames.count(TRACKED) if frames is not None else 0
         verdict = calibration_verdict(calibration, tracked, points, expected_offset(run["calibration"]), findings)
     summary = {**_summarise(frames, records, calibration, points), "calibration_verdict": verdict}
     if tracker is None:
@@ -239,6 +239,8 @@ def _summarise(
     return {
         "frames": 0 if frames is None else len(frames),
         **{status: 0 if frames is None else frames.status.count(status) for status in STATUSES},
+        "tracked": 0 if frames is None else frames.count(TRACKED),
+        "doubts": {} if frames is None else _count_doubts(frames),
         "poses": len(records),
         "first_frame_with_pose": first,
         "median_inliers": float(np.median(inliers)) if len(inliers) else 0.0,
@@ -250,9 +252,18 @@ def _summarise(
     }
 
 
+def _count_doubts(frames: FrameTable) -> dict[str, dict[str, float]]:
+    """By reason: in how many frames, and the time of the first, seconds since the first frame."""
+    counts: dict[str, dict[str, float]] = {}
+    for seconds, doubts in zip(frames.seconds.tolist(), frames.doubts, strict=True):
+        for reason in doubts:
+            counts.setdefault(reason, {"frames": 0, "first": seconds})["frames"] += 1
+    return counts
+
+
 def _count_contradicted(frames: FrameTable) -> int:
     """Tracked frames whose pose fewer than half of the matches agree with."""
-    tracked = np.array(frames.status) == "tracking"
+    tracked = np.isin(frames.status, TRACKED)
     return int((tracked & (2.0 * frames.columns["inliers"] < frames.columns["matches"])).sum())
 
 

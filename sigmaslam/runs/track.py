@@ -13,6 +13,7 @@ from typing import Any
 
 from sigmaslam.bodies.object_region import read_region
 from sigmaslam.bodies.object_tracker import OBJECT_CONFIG, ObjectEstimate, ObjectTracker
+from sigmaslam.checks.finding import disparity_error
 from sigmaslam.errors import InputError, OutputError, SigmaSlamError
 from sigmaslam.files import printable
 from sigmaslam.fusion.location_filter import LocationFilter
@@ -62,6 +63,9 @@ def track_sequence(request: TrackRequest) -> dict[str, Any]:
         location = LocationFilter(options.location, options.track_object is not None)
     rectified = None
     if isinstance(tracker, StereoTracker):
+        pixels = disparity_error(request.input.findings)
+        if pixels is not None:
+            tracker.distrust_eyes(pixels)
         if options.map is not None:
             tracker.load_map(options.map)
         rectified = tracker.describe_rectified() if request.outputs.tracks else None

@@ -12,7 +12,7 @@ from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.frame_update import FrameUpdate
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.frontend import StereoView
-from sigmaslam.geometry.se3 import turn_covariance
+from sigmaslam.geometry.se3 import se3_inverse, se3_log, turn_covariance
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.guided_matching import GuidedMatcher, GuidedMatches
@@ -112,6 +112,21 @@ class Localiser:
             return matches, None  # chance agreement of a few
         return matches, fit
 
+    def _is_reachable(self, matches: GuidedMatches, fit: FrameFit, prediction: Prediction) -> bool:
+        """Whether the motion allows the pose, or most landmarks of earlier keyframes in view confirm it.
+
+        Repeated texture of one keyframe agrees on wrong poses, hundreds of matches strong.
+        """
+        departure = se3_log(fit.pose @ se3_inverse(prediction.pose))
+        squared = departure @ np.linalg.lstsq(prediction.covariance, departure, rcond=1e-14)[0]
+        if squared <= ACCEPTANCE.jump**2:
+            return True
+        anchor = self.window.landmarks.anchor
+        earlier = anchor[matches.searched] < len(self.window) - 1
+        seen = anchor[matches.views.landmark[fit.inliers]] < len(self.window) - 1
+        enough = max(ACCEPTANCE.jump_support * earlier.sum(), self.config.min_inliers)
+        return len(self.window) == 1 or int(seen.sum()) >= enough
+
     def _is_doubtful(self, fit: FrameFit) -> bool:
         """Whether the pose may sit in a wrong place, or so little is left of the last frame that the search was off."""
         return fit.nis_per_dof > ACCEPTANCE.doubtful_nis or fit.count < ACCEPTANCE.left_over * self.follower.count
@@ -156,6 +171,7 @@ class Localiser:
                 matches.views, prediction.pose, prediction.covariance, self.config.min_inliers, start, relative.scale
             )
             clock.lap("filter")
-            if fit is not None and fit.count >= ACCEPTANCE.unguided_share * len(matches.probability):
+            enough = fit is not None and fit.count >= ACCEPTANCE.unguided_share * len(matches.probability)
+            if fit is not None and enough and self._is_reachable(matches, fit, prediction):
                 return matches, fit
         return matches, None

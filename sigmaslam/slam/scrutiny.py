@@ -60,5 +60,5 @@ class Scrutiny:
 
 def _is_rival(second: SecondMotion) -> bool:
     """Whether it may be the scene's: it explains a good part, and is no body before it that never stood still."""
-    is_body = second.disparity_ratio > ACCEPTANCE.scene_farther and not second.stood_still
+    is_body = second.stands_before and not second.stood_still
     return second.area >= ACCEPTANCE.second_motion and not is_body

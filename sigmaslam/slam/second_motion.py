@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.geometry.image_cells import CELLS, image_cells
 from sigmaslam.geometry.se3 import se3_inverse
 from sigmaslam.slam.guided_matching import CONFIRMED, GuidedMatches
+from sigmaslam.two_view.scene_pose import see_the_same, stands_before
 from sigmaslam.two_view.stereo_pose import MIN_POINTS, estimate_relative_pose
 
 
@@ -22,13 +22,13 @@ class SecondMotion:
     Attributes:
         pose: (4, 4) T_world_camera as if these landmarks stood still.
         area: share of the image that they stand for, of what the first pose and they explain together.
-        disparity_ratio: of their median disparity to that of the first pose's.
+        stands_before: they stand before what the first pose explains.
         stood_still: most of them agreed with earlier poses.
     """
 
     pose: np.ndarray
     area: float
-    disparity_ratio: float
+    stands_before: bool
     stood_still: bool
 
 
@@ -58,7 +58,7 @@ def find_second_motion(window: KeyframeWindow, matches: GuidedMatches, fit: Fram
         return None
     agreeing = others[relative.inliers]
     apart = np.linalg.norm(views.measurement[agreeing, :2] - expected[agreeing, :2], axis=1)
-    if np.median(apart) < ACCEPTANCE.same_motion:
+    if see_the_same(apart):
         return None
     cells = image_cells(views.measurement[:, :2], camera.width, camera.height)
     present = np.bincount(cells, minlength=CELLS)
@@ -66,9 +66,9 @@ def find_second_motion(window: KeyframeWindow, matches: GuidedMatches, fit: Fram
         float(np.mean(np.bincount(cells[chosen], minlength=CELLS)[present > 0] / present[present > 0]))
         for chosen in (fit.inliers, agreeing)
     )
-    ratio = float(np.median(expected[agreeing, 2]) / max(np.median(expected[fit.inliers, 2]), np.finfo(float).tiny))
+    nearer = stands_before(*(float(np.median(expected[chosen, 2])) for chosen in (agreeing, fit.inliers)))
     stood_still = bool(np.median(window.landmarks.views[rows[agreeing]]) >= CONFIRMED)
-    return SecondMotion(fit.pose @ relative.T_key_camera, second / (first + second), ratio, stood_still)
+    return SecondMotion(fit.pose @ relative.T_key_camera, second / (first + second), nearer, stood_still)
 
 
 def _seen_from(window: KeyframeWindow, rows: np.ndarray, pose: np.ndarray) -> np.ndarray:

@@ -137,6 +137,14 @@ class StereoTracker:
         self._keyframes.load(Path(path), self._frontend.name, self._camera)
         self._course.phase = Phase.WAITING_IN_MAP
 
+    def distrust_eyes(self, pixels: float) -> None:
+        """Before the first frame: a check found that the eyes do not fit, and disparities may be off by so many pixels.
+
+        All poses are doubtful then, and less certain.
+        """
+        self._scrutiny.input_is_wrong = True
+        self._window.distrust_eyes(pixels)
+
     def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> Estimate:
         """Takes one stereo pair.
 

@@ -73,7 +73,17 @@ def estimate_scene_pose(
     if lesser.area < ACCEPTANCE.rival_area * greater.area or _are_alike(camera, landmarks, pose, other):
         return greater.pose
     nearer, farther = sorted(motions, key=lambda motion: -motion.disparity)
-    return farther.pose if nearer.disparity > ACCEPTANCE.scene_farther * farther.disparity else None
+    return farther.pose if stands_before(nearer.disparity, farther.disparity) else None
+
+
+def stands_before(disparity: float, other: float) -> bool:
+    """Whether what has this median disparity stands clearly before what has the other one."""
+    return disparity > ACCEPTANCE.scene_farther * other
+
+
+def see_the_same(apart: np.ndarray) -> bool:
+    """Whether two poses see most points (K,) at the same places, so many pixels apart."""
+    return float(np.median(apart)) < ACCEPTANCE.same_motion
 
 
 def _are_alike(camera: RectifiedStereo, landmarks: np.ndarray, one: RelativePose, other: RelativePose) -> bool:
@@ -85,4 +95,4 @@ def _are_alike(camera: RectifiedStereo, landmarks: np.ndarray, one: RelativePose
     if not front.any():
         return False
     apart = camera.project(first[front])[:, :2] - camera.project(second[front])[:, :2]
-    return float(np.median(np.linalg.norm(apart, axis=1))) < ACCEPTANCE.same_motion
+    return see_the_same(np.linalg.norm(apart, axis=1))

@@ -65,7 +65,8 @@ def test_a_wrong_position_is_wrong_where_it_is_called_tracking():
     assert found.judged == 7
     assert found.statuses == {"starting": 1, "tracking": 7, "lost": 1, "relocalised": 1}
     assert (found.metres, found.sigmas, found.end_metres) == pytest.approx((0.1, 5.0, 0.0))
-    assert found.silent(exact=True) == 1
+    assert found.silent() == 1
+    assert found.silent(found) == 0
 
 
 def test_a_turn_alone_is_wrong_too():
@@ -79,13 +80,14 @@ def test_a_truth_that_was_measured_excuses_what_it_cannot_see_and_the_good_run_d
     true = straight(4)
     errors = np.zeros((4, 6))
     errors[3, 0] = 0.2
-    good = good_poses(estimated(true, np.zeros((4, 6))), 4)
+    good_run = estimated(true, np.zeros((4, 6)))
+    good = good_poses(good_run, 4)
     measured = References(true, truth_covariance(0.2, 0.05))
     found = judge(estimated(true, errors), measured, good)
     assert found.wrong == []
     assert found.away_wrong == [3]
     assert (found.away_metres, found.away_sigmas) == pytest.approx((0.2, 10.0))
-    assert (found.silent(exact=True), found.silent(exact=False)) == (0, 1)
+    assert (found.silent(), found.silent(judge(good_run, measured))) == (0, 1)
 
 
 def test_truth_is_looked_up_by_moment_and_the_start_is_the_first_pose():

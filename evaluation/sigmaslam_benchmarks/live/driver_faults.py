@@ -280,8 +280,9 @@ def _change_second_half(frames: Frames, change: Callable[[np.ndarray], np.ndarra
     ]
 
 
+NO_FAULT = "none"
 FAULTS: dict[str, Fault] = {
-    "none": Fault("as recorded", lambda frames, rng: frames),
+    NO_FAULT: Fault("as recorded", lambda frames, rng: frames),
     **{
         f"alternate_{round(100 * share)}": Fault(
             f"stamps early and late in turn by {share:.0%} of the interval", partial(alternate, share)

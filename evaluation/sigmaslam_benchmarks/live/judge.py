@@ -79,7 +79,7 @@ class Judgement:
     Attributes:
         statuses: frames by status; those without a pose and those that started included.
         judged: frames called `tracking` whose error is known.
-        wrong: of these, numbers of the delivered frames beyond the 99.9 % bound of position or pose.
+        wrong: of these, moments of the frames beyond the 99.9 % bound of position or pose.
         relocalised_wrong: frames called `relocalised` beyond it.
         metres, sigmas: largest errors of the position of frames called `tracking`; NaN where there is none.
         end_metres: of the last frame with a pose.
@@ -102,9 +102,14 @@ class Judgement:
     said: Sequence[str]
     refused: str = ""
 
-    def silent(self, exact: bool) -> int:
-        """Frames called `tracking` that are wrong; with a truth that was measured, also by the run with good frames."""
-        return len(set(self.wrong) if exact else {*self.wrong, *self.away_wrong})
+    def silent(self, good: Judgement | None = None) -> int:
+        """Frames called `tracking` that are wrong.
+
+        Args:
+            good: with a truth that was measured, of the run with good frames: what is wrong by that run counts, too,
+                and where that run departs from the truth itself, the truth says nothing of the fault.
+        """
+        return len(self.wrong) if good is None else len({*self.away_wrong} | ({*self.wrong} - {*good.wrong}))
 
 
 def pose_errors(poses: Sequence[DrivenPose], references: References) -> Errors:
@@ -157,12 +162,12 @@ def judge(
     return Judgement(
         statuses=dict(Counter(each.status for each in poses)),
         judged=int((tracking & np.isfinite(errors.pose)).sum()),
-        wrong=np.flatnonzero(errors.beyond & tracking).tolist(),
+        wrong=[poses[k].moment for k in np.flatnonzero(errors.beyond & tracking).tolist()],
         relocalised_wrong=int((errors.beyond & relocalised).sum()),
         metres=_largest(errors.metres[tracking]),
         sigmas=_largest(errors.sigmas[tracking]),
         end_metres=float(known[-1]) if len(known) else float("nan"),
-        away_wrong=[] if good is None else np.flatnonzero(away.beyond & tracking).tolist(),
+        away_wrong=[] if good is None else [poses[k].moment for k in np.flatnonzero(away.beyond & tracking).tolist()],
         away_metres=float("nan") if good is None else _largest(away.metres[tracking]),
         away_sigmas=float("nan") if good is None else _largest(away.sigmas[tracking]),
         said=list(said),

@@ -10,12 +10,12 @@ import jinja2
 import numpy as np
 
 from sigmaslam.source_commit import describe_source
-from sigmaslam_benchmarks.live.driver_faults import FAULTS
+from sigmaslam_benchmarks.live.driver_faults import FAULTS, NO_FAULT
 from sigmaslam_benchmarks.live.judge import Judgement
 from sigmaslam_benchmarks.live.recordings import Recording
 from sigmaslam_benchmarks.tracking.page import machine
 
-_COMMON = ("tracking", "relocalised", "lost", "skipped")
+_COMMON = ("tracking", "doubtful", "ambiguous", "relocalised", "lost", "skipped")
 _UNTOLD = ("starting", *_COMMON)
 
 
@@ -47,6 +47,11 @@ class LivePage:
         """Of a method on a case."""
         results = {recording: self.found.get((recording, method, case)) for recording in self.recordings}
         return {recording: each for recording, each in results.items() if isinstance(each, Judgement)}
+
+    def silent(self, recording: Recording, method: str, result: Judgement) -> int:
+        """As of `Judgement.silent`."""
+        good = self.found.get((recording, method, NO_FAULT))
+        return result.silent(None if recording.exact or not isinstance(good, Judgement) or good is result else good)
 
 
 def format_page(page: LivePage) -> str:
@@ -85,7 +90,7 @@ def _totals(page: LivePage, method: str) -> tuple[int, int, int, str]:
         for recording, result in page.judgements(method, case).items():
             runs += 1
             judged += result.judged
-            wrong[case] += result.silent(recording.exact)
+            wrong[case] += page.silent(recording, method, result)
     return runs, judged, wrong.total(), ", ".join(f"{case} ({count})" for case, count in wrong.most_common() if count)
 
 
@@ -94,7 +99,7 @@ def _case_rows(page: LivePage, method: str) -> Iterator[list[str]]:
         results = page.judgements(method, case)
         if not results:
             continue
-        silent = {recording: result.silent(recording.exact) for recording, result in results.items()}
+        silent = {recording: page.silent(recording, method, result) for recording, result in results.items()}
         rendered = [result for recording, result in results.items() if recording.exact]
         sizes = [max_of([result.sigmas for result in rendered]), max_of([result.metres for result in rendered])]
         sizes += [max_of([result.away_sigmas for result in results.values()])]
@@ -119,7 +124,7 @@ def _recording_rows(page: LivePage, recording: Recording) -> Iterator[list[str]]
                 case,
                 method,
                 *_statuses([result]),
-                _bold(result.silent(recording.exact)),
+                _bold(page.silent(recording, method, result)),
                 max_of([result.sigmas]),
                 max_of([result.metres]),
                 max_of([result.end_metres]),

@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sigmaslam.run_record.frame_table import FrameTable
+from sigmaslam.run_record.frame_table import TRACKED, FrameTable
 from sigmaslam_benchmarks.tracking.page import opening, table
 from sigmaslam_benchmarks.trial import TrialResult
 
@@ -176,7 +176,7 @@ def _row(result: SequenceResult) -> list[str]:
     translations, rotations = evaluation.rpe.translations, evaluation.rpe.rotations_deg
     ends_tracked, nis = np.ones(len(translations), bool), np.nan
     if frames is not None:
-        tracked = np.isin(frames.status, ("tracking", "relocalised"))
+        tracked = np.isin(frames.status, TRACKED)
         count = f"{tracked.sum()} of {len(frames) - 1}"
         # Frame k ends step k - 1; frames that were skipped, or before the start, have no pose and no step.
         ends = tracked[np.isfinite(frames.columns["inliers"])][1:]

@@ -31,7 +31,7 @@ def test_the_verdict_is_in_words(offset: float, sigma: float, words: str):
     ("contradicted", "tracked", "told"), [(0, 29, False), (2, 29, False), (3, 29, True), (1, 1, True)]
 )
 def test_frames_that_most_matches_contradict_are_told_of(contradicted: int, tracked: int, told: bool):
-    words = contradiction_verdict({"contradicted": contradicted, "tracking": tracked})
+    words = contradiction_verdict({"contradicted": contradicted, "tracked": tracked})
     assert (words is not None) == told
     assert words is None or f"{contradicted} of {tracked} tracked frames" in words
 
