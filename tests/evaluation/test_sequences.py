@@ -8,7 +8,7 @@ import pytest
 
 from sigmaslam.errors import InputError
 from sigmaslam_benchmarks.tracking import sequences
-from sigmaslam_benchmarks.tracking.sequences import METHODS, run_sequences, write_results
+from sigmaslam_benchmarks.tracking.sequences import METHODS, run_sequences, write_sequences
 from sigmaslam_benchmarks.tracking.sequences_page import method_label
 
 
@@ -22,7 +22,7 @@ def _rows(page: str, method: str) -> list[list[str]]:
 def test_the_page_has_a_row_for_each_method_and_keeps_the_notes(tmp_path: Path):
     page = tmp_path / "results.md"
     page.write_text("old table\n<!-- notes -->\nkept words\n")
-    text = write_results(page, None, "the command", ("klt", "klt-pnp"), ["demo"])
+    text = write_sequences(page, None, "the command", ("klt", "klt-pnp"), ["demo"])
     assert text == page.read_text()
     assert "old table" not in text
     assert text.endswith("<!-- notes -->\nkept words\n")
@@ -41,7 +41,7 @@ def test_the_page_has_a_row_for_each_method_and_keeps_the_notes(tmp_path: Path):
 @pytest.mark.slow
 def test_every_method_has_its_row(tmp_path: Path):
     pytest.importorskip("gtsam")
-    text = write_results(tmp_path / "results.md", None, "the command", METHODS, ["demo"])
+    text = write_sequences(tmp_path / "results.md", None, "the command", METHODS, ["demo"])
     for method in METHODS:
         if method == "cuvslam" and not find_spec("dim_odom"):
             continue
@@ -54,8 +54,8 @@ def test_every_method_has_its_row(tmp_path: Path):
 def test_without_gtsam_the_bundle_adjustment_is_left_out_with_a_note(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "gtsam", None)
     # Tracks that are there already, so that nothing is tracked.
-    monkeypatch.setattr(sequences, "track_ours", lambda sequence, run: run.mkdir(parents=True))
-    text = write_results(tmp_path / "results.md", None, "the command", ("klt-pnp", "bundle"), ["demo"])
+    monkeypatch.setattr(sequences, "_track_ours", lambda sequence, run: run.mkdir(parents=True))
+    text = write_sequences(tmp_path / "results.md", None, "the command", ("klt-pnp", "bundle"), ["demo"])
     assert _rows(text, "bundle") == []
     assert "*bundle adjustment* is left out: gtsam is not installed" in text
     assert len(_rows(text, "klt-pnp")) == 1
@@ -63,7 +63,7 @@ def test_without_gtsam_the_bundle_adjustment_is_left_out_with_a_note(tmp_path: P
 
 def test_a_peer_that_is_not_installed_is_left_out_with_a_note(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "dim_odom", None)
-    text = write_results(tmp_path / "results.md", None, "the command", ("klt-pnp", "cuvslam"), ["demo"])
+    text = write_sequences(tmp_path / "results.md", None, "the command", ("klt-pnp", "cuvslam"), ["demo"])
     assert _rows(text, "cuvslam") == []
     assert "*cuVSLAM* is left out: dim_odom" in text
     assert len(_rows(text, "klt-pnp")) == 1
@@ -71,7 +71,7 @@ def test_a_peer_that_is_not_installed_is_left_out_with_a_note(tmp_path: Path, mo
 
 @pytest.mark.long
 def test_ours_says_how_consistent_its_relative_poses_are(tmp_path: Path):
-    text = write_results(tmp_path / "results.md", None, "the command", ("ours", "klt-pnp"), ["demo"])
+    text = write_sequences(tmp_path / "results.md", None, "the command", ("ours", "klt-pnp"), ["demo"])
     assert text.count("Relative poses of *ours*; sigmas of the truth: exact.") == 1
     (row,) = (line.split("|")[1:-1] for line in text.splitlines() if line.startswith("| 1 s |"))
     assert 0.05 < float(row[2]) < 5.0  # NEES per degree of freedom; 1 is right
@@ -80,7 +80,7 @@ def test_ours_says_how_consistent_its_relative_poses_are(tmp_path: Path):
 
 def test_cuvslam_follows_the_demo(tmp_path: Path):
     pytest.importorskip("dim_odom")
-    row = _rows(write_results(tmp_path / "results.md", None, "the command", ("cuvslam",), ["demo"]), "cuvslam")[0]
+    row = _rows(write_sequences(tmp_path / "results.md", None, "the command", ("cuvslam",), ["demo"]), "cuvslam")[0]
     assert row[1] == "39 of 39"
     assert float(row[2]) < 0.01  # metres of 0.8
     assert row[8] == "-"
@@ -91,7 +91,7 @@ def test_without_torch_the_renders_are_left_out_with_a_note(tmp_path: Path, monk
         raise ImportError(name="torch")
 
     monkeypatch.setattr(sequences, "render", fail)
-    text = write_results(tmp_path / "results.md", None, "the command", ("klt-pnp",), ["demo", "street"])
+    text = write_sequences(tmp_path / "results.md", None, "the command", ("klt-pnp",), ["demo", "street"])
     assert "street (rendered) is left out: torch is not installed" in text
     assert len(_rows(text, "klt-pnp")) == 1
 
@@ -101,10 +101,10 @@ def test_what_was_found_is_written_when_it_is_stopped(tmp_path: Path, monkeypatc
         raise KeyboardInterrupt
 
     monkeypatch.setattr(sequences, "refine_run", interrupt)
-    monkeypatch.setattr(sequences, "track_ours", lambda sequence, run: run.mkdir(parents=True))
+    monkeypatch.setattr(sequences, "_track_ours", lambda sequence, run: run.mkdir(parents=True))
     page = tmp_path / "results.md"
     with pytest.raises(KeyboardInterrupt):
-        write_results(page, None, "the command", ("klt-pnp", "bundle"), ["demo"])
+        write_sequences(page, None, "the command", ("klt-pnp", "bundle"), ["demo"])
     assert "Stopped before the end" in page.read_text()
     assert len(_rows(page.read_text(), "klt-pnp")) == 1
 

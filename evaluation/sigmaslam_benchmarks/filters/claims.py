@@ -284,8 +284,9 @@ def plot_claims(comparisons: Sequence[Comparison], samples: int = 400_000) -> Fi
     return figure
 
 
-def write_claims(path: Path, figure: Path, command: str) -> str:
+def write_claims(path: Path, figure: Path, command: str, note: Callable[[str], None]) -> str:
     """Runs everything, writes page and figure and returns the page; what is below `<!-- notes -->` in it is kept."""
+    note("simulating a dozen scenarios (two to seven minutes)")
     bananas, comparisons = compare_bananas(), compare_filters()
     try:
         link = figure.resolve().relative_to(path.resolve().parent).as_posix()

@@ -287,7 +287,7 @@ def _version(package: str) -> str:
         return "not installed"
 
 
-def write_in_one_thread(path: Path, rounds: int, compiled: bool, command: str) -> str:
+def write_filters(path: Path, rounds: int, eager: bool, command: str) -> str:
     """Runs the benchmark in a process of one thread, writes the page and returns it.
 
     What is below a line `<!-- notes -->` in the page is kept.
@@ -303,7 +303,7 @@ def write_in_one_thread(path: Path, rounds: int, compiled: bool, command: str) -
         "--command",
         command,
     ]
-    if not compiled:
+    if eager:
         arguments.append("--eager")
     # BLAS reads its number of threads when it is loaded: hence another process.
     subprocess.run(arguments, env={**os.environ, **single_thread_environment()}, check=True)
@@ -320,7 +320,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     command = options.command or "python -m evaluation.benchmarks.filters"
     if os.environ.get("OMP_NUM_THREADS") != "1":
-        write_in_one_thread(options.out, options.rounds, not options.eager, command)
+        write_filters(options.out, options.rounds, options.eager, command)
         return
     import torch
 

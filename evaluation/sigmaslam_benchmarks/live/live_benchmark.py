@@ -30,11 +30,6 @@ _GOOD = "none"
 _JUDGING = ("driver_faults.py", "driven_runs.py", "judge.py", "recordings.py")  # the page may change without a new run
 
 
-def draw_first_seed() -> int:
-    """A seed that no tracker was made with: the time of day."""
-    return 10_000 + int(time.time()) % 1_000_000
-
-
 def write_live(
     path: Path,
     data: Path | None,
@@ -67,6 +62,7 @@ def write_live(
     """
     check_names("case", cases or (), list(FAULTS))
     check_names("method", methods, list(METHODS))
+    note(f"seeds {first_seed} to {first_seed + seeds - 1}")
     chosen = choose_recordings(sequences, data, first_seed, seeds, frames)
     make_folder(runs)
     wanted = [name for name in FAULTS if not cases or name in cases]

@@ -64,7 +64,7 @@ class Difference:
 
 
 def write_renders(
-    out: Path,
+    path: Path,
     figure: Path,
     data: Path,
     command: str,
@@ -74,7 +74,7 @@ def write_renders(
     """Measures everything, writes the page and its figure and returns the page.
 
     Args:
-        out: Markdown page; what is below a line `<!-- notes -->` in it is kept.
+        path: Markdown page; what is below a line `<!-- notes -->` in it is kept.
         figure: PNG, beside the page.
         data: folder of the real data sets.
         command: that makes the page again.
@@ -112,7 +112,7 @@ def write_renders(
         *speed.format_speeds(speeds),
         "",
     ]
-    return write_page(out, "\n".join(lines))
+    return write_page(path, "\n".join(lines))
 
 
 def summarize_all(data: Path, drives: Sequence[Path]) -> dict[str, ImageSet]:

@@ -82,7 +82,7 @@ class _BenchmarkSequence:
         return open_rendered(self.source) if self.exact else open_sequence(self.source)
 
 
-def write_results(
+def write_sequences(
     path: Path,
     data: Path | None,
     command: str,
@@ -116,7 +116,7 @@ def run_sequences(
     renders: Path | None = None,
     note: Callable[[str], None] = lambda text: None,
 ) -> Iterator[SequenceResult | Omission]:
-    """Runs and evaluates everything, one at a time; see `write_results`."""
+    """Runs and evaluates everything, one at a time; see `write_sequences`."""
     check_names("method", methods, METHODS)
     check_names("sequence", sequences or (), SEQUENCES)
     wanted = sequences or [name for name in SEQUENCES if data is not None or name not in REAL_NAMES]
