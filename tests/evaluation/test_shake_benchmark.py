@@ -14,9 +14,9 @@ from sigmaslam.readers import StereoSequence
 from sigmaslam_benchmarks.tracking import shake, trial_pool
 from sigmaslam_benchmarks.tracking.claimed_errors import motion_errors, sigmas_of_pose
 from sigmaslam_benchmarks.tracking.image_motion import ImageMotion, largest_reversal, read_image_motion
-from sigmaslam_benchmarks.tracking.pnp_baselines import track_with_pnp
 from sigmaslam_benchmarks.tracking.shake import FRAMES, MOVERS, judge, recipe
 from sigmaslam_benchmarks.tracking.shake_page import ShakenSequence, ShakeResult, format_page
+from sigmaslam_benchmarks.tracking.stereo_peers import track_with_peer
 from sigmaslam_benchmarks.trial import render
 from sigmaslam_synthetic.simulation import Recipe
 
@@ -138,10 +138,10 @@ def test_flow_and_blur_of_a_render_are_those_of_its_dense_truth(shaken_folder: P
 
 
 def test_a_method_that_is_right_has_no_wrong_frame_and_one_that_jumps_has(shaken_folder: Path):
-    right = judge(shaken_folder, lambda sequence, out: track_with_pnp(sequence, out, "klt"))
+    right = judge(shaken_folder, lambda sequence, out: track_with_peer(sequence, out, "klt-pnp"))
 
     def jumping(sequence: StereoSequence, out: Path) -> None:
-        track_with_pnp(sequence, out, "klt")
+        track_with_peer(sequence, out, "klt-pnp")
         rows = (out / "trajectory.tum").read_text().splitlines()
         words = rows[5].split()
         rows[5] = " ".join([words[0], str(float(words[1]) + 0.5), *words[2:]])

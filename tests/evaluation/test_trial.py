@@ -9,7 +9,7 @@ import pytest
 from sigmaslam.errors import InputError
 from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam_benchmarks import trial
-from sigmaslam_benchmarks.tracking.pnp_baselines import track_with_pnp
+from sigmaslam_benchmarks.tracking.stereo_peers import track_with_peer
 from sigmaslam_benchmarks.trial import Trial, TrialCache
 from sigmaslam_synthetic import render_sequence
 from sigmaslam_synthetic.simulation import Recipe
@@ -18,7 +18,7 @@ RECIPE, CONFIG = Recipe("room", 3, 7), TrackerConfig()
 
 
 def test_a_baseline_leaves_a_run_folder_without_a_map(demo_sequence: Path, tmp_path: Path):
-    method = partial(track_with_pnp, matcher="klt")
+    method = partial(track_with_peer, name="klt-pnp")
     result = Trial(demo_sequence, demo_sequence / "poses.txt", method).run(tmp_path / "run")
     assert len(result.trajectory) == len(result.table) == 40
     assert result.tracked.sum() == 39

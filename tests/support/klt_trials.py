@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam_benchmarks.rendered_camera import open_rendered
-from sigmaslam_benchmarks.tracking.pnp_baselines import track_with_pnp
+from sigmaslam_benchmarks.tracking.stereo_peers import track_with_peer
 from sigmaslam_benchmarks.trial import Trial, rendered_truth
 from sigmaslam_synthetic.simulation import Recipe
 
@@ -29,7 +29,7 @@ def judge_klt(source: Path, recipe: Recipe, method: str) -> ErrorFigures:
     if recipe.seed == 13:
         raise ValueError("13 is unlucky")
     trial = Trial(
-        open_rendered(source), rendered_truth(source), lambda sequence, out: track_with_pnp(sequence, out, "klt")
+        open_rendered(source), rendered_truth(source), lambda sequence, out: track_with_peer(sequence, out, "klt-pnp")
     )
     evaluation = trial.run().evaluation
     steps = evaluation.rpe

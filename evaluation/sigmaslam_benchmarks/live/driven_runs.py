@@ -8,6 +8,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,6 @@ from sigmaslam.checks.finding import wrong
 from sigmaslam.cli.run_summary import tell_summary
 from sigmaslam.errors import SigmaSlamError
 from sigmaslam.geometry.camera import StereoCamera
-from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.readers import StereoFrame, StereoSequence
 from sigmaslam.readers.images import RawPair
 from sigmaslam.runs.request import InputOptions, LiveOptions, OutputOptions, TrackerOptions, TrackRequest
@@ -28,8 +28,7 @@ from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.estimate import Estimate
 from sigmaslam_benchmarks.live.driver_faults import DrivenFrame
 from sigmaslam_benchmarks.live.judge import DrivenPose
-from sigmaslam_benchmarks.tracking.pnp_baselines import PnpOdometry
-from sigmaslam_benchmarks.tracking.stereo_peers import CuvslamPeer, OrbSlamPeer
+from sigmaslam_benchmarks.tracking.stereo_peers import open_peer
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,49 +138,19 @@ class _Warnings(logging.Handler):
         self.words.append(record.getMessage())
 
 
-def track_with_klt_pnp(frames: Sequence[DrivenFrame], camera: StereoCamera, out: Path) -> DrivenRun:
-    """KLT + PnP of OpenCV, which knows no time and says nothing in words."""
-    odometry = PnpOdometry(camera, "klt")
+def track_with_peer(frames: Sequence[DrivenFrame], camera: StereoCamera, out: Path, name: str) -> DrivenRun:
+    """A peer, which says nothing in words; MissingPeerError where it is not installed."""
     poses = []
-    for frame in frames:
-        step = odometry.step(frame.left, frame.right)
-        poses.append(DrivenPose(frame.moment, step.status, step.T_world_camera, step.covariance))
-    return DrivenRun(poses, [])
-
-
-def track_with_cuvslam(frames: Sequence[DrivenFrame], camera: StereoCamera, out: Path) -> DrivenRun:
-    """cuVSLAM on the CPU; MissingPeerError where it is not installed."""
-    return _track_with_peer(frames, camera, lambda rectifier: CuvslamPeer(rectifier.rectified))
-
-
-def track_with_orbslam(frames: Sequence[DrivenFrame], camera: StereoCamera, out: Path) -> DrivenRun:
-    """ORB-SLAM3; MissingPeerError where it is not installed."""
-    rate = 1.0 / float(np.median(np.diff([frame.timestamp for frame in frames])))
-    return _track_with_peer(frames, camera, lambda rectifier: OrbSlamPeer(rectifier.rectified, rate))
-
-
-def _track_with_peer(
-    frames: Sequence[DrivenFrame],
-    camera: StereoCamera,
-    make: Callable[[StereoRectifier], CuvslamPeer | OrbSlamPeer],
-) -> DrivenRun:
-    """A peer that says poses alone; they count as tracked, and are judged in metres."""
-    rectifier = StereoRectifier(camera)
-    T_rectified_left = np.eye(4)
-    T_rectified_left[:3, :3] = rectifier.R_rectified_left
-    poses = []
-    with closing(make(rectifier)) as peer:
+    with closing(open_peer(name, camera, [frame.timestamp for frame in frames])) as peer:
         for frame in frames:
-            found = peer.step(*rectifier.rectify(frame.left, frame.right), frame.timestamp)
-            pose = np.full((4, 4), np.nan) if found is None else T_rectified_left.T @ found @ T_rectified_left
-            poses.append(DrivenPose(frame.moment, "lost" if found is None else "tracking", pose, None))
+            found = peer.step(frame.left, frame.right, frame.timestamp)
+            pose = np.full((4, 4), np.nan) if found.T_world_camera is None else found.T_world_camera
+            poses.append(DrivenPose(frame.moment, found.status, pose, found.covariance))
     return DrivenRun(poses, [])
 
 
 METHODS: dict[str, Method] = {
     "ours": track_ours,
-    "klt-pnp": track_with_klt_pnp,
-    "cuvslam": track_with_cuvslam,
-    "orbslam3": track_with_orbslam,
+    **{name: partial(track_with_peer, name=name) for name in ("klt-pnp", "cuvslam", "orbslam3")},
 }
 """The first is what goals are for."""

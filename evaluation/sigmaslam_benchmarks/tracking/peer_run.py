@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import csv
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
 from sigmaslam.files import make_folder
 from sigmaslam.geometry.trajectory import Trajectory
-from sigmaslam.readers import StereoFrame, StereoSequence
+from sigmaslam.readers import StereoSequence
 from sigmaslam.readers.trajectory_files import write_tum
 from sigmaslam.run_record.frame_table import COLUMNS
 
@@ -25,28 +25,52 @@ class PeerStep:
         T_world_camera: (4, 4) pose of the left camera as calibrated; None where there is none.
         status: as in frames.csv.
         matches, inliers: points, where they are known.
+        covariance: (6, 6) in the camera's own frame, translation first; None where the peer says none.
     """
 
     T_world_camera: np.ndarray | None
     status: str
     matches: int = 0
     inliers: int = 0
+    covariance: np.ndarray | None = None
 
 
-def write_peer_run(sequence: StereoSequence, out: Path, step: Callable[[StereoFrame], PeerStep]) -> None:
-    """Tracks a sequence; leaves trajectory.tum, of the frames with a pose, and frames.csv in the new folder `out`."""
+class Peer(Protocol):
+    """Tracks stereo pairs, one after another.
+
+    Attributes:
+        version: of its package, if it has one.
+    """
+
+    version: str
+
+    def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> PeerStep:
+        """The pose of a pair (H, W) uint8; time stamps are seconds."""
+
+    def close(self) -> None:
+        """Ends what it has begun."""
+
+
+def write_peer_run(sequence: StereoSequence, out: Path, peer: Peer) -> None:
+    """Tracks a sequence into the new folder `out`: trajectory.tum and covariance.npy of the poses, and frames.csv."""
     make_folder(out)
     timestamps: list[float] = []
     poses: list[np.ndarray] = []
+    covariances: list[np.ndarray] = []
     with (out / "frames.csv").open("w", newline="", encoding="utf-8") as table:
         rows = csv.DictWriter(table, ["status", *COLUMNS, "ms_step"])
         rows.writeheader()
         for frame in sequence.frames():
             began = time.perf_counter()
-            found = step(frame)
-            row = {"status": found.status, "timestamp": frame.timestamp, "matches": found.matches}
+            found = peer.step(frame.left, frame.right, frame.timestamp)
+            status = "starting" if found.status == "tracking" and not poses else found.status
+            row = {"status": status, "timestamp": frame.timestamp, "matches": found.matches}
             rows.writerow(row | {"inliers": found.inliers, "ms_step": 1e3 * (time.perf_counter() - began)})
             if found.T_world_camera is not None:
                 timestamps.append(frame.timestamp)
                 poses.append(found.T_world_camera)
+            if found.covariance is not None:
+                covariances.append(found.covariance)
     write_tum(out / "trajectory.tum", Trajectory(np.array(timestamps), np.stack(poses)))
+    if covariances:
+        np.save(out / "covariance.npy", np.stack(covariances))

@@ -8,7 +8,6 @@ settings are common ones, the same for every sequence.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Protocol
 
 import cv2
@@ -17,8 +16,7 @@ import numpy as np
 from sigmaslam.geometry.camera import RectifiedStereo, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import rotation_exp, se3_adjoint, se3_inverse, se3_log, skew
-from sigmaslam.readers import StereoFrame, StereoSequence
-from sigmaslam_benchmarks.tracking.peer_run import PeerStep, write_peer_run
+from sigmaslam_benchmarks.tracking.peer_run import PeerStep
 
 _KEYPOINTS = 1500  # as many as the tracker asks for
 _PIXEL_SIGMA = 1.0
@@ -47,24 +45,6 @@ class PnpPose:
     T_key_camera: np.ndarray
     covariance: np.ndarray
     inliers: np.ndarray
-
-
-@dataclass(frozen=True, slots=True)
-class OdometryStep:
-    """Result for one stereo pair.
-
-    Attributes:
-        T_world_camera: (4, 4) pose of the left camera as calibrated; the world is the first one.
-        covariance: (6, 6) in the camera's own frame, translation first.
-        status: "starting" (the first frame), "tracking" or "lost".
-        matches, inliers: points matched to the keyframe, and those that agree with the pose.
-    """
-
-    T_world_camera: np.ndarray
-    covariance: np.ndarray
-    status: str
-    matches: int
-    inliers: int
 
 
 class Matcher(Protocol):
@@ -133,6 +113,8 @@ class PnpOdometry:
         matcher: "sift" or "klt".
     """
 
+    version = ""
+
     def __init__(self, camera: StereoCamera, matcher: str) -> None:
         self._rectifier = StereoRectifier(camera)
         self._camera = self._rectifier.rectified
@@ -147,8 +129,8 @@ class PnpOdometry:
         self._key_is_last = False
         self._reference: int | None = None  # inliers of the first view after the keyframe
 
-    def step(self, left: np.ndarray, right: np.ndarray) -> OdometryStep:
-        """Takes one stereo pair, raw images (H, W) uint8."""
+    def step(self, left: np.ndarray, right: np.ndarray, timestamp: float = 0.0) -> PeerStep:
+        """Takes one stereo pair, raw images (H, W) uint8; it knows no time. A lost pose is a guess."""
         view = self._matcher.look(*self._rectifier.rectify(left, right))
         if self._view is None:
             self._view = view
@@ -174,6 +156,9 @@ class PnpOdometry:
             self._start_keyframe(view)
         return self._report("tracking", matches, inliers)
 
+    def close(self) -> None:
+        """It needs no end."""
+
     def _locate(self, view: Any) -> tuple[int, PnpPose | None]:
         points, pixels = self._matcher.find(view)
         return len(points), pose_from_points(points, pixels, self._camera)
@@ -197,32 +182,11 @@ class PnpOdometry:
         self._key_pose, self._key_covariance = self._pose, self._covariance
         self._key_is_last, self._reference = True, None
 
-    def _report(self, status: str, matches: int, inliers: int) -> OdometryStep:
+    def _report(self, status: str, matches: int, inliers: int) -> PeerStep:
         T = self._T_rectified_left
         adjoint = se3_adjoint(se3_inverse(T))
-        return OdometryStep(
-            se3_inverse(T) @ self._pose @ T, adjoint @ self._covariance @ adjoint.T, status, matches, inliers
-        )
-
-
-def track_with_pnp(sequence: StereoSequence, out: Path, matcher: str) -> None:
-    """Tracks a sequence; leaves trajectory.tum, covariance.npy and frames.csv in the new folder `out`.
-
-    Args:
-        sequence: opened by `open_sequence`.
-        out: run folder.
-        matcher: "sift" or "klt".
-    """
-    odometry = PnpOdometry(sequence.camera, matcher)
-    covariances = []
-
-    def step(frame: StereoFrame) -> PeerStep:
-        found = odometry.step(frame.left, frame.right)
-        covariances.append(found.covariance)
-        return PeerStep(found.T_world_camera, found.status, found.matches, found.inliers)
-
-    write_peer_run(sequence, out, step)
-    np.save(out / "covariance.npy", np.stack(covariances))
+        covariance = adjoint @ self._covariance @ adjoint.T
+        return PeerStep(se3_inverse(T) @ self._pose @ T, status, matches, inliers, covariance)
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,8 @@ import numpy as np
 
 from sigmaslam_benchmarks.tracking.page import opening, table
 from sigmaslam_benchmarks.tracking.sequences_page import Omission, method_label
-from sigmaslam_benchmarks.tracking.time_method import METHODS, OURS, PEERS, WARM_UP, MethodTiming
+from sigmaslam_benchmarks.tracking.stereo_peers import RECTIFIED
+from sigmaslam_benchmarks.tracking.time_method import METHODS, OURS, WARM_UP, MethodTiming
 
 SEQUENCE, SIZE, LANDMARKS = "sequence", "size", "landmarks"
 """Sections of the page."""
@@ -99,7 +100,7 @@ def format_runtime(results: Sequence[TimedRun | Omission], command: str, rounds:
     runs = [result for result in results if isinstance(result, TimedRun)]
     versions = {run.method: run.timing.version for run in runs if run.timing.version}
     if versions:
-        lines += [f"Peers: {', '.join(versions[method] for method in PEERS if method in versions)}.", ""]
+        lines += [f"Peers: {', '.join(versions[method] for method in RECTIFIED if method in versions)}.", ""]
     for sequence in dict.fromkeys(run.sequence for run in runs if run.section == SEQUENCE):
         lines += _sequence_lines(sequence, [run for run in runs if (run.section, run.sequence) == (SEQUENCE, sequence)])
     for section, write in ((SIZE, _size_lines), (LANDMARKS, _landmark_lines)):

@@ -21,7 +21,6 @@ from sigmaslam.runs.request import TrackerOptions
 from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam_benchmarks.rendered_camera import open_rendered
 from sigmaslam_benchmarks.tracking.page import check_names, write_results_page
-from sigmaslam_benchmarks.tracking.pnp_baselines import track_with_pnp
 from sigmaslam_benchmarks.tracking.sequences_page import (
     Omission,
     SequenceResult,
@@ -30,7 +29,7 @@ from sigmaslam_benchmarks.tracking.sequences_page import (
     method_label,
     total_cell,
 )
-from sigmaslam_benchmarks.tracking.stereo_peers import MissingPeerError, track_with_cuvslam
+from sigmaslam_benchmarks.tracking.stereo_peers import MissingPeerError, track_with_peer
 from sigmaslam_benchmarks.trial import Method, Trial, TrialResult, read_trial, render, track_ours
 
 REAL = (
@@ -56,9 +55,7 @@ _TRIED: dict[str, Method] = {
     "sift": partial(track_ours, tracker=TrackerOptions("sift")),
     "orb": partial(track_ours, tracker=TrackerOptions("orb")),
     "klt": partial(track_ours, tracker=TrackerOptions("klt")),
-    "sift-pnp": partial(track_with_pnp, matcher="sift"),
-    "klt-pnp": partial(track_with_pnp, matcher="klt"),
-    "cuvslam": track_with_cuvslam,
+    **{name: partial(track_with_peer, name=name) for name in ("sift-pnp", "klt-pnp", "cuvslam")},
 }
 METHODS = (*_TRIED, "bundle")
 """In the order of the page; the bundle adjustment takes the tracks of the first."""

@@ -18,8 +18,8 @@ from sigmaslam_benchmarks.code_hash import hash_code
 from sigmaslam_benchmarks.rendered_camera import open_rendered
 from sigmaslam_benchmarks.tracking.claimed_errors import MotionErrors, motion_errors
 from sigmaslam_benchmarks.tracking.image_motion import ImageMotion, read_image_motion
-from sigmaslam_benchmarks.tracking.pnp_baselines import track_with_pnp
 from sigmaslam_benchmarks.tracking.shake_page import GROSS, ShakenSequence, ShakeResult, format_page
+from sigmaslam_benchmarks.tracking.stereo_peers import track_with_peer
 from sigmaslam_benchmarks.tracking.trial_pool import SequenceTrials, TrialKind, write_trials
 from sigmaslam_benchmarks.trial import Method, Trial, rendered_truth, track_ours
 from sigmaslam_evaluation.metrics.map_consistency import coverage
@@ -29,7 +29,7 @@ from sigmaslam_synthetic.simulation import Recipe
 
 METHODS: dict[str, Method] = {
     "ours": partial(track_ours, tracker=TrackerOptions(threads=1)),
-    "KLT + PnP": partial(track_with_pnp, matcher="klt"),
+    "KLT + PnP": partial(track_with_peer, name="klt-pnp"),
 }
 """The first is what goals are for."""
 FRAMES = 60

@@ -1,4 +1,4 @@
-"""Other people's stereo odometry, driven as its documentation has it, on rectified pairs.
+"""The peers by name; other people's stereo odometry, driven as its documentation has it, on rectified pairs.
 
 cuVSLAM by the package `dim-odom`, on the CPU; ORB-SLAM3 by the package `pyorbslam3`. ORB-SLAM3 is under the GPL and
 cuVSLAM under NVIDIA's Community License: both are peers to compare with while SigmaSLAM is developed, nothing else
@@ -8,6 +8,9 @@ imports them. They come with the extra `peers`.
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -15,12 +18,16 @@ from typing import Any
 import numpy as np
 
 from sigmaslam.errors import SigmaSlamError
-from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam.geometry.camera import RectifiedStereo, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import quaternion_to_matrix
-from sigmaslam.readers import StereoFrame, StereoSequence
-from sigmaslam_benchmarks.tracking.peer_run import PeerStep, write_peer_run
+from sigmaslam.readers import StereoSequence
+from sigmaslam_benchmarks.tracking.peer_run import Peer, PeerStep, write_peer_run
 
+RECTIFIED = ("cuvslam", "orbslam3")
+"""Peers that take rectified pairs."""
+PEERS = {"klt-pnp": "klt", "sift-pnp": "sift", **dict.fromkeys(RECTIFIED, "")}
+"""All peers, with the matcher of those from OpenCV."""
 _NO_TURN = (0.0, 0.0, 0.0, 1.0)
 # As in ORB-SLAM3's own settings for EuRoC and for KITTI.
 _WIDE, _ORB_KEYPOINTS, _ORB_KEYPOINTS_WIDE = 1000, 1200, 2000
@@ -88,8 +95,8 @@ class CuvslamPeer:
                 dim_odom.CameraModel(0, eye, camera.width, camera.height, [0.0] * 5, matrix)
             )
 
-    def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> np.ndarray | None:
-        """T_world_camera (4, 4) of a rectified pair (H, W) uint8; None when it is lost."""
+    def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> PeerStep:
+        """The pose of a rectified pair (H, W) uint8; without one it is lost."""
         estimate = None
         for eye, image in (("left", left), ("right", right)):
             height, width = image.shape
@@ -98,11 +105,11 @@ class CuvslamPeer:
             )
             estimate = self._tracker.handle_image(frame)
         if estimate is None:
-            return None
+            return PeerStep(None, "lost")
         pose = np.eye(4)
         pose[:3, :3] = quaternion_to_matrix(np.array(estimate.rotation_xyzw))
         pose[:3, 3] = estimate.translation
-        return pose
+        return PeerStep(pose, "tracking")
 
     def close(self) -> None:
         """It needs no end."""
@@ -141,10 +148,12 @@ class OrbSlamPeer:
             path.write_text(orb_settings(camera, rate), encoding="utf-8")
             self._slam: Any = pyorbslam3.Slam(vocabulary, path, pyorbslam3.Sensor.STEREO, use_viewer=False)
 
-    def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> np.ndarray | None:
-        """T_world_camera (4, 4) of a rectified pair (H, W) uint8; None when it is lost."""
+    def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> PeerStep:
+        """The pose of a rectified pair (H, W) uint8; without one it is lost."""
         result = self._slam.track_stereo(left, right, timestamp)
-        return np.array(result.pose_wc, np.float64) if result.pose_valid else None
+        return (
+            PeerStep(np.array(result.pose_wc, np.float64), "tracking") if result.pose_valid else PeerStep(None, "lost")
+        )
 
     def close(self) -> None:
         """Ends its threads."""
@@ -171,29 +180,54 @@ def orb_settings(camera: RectifiedStereo, rate: float) -> str:
     )
 
 
-def track_with_cuvslam(sequence: StereoSequence, out: Path) -> None:
-    """Tracks a sequence; leaves trajectory.tum, without frames that are lost, and frames.csv in the new folder `out`.
+class _RectifyingPeer:
+    """A peer that takes rectified pairs, given raw ones; poses are of the left camera as calibrated."""
 
+    def __init__(self, rectifier: StereoRectifier, peer: Peer) -> None:
+        self._rectifier, self._peer, self.version = rectifier, peer, peer.version
+        self._T_rectified_left = np.eye(4)
+        self._T_rectified_left[:3, :3] = rectifier.R_rectified_left
+
+    def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> PeerStep:
+        """As of the peer."""
+        found = self._peer.step(*self._rectifier.rectify(left, right), timestamp)
+        if found.T_world_camera is None:
+            return found
+        return replace(found, T_world_camera=self._T_rectified_left.T @ found.T_world_camera @ self._T_rectified_left)
+
+    def close(self) -> None:
+        """As of the peer."""
+        self._peer.close()
+
+
+def open_peer(name: str, camera: StereoCamera | RectifiedStereo, timestamps: Sequence[float] | None) -> Peer:
+    """A peer by its name.
+
+    Args:
+        name: of `PEERS`.
+        camera: of the pairs; those in `RECTIFIED` also take rectified ones.
+        timestamps: of the pairs, seconds; `orbslam3` asks for their rate.
     Raises:
-        MissingPeerError: see `CuvslamPeer`.
+        MissingPeerError: it is not installed.
     """
-    rectifier = StereoRectifier(sequence.camera)
-    peer = CuvslamPeer(rectifier.rectified)
-    T_rectified_left = np.eye(4)
-    T_rectified_left[:3, :3] = rectifier.R_rectified_left
+    if name not in RECTIFIED:
+        from sigmaslam_benchmarks.tracking.pnp_baselines import PnpOdometry  # start-up of the others does not count it
 
-    has_started = False
+        assert isinstance(camera, StereoCamera)
+        return PnpOdometry(camera, PEERS[name])
+    if isinstance(camera, StereoCamera):
+        rectifier = StereoRectifier(camera)
+        return _RectifyingPeer(rectifier, open_peer(name, rectifier.rectified, timestamps))
+    if name == "cuvslam":
+        return CuvslamPeer(camera)
+    assert timestamps is not None
+    return OrbSlamPeer(camera, 1.0 / float(np.median(np.diff(timestamps))))
 
-    def step(frame: StereoFrame) -> PeerStep:
-        nonlocal has_started
-        pose = peer.step(*rectifier.rectify(frame.left, frame.right), frame.timestamp)
-        if pose is None:
-            return PeerStep(None, "lost")
-        status, has_started = "tracking" if has_started else "starting", True
-        return PeerStep(T_rectified_left.T @ pose @ T_rectified_left, status)
 
-    write_peer_run(sequence, out, step)
-    peer.close()
+def track_with_peer(sequence: StereoSequence, out: Path, name: str) -> None:
+    """Tracks a sequence with a peer of `PEERS` into the new folder `out`, see `write_peer_run`; `MissingPeerError`."""
+    with closing(open_peer(name, sequence.camera, sequence.timestamps)) as peer:
+        write_peer_run(sequence, out, peer)
 
 
 def _not_installed(module: str, error: ImportError) -> MissingPeerError:

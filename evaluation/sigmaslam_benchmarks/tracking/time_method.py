@@ -23,16 +23,13 @@ import numpy as np
 import sigmaslam
 from sigmaslam.errors import SigmaSlamError
 from sigmaslam_benchmarks.tracking.decoded_pairs import DecodedPairs, open_pairs
-from sigmaslam_benchmarks.tracking.stereo_peers import CuvslamPeer, MissingPeerError, OrbSlamPeer
+from sigmaslam_benchmarks.tracking.stereo_peers import PEERS, RECTIFIED, MissingPeerError, open_peer
 
 WARM_UP = 2
 """Frames that are not counted: they build what later ones use."""
 OURS = {"ours": "learned", "sift": "sift", "orb": "orb", "klt": "klt"}
 """The tracker's front-end by method."""
-PNP = {"klt-pnp": "klt", "sift-pnp": "sift"}
-"""The matcher of the odometry from OpenCV by method."""
-PEERS = ("cuvslam", "orbslam3")
-METHODS = (*OURS, *PNP, *PEERS)
+METHODS = (*OURS, *PEERS)
 """In the order of the page."""
 
 
@@ -177,14 +174,11 @@ def run_job(job: TimingJob, started: float) -> MethodTiming:
 
 
 def _open(job: TimingJob, pairs: DecodedPairs) -> _Method:
-    if job.method in PEERS:
-        return _Peer(job.method, pairs)
-    import cv2
+    if job.method not in RECTIFIED:
+        import cv2
 
-    cv2.setNumThreads(job.threads)
-    if job.method in PNP:
-        return _Pnp(PNP[job.method], pairs)
-    return _Ours(job, pairs)
+        cv2.setNumThreads(job.threads)
+    return _Peer(job.method, pairs) if job.method in PEERS else _Ours(job, pairs)
 
 
 class _Ours:
@@ -206,36 +200,16 @@ class _Ours:
         """It needs no end."""
 
 
-class _Pnp:
-    rectified = False
-
-    def __init__(self, matcher: str, pairs: DecodedPairs) -> None:
-        from sigmaslam_benchmarks.tracking.pnp_baselines import PnpOdometry
-
-        self.version = ""
-        self._odometry = PnpOdometry(pairs.camera, matcher)
-
-    def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> _Step:
-        step = self._odometry.step(left, right)
-        return _Step(None if step.status == "lost" else step.T_world_camera, step.inliers)
-
-    def close(self) -> None:
-        """It needs no end."""
-
-
 class _Peer:
-    rectified = True
-
     def __init__(self, name: str, pairs: DecodedPairs) -> None:
-        peer: CuvslamPeer | OrbSlamPeer
-        if name == "cuvslam":
-            peer = CuvslamPeer(pairs.rectified)
-        else:
-            peer = OrbSlamPeer(pairs.rectified, 1.0 / float(np.median(np.diff(pairs.timestamps))))
-        self._peer, self.version = peer, peer.version
+        self.rectified = name in RECTIFIED
+        camera = pairs.rectified if self.rectified else pairs.camera
+        self._peer = open_peer(name, camera, pairs.timestamps)
+        self.version = self._peer.version
 
     def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> _Step:
-        return _Step(self._peer.step(left, right, timestamp))
+        step = self._peer.step(left, right, timestamp)
+        return _Step(None if step.status == "lost" else step.T_world_camera, step.inliers)
 
     def close(self) -> None:
         self._peer.close()
