@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sigmaslam.bodies.object_region import BodyShape, inner_half, pixels_in
+from sigmaslam.bodies.object_region import BodyShape, inner_half
 from sigmaslam.errors import InputError
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
@@ -17,6 +17,7 @@ from sigmaslam.estimation.landmark_table import LandmarkViews
 from sigmaslam.estimation.mahalanobis import squared_mahalanobis
 from sigmaslam.frontend import Frontend, KeypointSearch, StereoView, TemporalMatches
 from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam.geometry.image_cells import pixels_in
 from sigmaslam.geometry.se3 import se3_inverse, transform_points
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.frame import Frame

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 
 from sigmaslam.bounded_files import shorten
-from sigmaslam.errors import FrameError, InputError
+from sigmaslam.errors import InputError
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import se3_inverse, transform_points
-from sigmaslam.readers.images import read_image
+from sigmaslam.readers.masks import read_mask
 
 _NUMBER = r"\s*([-+]?(?:[0-9]{1,9}(?:\.[0-9]{0,9})?|\.[0-9]{1,9}))\s*"
 _BOX = re.compile(",".join([_NUMBER] * 4))
@@ -53,20 +53,7 @@ def read_region(text: str, width: int, height: int) -> np.ndarray:
             f"--track-object {shorten(text)}: neither a box nor an image file; give x,y,width,height in pixels of the "
             "first left image, or a mask of its size that is not zero on the body"
         )
-    try:
-        mask = read_image(path)
-    except FrameError as error:
-        raise InputError(f"{error}: give the mask as a PNG") from None
-    if mask.shape[:2] != (height, width):
-        raise InputError(
-            f"{path}: the mask is {mask.shape[1]}x{mask.shape[0]} pixels, the left image {width}x{height}; "
-            "draw it on the first left image"
-        )
-    if mask.ndim == 3:
-        mask = mask[..., :3].max(axis=2)  # without transparency
-    if not mask.any():
-        raise InputError(f"{path}: the mask is zero everywhere; pixels of the body must not be zero")
-    return np.asarray(mask > 0)
+    return read_mask(path, width, height)
 
 
 def _is_there(path: Path) -> bool:
@@ -81,13 +68,6 @@ def inner_half(region: np.ndarray) -> np.ndarray:
     padded = np.pad(region.astype(np.uint8), 1)
     distance = cv2.distanceTransform(padded, cv2.DIST_L2, 3)[1:-1, 1:-1]
     return np.asarray(distance >= 0.5 * distance.max())
-
-
-def pixels_in(region: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Which pixels (N, 2) (u, v) are in a region (H, W) bool; (N,) bool."""
-    height, width = region.shape
-    column, row = np.clip(np.rint(pixels), 0, (width - 1, height - 1)).astype(int).T
-    return np.asarray(region[row, column])
 
 
 class BodyShape:

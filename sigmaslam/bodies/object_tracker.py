@@ -141,13 +141,15 @@ class ObjectTracker:
         """(3,) of the body's frame in the first left camera's, metres."""
         return np.asarray((self._T_left_rectified @ self._body.T_camera_body)[:3, 3])
 
-    def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> ObjectEstimate:
+    def step(
+        self, left: np.ndarray, right: np.ndarray, timestamp: float, mask: np.ndarray | None = None
+    ) -> ObjectEstimate:
         """Takes one stereo pair; arguments and errors as of `StereoTracker.step`.
 
         Raises:
             InputError: also when too little of the region in the first frame is seen by both eyes.
         """
-        estimate = self._tracker.step(left, right, timestamp)
+        estimate = self._tracker.step(left, right, timestamp, mask)
         if not self._body.started:
             raise InputError(
                 "the first frame has too few points that both eyes see: start where the images are good, "

@@ -158,6 +158,14 @@ def track(
             "that come meanwhile are dropped. Cameras always do.",
         ),
     ] = False,
+    mask: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE|FOLDER",
+            help="Image of the left images' size, or a folder with one named as each: where it is black (0) nothing of "
+            "the left image is used, such as the robot itself, or people that a detector found.",
+        ),
+    ] = None,
     denoise: Annotated[
         bool, typer.Option("--denoise", help="Filter noise out of the images first: for the dark; slow.")
     ] = False,

@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from sigmaslam.estimation.acceptance import ACCEPTANCE
+from sigmaslam.geometry.image_cells import pixels_in
 from sigmaslam.table import Table
 
 
@@ -41,6 +42,7 @@ class StereoView:
         behind: keypoints that were found in the right image where only the eyes swapped would have them, far behind
             infinity; they have no disparity.
         small: the left image in smaller sizes, where the front-end needs them to follow its keypoints.
+        usable: (H, W) bool, pixels of the left image that landmarks may be found at; None: all.
     """
 
     left: np.ndarray
@@ -51,6 +53,16 @@ class StereoView:
     slope: np.ndarray | None = None
     behind: int = 0
     small: tuple[np.ndarray, ...] = ()
+    usable: np.ndarray | None = None
+
+    def within(self, usable: np.ndarray | None) -> StereoView:
+        """The view with the features of usable pixels (H, W) bool alone."""
+        if usable is None:
+            return self
+        kept = pixels_in(usable, self.features.keypoints)
+        disparity, sigma = self.disparity[kept], self.disparity_sigma[kept]
+        features = self.features.select(kept)
+        return replace(self, features=features, disparity=disparity, disparity_sigma=sigma, usable=usable)
 
     def measured(self, index: np.ndarray) -> np.ndarray:
         """(K, 3) float64 (u, v, disparity) of the features of that index or mask."""
@@ -143,6 +155,10 @@ class TemporalMatches(Table):
     def measured(self) -> np.ndarray:
         """(M, 3) (u, v, disparity)."""
         return np.column_stack([self.points, self.disparity])
+
+    def within(self, usable: np.ndarray | None) -> TemporalMatches:
+        """Those at usable pixels (H, W) bool alone."""
+        return self if usable is None else self.select(pixels_in(usable, self.points))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Cells of an image, so that what is crowded in one place counts no more than what covers as much of the image."""
+"""Regions of an image, and cells: what is crowded in one place counts no more than what covers as much of the image."""
 
 from __future__ import annotations
 
@@ -14,3 +14,10 @@ def image_cells(places: np.ndarray, width: int, height: int) -> np.ndarray:
     columns, rows = (_LONGER, _SHORTER) if width >= height else (_SHORTER, _LONGER)
     place = np.clip((places / (width, height) * (columns, rows)).astype(np.int64), 0, (columns - 1, rows - 1))
     return np.asarray(place[:, 0] + columns * place[:, 1])
+
+
+def pixels_in(region: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Which pixels (N, 2) (u, v) are in a region (H, W) bool; (N,) bool."""
+    height, width = region.shape
+    column, row = np.clip(np.rint(pixels), 0, (width - 1, height - 1)).astype(int).T
+    return np.asarray(region[row, column])

@@ -81,6 +81,13 @@ class StereoRectifier:
             cv2.remap(right, *right_map, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT),
         )
 
+    def rectify_mask(self, mask: np.ndarray) -> np.ndarray:
+        """(H, W) uint8 mask of the left image rectified, by the nearest pixel; 255 where there is none."""
+        if self._maps is None:
+            return mask
+        border = cv2.BORDER_CONSTANT
+        return np.asarray(cv2.remap(mask, *self._maps[0], cv2.INTER_NEAREST, borderMode=border, borderValue=255))
+
 
 def _parallel_rotations(camera: StereoCamera) -> tuple[np.ndarray, np.ndarray]:
     """Rotations from each eye to its rectified frame, as in cv2.stereoRectify."""

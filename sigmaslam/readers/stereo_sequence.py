@@ -16,6 +16,7 @@ import numpy as np
 from sigmaslam.errors import CalibrationError, FrameError, InputError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.readers.images import MAX_FAILURES, GreyConverter, ImagePairs, RawPair, SkippedFrame
+from sigmaslam.readers.masks import Masks
 from sigmaslam.readers.selection import Selection, select_pairs
 
 logger = logging.getLogger(__name__)
@@ -35,12 +36,14 @@ class StereoFrame:
         index: number of the pair in the sequence; skipped pairs leave a gap.
         timestamp: seconds.
         left, right: (H, W) uint8 grey images, as stored (not rectified here).
+        mask: (H, W) uint8, zero where the left image is not to be used; None: use all of it.
     """
 
     index: int
     timestamp: float
     left: np.ndarray
     right: np.ndarray
+    mask: np.ndarray | None = None
 
 
 FrameStep = tuple[StereoFrame, StereoFrame | None]
@@ -74,6 +77,7 @@ class StereoSequence:
         timestamps: seconds, one per pair, or None if only reading gives them (videos).
         length: number of pairs, or None if the file does not give it.
         skipped: the pairs that the latest run of `frames` could not use.
+        masks: of the left images, as `use_masks` took them.
 
     Raises:
         CalibrationError: the first images have another size than the calibration (the message gives both).
@@ -98,6 +102,7 @@ class StereoSequence:
         self.skipped: list[SkippedFrame] = []
         self._pairs = pairs
         self._grey = GreyConverter()
+        self.masks: Masks | None = None
         first = pairs.first_pair
         for eye, image, name, model in (
             ("left", first.left, first.left_name, camera.left),
@@ -122,6 +127,15 @@ class StereoSequence:
         """
         pairs = select_pairs(self._pairs, selection, self.source)
         return StereoSequence(pairs, self._stored, self.source, self.format, scale)
+
+    def use_masks(self, path: Path) -> None:
+        """Takes a mask of the left images as they are stored, or a folder with one for each; see `Masks`.
+
+        Raises:
+            InputError: the path is missing, a frame has no mask, or the mask of the first one cannot be used.
+        """
+        files = [left for left, _ in self._pairs.files] if isinstance(self._pairs, ImagePairs) else None
+        self.masks = Masks(path, files, self._stored.left.width, self._stored.left.height)
 
     @property
     def dropped(self) -> int:
@@ -186,7 +200,7 @@ class StereoSequence:
             try:
                 left = self._check(item.left, item.left_name, self._stored.left, self.camera.left)
                 right = self._check(item.right, item.right_name, self._stored.right, self.camera.right)
-                yield StereoFrame(item.index, item.timestamp, left, right)
+                yield StereoFrame(item.index, item.timestamp, left, right, self._mask(item.left_name))
             except FrameError as error:
                 yield SkippedFrame(item.index, item.timestamp, str(error))
 
@@ -198,6 +212,13 @@ class StereoSequence:
         if wanted is model:
             return grey
         return np.asarray(cv2.resize(grey, (wanted.width, wanted.height), interpolation=cv2.INTER_AREA))
+
+    def _mask(self, left_name: str) -> np.ndarray | None:
+        """(H, W) uint8 of a frame."""
+        if self.masks is None:
+            return None
+        mask, size = self.masks.read(left_name).astype(np.uint8), (self.camera.left.width, self.camera.left.height)
+        return np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST))
 
 
 def _size_mismatch(image: np.ndarray, model: CameraModel) -> str | None:

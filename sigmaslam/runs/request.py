@@ -27,7 +27,11 @@ _REFUSED = (
     ("no INPUT", ("no --camera",), "give either INPUT, a recording, or --camera, live cameras"),
     ("INPUT", ("--camera",), "give either INPUT, a recording, or --camera, live cameras, not both"),
     ("INPUT", ("--seconds",), "--seconds goes with --camera; a recording is tracked to its end"),
-    ("--camera", ("no --calibration",), "--camera needs --calibration: the stereo pair as YAML, as the README shows"),
+    (
+        "--camera",
+        ("no --calibration",),
+        "--camera needs --calibration: any file that `sigmaslam calibration show` reads",
+    ),
     ("--camera", ("--format", "--topic-left", "--topic-right"), "{all} go with INPUT, not with --camera"),
     ("--camera", ("--start", "--frames", "--every", "--scale"), "{all} go with INPUT, not with --camera"),
     ("--resume", ("--overwrite",), "--resume goes on with the run in the folder, {all} removes it: give one of them"),
@@ -50,6 +54,7 @@ class InputOptions:
         format, calibration, topic_left, topic_right: for `open_sequence`.
         camera, seconds: for `open_cameras`, in place of a source.
         start, frames, every, scale: for `StereoSequence.select`.
+        mask: for `StereoSequence.use_masks`.
         findings: of a check; they are kept in run.json, and explain a run that fails.
     Raises:
         InputError: options do not go together.
@@ -66,6 +71,7 @@ class InputOptions:
     frames: int | None = None
     every: int = 1
     scale: float = 1.0
+    mask: Path | None = None
     findings: Sequence[Finding] = ()
 
     def __post_init__(self) -> None:
@@ -81,7 +87,11 @@ class InputOptions:
         if not isinstance(sequence, StereoSequence):
             sequence = open_sequence(sequence, self.format, self.calibration, (self.topic_left, self.topic_right))
         selection = Selection(self.start, self.frames, self.every)
-        return sequence if (selection, self.scale) == (Selection(), 1.0) else sequence.select(selection, self.scale)
+        if (selection, self.scale) != (Selection(), 1.0):
+            sequence = sequence.select(selection, self.scale)
+        if self.mask is not None:
+            sequence.use_masks(self.mask)
+        return sequence
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,7 +35,7 @@ from sigmaslam.run_record.run_folder import RUN_NAME
 from sigmaslam.slam.start_pose import StartPose
 
 # What must be as it was; paths and settings of the command line.
-_SAME = ("input", "format", "frontend", "backend", "provider", "weights", "configuration", "calibration")
+_SAME = ("input", "format", "frontend", "backend", "provider", "weights", "mask", "configuration", "calibration")
 # Frames lie further apart, seconds; frames.csv and trajectory.tum round time stamps.
 _SAME_TIME = 1e-6
 

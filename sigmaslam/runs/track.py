@@ -138,6 +138,7 @@ def _describe_settings(sequence: StereoSequence, options: TrackerOptions) -> dic
         "provider": options.provider,
         "weights": describe_weights(options.frontend, options.backend, options.weights),
         "map": None if options.map is None else printable(options.map),
+        "mask": None if sequence.masks is None else printable(sequence.masks.source),
         "configuration": asdict(config),
         "calibration": describe_camera(sequence.camera),
     }
@@ -251,7 +252,7 @@ class _FrameSteps:
         """What is said of the frame."""
         if self.images is not None:
             frame = self.images.step(frame)
-        estimate = self.tracker.step(frame.left, frame.right, frame.timestamp)
+        estimate = self.tracker.step(frame.left, frame.right, frame.timestamp, frame.mask)
         self.timing.note(frame.timestamp)
         return estimate if self.location is None else estimate.map_camera(self.location.fuse)
 

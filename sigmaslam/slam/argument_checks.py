@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from sigmaslam.bounded_files import shorten
-from sigmaslam.errors import InputError
+from sigmaslam.errors import FrameError, InputError
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.inference.backends import ONNX, backend_names
 from sigmaslam.readers.images import check_grey
@@ -83,6 +83,19 @@ def check_frame(left: Any, right: Any, timestamp: Any, before: float | None) -> 
             f"time stamp {timestamp:.6f} s comes {timestamp - before:.3g} s after the one before: give seconds, not "
             "nano- or microseconds; after a pause of days make a new tracker"
         )
+
+
+def check_mask(mask: Any, width: int, height: int) -> None:
+    """The mask of a raw left image.
+
+    Raises:
+        FrameError: it is no (H, W) bool or uint8 array of the image's size, or zero everywhere.
+    """
+    if not isinstance(mask, np.ndarray) or mask.dtype not in (np.bool_, np.uint8) or mask.shape != (height, width):
+        given = f"{mask.dtype} {mask.shape}" if isinstance(mask, np.ndarray) else shorten(repr(mask), 60)
+        raise FrameError(f"mask is {given}: give a bool or uint8 array ({height}, {width}) of the raw left image")
+    if not mask.any():
+        raise FrameError("mask is zero everywhere: what may be used of the left image must not be zero")
 
 
 def _wrong(name: str, value: object, expected: str) -> InputError:

@@ -4,10 +4,16 @@ from __future__ import annotations
 
 from concurrent.futures import Executor
 
+import cv2
 import numpy as np
 
 from sigmaslam.frontend import Frontend, StereoView
+from sigmaslam.geometry.rectification import StereoRectifier
+from sigmaslam.slam.argument_checks import check_mask
 from sigmaslam.slam.deferred import Deferred
+
+# Patches have a radius of so many pixels: nearer to what is masked they show some of it.
+_MARGIN = 5
 
 
 class Frame:
@@ -16,12 +22,16 @@ class Frame:
     Args:
         left, right: (H, W) uint8, rectified.
         frontend: detects features.
+        usable: (H, W) bool, pixels of the left image that landmarks may be found at; None: all.
     """
 
-    def __init__(self, left: np.ndarray, right: np.ndarray, frontend: Frontend) -> None:
+    def __init__(
+        self, left: np.ndarray, right: np.ndarray, frontend: Frontend, usable: np.ndarray | None = None
+    ) -> None:
         self.left = left
         self.right = right
-        self._view = Deferred(lambda: frontend.observe(left, right))
+        self.usable = usable
+        self._view = Deferred(lambda: frontend.observe(left, right).within(usable))
 
     @property
     def view(self) -> StereoView:
@@ -35,3 +45,17 @@ class Frame:
     def finish(self) -> None:
         """What has been foreseen and not yet begun is not needed."""
         self._view.cancel()
+
+
+def usable_pixels(mask: np.ndarray, rectifier: StereoRectifier) -> np.ndarray:
+    """(H, W) bool, pixels of the rectified left image whose patches show nothing that is masked.
+
+    Args:
+        mask: (H, W) bool or uint8 of the raw left image, zero where it is not to be used.
+        rectifier: of the camera.
+    Raises:
+        FrameError: the mask has the wrong type or size, or is zero everywhere.
+    """
+    check_mask(mask, rectifier.camera.left.width, rectifier.camera.left.height)
+    side = 2 * _MARGIN + 1
+    return cv2.erode(rectifier.rectify_mask((mask > 0).astype(np.uint8)), np.ones((side, side), np.uint8)) > 0

@@ -14,8 +14,10 @@ from sigmaslam.estimation.mahalanobis import squared_mahalanobis
 from sigmaslam.frontend import Frontend, KeypointSearch, StereoView, TemporalMatches
 from sigmaslam.frontend.plane_alignment import plane_maps
 from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam.geometry.image_cells import pixels_in
 from sigmaslam.geometry.se3 import se3_inverse
 from sigmaslam.slam.config import TrackerConfig
+from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.measurement_noise import MeasurementNoise
 
 CONFIRMED = 2
@@ -99,8 +101,8 @@ class GuidedMatcher:
             alone: the view is too far from the keyframes' to share errors with them.
         """
         parts, count = [], self.config.min_inliers
-        for anchor, rows, search in self._searches(keyframes, pose, covariance, reference):
-            matches = self.frontend.match(search, view)
+        for anchor, rows, search in self._searches(view.usable, keyframes, pose, covariance, reference):
+            matches = self.frontend.match(search, view).within(view.usable)
             if alone and anchor != reference % len(keyframes) and len(matches) < count:
                 continue  # a few that agree by chance would connect keyframes that hardly see each other
             parts.append(self._measured(rows, search, matches, alone))
@@ -108,8 +110,7 @@ class GuidedMatcher:
 
     def follow(
         self,
-        left: np.ndarray,
-        right: np.ndarray,
+        frame: Frame,
         keyframes: list[StereoView],
         pose: np.ndarray,
         covariance: np.ndarray,
@@ -122,33 +123,38 @@ class GuidedMatcher:
         landmarks are searched for in ellipses that much wider.
 
         Args:
-            left, right: (H, W) uint8, rectified.
+            frame: the current one.
             keyframes, pose, covariance: as of `match_guided`.
             carry: from the left image, ids (K,) and predicted places (K, 2) of landmarks to where optical flow takes
                 them, NaN where it does not.
         Returns:
             The matches, and by what the prediction's variances are to be multiplied, 1 or more.
         """
-        searches = [(rows, search) for _, rows, search in self._searches(keyframes, pose, covariance, -1)]
+        searches = [(rows, search) for _, rows, search in self._searches(frame.usable, keyframes, pose, covariance, -1)]
         if not searches:
             return GuidedMatches.empty(), 1.0
         rows = np.concatenate([each for each, _ in searches])
         predicted = np.concatenate([search.predicted for _, search in searches])
-        start = carry(left, self.window.landmarks.id[rows], predicted)
+        start = carry(frame.left, self.window.landmarks.id[rows], predicted)
         covariances = [search.covariance for _, search in searches if search.covariance is not None]
         confirmed = self.window.landmarks.views[rows] >= CONFIRMED
         excess = _excess((start - predicted)[confirmed], np.concatenate(covariances)[confirmed])
         searches = [(each, search.widened(excess)) for each, search in searches]
         starts = np.split(start, np.cumsum([len(each) for each, _ in searches])[:-1])
-        found = self.frontend.follow([search for _, search in searches], starts, left, right)
+        found = self.frontend.follow([search for _, search in searches], starts, frame.left, frame.right)
         parts = [
-            self._measured(rows, search, matches, alone=False)
+            self._measured(rows, search, matches.within(frame.usable), alone=False)
             for (rows, search), matches in zip(searches, found, strict=True)
         ]
         return GuidedMatches.concatenate(parts), excess
 
     def _searches(
-        self, keyframes: list[StereoView], pose: np.ndarray, covariance: np.ndarray, reference: int
+        self,
+        usable: np.ndarray | None,
+        keyframes: list[StereoView],
+        pose: np.ndarray,
+        covariance: np.ndarray,
+        reference: int,
     ) -> Iterator[tuple[int, np.ndarray, KeypointSearch]]:
         """For each keyframe of which enough landmarks are in view: its number, their rows, and what is searched for."""
         landmarks = self.window.landmarks
@@ -159,6 +165,8 @@ class GuidedMatcher:
         S = S[:, :2, :2] + np.eye(2)
         inside = in_front & self._in_image(predicted)
         inside &= np.linalg.eigvalsh(S)[:, 1] < self.config.search_limit**2
+        if usable is not None:
+            inside[inside] = pixels_in(usable, predicted[inside, :2])
         rows, predicted, S = rows[inside], predicted[inside], S[inside]
         T_view_key = se3_inverse(pose) @ self.window.posterior.poses
         for anchor, key in enumerate(keyframes):

@@ -37,7 +37,7 @@ class Keyframe:
 
     def leave_window(self, points: PointMap) -> Keyframe:
         """The keyframe as it is remembered, with the points (in its frame) that leave with it."""
-        view = replace(self.view, right=np.zeros((0, 0), np.uint8), small=())
+        view = replace(self.view, right=np.zeros((0, 0), np.uint8), small=(), usable=None)
         return replace(self, view=view, energies=np.zeros((0, 2)), dense=None, points=points)
 
     def measure_surfaces(self, landmarks: LandmarkTable, anchor: int) -> None:

@@ -62,7 +62,7 @@ class LandmarkFollower:
             As of `GuidedMatcher.follow`.
         """
         views = [keyframe.view for keyframe in keyframes]
-        return self._guided.follow(frame.left, frame.right, views, pose, covariance, self._carry)
+        return self._guided.follow(frame, views, pose, covariance, self._carry)
 
     def has_fallen(self, matches: GuidedMatches, inliers: np.ndarray) -> bool:
         """Whether suddenly fewer of the landmarks have a disparity than usual.

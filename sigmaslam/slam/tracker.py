@@ -26,7 +26,7 @@ from sigmaslam.slam.argument_checks import check_frame, check_tracker_arguments
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.doubt import Doubts
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
-from sigmaslam.slam.frame import Frame
+from sigmaslam.slam.frame import Frame, usable_pixels
 from sigmaslam.slam.frame_history import FrameHistory
 from sigmaslam.slam.frozen_images import LastPairs
 from sigmaslam.slam.guided_matching import GuidedMatcher, GuidedMatches
@@ -145,24 +145,26 @@ class StereoTracker:
         self._scrutiny.input_is_wrong = True
         self._window.distrust_eyes(pixels)
 
-    def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> Estimate:
+    def step(self, left: np.ndarray, right: np.ndarray, timestamp: float, mask: np.ndarray | None = None) -> Estimate:
         """Takes one stereo pair.
 
         Args:
             left, right: (H, W) uint8, raw images of the calibrated size.
             timestamp: seconds, larger than the one before.
+            mask: (H, W) bool or uint8 of the raw left image: where it is zero no landmark is made, or found again.
         Raises:
             InputError: the time stamp is no finite number, or does not increase.
-            FrameError: an image has the wrong type or size.
+            FrameError: an image or the mask has the wrong type or size, or the mask leaves nothing.
         """
         check_frame(left, right, timestamp, self._course.timestamp)
+        usable = None if mask is None else usable_pixels(mask, self._rectifier)
         # The matrices are small: threads of BLAS would wait for each other for longer than they compute.
         with self._blas.limit(limits=1, user_api="blas"):
-            return self._step(left, right, timestamp)
+            return self._step(left, right, timestamp, usable)
 
-    def _step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> Estimate:
+    def _step(self, left: np.ndarray, right: np.ndarray, timestamp: float, usable: np.ndarray | None) -> Estimate:
         clock = Stopwatch()
-        frame = Frame(*self._rectifier.rectify(left, right), self._frontend)
+        frame = Frame(*self._rectifier.rectify(left, right), self._frontend, usable)
         clock.lap("rectify")
         if self._course.timestamp is not None:
             # Constant velocity since the last frame.

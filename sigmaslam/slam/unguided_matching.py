@@ -39,7 +39,7 @@ class UnguidedMatcher:
         index = np.flatnonzero(np.isfinite(key.disparity))
         if len(index) < self.config.min_inliers:
             return None
-        matches = self.frontend.match(KeypointSearch.anywhere(key, index), view)
+        matches = self.frontend.match(KeypointSearch.anywhere(key, index), view).within(view.usable)
         rows = matches.key_index
         place = np.full(len(rows), self.config.keyframe_sigma)
         relative = estimate_scene_pose(

@@ -60,6 +60,10 @@ def write_stand_ins(demo: Path, folder: Path) -> None:
     mask = np.zeros_like(pairs[0][0])
     mask[200:500, 300:700] = 255
     cv2.imwrite(str(folder / "mask.png"), mask)
+    bumper = np.full_like(mask, 255)
+    bumper[-100:] = 0
+    cv2.imwrite(str(folder / "bumper.png"), bumper)
+    _write_images(folder, ("masks",), [(bumper,)] * FRAMES)
     write_kalibr(camera, folder).rename(folder / "camchain.yaml")
     write_ros(camera, folder)
     _write_board(folder / "IMAGES")

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.support.estimates import statuses, track
+from tests.support.estimates import error_of, statuses, track
 from tests.support.faults import assert_honest
 
 torch = pytest.importorskip("torch")
@@ -22,7 +22,7 @@ from sigmaslam_synthetic.simulation import Recipe, Simulation, Studio, simulate 
 
 
 def filmed(simulation: Simulation) -> tuple[list[StereoFrame], np.ndarray]:
-    """All pairs, and the share of each left image that moves on its own."""
+    """All pairs, each with a mask of what moves on its own, and its share of each left image."""
     studio = Studio(simulation)
     moving = np.append(simulation.scene.moving, False)  # the last one is the sky, -1
     sensor = replace(simulation.sensor, shutter=0.0)
@@ -34,8 +34,9 @@ def filmed(simulation: Simulation) -> tuple[list[StereoFrame], np.ndarray]:
             expose(each.image[0].numpy(), sensor, np.random.default_rng((simulation.seed, k, eye)))
             for eye, each in enumerate(views)
         ]
-        shares.append(moving[views[0].body[0].numpy()].mean())
-        frames.append(StereoFrame(k, float(time), images[0], images[1]))
+        moves = moving[views[0].body[0].numpy()]
+        shares.append(moves.mean())
+        frames.append(StereoFrame(k, float(time), images[0], images[1], ~moves))
     return frames, np.array(shares)
 
 
@@ -116,6 +117,25 @@ def test_half_the_image_on_movers_from_the_first_frame_is_not_followed():
     assert shares.min() > 0.4
     estimates, truth = tracked(simulation, frames)
     assert_honest(estimates, truth)
+
+
+@pytest.mark.slow
+def test_movers_that_are_masked_do_no_harm():
+    """People in half of a room's image: masked by their own pixels, as good as if they were not there."""
+    simulation = simulate(Recipe("room", 20, seed=1, movers=0.5, width=320, height=240))
+    frames, shares = filmed(simulation)
+    assert shares.min() > 0.4
+    bodies = tuple(body for body in simulation.scene.bodies if body.path is None)
+    empty = replace(simulation, scene=replace(simulation.scene, bodies=bodies))
+    seen, truth = tracked(empty, filmed(empty)[0])
+    tracker = StereoTracker(simulation.rig.calibrated)
+    masked = [tracker.step(frame.left, frame.right, frame.timestamp, frame.mask) for frame in frames]
+    assert_honest(masked, truth)
+    errors = [
+        max(np.linalg.norm(error_of(*each)[:3]) for each in zip(run, truth, strict=True)) for run in (seen, masked)
+    ]
+    assert errors[1] < 2.0 * errors[0] + 0.002
+    assert statuses(masked[1:]) == ["tracking"] * 19
 
 
 @pytest.mark.slow

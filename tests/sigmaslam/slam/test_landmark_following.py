@@ -39,14 +39,13 @@ class CarryingOnly:
 
     def follow(
         self,
-        left: np.ndarray,
-        right: np.ndarray,
+        frame: Frame,
         keyframes: list[StereoView],
         pose: np.ndarray,
         covariance: np.ndarray,
         carry: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
     ) -> tuple[GuidedMatches, float]:
-        self.start = carry(left, self._landmark_id, self._predicted)
+        self.start = carry(frame.left, self._landmark_id, self._predicted)
         return GuidedMatches.empty(), 1.0
 
 
