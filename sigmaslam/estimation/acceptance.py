@@ -31,6 +31,7 @@ class Acceptance:
         second_motion: share of the image that another motion explains, of what both do; from there on nobody knows.
         time_error: frames by which an image is another moment's; drives that brake stay below a tenth.
         time_share: of a pose's departure that goes as the velocity does, where the stamp is wrong and not the pose.
+        bump: pixels; by more the right eye sees all landmarks elsewhere than before, and by less each for itself.
         jump: sigmas of the prediction by which a pose that was found without it departs.
         jump_support: share of the landmarks of earlier keyframes in view that must confirm such a pose.
         sharpness: share of what keyframes saw of the same landmarks; drives give 0.86 to 1.2, motion blur over 11 px
@@ -64,6 +65,7 @@ class Acceptance:
     second_motion: float = 0.1
     time_error: float = 0.5
     time_share: float = 0.8
+    bump: float = 1.0
     jump: float = 10.0
     jump_support: float = 0.5
     sharpness: float = 0.8

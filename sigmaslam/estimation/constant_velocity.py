@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sigmaslam.estimation.acceptance import ACCEPTANCE
-from sigmaslam.estimation.chi_square import CHI_SQUARE_999, CHI_SQUARE_9999_OF_6
 from sigmaslam.geometry.se3 import nearest_rigid, se3_adjoint, se3_inverse, se3_log
 from sigmaslam.inference.backends import load_step
 
@@ -58,6 +56,11 @@ class MotionFilter:
         """(6, 6) of `step`, perturbed from the left in the keyframe."""
         return self._covariance[_POSE, _POSE]
 
+    @property
+    def predicted_covariance(self) -> np.ndarray:
+        """(6, 6) of `step` by the motion alone, before it was widened."""
+        return self.step_covariance / self._widened
+
     def forget_twist(self, sigma: np.ndarray) -> None:
         """No velocity is known but that it is about zero; sigma (6,) m/s and rad/s."""
         self.set_twist(np.zeros(6), sigma)
@@ -94,47 +97,19 @@ class MotionFilter:
         """The prediction is off by more than it claims: all its variances are so many times as large."""
         self._covariance, self._widened = factor * self._covariance, factor * self._widened
 
-    def time_error(self, step: np.ndarray, interval: float) -> float:
-        """By how many frames an image seems to be later than its stamp; 0 where the motion's noise explains its pose.
-
-        A pose that departs from the prediction as the velocity goes, by half a frame's way or more, is of another
-        moment: a real acceleration does not do that within a frame.
-
-        Args:
-            step: (4, 4) T_keyframe_camera as the image shows it.
-            interval: of the frames, seconds.
-        """
-        departure, along = se3_log(step @ se3_inverse(self.step)), self._way(interval)
-        P = self.step_covariance / self._widened
-        weighted = np.linalg.lstsq(P, np.column_stack([departure, along]), rcond=1e-14)[0]
-        (whole, across), (_, visible) = np.stack([departure, along]) @ weighted
-        if visible <= CHI_SQUARE_999[1]:
-            return 0.0
-        frames, explained = float(across / visible), across**2 / visible
-        seen = explained > CHI_SQUARE_999[1] and explained > ACCEPTANCE.time_share * whole
-        return frames if seen and abs(frames) >= ACCEPTANCE.time_error else 0.0
-
-    def surprise(self, step: np.ndarray) -> float:
-        """By what the prediction's variances are too small where a pose (4, 4) T_keyframe_camera is right; 1 or more.
-
-        A prediction that the images contradict drags the pose along, and says nothing of it.
-        """
-        departure = se3_log(step @ se3_inverse(self.step))
-        squared = float(departure @ np.linalg.lstsq(self.step_covariance, departure, rcond=1e-14)[0])
-        return squared / len(departure) if squared > CHI_SQUARE_9999_OF_6 else 1.0
-
     def doubt_time(self, seconds: float) -> np.ndarray:
         """The image is of another moment, by so much: that, and no error of the velocity, makes the prediction wide.
 
         Returns:
             (6,) the way in that time, perturbed from the left in the keyframe.
         """
-        error = self._way(seconds)
+        error = self.way(seconds)
         self.widen(1.0 / self._widened)
         self._covariance[_POSE, _POSE] += np.outer(error, error)
         return error
 
-    def _way(self, seconds: float) -> np.ndarray:
+    def way(self, seconds: float) -> np.ndarray:
+        """(6,) what the velocity makes of the pose in that time, perturbed from the left in the keyframe."""
         return np.asarray(seconds * (se3_adjoint(self.step) @ self.twist))
 
     def correct(self, step: np.ndarray, covariance: np.ndarray) -> None:

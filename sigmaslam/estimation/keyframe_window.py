@@ -49,6 +49,7 @@ class KeyframeWindow:
         landmarks: estimated with the posterior.
         depth: of the scene that the last keyframe sees, metres.
         calibration: prior of the errors of the calibration.
+        expected: (12,) errors of the calibration about which its prior holds: zero until the rig changes.
         refused: (12,) what images made of errors that are not estimated any more; zero for the others.
     """
 
@@ -62,8 +63,8 @@ class KeyframeWindow:
         self.camera = camera
         self.graphs = graphs
         self.student_freedom = student_freedom
-        self.calibration = calibration
-        self.refused = np.zeros(CALIBRATION_SIZE)
+        self.calibration = self._first_calibration = calibration
+        self.expected, self.refused = np.zeros(CALIBRATION_SIZE), np.zeros(CALIBRATION_SIZE)
         self.prior = self.posterior = WindowState.initial(calibration)
         self.landmarks = LandmarkTable.empty(CALIBRATION_SIZE)
         self.depth = 1.0
@@ -82,10 +83,16 @@ class KeyframeWindow:
         self.landmarks = LandmarkTable.empty(CALIBRATION_SIZE)
         self._observations = KeyframeViews()
 
-    def distrust_eyes(self, pixels: float) -> None:
-        """Before the first keyframe: disparities may be off by so much, by an offset or a turned eye."""
-        self.calibration = self.calibration.widened(("offset", "yaw", "pitch", "roll"), pixels)
-        self.prior = self.posterior = WindowState.initial(self.calibration)
+    def change_rig(self, offset: float) -> None:
+        """The right camera was bumped, and disparities are larger by an offset; no keyframe is in the window.
+
+        What was refused before is estimated anew. The bump may have turned the camera, too.
+        """
+        assert not len(self)
+        self.expected[0] = self.posterior.calibration[0] + offset
+        self.refused = np.zeros(CALIBRATION_SIZE)
+        self.calibration = self._first_calibration
+        self.prior = self.posterior = self.posterior.with_bump(self.expected, offset)
 
     def add_keyframe(
         self,
@@ -236,7 +243,8 @@ def _refuse_errors(window: KeyframeWindow) -> bool:
     They stand for something else then, of a lens or of the other eye, that this model does not have.
     """
     estimate, prior = window.posterior.calibration, window.calibration
-    beyond = prior.estimated & (prior.sigma > 0.0) & (np.abs(estimate) > _CREDIBLE * prior.sigma)
+    departure = np.abs(estimate - window.expected)
+    beyond = prior.estimated & (prior.sigma > 0.0) & (departure > _CREDIBLE * prior.sigma)
     indices = np.flatnonzero(beyond).tolist()
     for index in indices:
         window.refused[index] = estimate[index]

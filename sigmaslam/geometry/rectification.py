@@ -81,6 +81,15 @@ class StereoRectifier:
             cv2.remap(right, *right_map, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT),
         )
 
+    def raise_right(self, rows: float) -> None:
+        """From now on the right images, which a bump has lowered by so many rows, are raised by them."""
+        if self._maps is None:
+            model = self.camera.right
+            u, v = np.meshgrid(np.arange(model.width, dtype=np.float32), np.arange(model.height, dtype=np.float32))
+            self._maps = (u, v), (u, v)
+        left, (u, v) = self._maps
+        self._maps = left, (u, v + np.float32(rows))
+
     def rectify_mask(self, mask: np.ndarray) -> np.ndarray:
         """(H, W) uint8 mask of the left image rectified, by the nearest pixel; 255 where there is none."""
         if self._maps is None:

@@ -57,15 +57,13 @@ def track_sequence(request: TrackRequest) -> dict[str, Any]:
     if request.outputs.resume:
         stopped = read_stopped_run(out, settings)
         stopped.check_sequence(sequence)
-    tracker = _build_tracker(sequence, options, None if stopped is None else stopped.start)
+    pixels = disparity_error(request.input.findings)
+    tracker = _build_tracker(sequence, options, None if stopped is None else stopped.start, pixels)
     location = None
     if options.location is not None:
         location = LocationFilter(options.location, options.track_object is not None)
     rectified = None
     if isinstance(tracker, StereoTracker):
-        pixels = disparity_error(request.input.findings)
-        if pixels is not None:
-            tracker.distrust_eyes(pixels)
         if options.map is not None:
             tracker.load_map(options.map)
         rectified = tracker.describe_rectified() if request.outputs.tracks else None
@@ -209,11 +207,13 @@ class _Timing:
         return {} if self._latency is None else describe_real_time(self._latency, self.dropped)
 
 
-def _build_tracker(sequence: StereoSequence, options: TrackerOptions, start: StartPose | None) -> Tracker:
+def _build_tracker(
+    sequence: StereoSequence, options: TrackerOptions, start: StartPose | None, pixels: float | None
+) -> Tracker:
     camera, frontend, backend, config = sequence.camera, options.frontend, options.backend, options.config
     threads, provider, weights = options.threads, options.provider, options.weights
     if options.track_object is None:
-        return StereoTracker(camera, frontend, backend, config, None, threads, start, provider, weights)
+        return StereoTracker(camera, frontend, backend, config, None, threads, start, provider, weights, pixels)
     region = read_region(options.track_object, camera.left.width, camera.left.height)
     return ObjectTracker(camera, region, frontend, backend, config, threads, provider, weights)
 

@@ -65,8 +65,8 @@ class Localiser:
 
     def follow(
         self, frame: Frame, keyframes: list[Keyframe], prediction: Prediction, clock: Stopwatch
-    ) -> tuple[GuidedMatches, FrameFit] | None:
-        """Matches and pose of a frame without features; None where that is doubtful.
+    ) -> tuple[GuidedMatches, FrameFit | None]:
+        """Matches and pose of a frame without features; no pose where that is doubtful.
 
         Args:
             frame: the current one.
@@ -82,7 +82,7 @@ class Localiser:
         fit = self._fit_near(matches, prediction)
         clock.lap("filter")
         if fit is None or self._is_doubtful(fit) or self.follower.has_fallen(matches, fit.inliers):
-            return None
+            return matches, None
         return matches, fit
 
     def localise(

@@ -61,6 +61,7 @@ class NewKeyframe:
         views: of the window's landmarks.
         origin: of the first one, the past pose relative to which `step_covariance` is.
         blur: of its image, as of `Keyframes.blur`.
+        rig_changed: the disparity offset is as unknown as at the start.
     """
 
     view: StereoView
@@ -71,6 +72,7 @@ class NewKeyframe:
     views: LandmarkViews = field(default_factory=LandmarkViews.empty)
     origin: int | None = None
     blur: float = 1.0
+    rig_changed: bool = False
 
 
 @dataclass(slots=True)
@@ -156,7 +158,7 @@ class Mapper:
             step_covariance = turn_covariance(window.posterior.poses[-1], step_covariance)
         since = new.timestamp - keyframes.active[-1].timestamp if keyframes.active else 0.0
         walk = np.zeros(CALIBRATION_SIZE)
-        walk[0] = self.config.offset_walk**2 * since
+        walk[0] = self.config.offset_walk**2 * since + (self.config.offset_sigma**2 if new.rig_changed else 0.0)
         disparity = max(float(np.nanmedian(new.view.disparity)), _MIN_DISPARITY)
         depth = self.camera.focal_baseline / disparity
         window.add_keyframe(new.pose, new.step, step_covariance, walk, depth, new.origin)

@@ -20,6 +20,7 @@ from sigmaslam.slam.mapping import KeyframeTracks, Mapper, NewKeyframe
 from sigmaslam.slam.motion_prior import densities, initial_twist_sigma
 from sigmaslam.slam.phase import Course, Phase
 from sigmaslam.slam.relocalisation import Relocalisation
+from sigmaslam.slam.rig_change import RigChange
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -76,6 +77,22 @@ class Recovery:
         covariance = turn_covariance(found.pose, found.covariance)
         new = NewKeyframe(found.view, timestamp, found.pose, found.pose, covariance, origin=found.origin)
         return self._insert(new)
+
+    def go_on_after_bump(self, change: RigChange, view: StereoView, timestamp: float) -> KeyframeTracks | None:
+        """Begins a window anew where the left camera is, with a calibration of which little is known.
+
+        None, and nothing is done, where the view has too little in stereo.
+        """
+        if not view.has_stereo(self.admission.min_points, self.config.min_inliers):
+            return None
+        last = self.keyframes.active[-1]
+        while self.keyframes.active:
+            self.keyframes.marginalise_oldest(spare=last)
+        self.window.change_rig(change.columns)
+        self.course.track(timestamp)
+        pose, origin = change.fit.pose, self.keyframes.index(last.id)
+        new = NewKeyframe(view, timestamp, pose, pose, change.fit.relative, origin=origin, rig_changed=True)
+        return self.mapper.insert(new)
 
     def begin_again(self, first: StereoView, timestamp: float) -> None:
         """Starts again from the first view, now with other landmarks, and predicts the current frame from there."""

@@ -7,6 +7,7 @@ from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.frame_clock import FrameClock
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
+from sigmaslam.estimation.prediction_errors import surprise, time_error
 from sigmaslam.geometry.se3 import se3_adjoint, se3_inverse, se3_log
 from sigmaslam.slam.doubt import Doubt, Doubts
 from sigmaslam.slam.guided_matching import GuidedMatches
@@ -18,21 +19,19 @@ class Scrutiny:
 
     Args:
         window, motion, clock: of the tracker.
-
-    Attributes:
         input_is_wrong: a check of the input found that the eyes do not fit.
     """
 
-    def __init__(self, window: KeyframeWindow, motion: MotionFilter, clock: FrameClock) -> None:
+    def __init__(self, window: KeyframeWindow, motion: MotionFilter, clock: FrameClock, input_is_wrong: bool) -> None:
         self._window, self._motion, self._clock = window, motion, clock
         self._last_error = 0.0
-        self.input_is_wrong = False
+        self._input_is_wrong = input_is_wrong
 
     def doubt(self, matches: GuidedMatches, fit: FrameFit) -> Doubts:
         """What speaks against a pose, before motion and map learn from it; the prediction becomes less certain by a
         wrong time."""
         doubts = Doubts()
-        if self.input_is_wrong:
+        if self._input_is_wrong:
             doubts.add(Doubt.INPUT)
         if self._window.refused.any():
             doubts.add(Doubt.OFFSET)
@@ -46,14 +45,14 @@ class Scrutiny:
     def _doubt_prediction(self, doubts: Doubts, fit: FrameFit) -> None:
         key = self._window.posterior.poses[-1]
         step = se3_inverse(key) @ fit.pose
-        error = self._motion.time_error(step, self._clock.interval)
+        error = time_error(self._motion, step, self._clock.interval)
         # What goes on is an acceleration: images out of order jump to and fro.
         if error * self._last_error < 0.0 or (error != 0.0 and self._last_error == 0.0):
             doubts.add(Doubt.TIME)
             doubts.prediction_is_wrong = True
             doubts.way = se3_adjoint(key) @ self._motion.doubt_time(error * self._clock.interval)
-        elif (surprise := self._motion.surprise(step)) > 1.0:
-            self._motion.widen(surprise)
+        elif (excess := surprise(self._motion, step)) > 1.0:
+            self._motion.widen(excess)
             doubts.prediction_is_wrong = True
         self._last_error = error
 

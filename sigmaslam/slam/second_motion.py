@@ -9,8 +9,8 @@ import numpy as np
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.geometry.image_cells import CELLS, image_cells
-from sigmaslam.geometry.se3 import se3_inverse
 from sigmaslam.slam.guided_matching import CONFIRMED, GuidedMatches
+from sigmaslam.slam.landmark_places import seen_from
 from sigmaslam.two_view.scene_pose import see_the_same, stands_before
 from sigmaslam.two_view.stereo_pose import MIN_POINTS, estimate_relative_pose
 
@@ -41,7 +41,7 @@ def find_second_motion(window: KeyframeWindow, matches: GuidedMatches, fit: Fram
     rows = views.landmark
     if len(rows) - fit.count < MIN_POINTS:
         return None
-    expected = _seen_from(window, rows, fit.pose)
+    expected = seen_from(window, rows, fit.pose)
     others = np.flatnonzero(~fit.inliers & np.isfinite(expected).all(axis=1))
     if len(others) < MIN_POINTS:
         return None
@@ -69,16 +69,3 @@ def find_second_motion(window: KeyframeWindow, matches: GuidedMatches, fit: Fram
     nearer = stands_before(*(float(np.median(expected[chosen, 2])) for chosen in (agreeing, fit.inliers)))
     stood_still = bool(np.median(window.landmarks.views[rows[agreeing]]) >= CONFIRMED)
     return SecondMotion(fit.pose @ relative.T_key_camera, second / (first + second), nearer, stood_still)
-
-
-def _seen_from(window: KeyframeWindow, rows: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """(K, 3) (u, v, disparity) of landmarks as a pose (4, 4) sees them; NaN of those that are behind it or far away."""
-    landmarks, camera = window.landmarks, window.camera
-    measured = window.as_calibrated(landmarks.estimate[rows])
-    near = measured[:, 2] > 0.0
-    points = camera.triangulate(np.where(near[:, None], measured, [0.0, 0.0, 1.0]))
-    T = (se3_inverse(pose) @ window.posterior.poses)[landmarks.anchor[rows]]
-    here = np.einsum("kij,kj->ki", T[:, :3, :3], points) + T[:, :3, 3]
-    front = near & (here[:, 2] > 0.0)
-    seen = camera.project(np.where(front[:, None], here, [0.0, 0.0, 1.0]))
-    return np.where(front[:, None], seen, np.nan)

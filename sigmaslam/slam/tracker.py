@@ -24,7 +24,7 @@ from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.inference.networks import WeightsFolder
 from sigmaslam.slam.argument_checks import check_frame, check_tracker_arguments
 from sigmaslam.slam.config import TrackerConfig
-from sigmaslam.slam.doubt import Doubts
+from sigmaslam.slam.doubt import Doubt, Doubts
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.slam.frame import Frame, usable_pixels
 from sigmaslam.slam.frame_history import FrameHistory
@@ -45,6 +45,7 @@ from sigmaslam.slam.recovery import Recovery
 from sigmaslam.slam.relative_poses import RelativePoseReporter
 from sigmaslam.slam.relocalisation import Relocaliser
 from sigmaslam.slam.reporting import Reporter
+from sigmaslam.slam.rig_change import RigChange, RigWatch
 from sigmaslam.slam.scrutiny import Scrutiny
 from sigmaslam.slam.start_pose import StartPose
 from sigmaslam.slam.stopwatch import Stopwatch
@@ -73,6 +74,8 @@ class StereoTracker:
         provider: where ONNX Runtime computes the networks, "cpu", "cuda" or "openvino"; the estimator stays on the CPU.
         weights: folder of networks of one's own, as `sigmaslam export` writes it; for those that it lacks, the ones
             that ship.
+        disparity_error: pixels by which disparities may be off, as a check found that the eyes do not fit: all poses
+            are doubtful then, and less certain; None: nothing was found.
 
     Attributes:
         last_frame: what the last frame saw, for pictures; None before the first.
@@ -92,6 +95,7 @@ class StereoTracker:
         start: StartPose | None = None,
         provider: str = "cpu",
         weights: WeightsFolder = None,
+        disparity_error: float | None = None,
     ) -> None:
         check_tracker_arguments(camera, frontend, backend, config, threads, weights)
         self.config = config = config or TrackerConfig()
@@ -106,18 +110,21 @@ class StereoTracker:
         self._admission = admission = admission or AdmitAll(config.min_inliers)
         graphs = EstimatorGraphs(rectified, backend, config.linearisation == "unscented")
         prior = CalibrationPrior.of(rectified, camera.sigmas, config.offset_sigma, config.estimate, camera.covariance)
+        if disparity_error is not None:
+            prior = prior.widened(("offset", "yaw", "pitch", "roll"), disparity_error)
         self._window = window = KeyframeWindow(rectified, prior, graphs)
         self._noise = noise = MeasurementNoise(config)
         self._motion = motion = MotionFilter(backend)
         self._course = course = Course()
         self._clock, self._last_pairs = FrameClock(), LastPairs()
         self._keyframes = keyframes = Keyframes(window, config.max_keyframes, config.max_points, self._beside)
-        self._scrutiny = Scrutiny(window, motion, self._clock)
+        self._scrutiny = Scrutiny(window, motion, self._clock, disparity_error is not None)
         update = FrameUpdate(window, config.iterations)
         guided = GuidedMatcher(rectified, frontend, window, update, noise, config)
         self._unguided = unguided = UnguidedMatcher(rectified, frontend, window, noise, config)
         self._follower = follower = LandmarkFollower(guided)
         self._localiser = Localiser(window, motion, update, guided, follower, unguided, config)
+        self._rig_watch = RigWatch(window, update, config.min_inliers)
         self._mapper = Mapper(rectified, window, keyframes, motion, noise, admission, config)
         self._loops = LoopCloser(window, keyframes, unguided)
         self._relocaliser = Relocaliser(window, keyframes, unguided, admission, config.min_inliers)
@@ -136,14 +143,6 @@ class StereoTracker:
         """
         self._keyframes.load(Path(path), self._frontend.name, self._camera)
         self._course.phase = Phase.WAITING_IN_MAP
-
-    def distrust_eyes(self, pixels: float) -> None:
-        """Before the first frame: a check found that the eyes do not fit, and disparities may be off by so many pixels.
-
-        All poses are doubtful then, and less certain.
-        """
-        self._scrutiny.input_is_wrong = True
-        self._window.distrust_eyes(pixels)
 
     def step(self, left: np.ndarray, right: np.ndarray, timestamp: float, mask: np.ndarray | None = None) -> Estimate:
         """Takes one stereo pair.
@@ -174,7 +173,9 @@ class StereoTracker:
                 self._motion.forget_twist(initial_twist_sigma(self.config, self._window.depth))
             self._motion.predict(seconds, densities(self.config, self._window.depth), sigma)
         is_repeated = self._last_pairs.is_repeated(left, right)
-        matches, fit = (GuidedMatches.empty(), None) if is_repeated else self._localise(frame, timestamp, clock)
+        matches, fit, change = GuidedMatches.empty(), None, None
+        if not is_repeated:
+            matches, fit, change = self._localise(frame, timestamp, clock)
         landmarks = self._window.landmarks.id[matches.views.landmark]
         self.last_frame = MatchedFrame(
             frame.left, frame.right, landmarks, matches, None if fit is None else fit.inliers
@@ -193,6 +194,12 @@ class StereoTracker:
             tracks = self._mapper.insert_if_due(frame, timestamp, fit, blur, matches, expected, doubts.is_ambiguous)
         elif is_repeated:
             status, tracks = "skipped", None
+        elif change is not None:
+            doubts.add(Doubt.RIG)
+            self._rectifier.raise_right(change.rows)
+            frame = Frame(*self._rectifier.rectify(left, right), self._frontend, usable)
+            tracks = self._recovery.go_on_after_bump(change, frame.view, timestamp)
+            status = "lost" if tracks is None else doubts.status
         elif (found := self._relocaliser.relocalise(frame.view)) is not None:
             status = "relocalised"
             tracks = self._recovery.resume(found, timestamp)
@@ -234,10 +241,12 @@ class StereoTracker:
 
     # ---- the stages of a frame
 
-    def _localise(self, frame: Frame, timestamp: float, clock: Stopwatch) -> tuple[GuidedMatches, FrameFit | None]:
-        """Matches with the window's landmarks, and the pose if enough of them agree."""
+    def _localise(
+        self, frame: Frame, timestamp: float, clock: Stopwatch
+    ) -> tuple[GuidedMatches, FrameFit | None, RigChange | None]:
+        """Matches with the window's landmarks, and the pose if enough of them agree, or else why they do not."""
         if self._course.is_waiting:
-            return GuidedMatches.empty(), None
+            return GuidedMatches.empty(), None, None
         first = self._admission.begin_again(frame, self._unguided)
         if first is not None:
             self._recovery.begin_again(first, timestamp)
@@ -246,16 +255,17 @@ class StereoTracker:
         if guided and self._follower.is_ready:
             if self._beside is not None and self._mapper.keyframe_is_near:
                 frame.foresee(self._beside)
-            followed = self._localiser.follow(frame, self._keyframes.active, prediction, clock)
-            if followed is not None:
-                return followed
+            matches, fit = self._localiser.follow(frame, self._keyframes.active, prediction, clock)
+            change = None if fit is not None else self._rig_watch.find_change(frame, matches, prediction)
+            if fit is not None or change is not None:
+                return matches, fit, change
             prediction = Prediction.of(self._window, self._motion)
         view = frame.view
         clock.lap("features")
         if view.is_swapped(self.config.min_inliers):
-            return GuidedMatches.empty(), None
+            return GuidedMatches.empty(), None, None
         keyframes = [keyframe.view for keyframe in self._keyframes.active]
-        return self._localiser.localise(view, keyframes, prediction, guided, clock)
+        return *self._localiser.localise(view, keyframes, prediction, guided, clock), None
 
     def _correct(
         self, fit: FrameFit, blur: float, doubts: Doubts, matches: GuidedMatches, timestamp: float

@@ -1,0 +1,87 @@
+"""Whether the right camera was bumped: it sees the landmarks elsewhere than before, all by the same."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sigmaslam.estimation.acceptance import ACCEPTANCE
+from sigmaslam.estimation.frame_fit import FrameFit
+from sigmaslam.estimation.frame_update import FrameUpdate
+from sigmaslam.estimation.keyframe_window import KeyframeWindow
+from sigmaslam.estimation.landmark_table import LandmarkViews
+from sigmaslam.frontend.lucas_kanade import lucas_kanade
+from sigmaslam.slam.frame import Frame
+from sigmaslam.slam.guided_matching import GuidedMatches
+from sigmaslam.slam.landmark_places import seen_from
+from sigmaslam.slam.localisation import Prediction
+
+# Of the optical flow from eye to eye: side of its patches, pixels, and levels above the image; it reaches some 20 px.
+_WINDOW, _LEVELS = 21, 3
+# From the spread of right matches to their standard deviation, by the median.
+_ROBUST = 1.4826
+
+
+@dataclass(frozen=True, slots=True)
+class RigChange:
+    """A bump of the right camera.
+
+    Attributes:
+        fit: pose of the left camera by its own image alone.
+        columns, rows: by how much disparities are larger, and right places lower than before, pixels.
+    """
+
+    fit: FrameFit
+    columns: float
+    rows: float
+
+
+@dataclass(frozen=True, slots=True)
+class RigWatch:
+    """Looks for bumps where a frame does not fit what was known.
+
+    Attributes:
+        window, update: of the tracker.
+        min_inliers: fewer are no pose.
+    """
+
+    window: KeyframeWindow
+    update: FrameUpdate
+    min_inliers: int
+
+    def find_change(self, frame: Frame, matches: GuidedMatches, prediction: Prediction) -> RigChange | None:
+        """The bump before a frame; None where the left image gives no pose, or the right one fits it as before.
+
+        Args:
+            frame: the current one.
+            matches: landmarks that were followed to it, with disparities that may be wrong.
+            prediction: of its pose.
+        """
+        views = _left_alone(matches.views)
+        fit = self.update.fit(views, prediction.pose, prediction.covariance, self.min_inliers)
+        if fit is None or fit.count < ACCEPTANCE.guided_share * len(views):
+            return None
+        chosen = views.select(fit.inliers)
+        expected = seen_from(self.window, chosen.landmark, fit.pose)[:, 2] + self.window.posterior.calibration[0]
+        known = np.isfinite(expected)
+        left = chosen.measurement[known, :2]
+        right = left - np.column_stack([expected[known], np.zeros(known.sum())])
+        found, ended = lucas_kanade(frame.left, frame.right, left, right, _WINDOW, _LEVELS)
+        back, returned = lucas_kanade(frame.right, frame.left, found, left, _WINDOW, 0)
+        good = ended & returned & (np.linalg.norm(back - left, axis=1) < 1.0)
+        if good.sum() < self.min_inliers:
+            return None
+        moved = (found - right)[good]
+        shift = np.median(moved, axis=0)
+        spread = _ROBUST * np.median(np.abs(moved - shift), axis=0)
+        if np.linalg.norm(shift) < ACCEPTANCE.bump or (spread > ACCEPTANCE.bump).any():
+            return None
+        return RigChange(fit, -float(shift[0]), float(shift[1]))
+
+
+def _left_alone(views: LandmarkViews) -> LandmarkViews:
+    """The same without disparities."""
+    measurement = views.measurement.copy()
+    measurement[:, 2] = np.nan
+    return LandmarkViews(views.landmark, measurement, views.noise, views.common)
