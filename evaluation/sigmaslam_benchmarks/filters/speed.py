@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import argparse
+import json
 import os
 import statistics
 import subprocess
@@ -292,42 +292,23 @@ def write_filters(path: Path, rounds: int, eager: bool, command: str) -> str:
 
     What is below a line `<!-- notes -->` in the page is kept.
     """
-    arguments = [
-        sys.executable,
-        "-m",
-        "sigmaslam_benchmarks.filters.speed",
-        "--out",
-        str(path),
-        "--rounds",
-        str(rounds),
-        "--command",
-        command,
-    ]
-    if eager:
-        arguments.append("--eager")
+    job = json.dumps({"path": str(path), "rounds": rounds, "eager": eager, "command": command})
     # BLAS reads its number of threads when it is loaded: hence another process.
-    subprocess.run(arguments, env={**os.environ, **single_thread_environment()}, check=True)
+    words = [sys.executable, "-m", "sigmaslam_benchmarks.filters.speed", job]
+    subprocess.run(words, env={**os.environ, **single_thread_environment()}, check=True)
     return path.read_text(encoding="utf-8")
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Command line of the measuring process."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("docs/benchmarks/filters.md"), help="page to write")
-    parser.add_argument("--rounds", type=int, default=7, help="rounds in which every contender is timed")
-    parser.add_argument("--eager", action="store_true", help="leave out the compiled filters (minutes to compile)")
-    parser.add_argument("--command", help="what the page says it was made by")
-    options = parser.parse_args(arguments)
-    command = options.command or "python -m evaluation.benchmarks.filters"
-    if os.environ.get("OMP_NUM_THREADS") != "1":
-        write_filters(options.out, options.rounds, options.eager, command)
-        return
+def main() -> None:
+    """Does the job of `write_filters` in this process."""
     import torch
 
+    job = json.loads(sys.argv[1])
     torch.set_num_threads(1)
     np.seterr(all="ignore")
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    write_page(options.out, format_page(options.rounds, not options.eager, command))
+    path = Path(job["path"])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_page(path, format_page(job["rounds"], not job["eager"], job["command"]))
 
 
 if __name__ == "__main__":

@@ -65,15 +65,9 @@ def write_consistency(
     A result is used again when it comes from the same recipe, configuration and code.
 
     Args:
-        path: Markdown page.
-        runs: folder for renders and results.
+        path, runs, workers, ray, note: of `write_trials`, and what it raises.
         seeds: sequences of each scale.
-        workers: processes; each takes a sequence at a time.
         command: what the page says it was made by.
-        ray: address of a Ray cluster, as `run_jobs` takes it.
-        note: is told of progress.
-    Raises:
-        OutputError: as of `write_trials`.
     """
 
     def form(done: list[SequenceTrials], missing: list[str]) -> str:
