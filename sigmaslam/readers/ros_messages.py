@@ -57,8 +57,10 @@ def image_array(message: Any, name: str) -> np.ndarray:
     Raises:
         FrameError: the encoding is not known, or there are fewer bytes than it takes.
     """
-    if message.__msgtype__ == COMPRESSED_IMAGE:
-        return decode_image(message.data.tobytes(), name)
+    # rclpy has arrays of Python, rosbags of NumPy.
+    data = np.frombuffer(message.data, np.uint8)
+    if not hasattr(message, "encoding"):  # compressed
+        return decode_image(data.tobytes(), name)
     if message.encoding not in _ENCODINGS:
         unknown = shorten(repr(message.encoding))
         raise FrameError(f"{name}: encoding {unknown} is not known; known are {', '.join(_ENCODINGS)}")
@@ -66,12 +68,11 @@ def image_array(message: Any, name: str) -> np.ndarray:
     height, width = int(message.height), int(message.width)
     row = width * channels * size
     step = max(int(message.step), row)
-    if not 0 < height * step <= len(message.data):
+    if not 0 < height * step <= len(data):
         raise FrameError(
-            f"{name}: {len(message.data)} bytes for a {width}x{height} image of {message.encoding}, "
-            f"{height * step} are needed"
+            f"{name}: {len(data)} bytes for a {width}x{height} image of {message.encoding}, {height * step} are needed"
         )
-    rows = np.ascontiguousarray(message.data[: height * step].reshape(height, step)[:, :row])
+    rows = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :row])
     values = rows.view(np.dtype(f"{'>' if message.is_bigendian else '<'}u{size}"))
     image = values.astype(f"u{size}", copy=False)
     image = image.reshape((height, width) if channels == 1 else (height, width, channels))

@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -15,6 +16,7 @@ def load_example(name: str) -> ModuleType:
     assert specification
     assert specification.loader
     example = importlib.util.module_from_spec(specification)
+    sys.modules[name] = example  # where dataclasses look for its types
     specification.loader.exec_module(example)
     return example
 
