@@ -16,7 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sigmaslam.estimation.calibration_errors import CalibrationPrior, measured_errors
+from sigmaslam.estimation.calibration_errors import ERRORS, CalibrationPrior, measured_errors
 from sigmaslam.estimation.chi_square import CHI_SQUARE_9999_OF_6
 from sigmaslam.estimation.estimator_graphs import EstimatorGraphs
 from sigmaslam.estimation.gaussian import matrix_root
@@ -32,6 +32,8 @@ _CREDIBLE = 4.0
 # Errors of right matches have longer tails than a Gaussian's: degrees of freedom of the Student-t that is fitted.
 # 4 and 1 are no better on rendered streets.
 _STUDENT_FREEDOM = 2.0
+# Errors of the right camera's rotation, in the order of the calibration.
+_TURNS = [ERRORS.index(name) for name in ("yaw", "pitch", "roll")]
 
 
 class KeyframeWindow:
@@ -48,7 +50,7 @@ class KeyframeWindow:
         posterior: what is known with them.
         landmarks: estimated with the posterior.
         depth: of the scene that the last keyframe sees, metres.
-        calibration: prior of the errors of the calibration.
+        calibration, first_calibration: prior of the errors of the calibration, without and with refused ones.
         expected: (12,) errors of the calibration about which its prior holds: zero until the rig changes.
         refused: (12,) what images made of errors that are not estimated any more; zero for the others.
     """
@@ -63,7 +65,7 @@ class KeyframeWindow:
         self.camera = camera
         self.graphs = graphs
         self.student_freedom = student_freedom
-        self.calibration = self._first_calibration = calibration
+        self.calibration = self.first_calibration = calibration
         self.expected, self.refused = np.zeros(CALIBRATION_SIZE), np.zeros(CALIBRATION_SIZE)
         self.prior = self.posterior = WindowState.initial(calibration)
         self.landmarks = LandmarkTable.empty(CALIBRATION_SIZE)
@@ -82,17 +84,6 @@ class KeyframeWindow:
         self.prior = self.posterior
         self.landmarks = LandmarkTable.empty(CALIBRATION_SIZE)
         self._observations = KeyframeViews()
-
-    def change_rig(self, offset: float) -> None:
-        """The right camera was bumped, and disparities are larger by an offset; no keyframe is in the window.
-
-        What was refused before is estimated anew. The bump may have turned the camera, too.
-        """
-        assert not len(self)
-        self.expected[0] = self.posterior.calibration[0] + offset
-        self.refused = np.zeros(CALIBRATION_SIZE)
-        self.calibration = self._first_calibration
-        self.prior = self.posterior = self.posterior.with_bump(self.expected, offset)
 
     def add_keyframe(
         self,
@@ -235,6 +226,21 @@ class KeyframeWindow:
         uvd = measured[:, :3] - measured_errors(self.camera, measured[:, :3]) @ self.posterior.calibration
         uvd[:, 2] -= measured[:, 3:MODELLED].sum(axis=1)
         return np.asarray(uvd)
+
+
+def change_rig(window: KeyframeWindow, offset: float) -> None:
+    """The right camera was bumped, and disparities are larger by an offset; no keyframe is in the window.
+
+    What was refused before is estimated anew. The bump may have turned the camera, too.
+    """
+    assert not len(window)
+    window.calibration = window.first_calibration
+    window.expected[0] = window.posterior.calibration[0] + offset
+    window.refused = np.zeros(CALIBRATION_SIZE)
+    common = window.posterior.common.copy()
+    common[_TURNS, _TURNS] = np.hypot(common[_TURNS, _TURNS], offset)
+    window.posterior = replace(window.posterior, calibration=window.expected.copy(), common=common)
+    window.prior = window.posterior
 
 
 def _refuse_errors(window: KeyframeWindow) -> bool:

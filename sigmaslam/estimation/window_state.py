@@ -6,15 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sigmaslam.estimation.calibration_errors import ERRORS, CalibrationPrior
+from sigmaslam.estimation.calibration_errors import CalibrationPrior
 from sigmaslam.estimation.gaussian import matrix_root
 from sigmaslam.estimation.marginalised_poses import PastPoses, past_slice
 from sigmaslam.estimation.state_layout import CALIBRATION, CALIBRATION_SIZE, pose_slice
 from sigmaslam.geometry.se3 import nearest_rigid, se3_exp, se3_inverse, se3_log
 from sigmaslam.inference.onnx_graph import Step
-
-# Errors of the right camera's rotation in the calibration.
-_TURNS = [ERRORS.index(name) for name in ("yaw", "pitch", "roll")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,12 +156,6 @@ class WindowState:
             self.covariance, self.common, index, difference, covariance
         )
         return replace(self.moved(step, posterior, common), past=past)
-
-    def with_bump(self, calibration: np.ndarray, turn: float) -> WindowState:
-        """With other errors of the calibration (12,), and a right eye turned by so much more or less, pixels."""
-        common = self.common.copy()
-        common[_TURNS, _TURNS] = np.hypot(common[_TURNS, _TURNS], turn)
-        return replace(self, calibration=calibration.copy(), common=common)
 
     def without_poses(self) -> WindowState:
         """What is known of the calibration alone."""

@@ -28,7 +28,7 @@ def describe_estimate(frame: TrackedFrame) -> dict[str, Any]:
     """What was said of a frame, as JSON has it; null before there is a pose.
 
     Returns:
-        `time` (seconds), `frame` (number of the row in frames.csv), `status`, the pose `T_world_camera`, or
+        `time` (seconds), `frame` (number of the row in frames.csv), `status`, `doubts`, the pose `T_world_camera`, or
         `T_camera_object` of a followed body, as `position` (metres) and `quaternion_xyzw`, `covariance` (6, 6) of it in
         its own frame, translation (metres) before rotation (radians), `belief`, `matches`, `inliers`, `nis`, `dof` and
         `disparity_offset` (pixels) as of `Estimate`, and `keyframe`, whether the frame became one.
@@ -44,6 +44,7 @@ def describe_estimate(frame: TrackedFrame) -> dict[str, Any]:
         "time": round(camera.timestamp, 9),
         "frame": frame.number,
         "status": camera.status,
+        "doubts": list(camera.doubts),
         "T_camera_object" if isinstance(result, ObjectEstimate) else "T_world_camera": pose,
         "covariance": covariance,
         "belief": _finite(camera.belief),

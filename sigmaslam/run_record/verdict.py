@@ -42,7 +42,7 @@ def contradiction_verdict(summary: dict[str, Any]) -> str | None:
         summary: of run.json: counts of frames that were tracked, and of those that fewer than half of their matches
             agree with.
     """
-    contradicted, tracked = summary.get("contradicted", 0), summary.get("tracked", 0)
+    contradicted, tracked = summary.get("contradicted", 0), summary.get("tracked", summary.get("tracking", 0))
     if contradicted <= _MAX_CONTRADICTED * tracked:
         return None
     return (
@@ -60,15 +60,20 @@ def doubts_verdict(summary: dict[str, Any]) -> list[str]:
     words = {
         Doubt.INPUT: "a check of the input found that the eyes do not fit",
         Doubt.OFFSET: "the images asked for a disparity offset beyond what calibrations are off by",
-        Doubt.RIG: "the rig changed: the right camera was bumped, turned or exchanged",
         Doubt.TIME: "the image shows another moment than its stamp says: does the driver deliver frames out of order?",
         Doubt.MOTIONS: "two motions explain the image about as well: a torn image, or something large that moves",
     }
-    return [
-        f"From {found['first']:.1f} s on, in {found['frames']} frames: {words.get(reason, reason)}. The covariances of "
-        "these poses hold what that may make of them."
+    said = {
+        reason: f"From {found['first']:.1f} s on, in {found['frames']} frames: {words.get(reason, reason)}. The "
+        "covariances of these poses hold what that may make of them."
         for reason, found in summary.get("doubts", {}).items()
-    ]
+    }
+    if Doubt.RIG in said:
+        said[Doubt.RIG] = (
+            f"The rig changed at {summary['doubts'][Doubt.RIG]['first']:.1f} s: the right camera was bumped or turned. "
+            "Its calibration was learned anew from there: calibrate again."
+        )
+    return list(said.values())
 
 
 def times_verdict(summary: dict[str, Any]) -> str | None:

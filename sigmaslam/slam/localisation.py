@@ -79,7 +79,7 @@ class Localiser:
             self.motion.widen(excess)
             prediction = Prediction.of(self.window, self.motion)
         clock.lap("match")
-        fit = self._fit_near(matches, prediction)
+        fit = self.fit_near(matches, prediction)
         clock.lap("filter")
         if fit is None or self._is_doubtful(fit) or self.follower.has_fallen(matches, fit.inliers):
             return matches, None
@@ -101,7 +101,7 @@ class Localiser:
         if guided:
             matches = self.guided.match_guided(view, keyframes, prediction.pose, prediction.covariance)
             clock.lap("match")
-            fit = self._fit_near(matches, prediction)
+            fit = self.fit_near(matches, prediction)
             clock.lap("filter")
         if fit is None or self._is_doubtful(fit):
             other_matches, other = self._localise_anywhere(view, keyframes, prediction, clock)
@@ -142,7 +142,7 @@ class Localiser:
         pose, covariance = prediction.pose, prediction.covariance
         return self.update.fit(matches.views, pose, covariance, self.config.min_inliers, fit.pose) or fit
 
-    def _fit_near(self, matches: GuidedMatches, prediction: Prediction) -> FrameFit | None:
+    def fit_near(self, matches: GuidedMatches, prediction: Prediction) -> FrameFit | None:
         """Update from the prediction; most of what was found near it must agree."""
         pose, covariance = prediction.pose, prediction.covariance
         count, min_inliers = len(matches.probability), self.config.min_inliers

@@ -9,7 +9,7 @@ import numpy as np
 
 from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.constant_velocity import MotionFilter
-from sigmaslam.estimation.keyframe_window import KeyframeWindow
+from sigmaslam.estimation.keyframe_window import KeyframeWindow, change_rig
 from sigmaslam.frontend import StereoView
 from sigmaslam.geometry.se3 import turn_covariance
 from sigmaslam.slam.config import TrackerConfig
@@ -88,7 +88,7 @@ class Recovery:
         last = self.keyframes.active[-1]
         while self.keyframes.active:
             self.keyframes.marginalise_oldest(spare=last)
-        self.window.change_rig(change.columns)
+        change_rig(self.window, change.columns)
         self.course.track(timestamp)
         pose, origin = change.fit.pose, self.keyframes.index(last.id)
         new = NewKeyframe(view, timestamp, pose, pose, change.fit.relative, origin=origin, rig_changed=True)

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.frame_fit import FrameFit
-from sigmaslam.estimation.frame_update import FrameUpdate
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
-from sigmaslam.estimation.landmark_table import LandmarkViews
 from sigmaslam.frontend.lucas_kanade import lucas_kanade
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.landmark_places import seen_from
-from sigmaslam.slam.localisation import Prediction
+from sigmaslam.slam.localisation import Localiser, Prediction
 
 # Of the optical flow from eye to eye: side of its patches, pixels, and levels above the image; it reaches some 20 px.
 _WINDOW, _LEVELS = 21, 3
@@ -42,13 +40,11 @@ class RigWatch:
     """Looks for bumps where a frame does not fit what was known.
 
     Attributes:
-        window, update: of the tracker.
-        min_inliers: fewer are no pose.
+        window, localiser: of the tracker.
     """
 
     window: KeyframeWindow
-    update: FrameUpdate
-    min_inliers: int
+    localiser: Localiser
 
     def find_change(self, frame: Frame, matches: GuidedMatches, prediction: Prediction) -> RigChange | None:
         """The bump before a frame; None where the left image gives no pose, or the right one fits it as before.
@@ -58,11 +54,11 @@ class RigWatch:
             matches: landmarks that were followed to it, with disparities that may be wrong.
             prediction: of its pose.
         """
-        views = _left_alone(matches.views)
-        fit = self.update.fit(views, prediction.pose, prediction.covariance, self.min_inliers)
-        if fit is None or fit.count < ACCEPTANCE.guided_share * len(views):
+        matches = _left_alone(matches)
+        fit = self.localiser.fit_near(matches, prediction)
+        if fit is None:
             return None
-        chosen = views.select(fit.inliers)
+        chosen = matches.views.select(fit.inliers)
         expected = seen_from(self.window, chosen.landmark, fit.pose)[:, 2] + self.window.posterior.calibration[0]
         known = np.isfinite(expected)
         left = chosen.measurement[known, :2]
@@ -70,7 +66,7 @@ class RigWatch:
         found, ended = lucas_kanade(frame.left, frame.right, left, right, _WINDOW, _LEVELS)
         back, returned = lucas_kanade(frame.right, frame.left, found, left, _WINDOW, 0)
         good = ended & returned & (np.linalg.norm(back - left, axis=1) < 1.0)
-        if good.sum() < self.min_inliers:
+        if good.sum() < self.localiser.config.min_inliers:
             return None
         moved = (found - right)[good]
         shift = np.median(moved, axis=0)
@@ -80,8 +76,8 @@ class RigWatch:
         return RigChange(fit, -float(shift[0]), float(shift[1]))
 
 
-def _left_alone(views: LandmarkViews) -> LandmarkViews:
+def _left_alone(matches: GuidedMatches) -> GuidedMatches:
     """The same without disparities."""
-    measurement = views.measurement.copy()
+    measurement = matches.views.measurement.copy()
     measurement[:, 2] = np.nan
-    return LandmarkViews(views.landmark, measurement, views.noise, views.common)
+    return replace(matches, views=replace(matches.views, measurement=measurement))

@@ -124,7 +124,7 @@ class StereoTracker:
         self._unguided = unguided = UnguidedMatcher(rectified, frontend, window, noise, config)
         self._follower = follower = LandmarkFollower(guided)
         self._localiser = Localiser(window, motion, update, guided, follower, unguided, config)
-        self._rig_watch = RigWatch(window, update, config.min_inliers)
+        self._rig_watch = RigWatch(window, self._localiser)
         self._mapper = Mapper(rectified, window, keyframes, motion, noise, admission, config)
         self._loops = LoopCloser(window, keyframes, unguided)
         self._relocaliser = Relocaliser(window, keyframes, unguided, admission, config.min_inliers)

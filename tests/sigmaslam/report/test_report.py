@@ -102,7 +102,7 @@ def test_report_says_what_the_run_was(tmp_path):
     assert "poses 199" in text
     assert "map points 20000" in text
     assert "keyframes 19 loops 1" in text
-    assert "1 starting, 192 tracking, 5 lost, 1 relocalised, 1 skipped." in text
+    assert "1 starting, 192 tracking, 5 lost, 1 relocalised, 1 skipped, 0 doubtful, 0 ambiguous." in text
     assert "disparity is 0.30 px <too small>; depth reads 1 % long" in text
     assert "<too small>" not in write_report(tmp_path / "run").read_text(encoding="utf-8")
     assert "sigmaslam track x" in text
@@ -294,7 +294,7 @@ def test_run_with_only_skipped_frames_has_a_report(tmp_path):
     page = _page(tmp_path / "run")
     assert page.data["plots"] == []
     assert page.data["scene"] is None
-    assert "2 skipped." in _text(tmp_path / "run")
+    assert "2 skipped," in _text(tmp_path / "run")
     assert "Run run failed" in _text(tmp_path / "run")
 
 

@@ -1,0 +1,83 @@
+"""Faults of drivers in the demo: poses are right, or there is a doubt."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sigmaslam.estimation.chi_square import CHI_SQUARE_999
+from sigmaslam.geometry.se3 import se3_inverse
+from sigmaslam.slam.doubt import Doubt
+from sigmaslam.slam.tracker import Estimate, StereoTracker
+from sigmaslam_benchmarks.live.driver_faults import DrivenFrame, spoil
+from tests.support.estimates import Demo, squared_error
+
+FRAMES = 40
+
+pytestmark = pytest.mark.long
+
+
+def driven(demo: Demo, fault: str) -> tuple[list[Estimate], np.ndarray]:
+    """The estimates with a fault, and the true pose at the stamp of each."""
+    camera, frames, truth = demo
+    good = [DrivenFrame(k, each.timestamp, each.left, each.right) for k, each in enumerate(frames[:FRAMES])]
+    spoiled, tracker = spoil(fault, good, 7), StereoTracker(camera)
+    estimates = [tracker.step(each.left, each.right, each.timestamp) for each in spoiled]
+    return estimates, se3_inverse(truth[0]) @ truth[[each.moment for each in spoiled]]
+
+
+def silent_wrong(estimates: list[Estimate], truth: np.ndarray) -> list[int]:
+    pairs = enumerate(zip(estimates, truth, strict=True))
+    return [
+        k for k, (each, true) in pairs if each.status == "tracking" and squared_error(each, true) > CHI_SQUARE_999[6]
+    ]
+
+
+@pytest.mark.parametrize(
+    ("fault", "doubt"),
+    [
+        ("out_of_order", Doubt.TIME),
+        ("torn", Doubt.MOTIONS),
+        ("columns_2", Doubt.RIG),
+        ("rows_3", Doubt.RIG),
+        ("yaw", Doubt.RIG),
+    ],
+)
+def test_a_fault_is_doubted_and_no_pose_is_silently_wrong(demo: Demo, fault: str, doubt: Doubt):
+    estimates, truth = driven(demo, fault)
+    assert silent_wrong(estimates, truth) == []
+    assert any(doubt in each.doubts for each in estimates)
+    assert sum(each.status == "tracking" for each in estimates) > FRAMES // 2
+
+
+@pytest.mark.parametrize("fault", ["none", "jitter_20", "alternate_40", "bursts_3"])
+def test_stamps_that_can_be_read_leave_poses_right(demo: Demo, fault: str):
+    estimates, truth = driven(demo, fault)
+    assert silent_wrong(estimates, truth) == []
+    assert sum(each.status == "tracking" for each in estimates) >= FRAMES - 4
+    assert fault != "none" or not any(each.doubts for each in estimates)
+
+
+def test_an_old_pair_is_skipped(demo: Demo):
+    estimates, truth = driven(demo, "repeated")
+    assert [k for k, each in enumerate(estimates) if each.status == "skipped"] == list(range(5, FRAMES, 10))
+    assert silent_wrong(estimates, truth) == []
+
+
+def test_a_bump_is_said_when_it_happens_and_its_offset_is_learned(demo: Demo):
+    estimates, _ = driven(demo, "columns_2")
+    assert [k for k, each in enumerate(estimates) if Doubt.RIG in each.doubts] == [FRAMES // 2]
+    before, after = estimates[FRAMES // 2 - 1].calibration, estimates[-1].calibration
+    change = after.disparity_offset - before.disparity_offset
+    sigma = np.hypot(before.disparity_offset_sigma, after.disparity_offset_sigma)
+    assert change == pytest.approx(-2.0, abs=float(4.0 * sigma))
+
+
+def test_eyes_that_do_not_fit_make_all_poses_doubtful_and_less_certain(demo: Demo):
+    camera, frames, _ = demo
+    sure, unsure = StereoTracker(camera), StereoTracker(camera, disparity_error=2.0)
+    for frame in frames[:6]:
+        one, other = (each.step(frame.left, frame.right, frame.timestamp) for each in (sure, unsure))
+        assert (one.status, other.status) in [("starting", "starting"), ("tracking", "doubtful")]
+    assert list(other.doubts) == [Doubt.INPUT]
+    assert np.trace(other.covariance[:3, :3]) > 2.0 * np.trace(one.covariance[:3, :3])
