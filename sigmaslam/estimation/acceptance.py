@@ -62,7 +62,7 @@ class Acceptance:
     same_motion: float = 2.0
     scaled_agreement: float = 0.95
     max_noise_scale: float = 9.0
-    second_motion: float = 0.1
+    second_motion: float = 0.2
     time_error: float = 0.5
     time_share: float = 0.8
     bump: float = 1.0
