@@ -27,7 +27,7 @@ RENDERS = "build/results"
 PEERS = {
     "filters": ("filterpy", "stonesoup", "dynamax", "pypose", "torch_kf"),
     "runtime": ("dim_odom", "pyorbslam3"),
-    "sequences": ("dim_odom",),
+    "sequences": ("dim_odom", "pyorbslam3"),
 }
 
 
@@ -78,8 +78,16 @@ def absent(words: list[str]) -> str:
     for option, graph in itertools.pairwise(words):
         if option == "--peer" and not Path(graph).is_file():
             return f"{graph} is missing: make it by python -m sigmaslam_benchmarks.matching.peer_exports"
-    modules = [module for module in PEERS.get(name, ()) if find_spec(module) is None]
-    return f"{', '.join(modules)} not installed: pip install 'sigmaslam[peers]'" if modules else ""
+    peers = PEERS.get(name, ())
+    modules = [module for module in peers if find_spec(module) is None]
+    if modules:
+        return f"{', '.join(modules)} not installed: pip install 'sigmaslam[peers]'"
+    if "pyorbslam3" in peers and not Path(os.environ.get("PYORBSLAM3_VOCAB") or "/nowhere").is_file():
+        return (
+            "PYORBSLAM3_VOCAB names no vocabulary of ORB-SLAM3: make one by "
+            "python -m sigmaslam_benchmarks.tracking.orb_vocabulary"
+        )
+    return ""
 
 
 def runnable(words: list[str]) -> list[str]:

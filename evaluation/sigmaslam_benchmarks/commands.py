@@ -88,12 +88,16 @@ _TRAIN = ("train",)
 BENCHMARKS = {
     "sequences": Benchmark(
         "tracking.sequences",
-        "The tracker and its peers on every sequence. Its EKF, PnP from OpenCV, cuVSLAM, bundle adjustment (half an "
-        "hour). The extra 'train' renders three of them, 'graph' adjusts, 'peers' brings cuVSLAM.",
+        "The tracker and its peers on every sequence. Its EKF, PnP from OpenCV, cuVSLAM, ORB-SLAM3, bundle adjustment "
+        "(an hour). The extra 'train' renders three of them, 'graph' adjusts, 'peers' brings cuVSLAM and ORB-SLAM3.",
         (
             _DATA_IF_ANY,
-            _repeated("methods", "--method", str, "ours, ekf, sift, orb, klt, sift-pnp, klt-pnp, cuvslam, bundle"),
-            _repeated("sequences", "--sequence", str, "demo, street, room, organ, or a folder of the data"),
+            _repeated(
+                "methods", "--method", str, "ours, ekf, sift, orb, klt, sift-pnp, klt-pnp, cuvslam, orbslam3, bundle"
+            ),
+            _repeated(
+                "sequences", "--sequence", str, "demo, street, street-calibrated, room, organ, or a folder of the data"
+            ),
             _RENDERS,
         ),
     ),

@@ -106,7 +106,8 @@ class Evaluation:
 def _errors_to_dict(errors: Evaluation | FinalErrors) -> dict[str, Any]:
     """ATE, RPE without its steps, and NEES with the number of its frames in their place."""
     rpe, nees = asdict(errors.rpe), asdict(errors.nees) if errors.nees else None
-    del rpe["translations"], rpe["rotations_deg"]
+    for each in ("translations", "rotations_deg", "forward", "lengths"):
+        del rpe[each]
     if nees:
         per_frame = nees.pop("per_frame")
         nees |= {"count": len(per_frame), "inside": coverage(per_frame, 6)}

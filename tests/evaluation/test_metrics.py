@@ -1,3 +1,4 @@
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
@@ -83,6 +84,23 @@ def test_rpe_equals_evo(truth, delta):
         np.testing.assert_allclose(steps, rpe.error, rtol=1e-7)
         assert rmse == pytest.approx(expected["rmse"], rel=1e-9)
         assert median == pytest.approx(expected["median"], rel=1e-9)
+
+
+def test_the_forward_error_is_the_part_along_the_true_step():
+    generator = np.random.default_rng(3)
+    steps = se3_exp(generator.normal(0.0, 0.3, (50, 6)))
+    steps[7, :3, 3] = 0.0  # a turn on the spot has no direction
+    along, across = generator.normal(0.0, 0.1, (2, 50))
+    direction = steps[:, :3, 3] / np.maximum(np.linalg.norm(steps[:, :3, 3], axis=1, keepdims=True), 1e-300)
+    side = np.cross(direction, generator.normal(0.0, 1.0, (50, 3)))
+    wrong = steps.copy()
+    wrong[:, :3, 3] += along[:, None] * direction + across[:, None] * side
+    poses = [np.stack(list(accumulate([np.eye(4), *each], np.matmul))) for each in (steps, wrong)]
+    truth, estimate = (Trajectory(np.arange(51.0), each) for each in poses)
+    found = relative_pose_error(estimate, truth)
+    along[7] = 0.0
+    np.testing.assert_allclose(found.forward, along, atol=1e-12)
+    np.testing.assert_allclose(found.lengths, np.linalg.norm(steps[:, :3, 3], axis=1), atol=1e-12)
 
 
 def test_missing_frames_and_jittered_times_equal_evo(truth):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from release import remake_pages
 from release.remake_pages import PEERS, ROOT, absent, command_of, remake, runnable
 from sigmaslam_benchmarks.commands import BENCHMARKS, reads_data
 from sigmaslam_benchmarks.filters import peer_filters
@@ -52,6 +53,17 @@ def test_what_lacks_data_or_peers_is_skipped_by_name(
     assert len(lines) == 3
     assert lines[0].endswith("results.md: skipped, SIGMASLAM_DATA names no folder of the real data sets")
     assert "filters.md: skipped, a_peer_that_is_not_there not installed" in lines[1]
+
+
+def test_a_page_beside_orb_slam3_lacks_its_vocabulary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("SIGMASLAM_DATA", str(tmp_path))
+    monkeypatch.setattr(remake_pages, "find_spec", lambda module: module)
+    monkeypatch.delenv("PYORBSLAM3_VOCAB", raising=False)
+    assert absent(["sigmaslam", "benchmark", "sequences"]).startswith("PYORBSLAM3_VOCAB names no vocabulary")
+    vocabulary = tmp_path / "vocabulary.txt"
+    vocabulary.touch()
+    monkeypatch.setenv("PYORBSLAM3_VOCAB", str(vocabulary))
+    assert absent(["sigmaslam", "benchmark", "sequences"]) == ""
 
 
 def test_with_data_nothing_lacks_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -28,7 +28,7 @@ from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.estimate import Estimate
 from sigmaslam_benchmarks.live.driver_faults import DrivenFrame
 from sigmaslam_benchmarks.live.judge import DrivenPose
-from sigmaslam_benchmarks.tracking.stereo_peers import open_peer
+from sigmaslam_benchmarks.tracking.stereo_peers import RECTIFIED, open_peer
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +145,9 @@ def track_with_peer(frames: Sequence[DrivenFrame], camera: StereoCamera, out: Pa
         for frame in frames:
             found = peer.step(frame.left, frame.right, frame.timestamp)
             pose = np.full((4, 4), np.nan) if found.T_world_camera is None else found.T_world_camera
-            poses.append(DrivenPose(frame.moment, found.status, pose, found.covariance))
+            # cuVSLAM's does not grow along the path: it is not that of the pose relative to the start.
+            covariance = None if name in RECTIFIED else found.covariance
+            poses.append(DrivenPose(frame.moment, found.status, pose, covariance))
     return DrivenRun(poses, [])
 
 

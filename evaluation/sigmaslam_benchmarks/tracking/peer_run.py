@@ -25,7 +25,8 @@ class PeerStep:
         T_world_camera: (4, 4) pose of the left camera as calibrated; None where there is none.
         status: as in frames.csv.
         matches, inliers: points, where they are known.
-        covariance: (6, 6) in the camera's own frame, translation first; None where the peer says none.
+        covariance: (6, 6) in the camera's own frame, translation (metres) before rotation (radians); None where
+            the peer says none.
     """
 
     T_world_camera: np.ndarray | None
@@ -51,16 +52,29 @@ class Peer(Protocol):
         """Ends what it has begun."""
 
 
-def write_peer_run(sequence: StereoSequence, out: Path, peer: Peer) -> None:
-    """Tracks a sequence into the new folder `out`: trajectory.tum and covariance.npy of the poses, and frames.csv."""
+def write_peer_run(sequence: StereoSequence, out: Path, peer: Peer, live: bool = False) -> None:
+    """Tracks a sequence into the new folder `out`: trajectory.tum of the frames with a pose, and frames.csv.
+
+    Where each of these poses has a covariance, covariance.npy has them.
+
+    Args:
+        sequence: opened by `open_sequence`.
+        out: run folder.
+        peer: tracks the pairs.
+        live: frames come no sooner than their time stamps say, as from a camera.
+    """
     make_folder(out)
     timestamps: list[float] = []
     poses: list[np.ndarray] = []
     covariances: list[np.ndarray] = []
+    ahead: float | None = None  # of the time stamps before the clock, seconds
     with (out / "frames.csv").open("w", newline="", encoding="utf-8") as table:
         rows = csv.DictWriter(table, ["status", *COLUMNS, "ms_step"])
         rows.writeheader()
         for frame in sequence.frames():
+            if live:
+                ahead = frame.timestamp - time.perf_counter() if ahead is None else ahead
+                time.sleep(max(0.0, frame.timestamp - ahead - time.perf_counter()))
             began = time.perf_counter()
             found = peer.step(frame.left, frame.right, frame.timestamp)
             status = "starting" if found.status == "tracking" and not poses else found.status
@@ -69,8 +83,8 @@ def write_peer_run(sequence: StereoSequence, out: Path, peer: Peer) -> None:
             if found.T_world_camera is not None:
                 timestamps.append(frame.timestamp)
                 poses.append(found.T_world_camera)
-            if found.covariance is not None:
-                covariances.append(found.covariance)
+                if found.covariance is not None:
+                    covariances.append(found.covariance)
     write_tum(out / "trajectory.tum", Trajectory(np.array(timestamps), np.stack(poses)))
-    if covariances:
+    if covariances and len(covariances) == len(poses):
         np.save(out / "covariance.npy", np.stack(covariances))

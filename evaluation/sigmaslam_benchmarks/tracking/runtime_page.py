@@ -14,7 +14,6 @@ from sigmaslam_benchmarks.tracking.time_method import METHODS, OURS, WARM_UP, Me
 
 SEQUENCE, SIZE, LANDMARKS = "sequence", "size", "landmarks"
 """Sections of the page."""
-_PEER_LABELS = {"cuvslam": "cuVSLAM", "orbslam3": "ORB-SLAM3"}
 _COLUMNS = (
     "method",
     "tracked",
@@ -44,8 +43,8 @@ methods take turns, {rounds}. Figures are medians over the rounds, with the lowe
 - *ours*: learned features; *ours with*: other features under the same filter. *KLT + PnP*, *SIFT + PnP*: from OpenCV
   alone (`sigmaslam_benchmarks.tracking.pnp_baselines`).
 - *cuVSLAM*: on the CPU, by the package dim-odom. *ORB-SLAM3*: by the package pyorbslam3, the threads of its
-  mapping included. Both are given rectified images: to rectify is in the time of the others, not in theirs. ORB-SLAM3
-  is under the GPL: a peer of the development, no part of SigmaSLAM.
+  mapping included, with the vocabulary that `PYORBSLAM3_VOCAB` names. Both are given rectified images: to rectify is
+  in the time of the others, not in theirs. ORB-SLAM3 is under the GPL: a peer of the development, no part of SigmaSLAM.
 """
 
 
@@ -75,7 +74,7 @@ class TimedRun:
 
 def runtime_label(method: str) -> str:
     """A method as the page calls it."""
-    return _PEER_LABELS.get(method) or method_label(method)
+    return method_label(method)
 
 
 def progress(run: TimedRun) -> str:

@@ -6,7 +6,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -17,6 +17,7 @@ from sigmaslam.bundle_adjustment.refine_run import refine_run
 from sigmaslam.bundle_adjustment.track_file import TRACKS_NAME
 from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.readers import StereoSequence, open_sequence
+from sigmaslam.readers.trajectory_files import read_covariances, read_trajectory
 from sigmaslam.runs.request import TrackerOptions
 from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam_benchmarks.rendered_camera import open_rendered
@@ -29,6 +30,7 @@ from sigmaslam_benchmarks.tracking.sequences_page import (
     method_label,
     total_cell,
 )
+from sigmaslam_benchmarks.tracking.step_nees import step_nees
 from sigmaslam_benchmarks.tracking.stereo_peers import MissingPeerError, track_with_peer
 from sigmaslam_benchmarks.trial import Method, Trial, TrialResult, read_trial, render, track_ours
 
@@ -41,7 +43,9 @@ REAL = (
 )
 """Folder, its truth, and the sigmas of this, as those who measured it give them: metres and degrees."""
 REAL_NAMES = tuple(name for name, _, _ in REAL)
-RENDERED = ("street", "room", "organ")
+CALIBRATED = "street-calibrated"
+"""The images of the street, with the calibration of the cameras that took them."""
+RENDERED = ("street", CALIBRATED, "room", "organ")
 """Presets, in the sizes and with the disparity offset of the benchmark consistency."""
 SEQUENCES = ("demo", *RENDERED, *REAL_NAMES)
 """In the order of the page; the demo needs no data, the next ones are rendered."""
@@ -55,7 +59,7 @@ _TRIED: dict[str, Method] = {
     "sift": partial(track_ours, tracker=TrackerOptions("sift")),
     "orb": partial(track_ours, tracker=TrackerOptions("orb")),
     "klt": partial(track_ours, tracker=TrackerOptions("klt")),
-    **{name: partial(track_with_peer, name=name) for name in ("sift-pnp", "klt-pnp", "cuvslam")},
+    **{name: partial(track_with_peer, name=name) for name in ("sift-pnp", "klt-pnp", "cuvslam", "orbslam3")},
 }
 METHODS = (*_TRIED, "bundle")
 """In the order of the page; the bundle adjustment takes the tracks of the first."""
@@ -63,12 +67,21 @@ METHODS = (*_TRIED, "bundle")
 
 @dataclass(frozen=True, slots=True)
 class _BenchmarkSequence:
-    """A sequence; `truth_sigmas` are None where the truth is exact."""
+    """A sequence.
+
+    Attributes:
+        name: as the page calls it.
+        source: what `open_sequence` opens.
+        truth: trajectory file.
+        truth_sigmas: of the true poses, metres and degrees; None where they are exact.
+        disparity_error: that its calibration makes and that is mended, pixels.
+    """
 
     name: str
     source: Path
     truth: Path
     truth_sigmas: tuple[float, float] | None = None
+    disparity_error: float = 0.0
 
     @property
     def exact(self) -> bool:
@@ -76,7 +89,12 @@ class _BenchmarkSequence:
 
     def open(self) -> StereoSequence:
         """The sequence; where the truth is exact, its calibration is."""
-        return open_rendered(self.source) if self.exact else open_sequence(self.source)
+        sequence = open_rendered(self.source) if self.exact else open_sequence(self.source)
+        if self.disparity_error:
+            # A disparity is u_left - u_right: where it is too large, the right camera's centre is further left.
+            right = sequence.camera.right
+            sequence.camera = replace(sequence.camera, right=replace(right, cx=right.cx - self.disparity_error))
+        return sequence
 
 
 def write_sequences(
@@ -127,13 +145,13 @@ def run_sequences(
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         demo = stack.enter_context(as_file(files("sigmaslam_synthetic") / "demo"))
         jobs = [_BenchmarkSequence("demo (rendered)", demo, demo / "poses.txt")] if "demo" in wanted else []
-        for preset in RENDERED:
-            if preset in wanted:
+        for name in RENDERED:
+            if name in wanted:
                 try:
-                    jobs.append(_render(preset, renders or scratch / "renders", note))
+                    jobs.append(_render(name, renders or scratch / "renders", note))
                 except ImportError as error:
                     reason = f"{error.name} is not installed: pip install 'sigmaslam[train]'"
-                    yield Omission(f"{preset} (rendered)", "", reason)
+                    yield Omission(f"{name} (rendered)", "", reason)
         if data is not None:
             jobs += [
                 _BenchmarkSequence(name, data / name, data / name / truth, sigmas)
@@ -154,17 +172,22 @@ def run_sequences(
                     note(f"{label}, ATE {ate_cell(result)} m, {total_cell(result)} ms")
 
 
-def _render(preset: str, folder: Path, note: Callable[[str], None]) -> _BenchmarkSequence:
+def _render(name: str, folder: Path, note: Callable[[str], None]) -> _BenchmarkSequence:
     """Renders a sequence; frames that are there are kept."""
     from sigmaslam_benchmarks.tracking.consistency import OFFSET, SCALES
     from sigmaslam_synthetic.render_sequence import default_workers
     from sigmaslam_synthetic.simulation import Recipe
 
+    preset = "street" if name == CALIBRATED else name
     (scale,) = (scale for scale in SCALES if scale.preset == preset)
     recipe = Recipe(preset, FRAMES, _SEED, disparity_offset=OFFSET, width=scale.width, height=scale.height)
     began = time.perf_counter()
     out = render(folder, recipe, default_workers())
     note(f"{preset} rendered in {time.perf_counter() - began:.0f} s")
+    if name == CALIBRATED:
+        return _BenchmarkSequence(
+            f"{preset} (the same images, their right calibration)", out, out / "poses.txt", disparity_error=OFFSET
+        )
     return _BenchmarkSequence(f"{preset} (rendered, disparities {OFFSET} px too large)", out, out / "poses.txt")
 
 
@@ -176,7 +199,11 @@ def _run(job: _BenchmarkSequence, method: str, runs: Path) -> SequenceResult | O
     except MissingPeerError as error:
         return Omission(job.name, method, str(error))
     nees = trial.evaluation.nees.mean if job.exact and trial.evaluation.nees else np.nan
-    return SequenceResult(job.name, method, trial, nees, truth_sigmas=job.truth_sigmas)
+    of_step = None
+    if method == "cuvslam" and job.exact:
+        covariances = read_covariances(runs / method / "covariance.npy", len(trial.trajectory))
+        of_step = step_nees(trial.trajectory, read_trajectory(job.truth), covariances)
+    return SequenceResult(job.name, method, trial, nees, truth_sigmas=job.truth_sigmas, step_nees=of_step)
 
 
 def _adjust(job: _BenchmarkSequence, runs: Path) -> SequenceResult | Omission:

@@ -22,6 +22,7 @@ _LABELS = {
     "sift-pnp": "SIFT + PnP",
     "klt-pnp": "KLT + PnP",
     "cuvslam": "cuVSLAM",
+    "orbslam3": "ORB-SLAM3",
     "bundle": "bundle adjustment",
 }
 _STAGES = ("features", "match", "filter", "map")
@@ -32,11 +33,12 @@ _COLUMNS = (
     "t_rel %",
     "r_rel deg/100 m",
     "step mm",
+    "forward noise mm",
     "step deg",
     "NIS",
     "NEES",
     "offset px",
-    "ms, median (p10 - p90)",
+    "ms, mean (p10 - p90)",
     "frames/s",
 )
 _STAGE_COLUMNS = ("method", "inliers", "features ms", "matching ms", "filter ms", "map ms")
@@ -52,20 +54,28 @@ _RELATIVE_COLUMNS = (
 )
 _WORDS = """\
 All methods in turn in one run, with {threads} threads in OpenCV and 2 in the network. Accuracy is the same in every run
-on one machine; times are wall milliseconds. No setting of any method differs between sequences.
+on one machine, but for ORB-SLAM3's; times are wall milliseconds, means over all frames, keyframes in them. No setting
+of any method differs between sequences.
 
 - *ours*: learned features, unscented updates, two linearisations: what `sigmaslam track` does. *Our EKF*: the same with
   Jacobians, linearised once. *Ours with*: other features under the same filter.
 - *SIFT + PnP*, *KLT + PnP*: from OpenCV alone (`sigmaslam_benchmarks.tracking.pnp_baselines`): points of a keyframe,
   found again by ratio test or Lucas-Kanade, RANSAC, least squares. Landmarks count as known, the noise as 1 px.
 - *cuVSLAM*: on the CPU, by the package dim-odom (extra `peers`), given rectified pairs; rectifying is in its
-  time. It gives no covariance here, and no pose where it is lost.
+  time. No pose where it is lost. Its covariance (`pose_covariance`) is of x, y, z in the world and of roll, pitch, yaw
+  about fixed axes, as its header documents, and is turned into the camera's frame here. It is of the fit of one frame
+  to its map and does not grow along the path. *NEES* takes it for that of the pose relative to the first, as of the
+  others; a line below the table takes it for that of the step from the frame before.
+- *ORB-SLAM3*: by the package pyorbslam3 (extra `peers`), given rectified pairs, which come no sooner than their time
+  stamps say: its mapping has threads of its own. Poses as it says them at each frame, without what loops change later.
+  Its vocabulary is the one that `PYORBSLAM3_VOCAB` names. It gives no covariance.
 - *bundle adjustment*: of the tracks of *ours* (`track --tracks`, then `refine`), all keyframes at once; frames in
   between move with them. Its time is that of the optimisation, on top of the tracking; its NEES that of the keyframes.
 - *tracked*: frames with a pose from the images, relocalised ones too; the first frame of a run is its origin.
 - *ATE*: root mean square position error after the best rigid alignment, metres.
 - *t_rel*, *r_rel*: KITTI segments, of 100 m where the path allows, else of 10 to 50 m.
-- *step*: median error from frame to frame over tracked frames.
+- *step*: median error from frame to frame over tracked frames. *Forward noise*: standard deviation over these frames of
+  the error along the true step; steps shorter than the truth's sigma have no direction and are left out.
 - *NIS*, *NEES*: per degree of freedom, 1 is right, more is overconfident. NEES is given where the truth is exact: on
   renders.
 - *Relative poses*: of frames a span apart, which overlap. The covariance of a pair is the estimate's and the truth's
@@ -85,6 +95,8 @@ class SequenceResult:
         nees: mean per degree of freedom; NaN where the truth is not exact.
         refined: what refine.json says; None but for the bundle adjustment.
         truth_sigmas: of the true poses, metres and degrees; None where they are exact.
+        step_nees: of each step, with the covariance that cuVSLAM gives of its end, per degree of freedom; None of
+            other methods, and where the truth is not exact.
     """
 
     sequence: str
@@ -93,6 +105,7 @@ class SequenceResult:
     nees: float
     refined: Mapping[str, Any] | None = None
     truth_sigmas: tuple[float, float] | None = None
+    step_nees: np.ndarray | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,8 +142,19 @@ def format_results(results: Sequence[SequenceResult | Omission], command: str, c
         if staged:
             lines += [*table(_STAGE_COLUMNS, map(_stage_row, staged)), ""]
         for result in of_sequence:
+            lines += _step_lines(result)
+        for result in of_sequence:
             lines += _relative_lines(result)
     return "\n".join(lines)
+
+
+def _step_lines(result: SequenceResult) -> list[str]:
+    """The other reading of cuVSLAM's covariance."""
+    if result.step_nees is None:
+        return []
+    mean, median = result.step_nees.mean(), np.median(result.step_nees)
+    label = _LABELS[result.method]
+    return [f"Covariance of *{label}* read as that of a step: NEES {mean:.2g} in the mean, {median:.2g} median.", ""]
 
 
 def _relative_lines(result: SequenceResult) -> list[str]:
@@ -167,8 +191,9 @@ def total_cell(result: SequenceResult) -> str:
     if result.trial.frames is None:
         seconds, share = _seconds_adjusting(result)
         return f"{share:.0f} (whole: {seconds:.1f} s)"
-    low, middle, high = np.percentile(_totals(result.trial.frames), [10, 50, 90])
-    return f"{middle:.0f} ({low:.0f} - {high:.0f})"
+    totals = _totals(result.trial.frames)
+    low, high = np.percentile(totals, [10, 90])
+    return f"{totals.mean():.0f} ({low:.0f} - {high:.0f})"
 
 
 def _row(result: SequenceResult) -> list[str]:
@@ -185,12 +210,14 @@ def _row(result: SequenceResult) -> list[str]:
             updated = frames.columns["dof"] > 0  # a relocalised frame is not
             nis = float(np.median(frames.columns["nis"][updated] / frames.columns["dof"][updated]))
         offset, sigma = (float(frames.columns[name][-1]) for name in ("disparity_offset", "disparity_offset_sigma"))
-        pace = float(np.median(_totals(frames)))
+        pace = float(_totals(frames).mean())
     else:
         assert refined is not None
         count = f"{refined['keyframes']} keyframes"
         offset, sigma = refined["disparity_offset"], refined["disparity_offset_sigma"]
         _, pace = _seconds_adjusting(result)
+    shortest = result.truth_sigmas[0] if result.truth_sigmas else 0.0
+    forward = evaluation.rpe.forward[ends_tracked & (evaluation.rpe.lengths > shortest)]
     return [
         _LABELS[result.method],
         count,
@@ -198,6 +225,7 @@ def _row(result: SequenceResult) -> list[str]:
         _number(evaluation.kitti.mean_translation_percent, ".2f"),
         _number(evaluation.kitti.mean_rotation_deg_per_100m, ".2f"),
         _number(1e3 * float(np.median(translations[ends_tracked])) if ends_tracked.any() else np.nan, ".2f"),
+        _number(1e3 * float(forward.std()) if len(forward) > 1 else np.nan, ".2f"),
         _number(float(np.median(rotations[ends_tracked])) if ends_tracked.any() else np.nan, ".3f"),
         _number(nis, ".2f"),
         _number(result.nees, ".2f"),

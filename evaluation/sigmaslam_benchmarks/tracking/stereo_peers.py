@@ -20,7 +20,7 @@ import numpy as np
 from sigmaslam.errors import SigmaSlamError
 from sigmaslam.geometry.camera import RectifiedStereo, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
-from sigmaslam.geometry.se3 import quaternion_to_matrix
+from sigmaslam.geometry.se3 import quaternion_to_matrix, turn_covariance
 from sigmaslam.readers import StereoSequence
 from sigmaslam_benchmarks.tracking.peer_run import Peer, PeerStep, write_peer_run
 
@@ -96,7 +96,7 @@ class CuvslamPeer:
             )
 
     def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> PeerStep:
-        """The pose of a rectified pair (H, W) uint8; without one it is lost."""
+        """The pose of a rectified pair (H, W) uint8, with the covariance that it gives; without one it is lost."""
         estimate = None
         for eye, image in (("left", left), ("right", right)):
             height, width = image.shape
@@ -109,7 +109,8 @@ class CuvslamPeer:
         pose = np.eye(4)
         pose[:3, :3] = quaternion_to_matrix(np.array(estimate.rotation_xyzw))
         pose[:3, 3] = estimate.translation
-        return PeerStep(pose, "tracking")
+        covariance = body_covariance(np.reshape(estimate.pose_covariance, (6, 6)), pose[:3, :3])
+        return PeerStep(pose, "tracking", covariance=covariance)
 
     def close(self) -> None:
         """It needs no end."""
@@ -140,8 +141,8 @@ class OrbSlamPeer:
             vocabulary = pyorbslam3.vocabulary_path(download=False)
         except FileNotFoundError as error:
             raise MissingPeerError(
-                "its vocabulary is not here: call `pyorbslam3.vocabulary_path()` once, which downloads it, or set "
-                "PYORBSLAM3_VOCAB to an ORBvoc.txt"
+                "its vocabulary is not here: call `pyorbslam3.vocabulary_path()` once, which loads it, or make one by "
+                "python -m sigmaslam_benchmarks.tracking.orb_vocabulary and set PYORBSLAM3_VOCAB to it"
             ) from error
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "settings.yaml"
@@ -180,20 +181,44 @@ def orb_settings(camera: RectifiedStereo, rate: float) -> str:
     )
 
 
+def body_covariance(covariance: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """A covariance as ROS and cuVSLAM give it, as one of an error in the body's own frame.
+
+    Args:
+        covariance: (6, 6) of x, y, z in the world (metres) and of roll, pitch, yaw about its fixed axes (radians), as
+            `PoseWithCovariance` of cuVSLAM's header cuvslam2.h documents its `covariance_xyz_rpy`.
+        rotation: (3, 3) R_world_body = Rz(yaw) Ry(pitch) Rx(roll).
+    Returns:
+        (6, 6), translation before rotation.
+    """
+    roll, pitch = np.arctan2(rotation[2, 1], rotation[2, 2]), -np.arcsin(rotation[2, 0])
+    to_body = np.zeros((6, 6))
+    to_body[:3, :3] = rotation.T
+    # Rates of the angles as a rate of turn about the body's axes.
+    to_body[3:, 3:] = [
+        [1.0, 0.0, -np.sin(pitch)],
+        [0.0, np.cos(roll), np.sin(roll) * np.cos(pitch)],
+        [0.0, -np.sin(roll), np.cos(roll) * np.cos(pitch)],
+    ]
+    return np.asarray(to_body @ covariance @ to_body.T)
+
+
 class _RectifyingPeer:
     """A peer that takes rectified pairs, given raw ones; poses are of the left camera as calibrated."""
 
     def __init__(self, rectifier: StereoRectifier, peer: Peer) -> None:
         self._rectifier, self._peer, self.version = rectifier, peer, peer.version
-        self._T_rectified_left = np.eye(4)
-        self._T_rectified_left[:3, :3] = rectifier.R_rectified_left
+        self._T_left_rectified = np.eye(4)
+        self._T_left_rectified[:3, :3] = rectifier.R_rectified_left.T
 
     def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> PeerStep:
         """As of the peer."""
         found = self._peer.step(*self._rectifier.rectify(left, right), timestamp)
         if found.T_world_camera is None:
             return found
-        return replace(found, T_world_camera=self._T_rectified_left.T @ found.T_world_camera @ self._T_rectified_left)
+        T = self._T_left_rectified
+        covariance = None if found.covariance is None else turn_covariance(T, found.covariance)
+        return replace(found, T_world_camera=T @ found.T_world_camera @ T.T, covariance=covariance)
 
     def close(self) -> None:
         """As of the peer."""
@@ -225,9 +250,15 @@ def open_peer(name: str, camera: StereoCamera | RectifiedStereo, timestamps: Seq
 
 
 def track_with_peer(sequence: StereoSequence, out: Path, name: str) -> None:
-    """Tracks a sequence with a peer of `PEERS` into the new folder `out`, see `write_peer_run`; `MissingPeerError`."""
+    """Tracks a sequence with a peer of `PEERS` into the new folder `out`, see `write_peer_run`.
+
+    ORB-SLAM3 is given frames as fast as their time stamps say: its mapping runs beside them, and would fall behind.
+
+    Raises:
+        MissingPeerError: it is not installed.
+    """
     with closing(open_peer(name, sequence.camera, sequence.timestamps)) as peer:
-        write_peer_run(sequence, out, peer)
+        write_peer_run(sequence, out, peer, live=name == "orbslam3")
 
 
 def _not_installed(module: str, error: ImportError) -> MissingPeerError:

@@ -59,6 +59,9 @@ class RelativeError:
         delta: frames in a step.
         translations: (M,) error of each step, metres.
         rotations_deg: (M,) error of each step, degrees.
+        forward: (M,) part of each translation's error along the true step, metres, positive where the estimate goes
+            too far; 0 where the true step has no length.
+        lengths: (M,) of the true steps, metres.
     """
 
     translation_rmse: float
@@ -68,6 +71,8 @@ class RelativeError:
     delta: int
     translations: np.ndarray
     rotations_deg: np.ndarray
+    forward: np.ndarray
+    lengths: np.ndarray
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,9 +241,13 @@ def relative_pose_error(estimate: Trajectory, truth: Trajectory, delta: int = 1)
             f"{delta + 1}: give a longer trajectory or a smaller delta"
         )
     first, last = np.arange(len(truth) - delta), np.arange(delta, len(truth))
-    errors = se3_inverse(_motions(truth.poses, first, last)) @ _motions(estimate.poses, first, last)
+    backward = se3_inverse(_motions(truth.poses, first, last))
+    errors = backward @ _motions(estimate.poses, first, last)
     translations = np.linalg.norm(errors[:, :3, 3], axis=1)
     rotations = _angles_deg(errors[:, :3, :3])
+    lengths = np.linalg.norm(backward[:, :3, 3], axis=1)
+    # The errors are in the frame at the step's end, from which its start lies backward.
+    forward = -(errors[:, :3, 3] * backward[:, :3, 3]).sum(axis=1) / np.where(lengths > 0.0, lengths, 1.0)
     return RelativeError(
         translation_rmse=_root_mean_square(translations),
         translation_median=float(np.median(translations)),
@@ -247,6 +256,8 @@ def relative_pose_error(estimate: Trajectory, truth: Trajectory, delta: int = 1)
         delta=delta,
         translations=translations,
         rotations_deg=rotations,
+        forward=forward,
+        lengths=lengths,
     )
 
 
