@@ -11,13 +11,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sigmaslam.errors import InputError
+from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import rotation_log, se3_exp
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import read_covariances, read_trajectory
 from sigmaslam_benchmarks.tracking.orb_vocabulary import BRANCHES, LEVELS, train_vocabulary
 from sigmaslam_benchmarks.tracking.peer_run import PeerStep, write_peer_run
 from sigmaslam_benchmarks.tracking.step_nees import step_nees
-from sigmaslam_benchmarks.tracking.stereo_peers import body_covariance
+from sigmaslam_benchmarks.tracking.stereo_peers import MissingPeerError, OrbSlamProcess, body_covariance
 
 
 def test_a_covariance_about_fixed_axes_is_that_of_turns_of_the_body():
@@ -94,3 +95,12 @@ def test_a_vocabulary_is_a_tree_whose_words_are_at_its_ends():
 def test_too_few_descriptors_make_no_vocabulary():
     with pytest.raises(InputError, match="1 images have 0 descriptors: give more"):
         train_vocabulary([np.zeros((100, 100), np.uint8)])
+
+
+@pytest.mark.long
+def test_orb_slam3_that_is_missing_says_so_from_its_own_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    # Neither a vocabulary in the cache nor a named one, where the package is installed.
+    monkeypatch.setenv("PYORBSLAM3_CACHE", str(tmp_path))
+    monkeypatch.delenv("PYORBSLAM3_VOCAB", raising=False)
+    with pytest.raises(MissingPeerError, match=r"is not installed|its vocabulary is not here"):
+        OrbSlamProcess(RectifiedStereo(400.0, 400.0, 320.0, 240.0, 0.1, 640, 480), 20.0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
@@ -196,7 +197,7 @@ def _run(job: _BenchmarkSequence, method: str, runs: Path) -> SequenceResult | O
         return _adjust(job, runs)
     try:
         trial = Trial(job.open(), job.truth, _TRIED[method], job.truth_sigmas).run(runs / method)
-    except MissingPeerError as error:
+    except (MissingPeerError, BrokenProcessPool) as error:
         return Omission(job.name, method, str(error))
     nees = trial.evaluation.nees.mean if job.exact and trial.evaluation.nees else np.nan
     of_step = None

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
 from dataclasses import replace
 from importlib.metadata import version
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -124,6 +126,8 @@ class CuvslamPeer:
 class OrbSlamPeer:
     """ORB-SLAM3, stereo, without a viewer; its mapping and loop closure run in threads of their own.
 
+    One alone in a process: a second one would go on with the camera of the first, which it keeps in static variables.
+
     Args:
         camera: of the rectified pairs.
         rate: frames per second.
@@ -159,6 +163,43 @@ class OrbSlamPeer:
     def close(self) -> None:
         """Ends its threads."""
         self._slam.shutdown()
+
+
+class OrbSlamProcess:
+    """ORB-SLAM3 in a process of its own; arguments and errors as of `OrbSlamPeer`."""
+
+    def __init__(self, camera: RectifiedStereo, rate: float) -> None:
+        self._process = ProcessPoolExecutor(1, get_context("spawn"))
+        self.version = self._process.submit(_start_orbslam, camera, rate).result()
+
+    def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> PeerStep:
+        """The pose of a rectified pair (H, W) uint8; without one it is lost.
+
+        Raises:
+            BrokenProcessPool: it crashed.
+        """
+        return self._process.submit(_step_orbslam, left, right, timestamp).result()
+
+    def close(self) -> None:
+        """Ends it."""
+        self._process.submit(_close_orbslam).result()
+        self._process.shutdown()
+
+
+_of_this_process: list[OrbSlamPeer] = []
+
+
+def _start_orbslam(camera: RectifiedStereo, rate: float) -> str:
+    _of_this_process.append(OrbSlamPeer(camera, rate))
+    return _of_this_process[0].version
+
+
+def _step_orbslam(left: np.ndarray, right: np.ndarray, timestamp: float) -> PeerStep:
+    return _of_this_process[0].step(left, right, timestamp)
+
+
+def _close_orbslam() -> None:
+    _of_this_process[0].close()
 
 
 def orb_settings(camera: RectifiedStereo, rate: float) -> str:
@@ -225,13 +266,19 @@ class _RectifyingPeer:
         self._peer.close()
 
 
-def open_peer(name: str, camera: StereoCamera | RectifiedStereo, timestamps: Sequence[float] | None) -> Peer:
+def open_peer(
+    name: str,
+    camera: StereoCamera | RectifiedStereo,
+    timestamps: Sequence[float] | None,
+    own_process: bool = True,
+) -> Peer:
     """A peer by its name.
 
     Args:
         name: of `PEERS`.
         camera: of the pairs; those in `RECTIFIED` also take rectified ones.
         timestamps: of the pairs, seconds; `orbslam3` asks for their rate.
+        own_process: `orbslam3` runs in a process of its own; without it, it must be the only one of this process.
     Raises:
         MissingPeerError: it is not installed.
     """
@@ -242,11 +289,12 @@ def open_peer(name: str, camera: StereoCamera | RectifiedStereo, timestamps: Seq
         return PnpOdometry(camera, PEERS[name])
     if isinstance(camera, StereoCamera):
         rectifier = StereoRectifier(camera)
-        return _RectifyingPeer(rectifier, open_peer(name, rectifier.rectified, timestamps))
+        return _RectifyingPeer(rectifier, open_peer(name, rectifier.rectified, timestamps, own_process))
     if name == "cuvslam":
         return CuvslamPeer(camera)
     assert timestamps is not None
-    return OrbSlamPeer(camera, 1.0 / float(np.median(np.diff(timestamps))))
+    orbslam = OrbSlamProcess if own_process else OrbSlamPeer
+    return orbslam(camera, 1.0 / float(np.median(np.diff(timestamps))))
 
 
 def track_with_peer(sequence: StereoSequence, out: Path, name: str) -> None:
@@ -256,6 +304,7 @@ def track_with_peer(sequence: StereoSequence, out: Path, name: str) -> None:
 
     Raises:
         MissingPeerError: it is not installed.
+        BrokenProcessPool: ORB-SLAM3 crashed.
     """
     with closing(open_peer(name, sequence.camera, sequence.timestamps)) as peer:
         write_peer_run(sequence, out, peer, live=name == "orbslam3")

@@ -204,7 +204,8 @@ class _Peer:
     def __init__(self, name: str, pairs: DecodedPairs) -> None:
         self.rectified = name in RECTIFIED
         camera = pairs.rectified if self.rectified else pairs.camera
-        self._peer = open_peer(name, camera, pairs.timestamps)
+        # It is the only one of this process, whose time and memory are measured.
+        self._peer = open_peer(name, camera, pairs.timestamps, own_process=False)
         self.version = self._peer.version
 
     def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> _Step:
