@@ -1,4 +1,4 @@
-"""Peers that take rectified pairs, given raw ones: poses are of the left camera as calibrated."""
+"""Peers that take rectified pairs, given raw ones: poses and covariances are of the left camera as calibrated."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LOST = 2
 
 
 class StandIn:
-    """Says known poses."""
+    """Says known poses and covariances."""
 
     version = "stand-in 1"
 
@@ -31,7 +31,7 @@ class StandIn:
 
     def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> PeerStep:
         self.count += 1
-        return PeerStep(None, "lost") if self.count == LOST else PeerStep(pose(self.count), "tracking")
+        return PeerStep(None, "lost") if self.count == LOST else known_step(self.count)
 
     def close(self) -> None:
         self.is_closed = True
@@ -39,6 +39,10 @@ class StandIn:
 
 def pose(number: int) -> np.ndarray:
     return se3_exp(number * np.array([0.1, -0.02, 0.3, 0.01, 0.03, -0.02]))
+
+
+def known_step(number: int) -> PeerStep:
+    return PeerStep(pose(number), "tracking", covariance=number * np.diag([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]))
 
 
 def test_poses_are_of_the_left_camera_as_calibrated(
@@ -64,5 +68,7 @@ def test_poses_are_of_the_left_camera_as_calibrated(
         "lost",
         *["tracking"] * (count - 3),
     ]
-    assert not (tmp_path / "run" / "covariance.npy").exists()
+    both = np.kron(np.eye(2), R.T)  # turns translation and rotation
+    turned_covariances = [both @ known_step(k).covariance @ both.T for k in range(count) if k != LOST]
+    np.testing.assert_allclose(np.load(tmp_path / "run" / "covariance.npy"), turned_covariances, rtol=0, atol=1e-12)
     assert peers[0].is_closed

@@ -15,10 +15,13 @@ from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import rotation_log, se3_exp
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import read_covariances, read_trajectory
+from sigmaslam_benchmarks.tracking import stereo_peers
 from sigmaslam_benchmarks.tracking.orb_vocabulary import BRANCHES, LEVELS, train_vocabulary
 from sigmaslam_benchmarks.tracking.peer_run import PeerStep, write_peer_run
 from sigmaslam_benchmarks.tracking.step_nees import step_nees
 from sigmaslam_benchmarks.tracking.stereo_peers import MissingPeerError, OrbSlamProcess, body_covariance
+
+CAMERA = RectifiedStereo(400.0, 400.0, 320.0, 240.0, 0.1, 640, 480)
 
 
 def test_a_covariance_about_fixed_axes_is_that_of_turns_of_the_body():
@@ -97,10 +100,20 @@ def test_too_few_descriptors_make_no_vocabulary():
         train_vocabulary([np.zeros((100, 100), np.uint8)])
 
 
+@pytest.mark.parametrize("own_process", [True, False])
+def test_orb_slam3_has_its_own_process_unless_it_is_the_only_one_of_this(
+    own_process: bool, monkeypatch: pytest.MonkeyPatch
+):
+    for name in ("OrbSlamPeer", "OrbSlamProcess"):
+        monkeypatch.setattr(stereo_peers, name, lambda camera, rate, name=name: (name, rate))
+    opened = stereo_peers.open_peer("orbslam3", CAMERA, [1.0, 1.05, 1.1, 2.0], own_process)
+    assert opened == ("OrbSlamProcess" if own_process else "OrbSlamPeer", pytest.approx(20.0))
+
+
 @pytest.mark.long
 def test_orb_slam3_that_is_missing_says_so_from_its_own_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     # Neither a vocabulary in the cache nor a named one, where the package is installed.
     monkeypatch.setenv("PYORBSLAM3_CACHE", str(tmp_path))
     monkeypatch.delenv("PYORBSLAM3_VOCAB", raising=False)
     with pytest.raises(MissingPeerError, match=r"is not installed|its vocabulary is not here"):
-        OrbSlamProcess(RectifiedStereo(400.0, 400.0, 320.0, 240.0, 0.1, 640, 480), 20.0)
+        OrbSlamProcess(CAMERA, 20.0)
