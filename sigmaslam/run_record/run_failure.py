@@ -18,7 +18,8 @@ def explain_failure(summary: dict[str, Any], in_map: bool, started: bool, findin
         findings: of a check of the input: where it found a fault, that is the reason.
     """
     frames, skipped = summary["frames"], summary["skipped"]
-    tracked = summary["tracked"]
+    # Of an ambiguous pose nobody knows whether it is right.
+    tracked = summary["tracked"] - summary["ambiguous"]
     if frames and 2 * tracked >= frames:
         return None
     if frames == skipped:

@@ -138,7 +138,7 @@ def _find_wrong_poses(run: Path, compare: bool) -> str | None:
     if (diagonals[1:] <= 0).any():
         return "poses after the first without a variance"
     summary = json.loads((run / "run.json").read_text()).get("summary")
-    if summary is not None and not summary["tracking"] + summary["relocalised"]:
+    if summary is not None and not summary["tracked"]:
         return f"{len(trajectory)} poses, though no frame was tracked"
     if not compare:
         return None

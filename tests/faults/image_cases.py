@@ -42,6 +42,7 @@ _GOES_ON = {
     "intrinsics of half the size",
     "focal length in mm",
     "distortion of rectified images",
+    "eyes exchanged in mid-run",
     "times in ms",
 }
 _FIRST = {

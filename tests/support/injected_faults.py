@@ -166,7 +166,7 @@ FAULTS = {
         "eyes", "do not mirror", of_images(lambda left, right: (left[:, ::-1], right[:, ::-1]))
     ),
     "eyes exchanged in mid-run": Fault(
-        "eyes", "in 1 of 2 frames", _from_a_third_on(of_images(lambda left, right: (right, left)))
+        "eyes", "exchanged in", _from_a_third_on(of_images(lambda left, right: (right, left)))
     ),
     "right eye at a third of its light": Fault(
         "light", "the right eye is", of_images(lambda left, right: (left, right // 3))
