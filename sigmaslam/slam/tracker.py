@@ -274,8 +274,6 @@ class StereoTracker:
         # Patches that are blurred are misplaced alike, along the blur and towards where they were expected: many of
         # them say no more than a few. So do those of a body that moves on its own.
         fit = fit.inflated(max(fit.nis_before_scaling, 1.0) * blur * fit.clustering)
-        if doubts.spread.any():
-            fit = fit.spread_by(doubts.spread)
         seen = matches.views.select(fit.inliers)
         self._admission.confirm(seen, self._window)
         self._window.count_sightings(matches.searched, seen.landmark)
