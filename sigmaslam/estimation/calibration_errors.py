@@ -34,6 +34,8 @@ ERRORS = (
 
 What is the right camera's alone depends on the place in the right image.
 """
+TURNS = ("yaw", "pitch", "roll")
+"""Of the right camera."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,7 +41,7 @@ class FrameFit:
         nis, dof: of the inliers.
         noise_scale: what the variances of all views are multiplied by in the posterior, 1 or more, as they scatter.
         clustering: by what errors that neighbours share make `relative` too small, 1 or more; not applied to it.
-        inflation: by what `relative` grew for errors that all views share.
+        inflation: by what `relative` was multiplied for errors that all views share.
     """
 
     pose: np.ndarray
@@ -73,14 +73,8 @@ class FrameFit:
         return self.noise_scale * self.nis_per_dof
 
     def spread_by(self, covariance: np.ndarray) -> FrameFit:
-        """The same pose, less certain by a covariance (6, 6) that matches do not know of; views by the mean of it."""
-        growth = 1.0 + float(np.trace(np.linalg.lstsq(self.relative, covariance, rcond=1e-14)[0])) / len(covariance)
-        return replace(
-            self,
-            relative=self.relative + covariance,
-            covariance=self.covariance + covariance,
-            inflation=growth * self.inflation,
-        )
+        """The same pose, less certain by a covariance (6, 6) that matches do not know of."""
+        return replace(self, relative=self.relative + covariance, covariance=self.covariance + covariance)
 
     def inflated(self, factor: float) -> FrameFit:
         """The same pose, known so much less well relative to the last keyframe."""

@@ -16,7 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sigmaslam.estimation.calibration_errors import ERRORS, CalibrationPrior, measured_errors
+from sigmaslam.estimation.calibration_errors import ERRORS, TURNS, CalibrationPrior, measured_errors
 from sigmaslam.estimation.chi_square import CHI_SQUARE_9999_OF_6
 from sigmaslam.estimation.estimator_graphs import EstimatorGraphs
 from sigmaslam.estimation.gaussian import matrix_root
@@ -32,8 +32,6 @@ _CREDIBLE = 4.0
 # Errors of right matches have longer tails than a Gaussian's: degrees of freedom of the Student-t that is fitted.
 # 4 and 1 are no better on rendered streets.
 _STUDENT_FREEDOM = 2.0
-# Errors of the right camera's rotation, in the order of the calibration.
-_TURNS = [ERRORS.index(name) for name in ("yaw", "pitch", "roll")]
 
 
 class KeyframeWindow:
@@ -237,8 +235,8 @@ def change_rig(window: KeyframeWindow, offset: float) -> None:
     window.calibration = window.first_calibration
     window.expected[0] = window.posterior.calibration[0] + offset
     window.refused = np.zeros(CALIBRATION_SIZE)
-    common = window.posterior.common.copy()
-    common[_TURNS, _TURNS] = np.hypot(common[_TURNS, _TURNS], offset)
+    common, turns = window.posterior.common.copy(), [ERRORS.index(name) for name in TURNS]
+    common[turns, turns] = np.hypot(common[turns, turns], offset)
     window.posterior = replace(window.posterior, calibration=window.expected.copy(), common=common)
     window.prior = window.posterior
 

@@ -16,6 +16,19 @@ def image_cells(places: np.ndarray, width: int, height: int) -> np.ndarray:
     return np.asarray(place[:, 0] + columns * place[:, 1])
 
 
+def explained_area(cells: np.ndarray, chosen: np.ndarray, weight: np.ndarray) -> float:
+    """Share of the image that some places stand for: of each cell with places the share of its own.
+
+    Args:
+        cells: (M,) of all places, as of `image_cells`.
+        chosen: (M,) bool.
+        weight: (M,) of each place.
+    """
+    agreeing, present = (np.bincount(cells, each, CELLS) for each in (weight * chosen, weight))
+    seen = present > 0.0
+    return float(np.mean(agreeing[seen] / present[seen])) if seen.any() else 0.0
+
+
 def pixels_in(region: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """Which pixels (N, 2) (u, v) are in a region (H, W) bool; (N,) bool."""
     height, width = region.shape

@@ -24,15 +24,13 @@ class Doubts:
 
     Attributes:
         reasons: each once, in the order in which they were found.
-        spread: (6, 6) by what they make the pose less certain, perturbed from the left in the world.
-        way: (6,) between the moments of the stamp and of the image, likewise; zero where they are the same.
+        spread: (6, 6) by what they make the pose that is published less certain, perturbed from the left in the world.
         prediction_is_wrong: it was made less certain, so that the same matches give another pose.
         is_ambiguous: another pose explains the image about as well.
     """
 
     reasons: list[Doubt] = field(default_factory=list)
     spread: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
-    way: np.ndarray = field(default_factory=lambda: np.zeros(6))
     prediction_is_wrong: bool = False
     is_ambiguous: bool = False
 

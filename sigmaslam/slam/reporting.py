@@ -58,8 +58,7 @@ class Reporter:
         by_error = np.zeros((6, CALIBRATION_SIZE))
         if fit is not None:
             # Published alone: a prediction as wide as that would find nothing.
-            spread = doubts.spread + np.outer(doubts.way, doubts.way)
-            fit = fit.spread_by(spread) if spread.any() else fit
+            fit = fit.spread_by(doubts.spread)
             pose, absolute, relative = fit.pose, fit.covariance, fit.relative
             calibration, spread = fit.calibration, fit.calibration_covariance
             on_calibration, by_error = fit.joint.common[CALIBRATION], fit.joint.common[-6:]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.frame_clock import FrameClock
 from sigmaslam.estimation.frame_fit import FrameFit
@@ -11,7 +10,7 @@ from sigmaslam.estimation.prediction_errors import surprise, time_error
 from sigmaslam.geometry.se3 import se3_adjoint, se3_inverse, se3_log
 from sigmaslam.slam.doubt import Doubt, Doubts
 from sigmaslam.slam.guided_matching import GuidedMatches
-from sigmaslam.slam.second_motion import SecondMotion, find_second_motion
+from sigmaslam.slam.second_motion import find_second_motion
 
 
 class Scrutiny:
@@ -37,7 +36,8 @@ class Scrutiny:
             doubts.add(Doubt.OFFSET)
         self._doubt_prediction(doubts, fit)
         second = find_second_motion(self._window, matches, fit)
-        if second is not None and _is_rival(second):
+        # A body before the scene that never stood still is no rival of it.
+        if second is not None and (second.stood_still or not second.stands_before):
             doubts.add(Doubt.MOTIONS, se3_log(second.pose @ se3_inverse(fit.pose)))
             doubts.is_ambiguous = True
         return doubts
@@ -48,16 +48,9 @@ class Scrutiny:
         error = time_error(self._motion, step, self._clock.interval)
         # What goes on is an acceleration: images out of order jump to and fro.
         if error * self._last_error < 0.0 or (error != 0.0 and self._last_error == 0.0):
-            doubts.add(Doubt.TIME)
+            doubts.add(Doubt.TIME, se3_adjoint(key) @ self._motion.doubt_time(error * self._clock.interval))
             doubts.prediction_is_wrong = True
-            doubts.way = se3_adjoint(key) @ self._motion.doubt_time(error * self._clock.interval)
         elif (excess := surprise(self._motion, step)) > 1.0:
             self._motion.widen(excess)
             doubts.prediction_is_wrong = True
         self._last_error = error
-
-
-def _is_rival(second: SecondMotion) -> bool:
-    """Whether it may be the scene's: it explains a good part, and is no body before it that never stood still."""
-    is_body = second.stands_before and not second.stood_still
-    return second.area >= ACCEPTANCE.second_motion and not is_body

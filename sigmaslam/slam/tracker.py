@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from sigmaslam.estimation.calibration_errors import CalibrationPrior
+from sigmaslam.estimation.calibration_errors import TURNS, CalibrationPrior
 from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.estimator_graphs import EstimatorGraphs
 from sigmaslam.estimation.frame_clock import FrameClock
@@ -111,7 +111,7 @@ class StereoTracker:
         graphs = EstimatorGraphs(rectified, backend, config.linearisation == "unscented")
         prior = CalibrationPrior.of(rectified, camera.sigmas, config.offset_sigma, config.estimate, camera.covariance)
         if disparity_error is not None:
-            prior = prior.widened(("offset", "yaw", "pitch", "roll"), disparity_error)
+            prior = prior.widened(("offset", *TURNS), disparity_error)
         self._window = window = KeyframeWindow(rectified, prior, graphs)
         self._noise = noise = MeasurementNoise(config)
         self._motion = motion = MotionFilter(backend)
@@ -189,7 +189,7 @@ class StereoTracker:
             status = doubts.status
             expected = self._motion.step, self._motion.step_covariance
             blur, of_matches = self._keyframes.blur(frame.left, matches.views.select(fit.inliers))
-            fit = self._correct(fit, of_matches, doubts, matches, timestamp)
+            fit = self._correct(fit, of_matches, matches, timestamp)
             filtered = self._motion.state
             tracks = self._mapper.insert_if_due(frame, timestamp, fit, blur, matches, expected, doubts.is_ambiguous)
         elif is_repeated:
@@ -267,10 +267,8 @@ class StereoTracker:
         keyframes = [keyframe.view for keyframe in self._keyframes.active]
         return *self._localiser.localise(view, keyframes, prediction, guided, clock), None
 
-    def _correct(
-        self, fit: FrameFit, blur: float, doubts: Doubts, matches: GuidedMatches, timestamp: float
-    ) -> FrameFit:
-        """Takes a pose over, less certain where the frame is blurred, or there are doubts."""
+    def _correct(self, fit: FrameFit, blur: float, matches: GuidedMatches, timestamp: float) -> FrameFit:
+        """Takes a pose over, less certain where the frame is blurred."""
         # Patches that are blurred are misplaced alike, along the blur and towards where they were expected: many of
         # them say no more than a few. So do those of a body that moves on its own.
         fit = fit.inflated(max(fit.nis_before_scaling, 1.0) * blur * fit.clustering)

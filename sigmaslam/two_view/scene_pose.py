@@ -8,7 +8,7 @@ import numpy as np
 
 from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.geometry.camera import RectifiedStereo
-from sigmaslam.geometry.image_cells import CELLS, image_cells
+from sigmaslam.geometry.image_cells import explained_area, image_cells
 from sigmaslam.geometry.se3 import se3_inverse, transform_points
 from sigmaslam.two_view.stereo_pose import MIN_POINTS, RelativePose, estimate_relative_pose
 
@@ -30,10 +30,7 @@ class _Motion:
     @classmethod
     def of(cls, pose: RelativePose, cells: np.ndarray, disparity: np.ndarray, probability: np.ndarray) -> _Motion:
         """Of matches (M,) in these cells, each with the disparity of its point and the probability that it is right."""
-        agreeing, present = (np.bincount(cells, weight, CELLS) for weight in (probability * pose.inliers, probability))
-        seen = present > 0.0
-        area = float(np.mean(agreeing[seen] / present[seen])) if seen.any() else 0.0
-        return cls(pose, area, float(np.median(disparity[pose.inliers])))
+        return cls(pose, explained_area(cells, pose.inliers, probability), float(np.median(disparity[pose.inliers])))
 
 
 def estimate_scene_pose(

@@ -18,7 +18,7 @@ from sigmaslam.errors import InputError, OutputError
 from sigmaslam.files import atomic_write_text, make_folder
 from sigmaslam_benchmarks.code_hash import hash_code
 from sigmaslam_benchmarks.live.driven_runs import METHODS, DrivenRun
-from sigmaslam_benchmarks.live.driver_faults import FAULTS, spoil
+from sigmaslam_benchmarks.live.driver_faults import FAULTS, NO_FAULT, spoil
 from sigmaslam_benchmarks.live.judge import Judgement, References, good_poses, judge
 from sigmaslam_benchmarks.live.live_page import LivePage, format_page
 from sigmaslam_benchmarks.live.recordings import GoodFrames, Recording, choose_recordings
@@ -26,7 +26,6 @@ from sigmaslam_benchmarks.tracking.page import check_names, write_page
 from sigmaslam_benchmarks.tracking.stereo_peers import MissingPeerError
 from sigmaslam_synthetic.parallel_jobs import list_failures, run_jobs
 
-_GOOD = "none"
 _JUDGING = ("driver_faults.py", "driven_runs.py", "judge.py", "recordings.py")  # the page may change without a new run
 
 
@@ -141,7 +140,7 @@ class LiveJob:
         if not FAULTS[case].fits(good.frames):
             return {"left_out": "longer than the recording"}
         try:
-            reference = None if self.recording.exact or case == _GOOD else self._reference(good, method)
+            reference = None if self.recording.exact or case == NO_FAULT else self._reference(good, method)
             run = self._run(good, method, case)
         except MissingPeerError as error:
             return {"left_out": str(error)}
@@ -155,7 +154,7 @@ class LiveJob:
         """The run with good frames, whose poses are kept beside the results."""
         path = self._path(method, "poses").with_suffix(f".{self.code[:16]}.npy")
         if not path.is_file():
-            np.save(path, good_poses(self._run(good, method, _GOOD).poses, len(good.frames)).poses)
+            np.save(path, good_poses(self._run(good, method, NO_FAULT).poses, len(good.frames)).poses)
         return References(np.load(path))
 
     def _write(self, method: str, case: str, result: dict[str, Any]) -> None:
