@@ -20,6 +20,7 @@ from sigmaslam.estimation.calibration_errors import ERRORS, TURNS, CalibrationPr
 from sigmaslam.estimation.chi_square import CHI_SQUARE_9999_OF_6
 from sigmaslam.estimation.estimator_graphs import EstimatorGraphs
 from sigmaslam.estimation.gaussian import matrix_root
+from sigmaslam.estimation.held_offset import HeldOffset
 from sigmaslam.estimation.landmark_table import KeyframeViews, LandmarkTable, LandmarkViews
 from sigmaslam.estimation.marginalised_poses import PastPoses, point_lever
 from sigmaslam.estimation.state_layout import CALIBRATION_SIZE, LANDMARK_SIZE, MODELLED, pose_slice
@@ -50,6 +51,7 @@ class KeyframeWindow:
         depth: of the scene that the last keyframe sees, metres.
         calibration, first_calibration: prior of the errors of the calibration, without and with refused ones.
         expected: (12,) errors of the calibration about which its prior holds: zero until the rig changes.
+        held_offset: what the disparity offset is taken to be in poses that are published.
         refused: (12,) what images made of errors that are not estimated any more; zero for the others.
     """
 
@@ -65,6 +67,7 @@ class KeyframeWindow:
         self.student_freedom = student_freedom
         self.calibration = self.first_calibration = calibration
         self.expected, self.refused = np.zeros(CALIBRATION_SIZE), np.zeros(CALIBRATION_SIZE)
+        self.held_offset = HeldOffset()
         self.prior = self.posterior = WindowState.initial(calibration)
         self.landmarks = LandmarkTable.empty(CALIBRATION_SIZE)
         self.depth = 1.0
@@ -167,6 +170,8 @@ class KeyframeWindow:
             self._observations = self._observations.select(agree)
         if _refuse_errors(self):
             self.solve(iterations)
+        else:
+            self.held_offset = self.held_offset.following(self.posterior, self.calibration, float(self.expected[0]))
 
     def add_loop_constraint(self, index: int, T_past_last: np.ndarray, covariance: np.ndarray) -> bool:
         """Closes a loop: the last keyframe sees what a past pose saw, and the past is corrected with the window.

@@ -158,7 +158,10 @@ class Mapper:
             step_covariance = turn_covariance(window.posterior.poses[-1], step_covariance)
         since = new.timestamp - keyframes.active[-1].timestamp if keyframes.active else 0.0
         walk = np.zeros(CALIBRATION_SIZE)
-        walk[0] = self.config.offset_walk**2 * since + (self.config.offset_sigma**2 if new.rig_changed else 0.0)
+        if window.held_offset.is_moving:
+            walk[0] = self.config.offset_walk**2 * since
+        if new.rig_changed:
+            walk[0] += self.config.offset_sigma**2
         disparity = max(float(np.nanmedian(new.view.disparity)), _MIN_DISPARITY)
         depth = self.camera.focal_baseline / disparity
         window.add_keyframe(new.pose, new.step, step_covariance, walk, depth, new.origin)

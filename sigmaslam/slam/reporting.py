@@ -55,18 +55,22 @@ class Reporter:
             state.covariance[CALIBRATION, CALIBRATION],
             state.common[CALIBRATION],
         )
-        by_error = np.zeros((6, CALIBRATION_SIZE))
+        by_error, held = np.zeros((6, CALIBRATION_SIZE)), self.window.held_offset
         if fit is not None:
             # Published alone: a prediction as wide as that would find nothing.
             fit = fit.spread_by(doubts.spread)
             pose, absolute, relative = fit.pose, fit.covariance, fit.relative
             calibration, spread = fit.calibration, fit.calibration_covariance
             on_calibration, by_error = fit.joint.common[CALIBRATION], fit.joint.common[-6:]
+            with_offset = fit.joint.covariance[-6:, 0]
         else:
             prediction = Prediction.of(self.window, self.motion)
             last = pose_slice(len(state) - 1)
             pose, relative = prediction.pose, prediction.covariance
             absolute, by_error = state.covariance[last, last] + relative, state.common[last]
+            with_offset = state.covariance[last, 0]
+        pose, shift = held.place(pose, calibration[0], spread[0, 0], with_offset)
+        absolute, calibration, spread = absolute + shift, *held.describe(calibration, spread)
         # The filter knows the rectified camera; users know the left camera of their calibration.
         T_left_rectified = se3_inverse(self.T_rectified_left)
         adjoint = se3_adjoint(T_left_rectified) @ se3_adjoint(se3_inverse(pose))

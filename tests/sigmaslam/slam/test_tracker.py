@@ -57,6 +57,16 @@ def test_the_covariance_is_positive_definite_and_grows_along_the_way(demo_estima
 
 
 @pytest.mark.long
+def test_poses_between_two_keyframes_stand_on_one_offset(demo_estimates: Tracked):
+    estimates = demo_estimates("learned")
+    second = [k for k, each in enumerate(estimates) if each.tracks is not None][1]
+    held = [each.calibration.disparity_offset for each in estimates[second:]]
+    between = [k for k, each in enumerate(estimates[second:]) if k and each.tracks is None]
+    assert len(between) > len(held) // 2
+    assert all(held[k] == held[k - 1] for k in between)
+
+
+@pytest.mark.long
 def test_onnx_and_torch_give_the_same_poses(demo: Demo):
     pytest.importorskip("torch")
     camera, frames, _ = demo
