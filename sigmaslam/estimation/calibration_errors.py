@@ -59,12 +59,6 @@ class CalibrationPrior:
         """(12,) standard deviations."""
         return np.sqrt(np.diag(self.covariance))
 
-    def considering(self, index: int) -> CalibrationPrior:
-        """The same with one error more that is considered."""
-        estimated = self.estimated.copy()
-        estimated[index] = False
-        return replace(self, estimated=estimated)
-
     def widened(self, names: tuple[str, ...], sigma: float) -> CalibrationPrior:
         """The same with independent errors more, of that standard deviation, by their names."""
         return replace(self, covariance=self.covariance + np.diag(np.isin(ERRORS, names) * sigma**2))

@@ -35,7 +35,7 @@ class FrameFit:
         relative: (6, 6) covariance of the pose relative to the last keyframe, perturbed from the left in the world, as
             far as it comes from matches and motion.
         covariance: (6, 6) of the pose, likewise.
-        calibration, calibration_covariance: (12,), (12, 12) as this frame adds to it.
+        calibration: (12,) its errors as this frame has them.
         joint: of the window and the frame, without `inflation`.
         inliers: (M,) bool, the views that agree.
         nis, dof: of the inliers.
@@ -48,7 +48,6 @@ class FrameFit:
     relative: np.ndarray
     covariance: np.ndarray
     calibration: np.ndarray
-    calibration_covariance: np.ndarray
     joint: FramePosterior
     inliers: np.ndarray
     nis: float

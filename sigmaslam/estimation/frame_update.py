@@ -124,7 +124,6 @@ class FrameUpdate:
             spread[frame, frame] + spread[last, last] - cross - cross.T,
             spread[frame, frame],
             posterior.calibration + offset[CALIBRATION],
-            spread[CALIBRATION, CALIBRATION],
             FramePosterior(offset, spread, common, information, score),
             inliers,
             float(prior_cost + squared[inliers].sum()),

@@ -28,8 +28,10 @@ from sigmaslam.estimation.window_equations import eliminate_landmarks, gate_view
 from sigmaslam.estimation.window_state import WindowState, loop_difference
 from sigmaslam.geometry.camera import RectifiedStereo
 
-# An error of the calibration beyond so many standard deviations of its prior is not believed.
+# An error of the calibration beyond so many standard deviations of its prior is none that calibrations usually have.
 _CREDIBLE = 4.0
+# Boards are held within arm's reach: there depths are right, whatever else a calibration has wrong, metres.
+_REACH = 0.5
 # Errors of right matches have longer tails than a Gaussian's: degrees of freedom of the Student-t that is fitted.
 # 4 and 1 are no better on rendered streets.
 _STUDENT_FREEDOM = 2.0
@@ -49,10 +51,11 @@ class KeyframeWindow:
         posterior: what is known with them.
         landmarks: estimated with the posterior.
         depth: of the scene that the last keyframe sees, metres.
-        calibration, first_calibration: prior of the errors of the calibration, without and with refused ones.
+        calibration: prior of its errors.
         expected: (12,) errors of the calibration about which its prior holds: zero until the rig changes.
         held_offset: what the disparity offset is taken to be in poses that are published.
-        refused: (12,) what images made of errors that are not estimated any more; zero for the others.
+        board_disparity: pixels where a calibration that is off by more than most is right; None until one is.
+        exceeded: (12,) bool, estimated errors beyond four standard deviations of their prior.
     """
 
     def __init__(
@@ -65,9 +68,10 @@ class KeyframeWindow:
         self.camera = camera
         self.graphs = graphs
         self.student_freedom = student_freedom
-        self.calibration = self.first_calibration = calibration
-        self.expected, self.refused = np.zeros(CALIBRATION_SIZE), np.zeros(CALIBRATION_SIZE)
+        self.calibration = calibration
+        self.expected, self.exceeded = np.zeros(CALIBRATION_SIZE), np.zeros(CALIBRATION_SIZE, bool)
         self.held_offset = HeldOffset()
+        self.board_disparity: float | None = None
         self.prior = self.posterior = WindowState.initial(calibration)
         self.landmarks = LandmarkTable.empty(CALIBRATION_SIZE)
         self.depth = 1.0
@@ -168,10 +172,7 @@ class KeyframeWindow:
         agree = gate_views(self, self._observations)
         if not agree.all():
             self._observations = self._observations.select(agree)
-        if _refuse_errors(self):
-            self.solve(iterations)
-        else:
-            self.held_offset = self.held_offset.following(self.posterior, self.calibration, float(self.expected[0]))
+        _judge_calibration(self)
 
     def add_loop_constraint(self, index: int, T_past_last: np.ndarray, covariance: np.ndarray) -> bool:
         """Closes a loop: the last keyframe sees what a past pose saw, and the past is corrected with the window.
@@ -234,32 +235,34 @@ class KeyframeWindow:
 def change_rig(window: KeyframeWindow, offset: float) -> None:
     """The right camera was bumped, and disparities are larger by an offset; no keyframe is in the window.
 
-    What was refused before is estimated anew. The bump may have turned the camera, too.
+    The bump may have turned the camera, too.
     """
     assert not len(window)
-    window.calibration = window.first_calibration
     window.expected[0] = window.posterior.calibration[0] + offset
-    window.refused = np.zeros(CALIBRATION_SIZE)
+    window.exceeded[:], window.board_disparity = False, None
     common, turns = window.posterior.common.copy(), [ERRORS.index(name) for name in TURNS]
     common[turns, turns] = np.hypot(common[turns, turns], offset)
     window.posterior = replace(window.posterior, calibration=window.expected.copy(), common=common)
     window.prior = window.posterior
 
 
-def _refuse_errors(window: KeyframeWindow) -> bool:
-    """Considers estimated errors that the images move beyond what a calibration can be off by; whether there were any.
+def _judge_calibration(window: KeyframeWindow) -> None:
+    """Which offset poses stand on, and whether an error is larger than calibrations usually have."""
+    prior, before = window.calibration, window.held_offset
+    window.held_offset = before.following(window.posterior)
+    departure = np.abs(window.posterior.calibration - window.expected)
+    window.exceeded |= prior.estimated & (prior.sigma > 0.0) & (departure > _CREDIBLE * prior.sigma)
+    held = window.held_offset.value
+    if window.exceeded[0] and held is not None and (window.board_disparity is None or window.held_offset != before):
+        _move_baseline(window, held - float(window.expected[0]))
 
-    They stand for something else then, of a lens or of the other eye, that this model does not have.
-    """
-    estimate, prior = window.posterior.calibration, window.calibration
-    departure = np.abs(estimate - window.expected)
-    beyond = prior.estimated & (prior.sigma > 0.0) & (departure > _CREDIBLE * prior.sigma)
-    indices = np.flatnonzero(beyond).tolist()
-    for index in indices:
-        window.refused[index] = estimate[index]
-        window.calibration = window.calibration.considering(index)
-        # Whatever they stand for, it is as large as they are.
-        window.prior, window.posterior = (
-            state.without_estimate(index, abs(estimate[index])) for state in (window.prior, window.posterior)
-        )
-    return bool(indices)
+
+def _move_baseline(window: KeyframeWindow, offset: float) -> None:
+    """Takes the baseline for one that made up for an offset when the rig was calibrated, as uncertain as that."""
+    if window.board_disparity is None:
+        seen = float(np.median(window.landmarks.estimate[:, 2]))
+        window.board_disparity = max(window.camera.focal_baseline / _REACH, seen)
+    change = ERRORS.index("baseline"), -offset / window.board_disparity, window.calibration
+    window.prior, _ = window.prior.with_error(*change)
+    window.posterior, step = window.posterior.with_error(*change)
+    window.landmarks.estimate += window.landmarks.dependence @ step

@@ -82,30 +82,24 @@ class WindowState:
         step, covariance, common = condition(learned)
         return replace(self.moved(step, covariance, common), past=past)
 
-    def without_estimate(self, index: int, sigma: float) -> WindowState:
-        """As if an estimated error of the calibration had been considered from the start: it is zero, give or take.
+    def with_error(self, index: int, value: float, prior: CalibrationPrior) -> tuple[WindowState, np.ndarray]:
+        """As if a considered error of the calibration had another mean, and a standard deviation as large as that.
 
         Args:
             index: in `calibration_errors.ERRORS`.
-            sigma: standard deviation of its prior.
+            value: its mean.
+            prior: of the errors, with the disparity offset estimated, whose column of `common` is free.
+        Returns:
+            The state, and its step (n,).
         """
-        past, variance = self.past, self.covariance[index, index]
-        by_error = self.covariance[index]
-        states, poses = by_error / variance, past.cross[:, index] / variance
-        step = -self.calibration[index]
-        common, past_common = (
-            of - np.outer(slope, self.common[index]) for of, slope in ((self.common, states), (past.common, poses))
-        )
-        common[:, index], past_common[:, index] = sigma * states, sigma * poses
-        past = past.moved(
-            step * poses,
-            past.covariance - np.outer(poses, past.cross[:, index]),
-            past.cross - np.outer(poses, by_error),
-            past_common,
-        )
-        covariance = self.covariance - np.outer(states, by_error)
-        covariance[index], covariance[:, index] = 0.0, 0.0
-        return replace(self.moved(step * states, covariance, common), past=past)
+        by_factor = np.linalg.pinv(prior.considered_factor)[:, index]
+        slope, past_slope = self.common @ by_factor, self.past.common @ by_factor
+        common, past_common = self.common.copy(), self.past.common.copy()
+        common[:, 0], past_common[:, 0] = value * slope, value * past_slope
+        change = value - self.calibration[index]
+        past = self.past.moved(change * past_slope, self.past.covariance, self.past.cross, past_common)
+        step = change * slope
+        return replace(self.moved(step, self.covariance, common), past=past), step
 
     def grow(
         self, pose: np.ndarray, step_covariance: np.ndarray, walk: np.ndarray, origin: int | None = None

@@ -109,8 +109,7 @@ class RunWriter:
         """
         self.calibration = estimate.calibration
         if estimate.has_pose:
-            refused = estimate.calibration.refused_offset
-            self._poses.add(estimate.timestamp, pose, covariance, matching, refused)
+            self._poses.add(estimate.timestamp, pose, covariance, matching)
             self._relative_poses.add(self._count, estimate.relative_poses)
             if estimate.tracks is not None and self._rectified is not None:
                 self._tracks.append((self._count, estimate.tracks))

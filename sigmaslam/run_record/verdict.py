@@ -59,7 +59,8 @@ def doubts_verdict(summary: dict[str, Any]) -> list[str]:
     """
     words = {
         Doubt.INPUT: "a check of the input found that the eyes do not fit",
-        Doubt.OFFSET: "the images asked for a disparity offset beyond what calibrations are off by",
+        Doubt.OFFSET: "disparities are off by more than calibrations are. Poses are corrected, and have the scale of a "
+        "calibration that is right within arm's reach, where boards are held: calibrate again",
         Doubt.TIME: "the image shows another moment than its stamp says: does the driver deliver frames out of order?",
         Doubt.MOTIONS: "two motions explain the image about as well: a torn image, or something large that moves",
     }
@@ -122,20 +123,15 @@ def calibration_verdict(
     if causes:
         return "The images do not fit the calibration: " + "; ".join(causes) + "."
     offset, sigma = calibration.disparity_offset, calibration.disparity_offset_sigma
-    if calibration.refused_offset:
-        return (
-            f"The images ask for a disparity offset of {calibration.refused_offset:+.1f} px, which is more than "
-            "calibrations are off by: nothing was corrected. A lens, the baseline or the right camera is wrong: "
-            "calibrate again."
-        )
     known = float(np.hypot(sigma, expected))
     figure = f"{offset:+.2f} ± {known:.2f} px"
-    if sigma > _MAX_SIGMA or frames < MIN_FRAMES or points < MIN_POINTS:
+    is_wrong = abs(offset) > max(3.0 * known, _MIN_OFFSET)
+    if frames < MIN_FRAMES or points < MIN_POINTS or (sigma > _MAX_SIGMA and not is_wrong):
         return (
             f"It is too early to say whether the rectification is right (disparity offset {figure} from {frames} "
             f"tracked frames and {points} map points): more frames, or things nearer and farther, would tell."
         )
-    if abs(offset) > max(3.0 * known, _MIN_OFFSET):
+    if is_wrong:
         return (
             f"The rectification is off by {figure} of disparity. The poses are corrected for it; depth measured with "
             "this calibration elsewhere is not: calibrate again."

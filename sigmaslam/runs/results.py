@@ -169,8 +169,7 @@ def _last_calibration(frames: FrameTable | None, records: PoseRecords) -> Calibr
     said = np.flatnonzero(np.isfinite(offset))
     if not len(said):
         return None
-    refused = float(records.refused_offset[-1]) if len(records) else 0.0
-    return CalibrationEstimate(float(offset[said[-1]]), float(sigma[said[-1]]), refused)
+    return CalibrationEstimate(float(offset[said[-1]]), float(sigma[said[-1]]))
 
 
 def _write_poses(files: _Files, records: PoseRecords, frames: FrameTable | None, has_matching: bool) -> None:

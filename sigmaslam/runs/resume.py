@@ -195,8 +195,7 @@ def _read_poses(folder: Path) -> tuple[PoseRecords, FramePairs]:
                 "both must come from the same run"
             )
         covariances.append(covariance)
-    # The refused offset is of interest in the last frame of a run alone.
-    records = PoseRecords(trajectory.timestamps, trajectory.poses, covariances[0], covariances[1], np.zeros(count))
+    records = PoseRecords(trajectory.timestamps, trajectory.poses, covariances[0], covariances[1])
     return records, read_frame_pairs(folder / RELATIVE_POSES_NAME, count)
 
 

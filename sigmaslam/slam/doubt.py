@@ -12,7 +12,7 @@ class Doubt(StrEnum):
     """Reasons why a pose may be wrong; the words stand in frames.csv."""
 
     INPUT = "eyes do not fit"
-    OFFSET = "offset refused"
+    OFFSET = "offset too large"
     RIG = "rig changed"
     TIME = "image of another time"
     MOTIONS = "two motions"
@@ -36,7 +36,8 @@ class Doubts:
 
     def add(self, reason: Doubt, error: np.ndarray | None = None) -> None:
         """One more; `error` (6,) is how far off the pose is if it is right, as `spread` is perturbed."""
-        self.reasons.append(reason)
+        if reason not in self.reasons:
+            self.reasons.append(reason)
         if error is not None:
             self.spread = self.spread + np.outer(error, error)
 

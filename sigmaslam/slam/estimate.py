@@ -19,15 +19,12 @@ class CalibrationEstimate:
     Attributes:
         disparity_offset: measured minus true disparity, pixels.
         disparity_offset_sigma: its standard deviation, pixels.
-        refused_offset: what the images made of it where no such calibration could be so far off, pixels; it is not
-            estimated any more then. Zero otherwise.
         errors: other errors that are estimated, by their names: value and standard deviation, in the units of
             `sigmaslam.estimation.calibration_errors.ERRORS`.
     """
 
     disparity_offset: float
     disparity_offset_sigma: float
-    refused_offset: float = 0.0
     errors: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 

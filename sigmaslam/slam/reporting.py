@@ -10,7 +10,7 @@ from sigmaslam.estimation.calibration_errors import ERRORS
 from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
-from sigmaslam.estimation.state_layout import CALIBRATION, CALIBRATION_SIZE, pose_slice
+from sigmaslam.estimation.state_layout import CALIBRATION, pose_slice
 from sigmaslam.geometry.se3 import se3_adjoint, se3_inverse, turn_covariance
 from sigmaslam.slam.doubt import Doubts
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
@@ -50,27 +50,21 @@ class Reporter:
         state = self.window.posterior
         if not len(state):
             return self._report_nothing(timestamp, status, milliseconds)
-        calibration, spread, on_calibration = (
-            state.calibration,
-            state.covariance[CALIBRATION, CALIBRATION],
-            state.common[CALIBRATION],
-        )
-        by_error, held = np.zeros((6, CALIBRATION_SIZE)), self.window.held_offset
         if fit is not None:
             # Published alone: a prediction as wide as that would find nothing.
             fit = fit.spread_by(doubts.spread)
             pose, absolute, relative = fit.pose, fit.covariance, fit.relative
-            calibration, spread = fit.calibration, fit.calibration_covariance
-            on_calibration, by_error = fit.joint.common[CALIBRATION], fit.joint.common[-6:]
-            with_offset = fit.joint.covariance[-6:, 0]
+            by_error, joint = fit.joint.common[-6:], fit.joint.covariance
+            offset, variance, with_offset = float(fit.calibration[0]), float(joint[0, 0]), joint[-6:, 0]
         else:
             prediction = Prediction.of(self.window, self.motion)
             last = pose_slice(len(state) - 1)
             pose, relative = prediction.pose, prediction.covariance
             absolute, by_error = state.covariance[last, last] + relative, state.common[last]
-            with_offset = state.covariance[last, 0]
-        pose, shift = held.place(pose, calibration[0], spread[0, 0], with_offset)
-        absolute, calibration, spread = absolute + shift, *held.describe(calibration, spread)
+            joint = state.covariance
+            offset, variance, with_offset = float(state.calibration[0]), float(joint[0, 0]), joint[last, 0]
+        pose, shift = self.window.held_offset.place(pose, offset, variance, with_offset)
+        absolute = absolute + shift
         # The filter knows the rectified camera; users know the left camera of their calibration.
         T_left_rectified = se3_inverse(self.T_rectified_left)
         adjoint = se3_adjoint(T_left_rectified) @ se3_adjoint(se3_inverse(pose))
@@ -90,7 +84,7 @@ class Reporter:
             inliers=fit.count if fit is not None else 0,
             nis=fit.nis if fit is not None else 0.0,
             dof=fit.dof if fit is not None else 0,
-            calibration=self._describe_calibration(calibration, spread + on_calibration @ on_calibration.T),
+            calibration=self._describe_calibration(),
             milliseconds=milliseconds,
             frame_covariance=0.5 * (frame_covariance + frame_covariance.T),
             tracks=tracks,
@@ -102,9 +96,6 @@ class Reporter:
 
     def _report_nothing(self, timestamp: float, status: str, milliseconds: dict[str, float]) -> Estimate:
         """A frame before the first keyframe, which has no pose."""
-        state = self.window.posterior
-        errors = state.common[CALIBRATION]
-        spread = state.covariance[CALIBRATION, CALIBRATION] + errors @ errors.T
         anywhere = np.diag(np.full(6, np.inf))
         return Estimate(
             timestamp=timestamp,
@@ -117,16 +108,17 @@ class Reporter:
             inliers=0,
             nis=0.0,
             dof=0,
-            calibration=self._describe_calibration(state.calibration, spread),
+            calibration=self._describe_calibration(),
             milliseconds=milliseconds,
         )
 
-    def _describe_calibration(self, errors: np.ndarray, covariance: np.ndarray) -> CalibrationEstimate:
-        """What is known of errors (12,) with covariance (12, 12)."""
-        sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    def _describe_calibration(self) -> CalibrationEstimate:
+        """As the last keyframe has it: what a frame adds to it is forgotten."""
+        errors = self.window.posterior.calibration
+        sigma = np.sqrt(np.maximum(np.diag(self.window.posterior.whole_covariance)[CALIBRATION], 0.0))
         chosen = [k for k in np.flatnonzero(self.window.calibration.estimated).tolist() if k]
         others = {ERRORS[k]: (float(errors[k]), float(sigma[k])) for k in chosen}
-        return CalibrationEstimate(float(errors[0]), float(sigma[0]), float(self.window.refused[0]), others)
+        return CalibrationEstimate(float(errors[0]), float(sigma[0]), others)
 
 
 def _within_half_turn(covariance: np.ndarray) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.frame_clock import FrameClock
 from sigmaslam.estimation.frame_fit import FrameFit
@@ -32,8 +34,8 @@ class Scrutiny:
         doubts = Doubts()
         if self._input_is_wrong:
             doubts.add(Doubt.INPUT)
-        if self._window.refused.any():
-            doubts.add(Doubt.OFFSET)
+        for index in np.flatnonzero(self._window.exceeded).tolist():
+            doubts.add(Doubt.OFFSET, _without_error(self._window, fit, index))
         self._doubt_prediction(doubts, fit)
         second = find_second_motion(self._window, matches, fit)
         # A body before the scene that never stood still is no rival of it.
@@ -54,3 +56,14 @@ class Scrutiny:
             self._motion.widen(excess)
             doubts.prediction_is_wrong = True
         self._last_error = error
+
+
+def _without_error(window: KeyframeWindow, fit: FrameFit, index: int) -> np.ndarray:
+    """(6,) spread of a pose that stands on an error of the calibration which may as well stand for something else.
+
+    A delay between the eyes, say, makes up an offset. With even odds that there is none the second moment about the
+    pose is half of the squared step between the two.
+    """
+    covariance = fit.joint.covariance
+    slope = covariance[-6:, index] / covariance[index, index]
+    return np.asarray(np.sqrt(0.5) * slope * (fit.calibration[index] - window.expected[index]))

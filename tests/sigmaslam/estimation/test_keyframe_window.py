@@ -193,7 +193,7 @@ def test_a_frame_equals_one_more_pose_in_dense_least_squares(scale: float, toler
         error = np.r_[found.calibration[:3] - dense.at[:3], se3_log(found.pose @ se3_inverse(dense.poses[-1]))]
         assert np.abs(error / sigma[np.r_[0:3, frame]]).max() < tolerance
         assert in_sigmas(found.covariance, covariance[frame, frame]) < tolerance
-        calibration_covariance = without_considered(found.calibration_covariance)
+        calibration_covariance = without_considered(found.joint.covariance[CALIBRATION, CALIBRATION])
         assert in_sigmas(calibration_covariance, covariance[calibration, calibration]) < tolerance
         np.testing.assert_allclose(found.calibration[CONSIDERED], 0.0, atol=1e-12)
         assert in_sigmas(found.relative, relative @ covariance @ relative.T) < tolerance
@@ -290,7 +290,9 @@ def test_errors_are_as_large_as_the_covariance_says(linearisation: str):
         ]
         state += error @ np.linalg.solve(without_considered(window.posterior.covariance), error)
         error = given.calibration - found.calibration[:3]
-        calibration += error @ np.linalg.solve(without_considered(found.calibration_covariance), error)
+        calibration += error @ np.linalg.solve(
+            without_considered(found.joint.covariance[CALIBRATION, CALIBRATION]), error
+        )
         nis, dof = nis + found.nis, dof + found.dof
     for total, freedom in ((frame, 6 * worlds), (state, 21 * worlds), (calibration, 3 * worlds), (nis, dof)):
         low, high = chi2.ppf([0.0005, 0.9995], freedom)

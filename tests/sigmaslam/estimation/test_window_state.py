@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sigmaslam.estimation.calibration_errors import ERRORS, CalibrationPrior
 from sigmaslam.estimation.marginalised_poses import PastPoses
 from sigmaslam.estimation.relative_covariance import relative_to_first
 from sigmaslam.estimation.state_layout import CALIBRATION, CALIBRATION_SIZE, pose_slice
@@ -216,17 +217,16 @@ def test_covariances_relative_to_a_pose_are_those_of_the_differences():
     assert np.linalg.eigvalsh(joint)[0] > -1e-18
 
 
-def test_an_error_that_is_not_estimated_after_all_is_zero_give_or_take_its_prior():
-    """The poses are those given that it is zero; how it then enters them is what they had learned with it."""
-    state, sigma = random_state(3), 0.02
-    state = replace(state, common=np.zeros_like(state.common))
-    state = replace(state, past=replace(state.past, common=np.zeros_like(state.past.common)))
-    before, after = joint_of(state), state.without_estimate(0, sigma)
-    gain = before[:, 0] / before[0, 0]
-    expected = before - np.outer(gain, before[0]) + sigma**2 * np.outer(gain, gain)
-    found = joint_of(after) + common_of(after) @ common_of(after).T
-    scale = np.sqrt(np.diag(expected))
-    assert np.abs((found - expected) / np.outer(scale, scale)).max() < 1e-9
-    assert after.calibration[0] == 0.0
-    moved = se3_log(poses_of(after) @ se3_inverse(poses_of(state))).ravel()
-    np.testing.assert_allclose(moved, -gain[CALIBRATION_SIZE:] * state.calibration[0], atol=1e-12)
+def test_another_baseline_moves_poses_as_a_considered_one_would():
+    """Of variance one, it enters them as a column of `common`; with a mean the poses go along."""
+    prior = CalibrationPrior.independent(np.r_[0.5, np.full(10, 0.2), 0.001], "offset")
+    state = random_state(3)
+    state = replace(state, common=np.c_[np.zeros(len(state.common)), state.common[:, 1:]])
+    after, step = state.with_error(ERRORS.index("baseline"), 0.05, prior)
+    expected = state.common[:, -1] / 0.001
+    np.testing.assert_allclose(step, expected * (0.05 - state.calibration[-1]), rtol=1e-9)
+    np.testing.assert_allclose(after.minus(state), step, atol=1e-9 * np.abs(step).max())
+    np.testing.assert_allclose(after.common[:, 0], 0.05 * expected, rtol=1e-9)
+    np.testing.assert_allclose(after.past.common[:, 0], 50.0 * state.past.common[:, -1], rtol=1e-9)
+    np.testing.assert_array_equal(after.common[:, 1:], state.common[:, 1:])
+    np.testing.assert_array_equal(after.covariance, state.covariance)

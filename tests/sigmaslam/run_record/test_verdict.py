@@ -3,7 +3,14 @@
 import pytest
 
 from sigmaslam.checks.finding import Finding
-from sigmaslam.run_record.verdict import calibration_verdict, contradiction_verdict, expected_offset, times_verdict
+from sigmaslam.run_record.verdict import (
+    calibration_verdict,
+    contradiction_verdict,
+    doubts_verdict,
+    expected_offset,
+    times_verdict,
+)
+from sigmaslam.slam.doubt import Doubt
 from sigmaslam.slam.tracker import CalibrationEstimate
 
 EXPECTED = 0.1
@@ -44,9 +51,12 @@ def test_a_calibration_without_errors_leaves_the_estimate_alone():
     assert "nothing wrong" in calibration_verdict(CalibrationEstimate(0.09, 0.01), 100, 1000, 0.0)
 
 
-def test_the_verdict_names_an_offset_that_was_refused():
-    refused = CalibrationEstimate(0.0, 0.5, 2.4)
-    assert "ask for a disparity offset of +2.4 px" in calibration_verdict(refused, 100, 1000, EXPECTED)
+def test_a_large_offset_is_named_however_uncertain_its_scale_makes_it():
+    assert "off by +3.40 ± 0.4" in verdict(3.4, 0.4)
+    assert (
+        "scale of a calibration that is right within arm's reach"
+        in doubts_verdict({"doubts": {Doubt.OFFSET: {"frames": 3, "first": 1.0}}})[0]
+    )
 
 
 @pytest.mark.parametrize(("frames", "points"), [(3, 1000), (100, 22)])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
+from sigmaslam.slam.doubt import Doubt
 from sigmaslam.slam.tracker import StereoTracker
 from tests.support.quantiles import chi_square_quantile
 from tests.support.simulated_frontend import SCALES, SimulatedFrontend, SimulatedRun, run_simulated
@@ -49,20 +50,18 @@ def test_errors_are_as_large_as_the_covariance_says_at_every_scale(kind: str):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("offset", "refused"), [(1.5, False), (3.0, True)])
-def test_an_offset_that_no_calibration_has_is_refused(offset: float, refused: bool):
-    """1.5 px are three sigma of its prior, 3 px six: then it is not estimated any more."""
+@pytest.mark.parametrize(("offset", "is_usual"), [(1.5, True), (3.0, False)])
+def test_an_offset_that_calibrations_do_not_have_is_corrected_and_doubted(offset: float, is_usual: bool):
+    """1.5 px are three sigma of its prior, 3 px six."""
     scale = SCALES["drone"]
     frontend = SimulatedFrontend(scale, 0, 20, 150, offset=offset)
-    calibration = run_simulated(StereoTracker(frontend.camera, frontend), frontend, scale).estimates[-1].calibration
-    if refused:
-        assert calibration.refused_offset > 2.0
-        # Whatever it stands for is as large as it was.
-        assert calibration.disparity_offset == 0.0
-        assert calibration.disparity_offset_sigma == pytest.approx(calibration.refused_offset)
-    else:
-        assert calibration.refused_offset == 0.0
-        assert abs(calibration.disparity_offset - offset) < 3 * calibration.disparity_offset_sigma
+    run = run_simulated(StereoTracker(frontend.camera, frontend), frontend, scale)
+    last = run.estimates[-1]
+    assert abs(last.calibration.disparity_offset - offset) < 3 * last.calibration.disparity_offset_sigma
+    assert (last.status == "tracking") == is_usual
+    assert (Doubt.OFFSET in last.doubts) != is_usual
+    # The covariance holds the scale of a calibration that had made up for the offset.
+    assert run.nees.mean() < NEES_95
 
 
 @pytest.mark.long
