@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from sigmaslam.errors import OutputError
-from sigmaslam_benchmarks.tracking.page import missing_sequences
+from sigmaslam_benchmarks.tracking.page import fill_page
 from sigmaslam_benchmarks.tracking.trial_pool import SequenceTrials, TrialKind, write_trials
 from sigmaslam_synthetic.simulation import Recipe
 from tests.support.klt_trials import METHODS, hash_nothing, hash_process, judge_klt
@@ -16,7 +16,7 @@ RECIPES = [Recipe("room", 4, seed, width=160, height=120) for seed in (7, 13, 8)
 
 def form(done: list[SequenceTrials], missing: list[str]) -> str:
     figures = [f"{trials.recipe.name}: {trials.read('KLT + PnP')}" for trials in done]
-    return "\n".join([*figures, *missing_sequences(missing), ""])
+    return "\n".join([*figures, fill_page("missing", "", missing=missing)])
 
 
 @pytest.mark.long

@@ -6,14 +6,12 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-import jinja2
 import numpy as np
 
-from sigmaslam.source_commit import describe_source
 from sigmaslam_benchmarks.live.driver_faults import FAULTS, NO_FAULT
 from sigmaslam_benchmarks.live.judge import Judgement
 from sigmaslam_benchmarks.live.recordings import Recording
-from sigmaslam_benchmarks.tracking.page import machine
+from sigmaslam_benchmarks.tracking.page import fill_page, number
 
 _COMMON = ("tracking", "doubtful", "ambiguous", "relocalised", "lost", "skipped")
 _UNTOLD = ("starting", *_COMMON)
@@ -56,20 +54,11 @@ class LivePage:
 
 def format_page(page: LivePage) -> str:
     """The page as Markdown."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("sigmaslam_benchmarks.live", "templates"),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-        autoescape=False,  # Markdown
-    )
     recordings = page.recordings
     rendered = [recording for recording in recordings if recording.exact]
-    return environment.get_template("live.md").render(
-        command=page.command,
-        source=describe_source(),
-        machine=machine(),
+    return fill_page(
+        "live",
+        page.command,
         frames=page.frames,
         seeds=sorted({recording.seed for recording in rendered}),
         recordings=[recording.name for recording in recordings],
@@ -161,7 +150,7 @@ def _one_of_each(recordings: Sequence[Recording]) -> list[Recording]:
 def max_of(values: Sequence[float]) -> str:
     """The largest number as a cell."""
     known = [value for value in values if np.isfinite(value)]
-    return f"{max(known):.3g}" if known else "-"
+    return number(max(known, default=np.nan), ".3g")
 
 
 def _bold(count: int) -> str:

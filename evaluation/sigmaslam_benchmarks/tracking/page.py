@@ -6,7 +6,10 @@ import os
 import platform
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
+
+import jinja2
+import numpy as np
 
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text
@@ -26,6 +29,27 @@ def write_page(path: Path, page: str) -> str:
     return page
 
 
+def fill_page(template: str, command: str, **values: Any) -> str:
+    """The page of a template, which also knows what it was made by, of which sources, and where.
+
+    Args:
+        template: name in `sigmaslam_benchmarks/templates`, without .md.
+        command: that makes the page.
+        values: all others that the template names.
+    """
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("sigmaslam_benchmarks", "templates"),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        autoescape=False,  # Markdown
+    )
+    environment.filters["row"] = lambda cells: row(*cells)
+    values |= {"command": command, "source": describe_source(), "machine": machine()}
+    return environment.get_template(f"{template}.md").render(values)
+
+
 def opening(title: str, command: str, text: str, place: str = "") -> list[str]:
     """The first lines of a page: its title, what it was made by, of which sources, and where.
 
@@ -36,11 +60,6 @@ def opening(title: str, command: str, text: str, place: str = "") -> list[str]:
         place: the machine, if it is described otherwise than by `machine`.
     """
     return [f"# {title}", "", f"Made by `{command}` {describe_source()} on {place or machine()}{text}"]
-
-
-def missing_sequences(names: Sequence[str]) -> list[str]:
-    """What a page says of sequences that failed, as a paragraph after others."""
-    return ["", f"**Missing, because they failed: {', '.join(names)}.**"] if names else []
 
 
 def machine() -> str:
@@ -62,6 +81,16 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 def row(*cells: str) -> str:
     """A line of a table."""
     return "| " + " | ".join(cells) + " |"
+
+
+def number(value: float, form: str) -> str:
+    """A cell; a dash where there is no number."""
+    return format(value, form) if np.isfinite(value) else "-"
+
+
+def number_with_error(value: float, error: float, form: str) -> str:
+    """A cell; the error is left out where it is NaN."""
+    return number(value, form) + ("" if np.isnan(error) else f" ± {format(error, form.replace('+', ''))}")
 
 
 def write_results_page(path: Path, results: Iterable[T], form: Callable[[list[T], bool], str]) -> str:

@@ -9,11 +9,10 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from sigmaslam_benchmarks.tracking.depth_accuracy import DepthFigures
-from sigmaslam_benchmarks.tracking.page import header, missing_sequences, opening, row
+from sigmaslam_benchmarks.tracking.page import fill_page
 
 MOST_RATIO, LEAST_COMPLETENESS, INSIDE = 0.6, 0.6, (0.90, 0.98)
 """Goals: error over the single view's, share of the pixels at rest, share inside the 95 % interval."""
-_COLUMNS = ("world", "sequences", "depth error", "single view", "ratio", "inside 95 %", "complete", "gross", "ghosts")
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,39 +36,18 @@ def format_page(
     sequences: Sequence[ReconstructedSequence], seeds: int, command: str, missing: Sequence[str] = ()
 ) -> str:
     """The page; `missing` are the names of sequences that failed."""
-    lines = [
-        *opening("Dense reconstruction", command, f". {len(sequences)} rendered sequences"),
-        f"with exact depth, {seeds} of each world, seeds from 1002 on (those below were looked at while it was made);",
-        "odd seeds have bodies that move on their own. Disparities exceed what the calibration says by 0.3 px.",
-        "",
-        "A depth error is the median of the absolute errors of the points' depths, as shares of the depth; that of the",
-        "single view is of semi-global matching at the same pixels, with the same disparity offset taken off. Inside:",
-        "the share of the points inside the 95 % interval of their inverse depth; complete the share of the pixels at",
-        "rest, seen by both eyes, that became points; gross the share of points off by more than a tenth of the depth;",
-        "ghosts the share of the pixels on moving bodies that became points. Rows of worlds and goals are medians of",
-        "sequences; errors of those that have points.",
-        *missing_sequences(missing),
-        "",
-        "## Goals",
-        "",
-        *header("goal", "found", "reached"),
-        *_goals(sequences),
-        "",
-        "## By world",
-        "",
-        *header(*_COLUMNS, numbers_from=1),
-        *(_world(world, sequences) for world in dict.fromkeys(each.world for each in sequences)),
-        "",
-        "## By sequence",
-        "",
-        *header("world", "seed", "movers", *_COLUMNS[2:], numbers_from=1),
-        *(row(each.world, str(each.seed), f"{each.movers:g}", *_cells(each.figures)) for each in sequences),
-        "",
-    ]
-    return "\n".join(lines)
+    return fill_page(
+        "reconstruction",
+        command,
+        seeds=seeds,
+        missing=missing,
+        goals=_goals(sequences),
+        worlds=[_world(world, sequences) for world in dict.fromkeys(each.world for each in sequences)],
+        sequences=[[each.world, str(each.seed), f"{each.movers:g}", *_cells(each.figures)] for each in sequences],
+    )
 
 
-def _goals(sequences: Sequence[ReconstructedSequence]) -> list[str]:
+def _goals(sequences: Sequence[ReconstructedSequence]) -> list[list[str]]:
     found = _medians(sequences)
     ratio, inside, complete = found.fused_error / found.single_error, found.inside, found.completeness
     low, high = INSIDE
@@ -78,12 +56,12 @@ def _goals(sequences: Sequence[ReconstructedSequence]) -> list[str]:
         (f"{low:.0%} to {high:.0%} inside 95 %", f"{inside:.1%}", low <= inside <= high),
         (f"{LEAST_COMPLETENESS:.0%} complete", f"{complete:.0%}", complete >= LEAST_COMPLETENESS),
     )
-    return [row(goal, found, "yes" if reached else "no") for goal, found, reached in goals]
+    return [[goal, found, "yes" if reached else "no"] for goal, found, reached in goals]
 
 
-def _world(world: str, sequences: Sequence[ReconstructedSequence]) -> str:
+def _world(world: str, sequences: Sequence[ReconstructedSequence]) -> list[str]:
     of_world = [each for each in sequences if each.world == world]
-    return row(world, str(len(of_world)), *_cells(_medians(of_world)))
+    return [world, str(len(of_world)), *_cells(_medians(of_world))]
 
 
 def _medians(sequences: Sequence[ReconstructedSequence]) -> DepthFigures:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sigmaslam_benchmarks.tracking.page import opening, table
+from sigmaslam_benchmarks.tracking.page import number, opening, table
 from sigmaslam_benchmarks.tracking.sequences_page import Omission, method_label
 from sigmaslam_benchmarks.tracking.stereo_peers import RECTIFIED
 from sigmaslam_benchmarks.tracking.time_method import METHODS, OURS, WARM_UP, MethodTiming
@@ -83,7 +83,7 @@ def progress(run: TimedRun) -> str:
     cpu, wall = np.mean(run.timing.cpu_ms), np.mean(run.timing.wall_ms)
     return (
         f"{run.sequence}, {run.variant}: {runtime_label(run.method)}, {threads}, {cpu:.1f} ms CPU, {wall:.1f} ms wall, "
-        f"{run.timing.peak_mib:.0f} MiB, ATE {_number(run.ate, '.4f')} m"
+        f"{run.timing.peak_mib:.0f} MiB, ATE {number(run.ate, '.4f')} m"
     )
 
 
@@ -135,10 +135,10 @@ def _row(method: str, runs: Sequence[TimedRun]) -> list[str]:
     return [
         runtime_label(method),
         f"{tracked} of {of_method[0].timing.frames}",
-        _number(float(np.median([run.ate for run in of_method])), ".4f"),
+        number(float(np.median([run.ate for run in of_method])), ".4f"),
         _spread(one, _mean_cpu, ".1f"),
         _middle(one, lambda run: float(np.percentile(run.timing.cpu_ms, 95)), ".1f"),
-        _number(float(np.median(ratios)) if ratios else np.nan, ".2f"),
+        number(float(np.median(ratios)) if ratios else np.nan, ".2f"),
         _spread(two, lambda run: float(np.mean(run.timing.wall_ms)), ".1f"),
         _middle(two, lambda run: float(np.percentile(run.timing.wall_ms, 95)), ".1f"),
         _middle(two, lambda run: 1e3 / float(np.mean(run.timing.wall_ms)), ".1f"),
@@ -211,7 +211,7 @@ def _mean_cpu(run: TimedRun) -> float:
 
 def _middle(runs: Sequence[TimedRun], measure: Callable[[TimedRun], float], form: str) -> str:
     """Median over the rounds."""
-    return _number(float(np.median([measure(run) for run in runs])) if runs else np.nan, form)
+    return number(float(np.median([measure(run) for run in runs])) if runs else np.nan, form)
 
 
 def _spread(runs: Sequence[TimedRun], measure: Callable[[TimedRun], float], form: str) -> str:
@@ -219,7 +219,3 @@ def _spread(runs: Sequence[TimedRun], measure: Callable[[TimedRun], float], form
     figures = [measure(run) for run in runs]
     middle = _middle(runs, measure, form)
     return middle if len(figures) < 2 else f"{middle} ({min(figures):{form}} - {max(figures):{form}})"
-
-
-def _number(value: float, form: str) -> str:
-    return "-" if not np.isfinite(value) else format(value, form)

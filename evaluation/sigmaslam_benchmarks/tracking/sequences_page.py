@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from sigmaslam.run_record.frame_table import TRACKED, FrameTable
-from sigmaslam_benchmarks.tracking.page import opening, table
+from sigmaslam_benchmarks.tracking.page import number, opening, table
 from sigmaslam_benchmarks.trial import TrialResult
 
 _LABELS = {
@@ -173,7 +173,7 @@ def _relative_lines(result: SequenceResult) -> list[str]:
             f"{100 * each.inside:.0f}",
             f"{each.translation_rmse:.2g}",
             f"{each.translation_sigma:.2g}",
-            _number(100 * each.truth_share, ".0f"),
+            number(100 * each.truth_share, ".0f"),
         ]
         for each in spans
     )
@@ -222,13 +222,13 @@ def _row(result: SequenceResult) -> list[str]:
         _LABELS[result.method],
         count,
         ate_cell(result),
-        _number(evaluation.kitti.mean_translation_percent, ".2f"),
-        _number(evaluation.kitti.mean_rotation_deg_per_100m, ".2f"),
-        _number(1e3 * float(np.median(translations[ends_tracked])) if ends_tracked.any() else np.nan, ".2f"),
-        _number(1e3 * float(forward.std()) if len(forward) > 1 else np.nan, ".2f"),
-        _number(float(np.median(rotations[ends_tracked])) if ends_tracked.any() else np.nan, ".3f"),
-        _number(nis, ".2f"),
-        _number(result.nees, ".2f"),
+        number(evaluation.kitti.mean_translation_percent, ".2f"),
+        number(evaluation.kitti.mean_rotation_deg_per_100m, ".2f"),
+        number(1e3 * float(np.median(translations[ends_tracked])) if ends_tracked.any() else np.nan, ".2f"),
+        number(1e3 * float(forward.std()) if len(forward) > 1 else np.nan, ".2f"),
+        number(float(np.median(rotations[ends_tracked])) if ends_tracked.any() else np.nan, ".3f"),
+        number(nis, ".2f"),
+        number(result.nees, ".2f"),
         f"{offset:+.2f} ± {sigma:.2f}" if np.isfinite(offset) else "-",
         total_cell(result),
         f"{1e3 / pace:.1f}",
@@ -239,7 +239,7 @@ def _stage_row(result: SequenceResult) -> list[str]:
     frames, tracked = result.trial.table, result.trial.tracked
     inliers = float(np.median(frames.columns["inliers"][tracked])) if tracked.any() else np.nan
     stages = (f"{np.nanmedian(frames.milliseconds[stage]):.1f}" for stage in _STAGES)
-    return [_LABELS[result.method], _number(inliers, ".0f"), *stages]
+    return [_LABELS[result.method], number(inliers, ".0f"), *stages]
 
 
 def _totals(frames: FrameTable) -> np.ndarray:
@@ -253,7 +253,3 @@ def _seconds_adjusting(result: SequenceResult) -> tuple[float, float]:
     assert result.refined is not None
     seconds = float(result.refined["seconds_adjust"])
     return seconds, 1e3 * seconds / result.refined["frames"]
-
-
-def _number(value: float, form: str) -> str:
-    return "-" if not np.isfinite(value) else format(value, form)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 
 from sigmaslam_benchmarks.tracking.image_motion import ImageMotion
-from sigmaslam_benchmarks.tracking.page import header, missing_sequences, opening, row
+from sigmaslam_benchmarks.tracking.page import fill_page, number_with_error
 from sigmaslam_evaluation.metrics.map_consistency import mean_with_error
 
 GROSS = 5.0
@@ -80,12 +80,6 @@ class ShakeResult:
 Results: TypeAlias = Mapping[str, Mapping[ShakenSequence, ShakeResult]]
 """By method and sequence."""
 
-_SUMMARY = ("sequences", "method", "tracking", "lost", "ATE, % of path: median", "quartiles", "worst", "wrong over a "
-            "frame", "over 1 s", "since the start", "NEES", "inside 95 %")  # fmt: skip
-_MOTION = ("sequence", "movers", "largest flow px", "largest change within 0.5 s px", "largest blur, left / right px")
-_SEQUENCE = ("sequence", "movers", "method", "tracking", "lost", "ATE mm", "% of path", "wrong: frame / 1 s / start",
-             "worst, sigmas", "largest step error", "NEES", "inside 95 %")  # fmt: skip
-
 
 def format_page(
     results: Results, frames: int, seeds: tuple[int, int], command: str, missing: Sequence[str] = ()
@@ -99,88 +93,66 @@ def format_page(
         command: that makes the page.
         missing: names of sequences that failed.
     """
-    ours = next(iter(results.values()))
-    sizes = sorted({f"{sequence.size[0]}x{sequence.size[1]}" for sequence in ours})
-    moving = sum(sequence.movers > 0 for sequence in ours)
+    method, ours = next(iter(results.items()))
     first, count = seeds
-    lines = [
-        *opening("Shaken by hand, blurred by the shutter", command, f". {len(ours)} rendered sequences"),
-        f"(seeds {first} to {first + count - 1}, used for nothing else), {frames} frames each at 20 Hz,",
-        f"{' and '.join(sizes)}, exact truth; {moving} of them with bodies that move on their own. Motion `shaken`,",
-        "sensor `slow` ([synthetic.md](../synthetic.md)): the turning reverses within half a second, again and again,",
-        "and half of it is blur.",
-        *missing_sequences(missing),
-        "",
-        "## Goals, for ours",
-        "",
-        *_goals(list(ours.values())),
-        "",
-        "## Summary",
-        "",
-        *header(*_SUMMARY, numbers_from=2),
-    ]
+    goals, missed = _goals(list(ours.values()))
     groups: dict[str, Callable[[ShakenSequence], bool]] = {
         "all": lambda sequence: True,
         "at rest but for the camera": lambda sequence: sequence.movers == 0,
         "with movers": lambda sequence: sequence.movers > 0,
     }
-    for label, member in groups.items():
-        for method, trials in results.items():
-            chosen = [result for sequence, result in trials.items() if member(sequence)]
-            if chosen:
-                lines.append(row(label, method, *_summary(chosen)))
-    lines += ["", "## How hard it is", "", "From the exact landmarks of what rests, median over the image.", ""]
-    lines += header(*_MOTION, numbers_from=1)
-    for sequence in ours:
-        motion = sequence.motion
-        blur = f"{motion.blur_left:.1f} / {motion.blur_right:.1f}"
-        lines.append(row(sequence.name, f"{sequence.movers:g}", f"{motion.flow:.1f}", f"{motion.reversal:.1f}", blur))
-    lines += ["", "## Sequences", "", *header(*_SEQUENCE, numbers_from=3)]
-    for sequence in ours:
-        for method, trials in results.items():
-            lines.append(row(sequence.name, f"{sequence.movers:g}", method, *_cells(trials[sequence])))
-    lines += ["", *_wrong_frames(results), *_NOTES]
-    return "\n".join([*lines, ""])
+    chosen = (
+        (label, method, [result for sequence, result in trials.items() if member(sequence)])
+        for label, member in groups.items()
+        for method, trials in results.items()
+    )
+    return fill_page(
+        "shake",
+        command,
+        first=first,
+        count=count,
+        frames=frames,
+        sizes=sorted({f"{sequence.size[0]}x{sequence.size[1]}" for sequence in ours}),
+        moving=sum(sequence.movers > 0 for sequence in ours),
+        missing=missing,
+        goals=goals,
+        missed=missed,
+        summary=[[label, method, *_summary(trials)] for label, method, trials in chosen if trials],
+        motions=[_motion_cells(sequence) for sequence in ours],
+        sequences=[
+            [sequence.name, f"{sequence.movers:g}", method, *_cells(trials[sequence])]
+            for sequence in ours
+            for method, trials in results.items()
+        ],
+        method=method,
+        wrong=[(sequence.name, r.wrong_step, r.wrong_second) for sequence, r in ours.items() if r.motion_wrong],
+    )
 
 
-_NOTES = [
-    "## How it is measured",
-    "",
-    "- *tracking*, *lost*: frames after the first that the method calls `tracking`, and all others.",
-    "- *ATE*: root mean square position error after the best rigid alignment, over all frames, lost ones too.",
-    "- *wrong*: frames called `tracking` whose error passes 5 sigmas of what is claimed, that is, whose squared",
-    "  Mahalanobis length with 6 degrees of freedom is as improbable as 5 sigmas of one Gaussian (1 in 1.7 million;",
-    "  a length of 6.4). *Over a frame* and *over 1 s*: of the motion from the frame before and from the one a second",
-    "  before, against the sum of the covariances of both poses (carried into one frame). A run folder does not hold",
-    "  the covariance between them; with what they share the motion is known better than the sum says, so a frame that",
-    "  is wrong here is wrong, and one that is not may still be. *Since the start*: of the pose relative to the first",
-    "  one, against its own covariance; after one wrong step all later frames may be wrong here.",
-    "- *worst*: the largest of the three errors, in the same order. *Largest step error*: of the motion from the frame",
-    "  before, of frames called `tracking`.",
-    "- *NEES*: of T_estimate^-1 T_truth relative to the first frame per degree of freedom, over all frames after the",
-    "  first; 1 is right, more is overconfident.",
-    "- *KLT + PnP*: OpenCV's corners and pyramidal Lucas-Kanade, PnP by RANSAC; landmarks count as known, the noise as",
-    "  1 px. It shows what the motion does to a common tracker, not what can be claimed by one.",
-]
-
-
-def _goals(ours: Sequence[ShakeResult]) -> Iterator[str]:
-    yield from header("", "goal", "found", numbers_from=1)
+def _goals(ours: Sequence[ShakeResult]) -> tuple[list[list[str]], list[str]]:
+    """Rows of the goals, and which are missed."""
     wrong = {"over a frame": "wrong_step", "over 1 s": "wrong_second", "since the start": "wrong_start"}
-    missed = []
+    rows, missed = [], []
     for label, name in wrong.items():
         count = sum(len(getattr(result, name)) for result in ours)
         of = sum(result.tracking for result in ours)
         if count:
             missed.append(f"frames wrong {label} ({count})")
-        yield row(f"frames called `tracking`, wrong {label}", "0", f"{count} of {of}" + ", **missed**" * (count > 0))
+        rows.append(
+            [f"frames called `tracking`, wrong {label}", "0", f"{count} of {of}" + ", **missed**" * (count > 0)]
+        )
     median = float(np.median([result.percent for result in ours]))
     holds = median <= MOST_ATE
     if not holds:
         missed.append(f"median ATE ({median:.2f} %)")
-    yield row("ATE, % of path, median", f"{MOST_ATE:g}", f"{median:.2f}" + ("" if holds else ", **missed**"))
-    yield ""
-    yield "Missed: " + "; ".join(missed) + "." if missed else "All goals are met."
+    rows.append(["ATE, % of path, median", f"{MOST_ATE:g}", f"{median:.2f}" + ("" if holds else ", **missed**")])
+    return rows, missed
+
+
+def _motion_cells(sequence: ShakenSequence) -> list[str]:
+    motion = sequence.motion
+    blur = f"{motion.blur_left:.1f} / {motion.blur_right:.1f}"
+    return [sequence.name, f"{sequence.movers:g}", f"{motion.flow:.1f}", f"{motion.reversal:.1f}", blur]
 
 
 def _summary(trials: Sequence[ShakeResult]) -> list[str]:
@@ -193,8 +165,8 @@ def _summary(trials: Sequence[ShakeResult]) -> list[str]:
         f"{low:.2f} - {high:.2f}",
         f"{percent.max():.2f}",
         *(str(sum(len(getattr(r, name)) for r in trials)) for name in ("wrong_step", "wrong_second", "wrong_start")),
-        _spread([result.nees for result in trials], ".2f"),
-        _spread([100 * result.inside for result in trials], ".0f"),
+        number_with_error(*mean_with_error([result.nees for result in trials]), ".2f"),
+        number_with_error(*mean_with_error([100 * result.inside for result in trials]), ".0f"),
     ]
 
 
@@ -212,25 +184,3 @@ def _cells(result: ShakeResult) -> list[str]:
         f"{result.nees:.2f}",
         f"{100 * result.inside:.0f}",
     ]
-
-
-def _wrong_frames(results: Results) -> Iterator[str]:
-    """Which frames' motion is wrong, of the first method."""
-    method, trials = next(iter(results.items()))
-    found = {sequence.name: result for sequence, result in trials.items() if result.motion_wrong}
-    if not found:
-        return
-    yield f"Frames of {method} that are wrong over a frame, and over 1 s:"
-    yield ""
-    for name, result in found.items():
-        yield f"- {name}: {_numbers(result.wrong_step)}; {_numbers(result.wrong_second)}"
-    yield ""
-
-
-def _numbers(frames: Sequence[int]) -> str:
-    return ", ".join(map(str, frames)) or "none"
-
-
-def _spread(values: Sequence[float], form: str) -> str:
-    value, error = mean_with_error(values)
-    return "-" if np.isnan(value) else format(value, form) + ("" if np.isnan(error) else f" ± {format(error, form)}")
