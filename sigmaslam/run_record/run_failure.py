@@ -9,7 +9,7 @@ from sigmaslam.checks.finding import Finding, explain
 
 
 def explain_failure(summary: dict[str, Any], in_map: bool, started: bool, findings: Sequence[Finding]) -> str | None:
-    """Why so little of a run, of which less than half of the frames were tracked; None for any other.
+    """Why so little of a run, of which less than half of the frames were tracked without two answers; else None.
 
     Args:
         summary: counts of frames by status, under the names of the statuses, and of all under `frames`.
@@ -19,15 +19,17 @@ def explain_failure(summary: dict[str, Any], in_map: bool, started: bool, findin
     """
     frames, skipped = summary["frames"], summary["skipped"]
     # Of an ambiguous pose nobody knows whether it is right.
-    tracked = summary["tracked"] - summary["ambiguous"]
-    if frames and 2 * tracked >= frames:
+    tracked, ambiguous = summary["tracked"], summary["ambiguous"]
+    if frames and 2 * (tracked - ambiguous) >= frames:
         return None
     if frames == skipped:
         return f"None of the {frames} frames could be read." if frames else "There was no frame."
     reasons = " ".join(explain(findings).splitlines())
     if tracked:
+        unsure = f"{ambiguous} are ambiguous, " if ambiguous else ""
         counts = (
-            f"Less than half of the frames were tracked: of {frames}, {summary['lost']} are lost, "
+            f"Less than half of the frames were tracked{' with one answer' if ambiguous else ''}: "
+            f"of {frames}, {unsure}{summary['lost']} are lost, "
             f"{summary['starting']} were before or at the start, {skipped} could not be read or show an image again."
         )
         return f"{counts} {reasons}".rstrip()

@@ -165,6 +165,8 @@ def summary_of(**counts: int) -> dict[str, int]:
         ({"starting": 1, "tracking": 1}, False, True, None),
         ({"starting": 4, "tracking": 3, "relocalised": 1}, False, True, None),
         ({"starting": 2, "tracking": 3, "lost": 2}, False, True, "of 7, 2 are lost, 2 were before"),
+        ({"starting": 1, "tracking": 2, "ambiguous": 4}, False, True, "with one answer: of 7, 4 are ambiguous"),
+        ({"starting": 1, "ambiguous": 6}, False, True, "of 7, 6 are ambiguous, 0 are lost"),
         ({"skipped": 3}, False, False, "None of the 3 frames could be read"),
         ({}, False, False, "There was no frame"),
         ({"starting": 1}, False, True, "single frame"),
