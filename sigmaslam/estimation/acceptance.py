@@ -36,6 +36,9 @@ class Acceptance:
         jump_support: share of the landmarks of earlier keyframes in view that must confirm such a pose.
         sharpness: share of what keyframes saw of the same landmarks; drives give 0.86 to 1.2, motion blur over 11 px
             0.6 to 0.78.
+        equal_blur: what gradients change by between two images, least over most along any direction; below it motion
+            has blurred only one of them, if it has.
+        even_sharpness: of the least sharp direction of an image, over the sharpest; below it motion has blurred it.
         least_sharpness: likewise; bounds by how much a blurred frame is less certain.
         usual_clustering: factor on variances; nine of ten quiet frames stay below, the noise of landmarks covers it.
         scattered_nis: NIS per degree of freedom; a blurred view above it would spoil what comes after, as a keyframe.
@@ -69,6 +72,8 @@ class Acceptance:
     jump: float = 10.0
     jump_support: float = 0.5
     sharpness: float = 0.8
+    equal_blur: float = 0.65
+    even_sharpness: float = 0.38
     least_sharpness: float = 0.1
     usual_clustering: float = 2.0
     scattered_nis: float = 1.6

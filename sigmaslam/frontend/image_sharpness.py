@@ -32,17 +32,43 @@ def patch_energies(image: np.ndarray, places: np.ndarray) -> np.ndarray:
     """
     if not len(places):
         return np.zeros((0, 2))
+    patches, smooth = _smooth_patches(image, places)
+    across, down = (cv2.Sobel(smooth, cv2.CV_32F, *axes, ksize=1) for axes in ((1, 0), (0, 1)))
+    maps = across * across + down * down, cv2.Laplacian(smooth, cv2.CV_32F) ** 2
+    return np.column_stack([_inner_mean(each, patches) for each in maps])
+
+
+def gradient_moments(image: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """(2, 2) second moments of the grey values' gradients in patches of an image, over the patches' variance.
+
+    1 / pixels squared; infinite where nothing varies.
+
+    Args:
+        image: (H, W) uint8.
+        places: (M, 2) centres of the patches, pixels; at least one.
+    """
+    patches, smooth = _smooth_patches(image, places)
+    gradient = [0.5 * cv2.Sobel(smooth, cv2.CV_32F, *axes, ksize=1) for axes in ((1, 0), (0, 1))]
+    moments = [float(_inner_mean(one * other, patches).mean()) for one in gradient for other in gradient]
+    variance = float(patches.var(axis=(1, 2)).mean())
+    return np.reshape(moments, (2, 2)) / variance if variance > 0.0 else np.full((2, 2), np.inf)
+
+
+def _smooth_patches(image: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(M, S, S) grey values around places with what derivatives need, and the same smoothed, (M S, S) in one column."""
     reach = _RADIUS + _MARGIN
     corner = np.rint(places).astype(np.int64)[:, ::-1]
     framed = np.pad(image, reach, mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(framed, (2 * reach + 1, 2 * reach + 1))
     patches = windows[tuple(np.clip(corner, 0, np.array(image.shape) - 1).T)]
     # One below the other, so that one call filters all; what their margins share is cut off.
-    smooth = cv2.sepFilter2D(patches.reshape(-1, 2 * reach + 1), cv2.CV_32F, _KERNEL, _KERNEL)
-    across, down = (cv2.Sobel(smooth, cv2.CV_32F, *axes, ksize=1) for axes in ((1, 0), (0, 1)))
-    maps = across * across + down * down, cv2.Laplacian(smooth, cv2.CV_32F) ** 2
+    return patches, cv2.sepFilter2D(patches.reshape(-1, 2 * reach + 1), cv2.CV_32F, _KERNEL, _KERNEL)
+
+
+def _inner_mean(values: np.ndarray, patches: np.ndarray) -> np.ndarray:
+    """(M,) means of values like `_smooth_patches` gives them, without the patches' margins."""
     inner = slice(_MARGIN, -_MARGIN)
-    return np.column_stack([each.reshape(patches.shape)[:, inner, inner].mean(axis=(1, 2)) for each in maps])
+    return np.asarray(values.reshape(patches.shape)[:, inner, inner].mean(axis=(1, 2)))
 
 
 def _gaussian() -> np.ndarray:

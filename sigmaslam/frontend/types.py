@@ -43,6 +43,7 @@ class StereoView:
             infinity; they have no disparity.
         small: the left image in smaller sizes, where the front-end needs them to follow its keypoints.
         usable: (H, W) bool, pixels of the left image that landmarks may be found at; None: all.
+        is_blurred: motion has blurred the left image; of keyframes, not known of others.
     """
 
     left: np.ndarray
@@ -54,6 +55,7 @@ class StereoView:
     behind: int = 0
     small: tuple[np.ndarray, ...] = ()
     usable: np.ndarray | None = None
+    is_blurred: bool = False
 
     def within(self, usable: np.ndarray | None) -> StereoView:
         """The view with the features of usable pixels (H, W) bool alone."""

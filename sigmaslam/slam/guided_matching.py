@@ -12,11 +12,13 @@ from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
 from sigmaslam.estimation.mahalanobis import squared_mahalanobis
 from sigmaslam.frontend import Frontend, KeypointSearch, StereoView, TemporalMatches
+from sigmaslam.frontend.motion_blur import is_blurred, streak_covariance
 from sigmaslam.frontend.plane_alignment import plane_maps
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.image_cells import pixels_in
 from sigmaslam.geometry.se3 import se3_inverse
 from sigmaslam.slam.config import TrackerConfig
+from sigmaslam.slam.deferred import Deferred
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.measurement_noise import MeasurementNoise
 
@@ -38,11 +40,13 @@ class GuidedMatches:
         views: of those that were found.
         probability: (M,) that each match is right.
         searched: (S,) rows of those that were searched for.
+        streaked: motion has blurred either the view or one of the keyframes.
     """
 
     views: LandmarkViews
     probability: np.ndarray
     searched: np.ndarray
+    streaked: bool = False
 
     @classmethod
     def empty(cls) -> GuidedMatches:
@@ -58,7 +62,16 @@ class GuidedMatches:
             LandmarkViews.concatenate([part.views for part in parts]),
             np.concatenate([part.probability for part in parts]),
             np.concatenate([part.searched for part in parts]),
+            any(part.streaked for part in parts),
         )
+
+
+class _Image:
+    """The left image (H, W) uint8 that landmarks are searched for in, and whether it is blurred, asked for once."""
+
+    def __init__(self, pixels: np.ndarray) -> None:
+        self.pixels = pixels
+        self.is_blurred = Deferred(lambda: is_blurred(pixels))
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,12 +113,12 @@ class GuidedMatcher:
             reference: the last one by default.
             alone: the view is too far from the keyframes' to share errors with them.
         """
-        parts, count = [], self.config.min_inliers
+        parts, count, left = [], self.config.min_inliers, _Image(view.left)
         for anchor, rows, search in self._searches(view.usable, keyframes, pose, covariance, reference):
             matches = self.frontend.match(search, view).within(view.usable)
             if alone and anchor != reference % len(keyframes) and len(matches) < count:
                 continue  # a few that agree by chance would connect keyframes that hardly see each other
-            parts.append(self._measured(rows, search, matches, alone))
+            parts.append(self._measured(rows, search, matches, left, alone))
         return GuidedMatches.concatenate(parts)
 
     def follow(
@@ -142,8 +155,9 @@ class GuidedMatcher:
         searches = [(each, search.widened(excess)) for each, search in searches]
         starts = np.split(start, np.cumsum([len(each) for each, _ in searches])[:-1])
         found = self.frontend.follow([search for _, search in searches], starts, frame.left, frame.right)
+        left = _Image(frame.left)
         parts = [
-            self._measured(rows, search, matches.within(frame.usable), alone=False)
+            self._measured(rows, search, matches.within(frame.usable), left, alone=False)
             for (rows, search), matches in zip(searches, found, strict=True)
         ]
         return GuidedMatches.concatenate(parts), excess
@@ -182,15 +196,21 @@ class GuidedMatcher:
             yield anchor, rows[chosen], KeypointSearch(key, feature, places[:, :2], S[chosen], maps, places[:, 2])
 
     def _measured(
-        self, rows: np.ndarray, search: KeypointSearch, matches: TemporalMatches, alone: bool
+        self, rows: np.ndarray, search: KeypointSearch, matches: TemporalMatches, left: _Image, alone: bool
     ) -> GuidedMatches:
         """Matches of one keyframe as views of landmarks."""
         # Features of a keyframe ascend with the rows of its landmarks.
         place = np.searchsorted(search.index, matches.key_index)
         noise, common = self.noise.of_matches(matches), np.zeros((len(place), 3, 2))
+        key = search.key
+        streak = streak_covariance(key.left, left.pixels, key.features.keypoints[matches.key_index], matches.points)
+        if streaked := streak is not None and (key.is_blurred or left.is_blurred.get()):
+            # They share it: all of them say no more of it than one.
+            noise[:, :2, :2] += len(place) * streak
         if not alone:
             noise, common = self.noise.split(noise)
-        return GuidedMatches(LandmarkViews(rows[place], matches.measured, noise, common), matches.probability, rows)
+        views = LandmarkViews(rows[place], matches.measured, noise, common)
+        return GuidedMatches(views, matches.probability, rows, streaked)
 
     def _in_image(self, predicted: np.ndarray) -> np.ndarray:
         u, v = predicted[:, 0], predicted[:, 1]

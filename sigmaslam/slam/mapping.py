@@ -14,6 +14,7 @@ from sigmaslam.estimation.landmark_table import LandmarkViews
 from sigmaslam.estimation.state_layout import CALIBRATION_SIZE
 from sigmaslam.frontend import StereoView
 from sigmaslam.frontend.feature_spacing import select_spaced
+from sigmaslam.frontend.motion_blur import is_blurred
 from sigmaslam.frontend.plane_alignment import disparity_slopes
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import turn_covariance
@@ -133,8 +134,8 @@ class Mapper:
             return None
         # A blurred or ambiguous keyframe would spoil what comes after it, too few landmarks spoil more. A sharp view
         # that scatters is one: no keyframes at all for 20 frames lost the KITTI drive.
-        is_blurred = blur > 1.0 and fit.nis_before_scaling > ACCEPTANCE.scattered_nis
-        if (is_blurred or is_ambiguous) and share >= ACCEPTANCE.bad_keyframe_landmarks:
+        is_bad = is_ambiguous or (blur > 1.0 and fit.nis_before_scaling > ACCEPTANCE.scattered_nis)
+        if share >= ACCEPTANCE.bad_keyframe_landmarks and (is_bad or is_blurred(frame.left)):
             return None
         view = frame.view
         admitted = view.only(self.admission.admit(view, fit.pose, self.window))
@@ -165,7 +166,8 @@ class Mapper:
         disparity = max(float(np.nanmedian(new.view.disparity)), _MIN_DISPARITY)
         depth = self.camera.focal_baseline / disparity
         window.add_keyframe(new.pose, new.step, step_covariance, walk, depth, new.origin)
-        view = replace(new.view, slope=disparity_slopes(new.view.features.keypoints, new.view.disparity))
+        slope = disparity_slopes(new.view.features.keypoints, new.view.disparity)
+        view = replace(new.view, slope=slope, is_blurred=is_blurred(new.view.left))
         keyframes.append(view, new.timestamp, new.blur)
         window.add_views(views)
         self._add_landmarks(view, views, new.blur)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import Enum, auto
+from math import inf
 
 
 class Phase(Enum):
@@ -21,12 +22,14 @@ class Course:
     Attributes:
         phase: the current one.
         timestamp: of the last frame, seconds; None before the first.
+        waiting_since: time stamp of the first view that could be a keyframe, blurred or not, seconds.
         started_at, tracked_at: time stamps of the first keyframe and of the last pose.
     """
 
     def __init__(self) -> None:
         self.phase = Phase.WAITING
         self.timestamp: float | None = None
+        self.waiting_since = inf
         self.started_at = self.tracked_at = 0.0
 
     def start(self, timestamp: float) -> None:

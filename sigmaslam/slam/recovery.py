@@ -11,6 +11,7 @@ from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.keyframe_window import KeyframeWindow, change_rig
 from sigmaslam.frontend import StereoView
+from sigmaslam.frontend.motion_blur import is_blurred
 from sigmaslam.geometry.se3 import turn_covariance
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.keyframes import Keyframes
@@ -60,7 +61,7 @@ class Recovery:
             # Of an earlier run it was a keyframe.
             known = self.start is not None
             accepted = known or seen_by_both >= ACCEPTANCE.start_stereo_share
-            return self._start(view, timestamp) if accepted else None
+            return self._start(view, timestamp) if accepted and not self._waits(view, timestamp) else None
         since = timestamp - course.tracked_at
         if since <= self.config.lost_seconds or not self.admission.restarts_anywhere:
             return None
@@ -70,6 +71,14 @@ class Recovery:
         course.tracked_at = timestamp
         pose = Prediction.of(self.window, self.motion).pose
         return self._insert(NewKeyframe(view, timestamp, pose, self.motion.step, self.motion.step_covariance))
+
+    def _waits(self, view: StereoView, timestamp: float) -> bool:
+        """Whether a blurred first view should give way to a sharper one, which an unsteady hand soon sees.
+
+        All poses are relative to it: its error stays in them.
+        """
+        since = self.course.waiting_since = min(timestamp, self.course.waiting_since)
+        return timestamp - since < self.config.lost_seconds and is_blurred(view.left)
 
     def resume(self, found: Relocalisation, timestamp: float) -> KeyframeTracks:
         """Goes on from where a lost view was found."""

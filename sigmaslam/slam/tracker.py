@@ -277,7 +277,9 @@ class StereoTracker:
         self._window.count_sightings(matches.searched, seen.landmark)
         back = se3_inverse(self._window.posterior.poses[-1])
         self._motion.correct(back @ fit.pose, turn_covariance(back, fit.relative))
-        self._noise.adapt(fit.nis_per_dof)
+        if not matches.streaked:
+            # What streaks add to the noise is no scatter.
+            self._noise.adapt(fit.nis_per_dof)
         self._course.track(timestamp)
         return fit
 
