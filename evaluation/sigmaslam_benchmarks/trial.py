@@ -39,7 +39,7 @@ def track_ours(
     sequence: StereoSequence, out: Path, tracker: TrackerOptions = _DEFAULT, tracks: bool = False
 ) -> dict[str, Any]:
     """What `sigmaslam track` does, with --tracks or without; its summary."""
-    return track_sequence(TrackRequest(InputOptions(sequence), OutputOptions(out, tracks), tracker))
+    return track_sequence(TrackRequest(InputOptions(sequence), OutputOptions(out, tracks=tracks), tracker))
 
 
 @dataclass(frozen=True, slots=True)

@@ -123,6 +123,14 @@ def track(
     tracks: Annotated[
         bool, typer.Option("--tracks", help="Also write tracks.npz, what keyframes saw, for `sigmaslam refine`.")
     ] = False,
+    save_calibration: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Also write a calibration without the disparity offset that the run found, with its sigma: the next "
+            "run starts from it by --calibration FILE.",
+        ),
+    ] = None,
     camera: Annotated[
         str | None,
         typer.Option(

@@ -23,7 +23,8 @@ ERROR_NAMES = (
     "lens",
     "baseline",
 )
-"""Errors of a calibration that a file may describe: those of `sigmaslam track --estimate`."""
+"""Errors of a calibration that a board measures: those of `sigmaslam track --estimate`."""
+_KNOWN = ("offset", *ERROR_NAMES)
 
 # Eigenvalues may be so much below zero, relative to the largest correlation, as files have few digits.
 _ROUNDING = 1e-6
@@ -34,7 +35,7 @@ class CalibrationCovariance:
     """What is wrong with a calibration, jointly; what it does not name is as `CalibrationSigmas` say.
 
     Attributes:
-        names: (n,) of `ERROR_NAMES`.
+        names: (n,) of `ERROR_NAMES`, and `offset` of disparities, which `track --save-calibration` learns.
         matrix: (n, n) float64, read-only. `focal` and `baseline` are shares of them, all others shares of the focal
             length of the rectified pair, at unit normalised coordinates.
 
@@ -47,9 +48,9 @@ class CalibrationCovariance:
 
     def __post_init__(self) -> None:
         matrix = np.array(self.matrix, np.float64)
-        unknown = [name for name in self.names if name not in ERROR_NAMES]
+        unknown = [name for name in self.names if name not in _KNOWN]
         if unknown:
-            raise CalibrationError(f"covariance names {', '.join(unknown)}; known are {', '.join(ERROR_NAMES)}")
+            raise CalibrationError(f"covariance names {', '.join(unknown)}; known are {', '.join(_KNOWN)}")
         if len(set(self.names)) < len(self.names):
             raise CalibrationError(f"covariance names an error twice: {', '.join(self.names)}")
         if matrix.shape != (len(self.names), len(self.names)):
@@ -80,7 +81,7 @@ class CalibrationCovariance:
         section.reject_unknown(("names", "matrix"))
         names = section.entries.get("names")
         if not isinstance(names, list):
-            raise section.error(f"names must be a list of {', '.join(ERROR_NAMES)}, got {names}")
+            raise section.error(f"names must be a list of {', '.join(_KNOWN)}, got {names}")
         matrix = section.numbers("matrix", (None, None))
         try:
             return cls(tuple(map(str, names)), matrix)

@@ -38,6 +38,11 @@ _REFUSED = (
     ("--resume", ("--video", "--viewer"), "--resume does not go with {all}, which show a whole run: leave them out"),
     ("--resume", _FORGOTTEN, "--resume does not go with {given}: leave one of them out"),
     (
+        "--save-calibration",
+        ("--track-object", "--scale"),
+        "--save-calibration is of the whole scene in images as they are: leave out {all}",
+    ),
+    (
         "--track-object",
         ("--map", "--tracks"),
         "{all} are of a moving camera's world: leave them out with --track-object",
@@ -100,16 +105,24 @@ class OutputOptions:
 
     Attributes:
         out: the folder, new or empty.
+        save_calibration: a calibration file, new, for what the run learns of its own.
         tracks: write tracks.npz, too, the observations of keyframes for `sigmaslam refine`.
         overwrite: the command removes the run in the folder first.
         resume: `out` holds a run of the same input that was stopped or killed, which goes on where it was. The map is
             then that of the frames from its last keyframe on, and there is no trajectory after the fact.
+    Raises:
+        InputError: there is a file of the name for the calibration.
     """
 
     out: Path
+    save_calibration: Path | None = None
     tracks: bool = False
     overwrite: bool = False
     resume: bool = False
+
+    def __post_init__(self) -> None:
+        if self.save_calibration is not None and self.save_calibration.exists():
+            raise InputError(f"{self.save_calibration}: there is such a file: give --save-calibration another name")
 
 
 @dataclass(frozen=True, slots=True)

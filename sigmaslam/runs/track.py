@@ -13,6 +13,8 @@ from typing import Any
 
 from sigmaslam.bodies.object_region import read_region
 from sigmaslam.bodies.object_tracker import OBJECT_CONFIG, ObjectEstimate, ObjectTracker
+from sigmaslam.calibration.learned_calibration import learned_calibration
+from sigmaslam.calibration_files.calibration_writer import write_calibration
 from sigmaslam.checks.finding import disparity_error
 from sigmaslam.errors import InputError, OutputError, SigmaSlamError
 from sigmaslam.files import printable
@@ -111,6 +113,11 @@ def track_sequence(request: TrackRequest) -> dict[str, Any]:
         others = {"tracks.npz": writer.write_tracks} if writer.has_tracks else {}
         if location is not None and location.T_sensor_world is not None:
             others["trajectory_location.tum"] = lambda path: _write_location(path, location)
+        saved = request.outputs.save_calibration
+        if saved is not None and writer.calibration is not None and isinstance(tracker, StereoTracker):
+            focal_length = float(tracker.describe_rectified()["intrinsics"][0])
+            learned = learned_calibration(sequence.camera, writer.calibration, focal_length)
+            others[str(saved.resolve())] = lambda path: write_calibration(path, learned)
         # A sensor's readings correct poses as they come, not after the fact; what was before a stop is not in memory.
         final = tracker.final_trajectory if location is None and stopped is None else None
         results = TrackerResults(tracker.map, tracker.pack_keyframes, final, others, pictures.write)

@@ -19,8 +19,8 @@ class CalibrationEstimate:
     Attributes:
         disparity_offset: measured minus true disparity, pixels.
         disparity_offset_sigma: its standard deviation, pixels.
-        errors: other errors that are estimated, by their names: value and standard deviation, in the units of
-            `sigmaslam.estimation.calibration_errors.ERRORS`.
+        errors: other errors that are estimated, and a baseline that made up for a large offset, by their
+            names: value and standard deviation, in the units of `sigmaslam.estimation.calibration_errors.ERRORS`.
     """
 
     disparity_offset: float

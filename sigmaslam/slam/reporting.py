@@ -84,7 +84,7 @@ class Reporter:
             inliers=fit.count if fit is not None else 0,
             nis=fit.nis if fit is not None else 0.0,
             dof=fit.dof if fit is not None else 0,
-            calibration=self._describe_calibration(),
+            calibration=self._describe_calibration(fit),
             milliseconds=milliseconds,
             frame_covariance=0.5 * (frame_covariance + frame_covariance.T),
             tracks=tracks,
@@ -108,15 +108,21 @@ class Reporter:
             inliers=0,
             nis=0.0,
             dof=0,
-            calibration=self._describe_calibration(),
+            calibration=self._describe_calibration(None),
             milliseconds=milliseconds,
         )
 
-    def _describe_calibration(self) -> CalibrationEstimate:
-        """As the last keyframe has it: what a frame adds to it is forgotten."""
-        errors = self.window.posterior.calibration
-        sigma = np.sqrt(np.maximum(np.diag(self.window.posterior.whole_covariance)[CALIBRATION], 0.0))
+    def _describe_calibration(self, fit: FrameFit | None) -> CalibrationEstimate:
+        """As the last keyframe has it, as a frame's own is forgotten; before the second one as the frame has it."""
+        state = self.window.posterior
+        errors, covariance, common = state.calibration, state.covariance, state.common
+        if fit is not None and self.window.held_offset.value is None:
+            errors, covariance, common = fit.calibration, fit.joint.covariance, fit.joint.common
+        common = common[CALIBRATION]
+        sigma = np.sqrt(np.maximum(np.diag(covariance[CALIBRATION, CALIBRATION] + common @ common.T), 0.0))
         chosen = [k for k in np.flatnonzero(self.window.calibration.estimated).tolist() if k]
+        if self.window.board_disparity is not None:
+            chosen.append(ERRORS.index("baseline"))
         others = {ERRORS[k]: (float(errors[k]), float(sigma[k])) for k in chosen}
         return CalibrationEstimate(float(errors[0]), float(sigma[0]), others)
 

@@ -40,8 +40,8 @@ def test_a_covariance_survives_a_file(tmp_path: Path):
     [
         (3, "key 'covariance' must be a mapping, got 3"),
         ({"names": ["focal"]}, r"key 'covariance.matrix' is missing"),
-        ({"names": "focal", "matrix": [[1]]}, "names must be a list of yaw, pitch"),
-        ({"names": ["fokal"], "matrix": [[1]]}, "covariance names fokal; known are yaw"),
+        ({"names": "focal", "matrix": [[1]]}, "names must be a list of offset, yaw"),
+        ({"names": ["fokal"], "matrix": [[1]]}, "covariance names fokal; known are offset, yaw"),
         ({"names": ["yaw", "yaw"], "matrix": [[1, 0], [0, 1]]}, "covariance names an error twice: yaw, yaw"),
         ({"names": ["yaw"], "matrix": [[1, 0], [0, 1]]}, "covariance has 1 names and a matrix of 2x2"),
         ({"names": ["yaw", "roll"], "matrix": [[1, 0.5], [0, 1]]}, "is not symmetric"),

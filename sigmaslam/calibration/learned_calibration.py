@@ -1,0 +1,38 @@
+"""What a run learned of its calibration, as a calibration for the next one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sigmaslam.geometry.calibration_covariance import CalibrationCovariance
+from sigmaslam.geometry.camera import StereoCamera
+from sigmaslam.slam.estimate import CalibrationEstimate
+
+
+def learned_calibration(camera: StereoCamera, learned: CalibrationEstimate, focal_length: float) -> StereoCamera:
+    """The pair without its disparity offset, which is taken for one of the right principal point.
+
+    Where the offset was so large that the baseline must have made up for it, that is corrected, too. Other errors that
+    were estimated are not: which parameter they belong to is not known.
+
+    Args:
+        camera: as calibrated.
+        learned: what the images say.
+        focal_length: of the rectified pair, pixels.
+    """
+    offset = learned.disparity_offset
+    right = replace(camera.right, cx=camera.right.cx - offset * camera.right.fx / focal_length)
+    variances = {"offset": (learned.disparity_offset_sigma / focal_length) ** 2}
+    T_left_right = camera.T_left_right.copy()
+    if "baseline" in learned.errors:
+        baseline, sigma = learned.errors["baseline"]
+        T_left_right[:3, 3] *= 1.0 + baseline
+        variances["baseline"] = sigma**2
+    known = camera.covariance or CalibrationCovariance((), np.zeros((0, 0)))
+    kept = [k for k, name in enumerate(known.names) if name not in variances]
+    names = (*(known.names[k] for k in kept), *variances)
+    matrix = np.diag(np.r_[np.zeros(len(kept)), list(variances.values())])
+    matrix[: len(kept), : len(kept)] = known.matrix[np.ix_(kept, kept)]
+    return replace(camera, right=right, T_left_right=T_left_right, covariance=CalibrationCovariance(names, matrix))

@@ -1,0 +1,63 @@
+"""A calibration that a run has learned: the next run finds nothing wrong with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sigmaslam.calibration.learned_calibration import learned_calibration
+from sigmaslam.calibration_files.calibration_writer import write_calibration
+from sigmaslam.estimation.calibration_errors import CalibrationPrior
+from sigmaslam.geometry.camera import CameraModel, StereoCamera
+from sigmaslam.geometry.rectification import StereoRectifier
+from sigmaslam.slam.estimate import CalibrationEstimate
+from tests.support.calibration_forms import raw_rig
+
+PINHOLE = CameraModel(640, 480, 500.0, 500.0, 319.5, 239.5)
+
+
+def rectified_pair() -> StereoCamera:
+    T = np.eye(4)
+    T[0, 3] = 0.2
+    return StereoCamera(PINHOLE, PINHOLE, T)
+
+
+def test_disparities_lose_their_offset():
+    """A point at 2 m: 50 px, measured as 50.7."""
+    learned = learned_calibration(rectified_pair(), CalibrationEstimate(0.7, 0.05), 500.0)
+    point = np.array([[0.3, 0.1, 2.0]])
+    left, right = learned.left.project(point), learned.right.project(point - [0.2, 0.0, 0.0])
+    assert (left - right)[0, 0] == pytest.approx(50.7)
+
+
+def test_the_next_run_begins_with_what_is_still_unknown(tmp_path: Path):
+    learned = learned_calibration(raw_rig("radtan"), CalibrationEstimate(-0.4, 0.05), 450.0)
+    write_calibration(tmp_path / "learned.yaml", learned)
+    read = StereoCamera.from_yaml(tmp_path / "learned.yaml")
+    rectified = StereoRectifier(read).rectified
+    prior = CalibrationPrior.of(rectified, read.sigmas, 0.5, covariance=read.covariance)
+    assert prior.sigma[0] == pytest.approx(0.05 * rectified.fx / 450.0)
+    assert prior.estimated[0]
+    assert prior.sigma[1] == pytest.approx(rectified.fx * read.sigmas.rotation)
+
+
+def test_a_baseline_that_made_up_for_the_offset_is_corrected():
+    learned = learned_calibration(rectified_pair(), CalibrationEstimate(3.0, 0.1, {"baseline": (-0.06, 0.06)}), 500.0)
+    assert learned.T_left_right[0, 3] == pytest.approx(0.2 * 0.94)
+    assert learned.covariance is not None
+    assert dict(zip(learned.covariance.names, np.sqrt(np.diag(learned.covariance.matrix)), strict=True)) == {
+        "offset": pytest.approx(0.0002),
+        "baseline": pytest.approx(0.06),
+    }
+
+
+def test_learning_once_more_keeps_what_else_is_known():
+    once = learned_calibration(rectified_pair(), CalibrationEstimate(3.0, 0.1, {"baseline": (-0.06, 0.06)}), 500.0)
+    twice = learned_calibration(once, CalibrationEstimate(0.01, 0.02), 500.0)
+    assert twice.covariance is not None
+    sigmas = dict(zip(twice.covariance.names, np.sqrt(np.diag(twice.covariance.matrix)), strict=True))
+    assert sigmas == {"baseline": pytest.approx(0.06), "offset": pytest.approx(0.02 / 500.0)}
+    assert replace(twice, covariance=once.covariance).right.cx == pytest.approx(once.right.cx - 0.01)
