@@ -42,6 +42,14 @@ def replace_part(covariance: np.ndarray, part: slice, other: slice) -> np.ndarra
     return replaced
 
 
+def step_with(covariance: np.ndarray, part: slice, index: int, change: float) -> np.ndarray:
+    """By how much a part of a state moves when one of its numbers is known to be another; not where it is known."""
+    variance = covariance[index, index]
+    if variance <= 0.0:
+        return np.zeros_like(covariance[part, index])
+    return np.asarray(covariance[part, index] / variance * change)
+
+
 def regression(cross: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """cross covariance^-1 (n, k), with the pseudo-inverse in units of the standard deviations where it is singular."""
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sigmaslam.estimation.gaussian import step_with
 from sigmaslam.estimation.window_state import WindowState
 from sigmaslam.geometry.se3 import nearest_rigid, se3_exp
 
@@ -40,17 +41,17 @@ class HeldOffset:
         return HeldOffset(value, value != self.value)
 
     def place(
-        self, pose: np.ndarray, estimate: float, variance: float, cross: np.ndarray
+        self, pose: np.ndarray, estimate: float, covariance: np.ndarray, part: slice
     ) -> tuple[np.ndarray, np.ndarray]:
         """A pose as it is with this offset, and by what covariance (6, 6) it is off if the estimate is right.
 
         Args:
             pose: (4, 4) as estimated together with an offset.
             estimate: that offset, pixels.
-            variance: of it, pixels squared.
-            cross: (6,) covariance of the pose with it, perturbed from the left in the world.
+            covariance: (n, n) of a state with the offset in front, and the pose, perturbed from the left in the world.
+            part: the pose's.
         """
-        if self.value is None or variance <= 0.0:
+        if self.value is None:
             return pose, np.zeros((6, 6))
-        step = cross / variance * (self.value - estimate)
+        step = step_with(covariance, part, 0, self.value - estimate)
         return nearest_rigid(se3_exp(step) @ pose), np.outer(step, step)

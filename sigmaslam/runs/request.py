@@ -105,20 +105,20 @@ class OutputOptions:
 
     Attributes:
         out: the folder, new or empty.
-        save_calibration: a calibration file, new, for what the run learns of its own.
         tracks: write tracks.npz, too, the observations of keyframes for `sigmaslam refine`.
         overwrite: the command removes the run in the folder first.
         resume: `out` holds a run of the same input that was stopped or killed, which goes on where it was. The map is
             then that of the frames from its last keyframe on, and there is no trajectory after the fact.
+        save_calibration: a calibration file, new, for what the run learns of its own.
     Raises:
         InputError: there is a file of the name for the calibration.
     """
 
     out: Path
-    save_calibration: Path | None = None
     tracks: bool = False
     overwrite: bool = False
     resume: bool = False
+    save_calibration: Path | None = None
 
     def __post_init__(self) -> None:
         if self.save_calibration is not None and self.save_calibration.exists():

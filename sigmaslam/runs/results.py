@@ -85,7 +85,7 @@ def write_results(
     if frames is None or not frames.count(TRACKED):
         # A start that no second frame confirms is none.
         records = records.select(np.zeros(0, np.int64))
-    calibration = calibration or _last_calibration(frames, records)
+    calibration = calibration or _last_calibration(frames)
     _write_poses(files, records, frames, run.get("location") is None)
     of_folder = list(files.failed)
     points = 0
@@ -161,8 +161,8 @@ def _read_complete_frames(path: Path) -> FrameTable | None:
     return read_frames(path) if content.count(b"\n") > 1 else None
 
 
-def _last_calibration(frames: FrameTable | None, records: PoseRecords) -> CalibrationEstimate | None:
-    """What frames.csv and the poses say of it; other errors than the disparity offset are not on disk."""
+def _last_calibration(frames: FrameTable | None) -> CalibrationEstimate | None:
+    """What frames.csv says of it; other errors than the disparity offset are not on disk."""
     if frames is None:
         return None
     offset, sigma = (frames.columns[name] for name in ("disparity_offset", "disparity_offset_sigma"))

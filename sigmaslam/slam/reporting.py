@@ -54,16 +54,15 @@ class Reporter:
             # Published alone: a prediction as wide as that would find nothing.
             fit = fit.spread_by(doubts.spread)
             pose, absolute, relative = fit.pose, fit.covariance, fit.relative
-            by_error, joint = fit.joint.common[-6:], fit.joint.covariance
-            offset, variance, with_offset = float(fit.calibration[0]), float(joint[0, 0]), joint[-6:, 0]
+            by_error, offset = fit.joint.common[-6:], float(fit.calibration[0])
+            covariance, part = fit.joint.covariance, slice(-6, None)
         else:
             prediction = Prediction.of(self.window, self.motion)
-            last = pose_slice(len(state) - 1)
+            covariance, part = state.covariance, pose_slice(len(state) - 1)
             pose, relative = prediction.pose, prediction.covariance
-            absolute, by_error = state.covariance[last, last] + relative, state.common[last]
-            joint = state.covariance
-            offset, variance, with_offset = float(state.calibration[0]), float(joint[0, 0]), joint[last, 0]
-        pose, shift = self.window.held_offset.place(pose, offset, variance, with_offset)
+            absolute, by_error = covariance[part, part] + relative, state.common[part]
+            offset = float(state.calibration[0])
+        pose, shift = self.window.held_offset.place(pose, offset, covariance, part)
         absolute = absolute + shift
         # The filter knows the rectified camera; users know the left camera of their calibration.
         T_left_rectified = se3_inverse(self.T_rectified_left)

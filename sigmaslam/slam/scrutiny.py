@@ -7,6 +7,7 @@ import numpy as np
 from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.frame_clock import FrameClock
 from sigmaslam.estimation.frame_fit import FrameFit
+from sigmaslam.estimation.gaussian import step_with
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.prediction_errors import surprise, time_error
 from sigmaslam.geometry.se3 import se3_adjoint, se3_inverse, se3_log
@@ -64,6 +65,5 @@ def _without_error(window: KeyframeWindow, fit: FrameFit, index: int) -> np.ndar
     A delay between the eyes, say, makes up an offset. With even odds that there is none the second moment about the
     pose is half of the squared step between the two.
     """
-    covariance = fit.joint.covariance
-    slope = covariance[-6:, index] / covariance[index, index]
-    return np.asarray(np.sqrt(0.5) * slope * (fit.calibration[index] - window.expected[index]))
+    change = fit.calibration[index] - window.expected[index]
+    return np.sqrt(0.5) * step_with(fit.joint.covariance, slice(-6, None), index, change)

@@ -29,7 +29,7 @@ def test_a_pose_for_another_offset_is_the_mean_given_that_offset():
     rng = np.random.default_rng(3)
     root = 0.01 * rng.normal(size=(7, 7))
     covariance, pose = root @ root.T, se3_exp(rng.normal(size=6))
-    placed, spread = HeldOffset(0.3).place(pose, 0.29, covariance[0, 0], covariance[1:, 0])
+    placed, spread = HeldOffset(0.3).place(pose, 0.29, covariance, slice(1, 7))
     # The same as a measurement of the offset without noise.
     gain = covariance[:, :1] @ np.linalg.inv(covariance[:1, :1])
     given = (gain * 0.01)[1:, 0]
@@ -41,7 +41,7 @@ def test_nothing_is_held_before_a_second_keyframe():
     held = HeldOffset().following(state(0.4, 0.01, keyframes=1))
     pose = np.eye(4)
     assert held.value is None
-    assert held.place(pose, 0.4, 1e-4, np.ones(6))[0] is pose
+    assert held.place(pose, 0.4, np.eye(7), slice(1, 7))[0] is pose
 
 
 def test_it_is_held_while_the_images_agree_and_follows_as_far_as_they_do_not():
