@@ -40,7 +40,7 @@ class Acceptance:
             has blurred only one of them, if it has.
         even_sharpness: of the least sharp direction of an image, over the sharpest; below it motion has blurred it.
         least_sharpness: likewise; bounds by how much a blurred frame is less certain.
-        usual_clustering: factor on variances; nine of ten quiet frames stay below, the noise of landmarks covers it.
+        usual_clustering: factor on variances; nine of ten quiet frames stay below, above it one frame is believed.
         scattered_nis: NIS per degree of freedom; a blurred view above it would spoil what comes after, as a keyframe.
         bad_keyframe_landmarks: share of the last keyframe's; below it a blurred view is better than none.
         keyframe_points: times the least inliers, of stereo points; most of them are lost until the next keyframe.

@@ -7,26 +7,54 @@ import numpy as np
 from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.geometry.image_cells import CELLS, image_cells
 
+# Part of one frame in the average: one frame's cells are too few to tell (docs/notebook/noise.md).
+_GAIN = 0.1
+# What one cell alone knows tells nothing of its errors: they are taken for twice as large as what is left, no more.
+_LEAST_LEFT = 0.25
+# Of what the views say together; so few say nothing of each other.
+_MAX_CONDITION = 1e12
+
 
 def clustering(places: np.ndarray, size: tuple[int, int], scores: np.ndarray, information: np.ndarray) -> float:
-    """Factor by which a pose's variances are too small because errors of neighbouring views are alike; 1 where usual.
+    """Factor by which a pose's variances are too small because errors of neighbouring views are alike; about 1 if not.
 
     What the views of each cell of the image say together, their scores summed, is compared with what they say one by
-    one (Liang and Zeger 1986, with the small-sample factor). A body that moves on its own makes whole cells
-    disagree, and so does a blur that misplaces patches of one depth alike.
+    one (Liang and Zeger 1986). The pose follows each cell by the cell's share in what is known of it, and what is left
+    of the cell's errors is taken for so much more (CR2 of Bell and McCaffrey 2002). A body that moves on its own makes
+    whole cells disagree, and so do a blur that misplaces patches of one depth alike, and shelves full of edges.
 
     Args:
         places: (M, 2) of the views, pixels.
         size: of the image, width and height.
-        scores: (M, p) slopes of each view's log-likelihood by the pose, at the estimate; zero for those not used.
-        information: (p, p) of the views.
+        scores: (M, 6) slopes of each view's log-likelihood by the pose, at the estimate; zero for those not used.
+        information: (6, 6) of the views.
     """
     cell = image_cells(places, *size)
-    sums = np.zeros((CELLS, scores.shape[1]))
-    np.add.at(sums, cell, scores)
-    used = len(np.unique(cell[(scores != 0.0).any(axis=1)]))
-    alone, together = (float(np.trace(np.linalg.solve(information, each.T @ each))) for each in (scores, sums))
-    if used < 2 or alone <= 0.0:
+    one_by_one = scores.T @ scores
+    if not np.trace(one_by_one) > 0.0 or np.linalg.cond(one_by_one) > _MAX_CONDITION:
         return 1.0
-    factor = together / alone * used / (used - 1)
-    return factor if factor > ACCEPTANCE.usual_clustering else 1.0
+    # In units of what the views say one by one, which is the identity then.
+    root = np.linalg.cholesky(one_by_one)
+    scores = np.linalg.solve(root, scores.T).T
+    sums, share = np.zeros((CELLS, 6)), np.zeros((CELLS, 6, 6))
+    np.add.at(sums, cell, scores)
+    np.add.at(share, cell, scores[:, :, None] * scores[:, None, :])
+    left, along = np.linalg.eigh(np.eye(6) - share)
+    scale = 1.0 / np.sqrt(np.maximum(left, _LEAST_LEFT))
+    sums = (along @ (scale[..., None] * (along.transpose(0, 2, 1) @ sums[..., None])))[..., 0]
+    by_pose = root.T @ np.linalg.solve(information, root)
+    return float(np.einsum("ia,ab,ib->", sums, by_pose, sums) / np.trace(by_pose))
+
+
+class SharedErrors:
+    """How alike errors of neighbouring views are in the scene at hand: an average over frames."""
+
+    def __init__(self) -> None:
+        self._average, self._count = 1.0, 1
+
+    def factor(self, clustering: float) -> float:
+        """What variances of one more frame are to be multiplied by, 1 or more; `clustering`: as found in it alone."""
+        self._count += 1
+        self._average += max(1.0 / self._count, _GAIN) * (clustering - self._average)
+        # A body that comes into view is news.
+        return max(self._average, 1.0, clustering if clustering > ACCEPTANCE.usual_clustering else 1.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from sigmaslam.estimation.calibration_errors import TURNS, CalibrationPrior
+from sigmaslam.estimation.clustered_errors import SharedErrors
 from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.estimator_graphs import EstimatorGraphs
 from sigmaslam.estimation.frame_clock import FrameClock
@@ -116,6 +118,7 @@ class StereoTracker:
         self._noise = noise = MeasurementNoise(config)
         self._motion = motion = MotionFilter(backend)
         self._course = course = Course()
+        self._shared_errors = SharedErrors()
         self._clock, self._last_pairs = FrameClock(), LastPairs()
         self._keyframes = keyframes = Keyframes(window, config.max_keyframes, config.max_points, self._beside)
         self._scrutiny = Scrutiny(window, motion, self._clock, disparity_error is not None)
@@ -271,6 +274,7 @@ class StereoTracker:
         """Takes a pose over, less certain where the frame is blurred."""
         # Patches that are blurred are misplaced alike, along the blur and towards where they were expected: many of
         # them say no more than a few. So do those of a body that moves on its own.
+        fit = replace(fit, clustering=self._shared_errors.factor(fit.clustering))
         fit = fit.inflated(max(fit.nis_before_scaling, 1.0) * blur * fit.clustering)
         seen = matches.views.select(fit.inliers)
         self._admission.confirm(seen, self._window)
