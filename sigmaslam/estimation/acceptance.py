@@ -22,7 +22,7 @@ class Acceptance:
         last_keyframes: number compared without a prediction; one of them may be blurred or covered.
         unguided_margin: share of the scene's depth, and radians, that an unguided pose is off by beyond its covariance.
         probable_share: of the matches that should be right by their probabilities; symmetric texture gives less.
-        improbable_inliers: times the least inliers below that share; half of the right matches may be on movers.
+        improbable_inliers: times the least inliers below that share, and where the motion excludes the pose.
         rival_area: share of the image that the greater motion explains; a lesser one is a wrong lens or chance.
         scene_farther: ratio of median disparities; of two rivals the scene lies behind what moves.
         same_motion: pixels between what two poses see, in the median; nearer ones say the same.

@@ -9,12 +9,17 @@ import numpy as np
 
 # Intervals that are remembered, and so many must be there before they are judged: a moment needs a few.
 _REMEMBERED, _LEAST = 20, 4
+# One long interval beside so many others is a pause; beside fewer, or another long one, it may end a burst of five.
+_REGULAR = 9
 # Share of the mean interval up to which stamps are believed as they are: recordings that a sensor has stamped stay
 # below 0.02, and the motion's own noise covers more than this.
 _BELIEVED = 0.05
 # Intervals of up to so many frames are drops of a regular camera; a longer one alone is a pause, and stamps that
 # alternate by two fifths of an interval are nine times as far apart as they are close.
 _MOST_DROPPED = 4
+# Share of the intervals' variance that successive ones have in common, with the opposite sign: none where frames are
+# dropped, half for noise of stamps; above it long and short ones take turns, and no drops do that.
+_TAKES_TURNS = 0.75
 # Seconds. A slower camera's frames were chosen, and a host is late by less; the motion in between is unknown anyway.
 _SLOWEST = 0.5
 # Of the mean interval: no two frames of a camera are closer.
@@ -31,13 +36,15 @@ def stamp_noise(intervals: Sequence[float] | np.ndarray) -> float:
         intervals: seconds between successive stamps, in order.
     """
     steps = np.asarray(intervals, float)
-    if len(steps) > _LEAST and steps.max() > 3.0 * np.median(steps):
-        # One long interval is a pause; several with short ones between them are bursts.
-        steps = np.delete(steps, np.argmax(steps))
-    if len(steps) < _LEAST or np.median(steps) > _SLOWEST or _are_multiples(steps):
+    others = np.delete(steps, np.argmax(steps)) if len(steps) else steps
+    if len(others) >= _REGULAR and steps.max() > 3.0 * np.median(steps) >= others.max():
+        steps = others
+    if len(steps) < _LEAST or np.median(steps) > _SLOWEST:
         return 0.0
     departure = steps - steps.mean()
     variance = -float(np.sum(departure[1:] * departure[:-1])) / len(steps)
+    if variance < _TAKES_TURNS * departure.var() and _are_multiples(steps):
+        return 0.0
     sigma = float(np.sqrt(max(variance, 0.0)))
     return sigma if sigma > _BELIEVED * steps.mean() else 0.0
 

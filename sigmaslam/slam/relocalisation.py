@@ -6,11 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sigmaslam.estimation.chi_square import CHI_SQUARE_9999_OF_6
+from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.frontend import StereoView
-from sigmaslam.geometry.se3 import nearest_rigid
+from sigmaslam.geometry.se3 import nearest_rigid, se3_inverse, se3_log
 from sigmaslam.slam.keyframes import Keyframes
 from sigmaslam.slam.landmark_admission import LandmarkAdmission
+from sigmaslam.slam.localisation import Prediction
 from sigmaslam.slam.place_recognition import retrieve
 from sigmaslam.slam.unguided_matching import UnguidedMatcher
 
@@ -42,6 +45,7 @@ class Relocaliser:
     Attributes:
         window: emptied where a view is found.
         keyframes: of the window and its past.
+        motion: predicts the view while the window has keyframes.
         matcher: finds keyframes in views.
         admission: what may become a landmark.
         min_inliers: fewer are no pose.
@@ -49,6 +53,7 @@ class Relocaliser:
 
     window: KeyframeWindow
     keyframes: Keyframes
+    motion: MotionFilter
     matcher: UnguidedMatcher
     admission: LandmarkAdmission
     min_inliers: int
@@ -64,6 +69,9 @@ class Relocaliser:
             if relative is None:
                 continue
             pose = nearest_rigid(keyframes.pose(keyframe) @ relative.T_key_camera)
+            # Repeated texture agrees on other places, by a few dozens of matches far away.
+            if not self.matcher.is_beyond_chance(relative) and not self._is_expected(pose):
+                continue
             admitted = view.only(self.admission.admit(view, pose, self.window))
             if not admitted.has_stereo(min_points, self.min_inliers):
                 continue
@@ -71,3 +79,12 @@ class Relocaliser:
                 keyframes.marginalise_oldest(spare=keyframe)
             return Relocalisation(admitted, pose, relative.covariance, keyframes.index(keyframe.id))
         return None
+
+    def _is_expected(self, pose: np.ndarray) -> bool:
+        """Whether the motion may have led to a pose (4, 4) since the last one."""
+        if not len(self.window):
+            return True
+        prediction = Prediction.of(self.window, self.motion)
+        departure = se3_log(pose @ se3_inverse(prediction.pose))
+        squared = departure @ np.linalg.lstsq(prediction.covariance, departure, rcond=1e-14)[0]
+        return bool(squared <= CHI_SQUARE_9999_OF_6)

@@ -130,7 +130,7 @@ class StereoTracker:
         self._rig_watch = RigWatch(window, self._localiser)
         self._mapper = Mapper(rectified, window, keyframes, motion, noise, admission, config)
         self._loops = LoopCloser(window, keyframes, unguided)
-        self._relocaliser = Relocaliser(window, keyframes, unguided, admission, config.min_inliers)
+        self._relocaliser = Relocaliser(window, keyframes, motion, unguided, admission, config.min_inliers)
         origin = None if start is None else start.of_rectified(self._T_rectified_left)
         self._recovery = Recovery(course, window, keyframes, motion, self._mapper, admission, config, origin)
         relative_poses = RelativePoseReporter(self._T_rectified_left, window, keyframes, motion)

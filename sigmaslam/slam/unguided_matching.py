@@ -57,3 +57,7 @@ class UnguidedMatcher:
         fair = agreeing >= ACCEPTANCE.probable_share * matches.probability.sum()
         least = self.config.min_inliers * (1 if fair else ACCEPTANCE.improbable_inliers)
         return relative if agreeing >= least else None
+
+    def is_beyond_chance(self, relative: RelativePose) -> bool:
+        """Whether so many agree as no repeated texture does, wherever the pose lies."""
+        return bool(relative.inliers.sum() >= ACCEPTANCE.improbable_inliers * self.config.min_inliers)

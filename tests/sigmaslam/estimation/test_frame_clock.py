@@ -48,10 +48,11 @@ def test_intervals_that_vary_by_themselves_are_no_noise_of_stamps():
     "noise",
     [
         0.04 * (-1.0) ** np.arange(FRAMES),
+        0.03 * (-1.0) ** np.arange(FRAMES),
         np.random.default_rng(4).normal(0.0, 0.02, FRAMES),
         -0.096 * (np.arange(FRAMES) % 3) + 0.096,
     ],
-    ids=["alternating", "Gaussian", "bursts of three"],
+    ids=["alternating", "alternating by one to four", "Gaussian", "bursts of three"],
 )
 def test_jitter_is_smoothed_and_said(noise: np.ndarray):
     """From the second burst on the step is nearer to the camera's than the stamps', and three sigma hold the truth."""
@@ -60,3 +61,13 @@ def test_jitter_is_smoothed_and_said(noise: np.ndarray):
     assert (found[:, 1] > 0.0).mean() > 0.9
     assert np.abs(found[:, 0] - 0.1).mean() < 0.5 * np.abs(np.diff(stamps)[8:] - 0.1).mean()
     assert (np.abs(found[:, 0] - 0.1) < 3.0 * found[:, 1] + 1e-9).mean() > 0.9
+
+
+@pytest.mark.parametrize("size", [3, 5])
+def test_bursts_are_no_pauses_of_a_fast_camera(size: int):
+    """After the first burst no stamp is believed, and within bursts three sigma hold the camera's own step."""
+    stamps = 0.1 * size * (np.arange(FRAMES) // size + 1) + 0.004 * (np.arange(FRAMES) % size)
+    found = np.array(steps_of(stamps))[size:]
+    assert (found[:, 1] > 0.0).all()
+    within = np.arange(len(found)) % size != size - 1
+    assert (np.abs(found[:, 0] - 0.1) < 3.0 * found[:, 1])[within].all()

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,9 +20,12 @@ from sigmaslam.readers.trajectory_files import read_kitti
 from sigmaslam.slam.doubt import Doubt
 from sigmaslam.slam.keyframe import Keyframe
 from sigmaslam.slam.keyframes import Keyframes
+from sigmaslam.slam.landmark_admission import AdmitAll
 from sigmaslam.slam.map_file import pack_keyframes, read_keyframes
 from sigmaslam.slam.place_recognition import retrieve
+from sigmaslam.slam.relocalisation import Relocaliser
 from sigmaslam.slam.tracker import TrackerConfig
+from sigmaslam.two_view.stereo_pose import RelativePose
 from tests.support.dense_window import NO_WALK, make_window
 from tests.support.estimates import Demo, error_of, mirrored, squared_error
 from tests.support.faults import assert_no_pose
@@ -259,6 +263,23 @@ def test_an_array_in_place_of_a_map_is_refused_without_advice_to_unpickle(tmp_pa
     with pytest.raises(InputError) as caught:
         read_keyframes(tmp_path / "map.npz", "learned", CAMERA)
     assert "pickle" not in str(caught.value)
+
+
+# ---- what the motion excludes
+
+
+@pytest.mark.parametrize(("away", "inliers", "is_found"), [(0.01, 20, True), (5.0, 20, False), (5.0, 60, True)])
+def test_a_few_matches_find_no_place_that_the_motion_excludes(away: float, inliers: int, is_found: bool):
+    keyframes = visited([looking(0.0)], 10)
+    window = keyframes._window
+    window.add_keyframe(looking(0.1), looking(0.1), 1e-4 * np.eye(6), NO_WALK, 1.0)
+    keyframes.append(view_of(1, 80), 0.5)
+    motion = SimpleNamespace(step=np.eye(4), step_covariance=1e-2 * np.eye(6))
+    found = RelativePose(looking(0.1 + away), np.arange(80) < inliers, 1e-4 * np.eye(6), 1.0)
+    matcher = SimpleNamespace(relative_pose_to=lambda key, view: found, is_beyond_chance=lambda found: inliers > 45)
+    relocaliser = Relocaliser(window, keyframes, motion, matcher, AdmitAll(10), 15)
+    assert (relocaliser.relocalise(view_of(0, 80)) is not None) == is_found
+    assert len(window) == (0 if is_found else 1)
 
 
 # ---- the tracker
