@@ -39,7 +39,8 @@ class Acceptance:
         equal_blur: what gradients change by between two images, least over most along any direction; below it motion
             has blurred only one of them, if it has.
         even_sharpness: of the least sharp direction of an image, over the sharpest; below it motion has blurred it.
-        least_sharpness: likewise; bounds by how much a blurred frame is less certain.
+        streak_sharpness: of the least sharp direction, per squared pixel of half the image; stripes have more.
+        least_sharpness: share of what keyframes saw; bounds by how much a blurred frame is less certain.
         usual_clustering: factor on variances; nine of ten quiet frames stay below, above it one frame is believed.
         scattered_nis: NIS per degree of freedom; a blurred view above it would spoil what comes after, as a keyframe.
         bad_keyframe_landmarks: share of the last keyframe's; below it a blurred view is better than none.
@@ -74,6 +75,7 @@ class Acceptance:
     sharpness: float = 0.8
     equal_blur: float = 0.65
     even_sharpness: float = 0.38
+    streak_sharpness: float = 0.09
     least_sharpness: float = 0.1
     usual_clustering: float = 2.0
     scattered_nis: float = 1.6

@@ -28,15 +28,18 @@ _DIRECTIONS, _MARGIN = 12, 4
 def is_blurred(image: np.ndarray) -> bool:
     """Whether an (H, W) uint8 image is blurred along one direction.
 
-    Edges of any strength and number have the same width in all directions if it is not.
+    Edges of any strength and number have the same width in all directions if it is not, but for stripes: these vary
+    slowly across, but not as slowly as a streak does.
     """
-    return evenness(image) < ACCEPTANCE.even_sharpness
+    least, most = extreme_sharpness(image)
+    return least < ACCEPTANCE.even_sharpness * most and least < ACCEPTANCE.streak_sharpness
 
 
-def evenness(image: np.ndarray) -> float:
-    """Sharpness of an (H, W) uint8 image in its least sharp direction, over that in its sharpest; in [0, 1].
+def extreme_sharpness(image: np.ndarray) -> tuple[float, float]:
+    """Sharpness of an (H, W) uint8 image in its least sharp direction and in its sharpest.
 
-    The sharpness in a direction is the mean squared second derivative over that of the first. 1 where nothing varies.
+    The sharpness in a direction is the mean squared second derivative over that of the first, per squared pixel of half
+    the image. Infinite where nothing varies.
     """
     half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     smooth = cv2.GaussianBlur(half.astype(np.float32), (0, 0), _SMOOTHING)
@@ -51,9 +54,9 @@ def evenness(image: np.ndarray) -> float:
     once, twice = np.stack([cosine, sine]), np.stack([cosine**2, 2.0 * cosine * sine, sine**2])
     energies = [np.einsum("id,ij,jd->d", each, maps @ maps.T, each) for each, maps in ((once, first), (twice, second))]
     if not (np.array(energies) > 0.0).all():
-        return 1.0
+        return np.inf, np.inf
     sharpness = energies[1] / energies[0]
-    return float(sharpness.min() / sharpness.max())
+    return float(sharpness.min()), float(sharpness.max())
 
 
 def streak_covariance(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sigmaslam.estimation.acceptance import ACCEPTANCE
-from sigmaslam.frontend.motion_blur import evenness, is_blurred, streak_covariance
+from sigmaslam.frontend.motion_blur import extreme_sharpness, is_blurred, streak_covariance
 
 SIZE = 240
 GRID = np.stack(np.meshgrid(*[np.arange(24.0, SIZE - 24, 24)] * 2), axis=-1).reshape(-1, 2)
@@ -24,6 +24,12 @@ def polygons(seed: int = 0, flatness: float = 1.0) -> np.ndarray:
         cv2.ellipse(image, (int(4 * SIZE * u), int(4 * SIZE * v)), axes, tilt, 0, 360, grey, -1)
     image = cv2.resize(image, (SIZE, SIZE), interpolation=cv2.INTER_AREA)
     return np.clip(image + generator.normal(0.0, 1.0, image.shape), 0, 255).astype(np.uint8)
+
+
+def evenness(image: np.ndarray) -> float:
+    """Of the sharpest direction what the least sharp one has."""
+    least, most = extreme_sharpness(image)
+    return least / most
 
 
 def blurred(image: np.ndarray, length: int, degrees: float) -> np.ndarray:
@@ -59,8 +65,17 @@ def test_the_longer_the_streak_the_less_even():
 
 
 def test_nothing_is_said_of_an_even_or_a_tiny_image():
-    assert evenness(np.full((SIZE, SIZE), 7, np.uint8)) == 1.0
-    assert evenness(np.arange(100, dtype=np.uint8).reshape(10, 10)) == 1.0
+    assert not is_blurred(np.full((SIZE, SIZE), 7, np.uint8))
+    assert not is_blurred(np.arange(100, dtype=np.uint8).reshape(10, 10))
+
+
+def test_stripes_are_no_streaks():
+    """A wall of them with grain, and a tenth of the image with other things: uneven, but not as a streak is."""
+    grain = cv2.GaussianBlur(np.random.default_rng(0).normal(0.0, 6.0, (SIZE, SIZE)), (0, 0), 0.8)
+    wall = (120.0 + 40.0 * np.sin(2.0 * np.pi * np.arange(SIZE) / 10.0) + grain).clip(0, 255).astype(np.uint8)
+    wall[-SIZE // 10 :] = polygons()[-SIZE // 10 :]
+    assert evenness(wall) < ACCEPTANCE.even_sharpness
+    assert not is_blurred(wall)
 
 
 @pytest.mark.parametrize("degrees", [0.0, 60.0, 90.0])
@@ -96,3 +111,4 @@ def test_few_matches_and_even_patches_say_nothing():
 def test_the_bounds_lie_between_sharp_and_streaked():
     image = polygons()
     assert evenness(blurred(image, 17, 0.0)) < ACCEPTANCE.even_sharpness < evenness(image)
+    assert extreme_sharpness(blurred(image, 17, 0.0))[0] < ACCEPTANCE.streak_sharpness < extreme_sharpness(image)[0]
