@@ -5,8 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-# A disparity that is not there: its variance, pixels squared.
-UNKNOWN_VARIANCE = 1e12
+from sigmaslam.estimation.linearised_views import UNKNOWN_VARIANCE
 
 
 def mask_missing(measurement: Tensor, mean: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
