@@ -4,23 +4,14 @@ import pybind11
 from setuptools import Extension, setup
 
 # No -ffast-math and no contraction: the same bits on every run. AVX2 is chosen when the module is loaded.
-_OPTIONS = {
-    "include_dirs": [pybind11.get_include()],
-    "extra_compile_args": ["-O3", "-std=c++17", "-ffp-contract=off", "-fvisibility=hidden", "-Wno-psabi", "-g0"],
-    "language": "c++",
-    "optional": True,  # without a compiler the NumPy twin and the graphs serve
-}
 KERNELS = Extension(
     "sigmaslam.frontend._kernels",
     ["sigmaslam/frontend/kernels.cpp"],
     depends=["sigmaslam/frontend/kernels.inc"],
-    **_OPTIONS,
-)
-VIEWS = Extension(
-    "sigmaslam.estimation._views",
-    ["sigmaslam/estimation/views.cpp"],
-    depends=["sigmaslam/estimation/views.inc"],
-    **_OPTIONS,
+    include_dirs=[pybind11.get_include()],
+    extra_compile_args=["-O3", "-std=c++17", "-ffp-contract=off", "-fvisibility=hidden", "-Wno-psabi", "-g0"],
+    language="c++",
+    optional=True,  # without a compiler the NumPy twin serves
 )
 
-setup(ext_modules=[KERNELS, VIEWS])
+setup(ext_modules=[KERNELS])

@@ -74,22 +74,6 @@ class ScalarLoop:
         return outputs
 
 
-def write_function(name: str, step: Callable[..., Sequence[Tensor]], inputs: Sequence[Tensor]) -> str:
-    """A step without a state as C++: `static void name(void** in, void** out, int64_t steps, int64_t batch)`.
-
-    Args:
-        name: of the function.
-        step: (*inputs) of one batch dimension -> outputs, without side effects.
-        inputs: those of one element.
-    Raises:
-        ScalarLoopError: the step cannot be written this way.
-    """
-    arguments = [each.expand(TRACED, *each.shape).clone() for each in inputs]
-    with torch.no_grad():
-        source, _ = _Writer(*_trace(step, arguments), arguments, 0).source()
-    return source.removeprefix(HEAD).replace('extern "C" void run(', f"static void {name}(").strip() + "\n"
-
-
 def _trace(step: Callable[..., Any], arguments: Sequence[Tensor]) -> tuple[fx.GraphModule, list[Tensor]]:
     """The graph of a step in aten's operations, and its inputs: the arguments, and tensors of the models."""
     modules: list[fx.GraphModule] = []
@@ -189,7 +173,7 @@ class _Writer:
         loop = ["for (int64_t t = 0; t < steps; ++t) {", *read, *self._lines, *write, *move, "}"]
         body = ["for (int64_t b = 0; b < batch; ++b) {", *start, *loop, "}"]
         head = 'extern "C" void run(void** in, void** out, int64_t steps, int64_t batch) {'
-        return "\n".join([HEAD, head, *body, "}", ""]), shapes
+        return "\n".join([_HEAD, head, *body, "}", ""]), shapes
 
     def _entries(self, result: Any) -> Entries:
         if not isinstance(result, Entries) or result.dtype not in _TYPES:
@@ -299,7 +283,7 @@ def _type(node: fx.Node) -> str:
     return _TYPES[dtype]
 
 
-HEAD = """#include <algorithm>
+_HEAD = """#include <algorithm>
 #include <cmath>
 #include <cstdint>
 template <typename T> static inline T at_most(T a, T b) { return (a != a || a < b) ? a : b; }
@@ -307,7 +291,6 @@ template <typename T> static inline T at_least(T a, T b) { return (a != a || a >
 template <typename T> static inline T sign(T a) { return (T)((T(0) < a) - (a < T(0))); }
 template <typename T> static inline T modulo(T a, T b) { return a - b * std::floor(a / b); }
 """
-"""What the functions need."""
 
 _SAME = "sqrt sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp exp2 expm1 log log2 log10 log1p"
 _INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", "eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">"}

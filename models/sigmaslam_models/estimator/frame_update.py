@@ -11,16 +11,18 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999, CHI_SQUARE_MEDIAN
-from sigmaslam.estimation.frame_steps import ROBUST_SCALES, SCALE_RULES
-from sigmaslam.estimation.linearised_views import UNKNOWN_VARIANCE
 from sigmaslam.estimation.state_layout import CALIBRATION, CALIBRATION_SIZE, LANDMARK_SIZE, MODELLED
 from sigmaslam_filters.core.plain_factors import invert
 from sigmaslam_filters.core.unrolled_factors import whiten
 from sigmaslam_filters.manifolds.se3_matrices import exp_se3, invert_se3, log_se3
 from sigmaslam_filters.robust import common_scale, student_weight
-from sigmaslam_models.estimator.residuals import chi_square, mask_missing
+from sigmaslam_models.estimator.residuals import UNKNOWN_VARIANCE, chi_square, mask_missing
 from sigmaslam_models.estimator.stereo_views import Scene, Slopes, by_state, linearise
+
+# Scales of the robust loss by which a frame's pose is first found, in standard deviations: it narrows.
+_ROBUST_SCALES = (6.0, 4.0, 3.0)
 
 
 class FrameViews(NamedTuple):
@@ -142,7 +144,7 @@ class RobustStep(nn.Module):
         squared = torch.where(gated > 0.0, _lengths(whitened[..., 0]), seen.squared)
         usable = seen.usable.to(noise.dtype)
         z, inverse, after = seen.beyond, spread, seen.residual
-        for limit in ROBUST_SCALES:
+        for limit in _ROBUST_SCALES:
             loss = 1.0 + squared / (scale * (limit * limit))
             weight = usable / (loss * loss)
             z, inverse = _solve(seen, weight)
@@ -186,7 +188,8 @@ class GatedStep(nn.Module):
         frame = FrameViews(*views)
         seen = _linearised(frame, measurement, noise, offset, spread, moved)
         median, largest = (chi_square(table, seen.components) for table in (CHI_SQUARE_MEDIAN, CHI_SQUARE_999))
-        found = common_scale(seen.squared, median, largest, seen.usable, *SCALE_RULES)
+        rules = ACCEPTANCE.scaled_agreement, ACCEPTANCE.max_noise_scale
+        found = common_scale(seen.squared, median, largest, seen.usable, *rules)
         noise_scale = torch.where(noise_scale > 0.0, noise_scale, found)
         squared = seen.squared / noise_scale
         agree = seen.usable & (squared <= scale * largest)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sigmaslam.estimation.linearised_views import UNKNOWN_VARIANCE
+# A disparity that is not there: its variance, pixels squared.
+UNKNOWN_VARIANCE = 1e12
 
 
 def mask_missing(measurement: Tensor, mean: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:

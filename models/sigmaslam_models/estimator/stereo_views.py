@@ -7,12 +7,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from sigmaslam.estimation.linearised_views import LEAST_SPREAD, MAX_SPREAD
 from sigmaslam.estimation.state_layout import CALIBRATION_MODELLED, CALIBRATION_SIZE, MODELLED
 from sigmaslam_filters.core.plain_factors import definite_cholesky
 from sigmaslam_filters.manifolds.se3_matrices import adjoint_se3, invert_se3
 from sigmaslam_models.estimator.calibration_errors import unmodelled_errors
 from sigmaslam_models.estimator.stereo_window import StereoTransfer
+
+# Least spread of sigma points: share of the scene's depth, radians, pixels; with it alone slopes are derivatives.
+LEAST_SPREAD = 1e-6
+# Largest standard deviation that sigma points are drawn from: share of the scene's depth and radians.
+_MAX_SPREAD = 0.05
 
 
 class Scene(NamedTuple):
@@ -129,5 +133,5 @@ def _limited(covariance: Tensor, depth: Tensor) -> Tensor:
     """Covariances (p, 9, 9) of relative poses and calibration, shrunk where sigma points would leave the scene."""
     variance = torch.diagonal(covariance, dim1=1, dim2=2)
     worst = torch.maximum(variance[:, :3].amax(dim=1) / (depth * depth), variance[:, 3:6].amax(dim=1))
-    most = torch.tensor(MAX_SPREAD**2, dtype=covariance.dtype, device=covariance.device)
+    most = torch.tensor(_MAX_SPREAD**2, dtype=covariance.dtype, device=covariance.device)
     return covariance * (most / torch.maximum(worst, most))[:, None, None]

@@ -30,8 +30,6 @@ CALIBRATION = slice(6, 9)
 LANDMARK = slice(9, 13)
 SIZE = 13
 _SPREAD = cubature().spread(SIZE)
-# Numbers of the pose that its sigma points move, and the poses they make with the unmoved one.
-_SIX, _POSES = CALIBRATION.start, 2 * CALIBRATION.start + 1
 
 # A point whose depth along the view's optical axis is below this share of its depth in the host is not used: it is
 # behind the camera, or about to be. A power of two is exact in float32, through which the exporter takes scalars.
@@ -60,63 +58,38 @@ class StereoTransfer(nn.Module):
         landmark_spread: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The unscented transform (steps 4 and 5 of Table 9.2), landmark by landmark."""
-        moved, biased = pair_points(relative, spread, calibration)
+        root = torch.sqrt(torch.tensor(_SPREAD, dtype=relative.dtype, device=relative.device))
+        steps = root * spread.movedim(-1, 0)
+        six, nine = CALIBRATION.start, LANDMARK.start
+        # The last three columns of a lower factor do not move the pose.
+        moving, biasing = steps[:six], steps[six:, :, CALIBRATION]
+        moving, biasing = torch.cat([moving, -moving]), torch.cat([biasing, -biasing])
+        moved = torch.cat([exp_se3(moving[..., POSE]) @ relative, relative[None]])[..., :3, :]
+        biased = torch.cat([moving[..., CALIBRATION], biasing]) + calibration
         # A product with zeros and ones takes each measurement's pair out, entry by entry, and is faster than indexing.
         entries = torch.cat([moved.permute(2, 3, 0, 1).flatten(0, 2), biased.permute(2, 0, 1).flatten(0, 1)])
         pairs = torch.arange(relative.shape[0], device=relative.device)
         each = entries @ (pairs[:, None] == pair).to(relative.dtype)
-        poses = each[: 12 * _POSES].unflatten(0, (12, -1)).unbind(0)
-        biases = each[12 * _POSES :].unflatten(0, (3, -1))
-        spread = landmark_spread.permute(1, 2, 0)
-        mean, odd, even, in_front = transfer(poses, biases, calibration[:, None], intrinsics, landmarks.mT, spread)
-        return mean, odd, even @ even.mT, in_front
-
-
-def pair_points(relative: Tensor, spread: Tensor, calibration: Tensor) -> tuple[Tensor, Tensor]:
-    """Sigma points of p pairs of poses: T_view_host (13, p, 3, 4), the last one unmoved, calibrations (18, p, 3)."""
-    root = torch.sqrt(torch.tensor(_SPREAD, dtype=relative.dtype, device=relative.device))
-    steps = root * spread.movedim(-1, 0)
-    # The last three columns of a lower factor do not move the pose.
-    moving, biasing = steps[:_SIX], steps[_SIX:, :, CALIBRATION]
-    moving, biasing = torch.cat([moving, -moving]), torch.cat([biasing, -biasing])
-    moved = torch.cat([exp_se3(moving[..., POSE]) @ relative, relative[None]])[..., :3, :]
-    return moved, torch.cat([moving[..., CALIBRATION], biasing]) + calibration
-
-
-def transfer(
-    poses: Sequence[Tensor],
-    biases: Tensor,
-    calibration: Tensor,
-    intrinsics: Tensor,
-    own: Tensor,
-    landmark_spread: Tensor,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """What sigma points of the pair of poses and of the landmark make of each measurement; arrays end with these (m).
-
-    Args:
-        poses, biases: the twelve entries (13, m) and the calibrations (3, 18, m) of `pair_points`.
-        calibration: (3, m) or (3, 1).
-        intrinsics, own, landmark_spread: (5,) or (5, m), (4, m), (4, 4, m).
-    Returns:
-        As of `StereoTransfer`, with a factor (m, 3, 13) of the covariance.
-    """
-    root = torch.sqrt(torch.tensor(_SPREAD, dtype=own.dtype, device=own.device))
-    six, nine = _SIX, LANDMARK.start
-    by_pose, _ = _project([entry[:-1] for entry in poses], biases[:, : 2 * six].unbind(0), intrinsics, own.unbind(0))
-    # At the pose itself: other calibrations, the landmark and calibration themselves, and other landmarks.
-    steps = root * landmark_spread
-    count = 2 * (nine - six) + 1
-    constant = calibration[:, None].expand(-1, 1 + 2 * (SIZE - nine), own.shape[1])
-    own = own[:, None]
-    around = torch.cat([own.expand(-1, count, -1), own + steps, own - steps], dim=1)
-    biases = torch.cat([biases[:, 2 * six :], constant], dim=1)
-    others, depth = _project([entry[-1] for entry in poses], biases.unbind(0), intrinsics, around.unbind(0))
-    three, four = nine - six, SIZE - nine
-    plus = torch.cat([by_pose[:, :six], others[:, :three], others[:, count : count + four]], dim=1)
-    minus = torch.cat([by_pose[:, six:], others[:, three : count - 1], others[:, count + four :]], dim=1)
-    mean = (plus + minus).sum(dim=1) / (2.0 * _SPREAD)
-    odd, even = ((half / (2.0 * root)).permute(2, 0, 1) for half in odd_and_even(plus, minus, mean[:, None]))
-    return mean.mT, odd, even, (depth[count - 1] > _NEAREST).to(mean.dtype)
+        poses = each[: 12 * (2 * six + 1)].unflatten(0, (12, -1)).unbind(0)
+        biases = each[12 * (2 * six + 1) :].unflatten(0, (3, -1))
+        own = landmarks.mT
+        by_pose, _ = _project(
+            [entry[:-1] for entry in poses], biases[:, : 2 * six].unbind(0), intrinsics, own.unbind(0)
+        )
+        # At the pose itself: other calibrations, the landmark and calibration themselves, and other landmarks.
+        steps = root * landmark_spread.permute(1, 2, 0)
+        count = 2 * (nine - six) + 1
+        own = own[:, None]
+        around = torch.cat([own.expand(-1, count, -1), own + steps, own - steps], dim=1)
+        constant = calibration[:, None, None].expand(-1, 1 + 2 * (SIZE - nine), landmarks.shape[0])
+        biases = torch.cat([biases[:, 2 * six :], constant], dim=1)
+        others, depth = _project([entry[-1] for entry in poses], biases.unbind(0), intrinsics, around.unbind(0))
+        three, four = nine - six, SIZE - nine
+        plus = torch.cat([by_pose[:, :six], others[:, :three], others[:, count : count + four]], dim=1)
+        minus = torch.cat([by_pose[:, six:], others[:, three : count - 1], others[:, count + four :]], dim=1)
+        mean = (plus + minus).sum(dim=1) / (2.0 * _SPREAD)
+        odd, even = ((half / (2.0 * root)).permute(2, 0, 1) for half in odd_and_even(plus, minus, mean[:, None]))
+        return mean.mT, odd, even @ even.mT, (depth[count - 1] > _NEAREST).to(mean.dtype)
 
 
 def _project(

@@ -12,12 +12,11 @@ import torch
 from torch import Tensor, nn
 
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999
-from sigmaslam.estimation.linearised_views import UNKNOWN_VARIANCE
 from sigmaslam.estimation.state_layout import LANDMARK_SIZE, MODELLED
 from sigmaslam_filters.core.plain_factors import invert
 from sigmaslam_filters.core.unrolled_factors import whiten
 from sigmaslam_filters.robust import student_weight
-from sigmaslam_models.estimator.residuals import chi_square, mask_missing
+from sigmaslam_models.estimator.residuals import UNKNOWN_VARIANCE, chi_square, mask_missing
 from sigmaslam_models.estimator.stereo_views import Scene, Slopes, by_state, linearise
 
 
