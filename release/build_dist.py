@@ -23,7 +23,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 TOOLS = ("build", "setuptools", "pybind11")
-KERNELS = "sigmaslam/frontend/_kernels."
+COMPILED = ("sigmaslam/frontend/_kernels.", "sigmaslam/estimation/_estimator.")
 
 
 def main() -> None:
@@ -68,8 +68,8 @@ def build_dist(out: Path, pythons: list[str]) -> list[Path]:
                 (sources / "setup.py").unlink()  # which holds the kernels alone
             wheel = _build(builder, "wheel", sources, out, environment)
             with zipfile.ZipFile(wheel) as content:
-                compiled = any(each.startswith(KERNELS) for each in content.namelist())
-            if compiled != (number > 0):
+                compiled = [each for each in content.namelist() if each.startswith(COMPILED)]
+            if len(compiled) != (len(COMPILED) if number > 0 else 0):
                 raise RuntimeError(f"{wheel} holds no compiled kernels: install a C++ compiler (apt install g++)")
             archives.append(wheel)
     sums = out / "SHA256SUMS"

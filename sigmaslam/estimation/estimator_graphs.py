@@ -1,11 +1,26 @@
-"""The estimator's equations as graphs: the torch modules of `sigmaslam_models.estimator`, exported."""
+"""The estimator's equations: the torch modules of `sigmaslam_models.estimator`, compiled or exported as graphs."""
 
 from __future__ import annotations
+
+import logging
+from functools import cache
+from importlib import import_module
+from types import ModuleType
+from typing import cast
 
 import numpy as np
 
 from sigmaslam.geometry.camera import RectifiedStereo
-from sigmaslam.inference.backends import load_step
+from sigmaslam.inference.backends import ONNX, load_step
+from sigmaslam.inference.onnx_graph import Step
+
+_compiled: ModuleType | None
+try:
+    _compiled = import_module("sigmaslam.estimation._estimator")
+except ImportError:  # installed without a compiler
+    _compiled = None
+
+_LOGGER = logging.getLogger(__name__)
 
 
 class EstimatorGraphs:
@@ -13,7 +28,7 @@ class EstimatorGraphs:
 
     Args:
         camera: the rectified pair.
-        backend: "onnx" or "torch".
+        backend: "onnx", of which what is compiled takes the place; or "torch".
         unscented: linearise by sigma points; else by first derivatives.
 
     Attributes:
@@ -22,11 +37,11 @@ class EstimatorGraphs:
     """
 
     def __init__(self, camera: RectifiedStereo, backend: str, unscented: bool) -> None:
-        self.predict_views = load_step("frame_predict", backend)
-        self.robust_step = load_step("frame_robust", backend)
-        self.gated_step = load_step("frame_gated", backend)
-        self.eliminate_landmarks = load_step("window_eliminate", backend)
-        self.gate_window = load_step("window_gate", backend)
+        self.predict_views = open_step("frame_predict", backend)
+        self.robust_step = open_step("frame_robust", backend)
+        self.gated_step = open_step("frame_gated", backend)
+        self.eliminate_landmarks = open_step("window_eliminate", backend)
+        self.gate_window = open_step("window_gate", backend)
         self.condition = load_step("window_condition", backend)
         self._intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.focal_baseline])
         self._unscented = np.array(float(unscented))
@@ -34,3 +49,22 @@ class EstimatorGraphs:
     def constants(self, depth: float) -> dict[str, np.ndarray]:
         """The inputs that all of them begin with, for a depth of the scene, metres."""
         return {"intrinsics": self._intrinsics, "depth": np.array(depth, float), "unscented": self._unscented}
+
+
+def open_step(name: str, backend: str = ONNX) -> Step:
+    """A step by the name of its graph: compiled where a compiler was at hand, else the graph."""
+    if backend != ONNX:
+        return load_step(name, backend)
+    if _compiled is None:
+        _tell_slow()
+        return load_step(name)
+    return cast(Step, getattr(_compiled, name))
+
+
+@cache
+def _tell_slow() -> None:
+    """Once."""
+    _LOGGER.warning(
+        "poses are estimated by graphs, which takes five times longer: install the wheel of this Python and platform, "
+        "or a C++ compiler and then sigmaslam from its sources"
+    )

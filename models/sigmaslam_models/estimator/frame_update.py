@@ -22,7 +22,9 @@ from sigmaslam_models.estimator.residuals import UNKNOWN_VARIANCE, chi_square, m
 from sigmaslam_models.estimator.stereo_views import Scene, Slopes, by_state, linearise
 
 # Scales of the robust loss by which a frame's pose is first found, in standard deviations: it narrows.
-_ROBUST_SCALES = (6.0, 4.0, 3.0)
+ROBUST_SCALES = (6.0, 4.0, 3.0)
+# Of the factor by which all variances of a frame together are too small, see `common_scale`.
+NOISE_SCALE_RULES = ACCEPTANCE.scaled_agreement, ACCEPTANCE.max_noise_scale
 
 
 class FrameViews(NamedTuple):
@@ -106,11 +108,9 @@ class PredictViews(nn.Module):
         """At the prior's mean, over the prior."""
         frame = FrameViews(*views)
         zero = torch.zeros_like(frame.factor[:, 0])
-        linear = frame.linearise(zero, frame.factor @ frame.factor.mT, torch.zeros_like(frame.estimate))
-        by_prior = frame.by_state(linear.by_pair, linear.by_landmark, linear.chain) @ frame.factor
-        by_prior = by_prior.unflatten(0, (-1, 3))
-        through = linear.by_landmark @ frame.covariance @ linear.by_landmark.mT
-        return linear.mean, linear.nonlinearity + through + by_prior @ by_prior.mT, linear.in_front
+        mean, by_state, _, noise, in_front = predicted(frame, zero, frame.factor @ frame.factor.mT)
+        by_prior = (by_state @ frame.factor).unflatten(0, (-1, 3))
+        return mean, noise + by_prior @ by_prior.mT, in_front > 0.0
 
 
 class RobustStep(nn.Module):
@@ -136,7 +136,7 @@ class RobustStep(nn.Module):
     ) -> tuple[Tensor, ...]:
         """Three weighted solutions of the same linear system."""
         frame = FrameViews(*views)
-        seen = _linearised(frame, measurement, noise, offset, spread, moved)
+        seen = linearised(frame, measurement, noise, offset, spread, moved)
         # About what the prior expects.
         slopes = seen.by_prior.unflatten(0, (-1, 3))
         innovation = slopes @ slopes.mT + torch.eye(3, dtype=noise.dtype, device=noise.device)
@@ -144,7 +144,7 @@ class RobustStep(nn.Module):
         squared = torch.where(gated > 0.0, _lengths(whitened[..., 0]), seen.squared)
         usable = seen.usable.to(noise.dtype)
         z, inverse, after = seen.beyond, spread, seen.residual
-        for limit in _ROBUST_SCALES:
+        for limit in ROBUST_SCALES:
             loss = 1.0 + squared / (scale * (limit * limit))
             weight = usable / (loss * loss)
             z, inverse = _solve(seen, weight)
@@ -186,10 +186,9 @@ class GatedStep(nn.Module):
     ) -> tuple[Tensor, ...]:
         """The gate before the step, which the caller takes or leaves."""
         frame = FrameViews(*views)
-        seen = _linearised(frame, measurement, noise, offset, spread, moved)
+        seen = linearised(frame, measurement, noise, offset, spread, moved)
         median, largest = (chi_square(table, seen.components) for table in (CHI_SQUARE_MEDIAN, CHI_SQUARE_999))
-        rules = ACCEPTANCE.scaled_agreement, ACCEPTANCE.max_noise_scale
-        found = common_scale(seen.squared, median, largest, seen.usable, *rules)
+        found = common_scale(seen.squared, median, largest, seen.usable, *NOISE_SCALE_RULES)
         noise_scale = torch.where(noise_scale > 0.0, noise_scale, found)
         squared = seen.squared / noise_scale
         agree = seen.usable & (squared <= scale * largest)
@@ -288,9 +287,20 @@ def update_frame(
     return FrameEstimate(offset, spread, inliers & agree)
 
 
-def _linearised(
+def predicted(frame: FrameViews, offset: Tensor, spread: Tensor) -> tuple[Tensor, ...]:
+    """What a frame should see: mean (M, 3), derivatives by the state (3 M, n) and by the landmarks (M, 3, 6), what they
+    leave uncertain (M, 3, 3), and 1.0 for what is in front (M,)."""
+    linear = frame.linearise(offset, spread, torch.zeros_like(frame.estimate))
+    by_state = frame.by_state(linear.by_pair, linear.by_landmark, linear.chain)
+    through = linear.by_landmark @ frame.covariance @ linear.by_landmark.mT
+    in_front = linear.in_front.to(offset.dtype)
+    return linear.mean, by_state, linear.by_landmark, linear.nonlinearity + through, in_front
+
+
+def linearised(
     frame: FrameViews, measurement: Tensor, noise: Tensor, offset: Tensor, spread: Tensor, moved: Tensor
 ) -> _Whitened:
+    """What a frame sees, at an offset of the state and landmarks that moved."""
     linear = frame.linearise(offset, spread, moved)
     through = linear.by_landmark @ frame.covariance @ linear.by_landmark.mT
     residual, noise, components = mask_missing(measurement, linear.mean, noise + linear.nonlinearity + through)

@@ -68,9 +68,7 @@ class GateWindow(nn.Module):
 
     def forward(self, *views: Tensor) -> Tensor:
         """By the length of each view's residual."""
-        linear, residual, noise, components = WindowViews(*views).linearise()
-        whitened = whiten(residual[..., None], noise)[..., 0]
-        return linear.in_front & ((whitened * whitened).sum(dim=1) <= chi_square(CHI_SQUARE_999, components))
+        return agreeing(WindowViews(*views))
 
 
 class EliminateLandmarks(nn.Module):
@@ -86,19 +84,8 @@ class EliminateLandmarks(nn.Module):
     def forward(self, measured: Tensor, variance: Tensor, freedom: Tensor, *views: Tensor) -> tuple[Tensor, ...]:
         """By Schur's complement of each landmark."""
         window = WindowViews(*views)
-        linear, residual, noise, components = window.linearise()
-        identity = torch.eye(3, dtype=noise.dtype, device=noise.device)
-        unknown = torch.tensor(UNKNOWN_VARIANCE, dtype=noise.dtype, device=noise.device)
-        noise = torch.where(linear.in_front[:, None, None], noise, unknown * identity)
-        pieces = [linear.by_pair, linear.by_landmark, residual[..., None]]
-        stacked = whiten(torch.cat(pieces, dim=2), noise)
-        squared = (stacked[..., -1] * stacked[..., -1]).sum(dim=1)
-        weight = student_weight(squared, components, freedom, consistent=True)
-        stacked = stacked * torch.sqrt(weight)[:, None, None]
-        rows = by_state(stacked[..., :18], linear.chain, window.pair)
-        size = rows.shape[1]
-        rows = torch.cat([rows, stacked[..., 24].flatten()[:, None]], dim=1)
-        by_landmark = stacked[..., 18:24]
+        rows, by_landmark = whitened(window, freedom)
+        size = rows.shape[1] - 1
         right = torch.cat([by_landmark, rows.unflatten(0, (-1, 3))], dim=2)
         products = by_landmark.mT @ right
         sums = torch.zeros_like(products[:1]).expand(measured.shape[0], -1, -1)
@@ -130,6 +117,28 @@ class Condition(nn.Module):
         learned = torch.cat([vector[:, None], -information @ common], dim=1)
         moved = covariance @ learned
         return moved[:, 0], covariance, common + moved[:, 1:]
+
+
+def agreeing(window: WindowViews) -> Tensor:
+    """(O,) bool, the views whose residuals are no longer than 99.9 % are."""
+    linear, residual, noise, components = window.linearise()
+    white = whiten(residual[..., None], noise)[..., 0]
+    return linear.in_front & ((white * white).sum(dim=1) <= chi_square(CHI_SQUARE_999, components))
+
+
+def whitened(window: WindowViews, freedom: Tensor) -> tuple[Tensor, Tensor]:
+    """Weighted and in units of their noise: derivatives by the state, the residuals behind them (3 O, n + 1), and
+    derivatives by the landmarks (O, 3, 6)."""
+    linear, residual, noise, components = window.linearise()
+    identity = torch.eye(3, dtype=noise.dtype, device=noise.device)
+    unknown = torch.tensor(UNKNOWN_VARIANCE, dtype=noise.dtype, device=noise.device)
+    noise = torch.where(linear.in_front[:, None, None], noise, unknown * identity)
+    stacked = whiten(torch.cat([linear.by_pair, linear.by_landmark, residual[..., None]], dim=2), noise)
+    squared = (stacked[..., -1] * stacked[..., -1]).sum(dim=1)
+    weight = student_weight(squared, components, freedom, consistent=True)
+    stacked = stacked * torch.sqrt(weight)[:, None, None]
+    rows = by_state(stacked[..., :18], linear.chain, window.pair)
+    return torch.cat([rows, stacked[..., 24].flatten()[:, None]], dim=1), stacked[..., 18:24]
 
 
 def _prior_precision(departure: Tensor, variance: Tensor, freedom: Tensor) -> Tensor:

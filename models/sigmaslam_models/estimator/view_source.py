@@ -1,0 +1,96 @@
+"""What the estimator's graphs do for each view, as C++ from the same modules: `sigmaslam/estimation/views.inc`.
+
+A view is traced with two poses alone, those that its landmark is anchored to and that see it, so the state has 24
+numbers: of the calibration and of both poses. `estimator.cpp` puts them where they belong in the whole state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from sigmaslam.estimation.chi_square import CHI_SQUARE_999, CHI_SQUARE_MEDIAN
+from sigmaslam.estimation.state_layout import CALIBRATION_SIZE, LANDMARK_SIZE
+from sigmaslam_filters.compiler.item_source import write_functions
+from sigmaslam_models.estimator.frame_update import NOISE_SCALE_RULES, ROBUST_SCALES, FrameViews, linearised, predicted
+from sigmaslam_models.estimator.window_solution import WindowViews, agreeing, whitened
+
+SIZE = CALIBRATION_SIZE + 12
+_HEAD = "// Made by sigmaslam_models.estimator.view_source; do not edit.\n\n"
+
+
+def write_views() -> str:
+    """The whole file."""
+    constants: dict[str, Sequence[float]] = {
+        "CHI_SQUARE_MEDIAN": CHI_SQUARE_MEDIAN[2:4].tolist(),
+        "CHI_SQUARE_999": CHI_SQUARE_999[2:4].tolist(),
+        "ROBUST_SCALES": ROBUST_SCALES,
+        "NOISE_SCALE_RULES": NOISE_SCALE_RULES,
+    }
+    return _HEAD + "\n".join(
+        [
+            *(
+                f"constexpr double {name}[] = {{{', '.join(str(value) for value in each)}}};"
+                for name, each in constants.items()
+            ),
+            write_functions("predict", _predicted_view, _numbers(_FRAME), _numbers(_OWN)),
+            write_functions("frame", _linearised_view, _numbers(_FRAME), _numbers((*_OWN, "moved", *_SEEN))),
+            write_functions("window", _window_view, _numbers((*_WINDOW, "freedom")), _numbers((*_OWN, *_SEEN))),
+        ]
+    )
+
+
+_WINDOW = ("intrinsics", "depth", "unscented", "poses", "calibration", "spread")
+_FRAME = (*_WINDOW, "offset")
+_OWN = ("estimate", "covariance", "common")
+_SEEN = ("measurement", "noise")
+_SHAPES: dict[str, tuple[int, ...]] = {
+    **{"intrinsics": (5,), "depth": (), "unscented": (), "freedom": (), "poses": (2, 4, 4)},
+    **{"calibration": (CALIBRATION_SIZE,), "spread": (SIZE, SIZE), "offset": (SIZE,), "common": (3, 2)},
+    **{"estimate": (LANDMARK_SIZE,), "covariance": (LANDMARK_SIZE, LANDMARK_SIZE), "moved": (LANDMARK_SIZE,)},
+    **{"measurement": (3,), "noise": (3, 3)},
+}
+
+
+def _numbers(names: tuple[str, ...]) -> dict[str, Tensor]:
+    return {name: torch.ones(_SHAPES[name], dtype=torch.float64) for name in names}
+
+
+def _frame(window: Sequence[Tensor], own: Sequence[Tensor]) -> FrameViews:
+    """A frame with one view, whose landmark does not depend on the state: how it does is the caller's."""
+    intrinsics, depth, unscented, poses, calibration = window
+    estimate, covariance, common = own
+    anchor = torch.zeros(1, dtype=torch.int64)
+    scene = (intrinsics, depth, unscented, anchor, anchor + 1, anchor, common[None], covariance[None])
+    still = torch.zeros(1, LANDMARK_SIZE, SIZE, dtype=torch.float64)
+    return FrameViews(*scene, estimate[None], still, poses, calibration, torch.zeros(SIZE, 1, dtype=torch.float64))
+
+
+def _predicted_view(*given: Tensor) -> tuple[Tensor, ...]:
+    spread, offset = given[5:7]
+    return predicted(_frame(given[:5], given[7:10]), offset, spread)
+
+
+def _linearised_view(*given: Tensor) -> tuple[Tensor, ...]:
+    spread, offset, moved, measurement, noise = *given[5:7], *given[10:]
+    frame = _frame(given[:5], given[7:10])
+    seen = linearised(frame, measurement[None], noise[None], offset, spread, moved[None])
+    return seen.by_state, seen.by_landmark, seen.residual, seen.squared, seen.components, seen.usable.to(noise.dtype)
+
+
+def _window_view(*given: Tensor) -> tuple[Tensor, ...]:
+    intrinsics, depth, unscented, poses, calibration, spread, freedom, *own = given
+    estimate, covariance, common, measurement, noise = (each[None] for each in own)
+    anchor = torch.zeros(1, dtype=torch.int64)
+    scene = (intrinsics, depth, unscented, anchor, anchor + 1, anchor, common)
+    window = WindowViews(*scene, anchor, estimate, covariance, poses, calibration, spread, measurement, noise)
+    return *whitened(window, freedom), agreeing(window).to(torch.float64)
+
+
+if __name__ == "__main__":
+    import sigmaslam.estimation
+
+    (Path(sigmaslam.estimation.__file__).parent / "views.inc").write_text(write_views())

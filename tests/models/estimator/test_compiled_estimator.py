@@ -1,0 +1,76 @@
+"""The compiled estimator against the modules that it is made from; `test_estimator_export` does so with the graphs."""
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sigmaslam.estimation
+from sigmaslam.estimation import estimator_graphs
+from sigmaslam.estimation.estimator_graphs import open_step
+from sigmaslam.inference.backends import load_step
+from sigmaslam_models.estimator.estimator_export import estimator_graphs as traced_modules
+from sigmaslam_models.estimator.graph_examples import frame_example, window_example
+from sigmaslam_models.estimator.view_source import write_views
+
+FRAME_STEPS = ("frame_predict", "frame_robust", "frame_gated")
+WINDOW_STEPS = ("window_eliminate", "window_gate")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _compiled():
+    pytest.importorskip("sigmaslam.estimation._estimator", reason="installed without a compiler")
+
+
+@pytest.fixture(scope="module")
+def inputs():
+    return {name: module.inputs for name, module in traced_modules().items()}
+
+
+def feeds(name, inputs):
+    """Few and many views, one pair of poses and a full window."""
+    example, sizes = (
+        (frame_example, ((1, 2), (6, 211), (7, 40))) if name in FRAME_STEPS else (window_example, ((2, 3), (7, 120)))
+    )
+    for seed, (keyframes, count) in enumerate(sizes, start=5):
+        values = example(seed, keyframes, count, *inputs[name])
+        yield {key: value.numpy() for key, value in zip(inputs[name], values, strict=True)}
+
+
+@pytest.mark.parametrize("name", [*FRAME_STEPS, *WINDOW_STEPS])
+@pytest.mark.parametrize(
+    ("unscented", "tolerance"),
+    # Derivatives are differences over a spread of 1e-6, which is what rounding is multiplied by.
+    [(1.0, 1e-10), (0.0, 1e-4)],
+)
+def test_compiled_step_equals_torch(name, unscented, tolerance, inputs):
+    for feed in feeds(name, inputs):
+        feed["unscented"] = np.array(unscented)
+        found, expected = open_step(name)(feed), open_step(name, "torch")(feed)
+        assert len(found) == len(expected)
+        for a, b in zip(found, expected, strict=True):
+            assert (a.shape, a.dtype) == (b.shape, b.dtype)
+            np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance * max(1.0, float(np.abs(b).max())))
+
+
+@pytest.mark.parametrize("name", [*FRAME_STEPS, *WINDOW_STEPS])
+def test_compiled_step_repeats_to_the_bit(name, inputs):
+    feed = next(feeds(name, inputs))
+    for a, b in zip(open_step(name)(feed), open_step(name)(feed), strict=True):
+        assert a.tobytes() == b.tobytes()
+
+
+@pytest.mark.long
+def test_view_source_is_that_of_the_modules():
+    written = Path(sigmaslam.estimation.__file__).with_name("views.inc").read_text()
+    assert write_views() == written, "run python -m sigmaslam_models.estimator.view_source and compile again"
+
+
+def test_graphs_serve_without_a_compiler(monkeypatch, caplog):
+    monkeypatch.setattr(estimator_graphs, "_compiled", None)
+    estimator_graphs._tell_slow.cache_clear()
+    with caplog.at_level(logging.WARNING):
+        steps = [open_step(name) for name in ("frame_robust", "frame_gated")]
+    assert steps == [load_step("frame_robust"), load_step("frame_gated")]
+    assert len(caplog.records) == 1
