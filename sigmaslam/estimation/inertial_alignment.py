@@ -23,6 +23,8 @@ _GRAVITY_LENGTH = 0.05
 _LEAST_PLACE, _LEAST_TURN = 1e-3, 2e-4
 # Gravity whose length is off by more was not found, m/s^2; nor was one whose direction is less certain, radians.
 _LENGTH_TOLERANCE, _LEAST_TILT_CERTAINTY = 0.5, 0.05
+# Turns of gyro and images that differ by more are not of one body: of the turns, and radians from frame to frame.
+_TURN_SHARE, _TURN_ERROR = 0.25, 3e-3
 # Residuals are no white noise: neighbours share landmarks, so that there are about so many times fewer of them.
 _SHARED = 4.0
 
@@ -45,6 +47,20 @@ class Alignment:
     def tilt(self) -> float:
         """Standard deviation of gravity's direction, radians, of the less certain axis."""
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance[3:6, 3:6])[-1]) / STANDARD_GRAVITY)
+
+
+def gyro_fits(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> bool:
+    """Whether the gyro's turns are those of the images, so that unit, axes and clock are right.
+
+    Args:
+        bodies: (N, 4, 4) poses of the sensor.
+        motions: N - 1, between successive poses, integrated with the gyro's bias.
+    """
+    R = bodies[:, :3, :3]
+    seen = rotation_log(R[:-1].transpose(0, 2, 1) @ R[1:])
+    measured = rotation_log(np.array([each.turn for each in motions]))
+    size = np.sqrt(np.mean((seen - measured) ** 2))
+    return bool(size <= max(_TURN_SHARE * np.sqrt(np.mean(seen**2)), _TURN_ERROR))
 
 
 def align_gyro(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> tuple[np.ndarray, np.ndarray]:

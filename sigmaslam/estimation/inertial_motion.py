@@ -9,7 +9,7 @@ import numpy as np
 
 from sigmaslam.estimation.constant_velocity import MotionFilter, MotionState
 from sigmaslam.estimation.gaussian import regression
-from sigmaslam.estimation.inertial_alignment import align, align_gyro
+from sigmaslam.estimation.inertial_alignment import align, align_gyro, gyro_fits
 from sigmaslam.estimation.inertial_buffer import InertialBuffer, LearnedNoise
 from sigmaslam.estimation.preintegration import Preintegrated
 from sigmaslam.geometry.inertial_sensor import STANDARD_GRAVITY, InertialSensor
@@ -55,7 +55,7 @@ class InertialMotion(MotionFilter):
         self._carried: np.ndarray | None = None
         # Poses by images, T_first_camera, with their times, and T_first_keyframe.
         self._poses: list[tuple[float, np.ndarray]] = []
-        self._T_first_key = np.eye(4)
+        self._T_first_key, self._is_refused = np.eye(4), False
         self._time: float | None = None
         self._densities = np.zeros(2)
 
@@ -179,6 +179,14 @@ class InertialMotion(MotionFilter):
                 return
             change, spread = align_gyro(bodies, whole)
             bias = bias + change
+        if not gyro_fits(bodies, whole):
+            if not self._is_refused:
+                _LOGGER.warning(
+                    "the inertial sensor is not used: its turns are not those of the images; are unit (rad/s), axes, "
+                    "T_cam_imu and clock right?"
+                )
+            self._is_refused, self._poses = True, []
+            return
         found = align(bodies, whole)
         if found is None:
             return

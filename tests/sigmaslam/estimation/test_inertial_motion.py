@@ -159,3 +159,24 @@ def test_images_widen_pose_and_velocity_alone_and_can_be_taken_back():
     np.testing.assert_array_equal(wide[9:, 9:], before[9:, 9:])
     flight.filter.widen(1.0 / flight.filter.widened)
     np.testing.assert_allclose(flight.filter.state.covariance, before, rtol=1e-12)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "fault",
+    [
+        np.degrees,
+        lambda gyro: -gyro,
+        lambda gyro: gyro[:, [1, 2, 0]],
+        lambda gyro: gyro * [1, -1, -1],
+        lambda gyro: 0.0 * gyro,
+    ],
+    ids=["degrees", "signs", "axes", "turned by 180 degrees", "dead"],
+)
+def test_a_gyro_of_another_unit_or_axis_is_said_once_and_not_used(fault, caplog):
+    flight = Flight(6)
+    flight.samples = InertialSamples(flight.samples.timestamp, fault(flight.samples.gyro), flight.samples.accel)
+    flight.fly(60)
+    assert not flight.filter.is_inertial
+    assert caplog.text.count("are unit (rad/s), axes") == 1
+    assert np.linalg.norm((flight.truth - flight.filter.step)[:3, 3]) < 0.01
