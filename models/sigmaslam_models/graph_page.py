@@ -81,6 +81,27 @@ TEXTS: Mapping[str, GraphText] = {
             "predicted_covariance": "of it and of the twist",
         },
     ),
+    "inertial_predict": GraphText(
+        "Prediction by an inertial sensor, unscented. Once a frame in place of `pose_predict`, where gravity is known.",
+        {
+            "pose": "T_keyframe_camera, metres",
+            "velocity": "of the sensor in the keyframe's frame, m/s",
+            "gravity": "in the keyframe's frame, m/s^2",
+            "mounting": "T_camera_imu",
+            "covariance": "of pose (perturbed from the left), velocity, gravity, biases, delay, mounting",
+            "seconds": "since the last frame",
+            "turn": "R_start_end of the preintegrated samples",
+            "velocity_change": "of them, in the sensor's frame at the start, m/s",
+            "position_change": "likewise, metres",
+            "slope": "derivatives of (turn, velocity, position) by gyro bias, accelerometer bias, delay",
+            "noise": "covariance of (turn, velocity, position)",
+            "walk": "power spectra of the biases' random walks, gyro and accelerometer",
+            "predicted_pose": "T_keyframe_camera after the step",
+            "predicted_velocity": "likewise",
+            "predicted_covariance": "of the state after the step",
+            "carried": "covariance of the state before with the state after",
+        },
+    ),
     "features": GraphText(
         "Keypoints with descriptors of one image, best first. Of the left image of a keyframe, and of each image that "
         "`sigmaslam match` is given.",

@@ -11,6 +11,7 @@ from torch import nn
 
 from sigmaslam.inference.networks import WeightsFolder, network_path
 from sigmaslam_models.estimator.frame_update import GatedStep, PredictViews, RobustStep
+from sigmaslam_models.estimator.inertial_prediction import InertialPredict
 from sigmaslam_models.estimator.pose_prediction import Predict
 from sigmaslam_models.estimator.window_solution import Condition, EliminateLandmarks, GateWindow
 from sigmaslam_models.extractor import FeatureExtractor
@@ -55,6 +56,7 @@ def open_step(name: str) -> TorchModule:
     return TorchModule(
         {
             "pose_predict": Predict,
+            "inertial_predict": InertialPredict,
             "frame_predict": PredictViews,
             "frame_robust": RobustStep,
             "frame_gated": GatedStep,

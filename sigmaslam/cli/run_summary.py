@@ -22,7 +22,7 @@ def tell_summary(summary: dict[str, Any], out: Path) -> None:
     """
     typer.echo(
         f"{summary['tracked']} of {summary['frames']} frames tracked{_doubted(summary)}, "
-        f"{summary['starting']} starting, {summary['lost']} lost, {summary['skipped']} skipped; "
+        f"{_inertial(summary)}{summary['starting']} starting, {summary['lost']} lost, {summary['skipped']} skipped; "
         f"{summary['median_inliers']:.0f} inliers in the median frame, {summary['map_points']} map points.\n"
         f"{_world(summary)}{_times(summary)}{_contradiction(summary)}{_doubts(summary)}{summary['calibration_verdict']}\n"
         f"{_location_verdict(summary)}{_real_time_verdict(summary)}Report: {printable(out / 'report.html')}"
@@ -55,6 +55,11 @@ def _doubted(summary: dict[str, Any]) -> str:
     """How many of the poses are in doubt; empty where none is."""
     counts = [f"{summary[status]} {status}" for status in ("doubtful", "ambiguous") if summary[status]]
     return f" ({', '.join(counts)})" if counts else ""
+
+
+def _inertial(summary: dict[str, Any]) -> str:
+    """How many frames the inertial sensor carried through the dark; empty where none."""
+    return f"{summary['inertial']} by the inertial sensor alone, " if summary.get("inertial") else ""
 
 
 def _doubts(summary: dict[str, Any]) -> str:

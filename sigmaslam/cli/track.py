@@ -174,6 +174,14 @@ def track(
             "the left image is used, such as the robot itself, or people that a detector found.",
         ),
     ] = None,
+    imu: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE|off",
+            help="CSV of an inertial sensor (time, rad/s, m/s^2) with its YAML beside; off: use none.",
+            show_default="imu0/data.csv in INPUT",
+        ),
+    ] = None,
     denoise: Annotated[
         bool, typer.Option("--denoise", help="Filter noise out of the images first: for the dark; slow.")
     ] = False,

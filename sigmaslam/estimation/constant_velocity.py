@@ -21,11 +21,14 @@ class MotionState:
         step: (4, 4) T_keyframe_camera.
         twist: (6,) velocity of the camera in its own frame, m/s and rad/s.
         covariance: (12, 12) of both; the step is perturbed from the left in the keyframe.
+        carried: (12, 12) covariance of the state before the prediction with the one after it; None: that of constant
+            velocity. By an inertial sensor there are 19 numbers in place of the twist.
     """
 
     step: np.ndarray
     twist: np.ndarray
     covariance: np.ndarray
+    carried: np.ndarray | None = None
 
 
 class MotionFilter:
@@ -34,6 +37,8 @@ class MotionFilter:
     Attributes:
         step: (4, 4) T_keyframe_camera.
         twist: (6,) velocity of the camera in its own frame, m/s and rad/s.
+        widened: by which factor since the last prediction.
+        is_inertial: an inertial sensor predicts, which knows the velocity without images.
 
     Args:
         backend: "onnx" or "torch".
@@ -44,7 +49,8 @@ class MotionFilter:
         self.step = np.eye(4)
         self.twist = np.zeros(6)
         self._covariance = np.zeros((_STATE_SIZE, _STATE_SIZE))
-        self._widened = 1.0  # by which factor since the last prediction
+        self.widened = 1.0
+        self.is_inertial = False
 
     @property
     def state(self) -> MotionState:
@@ -59,7 +65,7 @@ class MotionFilter:
     @property
     def predicted_covariance(self) -> np.ndarray:
         """(6, 6) of `step` by the motion alone, before it was widened."""
-        return self.step_covariance / self._widened
+        return self.step_covariance / self.widened
 
     def forget_twist(self, sigma: np.ndarray) -> None:
         """No velocity is known but that it is about zero; sigma (6,) m/s and rad/s."""
@@ -72,13 +78,16 @@ class MotionFilter:
         self._covariance[:, _TWIST] = 0.0
         self._covariance[_TWIST, _TWIST] = np.diag(sigma**2)
 
-    def predict(self, seconds: float, densities: np.ndarray, sigma: float = 0.0) -> None:
+    def predict(
+        self, seconds: float, densities: np.ndarray, sigma: float = 0.0, timestamp: float | None = None
+    ) -> None:
         """Moves on.
 
         Args:
             seconds: since the last frame.
             densities: (2,) power spectra of the accelerations, m^2/s^3 and rad^2/s^3.
             sigma: standard deviation of the seconds; along the velocity the pose is that much less certain.
+            timestamp: of the frame, seconds; for an inertial sensor.
         """
         self.step, covariance = self._predict(
             {
@@ -89,13 +98,13 @@ class MotionFilter:
                 "densities": densities,
             }
         )
-        self._covariance, self._widened = 0.5 * (covariance + covariance.T), 1.0
+        self._covariance, self.widened = 0.5 * (covariance + covariance.T), 1.0
         if sigma > 0.0:
             self.doubt_time(sigma)
 
     def widen(self, factor: float) -> None:
         """The prediction is off by more than it claims: all its variances are so many times as large."""
-        self._covariance, self._widened = factor * self._covariance, factor * self._widened
+        self._covariance, self.widened = factor * self._covariance, factor * self.widened
 
     def doubt_time(self, seconds: float) -> np.ndarray:
         """The image is of another moment, by so much: that, and no error of the velocity, makes the prediction wide.
@@ -104,7 +113,7 @@ class MotionFilter:
             (6,) the way in that time, perturbed from the left in the keyframe.
         """
         error = self.way(seconds)
-        self.widen(1.0 / self._widened)
+        self.widen(1.0 / self.widened)
         self._covariance[_POSE, _POSE] += np.outer(error, error)
         return error
 

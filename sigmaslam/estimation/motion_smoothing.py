@@ -50,11 +50,23 @@ def smooth_motion(chain: list[MotionLink]) -> SmoothedMotion:
     states = [chain[-1].filtered]
     for link, later in zip(chain[-2::-1], chain[:0:-1], strict=True):
         here, predicted, after = link.filtered, later.predicted, states[-1]
-        slope = _transition(here, later.timestamp - link.timestamp)
-        gain = regression(here.covariance @ slope.T, predicted.covariance)
-        move = gain @ np.r_[se3_log(after.step @ se3_inverse(predicted.step)), after.twist - predicted.twist]
+        ends = predicted.carried is None and len(here.twist) != len(predicted.twist)
+        if ends or not here.covariance.any():  # the inertial sensor died, or the keyframe, whose frame all are in
+            states.append(here)
+            continue
+        carried = predicted.carried
+        if carried is None:
+            carried = here.covariance @ _transition(here, later.timestamp - link.timestamp).T
+        departure = np.r_[se3_log(after.step @ se3_inverse(predicted.step)), np.zeros(len(predicted.covariance) - 6)]
+        spread = predicted.covariance
+        if len(after.twist) == len(predicted.twist):
+            departure[6:] = after.twist - predicted.twist
+        else:  # the inertial sensor began there: poses alone are common
+            departure, carried, spread = departure[:6], carried[:, :6], spread[:6, :6]
+        gain, size = regression(carried, spread), len(departure)
+        move = gain @ departure
         # Of a motion that is hardly known, predicted by sigma points, the difference may be negative somewhere.
-        root = matrix_root(here.covariance + gain @ (after.covariance - predicted.covariance) @ gain.T)
+        root = matrix_root(here.covariance + gain @ (after.covariance[:size, :size] - spread) @ gain.T)
         step = nearest_rigid(se3_exp(move[:6]) @ here.step)
         states.append(MotionState(step, here.twist + move[6:], root @ root.T))
     states.reverse()

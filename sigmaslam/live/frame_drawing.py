@@ -23,6 +23,7 @@ STATUS_COLOURS = {
     "relocalised": bgr("#e08bc0"),
     "doubtful": bgr("#f0d03f"),
     "ambiguous": bgr("#b57bff"),
+    "inertial": bgr("#4fc3a1"),
 }
 """Those of the report."""
 _BACKGROUND, _TEXT, _FAINT, _OUTLIER = bgr("#14181d"), bgr("#e6e9ec"), bgr("#7d8791"), bgr("#ff4d3d")

@@ -92,8 +92,9 @@ def list_facts(run: RecordedRun) -> Facts:
 
 
 def list_statuses(run: RecordedRun) -> list[tuple[str, int]]:
-    """Counts of frames."""
-    return [(status, run.frames.status.count(status)) for status in STATUSES]
+    """Counts of frames; "inertial" only where there is one, as few rigs have such a sensor."""
+    counts = [(status, run.frames.status.count(status)) for status in STATUSES]
+    return [each for each in counts if each[1] or each[0] != "inertial"]
 
 
 def list_calibration(run: RecordedRun) -> list[tuple[str, str, str]]:

@@ -47,6 +47,7 @@ _GRAPHS = (
     "verifier.onnx",
     "place_verifier.onnx",
     "pose_predict.onnx",
+    "inertial_predict.onnx",
     "frame_predict.onnx",
     "frame_robust.onnx",
     "frame_gated.onnx",

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from sigmaslam.errors import InputError
 from sigmaslam.readers import StereoSequence, open_cameras, open_sequence
+from sigmaslam.readers.inertial import find_imu, read_imu
 from sigmaslam.readers.selection import Selection
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ _REFUSED = (
         "--camera needs --calibration: any file that `sigmaslam calibration show` reads",
     ),
     ("--camera", ("--format", "--topic-left", "--topic-right"), "{all} go with INPUT, not with --camera"),
-    ("--camera", ("--start", "--frames", "--every", "--scale"), "{all} go with INPUT, not with --camera"),
+    ("--camera", ("--start", "--frames", "--every", "--scale", "--imu"), "{all} go with INPUT, not with --camera"),
     ("--resume", ("--overwrite",), "--resume goes on with the run in the folder, {all} removes it: give one of them"),
     ("--resume", ("--video", "--viewer"), "--resume does not go with {all}, which show a whole run: leave them out"),
     ("--resume", _FORGOTTEN, "--resume does not go with {given}: leave one of them out"),
@@ -42,6 +43,7 @@ _REFUSED = (
         ("--track-object", "--scale"),
         "--save-calibration is of the whole scene in images as they are: leave out {all}",
     ),
+    ("--track-object", ("--imu",), "the camera is at rest with --track-object: leave out --imu"),
     (
         "--track-object",
         ("--map", "--tracks"),
@@ -60,6 +62,7 @@ class InputOptions:
         camera, seconds: for `open_cameras`, in place of a source.
         start, frames, every, scale: for `StereoSequence.select`.
         mask: for `StereoSequence.use_masks`.
+        imu: table of an inertial sensor, for `read_imu`; "off": none; None: the one in the recording's folder.
         findings: of a check; they are kept in run.json, and explain a run that fails.
     Raises:
         InputError: options do not go together.
@@ -77,6 +80,7 @@ class InputOptions:
     every: int = 1
     scale: float = 1.0
     mask: Path | None = None
+    imu: str | None = None
     findings: Sequence[Finding] = ()
 
     def __post_init__(self) -> None:
@@ -96,6 +100,9 @@ class InputOptions:
             sequence = sequence.select(selection, self.scale)
         if self.mask is not None:
             sequence.use_masks(self.mask)
+        table = None if self.imu == "off" else Path(self.imu) if self.imu else find_imu(Path(sequence.source))
+        if self.imu is not None or not isinstance(self.source, StereoSequence):
+            sequence.imu = None if table is None else read_imu(table)
         return sequence
 
 

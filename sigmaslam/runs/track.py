@@ -11,6 +11,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sigmaslam.bodies.object_region import read_region
 from sigmaslam.bodies.object_tracker import OBJECT_CONFIG, ObjectEstimate, ObjectTracker
 from sigmaslam.calibration.learned_calibration import learned_calibration
@@ -82,7 +84,7 @@ def track_sequence(request: TrackRequest) -> dict[str, Any]:
     writer = RunWriter(out, run, rectified, None if stopped is None else len(stopped.records))
     pictures = PictureRecorder(sequence.length)
     images = StereoFilter() if options.denoise else None
-    steps = _FrameSteps(images, tracker, _Timing(sequence, options.realtime), location)
+    steps = _FrameSteps(images, tracker, _Timing(sequence, options.realtime), location, _feed(sequence))
     on_estimate = live.on_estimate
     listeners = [(lambda frame: on_estimate(frame.result))] if on_estimate else []
     listeners += [sink.add for sink in live.sinks]
@@ -143,6 +145,7 @@ def _describe_settings(sequence: StereoSequence, options: TrackerOptions) -> dic
         "provider": options.provider,
         "weights": describe_weights(options.frontend, options.backend, options.weights),
         "map": None if options.map is None else printable(options.map),
+        **({} if sequence.imu is None else {"imu": printable(sequence.imu.source)}),
         "mask": None if sequence.masks is None else printable(sequence.masks.source),
         "configuration": asdict(config),
         "calibration": describe_camera(sequence.camera),
@@ -220,7 +223,8 @@ def _build_tracker(
     camera, frontend, backend, config = sequence.camera, options.frontend, options.backend, options.config
     threads, provider, weights = options.threads, options.provider, options.weights
     if options.track_object is None:
-        return StereoTracker(camera, frontend, backend, config, None, threads, start, provider, weights, pixels)
+        imu = None if sequence.imu is None else sequence.imu.sensor
+        return StereoTracker(camera, frontend, backend, config, None, threads, start, provider, weights, pixels, imu)
     region = read_region(options.track_object, camera.left.width, camera.left.height)
     return ObjectTracker(camera, region, frontend, backend, config, threads, provider, weights)
 
@@ -254,14 +258,34 @@ class _FrameSteps:
     tracker: Tracker
     timing: _Timing
     location: LocationFilter | None
+    inertial: Callable[[float], Iterator[tuple[float, np.ndarray, np.ndarray]]]
 
     def step(self, frame: StereoFrame) -> Estimate | ObjectEstimate:
         """What is said of the frame."""
         if self.images is not None:
             frame = self.images.step(frame)
+        if isinstance(self.tracker, StereoTracker):
+            for sample in self.inertial(frame.timestamp):
+                self.tracker.add_imu(*sample)
         estimate = self.tracker.step(frame.left, frame.right, frame.timestamp, frame.mask)
         self.timing.note(frame.timestamp)
         return estimate if self.location is None else estimate.map_camera(self.location.fuse)
+
+
+def _feed(sequence: StereoSequence) -> Callable[[float], Iterator[tuple[float, np.ndarray, np.ndarray]]]:
+    """Samples of the inertial sensor up to a frame that were not yet given, and the one behind it."""
+    if sequence.imu is None:
+        return lambda timestamp: iter(())
+    samples, shift, given = sequence.imu.samples, sequence.imu.sensor.time_shift, 0
+
+    def feed(timestamp: float) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
+        nonlocal given
+        end = min(int(np.searchsorted(samples.timestamp, timestamp + shift)) + 1, len(samples))
+        for k in range(given, end):
+            yield float(samples.timestamp[k]), samples.gyro[k], samples.accel[k]
+        given = max(given, end)
+
+    return feed
 
 
 class _Rows:

@@ -9,6 +9,8 @@ import numpy as np
 
 from sigmaslam.bounded_files import shorten
 from sigmaslam.errors import FrameError, InputError
+from sigmaslam.estimation.inertial_buffer import InertialBuffer
+from sigmaslam.estimation.inertial_motion import InertialMotion
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.inference.backends import ONNX, backend_names
 from sigmaslam.readers.images import check_grey
@@ -39,6 +41,20 @@ def check_tracker_arguments(
         raise _wrong("threads", threads, "a whole number from 1")
     if weights is not None and not isinstance(frontend, str):
         raise InputError(f"weights {weights} are for a front-end by name: give the networks to your own one instead")
+
+
+def check_sample(motion: object, timestamp: float, gyro: Any, accel: Any) -> InertialBuffer:
+    """A sample of an inertial sensor; what takes it.
+
+    Raises:
+        InputError: the tracker knows no such sensor, or the sample is no time and two vectors of finite numbers.
+    """
+    if not isinstance(motion, InertialMotion):
+        raise InputError("add_imu: the tracker knows no inertial sensor: make it with imu=InertialSensor(...)")
+    if np.shape(gyro) != (3,) or np.shape(accel) != (3,) or not np.isfinite([timestamp, *gyro, *accel]).all():
+        given = shorten(f"{timestamp!r}, {gyro!r}, {accel!r}")
+        raise InputError(f"add_imu: expected seconds and two vectors of three finite numbers, found {given}")
+    return motion.samples
 
 
 def check_region(region: Any, camera: StereoCamera) -> None:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from sigmaslam.estimation.acceptance import ACCEPTANCE
+from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.frontend.followed_patches import FLOW_LEVELS, FLOW_WINDOW
 from sigmaslam.frontend.lucas_kanade import lucas_kanade
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.guided_matching import GuidedMatcher, GuidedMatches
 from sigmaslam.slam.keyframe import Keyframe
+from sigmaslam.slam.mapping import KeyframeTracks
 
 
 class LandmarkFollower:
@@ -48,6 +50,24 @@ class LandmarkFollower:
         """
         order = np.argsort(landmark_id)
         self._left, self._id, self._places = left, landmark_id[order], places[order]
+
+    def remember_frame(
+        self, left: np.ndarray, matches: GuidedMatches, fit: FrameFit | None, tracks: KeyframeTracks | None
+    ) -> None:
+        """Takes note of where landmarks are in the frame, so that the next one can be followed.
+
+        Args:
+            left: (H, W) uint8.
+            matches, fit: of the frame; None: it has no pose.
+            tracks: what it saw where it became a keyframe.
+        """
+        if tracks is not None:
+            self.remember(left, tracks.landmark_id, tracks.measurement[:, :2])
+        elif fit is not None:
+            seen = matches.views.select(fit.inliers)
+            self.remember(left, self._guided.window.landmarks.id[seen.landmark], seen.measurement[:, :2])
+        else:
+            self.forget()
 
     def follow(
         self, frame: Frame, keyframes: list[Keyframe], pose: np.ndarray, covariance: np.ndarray

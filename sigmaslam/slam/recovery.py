@@ -12,7 +12,7 @@ from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.keyframe_window import KeyframeWindow, change_rig
 from sigmaslam.frontend import StereoView
 from sigmaslam.frontend.motion_blur import is_blurred
-from sigmaslam.geometry.se3 import turn_covariance
+from sigmaslam.geometry.se3 import se3_body, turn_covariance
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.keyframes import Keyframes
 from sigmaslam.slam.landmark_admission import LandmarkAdmission
@@ -24,6 +24,10 @@ from sigmaslam.slam.relocalisation import Relocalisation
 from sigmaslam.slam.rig_change import RigChange
 
 _LOGGER = logging.getLogger(__name__)
+
+# A pose by the inertial sensor alone is one as long as its place is this certain, in median scene depths: of most
+# landmarks a search knows about where they are.
+_INERTIAL_SIGMA = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +54,15 @@ class Recovery:
     config: TrackerConfig
     start: tuple[np.ndarray, np.ndarray] | None = None
 
+    @property
+    def status(self) -> str:
+        """Of a view without a pose by its images."""
+        if self.motion.is_inertial:
+            sigma = np.sqrt(np.linalg.eigvalsh(se3_body(self.motion.step, self.motion.step_covariance)[:3, :3])[-1])
+            if sigma <= _INERTIAL_SIGMA * self.window.depth:
+                return "inertial"
+        return "lost" if self.course.has_moved else "starting"
+
     def start_or_recover(self, view: StereoView, timestamp: float) -> KeyframeTracks | None:
         """Without a pose: starts, or waits for a while and goes on with the uncertainty of the prediction."""
         course = self.course
@@ -66,7 +79,7 @@ class Recovery:
         if since <= self.config.lost_seconds or not self.admission.restarts_anywhere:
             return None
         _LOGGER.warning("tracking starts anew at %.3f s, %.2f s after the last pose", timestamp, since)
-        if course.has_moved:
+        if course.has_moved and not self.motion.is_inertial:
             course.resume(timestamp)
         course.tracked_at = timestamp
         pose = Prediction.of(self.window, self.motion).pose
@@ -82,7 +95,10 @@ class Recovery:
 
     def resume(self, found: Relocalisation, timestamp: float) -> KeyframeTracks:
         """Goes on from where a lost view was found."""
-        self.course.resume(timestamp)
+        if self.motion.is_inertial:
+            self.course.track(timestamp)
+        else:
+            self.course.resume(timestamp)
         covariance = turn_covariance(found.pose, found.covariance)
         new = NewKeyframe(found.view, timestamp, found.pose, found.pose, covariance, origin=found.origin)
         return self._insert(new)
@@ -110,7 +126,7 @@ class Recovery:
         self._start(first, started_at)
         if had_moved:
             course.resume(started_at)
-        self.motion.predict(timestamp - started_at, densities(self.config, self.window.depth))
+        self.motion.predict(timestamp - started_at, densities(self.config, self.window.depth), timestamp=timestamp)
 
     def _start(self, view: StereoView, timestamp: float) -> KeyframeTracks:
         """Makes the view the first keyframe, and its camera the world where no other one is given."""

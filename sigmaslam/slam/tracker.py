@@ -12,19 +12,20 @@ from threadpoolctl import ThreadpoolController
 
 from sigmaslam.estimation.calibration_errors import TURNS, CalibrationPrior
 from sigmaslam.estimation.clustered_errors import SharedErrors
-from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.estimator_graphs import EstimatorGraphs
 from sigmaslam.estimation.frame_clock import FrameClock
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.frame_update import FrameUpdate
+from sigmaslam.estimation.inertial_motion import build_motion
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.frontend import Frontend, build_frontend
 from sigmaslam.geometry.camera import StereoCamera
+from sigmaslam.geometry.inertial_sensor import InertialSensor
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.inference.networks import WeightsFolder
-from sigmaslam.slam.argument_checks import check_frame, check_tracker_arguments
+from sigmaslam.slam.argument_checks import check_frame, check_sample, check_tracker_arguments
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.doubt import Doubt, Doubts
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
@@ -37,7 +38,7 @@ from sigmaslam.slam.landmark_admission import AdmitAll, LandmarkAdmission
 from sigmaslam.slam.landmark_following import LandmarkFollower
 from sigmaslam.slam.localisation import Localiser, Prediction
 from sigmaslam.slam.loop_closure import LoopCloser
-from sigmaslam.slam.mapping import KeyframeTracks, Mapper
+from sigmaslam.slam.mapping import Mapper
 from sigmaslam.slam.matched_frame import MatchedFrame
 from sigmaslam.slam.measurement_noise import MeasurementNoise
 from sigmaslam.slam.motion_prior import densities, initial_twist_sigma
@@ -78,6 +79,7 @@ class StereoTracker:
             that ship.
         disparity_error: pixels by which disparities may be off, as a check found that the eyes do not fit: all poses
             are doubtful then, and less certain; None: nothing was found.
+        imu: an inertial sensor on the rig, whose samples `add_imu` takes.
 
     Attributes:
         last_frame: what the last frame saw, for pictures; None before the first.
@@ -98,6 +100,7 @@ class StereoTracker:
         provider: str = "cpu",
         weights: WeightsFolder = None,
         disparity_error: float | None = None,
+        imu: InertialSensor | None = None,
     ) -> None:
         check_tracker_arguments(camera, frontend, backend, config, threads, weights)
         self.config = config = config or TrackerConfig()
@@ -116,7 +119,7 @@ class StereoTracker:
             prior = prior.widened(("offset", *TURNS), disparity_error)
         self._window = window = KeyframeWindow(rectified, prior, graphs)
         self._noise = noise = MeasurementNoise(config)
-        self._motion = motion = MotionFilter(backend)
+        self._motion = motion = build_motion(backend, imu, self._T_rectified_left)
         self._course = course = Course()
         self._shared_errors = SharedErrors()
         self._clock, self._last_pairs = FrameClock(), LastPairs()
@@ -147,6 +150,17 @@ class StereoTracker:
         self._keyframes.load(Path(path), self._frontend.name, self._camera)
         self._course.phase = Phase.WAITING_IN_MAP
 
+    def add_imu(self, timestamp: float, gyro: np.ndarray, accel: np.ndarray) -> None:
+        """Takes a sample of the inertial sensor; those up to a frame come before its `step`.
+
+        Args:
+            timestamp: seconds of its clock; a sample that is not later than the last one is left out.
+            gyro, accel: (3,) rad/s and m/s^2; at rest the second is 9.81 away from the ground.
+        Raises:
+            InputError: the tracker was made without `imu`, or a value is not finite.
+        """
+        check_sample(self._motion, timestamp, gyro, accel).add(timestamp, gyro, accel)
+
     def step(self, left: np.ndarray, right: np.ndarray, timestamp: float, mask: np.ndarray | None = None) -> Estimate:
         """Takes one stereo pair.
 
@@ -169,20 +183,21 @@ class StereoTracker:
         frame = Frame(*self._rectifier.rectify(left, right), self._frontend, usable)
         clock.lap("rectify")
         if self._course.timestamp is not None:
-            # Constant velocity since the last frame.
             seconds, sigma = self._clock.tick(timestamp - self._course.timestamp)
             if sigma > 0.0 and self._clock.was_believed:
                 # It was learned by wrong times.
                 self._motion.forget_twist(initial_twist_sigma(self.config, self._window.depth))
-            self._motion.predict(seconds, densities(self.config, self._window.depth), sigma)
+            self._motion.predict(seconds, densities(self.config, self._window.depth), sigma, timestamp)
         is_repeated = self._last_pairs.is_repeated(left, right)
         matches, fit, change = GuidedMatches.empty(), None, None
         if not is_repeated:
             matches, fit, change = self._localise(frame, timestamp, clock)
+        if fit is None and self._motion.is_inertial:
+            # Images that give no pose say nothing against the prediction either.
+            self._motion.widen(1.0 / self._motion.widened)
         landmarks = self._window.landmarks.id[matches.views.landmark]
-        self.last_frame = MatchedFrame(
-            frame.left, frame.right, landmarks, matches, None if fit is None else fit.inliers
-        )
+        inliers = None if fit is None else fit.inliers
+        self.last_frame = MatchedFrame(frame.left, frame.right, landmarks, matches, inliers)
         predicted = filtered = self._motion.state
         doubts = Doubts()
         if fit is not None:
@@ -207,10 +222,10 @@ class StereoTracker:
             status = "relocalised"
             tracks = self._recovery.resume(found, timestamp)
         else:
-            status = "lost" if self._course.has_moved else "starting"
+            status = self._recovery.status
             tracks = self._recovery.start_or_recover(frame.view, timestamp)
         if not is_repeated:
-            self._remember(frame, matches, fit, tracks)
+            self._follower.remember_frame(frame.left, matches, fit, tracks)
         frame.finish()
         loop = self._loops.close() if tracks is not None else None
         clock.lap("map")
@@ -286,15 +301,3 @@ class StereoTracker:
             self._noise.adapt(fit.nis_per_dof)
         self._course.track(timestamp)
         return fit
-
-    def _remember(
-        self, frame: Frame, matches: GuidedMatches, fit: FrameFit | None, tracks: KeyframeTracks | None
-    ) -> None:
-        """Takes note of where landmarks are in the frame, so that the next one can be followed."""
-        if tracks is not None:
-            self._follower.remember(frame.left, tracks.landmark_id, tracks.measurement[:, :2])
-        elif fit is not None:
-            seen = matches.views.select(fit.inliers)
-            self._follower.remember(frame.left, self._window.landmarks.id[seen.landmark], seen.measurement[:, :2])
-        else:
-            self._follower.forget()

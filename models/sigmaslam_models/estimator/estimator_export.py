@@ -25,6 +25,8 @@ from sigmaslam_models.estimator.graph_examples import (
     window_axes,
     window_example,
 )
+from sigmaslam_models.estimator.inertial_prediction import STATE_SIZE as INERTIAL_SIZE
+from sigmaslam_models.estimator.inertial_prediction import InertialPredict
 from sigmaslam_models.estimator.pose_prediction import STATE_SIZE, Predict
 from sigmaslam_models.estimator.window_solution import Condition, EliminateLandmarks, GateWindow, WindowViews
 from sigmaslam_models.graph_export import TracedModule, export_graph
@@ -55,6 +57,17 @@ def estimator_graphs() -> dict[str, TracedModule]:
             ["pose", "twist", "covariance", "step", "densities"],
             ["predicted_pose", "predicted_covariance"],
             (fixed,) * 5,
+        ),
+        "inertial_predict": TracedModule(
+            InertialPredict(),
+            _inertial_example(0),
+            _inertial_example(1),
+            [
+                *("pose", "velocity", "gravity", "mounting", "covariance", "seconds", "turn", "velocity_change"),
+                *("position_change", "slope", "noise", "walk"),
+            ],
+            ["predicted_pose", "predicted_velocity", "predicted_covariance", "carried"],
+            (fixed,) * 12,
         ),
         "frame_predict": _frame_graph(PredictViews(), (), PREDICTED),
         "frame_robust": _frame_graph(RobustStep(), ROBUST_INPUTS, ROBUST_OUTPUTS),
@@ -102,3 +115,16 @@ def _predict_example(seed: int) -> tuple[Tensor, ...]:
     densities = 0.1 + random(2).abs()
     step = torch.tensor(0.1 + 0.2 * seed, dtype=torch.float64)
     return exp_se3(0.3 * random(6)), random(6), root @ root.T, step, densities
+
+
+def _inertial_example(seed: int) -> tuple[Tensor, ...]:
+    generator = torch.Generator().manual_seed(seed)
+
+    def random(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    root, noise = 0.004 * random(INERTIAL_SIZE, INERTIAL_SIZE), 0.001 * random(9, 9)
+    pose, mounting, turn = (exp_se3(0.3 * random(6)) for _ in range(3))
+    seconds = torch.tensor(0.1 + 0.2 * seed, dtype=torch.float64)
+    state = pose, random(3), 9.8 * random(3), mounting, root @ root.T, seconds
+    return *state, turn[:3, :3], random(3), random(3), random(9, 7), noise @ noise.T, 0.01 + random(2).abs()

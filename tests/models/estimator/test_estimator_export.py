@@ -11,7 +11,7 @@ from sigmaslam_models.torch_runtime import open_step
 
 FRAME_STEPS = ("frame_predict", "frame_robust", "frame_gated")
 WINDOW_STEPS = ("window_eliminate", "window_gate")
-ESTIMATOR = ("pose_predict", *FRAME_STEPS, *WINDOW_STEPS, "window_condition")
+ESTIMATOR = ("pose_predict", "inertial_predict", *FRAME_STEPS, *WINDOW_STEPS, "window_condition")
 
 
 def shipped(name: str) -> Path:
@@ -49,6 +49,8 @@ def assert_graphs_equal_torch(folder: Path, names: tuple[str, ...] = ESTIMATOR) 
             examples = [window_example(seed, *sizes, *inputs) for seed, sizes in ((5, (2, 3)), (6, (7, 120)))]
         elif name == "window_condition":
             examples = [condition_example(5, 12, 1), condition_example(6, 54, 43)]
+        elif name == "inertial_predict":
+            examples = [estimator_export._inertial_example(seed) for seed in (5, 6)]
         else:
             examples = [estimator_export._predict_example(seed) for seed in (5, 6)]
         for example in examples:

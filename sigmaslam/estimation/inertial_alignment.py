@@ -1,0 +1,130 @@
+"""Gravity, velocity and biases from a short while of poses: linear, because stereo knows the scale.
+
+T. Qin, P. Li, S. Shen: VINS-Mono, IEEE Transactions on Robotics 34(4), 2018, section V-B, without the scale; at rest
+the same equations hold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sigmaslam.estimation.preintegration import ACCEL_BIAS, GYRO_BIAS, POSITION, TURN, VELOCITY, Preintegrated
+from sigmaslam.geometry.inertial_sensor import STANDARD_GRAVITY
+from sigmaslam.geometry.se3 import rotation_log
+
+# m/s^2, standard deviation of an accelerometer's bias: data sheets of small sensors say 0.02 to 0.5.
+_ACCEL_BIAS = 0.2
+# Of gravity's length on Earth with the scale error of an accelerometer, m/s^2.
+_GRAVITY_LENGTH = 0.05
+# Metres and radians by which poses from frame to frame are off at least, and rad/s that a gyro's bias then is.
+_LEAST_PLACE, _LEAST_TURN = 1e-3, 2e-4
+# Gravity whose length is off by more was not found, m/s^2; nor was one whose direction is less certain, radians.
+_LENGTH_TOLERANCE, _LEAST_TILT_CERTAINTY = 0.5, 0.05
+# Turns of gyro and images that differ by more are not of one body: of the turns, and radians from frame to frame.
+_TURN_SHARE, _TURN_ERROR = 0.25, 3e-3
+# Residuals are no white noise: neighbours share landmarks, so that there are about so many times fewer of them.
+_SHARED = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """What is known at the last pose, in the frame of all poses.
+
+    Attributes:
+        velocity, gravity, accel_bias: (3,) each; the velocity is the sensor's.
+        covariance: (9, 9) of the three.
+    """
+
+    velocity: np.ndarray
+    gravity: np.ndarray
+    accel_bias: np.ndarray
+    covariance: np.ndarray
+
+    @property
+    def tilt(self) -> float:
+        """Standard deviation of gravity's direction, radians, of the less certain axis."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[3:6, 3:6])[-1]) / STANDARD_GRAVITY)
+
+
+def gyro_fits(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> bool:
+    """Whether the gyro's turns are those of the images, so that unit, axes and clock are right.
+
+    Args:
+        bodies: (N, 4, 4) poses of the sensor.
+        motions: N - 1, between successive poses, integrated with the gyro's bias.
+    """
+    R = bodies[:, :3, :3]
+    seen = rotation_log(R[:-1].transpose(0, 2, 1) @ R[1:])
+    measured = rotation_log(np.array([each.turn for each in motions]))
+    size = np.sqrt(np.mean((seen - measured) ** 2))
+    return bool(size <= max(_TURN_SHARE * np.sqrt(np.mean(seen**2)), _TURN_ERROR))
+
+
+def align_gyro(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> tuple[np.ndarray, np.ndarray]:
+    """Gyro bias (3,), beside the one that the motions were integrated with, and its covariance (3, 3).
+
+    Args:
+        bodies: (N, 4, 4) poses of the sensor.
+        motions: N - 1, between successive poses.
+    """
+    R = bodies[:, :3, :3]
+    turns = np.array([each.turn for each in motions])
+    slope = np.concatenate([each.slope[TURN, GYRO_BIAS] for each in motions])
+    departure = rotation_log(turns.transpose(0, 2, 1) @ R[:-1].transpose(0, 2, 1) @ R[1:]).ravel()
+    information = slope.T @ slope
+    bias = np.linalg.solve(information, slope.T @ departure)
+    residual = departure - slope @ bias
+    variance = max(float(residual @ residual) / max(len(residual) - 3, 1), _LEAST_TURN**2)
+    return bias, _SHARED * variance * np.linalg.inv(information)
+
+
+def align(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> Alignment | None:
+    """Velocity, gravity and accelerometer bias by least squares; None where they cannot be told.
+
+    Args:
+        bodies: (N, 4, 4) poses of the sensor, N >= 4.
+        motions: N - 1 between successive poses, integrated with the gyro's bias and without the accelerometer's.
+    """
+    R, p = bodies[:, :3, :3], bodies[:, :3, 3]
+    # Unknown: first place, first velocity, gravity, bias. Place and velocity of each pose as maps of these.
+    identity, unknown = np.eye(12), slice(9, 12)
+    place, speed = identity[:3].copy(), identity[3:6].copy()
+    place_known, speed_known = np.zeros(3), np.zeros(3)
+    rows, values = [place], [p[0]]
+    for k, each in enumerate(motions):
+        s = each.seconds
+        place = place + s * speed + 0.5 * s * s * identity[6:9]
+        place_known = place_known + s * speed_known + R[k] @ each.position
+        place[:, unknown] += R[k] @ each.slope[POSITION, ACCEL_BIAS]
+        speed = speed + s * identity[6:9]
+        speed_known = speed_known + R[k] @ each.velocity
+        speed[:, unknown] += R[k] @ each.slope[VELOCITY, ACCEL_BIAS]
+        rows.append(place.copy())
+        values.append(p[k + 1] - place_known)
+    A, y = np.concatenate(rows), np.concatenate(values)
+    variance, direction = _LEAST_PLACE**2, np.zeros(3)
+    for turn in range(3):  # without gravity's length, with it, and with the residuals' size
+        information, vector = A.T @ A / variance, A.T @ y / variance
+        information[unknown, unknown] += np.eye(3) / _ACCEL_BIAS**2
+        information[6:9, 6:9] += np.outer(direction, direction) / _GRAVITY_LENGTH**2
+        vector[6:9] += direction * STANDARD_GRAVITY / _GRAVITY_LENGTH**2
+        solution = np.linalg.solve(information, vector)
+        residual = y - A @ solution
+        variance = _SHARED * max(float(residual @ residual) / max(len(y) - 12, 1), _LEAST_PLACE**2)
+        gravity = solution[6:9]
+        length = np.linalg.norm(gravity)
+        if not turn and abs(length - STANDARD_GRAVITY) > _LENGTH_TOLERANCE:
+            return None
+        direction = gravity / length
+    covariance = np.linalg.inv(information)
+    end = np.concatenate([speed, identity[6:]])
+    alignment = Alignment(
+        speed @ solution + speed_known,
+        direction * STANDARD_GRAVITY,
+        solution[unknown],
+        end @ (0.5 * (covariance + covariance.T)) @ end.T,
+    )
+    return alignment if alignment.tilt < _LEAST_TILT_CERTAINTY else None

@@ -1,0 +1,241 @@
+"""Motion by an inertial sensor: pose since the keyframe, velocity, gravity, biases; before that constant velocity."""
+
+from __future__ import annotations
+
+import logging
+from itertools import pairwise
+
+import numpy as np
+
+from sigmaslam.estimation.constant_velocity import MotionFilter, MotionState
+from sigmaslam.estimation.gaussian import regression
+from sigmaslam.estimation.inertial_alignment import align, align_gyro, gyro_fits
+from sigmaslam.estimation.inertial_buffer import InertialBuffer, LearnedNoise
+from sigmaslam.estimation.preintegration import Preintegrated
+from sigmaslam.geometry.inertial_sensor import STANDARD_GRAVITY, InertialSensor
+from sigmaslam.geometry.se3 import nearest_rigid, se3_inverse, se3_log, skew
+from sigmaslam.inference.backends import load_step
+
+_LOGGER = logging.getLogger(__name__)
+
+# Order of the graph's error state, see sigmaslam_models.estimator.inertial_prediction.
+_POSE, _VELOCITY, _GRAVITY, _BIASES = slice(0, 6), slice(6, 9), slice(9, 12), slice(12, 18)
+# What poses correct, and what they do not.
+_OTHERS, _CONSIDERED, _SIZE = slice(6, 18), slice(18, 25), 25
+# Prior standard deviations of what is only considered: delay (s), place (m) and rotation (rad) of the sensor. Those of
+# careful calibrations: 2 ms, 5 mm and 0.2 degrees.
+_CONSIDERED_SIGMA = np.array([2e-3, *[5e-3] * 3, *[3.5e-3] * 3])
+# Gravity is looked for in the poses of so many seconds, and in no fewer than so many poses.
+_ALIGNED_SECONDS, _ALIGNED_POSES = 1.0, 8
+# Poses of a camera that is so slow that fewer fit into the seconds above are kept for so long, seconds.
+_LONGEST = 10.0
+# rad/s and m/s^2: biases are not known better at the start, whatever residuals say.
+_GYRO_BIAS_FLOOR = 2e-3
+# Seconds without samples after which the sensor is taken for dead.
+_DEAD = 1.0
+
+
+class InertialMotion(MotionFilter):
+    """Predicts by an inertial sensor; by constant velocity until gravity is known.
+
+    Everything is in the frame of the last keyframe, so that nothing is far from zero. Delay and mounting of the sensor
+    are considered: they make predictions less certain, and poses do not move them (Schmidt-Kalman).
+
+    Args:
+        backend: "onnx" or "torch".
+        sensor: its noise and clock.
+        T_camera_imu: (4, 4) takes points of the sensor into the camera that is tracked.
+    """
+
+    def __init__(self, backend: str, sensor: InertialSensor, T_camera_imu: np.ndarray) -> None:
+        super().__init__(backend)
+        self._predict_inertial = load_step("inertial_predict", backend)
+        self.samples, self.noise, self._T_camera_imu = InertialBuffer(sensor), LearnedNoise(), T_camera_imu
+        self._velocity, self._gravity, self._biases = np.zeros(3), np.zeros(3), np.zeros(6)
+        self._carried: np.ndarray | None = None
+        # Poses by images, T_first_camera, with their times, and T_first_keyframe.
+        self._poses: list[tuple[float, np.ndarray]] = []
+        self._T_first_key, self._is_refused = np.eye(4), False
+        self._time: float | None = None
+        self._densities = np.zeros(2)
+
+    @property
+    def state(self) -> MotionState:
+        """What is known now."""
+        if not self.is_inertial:
+            return super().state
+        others = np.concatenate([self._velocity, self._gravity, self._biases, np.zeros(7)])
+        return MotionState(self.step.copy(), others, self._covariance.copy(), self._carried)
+
+    def set_twist(self, twist: np.ndarray, sigma: np.ndarray) -> None:
+        """Of constant velocity alone: the sensor measures on where images are lost."""
+        if not self.is_inertial:
+            super().set_twist(twist, sigma)
+            self._poses = []
+
+    def predict(
+        self, seconds: float, densities: np.ndarray, sigma: float = 0.0, timestamp: float | None = None
+    ) -> None:
+        """Moves on to the frame of that time stamp, by the samples since the last one."""
+        start, self._time, self._densities = self._time, timestamp, densities
+        if not self.is_inertial or start is None or timestamp is None:
+            super().predict(seconds, densities, sigma)
+            return
+        sensor = self.samples.sensor
+        self.samples.forget(start + sensor.time_shift)
+        motion = self.samples.preintegrate(start, timestamp, self._biases, densities)
+        if motion is None or motion.missing > _DEAD:
+            self._leave(seconds, densities)
+            return
+        step, velocity, covariance, carried = self._predict_inertial(
+            {
+                "pose": self.step,
+                "velocity": self._velocity,
+                "gravity": self._gravity,
+                "mounting": self._T_camera_imu,
+                "covariance": self._covariance,
+                "seconds": np.array(motion.seconds),
+                "turn": motion.turn,
+                "velocity_change": motion.velocity,
+                "position_change": motion.position,
+                "slope": motion.slope,
+                "noise": self.noise.of(motion),
+                "walk": np.array([sensor.gyro_walk, sensor.accel_walk]) ** 2,
+            }
+        )
+        turned = se3_log(se3_inverse(self.step) @ step)[3:] / motion.seconds
+        self.step, self._velocity = nearest_rigid(step), velocity
+        self._covariance, self._carried, self.widened = 0.5 * (covariance + covariance.T), carried, 1.0
+        self._note_twist(turned)
+        if sigma > 0.0:
+            self.doubt_time(sigma)
+
+    def widen(self, factor: float) -> None:
+        """Pose and velocity are off by more than the prediction claims; gravity and biases are not to blame."""
+        if not self.is_inertial:
+            super().widen(factor)
+            return
+        scale = np.ones(_SIZE)
+        scale[: _VELOCITY.stop] = np.sqrt(factor)
+        self._covariance, self.widened = scale[:, None] * self._covariance * scale, factor * self.widened
+
+    def correct(self, step: np.ndarray, covariance: np.ndarray) -> None:
+        """Takes over the posterior of the pose, which knew the prediction; looks for gravity while it is unknown."""
+        if not self.is_inertial:
+            super().correct(step, covariance)
+            self._align()
+            return
+        P = self._covariance
+        departure = se3_log(step @ se3_inverse(self.step))
+        removed = P[_POSE, _POSE] - covariance
+        self.noise.learn(departure, removed)
+        gain = regression(P[6:, _POSE], P[_POSE, _POSE])
+        change = gain[: _OTHERS.stop - 6] @ departure
+        self._velocity = self._velocity + change[:3]
+        gravity = self._gravity + change[3:6]
+        self._gravity = STANDARD_GRAVITY / np.linalg.norm(gravity) * gravity
+        self._biases = self._biases + change[6:]
+        others = P[6:, 6:] - gain @ removed @ gain.T
+        others[12:, 12:] = P[_CONSIDERED, _CONSIDERED]
+        self.step = nearest_rigid(step)
+        self._covariance = np.block([[covariance, covariance @ gain.T], [gain @ covariance, 0.5 * (others + others.T)]])
+        self._note_twist(self.twist[3:])
+
+    def start_keyframe(self) -> None:
+        """The current pose is the keyframe's from now on: velocity and gravity turn into its frame."""
+        self._T_first_key = self._T_first_key @ self.step
+        if not self.is_inertial:
+            super().start_keyframe()
+            return
+        turn = np.eye(_SIZE)
+        R = self.step[:3, :3].T
+        for part, vector in ((_VELOCITY, self._velocity), (_GRAVITY, self._gravity)):
+            turn[part, part], turn[part, 3:6] = R, R @ skew(vector)
+        self._velocity, self._gravity = R @ self._velocity, R @ self._gravity
+        self._covariance = turn @ self._covariance @ turn.T
+        super().start_keyframe()
+
+    # ---- parts
+
+    def _align(self) -> None:
+        """Looks for gravity in the last poses."""
+        if self._time is None:
+            return
+        self._poses.append((self._time, self._T_first_key @ self.step))
+        while self._poses[0][0] < self._time - _LONGEST or (
+            len(self._poses) > _ALIGNED_POSES and self._poses[1][0] <= self._time - _ALIGNED_SECONDS
+        ):
+            del self._poses[0]
+        times = [each[0] for each in self._poses]
+        if len(times) < _ALIGNED_POSES or times[-1] - times[0] < 0.9 * _ALIGNED_SECONDS:
+            return
+        bodies = np.array([pose for _, pose in self._poses]) @ self._T_camera_imu
+        bias, whole = np.zeros(3), list[Preintegrated]()
+        for _ in range(2):  # long intervals are no longer linear in the bias
+            biases = np.r_[bias, np.zeros(3)]
+            motions = [self.samples.preintegrate(*pair, biases, self._densities) for pair in pairwise(times)]
+            whole = [each for each in motions if each is not None and each.missing == 0.0]
+            if len(whole) < len(motions):
+                return
+            change, spread = align_gyro(bodies, whole)
+            bias = bias + change
+        if not gyro_fits(bodies, whole):
+            if not self._is_refused:
+                _LOGGER.warning(
+                    "the inertial sensor is not used: its turns are not those of the images; are unit (rad/s), axes, "
+                    "T_cam_imu and clock right?"
+                )
+            self._is_refused, self._poses = True, []
+            return
+        found = align(bodies, whole)
+        if found is None:
+            return
+        R = self._T_first_key[:3, :3].T
+        self._velocity, self._gravity = R @ found.velocity, R @ found.gravity
+        self._biases = np.r_[bias, found.accel_bias]
+        covariance = np.zeros((_SIZE, _SIZE))
+        covariance[_POSE, _POSE] = self.step_covariance
+        turn = np.eye(9)
+        turn[:3, :3] = turn[3:6, 3:6] = R
+        part = np.r_[6:12, 15:18]
+        covariance[np.ix_(part, part)] = turn @ found.covariance @ turn.T
+        covariance[12:15, 12:15] = spread + _GYRO_BIAS_FLOOR**2 * np.eye(3)
+        covariance[_CONSIDERED, _CONSIDERED] = np.diag(_CONSIDERED_SIGMA**2)
+        self._covariance, self.is_inertial, self._carried, self.widened = covariance, True, None, 1.0
+        self._note_twist(se3_log(se3_inverse(self._poses[-2][1]) @ self._poses[-1][1])[3:] / (times[-1] - times[-2]))
+        way = np.linalg.norm(np.diff(bodies[:, :3, 3], axis=0), axis=1).sum()
+        _LOGGER.info(
+            "gravity is known to %.1f degrees, from %.1f s of images along %.2f m",
+            np.degrees(found.tilt),
+            times[-1] - times[0],
+            way,
+        )
+
+    def _leave(self, seconds: float, densities: np.ndarray) -> None:
+        """No samples come any more: constant velocity again, until gravity is found anew."""
+        _LOGGER.warning("the inertial sensor gives no samples: constant velocity goes on")
+        sigma = np.sqrt(np.r_[np.diag(self._covariance)[_VELOCITY], np.full(3, densities[1])])
+        pose = self.step_covariance.copy()
+        self.is_inertial, self._covariance = False, np.zeros((12, 12))
+        self._covariance[_POSE, _POSE] = pose
+        self.set_twist(self.twist, sigma)
+        super().predict(seconds, densities)
+
+    def _note_twist(self, rate: np.ndarray) -> None:
+        """The camera's twist in its own frame, at that angular rate (3,)."""
+        T_kc = self.step
+        lever = self._T_camera_imu[:3, 3]
+        self.twist = np.r_[T_kc[:3, :3].T @ self._velocity - np.cross(rate, lever), rate]
+
+
+def build_motion(backend: str, sensor: InertialSensor | None, T_camera_left: np.ndarray) -> MotionFilter:
+    """The motion of a rectified camera, by its inertial sensor where it has one.
+
+    Args:
+        backend: "onnx" or "torch".
+        sensor: beside the left camera.
+        T_camera_left: (4, 4) takes points of the left camera into the rectified one.
+    """
+    return (
+        MotionFilter(backend) if sensor is None else InertialMotion(backend, sensor, T_camera_left @ sensor.T_left_imu)
+    )

@@ -1,0 +1,120 @@
+"""Inertial samples between two images as one relative motion that needs neither pose, velocity nor gravity.
+
+C. Forster, L. Carlone, F. Dellaert, D. Scaramuzza: On-Manifold Preintegration for Real-Time Visual-Inertial Odometry,
+IEEE Transactions on Robotics 33(1), 2017, eqs. (26) - (48); integrated by the midpoint rule.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sigmaslam.geometry.inertial_sensor import InertialSamples, InertialSensor
+from sigmaslam.geometry.se3 import rotation_exp, skew
+
+# Order of the errors of a preintegrated motion.
+TURN, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
+# What it depends on.
+GYRO_BIAS, ACCEL_BIAS = slice(0, 3), slice(3, 6)
+# Mean periods between two samples above which some are missing: jitter is less.
+_GAP = 2.5
+
+
+@dataclass(frozen=True, slots=True)
+class Preintegrated:
+    """Relative motion of the sensor in its frame at the start, without gravity and without the velocity there.
+
+    Attributes:
+        seconds: duration.
+        turn: (3, 3) rotation R_start_end.
+        velocity, position: (3,) changes, m/s and m.
+        slope: (9, 7) derivatives of (turn from the right, velocity, position) by gyro bias, accelerometer bias and the
+            delay of the sensor's clock, rad/s, m/s^2 and s.
+        gyro_noise, accel_noise: (9, 9) covariances by the white noise of each.
+        missing: seconds of it without samples.
+    """
+
+    seconds: float
+    turn: np.ndarray
+    velocity: np.ndarray
+    position: np.ndarray
+    slope: np.ndarray
+    gyro_noise: np.ndarray
+    accel_noise: np.ndarray
+    missing: float = 0.0
+
+
+def preintegrate(
+    samples: InertialSamples,
+    start: float,
+    end: float,
+    gyro_bias: np.ndarray,
+    accel_bias: np.ndarray,
+    sensor: InertialSensor,
+    densities: np.ndarray,
+) -> Preintegrated:
+    """Integrates samples from `start` to `end`, seconds of the sensor's clock.
+
+    Across gaps, and beyond the first and last sample, values are interpolated or held, and the noise is that of a
+    motion which nobody measured.
+
+    Args:
+        samples: at least one; those around the interval, too.
+        start, end: of the interval.
+        gyro_bias, accel_bias: (3,) taken off.
+        sensor: its noise.
+        densities: (2,) power spectra of unknown accelerations, m^2/s^3 and rad^2/s^3, for gaps.
+    """
+    t = samples.timestamp
+    inside = t[(t > start) & (t < end)]
+    edges = np.r_[start, inside, end]
+    gyro, accel = (_interpolate(edges, t, each) for each in (samples.gyro - gyro_bias, samples.accel - accel_bias))
+    steps, middles = np.diff(edges), 0.5 * (edges[1:] + edges[:-1])
+    # Length of the gap between samples that each step lies in.
+    after = np.searchsorted(t, middles)
+    before_first, behind_last = after == 0, after == len(t)
+    gaps = t[np.clip(after, 1, len(t) - 1)] - t[np.clip(after - 1, 0, max(len(t) - 2, 0))]
+    period = float(np.median(np.diff(t))) if len(t) > 1 else float(end - start)
+    gaps = np.where(before_first, t[0] - start, np.where(behind_last, end - t[-1], gaps))
+    is_missing = gaps > _GAP * period
+    turn, velocity, position = np.eye(3), np.zeros(3), np.zeros(3)
+    slope, noises = np.zeros((9, 6)), [np.zeros((9, 9)), np.zeros((9, 9))]
+    for k, h in enumerate(steps):
+        rate, force = 0.5 * (gyro[k] + gyro[k + 1]), 0.5 * (accel[k] + accel[k + 1])
+        half = rotation_exp(0.5 * h * rate)
+        middle = turn @ half
+        moved = middle @ force
+        A, B = np.eye(9), np.zeros((9, 6))
+        A[TURN, TURN] = (half @ half).T
+        A[VELOCITY, TURN] = -h * middle @ skew(force) @ half.T
+        A[POSITION, TURN] = 0.5 * h * A[VELOCITY, TURN]
+        A[POSITION, VELOCITY] = h * np.eye(3)
+        B[TURN, GYRO_BIAS] = h * np.eye(3)
+        B[VELOCITY, ACCEL_BIAS], B[POSITION, ACCEL_BIAS] = h * middle, 0.5 * h * h * middle
+        slope = A @ slope - B
+        spectra = [sensor.gyro_density**2, sensor.accel_density**2]
+        if is_missing[k]:
+            # A rate that goes from end to end with an unknown angular acceleration, as a Brownian bridge.
+            spectra = [spectra[0] + densities[1] * gaps[k] ** 2 / 12.0, spectra[1] + densities[0]]
+        for column, noise in enumerate(noises):
+            part = B[:, 3 * column : 3 * column + 3]
+            noises[column] = A @ noise @ A.T + spectra[column] / h * part @ part.T
+        position = position + h * velocity + 0.5 * h * h * moved
+        velocity = velocity + h * moved
+        turn = middle @ half
+    # The same samples, taken a moment later.
+    delay = np.concatenate(
+        [
+            gyro[-1] - turn.T @ gyro[0],
+            turn @ accel[-1] - accel[0] - np.cross(gyro[0], velocity),
+            velocity - (end - start) * accel[0] - np.cross(gyro[0], position),
+        ]
+    )
+    missing = float(steps[is_missing].sum())
+    slope = np.column_stack([slope, delay])
+    return Preintegrated(end - start, turn, velocity, position, slope, noises[0], noises[1], missing)
+
+
+def _interpolate(at: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
+    return np.column_stack([np.interp(at, t, values[:, axis]) for axis in range(3)])

@@ -1,0 +1,173 @@
+"""Inertial sensors of recordings: EuRoC's and TUM-VI's imu0, Kalibr's files, and CSV with a YAML beside."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sigmaslam.bounded_files import TABLE_BYTES, read_text, shorten
+from sigmaslam.errors import CalibrationError, InputError
+from sigmaslam.geometry.checked_yaml import CalibrationYaml
+from sigmaslam.geometry.inertial_sensor import InertialSamples, InertialSensor
+from sigmaslam.geometry.se3 import se3_inverse
+
+# A time stamp above this is in nanoseconds: seconds would be of the year 33658.
+_NANOSECONDS_FROM = 1e12
+# More of the stamps may not be out of order: then columns or clock are wrong.
+_MOST_OUT_OF_ORDER = 0.01
+# Names of Kalibr's results, and of TUM-VI's.
+_CHAINS = ("camchain-imucam*.yaml", "*-camchain-imucam.yaml", "dso/camchain.yaml", "camchain*.yaml")
+_NOISES = ("imu.yaml", "imu_config.yaml", "dso/imu_config.yaml")
+_DENSITIES = (
+    "gyroscope_noise_density",
+    "accelerometer_noise_density",
+    "gyroscope_random_walk",
+    "accelerometer_random_walk",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class InertialRecording:
+    """What an inertial sensor measured beside the images.
+
+    Attributes:
+        source: the table.
+        sensor: mounting and noise.
+        samples: in the order of time.
+        dropped: samples that came out of order and were left out.
+    """
+
+    source: Path
+    sensor: InertialSensor
+    samples: InertialSamples
+    dropped: int = 0
+
+
+def find_imu(folder: Path) -> Path | None:
+    """The table of a EuRoC or TUM-VI folder, if it has one that says how the sensor is mounted."""
+    for root in (folder, folder / "mav0"):
+        table = root / "imu0" / "data.csv"
+        if table.is_file() and _find_mounting(table) is not None:
+            return table
+    return None
+
+
+def read_imu(path: Path) -> InertialRecording:
+    """An inertial sensor's table of time, angular rate (rad/s) and specific force (m/s^2), with its YAML.
+
+    Noise densities come from a YAML of the table's name, from sensor.yaml or from Kalibr's imu.yaml beside it; the
+    mounting from T_cam_imu in the first, in Kalibr's camchain, or from T_BS of EuRoC's sensors.
+
+    Raises:
+        InputError: the table is missing, or a row is no time and six numbers, or time runs backwards.
+        CalibrationError: noise or mounting are missing or wrong.
+    """
+    path = path / "data.csv" if path.is_dir() else path
+    samples, dropped = _read_samples(path)
+    noise = _noise_file(path)
+    if noise is None:
+        raise CalibrationError(
+            f"{path}: nothing says how noisy the sensor is: put {path.with_suffix('.yaml').name} beside it, with "
+            f"{', '.join(_DENSITIES)} and T_cam_imu"
+        )
+    mounting = _find_mounting(path)
+    if mounting is None:
+        raise CalibrationError(
+            f"{path}: nothing says where the sensor is: give T_cam_imu in {path.with_suffix('.yaml').name}, or "
+            "Kalibr's camchain-imucam.yaml beside it"
+        )
+    values = []
+    for name in _DENSITIES:
+        value = noise.number(name)
+        if value <= 0.0:
+            raise noise.error(f"{name} is {value:g}: give the density of the data sheet, above zero")
+        values.append(value)
+    gyro, accel, gyro_walk, accel_walk = values
+    return InertialRecording(
+        path, InertialSensor(mounting[0], gyro, accel, gyro_walk, accel_walk, mounting[1]), samples, dropped
+    )
+
+
+def _read_samples(path: Path) -> tuple[InertialSamples, int]:
+    lines = read_text(path, TABLE_BYTES, "the inertial samples").splitlines()
+    rows, stamps = [], []
+    for number, row in enumerate(csv.reader(lines), start=1):
+        if not row or row[0].lstrip().startswith("#") or (number == 1 and not _is_number(row[0])):
+            continue
+        try:
+            stamp, values = row[0].strip(), [float(each) for each in row[1:7]]
+            seconds = int(stamp) / 1e9 if float(stamp) > _NANOSECONDS_FROM and "." not in stamp else float(stamp)
+        except ValueError:
+            values, seconds = [], np.nan
+        if len(values) != 6 or not np.isfinite([seconds, *values]).all():
+            raise InputError(
+                f"{path}: line {number}: expected time, angular rate x, y, z in rad/s and specific force x, y, z in "
+                f"m/s^2, found {shorten(','.join(row))}"
+            )
+        stamps.append(seconds)
+        rows.append(values)
+    if len(rows) < 2:
+        raise InputError(f"{path}: has {len(rows)} inertial samples; give the sensor's table")
+    t, table = np.array(stamps), np.array(rows)
+    later = np.r_[True, t[1:] > np.maximum.accumulate(t)[:-1]]
+    dropped = int((~later).sum())
+    if dropped > _MOST_OUT_OF_ORDER * len(t):
+        raise InputError(f"{path}: {dropped} of {len(t)} time stamps do not increase: sort the samples by time")
+    return InertialSamples(t[later], table[later, :3], table[later, 3:]), dropped
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _noise_file(table: Path) -> CalibrationYaml | None:
+    beside = [table.with_suffix(".yaml"), table.parent / "sensor.yaml"]
+    folders = (table.parent, table.parent.parent, table.parent.parent.parent)
+    beside += [folder / name for folder in folders for name in _NOISES]
+    for path in beside:
+        if path.is_file():
+            content = CalibrationYaml.read(path)
+            section = content.section("imu0") if isinstance(content.entries.get("imu0"), dict) else content
+            if any(name in section.entries for name in _DENSITIES):
+                return section
+    return None
+
+
+def _find_mounting(table: Path) -> tuple[np.ndarray, float] | None:
+    """T_left_imu (4, 4), and the sensor's clock minus the camera's, seconds."""
+    own = table.with_suffix(".yaml")
+    if own.is_file() and "T_cam_imu" in (content := CalibrationYaml.read(own)).entries:
+        return _rigid(content, "T_cam_imu"), content.number("timeshift_cam_imu", 0.0)
+    for folder in (table.parent, table.parent.parent, table.parent.parent.parent):
+        for pattern in _CHAINS:
+            for path in sorted(folder.glob(pattern)):
+                content = CalibrationYaml.read(path)
+                left = content.section("cam0") if isinstance(content.entries.get("cam0"), dict) else content
+                if "T_cam_imu" in left.entries:
+                    return _rigid(left, "T_cam_imu"), left.number("timeshift_cam_imu", 0.0)
+    sensor, camera = table.parent / "sensor.yaml", table.parent.parent / "cam0" / "sensor.yaml"
+    if not camera.is_file():
+        camera = table.parent.parent / "cam0_sensor.yaml"
+    if sensor.is_file() and camera.is_file():
+        T_body_imu, T_body_left = (_rigid(CalibrationYaml.read(path), "T_BS") for path in (sensor, camera))
+        return se3_inverse(T_body_left) @ T_body_imu, 0.0
+    return None
+
+
+def _rigid(content: CalibrationYaml, key: str) -> np.ndarray:
+    """A rigid transform (4, 4), in rows or as OpenCV writes matrices."""
+    if isinstance(content.entries.get(key), dict):
+        T = content.section(key).numbers("data", (16,)).reshape(4, 4)
+    else:
+        T = content.numbers(key, (4, 4))
+    # Files have as few as six digits.
+    if not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3) or np.linalg.det(T[:3, :3]) < 0.0:
+        raise content.error(f"{key} is no rotation with a translation: {T.tolist()}")
+    return T

@@ -1,0 +1,41 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sigmaslam.checks.inertial import check_inertial
+from sigmaslam.geometry.inertial_sensor import InertialSamples
+from sigmaslam.readers.inertial import InertialRecording
+from tests.support.inertial import SENSOR, Motion
+
+IMAGES = np.arange(0.5, 4.5, 0.05)
+
+
+def recorded(scale: float = 1.0, shift: float = 0.0, every: int = 1, keep: float = 9.0) -> InertialRecording:
+    samples = Motion(0, size=0.1).measure(np.arange(0, 5, 0.005)).select(slice(None, None, every))
+    samples = samples.select((samples.timestamp < keep) | (samples.timestamp > keep + 0.3))
+    samples = InertialSamples(samples.timestamp + shift, samples.gyro, scale * samples.accel)
+    return InertialRecording(Path("imu.csv"), SENSOR, samples)
+
+
+def test_a_good_table_is_ok():
+    assert check_inertial(recorded(), IMAGES.tolist()).severity == "ok"
+    assert check_inertial(recorded(), None).severity == "ok"
+
+
+@pytest.mark.parametrize(
+    ("recording", "severity", "message"),
+    [
+        (recorded(scale=1 / 9.80665), "error", "it is in g: give m/s"),
+        (recorded(scale=1000 / 9.80665), "error", "it is in mg"),
+        (recorded(scale=0.3), "error", "are its columns those"),
+        (recorded(shift=100.0), "error", "100% of the images lie outside its time"),
+        (recorded(shift=-2.0), "warning", "of the images lie outside"),
+        (recorded(every=10), "warning", "20 samples a second"),
+        (recorded(keep=2.0), "warning", "1 gaps of up to 0.3"),
+    ],
+)
+def test_faults_are_named(recording, severity, message):
+    found = check_inertial(recording, IMAGES.tolist())
+    assert found.severity == severity
+    assert message in found.message

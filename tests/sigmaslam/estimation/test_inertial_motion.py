@@ -1,0 +1,182 @@
+import logging
+
+import numpy as np
+import pytest
+
+from sigmaslam.estimation.inertial_motion import InertialMotion
+from sigmaslam.geometry.inertial_sensor import InertialSamples
+from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
+from tests.support.inertial import GRAVITY, SENSOR, Motion
+
+FRAME = 0.05
+DENSITIES = np.array([0.25, 0.25])
+# Of poses, metres and radians.
+SIGMA = np.repeat([0.002, 0.0005], 3)
+MOUNTING = se3_exp(np.array([0.06, -0.02, 0.01, 0.3, -1.2, 0.5]))
+GYRO_BIAS, ACCEL_BIAS = np.array([-0.003, 0.02, 0.08]), np.array([0.05, -0.1, 0.07])
+
+
+class Flight:
+    """A camera with a noisy sensor: every frame is predicted, and corrected unless it is dark."""
+
+    def __init__(self, seed: int, motion: Motion | None = None, noise: float = 5.0) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.motion, self.filter = motion or Motion(seed), InertialMotion("onnx", SENSOR, MOUNTING)
+        exact = self.motion.measure(np.arange(-0.02, 6.0, 0.005))
+        scale = noise / np.sqrt(0.005)
+        size = exact.gyro.shape
+        self.samples = InertialSamples(
+            exact.timestamp,
+            exact.gyro + GYRO_BIAS + scale * SENSOR.gyro_density * self.rng.normal(size=size),
+            exact.accel + ACCEL_BIAS + scale * SENSOR.accel_density * self.rng.normal(size=size),
+        )
+        self.given, self.frame, self.key = 0, 0, self.camera(0)
+        self.filter.forget_twist(np.repeat([1.0, 1.0], 3))
+
+    def camera(self, frame: int) -> np.ndarray:
+        return np.asarray(self.motion.poses(np.array([frame * FRAME]))[0] @ se3_inverse(MOUNTING))
+
+    @property
+    def truth(self) -> np.ndarray:
+        """(4, 4) since the keyframe."""
+        return np.asarray(se3_inverse(self.key) @ self.camera(self.frame))
+
+    def fly(self, frames: int, dark: bool = False, keyframes: int = 7, samples: bool = True) -> None:
+        for _ in range(frames):
+            self.frame += 1
+            t = self.frame * FRAME
+            end = int(np.searchsorted(self.samples.timestamp, t)) + 1
+            for k in range(self.given, end) if samples else ():
+                self.filter.samples.add(*(column[k] for column in self.samples.columns()))
+            self.given = end
+            self.filter.predict(FRAME, DENSITIES, timestamp=t)
+            if dark:
+                continue
+            P, seen = self.filter.step_covariance, se3_exp(SIGMA * self.rng.normal(size=6)) @ self.truth
+            gain = P @ np.linalg.inv(P + np.diag(SIGMA**2))
+            change = gain @ se3_log(seen @ se3_inverse(self.filter.step))
+            self.filter.correct(se3_exp(change) @ self.filter.step, P - gain @ P)
+            if self.frame % keyframes == 0:
+                self.key = self.camera(self.frame)
+                self.filter.start_keyframe()
+
+    def nees(self) -> dict[str, float]:
+        """Per degree of freedom, of pose, velocity, gravity and biases."""
+        state, t = self.filter.state, np.array([self.frame * FRAME])
+        R = self.key[:3, :3].T
+        velocity, gravity = R @ self.motion.place(t, 1)[0], R @ GRAVITY
+        error = np.r_[
+            se3_log(self.truth @ se3_inverse(state.step)),
+            np.r_[velocity, gravity, GYRO_BIAS, ACCEL_BIAS] - state.twist[:12],
+        ]
+        parts = {"pose": slice(0, 6), "velocity": slice(6, 9), "gravity": slice(9, 12)}
+        parts |= {"gyro": slice(12, 15), "accel": slice(15, 18)}
+        sizes = {name: part.stop - part.start for name, part in parts.items()} | {"gravity": 2}
+        return {
+            name: float(error[part] @ np.linalg.pinv(state.covariance[part, part], 1e-9) @ error[part]) / sizes[name]
+            for name, part in parts.items()
+        }
+
+
+def test_gravity_and_biases_are_found_in_a_second():
+    flight = Flight(0)
+    flight.fly(22)
+    assert flight.filter.is_inertial
+    flight.fly(58)
+    _, gravity, gyro = np.split(flight.filter.state.twist[:9], 3)
+    expected = flight.key[:3, :3].T @ GRAVITY
+    assert np.degrees(np.arccos(gravity @ expected / np.linalg.norm(gravity) / np.linalg.norm(expected))) < 1.0
+    np.testing.assert_allclose(gyro, GYRO_BIAS, atol=0.003)
+
+
+@pytest.mark.slow
+def test_a_dark_second_stays_within_what_is_claimed():
+    errors, nees = [], []
+    for seed in range(30):
+        flight = Flight(seed)
+        flight.fly(60)
+        assert flight.filter.is_inertial
+        flight.fly(20, dark=True)
+        errors.append(np.linalg.norm((flight.truth - flight.filter.step)[:3, 3]))
+        nees.append(list(flight.nees().values()))
+    mean = dict(zip(flight.nees(), np.mean(nees, axis=0), strict=True))
+    # Of places some 0.5 m apart every half second.
+    assert np.median(errors) < 0.04, errors
+    assert np.max(errors) < 0.1, errors
+    # Mounting and clock are exact here, and considered all the same.
+    assert all(0.3 < each < 1.6 for each in mean.values()), mean
+
+
+def test_at_rest_gravity_is_found_as_well():
+    flight = Flight(1, Motion(1, size=0.0))
+    flight.fly(40)
+    assert flight.filter.is_inertial
+    flight.fly(20, dark=True)
+    assert np.linalg.norm(flight.filter.step[:3, 3]) < 0.03
+    assert flight.nees()["pose"] < 3
+
+
+def test_without_samples_it_is_constant_velocity():
+    from sigmaslam.estimation.constant_velocity import MotionFilter
+
+    flight, other = Flight(2), MotionFilter()
+    other.forget_twist(np.repeat([1.0, 1.0], 3))
+    for _ in range(30):
+        flight.fly(1, keyframes=1000, samples=False)
+        other.predict(FRAME, DENSITIES)
+        state = flight.filter.state
+        other.correct(state.step, state.covariance[:6, :6])
+    assert not flight.filter.is_inertial
+    np.testing.assert_allclose(flight.filter.twist, other.twist, atol=1e-12)
+
+
+def test_a_sensor_that_dies_leaves_constant_velocity(caplog):
+    flight = Flight(3)
+    flight.fly(40)
+    with caplog.at_level(logging.WARNING):
+        flight.fly(30, samples=False)
+    assert not flight.filter.is_inertial
+    assert caplog.text.count("gives no samples") == 1
+    assert np.linalg.norm((flight.truth - flight.filter.step)[:3, 3]) < 0.02
+
+
+def test_late_samples_are_left_out_and_said_once(caplog):
+    flight = Flight(4)
+    flight.fly(10)
+    for _ in range(3):
+        flight.filter.samples.add(0.1, np.zeros(3), np.zeros(3))
+    assert flight.filter.samples.late == 3
+    assert caplog.text.count("not later than the last one") == 1
+
+
+def test_images_widen_pose_and_velocity_alone_and_can_be_taken_back():
+    flight = Flight(5)
+    flight.fly(40)
+    before = flight.filter.state.covariance
+    flight.filter.widen(9.0)
+    wide = flight.filter.state.covariance
+    np.testing.assert_allclose(wide[:9, :9], 9 * before[:9, :9])
+    np.testing.assert_array_equal(wide[9:, 9:], before[9:, 9:])
+    flight.filter.widen(1.0 / flight.filter.widened)
+    np.testing.assert_allclose(flight.filter.state.covariance, before, rtol=1e-12)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "fault",
+    [
+        np.degrees,
+        lambda gyro: -gyro,
+        lambda gyro: gyro[:, [1, 2, 0]],
+        lambda gyro: gyro * [1, -1, -1],
+        lambda gyro: 0.0 * gyro,
+    ],
+    ids=["degrees", "signs", "axes", "turned by 180 degrees", "dead"],
+)
+def test_a_gyro_of_another_unit_or_axis_is_said_once_and_not_used(fault, caplog):
+    flight = Flight(6)
+    flight.samples = InertialSamples(flight.samples.timestamp, fault(flight.samples.gyro), flight.samples.accel)
+    flight.fly(60)
+    assert not flight.filter.is_inertial
+    assert caplog.text.count("are unit (rad/s), axes") == 1
+    assert np.linalg.norm((flight.truth - flight.filter.step)[:3, 3]) < 0.01
