@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from sigmaslam.estimation.acceptance import ACCEPTANCE
+from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.geometry.image_cells import CELLS, image_cells
 
 # Part of one frame in the average: one frame's cells are too few to tell (docs/notebook/noise.md).
@@ -52,9 +55,10 @@ class SharedErrors:
     def __init__(self) -> None:
         self._average, self._count = 1.0, 1
 
-    def factor(self, clustering: float) -> float:
-        """What variances of one more frame are to be multiplied by, 1 or more; `clustering`: as found in it alone."""
+    def averaged(self, fit: FrameFit) -> FrameFit:
+        """One more frame, with a `clustering` by which to multiply its variances, 1 or more, in place of its own."""
         self._count += 1
-        self._average += max(1.0 / self._count, _GAIN) * (clustering - self._average)
+        self._average += max(1.0 / self._count, _GAIN) * (fit.clustering - self._average)
         # A body that comes into view is news.
-        return max(self._average, 1.0, clustering if clustering > ACCEPTANCE.usual_clustering else 1.0)
+        alone = fit.clustering if fit.clustering > ACCEPTANCE.usual_clustering else 1.0
+        return replace(fit, clustering=max(self._average, 1.0, alone))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -287,17 +286,15 @@ class StereoTracker:
 
     def _correct(self, fit: FrameFit, blur: float, matches: GuidedMatches, timestamp: float) -> FrameFit:
         """Takes a pose over, less certain where the frame is blurred."""
-        # Patches that are blurred are misplaced alike, along the blur and towards where they were expected: many of
-        # them say no more than a few. So do those of a body that moves on its own.
-        fit = replace(fit, clustering=self._shared_errors.factor(fit.clustering))
+        # Blurred patches are misplaced alike, as those of a body that moves: many of them say no more than a few.
+        fit = self._shared_errors.averaged(fit)
         fit = fit.inflated(max(fit.nis_before_scaling, 1.0) * blur * fit.clustering)
         seen = matches.views.select(fit.inliers)
         self._admission.confirm(seen, self._window)
         self._window.count_sightings(matches.searched, seen.landmark)
         back = se3_inverse(self._window.posterior.poses[-1])
         self._motion.correct(back @ fit.pose, turn_covariance(back, fit.relative))
-        if not matches.streaked:
-            # What streaks add to the noise is no scatter.
+        if not matches.streaked:  # what streaks add to the noise is no scatter
             self._noise.adapt(fit.nis_per_dof)
         self._course.track(timestamp)
         return fit

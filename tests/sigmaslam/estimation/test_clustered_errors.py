@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sigmaslam.estimation.clustered_errors import SharedErrors, clustering
+from sigmaslam.estimation.frame_fit import FrameFit, FramePosterior
 
 SIZE = (640, 480)
 
@@ -32,14 +33,20 @@ def test_independent_errors_have_nothing_in_common():
     assert 0.85 < np.mean(found) < 1.15
 
 
+def fit_of(clustering: float) -> FrameFit:
+    zero = np.zeros((6, 6))
+    joint = FramePosterior(np.zeros(6), zero, zero, zero, np.zeros(6))
+    return FrameFit(np.eye(4), zero, zero, np.zeros(12), joint, np.ones(9, bool), 9.0, 27, 1.0, clustering)
+
+
 def test_frames_are_averaged_but_a_large_factor_counts_at_once():
     shared = SharedErrors()
-    found = [shared.factor(1.6 if k % 2 else 1.2) for k in range(200)]
+    found = [shared.averaged(fit_of(1.6 if k % 2 else 1.2)).clustering for k in range(200)]
     # Least believed at first, then what frames say in the mean.
     assert found[0] < 1.2 < found[-1]
     assert np.mean(found[-20:]) == pytest.approx(1.4, abs=0.02)
-    assert shared.factor(5.0) == 5.0
-    assert all(shared.factor(0.3) >= 1.0 for _ in range(100))
+    assert shared.averaged(fit_of(5.0)).clustering == 5.0
+    assert all(shared.averaged(fit_of(0.3)).clustering >= 1.0 for _ in range(100))
 
 
 @pytest.mark.parametrize("shared", [0.5, 0.9])
