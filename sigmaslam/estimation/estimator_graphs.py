@@ -65,6 +65,6 @@ def open_step(name: str, backend: str = ONNX) -> Step:
 def _tell_slow() -> None:
     """Once."""
     _LOGGER.warning(
-        "poses are estimated by graphs, which takes five times longer: install the wheel of this Python and platform, "
+        "poses are estimated by graphs, which takes four times longer: install the wheel of this Python and platform, "
         "or a C++ compiler and then sigmaslam from its sources"
     )
