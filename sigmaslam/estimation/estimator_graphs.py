@@ -52,10 +52,10 @@ class EstimatorGraphs:
 
 
 def open_step(name: str, backend: str = ONNX) -> Step:
-    """A step by the name of its graph: compiled where a compiler was at hand, else the graph."""
+    """A step by its graph's name: compiled where that and AVX2 are at hand, else the graph."""
     if backend != ONNX:
         return load_step(name, backend)
-    if _compiled is None:
+    if _compiled is None or not _compiled.FAST:
         _tell_slow()
         return load_step(name)
     return cast(Step, getattr(_compiled, name))
@@ -65,6 +65,6 @@ def open_step(name: str, backend: str = ONNX) -> Step:
 def _tell_slow() -> None:
     """Once."""
     _LOGGER.warning(
-        "poses are estimated by graphs, which takes four times longer: install the wheel of this Python and platform, "
-        "or a C++ compiler and then sigmaslam from its sources"
+        "poses are estimated by graphs, which takes four times longer: with AVX2, install the wheel of this "
+        "Python and platform, or a C++ compiler and then sigmaslam from its sources"
     )
