@@ -27,6 +27,7 @@ PRIVATE = {
     "torch._dynamo.exc.TorchDynamoException": None,
     "torch._inductor.codecache.CppCodeCache.load": ("source",),
     "torch._inductor.decomposition.select_decomp_table": (),
+    "torch._decomp.core_aten_decompositions": (),
 }
 PRIVATE_OPERATORS = {"_efficientzerotensor", "_to_copy"}
 OPTIONS = {"post_grad_custom_pre_pass", "max_fusion_size", "guard_filter_fn", "size_asserts", "cpp_wrapper"}

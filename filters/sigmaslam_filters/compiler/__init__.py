@@ -9,6 +9,7 @@ Private parts of torch that are used, each listed with its signature in that tes
   `torch._subclasses.fake_tensor.FakeTensorMode`, `aten._efficientzerotensor`, `aten._to_copy`.
 - `scalar_loop`: `torch._dynamo.backends.common.aot_autograd`, `torch._dynamo.exc.TorchDynamoException`,
   `torch._inductor.codecache.CppCodeCache`, `torch._inductor.decomposition.select_decomp_table`.
+- `item_source`: `torch._decomp.core_aten_decompositions`.
 - `compiled_step`: settings of `torch._inductor.config`, given as options of `torch.compile`.
 
 What is rewritten: `components` writes the traced aten graph of a step anew, one array (B,) for each number, where the
