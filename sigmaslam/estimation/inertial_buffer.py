@@ -34,6 +34,7 @@ class InertialBuffer:
         self.late = 0
         """Samples that were left out, as they were not later than the one before."""
         self._samples: deque[np.ndarray] = deque()
+        self._table: np.ndarray | None = None  # of the samples, while they stay as they are
 
     def add(self, timestamp: float, gyro: np.ndarray, accel: np.ndarray) -> None:
         """Takes a sample, rad/s and m/s^2."""
@@ -43,12 +44,14 @@ class InertialBuffer:
             self.late += 1
             return
         self._samples.append(np.r_[timestamp, gyro, accel])
+        self._table = None
         self.forget(timestamp - _KEPT)
 
     def forget(self, before: float) -> None:
         """Samples before that time of the sensor's clock, but for the last of them, are needed no longer."""
         while len(self._samples) > 2 and self._samples[1][0] < before:
             self._samples.popleft()
+            self._table = None
 
     def preintegrate(self, start: float, end: float, biases: np.ndarray, densities: np.ndarray) -> Preintegrated | None:
         """The motion between two time stamps of the camera; None without samples near them.
@@ -58,7 +61,9 @@ class InertialBuffer:
             biases: (6,) of gyro and accelerometer.
             densities: (2,) power spectra of unknown accelerations, m^2/s^3 and rad^2/s^3, for gaps.
         """
-        table = np.array(self._samples).reshape(-1, 7)
+        if self._table is None:
+            self._table = np.array(self._samples).reshape(-1, 7)
+        table = self._table
         start, end = start + self.sensor.time_shift, end + self.sensor.time_shift
         first = max(int(np.searchsorted(table[:, 0], start, "right")) - 1, 0)
         table = table[first : int(np.searchsorted(table[:, 0], end)) + 1]

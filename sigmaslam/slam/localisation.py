@@ -40,6 +40,11 @@ class Prediction:
         key = window.posterior.poses[-1]
         return cls(key @ motion.step, turn_covariance(key, motion.step_covariance))
 
+    def squared_departure(self, pose: np.ndarray) -> float:
+        """Squared sigmas by which a pose (4, 4) departs from this one."""
+        departure = se3_log(pose @ se3_inverse(self.pose))
+        return float(departure @ np.linalg.lstsq(self.covariance, departure, rcond=1e-14)[0])
+
 
 @dataclass(frozen=True, slots=True)
 class Localiser:
@@ -117,9 +122,7 @@ class Localiser:
 
         Repeated texture of one keyframe agrees on wrong poses, hundreds of matches strong.
         """
-        departure = se3_log(fit.pose @ se3_inverse(prediction.pose))
-        squared = departure @ np.linalg.lstsq(prediction.covariance, departure, rcond=1e-14)[0]
-        if squared <= ACCEPTANCE.jump**2:
+        if prediction.squared_departure(fit.pose) <= ACCEPTANCE.jump**2:
             return True
         anchor = self.window.landmarks.anchor
         earlier = anchor[matches.searched] < len(self.window) - 1

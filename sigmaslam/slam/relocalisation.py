@@ -10,7 +10,7 @@ from sigmaslam.estimation.chi_square import CHI_SQUARE_9999_OF_6
 from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.frontend import StereoView
-from sigmaslam.geometry.se3 import nearest_rigid, se3_inverse, se3_log
+from sigmaslam.geometry.se3 import nearest_rigid
 from sigmaslam.slam.keyframes import Keyframes
 from sigmaslam.slam.landmark_admission import LandmarkAdmission
 from sigmaslam.slam.localisation import Prediction
@@ -84,7 +84,4 @@ class Relocaliser:
         """Whether the motion may have led to a pose (4, 4) since the last one."""
         if not len(self.window):
             return True
-        prediction = Prediction.of(self.window, self.motion)
-        departure = se3_log(pose @ se3_inverse(prediction.pose))
-        squared = departure @ np.linalg.lstsq(prediction.covariance, departure, rcond=1e-14)[0]
-        return bool(squared <= CHI_SQUARE_9999_OF_6)
+        return Prediction.of(self.window, self.motion).squared_departure(pose) <= CHI_SQUARE_9999_OF_6
