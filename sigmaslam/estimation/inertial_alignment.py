@@ -7,24 +7,26 @@ the same equations hold.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sigmaslam.estimation.preintegration import ACCEL_BIAS, GYRO_BIAS, POSITION, TURN, VELOCITY, Preintegrated
+from sigmaslam.estimation.preintegration import ACCEL_BIAS, DELAY, GYRO_BIAS, POSITION, TURN, VELOCITY, Preintegrated
 from sigmaslam.geometry.inertial_sensor import STANDARD_GRAVITY
-from sigmaslam.geometry.se3 import rotation_log
+from sigmaslam.geometry.se3 import rotation_exp, rotation_log, se3_exp
 
 # m/s^2, standard deviation of an accelerometer's bias: data sheets of small sensors say 0.02 to 0.5.
 _ACCEL_BIAS = 0.2
 # Of gravity's length on Earth with the scale error of an accelerometer, m/s^2.
 _GRAVITY_LENGTH = 0.05
 # Metres and radians by which poses from frame to frame are off at least, and rad/s that a gyro's bias then is.
-_LEAST_PLACE, _LEAST_TURN = 1e-3, 2e-4
+_LEAST_PLACE, _LEAST_TURN = 2e-4, 2e-4
 # Gravity whose length is off by more was not found, m/s^2; nor was one whose direction is less certain, radians.
 _LENGTH_TOLERANCE, _LEAST_TILT_CERTAINTY = 0.5, 0.05
 # Turns of gyro and images that differ by more are not of one body: of the turns, and radians from frame to frame.
 _TURN_SHARE, _TURN_ERROR = 0.25, 3e-3
+# rad/s: a gyro's bias is not known better at the start, whatever residuals say.
+_GYRO_BIAS_FLOOR = 2e-3
 # Residuals are no white noise: neighbours share landmarks, so that there are about so many times fewer of them.
 _SHARED = 4.0
 
@@ -34,19 +36,22 @@ class Alignment:
     """What is known at the last pose, in the frame of all poses.
 
     Attributes:
-        velocity, gravity, accel_bias: (3,) each; the velocity is the sensor's.
-        covariance: (9, 9) of the three.
+        velocity, gravity: (3,) each; the velocity is the sensor's.
+        biases: (6,) of gyro, beside that of the motions, and accelerometer.
+        covariance: (12, 12) of the four.
+        shared: (12, 7) of the four with delay and mounting, whose errors enter all of them.
     """
 
     velocity: np.ndarray
     gravity: np.ndarray
-    accel_bias: np.ndarray
+    biases: np.ndarray
     covariance: np.ndarray
+    shared: np.ndarray
 
     @property
     def tilt(self) -> float:
         """Standard deviation of gravity's direction, radians, of the less certain axis."""
-        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[3:6, 3:6])[-1]) / STANDARD_GRAVITY)
+        return _tilt(self.covariance)
 
 
 def gyro_fits(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> bool:
@@ -81,13 +86,53 @@ def align_gyro(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> tuple[np
     return bias, _SHARED * variance * np.linalg.inv(information)
 
 
-def align(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> Alignment | None:
-    """Velocity, gravity and accelerometer bias by least squares; None where they cannot be told.
+def align(
+    poses: np.ndarray, mounting: np.ndarray, motions: Sequence[Preintegrated], considered: np.ndarray
+) -> Alignment | None:
+    """Velocity, gravity and biases by least squares; None where they cannot be told.
+
+    A sensor that is mounted otherwise than believed finds gravity turned likewise, so that the two errors nearly
+    cancel in what is predicted: `shared` holds that.
 
     Args:
-        bodies: (N, 4, 4) poses of the sensor, N >= 4.
+        poses: (N, 4, 4) of the camera, N >= 4.
+        mounting: (4, 4) T_camera_imu.
         motions: N - 1 between successive poses, integrated with the gyro's bias and without the accelerometer's.
+        considered: (7,) standard deviations of the clock's delay and of the mounting, perturbed from the left.
     """
+    bodies = poses @ mounting
+    found, covariance, length = _solve(bodies, motions)
+    if abs(length - STANDARD_GRAVITY) > _LENGTH_TOLERANCE or _tilt(covariance) > _LEAST_TILT_CERTAINTY:
+        return None
+    columns = np.empty((len(found), len(considered)))
+    for k, sigma in enumerate(considered):
+        sides = []
+        for error in (sigma, -sigma):
+            moved = [_delayed(each, error) for each in motions] if k == 0 else motions
+            mounted = mounting if k == 0 else se3_exp(error * np.eye(6)[k - 1]) @ mounting
+            sides.append(_solve(poses @ mounted, moved)[0])
+        columns[:, k] = 0.5 * (sides[0] - sides[1])
+    covariance[6:9, 6:9] += _GYRO_BIAS_FLOOR**2 * np.eye(3)
+    return Alignment(found[:3], found[3:6], found[6:], covariance + columns @ columns.T, columns * considered)
+
+
+def _tilt(covariance: np.ndarray) -> float:
+    return float(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1]) / STANDARD_GRAVITY)
+
+
+def _delayed(motion: Preintegrated, delay: float) -> Preintegrated:
+    """The motion between the same images where the sensor's clock is off."""
+    change = delay * motion.slope[:, DELAY]
+    return replace(
+        motion,
+        turn=motion.turn @ rotation_exp(change[TURN]),
+        velocity=motion.velocity + change[VELOCITY],
+        position=motion.position + change[POSITION],
+    )
+
+
+def _solve(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> tuple[np.ndarray, np.ndarray, float]:
+    """(12,) velocity, gravity and biases, their covariance (12, 12), and gravity's length before it is assumed."""
     R, p = bodies[:, :3, :3], bodies[:, :3, 3]
     # Unknown: first place, first velocity, gravity, bias. Place and velocity of each pose as maps of these.
     identity, unknown = np.eye(12), slice(9, 12)
@@ -105,7 +150,7 @@ def align(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> Alignment | N
         rows.append(place.copy())
         values.append(p[k + 1] - place_known)
     A, y = np.concatenate(rows), np.concatenate(values)
-    variance, direction = _LEAST_PLACE**2, np.zeros(3)
+    variance, direction, first = _LEAST_PLACE**2, np.zeros(3), 0.0
     for turn in range(3):  # without gravity's length, with it, and with the residuals' size
         information, vector = A.T @ A / variance, A.T @ y / variance
         information[unknown, unknown] += np.eye(3) / _ACCEL_BIAS**2
@@ -116,15 +161,10 @@ def align(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> Alignment | N
         variance = _SHARED * max(float(residual @ residual) / max(len(y) - 12, 1), _LEAST_PLACE**2)
         gravity = solution[6:9]
         length = np.linalg.norm(gravity)
-        if not turn and abs(length - STANDARD_GRAVITY) > _LENGTH_TOLERANCE:
-            return None
+        first = length if not turn else first
         direction = gravity / length
-    covariance = np.linalg.inv(information)
-    end = np.concatenate([speed, identity[6:]])
-    alignment = Alignment(
-        speed @ solution + speed_known,
-        direction * STANDARD_GRAVITY,
-        solution[unknown],
-        end @ (0.5 * (covariance + covariance.T)) @ end.T,
-    )
-    return alignment if alignment.tilt < _LEAST_TILT_CERTAINTY else None
+    end = np.concatenate([speed, identity[6:9], np.zeros((3, 12)), identity[9:]])
+    covariance = end @ np.linalg.inv(information) @ end.T
+    bias, covariance[6:9, 6:9] = align_gyro(bodies, motions)
+    found = np.concatenate([speed @ solution + speed_known, direction * STANDARD_GRAVITY, bias, solution[unknown]])
+    return found, 0.5 * (covariance + covariance.T), float(first)

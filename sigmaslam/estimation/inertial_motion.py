@@ -29,8 +29,6 @@ _CONSIDERED_SIGMA = np.array([2e-3, *[5e-3] * 3, *[3.5e-3] * 3])
 _ALIGNED_SECONDS, _ALIGNED_POSES = 1.0, 8
 # Poses of a camera that is so slow that fewer fit into the seconds above are kept for so long, seconds.
 _LONGEST = 10.0
-# rad/s and m/s^2: biases are not known better at the start, whatever residuals say.
-_GYRO_BIAS_FLOOR = 2e-3
 # Seconds without samples after which the sensor is taken for dead.
 _DEAD = 1.0
 
@@ -177,8 +175,7 @@ class InertialMotion(MotionFilter):
             whole = [each for each in motions if each is not None and each.missing == 0.0]
             if len(whole) < len(motions):
                 return
-            change, spread = align_gyro(bodies, whole)
-            bias = bias + change
+            bias = bias + align_gyro(bodies, whole)[0]
         if not gyro_fits(bodies, whole):
             if not self._is_refused:
                 _LOGGER.warning(
@@ -187,19 +184,18 @@ class InertialMotion(MotionFilter):
                 )
             self._is_refused, self._poses = True, []
             return
-        found = align(bodies, whole)
+        found = align(np.array([pose for _, pose in self._poses]), self._T_camera_imu, whole, _CONSIDERED_SIGMA)
         if found is None:
             return
         R = self._T_first_key[:3, :3].T
         self._velocity, self._gravity = R @ found.velocity, R @ found.gravity
-        self._biases = np.r_[bias, found.accel_bias]
-        covariance = np.zeros((_SIZE, _SIZE))
-        covariance[_POSE, _POSE] = self.step_covariance
-        turn = np.eye(9)
+        self._biases = np.r_[bias, np.zeros(3)] + found.biases
+        turn, covariance = np.eye(12), np.zeros((_SIZE, _SIZE))
         turn[:3, :3] = turn[3:6, 3:6] = R
-        part = np.r_[6:12, 15:18]
-        covariance[np.ix_(part, part)] = turn @ found.covariance @ turn.T
-        covariance[12:15, 12:15] = spread + _GYRO_BIAS_FLOOR**2 * np.eye(3)
+        covariance[_POSE, _POSE] = self.step_covariance
+        covariance[_OTHERS, _OTHERS] = turn @ found.covariance @ turn.T
+        covariance[_OTHERS, _CONSIDERED] = turn @ found.shared
+        covariance[_CONSIDERED, _OTHERS] = covariance[_OTHERS, _CONSIDERED].T
         covariance[_CONSIDERED, _CONSIDERED] = np.diag(_CONSIDERED_SIGMA**2)
         self._covariance, self.is_inertial, self._carried, self.widened = covariance, True, None, 1.0
         self._note_twist(se3_log(se3_inverse(self._poses[-2][1]) @ self._poses[-1][1])[3:] / (times[-1] - times[-2]))

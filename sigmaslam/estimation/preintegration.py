@@ -16,7 +16,7 @@ from sigmaslam.geometry.se3 import rotation_exp, skew
 # Order of the errors of a preintegrated motion.
 TURN, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
 # What it depends on.
-GYRO_BIAS, ACCEL_BIAS = slice(0, 3), slice(3, 6)
+GYRO_BIAS, ACCEL_BIAS, DELAY = slice(0, 3), slice(3, 6), 6
 # Mean periods between two samples above which some are missing: jitter is less.
 _GAP = 2.5
 
