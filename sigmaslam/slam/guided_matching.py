@@ -203,8 +203,11 @@ class GuidedMatcher:
         place = np.searchsorted(search.index, matches.key_index)
         noise, common = self.noise.of_matches(matches), np.zeros((len(place), 3, 2))
         key = search.key
-        streak = streak_covariance(key.left, left.pixels, key.features.keypoints[matches.key_index], matches.points)
-        if streaked := streak is not None and (key.is_blurred or left.is_blurred.get()):
+        streak = None
+        if key.is_blurred or left.is_blurred.get():
+            streak = streak_covariance(key.left, left.pixels, key.features.keypoints[matches.key_index], matches.points)
+        streaked = streak is not None
+        if streak is not None:
             # They share it: all of them say no more of it than one.
             noise[:, :2, :2] += len(place) * streak
         if not alone:

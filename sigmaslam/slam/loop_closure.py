@@ -20,11 +20,13 @@ _LOGGER = logging.getLogger(__name__)
 # A loop is looked for beyond so many keyframes that left the window last, among those that look less than 60 degrees
 # away.
 _RECENT, _LOOP_COSINE = 10, 0.5
+# Seconds from one look to the next, which teaches hardly more, unless the place is as uncertain as the scene is deep.
+_PAUSE = 1.0
 # And are nearer than the scene is deep and so many standard deviations of where they are.
 _REACH_SIGMAS = 3.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class LoopCloser:
     """Constrains the newest keyframe to one that left the window long ago.
 
@@ -32,11 +34,13 @@ class LoopCloser:
         window: owns the poses.
         keyframes: of the window and its past.
         matcher: finds keyframes in views.
+        looked: when a keyframe was last held against others, time stamp in seconds.
     """
 
     window: KeyframeWindow
     keyframes: Keyframes
     matcher: UnguidedMatcher
+    looked: float = -np.inf
 
     def close(self) -> float | None:
         """Closes a loop where the newest keyframe sees what one of long ago saw.
@@ -44,9 +48,10 @@ class LoopCloser:
         Returns:
             The time stamp of that one, seconds; None where there is no loop.
         """
-        closed = None
-        view = self.keyframes.active[-1].view
+        closed, newest = None, self.keyframes.active[-1]
+        view = newest.view
         for keyframe in retrieve(view, 1, self._revisited()):
+            self.looked = newest.timestamp
             relative = self.matcher.relative_pose_to(keyframe.view, view)
             if relative is None:
                 continue
@@ -64,6 +69,8 @@ class LoopCloser:
         pose, place = state.poses[-1], pose_slice(len(state) - 1)
         sigma = np.sqrt(np.trace(se3_body(pose, state.whole_covariance[place, place])[:3, :3]))
         reach = self.window.depth + _REACH_SIGMAS * sigma
+        if self.keyframes.active[-1].timestamp < self.looked + _PAUSE and reach < 2.0 * self.window.depth:
+            return []
 
         def is_near(keyframe: Keyframe) -> bool:
             between = se3_inverse(pose) @ self.keyframes.pose(keyframe)
