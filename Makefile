@@ -13,8 +13,9 @@ endif
 endif
 
 # What an installation is made of: when one of these changes, it is made again.
-BUILD := pyproject.toml evaluation/pyproject.toml setup.py requirements.lock sigmaslam/frontend/kernels.cpp sigmaslam/frontend/kernels.inc \
-         sigmaslam/estimation/estimator.cpp sigmaslam/estimation/estimator.inc sigmaslam/estimation/views.inc
+BUILD := pyproject.toml evaluation/pyproject.toml setup.py requirements.lock sigmaslam/both_ways.inc \
+         sigmaslam/frontend/kernels.cpp sigmaslam/frontend/kernels.inc sigmaslam/estimation/estimator.cpp \
+         sigmaslam/estimation/estimator.inc sigmaslam/estimation/views.inc
 
 .PHONY: demo test test-long test-slow lint docs results dist wheel sbom clean
 

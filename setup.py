@@ -12,7 +12,7 @@ def compiled(name: str, folder: str, source: str, included: list[str], optimised
     return Extension(
         name,
         [f"{folder}/{source}"],
-        depends=[f"{folder}/{each}" for each in included],
+        depends=["sigmaslam/both_ways.inc", *(f"{folder}/{each}" for each in included)],
         include_dirs=[pybind11.get_include()],
         extra_compile_args=[*optimised, *FLAGS],
         language="c++",

@@ -67,30 +67,8 @@ struct Equations {
     std::vector<double> own;
 };
 
-namespace plain {
-#include "estimator.inc"
-}  // namespace plain
-
-#if defined(__x86_64__)
-#if defined(__clang__)
-#pragma clang attribute push(__attribute__((target("avx2"))), apply_to = function)
-#else
-#pragma GCC push_options
-#pragma GCC target("avx2")
-#endif
-namespace wide {
-#include "estimator.inc"
-}  // namespace wide
-#if defined(__clang__)
-#pragma clang attribute pop
-#else
-#pragma GCC pop_options
-#endif
-const bool HAS_AVX2 = __builtin_cpu_supports("avx2");
-#else
-namespace wide = plain;
-constexpr bool HAS_AVX2 = false;
-#endif
+#define FUNCTIONS "estimation/estimator.inc"
+#include "../both_ways.inc"
 
 // Arrays by name, kept while their numbers are used.
 class Feed {

@@ -101,30 +101,8 @@ struct Alignment {
     float correlation;
 };
 
-namespace plain {
-#include "kernels.inc"
-}  // namespace plain
-
-#if defined(__x86_64__)
-#if defined(__clang__)
-#pragma clang attribute push(__attribute__((target("avx2"))), apply_to = function)
-#else
-#pragma GCC push_options
-#pragma GCC target("avx2")
-#endif
-namespace wide {
-#include "kernels.inc"
-}  // namespace wide
-#if defined(__clang__)
-#pragma clang attribute pop
-#else
-#pragma GCC pop_options
-#endif
-const bool HAS_AVX2 = __builtin_cpu_supports("avx2");
-#else
-namespace wide = plain;
-constexpr bool HAS_AVX2 = false;
-#endif
+#define FUNCTIONS "frontend/kernels.inc"
+#include "../both_ways.inc"
 
 const auto align_one = HAS_AVX2 ? wide::align_one : plain::align_one;
 const auto examine_one = HAS_AVX2 ? wide::examine_one : plain::examine_one;
