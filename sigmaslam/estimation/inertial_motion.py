@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -12,19 +13,20 @@ from sigmaslam.estimation.gaussian import regression
 from sigmaslam.estimation.inertial_alignment import align, align_gyro, gyro_fits
 from sigmaslam.estimation.inertial_buffer import InertialBuffer, LearnedNoise
 from sigmaslam.estimation.preintegration import Preintegrated
-from sigmaslam.geometry.inertial_sensor import STANDARD_GRAVITY, InertialSensor
-from sigmaslam.geometry.se3 import nearest_rigid, se3_inverse, se3_log, skew
+from sigmaslam.geometry.inertial_sensor import InertialSensor
+from sigmaslam.geometry.se3 import nearest_rigid, se3_exp, se3_inverse, se3_log, skew
 from sigmaslam.inference.backends import load_step
 
 _LOGGER = logging.getLogger(__name__)
 
 # Order of the graph's error state, see sigmaslam_models.estimator.inertial_prediction.
 _POSE, _VELOCITY, _GRAVITY, _BIASES = slice(0, 6), slice(6, 9), slice(9, 12), slice(12, 18)
-# What poses correct, and what they do not.
-_OTHERS, _CONSIDERED, _SIZE = slice(6, 18), slice(18, 25), 25
-# Prior standard deviations of what is only considered: delay (s), place (m) and rotation (rad) of the sensor. Those of
-# careful calibrations: 2 ms, 5 mm and 0.2 degrees.
-_CONSIDERED_SIGMA = np.array([2e-3, *[5e-3] * 3, *[3.5e-3] * 3])
+_SENSOR, _SIZE = slice(18, 25), 25
+# Prior standard deviations of delay (s), place (m) and rotation (rad) of the sensor. Those of careful calibrations:
+# 2 ms, 5 mm and 0.2 degrees.
+_SENSOR_SIGMA = np.array([2e-3, *[5e-3] * 3, *[3.5e-3] * 3])
+# Seconds in which clocks drift and mounts bend, as they warm up, by as much as they are off at first.
+_WARM_UP = 600.0
 # Gravity is looked for in the poses of so many seconds, and in no fewer than so many poses.
 _ALIGNED_SECONDS, _ALIGNED_POSES = 1.0, 8
 # Poses of a camera that is so slow that fewer fit into the seconds above are kept for so long, seconds.
@@ -37,7 +39,7 @@ class InertialMotion(MotionFilter):
     """Predicts by an inertial sensor; by constant velocity until gravity is known.
 
     Everything is in the frame of the last keyframe, so that nothing is far from zero. Delay and mounting of the sensor
-    are considered: they make predictions less certain, and poses do not move them (Schmidt-Kalman).
+    are part of the state: a sensor that is mounted as believed to 0.2 degrees would fall aside by 17 mm in a second.
 
     Args:
         backend: "onnx" or "torch".
@@ -104,6 +106,7 @@ class InertialMotion(MotionFilter):
         turned = se3_log(se3_inverse(self.step) @ step)[3:] / motion.seconds
         self.step, self._velocity = nearest_rigid(step), velocity
         self._covariance, self._carried, self.widened = 0.5 * (covariance + covariance.T), carried, 1.0
+        self._covariance[_SENSOR, _SENSOR] += np.diag(_SENSOR_SIGMA**2 * motion.seconds / _WARM_UP)
         self._note_twist(turned)
         if sigma > 0.0:
             self.doubt_time(sigma)
@@ -128,13 +131,14 @@ class InertialMotion(MotionFilter):
         removed = P[_POSE, _POSE] - covariance
         self.noise.learn(departure, removed)
         gain = regression(P[6:, _POSE], P[_POSE, _POSE])
-        change = gain[: _OTHERS.stop - 6] @ departure
+        change = gain @ departure
         self._velocity = self._velocity + change[:3]
-        gravity = self._gravity + change[3:6]
-        self._gravity = STANDARD_GRAVITY / np.linalg.norm(gravity) * gravity
-        self._biases = self._biases + change[6:]
+        self._gravity = self._gravity + change[3:6]
+        self._biases = self._biases + change[6:12]
+        sensor = self.samples.sensor
+        self.samples.sensor = replace(sensor, time_shift=sensor.time_shift + float(change[12]))
+        self._T_camera_imu = nearest_rigid(se3_exp(change[13:]) @ self._T_camera_imu)
         others = P[6:, 6:] - gain @ removed @ gain.T
-        others[12:, 12:] = P[_CONSIDERED, _CONSIDERED]
         self.step = nearest_rigid(step)
         self._covariance = np.block([[covariance, covariance @ gain.T], [gain @ covariance, 0.5 * (others + others.T)]])
         self._note_twist(self.twist[3:])
@@ -184,7 +188,7 @@ class InertialMotion(MotionFilter):
                 )
             self._is_refused, self._poses = True, []
             return
-        found = align(np.array([pose for _, pose in self._poses]), self._T_camera_imu, whole, _CONSIDERED_SIGMA)
+        found = align(np.array([pose for _, pose in self._poses]), self._T_camera_imu, whole, _SENSOR_SIGMA)
         if found is None:
             return
         R = self._T_first_key[:3, :3].T
@@ -193,10 +197,10 @@ class InertialMotion(MotionFilter):
         turn, covariance = np.eye(12), np.zeros((_SIZE, _SIZE))
         turn[:3, :3] = turn[3:6, 3:6] = R
         covariance[_POSE, _POSE] = self.step_covariance
-        covariance[_OTHERS, _OTHERS] = turn @ found.covariance @ turn.T
-        covariance[_OTHERS, _CONSIDERED] = turn @ found.shared
-        covariance[_CONSIDERED, _OTHERS] = covariance[_OTHERS, _CONSIDERED].T
-        covariance[_CONSIDERED, _CONSIDERED] = np.diag(_CONSIDERED_SIGMA**2)
+        covariance[6:18, 6:18] = turn @ found.covariance @ turn.T
+        covariance[6:18, _SENSOR] = turn @ found.shared
+        covariance[_SENSOR, 6:18] = covariance[6:18, _SENSOR].T
+        covariance[_SENSOR, _SENSOR] = np.diag(_SENSOR_SIGMA**2)
         self._covariance, self.is_inertial, self._carried, self.widened = covariance, True, None, 1.0
         self._note_twist(se3_log(se3_inverse(self._poses[-2][1]) @ self._poses[-1][1])[3:] / (times[-1] - times[-2]))
         way = np.linalg.norm(np.diff(bodies[:, :3, 3], axis=0), axis=1).sum()

@@ -74,7 +74,7 @@ class Flight:
         ]
         parts = {"pose": slice(0, 6), "velocity": slice(6, 9), "gravity": slice(9, 12)}
         parts |= {"gyro": slice(12, 15), "accel": slice(15, 18)}
-        sizes = {name: part.stop - part.start for name, part in parts.items()} | {"gravity": 2}
+        sizes = {name: part.stop - part.start for name, part in parts.items()}
         return {
             name: float(error[part] @ np.linalg.pinv(state.covariance[part, part], 1e-9) @ error[part]) / sizes[name]
             for name, part in parts.items()
@@ -104,9 +104,9 @@ def test_a_dark_second_stays_within_what_is_claimed():
         nees.append(list(flight.nees().values()))
     mean = dict(zip(flight.nees(), np.mean(nees, axis=0), strict=True))
     # Of places some 0.5 m apart every half second.
-    assert np.median(errors) < 0.06, errors
-    assert np.max(errors) < 0.15, errors
-    assert all(0.5 < each < 2.0 for each in mean.values()), mean
+    assert np.median(errors) < 0.04, errors
+    assert np.max(errors) < 0.1, errors
+    assert all(0.5 < each < 1.6 for each in mean.values()), mean
 
 
 def test_at_rest_gravity_is_found_as_well():
