@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sigmaslam.checks.calibration import MAX_BASELINE
 from sigmaslam.checks.finding import Finding
 from sigmaslam.geometry.inertial_sensor import STANDARD_GRAVITY
 from sigmaslam.readers.inertial import InertialRecording
@@ -25,6 +26,11 @@ def check_inertial(recording: InertialRecording, timestamps: Sequence[float] | N
         timestamps: of the images, seconds; None where they are not known.
     """
     samples, source = recording.samples, recording.source
+    lever = float(np.linalg.norm(recording.sensor.T_left_imu[:3, 3]))
+    if lever > MAX_BASELINE:
+        where = "millimetres" if lever < 1e3 * MAX_BASELINE else "other units than metres"
+        message = f"{source}: T_cam_imu has the sensor {lever:.3g} m from the camera: is it in {where}? Give metres"
+        return Finding(_NAME, "error", message, lever)
     length = float(np.median(np.linalg.norm(samples.accel, axis=1)))
     if abs(length - STANDARD_GRAVITY) > _LENGTH_TOLERANCE:
         factors = {"g": 1.0, "mg": 1e3, "cm/s^2": 1e2 * STANDARD_GRAVITY}
