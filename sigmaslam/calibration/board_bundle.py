@@ -141,6 +141,11 @@ def project_corners(rig: Rig, poses: np.ndarray, corners: Corners) -> np.ndarray
     return corners.pixels - _residuals(rig, poses, corners)
 
 
+def pose_covariances(bundle: BoardBundle, corners: Corners, sigma: float) -> np.ndarray:
+    """(n, 6, 6) of the bundle's poses in the left camera's frame, for a known rig; sigma of a corner in pixels."""
+    return _linearise(bundle.rig, bundle.poses, corners, bundle.residuals)[0] * sigma**2
+
+
 def _residuals(rig: Rig, poses: np.ndarray, corners: Corners) -> np.ndarray:
     pixels = np.empty((len(corners), 2))
     for k, (_, at) in enumerate(_in_eyes(rig, poses, corners)):

@@ -15,13 +15,13 @@ import numpy as np
 from sigmaslam.geometry.inertial_sensor import InertialSamples
 from sigmaslam.geometry.se3 import rotation_exp, rotation_log, skew
 
+SHARED_ERRORS = 4.0
+"""Errors of a tracker's poses are no white noise: neighbours share landmarks, about so many times fewer count."""
 # Delays that are searched, seconds, and the step of the search: the turns of a frame of 50 ms are smooth over it.
 _LONGEST_DELAY, _STEP = 0.5, 5e-3
 _ROUNDS = 6
 # So many intervals determine seven unknowns; more than so many say no more, and take long.
 _FEWEST, _MOST = 12, 400
-# Residuals are no white noise, as for gravity: neighbours share landmarks.
-_SHARED = 4.0
 # Rates that are so many times as large are in another unit.
 _UNIT = 3.0
 # By so many variances a mirrored gyro must fit better than a right one.
@@ -120,11 +120,11 @@ def fit_turns(
         delay += float(np.linalg.lstsq(columns / length, residual.ravel(), rcond=None)[0][6] / length[6])
     variance = max(float(np.sum(residual**2)) / (residual.size - 7), 1e-20)
     information = columns.T @ columns / variance
-    sigma = np.sqrt(_SHARED * np.linalg.pinv(information, hermitian=True)[6, 6])
+    sigma = np.sqrt(SHARED_ERRORS * np.linalg.pinv(information, hermitian=True)[6, 6])
     of_rotation = information[:3, :3] - information[:3, 3:] @ np.linalg.pinv(information[3:, 3:]) @ information[3:, :3]
     # Turns that are noise, as about the other axes of a car, do not show how a sensor is turned about its axis.
     values, vectors = np.linalg.eigh(of_rotation)
-    values = np.maximum(values - 2.0 * len(seen), 0.0) / _SHARED + np.pi**-2
+    values = np.maximum(values - 2.0 * len(seen), 0.0) / SHARED_ERRORS + np.pi**-2
     whole = np.sum((gyro - bias * seconds[:, None]) ** 2)
     explained = 1.0 - float(np.sum(residual**2) / max(whole, 1e-30))
     return TurnFit(unit * scale, rotation, unit * bias, delay, float(sigma), vectors / values @ vectors.T, explained)

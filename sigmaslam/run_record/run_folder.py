@@ -22,7 +22,8 @@ import numpy as np
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder, printable
 from sigmaslam.frontend.build import own_networks
-from sigmaslam.geometry.camera import StereoCamera
+from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
+from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.inference.networks import WeightsFolder, network_path
 from sigmaslam.inference.onnx_graph import shipped_weights
 from sigmaslam.run_record.appended_file import AppendedFile, is_in_use
@@ -220,6 +221,16 @@ def describe_camera(camera: StereoCamera) -> dict[str, Any]:
         "sigmas": asdict(camera.sigmas),
         "covariance": covariance and {"names": list(covariance.names), "matrix": covariance.matrix.tolist()},
     }
+
+
+def camera_of(path: Path, entries: dict[str, Any]) -> StereoCamera:
+    """The calibration that run.json has; its measured covariance is not needed."""
+    try:
+        left, right = (CameraModel(**entries[eye]) for eye in ("left", "right"))
+        sigmas = CalibrationSigmas(**entries["sigmas"])
+        return StereoCamera(left, right, np.array(entries["T_left_right"], float), sigmas)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: calibration cannot be read ({error}): run `sigmaslam track` again") from error
 
 
 def describe_weights(frontend: str, backend: str, weights: WeightsFolder) -> dict[str, Any] | None:
