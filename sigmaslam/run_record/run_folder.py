@@ -28,6 +28,7 @@ from sigmaslam.inference.networks import WeightsFolder, network_path
 from sigmaslam.inference.onnx_graph import shipped_weights
 from sigmaslam.run_record.appended_file import AppendedFile, is_in_use
 from sigmaslam.run_record.frame_table import COLUMNS, DOUBTS_SEPARATOR, FRAMES_NAME, KEYFRAME_COLUMNS
+from sigmaslam.run_record.inertial_file import InertialWriter
 from sigmaslam.run_record.pose_file import PARTIAL_POSES, PoseWriter
 from sigmaslam.run_record.relative_pose_file import RelativePoseWriter
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
@@ -88,6 +89,7 @@ class RunWriter:
             self._poses = PoseWriter(out, goes_on)
             self._relative_poses = RelativePoseWriter(out, goes_on)
             self._table = AppendedFile(out / FRAMES_NAME, goes_on)
+            self._inertial = InertialWriter(out, goes_on) if "imu" in run else None
         except OSError as error:
             raise InputError(f"{out}: cannot be written ({error.strerror}): choose another --out") from error
         if not goes_on:
@@ -112,6 +114,8 @@ class RunWriter:
         self.calibration = estimate.calibration
         if estimate.has_pose:
             self._poses.add(estimate.timestamp, pose, covariance, matching)
+            if self._inertial is not None and estimate.inertial is not None:
+                self._inertial.add(estimate.timestamp, estimate.inertial)
             self._relative_poses.add(self._count, estimate.relative_poses)
             if estimate.tracks is not None and self._rectified is not None:
                 self._tracks.append((self._count, estimate.tracks))
@@ -141,8 +145,9 @@ class RunWriter:
 
     def close(self) -> None:
         """The last frame has come."""
-        for file in (self._poses, self._relative_poses, self._table):
-            file.close()
+        for file in (self._poses, self._relative_poses, self._table, self._inertial):
+            if file is not None:
+                file.close()
 
     @property
     def has_tracks(self) -> bool:
