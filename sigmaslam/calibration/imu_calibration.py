@@ -134,8 +134,8 @@ def calibrate_imu(
         if turn < _INTEGRATED:
             reference = state
             whole = [
-                preintegrate(samples, *(np.array(pair) + state.shift), bias[:3], bias[3:], sensor, _UNKNOWN)
-                for pair, bias in zip(pairwise(times.tolist()), state.biases, strict=False)
+                preintegrate(samples, start, end, bias[:3], bias[3:], sensor, _UNKNOWN)
+                for (start, end), bias in zip(pairwise((times + state.shift).tolist()), state.biases, strict=False)
             ]
         delay = state.shift - reference.shift
         motions = [

@@ -12,7 +12,7 @@ from sigmaslam.checks.eye_matches import EyeMatcher, EyeMatches
 from sigmaslam.checks.finding import Finding, has_errors, wrong
 from sigmaslam.checks.images import check_images, check_light, describe_frames
 from sigmaslam.checks.inertial import check_inertial
-from sigmaslam.checks.inertial_motion import check_motion
+from sigmaslam.checks.inertial_agreement import check_motion
 from sigmaslam.checks.rig import TOO_FEW, check_pairing, check_rig, find_exchanged, suspect_pairing, unknown_rig
 from sigmaslam.checks.row_fit import MIN_INLIERS, MIN_MATCHES
 from sigmaslam.checks.time_stamps import check_time_stamps

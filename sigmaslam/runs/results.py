@@ -115,8 +115,8 @@ def write_results(
     if frames is not None and len(records):
         summary |= describe_gravity(read_inertial_records(folder), records)
         if tracker is not None and tracker.judge_imu is not None:
-            tracked = ~predicted_poses(frames, records.timestamp)
-            judged = tracker.judge_imu(records.timestamp, records.pose, tracked)
+            by_images = ~predicted_poses(frames, records.timestamp)
+            judged = tracker.judge_imu(records.timestamp, records.pose, by_images)
             summary["imu"] = [asdict(each) for each in judged]
     summary["world"] = _describe_world(summary, run)
     summary["failure"] = explain_failure(summary, run.get("map") is not None, started, findings)

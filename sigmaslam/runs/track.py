@@ -19,7 +19,7 @@ from sigmaslam.bodies.object_tracker import OBJECT_CONFIG, ObjectEstimate, Objec
 from sigmaslam.calibration.learned_calibration import learned_calibration
 from sigmaslam.calibration_files.calibration_writer import write_calibration
 from sigmaslam.checks.finding import disparity_error
-from sigmaslam.checks.inertial_motion import judge_motion
+from sigmaslam.checks.inertial_agreement import judge_motion
 from sigmaslam.errors import InputError, OutputError, SigmaSlamError
 from sigmaslam.files import printable
 from sigmaslam.fusion.location_filter import LocationFilter

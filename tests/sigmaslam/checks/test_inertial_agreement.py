@@ -11,7 +11,7 @@ import pytest
 
 from sigmaslam.checks.finding import Finding, wrong
 from sigmaslam.checks.inertial import check_inertial
-from sigmaslam.checks.inertial_motion import judge_motion
+from sigmaslam.checks.inertial_agreement import judge_motion
 from sigmaslam.estimation.accelerometer_axes import SIGNED_AXES
 from sigmaslam.geometry.inertial_sensor import InertialSamples
 from sigmaslam.geometry.se3 import rotation_exp, se3_exp, se3_inverse
