@@ -132,18 +132,19 @@ def calibrate_imu(
     measured = poses
     for turn in range(MAX_ROUNDS):
         if turn < _INTEGRATED:
-            reference = state
-            whole = [
-                preintegrate(samples, start, end, bias[:3], bias[3:], sensor, _UNKNOWN)
-                for (start, end), bias in zip(pairwise((times + state.shift).tolist()), state.biases, strict=False)
-            ]
+            reference, whole = state, _integrate(times + state.shift, state.biases, samples, sensor)
         delay = state.shift - reference.shift
         motions = [
             _corrected(each, np.r_[change, delay])
             for each, change in zip(whole, state.biases - reference.biases, strict=False)
         ]
         factors = _factors(state, measured, roots, motions, sensor, scales)
-        system = ArrowSystem(factors, len(times), _SIZE, _COMMON)
+        try:
+            system = ArrowSystem(factors, len(times), _SIZE, _COMMON)
+        except np.linalg.LinAlgError:
+            raise CalibrationError(
+                "the motion leaves the mounting open: turn the rig about all axes and move it"
+            ) from None
         steps, shared = system.solve()
         moved = float(np.max(np.abs(shared[: len(NAMES)])))
         state = state.moved(steps, shared)
@@ -167,6 +168,18 @@ def calibrate_imu(
         np.sqrt(scales),
         len(times),
     )
+
+
+def _integrate(
+    times: np.ndarray, biases: np.ndarray, samples: InertialSamples, sensor: InertialSensor
+) -> list[Preintegrated]:
+    """Motions between times (N,) of the sensor's clock, with the biases (N, 6) of the first of each two."""
+    motions = []
+    for (start, end), bias in zip(pairwise(times.tolist()), biases, strict=False):
+        first, last = np.searchsorted(samples.timestamp, [start, end])
+        near = samples.select(slice(max(first - 2, 0), last + 2))
+        motions.append(preintegrate(near, start, end, bias[:3], bias[3:], sensor, _UNKNOWN))
+    return motions
 
 
 def _start(times: np.ndarray, poses: np.ndarray, samples: InertialSamples, sensor: InertialSensor) -> _State:

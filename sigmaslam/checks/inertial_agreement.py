@@ -28,6 +28,8 @@ _DELAY, _TURN = 2e-3, 3.5e-3
 _CHI_SQUARE = 14.16
 # A path is integrated over so many seconds of images whose turns can be interpolated: no further apart than that.
 _WINDOW, _INTERVAL = 2.0, 0.15
+# Place, speed and gravity are fitted to fewer than half of that many.
+_LEAST_POSES = 8
 # Frames that are tracked for the check: 2.5 s at 20 Hz.
 _FRAMES = 50
 
@@ -130,10 +132,14 @@ def _axes_of_forces(
     usable = tracked & (times + shift > samples.timestamp[0]) & (times + shift < samples.timestamp[-1])
     breaks = np.flatnonzero(np.r_[True, (np.diff(times) > _INTERVAL) | ~usable[1:] | ~usable[:-1], True])
     longest = int(np.argmax(np.diff(breaks)))
-    chosen = np.arange(breaks[longest], breaks[longest + 1])
-    chosen = chosen[times[chosen] > times[chosen[-1]] - _WINDOW]
-    if len(chosen) < 3 * _FRAMES // 10:
+    first, last = int(breaks[longest]), int(breaks[longest + 1]) - 1
+    if times[last] - times[first] < 0.5 * _WINDOW or last - first < _LEAST_POSES:
         return None
+    # The part of it with the longest way.
+    way = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(bodies[first : last + 1, :3, 3], axis=0), axis=1))]
+    ends = np.searchsorted(times[first : last + 1], times[first : last + 1] + _WINDOW, "right") - 1
+    start = int(np.argmax(way[ends] - way))
+    chosen = slice(first + start, first + int(ends[start]) + 1)
     misses = fit_axes(times[chosen], bodies[chosen], samples, shift)
     best = int(np.argmin(misses))
     if misses[0] <= _BETTER * misses[best]:
@@ -175,7 +181,8 @@ def _judge_mounting(
         inverse: (3, 3) the same if T_cam_imu were inverted.
     """
     right = np.linalg.det(off) > 0.0
-    angle = float(np.degrees(np.linalg.norm(rotation_log(off)))) if right else np.nan
+    # A mirror is no rotation: determinant and all signs are changed first, for a number to show.
+    angle = float(np.degrees(np.linalg.norm(rotation_log(off if right else -off))))
     sigma = float(np.degrees(np.sqrt(np.linalg.eigvalsh(fit.rotation_covariance)[-1])))
     if axes is not None and np.array_equal(axes, np.eye(3)):
         if np.radians(sigma) > _NEAR:
