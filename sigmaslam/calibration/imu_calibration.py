@@ -177,7 +177,7 @@ def _integrate(
     motions = []
     for (start, end), bias in zip(pairwise(times.tolist()), biases, strict=False):
         first, last = np.searchsorted(samples.timestamp, [start, end])
-        near = samples.select(slice(max(first - 2, 0), last + 2))
+        near = samples.select(np.arange(max(first - 2, 0), min(last + 2, len(samples))))
         motions.append(preintegrate(near, start, end, bias[:3], bias[3:], sensor, _UNKNOWN))
     return motions
 
