@@ -141,9 +141,12 @@ def project_corners(rig: Rig, poses: np.ndarray, corners: Corners) -> np.ndarray
     return corners.pixels - _residuals(rig, poses, corners)
 
 
-def pose_covariances(bundle: BoardBundle, corners: Corners, sigma: float) -> np.ndarray:
-    """(n, 6, 6) of the bundle's poses in the left camera's frame, for a known rig; sigma of a corner in pixels."""
-    return _linearise(bundle.rig, bundle.poses, corners, bundle.residuals)[0] * sigma**2
+def pose_errors(bundle: BoardBundle, corners: Corners) -> tuple[np.ndarray, np.ndarray]:
+    """Of the bundle's T_board_left, from the right: covariances for a known rig, (n, 6, 6) for a sigma of 1 px, and
+    by what the rig's parameters move them, (n, 6, P).
+    """
+    inverse, across, *_ = _linearise(bundle.rig, bundle.poses, corners, bundle.residuals)
+    return inverse, across
 
 
 def _residuals(rig: Rig, poses: np.ndarray, corners: Corners) -> np.ndarray:

@@ -22,6 +22,7 @@ from sigmaslam.estimation.inertial_turns import fit_turns
 from sigmaslam.estimation.preintegration import POSITION, TURN, VELOCITY, Preintegrated, preintegrate
 from sigmaslam.geometry.inertial_sensor import STANDARD_GRAVITY, InertialSamples, InertialSensor
 from sigmaslam.geometry.se3 import nearest_rotation, rotation_exp, rotation_log, se3_exp, se3_inverse, se3_log, skew
+from sigmaslam.table import Table
 
 NAMES = ("delay", *(f"{part}_{axis}" for part in ("rotation", "lever") for axis in "xyz"))
 """Of the calibration: seconds; radians, of T_cam_imu from the right; metres."""
@@ -68,6 +69,24 @@ class ImuCalibration:
 
 
 @dataclass(frozen=True, slots=True)
+class CameraPath(Table):
+    """Poses of a left camera that are measured.
+
+    Attributes:
+        times: (N,) seconds, increasing.
+        poses: (N, 4, 4) T_world_camera, in any world that stands still.
+        covariances: (N, 6, 6) of errors of their own, in the camera's frame, translation before rotation; their size is
+            estimated.
+        common: (N, 6, P) by what errors that all poses have in common, each of a sigma of one, move them.
+    """
+
+    times: np.ndarray
+    poses: np.ndarray
+    covariances: np.ndarray
+    common: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
 class _State:
     """Estimates of N images and of what they share."""
 
@@ -94,9 +113,7 @@ class _State:
 
 
 def calibrate_imu(
-    times: np.ndarray,
-    poses: np.ndarray,
-    covariances: np.ndarray,
+    path: CameraPath,
     samples: InertialSamples,
     sensor: InertialSensor,
     shared_errors: float = 1.0,
@@ -105,10 +122,7 @@ def calibrate_imu(
     """Calibrates an inertial sensor beside a camera.
 
     Args:
-        times: (N,) of the images, seconds, increasing.
-        poses: (N, 4, 4) T_world_camera of the left camera, in any world that stands still.
-        covariances: (N, 6, 6) of these in the camera's own frame, translation before rotation; their size as a whole is
-            estimated.
+        path: of the left camera.
         samples: of the sensor.
         sensor: its noise; mounting and time shift are where the search begins: the rotation may be anything.
         shared_errors: so many times fewer poses than there are have errors of their own.
@@ -119,17 +133,16 @@ def calibrate_imu(
             something open.
     """
     t = samples.timestamp - sensor.time_shift
-    inside = (times > t[0] + 0.1) & (times < t[-1] - 0.1)
-    times, poses, covariances = times[inside], poses[inside], covariances[inside]
+    path = path.select((path.times > t[0] + 0.1) & (path.times < t[-1] - 0.1))
+    times, measured = path.times, path.poses
     if len(times) < _FEWEST or np.max(np.diff(times)) > _LONGEST:
         raise CalibrationError(
             f"{len(times)} images with a pose lie within the inertial table's time, {_FEWEST} or more are needed, none "
             f"further than {_LONGEST:g} s from the next: keep the board in view, and move and turn the rig"
         )
-    state = _start(times, poses, samples, sensor)
-    roots = np.linalg.cholesky(np.linalg.inv(covariances)).transpose(0, 2, 1)
+    state = _start(times, measured, samples, sensor)
+    roots = np.linalg.cholesky(np.linalg.inv(path.covariances)).transpose(0, 2, 1)
     scales = np.array([1.0, _FIRST_SCALE, _FIRST_SCALE])
-    measured = poses
     for turn in range(MAX_ROUNDS):
         if turn < _INTEGRATED:
             reference, whole = state, _integrate(times + state.shift, state.biases, samples, sensor)
@@ -156,6 +169,13 @@ def calibrate_imu(
         if moved < _CONVERGED and np.max(np.abs(scales / before - 1.0)) < 1e-2:
             break
     last, joint = (shared_errors * each for each in system.last_covariance())
+    moves = [
+        ArrowSystem(_factors(state, poses, roots, motions, sensor, scales), len(times), _SIZE, _COMMON).solve()
+        for poses in (measured, *(measured @ se3_exp(each) for each in np.moveaxis(path.common, 2, 0)))
+    ]
+    for steps, shared in moves[1:]:
+        of_last, of_shared = steps[-1] - moves[0][0][-1], shared - moves[0][1]
+        last, joint = last + np.outer(of_last, of_last), joint + np.outer(of_shared, of_shared)
     tangent = np.linalg.svd(state.gravity[None])[2][1:]
     of_gravity = tangent @ joint[_GRAVITY, _GRAVITY] @ tangent.T / STANDARD_GRAVITY**2
     return ImuCalibration(

@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from sigmaslam.calibration.board_bundle import pose_covariances
+from sigmaslam.calibration.board_bundle import pose_errors
 from sigmaslam.calibration.calibrate import BoardCalibration
-from sigmaslam.calibration.imu_calibration import NAMES, ImuCalibration
+from sigmaslam.calibration.imu_calibration import NAMES, CameraPath, ImuCalibration
 from sigmaslam.calibration_files.kalibr_calibration import write_kalibr
 from sigmaslam.errors import InputError
+from sigmaslam.estimation.gaussian import matrix_root
 from sigmaslam.geometry.camera import CameraModel
 from sigmaslam.geometry.se3 import rotation_log, se3_inverse
 from sigmaslam.readers.pairing import is_stamp
@@ -31,12 +32,13 @@ def image_times(names: Sequence[str]) -> np.ndarray:
     return np.array([int(stem) / 1e9 for stem in stems])
 
 
-def board_path(result: BoardCalibration) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times (N,), T_board_left (N, 4, 4) and covariances (N, 6, 6) in the camera's frame, in the order of time."""
+def board_path(result: BoardCalibration) -> CameraPath:
+    """The left camera's path before the board."""
     times = image_times(result.names)
     order = np.argsort(times)
-    spread = pose_covariances(result.bundle, result.corners, result.sigma)
-    return times[order], se3_inverse(result.bundle.poses)[order], spread[order]
+    own, by_rig = pose_errors(result.bundle, result.corners)
+    common = by_rig @ matrix_root(result.covariance)
+    return CameraPath(times, se3_inverse(result.bundle.poses), result.sigma**2 * own, common).select(order)
 
 
 def write_imu_calibration(

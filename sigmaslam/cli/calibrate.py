@@ -95,7 +95,7 @@ def calibrate(
     typer.echo(f"Written: {out}")
     if recording is not None:
         with _rounds() as done:
-            found = calibrate_imu(*board_path(result), recording.samples, recording.sensor, done=done)
+            found = calibrate_imu(board_path(result), recording.samples, recording.sensor, done=done)
         typer.echo(describe_imu_calibration(found))
         write_imu_calibration(chain, result.rig.eyes, result.rig.T_left_right, found)
         typer.echo(f"Written: {chain}")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmaslam.calibration.imu_calibration import ImuCalibration, calibrate_imu
+from sigmaslam.calibration.imu_calibration import CameraPath, ImuCalibration, calibrate_imu
 from sigmaslam.errors import InputError
 from sigmaslam.estimation.inertial_turns import SHARED_ERRORS
 from sigmaslam.geometry.camera import StereoCamera
@@ -43,6 +43,6 @@ def calibrate_imu_by_run(
     seen = ~predicted_poses(run.frames, run.final.timestamps)
     # Covariances are those in the world, most of which neighbours share: what is a frame's own is alike in all.
     own = np.tile(covariances.mean(axis=0), (int(seen.sum()), 1, 1))
-    times, poses = run.final.timestamps[seen], run.final.poses[seen]
-    result = calibrate_imu(times, poses, own, recording.samples, recording.sensor, SHARED_ERRORS, done)
+    path = CameraPath(run.final.timestamps[seen], run.final.poses[seen], own, np.zeros((len(own), 6, 0)))
+    result = calibrate_imu(path, recording.samples, recording.sensor, SHARED_ERRORS, done)
     return result, camera_of(folder / RUN_NAME, run.entries["calibration"])

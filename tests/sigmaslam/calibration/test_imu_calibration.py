@@ -10,7 +10,7 @@ import pytest
 
 from sigmaslam.calibration.arrow_solver import ArrowSystem, Factor
 from sigmaslam.calibration.calibrate import calibrate
-from sigmaslam.calibration.imu_calibration import ImuCalibration, _inertial, _State, calibrate_imu
+from sigmaslam.calibration.imu_calibration import CameraPath, ImuCalibration, _inertial, _State, calibrate_imu
 from sigmaslam.calibration.imu_report import board_path, describe_imu_calibration, write_imu_calibration
 from sigmaslam.calibration_files.calibration import read_calibration
 from sigmaslam.errors import CalibrationError
@@ -76,7 +76,9 @@ def calibrated(recorded: Recorded, seed: int, seconds: float) -> ImuCalibration:
     errors = se3_exp(rng.multivariate_normal(np.zeros(6), covariance, len(times)))
     poses = se3_exp(rng.normal(size=6)) @ recorded.motion.poses(times) @ se3_inverse(recorded.sensor.T_left_imu)
     start = replace(recorded.sensor, T_left_imu=np.eye(4), time_shift=0.0)
-    return calibrate_imu(times, poses @ errors, np.tile(covariance, (len(times), 1, 1)), recorded.samples, start)
+    spread = np.tile(covariance, (len(times), 1, 1))
+    path = CameraPath(times, poses @ errors, spread, np.zeros((len(times), 6, 0)))
+    return calibrate_imu(path, recorded.samples, start)
 
 
 def nees(error: np.ndarray, covariance: np.ndarray) -> float:
@@ -125,7 +127,7 @@ def test_a_board_before_a_moved_rig_calibrates_both(tmp_path: Path):
     eyes = [(eye.width, eye.height) for eye in rig.eyes]
     result = calibrate(stamps, views_of(rig, CHESSBOARD, corners), CHESSBOARD.points, eyes, "radtan5")
     later = replace(recorded.samples, timestamp=recorded.samples.timestamp + 1_700_000_000)
-    found = calibrate_imu(*board_path(result), later, replace(SENSOR, T_left_imu=np.eye(4)))
+    found = calibrate_imu(board_path(result), later, replace(SENSOR, T_left_imu=np.eye(4)))
     error, sigmas = recorded.error(found), np.sqrt(np.diag(found.covariance))
     # Time stamps of this size have a resolution of 0.2 us.
     assert np.all(np.abs(error) < 3.5 * sigmas)
@@ -215,11 +217,12 @@ def test_what_cannot_be_calibrated_is_refused():
     poses = recorded.motion.poses(times) @ se3_inverse(recorded.sensor.T_left_imu)
     spread = np.tile(1e-6 * np.eye(6), (len(times), 1, 1))
     start = replace(SENSOR, T_left_imu=np.eye(4))
+    path = CameraPath(times, poses, spread, np.zeros((len(times), 6, 0)))
     with pytest.raises(CalibrationError, match="5 images with a pose"):
-        calibrate_imu(times[:5], poses[:5], spread[:5], recorded.samples, start)
+        calibrate_imu(path.select(np.arange(5)), recorded.samples, start)
     faster = replace(recorded.samples, gyro=recorded.samples.gyro * 180 / np.pi)
     with pytest.raises(CalibrationError, match="are they in rad/s"):
-        calibrate_imu(times, poses, spread, faster, start)
+        calibrate_imu(path, faster, start)
 
 
 @pytest.mark.long
