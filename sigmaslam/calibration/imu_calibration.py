@@ -37,8 +37,9 @@ _PRIOR_ACCEL, _PRIOR_GYRO, _PRIOR_LENGTH = 0.2, 0.2, 0.05
 _FIRST_SCALE, _CONVERGED = 25.0, 1e-6
 # So many rounds integrate the samples anew; after them biases and delay hardly move, and the first order will do.
 _INTEGRATED = 3
-# Turns that are off by more are in another unit; focal lengths of few views are off by a tenth.
-_SCALE_TOLERANCE = 0.3
+# Turns that are off by more are in another unit (focal lengths of few views are off by a tenth); those of which less is
+# explained are of another motion.
+_SCALE_TOLERANCE, _EXPLAINED = 0.3, 0.7
 # Images: fewer say nothing; they lie no further apart than that, seconds.
 _FEWEST, _LONGEST = 20, 2.0
 # Power spectra of accelerations that nobody measured, across gaps, m^2/s^3 and rad^2/s^3: those of a hand.
@@ -211,7 +212,7 @@ def _start(times: np.ndarray, poses: np.ndarray, samples: InertialSamples, senso
     fit = fit_turns(times[:-1], times[1:], turns, samples, sensor.time_shift)
     if (
         fit is None
-        or fit.explained < 0.7
+        or fit.explained < _EXPLAINED
         or abs(fit.scale - 1.0) > _SCALE_TOLERANCE
         or np.linalg.det(fit.rotation) < 0.0
     ):
