@@ -141,6 +141,14 @@ def project_corners(rig: Rig, poses: np.ndarray, corners: Corners) -> np.ndarray
     return corners.pixels - _residuals(rig, poses, corners)
 
 
+def pose_errors(bundle: BoardBundle, corners: Corners) -> tuple[np.ndarray, np.ndarray]:
+    """Of the bundle's T_board_left, from the right: covariances for a known rig, (n, 6, 6) for a sigma of 1 px, and
+    by what the rig's parameters move them, (n, 6, P).
+    """
+    inverse, across, *_ = _linearise(bundle.rig, bundle.poses, corners, bundle.residuals)
+    return inverse, across
+
+
 def _residuals(rig: Rig, poses: np.ndarray, corners: Corners) -> np.ndarray:
     pixels = np.empty((len(corners), 2))
     for k, (_, at) in enumerate(_in_eyes(rig, poses, corners)):

@@ -1,11 +1,19 @@
 """Kalibr's camchain.yaml, which TUM-VI and 4Seasons have, too."""
 
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
 import numpy as np
+import yaml
 
 from sigmaslam.calibration_files.lens_models import read_lens, reject_unsupported
 from sigmaslam.errors import CalibrationError
+from sigmaslam.files import atomic_write_text
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.geometry.checked_yaml import CalibrationYaml
+from sigmaslam.geometry.inertial_sensor import InertialSensor
+from sigmaslam.geometry.se3 import se3_inverse
 
 
 def is_kalibr(content: CalibrationYaml) -> bool:
@@ -36,6 +44,37 @@ def read_kalibr(content: CalibrationYaml) -> StereoCamera:
         return StereoCamera(models[0], models[1], _inverse(right, "T_cn_cnm1", T_right_left))
     except CalibrationError as error:
         raise content.error(f"T_cn_cnm1 of cam1: {error}") from None
+
+
+def write_kalibr(
+    path: Path, eyes: Sequence[CameraModel], T_left_right: np.ndarray, sensor: InertialSensor, more: dict[str, Any]
+) -> None:
+    """Writes camchain-imucam.yaml of one camera or two; Kalibr itself knows radtan of four coefficients alone.
+
+    Args:
+        path: of the file.
+        eyes: left first.
+        T_left_right: (4, 4), not used for one camera.
+        sensor: with T_left_imu and time shift.
+        more: further entries, which readers leave alone.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    T_right_left, content = se3_inverse(T_left_right), dict[str, Any]()
+    for k, eye in enumerate(eyes):
+        T_eye_left = T_right_left if k else np.eye(4)
+        content[f"cam{k}"] = {
+            "T_cam_imu": (T_eye_left @ sensor.T_left_imu).tolist(),
+            **({"T_cn_cnm1": T_right_left.tolist()} if k else {}),
+            "timeshift_cam_imu": sensor.time_shift,
+            "camera_model": "pinhole",
+            "intrinsics": [eye.fx, eye.fy, eye.cx, eye.cy],
+            "distortion_model": eye.distortion_model,
+            "distortion_coeffs": list(eye.distortion),
+            "resolution": [eye.width, eye.height],
+        }
+    atomic_write_text(path, yaml.safe_dump(content | more, sort_keys=False, default_flow_style=None, width=120))
 
 
 def _inverse(section: CalibrationYaml, key: str, T: np.ndarray) -> np.ndarray:

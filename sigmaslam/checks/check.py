@@ -12,6 +12,7 @@ from sigmaslam.checks.eye_matches import EyeMatcher, EyeMatches
 from sigmaslam.checks.finding import Finding, has_errors, wrong
 from sigmaslam.checks.images import check_images, check_light, describe_frames
 from sigmaslam.checks.inertial import check_inertial
+from sigmaslam.checks.inertial_agreement import check_motion
 from sigmaslam.checks.rig import TOO_FEW, check_pairing, check_rig, find_exchanged, suspect_pairing, unknown_rig
 from sigmaslam.checks.row_fit import MIN_INLIERS, MIN_MATCHES
 from sigmaslam.checks.time_stamps import check_time_stamps
@@ -49,13 +50,16 @@ class Check:
     matches: EyeMatches
 
 
-def check_sequence(sequence: StereoSequence, samples: int = SAMPLES, threads: int = 2) -> Check:
+def check_sequence(
+    sequence: StereoSequence, samples: int = SAMPLES, threads: int = 2, track_imu: bool = False
+) -> Check:
     """Checks a sequence; of live cameras it takes the next frames.
 
     Args:
         sequence: opened by `sigmaslam.readers.open_sequence` or `open_cameras`, and not yet read.
         samples: pairs to look at.
         threads: of ONNX Runtime.
+        track_imu: where there is an inertial sensor, also track some seconds and judge it by how the cameras move.
     Raises:
         InputError: a file cannot be read.
     """
@@ -87,6 +91,8 @@ def check_sequence(sequence: StereoSequence, samples: int = SAMPLES, threads: in
             findings += unknown_rig(TOO_FEW)
         else:
             findings += _check_rig(matches, steps, matcher, interval, {each.name for each in wrong(calibration)})
+            if track_imu and sequence.imu is not None:
+                findings += check_motion(sequence, threads)
     return Check(findings, steps, [rectifier.rectify(frame.left, frame.right) for frame, _ in steps], matches)
 
 

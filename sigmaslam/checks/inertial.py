@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sigmaslam.checks.calibration import MAX_BASELINE
 from sigmaslam.checks.finding import Finding
 from sigmaslam.geometry.inertial_sensor import STANDARD_GRAVITY
 from sigmaslam.readers.inertial import InertialRecording
@@ -17,6 +18,12 @@ _LENGTH_TOLERANCE = 3.0
 _GAP, _LEAST_RATE = 2.5, 50.0
 
 
+# Ranges that sensors have, rad/s and m/s^2; a value within this share of one that lasts so long is at its end.
+_RATES = np.radians([125, 250, 500, 1000, 2000, 4000])
+_FORCES = STANDARD_GRAVITY * np.array([2, 4, 8, 16, 32])
+_AT_END, _FLAT = 0.02, 3
+
+
 def check_inertial(recording: InertialRecording, timestamps: Sequence[float] | None) -> Finding:
     """The worst that is wrong with a sensor's table; turns are judged while tracking, by those of the images.
 
@@ -25,6 +32,11 @@ def check_inertial(recording: InertialRecording, timestamps: Sequence[float] | N
         timestamps: of the images, seconds; None where they are not known.
     """
     samples, source = recording.samples, recording.source
+    lever = float(np.linalg.norm(recording.sensor.T_left_imu[:3, 3]))
+    if lever > MAX_BASELINE:
+        where = "millimetres" if lever < 1e3 * MAX_BASELINE else "other units than metres"
+        message = f"{source}: T_cam_imu has the sensor {lever:.3g} m from the camera: is it in {where}? Give metres"
+        return Finding(_NAME, "error", message, lever)
     length = float(np.median(np.linalg.norm(samples.accel, axis=1)))
     if abs(length - STANDARD_GRAVITY) > _LENGTH_TOLERANCE:
         factors = {"g": 1.0, "mg": 1e3, "cm/s^2": 1e2 * STANDARD_GRAVITY}
@@ -40,8 +52,24 @@ def check_inertial(recording: InertialRecording, timestamps: Sequence[float] | N
         if covered < 1.0:
             message = f"{source}: {1.0 - covered:.0%} of the images lie outside its time: is it of the same clock?"
             return Finding(_NAME, "error" if covered < 0.5 else "warning", message, covered)
+    for name, values, ranges in (("rate", samples.gyro, _RATES), ("force", samples.accel, _FORCES)):
+        peak, count = _saturated(values, ranges)
+        if count:
+            message = f"{source}: the {name} stays at {peak:.3g} for {count} samples: saturated? Set a wider range"
+            return Finding(_NAME, "warning", message, peak)
     gaps = intervals[intervals > _GAP / rate]
     if rate < _LEAST_RATE or len(gaps):
         message = f"{source}: {rate:.0f} samples a second, {len(gaps)} gaps of up to {intervals.max():.2f} s"
         return Finding(_NAME, "warning", f"{message}: at least {_LEAST_RATE:.0f} without gaps carry a pose", rate)
     return Finding(_NAME, "ok", f"{rate:.0f} samples a second, gravity {length:.2f} m/s^2", rate)
+
+
+def _saturated(values: np.ndarray, ranges: np.ndarray) -> tuple[float, int]:
+    """Size at which an axis of (N, 3) values stays at the end of a usual range, and for how many samples; or zeros."""
+    for axis in np.abs(values).T:
+        peak = float(axis.max())
+        top = np.flatnonzero(np.diff(np.r_[False, axis > 0.999 * peak, False].astype(int)))
+        flat = int(np.max(top[1::2] - top[::2]))
+        if flat >= _FLAT and np.min(np.abs(peak / ranges - 1.0)) < _AT_END:
+            return peak, flat
+    return 0.0, 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -17,9 +19,18 @@ from sigmaslam.calibration.calibration_report import (
     draw_board_calibration,
     write_board_calibration,
 )
+from sigmaslam.calibration.imu_calibration import MAX_ROUNDS, calibrate_imu
+from sigmaslam.calibration.imu_report import (
+    board_path,
+    describe_imu_calibration,
+    image_times,
+    write_imu_calibration,
+)
 from sigmaslam.cli.extras import need_report_extra
 from sigmaslam.errors import InputError
 from sigmaslam.progress import open_progress
+from sigmaslam.readers.inertial import read_imu
+from sigmaslam.runs.calibrate_imu import calibrate_imu_by_run
 
 # mypy reads the members of an enum from literals alone.
 Lens = StrEnum("Lens", list(LENSES))  # type: ignore[misc]
@@ -32,23 +43,44 @@ def calibrate(
         typer.Argument(
             metavar="IMAGES",
             help="Image files or folders; pairs where all names have left and right, cam0 and cam1, infra1 and infra2, "
-            "or end in _0 and _1, or _l and _r; else of one camera.",
+            "or end in _0 and _1, or _l and _r; else of one camera. With --imu and without --board a run of `track`.",
         ),
     ],
-    board: Annotated[str, typer.Option(help=f"{BOARD_FORMS}; metres.")],
     out: Annotated[Path, typer.Option(help="YAML file to write, which `track` reads; of one camera, its K and lens.")],
+    board: Annotated[str | None, typer.Option(help=f"{BOARD_FORMS}; metres.")] = None,
     lens: Annotated[
         Lens, typer.Option(help="Lens model: radial-tangential with 4, 5 or 8 coefficients, or fisheye.")
     ] = Lens["radtan5"],
     picture: Annotated[Path | None, typer.Option(help="PNG to draw: corners, residuals, the rms of images.")] = None,
+    imu: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="CSV of an inertial sensor with its noise beside: also calibrate T_cam_imu and its clock's delay, "
+            "into OUT-camchain-imucam.yaml, by a board before the moved rig, or by a run of `track --imu off`.",
+        ),
+    ] = None,
 ) -> None:
     """Calibrate a stereo pair, or one camera, from images of a board, with the covariance of all parameters."""
     if out.suffix.lower() not in (".yaml", ".yml"):
         raise InputError(f"{out}: a calibration is YAML; choose a name that ends in .yaml")
+    recording = None if imu is None else read_imu(imu, is_mounted=False)
+    chain = out.with_name(f"{out.stem}-camchain-imucam.yaml")
+    if board is None:
+        if recording is None or len(images) != 1:
+            raise InputError("--board is missing; only a run of `sigmaslam track`, with --imu, goes without it")
+        with _rounds() as done:
+            found, camera = calibrate_imu_by_run(images[0], recording, done)
+        typer.echo(describe_imu_calibration(found))
+        write_imu_calibration(chain, (camera.left, camera.right), camera.T_left_right, found)
+        typer.echo(f"Written: {chain}")
+        return
     if picture is not None:
         need_report_extra()
     plan = parse_board(board)
     moments = find_board_images(images)
+    if recording is not None:
+        image_times([each.name for each in moments])
     with open_progress() as progress:
         task = progress.add_task("images", total=len(moments), note="")
         seen = read_board_views(moments, plan, lambda: progress.advance(task))
@@ -61,3 +93,17 @@ def calibrate(
         draw_board_calibration(picture, result)
         typer.echo(f"Picture: {picture}")
     typer.echo(f"Written: {out}")
+    if recording is not None:
+        with _rounds() as done:
+            found = calibrate_imu(board_path(result), recording.samples, recording.sensor, done=done)
+        typer.echo(describe_imu_calibration(found))
+        write_imu_calibration(chain, result.rig.eyes, result.rig.T_left_right, found)
+        typer.echo(f"Written: {chain}")
+
+
+@contextmanager
+def _rounds() -> Iterator[Callable[[], None]]:
+    """The progress of a calibration of an inertial sensor."""
+    with open_progress() as progress:
+        task = progress.add_task("inertial rounds", total=MAX_ROUNDS, note="")
+        yield lambda: progress.advance(task)

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from sigmaslam.checks import Finding, check_sequence, has_errors
-from sigmaslam.cli.track import InputFormat, TopicLeft, TopicRight
+from sigmaslam.cli.track import Imu, InputFormat, TopicLeft, TopicRight
 from sigmaslam.runs.request import InputOptions
 
 _STYLES = {"ok": "green", "unknown": "dim", "warning": "yellow", "error": "bold red"}
@@ -30,6 +30,7 @@ def check(
     ] = None,
     topic_left: TopicLeft = None,
     topic_right: TopicRight = None,
+    imu: Imu = None,
     out: Annotated[
         Path | None, typer.Option(metavar="PAGE.HTML", help="Page to write: the findings, and pairs with matches.")
     ] = None,
@@ -37,13 +38,14 @@ def check(
     """Check images, calibration and time stamps before they are trusted; seconds, from a few pairs.
 
     Finds exchanged, mirrored or unsynchronised eyes, rows that do not agree, a turned camera, a wrong calibration, dark
-    or blurred images and wrong units. Exit code 1 where tracking would fail or be wrong.
+    or blurred images and wrong units; of an inertial sensor, by some seconds of tracking, units, axes, T_cam_imu and
+    the clock. Exit code 1 where tracking would fail or be wrong.
     """
     options = InputOptions(
-        source, format.value, calibration, camera=camera, topic_left=topic_left, topic_right=topic_right
+        source, format.value, calibration, camera=camera, topic_left=topic_left, topic_right=topic_right, imu=imu
     )
     sequence = options.open()
-    result = check_sequence(sequence)
+    result = check_sequence(sequence, track_imu=True)
     _print_table(result.findings)
     if out is not None:
         from sigmaslam.checks.check_page import write_page  # loads jinja2

@@ -7,6 +7,7 @@ from typing import Any
 
 import typer
 
+from sigmaslam.checks.finding import Finding, wrong
 from sigmaslam.files import printable
 from sigmaslam.run_record.verdict import contradiction_verdict, doubts_verdict, times_verdict
 
@@ -25,7 +26,8 @@ def tell_summary(summary: dict[str, Any], out: Path) -> None:
         f"{_inertial(summary)}{summary['starting']} starting, {summary['lost']} lost, {summary['skipped']} skipped; "
         f"{summary['median_inliers']:.0f} inliers in the median frame, {summary['map_points']} map points.\n"
         f"{_world(summary)}{_times(summary)}{_contradiction(summary)}{_doubts(summary)}{summary['calibration_verdict']}\n"
-        f"{_location_verdict(summary)}{_real_time_verdict(summary)}Report: {printable(out / 'report.html')}"
+        f"{_imu_verdict(summary)}{_location_verdict(summary)}{_real_time_verdict(summary)}"
+        f"Report: {printable(out / 'report.html')}"
     )
     if summary["failure"] is not None:
         typer.echo(summary["failure"], err=True)
@@ -65,6 +67,21 @@ def _inertial(summary: dict[str, Any]) -> str:
 def _doubts(summary: dict[str, Any]) -> str:
     """Lines about what speaks against poses."""
     return "".join(f"{each}\n" for each in doubts_verdict(summary))
+
+
+def _imu_verdict(summary: dict[str, Any]) -> str:
+    """Lines about an inertial sensor: what is wrong with it, or how it agrees, and how the camera is held."""
+    findings = [Finding(**each) for each in summary.get("imu", ())]
+    lines = [f"Inertial sensor, {each.name}: {each.message}" for each in wrong(findings)]
+    if findings and not lines:
+        lines = ["Inertial sensor: " + "; ".join(each.message for each in findings)]
+    if "gravity" in summary:
+        (roll, roll_sigma), (pitch, pitch_sigma) = (summary["gravity"][name] for name in ("roll_deg", "pitch_deg"))
+        lines.append(
+            f"In the end the camera has a roll of {roll:.1f} ± {roll_sigma:.1f} and a pitch of {pitch:.1f} ± "
+            f"{pitch_sigma:.1f} degrees; T_gravity in run.json turns the world's z up."
+        )
+    return "".join(f"{each}\n" for each in lines)
 
 
 def _location_verdict(summary: dict[str, Any]) -> str:

@@ -54,6 +54,14 @@ TopicLeft = Annotated[
 TopicRight = Annotated[
     str | None, typer.Option(help="Image topic in a bag.", show_default="the one with 'right', cam1 or infra2")
 ]
+Imu = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE|off",
+        help="CSV of an inertial sensor (time, rad/s, m/s^2) with its YAML beside; off: use none.",
+        show_default="imu0/data.csv in INPUT",
+    ),
+]
 Weights = Annotated[
     Path | None,
     typer.Option(
@@ -174,14 +182,7 @@ def track(
             "the left image is used, such as the robot itself, or people that a detector found.",
         ),
     ] = None,
-    imu: Annotated[
-        str | None,
-        typer.Option(
-            metavar="FILE|off",
-            help="CSV of an inertial sensor (time, rad/s, m/s^2) with its YAML beside; off: use none.",
-            show_default="imu0/data.csv in INPUT",
-        ),
-    ] = None,
+    imu: Imu = None,
     denoise: Annotated[
         bool, typer.Option("--denoise", help="Filter noise out of the images first: for the dark; slow.")
     ] = False,

@@ -67,6 +67,12 @@ class InertialMotion(MotionFilter):
         others = np.concatenate([self._velocity, self._gravity, self._biases, np.zeros(7)])
         return MotionState(self.step.copy(), others, self._covariance.copy(), self._carried)
 
+    @property
+    def gravity_and_biases(self) -> tuple[np.ndarray, np.ndarray]:
+        """Gravity in the keyframe's frame and both biases (9,), and the covariance (15, 15) of the pose and these."""
+        rows = np.r_[_POSE, _GRAVITY, _BIASES]
+        return np.r_[self._gravity, self._biases], self._covariance[np.ix_(rows, rows)]
+
     def set_twist(self, twist: np.ndarray, sigma: np.ndarray) -> None:
         """Of constant velocity alone: the sensor measures on where images are lost."""
         if not self.is_inertial:

@@ -31,7 +31,8 @@ def describe_estimate(frame: TrackedFrame) -> dict[str, Any]:
         `time` (seconds), `frame` (number of the row in frames.csv), `status`, `doubts`, the pose `T_world_camera`, or
         `T_camera_object` of a followed body, as `position` (metres) and `quaternion_xyzw`, `covariance` (6, 6) of it in
         its own frame, translation (metres) before rotation (radians), `belief`, `matches`, `inliers`, `nis`, `dof` and
-        `disparity_offset` (pixels) as of `Estimate`, and `keyframe`, whether the frame became one.
+        `disparity_offset` (pixels) as of `Estimate`, and `keyframe`, whether the frame became one. Where
+        an inertial sensor knows gravity also `roll`, `pitch` and `roll_pitch_sigma`, radians.
     """
     result, camera = frame.result, frame.result.camera
     pose = covariance = None
@@ -40,6 +41,8 @@ def describe_estimate(frame: TrackedFrame) -> dict[str, Any]:
         pose = {"position": result.pose[:3, 3].tolist(), "quaternion_xyzw": quaternion.tolist()}
         if np.isfinite(result.pose_covariance).all():
             covariance = result.pose_covariance.tolist()
+    up = camera.inertial
+    level = {} if up is None else {"roll": up.roll, "pitch": up.pitch, "roll_pitch_sigma": list(up.sigmas)}
     return {
         "time": round(camera.timestamp, 9),
         "frame": frame.number,
@@ -54,6 +57,7 @@ def describe_estimate(frame: TrackedFrame) -> dict[str, Any]:
         "dof": camera.dof,
         "disparity_offset": _finite(camera.calibration.disparity_offset),
         "keyframe": camera.tracks is not None,
+        **level,
     }
 
 

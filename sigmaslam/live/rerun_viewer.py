@@ -139,6 +139,12 @@ class RerunSink:
         diagonal = np.diag(covariance)
         self._plot("sigma_position_m", float(np.sqrt(diagonal[:3].sum())))
         self._plot("sigma_rotation_deg", float(np.degrees(np.sqrt(diagonal[3:].sum()))))
+        if (inertial := estimate.inertial) is not None:
+            self._plot("level_deg/roll", float(np.degrees(inertial.roll)))
+            self._plot("level_deg/pitch", float(np.degrees(inertial.pitch)))
+            for name in ("gyro_bias", "accel_bias"):
+                for axis, value in zip("xyz", getattr(inertial, name).tolist(), strict=True):
+                    self._plot(f"{name}/{axis}", value)
         if estimate.tracks is not None:
             self._show_keyframe(frame, T_world_rectified)
 
@@ -170,7 +176,8 @@ class RerunSink:
 
 def _blueprint() -> rrb.Blueprint:
     """The world beside the image and the plots."""
-    names = ("sigma_position_m", "sigma_rotation_deg", "nis_per_dof", "inliers", "milliseconds")
+    names = ["sigma_position_m", "sigma_rotation_deg", "nis_per_dof", "inliers", "milliseconds"]
+    names += ["level_deg", "gyro_bias", "accel_bias"]  # of an inertial sensor
     plots = [rrb.TimeSeriesView(origin=f"{PLOTS}/{name}", name=name.replace("_", " ")) for name in names]
     world = rrb.Spatial3DView(origin="world", name="world")
     image = rrb.Spatial2DView(origin=IMAGE, name="left image")

@@ -55,12 +55,15 @@ def find_imu(folder: Path) -> Path | None:
     return None
 
 
-def read_imu(path: Path) -> InertialRecording:
+def read_imu(path: Path, is_mounted: bool = True) -> InertialRecording:
     """An inertial sensor's table of time, angular rate (rad/s) and specific force (m/s^2), with its YAML.
 
     Noise densities come from a YAML of the table's name, from sensor.yaml or from Kalibr's imu.yaml beside it; the
     mounting from T_cam_imu in the first, in Kalibr's camchain, or from T_BS of EuRoC's sensors.
 
+    Args:
+        path: of the table, or its folder.
+        is_mounted: False: the mounting may be missing, and is the identity then, as before a calibration.
     Raises:
         InputError: the table is missing, or a row is no time and six numbers, or time runs backwards.
         CalibrationError: noise or mounting are missing or wrong.
@@ -73,7 +76,7 @@ def read_imu(path: Path) -> InertialRecording:
             f"{path}: nothing says how noisy the sensor is: put {path.with_suffix('.yaml').name} beside it, with "
             f"{', '.join(_DENSITIES)} and T_cam_imu"
         )
-    mounting = _find_mounting(path)
+    mounting = _find_mounting(path) or (None if is_mounted else (np.eye(4), 0.0))
     if mounting is None:
         raise CalibrationError(
             f"{path}: nothing says where the sensor is: give T_cam_imu in {path.with_suffix('.yaml').name}, or "

@@ -19,8 +19,7 @@ import numpy as np
 from sigmaslam.bounded_files import TABLE_BYTES, read_text, shorten
 from sigmaslam.calibration_files.calibration_writer import write_calibration
 from sigmaslam.errors import CalibrationError, InputError
-from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
-from sigmaslam.geometry.camera import CameraModel, StereoCamera
+from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.se3 import se3_adjoint, se3_inverse
 from sigmaslam.readers import StereoFrame, StereoSequence, open_sequence
 from sigmaslam.readers.open import FORMATS
@@ -28,7 +27,13 @@ from sigmaslam.readers.selection import Selection
 from sigmaslam.readers.trajectory_files import read_covariances, read_tum
 from sigmaslam.run_record.frame_table import FRAMES_NAME, read_frames
 from sigmaslam.run_record.relative_pose_file import RELATIVE_POSES_NAME, FramePairs, read_frame_pairs
-from sigmaslam.run_record.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY, RUN_NAME, check_has_trajectory
+from sigmaslam.run_record.run_folder import (
+    FINAL_COVARIANCE,
+    FINAL_TRAJECTORY,
+    RUN_NAME,
+    camera_of,
+    check_has_trajectory,
+)
 
 # At most so many frames from one view to the next.
 _MOST_FRAMES = 5
@@ -157,7 +162,7 @@ def read_recorded_keyframes(run: Path) -> RecordedKeyframes:
     return RecordedKeyframes(
         Path(str(entries["input"])),
         str(entries["format"]),
-        _camera_of(run / RUN_NAME, entries["calibration"]),
+        camera_of(run / RUN_NAME, entries["calibration"]),
         np.isin(rows, keyframe_rows),
         said.timestamps[rows],
         trajectory.poses[rows],
@@ -226,13 +231,3 @@ def _read_entries(path: Path) -> dict[str, Any]:
     if missing:
         raise InputError(f"{path}: says nothing of {', '.join(missing)}; {mend}")
     return dict(entries)
-
-
-def _camera_of(path: Path, entries: dict[str, Any]) -> StereoCamera:
-    """The calibration that run.json has; its measured covariance is not needed."""
-    try:
-        left, right = (CameraModel(**entries[eye]) for eye in ("left", "right"))
-        sigmas = CalibrationSigmas(**entries["sigmas"])
-        return StereoCamera(left, right, np.array(entries["T_left_right"], float), sigmas)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: calibration cannot be read ({error}): run `sigmaslam track` again") from error

@@ -50,7 +50,7 @@ def judge(run: RecordedRun) -> State:
             )
         )
     notices += [("warn", each) for each in doubts_verdict(run.summary)]
-    findings = wrong([Finding(**each) for each in run.entries.get("checks", ())])
+    findings = wrong([Finding(**each) for each in (*run.entries.get("checks", ()), *run.summary.get("imu", ()))])
     notices += [("warn", f"{each.name}: {each.message}") for each in findings if each.message not in (failure or "")]
     verdict = run.evaluation.get("nees_verdict")
     if verdict and verdict["kind"] == "warn":
@@ -106,6 +106,29 @@ def list_calibration(run: RecordedRun) -> list[tuple[str, str, str]]:
         rows.append(("disparity offset [px]", f"{offset[known[-1]]:+.3f}", f"{sigma[known[-1]]:.3f}"))
     errors = run.summary.get("calibration_errors") or {}
     return rows + [(name.replace("_", " "), f"{value:+.5g}", f"{sigma:.2g}") for name, (value, sigma) in errors.items()]
+
+
+def list_inertial(run: RecordedRun) -> Facts:
+    """Label and value of an inertial sensor: its check, where up is, and the stretches in the dark."""
+    rows = [(each["name"], each["message"]) for each in run.summary.get("imu", ())]
+    gravity = run.summary.get("gravity")
+    if gravity is not None:
+        since = gravity["since"] - float(run.frames.columns["timestamp"][0])
+        rows.append(("gravity", f"known since {since:.2f} s, in the world to {np.degrees(gravity['sigma']):.2f}°"))
+    return rows + [(f"in the dark {k}", words) for k, words in enumerate(_dark_stretches(run), start=1)]
+
+
+def _dark_stretches(run: RecordedRun) -> list[str]:
+    """In words, the frames in a row that the inertial sensor alone carried, the longest first, at most eight."""
+    dark = np.array(run.frames.status) == "inertial"
+    edges = np.flatnonzero(np.diff(np.r_[False, dark, False].astype(int))).reshape(-1, 2)
+    position, rotation = (run.of_frames(each) for each in run.sigmas)
+    order = np.argsort(edges[:, 0] - edges[:, 1], kind="stable")[:8]
+    return [
+        f"{last - first} frames from {run.frames.seconds[first]:.2f} s to {run.frames.seconds[last - 1]:.2f} s, in the "
+        f"end known to {_length(position[last - 1])} and {np.degrees(rotation[last - 1]):.2g}°"
+        for first, last in edges[order].tolist()
+    ]
 
 
 def list_machine(run: RecordedRun) -> Facts:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,7 @@ def build_plots(run: RecordedRun) -> list[dict[str, Any]]:
         _nis(run.frames),
         _inliers(run.frames),
         _offset(run.frames),
+        *_inertial(run),
         _times(run.frames),
         _belief(run.frames),
     ]
@@ -143,6 +145,35 @@ def _offset(frames: FrameTable) -> dict[str, Any] | None:
     ]
     bands = [{"series": [1, 2], "fill": "rgb(0 114 178 / 18%)"}]
     return _plot("Disparity offset [px]", "Estimated error of the calibration.", series, bands=bands)
+
+
+def _inertial(run: RecordedRun) -> list[dict[str, Any]]:
+    """Roll and pitch, and the biases, of the frames with a known gravity."""
+    records = run.inertial
+    if records is None or not len(records):
+        return []
+    rows = np.searchsorted(run.frames.columns["timestamp"], records.timestamp - 1e-6)
+
+    def of_frames(values: np.ndarray) -> np.ndarray:
+        spread = np.full(len(run.frames), np.nan)
+        spread[rows] = values
+        return spread
+
+    def plot(title: str, caption: str, names: Sequence[str], values: np.ndarray, sigmas: np.ndarray) -> dict[str, Any]:
+        series, bands = [], []
+        for k, (name, colour) in enumerate(zip(names, (BLUE, VERMILLION, GREEN), strict=False)):
+            for sign in (2.0, -2.0):
+                series.append(_line("", of_frames(values[:, k] + sign * sigmas[:, k]), GREY, width=0.5))
+            series.append(_line(name, of_frames(values[:, k]), colour, width=2))
+            bands.append({"series": [3 * k + 1, 3 * k + 2], "fill": "rgb(120 120 120 / 18%)"})
+        return _plot(title, f"{caption}, with 2 sigma.", series, bands=bands)
+
+    level, biases, sigmas = np.degrees(records.level), records.biases, records.bias_sigmas
+    return [
+        plot("Roll and pitch [deg]", "Of the camera against the vertical", ("roll", "pitch"), level, level[:, 2:]),
+        plot("Gyro bias [rad/s]", "In the sensor's frame", "xyz", biases, sigmas),
+        plot("Accelerometer bias [m/s²]", "In the sensor's frame", "xyz", biases[:, 3:], sigmas[:, 3:]),
+    ]
 
 
 def _belief(frames: FrameTable) -> dict[str, Any] | None:

@@ -23,6 +23,7 @@ from sigmaslam.run_record.evaluated_frames import (
 )
 from sigmaslam.run_record.frame_pictures import PICTURES_NAME, FramePictures, read_pictures
 from sigmaslam.run_record.frame_table import FRAMES_NAME, FrameTable, read_frames
+from sigmaslam.run_record.inertial_file import InertialRecords, read_inertial_records
 from sigmaslam.run_record.run_folder import FINAL_TRAJECTORY, RUN_NAME
 
 REFINED_TRAJECTORY, REFINE_NAME = "trajectory_refined.tum", "refine.json"
@@ -61,6 +62,7 @@ class RecordedRun:
         entries: of run.json.
         evaluation, refinement: content of evaluation.json and refine.json.
         evaluated: errors of frames.
+        inertial: the state of an inertial sensor, where gravity was known.
     """
 
     folder: Path
@@ -77,6 +79,7 @@ class RecordedRun:
     evaluation: dict[str, Any]
     refinement: dict[str, Any]
     evaluated: EvaluatedFrames | None
+    inertial: InertialRecords | None
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -131,6 +134,7 @@ def read_run(folder: Path) -> RecordedRun:
         evaluation=_read_json(folder / EVALUATION_NAME, "evaluate"),
         refinement=_read_json(folder / REFINE_NAME, "refine"),
         evaluated=read_evaluated_frames(errors, len(trajectory)) if errors.is_file() else None,
+        inertial=read_inertial_records(folder),
     )
 
 

@@ -11,6 +11,7 @@ from sigmaslam.run_record.dense_points import DENSE_NAME, RECONSTRUCTION_NAME
 from sigmaslam.run_record.evaluated_frames import EVALUATED_FRAMES_NAME, EVALUATION_NAME
 from sigmaslam.run_record.frame_pictures import PICTURES_NAME
 from sigmaslam.run_record.frame_table import FRAMES_NAME
+from sigmaslam.run_record.inertial_file import INERTIAL_NAME
 from sigmaslam.run_record.pose_file import PARTIAL_POSES
 from sigmaslam.run_record.pose_table import POSES_NAME
 from sigmaslam.run_record.recorded_run import REFINE_NAME, REFINED_TRAJECTORY
@@ -22,7 +23,7 @@ _NAMES = (
     *("trajectory.tum", "trajectory.kitti", "times.txt", "covariance.npy", "covariance_matching.npy"),
     *(FINAL_TRAJECTORY, FINAL_COVARIANCE, "trajectory_location.tum", "tracks.npz", "map.npz", "map.ply"),
     *(EVALUATION_NAME, EVALUATED_FRAMES_NAME, "evaluation.png", REFINE_NAME, REFINED_TRAJECTORY, "report.html"),
-    *(VIDEO_NAME, RERUN_NAME),
+    *(VIDEO_NAME, RERUN_NAME, INERTIAL_NAME),
     *(DENSE_NAME, RECONSTRUCTION_NAME),
     RUN_NAME,  # the last one, by which the folder is known
 )
@@ -55,5 +56,5 @@ def remove_run(folder: Path) -> None:
 def remove_results(folder: Path) -> None:
     """Removes what was made of a run in its folder, and leaves what `write_results` makes it of."""
     for name in _NAMES:
-        if name not in (RUN_NAME, FRAMES_NAME, PARTIAL_POSES, PARTIAL_RELATIVE_POSES):
+        if name not in (RUN_NAME, FRAMES_NAME, INERTIAL_NAME, PARTIAL_POSES, PARTIAL_RELATIVE_POSES):
             (folder / name).unlink(missing_ok=True)

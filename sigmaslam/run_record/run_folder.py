@@ -22,11 +22,13 @@ import numpy as np
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder, printable
 from sigmaslam.frontend.build import own_networks
-from sigmaslam.geometry.camera import StereoCamera
+from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
+from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.inference.networks import WeightsFolder, network_path
 from sigmaslam.inference.onnx_graph import shipped_weights
 from sigmaslam.run_record.appended_file import AppendedFile, is_in_use
 from sigmaslam.run_record.frame_table import COLUMNS, DOUBTS_SEPARATOR, FRAMES_NAME, KEYFRAME_COLUMNS
+from sigmaslam.run_record.inertial_file import InertialWriter
 from sigmaslam.run_record.pose_file import PARTIAL_POSES, PoseWriter
 from sigmaslam.run_record.relative_pose_file import RelativePoseWriter
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
@@ -87,6 +89,7 @@ class RunWriter:
             self._poses = PoseWriter(out, goes_on)
             self._relative_poses = RelativePoseWriter(out, goes_on)
             self._table = AppendedFile(out / FRAMES_NAME, goes_on)
+            self._inertial = InertialWriter(out, goes_on) if "imu" in run else None
         except OSError as error:
             raise InputError(f"{out}: cannot be written ({error.strerror}): choose another --out") from error
         if not goes_on:
@@ -111,6 +114,8 @@ class RunWriter:
         self.calibration = estimate.calibration
         if estimate.has_pose:
             self._poses.add(estimate.timestamp, pose, covariance, matching)
+            if self._inertial is not None and estimate.inertial is not None:
+                self._inertial.add(estimate.timestamp, estimate.inertial)
             self._relative_poses.add(self._count, estimate.relative_poses)
             if estimate.tracks is not None and self._rectified is not None:
                 self._tracks.append((self._count, estimate.tracks))
@@ -140,8 +145,9 @@ class RunWriter:
 
     def close(self) -> None:
         """The last frame has come."""
-        for file in (self._poses, self._relative_poses, self._table):
-            file.close()
+        for file in (self._poses, self._relative_poses, self._table, self._inertial):
+            if file is not None:
+                file.close()
 
     @property
     def has_tracks(self) -> bool:
@@ -220,6 +226,16 @@ def describe_camera(camera: StereoCamera) -> dict[str, Any]:
         "sigmas": asdict(camera.sigmas),
         "covariance": covariance and {"names": list(covariance.names), "matrix": covariance.matrix.tolist()},
     }
+
+
+def camera_of(path: Path, entries: dict[str, Any]) -> StereoCamera:
+    """The calibration that run.json has; its measured covariance is not needed."""
+    try:
+        left, right = (CameraModel(**entries[eye]) for eye in ("left", "right"))
+        sigmas = CalibrationSigmas(**entries["sigmas"])
+        return StereoCamera(left, right, np.array(entries["T_left_right"], float), sigmas)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: calibration cannot be read ({error}): run `sigmaslam track` again") from error
 
 
 def describe_weights(frontend: str, backend: str, weights: WeightsFolder) -> dict[str, Any] | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,8 @@ from sigmaslam.files import atomic_path, atomic_write_text
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import write_kitti, write_tum
 from sigmaslam.run_record.frame_pictures import PICTURES_NAME
-from sigmaslam.run_record.frame_table import FRAMES_NAME, STATUSES, TRACKED, FrameTable, read_frames
+from sigmaslam.run_record.frame_table import FRAMES_NAME, STATUSES, TRACKED, FrameTable, predicted_poses, read_frames
+from sigmaslam.run_record.inertial_file import describe_gravity, read_inertial_records
 from sigmaslam.run_record.pose_file import PARTIAL_POSES, PoseRecords, read_pose_records
 from sigmaslam.run_record.pose_table import POSES_NAME, write_pose_table
 from sigmaslam.run_record.relative_pose_file import (
@@ -49,6 +50,7 @@ class TrackerResults:
             None where other sensors corrected the poses, whose covariances then have no part of matches alone.
         others: more files, by name, in the order in which they are written before the map.
         pictures: writes pictures of frames, also of a run that failed.
+        judge_imu: findings about an inertial sensor from times (N,), poses and which of them images gave; None without.
     """
 
     point_map: Callable[[], PointMap]
@@ -56,6 +58,7 @@ class TrackerResults:
     final: Callable[[], tuple[Trajectory, np.ndarray]] | None
     others: Mapping[str, Callable[[Path], None]]
     pictures: Callable[[Path], None]
+    judge_imu: Callable[[np.ndarray, np.ndarray, np.ndarray], list[Finding]] | None = None
 
 
 def write_results(
@@ -109,6 +112,12 @@ def write_results(
         # Of a first attempt, if there was one.
         known = ("calibration_verdict", "calibration_errors")
         summary |= {name: value for name, value in run.get("summary", {}).items() if name in known}
+    if frames is not None and len(records):
+        summary |= describe_gravity(read_inertial_records(folder), records)
+        if tracker is not None and tracker.judge_imu is not None:
+            by_images = ~predicted_poses(frames, records.timestamp)
+            judged = tracker.judge_imu(records.timestamp, records.pose, by_images)
+            summary["imu"] = [asdict(each) for each in judged]
     summary["world"] = _describe_world(summary, run)
     summary["failure"] = explain_failure(summary, run.get("map") is not None, started, findings)
     content = json.dumps({**run, "summary": summary}, indent=2) + "\n"

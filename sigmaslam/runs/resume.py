@@ -21,6 +21,7 @@ from sigmaslam.readers import StereoFrame, StereoSequence
 from sigmaslam.readers.trajectory_files import read_tum
 from sigmaslam.run_record.appended_file import check_not_in_use
 from sigmaslam.run_record.frame_table import FRAMES_NAME, read_frames
+from sigmaslam.run_record.inertial_file import cut_inertial_records
 from sigmaslam.run_record.pose_file import PARTIAL_POSES, PoseRecords, read_pose_records, write_pose_records
 from sigmaslam.run_record.relative_pose_file import (
     PARTIAL_RELATIVE_POSES,
@@ -109,6 +110,7 @@ class StoppedRun:
         write_partial_frame_pairs(self.folder, self.pairs, self.records.timestamp)
         lines = (self.folder / FRAMES_NAME).read_text(encoding="utf-8").splitlines(keepends=True)
         atomic_write_text(self.folder / FRAMES_NAME, "".join(lines[: len(self.timestamps) + 1]))
+        cut_inertial_records(self.folder, float(self.timestamps[-1]))
         remove_results(self.folder)
 
     def _check_known(self, timestamp: float) -> None:

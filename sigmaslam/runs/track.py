@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from sigmaslam.bodies.object_tracker import OBJECT_CONFIG, ObjectEstimate, Objec
 from sigmaslam.calibration.learned_calibration import learned_calibration
 from sigmaslam.calibration_files.calibration_writer import write_calibration
 from sigmaslam.checks.finding import disparity_error
+from sigmaslam.checks.inertial_agreement import judge_motion
 from sigmaslam.errors import InputError, OutputError, SigmaSlamError
 from sigmaslam.files import printable
 from sigmaslam.fusion.location_filter import LocationFilter
@@ -122,7 +124,10 @@ def track_sequence(request: TrackRequest) -> dict[str, Any]:
             others[str(saved.resolve())] = lambda path: write_calibration(path, learned)
         # A sensor's readings correct poses as they come, not after the fact; what was before a stop is not in memory.
         final = tracker.final_trajectory if location is None and stopped is None else None
-        results = TrackerResults(tracker.map, tracker.pack_keyframes, final, others, pictures.write)
+        judge_imu = None
+        if sequence.imu is not None and location is None:
+            judge_imu = partial(judge_motion, recording=sequence.imu)
+        results = TrackerResults(tracker.map, tracker.pack_keyframes, final, others, pictures.write, judge_imu)
         summary, failed = write_results(out, run, writer.calibration, results)
     if stopped_by is not None:
         raise stopped_by

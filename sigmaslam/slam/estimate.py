@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sigmaslam.slam.doubt import Doubt
+from sigmaslam.slam.inertial_estimate import InertialEstimate
 from sigmaslam.slam.mapping import KeyframeTracks
 from sigmaslam.slam.relative_poses import RelativePoses
 
@@ -57,6 +58,7 @@ class Estimate:
         relative_poses: relative to keyframes some way and some time back.
         doubts: what speaks against the pose.
         loop: time stamp of the keyframe of long ago that the frame, a keyframe, closes a loop with, seconds.
+        inertial: which way is up, and the biases, where an inertial sensor says so.
     """
 
     timestamp: float
@@ -76,6 +78,7 @@ class Estimate:
     relative_poses: RelativePoses = field(default_factory=RelativePoses.empty)
     doubts: tuple[Doubt, ...] = ()
     loop: float | None = None
+    inertial: InertialEstimate | None = None
 
     @property
     def has_pose(self) -> bool:

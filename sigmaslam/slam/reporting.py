@@ -15,6 +15,7 @@ from sigmaslam.geometry.se3 import se3_adjoint, se3_inverse, turn_covariance
 from sigmaslam.slam.doubt import Doubts
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.slam.guided_matching import GuidedMatches
+from sigmaslam.slam.inertial_estimate import describe_inertial
 from sigmaslam.slam.localisation import Prediction
 from sigmaslam.slam.mapping import KeyframeTracks
 from sigmaslam.slam.relative_poses import RelativePoseReporter
@@ -72,9 +73,10 @@ class Reporter:
         covariance = matching + by_error @ by_error.T
         frame_covariance = adjoint @ relative @ adjoint.T if fit is not None else np.zeros((6, 6))
         covariance, matching = _within_half_turn(covariance), _within_half_turn(matching)
+        T_world_camera = T_left_rectified @ pose @ self.T_rectified_left
         return Estimate(
             timestamp=timestamp,
-            T_world_camera=T_left_rectified @ pose @ self.T_rectified_left,
+            T_world_camera=T_world_camera,
             covariance=0.5 * (covariance + covariance.T),
             matching_covariance=0.5 * (matching + matching.T),
             status=status,
@@ -91,6 +93,7 @@ class Reporter:
             relative_poses=self.relative_poses.report(timestamp, fit if tracks is None else None),
             doubts=tuple(doubts.reasons),
             loop=loop,
+            inertial=describe_inertial(self.motion, self.T_rectified_left[:3, :3], T_world_camera),
         )
 
     def _report_nothing(self, timestamp: float, status: str, milliseconds: dict[str, float]) -> Estimate:

@@ -30,6 +30,8 @@ NOT_RUN = {
     "sigmaslam render street --out drives": "ten drives",
     "sigmaslam calibrate IMAGES --board charuco": "the stand-in is a chessboard",
     "sigmaslam calibrate IMAGES --board aprilgrid": "the stand-in is a chessboard",
+    "sigmaslam calibrate mav0": "the stand-in has no inertial sensor",
+    "sigmaslam calibrate run --imu": "the stand-in has no inertial sensor",
     "sigmaslam localize MRCLAM_Dataset6": "a recording of others",
     "sigmaslam localize dataset": "a recording of others",
     "sigmaslam reconstruct run --out cloud.ply --mesh": "needs the extra `mesh`",

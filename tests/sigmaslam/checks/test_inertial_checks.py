@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,18 @@ def recorded(scale: float = 1.0, shift: float = 0.0, every: int = 1, keep: float
 def test_a_good_table_is_ok():
     assert check_inertial(recorded(), IMAGES.tolist()).severity == "ok"
     assert check_inertial(recorded(), None).severity == "ok"
+
+
+def test_saturation_is_said():
+    recording = recorded()
+    samples = recording.samples
+    clipped = np.clip(20.0 * samples.gyro, -np.radians(250), np.radians(250))
+    found = check_inertial(replace(recording, samples=replace(samples, gyro=clipped)), None)
+    assert found.severity == "warning"
+    assert "the rate stays at 4.36" in found.message
+    clipped = np.clip(samples.accel + [12.0, 0.0, 0.0], None, 2 * 9.80665 * 0.6)
+    # Flat, but at the end of no sensor's range.
+    assert check_inertial(replace(recording, samples=replace(samples, accel=clipped)), None).severity != "warning"
 
 
 @pytest.mark.parametrize(
