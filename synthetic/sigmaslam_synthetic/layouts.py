@@ -143,7 +143,7 @@ def save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
             info = zipfile.ZipInfo(f"{name}.npy")  # with a fixed date: the same arrays are the same bytes
             info.compress_type = zipfile.ZIP_DEFLATED
             with archive.open(info, "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, np.ascontiguousarray(array), allow_pickle=False)
+                np.lib.format.write_array(member, np.asarray(array, order="C"), allow_pickle=False)
 
 
 def _stamp(simulation: Simulation, frame: int) -> int:

@@ -171,6 +171,7 @@ def test_files_are_found_and_read_back(layout, tmp_path):
     assert read.samples.timestamp[-1] > first + simulation.times[-1]
     with np.load(table.with_name("truth.npz")) as truth:
         np.testing.assert_allclose(truth["timestamp"], read.samples.timestamp, atol=1e-6)
+        assert float(truth["time_shift"]) == float(made.truth.time_shift)
         assert np.linalg.norm(truth["gravity"]) == pytest.approx(9.80665)
         poses = simulation.path.poses(simulation.times)
         down = poses[0, 2, :3] if layout == "kitti" else np.array([0, 0, 1.0])
