@@ -110,7 +110,7 @@ def test_the_page_says_which_goals_are_missed_and_what_is_not_named():
     assert "| room7 | sign of rate x | nothing |" in page
     assert "- room7: a\\|b" in page
     assert "**3 runs are missing: the same command goes on.**" in page
-    assert "| room | 1 | images | 1 | 20 | 20 | 0 | 0 | 100% | 0.020 | 0.020 |" in page
+    assert "| room | 1 | images | 1 | 20 | 20 | 0 | 0 | 0 | 100% | 0.020 | 0.020 |" in page
     assert "| mh01 | 20 | " not in page
 
 
