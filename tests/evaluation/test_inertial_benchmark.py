@@ -100,7 +100,7 @@ def test_the_page_says_which_goals_are_missed_and_what_is_not_named():
         for method in METHODS:
             runs[recording, DarkCase(method)] = RESULT
             runs[recording, DarkCase(method, 1.0, 20)] = result
-    faults = [(room, FaultResult("sign", "sign of rate x", False, [])), (room, FaultResult("", "good", True, ["a|b"]))]
+    faults = [(room, FaultResult("sign", "sign of rate x", False, [])), (room, FaultResult("", "good", True, ["/home/me/imu0/data.csv: a|b"]))]
     page = format_page(InertialPage("sigmaslam benchmark inertial", (1.0, 2.0), runs, faults, 3))
     assert "| MH_01, 1 s: frames lost | 0 | 2, **missed** |" in page
     assert "| MH_01, 1 s: largest error, m | 0.05 | 0.070, **missed** |" in page
@@ -108,7 +108,7 @@ def test_the_page_says_which_goals_are_missed_and_what_is_not_named():
     assert "Missed: MH_01, 1 s: frames lost (2)" in page
     assert "| faulty tables that are named | all | 0 of 1, **missed** |" in page
     assert "| room7 | sign of rate x | nothing |" in page
-    assert "- room7: a\\|b" in page
+    assert "- room7: imu0/data.csv: a\\|b" in page
     assert "**3 runs are missing: the same command goes on.**" in page
     assert "| room | 1 | images | 1 | 20 | 20 | 0 | 0 | 0 | 100% | 0.020 | 0.020 |" in page
     assert "| mh01 | 20 | " not in page

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -218,4 +219,6 @@ def _mean(results: Sequence[DarkResult], name: str) -> float:
 
 
 def _said(result: FaultResult) -> str:
-    return " / ".join(result.said).replace("|", "\\|").replace("\n", " ") or "nothing"
+    # A page does not name folders of the machine that made it.
+    said = [re.sub(r"\S*/imu0/", "imu0/", line) for line in result.said]
+    return " / ".join(said).replace("|", "\\|").replace("\n", " ") or "nothing"
