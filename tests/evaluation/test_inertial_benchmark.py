@@ -48,6 +48,7 @@ def good(walk: tuple[SimulatedInertial, np.ndarray], tmp_path: Path) -> GoodFram
     return GoodFrames(frames, parallel_camera(64, 48, 50.0, 0.1), References(poses), imu)
 
 
+@pytest.mark.long
 def test_errors_drawn_from_the_covariance_have_a_nees_of_one(good, walk):
     truth, poses = walk[0].truth, walk[1]
     rng, mix = np.random.default_rng(1), np.random.default_rng(2).standard_normal((25, 25)) / 5.0
@@ -100,7 +101,8 @@ def test_the_page_says_which_goals_are_missed_and_what_is_not_named():
         for method in METHODS:
             runs[recording, DarkCase(method)] = RESULT
             runs[recording, DarkCase(method, 1.0, 20)] = result
-    faults = [(room, FaultResult("sign", "sign of rate x", False, [])), (room, FaultResult("", "good", True, ["/home/me/imu0/data.csv: a|b"]))]
+    good = FaultResult("", "good", True, ["/home/me/imu0/data.csv: a|b"])
+    faults = [(room, FaultResult("sign", "sign of rate x", False, [])), (room, good)]
     page = format_page(InertialPage("sigmaslam benchmark inertial", (1.0, 2.0), runs, faults, 3))
     assert "| MH_01, 1 s: frames lost | 0 | 2, **missed** |" in page
     assert "| MH_01, 1 s: largest error, m | 0.05 | 0.070, **missed** |" in page
