@@ -204,6 +204,19 @@ BENCHMARKS = {
         ),
         _TRAIN,
     ),
+    "inertial": Benchmark(
+        "inertial.inertial_benchmark",
+        "Dark stretches with and without an inertial sensor. And faults of its table that are named (extra 'train').",
+        (
+            _DATA_IF_ANY,
+            _names("worlds", "room, street or mh01, with commas."),
+            _RUNS,
+            _count("seeds", 3, "Renders of each kind."),
+            _FIRST_SEED,
+            _count("workers", 1, "Processes."),
+        ),
+        _TRAIN,
+    ),
 }
 """By name, in the order of the help."""
 

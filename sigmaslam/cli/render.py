@@ -53,6 +53,12 @@ def render(
         Path | None,
         typer.Option(metavar="FILE.py", help="A world of your own, as examples/my_world.py, by the preset's camera."),
     ] = None,
+    imu: Annotated[
+        float | None,
+        typer.Option(
+            metavar="RATE", help="Add an inertial sensor with so many samples a second, as 200, and its truth."
+        ),
+    ] = None,
     width: Annotated[int | None, typer.Option(min=16, help="Pixels.", show_default="the preset's")] = None,
     height: Annotated[int | None, typer.Option(min=16, help="Pixels.", show_default="the preset's")] = None,
     truth: Annotated[
@@ -64,7 +70,8 @@ def render(
 ) -> None:
     """Render a stereo sequence, or many, with exact truth (needs the extra 'train').
 
-    Writes a KITTI folder (drone and colon: EuRoC, unrectified), poses, truth/NNNNNN.npz, landmarks.npz, scene.json.
+    Writes a KITTI folder (drone and colon: EuRoC, unrectified), poses, truth/NNNNNN.npz, landmarks.npz, scene.json;
+    with --imu imu0/data.csv with its YAML and truth.npz, where `track` finds it.
     """
     need_train_extra()
     from sigmaslam_synthetic.render_sequence import default_workers, write_sequence, write_sequences
@@ -86,6 +93,7 @@ def render(
         height,
         None if profile is None else str(profile),
         None if world is None else str(world.resolve()),
+        imu,
     )
     workers = workers or default_workers()
     with open_progress() as progress:

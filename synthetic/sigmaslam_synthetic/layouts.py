@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from sigmaslam.files import atomic_write_text
+from sigmaslam.files import atomic_path, atomic_write_text
 from sigmaslam.geometry.camera import CameraModel
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import write_kitti
+from sigmaslam_synthetic.inertial import SimulatedInertial
 from sigmaslam_synthetic.simulation import Simulation
 
 _FIRST_STAMP = 1_600_000_000_000_000_000  # nanoseconds; EuRoC's stamps count from 1970
@@ -38,6 +42,43 @@ def write_layout(out: Path, simulation: Simulation) -> None:
         _write_kitti(out, simulation, poses)
     else:
         _write_euroc(out / "mav0", simulation, poses)
+
+
+def write_inertial(out: Path, simulation: Simulation, inertial: SimulatedInertial) -> None:
+    """The sensor's table with its YAML, and its truth, where `find_imu` looks.
+
+    KITTI knows no such sensor: its table is in seconds, with a YAML of its own name.
+    """
+    is_kitti = simulation.layout == "kitti"
+    folder = (out if is_kitti else out / "mav0") / "imu0"
+    folder.mkdir(exist_ok=True)
+    samples = inertial.samples
+    stamps = [f"{t:.9f}" if is_kitti else _FIRST_STAMP + round(1e9 * t) for t in samples.timestamp]
+    rows = np.concatenate([samples.gyro, samples.accel], axis=1)
+    names = [f"{name}_{axis} [{unit}]" for name, unit in (("w", "rad s^-1"), ("a", "m s^-2")) for axis in "xyz"]
+    text = [[stamp, *(f"{value:.9f}" for value in row)] for stamp, row in zip(stamps, rows, strict=True)]
+    header = [f"#timestamp [{'s' if is_kitti else 'ns'}]", *names]
+    atomic_write_text(folder / "data.csv", _table(header, text))
+    atomic_write_text(folder / ("data.yaml" if is_kitti else "sensor.yaml"), _inertial_yaml(inertial))
+    start = 0.0 if is_kitti else _FIRST_STAMP / 1e9
+    save_arrays(folder / "truth.npz", {**asdict(inertial.truth), "timestamp": start + inertial.truth.timestamp})
+
+
+def _inertial_yaml(inertial: SimulatedInertial) -> str:
+    sensor = inertial.sensor
+    content = {
+        "sensor_type": "imu",
+        "comment": "rendered",
+        "T_BS": {"cols": 4, "rows": 4, "data": sensor.T_left_imu.ravel().tolist()},
+        "T_cam_imu": sensor.T_left_imu.tolist(),
+        "timeshift_cam_imu": sensor.time_shift,
+        "rate_hz": round(1.0 / float(np.median(np.diff(inertial.samples.timestamp))), 6),
+        "gyroscope_noise_density": sensor.gyro_density,
+        "gyroscope_random_walk": sensor.gyro_walk,
+        "accelerometer_noise_density": sensor.accel_density,
+        "accelerometer_random_walk": sensor.accel_walk,
+    }
+    return yaml.safe_dump(content, sort_keys=False)
 
 
 def _write_kitti(out: Path, simulation: Simulation, poses: np.ndarray) -> None:
@@ -90,6 +131,19 @@ def _sensor_yaml(camera: CameraModel, T_body_camera: np.ndarray, fps: float) -> 
         "distortion_coefficients": list(camera.distortion) or [0.0] * 4,
     }
     return yaml.safe_dump(content, sort_keys=False)
+
+
+def save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
+    """A .npz like numpy's compressed ones, at the fastest level: numpy's own takes as long as the rendering."""
+    with (
+        atomic_path(path) as temporary,
+        zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
+    ):
+        for name, array in arrays.items():
+            info = zipfile.ZipInfo(f"{name}.npy")  # with a fixed date: the same arrays are the same bytes
+            info.compress_type = zipfile.ZIP_DEFLATED
+            with archive.open(info, "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.asarray(array, order="C"), allow_pickle=False)
 
 
 def _stamp(simulation: Simulation, frame: int) -> int:

@@ -1,14 +1,13 @@
 """Writes rendered stereo sequences with exact truth: in parallel, and again from where it stopped.
 
 A folder holds the images in KITTI's or EuRoC's layout with calibration, times and true poses; `scene.json`, from which
-everything can be made again; `truth/NNNNNN.npz` for each frame; and `landmarks.npz`.
+everything can be made again; `truth/NNNNNN.npz` for each frame; `landmarks.npz`; and, if asked for, an inertial sensor.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
@@ -22,10 +21,10 @@ import torch
 from sigmaslam.errors import InputError, OutputError
 from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder
 from sigmaslam_synthetic.landmark_tracks import Landmarks, choose_landmarks, observe
-from sigmaslam_synthetic.layouts import image_paths, write_layout
+from sigmaslam_synthetic.layouts import image_paths, save_arrays, write_inertial, write_layout
 from sigmaslam_synthetic.parallel_jobs import list_failures, run_jobs
 from sigmaslam_synthetic.render_choices import TRUTHS
-from sigmaslam_synthetic.simulation import Frame, Recipe, Simulation, Studio, simulate
+from sigmaslam_synthetic.simulation import Frame, Recipe, Simulation, Studio, inertial_of, simulate
 
 SCENE_NAME, LANDMARKS_NAME = "scene.json", "landmarks.npz"
 _BEGUN_NAME = ".begun.json"
@@ -138,8 +137,8 @@ def prepare(out: Path, recipe: Recipe, truth: str) -> None:
             content: dict[str, Any] = json.loads(scene.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
             raise InputError(f"{scene} cannot be read ({error}); remove it or choose another --out") from error
-        # Folders from before there were worlds of one's own lack the key.
-        there = {"recipe": {"world": None, **content.get("recipe", {})}, "truth": content.get("truth")}
+        # Folders from before there were worlds of one's own, and inertial sensors, lack the keys.
+        there = {"recipe": {"world": None, "imu": None, **content.get("recipe", {})}, "truth": content.get("truth")}
         if there != asked:
             raise InputError(f"{scene} was made with {there}, not {asked}; choose another --out")
         return
@@ -154,7 +153,9 @@ def prepare(out: Path, recipe: Recipe, truth: str) -> None:
         atomic_write_text(begun, text)
     (out / "truth").mkdir(exist_ok=True)
     write_layout(out, simulation)
-    _save(out / LANDMARKS_NAME, asdict(choose_landmarks(Studio(simulation))))
+    if recipe.imu is not None:
+        write_inertial(out, simulation, inertial_of(recipe, simulation))
+    save_arrays(out / LANDMARKS_NAME, asdict(choose_landmarks(Studio(simulation))))
     # The last to be written: a folder with scene.json is complete but for its frames.
     content = {**asked, "command": command(recipe, truth), "simulation": simulation.to_json()}
     atomic_write_text(scene, json.dumps(content) + "\n")
@@ -177,7 +178,7 @@ def write_frames(out: Path, studio: Studio, landmarks: Landmarks, truth: str, nu
             for path, image in zip(image_paths(out, studio.simulation, number), (frame.left, frame.right), strict=True):
                 _write_image(path, image)
             tracks = observe(landmarks, left.sight, right.sight, view)
-            _save(_truth_path(out, number), _truth_of(tracks, frame, truth))
+            save_arrays(_truth_path(out, number), _truth_of(tracks, frame, truth))
     return len(numbers)
 
 
@@ -191,7 +192,7 @@ def join_tracks(out: Path, frames: int) -> None:
             for key in _TRACK_KEYS:
                 rows[key].append(content[f"track_{key}"])
         rows["frame"].append(np.full(len(rows["landmark"][-1]), k))
-    _save(out / LANDMARKS_NAME, {**landmarks, **{f"track_{key}": np.concatenate(v) for key, v in rows.items()}})
+    save_arrays(out / LANDMARKS_NAME, {**landmarks, **{f"track_{key}": np.concatenate(v) for key, v in rows.items()}})
 
 
 def command(recipe: Recipe, truth: str) -> str:
@@ -265,19 +266,6 @@ def _truth_of(observed: dict[str, np.ndarray], frame: Frame, truth: str) -> dict
 
 def _truth_path(out: Path, frame: int) -> Path:
     return out / "truth" / f"{frame:06d}.npz"
-
-
-def _save(path: Path, arrays: dict[str, Any]) -> None:
-    """A .npz like numpy's compressed ones, at the fastest level: numpy's own takes as long as the rendering."""
-    with (
-        atomic_path(path) as temporary,
-        zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
-    ):
-        for name, array in arrays.items():
-            info = zipfile.ZipInfo(f"{name}.npy")  # with a fixed date: the same arrays are the same bytes
-            info.compress_type = zipfile.ZIP_DEFLATED
-            with archive.open(info, "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, np.ascontiguousarray(array), allow_pickle=False)
 
 
 def _write_image(path: Path, image: np.ndarray) -> None:

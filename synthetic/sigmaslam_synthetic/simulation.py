@@ -12,6 +12,7 @@ import torch
 from sigmaslam.errors import InputError
 from sigmaslam_synthetic.camera.rig import Miscalibration, Rig
 from sigmaslam_synthetic.camera.sensor import Sensor, expose, exposure_gains
+from sigmaslam_synthetic.inertial import InertialGrade, SimulatedInertial, simulate_inertial
 from sigmaslam_synthetic.motion.paths import Path
 from sigmaslam_synthetic.presets import EXPOSURES, PRESETS, SENSORS, Layout
 from sigmaslam_synthetic.render_choices import CARRIED, MOTIONS, ROLLING
@@ -25,7 +26,9 @@ from sigmaslam_synthetic.worlds.own import check_world, load_world
 _BRIGHTNESS = 0.48  # mean of the linear image that the exposure aims at
 _METERED = 5  # frames that are looked at for it
 # Streams of random numbers of one seed: what one draws does not depend on the others.
-_WORLD, _RIG, _ERRORS, _GAINS, _NOISE = range(5)
+_WORLD, _RIG, _ERRORS, _GAINS, _NOISE, _INERTIAL = range(6)
+# Samples a second that an inertial sensor may have.
+_RATES = (20.0, 10_000.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +47,7 @@ class Recipe:
         width, height: pixels; the preset's unless given.
         profile: KITTI poses file that a drive follows.
         world: Python file that makes the world, see `worlds.own`, in place of the preset's, whose camera it is seen by.
+        imu: samples a second of an inertial sensor on the camera; None: there is none.
     """
 
     preset: str
@@ -58,6 +62,7 @@ class Recipe:
     height: int | None = None
     profile: str | None = None
     world: str | None = None
+    imu: float | None = None
 
     @property
     def name(self) -> str:
@@ -90,6 +95,8 @@ class Recipe:
             raise InputError(f"the motion planar goes with {', '.join(ROLLING)}, where there is a level floor")
         if self.profile is not None and self.preset != "street":
             raise InputError(f"a profile of real motion goes with the preset street, not with {self.preset}")
+        if self.imu is not None and not _RATES[0] <= self.imu <= _RATES[1]:
+            raise InputError(f"imu is {self.imu}; give {_RATES[0]:g} to {_RATES[1]:g} samples a second, as 200")
         if self.world is not None:
             check_world(self.world)
 
@@ -210,6 +217,15 @@ def simulate(recipe: Recipe) -> Simulation:
         episode.scene, episode.path, rig, preset.fps, recipe.frames, preset.layout, sensor, gains, recipe.seed
     )
     return replace(draft, sensor=replace(sensor, gain=_metered_gain(draft)))
+
+
+def inertial_of(recipe: Recipe, simulation: Simulation, grade: InertialGrade | None = None) -> SimulatedInertial:
+    """What the inertial sensor of a recipe measures, in the frame of the true poses that the layout has."""
+    assert recipe.imu is not None
+    rng = np.random.default_rng((recipe.seed, _INERTIAL))
+    path, is_kitti = simulation.path, simulation.layout == "kitti"
+    T_truth_world = np.linalg.inv(path.poses(0.0)) if is_kitti else np.eye(4)
+    return simulate_inertial(path, float(simulation.times[-1]), recipe.imu, rng, T_truth_world, grade)
 
 
 class Studio:

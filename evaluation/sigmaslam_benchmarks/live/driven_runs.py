@@ -23,6 +23,7 @@ from sigmaslam.errors import SigmaSlamError
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.readers import StereoFrame, StereoSequence
 from sigmaslam.readers.images import RawPair
+from sigmaslam.readers.inertial import InertialRecording
 from sigmaslam.runs.request import InputOptions, LiveOptions, OutputOptions, TrackerOptions, TrackRequest
 from sigmaslam.runs.track import track_sequence
 from sigmaslam.slam.estimate import Estimate
@@ -87,7 +88,9 @@ class DrivenSequence(StereoSequence):
                 yield frame
 
 
-def track_ours(frames: Sequence[DrivenFrame], camera: StereoCamera, out: Path) -> DrivenRun:
+def track_ours(
+    frames: Sequence[DrivenFrame], camera: StereoCamera, out: Path, imu: InertialRecording | None = None
+) -> DrivenRun:
     """What `sigmaslam track` does and says, in one thread."""
     by_frame: dict[int, DrivenPose] = {}
 
@@ -100,6 +103,7 @@ def track_ours(frames: Sequence[DrivenFrame], camera: StereoCamera, out: Path) -
     logger.addHandler(warnings)
     try:
         sequence = DrivenSequence(frames, camera)
+        sequence.imu = imu
         with Path(os.devnull).open("w") as nowhere, redirect_stderr(nowhere):
             findings = check_sequence(sequence, SAMPLES_BEFORE_TRACKING, 1).findings
             source, live = InputOptions(sequence, findings=findings), LiveOptions(on_estimate=keep)

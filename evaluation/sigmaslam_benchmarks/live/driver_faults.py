@@ -200,7 +200,11 @@ def darken_right(factor: float, frames: Frames, rng: np.random.Generator) -> Fra
 
 def cover(seconds: float, frames: Frames, rng: np.random.Generator) -> Frames:
     """A hand over both lenses: black with some noise."""
-    first, count = start_of(frames), round(seconds / interval(frames))
+    return blacken(frames, start_of(frames), round(seconds / interval(frames)), rng)
+
+
+def blacken(frames: Frames, first: int, count: int, rng: np.random.Generator) -> Frames:
+    """So many frames from the first one on are black with some noise."""
     changed = list(frames)
     for number in range(first, min(first + count, len(frames))):
         shape = frames[number].left.shape

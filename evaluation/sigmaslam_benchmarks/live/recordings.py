@@ -13,6 +13,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import StereoSequence, open_sequence
+from sigmaslam.readers.inertial import InertialRecording, find_imu, read_imu
 from sigmaslam.readers.selection import Selection
 from sigmaslam.readers.trajectory_files import read_trajectory
 from sigmaslam_benchmarks.live.driver_faults import DrivenFrame
@@ -45,12 +46,14 @@ class Recording:
         kind: one of `SEQUENCES`.
         frames: number of pairs.
         seed: of the render, and of the faults.
+        imu: samples a second of the inertial sensor that is rendered; None: none is.
     """
 
     name: str
     kind: str
     frames: int
     seed: int
+    imu: float | None = None
 
     @property
     def exact(self) -> bool:
@@ -61,26 +64,28 @@ class Recording:
         """Reads the frames; renders what is missing into the folder `runs`."""
         if self.exact:
             source = render(runs, self._recipe(), 1)
-            return _read(open_rendered(source), read_trajectory(rendered_truth(source)), np.zeros((6, 6)))
+            return _read(open_rendered(source), source, read_trajectory(rendered_truth(source)), np.zeros((6, 6)))
         assert data is not None
         folder, truth, sigmas = REAL[self.kind]
         sequence = open_sequence(data / folder).select(Selection(count=self.frames))
-        return _read(sequence, read_trajectory(data / folder / truth), truth_covariance(*sigmas))
+        true = read_trajectory(data / folder / truth)
+        return _read(sequence, data / folder, true, truth_covariance(*sigmas))
 
     def _recipe(self) -> Recipe:
         from sigmaslam_synthetic.simulation import Recipe
 
         width, height = RENDERED[self.kind]
-        return Recipe(self.kind, self.frames, self.seed, width=width, height=height)
+        return Recipe(self.kind, self.frames, self.seed, width=width, height=height, imu=self.imu)
 
 
 @dataclass(frozen=True, slots=True)
 class GoodFrames:
-    """All pairs of a recording in memory, with calibration and truth."""
+    """All pairs of a recording in memory, with calibration and truth, and its inertial sensor where it has one."""
 
     frames: list[DrivenFrame]
     camera: StereoCamera
     truth: References
+    imu: InertialRecording | None = None
 
 
 def choose_recordings(
@@ -103,10 +108,12 @@ def choose_recordings(
     return chosen + [Recording(name, name, frames, first_seed) for name in wanted if name in REAL]
 
 
-def _read(sequence: StereoSequence, truth: Trajectory, covariance: np.ndarray) -> GoodFrames:
+def _read(sequence: StereoSequence, folder: Path, truth: Trajectory, covariance: np.ndarray) -> GoodFrames:
     frames = [DrivenFrame(k, each.timestamp, each.left, each.right) for k, each in enumerate(sequence.frames())]
     times = np.array([frame.timestamp for frame in frames])
     poses = np.full((len(frames), 4, 4), np.nan)
     here, there = associate(Trajectory(times, np.tile(np.eye(4), (len(frames), 1, 1))), truth)
     poses[here] = truth.poses[there]
-    return GoodFrames(frames, sequence.camera, References(poses, covariance))
+    table = find_imu(folder)
+    imu = None if table is None else read_imu(table)
+    return GoodFrames(frames, sequence.camera, References(poses, covariance), imu)

@@ -31,6 +31,22 @@ class Stop(NamedTuple):
     ease: float
 
 
+class BodyMotion(NamedTuple):
+    """How a body moves at N times.
+
+    Attributes:
+        rotation: (N, 3, 3) R_world_body.
+        rate, rate_change: (N, 3) angular rate and acceleration in the body's frame, rad/s and rad/s^2.
+        velocity, acceleration: (N, 3) of its origin in the world, m/s and m/s^2.
+    """
+
+    rotation: np.ndarray
+    rate: np.ndarray
+    rate_change: np.ndarray
+    velocity: np.ndarray
+    acceleration: np.ndarray
+
+
 @dataclass(frozen=True, eq=False)
 class Path:
     """A smooth rigid motion, of a camera or of a body.
@@ -104,6 +120,24 @@ class Path:
             T[:, :3, 3] = position(clock)
         return T.reshape(*t.shape, 4, 4)
 
+    def motion(self, t: np.ndarray) -> BodyMotion:
+        """Exact derivatives of `poses` at times t (N,), seconds; zero outside of the path's time."""
+        clock = self._knot_clock(t)
+        inside = (clock >= self.times[0]) & (clock <= self.times[-1])
+        speed, change = (np.where(inside, each, 0.0)[:, None] for each in self._clock_rates(t))
+        rotation = self.poses(t)[:, :3, :3]
+        if self._splines is None:
+            return BodyMotion(rotation, *np.zeros((4, len(t), 3)))
+        position, turn = self._splines
+        velocity, rate = position(clock, 1), turn(clock, 1)
+        return BodyMotion(
+            rotation,
+            rate * speed,
+            turn(clock, 2) * speed**2 + rate * change,
+            velocity * speed,
+            position(clock, 2) * speed**2 + velocity * change,
+        )
+
     def to_json(self) -> dict[str, Any]:
         """Lists of numbers, from which `from_json` makes the same path to the last bit."""
         return {
@@ -139,6 +173,18 @@ class Path:
             behind += np.clip(since - ease, 0.0, hold)
             rested += hold + ease
         return t - behind
+
+    def _clock_rates(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """First and second derivative of the knots' clock by t."""
+        speed, change, rested = np.ones_like(t), np.zeros_like(t), 0.0
+        for at, hold, ease in self.stops:
+            since = t - (at + rested - 0.5 * ease)
+            for sign, x in ((-1.0, since), (1.0, since - ease - hold)):
+                x = np.clip(x / ease, 0.0, 1.0) if ease > 0 else (x >= 0).astype(float)
+                speed += sign * x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
+                change += sign * 30.0 * x**2 * (1.0 - x) ** 2 / (ease or 1.0)
+            rested += hold + ease
+        return speed, change
 
 
 def _integrated_step(x: np.ndarray) -> np.ndarray:

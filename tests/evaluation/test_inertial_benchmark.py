@@ -1,0 +1,159 @@
+"""The benchmark of the inertial sensor: its errors on known answers, its faults, its page, and a short run."""
+
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from sigmaslam.cli.commands import app
+from sigmaslam.estimation.constant_velocity import MotionState
+from sigmaslam.geometry.se3 import rotation_log, se3_exp
+from sigmaslam.readers.inertial import InertialRecording
+from sigmaslam_benchmarks.inertial import dark_runs, inertial_benchmark
+from sigmaslam_benchmarks.inertial.dark_runs import METHODS, STATES, DarkCase, DarkResult
+from sigmaslam_benchmarks.inertial.inertial_benchmark import InertialJob
+from sigmaslam_benchmarks.inertial.inertial_page import InertialPage, format_page
+from sigmaslam_benchmarks.inertial.table_faults import FaultResult, shift_clock, swap_sign, turn_axes
+from sigmaslam_benchmarks.live import recordings
+from sigmaslam_benchmarks.live.driver_faults import DrivenFrame
+from sigmaslam_benchmarks.live.judge import References
+from sigmaslam_benchmarks.live.recordings import GoodFrames, Recording
+from sigmaslam_synthetic.inertial import SimulatedInertial, simulate_inertial
+from sigmaslam_synthetic.layouts import save_arrays
+from sigmaslam_synthetic.motion.random_motions import FreeSpace, hand_held
+from tests.support.simulated_stereo import parallel_camera
+
+TIMES = 0.05 * np.arange(30)
+KEYFRAME, FRAME = 12, 20
+SIGMA = np.array([5e-3] * 3 + [2e-3] * 3 + [0.02] * 3 + [0.05] * 3 + [1e-3] * 3 + [0.05] * 3 + [1e-3] * 7)
+
+
+@pytest.fixture(scope="module")
+def walk() -> tuple[SimulatedInertial, np.ndarray]:
+    """A sensor, and the true poses of the frames."""
+    path = hand_held(np.random.default_rng(3), 3.0, FreeSpace((0, 0, 1.5), (1.5, 1.5, 0.3)))
+    rng = np.random.default_rng(0)
+    return simulate_inertial(path, float(TIMES[-1]), 200.0, rng, np.eye(4)), path.poses(TIMES)
+
+
+@pytest.fixture
+def good(walk: tuple[SimulatedInertial, np.ndarray], tmp_path: Path) -> GoodFrames:
+    sensor, poses = walk
+    save_arrays(tmp_path / "truth.npz", asdict(sensor.truth))
+    image = np.zeros((4, 4), np.uint8)
+    frames = [DrivenFrame(k, float(t), image, image) for k, t in enumerate(TIMES)]
+    imu = InertialRecording(tmp_path / "data.csv", sensor.sensor, sensor.samples)
+    return GoodFrames(frames, parallel_camera(64, 48, 50.0, 0.1), References(poses), imu)
+
+
+@pytest.mark.long
+def test_errors_drawn_from_the_covariance_have_a_nees_of_one(good, walk):
+    truth, poses = walk[0].truth, walk[1]
+    rng, mix = np.random.default_rng(1), np.random.default_rng(2).standard_normal((25, 25)) / 5.0
+    root = SIGMA[:, None] * (np.eye(25) + mix)  # all states correlate with all
+    R = poses[KEYFRAME][:3, :3].T
+    row = int(np.argmin(np.abs(truth.timestamp - TIMES[FRAME] - truth.time_shift)))
+    step = np.linalg.inv(poses[KEYFRAME]) @ poses[FRAME]
+    vectors = [R @ truth.velocity[row], R @ truth.gravity, truth.gyro_bias[row], truth.accel_bias[row], np.zeros(7)]
+    found: dict[str, list[float]] = {}
+    for _ in range(400):
+        error = root @ rng.standard_normal(25)
+        others = np.concatenate(vectors) - error[6:]
+        motion = MotionState(se3_exp(-error[:6]) @ step, others, root @ root.T)
+        frame = dark_runs._Tracked("inertial", poses[FRAME], KEYFRAME, motion, True, 0.0)
+        for name, value in dark_runs._state_errors(frame, good, FRAME).items():
+            found.setdefault(name, []).append(value)
+        sigmas, nees = dark_runs._pose_sigmas(frame, good, FRAME)
+        found.setdefault("pose", []).append(nees)
+        found.setdefault("position", []).append(sigmas**2 / 3.0)
+    for name in (*STATES, "pose", "position"):
+        assert np.mean(found[name]) == pytest.approx(1.0, abs=0.15), name
+    ratio = np.sqrt(np.mean(np.square(found["tilt"]))) / np.mean(found["tilt sigma"])
+    assert ratio == pytest.approx(1.0, abs=0.1)
+
+
+def test_faults_change_what_they_say(walk):
+    samples, rng = walk[0].samples, np.random.default_rng(4)
+    for _ in range(20):
+        turned, words = turn_axes(samples, rng)
+        turn = np.linalg.lstsq(samples.gyro, turned.gyro)[0].T
+        np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-9)
+        assert np.linalg.det(turn) == pytest.approx(1.0)
+        assert np.linalg.norm(rotation_log(turn)) > 1.5
+        assert words.startswith("axes are ")
+        other, words = swap_sign(samples, rng)
+        changed = [np.abs(a - b).max(axis=0) > 0 for a, b in ((other.gyro, samples.gyro), (other.accel, samples.accel))]
+        assert np.concatenate(changed).sum() == 1
+        late, _ = shift_clock(samples, rng)
+        assert 0.01 <= abs(late.timestamp[0] - samples.timestamp[0]) <= 0.2
+
+
+RESULT = DarkResult(20, 20, 0, 0, 0, 0.02, 0.1, 1.2, 0.001, 1.1, dict.fromkeys(STATES, 1.2), 0.4, 0.5, 0.003, 50.0, 1.0)
+
+
+def test_the_page_says_which_goals_are_missed_and_what_is_not_named():
+    room, mh01 = Recording("room7", "room", 170, 7, 200.0), Recording("mh01", "mh01", 100, 7)
+    bad = replace(RESULT, end_metres=0.07, end_sigmas=3.0, lost=2, back=-1)
+    runs = {}
+    for recording, result in ((room, RESULT), (mh01, bad)):
+        for method in METHODS:
+            runs[recording, DarkCase(method)] = RESULT
+            runs[recording, DarkCase(method, 1.0, 20)] = result
+    good = FaultResult("", "good", True, ["/home/me/imu0/data.csv: a|b"])
+    faults = [(room, FaultResult("sign", "sign of rate x", False, [])), (room, good)]
+    page = format_page(InertialPage("sigmaslam benchmark inertial", (1.0, 2.0), runs, faults, 3))
+    assert "| MH_01, 1 s: frames lost | 0 | 2, **missed** |" in page
+    assert "| MH_01, 1 s: largest error, m | 0.05 | 0.070, **missed** |" in page
+    assert "| renders with images: NEES of gyro bias | 0.7 - 1.4 | 1.20 |" in page
+    assert "Missed: MH_01, 1 s: frames lost (2)" in page
+    assert "| faulty tables that are named | all | 0 of 1, **missed** |" in page
+    assert "| room7 | sign of rate x | nothing |" in page
+    assert "- room7: imu0/data.csv: a\\|b" in page
+    assert "**3 runs are missing: the same command goes on.**" in page
+    assert "| room | 1 | images | 1 | 20 | 20 | 0 | 0 | 0 | 100% | 0.020 | 0.020 |" in page
+    assert "| mh01 | 20 | " not in page
+
+
+def test_a_dark_stretch_leaves_frames_after_it_and_faults_are_dealt_to_the_first_recordings(tmp_path):
+    chosen = inertial_benchmark._recordings(["room", "street", "mh01"], 100, 10)
+    jobs = [InertialJob(each, tmp_path, None, "code") for each in chosen]
+    assert [each.name for each in chosen[:3]] == ["mh01", "room100", "street100"]
+    for job in jobs:
+        rate = 10.0 if job.recording.kind == "street" else 20.0
+        ends = [case.first + round(case.seconds * rate) for case in job.cases]
+        assert max(ends) <= job.recording.frames - 5
+        assert {case.seconds for case in job.cases} >= {0.0, 0.5, 1.0, 2.0}
+    inertial_benchmark._deal_faults(jobs, 100)
+    dealt = [kind for job in jobs for kind, _ in job.faults if kind]
+    assert len(dealt) == 40
+    assert {kind: dealt.count(kind) for kind in dealt} == dict.fromkeys(["deg/s", "g", "axes", "sign", "clock"], 8)
+    assert [len(job.faults) > 0 for job in jobs] == [True] * 7 + [False] * (len(jobs) - 7)
+
+
+@pytest.mark.slow
+def test_the_command_judges_a_short_render_and_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    pytest.importorskip("torch")
+
+    def run_here(work, jobs, workers, ended):
+        for job in jobs:
+            ended(job, work(job))
+
+    monkeypatch.setitem(recordings.RENDERED, "room", (160, 120))
+    monkeypatch.setitem(inertial_benchmark._FRAMES, "room", 45)
+    monkeypatch.setitem(inertial_benchmark._STARTS, "room", (26,))
+    monkeypatch.setattr(inertial_benchmark, "SECONDS", (0.5,))
+    monkeypatch.setattr(inertial_benchmark, "FAULTS", 1)
+    monkeypatch.setattr(inertial_benchmark, "run_jobs", run_here)
+    words = ["benchmark", "inertial", "--out", str(tmp_path / "page.md"), "--runs", str(tmp_path / "runs")]
+    words += ["--seeds", "1", "--first-seed", "8", "--worlds", "room"]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    page = (tmp_path / "page.md").read_text()
+    assert "| room | 0.5 | both sensors | 1 | 10 |" in page
+    assert "| deg/s | 1 |" in page
+    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").glob("*.json")}
+    assert len(kept) == 6
+    assert CliRunner().invoke(app, words).exit_code == 0
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").glob("*.json")} == kept
