@@ -5,10 +5,10 @@ from __future__ import annotations
 import logging
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from torch.fx.experimental.proxy_tensor import make_fx
 from sigmaslam_filters.bayes import BayesFilter
 from sigmaslam_filters.core.noise_covariance import as_noise
 from sigmaslam_filters.core.plain_factors import traced_for_export
+from sigmaslam_filters.core.tensors import Inputs, as_inputs
 from sigmaslam_filters.core.transforms import Taylor
 from sigmaslam_filters.gaussian_belief import Gaussian
 from sigmaslam_filters.graphs.exact_operators import ExactOperators
@@ -46,15 +47,23 @@ class StepExample:
         belief: without a batch, or with one dimension of it; the graph's batch is free.
         value: (m,) what was measured or, of several measurements of the model at one time, (l, m), of which the graph
             leaves the number free; behind the belief's batch. None: the graph predicts only.
-        motion_inputs: what `predict` passes on to the motion's function, in its order, by names for the graph.
+        motion_inputs: what `predict` passes on to the motion's function, in its order, by names for the graph; without
+            names they are motion_input_0, motion_input_1, ...
         measurement_inputs: the same of `update`: (·) behind the belief's batch or, for each of several measurements,
             (l, ·). One without the belief's batch is for all.
     """
 
     belief: Gaussian
     value: Tensor | None = None
-    motion_inputs: Mapping[str, Tensor] = field(default_factory=dict)
-    measurement_inputs: Mapping[str, Tensor] = field(default_factory=dict)
+    motion_inputs: Inputs = ()
+    measurement_inputs: Inputs = ()
+
+    def named(self, kind: Literal["motion", "measurement"]) -> Mapping[str, Tensor]:
+        """Inputs of a model by their names."""
+        given: Inputs = getattr(self, f"{kind}_inputs")
+        if isinstance(given, Mapping):
+            return given
+        return {f"{kind}_input_{k}": each for k, each in enumerate(as_inputs(given))}
 
 
 def export_step(
@@ -134,10 +143,10 @@ class _Step(nn.Module):
         """The example by the names of the graph's inputs."""
         example, belief = self.example, self.example.belief
         held = {"root": belief.factor} if self.by_root else {"covariance": belief.covariance}
-        named = {"mean": belief.mean, **held, **example.motion_inputs}
+        named = {"mean": belief.mean, **held, **example.named("motion")}
         if example.value is not None:
             named["value"] = example.value
-        for name, given in example.measurement_inputs.items():
+        for name, given in example.named("measurement").items():
             if name in named and named[name] is not given:
                 raise ValueError(f"{name!r} names two inputs of the graph: give one of them another name")
             named[name] = given
@@ -165,12 +174,12 @@ class _Step(nn.Module):
             belief = Gaussian(named["mean"], named["covariance"])
         healthy = torch.ones_like(belief.mean[..., 0], dtype=torch.bool)
         if self.motion is not None:
-            moved = self.bayes.predict(belief, self.motion, *(named[name] for name in self.example.motion_inputs))
+            moved = self.bayes.predict(belief, self.motion, *(named[name] for name in self.example.named("motion")))
             belief, healthy = moved.belief, healthy & moved.healthy
         if self.measurement is None:
             return belief.mean, belief.held, healthy
         value, measurement = named["value"], self.measurement
-        inputs = [named[name] for name in self.example.measurement_inputs]
+        inputs = [named[name] for name in self.example.named("measurement")]
         if self.is_stack:
             measurement = several(measurement, value.shape[-2])
             inputs = [self._for_each(one) for one in inputs]
@@ -192,7 +201,7 @@ class _Step(nn.Module):
         if given is value:
             return batched, self.is_stack
         # The belief and the motion's inputs have no such dimension, whatever their sizes are.
-        seen = any(given is one for one in self.example.measurement_inputs.values())
+        seen = any(given is one for one in self.example.named("measurement").values())
         each = self.is_stack and batched and seen and value is not None and given.shape[:2] == value.shape[:2]
         return batched, each and given.ndim > 2
 
@@ -233,7 +242,7 @@ def _complete(example: StepExample) -> StepExample:
         value = None if example.value is None else example.value[None]
         motion, measurement = (
             {name: given[None] for name, given in inputs.items()}
-            for inputs in (example.motion_inputs, example.measurement_inputs)
+            for inputs in (example.named("motion"), example.named("measurement"))
         )
         belief = belief.expand((1,))
         example = replace(example, belief=belief, value=value, motion_inputs=motion, measurement_inputs=measurement)
