@@ -235,7 +235,14 @@ def _student(distance: Tensor, count: Tensor) -> Tensor:
 
 def _quantiles(probability: float, count: Tensor, size: int, like: Tensor) -> Tensor:
     """Chi-square quantiles (..., b) for blocks of that size of which some components are missing."""
-    return torch.tensor(_quantiles_up_to(probability, size), dtype=like.dtype, device=like.device)[count]
+    known = _quantiles_up_to(probability, size)
+    if not torch.compiler.is_compiling():
+        return torch.tensor(known, dtype=like.dtype, device=like.device)[count]
+    # A table is no arithmetic.
+    found = torch.full_like(like, known[0])
+    for dof, quantile in enumerate(known):
+        found = torch.where(count == dof, quantile, found)
+    return found
 
 
 @torch.compiler.assume_constant_result

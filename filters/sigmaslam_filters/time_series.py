@@ -88,10 +88,8 @@ class Track:
             prior: before the first step.
             steps: what `predict` and `update` returned in each, each of the belief before; None where it was not asked.
         Raises:
-            ValueError: there is no step, or the batch changes on the way.
+            ValueError: the batch changes on the way.
         """
-        if not steps:
-            raise ValueError("a sequence needs one event at least")
         predicted, filtered = [], []
         for prediction, update in steps:
             predicted.append((filtered[-1] if filtered else prior) if prediction is None else prediction.belief)
@@ -178,9 +176,7 @@ class SequenceFilter(ABC):
             FilterError: as `predict` and `update`; the message begins with the step.
             ValueError: there is no event, or shapes do not fit.
         """
-        batch = torch.broadcast_shapes(
-            belief.batch_shape, *(event.value.shape[:-1] for event in events if isinstance(event.value, Tensor))
-        )
+        batch = common_batch(belief, events)
         if belief.batch_shape != batch:
             belief = belief.expand(batch)
         prior, steps = belief, []
@@ -267,6 +263,18 @@ class SequenceFilter(ABC):
             lower = columns if chart is None else triangularise(carried)
             return Gaussian(mean, factor=lower, factor_is_lower=True)
         return Gaussian(mean, square(carried), is_symmetric=True)
+
+
+def common_batch(belief: Gaussian, events: Sequence[Event]) -> torch.Size:
+    """The batch of a belief and of the values of events together.
+
+    Raises:
+        ValueError: there is no event.
+    """
+    if not events:
+        raise ValueError("a sequence needs one event at least")
+    shapes = {event.value.shape[:-1] for event in events if isinstance(event.value, Tensor)}
+    return torch.broadcast_shapes(belief.batch_shape, *shapes)
 
 
 def _each(given: Any, count: int, name: str) -> Sequence[Any]:
