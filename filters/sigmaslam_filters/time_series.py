@@ -176,7 +176,10 @@ class SequenceFilter(ABC):
             FilterError: as `predict` and `update`; the message begins with the step.
             ValueError: there is no event, or shapes do not fit.
         """
-        batch = common_batch(belief, events)
+        if not events:
+            raise ValueError("a sequence needs one event at least")
+        shapes = {event.value.shape[:-1] for event in events if isinstance(event.value, Tensor)}
+        batch = torch.broadcast_shapes(belief.batch_shape, *shapes)
         if belief.batch_shape != batch:
             belief = belief.expand(batch)
         prior, steps = belief, []
@@ -265,16 +268,47 @@ class SequenceFilter(ABC):
         return Gaussian(mean, square(carried), is_symmetric=True)
 
 
-def common_batch(belief: Gaussian, events: Sequence[Event]) -> torch.Size:
-    """The batch of a belief and of the values of events together.
+def interleaved(streams: Sequence[Event], order: Tensor) -> list[Event]:
+    """Events in the order of time, of streams by sensors.
+
+    Args:
+        streams: for each sensor an event whose value (n, ..., m) and inputs (n, ...) are those of its n readings.
+        order: (T,) which stream each event is the next of.
+    Raises:
+        ValueError: a stream has another length than the order says.
+    """
+    check_streams(streams, order)
+    taken, events = [0] * len(streams), []
+    for k in order.tolist():
+        stream, at = streams[k], taken[k]
+        taken[k] += 1
+        moving, seeing = (
+            tuple(each[at] for each in as_inputs(given)) for given in (stream.motion_inputs, stream.measurement_inputs)
+        )
+        value = None if stream.value is None else stream.value[at]
+        events.append(
+            Event(stream.motion, stream.measurement, value, moving, seeing, gate=stream.gate, robust=stream.robust)
+        )
+    return events
+
+
+def check_streams(streams: Sequence[Event], order: Tensor) -> None:
+    """Lengths of streams are those that the order (T,) has of each.
 
     Raises:
-        ValueError: there is no event.
+        ValueError: they are not.
     """
-    if not events:
-        raise ValueError("a sequence needs one event at least")
-    shapes = {event.value.shape[:-1] for event in events if isinstance(event.value, Tensor)}
-    return torch.broadcast_shapes(belief.batch_shape, *shapes)
+    if order.numel() and not 0 <= int(order.min()) <= int(order.max()) < len(streams):
+        raise ValueError(
+            f"the order names streams {int(order.min())} to {int(order.max())}, but {len(streams)} are given"
+        )
+    for k, stream in enumerate(streams):
+        count = int((order == k).sum())
+        values = () if stream.value is None else (stream.value,)
+        given = [*values, *as_inputs(stream.motion_inputs), *as_inputs(stream.measurement_inputs)]
+        if any(len(each) != count for each in given):
+            lengths = ", ".join(str(len(each)) for each in given)
+            raise ValueError(f"stream {k} comes {count} times in the order, but its value and inputs have {lengths}")
 
 
 def _each(given: Any, count: int, name: str) -> Sequence[Any]:

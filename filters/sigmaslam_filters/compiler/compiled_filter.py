@@ -13,14 +13,14 @@ from torch import Tensor
 
 from sigmaslam_filters.bayes import BayesFilter
 from sigmaslam_filters.compiler.compiled_step import compile_step
-from sigmaslam_filters.compiler.event_kinds import RESULTS, Group, Kind, as_belief, grouped
+from sigmaslam_filters.compiler.event_kinds import RESULTS, Group, Kind, Stream, as_belief, grouped, streams_of
 from sigmaslam_filters.core.factors import is_differentiated
 from sigmaslam_filters.core.tensors import Inputs, as_inputs
 from sigmaslam_filters.gaussian_belief import Gaussian
 from sigmaslam_filters.models import AnyMeasurement, AnyMotion
 from sigmaslam_filters.results import TimeUpdate
 from sigmaslam_filters.robust import Robust
-from sigmaslam_filters.time_series import Event, Track, common_batch, count_steps
+from sigmaslam_filters.time_series import Event, Track, check_streams, count_steps, interleaved
 
 _log = logging.getLogger(__name__)
 # Larger batches fill a processor's registers, and a loop around compiled steps over them is faster.
@@ -105,15 +105,36 @@ class CompiledFilter:
             FilterError: as `filter_events`, by which a sequence that fails is filtered once more.
             ValueError: shapes do not fit.
         """
-        batch = common_batch(belief, events)
+        return self._of_streams(belief, streams_of(events), lambda: events)
+
+    def filter_streams(self, belief: Gaussian, streams: Sequence[Event], order: Tensor) -> Track:
+        """`filter_events` of `interleaved(streams, order)`, which takes a tenth of the time without so many objects."""
+        check_streams(streams, order)
+        given = []
+        for k, stream in enumerate(streams):
+            inputs = list(as_inputs(stream.motion_inputs)), list(as_inputs(stream.measurement_inputs))
+            if len(times := (order == k).nonzero()[:, 0]):
+                given.append(Stream(stream, times, stream.value, *inputs))
+        return self._of_streams(belief, given, lambda: interleaved(streams, order))
+
+    def _of_streams(self, belief: Gaussian, streams: Sequence[Stream], events: Callable[[], Sequence[Event]]) -> Track:
+        shapes = {stream.value.shape[1:-1] for stream in streams if stream.value is not None}
+        if not streams:
+            raise ValueError("a sequence needs one event at least")
+        batch = torch.broadcast_shapes(belief.batch_shape, *shapes)
         prior = belief if belief.batch_shape == batch else belief.expand(batch)
         by_root = self.bayes.goes_on_with_roots(prior)
-        groups = grouped(self.bayes, events, by_root, self._varying, self._constants)
+        groups = grouped(self.bayes, streams, by_root, self._varying, self._constants)
+        made: list[Sequence[Event]] = []
 
         def moves(k: int) -> tuple[AnyMotion | None, Sequence[Tensor]]:
-            return events[k].motion, as_inputs(events[k].motion_inputs)
+            if not made:
+                made.append(events())
+            event = made[0][k]
+            return event.motion, as_inputs(event.motion_inputs)
 
-        return self._track(prior, len(events), groups, moves, lambda: self.bayes.filter_events(belief, events))
+        count = sum(len(stream.times) for stream in streams)
+        return self._track(prior, count, groups, moves, lambda: self.bayes.filter_events(belief, events()))
 
     def _track(
         self,

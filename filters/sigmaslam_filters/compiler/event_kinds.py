@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -106,65 +107,102 @@ class Group:
     trailing: list[int | None]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Stream:
+    """Events of the same models.
+
+    Attributes:
+        event: their models and options.
+        times: (n,) places in the sequence.
+        value: (n, ..., m); None: nothing is measured.
+        moving, seeing: inputs, each (n, ...) or, of all events, (1, ...).
+    """
+
+    event: Event
+    times: Tensor
+    value: Tensor | None
+    moving: list[Tensor]
+    seeing: list[Tensor]
+
+
+def streams_of(events: Sequence[Event]) -> list[Stream]:
+    """Events by their models, as arrays."""
+    alike: dict[Any, list[int]] = {}
+    for k, event in enumerate(events):
+        shape = None if event.value is None else event.value.shape
+        key = id(event.motion), id(event.measurement), event.gate, event.robust, shape
+        places = alike.get(key)
+        if places is None:
+            alike[key] = [k]
+        else:
+            places.append(k)
+    streams = []
+    for places in alike.values():
+        mine = [events[k] for k in places]
+        values = [event.value for event in mine if event.value is not None]
+        moving = _stacked([as_inputs(event.motion_inputs) for event in mine], "motion")
+        seeing = _stacked([as_inputs(event.measurement_inputs) for event in mine], "measurement")
+        times = torch.from_numpy(np.array(places))
+        streams.append(Stream(mine[0], times, _stack(values) if values else None, moving, seeing))
+    return streams
+
+
 def grouped(
-    bayes: BayesFilter, events: Sequence[Event], by_root: bool, varying: set[Any], constants: dict[Any, Any]
+    bayes: BayesFilter, streams: Sequence[Stream], by_root: bool, varying: set[Any], constants: dict[Any, Any]
 ) -> list[Group]:
-    """Events by their kinds.
+    """Streams by the kind of their events.
 
     A model's tensor is a constant of the step if it is the same for all events of the kind, as it was at the last call,
     and no derivative by it is asked for; else it is an input. What was an input once stays one.
 
     Args:
         bayes: the filter.
-        events: all of a sequence.
+        streams: all of a sequence.
         by_root: whether beliefs are held by roots.
         varying: keys of tensors that are inputs, to which more are added.
         constants: tensors by the same keys, as they are in compiled steps, to which more are added.
     """
-    alike: dict[Any, list[int]] = {}
-    for k, event in enumerate(events):
-        shape = None if event.value is None else event.value.shape
-        key = id(event.motion), id(event.measurement), event.gate, event.robust, shape
-        if key in alike:
-            alike[key].append(k)
-        else:
-            alike[key] = [k]
-    families: dict[Any, list[tuple[list[Tensor], list[int]]]] = {}
-    parts: dict[Any, list[_Part]] = {}
-    for places in alike.values():
-        event = events[places[0]]
-        taken = [*_parts(event.motion, True), *_parts(event.measurement, False)]
-        structure = tuple((part.is_motion, part.name, part.type, part.tensor.shape) for part in taken)
-        shape = None if event.value is None else event.value.shape
-        family = _structure(event.motion), _structure(event.measurement), event.gate, event.robust, structure, shape
-        families.setdefault(family, []).append(([part.tensor for part in taken], places))
-        parts[family] = taken
+    families: dict[Any, list[tuple[list[_Part], Stream]]] = {}
+    for stream in streams:
+        event = stream.event
+        parts = [*_parts(event.motion, True), *_parts(event.measurement, False)]
+        given = [each for each in (stream.value, *stream.moving, *stream.seeing) if each is not None]
+        family = (
+            _structure(event.motion), _structure(event.measurement), event.gate, event.robust, len(stream.moving),
+            tuple((part.is_motion, part.name, part.type, part.tensor.shape) for part in parts),
+            tuple(each.shape[1:] for each in given),
+        )  # fmt: skip
+        families.setdefault(family, []).append((parts, stream))
     groups = []
     for family, members in families.items():
-        first = events[members[0][1][0]]
-        inputs, trailing, places_of = [], [], []
-        for i, part in enumerate(parts[family]):
-            key = family, i
-            mine = [tensors[i] for tensors, _ in members]
-            same = all(each is mine[0] for each in mine)
-            known = constants.setdefault(key, mine[0])
-            if not same or mine[0].requires_grad or known is not mine[0]:
-                varying.add(key)
-            if key in varying:
-                places_of.append((part.is_motion, part.name, part.type))
+        (first_parts, first), counts = members[0], [len(stream.times) for _, stream in members]
+        inputs, trailing, places = [], [], []
+        for i, part in enumerate(first_parts):
+            tensors = [parts[i].tensor for parts, _ in members]
+            same = all(each is part.tensor for each in tensors)
+            if (
+                not same
+                or part.tensor.requires_grad
+                or constants.setdefault((family, i), part.tensor) is not part.tensor
+            ):
+                varying.add((family, i))
+            if (family, i) in varying:
+                places.append((part.is_motion, part.name, part.type))
                 trailing.append(part.trailing)
-                inputs.append(mine[0][None] if same else _repeated(mine, [len(places) for _, places in members]))
-        times = [k for _, places in members for k in places]
-        mine = [events[k] for k in times]
-        if first.measurement is not None:
-            inputs.append(torch.stack([event.value for event in mine]))  # type: ignore[misc]
+                inputs.append(part.tensor[None] if same else _joined([each[None] for each in tensors], counts))
+        if first.value is not None:
+            inputs.append(_joined([stream.value for _, stream in members], counts))  # type: ignore[misc]
             trailing.append(1)
-        moving = _stacked((as_inputs(event.motion_inputs) for event in mine), "motion")
-        seeing = _stacked((as_inputs(event.measurement_inputs) for event in mine), "measurement")
-        inputs += [*moving, *seeing]
-        trailing += [None] * (len(moving) + len(seeing))
-        kind = Kind(bayes, first.motion, first.measurement, first.gate, first.robust, places_of, len(moving), by_root)
-        groups.append(Group((family, tuple(places_of)), kind, torch.tensor(times), inputs, trailing))
+        for name in ("moving", "seeing"):
+            columns = zip(*(getattr(stream, name) for _, stream in members), strict=True)
+            inputs += [_joined(column, counts) for column in columns]
+        trailing += [None] * (len(first.moving) + len(first.seeing))
+        event = first.event
+        kind = Kind(
+            bayes, event.motion, event.measurement, event.gate, event.robust, places, len(first.moving), by_root
+        )
+        times = torch.cat([stream.times for _, stream in members])
+        groups.append(Group((family, tuple(places)), kind, times, inputs, trailing))
     return groups
 
 
@@ -199,22 +237,32 @@ def _structure(model: AnyMotion | AnyMeasurement | None) -> Any:
     return type(model), *(None if isinstance(v, Tensor) or type(v) in _OF_NOISE else v for v in values)
 
 
-def _repeated(tensors: Sequence[Tensor], counts: Sequence[int]) -> Tensor:
-    return torch.cat([each.expand(count, *each.shape) for each, count in zip(tensors, counts, strict=True)])
+def _joined(arrays: Sequence[Tensor], counts: Sequence[int]) -> Tensor:
+    """Arrays (n, ...), or (1, ...) for n events, of several streams one after the other."""
+    if len(arrays) == 1:
+        return arrays[0]
+    return torch.cat([each.expand(count, *each.shape[1:]) for each, count in zip(arrays, counts, strict=True)])
 
 
-def _stacked(given: Iterable[Sequence[Tensor]], name: str) -> list[Tensor]:
+def _stacked(rows: list[tuple[Tensor, ...]], name: str) -> list[Tensor]:
     """Inputs of several events (n, ...)."""
-    rows = list(given)
+    if not any(rows):
+        return []
     try:
-        columns = list(zip(*rows, strict=True))
-        return [
-            column[0][None] if all(each is column[0] for each in column) else torch.stack(column) for column in columns
-        ]
-    except (RuntimeError, ValueError) as error:
-        raise ValueError(
-            f"{name} inputs of events with one {name} have different numbers or shapes: {error}"
-        ) from error
+        return [_stack(column) for column in zip(*rows, strict=True)]
+    except ValueError as error:
+        raise ValueError(f"{name} inputs of events with one {name} differ in number or shape: {error}") from error
+
+
+def _stack(column: Sequence[Tensor]) -> Tensor:
+    """Tensors of one shape as (n, ...); (1, ...) if they are one."""
+    first, shapes = column[0], {each.shape for each in column}
+    if len(shapes) > 1:
+        raise ValueError(", ".join(str(tuple(shape)) for shape in shapes))
+    if column[-1] is first and all(each is first for each in column):
+        return first[None]
+    # Many times as fast as `torch.stack`, which makes a view of each.
+    return torch.cat(list(column)).reshape(len(column), *first.shape) if first.ndim else torch.stack(list(column))
 
 
 def as_belief(mean: Tensor, held: Tensor, by_root: bool) -> Gaussian:

@@ -49,9 +49,12 @@ def require_dtype(name: str, given: Tensor, expected: torch.dtype) -> None:
 
 def as_inputs(given: Inputs) -> tuple[Tensor, ...]:
     """Inputs in order, however they are given."""
+    if isinstance(given, tuple):
+        return given
     if isinstance(given, Tensor):
         return (given,)
-    return tuple(given.values() if isinstance(given, Mapping) else given)
+    # Asking for a dict is quick, for a Mapping it is not.
+    return tuple(given.values() if isinstance(given, dict) or isinstance(given, Mapping) else given)  # noqa: SIM101
 
 
 def require_symmetric(name: str, matrix: Tensor) -> None:
