@@ -90,7 +90,8 @@ class Track:
         Raises:
             ValueError: the batch changes on the way.
         """
-        predicted, filtered = [], []
+        predicted: list[Gaussian] = []
+        filtered: list[Gaussian] = []
         for prediction, update in steps:
             predicted.append((filtered[-1] if filtered else prior) if prediction is None else prediction.belief)
             filtered.append(predicted[-1] if update is None else update.belief)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
 import logging
-from pathlib import Path
 
 import pytest
 import torch
@@ -13,6 +11,7 @@ from torch import Tensor
 import sigmaslam_filters as filters
 from sigmaslam_filters import Event, systems
 from sigmaslam_filters.compiler.scalar_sequence import CompiledStep
+from tests.support.examples import load_example
 from tests.support.filter_assertions import assert_close, assert_same_belief
 from tests.support.filter_builders import beliefs, bent_measurement, bent_motion, covariances, random_numbers, tensor
 
@@ -143,19 +142,14 @@ def test_streams_are_events_in_their_order_for_large_batches_too(caplog):
 def test_events_that_fail_are_named_as_elsewhere():
     ukf = filters.UnscentedKalmanFilter()
     sequence = [Event(None, SPEED, tensor(0.1)), Event(None, SPEED, tensor(torch.inf))]
-    with pytest.raises(filters.FilterError, match="step 1 of 2.*measured value"):
+    with pytest.raises(filters.FilterError, match=r"step 1 of 2.*measured value"):
         filters.compile_filter(ukf).filter_events(beliefs(2), sequence)
 
 
 @pytest.mark.slow
 def test_the_vehicle_of_the_examples(tmp_path):
     """Late fixes are worth no less than those in time, once they are there; headers are torch to 1e-12."""
-    path = Path(__file__).parents[2] / "examples" / "fuse_vehicle.py"
-    spec = importlib.util.spec_from_file_location("fuse_vehicle", path)
-    assert spec is not None
-    assert spec.loader is not None
-    example = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(example)
+    example = load_example("fuse_vehicle")
     streams, order, truth = example.simulate(400)
     sequence = filters.interleaved(streams, order)
     compiled = filters.compile_filter(example.FILTER).filter_streams(example.start(), streams, order)
@@ -167,6 +161,18 @@ def test_the_vehicle_of_the_examples(tmp_path):
     assert_same_belief(example.late(sequence)[-1], compiled.filtered[-1], 1e-12)
     assert max(example.export(tmp_path).values()) < 1e-12
     assert sorted(file.name for file in tmp_path.iterdir()) == ["compass.hpp", "gps.hpp", "wheel.hpp"]
+
+
+@pytest.mark.slow
+def test_noise_is_learned_by_gradients_through_the_compiled_filter():
+    example = load_example("learn_noise")
+    values, fast = example.simulate(300, seed=1), filters.compile_filter(example.FILTER).filter_events
+    found = example.learn(values, fast)
+    # At the maximum the derivative by the logarithms vanishes, uncompiled as well.
+    slope, _ = example.gradient(found.log(), values, example.FILTER.filter_events)
+    assert float(slope.abs().max()) < 1.0
+    assert 0.8 < float(found[1] / example.TRUTH[1]) < 1.25
+    assert 0.3 < float(found[0] / example.TRUTH[0]) < 3.0
 
 
 @pytest.mark.slow

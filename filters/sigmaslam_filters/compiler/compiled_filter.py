@@ -180,7 +180,11 @@ class CompiledFilter:
         return Track(
             as_belief(predicted[0], predicted[1], by_root),
             filtered,
-            *(named[name] for name in ("innovation", "nis", "count", "log_likelihood", "healthy")),
+            named["innovation"],
+            named["nis"],
+            named["count"],
+            named["log_likelihood"],
+            named["healthy"],
             _Predictions(self.bayes, prior, filtered, moves),
         )
 
@@ -241,7 +245,7 @@ class CompiledFilter:
             given = (each[index if len(each) > 1 else 0] for each in inputs[kind])
             with torch.no_grad():
                 found = self._steps[key](*state, *given)
-            state = found[:2]
+            state = found[0], found[1]
             for slot, each in zip(group.kind.slots, found, strict=True):
                 into = results[slot][t]
                 into[(..., slice(0, each.shape[-1])) if RESULTS[slot] == "innovation" else ...] = each

@@ -176,7 +176,9 @@ def grouped(
     groups = []
     for family, members in families.items():
         (first_parts, first), counts = members[0], [len(stream.times) for _, stream in members]
-        inputs, trailing, places = [], [], []
+        inputs: list[Tensor] = []
+        trailing: list[int | None] = []
+        places: list[tuple[bool, str, type | None]] = []
         for i, part in enumerate(first_parts):
             tensors = [parts[i].tensor for parts, _ in members]
             same = all(each is part.tensor for each in tensors)

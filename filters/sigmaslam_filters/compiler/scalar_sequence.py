@@ -114,12 +114,12 @@ def run_sequence(plan: Plan, state: Sequence[Tensor], inputs: Sequence[Sequence[
         inputs: of each kind, (n, B, ...) for its n events; a length of 1 is for all events, or all elements.
     """
     flat = [each for kind in inputs for each in kind]
-    return list(_Run.apply(plan, *state, *flat))
+    return list(_Run.apply(plan, *state, *flat))  # type: ignore[no-untyped-call]
 
 
 class _Run(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, plan: Plan, *given: Tensor) -> tuple[Tensor, ...]:  # type: ignore[override]
+    def forward(ctx: Any, plan: Plan, *given: Tensor) -> tuple[Tensor, ...]:
         events, batch = len(plan.kind), len(given[0])
         arrays = [each.detach().contiguous() for each in given]
         states = [torch.cat([first[None], first.new_zeros(events, *first.shape)]) for first in arrays[:2]]
@@ -134,7 +134,7 @@ class _Run(torch.autograd.Function):
         return tuple(results)
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor | None) -> Any:  # type: ignore[override]
+    def backward(ctx: Any, *gradients: Tensor | None) -> Any:
         plan, wanted = ctx.plan, ctx.wanted
         states, inputs = ctx.saved_tensors[:2], ctx.saved_tensors[2:]
         by_state = [torch.zeros_like(each) for each in states]

@@ -169,7 +169,7 @@ class Dense(Noise):
         require_tensor(name, covariance)
         if covariance.ndim < 2 or covariance.shape[-1] != covariance.shape[-2]:
             raise ValueError(
-                f"{name} must be a covariance (..., m, m), got {tuple(covariance.shape)}; variances alone are a "
+                f"{name}: a covariance (..., m, m) expected, got {tuple(covariance.shape)}; variances alone are a "
                 "Diagonal"
             )
         if may_look(covariance):
