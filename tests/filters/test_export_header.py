@@ -64,7 +64,7 @@ def test_a_program_with_the_header_follows_a_robot_as_torch_does(make, dtype, tm
     assert not {"new ", "malloc", "std::vector"} & {word for word in ("new ", "malloc", "std::vector") if word in text}
     (tmp_path / "main.cpp").write_text(PROGRAM)
     flags = ["-std=c++17", "-O1", "-Wall", "-Werror", "-Wno-unused-variable", "-o", "robot"]
-    subprocess.run([compiler, *flags, "main.cpp"], cwd=tmp_path, check=True, timeout=300)
+    subprocess.run([compiler, *flags, "main.cpp"], cwd=tmp_path, check=True, timeout=600)
     by_root = dtype == torch.float32
     belief = filters.Gaussian(prior.mean, factor=prior.factor, factor_is_lower=True) if by_root else prior
     numbers = [*belief.mean.tolist(), *belief.held.flatten().tolist()]

@@ -21,7 +21,9 @@ from sigmaslam_filters.models import AnyMeasurement, AnyMotion
 from sigmaslam_filters.robust import Robust
 
 Run = Callable[[Mapping[str, Tensor]], dict[str, Tensor]]
-_TAKEN = {"mean", "covariance", "root", "value", "update", "predict", "Number", "Update", "int", "double", "float"}
+# Names of the header, and the words of C++ that users are likely to take.
+_TAKEN = """mean covariance root update predict result healthy Number Update sign modulo std int double float char short
+long bool auto const this new switch case default static struct"""
 
 
 def write_header(
@@ -87,7 +89,8 @@ def write_header(
 
 def _name(given: str) -> str:
     """A name in C++."""
-    if not re.fullmatch(r"[A-Za-z]\w*", given) or given in _TAKEN - {"value"} or keyword.iskeyword(given):
+    generated = re.fullmatch(r"[vio]\d+", given)
+    if generated or not re.fullmatch(r"[A-Za-z]\w*", given) or given in _TAKEN.split() or keyword.iskeyword(given):
         raise ValueError(f"{given!r} cannot name anything in C++: give it another name")
     return given
 

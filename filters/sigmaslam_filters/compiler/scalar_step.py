@@ -200,6 +200,8 @@ class ScalarStep:
             return f"{self._operand(condition, torch.bool)} ? {chosen[0]} : {chosen[1]}"
         if name in ("convert_element_type", "_to_copy"):
             return f"({TYPES[dtype]})({self._operand(node.args[0], tensors[0])})"
+        if name == "mul" and dtype == torch.bool:
+            name = "bitwise_and"
         if name.startswith("bitwise") and common != torch.bool:
             raise ScalarStepError(f"there is no form of {node.target} in C++")
         # Comparisons are made in the dtype of what is compared.

@@ -351,7 +351,7 @@ def _header(step: _Step, path: Path) -> Callable[[Mapping[str, Tensor]], dict[st
         motion = step.motion, {name: named[name] for name in step.example.named("motion")}
     try:
         return write_header(path, step.bayes, step.example.belief[0], motion, measurement, step.gate, step.robust)
-    except (ScalarStepError, ValueError) as error:
+    except (ScalarStepError, ValueError, RuntimeError) as error:
         raise ExportError(f"this step cannot be written as a header: {error}") from error
 
 
