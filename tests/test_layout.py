@@ -51,7 +51,7 @@ FLOORS = (
     ("__main__", "sigmaslam_benchmarks"),
 )
 # The filters likewise, from the ground up; "" is the files that users read first.
-FILTER_FLOORS = (("core", "consistency"), ("manifolds",), ("",), ("compiler", "graphs"))
+FILTER_FLOORS = (("core", "consistency"), ("manifolds",), ("",), ("compiler",), ("graphs",))
 # Rooms whose numbers decide what a pose is.
 EXPLAINED = ("frontend", "two_view", "estimation", "slam")
 # Of the tracker.

@@ -17,7 +17,7 @@ from sigmaslam_filters.models import LinearMeasurement, LinearMotion, Measuremen
 from sigmaslam_filters.particles import ParticleFilter, Particles
 from sigmaslam_filters.point_estimates import Observation, PointEstimate, maximum_a_posteriori, maximum_likelihood
 from sigmaslam_filters.results import TimeUpdate, Update
-from sigmaslam_filters.time_series import Event, Track
+from sigmaslam_filters.time_series import Event, Track, interleaved
 
 __all__ = [
     "SE2",
@@ -61,6 +61,7 @@ __all__ = [
     "degree_of_belief",
     "export_step",
     "fit_noise",
+    "interleaved",
     "julier",
     "maximum_a_posteriori",
     "maximum_likelihood",

@@ -9,7 +9,15 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from sigmaslam_filters.checks import check_belief, check_entering, check_inputs, check_motion, check_update
+from sigmaslam_filters.checks import (
+    check_belief,
+    check_entering,
+    check_inputs,
+    check_model,
+    check_motion,
+    check_space,
+    check_update,
+)
 from sigmaslam_filters.core.columns import Columns, noise_entering, predicted_covariance, predicted_factor
 from sigmaslam_filters.core.factors import (
     both,
@@ -29,7 +37,15 @@ from sigmaslam_filters.core.transforms import Exact, Taylor, Transform, Unscente
 from sigmaslam_filters.gaussian_belief import Gaussian
 from sigmaslam_filters.linearisation import Linearisation, LinearisedMeasurement
 from sigmaslam_filters.manifolds import Space
-from sigmaslam_filters.models import AnyMeasurement, AnyMotion, LinearMeasurement, LinearMotion, is_additive
+from sigmaslam_filters.models import (
+    MEASUREMENTS,
+    MOTIONS,
+    AnyMeasurement,
+    AnyMotion,
+    LinearMeasurement,
+    LinearMotion,
+    is_additive,
+)
 from sigmaslam_filters.results import TimeUpdate, Update
 from sigmaslam_filters.robust import Robust
 from sigmaslam_filters.sight import Sight
@@ -66,6 +82,7 @@ class BayesFilter(SequenceFilter):
     linearisation: Linearisation = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
+        check_space(self.space)
         object.__setattr__(self, "linearisation", Linearisation(self.transform, self.space))
         if self.form != "auto" and self.form not in FORMS:
             raise ValueError(f"form is {self.form!r}; choose auto, {', '.join(FORMS)}")
@@ -85,6 +102,7 @@ class BayesFilter(SequenceFilter):
             FilterError: an element's covariance is not positive semidefinite or not finite, and on_failure is "raise".
             ValueError: shapes do not fit.
         """
+        check_model(motion, MOTIONS, "the motion")
         noise = as_noise(motion.noise, f"{type(motion).__name__}.noise")
         check_belief(belief, self.space)
         check_inputs(inputs)
@@ -108,7 +126,7 @@ class BayesFilter(SequenceFilter):
             factor = predicted_factor(columns, entering, noise_matrix)
             predicted = Gaussian(mean, factor=factor, factor_is_lower=True)
         else:
-            predicted = Gaussian(mean, predicted_covariance(columns, entering, noise_matrix))
+            predicted = Gaussian(mean, predicted_covariance(columns, entering, noise_matrix), is_symmetric=True)
         usable = both(both(finite(mean, predicted.held), usable), _sound_variances(predicted))
         predicted = self._deal_with(usable, predicted, belief, "predict", _suspects(noise, predicted))
         return TimeUpdate(predicted, both(usable, sound), usable, lambda: (root, columns), entering, noise_matrix)
@@ -120,7 +138,8 @@ class BayesFilter(SequenceFilter):
         self.linearisation.require_flat("LinearMotion")
         mean = motion.function(belief.mean, *inputs)
         covariance = multiply(multiply(motion.matrix, belief.covariance), motion.matrix.mT)
-        predicted = Gaussian(mean, covariance + noise_entering(noise, motion.noise_matrix))
+        covariance = covariance + noise_entering(noise, motion.noise_matrix)
+        predicted = Gaussian(mean, covariance, is_symmetric=True)
         healthy = both(finite(mean, predicted.held), nonnegative(noise.variance()))
         healthy = both(healthy, _sound_variances(predicted))
         predicted = self._deal_with(healthy, predicted, belief, "predict", _suspects(noise, predicted))
@@ -164,7 +183,10 @@ class BayesFilter(SequenceFilter):
         posterior = self._correct(belief, solution)
         usable = both(both(finite(posterior.mean, posterior.held), solution.healthy), usable)
         usable = both(usable, _sound_variances(posterior))
-        suspects: dict[str, Callable[[], Tensor]] = {"measurement noise": sight.noise.covariance}
+        suspects: dict[str, Callable[[], Tensor]] = {
+            "measured value": lambda: torch.diag_embed(torch.where(value.isinf(), value, 1.0)),
+            "measurement noise": sight.noise.covariance,
+        }
         if (factored := solution.matrix) is not None:
             suspects["innovation covariance"] = lambda: factored
         posterior = self._deal_with(usable, posterior, belief, "update", suspects)
@@ -176,6 +198,7 @@ class BayesFilter(SequenceFilter):
         self, belief: Gaussian, measurement: AnyMeasurement, value: Tensor, inputs: tuple[Tensor, ...]
     ) -> tuple[Sight, Tensor | None, Gaussian]:
         """What an update looks at, whether its belief needed no mending (...,), and the belief in the value's batch."""
+        check_model(measurement, MEASUREMENTS, "the measurement")
         noise = as_noise(measurement.noise, f"{type(measurement).__name__}.noise")
         batch = check_update(belief, self.space, measurement, noise, value, inputs)
         if belief.batch_shape != batch:
@@ -235,11 +258,11 @@ class BayesFilter(SequenceFilter):
         if self.linearisation.chart is None:
             if solution.root is not None:
                 return Gaussian(mean, factor=solution.root, factor_is_lower=True)
-            return Gaussian(mean, solution.covariance)
+            return Gaussian(mean, solution.covariance, is_symmetric=True)
         carried = self.linearisation.carry(belief.mean, solution.shift, solution.factor(), mean)
         if solution.root is not None:
             return Gaussian(mean, factor=triangularise(carried), factor_is_lower=True)
-        return Gaussian(mean, square(carried))
+        return Gaussian(mean, square(carried), is_symmetric=True)
 
     def _deal_with(
         self, healthy: Tensor | None, result: Gaussian, before: Gaussian, stage: str, suspects: Suspects
@@ -279,6 +302,8 @@ def UnscentedKalmanFilter(  # noqa: N802
     on_failure: OnFailure = "raise",
 ) -> BayesFilter:
     """Sigma points, Table 9.2; `points` from `sigmaslam_filters.core.sigma_points`, by default `cubature()`."""
+    if points is not None and not hasattr(points, "offsets"):
+        raise TypeError(f"points is {points!r}: give a sigma set, such as cubature(), julier(kappa) or merwe(alpha)")
     return BayesFilter(Unscented(points or cubature()), space, form, iterations, on_failure)
 
 

@@ -12,6 +12,24 @@ from sigmaslam_filters.gaussian_belief import Gaussian
 from sigmaslam_filters.manifolds import Space
 from sigmaslam_filters.models import AnyMeasurement, AnyMotion, LinearMeasurement, LinearMotion
 
+# What to do where a batch is none.
+BY_TIME = "What changes with time is given as a list of models, one for each step"
+
+
+def check_space(space: object) -> None:
+    """A space has two functions and two sizes.
+
+    Raises:
+        TypeError: it has not.
+    """
+    lacks = [name for name in ("retract", "local", "point_size", "tangent_size") if not hasattr(space, name)]
+    if space is not None and (lacks or isinstance(space, type)):
+        shown = f"the class {space.__name__}" if isinstance(space, type) else repr(space)
+        raise TypeError(
+            f"space is {shown}: give a manifold such as SE2(), or an object with retract, local, point_size and "
+            "tangent_size; None is R^n"
+        )
+
 
 def check_belief(belief: Gaussian, space: Space | None) -> None:
     """In R^n a mean has as many components as the covariance has rows.
@@ -24,6 +42,19 @@ def check_belief(belief: Gaussian, space: Space | None) -> None:
         raise ValueError(
             f"the mean has {belief.mean.shape[-1]} components, the covariance is {n} x {n}: in R^n they agree; for "
             "points of a manifold give the filter its space"
+        )
+
+
+def check_model(given: object, kinds: tuple[type, ...], where: str) -> None:
+    """A motion is one, and a measurement one.
+
+    Raises:
+        TypeError: it is something else, such as the other one.
+    """
+    if not isinstance(given, kinds):
+        names = " or ".join(kind.__name__ for kind in kinds)
+        raise TypeError(
+            f"{where} must be a {names}, got {type(given).__name__}: Event and filter take the motion first"
         )
 
 
@@ -48,6 +79,7 @@ def check_motion(motion: AnyMotion, noise: Noise, belief: Gaussian) -> None:
     require_dtype(f"{kind}.noise", variance, belief.mean.dtype)
     _check_batch(f"{kind}.noise", variance.shape[:-1], belief.batch_shape)
     if isinstance(motion, LinearMotion):
+        _check_batch(f"{kind}.matrix", motion.matrix.shape[:-2], belief.batch_shape)
         require_dtype(f"{kind}.matrix", motion.matrix, belief.mean.dtype)
         if motion.matrix.shape[-2:] != (n, n):
             raise ValueError(f"{kind}.matrix is {tuple(motion.matrix.shape)}, but the state asks for {n} x {n}")
@@ -104,14 +136,26 @@ def check_update(
             raise ValueError(f"{kind}.matrix is {shape}, but a state of {belief.size} asks for {belief.size} columns")
         if rows != m:
             raise ValueError(f"this {kind} has {rows} components, the value has {m}")
+        _check_batch(f"{kind}.matrix", measurement.matrix.shape[:-2], belief.batch_shape)
     variance = noise.variance()
     require_dtype(f"{kind}.noise", variance, belief.mean.dtype)
     if isinstance(measurement, LinearMeasurement) or measurement.additive:
         given = variance.shape[-1]
         if given != m:
-            raise ValueError(f"{kind}.noise is {given} x {given}, but the value has {m} components: {m} x {m} expected")
-    if measurement.mask is not None and measurement.mask.shape[-1] != m:
-        raise ValueError(f"{kind}.mask is {tuple(measurement.mask.shape)}, but the value has {m} components")
+            returned = measurement.evaluate(belief.mean.unsqueeze(0), *inputs).shape[-1]
+            if returned == given:
+                raise ValueError(
+                    f"the value has {m} components, but {kind}.function returns {returned} and its noise is "
+                    f"{given} x {given}"
+                )
+            raise ValueError(
+                f"{kind}.noise is {given} x {given}, but its function returns {returned} components and the value has "
+                f"{m}: {returned} x {returned} expected"
+            )
+    if measurement.mask is not None:
+        if measurement.mask.shape[-1] != m:
+            raise ValueError(f"{kind}.mask is {tuple(measurement.mask.shape)}, but the value has {m} components")
+        _check_batch(f"{kind}.mask", measurement.mask.shape[:-1], belief.batch_shape)
     _check_batch("the value", value.shape[:-1], belief.batch_shape)
     batch = belief.batch_shape if value.shape[:-1] == belief.batch_shape else _joined(value, belief)
     _check_batch(f"{kind}.noise", variance.shape[:-1], batch)
@@ -129,5 +173,5 @@ def _check_batch(name: str, given: torch.Size, expected: torch.Size) -> None:
         torch.broadcast_shapes(given, expected)
     except RuntimeError:
         raise ValueError(
-            f"the batch of {name} {tuple(given)} does not broadcast to that of the belief, {tuple(expected)}"
+            f"the batch of {name} {tuple(given)} does not broadcast to that of the belief, {tuple(expected)}. {BY_TIME}"
         ) from None

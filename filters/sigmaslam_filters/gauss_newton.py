@@ -54,7 +54,7 @@ class Term:
         if isinstance(self.model, LinearMeasurement):
             predicted, compare = self.model.function(state), None
         else:
-            predicted, compare = self.model.function(state.unsqueeze(0), *self.inputs)[0], self.model.residual
+            predicted, compare = self.model.evaluate(state.unsqueeze(0), *self.inputs)[0], self.model.residual
         if predicted.shape[-1] != self.value.shape[-1]:
             raise ValueError(
                 f"a measurement's function returns {predicted.shape[-1]} components, its value has "
@@ -77,7 +77,7 @@ class Term:
                 columns = problem.columns(anchor, zeta, state) if problem.has_prior else problem.root
                 jacobian = model.jacobian(state, *self.inputs)
             seen = Taylor(jacobian)(
-                lambda offsets: model.function(problem.retract(anchor, shift + offsets), *self.inputs),
+                lambda offsets: model.evaluate(problem.retract(anchor, shift + offsets), *self.inputs),
                 columns,
                 model.residual,
             )

@@ -8,10 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sigmaslam_filters.core.factors import cholesky, may_look, square, triangularise
+from sigmaslam_filters.core.factors import apply, cholesky, may_look, solve_lower, square, triangularise
 from sigmaslam_filters.core.layout import choose
-from sigmaslam_filters.core.tensors import require_floating, require_tensor
+from sigmaslam_filters.core.tensors import require_floating, require_symmetric, require_tensor
 from sigmaslam_filters.core.unrolled_factors import known_lower
+from sigmaslam_filters.manifolds import Space
 
 
 class Gaussian:
@@ -32,6 +33,7 @@ class Gaussian:
         *,
         factor: Tensor | None = None,
         factor_is_lower: bool = False,
+        is_symmetric: bool = False,
     ) -> None:
         """Takes the covariance, or instead of it a square root.
 
@@ -40,8 +42,9 @@ class Gaussian:
             covariance: (..., n, n) symmetric positive semidefinite; leading dimensions broadcast to the mean's.
             factor: (..., n, k) any S with S S^T = covariance. A filter goes on with what it is given.
             factor_is_lower: the factor is known to be lower triangular, which saves making it so.
+            is_symmetric: the covariance is known to be symmetric, which saves a look.
         Raises:
-            ValueError: both or neither are given, or a shape or dtype does not fit.
+            ValueError: both or neither are given, a shape or dtype does not fit, or the covariance is not symmetric.
             TypeError: something other than a tensor is given.
         """
         if (covariance is None) == (factor is None):
@@ -56,13 +59,15 @@ class Gaussian:
         if mean.dtype != given.dtype:
             raise ValueError(f"mean and covariance need one floating dtype, got {mean.dtype} and {given.dtype}")
         require_floating("the belief", mean)
+        if covariance is not None and not is_symmetric and may_look(covariance):
+            require_symmetric("the covariance", covariance)
         if given.shape[:-2] != mean.shape[:-1]:
             try:
                 given = given.expand(*mean.shape[:-1], *given.shape[-2:])
             except RuntimeError:
                 raise ValueError(
                     f"batch of the covariance {tuple(given.shape[:-2])} does not broadcast to that of the mean "
-                    f"{tuple(mean.shape[:-1])}"
+                    f"{tuple(mean.shape[:-1])}; noises that change with time are a list of models, one for each step"
                 ) from None
         self.mean = mean
         self._covariance = given if covariance is not None else None
@@ -125,14 +130,14 @@ class Gaussian:
         """Elements of the batch: `belief[3]`, `belief[:, -1]`."""
         mean = self.mean[_of_batch(index, 1)]
         if self._covariance is not None:
-            return Gaussian(mean, self._covariance[_of_batch(index, 2)])
+            return Gaussian(mean, self._covariance[_of_batch(index, 2)], is_symmetric=True)
         return self._like(mean, lambda matrix: matrix[_of_batch(index, 2)])
 
     def expand(self, batch: Sequence[int]) -> Gaussian:
         """The same belief in every element of a larger batch."""
         mean = self.mean.expand(*batch, -1)
         if self._covariance is not None:
-            return Gaussian(mean, self._covariance.expand(*batch, -1, -1))
+            return Gaussian(mean, self._covariance.expand(*batch, -1, -1), is_symmetric=True)
         return self._like(mean, lambda matrix: matrix.expand(*batch, -1, -1))
 
     def where(self, chosen: Tensor, other: Gaussian) -> Gaussian:
@@ -141,7 +146,7 @@ class Gaussian:
             other = other.expand(self.batch_shape)
         mean = choose(chosen, self.mean, other.mean, 1)
         if self._covariance is not None:
-            return Gaussian(mean, choose(chosen, self._covariance, other.covariance, 2))
+            return Gaussian(mean, choose(chosen, self._covariance, other.covariance, 2), is_symmetric=True)
         factor, sound = other.checked_factor()
         if sound is None:
             return Gaussian(mean, factor=choose(chosen, self.factor, factor, 2), factor_is_lower=True)
@@ -155,15 +160,54 @@ class Gaussian:
         """Another dtype or device, as `Tensor.to`."""
         mean = self.mean.to(*arguments, **options)
         if self._covariance is not None:
-            return Gaussian(mean, self._covariance.to(*arguments, **options))
+            return Gaussian(mean, self._covariance.to(*arguments, **options), is_symmetric=True)
         return self._like(mean, lambda matrix: matrix.to(*arguments, **options))
 
     def batch_last(self) -> Gaussian:
         """The same belief with batch-last memory: `mean[..., i]` is contiguous, and large batches run much faster."""
         mean = _with_batch_last_memory(self.mean, 1)
         if self._covariance is not None:
-            return Gaussian(mean, _with_batch_last_memory(self._covariance, 2))
+            return Gaussian(mean, _with_batch_last_memory(self._covariance, 2), is_symmetric=True)
         return self._like(mean, lambda matrix: _with_batch_last_memory(matrix, 2))
+
+    def sample(self, number: int, generator: torch.Generator | None = None, space: Space | None = None) -> Tensor:
+        """States (number, ..., p) drawn from the belief; on a manifold of its space."""
+        shape = (number, *self.batch_shape, self.size)
+        normal = torch.randn(shape, generator=generator, dtype=self.mean.dtype, device=self.mean.device)
+        points, offsets = self.mean.expand(number, *self.mean.shape), apply(self.factor, normal)
+        return points + offsets if space is None else space.retract(points, offsets)
+
+    def marginal(self, components: Sequence[int]) -> Gaussian:
+        """The belief about some components of a state in R^n, in that order."""
+        kept = self._components(components)
+        if self._covariance is not None:
+            return Gaussian(self.mean[..., kept], self._covariance[..., kept, :][..., kept], is_symmetric=True)
+        return Gaussian(self.mean[..., kept], factor=self.factor[..., kept, :])
+
+    def conditional(self, components: Sequence[int], values: Tensor) -> Gaussian:
+        """The belief about the other components of a state in R^n, in their order, once some are known.
+
+        Args:
+            components: those that are known.
+            values: (..., c) what they are.
+        """
+        known = self._components(components)
+        others = [i for i in range(self.size) if i not in known]
+        size = len(known)
+        # The triangular root of the known, then the others: all that is left below is the others' own.
+        joint = triangularise([self.factor[..., [*known, *others], :]])
+        white = solve_lower(joint[..., :size, :size], (values - self.mean[..., known]).unsqueeze(-1))
+        mean = self.mean[..., others] + (joint[..., size:, :size] @ white).squeeze(-1)
+        left = Gaussian(mean, factor=joint[..., size:, size:], factor_is_lower=True)
+        return left if self.is_square_root else Gaussian(mean, left.covariance, is_symmetric=True)
+
+    def _components(self, components: Sequence[int]) -> list[int]:
+        if self.mean.shape[-1] != self.size:
+            raise ValueError("components are those of a state in R^n; these are points of a manifold")
+        found = [range(self.size)[i] for i in components]
+        if len(set(found)) < len(found):
+            raise ValueError(f"components {found} are not all different")
+        return found
 
     def _like(self, mean: Tensor, change: Callable[[Tensor], Tensor]) -> Gaussian:
         """With another mean, and the root changed; what has no root changes likewise."""

@@ -10,12 +10,13 @@ from torch import Tensor
 
 from sigmaslam_filters.bayes import BayesFilter
 from sigmaslam_filters.core.factors import square
+from sigmaslam_filters.core.tensors import shapes_of
 from sigmaslam_filters.gaussian_belief import Gaussian
 from sigmaslam_filters.models import AnyMeasurement, AnyMotion
 from sigmaslam_filters.robust import Robust
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Mixture:
     """A belief for each of M motions, and how probable it is that the motion holds.
 
@@ -28,6 +29,8 @@ class Mixture:
     beliefs: Sequence[Gaussian]
     probability: Tensor
     log_likelihood: Tensor
+
+    __repr__ = shapes_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,4 +120,4 @@ class InteractingMultipleModels:
                 columns = self.bayes.linearisation.carry(belief.mean, None, belief.factor, mean)
                 inside = square(columns)
             covariance = covariance + part[..., None, None] * (inside + apart @ apart.mT)
-        return Gaussian(mean, covariance)
+        return Gaussian(mean, covariance, is_symmetric=True)

@@ -130,8 +130,8 @@ class Linearisation:
 
         def evaluate(offsets: Tensor) -> Tensor:
             if motion.additive:
-                return motion.function(self.retract(mean, offsets), *inputs)
-            return motion.function(self.retract(mean, offsets[..., :size]), offsets[..., size:], *inputs)
+                return motion.evaluate(self.retract(mean, offsets), *inputs)
+            return motion.evaluate(self.retract(mean, offsets[..., :size]), offsets[..., size:], *inputs)
 
         columns = root if motion.additive else block_diagonal(root, noise.factor())
         return transform(evaluate, columns, self.chart, self.retract)
@@ -149,9 +149,7 @@ class Linearisation:
         """Innovation and deviations of a linearisation at the prior, or at the posterior of the previous one."""
         if isinstance(measurement, LinearMeasurement):
             self.require_flat("LinearMeasurement")
-            if inputs:
-                raise ValueError("an input was given, but a LinearMeasurement takes none")
-            innovation = value - measurement.function(mean)
+            innovation = value - measurement.evaluate(mean, *inputs)
             return LinearisedMeasurement(innovation, Columns(multiply(measurement.matrix, root)))
         size = root.shape[-1]
         shift = None if previous is None else previous.shift
@@ -167,8 +165,8 @@ class Linearisation:
             moved = offsets if measurement.additive else offsets[..., :size]
             state = self.retract(mean, moved if shift is None else shift + moved)
             if measurement.additive:
-                return measurement.function(state, *inputs)
-            return measurement.function(state, offsets[..., size:], *inputs)
+                return measurement.evaluate(state, *inputs)
+            return measurement.evaluate(state, offsets[..., size:], *inputs)
 
         offsets = columns if measurement.additive else block_diagonal(columns, noise.factor())
         if isinstance(transform, Taylor) and transform.jacobian is None:
@@ -216,11 +214,11 @@ class Linearisation:
         # One copy of the point for each direction, in their memory order.
         points = point + torch.zeros_like(along)
         if model.additive:
-            values, slopes = push_forward(lambda x: model.function(x, *inputs), [points], [along])
+            values, slopes = push_forward(lambda x: model.evaluate(x, *inputs), [points], [along])
         else:
             noise = directions[..., size:]
             values, slopes = push_forward(
-                lambda x, w: model.function(x, w, *inputs), [points, torch.zeros_like(noise)], [along, noise]
+                lambda x, w: model.evaluate(x, w, *inputs), [points, torch.zeros_like(noise)], [along, noise]
             )
         return values[0], slopes
 

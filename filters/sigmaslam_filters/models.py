@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
-from sigmaslam_filters.core.factors import apply
+from sigmaslam_filters.core.factors import apply, is_traced, may_look
 from sigmaslam_filters.core.noise_covariance import BlockDiagonal, Diagonal, Noise, as_noise
+from sigmaslam_filters.core.tensors import require_tensor, shapes_of
 
 Function = Callable[..., Tensor]
 Residual = Callable[[Tensor, Tensor], Tensor]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+_READ = "It is called once for all sigma points: read components as x[..., i] and join them with stack"
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class NonlinearModel:
     """What `MotionModel` and `MeasurementModel` have in common: y = f(x, *inputs) + w, or y = f(x, w, *inputs).
 
@@ -34,8 +40,54 @@ class NonlinearModel:
     additive: bool = True
     jacobian: Function | None = None
 
+    __repr__ = shapes_of
 
-@dataclass(frozen=True, slots=True, eq=False)
+    def evaluate(self, states: Tensor, *others: Tensor) -> Tensor:
+        """The function of states (k, ..., p), and of noise and inputs.
+
+        Raises:
+            TypeError: it takes other arguments, or returns something else than a tensor.
+            ValueError: what it returns is no (k, ..., m).
+        """
+        if is_traced():
+            return self.function(states, *others)
+        name = f"{type(self).__name__}.function"
+        try:
+            values = self.function(states, *others)
+        except TypeError as error:
+            self._check_arguments(name, states, *others)
+            raise TypeError(f"{name} of states {tuple(states.shape)}: {error}. {_READ}") from error
+        except IndexError as error:
+            raise ValueError(f"{name} of states {tuple(states.shape)}: {error}. {_READ}") from error
+        require_tensor(f"what {name} returns", values)
+        lead, expected = values.shape[:-1], states.shape[:-1]
+        fits = len(lead) >= len(expected) and lead[0] == expected[0]
+        # Of as many copies of a state as it has components x[i] has the shape of x[..., i], but not its value.
+        if fits and states.shape[:-1] == states.shape[1:] != (1,) and may_look(states):
+            copies = torch.equal(states[0].detach(), states[1].detach())
+            fits = not copies or torch.allclose(values[0].detach(), values[1].detach(), rtol=1e-3, equal_nan=True)
+        if not fits or any(a not in (b, 1) for a, b in zip(expected[::-1], lead[::-1], strict=False)):
+            raise ValueError(
+                f"{name} of states {tuple(states.shape)} returned {tuple(values.shape)}; "
+                f"{(*expected, 'm')} expected. {_READ}"
+            )
+        return values
+
+    def _check_arguments(self, name: str, *given: Tensor) -> None:
+        """Raises TypeError if the function takes another number of arguments."""
+        try:
+            parameters = inspect.signature(self.function)
+        except ValueError:
+            return
+        try:
+            parameters.bind(*given)
+        except TypeError:
+            takes = "the state" + ("" if self.additive else ", the noise")
+            inputs = len(given) - (1 if self.additive else 2)
+            raise TypeError(f"{name} takes {parameters}, but was given {takes} and {inputs} inputs") from None
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class MotionModel(NonlinearModel):
     """How a state moves: x' = f(x, *inputs) [+] w, or x' = f(x, w, *inputs); see `NonlinearModel`.
 
@@ -46,7 +98,7 @@ class MotionModel(NonlinearModel):
     noise_matrix: Tensor | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class MeasurementModel(NonlinearModel):
     """What a sensor sees: z = h(x, *inputs) + v, or z = h(x, v, *inputs); see `NonlinearModel`.
 
@@ -66,7 +118,7 @@ class MeasurementModel(NonlinearModel):
     block_size: int | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class LinearMotion:
     """x' = A x + B1 u + B2 w, (9.22); on R^n. `predict` takes u as its input when there is a B1.
 
@@ -82,6 +134,12 @@ class LinearMotion:
     control_matrix: Tensor | None = None
     noise_matrix: Tensor | None = None
 
+    __repr__ = shapes_of
+
+    def evaluate(self, state: Tensor, *inputs: Tensor) -> Tensor:
+        """As `function`."""
+        return self.function(state, *inputs)
+
     def function(self, state: Tensor, *inputs: Tensor) -> Tensor:
         """A x + B1 u for (..., n) and (..., c)."""
         moved = apply(self.matrix, state)
@@ -94,7 +152,7 @@ class LinearMotion:
         return moved
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class LinearMeasurement:
     """z = H x + v, (9.22); on R^n.
 
@@ -109,6 +167,14 @@ class LinearMeasurement:
     noise: Noise | Tensor
     mask: Tensor | None = None
     block_size: int | None = None
+
+    __repr__ = shapes_of
+
+    def evaluate(self, state: Tensor, *inputs: Tensor) -> Tensor:
+        """As `function`, which takes no inputs."""
+        if inputs:
+            raise ValueError("an input was given, but a LinearMeasurement takes none")
+        return self.function(state)
 
     def function(self, state: Tensor) -> Tensor:
         """H x for (..., n)."""
@@ -183,3 +249,4 @@ def _repeated(noise: Noise, count: int) -> Noise:
 
 AnyMotion = MotionModel | LinearMotion
 AnyMeasurement = MeasurementModel | LinearMeasurement
+MOTIONS, MEASUREMENTS = (MotionModel, LinearMotion), (MeasurementModel, LinearMeasurement)

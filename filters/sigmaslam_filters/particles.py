@@ -10,6 +10,7 @@ from torch import Tensor
 
 from sigmaslam_filters.core.factors import apply
 from sigmaslam_filters.core.noise_covariance import as_noise
+from sigmaslam_filters.core.tensors import shapes_of
 from sigmaslam_filters.gaussian_belief import Gaussian
 from sigmaslam_filters.manifolds import Space, is_flat
 from sigmaslam_filters.models import AnyMeasurement, AnyMotion, LinearMeasurement, LinearMotion
@@ -19,7 +20,7 @@ _RESAMPLED_BELOW = 0.5
 _ROUNDS_OF_THE_MEAN = 3
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Particles:
     """A belief by N weighted samples, for any batch (...,).
 
@@ -30,6 +31,8 @@ class Particles:
 
     states: Tensor
     log_weights: Tensor
+
+    __repr__ = shapes_of
 
     @property
     def effective_number(self) -> Tensor:
@@ -54,8 +57,7 @@ class ParticleFilter:
 
     def sample(self, belief: Gaussian, number: int) -> Particles:
         """Particles of equal weight from a Gaussian belief (...,)."""
-        offsets = apply(belief.factor, self._normal((number, *belief.batch_shape, belief.size), belief.mean))
-        states = self._retract(belief.mean.expand(number, *belief.mean.shape), offsets)
+        states = belief.sample(number, self.generator, self.space)
         return Particles(states, torch.full_like(states[..., 0], -math.log(number)))
 
     def predict(self, particles: Particles, motion: AnyMotion, *inputs: Tensor) -> Particles:
@@ -64,10 +66,10 @@ class ParticleFilter:
         factor = as_noise(motion.noise).factor()
         noise = apply(factor, self._normal((*states.shape[:-1], factor.shape[-1]), states))
         if not isinstance(motion, LinearMotion) and not motion.additive:
-            return Particles(motion.function(states, noise, *inputs), particles.log_weights)
+            return Particles(motion.evaluate(states, noise, *inputs), particles.log_weights)
         if motion.noise_matrix is not None:
             noise = apply(motion.noise_matrix, noise)
-        return Particles(self._retract(motion.function(states, *inputs), noise), particles.log_weights)
+        return Particles(self._retract(motion.evaluate(states, *inputs), noise), particles.log_weights)
 
     def update(
         self, particles: Particles, measurement: AnyMeasurement, value: Tensor, *inputs: Tensor
@@ -89,7 +91,7 @@ class ParticleFilter:
             present = present & measurement.mask
         noise = as_noise(measurement.noise).masked(present)
         residual = None if isinstance(measurement, LinearMeasurement) else measurement.residual
-        seen = measurement.function(particles.states, *inputs)
+        seen = measurement.evaluate(particles.states, *inputs)
         filled = torch.where(present, value, 0.0)
         difference = filled - seen if residual is None else residual(filled, seen)
         white = noise.whitened(torch.where(present, difference, 0.0).unsqueeze(-1)).squeeze(-1)
@@ -111,7 +113,7 @@ class ParticleFilter:
                 mean = self.space.retract(mean, (weights * offsets).sum(dim=0))
             offsets = self.space.local(mean.expand_as(states), states)
         weighted = (weights.sqrt() * offsets).movedim(0, -1)
-        return Gaussian(mean, weighted @ weighted.mT)
+        return Gaussian(mean, weighted @ weighted.mT, is_symmetric=True)
 
     def _resampled(self, particles: Particles) -> Particles:
         """Systematic resampling (Kitagawa 1996) of the elements whose effective number is low."""

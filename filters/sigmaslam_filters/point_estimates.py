@@ -22,6 +22,7 @@ from sigmaslam_filters.core.factors import (
 )
 from sigmaslam_filters.core.failure import FilterError, name_elements
 from sigmaslam_filters.core.noise_covariance import Dense, Rooted, as_noise
+from sigmaslam_filters.core.tensors import shapes_of
 from sigmaslam_filters.gauss_newton import LeastSquares, Minimum, Term, gauss_newton, holds_everywhere
 from sigmaslam_filters.gaussian_belief import Gaussian
 from sigmaslam_filters.manifolds import Space, is_flat
@@ -47,7 +48,7 @@ class Observation:
     weight: Tensor | float | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class PointEstimate:
     """The state that explains the observations best.
 
@@ -69,6 +70,8 @@ class PointEstimate:
     iterations: Tensor
     converged: Tensor
     healthy: Tensor
+
+    __repr__ = shapes_of
 
 
 def maximum_likelihood(

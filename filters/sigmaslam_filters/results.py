@@ -12,11 +12,12 @@ from sigmaslam_filters.core.columns import Columns
 from sigmaslam_filters.core.factors import identity, multiply
 from sigmaslam_filters.core.noise_covariance import Noise
 from sigmaslam_filters.core.solve import Form, log_likelihood
+from sigmaslam_filters.core.tensors import shapes_of
 from sigmaslam_filters.gaussian_belief import Gaussian
 from sigmaslam_filters.robust import WeightedPosterior
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class TimeUpdate:
     """What `predict` returns.
 
@@ -30,6 +31,8 @@ class TimeUpdate:
     _joint: Callable[[], tuple[Tensor, Columns]] = field(repr=False)
     _noise: Noise | None = field(repr=False)
     _noise_matrix: Tensor | None = field(repr=False)
+
+    __repr__ = shapes_of
 
     @property
     def healthy(self) -> Tensor:
@@ -57,7 +60,7 @@ class TimeUpdate:
         return torch.where(moved, columns.odd, still), others, torch.where(moved, root, still)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Update:
     """What `update` returns. Diagnostics are of the linearisation at the prior and are computed when asked for.
 
@@ -78,6 +81,8 @@ class Update:
     _posterior: WeightedPosterior = field(repr=False)
     _columns: Columns = field(repr=False)
     _prior_root: Tensor = field(repr=False)
+
+    __repr__ = shapes_of
 
     @property
     def healthy(self) -> Tensor:

@@ -6,7 +6,8 @@ unit:
 - gate: the distance is that of the innovation, whose covariance is S. A block beyond the gate is refused while more
   than half of the blocks agree with the belief. Where they do not, the belief is in doubt as well, and the block takes
   part with the weight that Student's t gives it. That weight is never zero, so a belief that is wrong and too sure of
-  itself is pulled back: the gate cannot lock itself out.
+  itself is pulled back: the gate cannot lock itself out. A measurement that is not cut into blocks has no witness: it
+  is refused beyond the gate, and motions alone widen the belief until it comes in again.
 - robust: noise of heavy tails. The distance is that of the posterior's residual, with the uncertainty that is left in
   it, and the update is solved a few times with the weights of the time before: expectation maximisation for Student's t
   (Agamennoni et al. 2012; Piché et al. 2012), iterated reweighting for Huber's loss.
@@ -62,12 +63,14 @@ class Blocks:
 
     Attributes:
         size: components of a block.
+        alone: whether the measurement is not cut: one block, which no other block is a witness for.
         count: (..., b) components of each that take part.
         weight: (..., b) by the gate; zero for a block that is refused.
         robust: what makes the other weights; None: nothing does.
     """
 
     size: int
+    alone: bool
     count: Tensor
     weight: Tensor
     robust: Robust | None
@@ -86,14 +89,14 @@ class Blocks:
         if not isinstance(measurement, LinearMeasurement) and not measurement.additive:
             raise ValueError("a gate or robust weights need additive noise: this MeasurementModel has additive=False")
         components = value.shape[-1]
-        size = measurement.block_size
-        if size is None:
-            size = noise.block_size if isinstance(noise, BlockDiagonal) else components
+        size = noise.block_size if isinstance(noise, BlockDiagonal) else None
+        size = size if measurement.block_size is None else measurement.block_size
+        alone, size = size is None, components if size is None else size
         if components % size:
             raise ValueError(f"block_size is {size}, but the value has {components} components, no multiple of it")
         present = torch.ones_like(value, dtype=torch.bool) if mask is None else mask
         count = present.unflatten(-1, (-1, size)).sum(dim=-1)
-        return cls(size, count, torch.ones_like(count, dtype=value.dtype), robust)
+        return cls(size, alone, count, torch.ones_like(count, dtype=value.dtype), robust)
 
     def gated(self, gate: float, innovation: Tensor, columns: Columns, noise: Noise) -> Blocks:
         """The blocks with the weights that a gate gives them.
@@ -110,10 +113,13 @@ class Blocks:
             raise ValueError(f"gate is {gate}; it must be a probability between 0 and 1, such as 0.999")
         distance = _distance([innovation.unsqueeze(-1)], columns.all(), noise, self.size)
         outside = distance > _quantiles(gate, self.count, self.size, distance)
-        there = self.count > 0
-        doubtful = 2 * outside.sum(dim=-1, keepdim=True) >= there.sum(dim=-1, keepdim=True)
-        weight = torch.where(doubtful, _student(distance, self.count), 0.0)
-        weight = torch.where(outside, weight, 1.0)
+        if self.alone:
+            weight = torch.where(outside, 0.0, torch.ones_like(distance))
+        else:
+            there = self.count > 0
+            doubtful = 2 * outside.sum(dim=-1, keepdim=True) >= there.sum(dim=-1, keepdim=True)
+            weight = torch.where(doubtful, _student(distance, self.count), 0.0)
+            weight = torch.where(outside, weight, 1.0)
         return replace(self, weight=weight, count=torch.where(weight > 0, self.count, 0))
 
     def masked(self, mask: Tensor | None) -> Tensor:
@@ -229,7 +235,14 @@ def _student(distance: Tensor, count: Tensor) -> Tensor:
 
 def _quantiles(probability: float, count: Tensor, size: int, like: Tensor) -> Tensor:
     """Chi-square quantiles (..., b) for blocks of that size of which some components are missing."""
-    return torch.tensor(_quantiles_up_to(probability, size), dtype=like.dtype, device=like.device)[count]
+    known = _quantiles_up_to(probability, size)
+    if not torch.compiler.is_compiling():
+        return torch.tensor(known, dtype=like.dtype, device=like.device)[count]
+    # A table is no arithmetic.
+    found = torch.full_like(like, known[0])
+    for dof, quantile in enumerate(known):
+        found = torch.where(count == dof, quantile, found)
+    return found
 
 
 @torch.compiler.assume_constant_result

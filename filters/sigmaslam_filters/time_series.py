@@ -5,21 +5,23 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from sigmaslam_filters.checks import BY_TIME, check_model
 from sigmaslam_filters.core.factors import apply, multiply, solve_lower_transposed, square, triangularise
 from sigmaslam_filters.core.failure import FilterError
-from sigmaslam_filters.core.tensors import require_tensor
+from sigmaslam_filters.core.tensors import Inputs, as_inputs, require_tensor, shapes_of
 from sigmaslam_filters.gaussian_belief import Gaussian
 from sigmaslam_filters.linearisation import Linearisation
-from sigmaslam_filters.models import AnyMeasurement, AnyMotion
+from sigmaslam_filters.models import MEASUREMENTS, MOTIONS, AnyMeasurement, AnyMotion
 from sigmaslam_filters.results import TimeUpdate, Update
 from sigmaslam_filters.robust import Robust
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Event:
     """What happens to a belief: a motion, then a measurement, either of which may be missing.
 
@@ -29,7 +31,7 @@ class Event:
         motion: since the event before; None: no time passed.
         measurement: None: nothing was measured.
         value: (..., m) of the measurement.
-        motion_inputs: what `predict` passes on.
+        motion_inputs: what `predict` passes on: a tensor, several in order, or several by names, in order.
         measurement_inputs: what `update` passes on.
         gate, robust: as `update`.
     """
@@ -37,17 +39,23 @@ class Event:
     motion: AnyMotion | None = None
     measurement: AnyMeasurement | None = None
     value: Tensor | None = None
-    motion_inputs: Sequence[Tensor] = ()
-    measurement_inputs: Sequence[Tensor] = ()
+    motion_inputs: Inputs = ()
+    measurement_inputs: Inputs = ()
     gate: float | None = None
     robust: Robust | None = None
 
+    __repr__ = shapes_of
+
     def __post_init__(self) -> None:
+        if self.motion is not None:
+            check_model(self.motion, MOTIONS, "an event's motion, its first argument,")
+        if self.measurement is not None:
+            check_model(self.measurement, MEASUREMENTS, "an event's measurement, its second argument,")
         if (self.measurement is None) != (self.value is None):
             raise ValueError("an event with a measurement needs a value, and one with a value a measurement")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Track:
     """A filtered sequence; time is the first dimension of everything.
 
@@ -69,6 +77,25 @@ class Track:
     log_likelihood: Tensor
     healthy: Tensor
     _predictions: Sequence[TimeUpdate | None] = field(repr=False)
+
+    __repr__ = shapes_of
+
+    @classmethod
+    def of(cls, prior: Gaussian, steps: Sequence[tuple[TimeUpdate | None, Update | None]]) -> Track:
+        """The track of a loop of one's own, which can be smoothed.
+
+        Args:
+            prior: before the first step.
+            steps: what `predict` and `update` returned in each, each of the belief before; None where it was not asked.
+        Raises:
+            ValueError: the batch changes on the way.
+        """
+        predicted: list[Gaussian] = []
+        filtered: list[Gaussian] = []
+        for prediction, update in steps:
+            predicted.append((filtered[-1] if filtered else prior) if prediction is None else prediction.belief)
+            filtered.append(predicted[-1] if update is None else update.belief)
+        return _track(predicted, filtered, *zip(*steps, strict=True))
 
 
 class SequenceFilter(ABC):
@@ -97,11 +124,11 @@ class SequenceFilter(ABC):
     def filter(
         self,
         belief: Gaussian,
-        motion: AnyMotion,
-        measurement: AnyMeasurement,
+        motion: AnyMotion | Sequence[AnyMotion],
+        measurement: AnyMeasurement | Sequence[AnyMeasurement],
         values: Tensor,
-        motion_inputs: Sequence[Tensor] = (),
-        measurement_inputs: Sequence[Tensor] = (),
+        motion_inputs: Inputs = (),
+        measurement_inputs: Inputs = (),
         *,
         gate: float | None = None,
         robust: Robust | None = None,
@@ -111,31 +138,33 @@ class SequenceFilter(ABC):
         Args:
             belief: at the time of the first measurement, before it; batch (...,), to which that of the values
                 broadcasts, or the other way round.
-            motion: the same for all steps, but for its inputs.
-            measurement: the same for all steps, but for its inputs.
+            motion: the same for all steps, but for its inputs; or T - 1 of them, of matrices or noises that change.
+            measurement: likewise, or T of them, of masks that change too.
             values: (T, ..., m); NaN for what is missing.
-            motion_inputs: (T - 1, ...) each: element k moves step k to k + 1.
+            motion_inputs: (T - 1, ...) each: element k moves step k to k + 1. One tensor, several in order, or by
+                names, in order.
             measurement_inputs: (T, ...) each.
             gate, robust: as `update`.
         Raises:
             FilterError: as `predict` and `update`; the message begins with the step.
             ValueError: lengths do not fit.
         """
-        steps = count_steps(values, motion_inputs, measurement_inputs)
-        first = Event(None, measurement, values[0], (), [given[0] for given in measurement_inputs], gate, robust)
-        later = (
+        moving, seeing = as_inputs(motion_inputs), as_inputs(measurement_inputs)
+        steps = count_steps(values, moving, seeing)
+        motions, measurements = _each(motion, steps - 1, "motions"), _each(measurement, steps, "measurements")
+        events = (
             Event(
-                motion,
-                measurement,
+                motions[k - 1] if k else None,
+                measurements[k],
                 values[k],
-                [given[k - 1] for given in motion_inputs],
-                [given[k] for given in measurement_inputs],
+                [given[k - 1] for given in moving] if k else (),
+                [given[k] for given in seeing],
                 gate,
                 robust,
             )
-            for k in range(1, steps)
+            for k in range(steps)
         )
-        return self.filter_events(belief, [first, *later])
+        return self.filter_events(belief, list(events))
 
     def filter_events(self, belief: Gaussian, events: Sequence[Event]) -> Track:
         """Predict and update, event by event; the track has one entry for each and can be smoothed.
@@ -150,38 +179,37 @@ class SequenceFilter(ABC):
         """
         if not events:
             raise ValueError("a sequence needs one event at least")
-        batch = torch.broadcast_shapes(
-            belief.batch_shape, *(event.value.shape[:-1] for event in events if isinstance(event.value, Tensor))
-        )
+        shapes = {event.value.shape[:-1] for event in events if isinstance(event.value, Tensor)}
+        batch = torch.broadcast_shapes(belief.batch_shape, *shapes)
         if belief.batch_shape != batch:
             belief = belief.expand(batch)
-        predictions: list[TimeUpdate | None] = []
-        predicted: list[Gaussian] = []
-        filtered: list[Gaussian] = []
-        updates: list[Update | None] = []
+        prior, steps = belief, []
         for k, event in enumerate(events):
             moved, seen = None, None
             try:
                 if event.motion is not None:
-                    moved = self.predict(belief, event.motion, *event.motion_inputs)
+                    moved = self.predict(belief, event.motion, *as_inputs(event.motion_inputs))
                     belief = moved.belief
-                predictions.append(moved)
-                predicted.append(belief)
                 if event.measurement is not None and event.value is not None:
                     seen = self.update(
                         belief,
                         event.measurement,
                         event.value,
-                        *event.measurement_inputs,
+                        *as_inputs(event.measurement_inputs),
                         gate=event.gate,
                         robust=event.robust,
                     )
                     belief = seen.belief
             except FilterError as error:
                 raise FilterError(f"step {k} of {len(events)}: {error}") from error
-            updates.append(seen)
-            filtered.append(belief)
-        return _track(predicted, filtered, predictions, updates)
+            if belief.batch_shape != batch:
+                raise ValueError(
+                    f"step {k} of {len(events)}: models or inputs make of the batch {tuple(batch)} one of "
+                    f"{tuple(belief.batch_shape)}. {BY_TIME}; for a model with a batch expand the prior "
+                    "(Gaussian.expand)"
+                )
+            steps.append((moved, seen))
+        return Track.of(prior, steps)
 
     def smooth(self, track: Track, lag: int | None = None) -> Gaussian:
         """Beliefs given all measurements, (T, ...), by the RTS recursion.
@@ -238,7 +266,59 @@ class SequenceFilter(ABC):
         if filtered.is_square_root:
             lower = columns if chart is None else triangularise(carried)
             return Gaussian(mean, factor=lower, factor_is_lower=True)
-        return Gaussian(mean, square(carried))
+        return Gaussian(mean, square(carried), is_symmetric=True)
+
+
+def interleaved(streams: Sequence[Event], order: Tensor) -> list[Event]:
+    """Events in the order of time, of streams by sensors.
+
+    Args:
+        streams: for each sensor an event whose value (n, ..., m) and inputs (n, ...) are those of its n readings.
+        order: (T,) which stream each event is the next of.
+    Raises:
+        ValueError: a stream has another length than the order says.
+    """
+    check_streams(streams, order)
+    taken, events = [0] * len(streams), []
+    for k in order.tolist():
+        stream, at = streams[k], taken[k]
+        taken[k] += 1
+        moving, seeing = (
+            tuple(each[at] for each in as_inputs(given)) for given in (stream.motion_inputs, stream.measurement_inputs)
+        )
+        value = None if stream.value is None else stream.value[at]
+        events.append(
+            Event(stream.motion, stream.measurement, value, moving, seeing, gate=stream.gate, robust=stream.robust)
+        )
+    return events
+
+
+def check_streams(streams: Sequence[Event], order: Tensor) -> None:
+    """Lengths of streams are those that the order (T,) has of each.
+
+    Raises:
+        ValueError: they are not.
+    """
+    if order.numel() and not 0 <= int(order.min()) <= int(order.max()) < len(streams):
+        raise ValueError(
+            f"the order names streams {int(order.min())} to {int(order.max())}, but {len(streams)} are given"
+        )
+    for k, stream in enumerate(streams):
+        count = int((order == k).sum())
+        values = () if stream.value is None else (stream.value,)
+        given = [*values, *as_inputs(stream.motion_inputs), *as_inputs(stream.measurement_inputs)]
+        if any(len(each) != count for each in given):
+            lengths = ", ".join(str(len(each)) for each in given)
+            raise ValueError(f"stream {k} comes {count} times in the order, but its value and inputs have {lengths}")
+
+
+def _each(given: Any, count: int, name: str) -> Sequence[Any]:
+    """A model for each step."""
+    if not isinstance(given, Sequence):
+        return [given] * count
+    if len(given) != count:
+        raise ValueError(f"{count} {name} expected, one for each step, got {len(given)}")
+    return given
 
 
 def count_steps(values: Tensor, motion_inputs: Sequence[Tensor], measurement_inputs: Sequence[Tensor]) -> int:
@@ -301,4 +381,4 @@ def _stack(beliefs: Sequence[Gaussian]) -> Gaussian:
     # The first belief may be held otherwise than those that a filter returns.
     if beliefs[-1].is_square_root:
         return Gaussian(mean, factor=torch.stack([belief.factor for belief in beliefs]), factor_is_lower=True)
-    return Gaussian(mean, torch.stack([belief.covariance for belief in beliefs]))
+    return Gaussian(mean, torch.stack([belief.covariance for belief in beliefs]), is_symmetric=True)

@@ -64,7 +64,10 @@ REFUSED = {
         lambda: UKF.update(beliefs(3), sight(), tensor(0.0)),
         "this LinearMeasurement has 2 components, the value has 1",
     ),
-    "function's value of one": (lambda: UKF.update(beliefs(3), see(), tensor(0.0)), "noise is 2 x 2.*value has 1"),
+    "function's value of one": (
+        lambda: UKF.update(beliefs(3), see(), tensor(0.0)),
+        "value has 1 components, but MeasurementModel.function returns 2",
+    ),
     "mask": (
         lambda: UKF.update(
             beliefs(3),

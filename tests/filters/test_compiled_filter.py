@@ -9,7 +9,8 @@ from torch import Tensor
 import sigmaslam_filters as filters
 from sigmaslam_filters import systems
 from sigmaslam_filters.compiler import compiled_filter
-from sigmaslam_filters.compiler.scalar_loop import ScalarLoop, ScalarLoopError
+from sigmaslam_filters.compiler.scalar_sequence import CompiledStep, Plan, run_sequence
+from sigmaslam_filters.compiler.scalar_step import ScalarStep, ScalarStepError
 from tests.support.filter_assertions import assert_close
 from tests.support.filter_builders import beliefs, bent_measurement, bent_motion, covariances, random_numbers, tensor
 
@@ -39,7 +40,7 @@ def linear() -> tuple[filters.LinearMotion, filters.LinearMeasurement]:
 
 
 def is_one_function(run: compiled_filter.CompiledFilter) -> bool:
-    return not run._steps and all(isinstance(loop, ScalarLoop) for loop in run._scalar_loops.values())
+    return not run._steps and all(isinstance(step, CompiledStep) for step in run._scalar_steps.values())
 
 
 @pytest.mark.slow
@@ -53,7 +54,7 @@ def test_compiled_linear_filter_equals_filter_for_other_batches_and_lengths(batc
         prior, values = beliefs(*shape, 3), random_numbers(steps, *shape, 2, seed=4)
         values[-1, ..., 0] = torch.nan
         assert_same_track(run(prior, values), kf.filter(prior, *models, values))
-    assert len(run._scalar_loops) == 1
+    assert len(run._scalar_steps) == 2  # the first event has no motion
     assert is_one_function(run)
     # A prior without a batch is that of every element, and so are values without one.
     assert_same_track(run(beliefs(3), values), kf.filter(beliefs(3), *models, values))
@@ -133,8 +134,7 @@ def test_robust_weights_and_gates_are_compiled():
         run = filters.compile_filter(ukf, motion, see, **options)
         found = run(prior, values, controls, landmarks)
         assert_same_track(found, ukf.filter(prior, motion, see, values, controls, landmarks, **options), 1e-11)
-        # A gate looks its quantile up in a table.
-        assert is_one_function(run) == ("robust" in options)
+        assert is_one_function(run)
 
 
 @pytest.mark.slow
@@ -181,7 +181,7 @@ def test_arguments_that_do_not_fit_are_refused_before_anything_is_compiled():
         run(beliefs(3), random_numbers(2, 2), [random_numbers(2, 1)])
     with pytest.raises(ValueError, match="has 2 components, the value has 3"):
         run(beliefs(3), random_numbers(2, 3))
-    assert not run._scalar_loops
+    assert not run._scalar_steps
 
 
 UNARY = """abs neg sqrt rsqrt reciprocal sin cos tan asin acos atan sinh cosh tanh asinh atanh exp exp2 expm1 log log2
@@ -193,7 +193,7 @@ COMPARISONS = "eq ne lt le gt ge logical_and logical_or logical_xor"
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_every_operation_is_that_of_torch(dtype):
-    def step(state: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
+    def step(state: Tensor, other: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
         one = [getattr(torch, name)(x) for name in UNARY.split()]
         two = [getattr(torch, name)(x, y) for name in BINARY.split()]
         two += [x.clamp(-0.3, 0.3), x.clamp_min(0.1), x.clamp_max(0.1), torch.addcmul(x, x, y, value=0.7)]
@@ -201,15 +201,17 @@ def test_every_operation_is_that_of_torch(dtype):
         flags = [getattr(torch, name)(x, y) for name in COMPARISONS.split()]
         flags += [x.isnan(), x.isinf(), x.isfinite(), x.signbit(), ~(x > 0) & (y > 0) | (x > y)]
         count = (torch.stack(flags, dim=-1).sum(dim=-1) + 2) * 3
-        return state + x, torch.stack([*one, *two], dim=-1), torch.stack(flags, dim=-1), count
+        return state + x, other - x, torch.stack([*one, *two], dim=-1), torch.stack(flags, dim=-1), count
 
     x, y = 0.8 * random_numbers(7, 2).to(dtype).clamp(-1.2, 1.2), random_numbers(7, 2, seed=1).to(dtype)
     x[0, 0], x[1, 0], y[2, 1], x[3, 0], y[4, 0] = torch.nan, torch.inf, torch.nan, 0.0, x[4, 0]
     state = random_numbers(2, seed=2).to(dtype)
-    states, numbers, flags, counts = ScalarLoop(step, [state[0]], [x[0, 0], y[0, 0]])([state], [x, y])
+    scalar = ScalarStep(step, [state[0], state[0], x[0, 0], y[0, 0]])
+    plan = Plan([CompiledStep(scalar, range(5))], torch.zeros(7).long(), torch.arange(7), [2], scalar.outputs)
+    states, _, numbers, flags, counts = run_sequence(plan, [state, state], [[x, y]])
     tolerance = 1e-13 if dtype == torch.float64 else 1e-5
     for k in range(7):
-        state, *expected = step(state, x[k], y[k])
+        state, _, *expected = step(state, state, x[k], y[k])
         torch.testing.assert_close(states[k], state, rtol=tolerance, atol=tolerance, equal_nan=True)
         torch.testing.assert_close(numbers[k], expected[0], rtol=tolerance, atol=tolerance, equal_nan=True)
         assert torch.equal(flags[k], expected[1])
@@ -222,11 +224,56 @@ def test_every_operation_is_that_of_torch(dtype):
         (lambda state, x: (state + x.mean(dim=0), x + 1.0), "not done number by number"),
         (lambda state, x: (state + x, x), "share their memory"),
         (lambda state, x: (state + torch.special.i0(x), x + 1.0), "no form"),
-        (lambda state, x: (torch.stack([state, x], dim=-1), x + 1.0), "another size"),
         (lambda state, x: (state + x.to(torch.float16).to(x), x + 1.0), "float16"),
         (lambda state, x: (x[:, None] * state, x + 1.0), "meet each other"),
     ],
 )
 def test_a_step_that_is_no_arithmetic_by_element_is_refused(step, message):
-    with pytest.raises(ScalarLoopError, match=message):
-        ScalarLoop(step, [tensor(1.0)[0]], [tensor(2.0)[0]])
+    with pytest.raises(ScalarStepError, match=message):
+        ScalarStep(step, [tensor(1.0)[0], tensor(2.0)[0]])
+
+
+# Where each is differentiable: what they are asked of lies between -1 and 1, and apart from zero.
+DIFFERENTIABLE = """abs neg reciprocal sin cos tan asin acos atan sinh cosh tanh exp expm1 erf floor round sign square
+sinc"""
+POSITIVE = "sqrt rsqrt log log1p"
+DIFFERENTIABLE_BY_BOTH = "add sub mul div hypot atan2 maximum minimum copysign"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_every_derivative_is_that_of_torch(dtype):
+    def step(state: Tensor, other: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
+        one = [getattr(torch, name)(x) for name in DIFFERENTIABLE.split()]
+        one += [getattr(torch, name)(x.abs()) for name in POSITIVE.split()]
+        two = [getattr(torch, name)(x, y) for name in DIFFERENTIABLE_BY_BOTH.split()]
+        two += [x.clamp(-0.3, 0.3), x.clamp_min(0.1), x.clamp_max(0.1), torch.addcmul(x, x, y, value=0.7)]
+        two += [torch.sub(x, y, alpha=0.1), torch.where(x > y, x * y, 0.1 / y), x**3, x.abs() ** 0.3]
+        two += [torch.remainder(x, 0.4), torch.fmod(x, 0.4)]
+        # What is not chosen has no derivative, even where it would not be finite.
+        two += [torch.where(x > 2.0, (x - 2.0).sqrt(), y), torch.where(x < 2.0, x, 1.0 / (x - x))]
+        return state * torch.sin(x) + other, other + state * y, torch.stack([*one, *two], dim=-1)
+
+    x, y = (0.9 * random_numbers(6, 2, seed=seed).to(dtype).tanh() for seed in range(2))
+    state = random_numbers(2, seed=2).to(dtype)
+    given = [each.clone().requires_grad_() for each in (state, state, x, y)]
+    scalar = ScalarStep(step, [state[0], state[0], x[0, 0], y[0, 0]])
+    plan = Plan([CompiledStep(scalar, range(3))], torch.zeros(6).long(), torch.arange(6), [2], scalar.outputs)
+    found = run_sequence(plan, given[:2], [given[2:]])
+    first, second, rows = given[0], given[1], []
+    for k in range(6):
+        first, second, numbers = step(first, second, given[2][k], given[3][k])
+        rows.append((first, second, numbers))
+    weights = [random_numbers(*each.shape, seed=k).to(dtype) for k, each in enumerate(found)]
+    gradients = [
+        torch.autograd.grad(sum((a * w).sum() for a, w in zip(results, weights, strict=True)), given)
+        for results in (found, [torch.stack(each) for each in zip(*rows, strict=True)])
+    ]
+    for a, b in zip(*gradients, strict=True):
+        assert_close(a, b, 1e-12 if dtype == torch.float64 else 1e-4)
+
+
+def test_what_has_no_derivative_is_said():
+    step = ScalarStep(lambda x, y: (torch.remainder(y, x), x + 1.0), [tensor(1.0)[0], tensor(2.0)[0]])
+    with pytest.raises(ScalarStepError, match=r"no derivative of aten\.remainder"):
+        step.adjoint_source([True, True])

@@ -7,20 +7,23 @@ Private parts of torch that are used, each listed with its signature in that tes
 
 - `components`: `torch._inductor.custom_graph_pass` (`CustomInferenceAwareGraphPass`, `get_hash_for_files`),
   `torch._subclasses.fake_tensor.FakeTensorMode`, `aten._efficientzerotensor`, `aten._to_copy`.
-- `scalar_loop`: `torch._dynamo.backends.common.aot_autograd`, `torch._dynamo.exc.TorchDynamoException`,
-  `torch._inductor.codecache.CppCodeCache`, `torch._inductor.decomposition.select_decomp_table`.
+- `scalar_step`: `torch._dynamo.backends.common.aot_autograd`, `torch._dynamo.exc.TorchDynamoException`,
+  `torch._inductor.decomposition.select_decomp_table`.
+- `scalar_sequence`, `header_export`: `torch._inductor.codecache.CppCodeCache`.
 - `item_source`: `torch._decomp.core_aten_decompositions`.
 - `compiled_step`: settings of `torch._inductor.config`, given as options of `torch.compile`.
 
 What is rewritten: `components` writes the traced aten graph of a step anew, one array (B,) for each number, where the
 batch is on a CPU, has 64 elements or more and no derivative is asked for; `component_moves` says what moves of memory
-do to these numbers. `scalar_loop` writes the same numbers as a C++ function over time.
+do to these numbers. `scalar_step` writes the same numbers, and their derivatives backward, as C++ functions of one
+element: `event_kinds` says which events share one, `scalar_sequence` calls them over time, `header_export` hands them
+out.
 
 What is guaranteed: the arithmetic is the library's, operation by operation, so results agree to 3e-14 of the largest
 value in float64. A model is taken as it is when the step is compiled. What fails is said as the library says it.
 
 What happens where it cannot be done: a graph that is too long, has another batch or leaves the CPU is compiled as torch
-does it. A step that is no arithmetic on numbers becomes a loop around compiled steps (`ScalarLoopError` is caught, the
+does it. A step that is no arithmetic on numbers becomes a loop around compiled steps (`ScalarStepError` is caught, the
 log says why). A step that raises `FAILED` is run once more uncompiled, which names the element. Errors of torch's
 compiler itself come out as they are: nothing goes on uncompiled in silence.
 """

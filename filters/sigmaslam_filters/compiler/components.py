@@ -72,7 +72,7 @@ def entries_of(graph: fx.Graph, batch: int, most: int) -> list[Any]:
     _fill_symbolic_zeros(graph)
     nodes = list(graph.nodes)
     with graph.inserting_before(nodes[-1]):
-        return _Rewriter(graph, batch, most).results(nodes)
+        return _Rewriter(graph, batch, most, with_products=True).results(nodes)
 
 
 def _fill_symbolic_zeros(graph: fx.Graph) -> None:
@@ -114,8 +114,9 @@ class _Rewriter:
         kept: operations of the graph that stay, though nothing may use them: a check raises.
     """
 
-    def __init__(self, graph: fx.Graph, batch: int, most: int) -> None:
+    def __init__(self, graph: fx.Graph, batch: int, most: int, with_products: bool = False) -> None:
         self._graph = graph
+        self._with_products = with_products
         self._batch = batch
         self._most = most
         self.kept: set[fx.Node] = set()
@@ -159,6 +160,8 @@ class _Rewriter:
             return self._pointwise(node)
         if target in _REDUCTIONS:
             return self._reduced(node)
+        if target is aten.bmm.default and self._with_products:
+            return self._product(node)
         moved = MOVES.get(target)
         if moved is not None and node.args and isinstance(self._given(node.args[0]), Entries):
             result = moved(self._batch, node, self._given(node.args[0]), *node.args[1:])
@@ -339,6 +342,24 @@ class _Rewriter:
                 parts = np.squeeze(parts, dim)
                 axis = axis - 1 if axis is not None and dim < axis else axis
         return Entries(parts, axis, dtype)
+
+    def _product(self, node: fx.Node) -> Any:
+        """Products of matrices (B, r, k) and (B, k, c)."""
+        given = [self._given(each) for each in node.args]
+        left, right = (each if isinstance(each, Entries) else self._split(each) for each in given)
+        if left.axis not in (0, None) or right.axis not in (0, None):
+            return self._kept(node)
+        dtype, parts = node.meta["val"].dtype, np.empty((1, left.parts.shape[1], right.parts.shape[2]), dtype=object)
+        for _, i, j in np.ndindex(*parts.shape):
+            terms = [
+                self._combine(aten.mul.Tensor, a, b, dtype)
+                for a, b in zip(left.parts[0, i], right.parts[0, :, j], strict=True)
+            ]
+            total = terms[0]
+            for term in terms[1:]:
+                total = self._combine(aten.add.Tensor, total, term, dtype)
+            parts[0, i, j] = total
+        return Entries(parts, 0, dtype)
 
     def _converted(self, given: Entries, dtype: torch.dtype) -> Entries:
         parts = np.empty(given.parts.shape, dtype=object)

@@ -8,8 +8,16 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from sigmaslam_filters.core.factors import cholesky, identity, log_diagonal, solve_lower, square, triangularise
-from sigmaslam_filters.core.tensors import require_tensor
+from sigmaslam_filters.core.factors import (
+    cholesky,
+    identity,
+    log_diagonal,
+    may_look,
+    solve_lower,
+    square,
+    triangularise,
+)
+from sigmaslam_filters.core.tensors import require_symmetric, require_tensor
 
 
 class Noise(ABC):
@@ -18,6 +26,9 @@ class Noise(ABC):
     @abstractmethod
     def covariance(self) -> Tensor:
         """R, (..., m, m)."""
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}{tuple(self.variance().shape)}"
 
     def masked(self, mask: Tensor) -> Noise:
         """The noise with unit variance, and no correlation, where mask (..., m) is False."""
@@ -108,7 +119,7 @@ class BlockDiagonal(Noise):
         require_tensor("BlockDiagonal's blocks", blocks)
         if blocks.ndim < 3 or blocks.shape[-1] != blocks.shape[-2]:
             raise ValueError(f"blocks (..., b, k, k) expected, got {tuple(blocks.shape)}")
-        self._blocks = Dense(blocks)
+        self._blocks = Dense(blocks, "BlockDiagonal's blocks")
         self._shape = blocks.shape[-3], blocks.shape[-1]
 
     @property
@@ -153,11 +164,16 @@ class BlockDiagonal(Noise):
 class Dense(Noise):
     """Any covariance."""
 
-    def __init__(self, covariance: Tensor) -> None:
-        """Takes the covariance (..., m, m)."""
-        require_tensor("Dense's covariance", covariance)
+    def __init__(self, covariance: Tensor, name: str = "Dense's covariance") -> None:
+        """Takes the covariance (..., m, m), symmetric; the name is for messages."""
+        require_tensor(name, covariance)
         if covariance.ndim < 2 or covariance.shape[-1] != covariance.shape[-2]:
-            raise ValueError(f"a covariance (..., m, m) expected, got {tuple(covariance.shape)}")
+            raise ValueError(
+                f"{name}: a covariance (..., m, m) expected, got {tuple(covariance.shape)}; variances alone are a "
+                "Diagonal"
+            )
+        if may_look(covariance):
+            require_symmetric(name, covariance)
         self._covariance = covariance
 
     def covariance(self) -> Tensor:
@@ -199,16 +215,9 @@ def as_noise(noise: Noise | Tensor, name: str = "noise") -> Noise:
 
     Raises:
         TypeError: it is neither.
-        ValueError: the covariance is not square.
+        ValueError: the covariance is not square, or not symmetric.
     """
-    if isinstance(noise, Noise):
-        return noise
-    require_tensor(name, noise)
-    if noise.ndim < 2 or noise.shape[-1] != noise.shape[-2]:
-        raise ValueError(
-            f"{name} must be a covariance (..., m, m), got {tuple(noise.shape)}; variances alone are a Diagonal"
-        )
-    return Dense(noise)
+    return noise if isinstance(noise, Noise) else Dense(noise, name)
 
 
 def _masked(covariance: Tensor, mask: Tensor) -> Tensor:

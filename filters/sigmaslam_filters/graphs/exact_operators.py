@@ -128,6 +128,21 @@ def _copysign(size: Tensor, sign: Tensor) -> Tensor:
     return torch.where(sign < 0, -size.abs(), size.abs())
 
 
+def _sinc(x: Tensor) -> Tensor:
+    angle = x * _exact(math.pi, x)
+    zero = angle == 0
+    safe = torch.where(zero, torch.ones_like(angle), angle)
+    return torch.where(zero, torch.ones_like(angle), torch.sin(safe) / safe)
+
+
+def _log2(x: Tensor) -> Tensor:
+    return torch.log(x) * _exact(1.0 / math.log(2.0), x)
+
+
+def _log10(x: Tensor) -> Tensor:
+    return torch.log(x) * _exact(1.0 / math.log(10.0), x)
+
+
 def _signbit(x: Tensor) -> Tensor:
     return x < 0
 
@@ -145,6 +160,10 @@ _REPLACED: Mapping[str, Callable[..., Tensor]] = {
     "tan": _tan,
     "copysign": _copysign,
     "signbit": _signbit,
+    "sinc": _sinc,
+    "special_sinc": _sinc,
+    "log2": _log2,
+    "log10": _log10,
 }
 
 # By the name under which torch calls a function; a number among their arguments may be a tensor as well.

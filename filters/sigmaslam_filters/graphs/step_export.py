@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from torch.fx.experimental.proxy_tensor import make_fx
 from sigmaslam_filters.bayes import BayesFilter
 from sigmaslam_filters.core.noise_covariance import as_noise
 from sigmaslam_filters.core.plain_factors import traced_for_export
+from sigmaslam_filters.core.tensors import Inputs, as_inputs
 from sigmaslam_filters.core.transforms import Taylor
 from sigmaslam_filters.gaussian_belief import Gaussian
 from sigmaslam_filters.graphs.exact_operators import ExactOperators
@@ -46,15 +47,23 @@ class StepExample:
         belief: without a batch, or with one dimension of it; the graph's batch is free.
         value: (m,) what was measured or, of several measurements of the model at one time, (l, m), of which the graph
             leaves the number free; behind the belief's batch. None: the graph predicts only.
-        motion_inputs: what `predict` passes on to the motion's function, in its order, by names for the graph.
+        motion_inputs: what `predict` passes on to the motion's function, in its order, by names for the graph; without
+            names they are motion_input_0, motion_input_1, ...
         measurement_inputs: the same of `update`: (·) behind the belief's batch or, for each of several measurements,
             (l, ·). One without the belief's batch is for all.
     """
 
     belief: Gaussian
     value: Tensor | None = None
-    motion_inputs: Mapping[str, Tensor] = field(default_factory=dict)
-    measurement_inputs: Mapping[str, Tensor] = field(default_factory=dict)
+    motion_inputs: Inputs = ()
+    measurement_inputs: Inputs = ()
+
+    def named(self, kind: Literal["motion", "measurement"]) -> Mapping[str, Tensor]:
+        """Inputs of a model by their names."""
+        given: Inputs = getattr(self, f"{kind}_inputs")
+        if isinstance(given, Mapping):
+            return given
+        return {f"{kind}_input_{k}": each for k, each in enumerate(as_inputs(given))}
 
 
 def export_step(
@@ -67,13 +76,17 @@ def export_step(
     gate: float | None = None,
     robust: Robust | None = None,
 ) -> float:
-    """Writes a step of a filter as an ONNX graph, for any batch, in the dtype of the example.
+    """Writes a step of a filter as an ONNX graph, for any batch, or as a C++ header, in the dtype of the example.
 
     The graph's inputs are mean (b, p), covariance (b, n, n), the motion's inputs, value (b, m) or (b, l, m), and the
     measurement's inputs; outputs are posterior_mean, posterior_covariance, healthy (b,) and, with a measurement,
     log_likelihood, nis and count. In float32, and with form="qr", beliefs are held by roots: root (b, n, n) and
     posterior_root are lower triangular. A component of the value that is NaN is missing; where all are, the step only
     predicts. Nothing is raised in a graph: an element that fails is held, and `healthy` says so.
+
+    A header (a path that ends in .hpp) has `predict` and `update` of one filter apart, in a namespace of the file's
+    name, for as many measurements as the example has: C++17 without a heap or anything to link. Several sensors are a
+    graph or a header each, called in the order of their events.
 
     Args:
         bayes: any filter. iterations="auto" always computes the second linearisation, and takes it where it should.
@@ -95,8 +108,11 @@ def export_step(
     # In place only when it is right: a graph that was there stays until then.
     with TemporaryDirectory(dir=path.parent) as folder:
         written = Path(folder) / path.name
-        _write(step, written)
-        difference = _check(step, written)
+        if path.suffix == ".hpp":
+            difference = _difference(step, path.name, _header(step, written), [(1, step.count), (8, step.count)])
+        else:
+            _write(step, written)
+            difference = _difference(step, path.name, _session(step, written), _CHECKED)
         if not difference <= (tolerance := TOLERANCES[example.belief.mean.dtype]):
             raise ExportError(
                 f"{path.name} differs from torch by {difference:.2e}, more than {tolerance:.0e}: not written. "
@@ -130,14 +146,19 @@ class _Step(nn.Module):
         self.is_stack = example.value is not None and example.value.ndim == 3
 
     @property
+    def count(self) -> int:
+        """How many measurements the example has."""
+        return self.example.value.shape[1] if self.is_stack and self.example.value is not None else 1
+
+    @property
     def arguments(self) -> dict[str, Tensor]:
         """The example by the names of the graph's inputs."""
         example, belief = self.example, self.example.belief
         held = {"root": belief.factor} if self.by_root else {"covariance": belief.covariance}
-        named = {"mean": belief.mean, **held, **example.motion_inputs}
+        named = {"mean": belief.mean, **held, **example.named("motion")}
         if example.value is not None:
             named["value"] = example.value
-        for name, given in example.measurement_inputs.items():
+        for name, given in example.named("measurement").items():
             if name in named and named[name] is not given:
                 raise ValueError(f"{name!r} names two inputs of the graph: give one of them another name")
             named[name] = given
@@ -165,12 +186,12 @@ class _Step(nn.Module):
             belief = Gaussian(named["mean"], named["covariance"])
         healthy = torch.ones_like(belief.mean[..., 0], dtype=torch.bool)
         if self.motion is not None:
-            moved = self.bayes.predict(belief, self.motion, *(named[name] for name in self.example.motion_inputs))
+            moved = self.bayes.predict(belief, self.motion, *(named[name] for name in self.example.named("motion")))
             belief, healthy = moved.belief, healthy & moved.healthy
         if self.measurement is None:
             return belief.mean, belief.held, healthy
         value, measurement = named["value"], self.measurement
-        inputs = [named[name] for name in self.example.measurement_inputs]
+        inputs = [named[name] for name in self.example.named("measurement")]
         if self.is_stack:
             measurement = several(measurement, value.shape[-2])
             inputs = [self._for_each(one) for one in inputs]
@@ -192,7 +213,7 @@ class _Step(nn.Module):
         if given is value:
             return batched, self.is_stack
         # The belief and the motion's inputs have no such dimension, whatever their sizes are.
-        seen = any(given is one for one in self.example.measurement_inputs.values())
+        seen = any(given is one for one in self.example.named("measurement").values())
         each = self.is_stack and batched and seen and value is not None and given.shape[:2] == value.shape[:2]
         return batched, each and given.ndim > 2
 
@@ -209,9 +230,8 @@ class _Step(nn.Module):
         """The arguments for another batch and number of measurements: elements of the example, at random if drawn."""
         sizes = [batch, count]
         first = self.example.belief.mean.shape[0]
-        second = self.example.value.shape[1] if self.is_stack and self.example.value is not None else 1
         picks = []
-        for size, there in zip(sizes, (first, second), strict=True):
+        for size, there in zip(sizes, (first, self.count), strict=True):
             if generator is None:
                 picks.append(torch.arange(size) % there)
             else:
@@ -233,7 +253,7 @@ def _complete(example: StepExample) -> StepExample:
         value = None if example.value is None else example.value[None]
         motion, measurement = (
             {name: given[None] for name, given in inputs.items()}
-            for inputs in (example.motion_inputs, example.measurement_inputs)
+            for inputs in (example.named("motion"), example.named("measurement"))
         )
         belief = belief.expand((1,))
         example = replace(example, belief=belief, value=value, motion_inputs=motion, measurement_inputs=measurement)
@@ -292,8 +312,8 @@ class _Traced(nn.Module):
             return self.step(*given)
 
 
-def _check(step: _Step, path: Path) -> float:
-    """Largest difference of the graph from torch on random arguments."""
+def _session(step: _Step, path: Path) -> Callable[[Mapping[str, Tensor]], dict[str, Tensor]]:
+    """Runs a graph."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
@@ -303,21 +323,61 @@ def _check(step: _Step, path: Path) -> float:
     except Exception as error:  # ONNX Runtime has a class of errors for each code
         reason = str(error).strip().splitlines()[0]
         raise ExportError(f"ONNX Runtime cannot run this step in {step.example.belief.mean.dtype}: {reason}") from error
+
+    def run(named: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        found = session.run(None, {name: each.numpy() for name, each in named.items()})
+        return dict(zip(step.outputs, map(torch.as_tensor, found), strict=True))
+
+    return run
+
+
+def _header(step: _Step, path: Path) -> Callable[[Mapping[str, Tensor]], dict[str, Tensor]]:
+    """Writes and runs a header."""
+    from sigmaslam_filters.compiler.header_export import write_header  # brings the compiler, as torch.onnx does
+    from sigmaslam_filters.compiler.scalar_step import ScalarStepError
+
+    one = [each[0] if step.axes(each)[0] else each for each in step.arguments.values()]
+    named = dict(zip(step.arguments, one, strict=True))
+    measurement = None
+    if step.measurement is not None:
+        inputs = {name: named[name] for name in step.example.named("measurement")}
+        sensor, value = step.measurement, named["value"]
+        if step.is_stack:
+            sensor, value = several(sensor, step.count), value.flatten()
+            inputs = {name: each if step.axes(step.arguments[name])[1] else each[None] for name, each in inputs.items()}
+        measurement = sensor, value, inputs
+    motion = None
+    if step.motion is not None:
+        motion = step.motion, {name: named[name] for name in step.example.named("motion")}
+    try:
+        return write_header(path, step.bayes, step.example.belief[0], motion, measurement, step.gate, step.robust)
+    except (ScalarStepError, ValueError, RuntimeError) as error:
+        raise ExportError(f"this step cannot be written as a header: {error}") from error
+
+
+def _difference(
+    step: _Step,
+    name: str,
+    run: Callable[[Mapping[str, Tensor]], dict[str, Tensor]],
+    sizes: Sequence[tuple[int, int]],
+) -> float:
+    """Largest difference from torch of what was written, on random arguments for batches and counts."""
     generator = torch.Generator().manual_seed(0)
     largest = 0.0
-    for batch, count in _CHECKED:
+    for batch, count in sizes:
         given = _moved(step, step.resized(batch, count, generator), generator)
-        found = session.run(None, {name: each.numpy() for name, each in zip(step.arguments, given, strict=True)})
+        found = run(dict(zip(step.arguments, given, strict=True)))
         with torch.no_grad():
-            expected = [each.numpy() for each in step(*given)]
-        mean_scale = float(np.abs(expected[0]).max())
-        for name, a, b in zip(step.outputs, found, expected, strict=True):
+            expected = dict(zip(step.outputs, step(*given), strict=True))
+        mean_scale = float(expected["posterior_mean"].abs().max())
+        for output, there in expected.items():
+            a, b = found[output].double(), there.double()
             if a.shape != b.shape:
-                raise ExportError(f"{path.name}: {name} is {a.shape}, in torch {b.shape}")
-            scale = max(1.0, mean_scale) if name == "posterior_mean" else float(np.abs(b.astype(float)).max())
-            if name in ("log_likelihood", "nis"):
+                raise ExportError(f"{name}: {output} is {tuple(a.shape)}, in torch {tuple(b.shape)}")
+            scale = max(1.0, mean_scale) if output == "posterior_mean" else float(b.abs().max())
+            if output in ("log_likelihood", "nis"):
                 scale = max(1.0, scale)
-            off = float(np.abs(a.astype(float) - b.astype(float)).max()) / max(scale, float(np.finfo(float).tiny))
+            off = float((a - b).abs().max()) / max(scale, float(np.finfo(float).tiny))
             largest = max(largest, off) if np.isfinite(off) else np.inf
     return largest
 
