@@ -136,7 +136,10 @@ def describe_files(
             )
     found = estimate_geometry(image0, image1, models, known, frontend, max_keypoints)
     if found is None:
-        raise InputError(f"{path0} and {path1}: too few matches agree on a geometry; do they show the same scene?")
+        raise InputError(
+            f"{path0} and {path1}: fewer than {_LEAST_INLIERS} matches agree on a geometry, or they lie in "
+            f"{_FEWEST_CELLS} or fewer of {CELLS} parts of the image; do both show the same scene?"
+        )
     if picture is not None:
         drawn = draw_geometry(image0, image1, found, models)
         atomic_write_bytes(picture, cv2.imencode(".png", drawn)[1].tobytes())
