@@ -43,6 +43,7 @@ _WIDE_STEPS, _STEPS, _CONVERGED, _LONGEST_STEP = 4, 15, 1e-5, 0.5
 _HOPELESS = 10.0
 # Variance, radians squared, of either angle of a direction of which nothing is known: uniform on the sphere.
 _UNKNOWN_DIRECTION = (np.pi**2 - 4.0) / 4.0
+# Its information beside that of the rotation, of which nothing is known either.
 _PRIOR = np.diag([0.0, 0.0, 0.0, 1.0 / _UNKNOWN_DIRECTION, 1.0 / _UNKNOWN_DIRECTION])
 # If the inliers depart from a turn by no more than this, relative to their variance across the lines, nothing is known
 # of the direction: without a translation it is 1 to 1.3, as the lines are those that suit the errors best.
