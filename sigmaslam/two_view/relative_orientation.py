@@ -91,6 +91,7 @@ def estimate_relative_orientation(
     probable = np.flatnonzero(probability >= _MIN_PROBABILITY)
     if len(probable) < _MIN_MATCHES:
         return None
+    K = np.ascontiguousarray(K, np.float64)  # OpenCV misreads a view of a projection matrix
     pixels0, pixels1 = points0[probable].astype(np.float64), points1[probable].astype(np.float64)
     K_inverse = np.linalg.inv(K)
     rays0, rays1 = (np.c_[pixels, np.ones(len(pixels))] @ K_inverse.T for pixels in (pixels0, pixels1))

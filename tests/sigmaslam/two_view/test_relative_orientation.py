@@ -145,3 +145,11 @@ def test_the_same_call_gives_the_same_pose():
     one, other = scene.estimate(), scene.estimate()
     np.testing.assert_array_equal(one.R, other.R)
     np.testing.assert_array_equal(one.covariance, other.covariance)
+
+
+def test_intrinsics_may_be_a_part_of_a_projection_matrix():
+    scene, part = views(0, SIDEWAYS), np.c_[K, np.zeros(3)][:, :3]
+    covariance = np.tile(SIGMA**2 * np.eye(2), (200, 1, 1))
+    found = estimate_relative_orientation(part, scene.points0, scene.points1, np.ones(200), covariance)
+    assert found is not None
+    np.testing.assert_array_equal(found.R, scene.estimate().R)
