@@ -26,6 +26,7 @@ RENDERS = "build/results"
 # Modules beside which a benchmark measures.
 PEERS = {
     "filters": ("filterpy", "stonesoup", "dynamax", "pypose", "torch_kf"),
+    "geometry": ("poselib", "pycolmap"),
     "runtime": ("dim_odom", "pyorbslam3"),
     "sequences": ("dim_odom", "pyorbslam3"),
 }

@@ -114,7 +114,9 @@ BENCHMARKS = {
     ),
     "geometry": Benchmark(
         "tracking.two_view_geometry",
-        "Two-view geometry beside OpenCV. Fundamental matrix, relative and absolute orientation and triangulation.",
+        "Two-view geometry beside OpenCV, PoseLib and COLMAP. Fundamental matrix, relative orientation (ten minutes), "
+        "absolute orientation and triangulation.",
+        (_DATA_IF_ANY,),
     ),
     "renders": Benchmark(
         "tracking.renders",

@@ -29,20 +29,20 @@ def clustering(places: np.ndarray, size: tuple[int, int], scores: np.ndarray, in
     Args:
         places: (M, 2) of the views, pixels.
         size: of the image, width and height.
-        scores: (M, 6) slopes of each view's log-likelihood by the pose, at the estimate; zero for those not used.
-        information: (6, 6) of the views.
+        scores: (M, n) slopes of each view's log-likelihood by the pose, at the estimate; zero for those not used.
+        information: (n, n) of the views; n is 6, without scale 5.
     """
-    cell = image_cells(places, *size)
+    cell, freedom = image_cells(places, *size), scores.shape[1]
     one_by_one = scores.T @ scores
     if not np.trace(one_by_one) > 0.0 or np.linalg.cond(one_by_one) > _MAX_CONDITION:
         return 1.0
     # In units of what the views say one by one, which is the identity then.
     root = np.linalg.cholesky(one_by_one)
     scores = np.linalg.solve(root, scores.T).T
-    sums, share = np.zeros((CELLS, 6)), np.zeros((CELLS, 6, 6))
+    sums, share = np.zeros((CELLS, freedom)), np.zeros((CELLS, freedom, freedom))
     np.add.at(sums, cell, scores)
     np.add.at(share, cell, scores[:, :, None] * scores[:, None, :])
-    left, along = np.linalg.eigh(np.eye(6) - share)
+    left, along = np.linalg.eigh(np.eye(freedom) - share)
     scale = 1.0 / np.sqrt(np.maximum(left, _LEAST_LEFT))
     sums = (along @ (scale[..., None] * (along.transpose(0, 2, 1) @ sums[..., None])))[..., 0]
     by_pose = root.T @ np.linalg.solve(information, root)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
@@ -20,6 +21,7 @@ from sigmaslam.frontend.epipolar_search import find_epipolar_geometry, nearest_n
 from sigmaslam.frontend.learned import LearnedDetector
 from sigmaslam.frontend.match_confidence import ConfidenceEstimator
 from sigmaslam.frontend.nearest_neighbours import Putative, nearest_anywhere
+from sigmaslam.frontend.rival_matches import count_rivals, share_with_rivals
 from sigmaslam.frontend.types import Features
 from sigmaslam.inference.networks import WeightsFolder
 from sigmaslam.readers.images import check_grey, read_grey
@@ -32,12 +34,16 @@ _MIN_SIDE = 96
 # Larger images are shrunk to this long side, pixels: a network sees texture of few pixels, and photographs of many
 # are blurred and noisy at those.
 _LONGEST_SIDE = 1600
+# If fewer of the keypoints are matched, though enough to be believed, image 1 is tried upside down.
+_FEW_SHARE, _BELIEVED = 0.1, 8
 # With fewer matches there is no map of neighbours.
 _MIN_KEYPOINTS = 4
 # More lines hide the images that they are drawn on.
 _MAX_LINES = 60
 # Lines begin so far apart at least, as a share of the image's longer side.
 _LINE_SPACING = 0.04
+
+_LOGGER = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +108,7 @@ def match_images(
     (image0, pixels0), (image1, pixels1) = _shrunk(_checked(image0, "image0")), _shrunk(_checked(image1, "image1"))
     features0, features1 = detect(image0), detect(image1)
     estimator = ConfidenceEstimator(provider=provider, weights=weights)
-    matches = match_twice(estimator, image0, image1, features0, features1, min_probability)
+    matches = _match_and_doubt(detect, estimator, image0, image1, features0, features1, min_probability)
     return _enlarged(matches, pixels0, pixels1)
 
 
@@ -159,6 +165,45 @@ def match_twice(
     return matches.select(matches.probability >= min_probability)
 
 
+def _match_and_doubt(
+    detect: Callable[[np.ndarray], Features],
+    estimator: ConfidenceEstimator,
+    image0: np.ndarray,
+    image1: np.ndarray,
+    features0: Features,
+    features1: Features,
+    min_probability: float,
+) -> Matches:
+    """As `match_twice`; probabilities are lowered, with a warning, where other matches agree with each other as well.
+
+    Either the scene repeats itself, or few match but many would with image 1 upside down: symmetric details then match
+    with confidence, a little beside themselves.
+    """
+    matches = match_twice(estimator, image0, image1, features0, features1, min_probability)
+    probable = matches.probability >= MIN_PROBABILITY
+    count = int(probable.sum())
+    if count < _BELIEVED:
+        return matches
+    rivals = count_rivals(features0, features1, matches.index0, matches.index1)
+    share = float((rivals[probable] > 0).mean())
+    probability = share_with_rivals(matches.probability, rivals, share)
+    if probability is not matches.probability:
+        _LOGGER.warning(
+            "the scene repeats itself: %.0f %% of %d matches fit other places as well; their probabilities are shared",
+            100.0 * share,
+            count,
+        )
+    elif count < _FEW_SHARE * min(len(features0.keypoints), len(features1.keypoints)):
+        turned = np.ascontiguousarray(image1[::-1, ::-1])
+        others = len(match_twice(estimator, image0, turned, features0, detect(turned)).probability)
+        if others > count:
+            probability = matches.probability * np.float32(count / (count + others))
+            _LOGGER.warning("upside down, image 1 has %d matches and not %d: turn it by 180 degrees", others, count)
+    matches = replace(matches, probability=probability)
+    matches = matches.select(np.argsort(-probability, kind="stable"))
+    return matches.select(matches.probability >= min_probability)
+
+
 def _refined(
     estimator: ConfidenceEstimator,
     image0: np.ndarray,
@@ -211,7 +256,7 @@ def match_files(
     (small0, pixels0), (small1, pixels1) = _shrunk(image0), _shrunk(image1)
     features0, features1 = detect(small0), detect(small1)
     detected = time.perf_counter()
-    matches = match_twice(estimator, small0, small1, features0, features1, min_probability)
+    matches = _match_and_doubt(detect, estimator, small0, small1, features0, features1, min_probability)
     matches = _enlarged(matches, pixels0, pixels1)
     end = time.perf_counter()
     with atomic_path(out) as temporary:

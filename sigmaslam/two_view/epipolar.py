@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from sigmaslam.estimation.clustered_errors import clustering
 from sigmaslam.geometry.se3 import skew
 
 # Five fix the pose; three more must say so, too.
@@ -32,8 +33,8 @@ _ROBUST = 2.0
 _INLIER = 3.0
 # Beyond this condition number the matches leave something free.
 _MAX_CONDITION = 1e14
-# Keypoints in image 0 have this standard deviation, pixels.
-_SIGMA0 = 0.1
+SIGMA0 = 0.1
+"""Keypoints in image 0 have this standard deviation, pixels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,9 +93,9 @@ def estimate_epipolar_pose(
     agreeing = probable[mask.ravel() > 0]
     # The covariances are in the units of the rays.
     J = K_inverse[:2, :2]
-    rays = MatchedRays(rays0, rays1, _SIGMA0**2 * J @ J.T, J @ covariance.astype(np.float64) @ J.T)
+    rays = MatchedRays(rays0, rays1, SIGMA0**2 * J @ J.T, J @ covariance.astype(np.float64) @ J.T)
     subset = agreeing[:: max(1, len(agreeing) // _SUBSET)]
-    starts = [_pose_of_essential(essential, rays0[subset], rays1[subset])]
+    starts = [pose_of_essential(essential, rays0[subset], rays1[subset])]
     starts += _poses_of_plane(K, points0[subset], points1[subset])
     best: EpipolarPose | None = None
     for start in starts:
@@ -136,7 +137,7 @@ class MatchedRays:
         return np.asarray(in_front | (parallax < _INLIER**2 * variance))
 
 
-def _pose_of_essential(essential: np.ndarray, rays0: np.ndarray, rays1: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def pose_of_essential(essential: np.ndarray, rays0: np.ndarray, rays1: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The one of the four poses of an essential matrix that puts most points in front of both cameras."""
     Ra, Rb, direction = cv2.decomposeEssentialMat(essential)
     poses = [(R, sign * direction.ravel()) for R in (Ra, Rb) for sign in (1.0, -1.0)]
@@ -209,6 +210,16 @@ def robust_weight(residual: np.ndarray) -> np.ndarray:
     return np.asarray(1.0 / (1.0 + (residual / _ROBUST) ** 2) ** 2)
 
 
+def soft_weight(squared: np.ndarray) -> np.ndarray:
+    """Weights of least squares up to three standard deviations, from squared residuals; one half there, 0 beyond."""
+    return np.asarray(1.0 / (1.0 + np.exp(np.minimum(0.5 * (squared - _INLIER**2), 50.0))))
+
+
+def log_gain(squared: np.ndarray) -> np.ndarray:
+    """What a match that is right adds to the log-likelihood; its slope has the weights of `soft_weight`."""
+    return np.log1p(np.exp(np.minimum(0.5 * (_INLIER**2 - squared), 50.0)))
+
+
 def robust_covariance(residual: np.ndarray, J: np.ndarray) -> np.ndarray:
     """Covariance (n, n) of what minimises that loss, from whitened residuals (M,) and derivatives (M, n) of inliers.
 
@@ -221,6 +232,19 @@ def robust_covariance(residual: np.ndarray, J: np.ndarray) -> np.ndarray:
     if len(J) <= J.shape[1] or np.linalg.cond(information) > _MAX_CONDITION or curvature.mean() <= 0.0:
         return np.full(information.shape, np.inf)
     return np.asarray(np.linalg.inv(information) * (slope**2).mean() / curvature.mean() ** 2)
+
+
+def neighbours_factor(pixels: np.ndarray, scores: np.ndarray, information: np.ndarray) -> float:
+    """Factor, 1 or more, by which variances are too small because errors of neighbouring matches are alike.
+
+    Args:
+        pixels: (M, 2) of the matches in image 0.
+        scores: (M, n) derivatives times whitened residuals, zero for outliers.
+        information: (n, n) of the inliers.
+    """
+    corner = pixels.min(axis=0)
+    width, height = np.ceil(pixels.max(axis=0) - corner + 1.0).astype(int).tolist()
+    return max(1.0, clustering(pixels - corner, (width, height), scores, information))
 
 
 def _depths_positive(

@@ -9,18 +9,21 @@ import cv2
 import numpy as np
 
 from sigmaslam.geometry.se3 import rotation_exp, skew
-from sigmaslam.two_view.epipolar import MatchedRays, robust_weight
+from sigmaslam.two_view.epipolar import MatchedRays, neighbours_factor, robust_weight
 
 # Matches that the 7-point and the 8-point method take.
 _SEVEN, _EIGHT = 7, 8
 # What is more likely wrong than right has no vote.
 _MIN_PROBABILITY = 0.5
-# The sampling consensus accepts this epipolar distance, pixels, and draws this many samples.
-_THRESHOLD, _SAMPLES = 1.0, 2000
+# The sampling consensus accepts this epipolar distance, pixels, and draws as many samples as it needs, up to what 63 %
+# of wrong matches take.
+_THRESHOLD, _SAMPLES = 1.0, 10_000
 # Gauss-Newton stops after so many steps, or at one below this, radians: far less than matches can tell.
 _ITERATIONS, _CONVERGED = 20, 1e-9
 # An inlier is nearer than so many standard deviations.
 _INLIER = 3.0
+# F has rank 2: its third singular value is rounding, relative to the first.
+_RANK = 1e-9
 # Beyond this condition number the matches leave something free.
 _MAX_CONDITION = 1e14
 
@@ -31,8 +34,8 @@ class FundamentalMatrix:
 
     Attributes:
         F: (3, 3) of rank 2 and norm 1.
-        covariance: (9, 9) of its entries row by row, from the inliers' noise, of rank 7; infinite where they leave it
-            free.
+        covariance: (9, 9) of its entries row by row, from the inliers' noise and what neighbours' errors have in
+            common, of rank 7; infinite where they leave it free.
         inliers: (M,) bool, probable matches within three standard deviations of their epipolar lines.
     """
 
@@ -106,7 +109,13 @@ def estimate_fundamental(
     by_step = np.stack([each.ravel() for each in _directions(u, angle, v)], axis=1)
     information = J[inliers].T @ J[inliers]
     free = inliers.sum() <= _SEVEN or np.linalg.cond(information) > _MAX_CONDITION
-    spread = np.full((7, 7), np.inf) if free else np.linalg.inv(information)
+    if free:
+        spread = np.full((7, 7), np.inf)
+    else:
+        # Matches are not taken to be better than they say, and may err as their neighbours do.
+        scale = max(1.0, float((residual[inliers] ** 2).sum()) / (inliers.sum() - _SEVEN))
+        factor = neighbours_factor(points0, np.where(inliers[:, None], J * residual[:, None], 0.0), information)
+        spread = scale * factor * np.linalg.inv(information)
     return _in_pixels(_compose(u, angle, v), by_step, spread, to0, to1, inliers)
 
 
@@ -114,6 +123,47 @@ def epipoles(F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where each image sees the other camera's centre: homogeneous pixels (3,) of norm 1, F e0 = 0 and F^T e1 = 0."""
     u, _, vt = np.linalg.svd(F)
     return vt[2], u[:, 2]
+
+
+def uncertain_epipoles(fundamental: FundamentalMatrix) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """The epipoles of both images as of `epipoles`, each with its covariance (3, 3) of rank 2.
+
+    To first order, F e = 0 gives de = -F^+ dF e (Papadopoulo and Lourakis 2000 propagate it likewise).
+    """
+    found = []
+    for F, epipole, transposed in zip(
+        (fundamental.F, fundamental.F.T), epipoles(fundamental.F), (False, True), strict=True
+    ):
+        entries = fundamental.covariance.reshape(3, 3, 3, 3)
+        entries = entries.transpose(1, 0, 3, 2) if transposed else entries
+        finite = bool(np.isfinite(entries).all())
+        spread = np.einsum("ijkl,j,l->ik", entries, epipole, epipole) if finite else np.full((3, 3), np.inf)
+        inverse = np.linalg.pinv(F, rcond=_RANK)
+        found.append((epipole, inverse @ spread @ inverse.T if finite else spread))
+    return tuple(found)
+
+
+def describe_epipole(epipole: np.ndarray, covariance: np.ndarray, size: tuple[int, int]) -> str:
+    """Where an epipole (3,) with that covariance (3, 3) is: a place if it is finite by far, else a direction.
+
+    Args:
+        epipole, covariance: as of `uncertain_epipoles`.
+        size: of the image, width and height, pixels.
+    """
+    if not np.isfinite(covariance).all():
+        return "at an unknown place"
+    if abs(epipole[2]) > _INLIER * np.sqrt(covariance[2, 2]):
+        place = epipole[:2] / epipole[2]
+        J = np.column_stack([np.eye(2), -place]) / epipole[2]
+        small, large = np.sqrt(np.maximum(np.linalg.eigvalsh(J @ covariance @ J.T), 0.0))
+        return f"at ({place[0]:.0f}, {place[1]:.0f}) px, sigma {large:.2g} and {small:.2g} px across"
+    # The line through the middle of the image to a place that may be at infinity.
+    middle = 0.5 * np.array(size)
+    x, y = epipole[:2] - middle * epipole[2]
+    J = np.array([-y, x]) @ np.column_stack([np.eye(2), -middle]) / (x * x + y * y)
+    angle = np.degrees(np.arctan2(y, x)) % 180.0
+    sigma = np.degrees(np.sqrt(J @ covariance @ J))
+    return f"far away along {angle:.1f} deg from the u axis to the v axis, sigma {sigma:.2g} deg"
 
 
 def epipolar_lines(F: np.ndarray, points0: np.ndarray) -> np.ndarray:
@@ -168,10 +218,16 @@ def _directions(u: np.ndarray, angle: float, v: np.ndarray) -> np.ndarray:
 
 
 def _slopes(matches: MatchedRays, u: np.ndarray, angle: float, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Whitened residuals (M,) and derivatives (M, 7)."""
-    residual, sigma = matches.whitened(_compose(u, angle, v))
-    J = np.einsum("mi,kij,mj->mk", matches.rays1, _directions(u, angle, v), matches.rays0)
-    return residual, J / sigma[:, None]
+    """Whitened residuals (M,) and derivatives (M, 7), also of the deviations that whiten."""
+    F = _compose(u, angle, v)
+    residual, sigma = matches.whitened(F)
+    D = _directions(u, angle, v)
+    by1, by0 = matches.rays0 @ D.transpose(0, 2, 1), matches.rays1 @ D
+    J = (by1 * matches.rays1).sum(axis=2)
+    slope1 = np.einsum("mij,mj->mi", matches.spread1, (matches.rays0 @ F.T)[:, :2])
+    slope0 = (matches.rays1 @ F)[:, :2] @ matches.spread0
+    by_variance = (by1[..., :2] * slope1).sum(axis=2) + (by0[..., :2] * slope0).sum(axis=2)
+    return residual, (J / sigma - residual / sigma**2 * by_variance).T
 
 
 def _in_pixels(

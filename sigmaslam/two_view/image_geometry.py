@@ -12,14 +12,30 @@ from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_bytes
 from sigmaslam.frontend.image_pair import draw_lines, match_images
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
+from sigmaslam.geometry.image_cells import CELLS, image_cells
 from sigmaslam.geometry.se3 import rotation_log
 from sigmaslam.readers.images import read_grey
-from sigmaslam.two_view.epipolar import EpipolarPose, essential_matrix, estimate_epipolar_pose
-from sigmaslam.two_view.fundamental import FundamentalMatrix, epipolar_lines, epipoles, estimate_fundamental
+from sigmaslam.two_view.epipolar import essential_matrix
+from sigmaslam.two_view.fundamental import (
+    FundamentalMatrix,
+    describe_epipole,
+    epipolar_lines,
+    estimate_fundamental,
+    uncertain_epipoles,
+)
+from sigmaslam.two_view.relative_orientation import RelativeOrientation, estimate_relative_orientation
 
 EYES = ("left", "right")
 # A homography is that of a plane, or of a turn, if this share of the inliers follow it within so many pixels.
-_PLANE_SHARE, _PLANE_THRESHOLD = 0.8, 1.0
+_PLANE_SHARE, _PLANE_THRESHOLD = 0.8, 2.0
+# What so few inliers off the plane say of seven degrees of freedom is chance.
+_LEAST_OFF_PLANE = 8
+# Below so many inliers seven degrees of freedom fit by chance; in so few parts of the image they are one thing.
+_LEAST_INLIERS, _FEWEST_CELLS, _FEW_CELLS = 16, 2, 6
+# Another geometry is told if it has this share of the inliers of the first.
+_SECOND_SHARE = 0.5
+# From this probability on another pose is told; above these standard deviations, degrees, a direction is not.
+_TOLD_RIVAL, _VAGUE, _UNKNOWN = 0.05, 10.0, 45.0
 # More lines and points hide the image; between so many samples a line bent by a lens looks round.
 _DRAWN_LINES, _DRAWN_MATCHES, _LINE_SAMPLES = 12, 100, 200
 
@@ -32,15 +48,21 @@ class ImageGeometry:
         points0, points1: (M, 2) keypoints of the matches as they are in the images, pixels.
         fundamental: of the pixels as a camera without distortion would see them.
         pose: None without calibration, or where there is none.
-        plane_share: share of the inliers that one homography explains within a pixel.
+        plane_share: share of the inliers that one homography explains within two pixels.
+        cells: parts of image 0, of 24, with inliers.
+        second: number of the other matches that agree on another geometry.
+        size: width and height of image 0, pixels.
         known: (4, 4) T_1_0 of the calibration, if both eyes of it took the images; else None.
     """
 
     points0: np.ndarray
     points1: np.ndarray
     fundamental: FundamentalMatrix
-    pose: EpipolarPose | None
+    pose: RelativeOrientation | None
     plane_share: float
+    cells: int
+    second: int
+    size: tuple[int, int]
     known: np.ndarray | None
 
     @property
@@ -51,14 +73,13 @@ class ImageGeometry:
     def describe(self) -> str:
         """Lines for people."""
         lines = [f"{len(self.points0)} matches, {self.inliers.sum()} agree on one geometry"]
-        if self.pose is None:
-            for number, (other, epipole) in enumerate(zip((1, 0), epipoles(self.fundamental.F), strict=True)):
-                place = "at infinity"
-                if abs(epipole[2]) > 1e-9:
-                    place = f"at ({epipole[0] / epipole[2]:.0f}, {epipole[1] / epipole[2]:.0f}) px"
-                lines.append(f"Camera {other} is seen by image {number} {place}.")
-        else:
+        if self.pose is not None:
             lines += _describe_pose(self.pose)
+        elif self.plane_share * self.inliers.sum() > self.inliers.sum() - _LEAST_OFF_PLANE:
+            lines.append("They follow one homography: a plane or a mere turn, from which the epipoles are not known.")
+        else:
+            for number, epipole in enumerate(uncertain_epipoles(self.fundamental)):
+                lines.append(f"Camera {1 - number} is seen by image {number} {describe_epipole(*epipole, self.size)}.")
         if self.known is not None and self.pose is not None:
             turn, direction = self.known[:3, :3] @ self.pose.R.T, self.known[:3, 3] / np.linalg.norm(self.known[:3, 3])
             lines.append(
@@ -67,8 +88,18 @@ class ImageGeometry:
             )
         if self.plane_share >= _PLANE_SHARE:
             lines.append(
-                f"{100 * self.plane_share:.0f} % of them follow one homography: a plane or a mere turn, from which the "
-                "geometry is hardly known."
+                f"{100 * self.plane_share:.0f} % of them follow one homography: a plane, a mere turn, or a baseline "
+                "far shorter than the depth. The geometry is less known than from a scene with depth."
+            )
+        if self.cells <= _FEW_CELLS:
+            lines.append(
+                f"They lie in {self.cells} of {CELLS} parts of image 0: whatever is there may move on its own, and "
+                "errors of a lens weigh more. Do not rely on the sigmas."
+            )
+        if self.second >= _SECOND_SHARE * self.inliers.sum():
+            lines.append(
+                f"Another {self.second} matches agree on another geometry: something moves, or the scene repeats "
+                "itself, and either may be the right one."
             )
         return "\n".join(lines)
 
@@ -105,7 +136,10 @@ def describe_files(
             )
     found = estimate_geometry(image0, image1, models, known, frontend, max_keypoints)
     if found is None:
-        raise InputError(f"{path0} and {path1}: too few matches agree on a geometry; do they show the same scene?")
+        raise InputError(
+            f"{path0} and {path1}: fewer than {_LEAST_INLIERS} matches agree on a geometry, or they lie in "
+            f"{_FEWEST_CELLS} or fewer of {CELLS} parts of the image; do both show the same scene?"
+        )
     if picture is not None:
         drawn = draw_geometry(image0, image1, found, models)
         atomic_write_bytes(picture, cv2.imencode(".png", drawn)[1].tobytes())
@@ -128,7 +162,7 @@ def estimate_geometry(
         known: (4, 4) T_1_0, if the calibration says it.
         frontend, max_keypoints: of `match_images`.
     Returns:
-        None where too few matches agree.
+        None where fewer than 16 matches agree, or they lie in no more than two of 24 parts of image 0.
     """
     matches = match_images(image0, image1, frontend, max_keypoints)
     ideal0, ideal1 = _ideal(matches.keypoints0, models, 0), _ideal(matches.keypoints1, models, 1)
@@ -143,10 +177,19 @@ def estimate_geometry(
         change = K0 @ np.linalg.inv(K1)
         as_first = np.column_stack([ideal1, np.ones(len(ideal1))]) @ change.T
         spread = change[:2, :2] @ covariance @ change[:2, :2].T
-        pose = estimate_epipolar_pose(K0, ideal0, as_first[:, :2], matches.probability, spread)
+        pose = estimate_relative_orientation(K0, ideal0, as_first[:, :2], matches.probability, spread)
     inliers = fundamental.inliers if pose is None else pose.inliers
+    height, width = image0.shape
+    cells = len(np.unique(image_cells(matches.keypoints0[inliers], width, height)))
+    if inliers.sum() < _LEAST_INLIERS or cells <= _FEWEST_CELLS:
+        return None
+    rest = ~inliers
+    other = estimate_fundamental(ideal0[rest], ideal1[rest], matches.probability[rest], covariance[rest])
+    second = 0 if other is None else int(other.inliers.sum())
     share = _plane_share(ideal0[inliers], ideal1[inliers])
-    return ImageGeometry(matches.keypoints0, matches.keypoints1, fundamental, pose, share, known)
+    return ImageGeometry(
+        matches.keypoints0, matches.keypoints1, fundamental, pose, share, cells, second, (width, height), known
+    )
 
 
 def draw_geometry(
@@ -181,19 +224,33 @@ def draw_geometry(
     return np.concatenate([above, below])
 
 
-def _describe_pose(pose: EpipolarPose) -> list[str]:
+def _describe_pose(pose: RelativeOrientation) -> list[str]:
     turn, sigma = rotation_log(pose.R), np.degrees(np.sqrt(np.diag(pose.covariance)))
     angle = np.linalg.norm(turn)
     axis = turn / angle if angle > 0.0 else np.zeros(3)
     x, y, z = -pose.R.T @ pose.direction
     # Of the direction, the larger of the two.
-    spread = np.linalg.eigvalsh(pose.covariance[:3, :3])[-1] if np.isfinite(sigma).all() else np.inf
-    return [
+    spread = np.degrees(np.sqrt(np.linalg.eigvalsh(pose.covariance[:3, :3])[-1]))
+    place = (
+        f"Camera 1 stands in the direction ({x:+.3f}, {y:+.3f}, {z:+.3f}) of camera 0 (x right, y down, z ahead); "
+        f"sigma {spread:.2f} deg, its distance unknown"
+    )
+    if spread > _UNKNOWN:
+        place = "The direction of camera 1 is not known: a mere turn, or poses that explain the matches alike"
+    lines = [
         f"Rotation: {np.degrees(angle):.2f} deg about ({axis[0]:+.2f}, {axis[1]:+.2f}, {axis[2]:+.2f}); sigma "
         f"{sigma[3]:.2f}, {sigma[4]:.2f}, {sigma[5]:.2f} deg about x, y, z",
-        f"Camera 1 stands in the direction ({x:+.3f}, {y:+.3f}, {z:+.3f}) of camera 0 (x right, y down, z ahead); "
-        f"sigma {np.degrees(np.sqrt(spread)):.2f} deg, its distance unknown",
+        place,
     ]
+    if pose.rival >= _TOLD_RIVAL:
+        by_turn, by_direction = np.degrees(pose.rival_angles)
+        lines.append(
+            f"Another pose is right with a probability of {100 * pose.rival:.0f} %: {by_turn:.1f} deg of rotation and "
+            f"{by_direction:.0f} deg of direction from this one. The sigmas allow for it."
+        )
+    elif _VAGUE < spread <= _UNKNOWN:
+        lines.append("The baseline is short for the depth, or the matches are few: the direction is vague.")
+    return lines
 
 
 def _cameras(

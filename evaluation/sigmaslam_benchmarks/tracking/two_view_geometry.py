@@ -13,9 +13,10 @@ from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import rotation_exp, rotation_log
 from sigmaslam.geometry.uncertainty import propagate
 from sigmaslam.two_view.absolute_orientation import absolute_orientation
-from sigmaslam.two_view.epipolar import estimate_epipolar_pose
 from sigmaslam.two_view.fundamental import FundamentalMatrix, epipolar_lines, estimate_fundamental, fundamental_by_eight
+from sigmaslam.two_view.relative_orientation import estimate_relative_orientation
 from sigmaslam.two_view.triangulation import METHODS, TwoViews, triangulate, triangulate_optimal
+from sigmaslam_benchmarks.tracking.orientation_peers import orientation_table
 from sigmaslam_benchmarks.tracking.page import header, opening, row, write_page
 
 SEEDS = range(1000, 1040)
@@ -35,8 +36,10 @@ class _Matches:
     wrong: np.ndarray
 
 
-def write_geometry(path: Path, command: str, note: Callable[[str], None] = lambda text: None) -> str:
-    """Writes the page and returns it; notes in it are kept."""
+def write_geometry(
+    path: Path, command: str, data: Path | None = None, note: Callable[[str], None] = lambda text: None
+) -> str:
+    """Writes the page and returns it; notes in it are kept. Without the folder `data`, without photographs."""
     lines = opening(
         "Two-view geometry",
         command,
@@ -51,6 +54,7 @@ def write_geometry(path: Path, command: str, note: Callable[[str], None] = lambd
     for part in (_fundamental, _relative, _absolute, _triangulation, _depth):
         lines += [*part(), ""]
         note(f"{part.__name__.strip('_')} done")
+    lines += [*orientation_table(data, note), ""]
     return write_page(path, "\n".join(lines))
 
 
@@ -248,7 +252,7 @@ def _opencv_f(m: _Matches, method: int) -> np.ndarray:
 
 def _ours_pose(m: _Matches) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     noise = np.tile(2.0 * _SIGMA**2 * np.eye(2), (_COUNT, 1, 1))
-    found = estimate_epipolar_pose(_K, m.pixels[:, :2], m.pixels[:, 2:], np.ones(_COUNT), noise)
+    found = estimate_relative_orientation(_K, m.pixels[:, :2], m.pixels[:, 2:], np.ones(_COUNT), noise)
     assert found is not None
     return found.R, found.direction, found.covariance
 

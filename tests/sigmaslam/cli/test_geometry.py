@@ -10,7 +10,8 @@ from typer.testing import CliRunner
 
 from sigmaslam.cli.commands import app
 from sigmaslam.errors import InputError
-from sigmaslam.two_view.image_geometry import estimate_geometry
+from sigmaslam.two_view.fundamental import FundamentalMatrix
+from sigmaslam.two_view.image_geometry import ImageGeometry, estimate_geometry
 
 DEMO = Path(str(files("sigmaslam_synthetic") / "demo"))
 IMAGES = sorted((DEMO / "image_0").glob("*.png")), sorted((DEMO / "image_1").glob("*.png"))
@@ -94,3 +95,49 @@ def test_an_image_of_another_size_than_the_calibration_s_is_named(calibration: P
     cv2.imwrite(str(path), cv2.resize(cv2.imread(str(IMAGES[0][0]), 0), None, fx=0.5, fy=0.5))
     with pytest.raises(InputError, match=r"small\.png"):
         run(path, IMAGES[0][0], "--calibration", calibration)
+
+
+def turned(tmp_path: Path, calibration: Path) -> Path:
+    """The first image as its camera would see it after a turn."""
+    from sigmaslam.geometry.camera import StereoCamera
+
+    K = StereoCamera.from_yaml(calibration).left.matrix
+    R = cv2.Rodrigues(np.array([0.02, 0.08, 0.03]))[0]
+    image, path = cv2.imread(str(IMAGES[0][0]), 0), tmp_path / "turned.png"
+    cv2.imwrite(str(path), cv2.warpPerspective(image, K @ R @ np.linalg.inv(K), image.shape[::-1]))
+    return path
+
+
+@pytest.mark.long
+def test_a_mere_turn_is_told_with_and_without_a_calibration(calibration: Path, tmp_path: Path):
+    path = turned(tmp_path, calibration)
+    printed = run(IMAGES[0][0], path, "--calibration", calibration)
+    assert "direction of camera 1 is not known" in printed
+    angle = float(printed.split("Rotation: ")[1].split()[0])
+    assert angle == pytest.approx(np.degrees(np.linalg.norm([0.02, 0.08, 0.03])), abs=0.1)
+    assert "epipoles are not known" in run(IMAGES[0][0], path)
+
+
+@pytest.mark.long
+def test_matches_in_one_corner_are_refused(tmp_path: Path):
+    """All that both images show is one picture on grey walls."""
+    paths = [tmp_path / f"{k}.png" for k in range(2)]
+    corner = cv2.imread(str(IMAGES[0][0]), 0)[:120, :120]
+    for path, shift in zip(paths, (0, 9), strict=True):
+        wall = np.full((600, 900), 120, np.uint8)
+        wall[10:130, 10 + shift : 130 + shift] = corner
+        cv2.imwrite(str(path), wall)
+    with pytest.raises(InputError, match="parts of the image"):
+        run(*paths)
+
+
+@pytest.mark.parametrize(
+    ("second", "cells", "words"),
+    [(20, 20, "Another 20 matches agree on another geometry"), (3, 5, "in 5 of 24 parts"), (3, 20, None)],
+)
+def test_a_second_geometry_and_crowded_inliers_are_told(second: int, cells: int, words: str | None):
+    F = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]) / np.sqrt(2.0)
+    fundamental = FundamentalMatrix(F, 1e-8 * np.eye(9), np.ones(30, bool))
+    points = np.zeros((30, 2))
+    printed = ImageGeometry(points, points, fundamental, None, 0.3, cells, second, (640, 480), None).describe()
+    assert words in printed if words else "Another" not in printed and "parts" not in printed

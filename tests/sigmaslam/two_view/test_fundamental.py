@@ -6,11 +6,13 @@ import pytest
 
 from sigmaslam.geometry.se3 import rotation_exp
 from sigmaslam.two_view.fundamental import (
+    describe_epipole,
     epipolar_lines,
     epipoles,
     estimate_fundamental,
     fundamental_by_eight,
     fundamental_by_seven,
+    uncertain_epipoles,
 )
 from sigmaslam.two_view.triangulation import TwoViews
 
@@ -123,3 +125,27 @@ def test_too_few_or_degenerate_matches():
     with pytest.raises(ValueError, match="8 matches"):
         fundamental_by_eight(pixels[:7, :2], pixels[:7, 2:])
     assert estimate_fundamental(pixels[:, :2], pixels[:, 2:], np.zeros(8), np.tile(np.eye(2), (8, 1, 1))) is None
+
+
+@pytest.mark.long
+def test_epipoles_are_as_far_off_as_their_covariances_say():
+    """Of either image, over twenty draws of the noise; two degrees of freedom."""
+    exact, true = matches(150, 0), epipoles(pair().fundamental)
+    squared = []
+    for seed in range(20):
+        found = estimate(exact + np.random.default_rng(seed).normal(0.0, SIGMA, exact.shape))
+        for (epipole, covariance), other in zip(uncertain_epipoles(found), true, strict=True):
+            values, vectors = np.linalg.eigh(covariance)
+            assert values[0] < 1e-6 * values[1]  # the length is no error
+            error = vectors[:, 1:].T @ (other * np.sign(other @ epipole) - epipole)
+            squared.append(float((error**2 / values[1:]).mean()))
+    assert 0.5 < np.mean(squared) < 1.5
+
+
+def test_an_epipole_is_a_place_a_direction_or_unknown():
+    spread = np.diag([1e-6, 1e-6, 1e-12])
+    near = np.array([100.0, 50.0, 1.0]) / np.linalg.norm([100.0, 50.0, 1.0])
+    assert "at (100, 50) px" in describe_epipole(near, spread, (640, 480))
+    far = np.array([np.cos(np.pi / 6), np.sin(np.pi / 6), 0.0])
+    assert "far away along 30.0 deg" in describe_epipole(far, spread, (640, 480))
+    assert "unknown" in describe_epipole(near, np.full((3, 3), np.inf), (640, 480))

@@ -1,0 +1,36 @@
+"""The table of relative orientation where it is hard: its matches are as it says, and every method has its column."""
+
+import numpy as np
+import pytest
+
+from sigmaslam_benchmarks.tracking import orientation_peers
+from sigmaslam_benchmarks.tracking.orientation_peers import CASES, COUNT, SIGMA, orientation_table, simulate
+
+
+def distances(name: str) -> np.ndarray:
+    """(M,) of image 1's pixels from their true epipolar lines."""
+    pair = simulate(CASES[name], 5)
+    K_inverse = np.linalg.inv(pair.K)
+    lines = (
+        np.c_[pair.points0, np.ones(COUNT)] @ (K_inverse.T @ np.cross(np.eye(3), pair.direction) @ pair.R @ K_inverse).T
+    )
+    return np.abs((lines * np.c_[pair.points1, np.ones(COUNT)]).sum(axis=1)) / np.linalg.norm(lines[:, :2], axis=1)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_right_matches_lie_on_the_lines_of_the_pose_and_wrong_ones_anywhere(name: str):
+    near = distances(name) < 6.0 * SIGMA
+    assert near.mean() == pytest.approx(1.0 - CASES[name].wrong, abs=0.12)
+
+
+@pytest.mark.slow
+def test_the_table_has_a_row_a_case_and_says_what_is_not_installed(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(orientation_peers, "SEEDS", range(2))
+    monkeypatch.setattr(orientation_peers, "CASES", {"plane, 30 %": CASES["plane, 30 %"]})
+    monkeypatch.setattr(orientation_peers, "find_spec", lambda module: None)
+    told: list[str] = []
+    lines = orientation_table(None, told.append)
+    (line,) = [line for line in lines if line.startswith("| plane, 30 %")]
+    assert line.count("|") == 6
+    assert "Not installed: poselib, pycolmap." in lines
+    assert told == ["plane, 30 % done"]
