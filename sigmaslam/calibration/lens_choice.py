@@ -13,8 +13,9 @@ from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel
 
 USUAL_LENS = "radtan5"
-# Fewer coefficients, more of them, and a polynomial of the angle, which grows where one of the tangent turns back.
-OTHER_LENSES = ("radtan4", "radtan8", "equidistant")
+# One coefficient fewer, and a polynomial of the angle, which goes on growing where one of the tangent turns back. With
+# eight coefficients what the border of the image shows is left open.
+OTHER_LENSES = ("radtan4", "equidistant")
 
 
 def calibrate_whole_images(
