@@ -57,6 +57,7 @@ def calibrated() -> BoardCalibration:
     return calibrate(names, views, CHESSBOARD.points, [SIZE], "radtan4")
 
 
+@pytest.mark.long
 def test_sigmas_widen_where_resamples_scatter_more_and_correlations_stay(calibrated: BoardCalibration):
     count = len(calibrated.sigmas)
     spread = np.ones(count)
