@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +27,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+ERRORS = ("position_rmse", "rotation_rmse", "nees_median", "nees_mean")
+"""Scores that need a truth."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyEstimate:
     """Where a body was.
@@ -41,6 +45,7 @@ class BodyEstimate:
         weight: (K, L) by robust weights.
         scale: (4,) standard deviation of the pixels over the nominal one, at the end.
         truth: (K + 1, 7), or None.
+        smoothed, lagged: the same given what was seen later: all of it, or with a fixed lag; None if not asked for.
     """
 
     seconds: np.ndarray
@@ -52,12 +57,19 @@ class BodyEstimate:
     weight: np.ndarray
     scale: np.ndarray
     truth: np.ndarray | None
+    smoothed: BodyEstimate | None = None
+    lagged: BodyEstimate | None = None
 
 
 def localise_body(
-    recording: StereoRecording, filter_name: FilterName = "ukf", tell: Callable[[str], None] = lambda _: None
+    recording: StereoRecording,
+    filter_name: FilterName = "ukf",
+    tell: Callable[[str], None] = lambda _: None,
+    lag: float | None = None,
 ) -> tuple[BodyEstimate, BodyEstimate]:
-    """The body's poses, in two passes as those of `localise_robots`: the second begins with the constants of the first.
+    """The body's poses, in two passes as those of `localise_robots`: the second begins with the first's constants.
+
+    With a lag in seconds the second pass is smoothed as well.
 
     Raises:
         InputError: there is no true pose to start from.
@@ -73,8 +85,23 @@ def localise_body(
     covariance_of_prior[:, CONSTANTS, CONSTANTS] = first.final.covariance[:, CONSTANTS, CONSTANTS]
     prior = Gaussian(mean, covariance_of_prior)
     scale = torch.from_numpy(first.scale[-1])
-    result = localise(bayes, body, prior, steps, scale, lambda done: tell(f"second pass: {done:.0%}"))
-    return _estimate(recording, steps, first), _estimate(recording, steps, result)
+    result = localise(
+        bayes, body, prior, steps, scale, lambda done: tell(f"second pass: {done:.0%}"), smoothing=lag is not None
+    )
+    estimate = _estimate(recording, steps, result)
+    if lag is not None:
+        tell("smoothing")
+        (smoother,) = result.smoothers
+        whole, lagged = (
+            replace(estimate, pose=mean[:, :7], covariance=covariance[:, :6, :6], belief=_belief(covariance))
+            for mean, covariance in (smoother.smooth(), smoother.smooth(estimate.seconds, lag))
+        )
+        estimate = replace(estimate, smoothed=whole, lagged=lagged)
+    return _estimate(recording, steps, first), estimate
+
+
+def _belief(covariance: np.ndarray) -> np.ndarray:
+    return degree_of_belief(torch.from_numpy(np.ascontiguousarray(covariance[:, :3, :3]))).numpy()
 
 
 def _estimate(recording: StereoRecording, steps: Steps, result: Localisation) -> BodyEstimate:
@@ -84,7 +111,7 @@ def _estimate(recording: StereoRecording, steps: Steps, result: Localisation) ->
         steps.seconds[:, 0],
         result.mean[:, 0, :7],
         covariance,
-        degree_of_belief(torch.from_numpy(covariance[:, :3, :3])).numpy(),
+        _belief(covariance),
         np.append(0, np.isfinite(nis).sum(axis=1)),
         nis,
         result.weight[:, 0],
@@ -132,11 +159,20 @@ def write_body(
     """
     write_lines(folder / "trajectory.csv", _lines(recording.name, estimate))
     write_lines(folder / "trajectory_first_pass.csv", _lines(recording.name, first))
+    later = {}
+    for kind in ("smoothed", "lagged"):
+        if (found := getattr(estimate, kind)) is not None:
+            write_lines(folder / f"trajectory_{kind}.csv", _lines(recording.name, found))
+            later[kind] = {recording.name: score_body(found)}
     summaries, at_first = ({recording.name: score_body(each)} for each in (estimate, first))
     atomic_write_text(
-        folder / "run.json", json.dumps({**settings, "robots": summaries, "first_pass": at_first}, indent=2) + "\n"
+        folder / "run.json",
+        json.dumps({**settings, "robots": summaries, "first_pass": at_first, **later}, indent=2) + "\n",
     )
     write_page(folder / "report.html", recording.name, summaries, _draw(recording, estimate, folder / "map.png"))
+    for kind, scores in later.items():
+        errors = {label: value for label, value in scores[recording.name].items() if label in ERRORS}
+        summaries[recording.name] |= {f"{kind}_{label}": value for label, value in errors.items()}
     return summaries
 
 

@@ -23,6 +23,7 @@ from sigmaslam_filters import (
 )
 from sigmaslam_filters.manifolds import Space
 from sigmaslam_localisation.sighting_noise import STUDENT_DOF, NoiseScale, repetition
+from sigmaslam_localisation.smoothing import Prediction, Smoother
 from sigmaslam_localisation.steps import Steps
 
 FilterName = Literal["ukf", "ekf", "iterated"]
@@ -74,6 +75,7 @@ class Localisation:
         scale: (K, B, m) learned variance of the noise over the nominal one.
         log_likelihood: (B,) of all sightings, by Student's t; a repetition counts for what it tells.
         final: the belief at the end.
+        smoothers: (B) of each robot, if they were asked for.
     """
 
     mean: np.ndarray
@@ -84,6 +86,7 @@ class Localisation:
     scale: np.ndarray
     log_likelihood: np.ndarray
     final: Gaussian
+    smoothers: tuple[Smoother, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,6 +109,7 @@ def localise(
     tell: Callable[[float], None] | None = None,
     admit: Admission | None = None,
     kept: int | None = None,
+    smoothing: bool = False,
 ) -> Localisation:
     """Filter all robots at once.
 
@@ -119,6 +123,7 @@ def localise(
         admit: for a map that is not known: first sightings go to it and update nothing, and the measurement's input is
             the number of the landmark (..., 1) instead of its place.
         kept: components of the state whose history is returned, in points and tangents; None: all.
+        smoothing: keep what smoothers need; not with `kept`.
     """
     K, B, L, m = steps.value.shape
     path, duration, value, position = (
@@ -136,6 +141,7 @@ def localise(
     noise = NoiseScale(torch.ones(B, m, dtype=torch.float64) if scale is None else scale)
     see = several(platform.measurement(), L)
     belief = prior
+    predictions: list[Prediction] = []
     means, covariances = [belief.mean[:, :kept]], [belief.covariance[:, :kept, :kept]]
     nis = torch.full((K, B, L), torch.nan, dtype=torch.float64)
     weight, innovation, scales = torch.ones(K, B, L), torch.full_like(value, torch.nan), torch.ones(K, B, m)
@@ -143,7 +149,10 @@ def localise(
     for k in range(K):
         if tell is not None and k % 100 == 0:
             tell(k / K)
-        belief = bayes.predict(belief, platform.motion(path[k], duration[k]), path[k], duration[k, :, None]).belief
+        moved = bayes.predict(belief, platform.motion(path[k], duration[k]), path[k], duration[k, :, None])
+        belief = moved.belief
+        if smoothing:
+            predictions.append(Prediction.of(moved))
         if anything[k]:
             there = present[k]
             inputs = torch.where(there[..., None], value[k], torch.nan).flatten(-2), position[k]
@@ -165,15 +174,17 @@ def localise(
         scales[k] = noise.scale
         means.append(belief.mean[:, :kept])
         covariances.append(belief.covariance[:, :kept, :kept])
+    filtered = Gaussian(torch.stack(means), torch.stack(covariances))
     return Localisation(
-        torch.stack(means).numpy(),
-        torch.stack(covariances).numpy(),
+        filtered.mean.numpy(),
+        filtered.covariance.numpy(),
         nis.numpy(),
         weight.numpy(),
         innovation.numpy(),
         scales.numpy(),
         log_likelihood.numpy(),
         belief,
+        tuple(Smoother.of(bayes, filtered, predictions, robot) for robot in range(B)) if smoothing else (),
     )
 
 

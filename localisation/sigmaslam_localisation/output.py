@@ -29,21 +29,30 @@ def write_robots(
     """Write all files into a folder that is there.
 
     Returns:
-        The summary of the second pass by robot, as in run.json.
+        The summary of the second pass by robot, as in run.json, with the errors of the smoothers.
     """
     names = recordings[0].landmark_names
     write_trajectories(folder / "trajectory.csv", second)
     write_trajectories(folder / "trajectory_first_pass.csv", first)
     _write_innovations(folder / "innovations.csv", second)
+    later = {}
+    for kind in ("smoothed", "lagged"):
+        estimates = [found for each in second if (found := getattr(each, kind)) is not None]
+        if estimates:
+            write_trajectories(folder / f"trajectory_{kind}.csv", estimates)
+            later[kind] = {each.name: score(each) for each in estimates}
     if any(estimate.map is not None for estimate in second):
         _write_maps(folder / "landmarks.csv", second, names)
     summaries = {estimate.name: summarise(estimate) for estimate in second}
     at_first = {estimate.name: summarise(estimate) for estimate in first}
-    run = {**settings, "robots": summaries, "first_pass": at_first}
+    run = {**settings, "robots": summaries, "first_pass": at_first, **later}
     atomic_write_text(folder / "run.json", json.dumps(run, indent=2) + "\n")
     write_page(
         folder / "report.html", name, summaries, draw_robots(second, recordings[0].landmarks, folder / "map.png")
     )
+    for kind, scores in later.items():
+        for robot, errors in scores.items():
+            summaries[robot] |= {f"{kind}_{label}": value for label, value in errors.items()}
     return summaries
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from sigmaslam_filters import Gaussian, degree_of_belief
 from sigmaslam_localisation.localise import FilterName, Localisation, Platform, localise, make_filter
 from sigmaslam_localisation.mapping_robot import ROBOT_SIZE, MappingRobot
 from sigmaslam_localisation.recording import PlanarTruth, Recording
+from sigmaslam_localisation.smoothing import Smoother
 from sigmaslam_localisation.steps import Steps, make_steps
 from sigmaslam_localisation.wheeled_robot import BODY, CONSTANTS, SPACE, WheeledRobot
 
@@ -57,6 +58,7 @@ class RobotEstimate:
         scale: (m,) standard deviation of the sightings over the nominal one, at the end.
         truth: None if there is none.
         map: landmarks at the end; None if their places were given.
+        smoothed, lagged: the same given what was seen later: all of it, or with a fixed lag; None if not asked for.
     """
 
     name: str
@@ -73,6 +75,8 @@ class RobotEstimate:
     scale: np.ndarray
     truth: PlanarTruth | None
     map: LandmarkMap | None = None
+    smoothed: RobotEstimate | None = None
+    lagged: RobotEstimate | None = None
 
 
 def localise_robots(
@@ -81,6 +85,7 @@ def localise_robots(
     start: tuple[float, float, float] | None = None,
     tell: Callable[[str], None] = lambda _: None,
     mapping: bool = False,
+    lag: float | None = None,
 ) -> tuple[list[RobotEstimate], list[RobotEstimate]]:
     """Estimates of each robot: of the first pass, and of the second.
 
@@ -95,6 +100,7 @@ def localise_robots(
         tell: takes a line of progress.
         mapping: find the places of the landmarks too, each robot for itself; the recordings' are not looked at but for
             scores. The second pass begins without a map, as the first.
+        lag: seconds of the fixed-lag smoother; None: nothing is smoothed. Not with `mapping`.
     Raises:
         InputError: there is no pose to start from.
     """
@@ -119,9 +125,36 @@ def localise_robots(
     prior = _with_constants(prior, _pick(first.final, torch.from_numpy(chosen)))
     scale = torch.from_numpy(first.scale[-1, chosen])
     second = localise(
-        bayes, platform, prior, steps, scale, lambda done: tell(f"second pass: {done:.0%}"), admit, ROBOT_SIZE
+        bayes,
+        platform,
+        prior,
+        steps,
+        scale,
+        lambda done: tell(f"second pass: {done:.0%}"),
+        admit,
+        ROBOT_SIZE,
+        lag is not None,
     )
-    return at_first, _estimates(recordings, delays, steps, second, np.arange(len(recordings)))
+    estimates = _estimates(recordings, delays, steps, second, np.arange(len(recordings)))
+    if lag is None:
+        return at_first, estimates
+    tell("smoothing")
+    pairs = zip(estimates, second.smoothers, strict=True)
+    return at_first, [_with_smoothed(estimate, smoother, lag) for estimate, smoother in pairs]
+
+
+def _with_smoothed(estimate: RobotEstimate, smoother: Smoother, lag: float) -> RobotEstimate:
+    """The estimate with those that know what was seen later."""
+    count = len(estimate.seconds)
+    # Steps after the robot's own end are of no time and see nothing.
+    seconds = np.pad(estimate.seconds, (0, len(smoother.mean) - count), mode="edge")
+    found = []
+    for mean, covariance in (smoother.smooth(), smoother.smooth(seconds, lag)):
+        pose = mean[:count, :3]
+        spread = _in_world(pose, covariance[:count, :3, :3])
+        belief = degree_of_belief(torch.from_numpy(spread[:, :2, :2])).numpy()
+        found.append(replace(estimate, pose=pose, covariance=spread, belief=belief))
+    return replace(estimate, smoothed=found[0], lagged=found[1])
 
 
 def _starts(recordings: Sequence[Recording], seconds: np.ndarray, start: tuple[float, float, float] | None) -> Tensor:

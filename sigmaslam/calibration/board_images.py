@@ -3,21 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from sigmaslam.calibration.boards import NOTHING, Board, DetectedCorners
+from sigmaslam.calibration.eye_names import EyeName, eye_tellers
 from sigmaslam.errors import FrameError, InputError
 from sigmaslam.readers.images import IMAGE_SUFFIXES, read_grey
 from sigmaslam.readers.pairing import list_images
-
-# What tells the eyes apart in names of files, or of the folders that they lie in.
-_EYES = (("left", "right"), ("cam0", "cam1"), ("infra1", "infra2"))
-# At the end of a file's name.
-_ENDINGS = (("_0", "_1"), ("_l", "_r"))
-# Before the number at its end, as in OpenCV's `imageL01`.
-_LETTERS = ("l", "r")
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,37 +45,64 @@ class BoardViews:
 
 
 def find_board_images(paths: Sequence[Path]) -> list[BoardImages]:
-    """Pairs, where the names of all files have a word for the eye; else images of one camera.
+    """Pairs, where the names of all files say which eye they are of (`eye_tellers`); else images of one camera.
 
     Args:
-        paths: files, or folders of them; a folder with the folders of both eyes counts as both.
+        paths: files, or folders of them; a folder without images stands for the folders in it.
 
     Raises:
-        InputError: a path is missing or holds no image, or two folders hold as many and nothing tells the eyes apart.
+        InputError: a path is missing or holds no image, two images have one name, or two folders look like two eyes
+            (as many images, or the same names) and no name tells which, or their images do not pair.
     """
-    groups = [_files_of(path) for path in paths]
-    files = [file for group in groups for file in group]
-    for tell in _tells():
-        told = [tell(file) for file in files]
-        if not all(told):
+    files = [file for path in paths for file in _files_of(path)]
+    alone: list[list[Path]] = []
+    for tell in eye_tellers():
+        names = [name for name in map(tell, files) if name is not None]
+        if len(names) < len(files) or len({name.eye for name in names}) < 2:
             continue
-        moments: dict[str, list[Path | None]] = {}
-        for file, (key, eye) in zip(files, (each for each in told if each), strict=True):
-            eyes = moments.setdefault(key, [None, None])
-            if eyes[eye] is not None:
-                raise InputError(f"{file} and {eyes[eye]} have the same name: give one of them")
-            eyes[eye] = file
-        if all(any(eyes[k] for eyes in moments.values()) for k in (0, 1)):
+        kinds = [_moments(files, names, kind) for kind in range(len(names[0].moments))]
+        moments = max(kinds, key=lambda each: sum(all(eyes) for eyes in each.values()))
+        if any(all(eyes) for eyes in moments.values()):
             return [
                 BoardImages(" + ".join(file.name for file in eyes if file), tuple(eyes))
                 for _, eyes in sorted(moments.items(), key=lambda moment: _by_number(moment[0]))
             ]
-    if len(paths) == 2 and all(path.is_dir() for path in paths) and len(groups[0]) == len(groups[1]):
+        alone.append([next(f for f, n in zip(files, names, strict=True) if n.eye == k) for k in (0, 1)])
+    if alone:
         raise InputError(
-            f"{paths[0]} and {paths[1]} hold {len(groups[0])} images each, and no name says which eye they are of: "
-            "call the folders left and right, or put the images of one camera into one folder"
+            f"no image of the left eye has one of the right eye beside it ({alone[0][0]}, {alone[0][1]}): give both "
+            "images of a moment the same name but for the eye"
         )
+    _refuse_two_eyes(files)
     return [BoardImages(file.name, (file,)) for file in files]
+
+
+def _moments(files: Sequence[Path], names: Sequence[EyeName], kind: int) -> dict[str, list[Path | None]]:
+    """The files of both eyes, by one of `EyeName.moments`; nothing where several would have the same name by it."""
+    moments: dict[str, list[Path | None]] = {}
+    for file, name in zip(files, names, strict=True):
+        eyes = moments.setdefault(name.moments[kind], [None, None])
+        other = eyes[name.eye]
+        if other is not None and other.parent == file.parent and other.stem == file.stem:
+            raise InputError(f"{file} and {other} have the same name: give one of them")
+        if other is not None:
+            return {}
+        eyes[name.eye] = file
+    return moments
+
+
+def _refuse_two_eyes(files: Sequence[Path]) -> None:
+    """Refuse two folders that are one of each eye, as far as can be seen."""
+    folders: dict[Path, set[str]] = {}
+    for file in files:
+        folders.setdefault(file.parent, set()).add(file.name)
+    if len(folders) == 2:
+        (one, first), (other, second) = folders.items()
+        if len(first) == len(second) or first & second:
+            raise InputError(
+                f"{one} and {other} hold {len(first)} and {len(second)} images, and no name says which eye they are "
+                "of: call the folders left and right, or put the images of one camera into one folder"
+            )
 
 
 def read_board_views(images: Sequence[BoardImages], board: Board, done: Callable[[], object]) -> BoardViews:
@@ -124,43 +145,21 @@ def _files_of(path: Path) -> list[Path]:
         return [path]
     if not path.is_dir():
         raise InputError(f"{path}: no such file or folder")
-    if any(child.suffix.lower() in IMAGE_SUFFIXES for child in path.iterdir()):
+    if any(child.suffix.lower() in IMAGE_SUFFIXES and not child.name.startswith(".") for child in path.iterdir()):
         return list_images(path)
-    eyes = [path / name for names in _EYES for name in names if (path / name).is_dir()]
-    return [file for eye in eyes for file in list_images(eye)] or list_images(path)
+    folders = sorted(child for child in path.iterdir() if child.is_dir() and not child.name.startswith("."))
+    inside = [file for folder in folders for file in _files_inside(folder)]
+    return inside or list_images(path)
 
 
-def _tells() -> Iterable[Callable[[Path], tuple[str, int] | None]]:
-    """Ways to tell the eyes apart: of a file, what both eyes have in their names, and which eye it is."""
-    for words in _EYES:
-        yield lambda file, words=words: _word(file.stem, words)  # type: ignore[misc]
-        yield lambda file, words=words: _in_folder(file, words)  # type: ignore[misc]
-    for endings in _ENDINGS:
-        yield lambda file, endings=endings: _word(file.stem, endings, "$")  # type: ignore[misc]
-    yield lambda file: _word(file.stem, _LETTERS, r"(?=\d+$)")
-    for words in _EYES:
-        yield lambda file, words=words: _inside_folder_name(file, words)  # type: ignore[misc]
-
-
-def _word(name: str, words: tuple[str, str], behind: str = "") -> tuple[str, int] | None:
-    found = re.search(f"({words[0]}|{words[1]}){behind}", name, re.IGNORECASE)
-    return found and (name[: found.start()] + "*" + name[found.end() :], words.index(found[1].lower()))
+def _files_inside(folder: Path) -> list[Path]:
+    """Of a folder in a folder, which may hold something else, too."""
+    try:
+        return _files_of(folder)
+    except InputError:
+        return []
 
 
 def _by_number(name: str) -> str:
     """A key that sorts 2 before 10."""
     return re.sub(r"\d+", lambda digits: digits[0].zfill(20), name)
-
-
-def _in_folder(file: Path, words: tuple[str, str]) -> tuple[str, int] | None:
-    """Folders of the eyes may have a folder of images in them, as EuRoC's `cam0/data`."""
-    for folder in (file.parent, file.parent.parent):
-        if folder.name.lower() in words:
-            return file.stem, words.index(folder.name.lower())
-    return None
-
-
-def _inside_folder_name(file: Path, words: tuple[str, str]) -> tuple[str, int] | None:
-    """Names of folders such as `stereoLeft`; the numbers in a file's name are those of its moment."""
-    told = _word(file.parent.name, words)
-    return told and ("-".join(re.findall(r"\d+", file.stem)) or file.stem, told[1])

@@ -83,6 +83,11 @@ class BoardCalibration:
         """Root of the mean squared distance of corners from their projections, pixels; OpenCV's rms."""
         return _rms(self.residuals)
 
+    @property
+    def rms_of_all(self) -> float:
+        """The same with the single corners that are not used."""
+        return _rms(np.concatenate([self.residuals, self.outlier_residuals]))
+
     def eye_rms(self, eye: int) -> float:
         """The same of one eye."""
         return _rms(self.residuals[self.corners.eye == eye])

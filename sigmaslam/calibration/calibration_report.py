@@ -10,6 +10,7 @@ import yaml
 
 from sigmaslam.calibration.board_bundle import INTRINSICS
 from sigmaslam.calibration.calibrate import BoardCalibration
+from sigmaslam.calibration.lens_choice import folds
 from sigmaslam.calibration.tracker_covariance import tracker_covariance
 from sigmaslam.calibration_files.calibration_writer import camera_entries, write_calibration
 from sigmaslam.files import atomic_path, atomic_write_text
@@ -68,7 +69,7 @@ def describe_board_calibration(result: BoardCalibration) -> str:
     lines = [
         f"images    {len(result.names)} used, {len(result.outlier_images)} left out; "
         f"{len(result.corners)} corners, {len(result.outlier_corners)} left out",
-        f"residuals rms {result.rms:.3f} px ({by_eye}); with the corners left out {_rms_of_all(result):.3f} px; "
+        f"residuals rms {result.rms:.3f} px ({by_eye}); with the corners left out {result.rms_of_all:.3f} px; "
         f"images differ {np.sqrt(result.design_effect):.1f} times as much as independent corners would make them",
     ]
     for name, eye in zip(_names(result), eyes, strict=True):
@@ -152,8 +153,7 @@ def _doubts(result: BoardCalibration) -> list[str]:
             doubts.append(
                 f"{name}: large parts of the image show no board, there the lens is extrapolated: move it there"
             )
-        border = np.array([[u, v] for u in (0, eye.width - 1) for v in (0, eye.height - 1)], float)
-        if not np.all(np.isfinite(eye.unproject(border))):
+        if folds(eye):
             doubts.append(
                 f"{name}: the lens model folds before the image's corners: show the board there, "
                 "or try --lens radtan4 or equidistant"
@@ -176,12 +176,6 @@ def _doubts(result: BoardCalibration) -> list[str]:
 
 def _names(result: BoardCalibration) -> tuple[str, ...]:
     return ("left", "right")[: len(result.rig.eyes)]
-
-
-def _rms_of_all(result: BoardCalibration) -> float:
-    """Of all corners of the images that are used, pixels."""
-    squared = np.r_[np.sum(result.residuals**2, axis=1), np.sum(result.outlier_residuals**2, axis=1)]
-    return float(np.sqrt(np.mean(squared)))
 
 
 def _rounded(values: np.ndarray) -> Any:

@@ -26,6 +26,8 @@ from sigmaslam.calibration.imu_report import (
     image_times,
     write_imu_calibration,
 )
+from sigmaslam.calibration.image_bootstrap import RESAMPLES, bootstrap_rigs, widened
+from sigmaslam.calibration.lens_choice import calibrate_whole_images
 from sigmaslam.cli.extras import need_report_extra
 from sigmaslam.errors import InputError
 from sigmaslam.progress import open_progress
@@ -33,7 +35,7 @@ from sigmaslam.readers.inertial import read_imu
 from sigmaslam.runs.calibrate_imu import calibrate_imu_by_run
 
 # mypy reads the members of an enum from literals alone.
-Lens = StrEnum("Lens", list(LENSES))  # type: ignore[misc]
+Lens = StrEnum("Lens", ["auto", *LENSES])  # type: ignore[misc]
 """Lens models."""
 
 
@@ -42,15 +44,20 @@ def calibrate(
         list[Path],
         typer.Argument(
             metavar="IMAGES",
-            help="Image files or folders; pairs where all names have left and right, cam0 and cam1, infra1 and infra2, "
-            "or end in _0 and _1, or _l and _r; else of one camera. With --imu and without --board a run of `track`.",
+            help="Image files, or folders of images or folders; pairs where all names, of files or folders, tell the "
+            "eye (left/right, cam0/cam1, image_0/image_1, infra1/infra2, _0/_1, L/R, ...); else of one camera. With "
+            "--imu and without --board a run of `track`.",
         ),
     ],
     out: Annotated[Path, typer.Option(help="YAML file to write, which `track` reads; of one camera, its K and lens.")],
     board: Annotated[str | None, typer.Option(help=f"{BOARD_FORMS}; metres.")] = None,
     lens: Annotated[
-        Lens, typer.Option(help="Lens model: radial-tangential with 4, 5 or 8 coefficients, or fisheye.")
-    ] = Lens["radtan5"],
+        Lens,
+        typer.Option(
+            help="Lens model: radial-tangential with 4, 5 or 8 coefficients, or fisheye; auto: radtan5, or the best "
+            "other one where that folds in the image."
+        ),
+    ] = Lens["auto"],
     picture: Annotated[Path | None, typer.Option(help="PNG to draw: corners, residuals, the rms of images.")] = None,
     imu: Annotated[
         Path | None,
@@ -60,6 +67,7 @@ def calibrate(
             "into OUT-camchain-imucam.yaml, by a board before the moved rig, or by a run of `track --imu off`.",
         ),
     ] = None,
+    seed: Annotated[int, typer.Option(help="Of the resamples of images that sigmas are compared with.")] = 0,
 ) -> None:
     """Calibrate a stereo pair, or one camera, from images of a board, with the covariance of all parameters."""
     if out.suffix.lower() not in (".yaml", ".yml"):
@@ -86,7 +94,13 @@ def calibrate(
         seen = read_board_views(moments, plan, lambda: progress.advance(task))
     for name, reason in seen.unreadable:
         typer.echo(f"left out  {name}: {reason}")
-    result = solve(seen.names, seen.views, plan.points, seen.sizes, lens.value)
+    if lens.value == "auto":
+        result = calibrate_whole_images(seen.names, seen.views, plan.points, seen.sizes)
+    else:
+        result = solve(seen.names, seen.views, plan.points, seen.sizes, lens.value)
+    with open_progress() as progress:
+        task = progress.add_task("sigmas", total=RESAMPLES, note="")
+        result = widened(result, bootstrap_rigs(result, RESAMPLES, seed, lambda: progress.advance(task)))
     typer.echo(describe_board_calibration(result))
     write_board_calibration(out, result)
     if picture is not None:

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import re
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from sigmaslam.calibration_files.calibration import read_calibration
-from sigmaslam.calibration_files.calibration_writer import describe_calibration, write_calibration
+from sigmaslam.calibration_files.calibration_writer import describe_calibration
+from sigmaslam.calibration_files.foreign_calibrations import FORMS, write_foreign_calibration
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.camera import StereoCamera
+
+# mypy reads the members of an enum from literals alone.
+Form = StrEnum("Form", list(FORMS))  # type: ignore[misc]
+"""Forms that can be written."""
 
 calibration = typer.Typer(name="calibration", no_args_is_help=True, help="Show or convert a stereo calibration.")
 
@@ -39,18 +45,19 @@ def show(file: Source, size: Size = None, rectified: Rectified = False) -> None:
     typer.echo(describe_calibration(_read(file, size, rectified)))
 
 
-@calibration.command(short_help="Write a calibration of any form as our YAML.")
+@calibration.command(short_help="Write a calibration of any form in another one.")
 def convert(
     file: Source,
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="YAML file to write.")],
+    out: Annotated[
+        Path, typer.Argument(metavar="OUT", help="YAML file to write; kitti: a text file; ros and euroc: a folder.")
+    ],
+    to: Annotated[Form, typer.Option(help="Form to write; only our own keeps the covariance.")] = Form["own"],
     size: Size = None,
     rectified: Rectified = False,
 ) -> None:
-    """Write a calibration of any form as our YAML, and print what is in it."""
-    if out.suffix.lower() not in (".yaml", ".yml"):
-        raise InputError(f"{out}: our form is YAML; choose a name that ends in .yaml")
+    """Write a calibration of any form in another one, and print what is in it; what a form cannot say is refused."""
     camera = _read(file, size, rectified)
-    write_calibration(out, camera)
+    write_foreign_calibration(out, camera, to.value)
     typer.echo(f"{describe_calibration(camera)}\nWritten: {out}")
 
 

@@ -21,6 +21,7 @@ from sigmaslam.cli.finish import finish
 from sigmaslam.cli.geometry import geometry
 from sigmaslam.cli.localize import localize
 from sigmaslam.cli.match import match
+from sigmaslam.cli.points import orient, triangulate
 from sigmaslam.cli.reconstruct import reconstruct
 from sigmaslam.cli.rectify import rectify
 from sigmaslam.cli.refine import refine
@@ -62,6 +63,8 @@ for _command, _line in (
     (match, "Match two images."),
     (denoise, "Filter noise out of images."),
     (geometry, "Find how two views lie to each other."),
+    (triangulate, "Points of a stereo pair from pixels in both images."),
+    (orient, "Find how two frames lie from points in both."),
     (calibrate, "Calibrate one or two cameras from images of a board."),
     (rectify, "Write rectified pairs."),
     (render, "Render a stereo sequence with exact truth (extra 'train')."),

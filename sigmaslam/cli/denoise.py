@@ -25,6 +25,12 @@ def denoise(
         float | None,
         typer.Option(min=0.0, help="Variance of shot noise per grey level: 255 / photons at white.", show_default="0"),
     ] = None,
+    blur: Annotated[
+        float,
+        typer.Option(
+            min=0.0, max=20.0, help="Of a lens out of focus: sigma in pixels; takes it out, each image by itself."
+        ),
+    ] = 0.0,
     single: Annotated[
         bool, typer.Option("--single", help="Filter each image by itself: they are no sequence.")
     ] = False,
@@ -37,7 +43,7 @@ def denoise(
         Path | None, typer.Option(help="With --stereo: calibration instead of the input's own.")
     ] = None,
 ) -> None:
-    """Filter Gaussian, shot and quantisation noise and stuck pixels out of images; writes 8-bit grey PNG.
+    """Filter Gaussian, shot and quantisation noise, stuck pixels and blur out of images; writes 8-bit grey PNG.
 
     Images of a folder or a video are a sequence, which is filtered over time: what moves is followed, what changes
     starts anew. The noise is estimated from the first image, or from each with --single.
@@ -51,9 +57,11 @@ def denoise(
             raise InputError("--calibration and --format go with --stereo: add it, or leave them out")
         if not source.exists():
             raise InputError(f"{source}: no such file or folder")
-        summary = denoise_files(source, out, noise, single, thorough)
+        if blur and thorough:
+            raise InputError("--thorough does not go with --blur: leave one of them out")
+        summary = denoise_files(source, out, noise, single, thorough, blur)
     else:
-        if single or thorough:
-            raise InputError("--single and --thorough go with images, not with --stereo: leave them out")
+        if single or thorough or blur:
+            raise InputError("--single, --thorough and --blur go with images, not with --stereo: leave them out")
         summary = denoise_stereo(open_sequence(source, format.value, calibration), out, noise)
     typer.echo(f"{summary.describe()}\nImages: {out}")

@@ -23,11 +23,19 @@ RayAddress = Annotated[
 
 def need_train_extra() -> None:
     """Refuses a command of the extra `train` where torch or kornia is missing."""
+    need_torch()
     try:
         import kornia  # noqa: F401
-        import torch  # noqa: F401
     except ImportError as error:
         raise InputError(f"{error.name} is not installed: pip install 'sigmaslam[train]'") from error
+
+
+def need_torch() -> None:
+    """Refuses a command of the filters where torch is missing; nothing else of the extra `train` is needed."""
+    try:
+        import torch  # noqa: F401
+    except ImportError as error:
+        raise InputError("torch is not installed: pip install torch, or 'sigmaslam[train]'") from error
 
 
 def need_viewer_extra() -> None:

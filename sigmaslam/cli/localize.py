@@ -14,7 +14,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from sigmaslam.cli.extras import need_train_extra
+from sigmaslam.cli.extras import need_torch
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text, check_new_folder, make_folder
 
@@ -60,6 +60,10 @@ def localize(
         str | None,
         typer.Option(metavar="X,Y,HEADING", help="First pose: metres, radians.", show_default="that of the truth"),
     ] = None,
+    smooth: Annotated[
+        bool, typer.Option("--smooth", help="Also write what is known when all was seen, and with a fixed lag.")
+    ] = False,
+    lag: Annotated[float, typer.Option(metavar="S", min=0.1, help="With --smooth: seconds of the fixed lag.")] = 5.0,
     max_range: Annotated[
         float | None, typer.Option(metavar="M", min=0.0, help="Leave out landmarks further away.")
     ] = None,
@@ -67,12 +71,13 @@ def localize(
     """Localise robots, or a stereo camera, among known landmarks (needs the extra 'train').
 
     Writes trajectory.csv with covariance and belief, trajectory_first_pass.csv, innovations.csv, run.json, map.png and
-    report.html. Noise, delay and systematic errors are found from the recording's innovations, not from its truth.
+    report.html; with --smooth trajectory_smoothed.csv and trajectory_lagged.csv as well.
+    Noise, delay and systematic errors are found from the recording's innovations, not from its truth.
     With --map unknown the landmarks are found as well, and landmarks.csv is written (SLAM; which landmark a sighting is
     of is known). With --compare there is such a folder for each filter, and comparison.csv with errors, consistency and
     time of all.
     """
-    need_train_extra()
+    need_torch()
     from sigmaslam_filters import FilterError
     from sigmaslam_localisation.formats import detect_format
 
@@ -85,7 +90,10 @@ def localize(
         raise InputError("--robot, --start and --max-range are for robots in the plane: leave them out here")
     if kind == "starry" and map is MapKind.unknown:
         raise InputError("--map unknown is for robots in the plane: leave it out here")
+    if smooth and map is MapKind.unknown:
+        raise InputError("--smooth does not go with --map unknown: leave one of them out")
     settings = {"source": str(path), "format": kind, "max_range": max_range, "start": start, "map": map.value}
+    settings["lag"] = lag if smooth else None
     rows: list[_Row] = []
     with Console(stderr=True).status("reading") as status:
         for name in [each.value for each in FilterKind] if compare else [filter.value]:
@@ -125,7 +133,7 @@ def _localise_robots(
     if max_range is not None:
         recordings = [recording.within(max_range) for recording in recordings]
     begin = time.process_time()
-    first, second = localise_robots(recordings, settings["filter"], start, tell, mapping)
+    first, second = localise_robots(recordings, settings["filter"], start, tell, mapping, settings["lag"])
     seconds = time.process_time() - begin
     make_folder(out)
     summaries = write_robots(out, path.resolve().name, first, second, recordings, settings)
@@ -141,7 +149,7 @@ def _localise_body(
 
     recording = read_starry(path)
     begin = time.process_time()
-    first, second = localise_body(recording, settings["filter"], tell)
+    first, second = localise_body(recording, settings["filter"], tell, settings["lag"])
     seconds = time.process_time() - begin
     make_folder(out)
     summaries = write_body(out, recording, first, second, settings)
@@ -158,12 +166,10 @@ def _parse_pose(text: str) -> tuple[float, float, float]:
 
 _Row = tuple[str, str, dict[str, Any]]
 """Filter, robot and summary."""
+_ERRORS = ("position_rmse", "heading_rmse", "rotation_rmse", "nees_median", "nees_mean")
 _SHOWN = (
-    "position_rmse",
-    "heading_rmse",
-    "rotation_rmse",
-    "nees_median",
-    "nees_mean",
+    *_ERRORS,
+    *(f"{kind}_{label}" for kind in ("smoothed", "lagged") for label in _ERRORS),
     "landmark_rmse",
     "landmark_rmse_aligned",
     "landmark_nees",

@@ -29,6 +29,7 @@ class NoiseModel:
         gain: variance per grey level of the signal: shot noise; 255 / photons at white.
         step: grey levels between the levels of the quantiser; 0 where they are not to be told apart from sigma.
         impulses: probability that a pixel is black or white whatever it sees.
+        blur: standard deviation of the Gaussian by which the lens blurred the image before all that, pixels.
 
     Raises:
         ValueError: a value is negative or not finite, or `impulses` is not below 1.
@@ -38,9 +39,10 @@ class NoiseModel:
     gain: float = 0.0
     step: float = 0.0
     impulses: float = 0.0
+    blur: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("sigma", "gain", "step", "impulses"):
+        for name in ("sigma", "gain", "step", "impulses", "blur"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
                 raise ValueError(f"{name} is {value}; give a finite number of 0 or more")
@@ -54,7 +56,7 @@ class NoiseModel:
 
 
 def estimate_noise(image: np.ndarray) -> NoiseModel:
-    """The noise of one image, from its quietest blocks at each brightness.
+    """The noise of one image, from its quietest blocks at each brightness; blur is not found.
 
     The variance of the high cosine frequencies of the blocks with the least energy in the low ones is fitted by
     sigma^2 + gain x. Texture of the finest scale that is everywhere is taken for noise.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from sigmaslam.image_filtering.deblur import remove_blur
 from sigmaslam.image_filtering.group_filter import filter_groups
 from sigmaslam.image_filtering.noise import NoiseModel, mean_of_others, stuck_pixels
 from sigmaslam.image_filtering.patch_filter import filter_patches
@@ -20,8 +21,9 @@ def denoise_image(image: np.ndarray, noise: NoiseModel, thorough: bool = False) 
 
     Args:
         image: (H, W) uint8, or float in grey levels, which may leave 0 to 255; at least 32 x 32.
-        noise: of its pixels.
-        thorough: let groups of alike patches have priors of their own, which takes thirty times as long.
+        noise: of its pixels, and blur of the lens.
+        thorough: let groups of alike patches have priors of their own, which takes thirty times as long; not
+            with a blur.
     Returns:
         (H, W) float32, in 0 to 255.
     Raises:
@@ -34,6 +36,9 @@ def denoise_image(image: np.ndarray, noise: NoiseModel, thorough: bool = False) 
     if stuck.any():
         measured = _guess_missing(measured, stuck, noise)
     variance = noise.variance(cv2.GaussianBlur(measured, (0, 0), 2.0))
+    if noise.blur > 0:
+        sharp = remove_blur(measured, noise.blur, float(np.sqrt(variance.mean())))
+        return np.asarray(np.clip(sharp, 0.0, 255.0))
     if float(variance.max()) <= 0:
         return np.asarray(np.clip(measured, 0.0, 255.0))
     estimate = filter_patches(measured, variance)

@@ -78,7 +78,12 @@ class StereoFilter:
 
 
 def denoise_files(
-    source: Path, out: Path, noise: NoiseModel | None = None, single: bool = False, thorough: bool = False
+    source: Path,
+    out: Path,
+    noise: NoiseModel | None = None,
+    single: bool = False,
+    thorough: bool = False,
+    blur: float = 0.0,
 ) -> DenoiseSummary:
     """Filters an image, the images of a folder or those of a video; writes 8-bit grey PNG.
 
@@ -88,12 +93,13 @@ def denoise_files(
         noise: None to estimate it from the first image, or from each where they are filtered one by one.
         single: filter each image by itself.
         thorough: as of `denoise_image`; images are then filtered one by one.
+        blur: of the lens, pixels; images are then filtered one by one.
     Raises:
         InputError: there is no image, one cannot be read, or has another size than those before.
     """
     check_new_folder(out)
     make_folder(out)
-    alone = single or thorough or _is_image(source)
+    alone = single or thorough or blur > 0.0 or _is_image(source)
     follow = SequenceFilter(noise)
     used: NoiseModel | None = noise
     count, seconds = 0, 0.0
@@ -103,8 +109,8 @@ def denoise_files(
             began = time.perf_counter()
             if alone:
                 _check_size(image, name)
-                own = noise or estimate_noise(image)
-                used = used or own
+                own = replace(noise or estimate_noise(image), blur=blur)
+                used = own if used is noise else used
                 result = denoise_image(image, own, thorough)
             else:
                 result = _filter_next(follow, image, name)
@@ -198,4 +204,5 @@ def _describe_noise(noise: NoiseModel) -> str:
     words += [f"shot noise of {noise.gain:.2f} x signal"] if noise.gain > 0 else []
     words += [f"quantiser steps of {noise.step:.1f}"] if noise.step > 0 else []
     words += [f"{100 * noise.impulses:.1f} % of the pixels stuck"] if noise.impulses > 0 else []
+    words += [f"after a blur of {noise.blur:g} px"] if noise.blur > 0 else []
     return f"Noise: {', '.join(words)} (grey levels)"

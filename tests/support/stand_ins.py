@@ -68,11 +68,21 @@ def write_stand_ins(demo: Path, folder: Path) -> None:
     write_ros(camera, folder)
     _write_board(folder / "IMAGES")
     write_csv_folder(folder / "my_robot", drive(World()))
+    _write_points(folder)
     write_video(folder / "film.mp4", [left for left, _ in pairs], 1 / SECONDS)
     _write_images(folder / "folder_of_frames", (".",), pairs)
     cv2.imwrite(str(folder / "photo.png"), pairs[0][0])
     cv2.imwrite(str(folder / "one.jpg"), pairs[0][0])
     cv2.imwrite(str(folder / "two.png"), pairs[-1][0])
+
+
+def _write_points(folder: Path) -> None:
+    """Pixels in both images, and control points in two frames that are a metre apart."""
+    (folder / "pixels.csv").write_text("id,u0,v0,u1,v1\na,300,200,270,200\nb,500,240,480,240.5\n")
+    places = {"a": (0, 0, 1), "b": (1, 0, 2), "c": (0, 1, 2), "d": (1, 1, 3)}
+    for name, shift in (("model.csv", 0), ("survey.csv", 1)):
+        rows = [f"{key},{x + shift},{y},{z}" for key, (x, y, z) in places.items()]
+        (folder / name).write_text("\n".join(["id,x,y,z", *rows]) + "\n")
 
 
 def _write_board(folder: Path) -> None:

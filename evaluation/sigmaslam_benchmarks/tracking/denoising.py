@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -65,6 +66,7 @@ def write_denoising(
     parts: tuple[Callable[[], list[str]], ...] = (
         partial(_gaussian, images),
         partial(_others, images),
+        partial(_blurred, images),
         partial(_sequences, data, sources),
         partial(_night, sources, runs),
     )
@@ -165,6 +167,32 @@ def _others(images: list[np.ndarray]) -> list[str]:
         ]
         lines.append(row(kind, *(f"{each:.2f}" for each in cells)))
     return lines
+
+
+def _blurred(images: list[np.ndarray]) -> list[str]:
+    lines = [
+        "## Set12, a lens out of focus",
+        "",
+        "Images of 8 bits, blurred by a Gaussian before noise comes to them. Ours is told the blur, and wrong ones, and",
+        "estimates the noise. The mask is added once, of the same blur.",
+        "",
+        *header("blur, noise", "blurred", "unsharp mask", "ours", "told 20 % less", "told 20 % more", numbers_from=1),
+    ]
+    for blur, sigma in ((1.6, 2.0), (1.6, 10.0), (3.0, 2.0)):
+        rng, scores = np.random.default_rng(0), []
+        for truth in images:
+            soft = _blur(truth.astype(np.float32), blur)
+            noisy = to_bytes(soft + rng.normal(0.0, sigma, truth.shape))
+            own = estimate_noise(noisy)
+            told = [denoise_image(noisy, replace(own, blur=share * blur)) for share in (1.0, 0.8, 1.2)]
+            masked = 2.0 * noisy - _blur(noisy.astype(np.float32), blur)
+            scores.append([psnr(to_bytes(each), truth) for each in (noisy, masked, *told)])
+        lines.append(row(f"{blur} px, sigma {sigma:.0f}", *(f"{each:.2f}" for each in np.mean(scores, axis=0))))
+    return lines
+
+
+def _blur(image: np.ndarray, sigma: float) -> np.ndarray:
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REFLECT))
 
 
 def _salt_and_pepper(image: np.ndarray, rng: np.random.Generator, share: float) -> np.ndarray:

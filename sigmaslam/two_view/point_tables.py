@@ -1,0 +1,203 @@
+"""Triangulation (9.34) and absolute orientation (9.2.3.3) from files to files."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+
+from sigmaslam.bounded_files import TABLE_BYTES, load_columns, read_text
+from sigmaslam.calibration_files.calibration import read_calibration
+from sigmaslam.errors import InputError
+from sigmaslam.files import atomic_write_text
+from sigmaslam.geometry.camera import StereoCamera
+from sigmaslam.geometry.rectification import StereoRectifier
+from sigmaslam.geometry.se3 import se3_inverse
+from sigmaslam.geometry.uncertainty import propagate
+from sigmaslam.two_view.absolute_orientation import absolute_orientation
+from sigmaslam.two_view.triangulation import TwoViews, triangulate
+
+_PIXELS = ("u0", "v0", "u1", "v1")
+_PLACE = ("x", "y", "z")
+_COVARIANCE = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
+
+
+def triangulate_file(source: Path, calibration: Path, out: Path, method: str, sigma: float) -> str:
+    """Points of a stereo pair, in the left camera, with their covariance (9.35); says in words what was written.
+
+    Args:
+        source: CSV with a header: u0,v0,u1,v1, pixels of the raw left and right image, and if wanted `id` and `sigma`;
+            or an .npz of `sigmaslam match`, left image first, of which the covariance of the right pixels is taken.
+        calibration: of the pair.
+        out: CSV to write: id,x,y,z in metres and the upper triangle of the covariance.
+        method: of `two_view.triangulation.METHODS`; parallel rectifies the pixels.
+        sigma: of a coordinate, pixels, where the file does not say.
+
+    Raises:
+        InputError: a file has other columns, or no pair of pixels meets in front of the cameras.
+    """
+    camera = read_calibration(calibration)
+    names, pixels, covariance = _read_pairs(source, sigma)
+    points, spread = triangulate_pairs(camera, pixels, covariance, method)
+    usable = np.isfinite(points).all(axis=1) & np.isfinite(spread).all(axis=(1, 2)) & (points[:, 2] > 0.0)
+    if not usable.any():
+        raise InputError(
+            f"{source}: none of {len(usable)} pairs meets in front of the cameras: is the left image first?"
+        )
+    upper = spread[:, *np.triu_indices(3)]
+    rows = [
+        [name, *(f"{value:.9g}" for value in (*point, *cells))]
+        for name, point, cells, used in zip(names, points.tolist(), upper.tolist(), usable.tolist(), strict=True)
+        if used
+    ]
+    _write_table(out, ["id", *_PLACE, *_COVARIANCE], rows)
+    depth, sigma_depth = points[usable, 2], np.sqrt(spread[usable, 2, 2])
+    return (
+        f"{len(rows)} points, {len(usable) - len(rows)} left out that meet nowhere before the cameras; "
+        f"depth {np.median(depth):.4g} ± {np.median(sigma_depth):.2g} m in the median\nWritten: {out}"
+    )
+
+
+def triangulate_pairs(
+    camera: StereoCamera, pixels: np.ndarray, covariance: np.ndarray, method: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 3) in the left camera with covariances (N, 3, 3); NaN where a pixel has no ray or no point.
+
+    Args:
+        camera: the pair.
+        pixels: (N, 4) of raw images.
+        covariance: (N, 4, 4) of them.
+        method: of `two_view.triangulation.METHODS`.
+    """
+    views, R_view_left, R_view_right = _views(camera, method == "parallel")
+
+    def straighten(raw: np.ndarray) -> np.ndarray:
+        """Pixels of cameras without distortion; for `parallel` those of the rectified ones."""
+        left = camera.left.unproject(raw[..., :2]) @ R_view_left.T @ views.K0.T
+        right = camera.right.unproject(raw[..., 2:]) @ R_view_right.T @ views.K1.T
+        return np.concatenate([left[..., :2] / left[..., 2:], right[..., :2] / right[..., 2:]], axis=-1)
+
+    straight, spread = propagate(straighten, pixels, covariance)
+    usable = np.isfinite(straight).all(axis=1) & np.isfinite(spread).all(axis=(1, 2))
+    if method == "parallel":
+        # Differences are taken over a thousandth of sigma, beyond which a disparity must stay positive.
+        usable &= straight[:, 0] - straight[:, 2] > 0.01 * np.sqrt(np.maximum(spread[:, 0, 0], spread[:, 2, 2]))
+    points, found = np.full((len(pixels), 3), np.nan), np.full((len(pixels), 3, 3), np.nan)
+    if usable.any():
+        points[usable], found[usable] = triangulate(views, straight[usable], spread[usable], method)
+    return points @ R_view_left, R_view_left.T @ found @ R_view_left
+
+
+def _views(camera: StereoCamera, rectified: bool) -> tuple[TwoViews, np.ndarray, np.ndarray]:
+    """Pinhole cameras in place of the pair's, and the rotations from the pair's into them."""
+    if not rectified:
+        return TwoViews(camera.left.matrix, camera.right.matrix, se3_inverse(camera.T_left_right)), np.eye(3), np.eye(3)
+    rectifier = StereoRectifier(camera)
+    K, T_right_left = rectifier.rectified.matrix, np.eye(4)
+    T_right_left[0, 3] = -rectifier.rectified.baseline
+    return TwoViews(K, K, T_right_left), rectifier.R_rectified_left, rectifier.R_rectified_right
+
+
+def orient_files(source: Path, target: Path, out: Path, with_scale: bool, sigma: float | None) -> str:
+    """Rotation, translation and scale from a frame into another by control points; says them in words.
+
+    Args:
+        source, target: CSV with a header: id,x,y,z; in the target, if wanted, `sigma` in metres. Points of one id
+            belong together; others are left out.
+        out: JSON to write: T_target_source (with the scale in its rotation), scale, covariance.
+        with_scale: a similarity.
+        sigma: of a coordinate of the target points, metres, where the file does not say; None: from the residuals.
+
+    Raises:
+        InputError: a file has other columns, or fewer than three points are in both.
+    """
+    first, second = (_read_points(path) for path in (source, target))
+    names = [name for name in first if name in second]
+    if len(names) < 3:
+        raise InputError(f"{source} and {target} have {len(names)} ids in common: give three points or more in both")
+    points, control = (np.array([each[name][:3] for name in names]) for each in (first, second))
+    sigmas = np.array([second[name][3] for name in names])
+    given = bool(np.isfinite(sigmas).all())
+    weight = 1.0 / sigmas**2 if given else None
+    found = absolute_orientation(points, control, weight, with_scale, 1.0 if given else sigma)
+    if not np.isfinite(found.covariance[:6, :6]).all():
+        raise InputError(f"{source}: {len(names)} points lie on a line or are too few to tell how well they fit")
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = found.scale * found.R, found.translation
+    residuals = np.linalg.norm(found.apply(points) - control, axis=1)
+    content = {
+        "T_target_source": T.tolist(),
+        "scale": found.scale,
+        "covariance": found.covariance.tolist(),
+        "covariance_of": ["x", "y", "z", "turn_x", "turn_y", "turn_z", "log_scale"][: len(found.covariance)],
+        "residuals": dict(zip(names, residuals.tolist(), strict=True)),
+    }
+    atomic_write_text(out, json.dumps(content, indent=2) + "\n")
+    deviation = np.sqrt(np.diag(found.covariance))
+    scale = f"; scale {found.scale:.6g} ± {found.scale * deviation[6]:.2g}" if with_scale else ""
+    return (
+        f"{len(names)} points, residuals rms {np.sqrt(np.mean(residuals**2)):.4g} m, largest {residuals.max():.4g} m "
+        f"of {names[int(residuals.argmax())]}\nsigma     place of the centroid {deviation[:3].max():.2g} m, turn "
+        f"{np.degrees(deviation[3:6].max()):.2g} deg{scale}\nWritten: {out}"
+    )
+
+
+def _read_pairs(path: Path, sigma: float) -> tuple[list[str], np.ndarray, np.ndarray]:
+    """Names (N,), pixels (N, 4) and covariances (N, 4, 4)."""
+    if path.suffix.lower() == ".npz":
+        shapes = {"keypoints0": ("M", 2), "keypoints1": ("M", 2), "covariance": ("M", 2, 2)}
+        arrays = load_columns(path, "write it by `sigmaslam match`", shapes, {})
+        pixels = np.column_stack([arrays["keypoints0"], arrays["keypoints1"]]).astype(float)
+        covariance = np.zeros((len(pixels), 4, 4))
+        # What is known is the covariance of the difference; each image is given half of it.
+        covariance[:, :2, :2] = covariance[:, 2:, 2:] = 0.5 * arrays["covariance"]
+        return [str(k) for k in range(len(pixels))], pixels, covariance
+    names, values = _read_table(path, _PIXELS)
+    sigmas = np.where(np.isfinite(values[:, 4]), values[:, 4], sigma)
+    return names, values[:, :4], sigmas[:, None, None] ** 2 * np.eye(4)
+
+
+def _read_points(path: Path) -> dict[str, np.ndarray]:
+    """By id x, y, z and sigma, which is NaN where the file has none."""
+    names, values = _read_table(path, _PLACE)
+    double = next((name for k, name in enumerate(names) if name in names[:k]), None)
+    if double is not None:
+        raise InputError(f"{path}: id {double} stands twice: remove the wrong line")
+    return dict(zip(names, values, strict=True))
+
+
+def _read_table(path: Path, columns: tuple[str, ...]) -> tuple[list[str], np.ndarray]:
+    """Ids (N,), which are the numbers of the lines without any, and the columns and sigma (N, C + 1), NaN for none."""
+    reader = csv.DictReader(io.StringIO(read_text(path, TABLE_BYTES, "the table"), newline=""), skipinitialspace=True)
+    missing = [column for column in columns if column not in (reader.fieldnames or ())]
+    if missing:
+        raise InputError(
+            f"{path}: no column {missing[0]}: give a header with {','.join(columns)}, and if wanted id and sigma"
+        )
+    names, rows = [], []
+    for number, row in enumerate(reader):
+        try:
+            values = [float(row[column]) for column in columns]
+            sigma = float(row["sigma"]) if row.get("sigma") else np.nan
+        except (TypeError, ValueError):
+            values, sigma = [np.nan], np.nan
+        if not np.isfinite(values).all() or sigma <= 0.0:
+            raise InputError(
+                f"{path}, line {reader.line_num}: not finite numbers, or a sigma that is not positive: mend it"
+            )
+        names.append(row.get("id") or str(number))
+        rows.append([*values, sigma])
+    if not rows:
+        raise InputError(f"{path}: has a header and no rows: give points")
+    return names, np.array(rows)
+
+
+def _write_table(path: Path, header: list[str], rows: list[list[str]]) -> None:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    atomic_write_text(path, text.getvalue())
