@@ -26,11 +26,14 @@ def test_right_matches_lie_on_the_lines_of_the_pose_and_wrong_ones_anywhere(name
 @pytest.mark.slow
 def test_the_table_has_a_row_a_case_and_says_what_is_not_installed(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(orientation_peers, "SEEDS", range(2))
-    monkeypatch.setattr(orientation_peers, "CASES", {"plane, 30 %": CASES["plane, 30 %"]})
+    names = ("plane, 30 %", "forward, 20 %")
+    monkeypatch.setattr(orientation_peers, "CASES", {name: CASES[name] for name in names})
     monkeypatch.setattr(orientation_peers, "find_spec", lambda module: None)
     told: list[str] = []
     lines = orientation_table(None, told.append)
-    (line,) = [line for line in lines if line.startswith("| plane, 30 %")]
-    assert line.count("|") == 6
+    plane, forward = (next(line for line in lines if line.startswith(f"| {name}")) for name in names)
+    assert plane.count("|") == forward.count("|") == 6
+    # Each case has its own matches.
+    assert plane.split("|")[2:] != forward.split("|")[2:]
     assert "Not installed: poselib, pycolmap." in lines
-    assert told == ["plane, 30 % done"]
+    assert told == [f"{name} done" for name in names]

@@ -92,9 +92,7 @@ def simulate(case: Case, seed: int) -> PosePair:
 
 def orientation_table(data: Path | None, note: Callable[[str], None]) -> list[str]:
     """The table of the page: every case and the fountain, if the data are there, by every method that is installed."""
-    sets: dict[str, Iterable[PosePair]] = {
-        name: (simulate(case, seed) for seed in SEEDS) for name, case in CASES.items()
-    }
+    sets: dict[str, Iterable[PosePair]] = {name: map(partial(simulate, case), SEEDS) for name, case in CASES.items()}
     if data is not None:
         sets["fountain, six pairs"] = _fountain(data)
     methods = _methods()
@@ -174,6 +172,7 @@ def _colmap(pair: PosePair) -> Pose | None:
 
     width, height, parameters = _camera(pair)
     camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=parameters)
+    pycolmap.set_random_seed(0)
     options = pycolmap.TwoViewGeometryOptions()
     options.compute_relative_pose, options.ransac.max_error = True, 2.0
     index = np.tile(np.arange(len(pair.points0), dtype=np.uint32)[:, None], 2)
