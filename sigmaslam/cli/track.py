@@ -177,9 +177,18 @@ def track(
     imu: Annotated[
         str | None,
         typer.Option(
-            metavar="FILE|off",
-            help="CSV of an inertial sensor (time, rad/s, m/s^2) with its YAML beside; off: use none.",
-            show_default="imu0/data.csv in INPUT",
+            metavar="FILE|TOPIC|off",
+            help="Inertial sensor: CSV (time, rad/s, m/s^2) with its YAML beside, KITTI's oxts, or a bag's topic; off: "
+            "use none.",
+            show_default="the one in INPUT, if files say all of it",
+        ),
+    ] = None,
+    odometry: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="CSV of wheels with a head timestamp, speed, yaw_rate (m/s, rad/s), or vx, vy, vz, wx, wy, wz, with "
+            "T_cam_base in the YAML beside.",
         ),
     ] = None,
     denoise: Annotated[

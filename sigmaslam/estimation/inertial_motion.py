@@ -226,16 +226,3 @@ class InertialMotion(MotionFilter):
         T_kc = self.step
         lever = self._T_camera_imu[:3, 3]
         self.twist = np.r_[T_kc[:3, :3].T @ self._velocity - np.cross(rate, lever), rate]
-
-
-def build_motion(backend: str, sensor: InertialSensor | None, T_camera_left: np.ndarray) -> MotionFilter:
-    """The motion of a rectified camera, by its inertial sensor where it has one.
-
-    Args:
-        backend: "onnx" or "torch".
-        sensor: beside the left camera.
-        T_camera_left: (4, 4) takes points of the left camera into the rectified one.
-    """
-    return (
-        MotionFilter(backend) if sensor is None else InertialMotion(backend, sensor, T_camera_left @ sensor.T_left_imu)
-    )

@@ -54,7 +54,7 @@ def test_a_dark_second_loses_no_frame_and_few_centimetres(real_data):
 
 def test_samples_are_for_trackers_with_a_sensor_and_must_be_numbers():
     camera = parallel_camera(160, 120, 100.0, 0.1)
-    with pytest.raises(InputError, match="knows no inertial sensor"):
+    with pytest.raises(InputError, match="knows no such sensor"):
         StereoTracker(camera, "orb").add_imu(0.0, np.zeros(3), np.zeros(3))
     tracker = StereoTracker(camera, "orb", imu=SENSOR)
     with pytest.raises(InputError, match="three finite numbers"):
