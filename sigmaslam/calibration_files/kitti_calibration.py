@@ -45,6 +45,34 @@ def read_kitti_calibration(path: Path, image_size: ImageSize | None, cameras: tu
     )
 
 
+def read_rigid(path: Path, rotation: str, translation: str) -> np.ndarray:
+    """(4, 4) transform of two keys, as in calib_imu_to_velo.txt, calib_velo_to_cam.txt and calib_cam_to_cam.txt.
+
+    Raises:
+        CalibrationError: a matrix is missing or incomplete, or the first is no rotation.
+    """
+    entries = _read_entries(path, GREY_PAIR)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = _matrix(path, entries, rotation, (3, 3)), _matrix(path, entries, translation, (3,))
+    # The files have seven digits.
+    if not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3):
+        raise CalibrationError(f"{path}: key '{rotation}' is no rotation; correct the numbers")
+    return T
+
+
+def read_rectification(path: Path, camera: int) -> np.ndarray:
+    """(4, 4) takes points of camera 0 into a rectified camera, by calib_cam_to_cam.txt.
+
+    Raises:
+        CalibrationError: a matrix is missing or incomplete.
+    """
+    entries = _read_entries(path, GREY_PAIR)
+    P = _matrix(path, entries, f"P_rect_{camera:02d}", (3, 4))
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = _matrix(path, entries, "R_rect_00", (3, 3)), np.linalg.solve(P[:, :3], P[:, 3])
+    return T
+
+
 def _read_entries(path: Path, cameras: tuple[int, int]) -> dict[str, str]:
     text = read_text(path, CALIBRATION_BYTES, "the calibration", CalibrationError)
     lines = [line.strip() for line in text.splitlines() if line.strip()]

@@ -1,4 +1,4 @@
-"""What is wrong with an inertial sensor's table: its times and its unit of force."""
+"""What is wrong with the tables of sensors of motion: their times, and the unit of force."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ from sigmaslam.checks.calibration import MAX_BASELINE
 from sigmaslam.checks.finding import Finding
 from sigmaslam.geometry.inertial_sensor import STANDARD_GRAVITY
 from sigmaslam.readers.inertial import InertialRecording
+from sigmaslam.readers.odometry import OdometryRecording
 
 _NAME = "inertial sensor"
 # The median specific force of whatever moves on Earth is within so much of gravity, m/s^2; other units are far off.
 _LENGTH_TOLERANCE = 3.0
-# Periods that are missing in a row before it is said, and samples a second that preintegration needs.
-_GAP, _LEAST_RATE = 2.5, 50.0
-
-
+# Periods that are missing in a row before it is said, and samples a second that preintegration needs, and velocities.
+_GAP, _LEAST_RATE, _LEAST_ODOMETRY_RATE = 2.5, 50.0, 10.0
 # Ranges that sensors have, rad/s and m/s^2; a value within this share of one that lasts so long is at its end.
 _RATES = np.radians([125, 250, 500, 1000, 2000, 4000])
 _FORCES = STANDARD_GRAVITY * np.array([2, 4, 8, 16, 32])
@@ -44,24 +43,44 @@ def check_inertial(recording: InertialRecording, timestamps: Sequence[float] | N
         cure = f"it is in {unit}: give m/s^2" if unit else "are its columns those of the specific force in m/s^2?"
         message = f"{source}: specific force is {length:.3g} in the median, not 9.81: {cure}"
         return Finding(_NAME, "error", message, length)
-    intervals = np.diff(samples.timestamp)
-    rate = 1.0 / float(np.median(intervals))
-    if timestamps is not None and len(timestamps):
-        images = np.asarray(timestamps) + recording.sensor.time_shift
-        covered = float(np.mean((images >= samples.timestamp[0]) & (images <= samples.timestamp[-1])))
-        if covered < 1.0:
-            message = f"{source}: {1.0 - covered:.0%} of the images lie outside its time: is it of the same clock?"
-            return Finding(_NAME, "error" if covered < 0.5 else "warning", message, covered)
+    found = _check_times(_NAME, recording, timestamps, _LEAST_RATE)
     for name, values, ranges in (("rate", samples.gyro, _RATES), ("force", samples.accel, _FORCES)):
         peak, count = _saturated(values, ranges)
-        if count:
+        if count and found.severity != "error":
             message = f"{source}: the {name} stays at {peak:.3g} for {count} samples: saturated? Set a wider range"
             return Finding(_NAME, "warning", message, peak)
+    if found.severity == "ok":
+        return Finding(_NAME, "ok", f"{found.message}, gravity {length:.2f} m/s^2", found.figure)
+    return found
+
+
+def check_odometry(recording: OdometryRecording, timestamps: Sequence[float] | None) -> Finding:
+    """The worst that is wrong with the times of odometry; velocities are judged while tracking, by those of the images.
+
+    Args:
+        recording: the table.
+        timestamps: of the images, seconds; None where they are not known.
+    """
+    return _check_times("odometry", recording, timestamps, _LEAST_ODOMETRY_RATE)
+
+
+def _check_times(
+    name: str, recording: InertialRecording | OdometryRecording, images: Sequence[float] | None, least_rate: float
+) -> Finding:
+    t, source = recording.samples.timestamp, recording.source
+    intervals = np.diff(t)
+    rate = 1.0 / float(np.median(intervals))
+    if images is not None and len(images):
+        shifted = np.asarray(images) + recording.sensor.time_shift
+        covered = float(np.mean((shifted >= t[0]) & (shifted <= t[-1])))
+        if covered < 1.0:
+            message = f"{source}: {1.0 - covered:.0%} of the images lie outside its time: is it of the same clock?"
+            return Finding(name, "error" if covered < 0.5 else "warning", message, covered)
     gaps = intervals[intervals > _GAP / rate]
-    if rate < _LEAST_RATE or len(gaps):
+    if rate < least_rate or len(gaps):
         message = f"{source}: {rate:.0f} samples a second, {len(gaps)} gaps of up to {intervals.max():.2f} s"
-        return Finding(_NAME, "warning", f"{message}: at least {_LEAST_RATE:.0f} without gaps carry a pose", rate)
-    return Finding(_NAME, "ok", f"{rate:.0f} samples a second, gravity {length:.2f} m/s^2", rate)
+        return Finding(name, "warning", f"{message}: at least {least_rate:.0f} without gaps carry a pose", rate)
+    return Finding(name, "ok", f"{rate:.0f} samples a second", rate)
 
 
 def _saturated(values: np.ndarray, ranges: np.ndarray) -> tuple[float, int]:

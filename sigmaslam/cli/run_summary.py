@@ -23,7 +23,7 @@ def tell_summary(summary: dict[str, Any], out: Path) -> None:
     """
     typer.echo(
         f"{summary['tracked']} of {summary['frames']} frames tracked{_doubted(summary)}, "
-        f"{_inertial(summary)}{summary['starting']} starting, {summary['lost']} lost, {summary['skipped']} skipped; "
+        f"{_reckoned(summary)}{summary['starting']} starting, {summary['lost']} lost, {summary['skipped']} skipped; "
         f"{summary['median_inliers']:.0f} inliers in the median frame, {summary['map_points']} map points.\n"
         f"{_world(summary)}{_times(summary)}{_contradiction(summary)}{_doubts(summary)}{summary['calibration_verdict']}\n"
         f"{_imu_verdict(summary)}{_location_verdict(summary)}{_real_time_verdict(summary)}"
@@ -59,9 +59,10 @@ def _doubted(summary: dict[str, Any]) -> str:
     return f" ({', '.join(counts)})" if counts else ""
 
 
-def _inertial(summary: dict[str, Any]) -> str:
-    """How many frames the inertial sensor carried through the dark; empty where none."""
-    return f"{summary['inertial']} by the inertial sensor alone, " if summary.get("inertial") else ""
+def _reckoned(summary: dict[str, Any]) -> str:
+    """How many frames a sensor of motion carried through the dark; empty where none."""
+    names = {"inertial": "the inertial sensor", "odometry": "odometry"}
+    return "".join(f"{summary[key]} by {name} alone, " for key, name in names.items() if summary.get(key))
 
 
 def _doubts(summary: dict[str, Any]) -> str:

@@ -57,9 +57,10 @@ TopicRight = Annotated[
 Imu = Annotated[
     str | None,
     typer.Option(
-        metavar="FILE|off",
-        help="CSV of an inertial sensor (time, rad/s, m/s^2) with its YAML beside; off: use none.",
-        show_default="imu0/data.csv in INPUT",
+        metavar="FILE|TOPIC|off",
+        help="Inertial sensor: CSV (time, rad/s, m/s^2) with its YAML beside, KITTI's oxts, or a bag's topic; off: "
+        "use none.",
+        show_default="the one in INPUT, if files say all of it",
     ),
 ]
 Weights = Annotated[
@@ -183,6 +184,14 @@ def track(
         ),
     ] = None,
     imu: Imu = None,
+    odometry: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="CSV of wheels with a head timestamp, speed, yaw_rate (m/s, rad/s), or vx, vy, vz, wx, wy, wz, with "
+            "T_cam_base in the YAML beside.",
+        ),
+    ] = None,
     denoise: Annotated[
         bool, typer.Option("--denoise", help="Filter noise out of the images first: for the dark; slow.")
     ] = False,

@@ -38,7 +38,7 @@ class MotionFilter:
         step: (4, 4) T_keyframe_camera.
         twist: (6,) velocity of the camera in its own frame, m/s and rad/s.
         widened: by which factor since the last prediction.
-        is_inertial: an inertial sensor predicts, which knows the velocity without images.
+        is_inertial, is_odometric: an inertial sensor or odometry predicts, which knows the velocity without images.
 
     Args:
         backend: "onnx" or "torch".
@@ -50,7 +50,7 @@ class MotionFilter:
         self.twist = np.zeros(6)
         self._covariance = np.zeros((_STATE_SIZE, _STATE_SIZE))
         self.widened = 1.0
-        self.is_inertial = False
+        self.is_inertial = self.is_odometric = False
 
     @property
     def state(self) -> MotionState:
@@ -87,7 +87,7 @@ class MotionFilter:
             seconds: since the last frame.
             densities: (2,) power spectra of the accelerations, m^2/s^3 and rad^2/s^3.
             sigma: standard deviation of the seconds; along the velocity the pose is that much less certain.
-            timestamp: of the frame, seconds; for an inertial sensor.
+            timestamp: of the frame, seconds; for a sensor.
         """
         self.step, covariance = self._predict(
             {
@@ -135,3 +135,8 @@ class MotionFilter:
         self.step = np.eye(4)
         self._covariance[_POSE, :] = 0.0
         self._covariance[:, _POSE] = 0.0
+
+
+def dead_reckoning(motion: MotionFilter) -> str | None:
+    """Status of frames that a sensor alone carries; None where none predicts."""
+    return "inertial" if motion.is_inertial else "odometry" if motion.is_odometric else None

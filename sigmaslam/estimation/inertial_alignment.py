@@ -161,7 +161,7 @@ def _solve(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> tuple[np.nda
         variance = _SHARED * max(float(residual @ residual) / max(len(y) - 12, 1), _LEAST_PLACE**2)
         gravity = solution[6:9]
         length = np.linalg.norm(gravity)
-        first = length if not turn else first
+        first = float(length) if not turn else first
         direction = gravity / length
     end = np.concatenate([speed, identity[6:9], np.zeros((3, 12)), identity[9:]])
     covariance = end @ np.linalg.inv(information) @ end.T

@@ -1,20 +1,14 @@
-"""The last samples of an inertial sensor, and what their noise turns out to be."""
+"""Inertial samples between images as relative motions, and what their noise turns out to be."""
 
 from __future__ import annotations
-
-import logging
-from collections import deque
 
 import numpy as np
 
 from sigmaslam.estimation.gaussian import regression
 from sigmaslam.estimation.preintegration import Preintegrated, preintegrate
+from sigmaslam.estimation.sample_buffer import SampleBuffer
 from sigmaslam.geometry.inertial_sensor import InertialSamples, InertialSensor
 
-_LOGGER = logging.getLogger(__name__)
-
-# Seconds of samples that are kept: twice what gravity is looked for in.
-_KEPT = 20.0
 # The noise that is learned begins at five times the densities of a data sheet, which hold at rest: in flight others
 # take 3 to 17 times as much. A frame changes it by this share, and none counts for more than so many variances.
 _FIRST_SCALE, _ADAPTATION, _MOST_SURPRISE = 25.0, 0.05, 9.0
@@ -22,36 +16,16 @@ _FIRST_SCALE, _ADAPTATION, _MOST_SURPRISE = 25.0, 0.05, 9.0
 _LARGEST_SCALE = 1e4
 
 
-class InertialBuffer:
-    """Takes samples as they come and integrates them between images.
+class InertialBuffer(SampleBuffer):
+    """Integrates samples of angular rate and specific force between images.
 
     Args:
         sensor: its noise and clock.
     """
 
     def __init__(self, sensor: InertialSensor) -> None:
+        super().__init__(sensor.time_shift)
         self.sensor = sensor
-        self.late = 0
-        """Samples that were left out, as they were not later than the one before."""
-        self._samples: deque[np.ndarray] = deque()
-        self._table: np.ndarray | None = None  # of the samples, while they stay as they are
-
-    def add(self, timestamp: float, gyro: np.ndarray, accel: np.ndarray) -> None:
-        """Takes a sample, rad/s and m/s^2."""
-        if self._samples and timestamp <= self._samples[-1][0]:
-            if not self.late:
-                _LOGGER.warning("an inertial sample at %.6f s is not later than the last one: left out", timestamp)
-            self.late += 1
-            return
-        self._samples.append(np.r_[timestamp, gyro, accel])
-        self._table = None
-        self.forget(timestamp - _KEPT)
-
-    def forget(self, before: float) -> None:
-        """Samples before that time of the sensor's clock, but for the last of them, are needed no longer."""
-        while len(self._samples) > 2 and self._samples[1][0] < before:
-            self._samples.popleft()
-            self._table = None
 
     def preintegrate(self, start: float, end: float, biases: np.ndarray, densities: np.ndarray) -> Preintegrated | None:
         """The motion between two time stamps of the camera; None without samples near them.
@@ -61,12 +35,8 @@ class InertialBuffer:
             biases: (6,) of gyro and accelerometer.
             densities: (2,) power spectra of unknown accelerations, m^2/s^3 and rad^2/s^3, for gaps.
         """
-        if self._table is None:
-            self._table = np.array(self._samples).reshape(-1, 7)
-        table = self._table
-        start, end = start + self.sensor.time_shift, end + self.sensor.time_shift
-        first = max(int(np.searchsorted(table[:, 0], start, "right")) - 1, 0)
-        table = table[first : int(np.searchsorted(table[:, 0], end)) + 1]
+        table = self.around(start, end)
+        start, end = start + self.time_shift, end + self.time_shift
         if len(table) < 2:
             return None
         samples = InertialSamples(table[:, 0], table[:, 1:4], table[:, 4:])

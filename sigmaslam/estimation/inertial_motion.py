@@ -21,6 +21,7 @@ _LOGGER = logging.getLogger(__name__)
 
 # Order of the graph's error state, see sigmaslam_models.estimator.inertial_prediction.
 _POSE, _VELOCITY, _GRAVITY, _BIASES = slice(0, 6), slice(6, 9), slice(9, 12), slice(12, 18)
+# Delay and mounting of the sensor, and the size of all.
 _SENSOR, _SIZE = slice(18, 25), 25
 # Prior standard deviations of delay (s), place (m) and rotation (rad) of the sensor. Those of careful calibrations:
 # 2 ms, 5 mm and 0.2 degrees.
@@ -232,16 +233,3 @@ class InertialMotion(MotionFilter):
         T_kc = self.step
         lever = self._T_camera_imu[:3, 3]
         self.twist = np.r_[T_kc[:3, :3].T @ self._velocity - np.cross(rate, lever), rate]
-
-
-def build_motion(backend: str, sensor: InertialSensor | None, T_camera_left: np.ndarray) -> MotionFilter:
-    """The motion of a rectified camera, by its inertial sensor where it has one.
-
-    Args:
-        backend: "onnx" or "torch".
-        sensor: beside the left camera.
-        T_camera_left: (4, 4) takes points of the left camera into the rectified one.
-    """
-    return (
-        MotionFilter(backend) if sensor is None else InertialMotion(backend, sensor, T_camera_left @ sensor.T_left_imu)
-    )

@@ -19,6 +19,8 @@ TURN, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, ACCEL_BIAS, DELAY = slice(0, 3), slice(3, 6), 6
 # Mean periods between two samples above which some are missing: jitter is less.
 _GAP = 2.5
+# Seconds of a gap across which values at both ends say what was between: bodies turn round in no less.
+_BRIDGED = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,8 +58,8 @@ def preintegrate(
 ) -> Preintegrated:
     """Integrates samples from `start` to `end`, seconds of the sensor's clock.
 
-    Across gaps, and beyond the first and last sample, values are interpolated or held, and the noise is that of a
-    motion which nobody measured.
+    Across gaps, and beyond the first and last sample, values are interpolated or held. In short gaps they depart from
+    that by as much as they change elsewhere in such a time; else the noise is that of a motion which nobody measured.
 
     Args:
         samples: at least one; those around the interval, too.
@@ -69,7 +71,7 @@ def preintegrate(
     t = samples.timestamp
     inside = t[(t > start) & (t < end)]
     edges = np.r_[start, inside, end]
-    gyro, accel = (_interpolate(edges, t, each) for each in (samples.gyro - gyro_bias, samples.accel - accel_bias))
+    gyro, accel = (interpolate(edges, t, each) for each in (samples.gyro - gyro_bias, samples.accel - accel_bias))
     steps, middles = np.diff(edges), 0.5 * (edges[1:] + edges[:-1])
     # Length of the gap between samples that each step lies in.
     after = np.searchsorted(t, middles)
@@ -77,7 +79,9 @@ def preintegrate(
     gaps = t[np.clip(after, 1, len(t) - 1)] - t[np.clip(after - 1, 0, max(len(t) - 2, 0))]
     period = float(np.median(np.diff(t))) if len(t) > 1 else float(end - start)
     gaps = np.where(before_first, t[0] - start, np.where(behind_last, end - t[-1], gaps))
-    is_missing = gaps > _GAP * period
+    is_gap = gaps > _GAP * period
+    is_bridged = is_gap & (gaps <= _BRIDGED) & ~before_first & ~behind_last
+    is_missing = is_gap & ~is_bridged
     turn, velocity, position = np.eye(3), np.zeros(3), np.zeros(3)
     slope, noises = np.zeros((9, 6)), [np.zeros((9, 9)), np.zeros((9, 9))]
     for k, h in enumerate(steps):
@@ -94,7 +98,12 @@ def preintegrate(
         B[VELOCITY, ACCEL_BIAS], B[POSITION, ACCEL_BIAS] = h * middle, 0.5 * h * h * middle
         slope = A @ slope - B
         spectra = [sensor.gyro_density**2, sensor.accel_density**2]
-        if is_missing[k]:
+        if is_bridged[k]:
+            spectra = [
+                own + float(bridge_spectrum(t, values, gaps[k]).mean())
+                for own, values in zip(spectra, (samples.gyro, samples.accel), strict=True)
+            ]
+        elif is_missing[k]:
             # A rate that goes from end to end with an unknown angular acceleration, as a Brownian bridge.
             spectra = [spectra[0] + densities[1] * gaps[k] ** 2 / 12.0, spectra[1] + densities[0]]
         for column, noise in enumerate(noises):
@@ -116,5 +125,16 @@ def preintegrate(
     return Preintegrated(end - start, turn, velocity, position, slope, noises[0], noises[1], missing)
 
 
-def _interpolate(at: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    return np.column_stack([np.interp(at, t, values[:, axis]) for axis in range(3)])
+def bridge_spectrum(t: np.ndarray, values: np.ndarray, gap: float) -> np.ndarray:
+    """Power spectra (D,), as of white noise, of how random walks depart from the line between both ends of a gap.
+
+    The walks are as fast as values (N, D) at times (N,) change over that time.
+    """
+    starts = t <= t[-1] - gap
+    changes = interpolate(t[starts] + gap, t, values) - values[starts]
+    return np.asarray(np.mean(changes**2, axis=0) * gap / 12.0)
+
+
+def interpolate(at: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """(M, D) values at times (M,), of those (N, D) at times (N,); held beyond these."""
+    return np.column_stack([np.interp(at, t, column) for column in values.T])

@@ -58,6 +58,12 @@ class StereoRectifier:
         T[:3, :3] = self.R_rectified_left
         return T
 
+    def describe(self) -> dict[str, np.ndarray]:
+        """The rectified pair: intrinsics (5,) fx, fy, cx, cy, baseline, and R_rectified_left (3, 3)."""
+        pair = self.rectified
+        intrinsics = np.array([pair.fx, pair.fy, pair.cx, pair.cy, pair.baseline])
+        return {"intrinsics": intrinsics, "R_rectified_left": self.R_rectified_left}
+
     def rectify(self, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rectified images, bilinear; the very same arrays if the camera is rectified already.
 

@@ -24,6 +24,7 @@ STATUS_COLOURS = {
     "doubtful": bgr("#f0d03f"),
     "ambiguous": bgr("#b57bff"),
     "inertial": bgr("#4fc3a1"),
+    "odometry": bgr("#a1c34f"),
 }
 """Those of the report."""
 _BACKGROUND, _TEXT, _FAINT, _OUTLIER = bgr("#14181d"), bgr("#e6e9ec"), bgr("#7d8791"), bgr("#ff4d3d")

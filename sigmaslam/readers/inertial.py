@@ -69,19 +69,56 @@ def read_imu(path: Path, is_mounted: bool = True) -> InertialRecording:
         CalibrationError: noise or mounting are missing or wrong.
     """
     path = path / "data.csv" if path.is_dir() else path
-    samples, dropped = _read_samples(path)
-    noise = _noise_file(path)
-    if noise is None:
-        raise CalibrationError(
-            f"{path}: nothing says how noisy the sensor is: put {path.with_suffix('.yaml').name} beside it, with "
-            f"{', '.join(_DENSITIES)} and T_cam_imu"
+    seconds, values = _read_table(path)
+    return record(path, seconds, values, read_sensor(path, is_mounted))
+
+
+def record(source: Path, seconds: np.ndarray, values: np.ndarray, sensor: InertialSensor) -> InertialRecording:
+    """Samples in the order of time; those out of order are left out.
+
+    Args:
+        source: named in messages.
+        seconds: (N,) times of the sensor's clock.
+        values: (N, 6) angular rate and specific force.
+        sensor: mounting and noise.
+    Raises:
+        InputError: there are fewer than two samples, or time runs backwards.
+    """
+    later = in_order(source, seconds)
+    seconds, values = seconds[later], values[later]
+    samples = InertialSamples(seconds, values[:, :3], values[:, 3:])
+    return InertialRecording(source, sensor, samples, int((~later).sum()))
+
+
+def in_order(source: Path, seconds: np.ndarray) -> np.ndarray:
+    """(N,) bool, which samples are later than all before them; InputError where there are too few."""
+    if len(seconds) < 2:
+        raise InputError(f"{source}: has {len(seconds)} samples; give the sensor's table")
+    later = np.r_[True, seconds[1:] > np.maximum.accumulate(seconds)[:-1]]
+    dropped = int((~later).sum())
+    if dropped > _MOST_OUT_OF_ORDER * len(seconds):
+        raise InputError(f"{source}: {dropped} of {len(seconds)} time stamps do not increase: sort the samples by time")
+    return np.asarray(later)
+
+
+def describe_lack(table: Path) -> str | None:
+    """What of a sensor no file beside its table, or bag, says, and how to give it; None where all is known."""
+    own = table.with_suffix(".yaml").name
+    if _noise_file(table) is None:
+        return (
+            f"nothing says how noisy the sensor is: put {own} beside it, with {', '.join(_DENSITIES)} and T_cam_imu, "
+            "or Kalibr's imu.yaml"
         )
-    mounting = _find_mounting(path) or (None if is_mounted else (np.eye(4), 0.0))
-    if mounting is None:
-        raise CalibrationError(
-            f"{path}: nothing says where the sensor is: give T_cam_imu in {path.with_suffix('.yaml').name}, or "
-            "Kalibr's camchain-imucam.yaml beside it"
-        )
+    if _find_mounting(table) is None:
+        return f"nothing says where the sensor is: give T_cam_imu in {own}, or Kalibr's camchain-imucam.yaml beside it"
+    return None
+
+
+def read_sensor(table: Path, is_mounted: bool = True) -> InertialSensor:
+    """Mounting and noise from the files beside a table or bag; CalibrationError where they are missing or wrong."""
+    noise, mounting = _noise_file(table), _find_mounting(table) or (None if is_mounted else (np.eye(4), 0.0))
+    if noise is None or mounting is None:
+        raise CalibrationError(f"{table}: {describe_lack(table)}")
     values = []
     for name in _DENSITIES:
         value = noise.number(name)
@@ -89,20 +126,17 @@ def read_imu(path: Path, is_mounted: bool = True) -> InertialRecording:
             raise noise.error(f"{name} is {value:g}: give the density of the data sheet, above zero")
         values.append(value)
     gyro, accel, gyro_walk, accel_walk = values
-    return InertialRecording(
-        path, InertialSensor(mounting[0], gyro, accel, gyro_walk, accel_walk, mounting[1]), samples, dropped
-    )
+    return InertialSensor(mounting[0], gyro, accel, gyro_walk, accel_walk, mounting[1])
 
 
-def _read_samples(path: Path) -> tuple[InertialSamples, int]:
+def _read_table(path: Path) -> tuple[np.ndarray, np.ndarray]:
     lines = read_text(path, TABLE_BYTES, "the inertial samples").splitlines()
     rows, stamps = [], []
     for number, row in enumerate(csv.reader(lines), start=1):
         if not row or row[0].lstrip().startswith("#") or (number == 1 and not _is_number(row[0])):
             continue
         try:
-            stamp, values = row[0].strip(), [float(each) for each in row[1:7]]
-            seconds = int(stamp) / 1e9 if float(stamp) > _NANOSECONDS_FROM and "." not in stamp else float(stamp)
+            seconds, values = parse_stamp(row[0]), [float(each) for each in row[1:7]]
         except ValueError:
             values, seconds = [], np.nan
         if len(values) != 6 or not np.isfinite([seconds, *values]).all():
@@ -112,14 +146,13 @@ def _read_samples(path: Path) -> tuple[InertialSamples, int]:
             )
         stamps.append(seconds)
         rows.append(values)
-    if len(rows) < 2:
-        raise InputError(f"{path}: has {len(rows)} inertial samples; give the sensor's table")
-    t, table = np.array(stamps), np.array(rows)
-    later = np.r_[True, t[1:] > np.maximum.accumulate(t)[:-1]]
-    dropped = int((~later).sum())
-    if dropped > _MOST_OUT_OF_ORDER * len(t):
-        raise InputError(f"{path}: {dropped} of {len(t)} time stamps do not increase: sort the samples by time")
-    return InertialSamples(t[later], table[later, :3], table[later, 3:]), dropped
+    return np.array(stamps), np.array(rows).reshape(-1, 6)
+
+
+def parse_stamp(text: str) -> float:
+    """Seconds, of seconds or whole nanoseconds; ValueError where it is neither."""
+    stamp = text.strip()
+    return int(stamp) / 1e9 if float(stamp) > _NANOSECONDS_FROM and "." not in stamp else float(stamp)
 
 
 def _is_number(text: str) -> bool:
@@ -147,24 +180,24 @@ def _find_mounting(table: Path) -> tuple[np.ndarray, float] | None:
     """T_left_imu (4, 4), and the sensor's clock minus the camera's, seconds."""
     own = table.with_suffix(".yaml")
     if own.is_file() and "T_cam_imu" in (content := CalibrationYaml.read(own)).entries:
-        return _rigid(content, "T_cam_imu"), content.number("timeshift_cam_imu", 0.0)
+        return read_rigid(content, "T_cam_imu"), content.number("timeshift_cam_imu", 0.0)
     for folder in (table.parent, table.parent.parent, table.parent.parent.parent):
         for pattern in _CHAINS:
             for path in sorted(folder.glob(pattern)):
                 content = CalibrationYaml.read(path)
                 left = content.section("cam0") if isinstance(content.entries.get("cam0"), dict) else content
                 if "T_cam_imu" in left.entries:
-                    return _rigid(left, "T_cam_imu"), left.number("timeshift_cam_imu", 0.0)
+                    return read_rigid(left, "T_cam_imu"), left.number("timeshift_cam_imu", 0.0)
     sensor, camera = table.parent / "sensor.yaml", table.parent.parent / "cam0" / "sensor.yaml"
     if not camera.is_file():
         camera = table.parent.parent / "cam0_sensor.yaml"
     if sensor.is_file() and camera.is_file():
-        T_body_imu, T_body_left = (_rigid(CalibrationYaml.read(path), "T_BS") for path in (sensor, camera))
+        T_body_imu, T_body_left = (read_rigid(CalibrationYaml.read(path), "T_BS") for path in (sensor, camera))
         return se3_inverse(T_body_left) @ T_body_imu, 0.0
     return None
 
 
-def _rigid(content: CalibrationYaml, key: str) -> np.ndarray:
+def read_rigid(content: CalibrationYaml, key: str) -> np.ndarray:
     """A rigid transform (4, 4), in rows or as OpenCV writes matrices."""
     if isinstance(content.entries.get(key), dict):
         T = content.section(key).numbers("data", (16,)).reshape(4, 4)

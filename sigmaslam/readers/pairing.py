@@ -240,7 +240,7 @@ def read_times(
         if not line.strip() or line.startswith("#"):
             continue
         try:
-            times.append(_seconds(line.strip()))
+            times.append(parse_seconds(line.strip()))
         except (ValueError, OverflowError):
             raise InputError(f"{path}: line {number} is not a time in seconds: {shorten(repr(line))}") from None
         rows.append(number)
@@ -266,7 +266,8 @@ def _check_increase(path: Path, times: Sequence[float], lines: Sequence[int]) ->
             )
 
 
-def _seconds(text: str) -> float:
+def parse_seconds(text: str) -> float:
+    """Seconds, or KITTI raw's date and time of day; ValueError where it is neither."""
     date, _, clock = text.partition(" ")
     if not clock:
         return float(text)

@@ -18,6 +18,7 @@ logger = logging.getLogger(__name__)
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+IMU = "sensor_msgs/msg/Imu"
 
 # Each encoding has its bytes per value, its channels, and the conversion to grey or BGR.
 _ENCODINGS: dict[str, tuple[int, int, int | None]] = {

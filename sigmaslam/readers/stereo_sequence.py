@@ -18,6 +18,7 @@ from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.readers.images import MAX_FAILURES, GreyConverter, ImagePairs, RawPair, SkippedFrame
 from sigmaslam.readers.inertial import InertialRecording
 from sigmaslam.readers.masks import Masks
+from sigmaslam.readers.odometry import OdometryRecording
 from sigmaslam.readers.selection import Selection, select_pairs
 
 logger = logging.getLogger(__name__)
@@ -79,7 +80,7 @@ class StereoSequence:
         length: number of pairs, or None if the file does not give it.
         skipped: the pairs that the latest run of `frames` could not use.
         masks: of the left images, as `use_masks` took them.
-        imu: an inertial sensor that was recorded beside the images, where it is to be used.
+        imu, odometry: sensors of motion that were recorded beside the images, where they are to be used.
 
     Raises:
         CalibrationError: the first images have another size than the calibration (the message gives both).
@@ -106,6 +107,7 @@ class StereoSequence:
         self._grey = GreyConverter()
         self.masks: Masks | None = None
         self.imu: InertialRecording | None = None
+        self.odometry: OdometryRecording | None = None
         first = pairs.first_pair
         for eye, image, name, model in (
             ("left", first.left, first.left_name, camera.left),

@@ -8,7 +8,7 @@ import numpy as np
 
 from sigmaslam.checks.finding import Finding, wrong
 from sigmaslam.report.report_plots import frame_interval, nis_per_dof
-from sigmaslam.run_record.frame_table import STATUSES, TRACKED
+from sigmaslam.run_record.frame_table import RECKONED, STATUSES, TRACKED
 from sigmaslam.run_record.real_time import format_latency
 from sigmaslam.run_record.recorded_run import RecordedRun
 from sigmaslam.run_record.verdict import doubts_verdict
@@ -92,9 +92,9 @@ def list_facts(run: RecordedRun) -> Facts:
 
 
 def list_statuses(run: RecordedRun) -> list[tuple[str, int]]:
-    """Counts of frames; "inertial" only where there is one, as few rigs have such a sensor."""
+    """Counts of frames; of those by sensors of motion only where there is one, as few rigs have any."""
     counts = [(status, run.frames.status.count(status)) for status in STATUSES]
-    return [each for each in counts if each[1] or each[0] != "inertial"]
+    return [each for each in counts if each[1] or each[0] not in RECKONED]
 
 
 def list_calibration(run: RecordedRun) -> list[tuple[str, str, str]]:

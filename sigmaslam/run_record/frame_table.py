@@ -29,9 +29,11 @@ COLUMNS = (
 KEYFRAME_COLUMNS = ("keyframe", "loop")
 """Columns that runs of earlier versions lack: 1 where the frame became a keyframe, and the time stamp of the one of
 long ago with which it closed a loop."""
-STATUSES = ("starting", "tracking", "lost", "relocalised", "skipped", "doubtful", "ambiguous", "inertial")
+STATUSES = ("starting", "tracking", "lost", "relocalised", "skipped", "doubtful", "ambiguous", "inertial", "odometry")
 TRACKED = ("tracking", "relocalised", "doubtful", "ambiguous")
 """Of frames with a pose from their images."""
+RECKONED = ("inertial", "odometry")
+"""Of frames that are lost by images, and that a sensor of motion predicts."""
 DOUBTS_SEPARATOR = "; "
 
 
@@ -80,7 +82,7 @@ def predicted_poses(frames: FrameTable, timestamps: np.ndarray) -> np.ndarray:
         timestamps: (N,) of its poses, seconds.
     """
     status = np.array(frames.status)
-    without_images = frames.columns["timestamp"][np.isin(status, ("lost", "inertial", "skipped", "starting"))]
+    without_images = frames.columns["timestamp"][np.isin(status, ("lost", *RECKONED, "skipped", "starting"))]
     predicted = np.isin(np.round(timestamps, 6), np.round(without_images, 6))
     predicted[:1] = False
     return np.asarray(predicted)

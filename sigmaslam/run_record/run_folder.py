@@ -65,7 +65,7 @@ class RunWriter:
     Args:
         out: folder to make; it must not exist, or be empty.
         run: entries of run.json, which is written at once, so that a run that is killed says what it was.
-        rectified: result of `StereoTracker.describe_rectified`, to keep what `write_tracks` writes.
+        rectified: result of `StereoRectifier.describe`, to keep what `write_tracks` writes.
         poses: number of poses in the folder, of a run that goes on in it; None: it is a new one.
 
     Attributes:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from sigmaslam.errors import InputError
 from sigmaslam.readers import StereoSequence, open_cameras, open_sequence
-from sigmaslam.readers.inertial import find_imu, read_imu
+from sigmaslam.readers.odometry import read_odometry
+from sigmaslam.readers.open_inertial import open_imu
 from sigmaslam.readers.selection import Selection
 
 if TYPE_CHECKING:
@@ -34,7 +35,8 @@ _REFUSED = (
         "--camera needs --calibration: any file that `sigmaslam calibration show` reads",
     ),
     ("--camera", ("--format", "--topic-left", "--topic-right"), "{all} go with INPUT, not with --camera"),
-    ("--camera", ("--start", "--frames", "--every", "--scale", "--imu"), "{all} go with INPUT, not with --camera"),
+    ("--camera", ("--start", "--frames", "--every", "--scale"), "{all} go with INPUT, not with --camera"),
+    ("--camera", ("--imu", "--odometry"), "{all} go with INPUT, not with --camera"),
     ("--resume", ("--overwrite",), "--resume goes on with the run in the folder, {all} removes it: give one of them"),
     ("--resume", ("--video", "--viewer"), "--resume does not go with {all}, which show a whole run: leave them out"),
     ("--resume", _FORGOTTEN, "--resume does not go with {given}: leave one of them out"),
@@ -43,7 +45,8 @@ _REFUSED = (
         ("--track-object", "--scale"),
         "--save-calibration is of the whole scene in images as they are: leave out {all}",
     ),
-    ("--track-object", ("--imu",), "the camera is at rest with --track-object: leave out --imu"),
+    ("--track-object", ("--imu", "--odometry"), "the camera is at rest with --track-object: leave out {all}"),
+    ("--odometry", ("--imu",), "one sensor predicts the motion: leave out --imu or --odometry"),
     (
         "--track-object",
         ("--map", "--tracks"),
@@ -62,7 +65,8 @@ class InputOptions:
         camera, seconds: for `open_cameras`, in place of a source.
         start, frames, every, scale: for `StereoSequence.select`.
         mask: for `StereoSequence.use_masks`.
-        imu: table of an inertial sensor, for `read_imu`; "off": none; None: the one in the recording's folder.
+        imu: for `open_imu`.
+        odometry: for `read_odometry`; an inertial sensor of the recording is not used then.
         findings: of a check; they are kept in run.json, and explain a run that fails.
     Raises:
         InputError: options do not go together.
@@ -81,6 +85,7 @@ class InputOptions:
     scale: float = 1.0
     mask: Path | None = None
     imu: str | None = None
+    odometry: Path | None = None
     findings: Sequence[Finding] = ()
 
     def __post_init__(self) -> None:
@@ -100,9 +105,10 @@ class InputOptions:
             sequence = sequence.select(selection, self.scale)
         if self.mask is not None:
             sequence.use_masks(self.mask)
-        table = None if self.imu == "off" else Path(self.imu) if self.imu else find_imu(Path(sequence.source))
         if self.imu is not None or not isinstance(self.source, StereoSequence):
-            sequence.imu = None if table is None else read_imu(table)
+            sequence.imu = open_imu(sequence, self.imu if self.odometry is None else "off")
+        if self.odometry is not None:
+            sequence.odometry = read_odometry(self.odometry)
         return sequence
 
 

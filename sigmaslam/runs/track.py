@@ -72,7 +72,7 @@ def track_sequence(request: TrackRequest) -> dict[str, Any]:
     if isinstance(tracker, StereoTracker):
         if options.map is not None:
             tracker.load_map(options.map)
-        rectified = tracker.describe_rectified() if request.outputs.tracks else None
+        rectified = tracker.rectifier.describe() if request.outputs.tracks else None
     run = {
         **settings,
         "checks": [asdict(each) for each in request.input.findings],
@@ -86,7 +86,7 @@ def track_sequence(request: TrackRequest) -> dict[str, Any]:
     writer = RunWriter(out, run, rectified, None if stopped is None else len(stopped.records))
     pictures = PictureRecorder(sequence.length)
     images = StereoFilter() if options.denoise else None
-    steps = _FrameSteps(images, tracker, _Timing(sequence, options.realtime), location, _feed(sequence))
+    steps = _FrameSteps(images, tracker, _Timing(sequence, options.realtime), location, _feed(sequence, tracker))
     on_estimate = live.on_estimate
     listeners = [(lambda frame: on_estimate(frame.result))] if on_estimate else []
     listeners += [sink.add for sink in live.sinks]
@@ -119,7 +119,7 @@ def track_sequence(request: TrackRequest) -> dict[str, Any]:
             others["trajectory_location.tum"] = lambda path: _write_location(path, location)
         saved = request.outputs.save_calibration
         if saved is not None and writer.calibration is not None and isinstance(tracker, StereoTracker):
-            focal_length = float(tracker.describe_rectified()["intrinsics"][0])
+            focal_length = float(tracker.rectifier.describe()["intrinsics"][0])
             learned = learned_calibration(sequence.camera, writer.calibration, focal_length)
             others[str(saved.resolve())] = lambda path: write_calibration(path, learned)
         # A sensor's readings correct poses as they come, not after the fact; what was before a stop is not in memory.
@@ -151,6 +151,7 @@ def _describe_settings(sequence: StereoSequence, options: TrackerOptions) -> dic
         "weights": describe_weights(options.frontend, options.backend, options.weights),
         "map": None if options.map is None else printable(options.map),
         **({} if sequence.imu is None else {"imu": printable(sequence.imu.source)}),
+        **({} if sequence.odometry is None else {"odometry": printable(sequence.odometry.source)}),
         "mask": None if sequence.masks is None else printable(sequence.masks.source),
         "configuration": asdict(config),
         "calibration": describe_camera(sequence.camera),
@@ -229,7 +230,10 @@ def _build_tracker(
     threads, provider, weights = options.threads, options.provider, options.weights
     if options.track_object is None:
         imu = None if sequence.imu is None else sequence.imu.sensor
-        return StereoTracker(camera, frontend, backend, config, None, threads, start, provider, weights, pixels, imu)
+        odometry = None if sequence.odometry is None else sequence.odometry.sensor
+        return StereoTracker(
+            camera, frontend, backend, config, None, threads, start, provider, weights, pixels, imu, odometry
+        )
     region = read_region(options.track_object, camera.left.width, camera.left.height)
     return ObjectTracker(camera, region, frontend, backend, config, threads, provider, weights)
 
@@ -263,31 +267,38 @@ class _FrameSteps:
     tracker: Tracker
     timing: _Timing
     location: LocationFilter | None
-    inertial: Callable[[float], Iterator[tuple[float, np.ndarray, np.ndarray]]]
+    feed: Callable[[float], None]
 
     def step(self, frame: StereoFrame) -> Estimate | ObjectEstimate:
         """What is said of the frame."""
         if self.images is not None:
             frame = self.images.step(frame)
-        if isinstance(self.tracker, StereoTracker):
-            for sample in self.inertial(frame.timestamp):
-                self.tracker.add_imu(*sample)
+        self.feed(frame.timestamp)
         estimate = self.tracker.step(frame.left, frame.right, frame.timestamp, frame.mask)
         self.timing.note(frame.timestamp)
         return estimate if self.location is None else estimate.map_camera(self.location.fuse)
 
 
-def _feed(sequence: StereoSequence) -> Callable[[float], Iterator[tuple[float, np.ndarray, np.ndarray]]]:
-    """Samples of the inertial sensor up to a frame that were not yet given, and the one behind it."""
-    if sequence.imu is None:
-        return lambda timestamp: iter(())
-    samples, shift, given = sequence.imu.samples, sequence.imu.sensor.time_shift, 0
+def _feed(sequence: StereoSequence, tracker: Tracker) -> Callable[[float], None]:
+    """Gives the tracker the samples of its sensor up to a frame that it does not have yet, and the one behind it."""
+    add: Callable[[float, np.ndarray, np.ndarray], None]
+    if not isinstance(tracker, StereoTracker):
+        return lambda timestamp: None
+    if sequence.odometry is not None:
+        moved, shift, add = sequence.odometry.samples, sequence.odometry.sensor.time_shift, tracker.add_odometry
+        columns = moved.timestamp, moved.linear, moved.angular
+    elif sequence.imu is not None:
+        felt, shift, add = sequence.imu.samples, sequence.imu.sensor.time_shift, tracker.add_imu
+        columns = felt.timestamp, felt.gyro, felt.accel
+    else:
+        return lambda timestamp: None
+    given = 0
 
-    def feed(timestamp: float) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
+    def feed(timestamp: float) -> None:
         nonlocal given
-        end = min(int(np.searchsorted(samples.timestamp, timestamp + shift)) + 1, len(samples))
-        for k in range(given, end):
-            yield float(samples.timestamp[k]), samples.gyro[k], samples.accel[k]
+        end = int(np.searchsorted(columns[0], timestamp + shift)) + 1
+        for row in zip(*(each[given:end] for each in columns), strict=True):
+            add(*row)
         given = max(given, end)
 
     return feed

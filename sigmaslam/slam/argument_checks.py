@@ -9,8 +9,9 @@ import numpy as np
 
 from sigmaslam.bounded_files import shorten
 from sigmaslam.errors import FrameError, InputError
-from sigmaslam.estimation.inertial_buffer import InertialBuffer
 from sigmaslam.estimation.inertial_motion import InertialMotion
+from sigmaslam.estimation.odometry_motion import OdometryMotion
+from sigmaslam.estimation.sample_buffer import SampleBuffer
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.inference.backends import ONNX, backend_names
 from sigmaslam.readers.images import check_grey
@@ -43,17 +44,22 @@ def check_tracker_arguments(
         raise InputError(f"weights {weights} are for a front-end by name: give the networks to your own one instead")
 
 
-def check_sample(motion: object, timestamp: float, gyro: Any, accel: Any) -> InertialBuffer:
-    """A sample of an inertial sensor; what takes it.
+def check_sample(motion: object, name: str, timestamp: float, one: Any, other: Any) -> SampleBuffer:
+    """A sample of an inertial sensor or of odometry; what takes it.
 
+    Args:
+        motion: of the tracker.
+        name: "imu" or "odometry".
+        timestamp, one, other: the sample.
     Raises:
         InputError: the tracker knows no such sensor, or the sample is no time and two vectors of finite numbers.
     """
-    if not isinstance(motion, InertialMotion):
-        raise InputError("add_imu: the tracker knows no inertial sensor: make it with imu=InertialSensor(...)")
-    if np.shape(gyro) != (3,) or np.shape(accel) != (3,) or not np.isfinite([timestamp, *gyro, *accel]).all():
-        given = shorten(f"{timestamp!r}, {gyro!r}, {accel!r}")
-        raise InputError(f"add_imu: expected seconds and two vectors of three finite numbers, found {given}")
+    kinds: dict[str, type[InertialMotion] | type[OdometryMotion]] = {"imu": InertialMotion, "odometry": OdometryMotion}
+    if not isinstance(motion, kinds[name]):
+        raise InputError(f"add_{name}: the tracker knows no such sensor: make it with {name}=...")
+    if np.shape(one) != (3,) or np.shape(other) != (3,) or not np.isfinite([timestamp, *one, *other]).all():
+        given = shorten(f"{timestamp!r}, {one!r}, {other!r}")
+        raise InputError(f"add_{name}: expected seconds and two vectors of three finite numbers, found {given}")
     return motion.samples
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sigmaslam.estimation.acceptance import ACCEPTANCE
-from sigmaslam.estimation.constant_velocity import MotionFilter
+from sigmaslam.estimation.constant_velocity import MotionFilter, dead_reckoning
 from sigmaslam.estimation.keyframe_window import KeyframeWindow, change_rig
 from sigmaslam.frontend import StereoView
 from sigmaslam.frontend.motion_blur import is_blurred
@@ -25,9 +25,9 @@ from sigmaslam.slam.rig_change import RigChange
 
 _LOGGER = logging.getLogger(__name__)
 
-# A pose by the inertial sensor alone is one as long as its place is this certain, in median scene depths: of most
+# A pose by a sensor of motion alone is one as long as its place is this certain, in median scene depths: of most
 # landmarks a search knows about where they are.
-_INERTIAL_SIGMA = 0.2
+_RECKONED_SIGMA = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,10 +57,11 @@ class Recovery:
     @property
     def status(self) -> str:
         """Of a view without a pose by its images."""
-        if self.motion.is_inertial:
+        reckoned = dead_reckoning(self.motion)
+        if reckoned is not None and self.course.has_moved:
             sigma = np.sqrt(np.linalg.eigvalsh(se3_body(self.motion.step, self.motion.step_covariance)[:3, :3])[-1])
-            if sigma <= _INERTIAL_SIGMA * self.window.depth:
-                return "inertial"
+            if sigma <= _RECKONED_SIGMA * self.window.depth:
+                return reckoned
         return "lost" if self.course.has_moved else "starting"
 
     def start_or_recover(self, view: StereoView, timestamp: float) -> KeyframeTracks | None:
@@ -79,7 +80,7 @@ class Recovery:
         if since <= self.config.lost_seconds or not self.admission.restarts_anywhere:
             return None
         _LOGGER.warning("tracking starts anew at %.3f s, %.2f s after the last pose", timestamp, since)
-        if course.has_moved and not self.motion.is_inertial:
+        if course.has_moved and dead_reckoning(self.motion) is None:
             course.resume(timestamp)
         course.tracked_at = timestamp
         pose = Prediction.of(self.window, self.motion).pose
@@ -95,7 +96,7 @@ class Recovery:
 
     def resume(self, found: Relocalisation, timestamp: float) -> KeyframeTracks:
         """Goes on from where a lost view was found."""
-        if self.motion.is_inertial:
+        if dead_reckoning(self.motion) is not None:
             self.course.track(timestamp)
         else:
             self.course.resume(timestamp)

@@ -9,17 +9,19 @@ from typing import Any
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
+from sigmaslam.estimation.build_motion import build_motion
 from sigmaslam.estimation.calibration_errors import TURNS, CalibrationPrior
 from sigmaslam.estimation.clustered_errors import SharedErrors
+from sigmaslam.estimation.constant_velocity import dead_reckoning
 from sigmaslam.estimation.estimator_graphs import EstimatorGraphs
 from sigmaslam.estimation.frame_clock import FrameClock
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.frame_update import FrameUpdate
-from sigmaslam.estimation.inertial_motion import build_motion
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.frontend import Frontend, build_frontend
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.inertial_sensor import InertialSensor
+from sigmaslam.geometry.odometry_sensor import OdometrySensor
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
@@ -79,8 +81,10 @@ class StereoTracker:
         disparity_error: pixels by which disparities may be off, as a check found that the eyes do not fit: all poses
             are doubtful then, and less certain; None: nothing was found.
         imu: an inertial sensor on the rig, whose samples `add_imu` takes.
+        odometry: wheels under the rig, whose samples `add_odometry` takes; an inertial sensor is not used then.
 
     Attributes:
+        rectifier: of the images that are tracked.
         last_frame: what the last frame saw, for pictures; None before the first.
     Raises:
         InputError: an argument is of another type, or there is no such front-end or backend, the provider is not
@@ -100,12 +104,13 @@ class StereoTracker:
         weights: WeightsFolder = None,
         disparity_error: float | None = None,
         imu: InertialSensor | None = None,
+        odometry: OdometrySensor | None = None,
     ) -> None:
         check_tracker_arguments(camera, frontend, backend, config, threads, weights)
         self.config = config = config or TrackerConfig()
-        self._rectifier = StereoRectifier(camera)
-        self._camera = rectified = self._rectifier.rectified
-        self._T_rectified_left = self._rectifier.T_rectified_left
+        self.rectifier = StereoRectifier(camera)
+        self._camera = rectified = self.rectifier.rectified
+        self._T_rectified_left = self.rectifier.T_rectified_left
         if isinstance(frontend, str):
             frontend = build_frontend(frontend, config.max_keypoints, backend, threads, provider, weights)
         self._frontend = frontend
@@ -118,10 +123,9 @@ class StereoTracker:
             prior = prior.widened(("offset", *TURNS), disparity_error)
         self._window = window = KeyframeWindow(rectified, prior, graphs)
         self._noise = noise = MeasurementNoise(config)
-        self._motion = motion = build_motion(backend, imu, self._T_rectified_left)
+        self._motion = motion = build_motion(backend, imu, odometry, self._T_rectified_left)
         self._course = course = Course()
-        self._shared_errors = SharedErrors()
-        self._clock, self._last_pairs = FrameClock(), LastPairs()
+        self._shared_errors, self._clock, self._last_pairs = SharedErrors(), FrameClock(), LastPairs()
         self._keyframes = keyframes = Keyframes(window, config.max_keyframes, config.max_points, self._beside)
         self._scrutiny = Scrutiny(window, motion, self._clock, disparity_error is not None)
         update = FrameUpdate(window, config.iterations)
@@ -158,7 +162,11 @@ class StereoTracker:
         Raises:
             InputError: the tracker was made without `imu`, or a value is not finite.
         """
-        check_sample(self._motion, timestamp, gyro, accel).add(timestamp, gyro, accel)
+        check_sample(self._motion, "imu", timestamp, gyro, accel).add(timestamp, gyro, accel)
+
+    def add_odometry(self, timestamp: float, linear: np.ndarray, angular: np.ndarray) -> None:
+        """Takes velocities (3,) of the vehicle in its axes forward, left, up, m/s and rad/s, as `add_imu` does."""
+        check_sample(self._motion, "odometry", timestamp, linear, angular).add(timestamp, angular, linear)
 
     def step(self, left: np.ndarray, right: np.ndarray, timestamp: float, mask: np.ndarray | None = None) -> Estimate:
         """Takes one stereo pair.
@@ -172,14 +180,14 @@ class StereoTracker:
             FrameError: an image or the mask has the wrong type or size, or the mask leaves nothing.
         """
         check_frame(left, right, timestamp, self._course.timestamp)
-        usable = None if mask is None else usable_pixels(mask, self._rectifier)
+        usable = None if mask is None else usable_pixels(mask, self.rectifier)
         # The matrices are small: threads of BLAS would wait for each other for longer than they compute.
         with self._blas.limit(limits=1, user_api="blas"):
             return self._step(left, right, timestamp, usable)
 
     def _step(self, left: np.ndarray, right: np.ndarray, timestamp: float, usable: np.ndarray | None) -> Estimate:
         clock = Stopwatch()
-        frame = Frame(*self._rectifier.rectify(left, right), self._frontend, usable)
+        frame = Frame(*self.rectifier.rectify(left, right), self._frontend, usable)
         clock.lap("rectify")
         if self._course.timestamp is not None:
             seconds, sigma = self._clock.tick(timestamp - self._course.timestamp)
@@ -191,7 +199,7 @@ class StereoTracker:
         matches, fit, change = GuidedMatches.empty(), None, None
         if not is_repeated:
             matches, fit, change = self._localise(frame, timestamp, clock)
-        if fit is None and self._motion.is_inertial:
+        if fit is None and dead_reckoning(self._motion) is not None:
             # Images that give no pose say nothing against the prediction either.
             self._motion.widen(1.0 / self._motion.widened)
         landmarks = self._window.landmarks.id[matches.views.landmark]
@@ -213,8 +221,8 @@ class StereoTracker:
             status, tracks = "skipped", None
         elif change is not None:
             doubts.add(Doubt.RIG)
-            self._rectifier.raise_right(change.rows)
-            frame = Frame(*self._rectifier.rectify(left, right), self._frontend, usable)
+            self.rectifier.raise_right(change.rows)
+            frame = Frame(*self.rectifier.rectify(left, right), self._frontend, usable)
             tracks = self._recovery.go_on_after_bump(change, frame.view, timestamp)
             status = "lost" if tracks is None else doubts.status
         elif (found := self._relocaliser.relocalise(frame.view)) is not None:
@@ -246,17 +254,9 @@ class StereoTracker:
         """All frames with a pose so far as they are known now, with covariances (N, 6, 6) in the camera's own frame."""
         return self._history.final()
 
-    def describe_rectified(self) -> dict[str, Any]:
-        """The rectified pair that tracks are measured in: intrinsics (5,), R_rectified_left (3, 3)."""
-        camera = self._camera
-        intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.baseline])
-        return {"intrinsics": intrinsics, "R_rectified_left": self._rectifier.R_rectified_left}
-
     def pack_keyframes(self) -> dict[str, Any]:
         """Keyframes by which a later run finds its place in the map, as arrays by name."""
         return self._keyframes.pack(self._frontend.name, self._camera)
-
-    # ---- the stages of a frame
 
     def _localise(
         self, frame: Frame, timestamp: float, clock: Stopwatch

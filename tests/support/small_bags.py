@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,18 @@ from rosbags.typesys import Stores, get_typestore
 START, STEP = 1_700_000_000_000_000_000, 50_000_000
 
 
-def write_bag(folder: Path, kind: str, size: tuple[int, int]) -> Path:
+IMU_COUNT, IMU_STEP = 6, 10_000_000
+
+
+def write_bag(folder: Path, kind: str, size: tuple[int, int], imu: Sequence[str] = (), stamped: bool = True) -> Path:
     """A file with two pairs of images and their CameraInfo.
 
     Args:
         folder: new.
         kind: "bag" (ROS 1), "db3" or "mcap".
         size: (width, height) of the images.
+        imu: topics of inertial sensors with samples whose values count from 0 on.
+        stamped: headers of these have time stamps.
     Returns:
         The file.
     """
@@ -41,6 +47,12 @@ def write_bag(folder: Path, kind: str, size: tuple[int, int]) -> Path:
             for k in range(2):
                 image = _image(store, size, START + k * STEP, ros1)
                 writer.write(images, START + k * STEP, serialize(image, image.__msgtype__))
+        for topic in imu:
+            connection = writer.add_connection(topic, "sensor_msgs/msg/Imu", typestore=store)
+            for k in range(IMU_COUNT):
+                stamp = START + k * IMU_STEP
+                message = _imu(store, stamp if stamped else 0, k, ros1)
+                writer.write(connection, stamp, serialize(message, message.__msgtype__))
     return path if ros1 else next((folder / "recording").glob(f"*.{kind}"))
 
 
@@ -59,6 +71,20 @@ def _image(store: Any, size: tuple[int, int], stamp: int, ros1: bool) -> Any:
         is_bigendian=0,
         step=width,
         data=np.random.default_rng(0).integers(0, 255, width * height, np.uint8),
+    )
+
+
+def _imu(store: Any, stamp: int, index: int, ros1: bool) -> Any:
+    vector, turn = store.types["geometry_msgs/msg/Vector3"], store.types["geometry_msgs/msg/Quaternion"]
+    unknown, first = np.zeros(9), 6.0 * index
+    return store.types["sensor_msgs/msg/Imu"](
+        header=_header(store, stamp, ros1),
+        orientation=turn(x=0.0, y=0.0, z=0.0, w=1.0),
+        orientation_covariance=unknown,
+        angular_velocity=vector(x=first, y=first + 1, z=first + 2),
+        angular_velocity_covariance=unknown,
+        linear_acceleration=vector(x=first + 3, y=first + 4, z=first + 5),
+        linear_acceleration_covariance=unknown,
     )
 
 

@@ -56,6 +56,10 @@ def write_stand_ins(demo: Path, folder: Path) -> None:
     readings = np.column_stack([times, poses[:, [3, 7, 11]], np.full(FRAMES, 0.01)])
     for name in ("gps.csv", "tracker.csv"):
         np.savetxt(folder / name, readings, delimiter=",", header="timestamp,x,y,z,sigma_position", comments="")
+    speeds = np.append(np.linalg.norm(np.diff(poses[:, [3, 7, 11]], axis=0), axis=1), 0.0) / SECONDS
+    wheels = np.column_stack([times, speeds, np.zeros(FRAMES)])
+    np.savetxt(folder / "wheels.csv", wheels, delimiter=",", header="timestamp,speed,yaw_rate", comments="")
+    (folder / "wheels.yaml").write_text(yaml.safe_dump({"T_cam_base": AHEAD.tolist()}))
     (folder / "settings.yaml").write_text(yaml.safe_dump({"keyframe_ratio": 0.75}))
     mask = np.zeros_like(pairs[0][0])
     mask[200:500, 300:700] = 255

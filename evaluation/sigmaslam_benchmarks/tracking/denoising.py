@@ -173,8 +173,8 @@ def _blurred(images: list[np.ndarray]) -> list[str]:
     lines = [
         "## Set12, a lens out of focus",
         "",
-        "Images of 8 bits, blurred by a Gaussian before noise comes to them. Ours is told the blur, and wrong ones, and",
-        "estimates the noise. The mask is added once, of the same blur.",
+        "Images of 8 bits, blurred by a Gaussian before noise comes to them. Ours is told the blur, and wrong ones,",
+        "and estimates the noise. The mask is added once, of the same blur.",
         "",
         *header("blur, noise", "blurred", "unsharp mask", "ours", "told 20 % less", "told 20 % more", numbers_from=1),
     ]

@@ -2,7 +2,7 @@
 // Plots over time, with one cursor for all of them; frames without a pose of their own are shaded.
 const SHADES = { lost: "rgb(213 94 0 / 25%)", starting: "rgb(120 120 120 / 18%)", relocalised: "rgb(204 121 167 / 45%)",
   skipped: "rgb(120 120 120 / 35%)", doubtful: "rgb(240 208 63 / 35%)", ambiguous: "rgb(181 123 255 / 35%)",
-  inertial: "rgb(79 195 161 / 25%)" };
+  inertial: "rgb(79 195 161 / 25%)", odometry: "rgb(161 195 79 / 25%)" };
 
 function shadeStatuses(intervals) {
   return (plot) => {

@@ -1,7 +1,8 @@
 "use strict";
 // The 3D view: path by status, ellipsoids, map points, keyframes, loops; y of the world points down.
 // Colours by number of the status, as in `statuses` of the page's data.
-const STATUS_COLOURS = ["#9aa3ad", "#3fa7f0", "#ff6a3d", "#e08bc0", "#6b7280", "#f0d03f", "#b57bff", "#4fc3a1"];
+const STATUS_COLOURS = ["#9aa3ad", "#3fa7f0", "#ff6a3d", "#e08bc0", "#6b7280", "#f0d03f", "#b57bff", "#4fc3a1",
+  "#a1c34f"];
 const LOST_STATUSES = new Set([0, 2]);
 // Viridis in nine steps.
 const VIRIDIS = ["#440154", "#472d7b", "#3b528b", "#2c728e", "#21918c", "#28ae80", "#5ec962", "#addc30", "#fde725"];

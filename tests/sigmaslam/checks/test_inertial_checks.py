@@ -4,9 +4,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sigmaslam.checks.inertial import check_inertial
+from sigmaslam.checks.inertial import check_inertial, check_odometry
 from sigmaslam.geometry.inertial_sensor import InertialSamples
+from sigmaslam.geometry.odometry_sensor import OdometrySamples, OdometrySensor
 from sigmaslam.readers.inertial import InertialRecording
+from sigmaslam.readers.odometry import OdometryRecording
 from tests.support.inertial import SENSOR, Motion
 
 IMAGES = np.arange(0.5, 4.5, 0.05)
@@ -51,4 +53,21 @@ def test_saturation_is_said():
 def test_faults_are_named(recording, severity, message):
     found = check_inertial(recording, IMAGES.tolist())
     assert found.severity == severity
+    assert message in found.message
+
+
+@pytest.mark.parametrize(
+    ("period", "shift", "severity", "message"),
+    [
+        (0.05, 0.0, "ok", "20 samples a second"),
+        (0.2, 0.0, "warning", "5 samples a second, 0 gaps of up to 0.20 s: at least 10 without gaps"),
+        (0.05, 3.0, "error", "of the images lie outside its time"),
+    ],
+)
+def test_times_of_odometry_are_judged(period, shift, severity, message):
+    t = np.arange(0, 5, period)
+    samples = OdometrySamples(t, np.zeros((len(t), 3)), np.zeros((len(t), 3)))
+    recording = OdometryRecording(Path("wheels.csv"), OdometrySensor(np.eye(4), shift), samples)
+    found = check_odometry(recording, IMAGES.tolist())
+    assert (found.name, found.severity) == ("odometry", severity)
     assert message in found.message

@@ -83,16 +83,21 @@ def test_the_covariance_is_that_of_noisy_samples():
 
 
 def test_a_gap_is_bridged_and_makes_the_motion_less_certain():
-    motion = Motion(5)
-    whole = motion.measure(np.arange(0, 2, 0.005))
-    gap = whole.select((whole.timestamp < 0.8) | (whole.timestamp > 0.9))
-    found, exact = integrate(gap, 0.5, 1.0), integrate(whole, 0.5, 1.0)
-    assert exact.missing == 0.0
-    assert found.missing == pytest.approx(0.11, abs=0.006)
-    difference = np.r_[rotation_log(exact.turn.T @ found.turn), found.velocity - exact.velocity]
-    sigma = np.sqrt(np.diag(found.gyro_noise + found.accel_noise))[:6]
-    assert (np.abs(difference) < 4 * sigma).all()
-    assert (sigma > 3 * np.sqrt(np.diag(exact.gyro_noise + exact.accel_noise))[:6]).all()
+    for seed in range(5, 15):
+        whole = Motion(seed).measure(np.arange(0, 2, 0.005))
+        gap = whole.select((whole.timestamp < 0.8) | (whole.timestamp > 0.9))
+        found, exact = integrate(gap, 0.5, 1.0), integrate(whole, 0.5, 1.0)
+        assert exact.missing == found.missing == 0.0
+        difference = np.r_[rotation_log(exact.turn.T @ found.turn), found.velocity - exact.velocity]
+        sigma = np.sqrt(np.diag(found.gyro_noise + found.accel_noise))[:6]
+        assert (np.abs(difference) < 4 * sigma).all()
+        assert (sigma > 3 * np.sqrt(np.diag(exact.gyro_noise + exact.accel_noise))[:6]).all()
+
+
+def test_a_gap_too_long_to_bridge_is_missing():
+    whole = Motion(5).measure(np.arange(0, 2, 0.005))
+    gap = whole.select((whole.timestamp < 0.8) | (whole.timestamp > 1.3))
+    assert integrate(gap, 0.5, 1.5).missing == pytest.approx(0.51, abs=0.006)
 
 
 def test_samples_that_end_early_are_held():

@@ -64,7 +64,7 @@ def test_kalibr_s_files_beside_a_table_of_seconds_are_read(tmp_path):
         ("data.csv", ",-1.5\n", "\n", InputError, r"line 2: expected time, angular rate"),
         ("data.csv", ",0.2,2,", ",0.2,nan,", InputError, r"line 4: expected time"),
         ("data.csv", "1403636579768555392", "1403636579758555391", InputError, r"1 of 5 time stamps do not increase"),
-        ("data.csv", ROWS, "", InputError, r"has 0 inertial samples"),
+        ("data.csv", ROWS, "", InputError, r"has 0 samples"),
         ("sensor.yaml", NOISE, "", CalibrationError, r"nothing says how noisy"),
         ("sensor.yaml", "walk: 3.0e-3", "walk: -1", CalibrationError, r"accelerometer_random_walk is -1"),
         ("sensor.yaml", "[[1.0,", "[[2.0,", CalibrationError, r"T_BS is no rotation"),

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sigmaslam.errors import InputError
+from sigmaslam.geometry.odometry_sensor import OdometrySensor
 from sigmaslam.geometry.se3 import quaternion_to_matrix, se3_inverse
 from sigmaslam.readers import open_sequence
 from sigmaslam.readers.inertial import find_imu, read_imu
@@ -54,10 +55,15 @@ def test_a_dark_second_loses_no_frame_and_few_centimetres(real_data):
 
 def test_samples_are_for_trackers_with_a_sensor_and_must_be_numbers():
     camera = parallel_camera(160, 120, 100.0, 0.1)
-    with pytest.raises(InputError, match="knows no inertial sensor"):
+    with pytest.raises(InputError, match="knows no such sensor"):
         StereoTracker(camera, "orb").add_imu(0.0, np.zeros(3), np.zeros(3))
     tracker = StereoTracker(camera, "orb", imu=SENSOR)
     with pytest.raises(InputError, match="three finite numbers"):
         tracker.add_imu(0.0, np.array([0, 0, np.nan]), np.zeros(3))
     with pytest.raises(InputError, match="three finite numbers"):
         tracker.add_imu(0.0, np.zeros(2), np.zeros(3))
+    with pytest.raises(InputError, match="add_odometry: the tracker knows no such sensor: make it with odometry="):
+        tracker.add_odometry(0.0, np.zeros(3), np.zeros(3))
+    tracker = StereoTracker(camera, "orb", odometry=OdometrySensor(np.eye(4)))
+    with pytest.raises(InputError, match="add_odometry: expected seconds"):
+        tracker.add_odometry(0.0, np.zeros(3), np.array([0, 0, np.inf]))

@@ -1,0 +1,28 @@
+"""The motion model of a tracker, by the sensor that it has."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sigmaslam.estimation.constant_velocity import MotionFilter
+from sigmaslam.estimation.inertial_motion import InertialMotion
+from sigmaslam.estimation.odometry_motion import OdometryMotion
+from sigmaslam.geometry.inertial_sensor import InertialSensor
+from sigmaslam.geometry.odometry_sensor import OdometrySensor
+
+
+def build_motion(
+    backend: str, imu: InertialSensor | None, odometry: OdometrySensor | None, T_camera_left: np.ndarray
+) -> MotionFilter:
+    """The motion of a rectified camera, by one sensor beside it; where there is none, constant velocity.
+
+    Args:
+        backend: "onnx" or "torch".
+        imu, odometry: beside the left camera.
+        T_camera_left: (4, 4) takes points of the left camera into the rectified one.
+    """
+    if odometry is not None:
+        return OdometryMotion(backend, odometry, T_camera_left @ odometry.T_left_base)
+    if imu is not None:
+        return InertialMotion(backend, imu, T_camera_left @ imu.T_left_imu)
+    return MotionFilter(backend)

@@ -1,0 +1,173 @@
+"""Motion by wheels: the velocity changes as they measure, and images say what is wrong with it."""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from sigmaslam.estimation.constant_velocity import MotionFilter
+from sigmaslam.estimation.preintegration import bridge_spectrum, interpolate
+from sigmaslam.estimation.sample_buffer import SampleBuffer
+from sigmaslam.geometry.odometry_sensor import OdometrySensor
+from sigmaslam.geometry.se3 import se3_adjoint, se3_exp, se3_inverse, se3_log
+
+_LOGGER = logging.getLogger(__name__)
+
+# Order of the error state, see `MotionFilter`.
+_POSE, _TWIST = slice(0, 6), slice(6, 12)
+# Frames with a pose over which velocities of wheels and images are compared before wheels predict.
+_COMPARED = 10
+# Wheels whose velocities depart by more than this share, or by more than this share of what constant velocity allows
+# in a second, are not of one body with the camera, or of another unit.
+_DEPARTURE = 0.25
+# Wheels are at first as noisy as this share of what constant velocity allows in a second; images have no less.
+_LEAST_SHARE = 0.01
+# Seconds over which the slowly changing part of an error, as of slip and worn tyres, grows as large as the white one:
+# at first, and at least and most, as it is learned by how successive errors resemble each other.
+_SLOW, _SHORTEST, _LONGEST = 1.0, 0.3, 30.0
+# A frame changes the noise that is learned by this share, and none counts for more than so many variances.
+_ADAPTATION, _MOST_SURPRISE = 0.05, 3.0
+# Seconds without samples after which the odometry is taken for dead.
+_DEAD = 1.0
+
+
+class OdometryMotion(MotionFilter):
+    """Predicts by wheels; by constant velocity until they are known to agree with images.
+
+    The state is that of constant velocity, whose twist follows the measured one: what images correct of the twist is
+    the slow error of the wheels, and stays. The noise is white besides, along each of the six axes of the vehicle, and
+    learned from how far poses lie from predictions. What no column measures is zero: wheels neither slide nor jump.
+
+    Args:
+        backend: "onnx" or "torch".
+        sensor: its clock.
+        T_camera_base: (4, 4) takes points of the vehicle's frame into the camera that is tracked.
+    """
+
+    def __init__(self, backend: str, sensor: OdometrySensor, T_camera_base: np.ndarray) -> None:
+        super().__init__(backend)
+        self.samples = SampleBuffer(sensor.time_shift)
+        self.spectrum, self.slow = np.zeros(6), np.zeros(6)
+        """Of the velocities of the vehicle: white noise, m^2/s and rad^2/s, and random walks, m^2/s^3 and rad^2/s^3."""
+        self._last = np.zeros(6)  # departure of the last frame
+        self._unsampled = np.zeros(6)  # spectrum of what samples up to this one are too few for
+        self._adjoint = se3_adjoint(T_camera_base)
+        # What of the slow error of the twist stays from frame to frame: roll and pitch return by themselves.
+        stays = np.array([1.0, 1.0, 1.0, *([0.0, 0.0] if sensor.is_planar else [1.0, 1.0]), 1.0])
+        self._stays = self._adjoint @ np.diag(stays) @ np.linalg.inv(self._adjoint)
+        self._measured: np.ndarray | None = None  # twist of the vehicle up to the last frame
+        self._departures: deque[np.ndarray] = deque(maxlen=_COMPARED)
+        self._compared: deque[np.ndarray] = deque(maxlen=_COMPARED)
+        self._seconds, self._densities, self._is_refused = 0.0, np.zeros(2), False
+
+    def set_twist(self, twist: np.ndarray, sigma: np.ndarray) -> None:
+        """Of constant velocity alone: wheels measure on where images are lost."""
+        if not self.is_odometric:
+            super().set_twist(twist, sigma)
+            self._departures.clear()
+            self._compared.clear()
+
+    def predict(
+        self, seconds: float, densities: np.ndarray, sigma: float = 0.0, timestamp: float | None = None
+    ) -> None:
+        """Moves on to the frame of that time stamp, by the samples of the seconds before it."""
+        self._seconds, self._densities = seconds, np.repeat(densities, 3)
+        before, self._measured = self._measured, None
+        if timestamp is not None:
+            self.samples.forget(timestamp - seconds + self.samples.time_shift)
+            self._measured, self._unsampled = self._mean_twist(timestamp - seconds, timestamp)
+        if self._measured is None and self.is_odometric:
+            _LOGGER.warning("the odometry gives no samples: constant velocity goes on")
+            self.is_odometric = False
+        if self._measured is None or before is None or not self.is_odometric:
+            super().predict(seconds, densities, sigma)
+            return
+        self.twist = self._adjoint @ self._measured + self._stays @ (self.twist - self._adjoint @ before)
+        kept = block_diag(np.eye(6), self._stays)
+        self._covariance = kept @ self._covariance @ kept.T
+        super().predict(seconds, np.zeros(2))
+        noise = (self._adjoint * (seconds * (self.spectrum + self._unsampled))) @ self._adjoint.T
+        adjoint = se3_adjoint(self.step)
+        self._covariance[_POSE, _POSE] += adjoint @ noise @ adjoint.T
+        self._covariance[_TWIST, _TWIST] += (self._adjoint * (seconds * self.slow)) @ self._adjoint.T
+        if sigma > 0.0:
+            self.doubt_time(sigma)
+
+    def correct(self, step: np.ndarray, covariance: np.ndarray) -> None:
+        """Takes over the posterior of the pose, which knew the prediction; compares wheels with it."""
+        if self.is_odometric:
+            self._learn(step, covariance)
+        super().correct(step, covariance)
+        if self._measured is not None and not self.is_odometric:
+            self._departures.append(np.linalg.solve(self._adjoint, self.twist) - self._measured)
+            self._compared.append(self._measured)
+            if len(self._compared) == _COMPARED:
+                self._begin()
+
+    # ---- parts
+
+    def _mean_twist(self, start: float, end: float) -> tuple[np.ndarray | None, np.ndarray]:
+        """Twist (6,) of the vehicle that leads from one of its poses to another; None without samples.
+
+        And spectra (6,) of what it may have done between samples, and beyond them, where its velocity is held.
+        """
+        table = self.samples.around(start, end)
+        if not len(table):
+            return None, np.zeros(6)
+        start, end = start + self.samples.time_shift, end + self.samples.time_shift
+        t = table[:, 0]
+        gap, held = np.diff(t).max(initial=0.0), max(t[0] - start, end - t[-1], 0.0)
+        if gap > _DEAD or held > _DEAD:
+            return None, np.zeros(6)
+        values = np.hstack([table[:, 4:], table[:, 1:4]])
+        unsampled = self._densities * held**2 / 3.0 + bridge_spectrum(t, values, gap)
+        edges = np.r_[start, t[(t > start) & (t < end)], end]
+        twists = interpolate(edges, t, values)
+        T = np.eye(4)
+        for part in se3_exp(np.diff(edges)[:, None] * 0.5 * (twists[1:] + twists[:-1])):
+            T = T @ part
+        return se3_log(T) / (end - start), unsampled
+
+    def _begin(self) -> None:
+        """Wheels predict from now on, if their velocities are those of the images."""
+        departures, measured = np.array(self._departures), np.array(self._compared)
+        least = _LEAST_SHARE**2 * self._densities
+        for part in (slice(0, 3), slice(3, 6)):
+            squared = np.sum(departures[:, part] ** 2, axis=1).mean()
+            allowed = _DEPARTURE**2 * np.sum(measured[:, part] ** 2, axis=1).mean()
+            if squared > max(allowed, _DEPARTURE**2 * self._densities[part].sum()):
+                if not self._is_refused:
+                    _LOGGER.warning(
+                        "the odometry is not used: its velocities are not those of the images; are units (m/s, rad/s), "
+                        "axes (forward, left, up), T_cam_base and clock right?"
+                    )
+                self._is_refused = True
+                return
+        self.spectrum = departures.var(axis=0) * self._seconds + least
+        self.slow, self._last, self.is_odometric = self.spectrum / _SLOW**2, np.zeros(6), True
+        offset = self.spectrum / (_COMPARED * self._seconds)
+        self._covariance[_TWIST, :] = self._covariance[:, _TWIST] = 0.0
+        self._covariance[_TWIST, _TWIST] = (self._adjoint * offset) @ self._adjoint.T
+        self._departures.clear()
+        self._compared.clear()
+        _LOGGER.info("wheels predict: speed to %.3f m/s, yaw rate to %.4f rad/s", *np.sqrt(self.spectrum[[0, 5]]))
+
+    def _learn(self, step: np.ndarray, covariance: np.ndarray) -> None:
+        """Noise of each axis, by how far a pose lies from its prediction."""
+        back = np.linalg.inv(se3_adjoint(self.step) @ self._adjoint)
+        departure = back @ se3_log(step @ se3_inverse(self.step))
+        # By so much the pose's covariance shrank, which is that of the departure, before this one made it wider.
+        variance = np.diag(back @ (self.step_covariance - covariance) @ back.T) / self.widened
+        seen = (variance > 0.0) & (self._unsampled < self.spectrum)
+        normalised = np.where(seen, departure / np.sqrt(np.where(seen, variance, 1.0)), 0.0)
+        normalised = np.clip(normalised, -_MOST_SURPRISE, _MOST_SURPRISE)
+        self.spectrum = self.spectrum * np.exp(_ADAPTATION * np.where(seen, normalised**2 - 1.0, 0.0))
+        self.slow = self.slow * np.exp(_ADAPTATION * normalised * self._last)
+        self.slow = np.clip(self.slow, self.spectrum / _LONGEST**2, self.spectrum / _SHORTEST**2)
+        self._last = normalised
+        if (self.spectrum > self._densities).any():
+            _LOGGER.warning("the odometry departs from the images: constant velocity goes on")
+            self.is_odometric = False
