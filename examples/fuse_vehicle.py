@@ -81,13 +81,13 @@ def simulate(events: int, seed: int = 0) -> tuple[list[Event], Tensor, Tensor]:
     order = torch.where(k % 20 == 0, 0, 1 + k % 2)
     streams = []
     for number, (sensor, deviation) in enumerate(SENSORS.values()):
-        at = (order == number).nonzero()[:, 0]
+        mine = (order == number).nonzero()[:, 0]
         size = 2 if sensor is GPS else 1
-        value = sensor.function(truth[at]) + deviation * normal[at, 5 : 5 + size]
+        value = sensor.function(truth[mine]) + deviation * normal[mine, 5 : 5 + size]
         if sensor is GPS:
-            value = value + 20.0 * (uniform[at, 1:] < 0.05)
+            value = value + 20.0 * (uniform[mine, 1:] < 0.05)
         gate = 0.999 if sensor is GPS else None
-        streams.append(Event(MOTION, sensor, value, {"imu": imu[at], "seconds": seconds[at]}, gate=gate))
+        streams.append(Event(MOTION, sensor, value, {"imu": imu[mine], "seconds": seconds[mine]}, gate=gate))
     return streams, order, truth
 
 

@@ -148,6 +148,8 @@ class CompiledFilter:
         held, sound = prior.checked_factor() if by_root else (prior.covariance, None)
         if sound is not None and not bool(sound.all()):
             return uncompiled()
+        if events == 1 and by_root != prior.is_square_root:
+            return uncompiled()  # its only prediction is the prior, held as it was given
         start = as_belief(prior.mean, held, by_root)
         for group in groups:
             group.inputs[:] = [

@@ -174,7 +174,9 @@ def grouped(
         )  # fmt: skip
         families.setdefault(family, []).append((parts, stream))
     groups = []
-    for family, members in families.items():
+    for (*rest, _), members in families.items():
+        # Steps are of one element: sizes of the batch make no other kind.
+        family = tuple(rest)
         (first_parts, first), counts = members[0], [len(stream.times) for _, stream in members]
         inputs: list[Tensor] = []
         trailing: list[int | None] = []
