@@ -173,8 +173,8 @@ def _blurred(images: list[np.ndarray]) -> list[str]:
     lines = [
         "## Set12, a lens out of focus",
         "",
-        "Images of 8 bits, blurred by a Gaussian before noise comes to them. Ours is told the blur, and wrong ones, and",
-        "estimates the noise. The mask is added once, of the same blur.",
+        "Images of 8 bits, blurred by a Gaussian before noise comes to them. Ours is told the blur, and wrong ones,",
+        "and estimates the noise. The mask is added once, of the same blur.",
         "",
         *header("blur, noise", "blurred", "unsharp mask", "ours", "told 20 % less", "told 20 % more", numbers_from=1),
     ]
@@ -187,7 +187,8 @@ def _blurred(images: list[np.ndarray]) -> list[str]:
             told = [denoise_image(noisy, replace(own, blur=share * blur)) for share in (1.0, 0.8, 1.2)]
             masked = 2.0 * noisy - _blur(noisy.astype(np.float32), blur)
             scores.append([psnr(to_bytes(each), truth) for each in (noisy, masked, *told)])
-        lines.append(row(f"{blur} px, sigma {sigma:.0f}", *(f"{each:.2f}" for each in np.mean(scores, axis=0))))
+        means = np.mean(scores, axis=0).tolist()
+        lines.append(row(f"{blur} px, sigma {sigma:.0f}", *(f"{each:.2f}" for each in means)))
     return lines
 
 
