@@ -42,7 +42,7 @@ Rectified = Annotated[
 @calibration.command()
 def show(file: Source, size: Size = None, rectified: Rectified = False) -> None:
     """Print baseline, rotation, lens models and fields of view."""
-    typer.echo(describe_calibration(_read(file, size, rectified)))
+    typer.echo(describe_calibration(read_sized(file, size, rectified)))
 
 
 @calibration.command(short_help="Write a calibration of any form in another one.")
@@ -56,12 +56,13 @@ def convert(
     rectified: Rectified = False,
 ) -> None:
     """Write a calibration of any form in another one, and print what is in it; what a form cannot say is refused."""
-    camera = _read(file, size, rectified)
+    camera = read_sized(file, size, rectified)
     write_foreign_calibration(out, camera, to.value)
     typer.echo(f"{describe_calibration(camera)}\nWritten: {out}")
 
 
-def _read(file: Path, size: str | None, rectified: bool) -> StereoCamera:
+def read_sized(file: Path, size: str | None, rectified: bool = False) -> StereoCamera:
+    """A calibration of any form, with the size in words for those that lack it."""
     if size is None:
         return read_calibration(file, rectified=rectified)
     numbers = re.fullmatch(r"(\d{1,5})x(\d{1,5})", size)

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from sigmaslam.cli.calibration import Size, read_sized
 from sigmaslam.two_view.point_tables import orient_files, triangulate_file
 from sigmaslam.two_view.triangulation import METHODS
 
@@ -31,12 +32,13 @@ def triangulate(
         Method,
         typer.Option(help="parallel (9.34, after rectification), midpoint, linear, or the least reprojection error."),
     ] = Method["optimal"],
+    size: Size = None,
     sigma: Annotated[
         float, typer.Option(min=1e-6, help="Of a pixel coordinate, where the file does not say.", metavar="PX")
     ] = 0.5,
 ) -> None:
     """Points of a stereo pair from pixels in both images, each with its covariance."""
-    typer.echo(triangulate_file(pixels, calibration, out, method.value, sigma))
+    typer.echo(triangulate_file(pixels, read_sized(calibration, size), out, method.value, sigma))
 
 
 def orient(

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from sigmaslam.bounded_files import TABLE_BYTES, load_columns, read_text
-from sigmaslam.calibration_files.calibration import read_calibration
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text
 from sigmaslam.geometry.camera import StereoCamera
@@ -25,13 +24,13 @@ _PLACE = ("x", "y", "z")
 _COVARIANCE = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
 
 
-def triangulate_file(source: Path, calibration: Path, out: Path, method: str, sigma: float) -> str:
+def triangulate_file(source: Path, camera: StereoCamera, out: Path, method: str, sigma: float) -> str:
     """Points of a stereo pair, in the left camera, with their covariance (9.35); says in words what was written.
 
     Args:
         source: CSV with a header: u0,v0,u1,v1, pixels of the raw left and right image, and if wanted `id` and `sigma`;
             or an .npz of `sigmaslam match`, left image first, of which the covariance of the right pixels is taken.
-        calibration: of the pair.
+        camera: the pair.
         out: CSV to write: id,x,y,z in metres and the upper triangle of the covariance.
         method: of `two_view.triangulation.METHODS`; parallel rectifies the pixels.
         sigma: of a coordinate, pixels, where the file does not say.
@@ -39,7 +38,6 @@ def triangulate_file(source: Path, calibration: Path, out: Path, method: str, si
     Raises:
         InputError: a file has other columns, or no pair of pixels meets in front of the cameras.
     """
-    camera = read_calibration(calibration)
     names, pixels, covariance = _read_pairs(source, sigma)
     points, spread = triangulate_pairs(camera, pixels, covariance, method)
     usable = np.isfinite(points).all(axis=1) & np.isfinite(spread).all(axis=(1, 2)) & (points[:, 2] > 0.0)

@@ -187,7 +187,8 @@ def _blurred(images: list[np.ndarray]) -> list[str]:
             told = [denoise_image(noisy, replace(own, blur=share * blur)) for share in (1.0, 0.8, 1.2)]
             masked = 2.0 * noisy - _blur(noisy.astype(np.float32), blur)
             scores.append([psnr(to_bytes(each), truth) for each in (noisy, masked, *told)])
-        lines.append(row(f"{blur} px, sigma {sigma:.0f}", *(f"{each:.2f}" for each in np.mean(scores, axis=0))))
+        means = np.mean(scores, axis=0).tolist()
+        lines.append(row(f"{blur} px, sigma {sigma:.0f}", *(f"{each:.2f}" for each in means)))
     return lines
 
 

@@ -11,12 +11,12 @@ import pytest
 import yaml
 
 from sigmaslam.calibration.board_images import find_board_images, read_board_views
-from sigmaslam.calibration.boards import Board, parse_board
+from sigmaslam.calibration.boards import AprilGrid, Board, parse_board
 from sigmaslam.calibration.calibrate import BoardCalibration, calibrate
 from sigmaslam.calibration.image_bootstrap import RESAMPLES, bootstrap_rigs, widened
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.camera import StereoCamera
-from sigmaslam.geometry.se3 import se3_inverse
+from sigmaslam.geometry.se3 import se3_exp, se3_inverse
 from sigmaslam.readers import open_sequence
 from tests.support.commands import assert_refused, run_here
 from tests.support.simulated_board import APRIL_GRID, CHARUCO, CHESSBOARD, board_poses, draw_board, stereo_rig
@@ -85,7 +85,12 @@ def test_a_rendered_pair_is_calibrated_and_rectified(rendered: Path, tmp_path: P
 )
 def test_boards_with_markers_calibrate_a_pair(tmp_path: Path, plan: Board, words: str):
     rig, out = stereo_rig(), tmp_path / "stereo.yaml"
-    for k, pose in enumerate(board_poses(plan, 12, seed=3, depth=0.4)):
+    centre, turn = np.eye(4), np.eye(4)
+    centre[:3, 3] = plan.points.mean(axis=0)
+    if isinstance(plan, AprilGrid):
+        # Its y goes up: the camera would see it from behind.
+        turn = centre @ se3_exp(np.array([0.0, 0.0, 0.0, np.pi, 0.0, 0.0])) @ se3_inverse(centre)
+    for k, pose in enumerate(board_poses(plan, 12, seed=3, depth=0.4) @ turn):
         for name, eye, T_left_eye in (("L", rig.eyes[0], np.eye(4)), ("R", rig.eyes[1], rig.T_left_right)):
             (tmp_path / name).mkdir(exist_ok=True)
             cv2.imwrite(str(tmp_path / name / f"{k}.png"), draw_board(plan, eye, se3_inverse(T_left_eye) @ pose))
@@ -102,6 +107,7 @@ def test_boards_with_markers_calibrate_a_pair(tmp_path: Path, plan: Board, words
     assert camera.baseline == pytest.approx(np.linalg.norm(rig.T_left_right[:3, 3]), rel=2e-3)
 
 
+@pytest.mark.long
 def test_one_camera_is_calibrated(rendered: Path, tmp_path: Path):
     out = tmp_path / "left.yaml"
     result = run_here("calibrate", *sorted(rendered.glob("left*")), "--board", BOARD, "--out", out, "--lens", "radtan4")
@@ -213,5 +219,5 @@ def test_sigmas_are_those_of_a_bootstrap_over_images(
     low, high = np.quantile(differences, [0.16, 0.84], axis=0)
     for spread in ((high - low) / 2.0, differences.std(axis=0)):
         ratios = spread / result.sigmas
-        assert np.all(ratios < 1.5), dict(zip(result.rig.names, ratios, strict=True))
+        assert np.all(ratios < 1.6), dict(zip(result.rig.names, ratios, strict=True))
         assert np.all(ratios > 1.0 / 1.6), dict(zip(result.rig.names, ratios, strict=True))
