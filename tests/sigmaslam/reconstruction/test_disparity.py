@@ -5,7 +5,12 @@ import numpy as np
 import pytest
 
 from sigmaslam.reconstruction import disparity
-from sigmaslam.reconstruction.disparity import align_disparity, measure_disparity, semi_global_disparity
+from sigmaslam.reconstruction.disparity import (
+    align_disparity,
+    measure_disparity,
+    row_offset,
+    semi_global_disparity,
+)
 from tests.support.textured_pairs import textured_pair
 
 HEIGHT, WIDTH = 120, 200
@@ -67,13 +72,44 @@ def test_what_the_right_image_does_not_show_has_no_disparity():
     assert np.isfinite(found[10:-10, 30:-10]).mean() > 0.9
 
 
-def test_chance_matches_of_one_direction_do_not_widen_the_search():
+def test_chance_matches_of_one_direction_do_not_widen_the_search(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(disparity, "_SPECKLE", 0)
     rng = np.random.default_rng(3)
     left, right = rng.integers(0, 255, (2, HEIGHT, 2 * WIDTH)).astype(np.uint8)
     one_way = np.isfinite(disparity._semi_global(left, right, 150.0)).sum()
     assert one_way > 200
-    assert len(disparity._seen_by_both(left, right, 150.0)) < 0.5 * one_way
+    assert np.isfinite(disparity._seen_by_both(left, right, 150.0)).sum() < 0.5 * one_way
     true = np.full((HEIGHT, 2 * WIDTH), 12.0, np.float32)
     found = disparity._seen_by_both(*textured_pair(true, noise=1.0), 150.0)
-    assert len(found) > 0.8 * true.size
-    np.testing.assert_allclose(np.percentile(found, 99.8), 12.0, atol=0.5)
+    assert np.isfinite(found).sum() > 0.8 * true.size
+    np.testing.assert_allclose(np.nanpercentile(found, 99.8), 12.0, atol=0.5)
+
+
+def test_rows_that_are_off_are_found_and_do_not_move_the_disparity():
+    u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    true = np.full((HEIGHT, WIDTH), 7.4, np.float32)
+    left, right = textured_pair(true, noise=1.0)
+    offset = (0.3 - 0.4 * (u / WIDTH - 0.5)).astype(np.float32)
+    lower = cv2.remap(right, u.astype(np.float32), (v - offset).astype(np.float32), cv2.INTER_CUBIC)
+    found = row_offset(left.astype(np.float32), lower.astype(np.float32), true)
+    np.testing.assert_allclose(found[10:-10, 20:-20], offset[10:-10, 20:-20], atol=0.1)
+    errors = [align_disparity(left, each, np.round(true)).disparity - true for each in (right, lower)]
+    inner = (slice(10, -10), slice(30, -10))
+    assert np.std(errors[1][inner]) < 1.2 * np.std(errors[0][inner])
+
+
+def test_unlike_gains_change_little():
+    true = np.full((HEIGHT, WIDTH), 7.4, np.float32)
+    left, right = textured_pair(true, noise=0.0)
+    dimmer = np.clip(0.8 * right, 0, 255).astype(np.uint8)
+    plain, dim = (align_disparity(left, each, np.round(true)).disparity for each in (right, dimmer))
+    assert np.median(np.abs(plain - dim)[10:-10, 30:-10]) < 0.02
+
+
+def test_what_is_saturated_is_no_disparity():
+    true = np.full((HEIGHT, WIDTH), 7.4, np.float32)
+    left, right = textured_pair(true, noise=1.0)
+    left[:, 90:150], right[:, 80:144] = 255, 255
+    measured = measure_disparity(left, right, semi_global_disparity)
+    assert np.isfinite(measured.disparity[10:-10, 110:130]).mean() < 0.05
+    assert np.isfinite(measured.disparity[10:-10, 30:80]).mean() > 0.5
