@@ -26,9 +26,19 @@ def reconstruct(
         float | None,
         typer.Option(
             min=1e-6,
-            help="Side of the voxels that points are merged in, metres.",
-            show_default="5 pixels at the median",
+            help="Side of the finest voxels that points are merged in, metres; doubled up to a point's sigma.",
+            show_default="3 pixels at the median",
         ),
+    ] = None,
+    max_sigma: Annotated[
+        float | None,
+        typer.Option(min=1e-6, help="Largest sigma of a point, metres.", show_default="a twentieth of its distance"),
+    ] = None,
+    min_views: Annotated[int, typer.Option(min=1, help="Keyframes that must have given a point.")] = 2,
+    every: Annotated[int, typer.Option(min=1, help="Use one of so many keyframes.")] = 1,
+    export: Annotated[
+        Path | None,
+        typer.Option(help="New folder for images, poses and points as nerfstudio and COLMAP read them."),
     ] = None,
 ) -> None:
     """Reconstruct the surfaces that the keyframes of a run saw: a dense cloud in which each point has a covariance.
@@ -38,13 +48,15 @@ def reconstruct(
     """
     from sigmaslam.reconstruction.reconstruct import reconstruct_run
 
-    summary = reconstruct_run(run, out, mesh, input, network, voxel)
+    summary = reconstruct_run(run, out, mesh, input, network, voxel, max_sigma, min_views, every, export)
     typer.echo(
-        f"{summary.points} points of {summary.keyframes} keyframes in {out}, one per voxel of {summary.voxel:g} m, "
+        f"{summary.points} points of {summary.keyframes} keyframes in {out}, voxels of {summary.voxel:g} m and more, "
         f"sigma {summary.median_sigma:.2g} m in the median.\n"
         f"Disparities of {summary.measured:.0%} of the pixels, {summary.confirmed:.0%} of these confirmed by other "
         f"keyframes; {summary.seconds_a_keyframe:.2f} s a keyframe."
     )
     if mesh is not None:
         typer.echo(f"Mesh: {mesh}")
+    if export is not None:
+        typer.echo(f"Images and poses: {export}")
     typer.echo(f"Report: {run / 'report.html'}")

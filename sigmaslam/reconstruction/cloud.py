@@ -16,8 +16,11 @@ from sigmaslam.table import Table
 _ROWS, _COLUMNS = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
 # Pixels are exact to half of one: a point is anywhere in its square.
 _PIXEL_VARIANCE = 1.0 / 12.0
-# One number for the three of a voxel: different ones of voxels fewer than two million apart.
-_ONE_KEY = np.array([1, 1 << 21, 1 << 42])
+# One number for the four of a voxel: different ones of voxels fewer than half a million apart, and of all levels.
+_ONE_KEY = np.array([1, 1 << 19, 1 << 38, 1 << 57])
+_MOST_LEVEL = 15
+# Sigma is along the ray: across it points are known to a pixel, and voxels of a sigma would leave gaps to see through.
+_SIGMA_SHARE = 0.125
 _COVARIANCE_NAMES = tuple(f"covariance_{'xyz'[a]}{'xyz'[b]}" for a, b in zip(_ROWS, _COLUMNS, strict=True))
 
 
@@ -137,7 +140,8 @@ class DepthPixels(Table):
     def thinned(self, camera: RectifiedStereo, size: float) -> DepthPixels:
         """The most certain pixel of each voxel of the camera's frame; those beside it have nearly the same errors."""
         points = self.points(camera)
-        keys = np.floor(points / size).astype(np.int64) @ _ONE_KEY
+        sigma = np.linalg.norm(points, axis=1) * np.sqrt(self.variance) / self.disparity
+        keys = _voxels(points, sigma, size) @ _ONE_KEY
         order = np.argsort(self.variance / self.disparity**2, kind="stable")
         _, first = np.unique(keys[order], return_index=True)
         return self.select(order[first])
@@ -146,17 +150,20 @@ class DepthPixels(Table):
 class VoxelCloud:
     """Points that come keyframe by keyframe, one kept per voxel.
 
+    A voxel follows what is known: its side is doubled until it is an eighth of the point's sigma, or more. Points of
+    different sides lie in different voxels; of those the finer ones stay.
+
     What falls into a voxel has errors in common, of poses and of texture, in a degree that is not known. Covariance
     intersection with equal weights is consistent whatever it is: the mean of the information, and the mean weighted by
     it.
 
     Args:
-        size: of a voxel, metres.
+        size: of the finest voxel, metres.
     """
 
     def __init__(self, size: float) -> None:
         self.size = size
-        self._merged: tuple[np.ndarray, np.ndarray] = np.zeros((0, 3), np.int64), np.zeros((0, 11))
+        self._merged: tuple[np.ndarray, np.ndarray] = np.zeros((0, 4), np.int64), np.zeros((0, 11))
         self._pending: list[tuple[np.ndarray, np.ndarray]] = []
 
     def add(self, cloud: DenseCloud) -> None:
@@ -166,31 +173,51 @@ class VoxelCloud:
         information = inverse(cloud.covariances.astype(np.float64))
         weighted = _times(information, cloud.points)
         sums = np.column_stack([information, weighted, cloud.intensity * cloud.views, cloud.views])
-        keys = np.floor(cloud.points / self.size).astype(np.int64)
-        self._pending.append(_sum_by_key(keys, sums))
+        self._pending.append(_sum_by_key(_voxels(cloud.points, cloud.sigma, self.size), sums))
         # Amortised: each point is sorted about as many times as the cloud doubles.
         if sum(len(part[0]) for part in self._pending) > len(self._merged[0]):
             self._merge()
 
-    def cloud(self) -> DenseCloud:
-        """The points so far."""
+    def cloud(self, min_views: int = 1) -> DenseCloud:
+        """The points that so many keyframes gave, or more, without those in whose voxels there are finer ones."""
         self._merge()
-        _, sums = self._merged
+        keys, sums = self._merged
+        seen = sums[:, 10] >= min_views
+        keys, sums = keys[seen], sums[seen]
         if not len(sums):
             return DenseCloud.empty()
         information, count = sums[:, :6], sums[:, 10]
         covariance = inverse(information)
+        points = _times(covariance, sums[:, 6:9])
+        finest = np.ones(len(keys), bool)
+        for level in range(1, int(keys[:, 3].max()) + 1):
+            here = keys[:, 3] == level
+            finer = _at_level(points[keys[:, 3] < level], level, self.size)
+            finest[here] = ~np.isin(keys[here] @ _ONE_KEY, finer @ _ONE_KEY)
         return DenseCloud(
-            _times(covariance, sums[:, 6:9]),
+            points,
             (covariance * count[:, None]).astype(np.float32),
             (sums[:, 9] / count).astype(np.float32),
             count.astype(np.int32),
-        )
+        ).select(finest)
 
     def _merge(self) -> None:
         parts = [self._merged, *self._pending]
         keys, sums = (np.concatenate([part[k] for part in parts]) for k in range(2))
         self._merged, self._pending = _sum_by_key(keys, sums), []
+
+
+def _voxels(points: np.ndarray, sigma: np.ndarray, size: float) -> np.ndarray:
+    """(N, 4) voxels of points with such sigmas: coordinates and how often the side was doubled."""
+    level = np.ceil(np.log2(np.maximum(_SIGMA_SHARE * sigma / size, 1.0))).clip(0, _MOST_LEVEL).astype(np.int64)
+    return _at_level(points, level, size)
+
+
+def _at_level(points: np.ndarray, level: np.ndarray | int, size: float) -> np.ndarray:
+    """(N, 4) voxels of points at a level, or at one each."""
+    levels = np.broadcast_to(level, len(points))
+    cells = np.floor(points / (size * 2.0 ** levels[:, None])).astype(np.int64)
+    return np.column_stack([cells, levels])
 
 
 def write_cloud(path: Path, cloud: DenseCloud) -> None:
@@ -217,7 +244,7 @@ def _times(six: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 
 
 def _sum_by_key(keys: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows with the same key (N, 3) summed."""
+    """Rows with the same key (N, 4) summed."""
     if not len(keys):
         return keys, sums
     order = np.argsort(keys @ _ONE_KEY)

@@ -36,8 +36,8 @@ _FLOW_VARIANCE, _GATE_2D = np.float32(0.3**2), 9.21
 _LEAST_SHARE = 0.5
 # Pixels whose derivatives by a pose are computed at a time.
 _PART = 8192
-# Confirmations that a point needs.
-_MIN_SUPPORT = 1
+# Confirmations that a point needs where there are so many other views.
+_MIN_SUPPORT = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,17 +70,19 @@ class FusedDepth:
         support: (H, W) uint8 other keyframes that confirm it.
         contradictions: (H, W) uint8 other keyframes that see something behind it, in its direction, or another
             texture in its place.
+        least_support: confirmations that a point needs.
     """
 
     disparity: np.ndarray
     variance: np.ndarray
     support: np.ndarray
     contradictions: np.ndarray
+    least_support: int = 1
 
     @property
     def is_confirmed(self) -> np.ndarray:
         """(H, W) bool: more keyframes confirm the point than contradict it. Where a body moved it is not."""
-        enough = (self.support >= _MIN_SUPPORT) & (self.support > self.contradictions)
+        enough = (self.support >= self.least_support) & (self.support > self.contradictions)
         return np.asarray(enough & (self.disparity > 0.0))
 
 
@@ -149,14 +151,16 @@ def fuse_depth(
         support += agrees
         contradictions += (there & ~agrees) | ((squared > GATE * expected) & (seen.innovation < 0.0))
         mean, variance = kalman_update(mean, variance, seen.innovation, seen.derivative, noise, agrees)
-    # Where the views differ by more than they should, or less, all variances are scaled: the mean of the posterior of a
-    # scale that has an inverse gamma distribution.
+    # Where the views differ by more than they should, or less, variances are scaled: the mean of the posterior of a
+    # scale that has an inverse gamma distribution. That they agree says nothing of what they have in common.
     scale = (_FREEDOM + cost) / (_FREEDOM + support)
+    fused = scale * variance + np.maximum(scale, np.float32(1.0)) * common
     return FusedDepth(
         _spread(mean, known, shape, np.nan),
-        _spread(scale * (variance + common), known, shape, np.nan),
+        _spread(fused, known, shape, np.nan),
         _spread(support, known, shape, 0),
         _spread(contradictions, known, shape, 0),
+        min(_MIN_SUPPORT, max(len(others), 1)),
     )
 
 

@@ -6,7 +6,7 @@ import json
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -20,9 +20,10 @@ from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.progress import open_progress
 from sigmaslam.readers import StereoSequence
 from sigmaslam.reconstruction.cloud import DenseCloud, DepthPixels, VoxelCloud, write_cloud
-from sigmaslam.reconstruction.depth_fusion import DepthView, FusedDepth, fuse_depth
+from sigmaslam.reconstruction.depth_fusion import SHARED, DepthView, FusedDepth, fuse_depth
 from sigmaslam.reconstruction.disparity import DisparityMap, Matcher, measure_disparity, semi_global_disparity
 from sigmaslam.reconstruction.mesh import DepthVolume, need_open3d
+from sigmaslam.reconstruction.posed_images import PosedImages, check_export
 from sigmaslam.reconstruction.recorded_keyframes import RecordedKeyframes, open_input, read_recorded_keyframes
 from sigmaslam.reconstruction.stereo_network import StereoNetwork
 from sigmaslam.report.report import write_report
@@ -30,10 +31,12 @@ from sigmaslam.run_record.dense_points import DENSE_NAME, RECONSTRUCTION_NAME, w
 
 NEIGHBOURS = 2
 """Views before, and behind, that a keyframe's depths are fused with."""
+MIN_VIEWS = 2
+"""Keyframes that a point of the cloud needs, half as many as there are at the most."""
 # Points less certain than this share of their depth are left out.
 _MAX_SIGMA = 0.05
-# Side of a voxel, in pixels at the median depth of the first keyframe.
-_VOXEL_PIXELS = 5.0
+# Side of the finest voxels, in pixels at the median depth of the first keyframe.
+_VOXEL_PIXELS = 3.0
 _NumberedView = tuple[int, np.ndarray, DepthView]
 
 
@@ -44,7 +47,7 @@ class ReconstructionSummary:
     Attributes:
         keyframes: how many of the run.
         points: of the cloud.
-        voxel: side, metres.
+        voxel: side of the finest ones, metres.
         measured: share of the pixels that have a disparity.
         confirmed: share of the pixels with a disparity that another keyframe confirms, and that became points.
         median_sigma: of the points, root of the largest eigenvalue of their covariance, metres.
@@ -106,6 +109,10 @@ def reconstruct_run(
     moved_to: Path | None = None,
     network: Path | None = None,
     voxel: float | None = None,
+    max_sigma: float | None = None,
+    min_views: int = MIN_VIEWS,
+    every: int = 1,
+    export: Path | None = None,
 ) -> ReconstructionSummary:
     """Reconstructs what the keyframes of a run saw; the report of the run shows the cloud, too.
 
@@ -115,7 +122,11 @@ def reconstruct_run(
         mesh: PLY file of a mesh; needs Open3D.
         moved_to: where the run's input is, if it has moved.
         network: ONNX file of a stereo network in place of semi-global matching.
-        voxel: side of the voxels that points are merged in, metres; None: five pixels at the median depth.
+        voxel: side of the finest voxels that points are merged in, metres; None: three pixels at the median depth.
+        max_sigma: points with a larger sigma are left out, metres; None: with one of a twentieth of their distance.
+        min_views: keyframes that must have given a point.
+        every: of so many keyframes one is used.
+        export: folder for images and poses in the forms of nerfstudio and COLMAP.
     Raises:
         InputError: something is missing or wrong; all of that is looked for before the work begins.
     """
@@ -123,13 +134,15 @@ def reconstruct_run(
         _check_writable(path)
     if mesh is not None:
         need_open3d()
-    keyframes = read_recorded_keyframes(run)
+    check_export(export)
+    keyframes = read_recorded_keyframes(run, every)
     sequence = open_input(keyframes, moved_to)
     match: Matcher = semi_global_disparity if network is None else StereoNetwork(network)
     rectifier = StereoRectifier(keyframes.camera)
     camera = rectifier.rectified
     cloud: VoxelCloud | None = None
     volume: DepthVolume | None = None
+    posed = None if export is None else PosedImages(export, camera)
     measured = confirmed = 0
     began = time.perf_counter()
     with open_progress() as progress:
@@ -140,6 +153,8 @@ def reconstruct_run(
                 cloud = VoxelCloud(voxel or _default_voxel(depth, camera))
                 volume = None if mesh is None else DepthVolume(cloud.size, camera)
             cloud.add(depth.cloud(camera, cloud.size))
+            if posed is not None:
+                posed.add(depth.image, depth.pose)
             if volume is not None:
                 z = np.where(chosen, camera.focal_baseline / np.where(chosen, depth.fused.disparity, 1.0), 0.0)
                 volume.integrate(z.astype(np.float32), depth.image, depth.pose)
@@ -148,8 +163,12 @@ def reconstruct_run(
             progress.update(task, advance=1, note=f"{confirmed / max(measured, 1):.0%} confirmed")
     seconds = time.perf_counter() - began
     assert cloud is not None
-    points = cloud.cloud()
+    points = cloud.cloud(min(min_views, max(keyframes.count // 2, 1)))
+    if max_sigma is not None:
+        points = points.select(points.sigma <= max_sigma)
     write_cloud(out, points)
+    if posed is not None:
+        posed.write(points)
     if mesh is not None and volume is not None:
         volume.write(mesh)
     pixels = keyframes.count * camera.width * camera.height
@@ -182,6 +201,10 @@ def fuse_keyframes(
 
     def fuse(number: int) -> KeyframeDepth:
         image, view = kept[number]
+        with np.errstate(invalid="ignore"):
+            # Fusion does not take the common part away: what is too uncertain by that part alone becomes no point.
+            hopeless = SHARED * view.measured.variance > (_MAX_SIGMA * view.measured.disparity) ** 2
+        reference = replace(view.measured, disparity=np.where(hopeless, np.nan, view.measured.disparity))
         others = []
         # The nearest first: it says most of what is seen, and sets what the others must agree with.
         for other in sorted((k for k in kept if k != number), key=lambda k: (abs(k - number), k)):
@@ -199,7 +222,7 @@ def fuse_keyframes(
             number,
             image,
             view.measured,
-            fuse_depth(image, view.measured, others, rectifier.rectified),
+            fuse_depth(image, reference, others, rectifier.rectified),
             keyframes.poses[number] @ T_left_rectified,
             turn_covariance(rectifier.T_rectified_left, keyframes.covariances[number]),
             keyframes.disparity_offset_sigma,
@@ -227,7 +250,7 @@ def _views(
         disparity = measured.disparity - np.float32(keyframes.disparity_offset)
         if valid is not None:
             disparity[valid == 0] = np.nan
-        yield number, left, DepthView.of(left, DisparityMap(disparity, measured.variance))
+        yield number, left, DepthView.of(left, replace(measured, disparity=disparity))
 
 
 def _prefetched(views: Iterator[_NumberedView]) -> Iterator[_NumberedView]:

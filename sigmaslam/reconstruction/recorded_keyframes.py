@@ -125,8 +125,8 @@ class RecordedKeyframes:
         )
 
 
-def read_recorded_keyframes(run: Path) -> RecordedKeyframes:
-    """Keyframes of a run of `sigmaslam track`.
+def read_recorded_keyframes(run: Path, every: int = 1) -> RecordedKeyframes:
+    """Keyframes of a run of `sigmaslam track`; of so many one.
 
     Raises:
         InputError: the folder is no such run, follows an object, or a file is missing or wrong.
@@ -147,7 +147,7 @@ def read_recorded_keyframes(run: Path) -> RecordedKeyframes:
     times = frames.columns["timestamp"][frames.columns["keyframe"] == 1]
     rows = np.searchsorted(said.timestamps, times - _SAME_TIME).clip(0, len(said) - 1)
     rows = np.unique(rows[np.abs(said.timestamps[rows] - times) < _SAME_TIME])
-    keyframe_rows = rows
+    keyframe_rows = rows = rows[::every]
     rows = _with_frames_between(rows, len(said))
     if len(rows) < 2:
         raise InputError(f"{run}: has {len(rows)} frame with a pose, two are needed: track a longer sequence")

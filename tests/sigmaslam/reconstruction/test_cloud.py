@@ -63,6 +63,27 @@ def test_points_of_a_voxel_are_weighted_by_information_and_gain_none():
     np.testing.assert_allclose(cloud.covariances[:, 0], [1.0 / 1.5, 4.0], rtol=1e-6)
 
 
+def test_voxels_follow_sigma_and_finer_points_take_the_place_of_coarser_ones():
+    voxels = VoxelCloud(0.1)
+    coarse = [[x, 0.5, 0.5] for x in (0.05, 0.15, 0.25, 0.35, 5.05, 5.15)]
+    voxels.add(_points(coarse, [3.2**2] * 6))
+    # An eighth of 3.2 m is four times the side.
+    assert len(voxels.cloud()) == 2
+    voxels.add(_points([[0.12, 0.5, 0.5]], [0.5**2]))
+    cloud = voxels.cloud()
+    assert cloud.views.tolist() == [1, 2]
+    np.testing.assert_allclose(cloud.sigma, [0.5, 3.2], rtol=1e-5)
+
+
+def test_points_of_too_few_views_are_left_out():
+    voxels = VoxelCloud(1.0)
+    for _ in range(2):
+        voxels.add(_points([[0.5, 0.5, 0.5]], [1.0]))
+    voxels.add(_points([[3.5, 0.5, 0.5]], [1.0]))
+    np.testing.assert_allclose(voxels.cloud(min_views=2).points, [[0.5, 0.5, 0.5]])
+    assert len(voxels.cloud(min_views=3)) == 0
+
+
 def test_the_order_in_which_keyframes_come_does_not_matter():
     rng = np.random.default_rng(2)
     parts = [_points(rng.uniform(0, 4, (60, 3)).tolist(), rng.uniform(0.1, 1, 60).tolist()) for _ in range(4)]

@@ -43,6 +43,26 @@ def test_a_run_becomes_a_cloud_and_its_report_shows_it(tracked: Path):
     assert len(report) < 8_000_000
 
 
+@pytest.mark.long
+def test_every_second_keyframe_certain_points_and_poses_for_others(tracked: Path):
+    keyframes = read_recorded_keyframes(tracked / "run")
+    shutil.copytree(tracked / "run", tracked / "again")
+    done = run_here(
+        *("reconstruct", tracked / "again", "--out", tracked / "few.ply", "--every", "2", "--max-sigma", "0.1"),
+        *("--min-views", "1", "--export", tracked / "posed"),
+    )
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((tracked / "again" / "reconstruction.json").read_text())
+    assert summary["keyframes"] == -(-keyframes.count // 2)
+    assert summary["points"] > 0
+    assert read_dense_points(tracked / "again" / "dense.npz").sigma.max() <= 0.1
+    transforms = json.loads((tracked / "posed" / "transforms.json").read_text())
+    assert len(transforms["frames"]) == summary["keyframes"] == len(list((tracked / "posed" / "images").iterdir()))
+    # The first pose is that of the run: nerfstudio's axes are turned about x.
+    first = np.array(transforms["frames"][0]["transform_matrix"]) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    np.testing.assert_allclose(first[:3, 3], keyframes.poses[0][:3, 3], atol=1e-9)
+
+
 def test_an_input_that_has_moved_is_asked_for_and_taken(tracked: Path, tmp_path: Path):
     shutil.copytree(tracked / "run", tmp_path / "run")
     entries = json.loads((tmp_path / "run" / "run.json").read_text())
