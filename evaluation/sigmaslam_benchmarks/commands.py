@@ -161,7 +161,13 @@ BENCHMARKS = {
     "reconstruction": Benchmark(
         "tracking.reconstruction",
         "Dense clouds beside exact depth. Their error, coverage, completeness and ghosts (extra 'train').",
-        (_RUNS, _count("seeds", 20, "Sequences a world."), _RAY),
+        (
+            _RUNS,
+            _count("seeds", 20, "Sequences a world."),
+            _RAY,
+            _option("real", "--real", bool, "Disparities beside LiDAR and Middlebury instead.", False),
+            _DATA_IF_ANY,
+        ),
         _TRAIN,
     ),
     "denoising": Benchmark(

@@ -22,6 +22,7 @@ from sigmaslam.slam.config import TrackerConfig
 from sigmaslam_benchmarks.code_hash import hash_code
 from sigmaslam_benchmarks.rendered_camera import open_rendered
 from sigmaslam_benchmarks.tracking.depth_accuracy import DepthFigures, JudgedPixels, judge_pixels, summarise
+from sigmaslam_benchmarks.tracking.real_disparity import write_real
 from sigmaslam_benchmarks.tracking.reconstruction_page import ReconstructedSequence, format_page
 from sigmaslam_benchmarks.tracking.trial_pool import SequenceTrials, TrialKind, write_trials
 from sigmaslam_benchmarks.trial import track_ours
@@ -46,6 +47,8 @@ def write_reconstruction(
     command: str,
     ray: str | None = None,
     note: Callable[[str], None] = lambda text: None,
+    real: bool = False,
+    data: Path | None = None,
 ) -> str:
     """Renders, tracks and reconstructs what is missing, writes the page and returns it; notes in it are kept.
 
@@ -55,7 +58,13 @@ def write_reconstruction(
         path, runs, workers, ray, note: of `write_trials`, and what it raises.
         seeds: sequences a world.
         command: what the page says it was made by.
+        real: judge disparities on real truth instead, which takes a minute.
+        data: folder of the real data sets.
     """
+    if real:
+        if data is None:
+            raise InputError("--real needs the real data sets: give --data, or set SIGMASLAM_DATA")
+        return write_real(path, data, command)
 
     def form(done: list[SequenceTrials], missing: list[str]) -> str:
         found = [
