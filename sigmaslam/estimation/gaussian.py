@@ -50,6 +50,15 @@ def step_with(covariance: np.ndarray, part: slice, index: int, change: float) ->
     return np.asarray(covariance[part, index] / variance * change)
 
 
+def at_most(covariance: np.ndarray, limit: np.ndarray) -> np.ndarray:
+    """The covariance (n, n), cut in the directions in which it is larger than another one, which is regular."""
+    root = np.linalg.cholesky(limit)
+    half = np.linalg.solve(root, covariance)
+    values, vectors = np.linalg.eigh(np.linalg.solve(root, half.T))
+    cut = root @ vectors
+    return np.asarray((cut * np.minimum(values, 1.0)) @ cut.T)
+
+
 def regression(cross: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """cross covariance^-1 (n, k), with the pseudo-inverse in units of the standard deviations where it is singular."""
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 
 from sigmaslam.estimation.constant_velocity import MotionFilter, MotionState
-from sigmaslam.estimation.gaussian import regression
+from sigmaslam.estimation.gaussian import at_most, regression
 from sigmaslam.estimation.inertial_alignment import align, align_gyro, gyro_fits
 from sigmaslam.estimation.inertial_buffer import InertialBuffer, LearnedNoise
 from sigmaslam.estimation.preintegration import Preintegrated
@@ -89,7 +88,7 @@ class InertialMotion(MotionFilter):
             super().predict(seconds, densities, sigma)
             return
         sensor = self.samples.sensor
-        self.samples.forget(start + sensor.time_shift)
+        self.samples.forget(start + self.samples.time_shift)
         motion = self.samples.preintegrate(start, timestamp, self._biases, densities)
         if motion is None or motion.missing > _DEAD:
             self._leave(seconds, densities)
@@ -135,19 +134,20 @@ class InertialMotion(MotionFilter):
             return
         P = self._covariance
         departure = se3_log(step @ se3_inverse(self.step))
-        removed = P[_POSE, _POSE] - covariance
+        # What images leave of the prediction; where they know less of the pose than it, they teach nothing.
+        kept = at_most(covariance, P[_POSE, _POSE])
+        removed = P[_POSE, _POSE] - kept
         self.noise.learn(departure, removed)
         gain = regression(P[6:, _POSE], P[_POSE, _POSE])
         change = gain @ departure
         self._velocity = self._velocity + change[:3]
         self._gravity = self._gravity + change[3:6]
         self._biases = self._biases + change[6:12]
-        sensor = self.samples.sensor
-        self.samples.sensor = replace(sensor, time_shift=sensor.time_shift + float(change[12]))
+        self.samples.time_shift += float(change[12])
         self._T_camera_imu = nearest_rigid(se3_exp(change[13:]) @ self._T_camera_imu)
         others = P[6:, 6:] - gain @ removed @ gain.T
         self.step = nearest_rigid(step)
-        self._covariance = np.block([[covariance, covariance @ gain.T], [gain @ covariance, 0.5 * (others + others.T)]])
+        self._covariance = np.block([[covariance, kept @ gain.T], [gain @ kept, 0.5 * (others + others.T)]])
         self._note_twist(self.twist[3:])
 
     def start_keyframe(self) -> None:

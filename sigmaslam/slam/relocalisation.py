@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sigmaslam.estimation.chi_square import CHI_SQUARE_9999_OF_6
-from sigmaslam.estimation.constant_velocity import MotionFilter
+from sigmaslam.estimation.constant_velocity import MotionFilter, dead_reckoning
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.frontend import StereoView
 from sigmaslam.geometry.se3 import nearest_rigid
@@ -69,8 +69,10 @@ class Relocaliser:
             if relative is None:
                 continue
             pose = nearest_rigid(keyframes.pose(keyframe) @ relative.T_key_camera)
-            # Repeated texture agrees on other places, by a few dozens of matches far away.
-            if not self.matcher.is_beyond_chance(relative) and not self._is_expected(pose):
+            # Repeated texture agrees on other places: by a few dozens of matches, which the motion since the last image
+            # excludes if that was guessed, or by hundreds, which it excludes if that was measured.
+            trusts_motion = dead_reckoning(self.motion) is not None or not self.matcher.is_beyond_chance(relative)
+            if trusts_motion and not self._is_expected(pose):
                 continue
             admitted = view.only(self.admission.admit(view, pose, self.window))
             if not admitted.has_stereo(min_points, self.min_inliers):
