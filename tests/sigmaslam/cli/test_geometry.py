@@ -34,6 +34,7 @@ def run(*arguments: object) -> str:
     return result.stdout
 
 
+@pytest.mark.long
 def test_the_eyes_of_a_rectified_pair_are_found_beside_each_other(calibration: Path, tmp_path: Path):
     picture = tmp_path / "pair.png"
     printed = run(
@@ -47,6 +48,7 @@ def test_the_eyes_of_a_rectified_pair_are_found_beside_each_other(calibration: P
     assert drawn.shape == (2 * image.shape[0], 2 * image.shape[1], 3)
 
 
+@pytest.mark.long
 def test_the_motion_between_two_frames_agrees_with_the_truth(calibration: Path):
     from sigmaslam.geometry.camera import StereoCamera
 
