@@ -407,7 +407,7 @@ _SLOPES: dict[tuple[str, ...], tuple[str, ...]] = {
     ("pow",): ("{1} * std::pow({0}, {1} - 1.0)",),
     ("remainder",): ("1",),
     ("fmod",): ("1",),
-    ("copysign",): ("std::signbit({0}) == std::signbit({1}) ? 1.0 : -1.0",),
+    ("copysign",): ("std::signbit({0}) == std::signbit({1}) ? 1.0 : -1.0", "0.0"),
     ("where",): ("{2} ? 1.0 : 0.0", "{2} ? 0.0 : 1.0"),
     ("alias",): ("1",),
     ("clone",): ("1",),
