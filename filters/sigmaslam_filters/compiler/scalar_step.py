@@ -221,7 +221,7 @@ class ScalarStep:
         if name in ("convert_element_type", "_to_copy"):
             return [(x, "1")]
         if name in _CONSTANT:
-            return []
+            return [(x, "0.0")]
         scale = {key: self._operand(value, dtype) for key, value in node.kwargs.items()}
         forms = _SLOPES.get((name, *sorted(scale)))
         if forms is None or len(forms) > len(given):
