@@ -40,6 +40,7 @@ class Acceptance:
             has blurred only one of them, if it has.
         even_sharpness: of the least sharp direction of an image, over the sharpest; below it motion has blurred it.
         streak_sharpness: of the least sharp direction, per squared pixel of half the image; stripes have more.
+        noise_contrast: variance between blocks of an image by that of white noise of its pixels; scenes have more.
         least_sharpness: share of what keyframes saw; bounds by how much a blurred frame is less certain.
         usual_clustering: factor on variances; nine of ten quiet frames stay below, above it one frame is believed.
         scattered_nis: NIS per degree of freedom; a blurred view above it would spoil what comes after, as a keyframe.
@@ -76,6 +77,7 @@ class Acceptance:
     equal_blur: float = 0.65
     even_sharpness: float = 0.38
     streak_sharpness: float = 0.09
+    noise_contrast: float = 2.0
     least_sharpness: float = 0.1
     usual_clustering: float = 2.0
     scattered_nis: float = 1.6

@@ -1,13 +1,18 @@
-"""Images that a driver has delivered before: a working camera never gives the same one twice."""
+"""Images that say nothing: delivered before, as a working camera never does, or noise alone, as in the dark."""
 
 from __future__ import annotations
 
 from collections import deque
 
+import cv2
 import numpy as np
+
+from sigmaslam.estimation.acceptance import ACCEPTANCE
 
 # Drivers have rings of a few buffers; an image from before those is not given by mistake.
 _REMEMBERED = 8
+# Side of the blocks whose means are compared, pixels.
+_BLOCK = 8
 
 
 class LastPairs:
@@ -33,6 +38,20 @@ class LastPairs:
         is_repeated = is_last or (is_old and not self._was_old)
         self._was_old = is_old and not is_last
         return is_repeated
+
+
+def is_noise(image: np.ndarray) -> bool:
+    """Whether an (H, W) uint8 image is white noise alone, which fits landmarks by chance where they are expected.
+
+    Means of blocks of white noise differ as its pixels do, in proportion; those of scenes differ by far more.
+    """
+    height, width = image.shape
+    blocks = cv2.resize(
+        image.astype(np.float32), (max(width // _BLOCK, 2), max(height // _BLOCK, 2)), interpolation=cv2.INTER_AREA
+    )
+    pixels = (width / blocks.shape[1]) * (height / blocks.shape[0])
+    between, within = (float(np.mean(np.diff(each, axis=1) ** 2)) for each in (blocks, image.astype(np.float32)))
+    return within > 0.0 and pixels * between < ACCEPTANCE.noise_contrast * within
 
 
 def _is_same(image: np.ndarray, other: np.ndarray) -> bool:

@@ -32,7 +32,7 @@ from sigmaslam.slam.doubt import Doubt, Doubts
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.slam.frame import Frame, usable_pixels
 from sigmaslam.slam.frame_history import FrameHistory
-from sigmaslam.slam.frozen_images import LastPairs
+from sigmaslam.slam.frozen_images import LastPairs, is_noise
 from sigmaslam.slam.guided_matching import GuidedMatcher, GuidedMatches
 from sigmaslam.slam.keyframes import Keyframes
 from sigmaslam.slam.landmark_admission import AdmitAll, LandmarkAdmission
@@ -197,7 +197,7 @@ class StereoTracker:
             self._motion.predict(seconds, densities(self.config, self._window.depth), sigma, timestamp)
         is_repeated = self._last_pairs.is_repeated(left, right)
         matches, fit, change = GuidedMatches.empty(), None, None
-        if not is_repeated:
+        if not is_repeated and not is_noise(left):
             matches, fit, change = self._localise(frame, timestamp, clock)
         if fit is None and dead_reckoning(self._motion) is not None:
             # Images that give no pose say nothing against the prediction either.

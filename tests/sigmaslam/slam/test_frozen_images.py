@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sigmaslam.slam.frozen_images import LastPairs
+from sigmaslam.slam.frozen_images import LastPairs, is_noise
 from sigmaslam.slam.tracker import StereoTracker
 from tests.support.estimates import Demo
 
@@ -27,6 +27,15 @@ def test_the_same_array_filled_again_is_another_image():
     pair.is_repeated(buffer, buffer)
     buffer[3, 3] ^= 1
     assert not pair.is_repeated(buffer, buffer)
+
+
+def test_noise_is_no_scene(demo: Demo):
+    rng, scene = np.random.default_rng(0), demo[1][0].left
+    for level, sigma in ((0.5, 1.0), (3.0, 1.5), (100.0, 20.0)):
+        assert is_noise(np.clip(rng.normal(level, sigma, (120, 160)), 0, 255).astype(np.uint8))
+    assert not is_noise(scene)
+    assert not is_noise(np.clip(scene + rng.normal(0.0, 25.0, scene.shape), 0, 255).astype(np.uint8))
+    assert not is_noise(np.full((120, 160), 9, np.uint8))
 
 
 @pytest.mark.long

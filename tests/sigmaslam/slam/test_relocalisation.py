@@ -268,13 +268,24 @@ def test_an_array_in_place_of_a_map_is_refused_without_advice_to_unpickle(tmp_pa
 # ---- what the motion excludes
 
 
-@pytest.mark.parametrize(("away", "inliers", "is_found"), [(0.01, 20, True), (5.0, 20, False), (5.0, 60, True)])
-def test_a_few_matches_find_no_place_that_the_motion_excludes(away: float, inliers: int, is_found: bool):
+@pytest.mark.parametrize(
+    ("away", "inliers", "is_measured", "is_found"),
+    [
+        (0.01, 20, False, True),
+        (5.0, 20, False, False),
+        (5.0, 60, False, True),
+        (5.0, 60, True, False),
+        (0.01, 60, True, True),
+    ],
+)
+def test_no_place_is_found_that_the_motion_excludes(away: float, inliers: int, is_measured: bool, is_found: bool):
     keyframes = visited([looking(0.0)], 10)
     window = keyframes._window
     window.add_keyframe(looking(0.1), looking(0.1), 1e-4 * np.eye(6), NO_WALK, 1.0)
     keyframes.append(view_of(1, 80), 0.5)
-    motion = SimpleNamespace(step=np.eye(4), step_covariance=1e-2 * np.eye(6))
+    motion = SimpleNamespace(
+        step=np.eye(4), step_covariance=1e-2 * np.eye(6), is_inertial=is_measured, is_odometric=False
+    )
     found = RelativePose(looking(0.1 + away), np.arange(80) < inliers, 1e-4 * np.eye(6), 1.0)
     matcher = SimpleNamespace(relative_pose_to=lambda key, view: found, is_beyond_chance=lambda found: inliers > 45)
     relocaliser = Relocaliser(window, keyframes, motion, matcher, AdmitAll(10), 15)
