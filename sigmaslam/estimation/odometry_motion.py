@@ -6,7 +6,6 @@ import logging
 from collections import deque
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.preintegration import bridge_spectrum, interpolate
@@ -86,7 +85,8 @@ class OdometryMotion(MotionFilter):
             super().predict(seconds, densities, sigma)
             return
         self.twist = self._adjoint @ self._measured + self._stays @ (self.twist - self._adjoint @ before)
-        kept = block_diag(np.eye(6), self._stays)
+        kept = np.eye(12)
+        kept[_TWIST, _TWIST] = self._stays
         self._covariance = kept @ self._covariance @ kept.T
         super().predict(seconds, np.zeros(2))
         noise = (self._adjoint * (seconds * (self.spectrum + self._unsampled))) @ self._adjoint.T

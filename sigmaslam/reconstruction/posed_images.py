@@ -7,12 +7,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text
 from sigmaslam.geometry.camera import RectifiedStereo
-from sigmaslam.geometry.se3 import se3_inverse
+from sigmaslam.geometry.se3 import matrix_to_quaternion, se3_inverse
 from sigmaslam.reconstruction.cloud import DenseCloud, write_cloud
 
 # Points of the COLMAP model, an even selection: so many start a splat.
@@ -89,5 +88,5 @@ def _name(number: int) -> str:
 def _inverse_pose(pose: np.ndarray) -> str:
     """Quaternion w, x, y, z and translation of T_camera_world."""
     inverse = se3_inverse(pose)
-    x, y, z, w = Rotation.from_matrix(inverse[:3, :3]).as_quat(canonical=True)
+    x, y, z, w = matrix_to_quaternion(inverse[:3, :3])
     return " ".join(f"{value:.9f}" for value in (w, x, y, z, *inverse[:3, 3]))

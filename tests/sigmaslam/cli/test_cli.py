@@ -348,7 +348,7 @@ def test_the_list_of_columns_is_whole_in_80_columns(monkeypatch: pytest.MonkeyPa
 @pytest.mark.long
 def test_tab_completes_commands_options_and_choices():
     for typed, expected in (
-        ("sigmaslam tr", {"track", "train", "train-scorer"}),
+        ("sigmaslam tr", {"track", "train", "train-scorer", "triangulate"}),
         ("sigmaslam track --fron", {"--frontend"}),
         ("sigmaslam track --frontend s", {"sift"}),
     ):
