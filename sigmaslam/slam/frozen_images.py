@@ -13,6 +13,8 @@ from sigmaslam.estimation.acceptance import ACCEPTANCE
 _REMEMBERED = 8
 # Side of the blocks whose means are compared, pixels.
 _BLOCK = 8
+# Grey values: no sensor is noisier in the dark.
+_MOST_NOISE = 32.0
 
 
 class LastPairs:
@@ -50,8 +52,11 @@ def is_noise(image: np.ndarray) -> bool:
         image.astype(np.float32), (max(width // _BLOCK, 2), max(height // _BLOCK, 2)), interpolation=cv2.INTER_AREA
     )
     pixels = (width / blocks.shape[1]) * (height / blocks.shape[0])
-    between, within = (float(np.mean(np.diff(each, axis=1) ** 2)) for each in (blocks, image.astype(np.float32)))
-    return within > 0.0 and pixels * between < ACCEPTANCE.noise_contrast * within
+    steps = np.diff(image.astype(np.float32), axis=1)
+    between, within = float(np.mean(np.diff(blocks, axis=1) ** 2)), float(np.mean(steps**2))
+    # Neither a few bright pixels of a black image nor more than any sensor's noise.
+    is_possible = np.count_nonzero(steps) > 0.1 * steps.size and within < 2.0 * _MOST_NOISE**2
+    return bool(is_possible and pixels * between < ACCEPTANCE.noise_contrast * within)
 
 
 def _is_same(image: np.ndarray, other: np.ndarray) -> bool:
