@@ -6,6 +6,7 @@ import numpy as np
 
 from sigmaslam.checks.finding import Finding
 from sigmaslam.estimation.accelerometer_axes import SIGNED_AXES, fit_axes
+from sigmaslam.estimation.inertial_motion import SENSOR_SIGMA
 from sigmaslam.estimation.inertial_turns import TurnFit, fit_turns
 from sigmaslam.geometry.se3 import nearest_rotation, rotation_log
 from sigmaslam.progress import open_progress
@@ -22,8 +23,8 @@ _SCALE_TOLERANCE = 0.1
 _SAME, _LEAST_TURN = 0.7, 2e-3
 # Rotations are signed axes if they are so near to them, radians; axes are wrong if others fit so many times better.
 _NEAR, _BETTER = 0.2, 3.0
-# What the tracker considers of delay and mounting, seconds and radians: by less they are not wrong.
-_DELAY, _TURN = 2e-3, 3.5e-3
+# What the tracker expects of delay and mounting, seconds and radians: by less they are not wrong.
+_DELAY, _TURN = float(SENSOR_SIGMA[0]), float(SENSOR_SIGMA[-1])
 # Of three degrees of freedom, the quantile of chi-square at 3 sigma (99.73 %).
 _CHI_SQUARE = 14.16
 # A path is integrated over so many seconds of images whose turns can be interpolated: no further apart than that.

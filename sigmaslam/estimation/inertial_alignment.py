@@ -87,7 +87,7 @@ def align_gyro(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> tuple[np
 
 
 def align(
-    poses: np.ndarray, mounting: np.ndarray, motions: Sequence[Preintegrated], considered: np.ndarray
+    poses: np.ndarray, mounting: np.ndarray, motions: Sequence[Preintegrated], sensor_sigma: np.ndarray
 ) -> Alignment | None:
     """Velocity, gravity and biases by least squares; None where they cannot be told.
 
@@ -98,14 +98,14 @@ def align(
         poses: (N, 4, 4) of the camera, N >= 4.
         mounting: (4, 4) T_camera_imu.
         motions: N - 1 between successive poses, integrated with the gyro's bias and without the accelerometer's.
-        considered: (7,) standard deviations of the clock's delay and of the mounting, perturbed from the left.
+        sensor_sigma: (7,) standard deviations of the clock's delay and of the mounting, perturbed from the left.
     """
     bodies = poses @ mounting
     found, covariance, length = _solve(bodies, motions)
     if abs(length - STANDARD_GRAVITY) > _LENGTH_TOLERANCE or _tilt(covariance) > _LEAST_TILT_CERTAINTY:
         return None
-    columns = np.empty((len(found), len(considered)))
-    for k, sigma in enumerate(considered):
+    columns = np.empty((len(found), len(sensor_sigma)))
+    for k, sigma in enumerate(sensor_sigma):
         sides = []
         for error in (sigma, -sigma):
             moved = [_delayed(each, error) for each in motions] if k == 0 else motions
@@ -113,7 +113,7 @@ def align(
             sides.append(_solve(poses @ mounted, moved)[0])
         columns[:, k] = 0.5 * (sides[0] - sides[1])
     covariance[6:9, 6:9] += _GYRO_BIAS_FLOOR**2 * np.eye(3)
-    return Alignment(found[:3], found[3:6], found[6:], covariance + columns @ columns.T, columns * considered)
+    return Alignment(found[:3], found[3:6], found[6:], covariance + columns @ columns.T, columns * sensor_sigma)
 
 
 def _tilt(covariance: np.ndarray) -> float:

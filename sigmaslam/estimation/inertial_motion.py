@@ -22,9 +22,9 @@ _LOGGER = logging.getLogger(__name__)
 _POSE, _VELOCITY, _GRAVITY, _BIASES = slice(0, 6), slice(6, 9), slice(9, 12), slice(12, 18)
 # Delay and mounting of the sensor, and the size of all.
 _SENSOR, _SIZE = slice(18, 25), 25
-# Prior standard deviations of delay (s), place (m) and rotation (rad) of the sensor. Those of careful calibrations:
-# 2 ms, 5 mm and 0.2 degrees.
-_SENSOR_SIGMA = np.array([2e-3, *[5e-3] * 3, *[3.5e-3] * 3])
+SENSOR_SIGMA = np.array([2e-3, *[5e-3] * 3, *[3.5e-3] * 3])
+"""Prior standard deviations of delay (s), place (m) and rotation (rad) of the sensor. Those of careful calibrations:
+2 ms, 5 mm and 0.2 degrees."""
 # Seconds in which clocks drift and mounts bend, as they warm up, by as much as they are off at first.
 _WARM_UP = 600.0
 # Gravity is looked for in the poses of so many seconds, and in no fewer than so many poses.
@@ -112,7 +112,7 @@ class InertialMotion(MotionFilter):
         turned = se3_log(se3_inverse(self.step) @ step)[3:] / motion.seconds
         self.step, self._velocity = nearest_rigid(step), velocity
         self._covariance, self._carried, self.widened = 0.5 * (covariance + covariance.T), carried, 1.0
-        self._covariance[_SENSOR, _SENSOR] += np.diag(_SENSOR_SIGMA**2 * motion.seconds / _WARM_UP)
+        self._covariance[_SENSOR, _SENSOR] += np.diag(SENSOR_SIGMA**2 * motion.seconds / _WARM_UP)
         self._note_twist(turned)
         if sigma > 0.0:
             self.doubt_time(sigma)
@@ -178,7 +178,8 @@ class InertialMotion(MotionFilter):
         times = [each[0] for each in self._poses]
         if len(times) < _ALIGNED_POSES or times[-1] - times[0] < 0.9 * _ALIGNED_SECONDS:
             return
-        bodies = np.array([pose for _, pose in self._poses]) @ self._T_camera_imu
+        poses = np.array([pose for _, pose in self._poses])
+        bodies = poses @ self._T_camera_imu
         bias, whole = np.zeros(3), list[Preintegrated]()
         for _ in range(2):  # long intervals are no longer linear in the bias
             biases = np.r_[bias, np.zeros(3)]
@@ -195,7 +196,7 @@ class InertialMotion(MotionFilter):
                 )
             self._is_refused, self._poses = True, []
             return
-        found = align(np.array([pose for _, pose in self._poses]), self._T_camera_imu, whole, _SENSOR_SIGMA)
+        found = align(poses, self._T_camera_imu, whole, SENSOR_SIGMA)
         if found is None:
             return
         R = self._T_first_key[:3, :3].T
@@ -207,7 +208,7 @@ class InertialMotion(MotionFilter):
         covariance[6:18, 6:18] = turn @ found.covariance @ turn.T
         covariance[6:18, _SENSOR] = turn @ found.shared
         covariance[_SENSOR, 6:18] = covariance[6:18, _SENSOR].T
-        covariance[_SENSOR, _SENSOR] = np.diag(_SENSOR_SIGMA**2)
+        covariance[_SENSOR, _SENSOR] = np.diag(SENSOR_SIGMA**2)
         self._covariance, self.is_inertial, self._carried, self.widened = covariance, True, None, 1.0
         self._note_twist(se3_log(se3_inverse(self._poses[-2][1]) @ self._poses[-1][1])[3:] / (times[-1] - times[-2]))
         way = np.linalg.norm(np.diff(bodies[:, :3, 3], axis=0), axis=1).sum()

@@ -47,12 +47,10 @@ def is_noise(image: np.ndarray) -> bool:
 
     Means of blocks of white noise differ as its pixels do, in proportion; those of scenes differ by far more.
     """
-    height, width = image.shape
-    blocks = cv2.resize(
-        image.astype(np.float32), (max(width // _BLOCK, 2), max(height // _BLOCK, 2)), interpolation=cv2.INTER_AREA
-    )
+    (height, width), values = image.shape, image.astype(np.float32)
+    blocks = cv2.resize(values, (max(width // _BLOCK, 2), max(height // _BLOCK, 2)), interpolation=cv2.INTER_AREA)
     pixels = (width / blocks.shape[1]) * (height / blocks.shape[0])
-    steps = np.diff(image.astype(np.float32), axis=1)
+    steps = np.diff(values, axis=1)
     between, within = float(np.mean(np.diff(blocks, axis=1) ** 2)), float(np.mean(steps**2))
     # Neither a few bright pixels of a black image nor more than any sensor's noise.
     is_possible = np.count_nonzero(steps) > 0.1 * steps.size and within < 2.0 * _MOST_NOISE**2
