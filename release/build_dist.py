@@ -7,8 +7,6 @@ times from the commit (or SOURCE_DATE_EPOCH), and archives are sorted and name n
 machine: kernels are the same where it is.
 """
 
-from __future__ import annotations
-
 import argparse
 import gzip
 import hashlib

@@ -6,8 +6,6 @@ A page whose data or peers are absent would lose rows: it is skipped, and said s
 used again. Records of commands that are gone, or of work by hand, name no command and stay.
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import os

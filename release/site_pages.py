@@ -5,8 +5,6 @@ index.md, what lies in docs/ moves up by a folder, and other files that a page l
 `on_files` and `on_page_markdown`.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from posixpath import dirname, relpath

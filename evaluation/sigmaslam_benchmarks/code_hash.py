@@ -1,7 +1,5 @@
 """Hashes of the code that figures and renders depend on: what a module imports, found by reading it."""
 
-from __future__ import annotations
-
 import ast
 import hashlib
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """`sigmaslam benchmark`: a command for each benchmark of one table, which writes its page."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 from importlib import import_module

@@ -1,7 +1,5 @@
 """Rendered sequences, whose calibration is known exactly, and calibrations with errors for them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What an evaluation of a run found, and as JSON."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path

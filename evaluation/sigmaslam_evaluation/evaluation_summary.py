@@ -1,7 +1,5 @@
 """An evaluation as a table of text."""
 
-from __future__ import annotations
-
 from sigmaslam_evaluation.evaluation_result import Evaluation, FinalErrors
 from sigmaslam_evaluation.metrics.map_consistency import coverage
 from sigmaslam_evaluation.metrics.trajectory_errors import (

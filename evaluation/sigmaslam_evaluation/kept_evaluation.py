@@ -1,7 +1,5 @@
 """The evaluation of a run in its folder and its report."""
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 from typing import Any

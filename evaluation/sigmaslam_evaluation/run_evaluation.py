@@ -1,7 +1,5 @@
 """Evaluate a run, or a trajectory of any origin, against the truth."""
 
-from __future__ import annotations
-
 import json
 import logging
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Conventions of truth files: applies the one that is said, and finds the one that makes the error collapse."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields, replace
 from itertools import product
 from typing import Literal

@@ -1,7 +1,5 @@
 """How good a truth is: its kind, the errors of this kind, and poses that nobody measured."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Literal
 

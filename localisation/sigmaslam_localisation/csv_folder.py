@@ -1,7 +1,5 @@
 """Recordings of one's own: a folder of CSV files with a header."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 

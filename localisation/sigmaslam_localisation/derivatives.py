@@ -1,7 +1,5 @@
 """Derivatives of a wheeled robot's motion and sightings in the tangents of its state, for the extended filter."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

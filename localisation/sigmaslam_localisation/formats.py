@@ -1,7 +1,5 @@
 """Which kind of recording a path is, and its robots."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from sigmaslam.errors import InputError

@@ -1,7 +1,5 @@
 """Localisation of robots among known landmarks: predict, look at the sightings, learn their noise, update."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol

@@ -6,8 +6,6 @@ in anything; its first sighting puts it into its place, by the inverse of (9.45)
 pose, the constants and the sighting's noise give it, the cross covariances among them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """Recordings in the form of the UTIAS MRCLAM data: robots in a room of barcodes (Leung et al. 2011)."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Files that a localisation leaves: trajectories, innovations, a summary, a map and a report."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Errors of an estimate against the truth, and whether its covariance fits them."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sigmaslam_localisation.robots import LandmarkMap, RobotEstimate

@@ -1,7 +1,5 @@
 """Recordings in the form of "Starry Night" (Barfoot): a MATLAB file of a stereo camera above points at known places."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A recording cut into steps of a filter: a motion, then what was seen at its end; several recordings are a batch."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -13,8 +13,6 @@ The camera's turn shifts all points of a frame alike: errors of mounting, of tim
 takes them for independent noise of each point averages what does not average out.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """Recordings in the form of "Lost in the Woods" (Barfoot): a MATLAB file of one robot with a laser among tubes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

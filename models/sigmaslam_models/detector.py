@@ -5,8 +5,6 @@ which keypoints are worth keeping. Of the classical ones the determinant of the 
 (docs/notebook/features.md).
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn import functional

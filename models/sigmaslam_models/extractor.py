@@ -1,7 +1,5 @@
 """From an image to keypoints, scores, descriptors and sigmas: the graph that is exported and shipped."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

@@ -1,7 +1,5 @@
 """The correspondence network: a descriptor, a quality and a log-sigma for every place of an image."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -1,7 +1,5 @@
 """A module as an ONNX graph: written, and compared with torch on inputs of other sizes than it was traced with."""
 
-from __future__ import annotations
-
 import logging
 import warnings
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The page of the graphs that ship: what each takes and gives, read from the files, and a short text of ours."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The model card that ships with weights: read, and as a page for people."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The trained networks: read from their weights, exported to ONNX, and checked where ONNX Runtime computes them."""
 
-from __future__ import annotations
-
 import json
 import time
 from dataclasses import dataclass

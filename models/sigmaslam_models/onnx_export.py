@@ -1,7 +1,5 @@
 """A folder of what the runtime needs: all graphs, exported to it and compared with torch."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

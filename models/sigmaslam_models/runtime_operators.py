@@ -1,7 +1,5 @@
 """Operators of ONNX Runtime that ONNX does not have, as the exporter takes them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The match scorer: which putative matches are right, from their neighbours and what the matcher knows of each."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import torch

@@ -1,7 +1,5 @@
 """The graphs' torch twins behind the same call: the back end that the package registers for `--backend torch`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The match verifier: probability and covariance of a match from what its refined patches look like."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

@@ -1,7 +1,5 @@
 """The report of a run: one HTML file that needs nothing outside it."""
 
-from __future__ import annotations
-
 import base64
 import json
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """What a report says in words and figures."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

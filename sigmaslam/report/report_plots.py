@@ -1,7 +1,5 @@
 """The plots of a report, over the time of all frames."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The 3D view of a report: what stands where."""
 
-from __future__ import annotations
-
 import base64
 from typing import Any
 

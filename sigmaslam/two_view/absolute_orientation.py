@@ -1,7 +1,5 @@
 """Absolute orientation: the motion between two frames from points that are known in both (9.2.3.3)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

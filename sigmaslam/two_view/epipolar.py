@@ -1,7 +1,5 @@
 """Relative orientation of two calibrated views from matches: the 5-point method, then least squares by covariance."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

@@ -1,7 +1,5 @@
 """The fundamental matrix of two views, epipoles and epipolar lines (9.31)-(9.33)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The geometry of two image files: `sigmaslam geometry`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Triangulation (9.34) and absolute orientation (9.2.3.3) from files to files."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -1,7 +1,5 @@
 """Relative pose without a prediction (9.5.1): 5-point method with scale from stereo, checked against P3P."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

@@ -1,7 +1,5 @@
 """Points from two calibrated views: parallel stereo, midpoint, linear least squares, optimal; with covariance (9.3)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

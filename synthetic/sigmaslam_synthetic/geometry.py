@@ -1,7 +1,5 @@
 """Curves and rigid motions."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

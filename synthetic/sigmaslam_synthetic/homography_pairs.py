@@ -3,8 +3,6 @@
 A pair is a pure function of (seed, index), so that a run can be resumed anywhere and repeated exactly.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

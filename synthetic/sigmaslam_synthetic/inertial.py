@@ -1,7 +1,5 @@
 """An inertial sensor on the rendered camera: exact motion by the path's splines, and a small sensor's errors."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

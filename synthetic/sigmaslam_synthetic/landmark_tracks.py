@@ -1,7 +1,5 @@
 """Points of the scene followed through a whole sequence: what certifies a tracker where its own features may err."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Folders that our readers and other people's tools read: KITTI odometry and EuRoC's ASL format."""
 
-from __future__ import annotations
-
 import csv
 import io
 import zipfile

@@ -1,7 +1,5 @@
 """Independent jobs in parallel: in processes of this machine, or as tasks of a Ray cluster."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed

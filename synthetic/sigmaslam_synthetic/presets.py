@@ -1,7 +1,5 @@
 """What `sigmaslam render` offers: a domain, its stereo camera, its clock and the folder layout of its field."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal

@@ -3,8 +3,6 @@
 A pair is a function of (seed, index).
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

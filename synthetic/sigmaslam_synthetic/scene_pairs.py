@@ -1,7 +1,5 @@
 """Image pairs of 3D scenes: true occlusion, depth edges, moving things. A pair is a function of (seed, index)."""
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from dataclasses import dataclass
 

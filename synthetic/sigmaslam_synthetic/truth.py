@@ -1,7 +1,5 @@
 """Where a point of one view appears in another, and whether it is seen there: flow, disparity, occlusion, tracks."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

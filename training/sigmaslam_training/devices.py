@@ -1,7 +1,5 @@
 """Where a run works: a processor or a GPU, alone or as one of several processes under torchrun."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Ctrl-C and SIGTERM wait for the end of the step that is under way, so that what is saved is a whole step."""
 
-from __future__ import annotations
-
 import signal
 import threading
 from collections.abc import Iterator

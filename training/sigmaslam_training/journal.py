@@ -1,7 +1,5 @@
 """What a run leaves behind to look at: log.jsonl, TensorBoard's events, sample pictures."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The card of a run: what the weights were made of, by what, and how good they are."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """The loop of a small network on one processor: saved now and then, and resumed to the bit."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any

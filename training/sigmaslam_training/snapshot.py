@@ -1,7 +1,5 @@
 """A training at the end of a step as one safetensors file: going on from it is as if it had not stopped."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass

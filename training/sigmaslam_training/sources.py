@@ -1,7 +1,5 @@
 """What training pairs come from, by name or file, and whose turn it is."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Two claims of the chapter put to Monte Carlo: the banana of 9.2.3.2, and that the UKF beats the EKF (9.6)."""
 
-from __future__ import annotations
-
 import math
 import platform
 from collections.abc import Callable, Sequence

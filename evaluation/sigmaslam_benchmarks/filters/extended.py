@@ -1,7 +1,5 @@
 """The extended filter beside the unscented one: the same models, which give no derivatives of their own."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

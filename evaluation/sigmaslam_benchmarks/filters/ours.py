@@ -1,7 +1,5 @@
 """SigmaSLAM's filters on the work of `filter_work`, as a user would drive them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, TypeAlias

@@ -8,8 +8,6 @@ Bearings are given to the libraries relative to the measured one, with a measure
 a wrapped difference, and where there is one it costs time. The reference wraps, and the results agree.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

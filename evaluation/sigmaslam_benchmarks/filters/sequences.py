@@ -1,7 +1,5 @@
 """A whole sequence by `filter`, by a loop around a compiled step, and by `compile_filter`: the same filters."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

@@ -7,8 +7,6 @@ The models take the array module as their first argument (numpy, jax.numpy or to
 same arithmetic and differs in its filter only.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

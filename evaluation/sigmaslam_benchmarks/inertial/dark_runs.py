@@ -1,7 +1,5 @@
 """Recordings tracked with some images black: what becomes of the pose, and whether it is as sure as it says."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Faults of an inertial sensor's table that a check before tracking is to name: units, axes, signs and clocks."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Faulty frames tracked in this process: what each method says of each frame, and in words."""
 
-from __future__ import annotations
-
 import io
 import logging
 import os

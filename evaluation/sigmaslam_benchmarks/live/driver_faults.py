@@ -1,7 +1,5 @@
 """Faults of camera drivers, made from good frames: stamps, order, light and the rig."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

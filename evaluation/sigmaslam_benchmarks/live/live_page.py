@@ -1,7 +1,5 @@
 """The page of the benchmark `live`."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

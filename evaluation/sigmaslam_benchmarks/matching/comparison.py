@@ -1,7 +1,5 @@
 """Everyone on every set, side by side."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Rendered pairs of views in which half of the right matches are on things that move: who accepts what."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

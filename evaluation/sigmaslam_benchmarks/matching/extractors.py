@@ -1,7 +1,5 @@
 """What is compared: a callable from a grey image to keypoints and descriptors."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol

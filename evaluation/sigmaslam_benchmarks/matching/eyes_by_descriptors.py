@@ -1,7 +1,5 @@
 """Stereo matches from features of both eyes: how extractors are compared; the tracker searches rows without them."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sigmaslam.frontend.descriptor import LEAST_PROBABILITY, RefinedMatches, refine_with_confidence

@@ -1,7 +1,5 @@
 """Whether the probability of matches holds when the camera advances and where structure repeats itself."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 

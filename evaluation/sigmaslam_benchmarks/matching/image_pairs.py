@@ -1,7 +1,5 @@
 """Two images and what is known to be true between them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

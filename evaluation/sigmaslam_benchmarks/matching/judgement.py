@@ -1,7 +1,5 @@
 """Whether probability and covariance of matches hold on real images: homographies, and rows of rectified pairs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

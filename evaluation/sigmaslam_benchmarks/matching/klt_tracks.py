@@ -1,7 +1,5 @@
 """Correct matches from frame to frame beside those of KLT, which has no descriptors."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

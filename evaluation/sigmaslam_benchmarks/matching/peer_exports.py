@@ -8,8 +8,6 @@ EdgePoint2 is `noahzhy/EdgePoint2` (MIT), the submodel S64. XFeat is `verlab/acc
 commit c58e74f, which holds the trained network as weights/xfeat.onnx; the graph there takes images of 640x640 alone.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import sys

@@ -1,7 +1,5 @@
 """Other people's extractors as ONNX graphs: recognised by their inputs and outputs, nothing else is known of them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

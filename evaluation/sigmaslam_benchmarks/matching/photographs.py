@@ -1,7 +1,5 @@
 """Sets of photographs: known warps, homographies, dense disparity, calibrated cameras."""
 
-from __future__ import annotations
-
 from itertools import combinations
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Telling right matches from wrong ones: our scorer beside the ratio test, AdaLAM and MAGSAC, on the same matches."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Relative pose of two views without a prediction: ours from judged matches beside MAGSAC."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

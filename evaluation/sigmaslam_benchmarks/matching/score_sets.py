@@ -1,7 +1,5 @@
 """Scores of an extractor on the sets, and their table."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

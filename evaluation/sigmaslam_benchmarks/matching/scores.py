@@ -1,7 +1,5 @@
 """Scores of one image pair and of many: matching accuracy, repeatability, homography and pose."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import cache
 

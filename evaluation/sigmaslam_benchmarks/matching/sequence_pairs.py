@@ -1,7 +1,5 @@
 """Pairs from stereo sequences: rows of the rectified eyes, and motion from frame to frame."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The sets by name: which choose models and data, and which are scored once."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 

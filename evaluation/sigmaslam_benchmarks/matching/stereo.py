@@ -1,7 +1,5 @@
 """What the tracker does with stereo pairs, with any features: refined row matches, and the pose of the next view."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

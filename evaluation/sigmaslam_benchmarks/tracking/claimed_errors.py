@@ -1,7 +1,5 @@
 """Errors of poses in the sigmas that the tracker claims: over a step, over some frames, since the start."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Whether poses and map are as sure as they say: on renders with exact truth, many seeds, five filters."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The page of image filtering: Set12, other noise, sequences, and the tracker in the dark."""
 
-from __future__ import annotations
-
 import shutil
 import time
 from collections.abc import Callable, Iterator

@@ -3,8 +3,6 @@
 `python -m sigmaslam_benchmarks.tracking.dense_gallery --out docs/images --work build/gallery`
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

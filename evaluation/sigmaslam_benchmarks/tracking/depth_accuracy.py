@@ -1,7 +1,5 @@
 """Depths of a keyframe against the exact ones of its render."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rectified pairs with true disparities: LiDAR, Middlebury, renders, and renders as a worse camera sees them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

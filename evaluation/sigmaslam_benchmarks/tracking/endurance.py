@@ -1,7 +1,5 @@
 """A rendered lap tracked over and over, with the outputs of `sigmaslam track`: memory, time a frame, error of a lap."""
 
-from __future__ import annotations
-
 import tempfile
 import time
 from collections.abc import Callable, Generator, Iterator

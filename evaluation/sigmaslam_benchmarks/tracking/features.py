@@ -1,7 +1,5 @@
 """Our features beside SIFT, ORB and other people's networks: time on one thread, and scores on real images."""
 
-from __future__ import annotations
-
 import json
 import sys
 import time

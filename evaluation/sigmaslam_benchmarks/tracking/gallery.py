@@ -3,8 +3,6 @@
 `python -m sigmaslam_benchmarks.tracking.gallery --out docs/synthetic`
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """How hard a rendered sequence moves in the image: flow, its reversals and the blur, from the exact landmarks."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ Images are (H, W) uint8 or float, grey levels 0 to 255. All is computed after a 
 images, but for the spectrum and the noise.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The tracker with every match's own covariance beside one constant for all, tuned on renders."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial

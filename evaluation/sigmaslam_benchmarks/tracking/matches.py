@@ -1,7 +1,5 @@
 """Probability and covariance of matches on real images and renders, beside what people use today."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import astuple, fields
 from itertools import pairwise

@@ -8,8 +8,6 @@ Recognition in Image Sequences": the centre of a branch is the majority of each 
 descriptors are left. The renders are of seeds that no benchmark tracks.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Relative orientation where it is hard: eight simulated cases and the fountain, beside OpenCV, PoseLib and COLMAP."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial

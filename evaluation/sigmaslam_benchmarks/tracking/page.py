@@ -1,7 +1,5 @@
 """Pages that benchmarks write and people annotate, and what their tables are made of."""
 
-from __future__ import annotations
-
 import os
 import platform
 from collections.abc import Callable, Iterable, Sequence

@@ -1,7 +1,5 @@
 """The run folder of a tracker that is not ours: poses, and a table of the frames with their times."""
 
-from __future__ import annotations
-
 import csv
 import time
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ the covariance of a pose is that of one pixel of noise in its own image, added a
 settings are common ones, the same for every sequence.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Protocol
 

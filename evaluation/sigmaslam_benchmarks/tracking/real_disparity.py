@@ -1,7 +1,5 @@
 """The page of `benchmark reconstruction --real`: disparities and sigmas on real truth, beside OpenCV's matching."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

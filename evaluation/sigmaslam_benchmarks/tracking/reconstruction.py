@@ -1,7 +1,5 @@
 """Dense reconstruction on renders with exact depth: errors, their intervals, completeness, ghosts of moving bodies."""
 
-from __future__ import annotations
-
 import json
 import os
 import tempfile

@@ -1,7 +1,5 @@
 """SIFT odometry on rendered drives beside the same on a real one: is what a tracker meets there alike?"""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """Renders beside real images: statistics of the images, odometry with SIFT, and how fast they are made."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor

@@ -1,7 +1,5 @@
 """CPU and wall time, memory and start-up of the tracker, of odometry from OpenCV, of cuVSLAM and of ORB-SLAM3."""
 
-from __future__ import annotations
-
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """The page of the benchmark `runtime`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 

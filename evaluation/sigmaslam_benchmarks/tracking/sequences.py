@@ -1,7 +1,5 @@
 """Our tracker, its EKF, classical odometry and bundle adjustment on every stereo sequence, side by side in one run."""
 
-from __future__ import annotations
-
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """The page of the benchmark `sequences`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

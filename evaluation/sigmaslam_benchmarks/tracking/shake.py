@@ -1,7 +1,5 @@
 """A shaken camera with a slow shutter: whether frames that are called tracked are right, beside KLT + PnP."""
 
-from __future__ import annotations
-
 import os
 import tempfile
 from collections.abc import Callable

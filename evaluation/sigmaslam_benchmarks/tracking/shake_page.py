@@ -1,7 +1,5 @@
 """The page of the benchmark `shake`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias

@@ -1,7 +1,5 @@
 """Whether a covariance of a pose is right as that of the last step, where it does not grow along the path."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sigmaslam.estimation.mahalanobis import squared_mahalanobis

@@ -5,8 +5,6 @@ cuVSLAM under NVIDIA's Community License: both are peers to compare with while S
 imports them. They come with the extra `peers`.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor

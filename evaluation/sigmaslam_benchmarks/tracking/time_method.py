@@ -4,8 +4,6 @@
 only some methods need is imported by them alone: start-up counts it.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

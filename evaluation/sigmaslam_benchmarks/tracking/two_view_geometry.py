@@ -1,7 +1,5 @@
 """The page of two-view geometry: ours beside OpenCV's on simulated matches, and what covariances are worth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Whether covariances are what they say: coverage, errors of map points in sigmas, means with their own errors."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Whether probabilities and sigmas mean what they say."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.stats import rankdata
 

@@ -1,7 +1,5 @@
 """Whether poses relative to earlier ones are as sure as they say, where errors of the first true pose do not rule."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Covariances of true poses, where the truth was measured, too."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

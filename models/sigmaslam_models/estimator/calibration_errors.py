@@ -1,7 +1,5 @@
 """What errors of a stereo calibration do to the measurements of a rectified pair."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """The tracker's estimator as ONNX graphs: its modules, with examples of what they are called with."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -4,8 +4,6 @@ The state is that of the window, n - 6 numbers, and the frame's pose behind it. 
 offset = factor z with z ~ N(0, I), so that a prior of any rank will do and no covariance is ever inverted.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

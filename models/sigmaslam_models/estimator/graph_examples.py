@@ -1,7 +1,5 @@
 """Inputs by which the graphs of the tracker's estimator are traced and checked, their names and free axes."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

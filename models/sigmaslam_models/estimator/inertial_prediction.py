@@ -9,8 +9,6 @@ State (error coordinates in this order):
   mounting  6  T_camera_imu, left perturbation
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

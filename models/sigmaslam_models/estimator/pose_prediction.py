@@ -5,8 +5,6 @@ State (error coordinates in this order):
   twist  6  constant velocity of the camera in its own frame, m/s and rad/s
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

@@ -1,7 +1,5 @@
 """Residuals of (u, v, disparity), of which the disparity may be missing."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Views of a window's landmarks by keyframes and frames, statistically linearised about poses and calibration."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -15,8 +15,6 @@ the slope does not explain is added to the noise (García-Fernández et al. 2015
 function gives the Jacobian: the extended filter is the limit of the unscented one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

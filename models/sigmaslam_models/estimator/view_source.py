@@ -4,8 +4,6 @@ A view is traced with two poses alone, those that its landmark is anchored to an
 numbers: of the calibration and of both poses. `estimator.cpp` puts them where they belong in the whole state.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Each landmark is eliminated by its own equations (Schur's complement), so that e
 landmark's error is shared by all its views.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -1,7 +1,5 @@
 """A camera in an unsteady hand or on a small drone in gusts: its turning reverses before a tracker has learned it."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.interpolate import CubicSpline
 

@@ -1,7 +1,5 @@
 """All textures of a scene with their mip levels in one image, so that one look-up serves every surface."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import lru_cache
 

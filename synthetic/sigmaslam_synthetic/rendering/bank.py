@@ -1,7 +1,5 @@
 """A bank of textures that renews itself while training goes on."""
 
-from __future__ import annotations
-
 from collections import OrderedDict
 
 import numpy as np

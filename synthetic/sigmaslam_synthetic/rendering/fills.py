@@ -4,8 +4,6 @@ Each is a function (shape, rng) -> (H, W) float32 of zero mean and unit standard
 everywhere), so that a contrast means the same for all. Lengths are pixels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 

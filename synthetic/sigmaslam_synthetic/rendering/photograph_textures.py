@@ -1,7 +1,5 @@
 """Photographs of one's own as textures."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Images with exact geometry from a scene: any number of views at once, on the CPU or a GPU."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

@@ -3,8 +3,6 @@
 Every shape stands in its own frame. Surfaces of one body show different parts of their texture.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cache
 

@@ -4,8 +4,6 @@ Sizes of leaves follow a power law (Lee, Mumford & Huang 2001), which gives the 
 edges of natural images; what fills a leaf varies, because the diversity of the generator is what transfers.
 """
 
-from __future__ import annotations
-
 import cmath
 import os
 import zlib

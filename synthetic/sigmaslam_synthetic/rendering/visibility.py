@@ -8,8 +8,6 @@ pixels, sub-samples, projected points, shadows) are tested exactly against what 
 Coordinates come first in arrays here, (2, N) and (3, N): what is computed for each coordinate then runs over long rows.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

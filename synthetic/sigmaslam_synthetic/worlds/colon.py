@@ -1,7 +1,5 @@
 """An endoscope in a bent, folded tube."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

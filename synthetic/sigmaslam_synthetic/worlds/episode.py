@@ -1,7 +1,5 @@
 """A world with a way through it: what every generator makes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path as FilePath
 

@@ -1,7 +1,5 @@
 """A drone's flight through a machine hall or a yard with containers."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A laparoscope over organs."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

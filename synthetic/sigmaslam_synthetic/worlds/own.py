@@ -1,7 +1,5 @@
 """A world of one's own: a Python file with a function `generate`, as every module of this folder has one."""
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 from collections.abc import Callable

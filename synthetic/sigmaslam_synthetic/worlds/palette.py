@@ -1,7 +1,5 @@
 """The materials of one scene, made of few textures in many sizes and greys."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

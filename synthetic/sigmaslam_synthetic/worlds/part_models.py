@@ -1,7 +1,5 @@
 """Things of several parts, at rest or on the move, and bodies that keep within a camera's view."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache

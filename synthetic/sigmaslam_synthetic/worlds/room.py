@@ -1,7 +1,5 @@
 """A furnished room through which a camera is carried by hand."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

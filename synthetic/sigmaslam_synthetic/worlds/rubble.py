@@ -1,7 +1,5 @@
 """What is left of a house: planks, nets and rubble close around a camera that is carried or flies through."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A drive through a town, as KITTI's car sees it: the way comes first, the town is laid out along it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

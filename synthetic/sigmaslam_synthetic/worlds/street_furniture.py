@@ -1,7 +1,5 @@
 """What stands along a street and drives on it: cars, trees, lamps, signs; x is ahead, the ground is at z = 0."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

@@ -1,7 +1,5 @@
 """Houses, walls and fences; x runs along the street, which lies towards -y, and the ground is at z = 0."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sigmaslam_synthetic.rendering.shapes import Box, Cylinder, Panel

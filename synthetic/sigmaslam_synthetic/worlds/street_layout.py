@@ -1,7 +1,5 @@
 """What stands where along a road."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """The ground of a street: heights that follow a drive, and which places are free."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

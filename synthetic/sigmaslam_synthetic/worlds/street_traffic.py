@@ -1,7 +1,5 @@
 """Cars and trucks on the road of a street."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

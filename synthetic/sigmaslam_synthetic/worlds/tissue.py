@@ -1,7 +1,5 @@
 """What the surgical worlds share: wet tissue, the light of an endoscope, instruments, motions."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """An instrument that is moved in front of a camera at rest: it is the thing to be tracked."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

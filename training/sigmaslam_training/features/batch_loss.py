@@ -1,7 +1,5 @@
 """One training step of the correspondence network: from a batch of pairs to its losses."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

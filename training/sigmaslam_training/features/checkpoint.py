@@ -1,7 +1,5 @@
 """A run that trains the features, in memory and as a checkpoint."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import asdict, dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The training loop: resumable at any step, the same result on as many processes whether it was interrupted or not."""
 
-from __future__ import annotations
-
 import json
 import time
 from contextlib import closing, nullcontext

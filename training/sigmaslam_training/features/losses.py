@@ -1,7 +1,5 @@
 """Losses of the correspondence network."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -1,7 +1,5 @@
 """What a network matches in a held-out pair, as a picture."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

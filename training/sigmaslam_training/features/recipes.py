@@ -1,7 +1,5 @@
 """What a training run is made of, and the runs that have a name."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path

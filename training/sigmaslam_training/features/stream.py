@@ -1,7 +1,5 @@
 """Training pairs as a torch data set: item i is a function of (seed, i) alone."""
 
-from __future__ import annotations
-
 import signal
 from typing import Protocol
 

@@ -1,7 +1,5 @@
 """How well a network matches held-out renders, in the terms of the field."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

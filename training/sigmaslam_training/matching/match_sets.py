@@ -1,7 +1,5 @@
 """What the match scorer learns from: putative matches of rendered pairs, with the error of each."""
 
-from __future__ import annotations
-
 import multiprocessing
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass

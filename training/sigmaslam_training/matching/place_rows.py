@@ -1,7 +1,5 @@
 """What the verifier of places learns from: patches of rendered pairs found without features of the second image."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 
 import numpy as np

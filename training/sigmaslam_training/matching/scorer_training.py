@@ -1,7 +1,5 @@
 """Trains the match scorer on putative matches of rendered pairs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from itertools import count, islice
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Scorer and verifier in one run: pairs, both trainings, calibration, weights and card."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Callable, Iterator

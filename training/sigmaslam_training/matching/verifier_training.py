@@ -1,7 +1,5 @@
 """Trains the match verifier on refined matches of rendered pairs, and calibrates it on others."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import count

@@ -1,7 +1,5 @@
 """Systems of the literature on nonlinear filters, with the figures they are known by."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """A robot in the plane and a stereo camera in space."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """A scenario is data and models; `run` sends a filter through all its runs as one batch."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
