@@ -10,7 +10,7 @@ import pytest
 from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.inference.onnx_graph import shipped_weights
 from sigmaslam_models import network_export
-from sigmaslam_models.graph_page import PAGE_COMMAND, TEXTS, graph_page
+from sigmaslam_models.graph_page import PAGE_COMMAND, graph_page, graph_texts
 from sigmaslam_models.network_export import check_networks
 from sigmaslam_models.onnx_export import check_graphs
 
@@ -25,11 +25,11 @@ def test_the_page_is_that_of_the_files_that_ship():
 @pytest.mark.parametrize("path", sorted(WEIGHTS.glob("*.onnx")), ids=lambda path: path.stem)
 def test_every_input_and_output_of_a_graph_has_its_meaning(path):
     graph = onnx.load(path).graph
-    assert {each.name for each in [*graph.input, *graph.output]} <= TEXTS[path.stem].meanings.keys()
+    assert {each.name for each in [*graph.input, *graph.output]} <= graph_texts()[path.stem]["meanings"].keys()
 
 
 def test_there_is_no_text_of_a_graph_that_does_not_ship():
-    assert set(TEXTS) == {path.stem for path in WEIGHTS.glob("*.onnx")}
+    assert set(graph_texts()) == {path.stem for path in WEIGHTS.glob("*.onnx")}
 
 
 @pytest.mark.long
