@@ -40,12 +40,12 @@ def fill_page(template: str, command: str, **values: Any) -> str:
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        keep_trailing_newline=True,
         autoescape=False,  # Markdown
     )
     environment.filters["row"] = lambda cells: row(*cells)
     values |= {"command": command, "source": describe_source(), "machine": machine()}
-    return environment.get_template(f"{template}.md").render(values)
+    # Blocks end with an empty line, the page does not.
+    return environment.get_template(f"{template}.md").render(values).rstrip("\n") + "\n"
 
 
 def opening(title: str, command: str, text: str, place: str = "") -> list[str]:

@@ -1,6 +1,6 @@
 """The page of the benchmark `sequences`."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from sigmaslam.run_record.frame_table import TRACKED, FrameTable
-from sigmaslam_benchmarks.tracking.page import number, opening, table
+from sigmaslam_benchmarks.tracking.page import fill_page, number
 from sigmaslam_benchmarks.trial import TrialResult
 
 _LABELS = {
@@ -24,62 +24,6 @@ _LABELS = {
     "bundle": "bundle adjustment",
 }
 _STAGES = ("features", "match", "filter", "map")
-_COLUMNS = (
-    "method",
-    "tracked",
-    "ATE m",
-    "t_rel %",
-    "r_rel deg/100 m",
-    "step mm",
-    "forward noise mm",
-    "step deg",
-    "NIS",
-    "NEES",
-    "offset px",
-    "ms, mean (p10 - p90)",
-    "frames/s",
-)
-_STAGE_COLUMNS = ("method", "inliers", "features ms", "matching ms", "filter ms", "map ms")
-_RELATIVE_COLUMNS = (
-    "span",
-    "pairs",
-    "NEES, mean",
-    "median",
-    "inside 95 %",
-    "rmse m",
-    "sigma m",
-    "truth's share %",
-)
-_WORDS = """\
-All methods in turn in one run, with {threads} threads in OpenCV and 2 in the network. Accuracy is the same in every run
-on one machine, but for ORB-SLAM3's; times are wall milliseconds, means over all frames, keyframes in them. No setting
-of any method differs between sequences.
-
-- *ours*: learned features, unscented updates, two linearisations: what `sigmaslam track` does. *Our EKF*: the same with
-  Jacobians, linearised once. *Ours with*: other features under the same filter.
-- *SIFT + PnP*, *KLT + PnP*: from OpenCV alone (`sigmaslam_benchmarks.tracking.pnp_baselines`): points of a keyframe,
-  found again by ratio test or Lucas-Kanade, RANSAC, least squares. Landmarks count as known, the noise as 1 px.
-- *cuVSLAM*: on the CPU, by the package dim-odom (extra `peers`), given rectified pairs; rectifying is in its
-  time. No pose where it is lost. Its covariance (`pose_covariance`) is of x, y, z in the world and of roll, pitch, yaw
-  about fixed axes, as its header documents, and is turned into the camera's frame here. It is of the fit of one frame
-  to its map and does not grow along the path. *NEES* takes it for that of the pose relative to the first, as of the
-  others; a line below the table takes it for that of the step from the frame before.
-- *ORB-SLAM3*: by the package pyorbslam3 (extra `peers`), given rectified pairs, which come no sooner than their time
-  stamps say: its mapping has threads of its own. Poses as it says them at each frame, without what loops change later.
-  Its vocabulary is the one that `PYORBSLAM3_VOCAB` names. It gives no covariance.
-- *bundle adjustment*: of the tracks of *ours* (`track --tracks`, then `refine`), all keyframes at once; frames in
-  between move with them. Its time is that of the optimisation, on top of the tracking; its NEES that of the keyframes.
-- *tracked*: frames with a pose from the images, relocalised ones too; the first frame of a run is its origin.
-- *ATE*: root mean square position error after the best rigid alignment, metres.
-- *t_rel*, *r_rel*: KITTI segments, of 100 m where the path allows, else of 10 to 50 m.
-- *step*: median error from frame to frame over tracked frames. *Forward noise*: standard deviation over these frames of
-  the error along the true step; steps shorter than the truth's sigma have no direction and are left out.
-- *NIS*, *NEES*: per degree of freedom, 1 is right, more is overconfident. NEES is given where the truth is exact: on
-  renders.
-- *Relative poses*: of frames a span apart, which overlap. The covariance of a pair is the estimate's and the truth's
-  together; *truth's share* of it, in the median.
-- *offset*: measured minus true disparity, of the methods that estimate it.
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,46 +66,39 @@ def method_label(method: str) -> str:
 
 def format_results(results: Sequence[SequenceResult | Omission], command: str, complete: bool = True) -> str:
     """The results as a Markdown page."""
-    lines = [*opening("Results", command, "."), _WORDS.format(threads=cv2.getNumThreads())]
-    if not complete:
-        lines += ["**Stopped before the end: what is missing was not run.**", ""]
-    for missing in results:
-        if isinstance(missing, Omission) and not missing.method:
-            lines += [f"{missing.sequence} is left out: {missing.reason}", ""]
-    for sequence in dict.fromkeys(result.sequence for result in results if isinstance(result, SequenceResult)):
-        of_sequence = [
-            result for result in results if isinstance(result, SequenceResult) and result.sequence == sequence
-        ]
-        lines += [f"## {sequence}", "", *table(_COLUMNS, (_row(result) for result in of_sequence)), ""]
-        for missing in results:
-            if isinstance(missing, Omission) and missing.method and missing.sequence == sequence:
-                lines += [f"The row *{_LABELS[missing.method]}* is left out: {missing.reason}", ""]
-        staged = [each for each in of_sequence if each.trial.frames and "filter" in each.trial.frames.milliseconds]
-        if staged:
-            lines += [*table(_STAGE_COLUMNS, map(_stage_row, staged)), ""]
-        for result in of_sequence:
-            lines += _step_lines(result)
-        for result in of_sequence:
-            lines += _relative_lines(result)
-    return "\n".join(lines)
+    by_sequence: dict[str, list[SequenceResult]] = {}
+    for result in results:
+        if isinstance(result, SequenceResult):
+            by_sequence.setdefault(result.sequence, []).append(result)
+    missing = [result for result in results if isinstance(result, Omission)]
+    sequences = [
+        {
+            "name": name,
+            "rows": map(_row, found),
+            "missing": [
+                (_LABELS[each.method], each.reason) for each in missing if each.method and each.sequence == name
+            ],
+            "stages": [
+                _stage_row(each) for each in found if each.trial.frames and "filter" in each.trial.frames.milliseconds
+            ],
+            "steps": [
+                (_LABELS[each.method], f"{each.step_nees.mean():.2g}", f"{np.median(each.step_nees):.2g}")
+                for each in found
+                if each.step_nees is not None
+            ],
+            "relative": [_relative(each) for each in found if each.method == "ours" and each.trial.evaluation.relative],
+        }
+        for name, found in by_sequence.items()
+    ]
+    left_out = [each for each in missing if not each.method]
+    return fill_page(
+        "sequences", command, threads=cv2.getNumThreads(), complete=complete, left_out=left_out, sequences=sequences
+    )
 
 
-def _step_lines(result: SequenceResult) -> list[str]:
-    """The other reading of cuVSLAM's covariance."""
-    if result.step_nees is None:
-        return []
-    mean, median = result.step_nees.mean(), np.median(result.step_nees)
-    label = _LABELS[result.method]
-    return [f"Covariance of *{label}* read as that of a step: NEES {mean:.2g} in the mean, {median:.2g} median.", ""]
-
-
-def _relative_lines(result: SequenceResult) -> list[str]:
-    """Consistency of relative poses of a method that says it, with the sigmas of the truth."""
-    spans = result.trial.evaluation.relative
-    if result.method != "ours" or not spans:
-        return []
+def _relative(result: SequenceResult) -> tuple[str, Iterator[list[str]]]:
+    """What the truth's sigmas are, and rows of the consistency of relative poses by span."""
     sigmas = result.truth_sigmas
-    truth = "exact" if sigmas is None else f"{sigmas[0]:g} m and {sigmas[1]:g} degrees in each pose"
     rows = (
         [
             each.span,
@@ -173,9 +110,9 @@ def _relative_lines(result: SequenceResult) -> list[str]:
             f"{each.translation_sigma:.2g}",
             number(100 * each.truth_share, ".0f"),
         ]
-        for each in spans
+        for each in result.trial.evaluation.relative or ()
     )
-    return [f"Relative poses of *ours*; sigmas of the truth: {truth}.", "", *table(_RELATIVE_COLUMNS, rows), ""]
+    return "exact" if sigmas is None else f"{sigmas[0]:g} m and {sigmas[1]:g} degrees in each pose", rows
 
 
 def ate_cell(result: SequenceResult) -> str:
