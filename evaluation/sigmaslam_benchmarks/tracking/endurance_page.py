@@ -1,20 +1,14 @@
 """The page of the benchmark `endurance`."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from sigmaslam_benchmarks.tracking.page import opening, table
+from sigmaslam_benchmarks.tracking.page import fill_page
 
 # Limits of growth of memory and time and of the loop error, percent.
 _MEMORY, _TIME, _LOOP = 5.0, 10.0, 0.2
-_WORDS = """\
-One lap through a rendered room ({lap_frames} frames, {length:.1f} m), whose end is its beginning, tracked over and over
-by what `sigmaslam track` does, with its outputs. Images are in memory from the start. CPU: milliseconds a frame of all
-threads, which other programs disturb less than wall milliseconds. Errors are distances from the exact position in the
-world of the first frame, nothing aligned. Without loops: keyframes that left the window long ago are not remembered.
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,26 +70,20 @@ class Endurance:
 
 def format_endurance(endurance: Endurance, command: str) -> str:
     """The run as a Markdown page."""
-    words = _WORDS.format(lap_frames=endurance.lap_frames, length=endurance.lap_length)
-    lines = [
-        *opening("Endurance", command, f", in {endurance.seconds / 60:.0f} minutes."),
-        "",
-        words,
-    ]
-    if endurance.frames < endurance.asked:
-        lines += [f"**Stopped after {endurance.frames} of {endurance.asked} frames.**", ""]
-    lines += [*_verdicts(endurance), ""]
-    if endurance.blocks:
-        columns = ("frames", "MB", "CPU ms", "wall ms, median (p10 - p90)", "keyframes", "lost")
-        lines += ["## Memory and time", "", *table(columns, map(_block_row, endurance.blocks)), ""]
-    if endurance.laps:
-        rows = (
+    return fill_page(
+        "endurance",
+        command,
+        run=endurance,
+        minutes=f"{endurance.seconds / 60:.0f}",
+        length=f"{endurance.lap_length:.1f}",
+        verdicts=list(_verdicts(endurance)),
+        blocks=[_block_row(block) for block in endurance.blocks],
+        laps=[
             [f"{number}", f"{1e3 * lap.end:.1f}", _percent(lap.end, endurance)]
             + [f"{1e3 * error:.1f}" for error in (lap.median, lap.most)]
             for number, lap in enumerate(endurance.laps, start=1)
-        )
-        lines += ["## Errors", "", *table(("lap", "at its end mm", "% of a lap", "median mm", "most mm"), rows), ""]
-    return "\n".join(lines)
+        ],
+    )
 
 
 def _block_row(block: Block) -> list[str]:
@@ -105,43 +93,44 @@ def _block_row(block: Block) -> list[str]:
     return [f"{block.end}", f"{block.megabytes:.0f}", f"{block.cpu:.1f}", wall, keyframes, f"{block.lost}"]
 
 
-def _verdicts(endurance: Endurance) -> list[str]:
-    """Goals, and what was found."""
-    lines = ["| goal | found | |", "| --- | --- | --- |"]
+def _verdicts(endurance: Endurance) -> Iterator[list[str]]:
+    """Goals, what was found, and whether that reaches them."""
     blocks = endurance.blocks
     if len(blocks) > 2:
         # The keyframe memory fills up during the first blocks.
         first = blocks[1]
         growth = 100.0 * max(block.megabytes / first.megabytes - 1.0 for block in blocks[2:])
-        lines.append(
-            f"| memory flat within {_MEMORY:.0f} % from frame {first.end} on | at most {growth:+.1f} % "
-            f"({first.megabytes:.0f} MB then) | {_word(growth <= _MEMORY)} |"
-        )
+        yield [
+            f"memory flat within {_MEMORY:.0f} % from frame {first.end} on",
+            f"at most {growth:+.1f} % ({first.megabytes:.0f} MB then)",
+            _word(growth <= _MEMORY),
+        ]
         half = max(len(blocks) // 2, 2)
         early, late = (np.median([block.cpu for block in part]) for part in (blocks[1:half], blocks[half:]))
         change = 100.0 * float(late / early - 1.0)
-        lines.append(
-            f"| time a frame flat (second half within {_TIME:.0f} % of the first) | {change:+.1f} % "
-            f"({early:.1f} -> {late:.1f} ms of CPU, medians of blocks) | {_word(change <= _TIME)} |"
-        )
+        yield [
+            f"time a frame flat (second half within {_TIME:.0f} % of the first)",
+            f"{change:+.1f} % ({early:.1f} -> {late:.1f} ms of CPU, medians of blocks)",
+            _word(change <= _TIME),
+        ]
     beyond = endurance.open_errors[endurance.lap_frames :]
     if len(beyond):
-        closed = endurance.errors[endurance.lap_frames : endurance.lap_frames + len(beyond)]
-        worst = float(closed[-1])
-        lines.append(
-            f"| loop error after closure <= {_LOOP} % of the path | {1e3 * worst:.1f} mm, "
-            f"{_percent(worst, endurance)}; "
-            f"without loops {1e3 * beyond[-1]:.1f} mm, {_percent(float(beyond[-1]), endurance)} "
-            f"({len(beyond)} frames into the second lap) | {_word(100 * worst / endurance.lap_length <= _LOOP)} |"
-        )
+        worst, apart = float(endurance.errors[endurance.lap_frames :][: len(beyond)][-1]), float(beyond[-1])
+        yield [
+            f"loop error after closure <= {_LOOP} % of the path",
+            f"{1e3 * worst:.1f} mm, {_percent(worst, endurance)}; without loops {1e3 * apart:.1f} mm, "
+            f"{_percent(apart, endurance)} ({len(beyond)} frames into the second lap)",
+            _word(100 * worst / endurance.lap_length <= _LOOP),
+        ]
     lost = sum(block.lost for block in blocks)
-    lines.append(f"| no frame lost | {lost} | {_word(lost == 0)} |")
-    lines.append(f"| map bounded | {endurance.points} points | |")
-    lines.append(
-        f"| `--tracks` | keeps all views: {endurance.tracks_bytes / 1024:.1f} kB a frame more, "
-        f"{endurance.tracks_bytes * 1e4 / 2**20:.0f} MB in 10,000 frames | not bounded |"
-    )
-    return lines
+    yield ["no frame lost", f"{lost}", _word(lost == 0)]
+    kept = endurance.tracks_bytes
+    yield ["map bounded", f"{endurance.points} points", ""]
+    yield [
+        "`--tracks`",
+        f"keeps all views: {kept / 1024:.1f} kB a frame more, {kept * 1e4 / 2**20:.0f} MB in 10,000 frames",
+        "not bounded",
+    ]
 
 
 def _percent(error: float, endurance: Endurance) -> str:

@@ -26,9 +26,8 @@ from sigmaslam_benchmarks.tracking.runtime_page import (
     TimedRun,
     format_runtime,
     progress,
-    runtime_label,
 )
-from sigmaslam_benchmarks.tracking.sequences_page import Omission
+from sigmaslam_benchmarks.tracking.sequences_page import Omission, method_label
 from sigmaslam_benchmarks.tracking.stereo_peers import MissingPeerError
 from sigmaslam_benchmarks.tracking.time_method import METHODS, WARM_UP, FailedMethodError, TimingJob, time_method
 from sigmaslam_benchmarks.trial import render
@@ -204,12 +203,12 @@ def _take_turns(
                     timing = time_method(TimingJob(str(test.pairs.folder), method, threads, test.settings))
                 except MissingPeerError as error:
                     missing.add(method)
-                    note(f"{runtime_label(method)} is left out: {error}")
+                    note(f"{method_label(method)} is left out: {error}")
                     yield Omission("", method, str(error))
                     continue
                 except FailedMethodError as error:
                     failed.add(place)
-                    note(f"{test.sequence} {test.variant}: {runtime_label(method)} is left out: {error}")
+                    note(f"{test.sequence} {test.variant}: {method_label(method)} is left out: {error}")
                     yield Omission(f"{test.sequence} {test.variant}", method, str(error))
                     continue
                 ate = _ate(timing.timestamps, timing.poses, test.truth)

@@ -1,49 +1,19 @@
 """The page of the benchmark `runtime`."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from sigmaslam_benchmarks.tracking.page import number, opening, table
+from sigmaslam_benchmarks.tracking.page import fill_page, number
 from sigmaslam_benchmarks.tracking.sequences_page import Omission, method_label
 from sigmaslam_benchmarks.tracking.stereo_peers import RECTIFIED
 from sigmaslam_benchmarks.tracking.time_method import METHODS, OURS, WARM_UP, MethodTiming
 
 SEQUENCE, SIZE, LANDMARKS = "sequence", "size", "landmarks"
 """Sections of the page."""
-_COLUMNS = (
-    "method",
-    "tracked",
-    "ATE m",
-    "CPU ms, 1 thread",
-    "p95",
-    "times cuVSLAM's",
-    "wall ms, 2 threads",
-    "p95",
-    "frames/s",
-    "peak MiB",
-    "first pose s",
-)
 _STAGES = ("rectify", "features", "match", "filter", "map")
-_WORDS = """\
-Every method runs in a process of its own, once held on one core and once on two; every library has as many threads. The
-methods take turns, {rounds}. Figures are medians over the rounds, with the lowest and highest round in brackets.
-
-- *CPU ms*: CPU time of all threads of the process from one frame to the next. *Wall ms*: time until the pose of a frame
-  is there. Means over the frames but the first {warm_up}, keyframes in them; *p95*: 95 % of the frames take less.
-  Images are decoded before, and reading them is not counted.
-- *times cuVSLAM's*: ratio of the CPU times of the same round.
-- *frames/s*: frames by the sum of their wall times, two threads.
-- *peak MiB*: largest resident memory of the process, two threads, with Python and all libraries.
-- *first pose*: from the start of the process to the pose of the second frame, two threads.
-- *tracked*: frames with a pose. *ATE*: root mean square error of their positions after the best rigid alignment.
-- *ours*: learned features; *ours with*: other features under the same filter. *KLT + PnP*, *SIFT + PnP*: from OpenCV
-  alone (`sigmaslam_benchmarks.tracking.pnp_baselines`).
-- *cuVSLAM*: on the CPU, by the package dim-odom. *ORB-SLAM3*: by the package pyorbslam3, the threads of its
-  mapping included, with the vocabulary that `PYORBSLAM3_VOCAB` names. Both are given rectified images: to rectify is
-  in the time of the others, not in theirs. ORB-SLAM3 is under the GPL: a peer of the development, no part of SigmaSLAM.
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,58 +40,53 @@ class TimedRun:
     ate: float
 
 
-def runtime_label(method: str) -> str:
-    """A method as the page calls it."""
-    return method_label(method)
-
-
 def progress(run: TimedRun) -> str:
     """A run in a line."""
     threads = "1 thread" if run.threads == 1 else f"{run.threads} threads"
     cpu, wall = np.mean(run.timing.cpu_ms), np.mean(run.timing.wall_ms)
     return (
-        f"{run.sequence}, {run.variant}: {runtime_label(run.method)}, {threads}, {cpu:.1f} ms CPU, {wall:.1f} ms wall, "
+        f"{run.sequence}, {run.variant}: {method_label(run.method)}, {threads}, {cpu:.1f} ms CPU, {wall:.1f} ms wall, "
         f"{run.timing.peak_mib:.0f} MiB, ATE {number(run.ate, '.4f')} m"
     )
 
 
 def format_runtime(results: Sequence[TimedRun | Omission], command: str, rounds: int, complete: bool = True) -> str:
     """The results as a Markdown page."""
-    turns = "one round" if rounds == 1 else f"{rounds} rounds"
-    lines = [*opening("Runtime", command, "."), "", _WORDS.format(rounds=turns, warm_up=WARM_UP)]
-    if not complete:
-        lines += ["**Stopped before the end: what is missing was not run.**", ""]
-    for missing in (result for result in results if isinstance(result, Omission)):
-        what = f" ({runtime_label(missing.method)})" if missing.sequence and missing.method else ""
-        lines += [f"{missing.sequence or runtime_label(missing.method)}{what} is left out: {missing.reason}", ""]
     runs = [result for result in results if isinstance(result, TimedRun)]
     versions = {run.method: run.timing.version for run in runs if run.timing.version}
-    if versions:
-        lines += [f"Peers: {', '.join(versions[method] for method in RECTIFIED if method in versions)}.", ""]
-    for sequence in dict.fromkeys(run.sequence for run in runs if run.section == SEQUENCE):
-        lines += _sequence_lines(sequence, [run for run in runs if (run.section, run.sequence) == (SEQUENCE, sequence)])
-    for section, write in ((SIZE, _size_lines), (LANDMARKS, _landmark_lines)):
-        of_section = [run for run in runs if run.section == section]
-        if of_section:
-            lines += write(of_section)
-    return "\n".join(lines)
+    sections = {section: [run for run in runs if run.section == section] for section in (SEQUENCE, SIZE, LANDMARKS)}
+    names = dict.fromkeys(run.sequence for run in sections[SEQUENCE])
+    return fill_page(
+        "runtime",
+        command,
+        rounds="one round" if rounds == 1 else f"{rounds} rounds",
+        warm_up=WARM_UP,
+        complete=complete,
+        left_out=[(_what(each), each.reason) for each in results if isinstance(each, Omission)],
+        versions=[versions[method] for method in RECTIFIED if method in versions],
+        stages=_STAGES,
+        sequences=[_sequence([run for run in sections[SEQUENCE] if run.sequence == name]) for name in names],
+        sizes=list(dict.fromkeys(run.variant for run in sections[SIZE])),
+        size_rows=list(_size_rows(sections[SIZE])),
+        landmark_rows=list(_landmark_rows(sections[LANDMARKS])),
+        varied=next((run.sequence for run in (*sections[SIZE], *sections[LANDMARKS])), ""),
+    )
 
 
-def _sequence_lines(sequence: str, runs: list[TimedRun]) -> list[str]:
-    frames = runs[0].timing.frames
+def _what(missing: Omission) -> str:
+    """The sequence, the method, or both."""
+    method = method_label(missing.method) if missing.method else ""
+    return f"{missing.sequence} ({method})" if missing.sequence and method else missing.sequence or method
+
+
+def _sequence(runs: Sequence[TimedRun]) -> dict[str, Any]:
+    """What the page says of one sequence."""
     methods = [method for method in METHODS if any(run.method == method for run in runs)]
-    lines = [f"## {sequence}, {runs[0].variant}, {frames} frames", ""]
-    lines += [*table(_COLUMNS, (_row(method, runs) for method in methods)), ""]
-    staged = [row for method in methods if method in OURS for row in _stage_rows(method, runs)]
-    if staged:
-        columns = ("method", "frames", "count", *(f"{stage} ms" for stage in _STAGES), "sum ms")
-        lines += [
-            "Stages: median wall time over the frames of all rounds, one thread.",
-            "",
-            *table(columns, staged),
-            "",
-        ]
-    return lines
+    return {
+        "title": f"{runs[0].sequence}, {runs[0].variant}, {runs[0].timing.frames} frames",
+        "rows": [_row(method, runs) for method in methods],
+        "stages": [row for method in methods if method in OURS for row in _stage_rows(method, runs)],
+    }
 
 
 def _row(method: str, runs: Sequence[TimedRun]) -> list[str]:
@@ -131,7 +96,7 @@ def _row(method: str, runs: Sequence[TimedRun]) -> list[str]:
     cuvslam = {run.round: np.mean(run.timing.cpu_ms) for run in runs if (run.method, run.threads) == ("cuvslam", 1)}
     ratios = [np.mean(run.timing.cpu_ms) / cuvslam[run.round] for run in one if run.round in cuvslam]
     return [
-        runtime_label(method),
+        method_label(method),
         f"{tracked} of {of_method[0].timing.frames}",
         number(float(np.median([run.ate for run in of_method])), ".4f"),
         _spread(one, _mean_cpu, ".1f"),
@@ -145,7 +110,7 @@ def _row(method: str, runs: Sequence[TimedRun]) -> list[str]:
     ]
 
 
-def _stage_rows(method: str, runs: Sequence[TimedRun]) -> Iterable[list[str]]:
+def _stage_rows(method: str, runs: Sequence[TimedRun]) -> Iterator[list[str]]:
     """Keyframes and the other frames apart."""
     alone = [run.timing for run in runs if (run.method, run.threads) == (method, 1)]
     if not alone:
@@ -157,50 +122,29 @@ def _stage_rows(method: str, runs: Sequence[TimedRun]) -> Iterable[list[str]]:
             total = np.sum([stages[stage][chosen] for stage in _STAGES], axis=0)
             cells = [f"{np.median(stages[stage][chosen]):.1f}" for stage in _STAGES]
             count = f"{chosen.sum() / len(alone):.0f}"
-            yield [runtime_label(method), name, count, *cells, f"{np.median(total):.1f}"]
+            yield [method_label(method), name, count, *cells, f"{np.median(total):.1f}"]
 
 
-def _size_lines(runs: list[TimedRun]) -> list[str]:
-    sizes = list(dict.fromkeys(run.variant for run in runs))
-    rows = []
+def _size_rows(runs: Sequence[TimedRun]) -> Iterator[list[str]]:
+    sizes = dict.fromkeys(run.variant for run in runs)
     for method in METHODS:
         of_method = [run for run in runs if run.method == method]
         if of_method:
             cells = [_spread([run for run in of_method if run.variant == size], _mean_cpu, ".1f") for size in sizes]
-            rows.append([runtime_label(method), *cells])
-    return [
-        "## Cost and image size",
-        "",
-        f"CPU ms of a frame, one thread, on the images of {runs[0].sequence}, resized.",
-        "",
-        *table(("method", *sizes), rows),
-        "",
-    ]
+            yield [method_label(method), *cells]
 
 
-def _landmark_lines(runs: list[TimedRun]) -> list[str]:
-    rows = []
+def _landmark_rows(runs: Sequence[TimedRun]) -> Iterator[list[str]]:
     for variant, method in dict.fromkeys((run.variant, run.method) for run in runs):
         chosen = [run for run in runs if (run.variant, run.method) == (variant, method)]
-        rows.append(
-            [
-                *variant.split(", "),
-                runtime_label(method),
-                _middle(chosen, lambda run: float(np.median(run.timing.landmarks)), ".0f"),
-                _spread(chosen, _mean_cpu, ".1f"),
-                _middle(chosen, lambda run: float(np.median(run.timing.stages_ms["filter"])), ".1f"),
-                _middle(chosen, lambda run: run.ate, ".4f"),
-            ]
-        )
-    columns = ("spacing", "max_keypoints", "method", "landmarks in a pose", "CPU ms", "filter ms", "ATE m")
-    return [
-        "## Cost and landmarks",
-        "",
-        f"The settings `spacing` and `max_keypoints` of the tracker on {runs[0].sequence}, one thread.",
-        "",
-        *table(columns, rows),
-        "",
-    ]
+        yield [
+            *variant.split(", "),
+            method_label(method),
+            _middle(chosen, lambda run: float(np.median(run.timing.landmarks)), ".0f"),
+            _spread(chosen, _mean_cpu, ".1f"),
+            _middle(chosen, lambda run: float(np.median(run.timing.stages_ms["filter"])), ".1f"),
+            _middle(chosen, lambda run: run.ate, ".4f"),
+        ]
 
 
 def _mean_cpu(run: TimedRun) -> float:
