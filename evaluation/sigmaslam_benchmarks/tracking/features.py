@@ -20,7 +20,7 @@ from sigmaslam_benchmarks.filters.speed import Contender, Timing, time_interleav
 from sigmaslam_benchmarks.matching import check_sets, compare, format_scores, load_extractor
 from sigmaslam_benchmarks.matching.extractors import CLASSICAL, MAX_KEYPOINTS
 from sigmaslam_benchmarks.matching.sets import ALL
-from sigmaslam_benchmarks.tracking.page import header, opening, row, write_page
+from sigmaslam_benchmarks.tracking.page import fill_page, write_page
 
 ROUNDS = 15
 """At least so many rounds, in each of which every extractor is timed."""
@@ -84,7 +84,18 @@ def write_features(
     reference = str(peers[0]) if peers else "orb"
     scores = compare(names, sets, data, note)
     atomic_write_text(path.with_suffix(".json"), _public(json.dumps(scores, indent=1)) + "\n")
-    page = "\n".join([*_introduction(command, rounds), *format_costs(costs, reference), "", format_scores(scores)])
+    packages = ("onnxruntime", "opencv-python-headless", "numpy")
+    page = fill_page(
+        "features",
+        command,
+        versions=", ".join(f"{name} {version(name)}" for name in packages),
+        size=f"{_WIDTH}x{_HEIGHT}",
+        keypoints=f"{MAX_KEYPOINTS:,}",
+        rounds=rounds,
+        reference=Path(reference).name,
+        costs=cost_rows(costs, reference),
+        scores=format_scores(scores),
+    )
     return write_page(path, _public(page))
 
 
@@ -125,35 +136,24 @@ def _use_one_torch_thread() -> None:
         sys.modules["torch"].set_num_threads(1)
 
 
-def format_costs(costs: Sequence[Cost], reference: str) -> list[str]:
-    """The table of times, parameters and loading."""
+def cost_rows(costs: Sequence[Cost], reference: str) -> list[list[str]]:
+    """Cells of the table of times, parameters and loading."""
     base = next(cost.timing for cost in costs if cost.name == reference)
-    lines = [
-        "## Cost",
-        "",
-        *header(
-            "extractor",
-            "ms (quartiles)",
-            f"time / {Path(reference).name}",
-            "keypoints",
-            "loading ms",
-            "parameters",
-            numbers_from=1,
-        ),
-    ]
+    rows = []
     for cost in costs:
         low, middle, high = np.percentile(1e3 * np.array(cost.timing.seconds), [25, 50, 75])
         ratio = cost.timing.ratio(base)
-        cells = (
-            cost.name,
-            f"{middle:.1f} ({low:.1f} - {high:.1f})",
-            "1" if cost.name == reference else f"x{ratio[0]:.2f} ({ratio[1]:.2f} - {ratio[2]:.2f})",
-            str(cost.keypoints),
-            "" if cost.loading is None else f"{1e3 * cost.loading:.0f}",
-            "" if cost.parameters is None else f"{cost.parameters:,}",
+        rows.append(
+            [
+                cost.name,
+                f"{middle:.1f} ({low:.1f} - {high:.1f})",
+                "1" if cost.name == reference else f"x{ratio[0]:.2f} ({ratio[1]:.2f} - {ratio[2]:.2f})",
+                str(cost.keypoints),
+                "" if cost.loading is None else f"{1e3 * cost.loading:.0f}",
+                "" if cost.parameters is None else f"{cost.parameters:,}",
+            ]
         )
-        lines.append(row(*cells))
-    return lines
+    return rows
 
 
 def photograph_like(shape: tuple[int, int]) -> np.ndarray:
@@ -191,21 +191,3 @@ def _loading_time(name: str) -> float | None:
         OnnxGraph(Path(name))
         seconds.append(time.perf_counter() - start)
     return float(np.median(seconds))
-
-
-def _introduction(command: str, rounds: int) -> list[str]:
-    versions = ", ".join(f"{name} {version(name)}" for name in ("onnxruntime", "opencv-python-headless", "numpy"))
-    return [
-        *opening("Features", command, f". {versions}."),
-        "",
-        f"- *ms*: from an 8-bit {_WIDTH}x{_HEIGHT} image to at most {MAX_KEYPOINTS:,} keypoints with descriptors; CPU",
-        f"  time on one thread, extractors in turn, {rounds} rounds; the ratio with its lowest and highest round.",
-        "- *parameters*: of a graph all its real constants, fixed filters among them; of .safetensors those trained.",
-        f"- Scores: at most {MAX_KEYPOINTS:,} keypoints, long side 640, mutual nearest neighbours; shares and areas in",
-        "  percent, numbers a pair. A graph too small for the images of a set has no row there.",
-        "- *rows_refined*: matched within 2 rows, then refined by Lucas-Kanade. The tracker searches rows without",
-        "  features of the right eye.",
-        "- *kitti_tracks*: kitti from frame to frame, with up to 2,048 keypoints, and KLT with as many corners.",
-        "- *euroc_steps*: keyframes whose next one is placed by PnP within 5 cm and 1 degree.",
-        "",
-    ]

@@ -12,7 +12,7 @@ from sigmaslam.readers import StereoSequence, open_sequence
 from sigmaslam.runs.request import TrackerOptions
 from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam_benchmarks.rendered_camera import open_rendered
-from sigmaslam_benchmarks.tracking.page import header, opening, row, write_page
+from sigmaslam_benchmarks.tracking.page import fill_page, write_page
 from sigmaslam_benchmarks.tracking.sequences import REAL, REAL_NAMES
 from sigmaslam_benchmarks.trial import Trial, render, rendered_truth, track_ours
 from sigmaslam_synthetic.simulation import Recipe
@@ -105,26 +105,14 @@ def _page(
     chosen: tuple[float, float],
     results: dict[str, tuple[NoiseResult, NoiseResult]],
 ) -> str:
-    lines = [
-        *opening("Every match its own covariance, or one for all", command, ". The tracker with the"),
-        "learned features; only R and the landmarks' disparity sigma differ. NEES and NIS per degree of freedom, 1 is",
-        "right; NEES says something on renders alone, whose truth is exact.",
-        "",
-        f"The constant is chosen on three rendered sequences of {_FRAMES} frames (seed {_TUNING_SEED}) by the",
-        "geometric mean of the ATE:",
-        "",
-        *header("sigma of places / disparity, px", "ATE, geometric mean, mm", "NEES, geometric mean"),
-    ]
+    tried = []
     for constant, trials in tuning.items():
         ate, nees = (_geometric_mean([getattr(each, name) for each in trials]) for name in ("ate", "nees"))
         mark = " (chosen)" if constant == chosen else ""
-        lines.append(f"| {constant[0]} / {constant[1]}{mark} | {1e3 * ate:.2f} | {nees:.2f} |")
-    lines += [
-        "",
-        *header("sequence", "tracked, own / constant", "ATE m, own / constant", "ratio", "step mm", "NEES", "NIS"),
-    ]
-    for name, (own, same) in results.items():
-        cells = [
+        tried.append([f"{constant[0]} / {constant[1]}{mark}", f"{1e3 * ate:.2f}", f"{nees:.2f}"])
+    rows = [
+        [
+            name,
             f"{own.tracked} / {same.tracked} of {own.frames}",
             f"{own.ate:.4f} / {same.ate:.4f}",
             f"{own.ate / same.ate:.2f}",
@@ -132,17 +120,18 @@ def _page(
             f"{own.nees:.2f} / {same.nees:.2f}",
             f"{own.nis:.2f} / {same.nis:.2f}",
         ]
-        lines.append(row(name, *cells))
-    for label, chosen_names in (("all", list(results)), ("renders", [n for n in results if n not in REAL_NAMES])):
-        pairs = [results[name] for name in chosen_names]
-        ate, step, nees = (
-            _geometric_mean([getattr(own, field) / getattr(same, field) for own, same in pairs])
+        for name, (own, same) in results.items()
+    ]
+    means = []
+    for label, names in (("all", list(results)), ("renders", [n for n in results if n not in REAL_NAMES])):
+        ratios = (
+            _geometric_mean(
+                [getattr(own, field) / getattr(same, field) for own, same in (results[name] for name in names)]
+            )
             for field in ("ate", "step", "nees")
         )
-        lines.append(
-            f"| **geometric mean of own over constant, {label}** | | | **{ate:.2f}** | {step:.2f} | {nees:.2f} | |"
-        )
-    return "\n".join([*lines, ""])
+        means.append((label, *(f"{ratio:.2f}" for ratio in ratios)))
+    return fill_page("noise", command, frames=_FRAMES, seed=_TUNING_SEED, tried=tried, rows=rows, means=means)
 
 
 def _geometric_mean(values: Sequence[float]) -> float:
