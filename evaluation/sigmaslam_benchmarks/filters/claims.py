@@ -17,10 +17,9 @@ from torch import Generator, Tensor
 
 from sigmaslam.plot_style import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION, style_axes
 from sigmaslam.report.figures import save_png
-from sigmaslam.source_commit import describe_source
 from sigmaslam_benchmarks.filters import scenarios
 from sigmaslam_benchmarks.filters.scenarios import Outcome, Scenario, run
-from sigmaslam_benchmarks.tracking.page import header, row, write_page
+from sigmaslam_benchmarks.tracking.page import fill_page, write_page
 from sigmaslam_filters import (
     SE2,
     SO2,
@@ -44,15 +43,6 @@ _SHOWN = 0.6
 _SAMPLES = 50_000
 # Relative changes below this are negligible, whatever their significance.
 _TOO_SMALL = 1e-3
-_COMPARISON_COLUMNS = (
-    "scenario",
-    "runs",
-    *("RMSE EKF", "UKF", "change %"),
-    *("bias EKF", "UKF", "share %"),
-    *("NEES EKF", "UKF"),
-    "closer %",
-    "verdict",
-)
 _BANANA_FILTERS: tuple[tuple[str, BayesFilter, str], ...] = (
     ("EKF, R^3", ExtendedKalmanFilter(), VERMILLION),
     ("UKF, R^3", UnscentedKalmanFilter(), BLUE),
@@ -213,64 +203,42 @@ def compare_filters(runs: int = 400) -> list[Comparison]:
 
 def format_claims(bananas: Sequence[BananaRow], comparisons: Sequence[Comparison], figure: str, command: str) -> str:
     """The results as a Markdown page; `figure` is the path of the picture from the page."""
-    lines = [
-        "# Two claims about filters",
-        "",
-        f"![Left: where a robot is after 10 m. Right: change of the position RMSE from EKF to UKF.]({figure})",
-        "",
-        f"Made by `{command}` {describe_source()} on {platform.machine()}.",
-        f"Random numbers are seeded. Intervals are 95 %, from the scatter of {_GROUPS} independent groups.",
-        "",
-        "## The banana (9.2.3.2)",
-        "",
-        f"A robot drives {_STEPS * _TIME_STEP * _SPEED:g} m straight ahead with noise in its speed, which spreads the",
-        f"distance by {_SPEED_SIGMA * _TIME_STEP * math.sqrt(_STEPS):.2f} m, and in its turn rate, (9.43) and (9.44).",
-        f"Against {_GROUPS * _SAMPLES} samples of where it is: the mean of x, along the road; the Kullback-Leibler",
-        "divergence of the Gaussian with the samples' moments of (x, y, theta) from that with the filter's; the share",
-        "of samples inside the filter's 95 % region. On SE(2) that is an ellipsoid in exponential coordinates, a",
-        "banana in the plane.",
-        "",
-        *header("heading spread rad", "filter", "mean of x off by mm", "divergence", "inside 95 %"),
-    ]
-    for banana in bananas:
-        cells = [
-            f"{banana.spread:g}",
-            banana.name.replace("R^3", "R³"),
-            _spread(banana.bias, 1e3, "+.1f"),
-            _spread(banana.divergence, 1.0, ".4f"),
-            _spread(banana.coverage, 100.0, ".2f"),
-        ]
-        lines.append(row(*cells))
-    lines += [
-        "",
-        "## UKF against EKF (9.6)",
-        "",
-        "Both filters on the same simulated runs, with the models that made them. *change*: of the position RMSE from",
-        "EKF to UKF. *bias*: root mean square over time of the mean error, scatter taken off; *share*: change of the",
-        "squared bias, in the EKF's mean square error. *NEES*: per degree of freedom, 1 is right. *closer*: runs in",
-        "which the UKF has the lower RMSE. *verdict*: on accuracy and on bias, the better one if zero is outside the",
-        f"interval and the change at least {100 * _TOO_SMALL:g} %.",
-        "",
-        *header(*_COMPARISON_COLUMNS),
-    ]
-    for item in comparisons:
-        cells = [
-            item.name.replace("R^2", "R²"),
-            f"{item.runs}",
-            f"{_short(item.rmse[0])} {item.unit}",
-            _short(item.rmse[1]),
-            _range(item.change),
-            _short(item.bias[0]),
-            _short(item.bias[1]),
-            _range(item.bias_change),
-            _short(item.nees[0]),
-            _short(item.nees[1]),
-            f"{100 * item.better:.0f}",
-            f"{_verdict(item.change)}; {_verdict(item.bias_change)}",
-        ]
-        lines.append(row(*cells))
-    lines.append("")
-    return "\n".join(lines) + "\n"
+    return fill_page(
+        "claims",
+        command,
+        figure=figure,
+        processor=platform.machine(),
+        groups=_GROUPS,
+        metres=f"{_STEPS * _TIME_STEP * _SPEED:g}",
+        spread=f"{_SPEED_SIGMA * _TIME_STEP * math.sqrt(_STEPS):.2f}",
+        samples=_GROUPS * _SAMPLES,
+        too_small=f"{100 * _TOO_SMALL:g}",
+        bananas=[
+            [
+                f"{banana.spread:g}",
+                banana.name.replace("R^3", "R³"),
+                _spread(banana.bias, 1e3, "+.1f"),
+                _spread(banana.divergence, 1.0, ".4f"),
+                _spread(banana.coverage, 100.0, ".2f"),
+            ]
+            for banana in bananas
+        ],
+        comparisons=[
+            [
+                item.name.replace("R^2", "R²"),
+                f"{item.runs}",
+                f"{_short(item.rmse[0])} {item.unit}",
+                _short(item.rmse[1]),
+                _range(item.change),
+                *map(_short, item.bias),
+                _range(item.bias_change),
+                *map(_short, item.nees),
+                f"{100 * item.better:.0f}",
+                f"{_verdict(item.change)}; {_verdict(item.bias_change)}",
+            ]
+            for item in comparisons
+        ],
+    )
 
 
 def plot_claims(comparisons: Sequence[Comparison], samples: int = 400_000) -> Figure:

@@ -12,14 +12,21 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
 
 from sigmaslam.progress import open_progress
+from sigmaslam_benchmarks.filters import extended, sequences
+from sigmaslam_benchmarks.filters import ours as filter_ours
 from sigmaslam_benchmarks.filters import work as filter_work
 from sigmaslam_benchmarks.filters.peer_filters import Peer, available, single_thread_environment
 from sigmaslam_benchmarks.filters.work import BatchedWork, StereoWork
-from sigmaslam_benchmarks.tracking.page import opening, table, write_page
+from sigmaslam_benchmarks.tracking.page import fill_page, write_page
+
+Table = tuple[list[str], list[list[str]]]
+"""Columns and rows."""
 
 POINTS = (10, 50, 100, 200, 500)
 MANY_POINTS = (1000, 2000, 5000)
@@ -81,8 +88,6 @@ def time_interleaved(contenders: Sequence[Contender], rounds: int) -> dict[str, 
 
 def stereo_contenders(work: StereoWork, peers: Sequence[Peer], compiled: bool) -> list[Contender]:
     """Everyone who does the 12-state stereo problem in float64; the plain numpy reference comes first."""
-    from sigmaslam_benchmarks.filters import ours as filter_ours
-
     contenders = [Contender(_REFERENCE, lambda: filter_work.step_stereo_low_rank(work))]
     contenders.append(Contender(_EAGER, filter_ours.make(work)))
     if compiled:
@@ -93,8 +98,6 @@ def stereo_contenders(work: StereoWork, peers: Sequence[Peer], compiled: bool) -
 
 def batch_contenders(kind: str, batch: int, peers: Sequence[Peer], compiled: bool) -> list[tuple[Contender, int]]:
     """Everyone who does a kind of small filter, with the number of filters in a step; in float32 where there is one."""
-    from sigmaslam_benchmarks.filters import ours as filter_ours
-
     work: BatchedWork = getattr(filter_work, kind)(batch, _SEED)
     looped: BatchedWork = work if batch <= _LOOP_LIMIT else getattr(filter_work, kind)(_LOOP_LIMIT, _SEED)
     size = min(batch, _LOOP_LIMIT)
@@ -117,17 +120,6 @@ _COMPILED = "SigmaSLAM, compiled"
 def format_page(rounds: int, compiled: bool, command: str) -> str:
     """Runs the benchmark and makes the page."""
     peers = available()
-    versions = ", ".join(f"{name} {_version(name)}" for name in _PACKAGES)
-    lines = [
-        *opening("Speed of the filters", command, ", one"),
-        f"thread; process CPU time, contenders in turn, {rounds} rounds. {versions}.",
-        "",
-        "Work: one prediction and one update of an unscented filter with the cubature set, one linearisation, sigma",
-        "points drawn anew after the process noise; the same models for all",
-        "(`evaluation/sigmaslam_benchmarks/filters/work.py`).",
-        "Tests check that every contender gets the same result. Compiled: `compile_step`, after its first call.",
-        "",
-    ]
     tables = len(POINTS) + 2 + len(KINDS) * len(BATCHES)
     with open_progress() as progress:
         task = progress.add_task("timing", total=tables, note="")
@@ -135,18 +127,19 @@ def format_page(rounds: int, compiled: bool, command: str) -> str:
         def advance() -> None:
             progress.advance(task)
 
-        lines += _stereo_section(peers, rounds, compiled, advance)
-        lines += _linear_cost_section(rounds, compiled, advance)
-        for kind in KINDS:
-            lines += _batch_section(kind, peers, rounds, compiled, advance)
-        lines += extended_section(rounds)
-        if compiled:
-            lines += sequence_section(rounds)
+        values = {
+            **_time_stereo(peers, rounds, compiled, advance),
+            "linear_cost": _time_many_points(rounds, compiled, advance),
+            "batches": [(_TITLES[kind], *_time_batches(kind, peers, rounds, compiled, advance)) for kind in KINDS],
+            "extended": time_extended(rounds),
+            "sequences": time_sequences(rounds) if compiled else None,
+        }
         advance()
-    return "\n".join(lines)
+    versions = ", ".join(f"{name} {_version(name)}" for name in _PACKAGES)
+    return fill_page("filters", command, rounds=rounds, versions=versions, steps=sequences.STEPS, **values)
 
 
-def _stereo_section(peers: Sequence[Peer], rounds: int, compiled: bool, advance: Callable[[], None]) -> list[str]:
+def _time_stereo(peers: Sequence[Peer], rounds: int, compiled: bool, advance: Callable[[], None]) -> dict[str, Any]:
     results = []
     for points in POINTS:
         results.append(time_interleaved(stereo_contenders(filter_work.stereo(points, _SEED), peers, compiled), rounds))
@@ -157,39 +150,28 @@ def _stereo_section(peers: Sequence[Peer], rounds: int, compiled: bool, advance:
             return [f"{1e3 * result[name].median:.3g} ms" for result in results]
         return [_ratio(*result[name].ratio(result[_REFERENCE])) for result in results]
 
-    lines = [
-        "## One 12-state stereo pose, m points (4m rows), float64",
-        "",
-        "Milliseconds for plain numpy, which has the low-rank form; for the others how many times longer they take,",
-        "with the lowest and highest round. Below 1 is faster.",
-        "",
-        *table(["", *(f"m = {points}" for points in POINTS)], ([name, *cells(name)] for name in results[0])),
-    ]
     best = _COMPILED if compiled else _EAGER
-    if "filterpy" in results[-1]:
-        middle, low, high = results[-1]["filterpy"].ratio(results[-1][best])
-        lines += ["", f"At m = {POINTS[-1]} {best} is {middle:.0f} times as fast as filterpy ({low:.0f} - {high:.0f})."]
-    return [*lines, ""]
+    beside = results[-1]["filterpy"].ratio(results[-1][best]) if "filterpy" in results[-1] else ()
+    return {
+        "stereo": (["", *(f"m = {points}" for points in POINTS)], [[name, *cells(name)] for name in results[0]]),
+        "most_points": POINTS[-1],
+        "best": best,
+        "beside_filterpy": [f"{each:.0f}" for each in beside],
+    }
 
 
-def _linear_cost_section(rounds: int, compiled: bool, advance: Callable[[], None]) -> list[str]:
+def _time_many_points(rounds: int, compiled: bool, advance: Callable[[], None]) -> Table:
+    """Microseconds a point."""
     counts, cells = (POINTS[-1], *MANY_POINTS), []
     for points in counts:
         results = time_interleaved(stereo_contenders(filter_work.stereo(points, _SEED), [], compiled), rounds)
         cells.append([1e6 * timing.median / points for timing in results.values()])
     advance()
     rows = [[name, *(f"{column[i]:.2f}" for column in cells)] for i, name in enumerate(results)]
-    return [
-        "Microseconds a point, for many points:",
-        "",
-        *table(["", *(f"m = {count}" for count in counts)], rows),
-        "",
-    ]
+    return ["", *(f"m = {count}" for count in counts)], rows
 
 
-def _batch_section(
-    kind: str, peers: Sequence[Peer], rounds: int, compiled: bool, advance: Callable[[], None]
-) -> list[str]:
+def _time_batches(kind: str, peers: Sequence[Peer], rounds: int, compiled: bool, advance: Callable[[], None]) -> Table:
     columns = []
     for batch in BATCHES:
         contenders = batch_contenders(kind, batch, peers, compiled)
@@ -197,20 +179,11 @@ def _batch_section(
         columns.append({c.name: [size / s for s in timings[c.name].seconds] for c, size in contenders})
         advance()
     rows = [[name, *(_rate(column[name]) for column in columns)] for name in columns[0]]
-    return [
-        f"## {_TITLES[kind]}",
-        "",
-        "Filter steps a second, with the lowest and highest round; float32 where there is one.",
-        "",
-        *table(["", *(f"B = {batch:,}" for batch in BATCHES)], rows),
-        "",
-    ]
+    return _batch_names(BATCHES), rows
 
 
-def extended_section(rounds: int) -> list[str]:
+def time_extended(rounds: int) -> Table:
     """The extended filter's time over the unscented one's, for models without derivatives of their own."""
-    from sigmaslam_benchmarks.filters import extended
-
     rows = []
     for name, make in extended.KINDS.items():
         cells = []
@@ -220,43 +193,21 @@ def extended_section(rounds: int) -> list[str]:
             milliseconds = ", ".join(f"{1e3 * timings[each.name].median:.3g} ms" for each in contenders)
             cells.append(f"{_ratio(*timings['EKF'].ratio(timings['UKF']))}: {milliseconds}")
         rows.append([name, *cells])
-    return [
-        "## Extended and unscented",
-        "",
-        "How many times longer the EKF takes than the UKF, and milliseconds of both; eager, float64, models without a",
-        "`jacobian` (`evaluation/sigmaslam_benchmarks/filters/extended.py`).",
-        "",
-        *table(["", *(f"B = {batch:,}" for batch in extended.BATCHES)], rows),
-        "",
-    ]
+    return _batch_names(extended.BATCHES), rows
 
 
-def sequence_section(rounds: int) -> list[str]:
+def time_sequences(rounds: int) -> Table:
     """Whole sequences, compiled and not."""
-    from sigmaslam_benchmarks.filters import sequences
-
     columns = []
     for batch in sequences.BATCHES:
         contenders = [Contender(each, step) for each, step in sequences.make(batch).items()]
         timings = time_interleaved(contenders, rounds)
-        columns.append(timings)
-    count = sequences.STEPS
-    rows = []
-    for name in columns[0]:
-        cells = [
-            _rate([batch * count / seconds for seconds in timings[name].seconds])
-            for batch, timings in zip(sequences.BATCHES, columns, strict=True)
-        ]
-        rows.append([name, *cells])
-    return [
-        "## Sequences",
-        "",
-        f"Filter steps a second over {count} steps of a robot in R^3 that sees range and bearing, with the lowest and",
-        "highest round; float64 (`evaluation/sigmaslam_benchmarks/filters/sequences.py`).",
-        "",
-        *table(["", *(f"B = {batch:,}" for batch in sequences.BATCHES)], rows),
-        "",
-    ]
+        columns.append({name: [batch * sequences.STEPS / s for s in timings[name].seconds] for name in timings})
+    return _batch_names(sequences.BATCHES), [[name, *(_rate(each[name]) for each in columns)] for name in columns[0]]
+
+
+def _batch_names(batches: Sequence[int]) -> list[str]:
+    return ["", *(f"B = {batch:,}" for batch in batches)]
 
 
 _TITLES = {
@@ -301,8 +252,6 @@ def write_filters(path: Path, rounds: int, eager: bool, command: str) -> str:
 
 def main() -> None:
     """Does the job of `write_filters` in this process."""
-    import torch
-
     job = json.loads(sys.argv[1])
     torch.set_num_threads(1)
     np.seterr(all="ignore")

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,7 +17,7 @@ from sigmaslam.image_filtering import NoiseModel, SequenceFilter, denoise_image,
 from sigmaslam.readers.images import read_grey
 from sigmaslam.readers.pairing import list_images
 from sigmaslam.runs.request import TrackerOptions
-from sigmaslam_benchmarks.tracking.page import header, opening, row, write_page
+from sigmaslam_benchmarks.tracking.page import fill_page, write_page
 from sigmaslam_benchmarks.trial import Trial, render, rendered_truth, track_ours
 from sigmaslam_synthetic.camera.sensor import Sensor, expose
 from sigmaslam_synthetic.simulation import Recipe
@@ -58,28 +59,32 @@ def write_denoising(
     for recipe in RECIPES:
         sources[recipe.name] = render(runs, recipe, 1)
         note(f"{recipe.name} is there")
-    lines = opening("Image filtering", command, ", one thread. PSNR in dB of the whole image, peak 255;")
-    lines += ["seconds are of CPU time.", ""]
-    page = ""
-    parts: tuple[Callable[[], list[str]], ...] = (
-        partial(_gaussian, images),
-        partial(_others, images),
-        partial(_blurred, images),
-        partial(_sequences, data, sources),
-        partial(_night, sources, runs),
-    )
-    threads = cv2.getNumThreads()
+    parts: dict[str, Callable[[], Iterator[list[str]]]] = {
+        "gaussian": partial(_gaussian, images),
+        "others": partial(_others, images),
+        "blurred": partial(_blurred, images),
+        "sequences": partial(_sequences, data, sources),
+        "night": partial(_night, sources, runs),
+    }
+    picture = path.with_suffix(".jpg")
+    values: dict[str, Any] = {
+        **{name: [] for name in parts},
+        "picture": "",
+        "sigmas": [f"{sigma:.0f}" for sigma in SIGMAS],
+        "filters": [name for name in _FILTERS if "thorough" not in name],
+        "first": _FIRST,
+        "last": _SEQUENCE_FRAMES - 1,
+        "frames": RECIPES[0].frames,
+    }
+    page, threads = "", cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        for part in parts:
-            lines += [*part(), ""]
-            note(lines[-2])
-            page = write_page(path, "\n".join(lines))
-        picture = path.with_suffix(".jpg")
+        for name, part in parts.items():
+            values[name] = list(part())
+            note(f"{name}: {values[name][-1]}")
+            page = write_page(path, fill_page("denoising", command, **values))
         draw_sequences(picture, [data / _REAL[0], *sources.values()])
-        lines += [f"![A frame of three sequences]({picture.name})", ""]
-        lines += ["*Noise of sigma 25, the frame filtered by itself, and over time; the last frame of the table.*", ""]
-        page = write_page(path, "\n".join(lines))
+        page = write_page(path, fill_page("denoising", command, **values | {"picture": picture.name}))
     finally:
         cv2.setNumThreads(threads)
     return page
@@ -111,15 +116,8 @@ _FILTERS: dict[str, Filter] = {
 }
 
 
-def _gaussian(images: list[np.ndarray]) -> list[str]:
-    lines = [
-        "## Set12, Gaussian noise",
-        "",
-        "Mean PSNR of the twelve images; noise of one generator a sigma, not clipped and not rounded. Sigma is given.",
-        "Seconds are the median of an image of 256 x 256.",
-        "",
-        *header("filter", *(f"sigma {sigma:.0f}" for sigma in SIGMAS), "seconds", numbers_from=1),
-    ]
+def _gaussian(images: list[np.ndarray]) -> Iterator[list[str]]:
+    """Filters on Set12 with Gaussian noise of each sigma, which is given."""
     scores: dict[str, list[list[float]]] = {name: [] for name in _FILTERS}
     seconds: dict[str, list[float]] = {name: [] for name in _FILTERS}
     for sigma in SIGMAS:
@@ -135,18 +133,11 @@ def _gaussian(images: list[np.ndarray]) -> list[str]:
             scores[name].append(found)
     for name, rows in scores.items():
         taken = "" if name == "noisy" else f"{np.median(seconds[name]):.3f}"
-        lines.append(row(name, *(f"{np.mean(each):.2f}" for each in rows), taken))
-    return lines
+        yield [name, *(f"{np.mean(each):.2f}" for each in rows), taken]
 
 
-def _others(images: list[np.ndarray]) -> list[str]:
-    lines = [
-        "## Set12, other noise",
-        "",
-        "Images of 8 bits; ours estimates the noise, non-local means is told the variance that was estimated.",
-        "",
-        *header("noise", *(name for name in _FILTERS if "thorough" not in name), numbers_from=1),
-    ]
+def _others(images: list[np.ndarray]) -> Iterator[list[str]]:
+    """Other noise on Set12, which is estimated."""
     kinds: dict[str, Spoil] = {
         "Gaussian, sigma 25, clipped": lambda image, rng: image + rng.normal(0.0, 25.0, image.shape),
         "Poisson, 30 photons at white": lambda image, rng: rng.poisson(image * (30 / 255)) * (255 / 30),
@@ -163,19 +154,11 @@ def _others(images: list[np.ndarray]) -> list[str]:
             for name, one in _FILTERS.items()
             if "thorough" not in name
         ]
-        lines.append(row(kind, *(f"{each:.2f}" for each in cells)))
-    return lines
+        yield [kind, *(f"{each:.2f}" for each in cells)]
 
 
-def _blurred(images: list[np.ndarray]) -> list[str]:
-    lines = [
-        "## Set12, a lens out of focus",
-        "",
-        "Images of 8 bits, blurred by a Gaussian before noise comes to them. Ours is told the blur, and wrong ones,",
-        "and estimates the noise. The mask is added once, of the same blur.",
-        "",
-        *header("blur, noise", "blurred", "unsharp mask", "ours", "told 20 % less", "told 20 % more", numbers_from=1),
-    ]
+def _blurred(images: list[np.ndarray]) -> Iterator[list[str]]:
+    """Set12 through a lens out of focus."""
     for blur, sigma in ((1.6, 2.0), (1.6, 10.0), (3.0, 2.0)):
         rng, scores = np.random.default_rng(0), []
         for truth in images:
@@ -186,8 +169,7 @@ def _blurred(images: list[np.ndarray]) -> list[str]:
             masked = 2.0 * noisy - _blur(noisy.astype(np.float32), blur)
             scores.append([psnr(to_bytes(each), truth) for each in (noisy, masked, *told)])
         means = np.mean(scores, axis=0).tolist()
-        lines.append(row(f"{blur} px, sigma {sigma:.0f}", *(f"{each:.2f}" for each in means)))
-    return lines
+        yield [f"{blur} px, sigma {sigma:.0f}", *(f"{each:.2f}" for each in means)]
 
 
 def _blur(image: np.ndarray, sigma: float) -> np.ndarray:
@@ -199,15 +181,8 @@ def _salt_and_pepper(image: np.ndarray, rng: np.random.Generator, share: float) 
     return np.where(drawn < share / 2, 0, np.where(drawn > 1 - share / 2, 255, image))
 
 
-def _sequences(data: Path, sources: dict[str, Path]) -> list[str]:
-    lines = [
-        "## Sequences, Gaussian noise of sigma 25",
-        "",
-        f"Left images {_FIRST} to {_SEQUENCE_FRAMES - 1}, mean PSNR. The state is what the filter over time makes of",
-        "them before the patches take out what noise is left. The truth of real images has noise of its own.",
-        "",
-        *header("sequence", "noisy", "each by itself", "state", "over time", "gain", "seconds a frame", numbers_from=1),
-    ]
+def _sequences(data: Path, sources: dict[str, Path]) -> Iterator[list[str]]:
+    """Rendered and real sequences, each image by itself and over time."""
     chosen = {**sources, **{name: data / name for name in _REAL}}
     for name, source in chosen.items():
         rng, noise = np.random.default_rng(0), NoiseModel(25.0)
@@ -221,8 +196,7 @@ def _sequences(data: Path, sources: dict[str, Path]) -> list[str]:
             found.append([psnr(each, truth) for each in (image, denoise_image(image, noise), state, result)])
         mean = np.mean(found[_FIRST:], axis=0)
         cells = [f"{each:.2f}" for each in (*mean, mean[3] - mean[0])]
-        lines.append(row(name, *cells, f"{seconds / len(found):.3f}"))
-    return lines
+        yield [name, *cells, f"{seconds / len(found):.3f}"]
 
 
 def draw_sequences(path: Path, sources: list[Path]) -> None:
@@ -248,15 +222,8 @@ def _left_images(source: Path) -> Iterator[np.ndarray]:
     raise InputError(f"{source}: no folder of left images; fetch the data set again")
 
 
-def _night(sources: dict[str, Path], runs: Path) -> list[str]:
-    lines = [
-        "## The tracker in the dark",
-        "",
-        f"{RECIPES[0].frames} rendered pairs, shown again to darker sensors. Root mean square error of the position",
-        "after alignment, millimetres, and frames with a pose from the images.",
-        "",
-        *header("sequence", "sensor", "`track`", "tracked", "`track --denoise`", "tracked", numbers_from=2),
-    ]
+def _night(sources: dict[str, Path], runs: Path) -> Iterator[list[str]]:
+    """The tracker on sequences that are shown again to darker sensors."""
     for name, source in sources.items():
         for night, sensor in NIGHTS.items():
             shown = source
@@ -268,8 +235,7 @@ def _night(sources: dict[str, Path], runs: Path) -> list[str]:
                 cells += _track(shown, denoise)
             if sensor is not None:
                 shutil.rmtree(shown)
-            lines.append(row(name, night, *cells))
-    return lines
+            yield [name, night, *cells]
 
 
 def _track(source: Path, denoise: bool) -> list[str]:
