@@ -13,10 +13,9 @@ from sigmaslam.geometry.se3 import rotation_log, se3_exp
 from sigmaslam.readers.inertial import InertialRecording
 from sigmaslam_benchmarks.inertial import dark_runs, inertial_benchmark
 from sigmaslam_benchmarks.inertial.dark_runs import METHODS, STATES, DarkCase, DarkResult
-from sigmaslam_benchmarks.inertial.inertial_benchmark import InertialJob
 from sigmaslam_benchmarks.inertial.inertial_page import InertialPage, format_page
 from sigmaslam_benchmarks.inertial.table_faults import FaultResult, shift_clock, swap_sign, turn_axes
-from sigmaslam_benchmarks.live import recordings
+from sigmaslam_benchmarks.live import recording_jobs, recordings
 from sigmaslam_benchmarks.live.driver_faults import DrivenFrame
 from sigmaslam_benchmarks.live.judge import References
 from sigmaslam_benchmarks.live.recordings import GoodFrames, Recording
@@ -117,19 +116,20 @@ def test_the_page_says_which_goals_are_missed_and_what_is_not_named():
 
 
 def test_a_dark_stretch_leaves_frames_after_it_and_faults_are_dealt_to_the_first_recordings(tmp_path):
-    chosen = inertial_benchmark._recordings(["room", "street", "mh01"], 100, 10)
-    jobs = [InertialJob(each, tmp_path, None, "code") for each in chosen]
+    (tmp_path / recordings.REAL["mh01"][0]).mkdir()
+    chosen = recordings.choose_recordings(None, tmp_path, 100, 10, inertial_benchmark.FRAMES, 200.0)
+    chosen.sort(key=lambda each: each.exact)
     assert [each.name for each in chosen[:3]] == ["mh01", "room100", "street100"]
-    for job in jobs:
-        rate = 10.0 if job.recording.kind == "street" else 20.0
-        ends = [case.first + round(case.seconds * rate) for case in job.cases]
-        assert max(ends) <= job.recording.frames - 5
-        assert {case.seconds for case in job.cases} >= {0.0, 0.5, 1.0, 2.0}
-    inertial_benchmark._deal_faults(jobs, 100)
-    dealt = [kind for job in jobs for kind, _ in job.faults if kind]
+    for recording in chosen:
+        rate = 10.0 if recording.kind == "street" else 20.0
+        cases = inertial_benchmark.dark_cases(recording)
+        assert max(case.first + round(case.seconds * rate) for case in cases) <= recording.frames - 5
+        assert {case.seconds for case in cases} >= {0.0, 0.5, 1.0, 2.0}
+    faults = inertial_benchmark.deal_faults(chosen, 100)
+    dealt = [fault.kind for found in faults.values() for fault in found if fault.kind]
     assert len(dealt) == 40
     assert {kind: dealt.count(kind) for kind in dealt} == dict.fromkeys(["deg/s", "g", "axes", "sign", "clock"], 8)
-    assert [len(job.faults) > 0 for job in jobs] == [True] * 7 + [False] * (len(jobs) - 7)
+    assert list(faults) == chosen[:7]
 
 
 @pytest.mark.slow
@@ -141,11 +141,11 @@ def test_the_command_judges_a_short_render_and_goes_on_where_it_was(tmp_path: Pa
             ended(job, work(job))
 
     monkeypatch.setitem(recordings.RENDERED, "room", (160, 120))
-    monkeypatch.setitem(inertial_benchmark._FRAMES, "room", 45)
+    monkeypatch.setitem(inertial_benchmark.FRAMES, "room", 45)
     monkeypatch.setitem(inertial_benchmark._STARTS, "room", (26,))
     monkeypatch.setattr(inertial_benchmark, "SECONDS", (0.5,))
     monkeypatch.setattr(inertial_benchmark, "FAULTS", 1)
-    monkeypatch.setattr(inertial_benchmark, "run_jobs", run_here)
+    monkeypatch.setattr(recording_jobs, "run_jobs", run_here)
     words = ["benchmark", "inertial", "--out", str(tmp_path / "page.md"), "--runs", str(tmp_path / "runs")]
     words += ["--seeds", "1", "--first-seed", "8", "--worlds", "room"]
     done = CliRunner().invoke(app, words)

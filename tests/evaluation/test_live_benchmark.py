@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from sigmaslam.cli.commands import app
 from sigmaslam.geometry.se3 import se3_exp
-from sigmaslam_benchmarks.live import live_benchmark, recordings
+from sigmaslam_benchmarks.live import recording_jobs, recordings
 from sigmaslam_benchmarks.live.driven_runs import DrivenSequence
 from sigmaslam_benchmarks.live.driver_faults import DrivenFrame, spoil
 from sigmaslam_benchmarks.live.judge import DrivenPose, Judgement, References, good_poses, judge, pose_errors
@@ -157,7 +157,7 @@ def run_here(work: Callable[[Any], str], jobs: Sequence[Any], workers: int, ende
 def test_the_command_judges_a_short_render_and_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     pytest.importorskip("torch")
     monkeypatch.setitem(recordings.RENDERED, "room", (160, 120))
-    monkeypatch.setattr(live_benchmark, "run_jobs", run_here)
+    monkeypatch.setattr(recording_jobs, "run_jobs", run_here)
     words = ["benchmark", "live", "--out", str(tmp_path / "live.md"), "--runs", str(tmp_path / "runs")]
     words += ["--seeds", "1", "--first-seed", "8", "--frames", "20", "--sequences", "room"]
     words += ["--methods", "klt-pnp", "--cases", "none,frozen_5"]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sigmaslam_benchmarks.tracking import orientation_peers
-from sigmaslam_benchmarks.tracking.orientation_peers import CASES, COUNT, SIGMA, orientation_table, simulate
+from sigmaslam_benchmarks.tracking.orientation_peers import CASES, COUNT, SIGMA, hard_cases, simulate
 
 
 def distances(name: str) -> np.ndarray:
@@ -30,10 +30,11 @@ def test_the_table_has_a_row_a_case_and_says_what_is_not_installed(monkeypatch: 
     monkeypatch.setattr(orientation_peers, "CASES", {name: CASES[name] for name in names})
     monkeypatch.setattr(orientation_peers, "find_spec", lambda module: None)
     told: list[str] = []
-    lines = orientation_table(None, told.append)
-    plane, forward = (next(line for line in lines if line.startswith(f"| {name}")) for name in names)
-    assert plane.count("|") == forward.count("|") == 6
+    found = hard_cases(None, told.append)
+    plane, forward = found["hard_rows"]
+    assert (plane[0], forward[0]) == names
+    assert len(plane) == len(forward) == 5
     # Each case has its own matches.
-    assert plane.split("|")[2:] != forward.split("|")[2:]
-    assert "Not installed: poselib, pycolmap." in lines
+    assert plane[1:] != forward[1:]
+    assert found["not_installed"] == ["poselib", "pycolmap"]
     assert told == [f"{name} done" for name in names]

@@ -3,13 +3,14 @@
 from pathlib import Path
 
 from sigmaslam.source_commit import describe_source
-from sigmaslam_benchmarks.tracking.page import opening, write_page
+from sigmaslam_benchmarks.tracking.page import fill_page, write_page
 
 
 def test_a_page_says_which_command_and_commit_made_it():
-    title, blank, line = opening("Results", "sigmaslam benchmark sequences --out page.md", ".", "a machine")
-    assert (title, blank) == ("# Results", "")
-    assert line == f"Made by `sigmaslam benchmark sequences --out page.md` {describe_source()} on a machine."
+    command = "sigmaslam benchmark reconstruction --out page.md"
+    empty = {name: [] for name in ("sequences", "goals", "worlds", "missing")}
+    page = fill_page("reconstruction", command, machine="a machine", seeds=1, **empty)
+    assert f"Made by `{command}` {describe_source()} on a machine." in page
 
 
 def test_notes_are_kept_when_a_page_is_made_again(tmp_path: Path):

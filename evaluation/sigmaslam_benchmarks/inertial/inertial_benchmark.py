@@ -1,41 +1,31 @@
 """Dark stretches on rendered and real recordings, without and with the inertial sensor, and faults of its table."""
 
-from __future__ import annotations
-
-import json
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
-from functools import cache
 from pathlib import Path
 from typing import Any
 
-from sigmaslam import errors
-from sigmaslam.errors import InputError, OutputError
-from sigmaslam.files import atomic_write_text, make_folder
-from sigmaslam_benchmarks.code_hash import hash_code
 from sigmaslam_benchmarks.inertial.dark_runs import METHODS, DarkCase, DarkResult, run_dark
 from sigmaslam_benchmarks.inertial.inertial_page import InertialPage, format_page
-from sigmaslam_benchmarks.inertial.table_faults import TABLE_FAULTS, FaultResult, judge_table
-from sigmaslam_benchmarks.live.recordings import REAL, RENDERED, Recording
+from sigmaslam_benchmarks.inertial.table_faults import TABLE_FAULTS, FaultResult, TableFault, judge_table
+from sigmaslam_benchmarks.live.recording_jobs import RecordingJob, hash_results, judge_recordings
+from sigmaslam_benchmarks.live.recordings import GoodFrames, Recording, choose_recordings
 from sigmaslam_benchmarks.tracking.page import check_names, write_page
-from sigmaslam_synthetic.parallel_jobs import list_failures, run_jobs
 
 SECONDS = (0.5, 1.0, 2.0, 5.0)
 """Of darkness."""
-WORLDS = (*RENDERED, "mh01")
 FAULTS = 40
 """Faulty tables that are drawn, of the kinds in turn."""
 # Recordings that they are put into, at most: one and three of each kind.
 _FAULTY = 7
-# Pairs of each recording: 8.5 s of a render, of which the first third is light, and all of MH_01 that is there.
-_FRAMES = {"room": 170, "street": 85, "mh01": 100}
+FRAMES = {"room": 170, "street": 85, "mh01": 100}
+"""Pairs of each world: 8.5 s of a render, of which the first third is light, and all of MH_01 that is there."""
 _RATE = 200.0
 # Of a render the dark begins once, where `live` covers lenses; in MH_01 wherever it leaves frames after it. A second of
 # darkness, which goals are for, begins there at all of these frames, other stretches at every second one.
 _STARTS = {"room": (56,), "street": (28,), "mh01": (20, 30, 40, 50, 60, 70)}
 _LEAST_AFTER = 5
-_JUDGING = ("dark_runs.py", "table_faults.py")  # the page may change without a new run
+_JUDGING = tuple(Path(__file__).with_name(name) for name in ("dark_runs.py", "table_faults.py"))
 
 
 def write_inertial(
@@ -52,153 +42,71 @@ def write_inertial(
     """Tracks what is missing, writes the page, at first of what is there, and returns it; notes in it are kept.
 
     Args:
-        path: Markdown page.
-        data: folder of the real data sets; None: renders alone.
-        runs: folder for renders and results; a result is used again when it comes from the same code.
-        command: what the page says it was made by.
-        first_seed, seeds: of the renders; dark images and faults have the first one.
-        worlds: names of `WORLDS`; all that there are unless given.
-        workers: processes; each takes a recording at a time.
-        note: is told of progress.
-    Raises:
-        InputError: a name is unknown, or the data are not there.
-        OutputError: a recording failed; the page holds what there is.
+        path, data, runs, command, first_seed, seeds, workers, note: as of `write_live`, and what it raises.
+        worlds: names of `FRAMES`; all that there are unless given.
     """
-    check_names("world", worlds or (), WORLDS)
-    wanted = worlds or [name for name in WORLDS if name in RENDERED or data is not None]
-    if "mh01" in wanted and (data is None or not (data / REAL["mh01"][0]).is_dir()):
-        raise InputError(f"{data or 'no folder'} does not hold {REAL['mh01'][0]}: give the folder with --data")
+    check_names("world", worlds or (), list(FRAMES))
     note(f"seeds {first_seed} to {first_seed + seeds - 1}")
-    make_folder(runs)
-    jobs = [InertialJob(each, runs.resolve(), data, _hash_code()) for each in _recordings(wanted, first_seed, seeds)]
-    _deal_faults(jobs, first_seed)
-    failed: dict[str, Exception] = {}
+    # The real ones first.
+    chosen = sorted(choose_recordings(worlds, data, first_seed, seeds, FRAMES, _RATE), key=lambda each: each.exact)
+    faults, code = deal_faults(chosen, first_seed), hash_results(_JUDGING)
+    jobs = [
+        RecordingJob(
+            each,
+            {task.name: task for task in (*dark_cases(each), *faults.get(each, ()))},
+            _judge,
+            _JUDGING,
+            runs.resolve(),
+            data,
+            code,
+        )
+        for each in chosen
+    ]
 
     def form() -> str:
-        return write_page(path, format_page(_collect(jobs, command, SECONDS)))
+        return write_page(path, format_page(_collect(jobs, command)))
 
-    def ended(job: InertialJob, outcome: str | Exception) -> None:
-        if isinstance(outcome, Exception):
-            failed[job.recording.name] = outcome
-        note(f"{job.recording.name}: {outcome}")
-        form()
-
-    run_jobs(InertialJob.make, [job for job in jobs if job.missing], workers, ended)
-    page = form()
-    if failed:
-        raise OutputError(f"{path} lacks {list_failures(failed)}: the same command tries what is missing again")
-    return page
+    return judge_recordings(path, jobs, form, workers, note)
 
 
-def _recordings(worlds: Sequence[str], first_seed: int, seeds: int) -> list[Recording]:
-    real = [Recording(name, name, _FRAMES[name], first_seed) for name in worlds if name in REAL]
-    rendered = [
-        Recording(f"{name}{seed}", name, _FRAMES[name], seed, _RATE)
-        for seed in range(first_seed, first_seed + seeds)
-        for name in worlds
-        if name in RENDERED
-    ]
-    return real + rendered
-
-
-def _deal_faults(jobs: Sequence[InertialJob], seed: int) -> None:
-    """Gives the first recordings their shares of the faults, and a good table each."""
-    faulty, kinds = jobs[:_FAULTY], list(TABLE_FAULTS)
-    for job in faulty:
-        job.faults.append(("", seed))
+def deal_faults(recordings: Sequence[Recording], seed: int) -> dict[Recording, list[TableFault]]:
+    """The shares of the first recordings in the faults, and a good table each."""
+    kinds = list(TABLE_FAULTS)
+    dealt = {each: [TableFault("", seed)] for each in recordings[:_FAULTY]}
     for number in range(FAULTS):
         # Every round of the kinds begins with the next recording.
-        job = faulty[(number + number // len(kinds)) % len(faulty)]
-        job.faults.append((kinds[number % len(kinds)], seed + number))
+        recording = recordings[(number + number // len(kinds)) % len(dealt)]
+        dealt[recording].append(TableFault(kinds[number % len(kinds)], seed + number))
+    return dealt
 
 
-@cache
-def _hash_code() -> str:
-    """Everything between the images and what is said, and the simulator."""
-    return hash_code(
-        *Path(errors.__file__).parent.rglob("*.py"), *(Path(__file__).with_name(name) for name in _JUDGING)
-    )
+def dark_cases(recording: Recording) -> list[DarkCase]:
+    """Without darkness, and with all that fits."""
+    kind, rate = recording.kind, 10.0 if recording.kind == "street" else 20.0
+    last = recording.frames - _LEAST_AFTER
+    dark = [
+        (seconds, first)
+        for seconds in SECONDS
+        for first in (_STARTS[kind] if seconds == 1.0 else _STARTS[kind][::2])
+        if first + round(seconds * rate) <= last
+    ]
+    return [DarkCase(method, *each) for each in [(0.0, 0), *dark] for method in METHODS]
 
 
-class InertialJob:
-    """One recording with all its cases and faults, in a worker.
-
-    Args:
-        recording: what is tracked.
-        runs: folder of renders and results.
-        data: of real recordings.
-        code: hash of all code that results depend on.
-    """
-
-    def __init__(self, recording: Recording, runs: Path, data: Path | None, code: str) -> None:
-        self.recording, self.runs, self.data, self.code = recording, runs, data, code
-        self.faults: list[tuple[str, int]] = []
-
-    @property
-    def cases(self) -> list[DarkCase]:
-        """Without darkness, and with all that fits."""
-        kind, rate = self.recording.kind, 10.0 if self.recording.kind == "street" else 20.0
-        last = self.recording.frames - _LEAST_AFTER
-        dark = [
-            (seconds, first)
-            for seconds in SECONDS
-            for first in (_STARTS[kind] if seconds == 1.0 else _STARTS[kind][::2])
-            if first + round(seconds * rate) <= last
-        ]
-        return [DarkCase(method, *each) for each in [(0.0, 0), *dark] for method in METHODS]
-
-    @property
-    def missing(self) -> list[str]:
-        """Names of results that are not there."""
-        names = [case.name for case in self.cases] + [self.fault_name(*fault) for fault in self.faults]
-        return [name for name in names if self.read(name) is None]
-
-    @staticmethod
-    def fault_name(kind: str, seed: int) -> str:
-        """Of the result of a faulty table."""
-        return f"table-{(kind or 'good').replace('/', '_')}-{seed}"
-
-    def read(self, name: str) -> dict[str, Any] | None:
-        """The figures; None where they are missing or of something else."""
-        path = self._path(name)
-        if not path.is_file():
-            return None
-        content = json.loads(path.read_text(encoding="utf-8"))
-        return dict(content["result"]) if content.get("made_from") == self._made_from() else None
-
-    def make(self) -> str:
-        """Judges what is missing; each result is kept at once."""
-        if _hash_code() != self.code:
-            raise InputError("this worker has another state of SigmaSLAM: install the same commit wherever jobs run")
-        began, missing = time.perf_counter(), set(self.missing)
-        good = self.recording.open(self.runs, self.data)
-        for case in self.cases:
-            if case.name in missing:
-                self._write(case.name, asdict(run_dark(good, case, self.recording.seed)))
-        for kind, seed in self.faults:
-            if (name := self.fault_name(kind, seed)) in missing:
-                self._write(name, asdict(judge_table(good, kind, seed)))
-        return f"{len(missing)} runs in {time.perf_counter() - began:.0f} s"
-
-    def _write(self, name: str, result: Mapping[str, Any]) -> None:
-        content = {"made_from": self._made_from(), "result": result}
-        atomic_write_text(self._path(name), json.dumps(content, indent=1) + "\n")
-
-    def _path(self, name: str) -> Path:
-        return self.runs / f"{self.recording.name}-{name}.json"
-
-    def _made_from(self) -> dict[str, Any]:
-        return {"recording": asdict(self.recording), "code": self.code}
+def _judge(job: RecordingJob, good: GoodFrames, task: DarkCase | TableFault) -> dict[str, Any]:
+    if isinstance(task, DarkCase):
+        return asdict(run_dark(good, task, job.recording.seed))
+    return asdict(judge_table(good, task.kind, task.seed))
 
 
-def _collect(jobs: Sequence[InertialJob], command: str, seconds: Sequence[float]) -> InertialPage:
+def _collect(jobs: Sequence[RecordingJob], command: str) -> InertialPage:
     runs: dict[tuple[Recording, DarkCase], DarkResult] = {}
     faults: list[tuple[Recording, FaultResult]] = []
     for job in jobs:
-        for case in job.cases:
-            if (found := job.read(case.name)) is not None:
-                runs[job.recording, case] = DarkResult(**found)
-        for fault in job.faults:
-            if (found := job.read(job.fault_name(*fault))) is not None:
+        for name, task in job.tasks.items():
+            found: Mapping[str, Any] | None = job.read(name)
+            if found is not None and isinstance(task, DarkCase):
+                runs[job.recording, task] = DarkResult(**found)
+            elif found is not None:
                 faults.append((job.recording, FaultResult(**found)))
-    return InertialPage(command, seconds, runs, faults, sum(len(job.missing) for job in jobs))
+    return InertialPage(command, SECONDS, runs, faults, sum(len(job.missing) for job in jobs))

@@ -23,6 +23,19 @@ Spoil = Callable[[InertialSamples, np.random.Generator], tuple[InertialSamples, 
 
 
 @dataclass(frozen=True, slots=True)
+class TableFault:
+    """A fault that is drawn with a seed; of kind `""`: none."""
+
+    kind: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Of its result."""
+        return f"table-{(self.kind or 'good').replace('/', '_')}-{self.seed}"
+
+
+@dataclass(frozen=True, slots=True)
 class FaultResult:
     """What is said of a faulty table.
 

@@ -1,32 +1,24 @@
 """Faults of drivers on rendered and real recordings: how many poses are silently wrong, and what is said."""
 
-from __future__ import annotations
-
-import json
 import tempfile
-import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from functools import cache
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sigmaslam import errors
-from sigmaslam.errors import InputError, OutputError
-from sigmaslam.files import atomic_write_text, make_folder
-from sigmaslam_benchmarks.code_hash import hash_code
 from sigmaslam_benchmarks.live.driven_runs import METHODS, DrivenRun
 from sigmaslam_benchmarks.live.driver_faults import FAULTS, NO_FAULT, spoil
 from sigmaslam_benchmarks.live.judge import Judgement, References, good_poses, judge
 from sigmaslam_benchmarks.live.live_page import LivePage, format_page
-from sigmaslam_benchmarks.live.recordings import GoodFrames, Recording, choose_recordings
+from sigmaslam_benchmarks.live.recording_jobs import RecordingJob, hash_results, judge_recordings
+from sigmaslam_benchmarks.live.recordings import SEQUENCES, GoodFrames, Recording, choose_recordings
 from sigmaslam_benchmarks.tracking.page import check_names, write_page
 from sigmaslam_benchmarks.tracking.stereo_peers import MissingPeerError
-from sigmaslam_synthetic.parallel_jobs import list_failures, run_jobs
 
-_JUDGING = ("driver_faults.py", "driven_runs.py", "judge.py", "recordings.py")  # the page may change without a new run
+_NAMES = ("driver_faults.py", "driven_runs.py", "judge.py", "recordings.py")
+_JUDGING = tuple(Path(__file__).with_name(name) for name in _NAMES)
 
 
 def write_live(
@@ -59,121 +51,60 @@ def write_live(
         InputError: a name is unknown, or the data are not there.
         OutputError: a recording failed; the page holds what there is.
     """
-    check_names("case", cases or (), list(FAULTS))
-    check_names("method", methods, list(METHODS))
+    for kind, names, known in (
+        ("case", cases, FAULTS),
+        ("method", methods, METHODS),
+        ("sequence", sequences, SEQUENCES),
+    ):
+        check_names(kind, names or (), list(known))
     note(f"seeds {first_seed} to {first_seed + seeds - 1}")
-    chosen = choose_recordings(sequences, data, first_seed, seeds, frames)
-    make_folder(runs)
+    chosen = choose_recordings(sequences, data, first_seed, seeds, dict.fromkeys(SEQUENCES, frames))
     wanted = [name for name in FAULTS if not cases or name in cases]
-    jobs = [
-        LiveJob(recording, tuple(wanted), tuple(methods), runs.resolve(), data, _hash_code()) for recording in chosen
-    ]
-    asked = sum(len(job.pairs) for job in jobs)
-    failed: dict[str, Exception] = {}
+    tasks = {f"{method}-{case}": (method, case) for method in methods for case in wanted}
+    code = hash_results(_JUDGING)
+    jobs = [RecordingJob(each, tasks, _judge, _JUDGING, runs.resolve(), data, code) for each in chosen]
 
     def form() -> str:
+        asked = len(jobs) * len(tasks)
         return write_page(path, format_page(LivePage(command, wanted, list(methods), _collect(jobs), frames, asked)))
-
-    def ended(job: LiveJob, outcome: str | Exception) -> None:
-        if isinstance(outcome, Exception):
-            failed[job.recording.name] = outcome
-        note(f"{job.recording.name}: {outcome}")
-        form()
 
     if _collect(jobs):
         form()
-    run_jobs(LiveJob.make, [job for job in jobs if job.missing], workers, ended)
-    page = form()
-    if failed:
-        raise OutputError(f"{path} lacks {list_failures(failed)}: the same command tries what is missing again")
-    return page
+    return judge_recordings(path, jobs, form, workers, note)
 
 
-@cache
-def _hash_code() -> str:
-    """Everything between the images and what is said, and the simulator."""
-    return hash_code(
-        *Path(errors.__file__).parent.rglob("*.py"), *(Path(__file__).with_name(name) for name in _JUDGING)
-    )
+def _judge(job: RecordingJob, good: GoodFrames, task: tuple[str, str]) -> dict[str, Any]:
+    """A judgement, or why there is none, under `left_out`."""
+    method, case = task
+    if not FAULTS[case].fits(good.frames):
+        return {"left_out": "longer than the recording"}
+    try:
+        reference = None if job.recording.exact or case == NO_FAULT else _reference(job, good, method)
+        run = _run(job, good, method, case)
+    except MissingPeerError as error:
+        return {"left_out": str(error)}
+    return asdict(judge(run.poses, good.truth, reference, run.said, run.refused))
 
 
-@dataclass(frozen=True, slots=True)
-class LiveJob:
-    """One recording with all its cases and methods, in a worker."""
-
-    recording: Recording
-    cases: tuple[str, ...]
-    methods: tuple[str, ...]
-    runs: Path
-    data: Path | None
-    code: str
-
-    @property
-    def pairs(self) -> list[tuple[str, str]]:
-        """Method and case in the order in which they run."""
-        return [(method, case) for method in self.methods for case in self.cases]
-
-    @property
-    def missing(self) -> list[tuple[str, str]]:
-        """Of `pairs`, those without a result."""
-        return [pair for pair in self.pairs if self.read(*pair) is None]
-
-    def read(self, method: str, case: str) -> dict[str, Any] | None:
-        """A judgement, or why there is none, under `left_out`; None where it is missing or of something else."""
-        path = self._path(method, case)
-        if not path.is_file():
-            return None
-        content = json.loads(path.read_text(encoding="utf-8"))
-        return dict(content["result"]) if content.get("made_from") == self._made_from() else None
-
-    def make(self) -> str:
-        """Judges what is missing; each result is kept at once."""
-        if _hash_code() != self.code:
-            raise InputError("this worker has another state of SigmaSLAM: install the same commit wherever jobs run")
-        began, missing = time.perf_counter(), self.missing
-        good = self.recording.open(self.runs, self.data)
-        for method, case in missing:
-            self._write(method, case, self._judge(good, method, case))
-        return f"{len(missing)} runs in {time.perf_counter() - began:.0f} s"
-
-    def _judge(self, good: GoodFrames, method: str, case: str) -> dict[str, Any]:
-        if not FAULTS[case].fits(good.frames):
-            return {"left_out": "longer than the recording"}
-        try:
-            reference = None if self.recording.exact or case == NO_FAULT else self._reference(good, method)
-            run = self._run(good, method, case)
-        except MissingPeerError as error:
-            return {"left_out": str(error)}
-        return asdict(judge(run.poses, good.truth, reference, run.said, run.refused))
-
-    def _run(self, good: GoodFrames, method: str, case: str) -> DrivenRun:
-        with tempfile.TemporaryDirectory() as scratch:
-            return METHODS[method](spoil(case, good.frames, self.recording.seed), good.camera, Path(scratch) / "run")
-
-    def _reference(self, good: GoodFrames, method: str) -> References:
-        """The run with good frames, whose poses are kept beside the results."""
-        path = self._path(method, "poses").with_suffix(f".{self.code[:16]}.npy")
-        if not path.is_file():
-            np.save(path, good_poses(self._run(good, method, NO_FAULT).poses, len(good.frames)).poses)
-        return References(np.load(path))
-
-    def _write(self, method: str, case: str, result: dict[str, Any]) -> None:
-        content = {"made_from": self._made_from(), "result": result}
-        atomic_write_text(self._path(method, case), json.dumps(content, indent=1) + "\n")
-
-    def _path(self, method: str, case: str) -> Path:
-        return self.runs / f"{self.recording.name}-{method}-{case}.json"
-
-    def _made_from(self) -> dict[str, Any]:
-        return {"recording": asdict(self.recording), "code": self.code}
+def _run(job: RecordingJob, good: GoodFrames, method: str, case: str) -> DrivenRun:
+    with tempfile.TemporaryDirectory() as scratch:
+        return METHODS[method](spoil(case, good.frames, job.recording.seed), good.camera, Path(scratch) / "run")
 
 
-def _collect(jobs: Sequence[LiveJob]) -> dict[tuple[Recording, str, str], Judgement | str]:
+def _reference(job: RecordingJob, good: GoodFrames, method: str) -> References:
+    """The run with good frames, whose poses are kept beside the results."""
+    path = job.path(f"{method}-poses").with_suffix(f".{job.code[:16]}.npy")
+    if not path.is_file():
+        np.save(path, good_poses(_run(job, good, method, NO_FAULT).poses, len(good.frames)).poses)
+    return References(np.load(path))
+
+
+def _collect(jobs: Sequence[RecordingJob]) -> dict[tuple[Recording, str, str], Judgement | str]:
     """What there is: a judgement, or why there is none, by recording, method and case."""
     found: dict[tuple[Recording, str, str], Judgement | str] = {}
     for job in jobs:
-        for method, case in job.pairs:
-            result = job.read(method, case)
+        for name, (method, case) in job.tasks.items():
+            result = job.read(name)
             if result is not None:
                 found[job.recording, method, case] = result.get("left_out") or Judgement(**result)
     return found

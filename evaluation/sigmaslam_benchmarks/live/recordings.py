@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,7 +19,6 @@ from sigmaslam.readers.trajectory_files import read_trajectory
 from sigmaslam_benchmarks.live.driver_faults import DrivenFrame
 from sigmaslam_benchmarks.live.judge import References
 from sigmaslam_benchmarks.rendered_camera import open_rendered
-from sigmaslam_benchmarks.tracking.page import check_names
 from sigmaslam_benchmarks.trial import render, rendered_truth
 from sigmaslam_evaluation.metrics.trajectory_errors import associate
 from sigmaslam_evaluation.metrics.truth_covariance import truth_covariance
@@ -89,23 +88,39 @@ class GoodFrames:
 
 
 def choose_recordings(
-    names: Sequence[str] | None, data: Path | None, first_seed: int, seeds: int, frames: int
+    names: Sequence[str] | None,
+    data: Path | None,
+    first_seed: int,
+    seeds: int,
+    frames: Mapping[str, int],
+    imu: float | None = None,
 ) -> list[Recording]:
     """The recordings that are asked for; of each preset as many as there are seeds.
 
+    Args:
+        names: of `frames`; None: all that there are.
+        data: folder of the real data sets; None: renders alone.
+        first_seed, seeds: of the renders; the faults of real recordings have the first one.
+        frames: pairs, by the name of each recording that is offered.
+        imu: samples a second of the inertial sensor that is rendered; None: none is.
     Raises:
-        InputError: a name is unknown, or the data are not there.
+        InputError: the data are not there.
     """
-    check_names("sequence", names or (), SEQUENCES)
-    wanted = names or [name for name in SEQUENCES if name in RENDERED or data is not None]
+    wanted = names or [name for name in frames if name in RENDERED or data is not None]
     missing = [name for name in wanted if name in REAL and (data is None or not (data / REAL[name][0]).is_dir())]
     if missing:
         raise InputError(
             f"{data or 'no folder'} does not hold {', '.join(missing)}: give the folder of the data sets with --data"
         )
-    numbers = range(first_seed, first_seed + seeds)
-    chosen = [Recording(f"{name}{seed}", name, frames, seed) for seed in numbers for name in wanted if name in RENDERED]
-    return chosen + [Recording(name, name, frames, first_seed) for name in wanted if name in REAL]
+    return [
+        *(
+            Recording(f"{name}{seed}", name, frames[name], seed, imu)
+            for seed in range(first_seed, first_seed + seeds)
+            for name in wanted
+            if name in RENDERED
+        ),
+        *(Recording(name, name, frames[name], first_seed) for name in wanted if name in REAL),
+    ]
 
 
 def _read(sequence: StereoSequence, folder: Path, truth: Trajectory, covariance: np.ndarray) -> GoodFrames:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,7 +15,6 @@ from sigmaslam.geometry.se3 import rotation_exp, rotation_log
 from sigmaslam.two_view.relative_orientation import estimate_relative_orientation
 from sigmaslam_benchmarks.matching.image_pairs import Motion
 from sigmaslam_benchmarks.matching.sets import load_set
-from sigmaslam_benchmarks.tracking.page import header, row
 
 SEEDS = range(3000, 3040)
 """Used for nothing else."""
@@ -88,22 +88,13 @@ def simulate(case: Case, seed: int) -> PosePair:
     return PosePair(_K, R, case.translation, pixels0, pixels1, np.ones(COUNT), told, _SIZE, np.zeros((6, 6)))
 
 
-def orientation_table(data: Path | None, note: Callable[[str], None]) -> list[str]:
-    """The table of the page: every case and the fountain, if the data are there, by every method that is installed."""
+def hard_cases(data: Path | None, note: Callable[[str], None]) -> dict[str, Any]:
+    """What the page says of every case and the fountain, if the data are there, by every method that is installed."""
     sets: dict[str, Iterable[PosePair]] = {name: map(partial(simulate, case), SEEDS) for name, case in CASES.items()}
     if data is not None:
         sets["fountain, six pairs"] = _fountain(data)
     methods = _methods()
-    lines = [
-        "## Relative orientation where it is hard",
-        "",
-        f"{COUNT} matches, {SIGMA} px of noise in each image, seeds {SEEDS[0]} to {SEEDS[-1]}, and our matches of the",
-        "fountain's four photographs (640 px). Medians of rotation / direction in degrees (90 % of the directions are",
-        f"below the number in brackets), and how many of the poses are off by more than {_FAILED:.0f} degrees. The",
-        "threshold of the others is 1 px, COLMAP's 2 px. NEES is per degree of freedom, of 5: median, mean.",
-        "",
-        *header("case", *methods, "our NEES", numbers_from=1),
-    ]
+    rows = []
     for name, pairs in sets.items():
         errors: dict[str, list[tuple[float, float]]] = {method: [] for method in methods}
         nees: list[tuple[float, float]] = []
@@ -118,11 +109,16 @@ def orientation_table(data: Path | None, note: Callable[[str], None]) -> list[st
         cell = f"{np.median(ratio):.2f}, {np.mean(ratio):.2f}"
         if name.startswith("fountain"):
             cell += f" (with the truth's error {np.median(beside_truth):.2f}, {np.mean(beside_truth):.2f})"
-        lines.append(row(name, *cells, cell))
+        rows.append([name, *cells, cell])
         note(f"{name} done")
-    missing = [module for module in ("poselib", "pycolmap") if find_spec(module) is None]
-    lines += ["", f"Not installed: {', '.join(missing)}." if missing else "Truth of the fountain: 3 mm, 0.01 degrees."]
-    return lines
+    return {
+        "hard_rows": rows,
+        "hard_methods": list(methods),
+        "hard_matches": (COUNT, SIGMA),
+        "hard_seeds": (SEEDS[0], SEEDS[-1]),
+        "failed_degrees": f"{_FAILED:.0f}",
+        "not_installed": [module for module in ("poselib", "pycolmap") if find_spec(module) is None],
+    }
 
 
 def _methods() -> dict[str, Callable[[PosePair], Pose | None]]:

@@ -33,7 +33,7 @@ def fill_page(template: str, command: str, **values: Any) -> str:
     Args:
         template: name in `sigmaslam_benchmarks/templates`, without .md.
         command: that makes the page.
-        values: all others that the template names.
+        values: all others that the template names; `machine`, if it is described otherwise than by `machine`.
     """
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("sigmaslam_benchmarks", "templates"),
@@ -42,43 +42,15 @@ def fill_page(template: str, command: str, **values: Any) -> str:
         lstrip_blocks=True,
         autoescape=False,  # Markdown
     )
-    environment.filters["row"] = lambda cells: row(*cells)
-    values |= {"command": command, "source": describe_source(), "machine": machine()}
+    environment.filters["row"] = lambda cells: f"| {' | '.join(cells)} |"
+    values = {"machine": machine(), **values, "command": command, "source": describe_source()}
     # Blocks end with an empty line, the page does not.
     return environment.get_template(f"{template}.md").render(values).rstrip("\n") + "\n"
-
-
-def opening(title: str, command: str, text: str, place: str = "") -> list[str]:
-    """The first lines of a page: its title, what it was made by, of which sources, and where.
-
-    Args:
-        title: of the page.
-        command: that makes the page.
-        text: what follows the machine, with its punctuation; its further lines come after it.
-        place: the machine, if it is described otherwise than by `machine`.
-    """
-    return [f"# {title}", "", f"Made by `{command}` {describe_source()} on {place or machine()}{text}"]
 
 
 def machine() -> str:
     """Kind of processor, and its cores."""
     return f"{platform.machine()}, {os.cpu_count()} cores"
-
-
-def header(*names: str, numbers_from: int | None = None) -> list[str]:
-    """The first two lines of a table; columns of numbers, from the given one on, are flush right."""
-    count = len(names) if numbers_from is None else numbers_from
-    return [row(*names), "|" + "---|" * count + "---:|" * (len(names) - count)]
-
-
-def table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """A whole table of words."""
-    return [row(*cells) for cells in (columns, ["---"] * len(columns), *rows)]
-
-
-def row(*cells: str) -> str:
-    """A line of a table."""
-    return "| " + " | ".join(cells) + " |"
 
 
 def number(value: float, form: str) -> str:

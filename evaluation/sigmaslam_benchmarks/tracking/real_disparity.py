@@ -1,7 +1,7 @@
 """The page of `benchmark reconstruction --real`: disparities and sigmas on real truth, beside OpenCV's matching."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -13,7 +13,7 @@ from sigmaslam.progress import open_progress
 from sigmaslam.reconstruction.disparity import DisparityMap, measure_disparity, semi_global_disparity
 from sigmaslam.table import Table
 from sigmaslam_benchmarks.tracking.disparity_pairs import DisparityPair, real_pairs, rendered_pairs, worse_camera
-from sigmaslam_benchmarks.tracking.page import header, number, opening, row, write_page
+from sigmaslam_benchmarks.tracking.page import fill_page, number, write_page
 
 SWEEP_SEED, SEED = 310, 320
 """Renders that the setting of OpenCV's matching is chosen on, and those that all are judged on."""
@@ -82,7 +82,16 @@ def write_real(path: Path, data: Path, command: str) -> str:
             for method, match in methods.items():
                 judged[name, method], seconds[name, method] = judge(pairs, match)
                 progress.update(task, advance=1, note=f"{name}, {method}")
-    return write_page(path, "\n".join(_page(list(sets), list(methods), judged, seconds, command)) + "\n")
+    page = fill_page(
+        "real_disparity",
+        command,
+        seed=SEED,
+        rows=list(_rows(list(sets), list(methods), judged, seconds)),
+        splits={
+            title: list(_parts(list(sets), next(iter(methods)), judged, split)) for title, split in _SPLITS.items()
+        },
+    )
+    return write_page(path, page)
 
 
 def opencv_matching(left: np.ndarray, right: np.ndarray, block: int, mode: int) -> DisparityMap:
@@ -147,51 +156,30 @@ _Judged = dict[tuple[str, str], JudgedDisparities]
 _Part = tuple[float, float, np.ndarray]
 
 
-def _page(
-    sets: list[str], methods: list[str], judged: _Judged, seconds: dict[tuple[str, str], float], command: str
-) -> list[str]:
-    lines = opening("Disparities on real truth", command, ".") + [
-        "",
-        "Drive: LiDAR in 8 left images of a KITTI drive. The time of a scan is not known: each method's errors are",
-        "after the shift along the drive that makes their median least. Its truth's sigma is 0.2 pixels and 1 %, that",
-        "of Middlebury Motorcycle 0.05 pixels, that of aloe the rounding to whole pixels, which favours a method that",
-        f"is drawn to them, too. Renders are of seed {SEED}, with exact truth; a worse camera adds noise, blur,",
-        "unlike eyes, saturation and a row error. Common pixels are those that all methods answer. Errors in pixels;",
-        "the truth's sigma is counted in what is inside 1, 2 and 3 sigma.",
-        "",
-        *header("set", "method", "truths", "density", "error", "bias", "> 3 px", "error, common", "bias, common",
-                "> 3 px, common", "1 sigma", "2 sigma", "3 sigma", "CPU s", numbers_from=2),
-    ]  # fmt: skip
+def _rows(
+    sets: list[str], methods: list[str], judged: _Judged, seconds: dict[tuple[str, str], float]
+) -> Iterator[list[str]]:
     for name in sets:
         common = np.logical_and.reduce([judged[name, method].known for method in methods])
         for method in methods:
             found = judged[name, method]
             answered = found.select(found.known)
-            lines.append(
-                row(name, method, str(len(found.truth)), f"{found.known.mean():.1%}", *_errors(answered.error),
-                    *_errors(found.error[common]), *_coverage(answered),
-                    f"{seconds[name, method]:.2f}")
-            )  # fmt: skip
-    splits: dict[str, Callable[[JudgedDisparities], list[_Part]]] = {
-        "distance, metres": lambda found: _ranges(found.distance, (2, 10, 20, 40, 80)),
-        "distance from a depth edge, pixels": lambda found: _ranges(found.edge, (0, 4, 8, 16, 1e4)),
-        "decile of sigma": lambda found: _deciles(found.sigma),
-    }
-    for title, split in splits.items():
-        lines += ["", f"## Ours by {title}", ""]
-        lines += header("set", "from", "to", "share", "error", "bias", "> 3 px", "1 sigma", "2 sigma", "3 sigma",
-                        numbers_from=1)  # fmt: skip
-        for name in sets:
-            found = judged[name, methods[0]]
-            found = found.select(found.known)
-            for low, high, inside in split(found):
-                part = found.select(inside)
-                if len(part.truth):
-                    lines.append(
-                        row(name, f"{low:.3g}", f"{high:.3g}", f"{inside.mean():.1%}", *_errors(part.error),
-                            *_coverage(part))
-                    )  # fmt: skip
-    return lines
+            counts = str(len(found.truth)), f"{found.known.mean():.1%}"
+            errors = *_errors(answered.error), *_errors(found.error[common])
+            yield [name, method, *counts, *errors, *_coverage(answered), f"{seconds[name, method]:.2f}"]
+
+
+def _parts(
+    sets: list[str], method: str, judged: _Judged, split: Callable[[JudgedDisparities], list[_Part]]
+) -> Iterator[list[str]]:
+    for name in sets:
+        found = judged[name, method]
+        found = found.select(found.known)
+        for low, high, inside in split(found):
+            part = found.select(inside)
+            if len(part.truth):
+                ends = f"{low:.3g}", f"{high:.3g}", f"{inside.mean():.1%}"
+                yield [name, *ends, *_errors(part.error), *_coverage(part)]
 
 
 def _errors(error: np.ndarray) -> list[str]:
@@ -214,3 +202,10 @@ def _deciles(values: np.ndarray) -> list[_Part]:
     ends = np.unique(np.quantile(values, np.linspace(0.0, 1.0, 11)))
     ends[-1] = np.nextafter(ends[-1], np.inf)
     return _ranges(values, ends.tolist())
+
+
+_SPLITS: dict[str, Callable[[JudgedDisparities], list[_Part]]] = {
+    "distance, metres": lambda found: _ranges(found.distance, (2, 10, 20, 40, 80)),
+    "distance from a depth edge, pixels": lambda found: _ranges(found.edge, (0, 4, 8, 16, 1e4)),
+    "decile of sigma": lambda found: _deciles(found.sigma),
+}

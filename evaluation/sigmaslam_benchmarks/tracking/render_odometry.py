@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +17,6 @@ from sigmaslam.readers.trajectory_files import read_trajectory
 from sigmaslam.runs.request import TrackerOptions
 from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam_benchmarks.matching.scores import mutual_nearest
-from sigmaslam_benchmarks.tracking.page import row
 from sigmaslam_benchmarks.trial import Trial, render, track_ours
 
 REAL_DRIVE = "kitti_raw_0926_0039_a"
@@ -156,13 +156,9 @@ def follow(name: str, sequence: Path, truth: Path) -> Drive:
     )
 
 
-def format_odometry(real: Drive, renders: Sequence[Drive]) -> list[str]:
-    """A table with a row a quantity, and a sentence on what is off by more than the limit."""
-    lines = [
-        f"| | {real.name} | " + " | ".join(render.name for render in renders) + " | ratio | within |",
-        "|---|" + "---:|" * (len(renders) + 3),
-    ]
-    off = []
+def compare_drives(real: Drive, renders: Sequence[Drive]) -> dict[str, Any]:
+    """Rows of the page's table, one a quantity, and what is off by more than the limit."""
+    rows, off = [], []
     for key, title, form, required in _ROWS:
         truth = getattr(real, key)
         values = [getattr(render, key) for render in renders]
@@ -171,12 +167,10 @@ def format_odometry(real: Drive, renders: Sequence[Drive]) -> list[str]:
         if required and not alike:
             off.append(f"{title} (x{ratio:.2f})")
         cells = [title, *(format(value, form) for value in (truth, *values)), f"{ratio:.2f}"]
-        lines.append(row(*cells, ("yes" if alike else "**no**") if required else ""))
+        rows.append([*cells, ("yes" if alike else "**no**") if required else ""])
     # The offset is near zero, where a ratio is undefined.
-    cells = ["disparity offset px", *(f"{drive.offset:+.2f}" for drive in (real, *renders))]
-    lines.append(row(*cells, "", ""))
-    verdict = f"Off by more than a factor of {LIMIT:g}: {', '.join(off)}." if off else "Every one is within the limit."
-    return [*lines, "", verdict]
+    rows.append(["disparity offset px", *(f"{drive.offset:+.2f}" for drive in (real, *renders)), "", ""])
+    return {"quantities": rows, "off": off}
 
 
 def row_noise(u: np.ndarray, v: np.ndarray, difference: np.ndarray) -> float:

@@ -14,8 +14,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sigmaslam_benchmarks.tracking.page import row
-
 if TYPE_CHECKING:
     from sigmaslam_synthetic.simulation import Studio
 
@@ -68,18 +66,14 @@ def measure_speeds(note: Callable[[str], None] = lambda text: None) -> list[Spee
     return speeds
 
 
-def format_speeds(speeds: list[Speed]) -> list[str]:
-    """A table, with median, lowest and highest repeat."""
-    lines = [
-        "| | pairs/s | goal | reached | CPU s a pair | CPU s to begin |",
-        "|---|---:|---:|---:|---:|---:|",
-    ]
+def speed_rows(speeds: list[Speed]) -> list[list[str]]:
+    """Rows of the page's table, with median, lowest and highest repeat."""
+    rows = []
     for speed in speeds:
         reached = "" if speed.goal is None else "yes" if np.median(speed.rates) >= speed.goal else "**no**"
         goal = "" if speed.goal is None else f"{speed.goal:g}"
-        cells = (speed.name, _spread(speed.rates), goal, reached, _spread(speed.cpu), f"{speed.preparation:.1f}")
-        lines.append(row(*cells))
-    return lines
+        rows.append([speed.name, _spread(speed.rates), goal, reached, _spread(speed.cpu), f"{speed.preparation:.1f}"])
+    return rows
 
 
 def describe_machine() -> str:

@@ -23,7 +23,7 @@ from sigmaslam_benchmarks.tracking import image_statistics as statistics
 from sigmaslam_benchmarks.tracking import render_odometry as odometry
 from sigmaslam_benchmarks.tracking import render_speed as speed
 from sigmaslam_benchmarks.tracking.image_statistics import ImageSet
-from sigmaslam_benchmarks.tracking.page import opening, row, write_page
+from sigmaslam_benchmarks.tracking.page import fill_page, write_page
 
 _RAW = "KITTI raw"  # before it was rectified: what the sensor itself does
 _SET12, _KITTI, _EUROC = "denoising/Set12", odometry.REAL_DRIVE, "euroc_v1_01_keyframes_a"
@@ -95,22 +95,34 @@ def write_renders(
         note("statistics of the images")
         sets = summarize_all(data, drives)
     save_png(draw(sets), figure)
-    lines = [
-        *opening("Renders beside real images", command, ".", machine),
-        "",
-        *_statistics_section(sets, figure),
-        *_odometry_section(real, renders),
-        "## Speed",
-        "",
-        f"{speed.PROCESSES} processes of one thread each, world made before; median, lowest and highest repeat. Stereo",
-        "pairs: both images with the sensor, depth, ids, flow, stereo and both occlusion masks. On a machine that",
-        "others use too only the CPU seconds mean something. *to begin*: until the world is made; of scene pairs until",
-        "the first eight worlds are.",
-        "",
-        *speed.format_speeds(speeds),
-        "",
-    ]
-    return write_page(path, "\n".join(lines))
+    low, high = statistics.MID_BAND
+    page = fill_page(
+        "renders",
+        command,
+        machine=machine,
+        figure=figure.name,
+        blur=f"{statistics.BLUR:g}",
+        flat=f"{statistics.FLAT:g}",
+        band=f"{low:g} to {high:g}",
+        levels=" / ".join(f"{level:g}" for level in statistics.CORNER_LEVELS),
+        strongest=f"{statistics.CORNERS_PER_10000:g}",
+        white=f"{statistics.BRIGHTNESS_EDGES[-2]:g}",
+        raw=_RAW,
+        sets=[
+            _set_cells(f"**{name}**" if name in (*REAL, _RAW) else name, sets[name])
+            for name in (*REAL, _RAW, *(name for name, _ in PAIRS), *ALONE)
+        ],
+        **_compare_all(sets),
+        drive=_KITTI,
+        drives=renders,
+        real=real,
+        odometry=odometry,
+        limit=f"{odometry.LIMIT:g}",
+        **odometry.compare_drives(real, renders),
+        processes=speed.PROCESSES,
+        speeds=speed.speed_rows(speeds),
+    )
+    return write_page(path, page)
 
 
 def summarize_all(data: Path, drives: Sequence[Path]) -> dict[str, ImageSet]:
@@ -239,81 +251,38 @@ def _ratio(one: float, other: float) -> Difference:
     return Difference(abs(float(np.log2(ratio))), f"x{ratio:.2f}")
 
 
-def _statistics_section(sets: dict[str, ImageSet], figure: Path) -> list[str]:
-    low, high = statistics.MID_BAND
-    levels = " / ".join(f"{level:g}" for level in statistics.CORNER_LEVELS)
-    lines = [
-        "## Statistics of the images",
-        "",
-        f"![Gradients, spectrum, corners, brightness and noise of renders and real images]({figure.name})",
-        "",
-        f"All but spectrum and noise after a blur of {statistics.BLUR:g} px. *gradient*: median magnitude, grey levels",
-        f"per pixel; *flat*: share of the pixels below {statistics.FLAT:g}. *slope*: of log power against log",
-        f"frequency, {low:g} to {high:g} cycles per pixel. *corners*: Shi-Tomasi's of {levels} grey levels per",
-        f"pixel or more, per 10^4 pixels. *repeated*: share of the {statistics.CORNERS_PER_10000:g} strongest per 10^4",
-        "pixels that are found again within 1 px when the image is warped by a random homography. *brightness*: a",
-        "tenth, half and nine tenths of the pixels are darker; *white*: share of",
-        f"{statistics.BRIGHTNESS_EDGES[-2]:g} and more. *noise*: as if white, grey levels, in the flattest tenth of",
-        "the patches of each brightness: median over brightness, lowest and highest. Compression (EuRoC) and",
-        f"resampling (KITTI, but not {_RAW}) hide noise.",
-        "",
-        f"| set | images | gradient | flat % | slope | corners {levels} | repeated % | brightness | white % | noise |",
-        "|---|" + "---:|" * 9,
+def _set_cells(name: str, images: ImageSet) -> list[str]:
+    """A row of the table of sets."""
+    greys = [statistics.quantile(images.brightness, statistics.BRIGHTNESS_EDGES, q) for q in (0.1, 0.5, 0.9)]
+    return [
+        name,
+        str(images.count),
+        f"{images.median_gradient:.2f}",
+        f"{100 * images.flat:.0f}",
+        f"{images.slope:.2f}",
+        " / ".join(f"{density:.1f}" for density in images.corner_density),
+        f"{100 * images.repeatability[0]:.0f} ± {100 * images.repeatability[1]:.0f}",
+        " / ".join(f"{grey:.0f}" for grey in greys),
+        f"{100 * images.brightness[-1]:.1f}",
+        f"{images.median_noise:.2f} ({np.nanmin(images.noise):.2f} - {np.nanmax(images.noise):.2f})",
     ]
-    for name in (*REAL, _RAW, *(name for name, _ in PAIRS), *ALONE):
-        images = sets[name]
-        greys = [statistics.quantile(images.brightness, statistics.BRIGHTNESS_EDGES, q) for q in (0.1, 0.5, 0.9)]
-        cells = (
-            f"**{name}**" if name in (*REAL, _RAW) else name,
-            str(images.count),
-            f"{images.median_gradient:.2f}",
-            f"{100 * images.flat:.0f}",
-            f"{images.slope:.2f}",
-            " / ".join(f"{density:.1f}" for density in images.corner_density),
-            f"{100 * images.repeatability[0]:.0f} ± {100 * images.repeatability[1]:.0f}",
-            " / ".join(f"{grey:.0f}" for grey in greys),
-            f"{100 * images.brightness[-1]:.1f}",
-            f"{images.median_noise:.2f} ({np.nanmin(images.noise):.2f} - {np.nanmax(images.noise):.2f})",
-        )
-        lines.append(row(*cells))
+
+
+def _compare_all(sets: dict[str, ImageSet]) -> dict[str, Any]:
+    """What the page says of renders beside real sets, and of these beside each other."""
     yardstick = real_yardstick(sets)
-    lines += [
-        "",
-        "Distances: Wasserstein's of histograms, differences and ratios of numbers. **Bold** is beyond the yardstick:",
-        "the median distance between two of the real sets.",
-        "",
-        "| | " + " | ".join(yardstick) + " |",
-        "|---|" + "---:|" * len(yardstick),
-    ]
-    sentences = []
+    rows, sentences = [], {}
     for one, other in (*PAIRS, *combinations(REAL, 2)):
-        difference = compare(sets[one], sets[other])
+        label, difference = f"{one} against {other}", compare(sets[one], sets[other])
         words = [
             f"**{entry.words}**" if one not in REAL and entry.distance > yardstick[key] else entry.words
             for key, entry in difference.items()
         ]
-        lines.append(row(f"{one} against {other}", *words))
+        rows.append([label, *words])
         if one not in REAL:
             found = [f"{key} {words} ({times:.1f} yardsticks)" for key, times, words in gaps(difference, yardstick)]
-            sentences.append(f"- {one} against {other}: {'; '.join(found) if found else 'nothing'}.")
-    return [*lines, "", "The gap that remains, beyond the yardstick, worst first:", "", *sentences, ""]
-
-
-def _odometry_section(real: odometry.Drive, renders: Sequence[odometry.Drive]) -> list[str]:
-    return [
-        "## SIFT odometry",
-        "",
-        f"`sigmaslam track --frontend sift` on `{_KITTI}` and on {len(renders)} rendered drives of",
-        f"{odometry.FRAMES} frames (street, {odometry.WIDTH}x{odometry.HEIGHT}, sensor normal, motion of",
-        f"`{odometry.PROFILE}`). *ratio*: median of the renders over the real drive; *within*: a factor of",
-        f"{odometry.LIMIT:g}. Raw SIFT: mutual nearest neighbours of the",
-        "two eyes, rows within 3 px. *without calibration error*: after a quadratic of the place in the image is taken",
-        "off. *roughness*: distance of a step's estimated length from the mean of its neighbours, median; it needs no",
-        "truth, while the real truth is good for about 1 cm a step and 0.5 % of the way.",
-        "",
-        *odometry.format_odometry(real, renders),
-        "",
-    ]
+            sentences[label] = "; ".join(found) if found else "nothing"
+    return {"yardstick": list(yardstick), "differences": rows, "gaps": sentences}
 
 
 def _lefts(folder: Path, step: int) -> list[np.ndarray]:

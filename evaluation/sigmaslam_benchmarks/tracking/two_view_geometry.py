@@ -1,6 +1,6 @@
 """The page of two-view geometry: ours beside OpenCV's on simulated matches, and what covariances are worth."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,13 +14,14 @@ from sigmaslam.two_view.absolute_orientation import absolute_orientation
 from sigmaslam.two_view.fundamental import FundamentalMatrix, epipolar_lines, estimate_fundamental, fundamental_by_eight
 from sigmaslam.two_view.relative_orientation import estimate_relative_orientation
 from sigmaslam.two_view.triangulation import METHODS, TwoViews, triangulate, triangulate_optimal
-from sigmaslam_benchmarks.tracking.orientation_peers import orientation_table
-from sigmaslam_benchmarks.tracking.page import header, opening, row, write_page
+from sigmaslam_benchmarks.tracking.orientation_peers import hard_cases
+from sigmaslam_benchmarks.tracking.page import fill_page, write_page
 
 SEEDS = range(1000, 1040)
 """Used for nothing else."""
 _K = np.array([[520.0, 0.0, 310.0], [0.0, 500.0, 250.0], [0.0, 0.0, 1.0]])
 _SIGMA, _COUNT, _WRONG = 0.5, 150, 0.2
+_CAMERA, _DEPTHS = RectifiedStereo(500.0, 500.0, 320.0, 240.0, 0.12, 640, 480), np.geomspace(0.5, 20.0, 9)
 _MOTIONS = {"sideways": (-1.0, 0.1, 0.2), "forward": (0.05, -0.02, -1.0)}
 
 
@@ -38,22 +39,24 @@ def write_geometry(
     path: Path, command: str, data: Path | None = None, note: Callable[[str], None] = lambda text: None
 ) -> str:
     """Writes the page and returns it; notes in it are kept. Without the folder `data`, without photographs."""
-    lines = opening(
-        "Two-view geometry",
-        command,
-        f". Simulated matches, seeds {SEEDS[0]} to {SEEDS[-1]}: {_COUNT}",
-    )
-    lines += [
-        f"points 4 to 12 baselines away, {_SIGMA} px of noise in each coordinate, {100 * _WRONG:.0f} % of wrong",
-        "matches in the first two tables, which the estimators are not told. Medians over the seeds, quartiles in",
-        "brackets. NEES is per degree of freedom, and its median.",
-        "",
-    ]
+    tables: dict[str, list[list[str]]] = {}
     for part in (_fundamental, _relative, _absolute, _triangulation, _depth):
-        lines += [*part(), ""]
-        note(f"{part.__name__.strip('_')} done")
-    lines += [*orientation_table(data, note), ""]
-    return write_page(path, "\n".join(lines))
+        name = part.__name__.strip("_")
+        tables[name] = list(part())
+        note(f"{name} done")
+    page = fill_page(
+        "geometry",
+        command,
+        **tables,
+        **hard_cases(data, note),
+        seeds=(SEEDS[0], SEEDS[-1]),
+        count=_COUNT,
+        sigma=_SIGMA,
+        wrong=f"{100 * _WRONG:.0f}",
+        motions=list(_MOTIONS),
+        slope=f"{_depth_slope():.4f}",
+    )
+    return write_page(path, page)
 
 
 def _draw(seed: int, motion: str, wrong: float = _WRONG) -> _Matches:
@@ -69,7 +72,7 @@ def _draw(seed: int, motion: str, wrong: float = _WRONG) -> _Matches:
     return _Matches(views, points, pixels, bad)
 
 
-def _fundamental() -> list[str]:
+def _fundamental() -> Iterator[list[str]]:
     """Distances of exact points from the epipolar lines of F."""
     methods: dict[str, Callable[[_Matches], np.ndarray]] = {
         "ours": lambda m: _ours_f(m).F,
@@ -79,34 +82,14 @@ def _fundamental() -> list[str]:
         "OpenCV LMEDS": lambda m: _opencv_f(m, cv2.FM_LMEDS),
         "8 points, right matches alone": lambda m: fundamental_by_eight(m.pixels[~m.wrong, :2], m.pixels[~m.wrong, 2:]),
     }
-    lines = [
-        "## Fundamental matrix",
-        "",
-        "RMS distance of exact points from their epipolar lines, pixels. NEES of 7 degrees of freedom: 0.91 is right.",
-        "",
-    ]
-    lines += header("method", *_MOTIONS, "NEES, sideways", "NEES, forward", numbers_from=1)
     for name, method in methods.items():
         cells = [_spread(_line_distance(method(m), m) for m in _all(motion)) for motion in _MOTIONS]
         nees = [_nees_f(motion) if name == "ours" else "" for motion in _MOTIONS]
-        lines.append(row(name, *cells, *nees))
-    return lines
+        yield [name, *cells, *nees]
 
 
-def _relative() -> list[str]:
+def _relative() -> Iterator[list[str]]:
     """Errors of rotation and direction."""
-    lines = [
-        "## Relative orientation",
-        "",
-        "Errors of rotation and of direction, degrees. NEES of 5 degrees of freedom: 0.87 is right.",
-        "",
-    ]
-    lines += header(
-        "method",
-        *(f"{motion}: {what}" for motion in _MOTIONS for what in ("rotation", "direction")),
-        "NEES",
-        numbers_from=1,
-    )
     methods = {"ours": None, "OpenCV USAC_ACCURATE": cv2.USAC_ACCURATE, "OpenCV RANSAC (5 points)": cv2.RANSAC}
     for name, flag in methods.items():
         cells, nees = [], []
@@ -121,19 +104,11 @@ def _relative() -> list[str]:
                 if covariance is not None:
                     nees.append(_nees(np.r_[true - direction, turn], covariance, 5))
             cells += [_spread(np.array(errors)[:, k]) for k in (0, 1)]
-        lines.append(row(name, *cells, f"{np.median(nees):.2f}" if nees else ""))
-    return lines
+        yield [name, *cells, f"{np.median(nees):.2f}" if nees else ""]
 
 
-def _absolute() -> list[str]:
+def _absolute() -> Iterator[list[str]]:
     """Errors of a rigid motion from control points of unlike weight."""
-    lines = [
-        "## Absolute orientation",
-        "",
-        "From 25 control points whose sigmas go from 0.02 to 0.2 m: error of the rotation, degrees.",
-        "",
-    ]
-    lines += header("method", "rigid", "similarity", "NEES, rigid", "NEES, similarity", numbers_from=1)
     ours: dict[bool, list[tuple[float, float]]] = {False: [], True: []}
     plain: dict[bool, list[float]] = {False: [], True: []}
     for seed in SEEDS:
@@ -154,20 +129,12 @@ def _absolute() -> list[str]:
             their = affine[:, :3] / np.cbrt(np.linalg.det(affine[:, :3]))
             plain[similar].append(float(np.degrees(np.linalg.norm(rotation_log(R @ their.T)))))
     found_nees = [f"{np.median([nees for _, nees in ours[each]]):.2f}" for each in ours]
-    lines.append(row("ours", *(_spread([angle for angle, _ in ours[each]]) for each in ours), *found_nees))
-    lines.append(row("OpenCV estimateAffine3D (no weights)", *(_spread(plain[each]) for each in ours), "", ""))
-    return lines
+    yield ["ours", *(_spread([angle for angle, _ in ours[each]]) for each in ours), *found_nees]
+    yield ["OpenCV estimateAffine3D (no weights)", *(_spread(plain[each]) for each in ours), "", ""]
 
 
-def _triangulation() -> list[str]:
+def _triangulation() -> Iterator[list[str]]:
     """Errors of points from right matches and the true pose."""
-    lines = [
-        "## Triangulation",
-        "",
-        "RMS error of points over their distance, per cent, right matches and the true pose.",
-        "",
-    ]
-    lines += header("method", *_MOTIONS, *(f"NEES, {motion}" for motion in _MOTIONS), numbers_from=1)
     noise = _SIGMA**2 * np.eye(4)
     for name in (*(method for method in METHODS if method != "parallel"), "Hartley and Sturm (OpenCV)"):
         cells, nees = [], []
@@ -190,47 +157,35 @@ def _triangulation() -> list[str]:
                 )
             cells.append(_spread(errors))
             nees.append("" if not np.isfinite(squared).all() else f"{np.mean(squared):.2f}")
-        lines.append(row(name, *cells, *nees))
-    lines += [
-        "",
-        "NEES here is the median over points; 0.79 is right. Points with less than 4 px of parallax are left out.",
-    ]
-    return lines
+        yield [name, *cells, *nees]
 
 
-def _depth() -> list[str]:
-    """Slope of the error of depth, first and second order beside Monte Carlo."""
-    camera = RectifiedStereo(500.0, 500.0, 320.0, 240.0, 0.12, 640, 480)
-    depth = np.geomspace(0.5, 20.0, 9)
-    lines = ["## Depth of a stereo point", ""]
-    lines += [
-        "Parallel stereo, f = 500 px, baseline 0.12 m, 0.2 px of noise: sigma of depth by (9.35), (9.36) and by",
-        "200,000 draws; bias of the depth to second order.",
-        "",
-    ]
-    lines += header(
-        "depth m",
-        "(9.36) mm",
-        "first order mm",
-        "second order mm",
-        "drawn mm",
-        "bias, second order mm",
-        "bias, drawn mm",
-        numbers_from=0,
-    )
-    found = []
-    for number, z in enumerate(depth):
-        uvd, sigma = np.array([400.0, 300.0, camera.focal_baseline / z]), np.array([0.2, 0.2, 0.2])
-        draws = camera.triangulate(uvd + sigma * np.random.default_rng(1000 + number).standard_normal((200_000, 3)))
+def _depth() -> Iterator[list[str]]:
+    """Error of the depth of a stereo point, first and second order beside Monte Carlo."""
+    for number, z in enumerate(_DEPTHS):
+        uvd, sigma = _stereo_point(z)
+        draws = _CAMERA.triangulate(uvd + sigma * np.random.default_rng(1000 + number).standard_normal((200_000, 3)))
         (mean, first), (moved, second) = (
-            propagate(camera.triangulate, uvd, np.diag(sigma**2), order) for order in (1, 2)
+            propagate(_CAMERA.triangulate, uvd, np.diag(sigma**2), order) for order in (1, 2)
         )
-        found.append(np.sqrt(first[2, 2]))
-        figures = (z * z / camera.focal_baseline * 0.2, found[-1], np.sqrt(second[2, 2]), draws[:, 2].std())
+        by_rule = z * z / _CAMERA.focal_baseline * sigma[2]
+        figures = (by_rule, np.sqrt(first[2, 2]), np.sqrt(second[2, 2]), draws[:, 2].std())
         bias = ((moved - mean)[2], draws[:, 2].mean() - mean[2])
-        lines.append(row(f"{z:.2f}", *(f"{1e3 * each:.2f}" for each in (*figures, *bias))))
-    slope = np.polyfit(np.log(depth), np.log(found), 1)[0]
-    return [*lines, "", f"Slope of log sigma_Z against log Z: {slope:.4f} (2 by 9.36)."]
+        yield [f"{z:.2f}", *(f"{1e3 * each:.2f}" for each in (*figures, *bias))]
+
+
+def _depth_slope() -> float:
+    """Of log sigma_Z against log Z, to first order."""
+    sigmas = []
+    for z in _DEPTHS:
+        uvd, sigma = _stereo_point(z)
+        sigmas.append(np.sqrt(propagate(_CAMERA.triangulate, uvd, np.diag(sigma**2), 1)[1][2, 2]))
+    return float(np.polyfit(np.log(_DEPTHS), np.log(sigmas), 1)[0])
+
+
+def _stereo_point(depth: float) -> tuple[np.ndarray, np.ndarray]:
+    """(u, v, disparity) of a point at a depth, metres, and their sigmas, pixels."""
+    return np.array([400.0, 300.0, _CAMERA.focal_baseline / depth]), np.array([0.2, 0.2, 0.2])
 
 
 def _all(motion: str) -> Iterable[_Matches]:
