@@ -67,7 +67,15 @@ _UNNAMED = ("data", "renders", "ray", "workers")
 class Benchmark:
     """A benchmark; its module's function `write_<name>` writes the page and returns it.
 
-    Of `path`, `figure` beside it, `command`, `note` and `workers` the function is given what it takes, and the options.
+    The function is given what it takes of these, and the options:
+
+    - path, figure: Markdown page, whose part below a line `<!-- notes -->` is kept, and a PNG beside it.
+    - command: what the page says it was made by.
+    - data: folder of the real data sets; None where it may be missing: renders alone.
+    - runs, renders: folder for renders and results; what is there is used again, results if they come from the same
+      recipe and code. Without `renders`: a temporary one.
+    - workers: processes.
+    - note: is told of progress.
 
     Attributes:
         module: of `sigmaslam_benchmarks`.

@@ -38,15 +38,9 @@ def write_live(
     """Tracks what is missing, writes the page, at first of what is there, and returns it; notes in it are kept.
 
     Args:
-        path: Markdown page.
-        data: folder of the real data sets; None: renders alone.
-        runs: folder for renders and results; a result is used again when it comes from the same code.
-        command: what the page says it was made by.
         first_seed, seeds: of the renders; the faults of real recordings have the first one.
         frames: of each recording.
         cases, sequences, methods: names of `FAULTS`, `SEQUENCES` and `METHODS`; all cases and sequences unless given.
-        workers: processes; each takes a recording at a time.
-        note: is told of progress.
     Raises:
         InputError: a name is unknown, or the data are not there.
         OutputError: a recording failed; the page holds what there is.

@@ -60,12 +60,9 @@ def write_consistency(
 ) -> str:
     """Renders and tracks what is missing, writes the page and returns it; notes in it are kept.
 
-    A result is used again when it comes from the same recipe, configuration and code.
-
     Args:
-        path, runs, workers, ray, note: of `write_trials`, and what it raises.
+        ray: of `write_trials`, and what it raises.
         seeds: sequences of each scale.
-        command: what the page says it was made by.
     """
 
     def form(done: list[SequenceTrials], missing: list[str]) -> str:

@@ -44,12 +44,6 @@ def write_denoising(
 ) -> str:
     """Writes the page and returns it; notes in it are kept. A picture goes beside it.
 
-    Args:
-        path: Markdown page.
-        data: folder of the real data sets.
-        runs: folder of the renders; those that are there are used again.
-        command: that makes the page.
-        note: tells of progress.
     Raises:
         InputError: a data set is missing.
     """

@@ -118,11 +118,7 @@ def write_endurance(
     Stopped by Ctrl-C, what was measured until then is written.
 
     Args:
-        path: Markdown page; what is below a line `<!-- notes -->` in it is kept.
         frames: to track.
-        command: what the page says it was made by.
-        renders: folder for the lap, which is used again; a temporary one unless given.
-        note: is told of progress.
         recipe: of the lap.
         block: frames that are told of together.
     """

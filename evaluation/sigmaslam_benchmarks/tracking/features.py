@@ -63,14 +63,10 @@ def write_features(
     Notes in the page are kept.
 
     Args:
-        path: Markdown page.
-        data: folder of the real data sets.
         weights: ours, .onnx, .safetensors or the folder of an export; the shipped graph if there are none.
         peers: .onnx graphs of other people.
-        command: what the page says it was made by.
         sets: to be scored.
         rounds: of timing.
-        note: is told of progress.
     Raises:
         InputError: a file or set cannot be used.
     """

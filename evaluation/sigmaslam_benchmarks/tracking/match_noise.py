@@ -49,13 +49,6 @@ def write_noise(
 ) -> str:
     """Renders what is missing, tunes the constant, compares, writes the page and returns it; notes in it are kept.
 
-    Args:
-        path: Markdown page.
-        data: folder of the real data sets.
-        runs: folder for the renders, which are used again.
-        workers: processes that render.
-        command: what the page says it was made by.
-        note: is told of progress.
     Raises:
         InputError: a sequence is missing.
     """

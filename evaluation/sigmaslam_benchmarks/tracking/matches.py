@@ -42,11 +42,6 @@ _FORWARD_DOMAINS = ("street", "street", "drone", "room")
 def write_matches(path: Path, data: Path, command: str, note: Callable[[str], None] = lambda text: None) -> str:
     """Measures everything, writes the page and returns it; notes in it are kept.
 
-    Args:
-        path: Markdown page.
-        data: folder of the real data sets.
-        command: what the page says it was made by.
-        note: is told of progress.
     Raises:
         InputError: a set is missing.
     """

@@ -50,14 +50,10 @@ def write_reconstruction(
 ) -> str:
     """Renders, tracks and reconstructs what is missing, writes the page and returns it; notes in it are kept.
 
-    A result is used again when it comes from the same recipe, configuration and code.
-
     Args:
-        path, runs, workers, ray, note: of `write_trials`, and what it raises.
+        ray: of `write_trials`, and what it raises.
         seeds: sequences a world.
-        command: what the page says it was made by.
         real: judge disparities on real truth instead, which takes a minute.
-        data: folder of the real data sets.
     """
     if real:
         if data is None:

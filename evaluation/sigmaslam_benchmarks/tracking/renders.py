@@ -72,11 +72,6 @@ def write_renders(
     """Measures everything, writes the page and its figure and returns the page.
 
     Args:
-        path: Markdown page; what is below a line `<!-- notes -->` in it is kept.
-        figure: PNG, beside the page.
-        data: folder of the real data sets.
-        command: that makes the page again.
-        note: told what is being done.
         scratch: folder whose rendered drives are used and kept; none: a temporary one.
     Raises:
         InputError: `data` does not hold the real sets.

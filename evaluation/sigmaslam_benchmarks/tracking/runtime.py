@@ -82,15 +82,10 @@ def write_runtime(
     When it is stopped, what was measured until then is written.
 
     Args:
-        path: Markdown page.
-        data: folder with the real sequences, which are left out without it.
-        command: what the page says it was made by.
         methods: of `METHODS`.
         sequences: of `SEQUENCES`, or "demo"; image size and landmarks are varied on the first that is there.
         rounds: in which every method is run once.
         frames: of each sequence, from its start.
-        renders: folder for the renders, which are used again; a temporary one unless given.
-        note: is told of progress.
     Raises:
         InputError: a name is unknown, or there are too few frames.
     """

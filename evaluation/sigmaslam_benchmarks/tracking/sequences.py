@@ -110,12 +110,7 @@ def write_sequences(
     When it is stopped, what was found until then is written.
 
     Args:
-        path: Markdown page.
-        data: folder with the real sequences, or None for the rendered ones alone.
-        command: what the page says it was made by.
         methods, sequences: of `METHODS` and `SEQUENCES`, all unless given.
-        renders: folder for the renders, which are used again; a temporary one unless given.
-        note: is told of progress.
     Raises:
         InputError: a name is unknown, or `data` does not hold the sequences.
     """

@@ -48,12 +48,9 @@ def write_shake(
 ) -> str:
     """Renders and tracks what is missing, writes the page and returns it; notes in it are kept.
 
-    A result is used again when it comes from the same recipe, configuration and code.
-
     Args:
-        path, runs, workers, ray, note: of `write_trials`, and what it raises.
+        ray: of `write_trials`, and what it raises.
         seeds: sequences, of the worlds in turn; every second one has movers.
-        command: what the page says it was made by.
     """
 
     def form(done: list[SequenceTrials], missing: list[str]) -> str:
