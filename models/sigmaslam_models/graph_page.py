@@ -27,7 +27,6 @@ def graph_page(folder: Path, command: str) -> str:
 
     Args:
         folder: with .onnx files; those of which nothing is known here come last.
-        command: that makes the page.
     Raises:
         InputError: there are none, or one cannot be read.
     """

@@ -67,7 +67,6 @@ def triangulate_midpoint(views: TwoViews, pixels: np.ndarray) -> np.ndarray:
     """Points (..., 3) in the middle of the shortest line between the two rays.
 
     Args:
-        views: the cameras.
         pixels: (..., 4) (u0, v0, u1, v1).
     """
     rays0, rays1 = _rays(views, pixels)
@@ -86,7 +85,6 @@ def triangulate_linear(views: TwoViews, pixels: np.ndarray) -> np.ndarray:
     """Points (..., 3) that minimise the algebraic error of homogeneous coordinates (OpenCV's triangulatePoints).
 
     Args:
-        views: the cameras.
         pixels: (..., 4) (u0, v0, u1, v1).
     """
     rays0, rays1 = _rays(views, pixels)
@@ -106,7 +104,6 @@ def triangulate_optimal(views: TwoViews, pixels: np.ndarray, covariance: np.ndar
     coordinates it is what Hartley and Sturm (1997) find.
 
     Args:
-        views: the cameras.
         pixels: (..., 4) (u0, v0, u1, v1).
         covariance: (..., 4, 4) of them; None: equal and independent.
     Returns:
@@ -143,7 +140,6 @@ def triangulate(
     """Points in camera 0 with their covariance, to first order (9.35).
 
     Args:
-        views: the cameras.
         pixels: (..., 4) (u0, v0, u1, v1).
         covariance: (..., 4, 4) of them.
         method: of `METHODS`.

@@ -111,7 +111,6 @@ def wander(rng: np.random.Generator, count: int, period: float, first: float, wa
     """Biases (count, 3) of a random walk.
 
     Args:
-        rng: source of all randomness.
         count: of samples, `period` seconds apart.
         period: seconds.
         first: standard deviation of the first one.
@@ -136,7 +135,6 @@ def simulate_inertial(
         path: of the left camera, from 0 on; before it samples are those of its start.
         duration: seconds from the first image, at 0, to the last one.
         rate: samples a second.
-        rng: source of all randomness.
         T_truth_world: (4, 4) takes the world to the frame of the true poses.
         grade: of the sensor.
     """

@@ -48,7 +48,6 @@ def write_sequence(
         recipe: what to render.
         truth: 'dense' for depth, instance ids, flow and occlusion of every pixel beside the landmarks; 'sparse' for
             the landmarks alone.
-        workers: processes.
         device: where frames are drawn.
         ray: address of a Ray cluster that renders instead, as `run_jobs` takes it; all its machines must share `out`.
         done: called with the number of frames that are there.

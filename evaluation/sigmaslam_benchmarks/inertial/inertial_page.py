@@ -24,7 +24,6 @@ class InertialPage:
     """What the page is made of.
 
     Attributes:
-        command: that makes the page.
         seconds: of darkness.
         runs: results by recording and case.
         faults: what was said of faulty and good tables, with the recordings.

@@ -20,7 +20,6 @@ class LivePage:
     """What the page is made of.
 
     Attributes:
-        command: that makes the page.
         cases, methods: in the order of the page.
         found: a judgement, or why there is none, by recording, method and case; what is missing is left out.
         frames: of each recording that were asked for.

@@ -89,8 +89,6 @@ def judge_recordings(
         path: of the page, for messages.
         jobs: of the recordings.
         form: writes the page of what there is.
-        workers: processes.
-        note: is told of progress.
     Raises:
         OutputError: a recording failed; the page holds what there is.
     """

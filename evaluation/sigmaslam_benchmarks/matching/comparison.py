@@ -26,7 +26,6 @@ def compare(
         names: as `load_extractor` takes them.
         sets: of `sets.ALL`.
         data: folder of the real data sets.
-        note: is told of progress.
     Raises:
         InputError: a name, a set or a file cannot be used; that sets are there is checked before anything is scored.
     """

@@ -56,8 +56,6 @@ def judge_movers(
     """Looks for such pairs among `tried` rendered ones and matches them.
 
     Args:
-        detect: image to features.
-        judge: of the matches.
         seed: of the pairs.
         tried: how many are rendered.
     """

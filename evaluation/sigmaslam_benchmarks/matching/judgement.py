@@ -60,8 +60,6 @@ def judge_homographies(pairs: Sequence[ImagePair], detect: Detect, judge: Confid
 
     Args:
         pairs: with homographies.
-        detect: image to features.
-        judge: of the matches.
     """
     ranked: list[tuple[float, ...]] = []
     pooled: list[tuple[np.ndarray, ...]] = []
@@ -150,8 +148,6 @@ def judge_rows(pairs: Sequence[ImagePair], detect: Detect, judge: ConfidenceEsti
 
     Args:
         pairs: rectified.
-        detect: image to features.
-        judge: of the matches.
     """
     rows = []
     for pair in pairs:

@@ -46,8 +46,6 @@ def compare_starts(
 
     Args:
         pairs: others are left out.
-        detect: image to features.
-        judge: of the matches.
     """
     measured: dict[str, list[tuple[float, float, float]]] = {}
     for pair in pairs:

@@ -113,7 +113,6 @@ def format_page(
         offset: of all disparities, pixels.
         frames: of a sequence.
         seeds: the first one, and how many of a scale were asked for.
-        command: that makes the page.
         missing: names of sequences that failed.
     """
     first, count = seeds

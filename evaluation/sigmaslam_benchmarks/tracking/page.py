@@ -32,7 +32,6 @@ def fill_page(template: str, command: str, **values: Any) -> str:
 
     Args:
         template: name in `sigmaslam_benchmarks/templates`, without .md.
-        command: that makes the page.
         values: all others that the template names; `machine`, if it is described otherwise than by `machine`.
     """
     environment = jinja2.Environment(

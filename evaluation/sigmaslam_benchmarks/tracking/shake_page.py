@@ -88,7 +88,6 @@ def format_page(
         results: of the sequences that there are.
         frames: of a sequence.
         seeds: the first one, and how many were asked for.
-        command: that makes the page.
         missing: names of sequences that failed.
     """
     method, ours = next(iter(results.items()))

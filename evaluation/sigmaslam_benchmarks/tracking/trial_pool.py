@@ -91,7 +91,6 @@ def write_trials(
         recipes: of the sequences, in the order in which they are begun.
         form: the page, of the sequences that are complete and the names of those that failed.
         workers, ray: as `run_jobs` takes them.
-        note: is told of progress.
     Raises:
         OutputError: a sequence failed, of which the page says that it is missing; or all did, and there is no page.
     """

@@ -133,9 +133,6 @@ def random_sensor(rng: np.random.Generator) -> Sensor:
     noise, hold for the encoded image, whatever the gamma (e^-0.8 to e^0.6, so that 1/2.2 is among them): the
     linear gain, black level and noise follow from them. Shading by lamps belongs to the scene, and the direction of
     motion blur to `expose`'s flow. Depth of field is off.
-
-    Args:
-        rng: source of all randomness.
     """
     gamma = float(np.exp(rng.uniform(-0.8, 0.6)))
     contrast = float(np.exp(rng.uniform(-1.2, 0.1)))

@@ -202,7 +202,6 @@ def with_stops(path: Path, rng: np.random.Generator, stops: int, ease: float = 1
 
     Args:
         path: without stops.
-        rng: source of all randomness.
         stops: how many.
         ease: seconds over which the speed falls to zero and over which it rises again.
     Raises:
@@ -238,7 +237,6 @@ def noise(rng: np.random.Generator, t: np.ndarray, channels: int, low: float, hi
     """Smooth noise of unit variance, never above `LARGEST_NOISE`: sums of `WAVES` sinusoids of equal amplitude.
 
     Args:
-        rng: source of all randomness.
         t: (N,) seconds (or metres, or any parameter).
         channels: how many, independent.
         low, high: band of the frequencies, which are uniform in their logarithm, in cycles per unit of t.

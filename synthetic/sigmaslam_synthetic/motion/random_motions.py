@@ -79,7 +79,6 @@ def hand_held(rng: np.random.Generator, duration: float, box: FreeSpace) -> Path
     tremor of the hand (0.15 degrees, 0.3 mm rms).
 
     Args:
-        rng: source of all randomness.
         duration: seconds.
         box: that the camera stays in.
     """
@@ -113,7 +112,6 @@ def drone(rng: np.random.Generator, duration: float, box: FreeSpace) -> Path:
     """A camera that is fixed to a drone: up to 2-3 m/s and 4 m/s^2, banks with its acceleration, turns at 45-90 deg/s.
 
     Args:
-        rng: source of all randomness.
         duration: seconds.
         box: that the camera stays in; in a small one the drone is slower, as its acceleration is bounded.
     """
@@ -155,7 +153,6 @@ def drive(rng: np.random.Generator, duration: float) -> Path:
     1 s, mostly below 0.5 Hz; slope 1.1-1.6 degrees rms.
 
     Args:
-        rng: source of all randomness.
         duration: seconds.
     """
     ease = rng.uniform(6.0, 7.5)
@@ -239,7 +236,6 @@ def insertion(rng: np.random.Generator, duration: float, centreline: np.ndarray,
     """An endoscope in a tube: 5-20 mm/s in, now and then back; steers, rolls, trembles and is moved by breathing.
 
     Args:
-        rng: source of all randomness.
         duration: seconds; where the end of the tube is reached, the way goes back and forth.
         centreline: (K, 3) points on the tube's axis from its mouth inwards, metres.
         radius: of the tube, metres; the camera stays within 0.6 of it.
@@ -279,7 +275,6 @@ def inspect(rng: np.random.Generator, duration: float, distance: float, extent: 
     """A camera that hovers over the surface z = 0 and looks down at it, slanted to 25 degrees, with slow roll.
 
     Args:
-        rng: source of all randomness.
         duration: seconds.
         distance: mean height above the surface, metres; it varies by a quarter.
         extent: half of the side of the square, about the origin, above which it stays, metres.
@@ -302,7 +297,6 @@ def tool(rng: np.random.Generator, duration: float, centre: tuple[float, float, 
     """A rigid instrument that is moved about, with rests of 1-3 s; T_world_tool is a turn of 10-50 degrees or so.
 
     Args:
-        rng: source of all randomness.
         duration: seconds.
         centre: of its motion, metres.
         reach: it stays within this distance of the centre, metres.
@@ -322,7 +316,6 @@ def pure_rotation(rng: np.random.Generator, duration: float, position: tuple[flo
     """A camera that turns at one place, up to 40 deg/s.
 
     Args:
-        rng: source of all randomness.
         duration: seconds.
         position: (x, y, z) metres.
     """
@@ -337,7 +330,6 @@ def closed_loop(rng: np.random.Generator, duration: float, box: FreeSpace) -> Pa
     """A camera that looks ahead on a round course and ends at its start, with the same pose and velocity.
 
     Args:
-        rng: source of all randomness.
         duration: seconds of a round; with the box it makes the speed, which varies by a quarter.
         box: that the course fills.
     """
@@ -376,7 +368,6 @@ def rolling(rng: np.random.Generator, duration: float, box: FreeSpace) -> Path:
     """A level camera on a robot with wheels, which looks where it drives: round courses at 0.3-0.5 m/s.
 
     Args:
-        rng: source of all randomness.
         duration: seconds.
         box: that the course fills, at the height of its centre.
     """

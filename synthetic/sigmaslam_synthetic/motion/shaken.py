@@ -29,7 +29,6 @@ def shaken(rng: np.random.Generator, slow: Path, reach: float) -> Path:
     and its past does not tell when or how far. The roll swings likewise, at less, and the position shakes.
 
     Args:
-        rng: source of all randomness.
         slow: where the camera goes but for the shaking; from 0 on.
         reach: metres that the position leaves the slow path along each axis, at most; in bands of 1 to 2.5 Hz.
     """
@@ -49,7 +48,6 @@ def _swings(
     """Angles (N,) at times t (N,), radians, of a C2 swinging to and fro.
 
     Args:
-        rng: source of all randomness.
         t: seconds.
         ends: range of the angles where a swing ends, to either side, degrees.
         peaks: range of the peaks of the rate, degrees a second; kept to about a tenth.

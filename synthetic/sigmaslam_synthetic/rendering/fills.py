@@ -44,7 +44,6 @@ def noise(shape: tuple[int, int], rng: np.random.Generator, persistence: float |
 
     Args:
         shape: (height, width).
-        rng: source of all randomness.
         persistence: amplitude of an octave over that of the next coarser one; 1 is about the 1/f amplitude of
             natural images, less is smoother. Random by default.
     """
@@ -156,7 +155,6 @@ def strokes(
 
     Args:
         shape: (height, width).
-        rng: source of all randomness.
         length: typical length of a stroke; random by default.
         spread: standard deviation of their directions, radians; random by default.
         most: strokes at most, which is where their time goes.

@@ -46,7 +46,6 @@ class Hall:
     """Fills a hall around a flight.
 
     Args:
-        rng: source of all randomness.
         wish: whose textures are used.
         size: metres along x, y, z; the floor's middle is the origin.
         path: of the camera.
@@ -55,7 +54,6 @@ class Hall:
 
     Attributes:
         bodies: what was built so far.
-        palette: of the materials.
     """
 
     def __init__(

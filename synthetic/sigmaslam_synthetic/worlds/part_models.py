@@ -146,7 +146,6 @@ def follow(
     They turn about z only, and stay when the camera bobs.
 
     Args:
-        rng: source of all randomness.
         camera: its path.
         duration: seconds.
         share: of the image that they cover together, on average.

@@ -51,14 +51,11 @@ class _Site:
     """What lies about so far.
 
     Args:
-        rng: source of all randomness.
-        palette: of the materials.
         path: of the camera.
         clearance: metres around the path that stay free.
 
     Attributes:
         bodies: what was built so far.
-        palette: of the materials.
     """
 
     def __init__(self, rng: np.random.Generator, palette: Palette, path: Path, clearance: float) -> None:

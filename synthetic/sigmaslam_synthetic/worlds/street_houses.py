@@ -14,8 +14,6 @@ def house(rng: np.random.Generator, palette: Palette, wide: float, deep: float, 
     """A house with what stands out of its front: door, balconies, bays, pipes, awnings, signs.
 
     Args:
-        rng: source of all randomness.
-        palette: of the materials.
         wide, deep, high: metres.
         detail: share of these things that it has, 0 to 1.
     """

@@ -36,9 +36,7 @@ class Street:
     """Lays out one street.
 
     Args:
-        rng: source of all randomness.
         road: along which.
-        palette: of the materials.
 
     Attributes:
         bodies: what was built so far.

@@ -25,7 +25,6 @@ class Road:
     """A lane along a drive, the ground around it, and what stands on it.
 
     Args:
-        rng: source of all randomness.
         way: (N, 3) places of the camera, in order, metres; those that stand still may repeat.
         closed: whether it ends at its start.
         opposite: distance to the left of the middle of the oncoming lane, 0 if there is none, metres.

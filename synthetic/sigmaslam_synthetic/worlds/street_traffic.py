@@ -20,11 +20,9 @@ def add_traffic(rng: np.random.Generator, wish: Wish, path: Path, road: Road, pa
     One drives ahead and, for a large share, one in the other lane; for a small share others come towards the camera.
 
     Args:
-        rng: source of all randomness.
         wish: what is asked for.
         path: of the camera.
         road: they drive on.
-        palette: of the materials.
     """
     if wish.movers <= 0:
         return []

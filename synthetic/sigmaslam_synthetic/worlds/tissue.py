@@ -32,7 +32,6 @@ def wet(rng: np.random.Generator, wish: Wish, tiles: tuple[float, float]) -> Mat
     """Tissue with vessels that shines where it is wet.
 
     Args:
-        rng: source of all randomness.
         wish: whose textures are taken.
         tiles: sides of the two textures, metres; the first one makes the surface uneven.
     """
@@ -62,7 +61,6 @@ def lump(
     """An ellipsoid turned at random about z; its poles, where the texture is squeezed, lie to the sides.
 
     Args:
-        rng: source of all randomness.
         radii: along, across and up, metres.
         place: of its centre, metres.
         material: index into `Scene.materials`.
@@ -79,7 +77,6 @@ def moved(
     """A path as `wish.motion` wants it.
 
     Args:
-        rng: source of all randomness.
         wish: gives motion and duration.
         make: the domain's own way of moving for a duration, seconds.
         turn: rms of the turning on the spot about the body's x, y, z, radians.
@@ -150,7 +147,6 @@ def reaching(
     """An instrument that comes through a port and works about a target; z points along it, the origin is at its tip.
 
     Args:
-        rng: source of all randomness.
         seconds: duration.
         port: (3,) where it comes from, metres.
         target: (3,) about which its tip moves, metres.
@@ -184,7 +180,6 @@ def instrument(
     Its tip is near the origin of the path's frame and points along z; the shaft reaches back to -z.
 
     Args:
-        rng: source of all randomness.
         wish: whose textures are taken.
         path: T_world_instrument.
         camera: that sees it.

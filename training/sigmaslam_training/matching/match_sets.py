@@ -177,7 +177,6 @@ def write_records(folder: Path, seed: int, pairs: int, workers: int) -> Iterator
         folder: of the files, NNNNN.npz.
         seed: of `MatchSets`.
         pairs: how many are wanted.
-        workers: processes.
     """
     make_folder(folder)
     missing = [index for index in range(pairs) if not record_path(folder, index).is_file()]
