@@ -112,10 +112,14 @@ class _PeerProblem:
     measure: Model
     measure_inputs: Array
 
+    @property
+    def arrays(self) -> tuple[Array, Array, Array, Array, Array]:
+        """Mean, covariance, measurement, and the inputs of transition and measurement."""
+        return self.mean, self.covariance, self.measurement, self.transition_inputs, self.measure_inputs
+
     def filters(self) -> list[tuple[Array, Array, Array, Array, Array]]:
-        """Mean, covariance, measurement, and the inputs of transition and measurement, of each filter."""
-        arrays = (self.mean, self.covariance, self.measurement, self.transition_inputs, self.measure_inputs)
-        return list(zip(*arrays, strict=True)) if self.batched else [arrays]
+        """The arrays of each filter."""
+        return list(zip(*self.arrays, strict=True)) if self.batched else [self.arrays]
 
     def collect(self, means: list[Array], covariances: list[Array]) -> tuple[Array, Array]:
         """Results of `filters`, in the shapes of the work."""
@@ -392,16 +396,7 @@ def dynamax(work: Work, dtype: str = "float64") -> Step:
             )
             return mean, covariance
 
-        arguments = [
-            jnp.asarray(array, dtype)
-            for array in (
-                problem.mean,
-                problem.covariance,
-                problem.measurement,
-                problem.transition_inputs,
-                problem.measure_inputs,
-            )
-        ]
+        arguments = [jnp.asarray(array, dtype) for array in problem.arrays]
         # Compiled here, for a jitted function would look up the precision again when it is called.
         compiled = jax.jit(jax.vmap(one) if problem.batched else one).lower(*arguments).compile()
 
@@ -466,16 +461,8 @@ def pypose(work: Work, dtype: str = "float64", repaired: bool = True) -> Step:
 
     system = System(torch.tensor(problem.measure_inputs, dtype=real))
     unscented = RepairedUKF(system, msqrt=columns) if repaired else UKF(system)
-    mean, measurement, inputs, covariance, Q, R = (
-        torch.tensor(array, dtype=real)
-        for array in (
-            problem.mean,
-            problem.measurement,
-            problem.transition_inputs,
-            problem.covariance,
-            problem.process_noise,
-            problem.measurement_noise,
-        )
+    mean, covariance, measurement, inputs, _, Q, R = (
+        torch.tensor(array, dtype=real) for array in (*problem.arrays, problem.process_noise, problem.measurement_noise)
     )
 
     def step() -> tuple[NDArray[Any], NDArray[Any]]:
@@ -518,29 +505,41 @@ def numpy_batched(work: Work, dtype: str = "float64") -> Step:
     if isinstance(work, LinearWork):
         return _numpy_batched_linear(work)
     problem = _problem(work)
-    transition_inputs, measure_inputs = problem.transition_inputs[:, None], problem.measure_inputs[:, None]
+    return partial(_step_batch, np, problem, *problem.arrays, problem.process_noise, problem.measurement_noise)
 
-    def sigma_points(mean: Array, covariance: Array) -> Array:
-        offsets = math.sqrt(mean.shape[-1]) * np.linalg.cholesky(covariance).mT
-        return np.concatenate([mean[:, None] + offsets, mean[:, None] - offsets], axis=-2)
 
-    def step() -> tuple[Array, Array]:
-        points = problem.transition(np, sigma_points(problem.mean, problem.covariance), transition_inputs)
-        count = points.shape[-2]
-        predicted = points.mean(axis=-2)
-        deviations = points - predicted[:, None]
-        P = deviations.mT @ deviations / count + problem.process_noise
+def _step_batch(
+    xp: Any,
+    problem: _PeerProblem,
+    mean: Any,
+    covariance: Any,
+    measurement: Any,
+    transition_inputs: Any,
+    measure_inputs: Any,
+    Q: Any,
+    R: Any,
+) -> tuple[Any, Any]:
+    """The batched filter that a person writes, batch first and without unrolling; xp is numpy or torch."""
 
-        points = sigma_points(predicted, P)
-        measured = problem.measure(np, points, measure_inputs)
-        expected = measured.mean(axis=-2)
-        X, Z = points - predicted[:, None], measured - expected[:, None]
-        S = Z.mT @ Z / count + problem.measurement_noise
-        gain = np.linalg.solve(S, Z.mT @ X / count).mT
-        posterior = predicted + (gain @ (problem.measurement - expected)[..., None])[..., 0]
-        return posterior, P - gain @ S @ gain.mT
+    def sigma_points(mean: Any, covariance: Any) -> Any:
+        offsets = math.sqrt(mean.shape[-1]) * xp.linalg.cholesky(covariance).mT
+        return xp.concatenate([mean[..., None, :] + offsets, mean[..., None, :] - offsets], -2)
 
-    return step
+    points = problem.transition(xp, sigma_points(mean, covariance), transition_inputs[..., None, :])
+    count = points.shape[-2]
+    predicted = points.mean(-2)
+    deviations = points - predicted[..., None, :]
+    P = deviations.mT @ deviations / count + Q
+
+    points = sigma_points(predicted, P)
+    measured = problem.measure(xp, points, measure_inputs[..., None, :])
+    expected = measured.mean(-2)
+    X, Z = points - predicted[..., None, :], measured - expected[..., None, :]
+    S = Z.mT @ Z / count + R
+    # Quicker than torch.cholesky_solve, by five times for S of 2 x 2.
+    gain = xp.linalg.solve(S, Z.mT @ X / count).mT
+    posterior = predicted + (gain @ (measurement - expected)[..., None])[..., 0]
+    return posterior, P - gain @ S @ gain.mT
 
 
 def _numpy_batched_linear(work: LinearWork) -> Step:
@@ -565,45 +564,14 @@ def torch_linalg(work: Work, dtype: str = "float64") -> Step:
     import torch
 
     problem = _problem(work)
-    mean, covariance, measurement, Q, R = (
+    tensors = [
         torch.tensor(array, dtype=getattr(torch, dtype))
-        for array in (
-            problem.mean,
-            problem.covariance,
-            problem.measurement,
-            problem.process_noise,
-            problem.measurement_noise,
-        )
-    )
-    transition_inputs, measure_inputs = (
-        torch.tensor(array, dtype=getattr(torch, dtype)).unsqueeze(-2)
-        for array in (problem.transition_inputs, problem.measure_inputs)
-    )
-
-    def sigma_points(mean: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
-        offsets = math.sqrt(mean.shape[-1]) * torch.linalg.cholesky(covariance).mT
-        return torch.cat([mean.unsqueeze(-2) + offsets, mean.unsqueeze(-2) - offsets], dim=-2)
-
-    def filter_step() -> tuple[torch.Tensor, torch.Tensor]:
-        points = problem.transition(torch, sigma_points(mean, covariance), transition_inputs)
-        count = points.shape[-2]
-        predicted = points.mean(dim=-2)
-        deviations = points - predicted.unsqueeze(-2)
-        P = deviations.mT @ deviations / count + Q
-
-        points = sigma_points(predicted, P)
-        measured = problem.measure(torch, points, measure_inputs)
-        expected = measured.mean(dim=-2)
-        X, Z = points - predicted.unsqueeze(-2), measured - expected.unsqueeze(-2)
-        S = Z.mT @ Z / count + R
-        # Quicker than torch.cholesky_solve, by five times for S of 2 x 2.
-        gain = torch.linalg.solve(S, Z.mT @ X / count).mT
-        posterior = predicted + (gain @ (measurement - expected).unsqueeze(-1)).squeeze(-1)
-        return posterior, P - gain @ S @ gain.mT
+        for array in (*problem.arrays, problem.process_noise, problem.measurement_noise)
+    ]
 
     def step() -> tuple[NDArray[Any], NDArray[Any]]:
         with torch.inference_mode():
-            posterior_mean, posterior_covariance = filter_step()
+            posterior_mean, posterior_covariance = _step_batch(torch, problem, *tensors)
         return posterior_mean.numpy(), posterior_covariance.numpy()
 
     return step
