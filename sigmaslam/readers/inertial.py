@@ -199,10 +199,7 @@ def _find_mounting(table: Path) -> tuple[np.ndarray, float] | None:
 
 def read_rigid(content: CalibrationYaml, key: str) -> np.ndarray:
     """A rigid transform (4, 4), in rows or as OpenCV writes matrices."""
-    if isinstance(content.entries.get(key), dict):
-        T = content.section(key).numbers("data", (16,)).reshape(4, 4)
-    else:
-        T = content.numbers(key, (4, 4))
+    T = content.transform(key)
     # Files have as few as six digits.
     if not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3) or np.linalg.det(T[:3, :3]) < 0.0:
         raise content.error(f"{key} is no rotation with a translation: {T.tolist()}")

@@ -206,7 +206,7 @@ def _camera_in_body(truth: Path) -> np.ndarray:
             f"{truth}: EuRoC truth is of the body, and no cam0/sensor.yaml or cam0_sensor.yaml with T_BS is "
             f"in {folders[0]}, its folder mav0 or the two folders above: put it there, or convert the truth to TUM form"
         )
-    T_body_camera = CalibrationYaml.read(sensor).section("T_BS").numbers("data", (16,)).reshape(4, 4)
+    T_body_camera = CalibrationYaml.read(sensor).transform("T_BS")
     T_body_camera[:3, :3] = nearest_rotation(T_body_camera[:3, :3])
     return T_body_camera
 
