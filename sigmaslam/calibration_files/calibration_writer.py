@@ -32,15 +32,15 @@ def write_calibration(path: Path, camera: StereoCamera, more: dict[str, Any] | N
     if camera.sigmas != CalibrationSigmas():
         content["sigmas"] = asdict(camera.sigmas)
     if camera.covariance is not None:
-        content["covariance"] = {
-            "names": list(camera.covariance.names),
-            "matrix": camera.covariance.matrix.tolist(),
-        }
+        content["covariance"] = {"names": list(camera.covariance.names), "matrix": camera.covariance.matrix.tolist()}
     content |= more or {}
-    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
-    atomic_write_text(
-        path, "# Pixels and metres; T_left_right takes points of the right camera into the left one.\n" + text
-    )
+    head = "# Pixels and metres; T_left_right takes points of the right camera into the left one.\n"
+    write_yaml(path, content, head)
+
+
+def write_yaml(path: Path, content: dict[str, Any], head: str = "") -> None:
+    """Write a mapping, behind comments; PyYAML writes the shortest digits that give the same number."""
+    atomic_write_text(path, head + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120))
 
 
 def camera_entries(camera: CameraModel) -> dict[str, Any]:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmaslam.calibration_files.lens_models import read_lens
+from sigmaslam.calibration_files.lens_models import camera_model, intrinsics_of, naming
 from sigmaslam.errors import CalibrationError
-from sigmaslam.geometry.camera import CameraModel, StereoCamera
+from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.checked_yaml import CalibrationYaml
 
 
@@ -62,26 +62,18 @@ def stereo_from_infos(left: CameraInfo, right: CameraInfo, rectified: bool) -> S
             f"{right.name}: no baseline (P[0, 3] is 0): the eyes were calibrated one by one; calibrate them as a "
             "stereo pair, or give --calibration"
         )
-    if rectified:
-        models = [_model(info, info.P[:, :3], False) for info in infos]
-    else:
-        models = [_model(info, info.K, True) for info in infos]
+    if not rectified:
         R_left, R_right = np.eye(4), np.eye(4)
         R_left[:3, :3], R_right[:3, :3] = left.R, right.R
         T_left_right = R_left.T @ T_left_right @ R_right
-    try:
-        return StereoCamera(models[0], models[1], T_left_right)
-    except CalibrationError as error:
-        raise CalibrationError(f"{left.name} and {right.name}: {error}") from None
-
-
-def _model(info: CameraInfo, K: np.ndarray, distorted: bool) -> CameraModel:
-    fx, fy, cx, cy, skew = (float(value) for value in (K[0, 0], K[1, 1], K[0, 2], K[1, 2], K[0, 1]))
-    try:
-        model, distortion = read_lens(info.lens if distorted else "none", info.D, "distortion_model")
-        return CameraModel(info.width, info.height, fx, fy, cx, cy, skew, model, distortion)
-    except CalibrationError as error:
-        raise CalibrationError(f"{info.name}: {error}; give --calibration") from None
+    eyes = [
+        camera_model(info.name, (info.width, info.height), intrinsics_of(info.P))
+        if rectified
+        else camera_model(info.name, (info.width, info.height), intrinsics_of(info.K), info.lens, info.D)
+        for info in infos
+    ]
+    with naming(f"{left.name} and {right.name}"):
+        return StereoCamera(eyes[0], eyes[1], T_left_right)
 
 
 def is_camera_info(content: CalibrationYaml) -> bool:

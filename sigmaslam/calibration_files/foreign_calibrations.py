@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
-from sigmaslam.calibration_files.calibration_writer import write_calibration
+from sigmaslam.calibration_files.calibration_writer import write_calibration, write_yaml
+from sigmaslam.calibration_files.kalibr_calibration import pinhole_entries
 from sigmaslam.errors import CalibrationError, InputError
 from sigmaslam.files import atomic_write_text, make_folder
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
@@ -48,18 +48,10 @@ def write_foreign_calibration(path: Path, camera: StereoCamera, form: str) -> No
 def _write_kalibr(path: Path, camera: StereoCamera) -> None:
     content: dict[str, Any] = {}
     for k, eye in enumerate((camera.left, camera.right)):
-        lens = _lens(eye, "kalibr", "radtan", (4,))
-        content[f"cam{k}"] = {
-            "cam_overlaps": [1 - k],
-            "camera_model": "pinhole",
-            "intrinsics": [eye.fx, eye.fy, eye.cx, eye.cy],
-            "distortion_model": lens[0],
-            "distortion_coeffs": lens[1],
-            "resolution": [eye.width, eye.height],
-            "rostopic": f"/cam{k}/image_raw",
-        }
+        entries = pinhole_entries(eye, *_lens(eye, "kalibr", "radtan", (4,)))
+        content[f"cam{k}"] = {"cam_overlaps": [1 - k], **entries, "rostopic": f"/cam{k}/image_raw"}
     content["cam1"]["T_cn_cnm1"] = se3_inverse(camera.T_left_right).tolist()
-    _write_yaml(path, content)
+    write_yaml(path, content)
 
 
 def _write_euroc(path: Path, camera: StereoCamera) -> None:
@@ -77,7 +69,7 @@ def _write_euroc(path: Path, camera: StereoCamera) -> None:
             "distortion_coefficients": coefficients,
         }
         make_folder(path / f"cam{k}")
-        _write_yaml(path / f"cam{k}" / "sensor.yaml", content)
+        write_yaml(path / f"cam{k}" / "sensor.yaml", content)
 
 
 def _write_ros(path: Path, camera: StereoCamera) -> None:
@@ -99,7 +91,7 @@ def _write_ros(path: Path, camera: StereoCamera) -> None:
             "rectification_matrix": _matrix(R),
             "projection_matrix": _matrix(P),
         }
-        _write_yaml(path / f"{name}.yaml", content)
+        write_yaml(path / f"{name}.yaml", content)
 
 
 def _write_opencv(path: Path, camera: StereoCamera) -> None:
@@ -162,14 +154,14 @@ FORMS: dict[str, tuple[Callable[[Path, StereoCamera], None], tuple[str, ...]]] =
 
 def _need_alike(camera: StereoCamera, form: str) -> None:
     left, right = camera.left, camera.right
-    if (left.width, left.height) != (right.width, right.height):
-        raise CalibrationError(
-            f"the form {form} has one image size for both eyes, which differ here: use kalibr or ros"
-        )
-    if (left.distortion_model == "equidistant") != (right.distortion_model == "equidistant"):
-        raise CalibrationError(
-            f"the form {form} has one lens model for both eyes, which differ here: use kalibr or ros"
-        )
+    for what, differ in (
+        ("image size", (left.width, left.height) != (right.width, right.height)),
+        ("lens model", (left.distortion_model == "equidistant") != (right.distortion_model == "equidistant")),
+    ):
+        if differ:
+            raise CalibrationError(
+                f"the form {form} has one {what} for both eyes, which differ here: use kalibr or ros"
+            )
 
 
 def _lens(eye: CameraModel, form: str, radtan: str, counts: tuple[int, ...]) -> tuple[str, list[float]]:
@@ -191,11 +183,6 @@ def _lens(eye: CameraModel, form: str, radtan: str, counts: tuple[int, ...]) -> 
 def _matrix(matrix: np.ndarray) -> dict[str, Any]:
     rows, cols = matrix.shape
     return {"rows": rows, "cols": cols, "data": matrix.ravel().tolist()}
-
-
-def _write_yaml(path: Path, content: Mapping[str, Any]) -> None:
-    # PyYAML writes the shortest digits that give the same number.
-    atomic_write_text(path, yaml.safe_dump(dict(content), sort_keys=False, default_flow_style=None, width=120))
 
 
 def _write_storage(path: Path, content: Mapping[str, Any]) -> None:

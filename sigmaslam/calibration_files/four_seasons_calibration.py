@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from sigmaslam.bounded_files import CALIBRATION_BYTES, read_text
+from sigmaslam.calibration_files.lens_models import camera_model, stereo_camera
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 
@@ -25,10 +26,7 @@ def read_four_seasons(paths: Sequence[Path]) -> StereoCamera:
     rows = [_numbers(paths[2], line) for line in _lines(paths[2])]
     if [len(row) for row in rows] != [4, 4, 4, 4]:
         raise CalibrationError(f"{paths[2]}: must be 4 lines of 4 numbers")
-    try:
-        return StereoCamera(models[0], models[1], np.linalg.inv(np.array(rows)))
-    except (CalibrationError, np.linalg.LinAlgError) as error:
-        raise CalibrationError(f"{paths[2]}: {error}") from None
+    return stereo_camera(str(paths[2]), models, np.array(rows))
 
 
 def _camera_model(path: Path) -> CameraModel:
@@ -42,11 +40,7 @@ def _camera_model(path: Path) -> CameraModel:
             f"{path}: must have fx fy cx cy, then zeros as the images are undistorted, and width and height in line 2, "
             f"got {lines[:2]}"
         )
-    fx, fy, cx, cy = values[:4]
-    try:
-        return CameraModel(int(size[0]), int(size[1]), fx, fy, cx, cy)
-    except CalibrationError as error:
-        raise CalibrationError(f"{path}: {error}") from None
+    return camera_model(str(path), size, values[:4])
 
 
 def _lines(path: Path) -> list[str]:

@@ -1,12 +1,20 @@
 """KITTI's calibration files: calib.txt and calib_cam_to_cam.txt."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from sigmaslam.bounded_files import CALIBRATION_BYTES, read_text, shorten
-from sigmaslam.calibration_files.calibration_size import ImageSize, UnknownImageSizeError, need_image_size
 from sigmaslam.calibration_files.camera_infos import right_position
+from sigmaslam.calibration_files.lens_models import (
+    ImageSize,
+    UnknownImageSizeError,
+    camera_model,
+    intrinsics_of,
+    naming,
+    need_image_size,
+)
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 
@@ -116,31 +124,14 @@ def _matrix(path: Path, entries: dict[str, str], key: str, shape: tuple[int, ...
     return values.reshape(shape)
 
 
-def _stereo(path: Path, left: CameraModel, right: CameraModel, T_left_right: np.ndarray) -> StereoCamera:
-    try:
-        return StereoCamera(left, right, T_left_right)
-    except CalibrationError as error:
-        raise CalibrationError(f"{path}: {error}") from None
-
-
 def _model(
     path: Path, key: str, K: np.ndarray, image_size: ImageSize, distortion: tuple[float, ...] = ()
 ) -> CameraModel:
     if not np.allclose([K[1, 0], *K[2]], [0, 0, 0, 1]):
         raise CalibrationError(f"{path}: key '{key}' must begin with an upper triangular K with K[2, 2] = 1, got\n{K}")
-    try:
-        return CameraModel(
-            *image_size,
-            fx=float(K[0, 0]),
-            fy=float(K[1, 1]),
-            cx=float(K[0, 2]),
-            cy=float(K[1, 2]),
-            skew=float(K[0, 1]),
-            distortion_model="radtan" if distortion else "none",
-            distortion=distortion,
-        )
-    except CalibrationError as error:
-        raise CalibrationError(f"{path}: {key}: {error}") from None
+    # All are distorted, also those whose coefficients are zero.
+    camera = camera_model(f"{path}: {key}", image_size, intrinsics_of(K))
+    return replace(camera, distortion_model="radtan", distortion=distortion) if distortion else camera
 
 
 def _from_projections(
@@ -151,13 +142,9 @@ def _from_projections(
     left, right = (_matrix(path, entries, key, (3, 4)) for key in keys)
     models = [_model(path, key, P[:, :3], image_size) for key, P in zip(keys, (left, right), strict=True)]
     T_left_right = np.eye(4)
-    try:
+    with naming(f"{path}: keys '{keys[0]}' and '{keys[1]}'"):
         T_left_right[:3, 3] = right_position(left, right)
-    except np.linalg.LinAlgError:
-        raise CalibrationError(
-            f"{path}: keys '{keys[0]}' and '{keys[1]}': K has no inverse; correct the numbers"
-        ) from None
-    return _stereo(path, models[0], models[1], T_left_right)
+        return StereoCamera(models[0], models[1], T_left_right)
 
 
 def _from_originals(
@@ -167,14 +154,11 @@ def _from_originals(
     models, poses = [], []
     for camera in cameras:
         distortion = tuple(_matrix(path, entries, f"D_{camera:02d}", (5,)).tolist())
-        K = _matrix(path, entries, f"K_{camera:02d}", (3, 3))
-        models.append(_model(path, f"K_{camera:02d}", K, image_size, distortion))
+        K = _matrix(path, entries, key := f"K_{camera:02d}", (3, 3))
+        models.append(_model(path, key, K, image_size, distortion))
         T_camera_camera0 = np.eye(4)
         T_camera_camera0[:3, :3] = _matrix(path, entries, f"R_{camera:02d}", (3, 3))
         T_camera_camera0[:3, 3] = _matrix(path, entries, f"T_{camera:02d}", (3,))
         poses.append(T_camera_camera0)
-    try:
-        T_left_right = poses[0] @ np.linalg.inv(poses[1])
-    except np.linalg.LinAlgError:
-        raise CalibrationError(f"{path}: key 'R_{cameras[1]:02d}' is no rotation; correct the numbers") from None
-    return _stereo(path, models[0], models[1], T_left_right)
+    with naming(f"{path}: R and T of cameras {cameras[0]} and {cameras[1]}"):
+        return StereoCamera(models[0], models[1], poses[0] @ np.linalg.inv(poses[1]))

@@ -1,13 +1,12 @@
 """Calibration of an OAK camera, the JSON that depthai's eepromToJsonFile writes."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sigmaslam.bounded_files import CALIBRATION_BYTES, read_text
-from sigmaslam.calibration_files.lens_models import read_lens
+from sigmaslam.bounded_files import CALIBRATION_BYTES, read_json
+from sigmaslam.calibration_files.lens_models import camera_model, intrinsics_of, naming
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.geometry.checked_yaml import CalibrationYaml
@@ -27,10 +26,8 @@ def read_oak(path: Path) -> StereoCamera:
     Raises:
         CalibrationError: names file, key and what was expected.
     """
-    try:
-        entries = json.loads(read_text(path, CALIBRATION_BYTES, "the calibration", CalibrationError))
-    except (ValueError, RecursionError) as error:
-        raise CalibrationError(f"{path}: cannot read the calibration: {error}") from None
+    mend = "write it again by depthai's eepromToJsonFile"
+    entries = read_json(path, "the calibration", mend, CalibrationError, CALIBRATION_BYTES)
     if not isinstance(entries, dict) or not isinstance(entries.get("cameraData"), list):
         raise CalibrationError(
             f"{path}: no key 'cameraData': of JSON, only what depthai's eepromToJsonFile writes is read"
@@ -47,11 +44,8 @@ def read_oak(path: Path) -> StereoCamera:
     shared = next((socket for socket in to_root[0] if socket in to_root[1]), None)
     if shared is None:
         raise CalibrationError(f"{path}: the extrinsics of sockets {left} and {right} have no camera in common")
-    try:
-        T_left_right = np.linalg.inv(to_root[0][shared]) @ to_root[1][shared]
-        return StereoCamera(models[0], models[1], T_left_right)
-    except (CalibrationError, np.linalg.LinAlgError) as error:
-        raise CalibrationError(f"{path}: extrinsics of sockets {left} and {right}: {error}") from None
+    with naming(f"{path}: extrinsics of sockets {left} and {right}"):
+        return StereoCamera(models[0], models[1], np.linalg.inv(to_root[0][shared]) @ to_root[1][shared])
 
 
 def _cameras(path: Path, pairs: list[Any]) -> dict[int, CalibrationYaml]:
@@ -95,13 +89,6 @@ def _camera_model(camera: CalibrationYaml) -> CameraModel:
     coefficients = camera.numbers("distortionCoeff", (None,)).tolist()
     if _LENSES[kind] == "equidistant":
         coefficients = coefficients[:4]
-    K = camera.numbers("intrinsicMatrix", (3, 3))
-    try:
-        where = f"{camera.path}: {camera.prefix}distortionCoeff"
-        model, distortion = read_lens(_LENSES[kind], coefficients, where)
-        size = camera.integer("width"), camera.integer("height")
-        fx, fy, cx, cy, skew = (float(value) for value in (K[0, 0], K[1, 1], K[0, 2], K[1, 2], K[0, 1]))
-        return CameraModel(*size, fx, fy, cx, cy, skew, model, distortion)
-    except CalibrationError as error:
-        message = str(error)
-        raise error if message.startswith(str(camera.path)) else camera.error(message) from None
+    size, intrinsics = [camera.integer(name) for name in ("width", "height")], camera.numbers("intrinsicMatrix", (3, 3))
+    where = str(camera.error("")).rstrip(": ")
+    return camera_model(where, size, intrinsics_of(intrinsics), _LENSES[kind], coefficients, "distortionCoeff")

@@ -10,11 +10,17 @@ import cv2
 import numpy as np
 
 from sigmaslam.bounded_files import CALIBRATION_BYTES, read_text
-from sigmaslam.calibration_files.calibration_size import ImageSize, need_image_size
 from sigmaslam.calibration_files.camera_infos import CameraInfo, stereo_from_infos
-from sigmaslam.calibration_files.lens_models import read_lens
+from sigmaslam.calibration_files.lens_models import (
+    ImageSize,
+    camera_model,
+    intrinsics_of,
+    naming,
+    need_image_size,
+    stereo_camera,
+)
 from sigmaslam.errors import CalibrationError
-from sigmaslam.geometry.camera import CameraModel, DistortionModel, StereoCamera
+from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.geometry.checked_yaml import CalibrationYaml
 
 logger = logging.getLogger(__name__)
@@ -108,20 +114,15 @@ def read_opencv(paths: Sequence[Path], image_size: ImageSize | None, rectified: 
         CalibrationError: names file, key and what was expected.
     """
     storage = _read_storage(paths)
-    try:
+    with naming(storage.path):
         for keys in _EYES:
             if _has(storage, *keys[0]):
                 return _from_matrices(storage, keys, image_size, rectified)
         if _has(storage, "Camera1.fx"):
             return _from_orb_slam3(storage, image_size)
         if _has(storage, "Camera.fx", "Camera.bf"):
-            eye = _pinhole(storage, "Camera", image_size, "none", ())
+            eye = _pinhole(storage, "Camera", image_size)
             return StereoCamera(eye, eye, _beside(storage.number("Camera.bf") / eye.fx))
-    except CalibrationError as error:
-        message = str(error)
-        raise (
-            error if message.startswith(str(storage.path)) else CalibrationError(f"{storage.path}: {message}")
-        ) from None
     raise CalibrationError(
         f"{storage.path}: no stereo calibration; looked for K1 + K2 (or M1, cameraMatrix1) with D1, D2, R and T, "
         "LEFT.K + RIGHT.K, Camera1.fx + Camera2.fx, and Camera.fx + Camera.bf; two files are given as "
@@ -156,19 +157,25 @@ def _from_matrices(
         return stereo_from_infos(infos[0], infos[1], rectified)
     models = []
     for key, D in zip(Ks, Ds, strict=True):
-        K = _matrix(storage, key, (3, 3))
-        lens, distortion = _lens(storage, D)
-        fx, fy, cx, cy, skew = (float(value) for value in (K[0, 0], K[1, 1], K[0, 2], K[1, 2], K[0, 1]))
-        models.append(CameraModel(*size, fx, fy, cx, cy, skew, lens, distortion))
+        K, where = _matrix(storage, key, (3, 3)), str(storage.path)
+        models.append(camera_model(where, size, intrinsics_of(K), *_lens(storage, D), key=D))
     rotation = _matrix(storage, "R")
     T_right_left = np.eye(4)
     T_right_left[:3, :3] = cv2.Rodrigues(rotation)[0] if rotation.size == 3 else _matrix(storage, "R", (3, 3))
     T_right_left[:3, 3] = _matrix(storage, "T", (3,))
-    return _checked_unit(storage, StereoCamera(models[0], models[1], _inverse(storage, "R", T_right_left)))
+    camera = stereo_camera(f"{storage.path}: R and T", models, T_right_left)
+    if camera.baseline > _LONGEST_BASELINE:
+        logger.warning(
+            "%s: a baseline of %.4g m; T has the unit of the chessboard's squares: if they were in millimetres, "
+            "divide T by 1000",
+            storage.path,
+            camera.baseline,
+        )
+    return camera
 
 
-def _lens(storage: CalibrationYaml, key: str) -> tuple[DistortionModel, tuple[float, ...]]:
-    """Coefficients of a file that need not say whether they are cv2.fisheye's, which are four."""
+def _lens(storage: CalibrationYaml, key: str) -> tuple[str, list[float]]:
+    """Lens and coefficients of a file that need not say whether these are cv2.fisheye's, which are four."""
     coefficients = _matrix(storage, key).tolist()
     name = storage.text("distortion_model", "")
     if not name and len(coefficients) == 4 and any(coefficients):
@@ -178,7 +185,7 @@ def _lens(storage: CalibrationYaml, key: str) -> tuple[DistortionModel, tuple[fl
             storage.path,
             key,
         )
-    return read_lens(name or "radtan", coefficients, f"{storage.path}: {key}")
+    return name or "radtan", coefficients
 
 
 def _from_orb_slam3(storage: CalibrationYaml, image_size: ImageSize | None) -> StereoCamera:
@@ -197,8 +204,7 @@ def _from_orb_slam3(storage: CalibrationYaml, image_size: ImageSize | None) -> S
         keys = [f"{camera}.{name}" for name in names[kind.lower()]]
         lens = "equidistant" if kind.lower() == "kannalabrandt8" else "radtan"
         values = [storage.number(key) for key in keys if lens == "equidistant" or _has(storage, key)]
-        model, distortion = read_lens(lens, values, f"{storage.path}: Camera.type")
-        models.append(_pinhole(storage, camera, image_size, model, distortion))
+        models.append(_pinhole(storage, camera, image_size, lens, values))
     if kind.lower() == "rectified":
         return StereoCamera(models[0], models[1], _beside(storage.number("Stereo.b")))
     return StereoCamera(models[0], models[1], _matrix(storage, "Stereo.T_c1_c2", (4, 4)))
@@ -208,32 +214,14 @@ def _pinhole(
     storage: CalibrationYaml,
     camera: str,
     image_size: ImageSize | None,
-    model: DistortionModel,
-    distortion: tuple[float, ...],
+    lens: str = "none",
+    values: Sequence[float] = (),
 ) -> CameraModel:
-    fx, fy, cx, cy = (storage.number(f"{camera}.{name}") for name in ("fx", "fy", "cx", "cy"))
-    return CameraModel(*_image_size(storage, image_size), fx, fy, cx, cy, 0.0, model, distortion)
+    intrinsics = [storage.number(f"{camera}.{name}") for name in ("fx", "fy", "cx", "cy")]
+    return camera_model(str(storage.path), _image_size(storage, image_size), intrinsics, lens, values, "Camera.type")
 
 
 def _beside(baseline: float) -> np.ndarray:
     T = np.eye(4)
     T[0, 3] = baseline
     return T
-
-
-def _inverse(storage: CalibrationYaml, key: str, T: np.ndarray) -> np.ndarray:
-    try:
-        return np.asarray(np.linalg.inv(T))
-    except np.linalg.LinAlgError:
-        raise CalibrationError(f"{storage.path}: {key} is no rotation: {T[:3, :3].tolist()}") from None
-
-
-def _checked_unit(storage: CalibrationYaml, camera: StereoCamera) -> StereoCamera:
-    if camera.baseline > _LONGEST_BASELINE:
-        logger.warning(
-            "%s: a baseline of %.4g m; T has the unit of the chessboard's squares: if they were in millimetres, "
-            "divide T by 1000",
-            storage.path,
-            camera.baseline,
-        )
-    return camera

@@ -7,9 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sigmaslam.bounded_files import CALIBRATION_BYTES, read_text
-from sigmaslam.calibration_files.calibration_size import ImageSize, need_image_size
-from sigmaslam.calibration_files.lens_models import read_lens
+from sigmaslam.bounded_files import CALIBRATION_BYTES, finite_number, read_text
+from sigmaslam.calibration_files.lens_models import ImageSize, camera_model, need_image_size, stereo_camera
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 
@@ -65,10 +64,7 @@ def read_zed(path: Path, image_size: ImageSize | None) -> StereoCamera:
         "then write its calibration_parameters into a YAML",
         path,
     )
-    try:
-        return StereoCamera(models[0], models[1], np.linalg.inv(T_right_left))
-    except CalibrationError as error:
-        raise CalibrationError(f"{path}: [STEREO]: {error}") from None
+    return stereo_camera(f"{path}: [STEREO]", models, T_right_left)
 
 
 class _Values:
@@ -81,11 +77,8 @@ class _Values:
 
     def number(self, section: str, key: str) -> float:
         value = self.sections.get(section, {}).get(key.lower())
-        try:
-            number = float(value) if value is not None else np.nan
-        except ValueError:
-            number = np.nan
-        if not np.isfinite(number):
+        number = np.nan if value is None else finite_number(value)
+        if np.isnan(number):
             raise CalibrationError(f"{self.path}: [{section}]: key '{key}' must be a finite number, got {value}")
         return number
 
@@ -108,9 +101,5 @@ def _camera_model(values: _Values, eye: str, resolution: str, size: ImageSize) -
     else:
         coefficients = [values.number(lens, key) for key in ("k1", "k2", "k3", "k4")]
         name = "equidistant"
-    model, distortion = read_lens(name, coefficients, f"{values.path}: [{lens}]")
-    fx, fy, cx, cy = (values.number(section, key) for key in ("fx", "fy", "cx", "cy"))
-    try:
-        return CameraModel(*size, fx, fy, cx, cy, 0.0, model, distortion)
-    except CalibrationError as error:
-        raise CalibrationError(f"{values.path}: [{section}]: {error}") from None
+    intrinsics = [values.number(section, key) for key in ("fx", "fy", "cx", "cy")]
+    return camera_model(f"{values.path}: [{section}]", size, intrinsics, name, coefficients, f"[{lens}]")

@@ -40,13 +40,11 @@ def _check_baseline(baseline: float) -> Finding:
         if MIN_BASELINE <= baseline * unit <= MAX_BASELINE
     ]
     guess = f"is it in {' or '.join(likely)}? Give" if likely else "give"
-    return Finding(
-        "baseline",
-        "warning",
+    message = (
         f"baseline {baseline:.4g} m is outside {MIN_BASELINE:g} to {MAX_BASELINE:g} m: {guess} T_left_right (or P) "
-        "in metres, as poses have its scale",
-        baseline,
+        "in metres, as poses have its scale"
     )
+    return Finding("baseline", "warning", message, baseline)
 
 
 def _off_centre(model: CameraModel, cx: float, cy: float) -> float:
@@ -71,12 +69,8 @@ def _check_centre(eye: str, model: CameraModel) -> Finding:
                     f"multiply fx, fy, cx, cy by {1.0 / scale:.3g}"
                 )
                 break
-    return Finding(
-        "principal point",
-        "warning",
-        f"{where} is {100 * off:.0f} % of the image from its middle ({size}): {cure}",
-        off,
-    )
+    message = f"{where} is {100 * off:.0f} % of the image from its middle ({size}): {cure}"
+    return Finding("principal point", "warning", message, off)
 
 
 def _check_focal(eye: str, model: CameraModel) -> Finding:
@@ -84,19 +78,15 @@ def _check_focal(eye: str, model: CameraModel) -> Finding:
     aspect = max(model.fx / model.fy, model.fy / model.fx)
     shown = f"fx {model.fx:.1f}, fy {model.fy:.1f} of the {eye} camera"
     if aspect > _MAX_ASPECT:
-        return Finding(
-            "focal length",
-            "warning",
-            f"{shown} differ by {100 * (aspect - 1):.0f} %: are pixels not square? Give both in pixels of these images",
-            aspect,
+        message = (
+            f"{shown} differ by {100 * (aspect - 1):.0f} %: are pixels not square? Give both in pixels of these images"
         )
+        return Finding("focal length", "warning", message, aspect)
     # Lenses that are described as equidistant may see more than a plane image holds.
     if view < _MIN_VIEW or (view > _MAX_VIEW and model.distortion_model != "equidistant"):
-        return Finding(
-            "focal length",
-            "warning",
+        message = (
             f"{shown} are a field of view of {view:.3g} degrees at {model.width} px: give them in pixels, not in "
-            "millimetres or shares of the width",
-            view,
+            "millimetres or shares of the width"
         )
+        return Finding("focal length", "warning", message, view)
     return Finding("focal length", "ok", f"{shown} are a field of view of {view:.0f} degrees", view)

@@ -145,22 +145,16 @@ def _check_overlap(matches: EyeMatches, steps: Sequence[FrameStep], matcher: Eye
     turned = {what: matcher.count_turned(step, turn) for what, turn in _TURNS.items()}
     what = max(turned, key=lambda each: turned[each])
     if turned[what] >= max(MIN_MATCHES, _BETTER * count):
-        return Finding(
-            "mirrored",
-            "error",
+        message = (
             f"one eye is {what}: {count} matches between the eyes as given, {turned[what]} once the right image is "
-            "turned back: undo it in the one of the two that is wrong",
-            turned[what],
+            "turned back: undo it in the one of the two that is wrong"
         )
+        return Finding("mirrored", "error", message, turned[what])
     keypoints = matcher.count_keypoints(step)
     cure = (
         "do both cameras see the same, and are the images of one time?"
         if keypoints >= 2 * MIN_MATCHES
         else "point the cameras at something with more texture"
     )
-    return Finding(
-        "overlap",
-        "error" if count < MIN_INLIERS else "warning",
-        f"{count} matches between the eyes in the median pair of {keypoints} keypoints: {cure}",
-        count,
-    )
+    message = f"{count} matches between the eyes in the median pair of {keypoints} keypoints: {cure}"
+    return Finding("overlap", "error" if count < MIN_INLIERS else "warning", message, count)

@@ -89,13 +89,11 @@ def check_light(frames: Sequence[StereoFrame]) -> Finding:
         return Finding("light", "ok", f"left images are {ratio:.2f} times as bright as right ones", ratio)
     ratio = float(np.median(ratios[uneven]))
     dark, times = ("right", ratio) if ratio > 1.0 else ("left", 1.0 / ratio)
-    return Finding(
-        "light",
-        "warning",
+    message = (
         f"the {dark} eye is {times:.1f} times darker than the other in {describe_frames(frames, uneven)}: give both "
-        "the same exposure, gain and aperture",
-        ratio,
+        "the same exposure, gain and aperture"
     )
+    return Finding("light", "warning", message, ratio)
 
 
 def describe_frames(frames: Sequence[StereoFrame], chosen: np.ndarray) -> str:
@@ -112,13 +110,11 @@ def _check_sharpness(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Finding:
     blur = blurs[worse]
     if blur <= _WARN_BLUR:
         return Finding("sharpness", "ok", f"edges are blurred by {blur:.1f} px", blur)
-    return Finding(
-        "sharpness",
-        "warning",
+    message = (
         f"edges of the {EYES[worse]} images are blurred by {blur:.1f} px ({EYES[1 - worse]} {blurs[1 - worse]:.1f}): "
-        "focus, clean the lens, move slowly, expose for a shorter time, or use smaller images",
-        blur,
+        "focus, clean the lens, move slowly, expose for a shorter time, or use smaller images"
     )
+    return Finding("sharpness", "warning", message, blur)
 
 
 def _check_same(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Finding:
@@ -127,11 +123,9 @@ def _check_same(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Finding:
     difference = float(np.median([np.abs(left.astype(np.int16) - right).mean() for left, right in pairs]))
     informative = float(np.median([left.std() for left, _ in pairs])) > _SAME
     if difference < _SAME and informative:
-        return Finding(
-            "same image",
-            "error",
+        message = (
             f"left and right images are the same (they differ by {difference:.2f} grey values): give the images of "
-            "both cameras",
-            difference,
+            "both cameras"
         )
+        return Finding("same image", "error", message, difference)
     return Finding("same image", "ok", f"left and right images differ by {difference:.1f} grey values", difference)

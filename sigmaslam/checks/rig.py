@@ -86,13 +86,11 @@ def find_exchanged(matches: EyeMatches, rectifier: StereoRectifier) -> np.ndarra
 
 def _check_eyes(matches: EyeMatches, given: float, swapped: float, exchanged: bool) -> Finding:
     if exchanged:
-        return Finding(
-            "eyes",
-            "error",
+        message = (
             f"left and right are exchanged: {100 * swapped:.0f} % of {len(matches)} matches fit the calibration with "
-            f"the eyes exchanged, {100 * given:.0f} % as given: swap the two (or do not mirror both)",
-            swapped,
+            f"the eyes exchanged, {100 * given:.0f} % as given: swap the two (or do not mirror both)"
         )
+        return Finding("eyes", "error", message, swapped)
     return Finding("eyes", "ok", f"left is left: {100 * given:.0f} % of the matches have the right order", given)
 
 
@@ -104,13 +102,11 @@ def _check_position(given: RowFit, rectifier: StereoRectifier) -> Finding:
     columns = upright.agreement(ROW_TOLERANCE)
     shifted = abs(float(np.median(matches.row_difference))) > ROW_TOLERANCE
     if shifted and columns > _EXPLAINED and _BETTER * _spread(upright.residual) < _spread(given.residual):
-        return Finding(
-            "rig",
-            "error",
+        message = (
             f"the cameras stand one above the other: {100 * columns:.0f} % of the matches lie in one column: turn "
-            "images and calibration by 90 degrees",
-            columns,
+            "images and calibration by 90 degrees"
         )
+        return Finding("rig", "error", message, columns)
     if share >= _EXPLAINED:
         return Finding("rig", "ok", f"{100 * share:.0f} % of the matches follow the calibrated rig", share)
     pose = estimate_epipolar_pose(
@@ -122,13 +118,11 @@ def _check_position(given: RowFit, rectifier: StereoRectifier) -> Finding:
         where = f"in the direction ({x:.2f}, {y:.2f}, {z:.2f}), turned by {angle:.1f} degrees"
     else:
         where = "where the pairs do not agree on"
-    return Finding(
-        "rig",
-        "error",
+    message = (
         f"{100 * share:.0f} % of the matches follow the calibration: the images have the right camera {where}, not "
-        "(1.00, 0.00, 0.00): give the calibration of this rig, and images taken at the same time",
-        share,
+        "(1.00, 0.00, 0.00): give the calibration of this rig, and images taken at the same time"
     )
+    return Finding("rig", "error", message, share)
 
 
 def _check_distortion(matches: EyeMatches, rectifier: StereoRectifier) -> Finding:
@@ -146,19 +140,13 @@ def _check_distortion(matches: EyeMatches, rectifier: StereoRectifier) -> Findin
     # A median of absolute values is known to about one part in the root of their number.
     worse = after > before * (1.0 + SIGNIFICANT / np.sqrt(len(stored)))
     if rows < _RECTIFIED_ROWS and worse:
-        return Finding(
-            "distortion",
-            "warning",
+        message = (
             f"the images look rectified already: rows scatter by {before:.2f} px as they are stored, by {after:.2f} px "
-            "after the rectification: give the calibration of the rectified images (no distortion)",
-            after / before,
+            "after the rectification: give the calibration of the rectified images (no distortion)"
         )
-    return Finding(
-        "distortion",
-        "ok",
-        f"rectification takes the scatter of rows from {before:.2f} to {after:.2f} px",
-        after / before,
-    )
+        return Finding("distortion", "warning", message, after / before)
+    message = f"rectification takes the scatter of rows from {before:.2f} to {after:.2f} px"
+    return Finding("distortion", "ok", message, after / before)
 
 
 def _check_synchronisation(fit: RowFit, frame_interval: float | None) -> Finding:
@@ -171,11 +159,14 @@ def _check_synchronisation(fit: RowFit, frame_interval: float | None) -> Finding
     explained = _BETTER * _spread(fit.residual) < _spread(fit.residual + fit.by_lag[:, 1])
     if fit.lag_shift < _WARN_LAG or not explained:
         return Finding(_SYNCHRONISATION, "ok", f"the eyes are {figure} apart", fit.lag)
+    message = (
+        f"the right images are {figure} {_when(fit.lag)} than the left ones, which moves them by {fit.lag_shift:.1f} "
+        "px in the median: trigger both cameras together"
+    )
     return Finding(
         _SYNCHRONISATION,
         "error" if float(np.median(np.abs(fit.by_lag[:, 1]))) > ROW_TOLERANCE else "warning",
-        f"the right images are {figure} {_when(fit.lag)} than the left ones, which moves them by {fit.lag_shift:.1f} "
-        "px in the median: trigger both cameras together",
+        message,
         fit.lag,
         fit.lag_shift,
     )
@@ -212,15 +203,12 @@ def check_pairing(
         return None
     lag = -best
     how_many = "one frame" if scatter[best] < _WARN_LAG else "a frame or more"
-    return Finding(
-        _SYNCHRONISATION,
-        "error",
+    message = (
         f"the right images are {how_many}{_milliseconds(lag, frame_interval)} {_when(lag)} than the left ones: rows of "
         f"matches scatter by {scatter[best]:.1f} px with the right image one {'after' if best > 0 else 'before'}, by "
-        f"{scatter[0]:.1f} px as given: pair them so, or trigger both cameras together",
-        lag,
-        abs(lag) * _median_flow(matches),
+        f"{scatter[0]:.1f} px as given: pair them so, or trigger both cameras together"
     )
+    return Finding(_SYNCHRONISATION, "error", message, lag, abs(lag) * _median_flow(matches))
 
 
 def _median_flow(matches: EyeMatches) -> float:
@@ -239,13 +227,11 @@ def _when(lag: float) -> str:
 def _check_shift(fit: RowFit) -> Finding:
     if abs(fit.shift) <= _WARN_ROWS:
         return Finding("rows", "ok", f"right rows are {fit.shift:+.2f} px from the left ones", fit.shift)
-    return Finding(
-        "rows",
-        "error" if abs(fit.shift) > ROW_TOLERANCE else "warning",
+    message = (
         f"right rows are {fit.shift:+.2f} px from the left ones; {ROW_TOLERANCE:g} px can be tracked: crop both images "
-        "alike, correct cy of one eye, or calibrate again",
-        fit.shift,
+        "alike, correct cy of one eye, or calibrate again"
     )
+    return Finding("rows", "error" if abs(fit.shift) > ROW_TOLERANCE else "warning", message, fit.shift)
 
 
 def _check_rotation(fit: RowFit, focal: float) -> Finding:
@@ -286,13 +272,11 @@ def _check_infinity(fit: RowFit) -> Finding:
     lowest = float(np.percentile(_disparity_in_rows(fit), 5))
     if behind <= _WARN_BEHIND:
         return Finding("infinity", "ok", f"{100 * behind:.0f} % of the matches lie behind infinity", behind)
-    return Finding(
-        "infinity",
-        "error" if behind > _MAX_BEHIND else "warning",
+    message = (
         f"{100 * behind:.0f} % of the matches lie behind infinity, with disparities from {lowest:.1f} px: cx of one "
-        "eye or the yaw of the right camera is wrong: calibrate again",
-        behind,
+        "eye or the yaw of the right camera is wrong: calibrate again"
     )
+    return Finding("infinity", "error" if behind > _MAX_BEHIND else "warning", message, behind)
 
 
 def _agreement(matches: EyeMatches, view: RectifiedStereo) -> float:

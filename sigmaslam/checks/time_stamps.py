@@ -39,9 +39,7 @@ def check_time_stamps(intervals: Sequence[float]) -> Finding:
     if fitting and interval > 0:
         name, unit = min(fitting, key=lambda each: abs(np.log(interval * each[1] / _USUAL)))
         guess = f"they look like {name} ({interval * unit:.4g} s): give seconds"
-    return Finding(
-        "time stamps",
-        "warning",
-        f"time stamps are {interval:.4g} s apart in the median, not {MIN_INTERVAL:g} to {MAX_INTERVAL:g} s: {guess}",
-        interval,
+    message = (
+        f"time stamps are {interval:.4g} s apart in the median, not {MIN_INTERVAL:g} to {MAX_INTERVAL:g} s: {guess}"
     )
+    return Finding("time stamps", "warning", message, interval)

@@ -10,19 +10,7 @@ import numpy as np
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.checked_yaml import CalibrationYaml
 
-ERROR_NAMES = (
-    "yaw",
-    "pitch",
-    "roll",
-    "zoom",
-    "bend",
-    "lenses",
-    "focal",
-    "centre_u",
-    "centre_v",
-    "lens",
-    "baseline",
-)
+ERROR_NAMES = ("yaw", "pitch", "roll", "zoom", "bend", "lenses", "focal", "centre_u", "centre_v", "lens", "baseline")
 """Errors of a calibration that a board measures: those of `sigmaslam track --estimate`."""
 _KNOWN = ("offset", *ERROR_NAMES)
 

@@ -82,6 +82,12 @@ class CalibrationYaml:
             raise self._wrong(key, expected, value, f" (size {actual})")
         return cast(np.ndarray, numbers)
 
+    def transform(self, key: str) -> np.ndarray:
+        """A matrix (4, 4), in rows or as OpenCV writes matrices."""
+        if isinstance(self.entries.get(key), dict):
+            return self.section(key).numbers("data", (16,)).reshape(4, 4)
+        return self.numbers(key, (4, 4))
+
     def reject_unknown(self, known: Collection[str]) -> None:
         """Refuse unknown keys, as a misspelt optional key would be ignored."""
         unknown = [str(key) for key in self.entries if key not in known]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -30,13 +31,21 @@ def parse_yaml(text: str, path: Path, error: type[InputError] = InputError) -> A
         InputError: the text is no YAML, has a key twice, or goes beyond a limit; names file, line or key, and the mend.
     """
     try:
-        return _RestrictedLoader(text).get_single_data()
+        loader = _Loader(text)
+        node = loader.get_single_node()
+        if node is None:
+            return None
+        _measure(node, [], {})
+        return loader.construct_document(node)
+    except RecursionError:
+        raise error(f"{path}: {_TOO_DEEP}") from None
     except _RefusedError as problem:
         raise error(f"{path}: {problem}") from None
     except yaml.YAMLError as problem:
         raise error(f"{path}: not valid YAML: {' '.join(str(problem).split())}") from None
 
 
+_TOO_DEEP = f"lists or mappings are deeper than {MAX_DEPTH}: write them flat"
 # Numbers with an exponent as everybody else writes them: YAML 1.1 takes `1e-3` and `1.0e3` for text.
 _EXPONENT = re.compile(r"^[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$")
 
@@ -45,60 +54,12 @@ class _RefusedError(Exception):
     """What is wrong with a document, and the mend."""
 
 
-class _RestrictedLoader(yaml.SafeLoader):
+class _Loader(yaml.SafeLoader):
     # A number with dashes or colons is no date here.
     yaml_implicit_resolvers = {  # noqa: RUF012
         first: [(tag, pattern) for tag, pattern in resolvers if tag != "tag:yaml.org,2002:timestamp"]
         for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
     }
-
-    def __init__(self, text: str) -> None:
-        super().__init__(text)
-        self._path: list[str] = []
-        self._characters = 0
-        # Characters of each node that has been read, with all that it contains, by the identity of the node.
-        self._sizes: dict[int, int] = {}
-
-    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """A node of the document, within the limits."""
-        self._path.append(_step(parent, index))
-        if len(self._path) > MAX_DEPTH:
-            raise _RefusedError(f"{self._where()}: lists or mappings are deeper than {MAX_DEPTH}: write them flat")
-        before = self._characters
-        if self.check_event(yaml.AliasEvent):
-            node = super().compose_node(parent, index)
-            if id(node) not in self._sizes:
-                raise _RefusedError(f"{self._where()}: an alias (*) is inside of what it names: write out the values")
-            self._count(self._sizes[id(node)])
-        else:
-            self._count(_NODE_CHARACTERS)
-            node = super().compose_node(parent, index)
-        if isinstance(node, yaml.ScalarNode) and node.tag.endswith((":int", ":float")):
-            self._check_digits(node)
-        self._sizes[id(node)] = self._characters - before
-        self._path.pop()
-        return node
-
-    def compose_scalar_node(self, anchor: Any) -> yaml.ScalarNode:
-        """A value, which counts by its length."""
-        node = super().compose_scalar_node(anchor)
-        self._count(len(node.value))
-        return node
-
-    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
-        """A mapping in which no key stands twice."""
-        node = super().compose_mapping_node(anchor)
-        seen: dict[str, int] = {}
-        for key, _ in node.value:
-            if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
-                line = key.start_mark.line + 1
-                if key.value in seen:
-                    name = ".".join(step for step in [*self._path, shorten(key.value, 40)] if step)
-                    raise _RefusedError(
-                        f"key '{name}' stands twice, in lines {seen[key.value]} and {line}: remove the wrong one"
-                    )
-                seen[key.value] = line
-        return node
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
         """The value of a node; tags that do not fit their text become errors of YAML."""
@@ -110,27 +71,56 @@ class _RestrictedLoader(yaml.SafeLoader):
                 f"{node.tag.rpartition(':')[2]}: correct it, or put it in quotes"
             ) from None
 
-    def _count(self, characters: int) -> None:
-        self._characters += characters
-        if self._characters > MAX_CHARACTERS:
+
+_Loader.add_implicit_resolver("tag:yaml.org,2002:float", _EXPONENT, list("-+.0123456789"))
+
+
+def _measure(node: yaml.Node, steps: list[str], sizes: dict[int, int]) -> int:
+    """Characters of a node with all that it contains, what aliases repeat included, if it is within the limits.
+
+    Args:
+        node: of the document.
+        steps: keys and numbers that lead to it.
+        sizes: of the nodes so far, by identity; zero while they are measured.
+    """
+    where = f"key '{shorten('.'.join(steps))}'"
+    if len(steps) >= MAX_DEPTH:
+        raise _RefusedError(f"{where}: {_TOO_DEEP}")
+    if id(node) in sizes:
+        if not sizes[id(node)]:
+            raise _RefusedError(f"{where}: an alias (*) is inside of what it names: write out the values")
+        return sizes[id(node)]
+    sizes[id(node)] = 0
+    size = _NODE_CHARACTERS
+    if isinstance(node, yaml.ScalarNode):
+        size += len(node.value)
+        if node.tag.endswith((":int", ":float")) and len(node.value) > _MAX_DIGITS:
+            raise _RefusedError(f"{where}: a number of {len(node.value):,} characters: round it")
+    for name, child in _children(node, steps):
+        size += _measure(child, [*steps, name], sizes)
+        if size > MAX_CHARACTERS:
             raise _RefusedError(
-                f"{self._where()}: with what aliases (*) repeat, the values have more than {MAX_CHARACTERS:,} "
-                "characters: write out the values that are needed"
+                f"key '{shorten('.'.join([*steps, name]))}': with what aliases (*) repeat, the values have more than "
+                f"{MAX_CHARACTERS:,} characters: write out the values that are needed"
             )
-
-    def _check_digits(self, node: yaml.ScalarNode) -> None:
-        if len(node.value) > _MAX_DIGITS:
-            raise _RefusedError(f"{self._where()}: a number of {len(node.value):,} characters: round it")
-
-    def _where(self) -> str:
-        return f"key '{shorten('.'.join(step for step in self._path if step))}'"
+    sizes[id(node)] = size
+    return size
 
 
-def _step(parent: yaml.Node | None, index: Any) -> str:
-    """Name of a node in its parent: the key of a mapping, the number in a list."""
-    if isinstance(index, yaml.ScalarNode):
-        return shorten(index.value, 40)
-    return str(index) if isinstance(index, int) else ""
-
-
-_RestrictedLoader.add_implicit_resolver("tag:yaml.org,2002:float", _EXPONENT, list("-+.0123456789"))
+def _children(node: yaml.Node, steps: list[str]) -> Iterator[tuple[str, yaml.Node]]:
+    """Keys and values of a mapping in which no key stands twice; numbers and items of a list."""
+    if isinstance(node, yaml.SequenceNode):
+        yield from ((str(number), item) for number, item in enumerate(node.value))
+    seen: dict[str, int] = {}
+    for key, value in node.value if isinstance(node, yaml.MappingNode) else ():
+        name = shorten(key.value, 40) if isinstance(key, yaml.ScalarNode) else "?"
+        if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
+            line = key.start_mark.line + 1
+            if key.value in seen:
+                raise _RefusedError(
+                    f"key '{'.'.join([*steps, name])}' stands twice, in lines {seen[key.value]} and {line}: remove the "
+                    "wrong one"
+                )
+            seen[key.value] = line
+        yield name, key
+        yield name, value

@@ -178,11 +178,11 @@ def edited(path: Path, old: str, new: str) -> Path:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("camera_model: pinhole", "camera_model: omni", "cam0.camera_model is 'omni', the omnidirectional model"),
+        ("camera_model: pinhole", "camera_model: omni", "cam0: camera_model is 'omni', the omnidirectional model"),
         ("camera_model: pinhole", "camera_model: ds", "'ds', the double-sphere model, which is not supported"),
         ("camera_model: pinhole", "camera_model: orthographic", "cam0: camera_model is 'orthographic'"),
-        ("distortion_model: radtan", "distortion_model: fov", "cam0.distortion_model is 'fov', the field-of-view"),
-        ("distortion_model: radtan", "distortion_model: cubic", "cam0.distortion_model is 'cubic'; known are"),
+        ("distortion_model: radtan", "distortion_model: fov", "cam0: distortion_model is 'fov', the field-of-view"),
+        ("distortion_model: radtan", "distortion_model: cubic", "cam0: distortion_model is 'cubic'; known are"),
         ("T_cn_cnm1", "T_other", "cam1: T_cn_cnm1 is missing: the cameras were calibrated one by one"),
         ("intrinsics: [358.6,", "intrinsics: [358.6, 1.0,", "key 'cam0.intrinsics' must be 4 numbers"),
         ("cam1:", "cam7:", r"no stereo calibration of a known form \(keys: cam0, cam7\)"),
@@ -213,7 +213,7 @@ def test_kalibr_cameras_in_the_wrong_order(tmp_path: Path):
         ({"K1": np.eye(4)}, "key 'K1' must be a matrix of 3x3 numbers"),
         ({"D1": np.full((1, 14), 0.1)}, "D1: thin prism and tilt .* are not supported"),
         ({"D1": np.full((1, 4), np.nan)}, r"key 'D1\.data' must be a list of numbers"),
-        ({"R": np.zeros((3, 3))}, "R is no rotation"),
+        ({"R": np.zeros((3, 3))}, "R and T: a matrix has no inverse"),
         ({"T": np.array([[0.12], [0.0], [0.0]])}, "left and right look swapped"),
     ],
 )
