@@ -180,19 +180,16 @@ def _page(
         "decile of sigma": lambda found: _deciles(found.sigma),
     }
     for title, split in splits.items():
-        lines += ["", f"## Ours by {title}", ""]
-        lines += header("set", "from", "to", "share", "error", "bias", "> 3 px", "1 sigma", "2 sigma", "3 sigma",
-                        numbers_from=1)  # fmt: skip
-        for name in sets:
-            found = judged[name, methods[0]]
-            found = found.select(found.known)
-            for low, high, inside in split(found):
-                part = found.select(inside)
-                if len(part.truth):
-                    lines.append(
-                        row(name, f"{low:.3g}", f"{high:.3g}", f"{inside.mean():.1%}", *_errors(part.error),
-                            *_coverage(part))
-                    )  # fmt: skip
+        lines += ["", f"## Ours on the {sets[0]}, by {title}", ""]
+        lines += header("from", "to", "share", "error", "bias", "> 3 px", "1 sigma", "2 sigma", "3 sigma",
+                        numbers_from=0)  # fmt: skip
+        found = judged[sets[0], methods[0]]
+        found = found.select(found.known)
+        for low, high, inside in split(found):
+            part = found.select(inside)
+            if len(part.truth):
+                ends = (f"{low:.3g}", f"{high:.3g}", f"{inside.mean():.1%}")
+                lines.append(row(*ends, *_errors(part.error), *_coverage(part)))
     return lines
 
 

@@ -25,31 +25,23 @@ _LABELS = {
     "orbslam3": "ORB-SLAM3",
     "bundle": "bundle adjustment",
 }
-_STAGES = ("features", "match", "filter", "map")
 _COLUMNS = (
     "method",
     "tracked",
     "ATE m",
     "t_rel %",
-    "r_rel deg/100 m",
     "step mm",
     "forward noise mm",
-    "step deg",
     "NIS",
     "NEES",
     "offset px",
-    "ms, mean (p10 - p90)",
-    "frames/s",
+    "ms, mean",
 )
-_STAGE_COLUMNS = ("method", "inliers", "features ms", "matching ms", "filter ms", "map ms")
 _RELATIVE_COLUMNS = (
     "span",
     "pairs",
     "NEES, mean",
-    "median",
     "inside 95 %",
-    "rmse m",
-    "sigma m",
     "truth's share %",
 )
 _WORDS = """\
@@ -73,7 +65,7 @@ of any method differs between sequences.
   between move with them. Its time is that of the optimisation, on top of the tracking; its NEES that of the keyframes.
 - *tracked*: frames with a pose from the images, relocalised ones too; the first frame of a run is its origin.
 - *ATE*: root mean square position error after the best rigid alignment, metres.
-- *t_rel*, *r_rel*: KITTI segments, of 100 m where the path allows, else of 10 to 50 m.
+- *t_rel*: KITTI segments, of 100 m where the path allows, else of 10 to 50 m.
 - *step*: median error from frame to frame over tracked frames. *Forward noise*: standard deviation over these frames of
   the error along the true step; steps shorter than the truth's sigma have no direction and are left out.
 - *NIS*, *NEES*: per degree of freedom, 1 is right, more is overconfident. NEES is given where the truth is exact: on
@@ -138,9 +130,6 @@ def format_results(results: Sequence[SequenceResult | Omission], command: str, c
         for missing in results:
             if isinstance(missing, Omission) and missing.method and missing.sequence == sequence:
                 lines += [f"The row *{_LABELS[missing.method]}* is left out: {missing.reason}", ""]
-        staged = [each for each in of_sequence if each.trial.frames and "filter" in each.trial.frames.milliseconds]
-        if staged:
-            lines += [*table(_STAGE_COLUMNS, map(_stage_row, staged)), ""]
         for result in of_sequence:
             lines += _step_lines(result)
         for result in of_sequence:
@@ -169,10 +158,7 @@ def _relative_lines(result: SequenceResult) -> list[str]:
             each.span,
             str(each.count),
             f"{each.mean_nees:.2f}",
-            f"{each.median_nees:.2f}",
             f"{100 * each.inside:.0f}",
-            f"{each.translation_rmse:.2g}",
-            f"{each.translation_sigma:.2g}",
             number(100 * each.truth_share, ".0f"),
         ]
         for each in spans
@@ -187,18 +173,16 @@ def ate_cell(result: SequenceResult) -> str:
 
 
 def total_cell(result: SequenceResult) -> str:
-    """Milliseconds a frame, and their spread where there is one."""
+    """Milliseconds a frame."""
     if result.trial.frames is None:
         seconds, share = _seconds_adjusting(result)
         return f"{share:.0f} (whole: {seconds:.1f} s)"
-    totals = _totals(result.trial.frames)
-    low, high = np.percentile(totals, [10, 90])
-    return f"{totals.mean():.0f} ({low:.0f} - {high:.0f})"
+    return f"{_totals(result.trial.frames).mean():.0f}"
 
 
 def _row(result: SequenceResult) -> list[str]:
     evaluation, frames, refined = result.trial.evaluation, result.trial.frames, result.refined
-    translations, rotations = evaluation.rpe.translations, evaluation.rpe.rotations_deg
+    translations = evaluation.rpe.translations
     ends_tracked, nis = np.ones(len(translations), bool), np.nan
     if frames is not None:
         tracked = np.isin(frames.status, TRACKED)
@@ -210,12 +194,10 @@ def _row(result: SequenceResult) -> list[str]:
             updated = frames.columns["dof"] > 0  # a relocalised frame is not
             nis = float(np.median(frames.columns["nis"][updated] / frames.columns["dof"][updated]))
         offset, sigma = (float(frames.columns[name][-1]) for name in ("disparity_offset", "disparity_offset_sigma"))
-        pace = float(_totals(frames).mean())
     else:
         assert refined is not None
         count = f"{refined['keyframes']} keyframes"
         offset, sigma = refined["disparity_offset"], refined["disparity_offset_sigma"]
-        _, pace = _seconds_adjusting(result)
     shortest = result.truth_sigmas[0] if result.truth_sigmas else 0.0
     forward = evaluation.rpe.forward[ends_tracked & (evaluation.rpe.lengths > shortest)]
     return [
@@ -223,23 +205,13 @@ def _row(result: SequenceResult) -> list[str]:
         count,
         ate_cell(result),
         number(evaluation.kitti.mean_translation_percent, ".2f"),
-        number(evaluation.kitti.mean_rotation_deg_per_100m, ".2f"),
         number(1e3 * float(np.median(translations[ends_tracked])) if ends_tracked.any() else np.nan, ".2f"),
         number(1e3 * float(forward.std()) if len(forward) > 1 else np.nan, ".2f"),
-        number(float(np.median(rotations[ends_tracked])) if ends_tracked.any() else np.nan, ".3f"),
         number(nis, ".2f"),
         number(result.nees, ".2f"),
         f"{offset:+.2f} ± {sigma:.2f}" if np.isfinite(offset) else "-",
         total_cell(result),
-        f"{1e3 / pace:.1f}",
     ]
-
-
-def _stage_row(result: SequenceResult) -> list[str]:
-    frames, tracked = result.trial.table, result.trial.tracked
-    inliers = float(np.median(frames.columns["inliers"][tracked])) if tracked.any() else np.nan
-    stages = (f"{np.nanmedian(frames.milliseconds[stage]):.1f}" for stage in _STAGES)
-    return [_LABELS[result.method], number(inliers, ".0f"), *stages]
 
 
 def _totals(frames: FrameTable) -> np.ndarray:
