@@ -200,7 +200,7 @@ def _batch_section(
     return [
         f"## {_TITLES[kind]}",
         "",
-        "Filter steps a second, with the lowest and highest round; float32 where there is one.",
+        "Filter steps a second, medians of the rounds; float32 where there is one.",
         "",
         *table(["", *(f"B = {batch:,}" for batch in BATCHES)], rows),
         "",
@@ -251,8 +251,8 @@ def sequence_section(rounds: int) -> list[str]:
     return [
         "## Sequences",
         "",
-        f"Filter steps a second over {count} steps of a robot in R^3 that sees range and bearing, with the lowest and",
-        "highest round; float64 (`evaluation/sigmaslam_benchmarks/filters/sequences.py`).",
+        f"Filter steps a second over {count} steps of a robot in R^3 that sees range and bearing, medians of the",
+        "rounds; float64 (`evaluation/sigmaslam_benchmarks/filters/sequences.py`).",
         "",
         *table(["", *(f"B = {batch:,}" for batch in sequences.BATCHES)], rows),
         "",
@@ -273,7 +273,7 @@ def _ratio(middle: float, low: float, high: float) -> str:
 
 
 def _rate(rates: list[float]) -> str:
-    return f"{_thousands(statistics.median(rates))} ({_thousands(min(rates))} - {_thousands(max(rates))})"
+    return _thousands(statistics.median(rates))
 
 
 def _thousands(value: float) -> str:

@@ -88,13 +88,16 @@ def format_endurance(endurance: Endurance, command: str) -> str:
         lines += [f"**Stopped after {endurance.frames} of {endurance.asked} frames.**", ""]
     lines += [*_verdicts(endurance), ""]
     if endurance.blocks:
+        apart = max(len(endurance.blocks) // 5, 1)
+        blocks = endurance.blocks[apart - 1 :: apart]
         columns = ("frames", "MB", "CPU ms", "wall ms, median (p10 - p90)", "keyframes", "lost")
-        lines += ["## Memory and time", "", *table(columns, map(_block_row, endurance.blocks)), ""]
+        lines += ["## Memory and time", "", *table(columns, map(_block_row, blocks)), ""]
     if endurance.laps:
         rows = (
             [f"{number}", f"{1e3 * lap.end:.1f}", _percent(lap.end, endurance)]
             + [f"{1e3 * error:.1f}" for error in (lap.median, lap.most)]
             for number, lap in enumerate(endurance.laps, start=1)
+            if number in (1, 2, len(endurance.laps))
         )
         lines += ["## Errors", "", *table(("lap", "at its end mm", "% of a lap", "median mm", "most mm"), rows), ""]
     return "\n".join(lines)

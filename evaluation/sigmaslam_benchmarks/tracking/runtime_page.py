@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,9 +10,9 @@ import numpy as np
 from sigmaslam_benchmarks.tracking.page import number, opening, table
 from sigmaslam_benchmarks.tracking.sequences_page import Omission, method_label
 from sigmaslam_benchmarks.tracking.stereo_peers import RECTIFIED
-from sigmaslam_benchmarks.tracking.time_method import METHODS, OURS, WARM_UP, MethodTiming
+from sigmaslam_benchmarks.tracking.time_method import METHODS, WARM_UP, MethodTiming
 
-SEQUENCE, SIZE, LANDMARKS = "sequence", "size", "landmarks"
+SEQUENCE, SIZE = "sequence", "size"
 """Sections of the page."""
 _COLUMNS = (
     "method",
@@ -27,7 +27,6 @@ _COLUMNS = (
     "peak MiB",
     "first pose s",
 )
-_STAGES = ("rectify", "features", "match", "filter", "map")
 _WORDS = """\
 Every method runs in a process of its own, once held on one core and once on two; every library has as many threads. The
 methods take turns, {rounds}. Figures are medians over the rounds, with the lowest and highest round in brackets.
@@ -55,7 +54,7 @@ class TimedRun:
     Attributes:
         section: of the page.
         sequence: name.
-        variant: size of the images, or settings.
+        variant: size of the images.
         method, threads: what was run.
         round: in which.
         timing: what it took.
@@ -102,10 +101,9 @@ def format_runtime(results: Sequence[TimedRun | Omission], command: str, rounds:
         lines += [f"Peers: {', '.join(versions[method] for method in RECTIFIED if method in versions)}.", ""]
     for sequence in dict.fromkeys(run.sequence for run in runs if run.section == SEQUENCE):
         lines += _sequence_lines(sequence, [run for run in runs if (run.section, run.sequence) == (SEQUENCE, sequence)])
-    for section, write in ((SIZE, _size_lines), (LANDMARKS, _landmark_lines)):
-        of_section = [run for run in runs if run.section == section]
-        if of_section:
-            lines += write(of_section)
+    sized = [run for run in runs if run.section == SIZE]
+    if sized:
+        lines += _size_lines(sized)
     return "\n".join(lines)
 
 
@@ -114,15 +112,6 @@ def _sequence_lines(sequence: str, runs: list[TimedRun]) -> list[str]:
     methods = [method for method in METHODS if any(run.method == method for run in runs)]
     lines = [f"## {sequence}, {runs[0].variant}, {frames} frames", ""]
     lines += [*table(_COLUMNS, (_row(method, runs) for method in methods)), ""]
-    staged = [row for method in methods if method in OURS for row in _stage_rows(method, runs)]
-    if staged:
-        columns = ("method", "frames", "count", *(f"{stage} ms" for stage in _STAGES), "sum ms")
-        lines += [
-            "Stages: median wall time over the frames of all rounds, one thread.",
-            "",
-            *table(columns, staged),
-            "",
-        ]
     return lines
 
 
@@ -147,21 +136,6 @@ def _row(method: str, runs: Sequence[TimedRun]) -> list[str]:
     ]
 
 
-def _stage_rows(method: str, runs: Sequence[TimedRun]) -> Iterable[list[str]]:
-    """Keyframes and the other frames apart."""
-    alone = [run.timing for run in runs if (run.method, run.threads) == (method, 1)]
-    if not alone:
-        return
-    keyframe = np.concatenate([timing.keyframe for timing in alone]).astype(bool)
-    stages = {stage: np.concatenate([timing.stages_ms[stage] for timing in alone]) for stage in _STAGES}
-    for name, chosen in (("keyframes", keyframe), ("others", ~keyframe)):
-        if chosen.any():
-            total = np.sum([stages[stage][chosen] for stage in _STAGES], axis=0)
-            cells = [f"{np.median(stages[stage][chosen]):.1f}" for stage in _STAGES]
-            count = f"{chosen.sum() / len(alone):.0f}"
-            yield [runtime_label(method), name, count, *cells, f"{np.median(total):.1f}"]
-
-
 def _size_lines(runs: list[TimedRun]) -> list[str]:
     sizes = list(dict.fromkeys(run.variant for run in runs))
     rows = []
@@ -176,31 +150,6 @@ def _size_lines(runs: list[TimedRun]) -> list[str]:
         f"CPU ms of a frame, one thread, on the images of {runs[0].sequence}, resized.",
         "",
         *table(("method", *sizes), rows),
-        "",
-    ]
-
-
-def _landmark_lines(runs: list[TimedRun]) -> list[str]:
-    rows = []
-    for variant, method in dict.fromkeys((run.variant, run.method) for run in runs):
-        chosen = [run for run in runs if (run.variant, run.method) == (variant, method)]
-        rows.append(
-            [
-                *variant.split(", "),
-                runtime_label(method),
-                _middle(chosen, lambda run: float(np.median(run.timing.landmarks)), ".0f"),
-                _spread(chosen, _mean_cpu, ".1f"),
-                _middle(chosen, lambda run: float(np.median(run.timing.stages_ms["filter"])), ".1f"),
-                _middle(chosen, lambda run: run.ate, ".4f"),
-            ]
-        )
-    columns = ("spacing", "max_keypoints", "method", "landmarks in a pose", "CPU ms", "filter ms", "ATE m")
-    return [
-        "## Cost and landmarks",
-        "",
-        f"The settings `spacing` and `max_keypoints` of the tracker on {runs[0].sequence}, one thread.",
-        "",
-        *table(columns, rows),
         "",
     ]
 
