@@ -204,7 +204,7 @@ def _introduction(command: str, rounds: int) -> list[str]:
         f"  time on one thread, extractors in turn, {rounds} rounds; the ratio with its lowest and highest round.",
         "- *parameters*: of a graph all its real constants, fixed filters among them; of .safetensors those trained.",
         f"- Scores: at most {MAX_KEYPOINTS:,} keypoints, long side 640, mutual nearest neighbours; shares and areas in",
-        "  percent, numbers a pair; more of them in the .json beside this page. A graph too small for a set has no row there.",
+        "  percent, numbers a pair; more in the .json beside this page. A graph too small for a set has no row there.",
         "- *rows_refined*: matched within 2 rows, then refined by Lucas-Kanade. The tracker searches rows without",
         "  features of the right eye.",
         "- *kitti_tracks*: kitti from frame to frame, with up to 2,048 keypoints, and KLT with as many corners.",

@@ -51,27 +51,21 @@ of any method differs between sequences.
 
 - *ours*: learned features, unscented updates, two linearisations: what `sigmaslam track` does. *Our EKF*: the same with
   Jacobians, linearised once. *Ours with*: other features under the same filter.
-- *SIFT + PnP*, *KLT + PnP*: from OpenCV alone (`sigmaslam_benchmarks.tracking.pnp_baselines`): points of a keyframe,
-  found again by ratio test or Lucas-Kanade, RANSAC, least squares. Landmarks count as known, the noise as 1 px.
-- *cuVSLAM*: on the CPU, by the package dim-odom (extra `peers`), given rectified pairs; rectifying is in its
-  time. No pose where it is lost. Its covariance (`pose_covariance`) is of x, y, z in the world and of roll, pitch, yaw
-  about fixed axes, as its header documents, and is turned into the camera's frame here. It is of the fit of one frame
-  to its map and does not grow along the path. *NEES* takes it for that of the pose relative to the first, as of the
-  others; a line below the table takes it for that of the step from the frame before.
-- *ORB-SLAM3*: by the package pyorbslam3 (extra `peers`), given rectified pairs, which come no sooner than their time
-  stamps say: its mapping has threads of its own. Poses as it says them at each frame, without what loops change later.
-  Its vocabulary is the one that `PYORBSLAM3_VOCAB` names. It gives no covariance.
-- *bundle adjustment*: of the tracks of *ours* (`track --tracks`, then `refine`), all keyframes at once; frames in
-  between move with them. Its time is that of the optimisation, on top of the tracking; its NEES that of the keyframes.
-- *tracked*: frames with a pose from the images, relocalised ones too; the first frame of a run is its origin.
-- *ATE*: root mean square position error after the best rigid alignment, metres.
-- *t_rel*: KITTI segments, of 100 m where the path allows, else of 10 to 50 m.
-- *step*: median error from frame to frame over tracked frames. *Forward noise*: standard deviation over these frames of
-  the error along the true step; steps shorter than the truth's sigma have no direction and are left out.
-- *NIS*, *NEES*: per degree of freedom, 1 is right, more is overconfident. NEES is given where the truth is exact: on
-  renders.
-- *Relative poses*: of frames a span apart, which overlap. The covariance of a pair is the estimate's and the truth's
-  together; *truth's share* of it, in the median.
+- *SIFT + PnP*, *KLT + PnP*: from OpenCV alone (`sigmaslam_benchmarks.tracking.pnp_baselines`). Landmarks count as known,
+  the noise as 1 px.
+- *cuVSLAM*: on the CPU, by the package dim-odom (extra `peers`), given rectified pairs. Its covariance
+  (`pose_covariance`) is turned into the camera's frame; it is of the fit of one frame to its map. *NEES* takes it for
+  that of the pose relative to the first; a line below the table for that of the step from the frame before.
+- *ORB-SLAM3*: by the package pyorbslam3 (extra `peers`), given rectified pairs at their time stamps, with the vocabulary
+  that `PYORBSLAM3_VOCAB` names. It gives no covariance.
+- *bundle adjustment*: of the tracks of *ours* (`track --tracks`, then `refine`). Its time is that of the optimisation,
+  its NEES that of the keyframes.
+- *tracked*: frames with a pose from the images. *ATE*: root mean square position error after the best rigid alignment.
+  *t_rel*: KITTI segments, of 100 m where the path allows, else of 10 to 50 m.
+- *step*: median error from frame to frame. *Forward noise*: standard deviation of the error along the true step; steps
+  shorter than the truth's sigma are left out.
+- *NIS*, *NEES*: per degree of freedom, 1 is right, more is overconfident. NEES where the truth is exact.
+- *Relative poses*: of frames a span apart, which overlap, with the truth's covariance; *truth's share*: median.
 - *offset*: measured minus true disparity, of the methods that estimate it.
 """
 
