@@ -127,32 +127,29 @@ def _probability(data: Path, judge: ConfidenceEstimator) -> list[str]:
     lines = [
         "## Probability in forward motion and on repeated structure",
         "",
-        f"Mutual nearest neighbours of {_PHOTOGRAPH_KEYPOINTS} keypoints an image. *claimed / right*: mean probability",
+        f"Mutual nearest neighbours of {_PHOTOGRAPH_KEYPOINTS} learned keypoints. *claimed / right*: mean probability",
         "and share of right ones of the matches of such a probability; right: within 3 px of the true place, which on",
         "real pairs is that of keypoints with a stereo match of at least 0.9, moved by the true motion. *precision*,",
         "*lost*: right ones among those of at least 0.5, and right ones that are not among them. *within*: errors of",
         "right matches within 1 and 2 sigma along the axes of their covariance.",
         f"Renders: {_RENDER_PAIRS} pairs of worlds and patterns of their own seed.",
         "",
-        *header("set", "features", "matches", *bins, "ece", "precision", "lost", "within 1", "within 2"),
+        *header("set", "matches", *bins, "ece", "precision", "lost", "within 1", "within 2"),
     ]
     renders: dict[str, Sequence[ScenePair | HomographyPair]] = {
         "renders, forward": list(map(ScenePairs(_RENDER_SEED, SIZE, _FORWARD_DOMAINS, forward=True).pair, _RENDERED)),
         "renders, repeated": list(map(RepeatedPairs(_RENDER_SEED, SIZE).pair, _RENDERED)),
     }
     gaps = {f"kitti gap {gap}": load_advances(data, gap) for gap in (1, 3)}
-    for kind, make in DETECTORS.items():
-        detect = make(_PHOTOGRAPH_KEYPOINTS)
-        measured = {name: measure_steps(steps, detect, judge) for name, steps in gaps.items()}
-        measured |= {name: measure_renders(pairs, detect, judge) for name, pairs in renders.items()}
-        for name, matches in measured.items():
-            judged = judge_probability(matches)
-            curve = (
-                f"{claimed:.2f} / {right:.2f}" for claimed, right in zip(judged.claimed, judged.right, strict=True)
-            )
-            shares = judged.precision, judged.lost, judged.within_1, judged.within_2
-            cells = *curve, f"{judged.ece:.3f}", *(f"{100 * share:.1f}" for share in shares)
-            lines.append(row(name, kind, str(judged.matches), *cells))
+    detect = DETECTORS["learned"](_PHOTOGRAPH_KEYPOINTS)
+    measured = {name: measure_steps(steps, detect, judge) for name, steps in gaps.items()}
+    measured |= {name: measure_renders(pairs, detect, judge) for name, pairs in renders.items()}
+    for name, matches in measured.items():
+        judged = judge_probability(matches)
+        curve = (f"{claimed:.2f} / {right:.2f}" for claimed, right in zip(judged.claimed, judged.right, strict=True))
+        shares = judged.precision, judged.lost, judged.within_1, judged.within_2
+        cells = *curve, f"{judged.ece:.3f}", *(f"{100 * share:.1f}" for share in shares)
+        lines.append(row(name, str(judged.matches), *cells))
     return [*lines, ""]
 
 

@@ -32,7 +32,6 @@ _COLUMNS = (
     "t_rel %",
     "step mm",
     "forward noise mm",
-    "NIS",
     "NEES",
     "offset px",
     "ms, mean",
@@ -51,20 +50,20 @@ of any method differs between sequences.
 
 - *ours*: learned features, unscented updates, two linearisations: what `sigmaslam track` does. *Our EKF*: the same with
   Jacobians, linearised once. *Ours with*: other features under the same filter.
-- *SIFT + PnP*, *KLT + PnP*: from OpenCV alone (`sigmaslam_benchmarks.tracking.pnp_baselines`). Landmarks count as known,
-  the noise as 1 px.
+- *SIFT + PnP*, *KLT + PnP*: from OpenCV alone (`sigmaslam_benchmarks.tracking.pnp_baselines`). Landmarks count as
+  known, the noise as 1 px.
 - *cuVSLAM*: on the CPU, by the package dim-odom (extra `peers`), given rectified pairs. Its covariance
   (`pose_covariance`) is turned into the camera's frame; it is of the fit of one frame to its map. *NEES* takes it for
   that of the pose relative to the first; a line below the table for that of the step from the frame before.
-- *ORB-SLAM3*: by the package pyorbslam3 (extra `peers`), given rectified pairs at their time stamps, with the vocabulary
-  that `PYORBSLAM3_VOCAB` names. It gives no covariance.
+- *ORB-SLAM3*: by the package pyorbslam3 (extra `peers`), given rectified pairs at their time stamps, with the
+  vocabulary that `PYORBSLAM3_VOCAB` names. It gives no covariance.
 - *bundle adjustment*: of the tracks of *ours* (`track --tracks`, then `refine`). Its time is that of the optimisation,
   its NEES that of the keyframes.
 - *tracked*: frames with a pose from the images. *ATE*: root mean square position error after the best rigid alignment.
   *t_rel*: KITTI segments, of 100 m where the path allows, else of 10 to 50 m.
 - *step*: median error from frame to frame. *Forward noise*: standard deviation of the error along the true step; steps
   shorter than the truth's sigma are left out.
-- *NIS*, *NEES*: per degree of freedom, 1 is right, more is overconfident. NEES where the truth is exact.
+- *NEES*: per degree of freedom, 1 is right, more is overconfident; where the truth is exact.
 - *Relative poses*: of frames a span apart, which overlap, with the truth's covariance; *truth's share*: median.
 - *offset*: measured minus true disparity, of the methods that estimate it.
 """
@@ -169,24 +168,21 @@ def ate_cell(result: SequenceResult) -> str:
 def total_cell(result: SequenceResult) -> str:
     """Milliseconds a frame."""
     if result.trial.frames is None:
-        seconds, share = _seconds_adjusting(result)
-        return f"{share:.0f} (whole: {seconds:.1f} s)"
+        assert result.refined is not None
+        return f"{1e3 * float(result.refined['seconds_adjust']) / result.refined['frames']:.0f}"
     return f"{_totals(result.trial.frames).mean():.0f}"
 
 
 def _row(result: SequenceResult) -> list[str]:
     evaluation, frames, refined = result.trial.evaluation, result.trial.frames, result.refined
     translations = evaluation.rpe.translations
-    ends_tracked, nis = np.ones(len(translations), bool), np.nan
+    ends_tracked = np.ones(len(translations), bool)
     if frames is not None:
         tracked = np.isin(frames.status, TRACKED)
-        count = f"{tracked.sum()} of {len(frames) - 1}"
+        count = f"{tracked.sum()}/{len(frames) - 1}"
         # Frame k ends step k - 1; frames that were skipped, or before the start, have no pose and no step.
         ends = tracked[np.isfinite(frames.columns["inliers"])][1:]
         ends_tracked = ends if len(ends) == len(translations) else ends_tracked
-        if tracked.any():
-            updated = frames.columns["dof"] > 0  # a relocalised frame is not
-            nis = float(np.median(frames.columns["nis"][updated] / frames.columns["dof"][updated]))
         offset, sigma = (float(frames.columns[name][-1]) for name in ("disparity_offset", "disparity_offset_sigma"))
     else:
         assert refined is not None
@@ -201,7 +197,6 @@ def _row(result: SequenceResult) -> list[str]:
         number(evaluation.kitti.mean_translation_percent, ".2f"),
         number(1e3 * float(np.median(translations[ends_tracked])) if ends_tracked.any() else np.nan, ".2f"),
         number(1e3 * float(forward.std()) if len(forward) > 1 else np.nan, ".2f"),
-        number(nis, ".2f"),
         number(result.nees, ".2f"),
         f"{offset:+.2f} ± {sigma:.2f}" if np.isfinite(offset) else "-",
         total_cell(result),
@@ -212,10 +207,3 @@ def _totals(frames: FrameTable) -> np.ndarray:
     """Milliseconds of each frame without the reading of files, which the baselines leave out too."""
     stages = np.array([values for stage, values in frames.milliseconds.items() if stage != "read"])
     return np.asarray(np.nansum(stages, axis=0)[np.isfinite(stages).any(axis=0)])
-
-
-def _seconds_adjusting(result: SequenceResult) -> tuple[float, float]:
-    """Of the whole optimisation, and milliseconds a frame."""
-    assert result.refined is not None
-    seconds = float(result.refined["seconds_adjust"])
-    return seconds, 1e3 * seconds / result.refined["frames"]
