@@ -2,7 +2,7 @@
 
 Published learned detectors localise worse than classical ones (repeatability within 1 px), so the network only says
 which keypoints are worth keeping. Of the classical ones the determinant of the Hessian repeats best
-(docs/notebook/features.md).
+(docs/notebook, features).
 """
 
 import torch

@@ -10,7 +10,7 @@ from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.geometry.image_cells import CELLS, image_cells
 
-# Part of one frame in the average: one frame's cells are too few to tell (docs/notebook/noise.md).
+# Part of one frame in the average: one frame's cells are too few to tell (docs/notebook, noise).
 _GAIN = 0.1
 # What one cell alone knows tells nothing of its errors: they are taken for twice as large as what is left, no more.
 _LEAST_LEFT = 0.25

@@ -14,7 +14,7 @@ from sigmaslam.frontend.knn import nearest_points
 from sigmaslam.frontend.patch_kernels import MAX_ZOOM, align
 from sigmaslam.frontend.types import Refinement
 
-# Three matches fix a map. Where 60 % are wrong, 24 find 0.60 of the maps, 12 only 0.40 (docs/notebook/following.md).
+# Three matches fix a map. Where 60 % are wrong, 24 find 0.60 of the maps, 12 only 0.40 (docs/notebook, following).
 _NEIGHBOURS = 24
 # Scale of the robust weight, pixels: from the first fit to the last.
 _FIRST_SCALE, _LAST_SCALE = 12.0, 2.0

@@ -7,7 +7,7 @@ import numpy as np
 
 from sigmaslam.frontend.types import Refinement
 
-# At most 20 steps, or until one is below 0.01 px, a sixth of what the best matches err by (docs/notebook/noise.md).
+# At most 20 steps, or until one is below 0.01 px, a sixth of what the best matches err by (docs/notebook, noise).
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
 
 

@@ -17,16 +17,16 @@ from sigmaslam.frontend.lucas_kanade import refine
 from sigmaslam.frontend.types import PatchMaps, Refinement
 from sigmaslam.geometry.camera import RectifiedStereo
 
-# With 15 pixels in place of 11 streets are 1.1 times worse (docs/notebook/following.md).
+# With 15 pixels in place of 11 streets are 1.1 times worse (docs/notebook, following).
 _RADIUS = 5
-# Patches come from where shifted ones agree: the first steps do most of the way (docs/notebook/following.md).
+# Patches come from where shifted ones agree: the first steps do most of the way (docs/notebook, following).
 _ITERATIONS = 3
 # A window that hardly falls off: with less of a patch a still image drifts by its noise.
 _TAPER = 1.0
 # Longest move of a shifted patch, pixels.
 _REACH = 2.0
 # More know a large surface better, and reach over the edge of a small one: the worst tenth has 1.4 times the error with
-# 24, the median 1.15 times with 12 (docs/notebook/following.md).
+# 24, the median 1.15 times with 12 (docs/notebook, following).
 _NEIGHBOURS = 16
 # Of a disparity about the plane through its neighbours, and of a slope beforehand: standard deviations, pixels, 1.
 _ROUGH, _STEEP = 0.2, 0.5

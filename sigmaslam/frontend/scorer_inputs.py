@@ -9,7 +9,7 @@ from sigmaslam.frontend.nearest_neighbours import Putative
 from sigmaslam.frontend.types import Features
 
 NEIGHBOURS = 12
-"""That a match is compared with; 16 are no better (docs/notebook/matching.md), and the scorer was trained on 12."""
+"""That a match is compared with; 16 are no better (docs/notebook, matching), and the scorer was trained on 12."""
 # With fewer mutual matches all matches may be neighbours.
 _MIN_ANCHORS = 32
 # Sevenfold sigmas are as unlike as any: the scorer has not to extrapolate beyond.

@@ -145,9 +145,9 @@ def test_an_unknown_extractor_is_refused(tmp_path: Path):
 
 def test_the_table_has_a_row_for_each_extractor():
     page = format_scores(
-        {"a": {"boat": {"mma_1": 0.25, "correct_3": 99.6}}, "b": {"boat": {"mma_1": 1, "correct_3": 7}}}
+        {"a": {"boat": {"mma_1": 0.25, "matches": 99.6, "auc_1": 1}}, "b": {"boat": {"mma_1": 1, "matches": 7}}}
     )
-    assert "| extractor | mma_1 | correct_3 |" in page
+    assert "| extractor | mma_1 | matches |" in page
     assert "| a | 25.0 | 100 |" in page
     assert "| b | 100.0 | 7 |" in page
 

@@ -73,9 +73,9 @@ def test_the_page_has_every_set_and_method(tmp_path: Path, monkeypatch: pytest.M
     for name in ("drive", "room", "room, worse camera"):
         assert page.count(f"| {name} | ours |") == 1
         assert page.count(f"| {name} | SGBM") == 2
-    assert "## Ours by distance, metres" in page
-    assert "| drive | 10 | 20 |" not in page
-    assert "| drive | 20 | 40 | 100.0% |" in page
+    assert "## Ours on the drive, by distance, metres" in page
+    assert "| 10 | 20 |" not in page
+    assert "| 20 | 40 | 100.0% |" in page
 
 
 def test_data_that_is_not_there_is_named(tmp_path: Path):

@@ -16,7 +16,7 @@ from tests.support.stand_ins import write_stand_ins
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 # Its commands build on each other: tests/training/test_own_scene_page.py runs them in their order.
-PAGES.remove(ROOT / "docs" / "own-scene.md")
+PAGES.remove(ROOT / "docs" / "matching.md")
 # What some commands write and others read.
 CALIBRATION = "stereo.yaml"
 # What is not run, by how it begins, and why.

@@ -1,4 +1,4 @@
-"""The commands of docs/own-scene.md run one after the other as they stand, but for the numbers of steps and frames."""
+"""The commands of docs/matching.md run one after the other as they stand, but for the numbers of steps and frames."""
 
 import re
 import shlex
@@ -11,7 +11,7 @@ import pytest
 from sigmaslam_training.features.recipes import RECIPES
 from tests.support.commands import ROOT, run_here
 
-PAGE = ROOT / "docs" / "own-scene.md"
+PAGE = ROOT / "docs" / "matching.md"
 # What is added to commands, by how they begin; of options that are given twice the last one counts.
 SMALL = {
     "sigmaslam render": ["--frames", "12", "--width", "192", "--height", "160"],
@@ -20,9 +20,9 @@ SMALL = {
 
 
 def commands() -> list[list[str]]:
-    blocks = re.findall(r"^```\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    blocks = re.findall(r"^```\w*\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
     lines = [line.partition("  #")[0] for block in blocks for line in block.splitlines()]
-    return [shlex.split(line) for line in lines if line]
+    return [shlex.split(line) for line in lines if line.startswith("sigmaslam ")]
 
 
 def test_the_page_goes_from_a_render_to_matches():

@@ -62,8 +62,6 @@ def format_page(page: LivePage) -> str:
         open=page.asked - len(page.found),
         methods=[(method, *_totals(page, method)) for method in page.methods],
         tables=[(method, list(_case_rows(page, method))) for method in page.methods],
-        details=[(recording.name, list(_recording_rows(page, recording))) for recording in recordings],
-        words=[(recording.name, list(_words(page, recording))) for recording in _one_of_each(recordings)],
         left_out=sorted({each for each in page.found.values() if isinstance(each, str)}),
     )
 
@@ -100,25 +98,6 @@ def _case_rows(page: LivePage, method: str) -> Iterator[list[str]]:
         ]
 
 
-def _recording_rows(page: LivePage, recording: Recording) -> Iterator[list[str]]:
-    for method in page.methods:
-        for case in page.cases:
-            result = page.found.get((recording, method, case))
-            if not isinstance(result, Judgement):
-                continue
-            yield [
-                case,
-                method,
-                *_statuses([result]),
-                _bold(page.silent(recording, method, result)),
-                max_of([result.sigmas]),
-                max_of([result.metres]),
-                max_of([result.end_metres]),
-                max_of([result.away_sigmas]),
-                max_of([result.away_metres]),
-            ]
-
-
 def _statuses(results: Sequence[Judgement]) -> list[str]:
     """Cells of counts: the common ones, and the others by name."""
     counts: Counter[str] = Counter()
@@ -126,22 +105,6 @@ def _statuses(results: Sequence[Judgement]) -> list[str]:
         counts.update(result.statuses)
     others = ", ".join(f"{count} {status}" for status, count in counts.items() if status not in _UNTOLD)
     return [*(str(counts[status]) for status in _COMMON), others or "-"]
-
-
-def _words(page: LivePage, recording: Recording) -> Iterator[tuple[str, str]]:
-    """What the first method says of each case."""
-    for case in page.cases:
-        result = page.found.get((recording, page.methods[0], case))
-        if isinstance(result, Judgement):
-            said = [*result.said, *([f"refused: {result.refused}"] if result.refused else [])]
-            yield case, " / ".join(said).replace("|", "\\|").replace("\n", " ") or "nothing"
-
-
-def _one_of_each(recordings: Sequence[Recording]) -> list[Recording]:
-    first: dict[str, Recording] = {}
-    for recording in recordings:
-        first.setdefault(recording.kind, recording)
-    return list(first.values())
 
 
 def max_of(values: Sequence[float]) -> str:

@@ -1,4 +1,4 @@
-"""Whether poses and map are as sure as they say: on renders with exact truth, many seeds, five filters."""
+"""Whether poses and map are as sure as they say: on renders with exact truth, many seeds, four filters."""
 
 import json
 import os
@@ -35,8 +35,6 @@ SCALES = (
 _DRAWN = "ours, calibration drawn"
 METHODS = {
     "ours": TrackerConfig(linearisation="unscented"),
-    "UKF, one iteration": TrackerConfig(linearisation="unscented", iterations=1),
-    "EKF, iterated": TrackerConfig(linearisation="extended"),
     "EKF, one iteration": TrackerConfig(linearisation="extended", iterations=1),
     "ours, offset not estimated": TrackerConfig(linearisation="unscented", offset_sigma=0.0, offset_walk=0.0),
     _DRAWN: TrackerConfig(linearisation="unscented"),

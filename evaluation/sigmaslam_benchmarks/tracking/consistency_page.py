@@ -4,11 +4,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
-import numpy as np
-
 from sigmaslam.slam.relative_poses import SPANS
 from sigmaslam_benchmarks.tracking.page import fill_page, number_with_error
-from sigmaslam_evaluation.metrics.map_consistency import mean_with_error, ratio_with_error, root_mean_square_with_error
+from sigmaslam_evaluation.metrics.map_consistency import mean_with_error, ratio_with_error
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,16 +157,12 @@ def _pose_rows(methods: Mapping[str, Sequence[ConsistencyResult]]) -> Iterator[l
         yield [
             method,
             _cell(trials, lambda r: r.nees),
-            _cell(trials, lambda r: r.nees_last),
             _cell(trials, lambda r: 100 * r.inside, ".0f"),
             _cell(trials, lambda r: r.nis),
-            _cell(trials, lambda r: 1e3 * r.ate, ".3g"),
             _cell(trials, lambda r: 100 * r.ate / r.path_length, ".3f"),
             "" if trials is ours else number_with_error(*ratio_with_error(ate, [r.ate for r in ours]), ".2f"),
             _cell(trials, lambda r: r.offset_error, "+.3f"),
-            number_with_error(*root_mean_square_with_error([result.offset_z for result in trials]), ".2f"),
             f"{sum(result.lost for result in trials)}",
-            f"{np.mean([r.filter_ms for r in trials]):.0f} / {np.mean([r.total_ms for r in trials]):.0f}",
         ]
 
 
@@ -189,13 +183,9 @@ def _relative_table(methods: Mapping[str, Sequence[ConsistencyResult]]) -> tuple
 
 def _map_rows(methods: Mapping[str, Sequence[ConsistencyResult]]) -> Iterator[list[str]]:
     for method, trials in methods.items():
-        points, edges = (sum(getattr(result, name) for result in trials) for name in ("points", "edges"))
         yield [
             method,
-            f"{points / len(trials):.0f}",
-            f"{100 * edges / max(points + edges, 1):.1f} %",
             _cell(trials, lambda r: r.point_nees),
-            _cell(trials, lambda r: r.point_median),
             _cell(trials, lambda r: 100 * r.point_inside, ".0f"),
             _cell(trials, lambda r: 100 * r.point_gross, ".1f") + " %",
         ]

@@ -1,4 +1,4 @@
-"""Pictures of dense clouds for docs/gallery.md: rendered sequences, tracked and reconstructed, from two viewpoints.
+"""Dense clouds of docs/reconstruction.md: rendered sequences, tracked and reconstructed, from two viewpoints.
 
 `python -m sigmaslam_benchmarks.tracking.dense_gallery --out docs/images --work build/gallery`
 """

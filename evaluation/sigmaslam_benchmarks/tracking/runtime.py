@@ -4,7 +4,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.resources import as_file, files
 from itertools import islice
 from pathlib import Path
@@ -16,11 +16,9 @@ from sigmaslam.errors import InputError
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import open_sequence
 from sigmaslam.readers.trajectory_files import read_trajectory
-from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam_benchmarks.tracking.decoded_pairs import DecodedPairs, write_pairs
 from sigmaslam_benchmarks.tracking.page import check_names, write_results_page
 from sigmaslam_benchmarks.tracking.runtime_page import (
-    LANDMARKS,
     SEQUENCE,
     SIZE,
     TimedRun,
@@ -40,8 +38,6 @@ SEQUENCES = ("kitti_raw_0926_0039_a", "room", "euroc_mh01_f000_099")
 FRAMES, ROUNDS = 60, 3
 SCALES = (0.5, 0.75, 1.0, 1.5)
 """Of the images of the first sequence."""
-SPACINGS = (6.0, 8.0, 12.0, 20.0)
-MAX_KEYPOINTS = (500, 1000, 1500, 3000)
 _SEED = 700  # a development seed
 _DEMO = "demo"  # for those who have neither torch nor data
 
@@ -52,9 +48,8 @@ class _Test:
 
     Attributes:
         section: of the page.
-        variant: of the sequence or of the settings, as the page calls it.
+        variant: size of the images.
         runs: method and threads of each.
-        settings: of the tracker.
     """
 
     section: str
@@ -63,7 +58,6 @@ class _Test:
     pairs: DecodedPairs
     truth: Trajectory
     runs: Sequence[tuple[str, int]]
-    settings: dict[str, Any] = field(default_factory=dict)
 
 
 def write_runtime(
@@ -83,7 +77,7 @@ def write_runtime(
 
     Args:
         methods: of `METHODS`.
-        sequences: of `SEQUENCES`, or "demo"; image size and landmarks are varied on the first that is there.
+        sequences: of `SEQUENCES`, or "demo"; the image size is varied on the first that is there.
         rounds: in which every method is run once.
         frames: of each sequence, from its start.
     Raises:
@@ -125,7 +119,6 @@ def time_everything(
             yield from _take_turns([_Test(SEQUENCE, name, pairs.size, pairs, truth, every)], rounds, missing, note)
         if first is not None:
             yield from _take_turns(_vary_size(*first, methods, scratch), rounds, missing, note)
-            yield from _take_turns(_vary_landmarks(*first, methods), rounds, missing, note)
 
 
 def _find(
@@ -172,16 +165,6 @@ def _vary_size(
         yield _Test(SIZE, name, scaled.size, scaled, truth, [(method, 1) for method in methods])
 
 
-def _vary_landmarks(name: str, pairs: DecodedPairs, truth: Trajectory, methods: Sequence[str]) -> Iterator[_Test]:
-    default = TrackerConfig()
-    variants = [(spacing, default.max_keypoints) for spacing in SPACINGS]
-    variants += [(default.spacing, count) for count in MAX_KEYPOINTS if count != default.max_keypoints]
-    runs = [(method, 1) for method in methods if method in ("ours", "klt")]
-    for spacing, count in variants:
-        settings = {"spacing": spacing, "max_keypoints": count}
-        yield _Test(LANDMARKS, name, f"{spacing:g} px, {count}", pairs, truth, runs, settings)
-
-
 def _take_turns(
     tests: Iterator[_Test] | list[_Test], rounds: int, missing: set[str], note: Callable[[str], None]
 ) -> Iterator[TimedRun | Omission]:
@@ -195,7 +178,7 @@ def _take_turns(
                 if method in missing or place in failed:
                     continue
                 try:
-                    timing = time_method(TimingJob(str(test.pairs.folder), method, threads, test.settings))
+                    timing = time_method(TimingJob(str(test.pairs.folder), method, threads))
                 except MissingPeerError as error:
                     missing.add(method)
                     note(f"{method_label(method)} is left out: {error}")

@@ -138,14 +138,14 @@ def run_sequences(
     with ExitStack() as stack:
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         demo = stack.enter_context(as_file(files("sigmaslam_synthetic") / "demo"))
-        jobs = [_BenchmarkSequence("demo (rendered)", demo, demo / "poses.txt")] if "demo" in wanted else []
+        jobs = [_BenchmarkSequence("demo", demo, demo / "poses.txt")] if "demo" in wanted else []
         for name in RENDERED:
             if name in wanted:
                 try:
                     jobs.append(_render(name, renders or scratch / "renders", note))
                 except ImportError as error:
                     reason = f"{error.name} is not installed: pip install 'sigmaslam[train]'"
-                    yield Omission(f"{name} (rendered)", "", reason)
+                    yield Omission(name, "", reason)
         if data is not None:
             jobs += [
                 _BenchmarkSequence(name, data / name, data / name / truth, sigmas)
@@ -178,11 +178,7 @@ def _render(name: str, folder: Path, note: Callable[[str], None]) -> _BenchmarkS
     began = time.perf_counter()
     out = render(folder, recipe, default_workers())
     note(f"{preset} rendered in {time.perf_counter() - began:.0f} s")
-    if name == CALIBRATED:
-        return _BenchmarkSequence(
-            f"{preset} (the same images, their right calibration)", out, out / "poses.txt", disparity_error=OFFSET
-        )
-    return _BenchmarkSequence(f"{preset} (rendered, disparities {OFFSET} px too large)", out, out / "poses.txt")
+    return _BenchmarkSequence(name, out, out / "poses.txt", disparity_error=OFFSET if name == CALIBRATED else 0.0)
 
 
 def _run(job: _BenchmarkSequence, method: str, runs: Path) -> SequenceResult | Omission:

@@ -69,11 +69,6 @@ class ShakeResult:
         """ATE, % of the path."""
         return 100.0 * self.ate / self.path_length if self.path_length > 0 else float("nan")
 
-    @property
-    def motion_wrong(self) -> int:
-        """Frames whose motion is wrong, over a frame or over a second."""
-        return len({*self.wrong_step, *self.wrong_second})
-
 
 Results: TypeAlias = Mapping[str, Mapping[ShakenSequence, ShakeResult]]
 """By method and sequence."""
@@ -90,7 +85,7 @@ def format_page(
         seeds: the first one, and how many were asked for.
         missing: names of sequences that failed.
     """
-    method, ours = next(iter(results.items()))
+    ours = next(iter(results.values()))
     first, count = seeds
     goals, missed = _goals(list(ours.values()))
     groups: dict[str, Callable[[ShakenSequence], bool]] = {
@@ -115,14 +110,10 @@ def format_page(
         goals=goals,
         missed=missed,
         summary=[[label, method, *_summary(trials)] for label, method, trials in chosen if trials],
-        motions=[_motion_cells(sequence) for sequence in ours],
-        sequences=[
-            [sequence.name, f"{sequence.movers:g}", method, *_cells(trials[sequence])]
-            for sequence in ours
-            for method, trials in results.items()
-        ],
-        method=method,
-        wrong=[(sequence.name, r.wrong_step, r.wrong_second) for sequence, r in ours.items() if r.motion_wrong],
+        sequences=len(ours),
+        hardness={
+            name: _span([getattr(each.motion, name) for each in ours]) for name in ("flow", "reversal", "blur_left")
+        },
     )
 
 
@@ -146,10 +137,8 @@ def _goals(ours: Sequence[ShakeResult]) -> tuple[list[list[str]], list[str]]:
     return rows, missed
 
 
-def _motion_cells(sequence: ShakenSequence) -> list[str]:
-    motion = sequence.motion
-    blur = f"{motion.blur_left:.1f} / {motion.blur_right:.1f}"
-    return [sequence.name, f"{sequence.movers:g}", f"{motion.flow:.1f}", f"{motion.reversal:.1f}", blur]
+def _span(values: Sequence[float]) -> str:
+    return f"{min(values):.1f} to {max(values):.1f}"
 
 
 def _summary(trials: Sequence[ShakeResult]) -> list[str]:
@@ -164,20 +153,4 @@ def _summary(trials: Sequence[ShakeResult]) -> list[str]:
         *(str(sum(len(getattr(r, name)) for r in trials)) for name in ("wrong_step", "wrong_second", "wrong_start")),
         number_with_error(*mean_with_error([result.nees for result in trials]), ".2f"),
         number_with_error(*mean_with_error([100 * result.inside for result in trials]), ".0f"),
-    ]
-
-
-def _cells(result: ShakeResult) -> list[str]:
-    counts = (result.wrong_step, result.wrong_second, result.wrong_start)
-    worst = (result.worst_step, result.worst_second, result.worst_start)
-    return [
-        str(result.tracking),
-        str(result.lost),
-        f"{1e3 * result.ate:.3g}",
-        f"{result.percent:.2f}",
-        " / ".join(str(len(frames)) for frames in counts),
-        " / ".join(f"{value:.1f}" for value in worst),
-        f"{1e3 * result.step_metres:.1f} mm, {result.step_degrees:.2f}°",
-        f"{result.nees:.2f}",
-        f"{100 * result.inside:.0f}",
     ]

@@ -14,7 +14,7 @@ import time
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -39,13 +39,11 @@ class TimingJob:
         pairs: folder of `write_pairs`.
         method: of `METHODS`.
         threads: of every library; the process is held on so many cores.
-        settings: of `TrackerConfig` that differ from the defaults; ours alone.
     """
 
     pairs: str
     method: str
     threads: int = 1
-    settings: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,11 +181,10 @@ class _Ours:
     rectified = False
 
     def __init__(self, job: TimingJob, pairs: DecodedPairs) -> None:
-        from sigmaslam.slam.tracker import StereoTracker, TrackerConfig
+        from sigmaslam.slam.tracker import StereoTracker
 
         self.version = ""
-        config = TrackerConfig(**job.settings)
-        self._tracker = StereoTracker(pairs.camera, OURS[job.method], config=config, threads=job.threads)
+        self._tracker = StereoTracker(pairs.camera, OURS[job.method], threads=job.threads)
 
     def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> _Step:
         estimate = self._tracker.step(left, right, timestamp)

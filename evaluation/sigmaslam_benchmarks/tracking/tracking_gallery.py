@@ -1,4 +1,4 @@
-"""Animations of docs/gallery.md: rendered sequences while they are tracked, as `track --video` shows them.
+"""Animations of docs/usage.md: rendered sequences while they are tracked, as `track --video` shows them.
 
 `python -m sigmaslam_benchmarks.tracking.tracking_gallery --out docs/images --work build/gallery`
 """

@@ -34,13 +34,6 @@ def mean_with_error(values: Sequence[float] | np.ndarray) -> tuple[float, float]
     return float(valid.mean()), float(valid.std(ddof=1) / np.sqrt(len(valid)))
 
 
-def root_mean_square_with_error(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
-    """Root of the mean square and its standard error, first order."""
-    mean, error = mean_with_error(np.asarray(values, dtype=np.float64) ** 2)
-    root = float(np.sqrt(mean))
-    return root, error / (2.0 * root) if root > 0 else float("nan")
-
-
 def ratio_with_error(values: Sequence[float], others: Sequence[float]) -> tuple[float, float]:
     """Geometric mean of values / others, paired, and its standard error, first order."""
     mean, error = mean_with_error(np.log(np.asarray(values) / np.asarray(others)))
