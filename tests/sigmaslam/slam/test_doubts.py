@@ -58,8 +58,9 @@ def test_stamps_that_can_be_read_leave_poses_right(demo: Demo, fault: str):
     assert fault != "none" or not any(each.doubts for each in estimates)
 
 
-def test_an_old_pair_is_skipped(demo: Demo):
-    estimates, truth = driven(demo, "repeated")
+@pytest.mark.parametrize("fault", ["repeated", "torn"])
+def test_an_old_pair_is_skipped_and_so_is_one_that_is_old_in_part(demo: Demo, fault: str):
+    estimates, truth = driven(demo, fault)
     assert [k for k, each in enumerate(estimates) if each.status == "skipped"] == list(range(5, FRAMES, 10))
     assert silent_wrong(estimates, truth) == []
 
