@@ -29,10 +29,11 @@ class LastPairs:
         self._was_old = False
 
     def is_repeated(self, left: np.ndarray, right: np.ndarray) -> bool:
-        """Whether one of the images shows the last one, to the byte, or one not long before it; the pair becomes the last.
+        """Whether one of the images shows the last one, to the byte, or one not long before it, at least in part.
 
-        A part of it is enough: a torn image shows two moments, and the scene has one pose in each. Several old ones in a row are no driver's fault but a recording that is played back and forth. An image of one
-        grey value alone says nothing: a covered camera gives it again and again.
+        A torn image shows two moments, and the scene has one pose in each. Several old ones in a row are no driver's
+        fault but a recording that is played back and forth. An image of one grey value alone says nothing: a covered
+        camera gives it again and again. The pair becomes the last.
 
         Args:
             left, right: (H, W) uint8.
