@@ -87,8 +87,8 @@ def times_verdict(summary: dict[str, Any]) -> str | None:
     words = [f"Time {jitter_words(noise)}."] if noise > 0.0 else []
     if repeated:
         words.append(
-            f"{repeated} frames show the left or right image of the frame before, to the byte: they were skipped (same "
-            "image), and their poses are predicted. Does the driver freeze?"
+            f"{repeated} frames show an image of a frame before, or an eighth of one or more, to the byte: they were "
+            "skipped (same image), and their poses are predicted. Does the driver freeze, or tear images?"
         )
     return " ".join(words) or None
 

@@ -79,7 +79,8 @@ class Relocaliser:
                 continue
             while keyframes.active:
                 keyframes.marginalise_oldest(spare=keyframe)
-            return Relocalisation(admitted, pose, relative.covariance, keyframes.index(keyframe.id))
+            covariance = max(relative.clustering, 1.0) * relative.covariance
+            return Relocalisation(admitted, pose, covariance, keyframes.index(keyframe.id))
         return None
 
     def _is_expected(self, pose: np.ndarray) -> bool:

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999, CHI_SQUARE_MEDIAN
+from sigmaslam.estimation.clustered_errors import clustering
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, skew
 from sigmaslam.two_view.epipolar import estimate_epipolar_pose
@@ -33,12 +34,14 @@ class RelativePose:
         inliers: (M,) bool, points that agree with the pose.
         covariance: (6, 6) of x in T_key_camera exp(x), x = (translation, rotation), from the inliers' noise.
         scale: 1 or less, ratio of the actual to the claimed variances of most points.
+        clustering: factor by which `covariance` is too small for errors that neighbours share; not applied to it.
     """
 
     T_key_camera: np.ndarray
     inliers: np.ndarray
     covariance: np.ndarray
     scale: float
+    clustering: float = 1.0
 
 
 def estimate_relative_pose(
@@ -232,12 +235,14 @@ def _pose_with_inliers(
     inliers = (matches.weight > 0) & (squared < scale * CHI_SQUARE_999[3])
     if inliers.sum() < MIN_POINTS:
         return None
-    _, by_pose, information = matches.linearise(T_camera_key)
-    jacobian = by_pose[inliers]
-    normal = (jacobian.transpose(0, 2, 1) @ information[inliers] @ jacobian).sum(axis=0)
+    residual, by_pose, information = (each[inliers] for each in matches.linearise(T_camera_key))
+    weighted = by_pose.transpose(0, 2, 1) @ information
+    normal = (weighted @ by_pose).sum(axis=0)
     if not np.linalg.cond(normal) < _MAX_CONDITION:
         return None
-    return RelativePose(se3_inverse(T_camera_key), inliers, np.linalg.inv(normal), scale)
+    size = matches.camera.width, matches.camera.height
+    shared = clustering(matches.landmarks[inliers, :2], size, (weighted @ residual[..., None])[..., 0], normal)
+    return RelativePose(se3_inverse(T_camera_key), inliers, np.linalg.inv(normal), scale, shared)
 
 
 def _pose(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:

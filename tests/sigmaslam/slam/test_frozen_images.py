@@ -25,8 +25,18 @@ def test_the_same_array_filled_again_is_another_image():
     buffer = np.random.default_rng(0).integers(0, 256, (8, 9), np.uint8)
     pair = LastPairs()
     pair.is_repeated(buffer, buffer)
-    buffer[3, 3] ^= 1
+    buffer ^= 1
     assert not pair.is_repeated(buffer, buffer)
+
+
+def test_an_eighth_of_an_old_image_is_enough_and_white_rows_say_nothing():
+    old, new, newer = np.random.default_rng(1).integers(1, 256, (3, 160, 30), np.uint8)
+    old[:60] = new[:60] = newer[:60] = 255
+    pair = LastPairs()
+    assert not pair.is_repeated(old, old)
+    assert not pair.is_repeated(new, new)
+    newer[133:] = new[133:]
+    assert pair.is_repeated(old ^ 1, newer)
 
 
 def test_noise_is_no_scene(demo: Demo):

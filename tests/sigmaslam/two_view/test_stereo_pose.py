@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam.geometry.image_cells import CELLS, image_cells
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
 from sigmaslam.two_view.stereo_pose import RelativePose, estimate_relative_pose
 
@@ -162,3 +163,18 @@ def test_the_same_points_give_the_same_pose():
     assert first is not None
     assert second is not None
     np.testing.assert_array_equal(first.T_key_camera, second.T_key_camera)
+
+
+@pytest.mark.parametrize("shared", [0.0, 0.3], ids=["own errors", "errors that neighbours share"])
+def test_clustering_says_by_how_much_errors_that_neighbours_share_exceed_the_covariance(shared):
+    rng, squared, factors = np.random.default_rng(3), [], []
+    for seed in range(20):
+        landmarks, truth = points_in_view(150, seed), se3_exp(MOTIONS["general"])
+        common = rng.normal(0.0, shared, (CELLS, 3))[image_cells(landmarks[:, :2], 640, 480)]
+        found = estimate(landmarks, observe(landmarks, truth) + rng.normal(0.0, 0.3, (150, 3)) + common, 0.3)
+        assert found is not None
+        off = se3_log(se3_inverse(truth) @ found.T_key_camera)
+        squared.append(off @ np.linalg.solve(found.covariance, off) / 6)
+        factors.append(found.clustering)
+    assert 0.5 * np.mean(squared) < np.mean(factors) < 2.0 * np.mean(squared), (np.mean(squared), np.mean(factors))
+    assert (np.mean(factors) > 2.0) == (shared > 0.0)
