@@ -61,11 +61,7 @@ def fundamental_by_eight(points0: np.ndarray, points1: np.ndarray) -> np.ndarray
 
 
 def estimate_fundamental(
-    points0: np.ndarray,
-    points1: np.ndarray,
-    probability: np.ndarray,
-    covariance: np.ndarray,
-    sigma0: float = 0.1,
+    points0: np.ndarray, points1: np.ndarray, probability: np.ndarray, covariance: np.ndarray, sigma0: float = 0.1
 ) -> FundamentalMatrix | None:
     """F that matches agree on, each weighted by its probability and covariance.
 

@@ -135,13 +135,7 @@ def _starts(
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Poses of the essential matrix that the matches agree on, and of the homography if most of them follow one."""
     E, mask = cv2.findEssentialMat(
-        points0,
-        points1,
-        K,
-        method=cv2.USAC_ACCURATE,
-        prob=_CONFIDENCE,
-        threshold=_THRESHOLD,
-        maxIters=_MAX_SAMPLES,
+        points0, points1, K, method=cv2.USAC_ACCURATE, prob=_CONFIDENCE, threshold=_THRESHOLD, maxIters=_MAX_SAMPLES
     )
     # OpenCV returns None on failure, although its type hints exclude None.
     if np.shape(E) != (3, 3):

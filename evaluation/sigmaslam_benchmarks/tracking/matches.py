@@ -10,17 +10,9 @@ import torch
 
 from sigmaslam.frontend.match_confidence import ConfidenceEstimator
 from sigmaslam_benchmarks.matching.dynamic_scenes import SHARES, judge_movers
-from sigmaslam_benchmarks.matching.forward_motion import (
-    EDGES,
-    judge_probability,
-    measure_renders,
-    measure_steps,
-)
+from sigmaslam_benchmarks.matching.forward_motion import EDGES, judge_probability, measure_renders, measure_steps
 from sigmaslam_benchmarks.matching.image_pairs import ImagePair, Motion, SameRows
-from sigmaslam_benchmarks.matching.judgement import (
-    judge_homographies,
-    judge_rows,
-)
+from sigmaslam_benchmarks.matching.judgement import judge_homographies, judge_rows
 from sigmaslam_benchmarks.matching.rejection import KEYPOINTS, compare_rejection
 from sigmaslam_benchmarks.matching.relative_pose import compare_starts
 from sigmaslam_benchmarks.matching.sets import check_sets, load_advances, load_set

@@ -265,10 +265,7 @@ class _RectifyingPeer:
 
 
 def open_peer(
-    name: str,
-    camera: StereoCamera | RectifiedStereo,
-    timestamps: Sequence[float] | None,
-    own_process: bool = True,
+    name: str, camera: StereoCamera | RectifiedStereo, timestamps: Sequence[float] | None, own_process: bool = True
 ) -> Peer:
     """A peer by its name.
 
