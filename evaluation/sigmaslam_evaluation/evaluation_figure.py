@@ -11,12 +11,7 @@ from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.plot_style import BLUE, VERMILLION, style_axes
 from sigmaslam.report.figures import AXIS_NAMES, plot_trajectory
 from sigmaslam_evaluation.evaluation_result import Evaluation
-from sigmaslam_evaluation.metrics.trajectory_errors import (
-    align,
-    associate,
-    pose_errors,
-    synchronise,
-)
+from sigmaslam_evaluation.metrics.trajectory_errors import align, associate, pose_errors, synchronise
 from sigmaslam_evaluation.relative_summary import draw_relative
 
 if TYPE_CHECKING:

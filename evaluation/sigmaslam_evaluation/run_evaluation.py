@@ -181,11 +181,7 @@ def _truth_sigmas(
 
 
 def _judge_relative_poses(
-    run: Path,
-    estimate: Trajectory,
-    truth: Trajectory,
-    of_truth: np.ndarray | None,
-    follows_object: bool,
+    run: Path, estimate: Trajectory, truth: Trajectory, of_truth: np.ndarray | None, follows_object: bool
 ) -> tuple[SpanConsistency, ...] | None:
     """Consistency of the camera's poses relative to earlier ones; of a followed body's run in the body's frame."""
     path = run / RELATIVE_POSES_NAME

@@ -146,11 +146,7 @@ def score_body(estimate: BodyEstimate) -> dict[str, float]:
 
 
 def write_body(
-    folder: Path,
-    recording: StereoRecording,
-    first: BodyEstimate,
-    estimate: BodyEstimate,
-    settings: Mapping[str, Any],
+    folder: Path, recording: StereoRecording, first: BodyEstimate, estimate: BodyEstimate, settings: Mapping[str, Any]
 ) -> dict[str, dict[str, Any]]:
     """Write trajectory.csv, trajectory_first_pass.csv, run.json, map.png and report.html into a folder that is there.
 

@@ -26,10 +26,7 @@ SIGMAS = 3.0
 
 
 def write_page(
-    path: Path,
-    name: str,
-    summaries: Mapping[str, Mapping[str, Any]],
-    figures: Sequence[tuple[str, str, Figure]],
+    path: Path, name: str, summaries: Mapping[str, Mapping[str, Any]], figures: Sequence[tuple[str, str, Figure]]
 ) -> None:
     """Write the page.
 

@@ -39,12 +39,7 @@ class TracedModule:
     dynamic: tuple[Any, ...]
 
 
-def export_graph(
-    graph: TracedModule,
-    out: Path,
-    tolerance: float,
-    compare: Compare | None = None,
-) -> float:
+def export_graph(graph: TracedModule, out: Path, tolerance: float, compare: Compare | None = None) -> float:
     """Writes a graph and returns its difference from torch.
 
     Raises:

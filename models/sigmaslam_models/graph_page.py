@@ -5,11 +5,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import onnx
 import yaml
 
 from sigmaslam.errors import InputError
+from sigmaslam_models.model_card import fill_template
 
 PAGE_COMMAND = "sigmaslam export --page docs/onnx.md"
 _UNKNOWN = {"purpose": "No text yet: `models/sigmaslam_models/graph_texts.yaml`.", "meanings": {}}
@@ -34,14 +34,8 @@ def graph_page(folder: Path, command: str) -> str:
     if not paths:
         raise InputError(f"{folder} has no .onnx files: give the folder that `sigmaslam export` wrote")
     names = [*(name for name in graph_texts() if name in paths), *(name for name in paths if name not in graph_texts())]
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("sigmaslam_models", "templates"),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        autoescape=False,  # Markdown
-    )
     graphs = [_describe(name, paths[name]) for name in names]
-    return environment.get_template("onnx.md").render(command=command, graphs=graphs)
+    return fill_template("onnx.md", command=command, graphs=graphs)
 
 
 def _describe(name: str, path: Path) -> dict[str, Any]:

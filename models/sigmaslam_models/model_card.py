@@ -4,6 +4,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+import jinja2
+
 from sigmaslam.bounded_files import read_text, shorten
 from sigmaslam.errors import InputError
 from sigmaslam_models.feature_network import DESCRIPTOR_SIZE
@@ -67,59 +69,26 @@ def read_scores(path: Path) -> dict[str, dict[str, float]]:
 
 def card_page(card: dict[str, Any]) -> str:
     """The model card for people, in Markdown."""
-    started = card.get("started_from")
-    origin = "random weights" if started is None else f"{started['name']} (sha256 {started['sha256']})"
-    sections = [
-        _table("setting", "", card["config"]),
-        _table("held-out renders (48 pairs, 256 keypoints)", "", card["metrics_on_held_out_renders"]),
-    ]
-    real = card.get("metrics_on_real_sets", {})
-    if real:
-        rows = {f"{name} {metric}": value for name, values in real.items() for metric, value in values.items()}
-        sections.append("## Real sets\n\nNone of them was used in training.\n\n" + _table("set, metric", "", rows))
-    if card.get("limits"):
-        sections.append("## Limits\n\n" + "".join(f"- {limit}\n" for limit in card["limits"]))
-    sections.append(_graphs_section(card))
-    return f"""# Model card: features
-
-Keypoints (blobs of two scales, ranked by a learned quality), {DESCRIPTOR_SIZE}-D descriptors, a sigma of each place;
-{card["parameters"]} parameters.
-
-- Recipe: {card.get("recipe") or "none"}, started from {origin}.
-- Data: {card["data"]}.
-- Command: `{card["command"]}`, commit {card["commit"]}, seed {card["seed"]}.
-- Duration: {card["duration_s"] / 60:.0f} minutes on {card["hardware"]}.
-- Figures on real sequences: docs/results.md; none of them was used in training.
-
-""" + "\n".join(sections)
+    real = {
+        f"{name} {metric}": value
+        for name, values in card.get("metrics_on_real_sets", {}).items()
+        for metric, value in values.items()
+    }
+    return fill_template("features_card.md", card=card, real=real, descriptor_size=DESCRIPTOR_SIZE)
 
 
 def scoring_page(card: dict[str, Any]) -> str:
     """The card of the scorer and both verifiers for people, in Markdown."""
-    sections = [
-        _table("setting", "", card["config"]),
-        _table("held-out renders", "", card["metrics_on_held_out_renders"]),
-        "## Limits\n\n" + "".join(f"- {limit}\n" for limit in card.get("limits", [])),
-        _graphs_section(card),
-    ]
-    counts = card["parameters"]
-    return f"""# Model card: match scorer and verifiers
-
-Probability that a match is right, and covariance of its place: scorer, {counts["scorer"]} parameters; verifiers of
-matches, {counts["verifier"]}, and of places found without features, {counts["place_verifier"]} (figures `place_`).
-
-- Data: {card["data"]}.
-- Command: `{card["command"]}`, commit {card["commit"]}, seed {card["seed"]}.
-- Duration: {card["duration_s"] / 60:.0f} minutes on {card["hardware"]}.
-- Figures on real images: docs/matching.md; none of them was used in training.
-
-""" + "\n".join(sections)
+    return fill_template("matching_card.md", card=card)
 
 
-def _graphs_section(card: dict[str, Any]) -> str:
-    differences = {f"{name}.onnx": f"{value:.1e}" for name, value in card["onnx_minus_torch"].items()}
-    return "## Graphs\n\n" + _table("ONNX minus torch", "largest difference", differences)
-
-
-def _table(left: str, right: str, rows: dict[str, Any]) -> str:
-    return f"| {left} | {right} |\n|---|---|\n" + "".join(f"| {name} | {value} |\n" for name, value in rows.items())
+def fill_template(name: str, **values: Any) -> str:
+    """A page of Markdown from a template of this package."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("sigmaslam_models", "templates"),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        keep_trailing_newline=True,
+        autoescape=False,  # Markdown
+    )
+    return environment.get_template(name).render(values)

@@ -34,9 +34,7 @@ def view_axes(positions: np.ndarray) -> tuple[int, int, int]:
 
 
 def plot_trajectory(
-    axes: Axes,
-    trajectories: Mapping[str, Trajectory],
-    predicted: Mapping[str, np.ndarray] | None = None,
+    axes: Axes, trajectories: Mapping[str, Trajectory], predicted: Mapping[str, np.ndarray] | None = None
 ) -> tuple[int, int, int]:
     """Draw trajectories from above, with equal scales and a mark where each begins; dashed where they are guesses.
 

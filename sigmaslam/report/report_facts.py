@@ -211,11 +211,7 @@ def _speed(run: RecordedRun) -> Facts:
             facts.append(("real time", f"{ratio:.2g} × {1 / interval:.3g} frames/s"))
     timing = run.entries.get("real_time")
     if isinstance(timing, dict):
-        return [
-            *facts,
-            ("dropped", f"{timing['dropped']}"),
-            ("latency", f"{format_latency(timing['latency_ms'])} ms"),
-        ]
+        return [*facts, ("dropped", f"{timing['dropped']}"), ("latency", f"{format_latency(timing['latency_ms'])} ms")]
     if len(total):
         values = np.percentile(total, (50, 95, 99))
         facts.append(("time per frame, p50, p95, p99", ", ".join(f"{value:.0f}" for value in values) + " ms"))

@@ -152,6 +152,11 @@ def _poses_of_plane(K: np.ndarray, points0: np.ndarray, points1: np.ndarray) -> 
     H, mask = cv2.findHomography(points0, points1, cv2.USAC_FAST, _PLANE_THRESHOLD, maxIters=_SAMPLES)
     if np.shape(H) != (3, 3) or mask.mean() < _PLANE_SHARE:
         return []
+    return poses_of_homography(K, H)
+
+
+def poses_of_homography(K: np.ndarray, H: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Rotations and directions by which a plane makes the homography H of pixels; none if it is that of a rotation."""
     _, rotations, translations, _ = cv2.decomposeHomographyMat(H, K)
     lengths = [float(np.linalg.norm(translation)) for translation in translations]
     return [

@@ -9,7 +9,7 @@ import numpy as np
 from sigmaslam.geometry.se3 import rotation_exp, skew
 from sigmaslam.two_view.epipolar import MatchedRays, neighbours_factor, robust_weight
 
-# Matches that the 7-point and the 8-point method take.
+# Degrees of freedom of F, and matches that the 8-point method takes.
 _SEVEN, _EIGHT = 7, 8
 # What is more likely wrong than right has no vote.
 _MIN_PROBABILITY = 0.5
@@ -42,30 +42,22 @@ class FundamentalMatrix:
     inliers: np.ndarray
 
 
-def fundamental_by_seven(points0: np.ndarray, points1: np.ndarray) -> list[np.ndarray]:
-    """The one or three F (3, 3) that seven matches (7, 2), (7, 2) allow; none where they are degenerate."""
-    stacked = _by_points(points0, points1, cv2.FM_7POINT, _SEVEN)
-    return [each / np.linalg.norm(each) for each in stacked.reshape(-1, 3, 3)]
-
-
 def fundamental_by_eight(points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
     """F (3, 3) of the normalised 8-point method, from eight matches (M, 2) or more.
 
     Raises:
         ValueError: there are fewer, or they are degenerate.
     """
-    F = _by_points(points0, points1, cv2.FM_8POINT, _EIGHT)
-    if F.shape != (3, 3):
+    if len(points0) != len(points1) or len(points0) < _EIGHT:
+        raise ValueError(f"{_EIGHT} matches are needed, got {len(points0)} and {len(points1)} points")
+    F, _ = cv2.findFundamentalMat(points0.astype(np.float64), points1.astype(np.float64), cv2.FM_8POINT)
+    if np.shape(F) != (3, 3):
         raise ValueError(f"the {len(points0)} matches allow more than one fundamental matrix")
     return np.asarray(F / np.linalg.norm(F))
 
 
 def estimate_fundamental(
-    points0: np.ndarray,
-    points1: np.ndarray,
-    probability: np.ndarray,
-    covariance: np.ndarray,
-    sigma0: float = 0.1,
+    points0: np.ndarray, points1: np.ndarray, probability: np.ndarray, covariance: np.ndarray, sigma0: float = 0.1
 ) -> FundamentalMatrix | None:
     """F that matches agree on, each weighted by its probability and covariance.
 
@@ -186,13 +178,6 @@ def _refine(
         if np.abs(step).max() < _CONVERGED:
             break
     return u, angle, v
-
-
-def _by_points(points0: np.ndarray, points1: np.ndarray, method: int, least: int) -> np.ndarray:
-    if len(points0) != len(points1) or len(points0) < least or (least == _SEVEN and len(points0) != least):
-        raise ValueError(f"{least} matches are needed, got {len(points0)} and {len(points1)} points")
-    F, _ = cv2.findFundamentalMat(points0.astype(np.float64), points1.astype(np.float64), method)
-    return np.zeros((0, 3)) if F is None else F
 
 
 def _normalised(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

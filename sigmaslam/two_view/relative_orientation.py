@@ -15,6 +15,7 @@ from sigmaslam.two_view.epipolar import (
     log_gain,
     neighbours_factor,
     pose_of_essential,
+    poses_of_homography,
     robust_weight,
     soft_weight,
 )
@@ -26,8 +27,6 @@ _MIN_MATCHES, _MIN_PROBABILITY = 8, 0.5
 _THRESHOLD, _CONFIDENCE, _MAX_SAMPLES = 1.0, 0.9999, 20_000
 # A homography may be that of a plane if it has this share of the matches of the essential matrix, this near, pixels.
 _PLANE_SHARE, _PLANE_THRESHOLD, _PLANE_SAMPLES = 0.5, 2.0, 2000
-# If the translation is smaller, relative to the distance of the plane, the homography is that of a rotation.
-_MIN_PARALLAX = 1e-3
 # Standard deviations up to which a match counts in full: 0.997 of the right ones are within.
 _GATE = 3.0
 # A match is not counted where its parallax is so many times the median: wrong ones have the largest by far, and with
@@ -135,13 +134,7 @@ def _starts(
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Poses of the essential matrix that the matches agree on, and of the homography if most of them follow one."""
     E, mask = cv2.findEssentialMat(
-        points0,
-        points1,
-        K,
-        method=cv2.USAC_ACCURATE,
-        prob=_CONFIDENCE,
-        threshold=_THRESHOLD,
-        maxIters=_MAX_SAMPLES,
+        points0, points1, K, method=cv2.USAC_ACCURATE, prob=_CONFIDENCE, threshold=_THRESHOLD, maxIters=_MAX_SAMPLES
     )
     # OpenCV returns None on failure, although its type hints exclude None.
     if np.shape(E) != (3, 3):
@@ -151,12 +144,7 @@ def _starts(
     H, near = cv2.findHomography(points0, points1, cv2.USAC_ACCURATE, _PLANE_THRESHOLD, maxIters=_PLANE_SAMPLES)
     if np.shape(H) != (3, 3) or near.sum() < _PLANE_SHARE * agreeing.sum():
         return starts
-    _, rotations, translations, _ = cv2.decomposeHomographyMat(H, K)
-    for R, translation in zip(rotations, translations, strict=True):
-        length = float(np.linalg.norm(translation))
-        if length > _MIN_PARALLAX:
-            starts.append((np.asarray(R), translation.ravel() / length))
-    return starts
+    return starts + poses_of_homography(K, H)
 
 
 @dataclass(frozen=True, slots=True)

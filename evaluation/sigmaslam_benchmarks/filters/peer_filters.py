@@ -483,10 +483,7 @@ def torch_kf(work: LinearWork, dtype: str = "float64") -> Step:
         return torch.tensor(array, dtype=getattr(torch, dtype))
 
     kalman = KalmanFilter(
-        tensor(work.transition),
-        tensor(work.observation),
-        tensor(work.process_noise),
-        tensor(work.measurement_noise),
+        tensor(work.transition), tensor(work.observation), tensor(work.process_noise), tensor(work.measurement_noise)
     )
     prior = GaussianState(tensor(work.mean[..., None]), tensor(work.covariance))
     measurement = tensor(work.measurement[..., None])

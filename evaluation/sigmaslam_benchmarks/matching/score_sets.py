@@ -1,5 +1,6 @@
 """Scores of an extractor on the sets, and their table."""
 
+import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -18,6 +19,8 @@ Scores = dict[str, dict[str, float]]
 """By set, then by name of the score; shares and areas in [0, 1], numbers of matches a pair."""
 
 _COUNTS = ("correct_3", "matches", "steps_good", "steps", "inliers")
+# In the .json beside the page alone: they rank the extractors as their neighbours do.
+_UNLISTED = re.compile("(polished_)?auc_[15]|.*auc_10|correct_3|row_matches|rows_1")
 
 
 def score_pairs(
@@ -82,7 +85,8 @@ def format_scores(results: Mapping[str, Scores]) -> str:
     lines = []
     for name in dict.fromkeys(name for scores in results.values() for name in scores):
         rows = {extractor: scores[name] for extractor, scores in results.items() if name in scores}
-        columns = list(dict.fromkeys(column for row in rows.values() for column in row))
+        names = dict.fromkeys(column for row in rows.values() for column in row)
+        columns = [column for column in names if not _UNLISTED.fullmatch(column)]
         lines += [f"## {name}", "", "| extractor | " + " | ".join(columns) + " |", "|---|" + "---:|" * len(columns)]
         for extractor, row in rows.items():
             lines.append(f"| {extractor} | " + " | ".join(_number(column, row) for column in columns) + " |")

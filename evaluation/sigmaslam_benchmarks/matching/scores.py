@@ -118,11 +118,7 @@ def score_points(pair: ImagePair, points0: np.ndarray, points1: np.ndarray) -> d
         }
     errors = np.linalg.norm(truth.transfer(points0) - points1, axis=1)
     errors = errors[~np.isnan(errors)]
-    scores = {
-        "mma_1": _share(errors < 1.0),
-        "mma_3": _share(errors < 3.0),
-        "correct_3": float((errors < 3.0).sum()),
-    }
+    scores = {"mma_1": _share(errors < 1.0), "mma_3": _share(errors < 3.0), "correct_3": float((errors < 3.0).sum())}
     if isinstance(truth, Homography):
         shape = pair.image0.shape
         scores[_CORNER_ERROR] = corner_error(points0, points1, truth, shape, cv2.USAC_MAGSAC, _INLIER_THRESHOLD)
@@ -180,13 +176,7 @@ def essential_by_magsac(
     if len(points0) < 5:
         return None
     E, inliers = cv2.findEssentialMat(
-        points0,
-        points1,
-        K,
-        method=cv2.USAC_MAGSAC,
-        prob=_CONFIDENCE,
-        threshold=_INLIER_THRESHOLD,
-        maxIters=_ITERATIONS,
+        points0, points1, K, method=cv2.USAC_MAGSAC, prob=_CONFIDENCE, threshold=_INLIER_THRESHOLD, maxIters=_ITERATIONS
     )
     return (E, inliers) if np.shape(E) == (3, 3) else None
 

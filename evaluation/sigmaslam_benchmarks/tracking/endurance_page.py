@@ -70,6 +70,7 @@ class Endurance:
 
 def format_endurance(endurance: Endurance, command: str) -> str:
     """The run as a Markdown page."""
+    apart = max(len(endurance.blocks) // 5, 1)
     return fill_page(
         "endurance",
         command,
@@ -77,11 +78,12 @@ def format_endurance(endurance: Endurance, command: str) -> str:
         minutes=f"{endurance.seconds / 60:.0f}",
         length=f"{endurance.lap_length:.1f}",
         verdicts=list(_verdicts(endurance)),
-        blocks=[_block_row(block) for block in endurance.blocks],
+        blocks=[_block_row(block) for block in endurance.blocks[apart - 1 :: apart]],
         laps=[
             [f"{number}", f"{1e3 * lap.end:.1f}", _percent(lap.end, endurance)]
             + [f"{1e3 * error:.1f}" for error in (lap.median, lap.most)]
             for number, lap in enumerate(endurance.laps, start=1)
+            if number in (1, 2, len(endurance.laps))
         ],
     )
 

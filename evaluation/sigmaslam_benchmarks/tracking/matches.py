@@ -10,17 +10,9 @@ import torch
 
 from sigmaslam.frontend.match_confidence import ConfidenceEstimator
 from sigmaslam_benchmarks.matching.dynamic_scenes import SHARES, judge_movers
-from sigmaslam_benchmarks.matching.forward_motion import (
-    EDGES,
-    judge_probability,
-    measure_renders,
-    measure_steps,
-)
+from sigmaslam_benchmarks.matching.forward_motion import EDGES, judge_probability, measure_renders, measure_steps
 from sigmaslam_benchmarks.matching.image_pairs import ImagePair, Motion, SameRows
-from sigmaslam_benchmarks.matching.judgement import (
-    judge_homographies,
-    judge_rows,
-)
+from sigmaslam_benchmarks.matching.judgement import judge_homographies, judge_rows
 from sigmaslam_benchmarks.matching.rejection import KEYPOINTS, compare_rejection
 from sigmaslam_benchmarks.matching.relative_pose import compare_starts
 from sigmaslam_benchmarks.matching.sets import check_sets, load_advances, load_set
@@ -97,18 +89,14 @@ def _probability(data: Path, judge: ConfidenceEstimator) -> Iterator[list[str]]:
         "renders, repeated": list(map(RepeatedPairs(_RENDER_SEED, SIZE).pair, _RENDERED)),
     }
     gaps = {f"kitti gap {gap}": load_advances(data, gap) for gap in (1, 3)}
-    for kind, make in DETECTORS.items():
-        detect = make(_PHOTOGRAPH_KEYPOINTS)
-        measured = {name: measure_steps(steps, detect, judge) for name, steps in gaps.items()}
-        measured |= {name: measure_renders(pairs, detect, judge) for name, pairs in renders.items()}
-        for name, matches in measured.items():
-            judged = judge_probability(matches)
-            curve = (
-                f"{claimed:.2f} / {right:.2f}" for claimed, right in zip(judged.claimed, judged.right, strict=True)
-            )
-            shares = judged.precision, judged.lost, judged.within_1, judged.within_2
-            cells = *curve, f"{judged.ece:.3f}", *(f"{100 * share:.1f}" for share in shares)
-            yield [name, kind, str(judged.matches), *cells]
+    detect = DETECTORS["learned"](_PHOTOGRAPH_KEYPOINTS)
+    measured = {name: measure_steps(steps, detect, judge) for name, steps in gaps.items()}
+    measured |= {name: measure_renders(pairs, detect, judge) for name, pairs in renders.items()}
+    for name, matches in measured.items():
+        judged = judge_probability(matches)
+        curve = (f"{claimed:.2f} / {right:.2f}" for claimed, right in zip(judged.claimed, judged.right, strict=True))
+        shares = judged.precision, judged.lost, judged.within_1, judged.within_2
+        yield [name, str(judged.matches), *curve, f"{judged.ece:.3f}", *(f"{100 * share:.1f}" for share in shares)]
 
 
 def _rejection(data: Path, judge: ConfidenceEstimator) -> Iterator[list[str]]:

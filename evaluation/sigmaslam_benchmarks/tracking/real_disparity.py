@@ -87,8 +87,10 @@ def write_real(path: Path, data: Path, command: str) -> str:
         command,
         seed=SEED,
         rows=list(_rows(list(sets), list(methods), judged, seconds)),
+        split_set=next(iter(sets)),
         splits={
-            title: list(_parts(list(sets), next(iter(methods)), judged, split)) for title, split in _SPLITS.items()
+            title: list(_parts(judged[next(iter(sets)), next(iter(methods))], split))
+            for title, split in _SPLITS.items()
         },
     )
     return write_page(path, page)
@@ -169,17 +171,13 @@ def _rows(
             yield [name, method, *counts, *errors, *_coverage(answered), f"{seconds[name, method]:.2f}"]
 
 
-def _parts(
-    sets: list[str], method: str, judged: _Judged, split: Callable[[JudgedDisparities], list[_Part]]
-) -> Iterator[list[str]]:
-    for name in sets:
-        found = judged[name, method]
-        found = found.select(found.known)
-        for low, high, inside in split(found):
-            part = found.select(inside)
-            if len(part.truth):
-                ends = f"{low:.3g}", f"{high:.3g}", f"{inside.mean():.1%}"
-                yield [name, *ends, *_errors(part.error), *_coverage(part)]
+def _parts(found: JudgedDisparities, split: Callable[[JudgedDisparities], list[_Part]]) -> Iterator[list[str]]:
+    found = found.select(found.known)
+    for low, high, inside in split(found):
+        part = found.select(inside)
+        if len(part.truth):
+            ends = f"{low:.3g}", f"{high:.3g}", f"{inside.mean():.1%}"
+            yield [*ends, *_errors(part.error), *_coverage(part)]
 
 
 def _errors(error: np.ndarray) -> list[str]:

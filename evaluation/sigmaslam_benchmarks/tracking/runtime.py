@@ -18,13 +18,7 @@ from sigmaslam.readers import open_sequence
 from sigmaslam.readers.trajectory_files import read_trajectory
 from sigmaslam_benchmarks.tracking.decoded_pairs import DecodedPairs, write_pairs
 from sigmaslam_benchmarks.tracking.page import check_names, write_results_page
-from sigmaslam_benchmarks.tracking.runtime_page import (
-    SEQUENCE,
-    SIZE,
-    TimedRun,
-    format_runtime,
-    progress,
-)
+from sigmaslam_benchmarks.tracking.runtime_page import SEQUENCE, SIZE, TimedRun, format_runtime, progress
 from sigmaslam_benchmarks.tracking.sequences_page import Omission, method_label
 from sigmaslam_benchmarks.tracking.stereo_peers import MissingPeerError
 from sigmaslam_benchmarks.tracking.time_method import METHODS, WARM_UP, FailedMethodError, TimingJob, time_method

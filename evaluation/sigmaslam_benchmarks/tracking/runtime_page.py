@@ -9,11 +9,10 @@ import numpy as np
 from sigmaslam_benchmarks.tracking.page import fill_page, number
 from sigmaslam_benchmarks.tracking.sequences_page import Omission, method_label
 from sigmaslam_benchmarks.tracking.stereo_peers import RECTIFIED
-from sigmaslam_benchmarks.tracking.time_method import METHODS, OURS, WARM_UP, MethodTiming
+from sigmaslam_benchmarks.tracking.time_method import METHODS, WARM_UP, MethodTiming
 
-SEQUENCE, SIZE, LANDMARKS = "sequence", "size", "landmarks"
+SEQUENCE, SIZE = "sequence", "size"
 """Sections of the page."""
-_STAGES = ("rectify", "features", "match", "filter", "map")
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +22,7 @@ class TimedRun:
     Attributes:
         section: of the page.
         sequence: name.
-        variant: size of the images, or settings.
+        variant: size of the images.
         method, threads: what was run.
         round: in which.
         timing: what it took.
@@ -54,7 +53,7 @@ def format_runtime(results: Sequence[TimedRun | Omission], command: str, rounds:
     """The results as a Markdown page."""
     runs = [result for result in results if isinstance(result, TimedRun)]
     versions = {run.method: run.timing.version for run in runs if run.timing.version}
-    sections = {section: [run for run in runs if run.section == section] for section in (SEQUENCE, SIZE, LANDMARKS)}
+    sections = {section: [run for run in runs if run.section == section] for section in (SEQUENCE, SIZE)}
     names = dict.fromkeys(run.sequence for run in sections[SEQUENCE])
     return fill_page(
         "runtime",
@@ -64,12 +63,10 @@ def format_runtime(results: Sequence[TimedRun | Omission], command: str, rounds:
         complete=complete,
         left_out=[(_what(each), each.reason) for each in results if isinstance(each, Omission)],
         versions=[versions[method] for method in RECTIFIED if method in versions],
-        stages=_STAGES,
         sequences=[_sequence([run for run in sections[SEQUENCE] if run.sequence == name]) for name in names],
         sizes=list(dict.fromkeys(run.variant for run in sections[SIZE])),
         size_rows=list(_size_rows(sections[SIZE])),
-        landmark_rows=list(_landmark_rows(sections[LANDMARKS])),
-        varied=next((run.sequence for run in (*sections[SIZE], *sections[LANDMARKS])), ""),
+        varied=next((run.sequence for run in sections[SIZE]), ""),
     )
 
 
@@ -85,7 +82,6 @@ def _sequence(runs: Sequence[TimedRun]) -> dict[str, Any]:
     return {
         "title": f"{runs[0].sequence}, {runs[0].variant}, {runs[0].timing.frames} frames",
         "rows": [_row(method, runs) for method in methods],
-        "stages": [row for method in methods if method in OURS for row in _stage_rows(method, runs)],
     }
 
 
@@ -110,21 +106,6 @@ def _row(method: str, runs: Sequence[TimedRun]) -> list[str]:
     ]
 
 
-def _stage_rows(method: str, runs: Sequence[TimedRun]) -> Iterator[list[str]]:
-    """Keyframes and the other frames apart."""
-    alone = [run.timing for run in runs if (run.method, run.threads) == (method, 1)]
-    if not alone:
-        return
-    keyframe = np.concatenate([timing.keyframe for timing in alone]).astype(bool)
-    stages = {stage: np.concatenate([timing.stages_ms[stage] for timing in alone]) for stage in _STAGES}
-    for name, chosen in (("keyframes", keyframe), ("others", ~keyframe)):
-        if chosen.any():
-            total = np.sum([stages[stage][chosen] for stage in _STAGES], axis=0)
-            cells = [f"{np.median(stages[stage][chosen]):.1f}" for stage in _STAGES]
-            count = f"{chosen.sum() / len(alone):.0f}"
-            yield [method_label(method), name, count, *cells, f"{np.median(total):.1f}"]
-
-
 def _size_rows(runs: Sequence[TimedRun]) -> Iterator[list[str]]:
     sizes = dict.fromkeys(run.variant for run in runs)
     for method in METHODS:
@@ -132,19 +113,6 @@ def _size_rows(runs: Sequence[TimedRun]) -> Iterator[list[str]]:
         if of_method:
             cells = [_spread([run for run in of_method if run.variant == size], _mean_cpu, ".1f") for size in sizes]
             yield [method_label(method), *cells]
-
-
-def _landmark_rows(runs: Sequence[TimedRun]) -> Iterator[list[str]]:
-    for variant, method in dict.fromkeys((run.variant, run.method) for run in runs):
-        chosen = [run for run in runs if (run.variant, run.method) == (variant, method)]
-        yield [
-            *variant.split(", "),
-            method_label(method),
-            _middle(chosen, lambda run: float(np.median(run.timing.landmarks)), ".0f"),
-            _spread(chosen, _mean_cpu, ".1f"),
-            _middle(chosen, lambda run: float(np.median(run.timing.stages_ms["filter"])), ".1f"),
-            _middle(chosen, lambda run: run.ate, ".4f"),
-        ]
 
 
 def _mean_cpu(run: TimedRun) -> float:

@@ -31,39 +31,7 @@ PEERS = {"klt-pnp": "klt", "sift-pnp": "sift", **dict.fromkeys(RECTIFIED, "")}
 _NO_TURN = (0.0, 0.0, 0.0, 1.0)
 # As in ORB-SLAM3's own settings for EuRoC and for KITTI.
 _WIDE, _ORB_KEYPOINTS, _ORB_KEYPOINTS_WIDE = 1000, 1200, 2000
-_ORB_SETTINGS = """\
-%YAML:1.0
-Camera.type: "PinHole"
-Camera.fx: {fx}
-Camera.fy: {fy}
-Camera.cx: {cx}
-Camera.cy: {cy}
-Camera.k1: 0.0
-Camera.k2: 0.0
-Camera.p1: 0.0
-Camera.p2: 0.0
-Camera.bf: {focal_baseline}
-Camera.width: {width}
-Camera.height: {height}
-Camera.fps: {rate}
-Camera.RGB: 1
-ThDepth: 35.0
-ORBextractor.nFeatures: {keypoints}
-ORBextractor.scaleFactor: 1.2
-ORBextractor.nLevels: 8
-ORBextractor.iniThFAST: 20
-ORBextractor.minThFAST: 7
-Viewer.KeyFrameSize: 0.05
-Viewer.KeyFrameLineWidth: 1.0
-Viewer.GraphLineWidth: 0.9
-Viewer.PointSize: 2.0
-Viewer.CameraSize: 0.08
-Viewer.CameraLineWidth: 3.0
-Viewer.ViewpointX: 0.0
-Viewer.ViewpointY: -0.7
-Viewer.ViewpointZ: -1.8
-Viewer.ViewpointF: 500.0
-"""
+_ORB_SETTINGS = Path(__file__).with_name("orbslam3.yaml")
 
 
 class MissingPeerError(SigmaSlamError):
@@ -207,12 +175,9 @@ def orb_settings(camera: RectifiedStereo, rate: float) -> str:
     It asks for the viewer's settings also where there is no viewer.
     """
     keypoints = _ORB_KEYPOINTS_WIDE if camera.width > _WIDE else _ORB_KEYPOINTS
-    return _ORB_SETTINGS.format(
-        fx=float(camera.fx),
-        fy=float(camera.fy),
-        cx=float(camera.cx),
-        cy=float(camera.cy),
-        focal_baseline=float(camera.focal_baseline),
+    names = ("fx", "fy", "cx", "cy", "focal_baseline")
+    return _ORB_SETTINGS.read_text(encoding="utf-8").format(
+        **{name: float(getattr(camera, name)) for name in names},
         width=camera.width,
         height=camera.height,
         rate=float(rate),
@@ -265,10 +230,7 @@ class _RectifyingPeer:
 
 
 def open_peer(
-    name: str,
-    camera: StereoCamera | RectifiedStereo,
-    timestamps: Sequence[float] | None,
-    own_process: bool = True,
+    name: str, camera: StereoCamera | RectifiedStereo, timestamps: Sequence[float] | None, own_process: bool = True
 ) -> Peer:
     """A peer by its name.
 

@@ -262,10 +262,7 @@ def relative_pose_error(estimate: Trajectory, truth: Trajectory, delta: int = 1)
 
 
 def kitti_errors(
-    estimate: Trajectory,
-    truth: Trajectory,
-    lengths: Sequence[float] | None = None,
-    step: int | None = None,
+    estimate: Trajectory, truth: Trajectory, lengths: Sequence[float] | None = None, step: int | None = None
 ) -> KittiErrors:
     """Segment errors of the KITTI odometry development kit (evaluate_odometry.cpp).
 

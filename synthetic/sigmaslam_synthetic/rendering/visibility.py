@@ -326,14 +326,7 @@ def _screen_boxes(origin: Tensor, edge_u: Tensor, edge_v: Tensor, triangle: Tens
 
 
 def _fill(
-    tables: Tensor,
-    view: Tensor,
-    facet: Tensor,
-    boxes: Tensor,
-    triangle: Tensor,
-    eye: Eye,
-    near: float,
-    views: int,
+    tables: Tensor, view: Tensor, facet: Tensor, boxes: Tensor, triangle: Tensor, eye: Eye, near: float, views: int
 ) -> Tensor:
     """The nearest facet (V, h, w) at each place, from P drawn pairs of view and facet with their boxes (P, 4)."""
     width, height = eye.width, eye.height

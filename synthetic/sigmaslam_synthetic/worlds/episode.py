@@ -5,7 +5,9 @@ from pathlib import Path as FilePath
 
 import numpy as np
 
-from sigmaslam_synthetic.motion.paths import Path
+from sigmaslam_synthetic.motion.paths import Path, at_rest, with_stops
+from sigmaslam_synthetic.motion.random_motions import FreeSpace, closed_loop, hand_held
+from sigmaslam_synthetic.motion.shaken import slowed
 from sigmaslam_synthetic.scene import Lights, Scene, Texture
 
 
@@ -54,3 +56,25 @@ def daylight(rng: np.random.Generator, lowest: float, sun: tuple[float, float]) 
     x, y = np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation)
     direction = float(x), float(y), float(np.sin(elevation))
     return Lights(ambient=float(rng.uniform(0.2, 0.4)), sun=float(rng.uniform(*sun)), sun_direction=direction)
+
+
+def carried(rng: np.random.Generator, wish: Wish, free: FreeSpace, shake: float = 0.0) -> Path:
+    """The path of a camera in a hand, but for the shaking; `wish.motion` is neither on the spot nor planar.
+
+    Args:
+        free: where the camera may be.
+        shake: metres by which a slow path that is to be shaken keeps off its borders.
+    """
+    duration = wish.duration
+    if wish.motion == "loop":
+        return closed_loop(rng, duration, free)
+    if wish.motion == "rest":
+        return at_rest(hand_held(rng, duration, free).poses(0.5 * duration), duration)
+    if wish.motion == "shaken":
+        x, y, z = free.half
+        inner = FreeSpace(free.centre, (x - shake, y - shake, z - shake))
+        return slowed(hand_held(rng, 0.5 * duration, inner), duration)
+    if wish.motion == "stops":
+        moving = 0.75 * duration
+        return with_stops(hand_held(rng, moving, free), rng, 1 + int(duration / 8), min(1.0, 0.5 * moving))
+    return hand_held(rng, duration, free)

@@ -20,8 +20,6 @@ _CLEARANCE = 0.7
 """Metres around the camera's way that stay free."""
 _SHAKE = 0.08  # metres that a shaken camera leaves its way
 _FREE_FOR_MOVERS = 0.8  # more of it where bodies fly about in front of the camera
-_TEXTURES = {"leaves": 2, "plaster": 1, "bricks": 2, "glyphs": 1, "wood": 1, "noise": 1, "cells": 1, "asphalt": 1,
-             "facade": 1, "checker": 1, "strokes": 1}  # fmt: skip
 
 
 def generate(rng: np.random.Generator, wish: Wish) -> Episode:
@@ -60,7 +58,7 @@ class Hall:
         self, rng: np.random.Generator, wish: Wish, size: np.ndarray, path: Path, clearance: float, outdoors: bool
     ) -> None:
         self.bodies: list[Body] = []
-        self.palette = _palette(rng, wish)
+        self.palette = Palette(rng, wish, "hall")
         self._rng, self._size, self._outdoors, self._clearance = rng, size, outdoors, clearance
         count = int(path.end / 0.08) + 2
         self._way = path.poses(np.linspace(0.0, path.end, count))[:, :3, 3]
@@ -350,29 +348,3 @@ def _flight(rng: np.random.Generator, wish: Wish, size: np.ndarray, clearance: f
 
 def _pose(place: np.ndarray, yaw: float) -> np.ndarray:
     return rigid_motion(Rotation.from_euler("z", yaw).as_matrix(), place)
-
-
-def _palette(rng: np.random.Generator, wish: Wish) -> Palette:
-    palette = Palette(rng, wish, _TEXTURES)
-    add = palette.add
-    add("floor", (0.45, 0.65), ("asphalt", 3.5, 1.0), ("cells", 7.0, 0.25))
-    add("wall", (0.3, 0.55), ("bricks", 1.5, 0.9), ("noise", 6.0, 0.4), count=2)
-    add("wall", (0.35, 0.6), ("plaster", 2.5, 1.6), ("asphalt", 2.2, 0.8))
-    add("facade", (0.3, 0.6), ("facade", 6.0, 1.2), ("noise", 4.0, 0.4), count=2)
-    add("stone", (0.35, 0.7), ("asphalt", 1.6, 1.2), ("noise", 3.0, 0.4), count=2)
-    add("stone", (0.3, 0.6), ("checker", 1.8, 1.0), ("noise", 3.0, 0.4))
-    add("wood", (0.25, 0.6), ("wood", 1.3, 1.3), ("noise", 3.0, 0.3), count=3)
-    add("crate", (0.25, 0.65), ("wood", 0.9, 1.3), ("glyphs", 1.1, 0.7), count=3)
-    add("crate", (0.25, 0.65), ("leaves", 1.5, 0.9), ("glyphs", 0.9, 0.7), count=3)
-    add("machine", (0.2, 0.6), ("noise", 2.0, 0.6), ("glyphs", 1.2, 0.8), count=3, specular=0.25)
-    add("machine", (0.25, 0.6), ("strokes", 1.2, 1.0), ("leaves", 2.2, 0.5), count=3, specular=0.15)
-    add("metal", (0.15, 0.65), ("noise", 1.2, 0.6), ("asphalt", 0.9, 0.7), count=3, specular=0.3)
-    add("metal", (0.2, 0.5), ("strokes", 0.8, 1.0), ("noise", 2.0, 0.4), count=2)
-    add("writing", (0.3, 0.65), ("glyphs", 0.9, 1.7), count=2)
-    add("poster", (0.35, 0.6), ("leaves", 1.5, 1.1), ("glyphs", 0.9, 0.9), count=3)
-    add("poster", (0.35, 0.65), ("glyphs", 1.0, 1.7), ("noise", 2.0, 0.3))
-    add("sign", (0.2, 0.8), ("glyphs", 0.7, 1.2), ("asphalt", 1.5, 0.6), count=3)
-    add("lamp", (0.8, 0.95), ("cells", 0.7, 0.5))
-    add("cloth", (0.15, 0.65), ("strokes", 0.8, 0.8), ("leaves", 1.0, 0.5), count=3)
-    add("skin", (0.35, 0.65), ("noise", 0.6, 0.4))
-    return palette

@@ -5,12 +5,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sigmaslam_synthetic.motion.paths import Path, at_rest, with_stops
-from sigmaslam_synthetic.motion.random_motions import FreeSpace, closed_loop, hand_held, pure_rotation, rolling
-from sigmaslam_synthetic.motion.shaken import shaken, slowed
+from sigmaslam_synthetic.motion.paths import Path
+from sigmaslam_synthetic.motion.random_motions import FreeSpace, pure_rotation, rolling
+from sigmaslam_synthetic.motion.shaken import shaken
 from sigmaslam_synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel, Shape
 from sigmaslam_synthetic.scene import Body, Lights, Material, Scene, Texture
-from sigmaslam_synthetic.worlds.episode import Episode, Wish
+from sigmaslam_synthetic.worlds.episode import Episode, Wish, carried
 from sigmaslam_synthetic.worlds.part_models import Model, Part, follow
 
 CLEARANCE = 0.3
@@ -60,21 +60,11 @@ def generate(rng: np.random.Generator, wish: Wish) -> Episode:
 
 def _carry(rng: np.random.Generator, wish: Wish, free: FreeSpace) -> Path:
     """The camera's path but for the shaking."""
-    if wish.motion == "loop":
-        return closed_loop(rng, wish.duration, free)
     if wish.motion == "rotation":
         return pure_rotation(rng, wish.duration, _triple(free.centre + rng.uniform(-0.8, 0.8, 3) * free.half))
-    if wish.motion == "rest":
-        return at_rest(hand_held(rng, wish.duration, free).poses(0.5 * wish.duration), wish.duration)
     if wish.motion == "planar":
         return rolling(rng, wish.duration, free)
-    if wish.motion == "shaken":
-        inner = FreeSpace(free.centre, _triple(np.array(free.half) - _SHAKE))
-        return slowed(hand_held(rng, 0.5 * wish.duration, inner), wish.duration)
-    if wish.motion == "stops":
-        moving = 0.75 * wish.duration
-        return with_stops(hand_held(rng, moving, free), rng, 1 + int(wish.duration / 8), min(1.0, 0.5 * moving))
-    return hand_held(rng, wish.duration, free)
+    return carried(rng, wish, free, _SHAKE)
 
 
 def _triple(values: np.ndarray) -> tuple[float, float, float]:

@@ -7,12 +7,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sigmaslam_synthetic.geometry import rigid_motion
-from sigmaslam_synthetic.motion.paths import Path, at_rest, with_stops
-from sigmaslam_synthetic.motion.random_motions import FreeSpace, closed_loop, hand_held, pure_rotation
-from sigmaslam_synthetic.motion.shaken import shaken, slowed
+from sigmaslam_synthetic.motion.paths import Path
+from sigmaslam_synthetic.motion.random_motions import FreeSpace, pure_rotation
+from sigmaslam_synthetic.motion.shaken import shaken
 from sigmaslam_synthetic.rendering.shapes import Box, Cylinder, Panel, Sheet
 from sigmaslam_synthetic.scene import Body, Scene
-from sigmaslam_synthetic.worlds.episode import Episode, Wish, daylight
+from sigmaslam_synthetic.worlds.episode import Episode, Wish, carried, daylight
 from sigmaslam_synthetic.worlds.palette import Palette
 from sigmaslam_synthetic.worlds.part_models import Model, Part, bounds, centred, follow, stand
 from sigmaslam_synthetic.worlds.street_furniture import person
@@ -26,15 +26,13 @@ _EYES = 1.5  # its height, metres
 _NEAREST, _FARTHEST = 1.1, 4.0  # metres from the way to the middles of what stands about
 _THINGS = 46
 _NETS = 4
-_TEXTURES = {"leaves": 2, "plaster": 1, "bricks": 2, "glyphs": 1, "wood": 2, "noise": 1, "cells": 1, "asphalt": 2,
-             "facade": 1, "strokes": 1}  # fmt: skip
 
 
 def generate(rng: np.random.Generator, wish: Wish) -> Episode:
     """Heaps, leaning planks, posts and nets 1-4 m around a short way, between the walls of houses that stand."""
     way = _way(rng, wish)
     path = shaken(rng, way, _SHAKE) if wish.motion == "shaken" else way
-    site = _Site(rng, _palette(rng, wish), path, CLEARANCE + _FREE_FOR_MOVERS * (wish.movers > 0))
+    site = _Site(rng, Palette(rng, wish, "rubble"), path, CLEARANCE + _FREE_FOR_MOVERS * (wish.movers > 0))
     site.build()
     bodies = site.bodies
     if wish.movers > 0:
@@ -180,34 +178,6 @@ class _Site:
 def _way(rng: np.random.Generator, wish: Wish) -> Path:
     """The camera's path but for the shaking."""
     free = FreeSpace((0.0, 0.0, _EYES), (1.2, 0.9, 0.25))
-    if wish.motion == "loop":
-        return closed_loop(rng, wish.duration, free)
     if wish.motion == "rotation":
         return pure_rotation(rng, wish.duration, free.centre)
-    if wish.motion == "rest":
-        return at_rest(hand_held(rng, wish.duration, free).poses(0.5 * wish.duration), wish.duration)
-    if wish.motion == "stops":
-        moving = 0.75 * wish.duration
-        return with_stops(hand_held(rng, moving, free), rng, 1 + int(wish.duration / 8), min(1.0, 0.5 * moving))
-    if wish.motion == "shaken":
-        return slowed(hand_held(rng, 0.5 * wish.duration, free), wish.duration)
-    return hand_held(rng, wish.duration, free)
-
-
-def _palette(rng: np.random.Generator, wish: Wish) -> Palette:
-    palette = Palette(rng, wish, _TEXTURES)
-    add = palette.add
-    add("ground", (0.3, 0.5), ("asphalt", 1.8, 1.4), ("noise", 4.0, 0.6))
-    add("wall", (0.35, 0.6), ("facade", 5.0, 1.2), ("plaster", 2.5, 1.0))
-    add("wall", (0.3, 0.6), ("bricks", 1.4, 1.0), ("noise", 5.0, 0.5), count=2)
-    add("wall", (0.4, 0.7), ("plaster", 2.0, 1.6), ("strokes", 3.0, 0.4))
-    add("stone", (0.35, 0.7), ("asphalt", 0.7, 1.3), ("noise", 1.5, 0.5), count=3)
-    add("stone", (0.3, 0.65), ("plaster", 0.8, 1.4), ("cells", 0.9, 0.5), count=2)
-    add("brick", (0.25, 0.5), ("bricks", 0.7, 1.0), ("noise", 1.2, 0.4), count=2)
-    add("wood", (0.2, 0.65), ("wood", 0.8, 1.4), ("noise", 1.8, 0.4), count=4)
-    add("wood", (0.3, 0.6), ("wood", 0.7, 1.2), ("leaves", 1.5, 0.6), count=2)
-    add("metal", (0.15, 0.4), ("noise", 0.5, 0.8), ("strokes", 0.8, 0.6), count=2, specular=0.2)
-    add("cord", (0.15, 0.75), ("noise", 0.4, 0.8), ("strokes", 0.5, 0.5), count=2)
-    add("cloth", (0.15, 0.65), ("strokes", 0.8, 0.8), ("leaves", 1.0, 0.5), count=3)
-    add("skin", (0.35, 0.65), ("noise", 0.6, 0.4))
-    return palette
+    return carried(rng, wish, free)

@@ -50,11 +50,7 @@ class Road:
             ahead = np.arange(1, count + 1)[:, None] * _STEP
             reach = min(6, len(points) - 1)
             first, last = points[reach] - points[0], points[-1] - points[-1 - reach]
-            pieces = [
-                points[0] - ahead[::-1] * _flat_unit(first),
-                points,
-                points[-1] + ahead * _flat_unit(last),
-            ]
+            pieces = [points[0] - ahead[::-1] * _flat_unit(first), points, points[-1] + ahead * _flat_unit(last)]
         self.before = len(pieces[0]) * _STEP
         lane = np.concatenate(pieces)
         self.points = lane[:, :2]

@@ -11,7 +11,6 @@ from sigmaslam.two_view.fundamental import (
     epipoles,
     estimate_fundamental,
     fundamental_by_eight,
-    fundamental_by_seven,
     uncertain_epipoles,
 )
 from sigmaslam.two_view.triangulation import TwoViews
@@ -55,14 +54,11 @@ def distance(F: np.ndarray, seed: int = 999) -> float:
     return float(np.sqrt((one**2 + other**2).mean() / 2.0))
 
 
-def test_seven_and_eight_points_and_the_estimate_are_exact():
+def test_eight_points_and_the_estimate_are_exact():
     true, pixels = unit(pair().fundamental), matches(60, 0)
     # Eight points without noise leave OpenCV's normalised equations ill-conditioned.
     np.testing.assert_allclose(unit(fundamental_by_eight(pixels[:8, :2], pixels[:8, 2:])), true, atol=1e-6)
     np.testing.assert_allclose(unit(fundamental_by_eight(pixels[:, :2], pixels[:, 2:])), true, atol=1e-9)
-    seven = fundamental_by_seven(pixels[:7, :2], pixels[:7, 2:])
-    assert len(seven) in (1, 3)
-    assert min(np.abs(unit(F) - true).max() for F in seven) < 1e-7
     found = estimate(pixels)
     np.testing.assert_allclose(unit(found.F), true, atol=1e-9)
     assert found.inliers.all()
@@ -120,8 +116,6 @@ def test_the_covariance_is_right():
 
 def test_too_few_or_degenerate_matches():
     pixels = matches(8, 0)
-    with pytest.raises(ValueError, match="7 matches"):
-        fundamental_by_seven(pixels[:, :2], pixels[:, 2:])
     with pytest.raises(ValueError, match="8 matches"):
         fundamental_by_eight(pixels[:7, :2], pixels[:7, 2:])
     assert estimate_fundamental(pixels[:, :2], pixels[:, 2:], np.zeros(8), np.tile(np.eye(2), (8, 1, 1))) is None

@@ -113,12 +113,7 @@ class MatchSets:
 
 
 def _match(
-    source: str,
-    guided: bool,
-    features0: Features,
-    features1: Features,
-    places: np.ndarray,
-    rng: np.random.Generator,
+    source: str, guided: bool, features0: Features, features1: Features, places: np.ndarray, rng: np.random.Generator
 ) -> Putative:
     descriptors = features0.descriptors, features1.descriptors
     if source == "stereo":

@@ -6,15 +6,7 @@ import torch
 from torch import Generator, Tensor
 
 from sigmaslam_benchmarks.filters.scenarios.scenario import Scenario, matrix, normal
-from sigmaslam_filters import (
-    Diagonal,
-    Gaussian,
-    LinearMotion,
-    MeasurementModel,
-    MotionModel,
-    stack,
-    wrap_angle,
-)
+from sigmaslam_filters import Diagonal, Gaussian, LinearMotion, MeasurementModel, MotionModel, stack, wrap_angle
 from sigmaslam_filters.systems import constant_velocity_over
 
 
