@@ -224,7 +224,7 @@ def _ratio(middle: float, low: float, high: float) -> str:
 
 
 def _rate(rates: list[float]) -> str:
-    return f"{_thousands(statistics.median(rates))} ({_thousands(min(rates))} - {_thousands(max(rates))})"
+    return _thousands(statistics.median(rates))
 
 
 def _thousands(value: float) -> str:
