@@ -53,13 +53,13 @@ def run_case(case: Case, runner: Runner) -> Result:
 
 
 def _without_folders(text: str) -> str:
-    """The text without the folders of this machine."""
+    """The text without the folders of this machine and without progress bars."""
+    text = re.sub(r" frames [━╸╺ ]+ .*?(tracking|starting|lost|relocalised)(?= |$)", "", text)
     return re.sub(r"/\S*?(?:sigmaslam-faults?-[^/\s]*|synthetic/sigmaslam_synthetic/demo)(?:/|(?=[\s:]))", "", text)
 
 
 def _excerpt(text: str, words: tuple[str, ...]) -> str:
     """The sentence of the text that has the first of the words, and what follows it."""
-    text = re.sub(r" frames [━╸╺ ]+ .*?(tracking|starting|lost|relocalised)(?= |$)", "", text)
     place = text.find(words[0]) if words else 0
     starts = [match.end() for match in re.finditer(r"WARNING |error: |html |Nothing was tracked: |\. ", text[:place])]
     return shorten(text[starts[-1] if starts else 0 :], _LONGEST)

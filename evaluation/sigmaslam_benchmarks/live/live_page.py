@@ -1,7 +1,7 @@
 """The page of the benchmark `live`."""
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,8 +11,8 @@ from sigmaslam_benchmarks.live.judge import Judgement
 from sigmaslam_benchmarks.live.recordings import Recording
 from sigmaslam_benchmarks.tracking.page import fill_page, number
 
-_COMMON = ("tracking", "doubtful", "ambiguous", "relocalised", "lost", "skipped")
-_UNTOLD = ("starting", *_COMMON)
+# In the order of the page; a starting frame has no pose yet.
+_STATUSES = ("tracking", "doubtful", "ambiguous", "relocalised", "lost", "skipped", "refused")
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,16 +66,11 @@ def format_page(page: LivePage) -> str:
     )
 
 
-def _totals(page: LivePage, method: str) -> tuple[int, int, int, str]:
-    """Runs, frames that are judged, silently wrong ones, and the cases that have such."""
-    wrong: Counter[str] = Counter()
-    runs = judged = 0
-    for case in page.cases:
-        for recording, result in page.judgements(method, case).items():
-            runs += 1
-            judged += result.judged
-            wrong[case] += page.silent(recording, method, result)
-    return runs, judged, wrong.total(), ", ".join(f"{case} ({count})" for case, count in wrong.most_common() if count)
+def _totals(page: LivePage, method: str) -> tuple[int, int, int]:
+    """Runs, frames that are judged, and silently wrong ones."""
+    results = [each for case in page.cases for each in page.judgements(method, case).items()]
+    silent = sum(page.silent(recording, method, result) for recording, result in results)
+    return len(results), sum(result.judged for _, result in results), silent
 
 
 def _case_rows(page: LivePage, method: str) -> Iterator[list[str]]:
@@ -91,20 +86,20 @@ def _case_rows(page: LivePage, method: str) -> Iterator[list[str]]:
         yield [
             case,
             FAULTS[case].words,
-            *_statuses(list(results.values())),
+            _statuses(results.values()),
             _bold(sum(silent.values())),
             f"{sum(count > 0 for count in silent.values())} of {len(silent)}",
             *sizes,
         ]
 
 
-def _statuses(results: Sequence[Judgement]) -> list[str]:
-    """Cells of counts: the common ones, and the others by name."""
+def _statuses(results: Iterable[Judgement]) -> str:
+    """Counts of the frames by status; others than those of the page come last."""
     counts: Counter[str] = Counter()
     for result in results:
         counts.update(result.statuses)
-    others = ", ".join(f"{count} {status}" for status, count in counts.items() if status not in _UNTOLD)
-    return [*(str(counts[status]) for status in _COMMON), others or "-"]
+    order = [*_STATUSES, *(status for status in counts if status not in ("starting", *_STATUSES))]
+    return ", ".join(f"{counts[status]} {status}" for status in order if counts[status])
 
 
 def max_of(values: Sequence[float]) -> str:

@@ -123,9 +123,7 @@ def _track(source: Path, recipe: Recipe, method: str) -> ConsistencyResult:
     evaluation, tracked, point_map = trial.evaluation, trial.tracked, trial.point_map
     assert evaluation.nees is not None
     columns = trial.table.columns
-    offset, sigma = columns["disparity_offset"][-1], columns["disparity_offset_sigma"][-1]
     if method == _DRAWN:
-        sigma = 0.0  # the angle between its eyes changes disparities, too
         # Its pixels are those of another camera than the one that the true depths are known of.
         point_map = {name: point_map[name][:0] for name in PointMap.__slots__}
     true = read_trajectory(truth)
@@ -138,25 +136,17 @@ def _track(source: Path, recipe: Recipe, method: str) -> ConsistencyResult:
     camera = StereoRectifier(sequence.camera).rectified
     true_points = consistency.points_of_depth(pixels[clear], depths[clear, 1, 1], camera, true.poses[hosts[clear]])
     nees = consistency.point_nees(point_map["points"][clear], point_map["covariances"][clear], true_points)
-    per_frame = evaluation.nees.per_frame
     some, dof = len(nees) > 0, columns["dof"][tracked].sum()
     nan = float("nan")
     return ConsistencyResult(
         nees=evaluation.nees.mean,
-        nees_last=float(per_frame[-1]) if len(per_frame) else nan,
-        inside=consistency.coverage(per_frame, 6),
+        inside=consistency.coverage(evaluation.nees.per_frame, 6),
         nis=float(columns["nis"][tracked].sum() / dof) if dof else nan,
         ate=evaluation.ate.rmse,
         path_length=evaluation.path_length,
-        offset_error=float(offset - OFFSET),
-        offset_z=float((offset - OFFSET) / sigma) if sigma > 0 else nan,
+        offset_error=float(columns["disparity_offset"][-1] - OFFSET),
         lost=int((~tracked[1:]).sum()),
-        filter_ms=float(np.median(trial.table.milliseconds["filter"])),
-        total_ms=float(np.median(trial.table.total_milliseconds)),
-        points=int(clear.sum()),
-        edges=int((~clear).sum()),
         point_nees=float(nees.mean()) if some else nan,
-        point_median=float(np.median(nees)) if some else nan,
         point_inside=consistency.coverage(nees, 3),
         point_gross=float((3.0 * nees > _GROSS**2).mean()) if some else nan,
         relative={span.span: (span.mean_nees, span.inside) for span in evaluation.relative or ()},

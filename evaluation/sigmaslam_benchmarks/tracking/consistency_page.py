@@ -31,18 +31,13 @@ class ConsistencyResult:
 
     Attributes:
         nees: of the absolute pose per degree of freedom, mean over frames.
-        nees_last: at the last frame.
         inside: share of frames inside the 95 % ellipsoid.
         nis: per degree of freedom, over all tracked frames.
         ate: root mean square position error after alignment, metres.
         path_length: metres.
         offset_error: disparity offset at the end, estimated minus true, pixels.
-        offset_z: the same over its sigma.
         lost: frames after the first without a pose from the images.
-        filter_ms, total_ms: wall milliseconds a frame, median.
-        points: of the map, judged.
-        edges: of the map, left out.
-        point_nees, point_median: of points per degree of freedom, mean and median.
+        point_nees: of points of the map per degree of freedom, mean; those at edges are left out.
         point_inside: share inside the 95 % ellipsoid.
         point_gross: share beyond 5 sigma.
         relative: of poses relative to earlier ones, by the name of the span: mean NEES per degree of freedom, and share
@@ -50,20 +45,13 @@ class ConsistencyResult:
     """
 
     nees: float
-    nees_last: float
     inside: float
     nis: float
     ate: float
     path_length: float
     offset_error: float
-    offset_z: float
     lost: int
-    filter_ms: float
-    total_ms: float
-    points: int
-    edges: int
     point_nees: float
-    point_median: float
     point_inside: float
     point_gross: float
     relative: Mapping[str, Sequence[float]]

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +10,7 @@ import numpy as np
 
 from sigmaslam.errors import InputError
 from sigmaslam.frontend.classical import SiftDetector
-from sigmaslam.geometry.se3 import rotation_log
 from sigmaslam.readers import open_sequence
-from sigmaslam.readers.trajectory_files import read_trajectory
 from sigmaslam.runs.request import TrackerOptions
 from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam_benchmarks.matching.scores import mutual_nearest
@@ -39,66 +36,37 @@ class Drive:
 
     Attributes:
         name: of the sequence.
-        step: distance a frame, metres, mean.
-        turn: rotation a frame, degrees, mean.
-        keypoints: SIFT keypoints of a left image, at most what the tracker asks for; median.
         stereo_matches: mutual nearest neighbours of the two eyes' keypoints whose rows differ by less than 3 pixels
             and whose disparity is positive; median of the frames.
-        stereo_share: their share among all mutual nearest neighbours, median.
         row_error: median |v_left - v_right| of them, pixels.
         row_noise: the same after a quadratic of (u, v), fitted robustly to the whole drive, is taken off: what is left
             when the calibration of the pair is mended.
-        disparity: their median disparity, pixels.
         inliers: points that carry the pose of a frame, median.
-        inlier_share: inliers over points matched to the keyframe, median.
-        nis: normalised innovation squared per degree of freedom, median.
         t_rel: translation error of segments of 10 to 50 m, percent.
-        r_rel: rotation error of the same, degrees per 100 m.
         step_error: median error of the motion from frame to frame, percent of the mean distance a frame.
         roughness: median distance of a step's estimated length from the mean of its two neighbours, percent of the mean
             distance a frame; needs no truth.
-        offset: disparity offset that the tracker found in the end, pixels.
-        tracked: share of the frames with a pose from the images; the first is the origin.
     """
 
     name: str
-    step: float
-    turn: float
-    keypoints: float
     stereo_matches: float
-    stereo_share: float
     row_error: float
     row_noise: float
-    disparity: float
     inliers: float
-    inlier_share: float
-    nis: float
     t_rel: float
-    r_rel: float
     step_error: float
     roughness: float
-    offset: float
-    tracked: float
 
 
-# Attribute, title, format, and whether the ratio must be within LIMIT.
-_ROWS: tuple[tuple[str, str, str, bool], ...] = (
-    ("inliers", "inliers a frame", ".0f", True),
-    ("stereo_matches", "stereo matches of raw SIFT", ".0f", True),
-    ("row_error", "their row error px", ".3f", True),
-    ("row_noise", "row error px without calibration error", ".3f", True),
-    ("t_rel", "t_rel %, 10 to 50 m", ".2f", True),
-    ("step_error", "error of a step against the truth, % of its length", ".2f", True),
-    ("roughness", "roughness of the steps, % of their length", ".2f", True),
-    ("step", "metres a frame", ".2f", False),
-    ("turn", "degrees a frame", ".2f", False),
-    ("keypoints", "keypoints", ".0f", False),
-    ("stereo_share", "stereo matches with equal rows, share", ".2f", False),
-    ("disparity", "disparity px", ".1f", False),
-    ("inlier_share", "inliers of the matches in time, share", ".2f", False),
-    ("nis", "NIS per degree of freedom", ".2f", False),
-    ("r_rel", "r_rel deg/100 m", ".2f", False),
-    ("tracked", "frames tracked, share", ".2f", False),
+# Attribute, title and format; each ratio should be within LIMIT.
+_ROWS: tuple[tuple[str, str, str], ...] = (
+    ("inliers", "inliers a frame", ".0f"),
+    ("stereo_matches", "stereo matches of raw SIFT", ".0f"),
+    ("row_error", "their row error px", ".3f"),
+    ("row_noise", "row error px without calibration error", ".3f"),
+    ("t_rel", "t_rel %, 10 to 50 m", ".2f"),
+    ("step_error", "error of a step against the truth, % of its length", ".2f"),
+    ("roughness", "roughness of the steps, % of their length", ".2f"),
 )
 
 
@@ -136,40 +104,28 @@ def follow(name: str, sequence: Path, truth: Path) -> Drive:
     counts, rows = _match_eyes(sequence)
     return Drive(
         name=name,
-        step=step,
-        turn=_mean_turn(truth),
-        keypoints=float(np.median(counts[:, 0])),
-        stereo_matches=float(np.median(counts[:, 1])),
-        stereo_share=float(np.median(counts[:, 2])),
+        stereo_matches=float(np.median(counts)),
         row_error=float(np.median(np.abs(rows[:, 3]))),
         row_noise=row_noise(rows[:, 0], rows[:, 1], rows[:, 3]),
-        disparity=float(np.median(rows[:, 2])),
         inliers=float(np.median(columns["inliers"][tracked])),
-        inlier_share=float(np.median(columns["inliers"][tracked] / np.maximum(columns["matches"][tracked], 1))),
-        nis=float(np.median(result.nis)),
         t_rel=evaluation.kitti.mean_translation_percent,
-        r_rel=evaluation.kitti.mean_rotation_deg_per_100m,
         step_error=100 * evaluation.rpe.translation_median / step,
         roughness=100 * float(np.median(np.abs(bend))) / step,
-        offset=float(columns["disparity_offset"][-1]),
-        tracked=float(tracked.sum() / max(len(tracked) - 1, 1)),
     )
 
 
 def compare_drives(real: Drive, renders: Sequence[Drive]) -> dict[str, Any]:
     """Rows of the page's table, one a quantity, and what is off by more than the limit."""
     rows, off = [], []
-    for key, title, form, required in _ROWS:
+    for key, title, form in _ROWS:
         truth = getattr(real, key)
         values = [getattr(render, key) for render in renders]
         ratio = float(np.median(values)) / truth
         alike = 1 / LIMIT <= ratio <= LIMIT
-        if required and not alike:
+        if not alike:
             off.append(f"{title} (x{ratio:.2f})")
         cells = [title, *(format(value, form) for value in (truth, *values)), f"{ratio:.2f}"]
-        rows.append([*cells, ("yes" if alike else "**no**") if required else ""])
-    # The offset is near zero, where a ratio is undefined.
-    rows.append(["disparity offset px", *(f"{drive.offset:+.2f}" for drive in (real, *renders)), "", ""])
+        rows.append([*cells, "yes" if alike else "**no**"])
     return {"quantities": rows, "off": off}
 
 
@@ -195,7 +151,7 @@ def _match_eyes(sequence: Path) -> tuple[np.ndarray, np.ndarray]:
     """Raw SIFT between the eyes.
 
     Returns:
-        (F, 3) keypoints, matches and their share of all mutual ones in each frame looked at; (N, 4) u and v of the left
+        (F,) matches in each frame looked at; (N, 4) u and v of the left
         image, u_left - u_right and v_left - v_right of the matches of all of them.
     """
     detect = SiftDetector(TrackerConfig().max_keypoints)
@@ -208,12 +164,6 @@ def _match_eyes(sequence: Path) -> tuple[np.ndarray, np.ndarray]:
         places = left.keypoints[index0].astype(np.float64)
         difference = places - right.keypoints[index1]
         good = (np.abs(difference[:, 1]) < _ROW_GATE) & (difference[:, 0] > 0)
-        counts.append((len(left.keypoints), good.sum(), good.mean() if len(good) else 0.0))
+        counts.append(good.sum())
         rows.append(np.concatenate([places[good], difference[good]], axis=1))
     return np.array(counts, dtype=np.float64), np.concatenate(rows)
-
-
-def _mean_turn(truth: Path) -> float:
-    rotations = read_trajectory(truth).rotations
-    turns = [np.linalg.norm(rotation_log(a.T @ b)) for a, b in pairwise(rotations)]
-    return float(np.degrees(np.mean(turns)))
