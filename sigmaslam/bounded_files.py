@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import stat
 import zipfile
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 from numpy.lib import format as npy_format
@@ -64,6 +66,21 @@ def read_text(path: Path, limit: int, what: str, error: type[InputError] = Input
         ) from None
 
 
+def read_json(path: Path, what: str, mend: str, error: type[InputError] = InputError, limit: int = TABLE_BYTES) -> Any:
+    """The content of a JSON file.
+
+    Args:
+        path, what, error, limit: of `read_bytes`.
+        mend: what to do about a bad one, for the message.
+    Raises:
+        InputError: as of `read_text`, or the text is no JSON.
+    """
+    try:
+        return json.loads(read_text(path, limit, what, error))
+    except (ValueError, RecursionError) as problem:
+        raise error(f"{path}: is no JSON ({shorten(str(problem))}): {mend}") from None
+
+
 def check_regular(path: Path, limit: int, what: str, error: type[InputError] = InputError) -> None:
     """Refuses what `read_bytes` would refuse by its kind and size, where a library reads the file.
 
@@ -91,6 +108,15 @@ def list_folder(folder: Path) -> list[Path]:
         raise _unreadable(folder, "the folder", problem, InputError) from None
 
 
+def finite_number(text: str) -> float:
+    """A number; NaN where the text is none, or is not finite."""
+    try:
+        number = float(text)
+    except ValueError:
+        return math.nan
+    return number if math.isfinite(number) else math.nan
+
+
 def shorten(value: object, length: int = 80) -> str:
     """A value for a message, in one line of at most so many characters."""
     text = value if isinstance(value, str) else repr(value)
@@ -111,18 +137,11 @@ def load_arrays(path: Path, mend: str, names: Collection[str] | None = None) -> 
         InputError: the file is missing, no archive, cut off or changed, misses an array, or unpacks to far more than
             its size.
     """
-    check_regular(path, _ARRAY_BYTES, "the arrays")
-    try:
-        with path.open("rb") as file:
-            if file.read(6) == npy_format.MAGIC_PREFIX:
-                raise InputError(f"{path}: is a single array (.npy) and no archive of arrays (.npz); {mend}")
-            with zipfile.ZipFile(file) as archive:
-                return _read_members(path, archive, mend, names)
-    except InputError:
-        raise
-    except Exception as problem:  # zip, deflate and the headers of arrays raise a dozen kinds on changed bytes
-        reason = shorten(str(problem)) or type(problem).__name__
-        raise InputError(f"{path}: is no numpy archive, or is cut off ({reason}); {mend}") from problem
+    with _open_arrays(path, "archive", mend) as file:
+        if file.read(6) == npy_format.MAGIC_PREFIX:
+            raise InputError(f"{path}: is a single array (.npy) and no archive of arrays (.npz); {mend}")
+        with zipfile.ZipFile(file) as archive:
+            return _read_members(path, archive, mend, names)
 
 
 def load_array(path: Path, mend: str) -> np.ndarray:
@@ -131,18 +150,25 @@ def load_array(path: Path, mend: str) -> np.ndarray:
     Raises:
         InputError: the file is missing, no array, or cut off.
     """
+    with _open_arrays(path, "array", mend) as file:
+        if file.read(4) == b"PK\x03\x04":
+            raise InputError(f"{path}: is an archive of arrays (.npz) and no single array (.npy); {mend}")
+        file.seek(0)
+        return _read_array(file, path.stat().st_size)
+
+
+@contextmanager
+def _open_arrays(path: Path, what: str, mend: str) -> Iterator[IO[bytes]]:
+    """A file of numpy's; zip, deflate and the headers of arrays raise a dozen kinds of errors on changed bytes."""
     check_regular(path, _ARRAY_BYTES, "the arrays")
     try:
         with path.open("rb") as file:
-            if file.read(4) == b"PK\x03\x04":
-                raise InputError(f"{path}: is an archive of arrays (.npz) and no single array (.npy); {mend}")
-            file.seek(0)
-            return _read_array(file, path.stat().st_size)
+            yield file
     except InputError:
         raise
-    except Exception as problem:  # zip, deflate and the headers of arrays raise a dozen kinds on changed bytes
+    except Exception as problem:
         reason = shorten(str(problem)) or type(problem).__name__
-        raise InputError(f"{path}: is no numpy array, or is cut off ({reason}); {mend}") from problem
+        raise InputError(f"{path}: is no numpy {what}, or is cut off ({reason}); {mend}") from problem
 
 
 def load_columns(

@@ -6,6 +6,9 @@ import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from sigmaslam.errors import InputError
 
@@ -88,6 +91,29 @@ def atomic_write_text(path: str | Path, text: str) -> None:
     with atomic_path(path) as temporary:
         # Names of files may have bytes that are no UTF-8, which Python keeps as lone surrogates.
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
+
+
+def save_arrays(path: str | Path, **arrays: Any) -> None:
+    """Write arrays by name as a compressed .npz; see `atomic_path`."""
+    with atomic_path(path) as temporary:
+        np.savez_compressed(temporary, **arrays)
+
+
+def save_array(path: str | Path, array: np.ndarray) -> None:
+    """Write an array as .npy; see `atomic_path`."""
+    with atomic_path(path) as temporary:
+        np.save(temporary, array)
+
+
+def write_ply(path: str | Path, columns: dict[str, tuple[str, np.ndarray]]) -> None:
+    """Write points as a binary PLY: by the name of a property its type ("float", "uchar", "int") and values (N,)."""
+    kinds = {"float": "<f4", "uchar": "u1", "int": "<i4"}
+    vertices = np.zeros(len(columns["x"][1]), [(name, kinds[kind]) for name, (kind, _) in columns.items()])
+    for name, (_, values) in columns.items():
+        vertices[name] = values
+    names = "".join(f"property {kind} {name}\n" for name, (kind, _) in columns.items())
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{names}end_header\n"
+    atomic_write_bytes(path, header.encode("ascii") + vertices.tobytes())
 
 
 def atomic_write_bytes(path: str | Path, content: bytes) -> None:

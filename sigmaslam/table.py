@@ -23,7 +23,11 @@ class Table:
 
     def columns(self) -> list[Any]:
         """The columns in the order of the fields."""
-        return [getattr(self, field.name) for field in fields(self)]  # type: ignore[arg-type]
+        return list(self.arrays().values())
+
+    def arrays(self) -> dict[str, Any]:
+        """The columns by the names of the fields."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
 
     @classmethod
     def concatenate(cls, parts: Sequence[Self]) -> Self:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 import logging
-import platform
 import time
 from collections.abc import Callable
 from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +16,18 @@ from sigmaslam.bundle_adjustment.adjustment import Adjustment, RefineConfig, adj
 from sigmaslam.bundle_adjustment.gtsam_bridge import load_gtsam
 from sigmaslam.bundle_adjustment.track_file import TRACKS_NAME, read_tracks
 from sigmaslam.errors import InputError
-from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder, make_folder
+from sigmaslam.files import atomic_write_text, check_new_folder, make_folder, save_array, save_arrays
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import read_covariances, read_tum, write_kitti, write_tum
 from sigmaslam.report.report import write_report
 from sigmaslam.run_record.frame_table import FRAMES_NAME
 from sigmaslam.run_record.recorded_run import REFINE_NAME, REFINED_TRAJECTORY
-from sigmaslam.run_record.run_folder import FINAL_TRAJECTORY, check_has_trajectory, write_ply
+from sigmaslam.run_record.run_folder import FINAL_TRAJECTORY, check_has_trajectory, describe_versions, write_map_points
 from sigmaslam.slam.point_map import PointMap
 
 _LOGGER = logging.getLogger(__name__)
+_COUNTS = ("observations", "outliers", "far_landmarks", "bridges", "iterations", "solves", "converged", "dof")
 
 
 def refine_run(
@@ -65,14 +64,7 @@ def refine_run(
         "frames": len(trajectory),
         "keyframes": len(adjustment.frames),
         "landmarks": len(adjustment.points),
-        "observations": adjustment.observations,
-        "outliers": adjustment.outliers,
-        "far_landmarks": adjustment.far_landmarks,
-        "bridges": adjustment.bridges,
-        "iterations": adjustment.iterations,
-        "solves": adjustment.solves,
-        "converged": adjustment.converged,
-        "dof": adjustment.dof,
+        **{name: getattr(adjustment, name) for name in _COUNTS},
         "cost_per_dof_before": adjustment.cost_before,
         "cost_per_dof_after": adjustment.cost_after,
         "disparity_offset_before": float(tracks.disparity_offset[0]),
@@ -81,10 +73,7 @@ def refine_run(
         "disparity_offset_sigma": adjustment.disparity_offset_sigma,
         "seconds_read": read - began,
         "seconds_adjust": adjusted - read,
-        "versions": {
-            "python": platform.python_version(),
-            **{name: version(name) for name in ("sigmaslam", "numpy", "gtsam")},
-        },
+        "versions": describe_versions("sigmaslam", "numpy", "gtsam"),
     }
     _write(out, trajectory, adjustment)
     content = json.dumps(summary, indent=2) + "\n"
@@ -123,18 +112,15 @@ def _write(out: Path, trajectory: Trajectory, adjustment: Adjustment) -> None:
     refined = spread_corrections(trajectory, adjustment.frames, adjustment.poses)
     write_tum(out / "trajectory.tum", refined)
     write_kitti(out / "trajectory.kitti", refined, out / "times.txt")
-    with atomic_path(out / "covariance.npy") as path:
-        np.save(path, adjustment.covariances[keyframe_before(adjustment.frames, len(trajectory))])
+    save_array(out / "covariance.npy", adjustment.covariances[keyframe_before(adjustment.frames, len(trajectory))])
     count = len(adjustment.points)
     # The adjustment does not keep the keyframe and the pixel that first saw a point.
     unknown = np.full((count, 4), np.nan)
     seen_first = unknown[:, 0], unknown[:, 1:3], unknown[:, 3]
     point_map = PointMap(adjustment.points, adjustment.point_covariances, adjustment.point_views, *seen_first)
-    with atomic_path(out / "map.npz") as path:
-        np.savez_compressed(
-            path, points=point_map.points, covariances=point_map.covariances, observations=point_map.observations
-        )
-    write_ply(out / "map.ply", point_map)
+    arrays = {name: getattr(point_map, name) for name in ("points", "covariances", "observations")}
+    save_arrays(out / "map.npz", **arrays)
+    write_map_points(out / "map.ply", point_map)
 
 
 def _add_to_report(run: Path, out: Path, content: str) -> None:

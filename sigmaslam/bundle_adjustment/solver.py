@@ -76,11 +76,7 @@ class Solver:
     """
 
     def __init__(
-        self,
-        observations: Observations,
-        tracked: np.ndarray,
-        covariances: np.ndarray,
-        tell: Callable[[str], None],
+        self, observations: Observations, tracked: np.ndarray, covariances: np.ndarray, tell: Callable[[str], None]
     ) -> None:
         self._gtsam = load_gtsam()
         self._observations = observations
@@ -246,15 +242,8 @@ class Solver:
 
 def connected_parts(count: int, pairs: Iterable[tuple[int, int]]) -> np.ndarray:
     """Connected components of a graph: the lowest member of each node's component, (count,)."""
-    parent = list(range(count))
-
-    def root(member: int) -> int:
-        while parent[member] != member:
-            parent[member] = parent[parent[member]]
-            member = parent[member]
-        return member
-
+    label = np.arange(count)
     for i, j in pairs:
-        low, high = sorted((root(i), root(j)))
-        parent[high] = low
-    return np.array([root(member) for member in range(count)])
+        low, high = sorted((label[i], label[j]))
+        label[label == high] = low
+    return label

@@ -140,8 +140,7 @@ def fit_structure(observations: Observations, kept: np.ndarray, poses: np.ndarra
         predicted, by_seen = _project(observations.intrinsics, seen, inverse_depth[landmark])
         predicted[:, 2] += offset
         by_place = np.stack(
-            [T_camera_host[:, :, 0] / fx, T_camera_host[:, :, 1] / fy, T_camera_host[:, :, 3] / focal_baseline],
-            axis=-1,
+            [T_camera_host[:, :, 0] / fx, T_camera_host[:, :, 1] / fy, T_camera_host[:, :, 3] / focal_baseline], axis=-1
         )
         jacobian = by_seen @ by_place
         # The disparity depends on the inverse depth directly, too.

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmaslam.bounded_files import load_arrays
+from sigmaslam.bounded_files import load_columns
 from sigmaslam.errors import InputError
 
 TRACKS_NAME = "tracks.npz"
@@ -39,16 +39,11 @@ class Tracks:
         return len(self.frame)
 
 
-# None is the number of observations.
-_SHAPES: dict[str, tuple[int | None, ...]] = {
-    "frame": (None,),
-    "landmark": (None,),
-    "measurement": (None, 3),
-    "covariance": (None, 3, 3),
-    "intrinsics": (5,),
-    "R_rectified_left": (3, 3),
-    "disparity_offset": (2,),
+_SHAPES: dict[str, tuple[str | int, ...]] = {
+    **{"frame": ("O",), "landmark": ("O",), "measurement": ("O", 3), "covariance": ("O", 3, 3)},
+    **{"intrinsics": (5,), "R_rectified_left": (3, 3), "disparity_offset": (2,)},
 }
+_KINDS = {name: "iu" if name in ("frame", "landmark") else "iuf" for name in _SHAPES}
 _MEND = "run `sigmaslam track --tracks` again"
 
 
@@ -63,18 +58,8 @@ def read_tracks(path: Path, frames: int) -> Tracks:
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file; {_MEND.replace(' again', '')} to make a run with the observations")
-    arrays = load_arrays(path, _MEND, _SHAPES)
-    count = len(arrays["frame"]) if arrays["frame"].ndim else 0
-    for name, shape in _SHAPES.items():
-        array = arrays[name]
-        expected = tuple(count if size is None else size for size in shape)
-        kinds = "iu" if name in ("frame", "landmark") else "iuf"
-        if array.shape != expected or array.dtype.kind not in kinds:
-            raise InputError(
-                f"{path}: {name} is {array.dtype} {array.shape} and must be "
-                f"{'integer' if kinds == 'iu' else 'float64'} {expected}; {_MEND}"
-            )
-        arrays[name] = array.astype(np.int64 if kinds == "iu" else np.float64)
+    arrays = load_columns(path, _MEND, _SHAPES, _KINDS)
+    arrays = {name: each.astype(np.int64 if _KINDS[name] == "iu" else np.float64) for name, each in arrays.items()}
     tracks = Tracks(**arrays)
     _check(path, tracks, frames)
     return tracks

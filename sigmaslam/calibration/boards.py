@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -36,17 +35,6 @@ class DetectedCorners:
 
 
 NOTHING = DetectedCorners(np.zeros(0, np.int64), np.zeros((0, 2)))
-
-
-class Board(Protocol):
-    """A plane with points that images show, Z = 0, metres."""
-
-    @property
-    def points(self) -> np.ndarray:
-        """(M, 3) on the board."""
-
-    def detect(self, image: np.ndarray) -> DetectedCorners:
-        """Corners in an (H, W) uint8 image; none where the board is not found."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,6 +152,10 @@ class AprilGrid:
         moved = np.linalg.norm(refined - pixels, axis=1).reshape(-1, 4).max(axis=1)
         stayed = np.repeat(moved <= 0.5 * self.spacing * sides[::4], 4)
         return DetectedCorners(ids[stayed], refined[stayed])
+
+
+Board = Chessboard | Charuco | AprilGrid
+"""A plane with `points` (M, 3) that images show, Z = 0, metres; `detect` finds them in an (H, W) uint8 image."""
 
 
 def parse_board(text: str) -> Board:

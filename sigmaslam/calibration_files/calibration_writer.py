@@ -32,10 +32,7 @@ def write_calibration(path: Path, camera: StereoCamera, more: dict[str, Any] | N
     if camera.sigmas != CalibrationSigmas():
         content["sigmas"] = asdict(camera.sigmas)
     if camera.covariance is not None:
-        content["covariance"] = {
-            "names": list(camera.covariance.names),
-            "matrix": camera.covariance.matrix.tolist(),
-        }
+        content["covariance"] = {"names": list(camera.covariance.names), "matrix": camera.covariance.matrix.tolist()}
     content |= more or {}
     head = "# Pixels and metres; T_left_right takes points of the right camera into the left one.\n"
     write_yaml(path, content, head)

@@ -1,12 +1,11 @@
 """Calibration of an OAK camera, the JSON that depthai's eepromToJsonFile writes."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sigmaslam.bounded_files import CALIBRATION_BYTES, read_text
+from sigmaslam.bounded_files import CALIBRATION_BYTES, read_json
 from sigmaslam.calibration_files.lens_models import camera_model, intrinsics_of, naming
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
@@ -27,10 +26,8 @@ def read_oak(path: Path) -> StereoCamera:
     Raises:
         CalibrationError: names file, key and what was expected.
     """
-    try:
-        entries = json.loads(read_text(path, CALIBRATION_BYTES, "the calibration", CalibrationError))
-    except (ValueError, RecursionError) as error:
-        raise CalibrationError(f"{path}: cannot read the calibration: {error}") from None
+    mend = "write it again by depthai's eepromToJsonFile"
+    entries = read_json(path, "the calibration", mend, CalibrationError, CALIBRATION_BYTES)
     if not isinstance(entries, dict) or not isinstance(entries.get("cameraData"), list):
         raise CalibrationError(
             f"{path}: no key 'cameraData': of JSON, only what depthai's eepromToJsonFile writes is read"

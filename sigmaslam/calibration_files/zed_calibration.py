@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sigmaslam.bounded_files import CALIBRATION_BYTES, read_text
+from sigmaslam.bounded_files import CALIBRATION_BYTES, finite_number, read_text
 from sigmaslam.calibration_files.calibration_size import ImageSize, need_image_size
 from sigmaslam.calibration_files.lens_models import camera_model, stereo_camera
 from sigmaslam.errors import CalibrationError
@@ -78,11 +78,8 @@ class _Values:
 
     def number(self, section: str, key: str) -> float:
         value = self.sections.get(section, {}).get(key.lower())
-        try:
-            number = float(value) if value is not None else np.nan
-        except ValueError:
-            number = np.nan
-        if not np.isfinite(number):
+        number = np.nan if value is None else finite_number(value)
+        if np.isnan(number):
             raise CalibrationError(f"{self.path}: [{section}]: key '{key}' must be a finite number, got {value}")
         return number
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmaslam.bounded_files import TABLE_BYTES, read_text, shorten
+from sigmaslam.bounded_files import TABLE_BYTES, finite_number, read_text, shorten
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.se3 import quaternion_to_matrix
 from sigmaslam.readers.pairing import in_seconds
@@ -77,7 +77,7 @@ def read_locations(path: Path) -> Locations:
                 f"{path}, line 1: the columns are separated by {word}: separate them by commas, and write numbers with "
                 "a decimal point"
             )
-    if all(_is_number(name) for name in names):
+    if not any(math.isnan(finite_number(name)) for name in names):
         raise InputError(f"{path}, line 1: holds numbers; {_FORM}")
     if len(set(names)) < len(names):
         double = next(name for name in names if names.count(name) > 1)
@@ -130,29 +130,17 @@ def _columns(path: Path, names: list[str]) -> list[str]:
     return columns
 
 
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
-
-
 def _numbers(path: Path, line: int, row: list[str], names: list[str], columns: list[str]) -> list[float]:
     if len(row) != len(names):
         raise InputError(f"{path}, line {line}: {len(row)} values for {len(names)} columns; mend or remove the line")
     cells = dict(zip(names, row, strict=True))
     values = []
     for name in columns:
-        try:
-            number = float(cells[name])
-        except ValueError:
-            number = math.nan
-        if not math.isfinite(number):
+        values.append(finite_number(cells[name]))
+        if math.isnan(values[-1]):
             raise InputError(
                 f"{path}, line {line}: {name} is {shorten(repr(cells[name]))}, no number; mend or remove the line"
             )
-        values.append(number)
     return values
 
 

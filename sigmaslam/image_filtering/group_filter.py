@@ -10,6 +10,8 @@ from itertools import product
 import cv2
 import numpy as np
 
+from sigmaslam.image_filtering.patch_filter import pad
+
 _SIZE = 7
 """Side of a patch, pixels."""
 _REACH = 12
@@ -33,7 +35,7 @@ def filter_groups(image: np.ndarray, variance: np.ndarray, pilot: np.ndarray) ->
         (H, W) float32.
     """
     border = _REACH + _SIZE
-    padded, guide, noise = (_pad(each, border) for each in (image, pilot, variance))
+    padded, guide, noise = (pad(each, border) for each in (image, pilot, variance))
     height, width = guide.shape
     ys = _grid(border - _SIZE + 1, height - border)
     xs = _grid(border - _SIZE + 1, width - border)
@@ -99,9 +101,3 @@ def _alike(guide: np.ndarray, ys: np.ndarray, xs: np.ndarray) -> np.ndarray:
 def _grid(first: int, end: int) -> np.ndarray:
     """Every few pixels from the first on, and the last before the end."""
     return np.unique(np.r_[np.arange(first, end, _STEP), end - 1])
-
-
-def _pad(image: np.ndarray, border: int) -> np.ndarray:
-    return np.asarray(
-        cv2.copyMakeBorder(image.astype(np.float32), border, border, border, border, cv2.BORDER_REFLECT_101)
-    )

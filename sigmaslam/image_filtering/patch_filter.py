@@ -35,10 +35,10 @@ def filter_patches(image: np.ndarray, variance: np.ndarray) -> np.ndarray:
 
 def _filter(image: np.ndarray, variance: np.ndarray, pilot: np.ndarray | None) -> np.ndarray:
     border = SIZE - 1
-    padded = _pad(image, border)
-    pilot = None if pilot is None else _pad(pilot, border)
+    padded = pad(image, border)
+    pilot = None if pilot is None else pad(pilot, border)
     # Of the patch that begins at a pixel.
-    noise = cv2.boxFilter(_pad(variance, border), -1, (SIZE, SIZE), anchor=(0, 0), borderType=cv2.BORDER_REFLECT)
+    noise = cv2.boxFilter(pad(variance, border), -1, (SIZE, SIZE), anchor=(0, 0), borderType=cv2.BORDER_REFLECT)
     basis = _cosines()
     height, width = padded.shape
     total, weights = np.zeros_like(padded), np.zeros_like(padded)
@@ -68,7 +68,8 @@ def _filter(image: np.ndarray, variance: np.ndarray, pilot: np.ndarray | None) -
     return np.asarray(total[inner, inner] / weights[inner, inner])
 
 
-def _pad(image: np.ndarray, border: int) -> np.ndarray:
+def pad(image: np.ndarray, border: int) -> np.ndarray:
+    """An image (H, W) as float32 with its mirror image beyond its border, so many pixels."""
     return np.asarray(
         cv2.copyMakeBorder(image.astype(np.float32), border, border, border, border, cv2.BORDER_REFLECT_101)
     )

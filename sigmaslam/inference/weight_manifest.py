@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterable
 from pathlib import Path
 
-from sigmaslam.bounded_files import read_text, shorten
+from sigmaslam.bounded_files import read_json, shorten
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text
 
@@ -43,10 +43,7 @@ def read_manifest(path: Path) -> dict[str, str]:
     Raises:
         InputError: the file cannot be read, or is no such table.
     """
-    try:
-        content = json.loads(read_text(path, _MANIFEST_BYTES, "the hashes of the weights"))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: is no JSON ({shorten(str(error))}): {_MEND}") from None
+    content = read_json(path, "the hashes of the weights", _MEND, limit=_MANIFEST_BYTES)
     if not isinstance(content, dict) or not all(isinstance(each, str) for each in content.values()):
         raise InputError(f"{path}: is no table of file names and SHA-256: {_MEND}")
     return content

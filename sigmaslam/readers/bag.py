@@ -4,7 +4,6 @@ import logging
 import re
 from collections.abc import Collection, Generator, Iterator
 from contextlib import closing, contextmanager
-from functools import cached_property
 from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -13,7 +12,7 @@ from sigmaslam.bounded_files import shorten
 from sigmaslam.calibration_files.calibration import read_calibration
 from sigmaslam.errors import CalibrationError, FrameError, InputError, SigmaSlamError
 from sigmaslam.geometry.camera import StereoCamera
-from sigmaslam.readers.images import RawPair, SkippedFrame, first_readable
+from sigmaslam.readers.images import PairSource, RawPair, SkippedFrame
 from sigmaslam.readers.kitti import common_size
 from sigmaslam.readers.pairing import STAMP_TOLERANCE_NS, Stamped, pair_streams
 from sigmaslam.readers.ros_messages import (
@@ -177,29 +176,18 @@ def _info_topic(bag: BagReader, image_topic: str) -> str | None:
     return None
 
 
-class BagPairs:
-    """Images of two topics, as a source of pairs that is read from disk as it goes.
-
-    Attributes:
-        timestamps: None; they are known on reading.
-        length: number of images of the eye that has fewer.
-    """
+class BagPairs(PairSource):
+    """Images of two topics, as a source of pairs that is read from disk as it goes; as many as the scarcer eye has."""
 
     def __init__(self, path: Path, topics: tuple[str, str]) -> None:
-        self.timestamps: list[float] | None = None
-        self._path = path
+        self.source = self._path = path
         self._topics = topics
         with open_reader(path) as bag, closing(bag.messages(topics)) as messages:
-            self.length: int | None = min(bag.topics[topic][1] for topic in topics)
+            self.length = min(bag.topics[topic][1] for topic in topics)
             # Drivers without a clock leave the stamps of the headers at zero.
             self._by_recording = all(stamp_ns(message) == 0 for _, _, message in islice(messages, 4))
         if self._by_recording:
             logger.warning("%s: images have no time stamps; the times of recording are used", path)
-
-    @cached_property
-    def first_pair(self) -> RawPair:
-        """The first pair; InputError if none of the first pairs can be read."""
-        return first_readable(self, self._path)
 
     def __iter__(self) -> Iterator[RawPair | SkippedFrame]:
         index, alone, alone_since = 0, 0, 0

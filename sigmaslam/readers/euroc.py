@@ -9,7 +9,7 @@ from sigmaslam.calibration_files.euroc_calibration import read_sensors
 from sigmaslam.errors import InputError
 from sigmaslam.readers.images import ImagePairs
 from sigmaslam.readers.kitti import common_size
-from sigmaslam.readers.pairing import is_stamp, list_images, pair_by_stamp
+from sigmaslam.readers.pairing import list_images, pair_by_stamp, stamped_images
 from sigmaslam.readers.stereo_sequence import StereoSequence
 
 LOOKED_FOR = (
@@ -61,10 +61,9 @@ def open_euroc(folder: Path, calibration: Path | None = None) -> StereoSequence:
 
 def _asl_images(camera: Path) -> dict[int, Path]:
     """Images of a camera by time stamp: the file name, or what data.csv says for that name."""
-    files = list_images(camera / "data")
-    if all(is_stamp(path.stem) for path in files):
-        return {int(path.stem): path for path in files}
-    table = camera / "data.csv"
+    if (stamped := stamped_images(camera / "data")) is not None:
+        return stamped
+    files, table = list_images(camera / "data"), camera / "data.csv"
     try:
         lines = read_text(table, TABLE_BYTES, "the time stamps").splitlines()
         rows = [row for row in csv.reader(lines) if len(row) >= 2 and not row[0].startswith("#")]

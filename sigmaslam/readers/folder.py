@@ -7,14 +7,7 @@ import numpy as np
 from sigmaslam.errors import InputError
 from sigmaslam.readers.images import IMAGE_SUFFIXES, ImagePairs
 from sigmaslam.readers.kitti import common_size
-from sigmaslam.readers.pairing import (
-    default_times,
-    is_stamp,
-    list_images,
-    pair_by_name,
-    pair_by_stamp,
-    read_times,
-)
+from sigmaslam.readers.pairing import default_times, is_stamp, list_images, pair_by_name, pair_by_stamp, read_times
 from sigmaslam.readers.stereo_sequence import StereoSequence
 from sigmaslam.readers.video import beside_calibration, find_videos, open_video
 

@@ -7,7 +7,7 @@ from sigmaslam.calibration_files.four_seasons_calibration import UNDISTORTED
 from sigmaslam.errors import CalibrationError, InputError
 from sigmaslam.readers.images import ImagePairs
 from sigmaslam.readers.kitti import common_size
-from sigmaslam.readers.pairing import is_stamp, list_images, pair_by_stamp
+from sigmaslam.readers.pairing import pair_by_stamp, stamped_images
 from sigmaslam.readers.stereo_sequence import StereoSequence
 
 LOOKED_FOR = "folders undistorted_images/cam0 + undistorted_images/cam1"
@@ -29,10 +29,10 @@ def open_four_seasons(folder: Path, calibration: Path | None = None) -> StereoSe
         raise InputError(f"{folder}: not a recording of 4Seasons; looked for {LOOKED_FOR}")
     sides = []
     for camera in ("cam0", "cam1"):
-        files = list_images(folder / "undistorted_images" / camera)
-        if not all(is_stamp(path.stem) for path in files):
+        files = stamped_images(folder / "undistorted_images" / camera)
+        if files is None:
             raise InputError(f"{folder}: names of images must be times in nanoseconds, such as 1602074877621449728.png")
-        sides.append({int(path.stem): path for path in files})
+        sides.append(files)
     pairs = ImagePairs(*pair_by_stamp(sides[0], sides[1], folder), folder)
     path = calibration or _find_undistorted(folder)
     return StereoSequence(pairs, read_calibration(path, common_size(pairs.first_pair)), folder, "4seasons")

@@ -1,7 +1,8 @@
 """Image files: reading one, making it grey 8-bit, and a list of left and right files as a source of pairs."""
 
 import logging
-from collections.abc import Iterable, Iterator, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -179,29 +180,42 @@ def _to_8_bits(image: np.ndarray, significant_bits: int) -> np.ndarray:
     return cv2.convertScaleAbs(image, alpha=255.0 / (2**significant_bits - 1))
 
 
-def first_readable(pairs: Iterable[RawPair | SkippedFrame], source: Path) -> RawPair:
-    """The first pair that can be read.
-
-    Raises:
-        InputError: none of the first pairs can.
-    """
-    tried = 0
-    reason = ""
-    for tried, item in enumerate(pairs, start=1):
-        if isinstance(item, RawPair):
-            return item
-        reason = reason or item.reason
-        if tried > MAX_FAILURES:
-            break
-    raise InputError(f"{source}: none of the first {tried} pairs can be read; the first: {reason}")
-
-
-class ImagePairs:
-    """Left and right image files with their timestamps, as a source of pairs.
+class PairSource(ABC):
+    """Pairs of a reader in order; pairs that cannot be read are SkippedFrame.
 
     Attributes:
-        timestamps: seconds, strictly increasing.
-        length: number of pairs.
+        timestamps: seconds, strictly increasing; None where reading alone gives them.
+        length: number of pairs; None where it is not known.
+        source: the file or folder, or the name of a camera, for messages.
+    """
+
+    timestamps: list[float] | None = None
+    length: int | None = None
+    source: Path | str
+
+    @abstractmethod
+    def __iter__(self) -> Iterator[RawPair | SkippedFrame]: ...
+
+    @cached_property
+    def first_pair(self) -> RawPair:
+        """The first pair that can be read.
+
+        Raises:
+            InputError: none of the first pairs can.
+        """
+        tried = 0
+        reason = ""
+        for tried, item in enumerate(self, start=1):
+            if isinstance(item, RawPair):
+                return item
+            reason = reason or item.reason
+            if tried > MAX_FAILURES:
+                break
+        raise InputError(f"{self.source}: none of the first {tried} pairs can be read; the first: {reason}")
+
+
+class ImagePairs(PairSource):
+    """Left and right image files with their timestamps, as a source of pairs.
 
     Raises:
         InputError: there is no pair, or a timestamp is not finite or not later than the one before.
@@ -221,18 +235,9 @@ class ImagePairs:
                 f"one before {timestamps[first - 1] if first else None!r}; they must be finite and increase"
             )
         self.files = list(files)
-        self.timestamps: list[float] | None = list(timestamps)
-        self.length: int | None = len(files)
-        self._source = source
-
-    @cached_property
-    def first_pair(self) -> RawPair:
-        """The first pair that can be read.
-
-        Raises:
-            InputError: none of the first pairs can.
-        """
-        return first_readable(self, self._source)
+        self.timestamps = list(timestamps)
+        self.length = len(files)
+        self.source = source
 
     def __iter__(self) -> Iterator[RawPair | SkippedFrame]:
         return (self.read(index) for index in range(len(self.files)))

@@ -5,10 +5,11 @@ from __future__ import annotations
 import csv
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Generic, TypeVar
 
 import numpy as np
 
-from sigmaslam.bounded_files import TABLE_BYTES, read_text, shorten
+from sigmaslam.bounded_files import TABLE_BYTES, finite_number, read_text, shorten
 from sigmaslam.errors import CalibrationError, InputError
 from sigmaslam.geometry.checked_yaml import CalibrationYaml
 from sigmaslam.geometry.inertial_sensor import InertialSamples, InertialSensor
@@ -29,21 +30,28 @@ _DENSITIES = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class InertialRecording:
-    """What an inertial sensor measured beside the images.
+Sensor = TypeVar("Sensor")
+Samples = TypeVar("Samples")
+
+
+@dataclass(frozen=True)
+class SensorRecording(Generic[Sensor, Samples]):
+    """What a sensor of motion measured beside the images.
 
     Attributes:
         source: the table.
-        sensor: mounting and noise.
+        sensor: mounting, clock and noise.
         samples: in the order of time.
         dropped: samples that came out of order and were left out.
     """
 
     source: Path
-    sensor: InertialSensor
-    samples: InertialSamples
+    sensor: Sensor
+    samples: Samples
     dropped: int = 0
+
+
+InertialRecording = SensorRecording[InertialSensor, InertialSamples]
 
 
 def find_imu(folder: Path) -> Path | None:
@@ -133,7 +141,7 @@ def _read_table(path: Path) -> tuple[np.ndarray, np.ndarray]:
     lines = read_text(path, TABLE_BYTES, "the inertial samples").splitlines()
     rows, stamps = [], []
     for number, row in enumerate(csv.reader(lines), start=1):
-        if not row or row[0].lstrip().startswith("#") or (number == 1 and not _is_number(row[0])):
+        if not row or row[0].lstrip().startswith("#") or (number == 1 and np.isnan(finite_number(row[0]))):
             continue
         try:
             seconds, values = parse_stamp(row[0]), [float(each) for each in row[1:7]]
@@ -153,14 +161,6 @@ def parse_stamp(text: str) -> float:
     """Seconds, of seconds or whole nanoseconds; ValueError where it is neither."""
     stamp = text.strip()
     return int(stamp) / 1e9 if float(stamp) > _NANOSECONDS_FROM and "." not in stamp else float(stamp)
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _noise_file(table: Path) -> CalibrationYaml | None:

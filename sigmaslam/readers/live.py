@@ -13,7 +13,7 @@ from sigmaslam.calibration_files.calibration import calibrated_size, read_calibr
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.readers.capture import Capture, StereoCapture, open_capture
-from sigmaslam.readers.images import MAX_FAILURES, RawPair, SkippedFrame
+from sigmaslam.readers.images import MAX_FAILURES, PairSource, RawPair, SkippedFrame
 from sigmaslam.readers.kitti import common_size
 from sigmaslam.readers.stereo_sequence import FrameStep, StereoFrame, StereoSequence
 
@@ -83,7 +83,7 @@ class LiveSequence(StereoSequence):
         return list(zip(frames[::2], frames[1::2], strict=False))
 
 
-class LivePairs:
+class LivePairs(PairSource):
     """A source of pairs that yields the latest pair; timestamps begin at 0 with the first.
 
     A thread takes pairs continuously, so that the drivers' buffers hold no old ones.
@@ -94,16 +94,13 @@ class LivePairs:
         seconds: ends the iteration after so long.
 
     Attributes:
-        timestamps, length: None, as the future is unknown.
         dropped: number of pairs that the consumer missed.
     """
 
     def __init__(self, capture: StereoCapture, name: str, seconds: float | None = None) -> None:
-        self.timestamps: list[float] | None = None
-        self.length: int | None = None
         self.dropped = 0
         self._capture = capture
-        self._name = name
+        self.source = self._name = name
         self._seconds = seconds
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,28 +11,14 @@ from sigmaslam.bounded_files import TABLE_BYTES, read_text, shorten
 from sigmaslam.errors import CalibrationError, InputError
 from sigmaslam.geometry.checked_yaml import CalibrationYaml
 from sigmaslam.geometry.odometry_sensor import OdometrySamples, OdometrySensor
-from sigmaslam.readers.inertial import in_order, parse_stamp, read_rigid
+from sigmaslam.readers.inertial import SensorRecording, in_order, parse_stamp, read_rigid
 
 # Names of columns, in the order of time, linear and angular velocity; the first name is the one in messages.
 _NAMES = (("timestamp", "time", "t"), ("vx", "speed"), ("vy",), ("vz",), ("wx",), ("wy",), ("wz", "yaw_rate"))
 _TIME, _FORWARD, _ROLL, _PITCH, _YAW = 0, 1, 4, 5, 6
 
 
-@dataclass(frozen=True, slots=True)
-class OdometryRecording:
-    """What was measured beside the images.
-
-    Attributes:
-        source: the table.
-        sensor: the vehicle's frame and the clock.
-        samples: in the order of time.
-        dropped: samples that came out of order and were left out.
-    """
-
-    source: Path
-    sensor: OdometrySensor
-    samples: OdometrySamples
-    dropped: int = 0
+OdometryRecording = SensorRecording[OdometrySensor, OdometrySamples]
 
 
 def read_odometry(path: Path) -> OdometryRecording:

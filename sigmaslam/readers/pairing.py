@@ -118,6 +118,12 @@ def is_stamp(stem: str) -> bool:
     return stem.isdecimal() and len(stem) >= STAMP_DIGITS
 
 
+def stamped_images(folder: Path) -> dict[int, Path] | None:
+    """Images of a folder by the times in their names, nanoseconds; None where a name is no time."""
+    files = list_images(folder)
+    return {int(path.stem): path for path in files} if all(is_stamp(path.stem) for path in files) else None
+
+
 def pair_by_stamp(
     left: Mapping[int, Path], right: Mapping[int, Path], source: Path
 ) -> tuple[list[tuple[Path, Path]], list[float]]:

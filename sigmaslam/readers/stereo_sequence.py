@@ -8,14 +8,14 @@ from contextlib import closing
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import cv2
 import numpy as np
 
 from sigmaslam.errors import CalibrationError, FrameError, InputError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
-from sigmaslam.readers.images import MAX_FAILURES, GreyConverter, ImagePairs, RawPair, SkippedFrame
+from sigmaslam.readers.images import MAX_FAILURES, GreyConverter, ImagePairs, PairSource, RawPair, SkippedFrame
 from sigmaslam.readers.inertial import InertialRecording
 from sigmaslam.readers.masks import Masks
 from sigmaslam.readers.odometry import OdometryRecording
@@ -50,19 +50,6 @@ class StereoFrame:
 
 FrameStep = tuple[StereoFrame, StereoFrame | None]
 """A frame and the one after it; None where that is missing or cannot be read."""
-
-
-class PairSource(Protocol):
-    """Pairs of a reader in order; pairs that cannot be read are SkippedFrame."""
-
-    timestamps: list[float] | None
-    length: int | None
-
-    @property
-    def first_pair(self) -> RawPair:
-        """The first pair that can be read; InputError if none can."""
-
-    def __iter__(self) -> Iterator[RawPair | SkippedFrame]: ...
 
 
 # Pixels that images may be shrunk to: one cell of the coarsest map of the features.

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from sigmaslam.bounded_files import TABLE_BYTES, load_array, read_text, shorten
+from sigmaslam.bounded_files import TABLE_BYTES, finite_number, load_array, read_text, shorten
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text
 from sigmaslam.geometry.checked_yaml import CalibrationYaml
@@ -229,19 +229,13 @@ def _numbers(path: Path, columns: int | None, form: str, separator: str | None =
         columns = len(fields) if columns is None else columns
         if len(fields) != columns:
             raise InputError(f"{path}: line {number} has {len(fields)} columns, not {columns} ({form})")
-        row = []
-        for field in fields:
-            try:
-                value = float(field)
-            except ValueError:
-                value = math.nan
-            if not math.isfinite(value):
+        rows.append([finite_number(field) for field in fields])
+        for field, value in zip(fields, rows[-1], strict=True):
+            if math.isnan(value):
                 raise InputError(
                     f"{path}: line {number}: {shorten(repr(field.strip()))} is not a finite number ({form}); "
                     "correct or remove the line"
                 )
-            row.append(value)
-        rows.append(row)
         numbers.append(number)
     if not rows:
         raise InputError(f"{path}: holds no rows; expected {form}")

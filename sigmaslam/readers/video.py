@@ -3,7 +3,6 @@
 import logging
 import math
 from collections.abc import Iterator
-from functools import cached_property
 from itertools import count, pairwise
 from pathlib import Path
 
@@ -14,26 +13,14 @@ from sigmaslam.calibration_files.calibration import find_calibration, read_calib
 from sigmaslam.calibration_files.calibration_size import ImageSize
 from sigmaslam.errors import CalibrationError, InputError
 from sigmaslam.geometry.camera import StereoCamera
-from sigmaslam.readers.images import IMAGE_SUFFIXES, RawPair
+from sigmaslam.readers.images import IMAGE_SUFFIXES, PairSource, RawPair
 from sigmaslam.readers.kitti import common_size
 from sigmaslam.readers.stereo_sequence import StereoSequence
 
 logger = logging.getLogger(__name__)
 
 # Files beside videos with these suffixes are no videos: images, calibrations, notes.
-_NOT_VIDEO = IMAGE_SUFFIXES | {
-    "",
-    ".yaml",
-    ".yml",
-    ".txt",
-    ".csv",
-    ".json",
-    ".md",
-    ".npz",
-    ".npy",
-    ".html",
-    ".pdf",
-}
+_NOT_VIDEO = IMAGE_SUFFIXES | {"", ".yaml", ".yml", ".txt", ".csv", ".json", ".md", ".npz", ".npy", ".html", ".pdf"}
 LOOKED_FOR = "one side-by-side video file, or a folder with videos left.* + right.*"
 _CLOCK_PROBE = 3
 
@@ -102,12 +89,8 @@ def open_video(path: Path, calibration: Path | None = None) -> StereoSequence:
     return StereoSequence(pairs, camera, path, "video")
 
 
-class VideoPairs:
-    """Frames of two videos, or the halves of one, as a source of pairs.
-
-    Attributes:
-        timestamps: None; they are known on reading.
-        length: number of frames as the container says, or None.
+class VideoPairs(PairSource):
+    """Frames of two videos, or the halves of one, as a source of pairs; as many as the container says.
 
     Raises:
         InputError: a file cannot be decoded, has no usable clock, or an odd width (side by
@@ -115,8 +98,8 @@ class VideoPairs:
     """
 
     def __init__(self, left: Path, right: Path | None = None) -> None:
-        self.timestamps: list[float] | None = None
         self._files: tuple[Path, ...] = (left,) if right is None else (left, right)
+        self.source = self._files[-1]
         captures = [_open(path) for path in self._files]
         counts = [int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) for capture in captures]
         self._rate_hz = float(captures[0].get(cv2.CAP_PROP_FPS))
@@ -127,17 +110,10 @@ class VideoPairs:
                 f"unequal left and right videos: {counts[0]} frames in {left}, {counts[1]} in {right}; "
                 "cut them to the same frames"
             )
-        self.length: int | None = counts[0] if counts[0] > 0 else None
+        self.length = counts[0] if counts[0] > 0 else None
         self._use_clock = self._clock_increases()
         if not self._use_clock and not (math.isfinite(self._rate_hz) and self._rate_hz > 0):
             raise InputError(f"{left}: the video has neither increasing times nor a frame rate; re-encode it")
-
-    @cached_property
-    def first_pair(self) -> RawPair:
-        """The first pair; InputError if there is none."""
-        for pair in self:
-            return pair
-        raise InputError(f"{self._files[-1]}: not one frame can be decoded")
 
     def __iter__(self) -> Iterator[RawPair]:
         captures = [_open(path) for path in self._files]

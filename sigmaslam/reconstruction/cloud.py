@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmaslam.files import atomic_path
+from sigmaslam.files import write_ply
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import skew, transform_points
 from sigmaslam.table import Table
@@ -222,18 +222,12 @@ def _at_level(points: np.ndarray, level: np.ndarray | int, size: float) -> np.nd
 
 def write_cloud(path: Path, cloud: DenseCloud) -> None:
     """A binary PLY: x, y, z, grey value as red, green and blue, sigma, six numbers of the covariance, and views."""
-    columns = {name: ("float", "<f4", cloud.points[:, axis]) for axis, name in enumerate("xyz")}
-    columns |= dict.fromkeys(("red", "green", "blue"), ("uchar", "u1", np.clip(np.rint(cloud.intensity), 0, 255)))
-    columns["sigma"] = ("float", "<f4", cloud.sigma)
-    columns |= {name: ("float", "<f4", cloud.covariances[:, k]) for k, name in enumerate(_COVARIANCE_NAMES)}
-    columns["views"] = ("int", "<i4", cloud.views)
-    vertices = np.zeros(len(cloud), [(name, kind) for name, (_, kind, _) in columns.items()])
-    for name, (_, _, values) in columns.items():
-        vertices[name] = values
-    names = "".join(f"property {kind} {name}\n" for name, (kind, _, _) in columns.items())
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{names}end_header\n"
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(header.encode("ascii") + vertices.tobytes())
+    columns = {name: ("float", cloud.points[:, axis]) for axis, name in enumerate("xyz")}
+    columns |= dict.fromkeys(("red", "green", "blue"), ("uchar", np.clip(np.rint(cloud.intensity), 0, 255)))
+    columns["sigma"] = ("float", cloud.sigma)
+    columns |= {name: ("float", cloud.covariances[:, k]) for k, name in enumerate(_COVARIANCE_NAMES)}
+    columns["views"] = ("int", cloud.views)
+    write_ply(path, columns)
 
 
 def _times(six: np.ndarray, vectors: np.ndarray) -> np.ndarray:

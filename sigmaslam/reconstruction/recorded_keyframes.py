@@ -5,7 +5,6 @@ Where keyframes are far apart in time, as in slow motion, frames between them he
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections.abc import Iterator
 from contextlib import closing
@@ -16,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from sigmaslam.bounded_files import TABLE_BYTES, read_text, shorten
+from sigmaslam.bounded_files import read_json
 from sigmaslam.calibration_files.calibration_writer import write_calibration
 from sigmaslam.errors import CalibrationError, InputError
 from sigmaslam.geometry.camera import StereoCamera
@@ -223,10 +222,7 @@ def _with_frames_between(keyframes: np.ndarray, count: int) -> np.ndarray:
 
 def _read_entries(path: Path) -> dict[str, Any]:
     mend = "give a folder written by `sigmaslam track`"
-    try:
-        entries = json.loads(read_text(path, TABLE_BYTES, "the run"))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: is no JSON ({shorten(str(error))}); {mend}") from error
+    entries = read_json(path, "the run", mend)
     missing = [name for name in ("input", "format", "calibration") if name not in entries]
     if missing:
         raise InputError(f"{path}: says nothing of {', '.join(missing)}; {mend}")

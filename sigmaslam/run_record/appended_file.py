@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
+import math
 import os
 import sys
 from contextlib import closing, suppress
@@ -112,8 +113,16 @@ def is_in_use(path: Path) -> bool:
     return False
 
 
-def read_records(path: Path, width: int) -> np.ndarray:
-    """Rows (N, width) float64 of a file to which they were appended; a last row that was cut off does not count."""
-    content = path.read_bytes()
-    size = 8 * width
-    return np.frombuffer(content[: len(content) // size * size]).reshape(-1, width)
+def pack_rows(*columns: np.ndarray) -> bytes:
+    """Columns (N, ...) as N rows of float64."""
+    flat = [column.reshape(len(column), math.prod(column.shape[1:])) for column in columns]
+    return np.column_stack(flat).astype(np.float64).tobytes()
+
+
+def read_rows(path: Path, *shapes: tuple[int, ...]) -> list[np.ndarray]:
+    """Columns (N, *shape) of a file of `pack_rows`; a last row that was cut off does not count."""
+    sizes = [math.prod(shape) for shape in shapes]
+    content, size = path.read_bytes(), 8 * sum(sizes)
+    rows = np.frombuffer(content[: len(content) // size * size]).reshape(-1, sum(sizes))
+    parts = np.split(rows, np.cumsum(sizes)[:-1], axis=1)
+    return [part.reshape(-1, *shape) for part, shape in zip(parts, shapes, strict=True)]

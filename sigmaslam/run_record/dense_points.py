@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from sigmaslam.bounded_files import load_columns
-from sigmaslam.files import atomic_path
+from sigmaslam.files import save_arrays
 
 DENSE_NAME, RECONSTRUCTION_NAME = "dense.npz", "reconstruction.json"
 MAX_POINTS = 150_000
@@ -40,13 +40,8 @@ def write_dense_points(path: Path, points: np.ndarray, sigma: np.ndarray, intens
     """
     rows = np.unique(np.linspace(0, max(len(points) - 1, 0), min(len(points), MAX_POINTS)).astype(np.int64))
     grey = np.clip(np.rint(intensity[rows]), 0, 255).astype(np.uint8)
-    with atomic_path(path) as temporary:
-        np.savez_compressed(
-            temporary,
-            points=points[rows].astype(np.float32),
-            sigma=sigma[rows].astype(np.float32),
-            intensity=grey,
-        )
+    metres, sigmas = points[rows].astype(np.float32), sigma[rows].astype(np.float32)
+    save_arrays(path, points=metres, sigma=sigmas, intensity=grey)
 
 
 def read_dense_points(path: Path) -> DensePoints:

@@ -11,7 +11,7 @@ import numpy as np
 
 from sigmaslam.bounded_files import load_columns
 from sigmaslam.errors import InputError
-from sigmaslam.files import atomic_path, atomic_write_text
+from sigmaslam.files import atomic_write_text, save_arrays
 from sigmaslam.table import Table
 
 EVALUATION_NAME, EVALUATED_FRAMES_NAME = "evaluation.json", "evaluation.npz"
@@ -38,8 +38,7 @@ class EvaluatedFrames(Table):
 
 def write_evaluation(folder: Path, evaluation: dict[str, Any], frames: EvaluatedFrames) -> None:
     """Writes both files into the folder of the run."""
-    with atomic_path(folder / EVALUATED_FRAMES_NAME) as temporary:
-        np.savez_compressed(temporary, **{name: getattr(frames, name) for name in EvaluatedFrames.__slots__})
+    save_arrays(folder / EVALUATED_FRAMES_NAME, **frames.arrays())
     atomic_write_text(folder / EVALUATION_NAME, json.dumps(evaluation, indent=2) + "\n")
 
 
@@ -53,10 +52,7 @@ def read_evaluated_frames(path: Path, count: int) -> EvaluatedFrames:
         InputError: it is no such file, or of another run.
     """
     mend = "run `sigmaslam evaluate` again"
-    shapes: dict[str, tuple[str | int, ...]] = {
-        **dict.fromkeys(EvaluatedFrames.__slots__, ("M",)),
-        "truth": ("M", 3),
-    }
+    shapes: dict[str, tuple[str | int, ...]] = {**dict.fromkeys(EvaluatedFrames.__slots__, ("M",)), "truth": ("M", 3)}
     frames = EvaluatedFrames(**load_columns(path, mend, shapes, {"row": "iu"}))
     if len(frames) and not (frames.row.min() >= 0 and frames.row.max() < count):
         raise InputError(f"{path}: is not of the {count} poses of trajectory.tum; {mend}")

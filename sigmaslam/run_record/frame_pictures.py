@@ -13,7 +13,7 @@ import numpy as np
 
 from sigmaslam.bounded_files import load_columns
 from sigmaslam.errors import InputError
-from sigmaslam.files import atomic_path
+from sigmaslam.files import save_arrays
 from sigmaslam.slam.estimate import Estimate
 from sigmaslam.slam.matched_frame import MatchedFrame
 
@@ -79,20 +79,9 @@ class FramePictures:
 
 
 _SHAPES: dict[str, tuple[str | int, ...]] = {
-    "timestamp": ("P",),
-    "score": ("P",),
-    "worst": ("P",),
-    "left": ("B",),
-    "left_end": ("P",),
-    "right": ("C",),
-    "right_end": ("P",),
-    "size": (2,),
-    "match_end": ("P",),
-    "pixels": ("M", 2),
-    "covariance": ("M", 2, 2),
-    "probability": ("M",),
-    "inlier": ("M",),
-    "trail": ("M", "T", 2),
+    **dict.fromkeys(("timestamp", "score", "worst", "left_end", "right_end", "match_end"), ("P",)),
+    **{"left": ("B",), "right": ("C",), "size": (2,)},
+    **{"pixels": ("M", 2), "covariance": ("M", 2, 2), "probability": ("M",), "inlier": ("M",), "trail": ("M", "T", 2)},
 }
 _KINDS = {
     **dict.fromkeys(("left", "right"), "u"),
@@ -177,9 +166,7 @@ class PictureRecorder:
             inlier=joined("inlier", np.zeros(0, bool)),
             trail=joined("trail", np.zeros((0, _TRAIL, 2), np.float32)),
         )
-        arrays = {field.name: getattr(content, field.name) for field in fields(FramePictures)}
-        with atomic_path(path) as temporary:
-            np.savez_compressed(temporary, **arrays)
+        save_arrays(path, **{field.name: getattr(content, field.name) for field in fields(FramePictures)})
 
     def _score(self, estimate: Estimate) -> float:
         """As of `FramePictures`; of frames without a pose of their own only the first one of each loss has a score."""

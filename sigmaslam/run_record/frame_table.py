@@ -15,16 +15,7 @@ from sigmaslam.bounded_files import TABLE_BYTES, read_text, shorten
 from sigmaslam.errors import InputError
 
 FRAMES_NAME = "frames.csv"
-COLUMNS = (
-    "timestamp",
-    "matches",
-    "inliers",
-    "nis",
-    "dof",
-    "belief",
-    "disparity_offset",
-    "disparity_offset_sigma",
-)
+COLUMNS = ("timestamp", "matches", "inliers", "nis", "dof", "belief", "disparity_offset", "disparity_offset_sigma")
 """Columns of numbers that frames.csv must have, next to `status` and any number of `ms_...`."""
 KEYFRAME_COLUMNS = ("keyframe", "loop")
 """Columns that runs of earlier versions lack: 1 where the frame became a keyframe, and the time stamp of the one of

@@ -52,14 +52,14 @@ class InertialRecords(Table):
     bias_sigmas: np.ndarray
 
 
-class InertialWriter:
+class InertialWriter(AppendedFile):
     """Appends rows to the file in the folder of a run, a new one or one that goes on."""
 
     def __init__(self, folder: Path, goes_on: bool = False) -> None:
         goes_on = goes_on and (folder / INERTIAL_NAME).is_file()
-        self._file = AppendedFile(folder / INERTIAL_NAME, goes_on)
+        super().__init__(folder / INERTIAL_NAME, goes_on)
         if not goes_on:
-            self._append(",".join(COLUMNS))
+            self.append(f"{','.join(COLUMNS)}\n".encode())
 
     def add(self, timestamp: float, estimate: InertialEstimate) -> None:
         """Takes a frame; it is on disk when this returns."""
@@ -67,14 +67,7 @@ class InertialWriter:
             *(estimate.roll, estimate.pitch, *estimate.sigmas, *estimate.up, estimate.tilt_sigma),
             *(*estimate.gyro_bias, *estimate.gyro_bias_sigma, *estimate.accel_bias, *estimate.accel_bias_sigma),
         ]
-        self._append(f"{timestamp:.9f}," + ",".join(f"{number:.7g}" for number in numbers))
-
-    def close(self) -> None:
-        """The last frame has come."""
-        self._file.close()
-
-    def _append(self, line: str) -> None:
-        self._file.append(f"{line}\n".encode())
+        self.append(f"{timestamp:.9f},{','.join(f'{number:.7g}' for number in numbers)}\n".encode())
 
 
 def read_inertial_records(folder: Path) -> InertialRecords | None:

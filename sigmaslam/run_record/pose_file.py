@@ -7,13 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmaslam.files import atomic_path
-from sigmaslam.run_record.appended_file import AppendedFile, read_records
+from sigmaslam.files import atomic_write_bytes
+from sigmaslam.run_record.appended_file import AppendedFile, pack_rows, read_rows
 from sigmaslam.table import Table
 
 PARTIAL_POSES = "poses.partial"
-# Numbers of a row on disk: time stamp, pose, two covariances.
-_WIDTH = 1 + 16 + 36 + 36
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,37 +31,22 @@ class PoseRecords(Table):
     matching: np.ndarray
 
 
-class PoseWriter:
+class PoseWriter(AppendedFile):
     """Appends poses to the file in the folder of a run, a new one or one that goes on."""
 
     def __init__(self, folder: Path, goes_on: bool = False) -> None:
-        self._file = AppendedFile(folder / PARTIAL_POSES, goes_on)
+        super().__init__(folder / PARTIAL_POSES, goes_on)
 
     def add(self, timestamp: float, pose: np.ndarray, covariance: np.ndarray, matching: np.ndarray) -> None:
         """Takes a row of `PoseRecords`; it is on disk when this returns."""
-        row = np.r_[timestamp, pose.ravel(), covariance.ravel(), matching.ravel()]
-        self._file.append(row.astype(np.float64).tobytes())
-
-    def close(self) -> None:
-        """The last pose has come."""
-        self._file.close()
+        self.append(pack_rows(np.array([timestamp]), pose[None], covariance[None], matching[None]))
 
 
 def read_pose_records(folder: Path) -> PoseRecords:
     """The poses that a run has left in its folder so far."""
-    rows = read_records(folder / PARTIAL_POSES, _WIDTH)
-    return PoseRecords(
-        rows[:, 0],
-        rows[:, 1:17].reshape(-1, 4, 4),
-        rows[:, 17:53].reshape(-1, 6, 6),
-        rows[:, 53:89].reshape(-1, 6, 6),
-    )
+    return PoseRecords(*read_rows(folder / PARTIAL_POSES, (), (4, 4), (6, 6), (6, 6)))
 
 
 def write_pose_records(folder: Path, records: PoseRecords) -> None:
     """Writes poses as a run leaves them, so that it can go on."""
-    count = len(records)
-    columns = (records.timestamp, records.pose, records.covariance, records.matching)
-    rows = np.column_stack([column.reshape(count, -1) for column in columns])
-    with atomic_path(folder / PARTIAL_POSES) as temporary:
-        temporary.write_bytes(rows.astype(np.float64).tobytes())
+    atomic_write_bytes(folder / PARTIAL_POSES, pack_rows(*records.columns()))

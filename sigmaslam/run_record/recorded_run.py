@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sigmaslam.bounded_files import TABLE_BYTES, check_columns, load_arrays, read_text, shorten
+from sigmaslam.bounded_files import check_columns, load_arrays, read_json
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import read_covariances, read_tum
@@ -118,12 +117,12 @@ def read_run(folder: Path) -> RecordedRun:
     pose_row = np.searchsorted(frames.columns["timestamp"], trajectory.timestamps - 1e-6)
     if len(pose_row) and pose_row.max() >= len(frames):
         raise InputError(f"{folder / FRAMES_NAME}: ends before trajectory.tum: both must come from the same run")
-    errors = folder / EVALUATED_FRAMES_NAME
+    path, count, errors = folder / "covariance.npy", len(trajectory), folder / EVALUATED_FRAMES_NAME
     return RecordedRun(
         folder=folder,
         frames=frames,
         trajectory=trajectory,
-        covariances=_read_covariances(folder / "covariance.npy", len(trajectory)),
+        covariances=read_covariances(path, count) if path.is_file() else np.full((count, 6, 6), np.nan),
         pose_row=pose_row,
         final=_read_trajectory(folder / FINAL_TRAJECTORY),
         refined=_read_trajectory(folder / REFINED_TRAJECTORY),
@@ -133,17 +132,13 @@ def read_run(folder: Path) -> RecordedRun:
         entries=_read_json(folder / RUN_NAME, "track"),
         evaluation=_read_json(folder / EVALUATION_NAME, "evaluate"),
         refinement=_read_json(folder / REFINE_NAME, "refine"),
-        evaluated=read_evaluated_frames(errors, len(trajectory)) if errors.is_file() else None,
+        evaluated=read_evaluated_frames(errors, count) if errors.is_file() else None,
         inertial=read_inertial_records(folder),
     )
 
 
 def _read_trajectory(path: Path) -> Trajectory | None:
     return read_tum(path) if path.is_file() else None
-
-
-def _read_covariances(path: Path, count: int) -> np.ndarray:
-    return read_covariances(path, count) if path.is_file() else np.full((count, 6, 6), np.nan)
 
 
 def _read_map(path: Path) -> RecordedMap | None:
@@ -169,10 +164,5 @@ def _read_map(path: Path) -> RecordedMap | None:
 
 
 def _read_json(path: Path, command: str) -> dict[str, Any]:
-    if not path.is_file():
-        return {}
-    try:
-        content = json.loads(read_text(path, TABLE_BYTES, "the run"))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: is no JSON ({shorten(str(error))}); run `sigmaslam {command}` again") from error
+    content = read_json(path, "the run", f"run `sigmaslam {command}` again") if path.is_file() else {}
     return content if isinstance(content, dict) else {}

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from sigmaslam.errors import InputError
-from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder, printable
+from sigmaslam.files import atomic_write_text, check_new_folder, printable, save_arrays, write_ply
 from sigmaslam.frontend.build import own_networks
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
@@ -44,18 +44,9 @@ UNFINISHED = "not yet"
 STAGES = ("read", "rectify", "features", "match", "filter", "map")
 _COLUMNS = (COLUMNS[0], "status", "doubts", *COLUMNS[1:], *KEYFRAME_COLUMNS, *(f"ms_{stage}" for stage in STAGES))
 _GRAPHS = (
-    "features.onnx",
-    "scorer.onnx",
-    "verifier.onnx",
-    "place_verifier.onnx",
-    "pose_predict.onnx",
-    "inertial_predict.onnx",
-    "frame_predict.onnx",
-    "frame_robust.onnx",
-    "frame_gated.onnx",
-    "window_eliminate.onnx",
-    "window_gate.onnx",
-    "window_condition.onnx",
+    *("features.onnx", "scorer.onnx", "verifier.onnx", "place_verifier.onnx"),
+    *("pose_predict.onnx", "inertial_predict.onnx", "frame_predict.onnx", "frame_robust.onnx", "frame_gated.onnx"),
+    *("window_eliminate.onnx", "window_gate.onnx", "window_condition.onnx"),
 )
 
 
@@ -81,7 +72,8 @@ class RunWriter:
         goes_on = poses is not None
         if not goes_on:
             check_new_folder(out)
-        self.run = {**run, **_describe_start(), "versions": _versions(), "weights_sha256": _weight_hashes(run)}
+        versions = describe_versions("sigmaslam", "numpy", "opencv-python-headless", "onnxruntime")
+        self.run = {**run, **_describe_start(), "versions": versions, "weights_sha256": _weight_hashes(run)}
         self.calibration: CalibrationEstimate | None = None
         try:
             out.mkdir(parents=True, exist_ok=True)
@@ -159,16 +151,15 @@ class RunWriter:
         assert self._rectified is not None
         assert self.calibration is not None
         seen = KeyframeTracks.concatenate([tracks for _, tracks in self._tracks])
-        with atomic_path(path) as temporary:
-            np.savez_compressed(
-                temporary,
-                frame=np.concatenate([np.full(len(tracks), frame) for frame, tracks in self._tracks]),
-                landmark=seen.landmark_id,
-                measurement=seen.measurement,
-                covariance=seen.covariance,
-                disparity_offset=np.array([self.calibration.disparity_offset, self.calibration.disparity_offset_sigma]),
-                **self._rectified,
-            )
+        save_arrays(
+            path,
+            frame=np.concatenate([np.full(len(tracks), frame) for frame, tracks in self._tracks]),
+            landmark=seen.landmark_id,
+            measurement=seen.measurement,
+            covariance=seen.covariance,
+            disparity_offset=np.array([self.calibration.disparity_offset, self.calibration.disparity_offset_sigma]),
+            **self._rectified,
+        )
 
     def _add_row(self, fields: Sequence[Any]) -> None:
         line = io.StringIO()
@@ -195,24 +186,17 @@ def check_has_trajectory(run: Path) -> None:
     raise InputError(f"{run}: holds no trajectory.tum: {reason}")
 
 
-def write_ply(path: Path, point_map: PointMap) -> None:
+def write_map_points(path: Path, point_map: PointMap) -> None:
     """Points as a binary PLY with x, y, z, their grey value in the images, and sigma.
 
     Sigma is the root of the largest eigenvalue of the covariance, metres. The grey value stands for red, green and
     blue, which viewers know; a map of points whose grey values are not known has none.
     """
-    columns = {name: ("float", "<f4", point_map.points[:, axis]) for axis, name in enumerate("xyz")}
+    columns = {name: ("float", point_map.points[:, axis]) for axis, name in enumerate("xyz")}
     if np.isfinite(point_map.intensity).all():
-        columns |= dict.fromkeys(("red", "green", "blue"), ("uchar", "u1", point_map.intensity))
-    sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(point_map.covariances)[:, -1], 0.0))
-    columns["sigma"] = ("float", "<f4", sigma)
-    vertices = np.zeros(len(sigma), [(name, kind) for name, (_, kind, _) in columns.items()])
-    for name, (_, _, values) in columns.items():
-        vertices[name] = values
-    names = "".join(f"property {kind} {name}\n" for name, (kind, _, _) in columns.items())
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{names}end_header\n"
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(header.encode("ascii") + vertices.tobytes())
+        columns |= dict.fromkeys(("red", "green", "blue"), ("uchar", point_map.intensity))
+    columns["sigma"] = ("float", np.sqrt(np.maximum(np.linalg.eigvalsh(point_map.covariances)[:, -1], 0.0)))
+    write_ply(path, columns)
 
 
 def describe_camera(camera: StereoCamera) -> dict[str, Any]:
@@ -256,11 +240,7 @@ def _describe_start() -> dict[str, Any]:
     return {
         "command": printable(shlex.join([program, *sys.argv[1:]])),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
-        "machine": {
-            "system": platform.platform(),
-            "processor": _processor(),
-            "cores": os.cpu_count(),
-        },
+        "machine": {"system": platform.platform(), "processor": _processor(), "cores": os.cpu_count()},
     }
 
 
@@ -272,9 +252,9 @@ def _processor() -> str:
     return models[0] if models else platform.machine()
 
 
-def _versions() -> dict[str, str]:
-    names = ("sigmaslam", "numpy", "opencv-python-headless", "onnxruntime")
-    return {"python": platform.python_version(), **{name: version(name) for name in names}}
+def describe_versions(*packages: str) -> dict[str, str]:
+    """Those of Python and of packages, for run.json."""
+    return {"python": platform.python_version(), **{name: version(name) for name in packages}}
 
 
 def _weight_hashes(run: dict[str, Any]) -> dict[str, str]:

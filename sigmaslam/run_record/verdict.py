@@ -94,11 +94,7 @@ def times_verdict(summary: dict[str, Any]) -> str | None:
 
 
 def calibration_verdict(
-    calibration: CalibrationEstimate,
-    frames: int,
-    points: int,
-    expected: float,
-    findings: Sequence[Finding] = (),
+    calibration: CalibrationEstimate, frames: int, points: int, expected: float, findings: Sequence[Finding] = ()
 ) -> str:
     """The estimated disparity offset, and what a check found about the rig, in words.
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
+from sigmaslam.bounded_files import read_json
 from sigmaslam.errors import InputError
 from sigmaslam.files import left_behind
 from sigmaslam.run_record.appended_file import check_not_in_use
@@ -39,10 +39,7 @@ def finish_run(run: Path) -> dict[str, Any] | None:
     check_not_in_use(partial)
     for path in left_behind(run):
         path.unlink(missing_ok=True)
-    try:
-        entries = json.loads((run / RUN_NAME).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{run / RUN_NAME}: is no JSON ({error}); remove it") from error
+    entries = read_json(run / RUN_NAME, "the run", "remove it")
     if entries["ended"] == UNFINISHED:
         entries["ended"] = "killed"
     summary, failed = write_results(run, entries, None, None)

@@ -14,7 +14,7 @@ import numpy as np
 from sigmaslam.checks.finding import Finding, wrong
 from sigmaslam.errors import OutputError, SigmaSlamError
 from sigmaslam.estimation.frame_clock import stamp_noise
-from sigmaslam.files import atomic_path, atomic_write_text
+from sigmaslam.files import atomic_write_text, save_array, save_arrays
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import write_kitti, write_tum
 from sigmaslam.run_record.frame_pictures import PICTURES_NAME
@@ -29,7 +29,7 @@ from sigmaslam.run_record.relative_pose_file import (
     write_frame_pairs,
 )
 from sigmaslam.run_record.run_failure import explain_failure
-from sigmaslam.run_record.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY, RUN_NAME, write_ply
+from sigmaslam.run_record.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY, RUN_NAME, write_map_points
 from sigmaslam.run_record.verdict import calibration_verdict, expected_offset
 from sigmaslam.slam.estimate import CalibrationEstimate
 from sigmaslam.slam.point_map import PointMap
@@ -186,14 +186,13 @@ def _write_poses(files: _Files, records: PoseRecords, frames: FrameTable | None,
         return
     trajectory = Trajectory(records.timestamp, records.pose)
     files.attempt("trajectory.tum", lambda path: write_tum(path, trajectory))
-    files.attempt("covariance.npy", lambda path: _save(path, records.covariance))
+    files.attempt("covariance.npy", lambda path: save_array(path, records.covariance))
     files.attempt(POSES_NAME, lambda path: write_pose_table(path, records, frames))
     files.attempt("trajectory.kitti", lambda path: write_kitti(path, trajectory, path.with_name("times.txt")))
     if has_matching:
-        files.attempt("covariance_matching.npy", lambda path: _save(path, records.matching))
+        files.attempt("covariance_matching.npy", lambda path: save_array(path, records.matching))
     files.attempt(
-        RELATIVE_POSES_NAME,
-        lambda path: write_frame_pairs(path, collect_frame_pairs(path.parent, records.timestamp)),
+        RELATIVE_POSES_NAME, lambda path: write_frame_pairs(path, collect_frame_pairs(path.parent, records.timestamp))
     )
 
 
@@ -206,7 +205,7 @@ def _write_final(files: _Files, tracker: TrackerResults, count: int) -> None:
     def write(path: Path) -> None:
         trajectory, covariances = final()
         write_tum(path, trajectory.subset(np.arange(count)))
-        files.attempt(FINAL_COVARIANCE, lambda path: _save(path, covariances[:count]))
+        files.attempt(FINAL_COVARIANCE, lambda path: save_array(path, covariances[:count]))
 
     files.attempt(FINAL_TRAJECTORY, write)
 
@@ -219,13 +218,12 @@ def _write_map(files: _Files, tracker: TrackerResults) -> int:
         point_map = tracker.point_map()
         made.append(point_map)
         arrays = {name: getattr(point_map, name) for name in PointMap.__slots__}
-        with atomic_path(path) as temporary:
-            np.savez_compressed(temporary, **arrays, **tracker.keyframes())
+        save_arrays(path, **arrays, **tracker.keyframes())
 
     files.attempt(MAP_NAME, write)
     if not made:
         return 0
-    files.attempt("map.ply", lambda path: write_ply(path, made[0]))
+    files.attempt("map.ply", lambda path: write_map_points(path, made[0]))
     return len(made[0].points)
 
 
@@ -289,8 +287,3 @@ def _describe_world(summary: dict[str, Any], run: dict[str, Any]) -> str | None:
     if run.get("map") is not None:
         return f"that of the map, in which the camera was found in frame {first} (from 0 on)"
     return f"the left camera of frame {first} (from 0 on), where tracking started"
-
-
-def _save(path: Path, array: np.ndarray) -> None:
-    with atomic_path(path) as temporary:
-        np.save(temporary, array)

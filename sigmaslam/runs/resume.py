@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from sigmaslam.bounded_files import load_array
+from sigmaslam.bounded_files import read_json
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text
 from sigmaslam.readers import StereoFrame, StereoSequence
-from sigmaslam.readers.trajectory_files import read_tum
+from sigmaslam.readers.trajectory_files import read_covariances, read_tum
 from sigmaslam.run_record.appended_file import check_not_in_use
 from sigmaslam.run_record.frame_table import FRAMES_NAME, read_frames
 from sigmaslam.run_record.inertial_file import cut_inertial_records
@@ -138,10 +138,7 @@ def read_stopped_run(folder: Path, run: dict[str, Any]) -> StoppedRun:
         raise InputError(f"{folder}: holds no run that could go on: track without --resume")
     if partial.is_file():
         check_not_in_use(partial)
-    try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: is no JSON ({error}): track anew with --overwrite") from error
+    entries = read_json(path, "the run", "track anew with --overwrite")
     _check_entries(folder, entries, json.loads(json.dumps(run)))
     records, pairs = _read_poses(folder)
     times, keyframe = _read_rows(folder / FRAMES_NAME)
@@ -188,16 +185,8 @@ def _read_poses(folder: Path) -> tuple[PoseRecords, FramePairs]:
         raise InputError(f"{folder}: none of its frames has a pose to go on from: track anew with --overwrite")
     trajectory = read_tum(folder / "trajectory.tum")
     count = len(trajectory.timestamps)
-    covariances = []
-    for name in ("covariance.npy", "covariance_matching.npy"):
-        covariance = load_array(folder / name, "track anew with --overwrite")
-        if covariance.shape != (count, 6, 6):
-            raise InputError(
-                f"{folder / name}: has shape {covariance.shape}, trajectory.tum beside it {count} poses: "
-                "both must come from the same run"
-            )
-        covariances.append(covariance)
-    records = PoseRecords(trajectory.timestamps, trajectory.poses, covariances[0], covariances[1])
+    covariances = [read_covariances(folder / name, count) for name in ("covariance.npy", "covariance_matching.npy")]
+    records = PoseRecords(trajectory.timestamps, trajectory.poses, *covariances)
     return records, read_frame_pairs(folder / RELATIVE_POSES_NAME, count)
 
 

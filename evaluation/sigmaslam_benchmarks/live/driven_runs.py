@@ -22,7 +22,7 @@ from sigmaslam.cli.run_summary import tell_summary
 from sigmaslam.errors import SigmaSlamError
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.readers import StereoFrame, StereoSequence
-from sigmaslam.readers.images import RawPair
+from sigmaslam.readers.images import PairSource, RawPair
 from sigmaslam.readers.inertial import InertialRecording
 from sigmaslam.runs.request import InputOptions, LiveOptions, OutputOptions, TrackerOptions, TrackRequest
 from sigmaslam.runs.track import track_sequence
@@ -51,18 +51,14 @@ Method = Callable[[Sequence[DrivenFrame], StereoCamera, Path], DrivenRun]
 """Tracks frames; a run folder may be written to the path, which does not exist."""
 
 
-class DrivenPairs:
+class DrivenPairs(PairSource):
     """Delivered frames as a source of pairs."""
 
     def __init__(self, frames: Sequence[DrivenFrame]) -> None:
-        self.timestamps: list[float] | None = [frame.timestamp for frame in frames]
-        self.length: int | None = len(frames)
+        self.timestamps = [frame.timestamp for frame in frames]
+        self.length = len(frames)
+        self.source = "driver"
         self._frames = frames
-
-    @property
-    def first_pair(self) -> RawPair:
-        """The first pair."""
-        return next(iter(self))
 
     def __iter__(self) -> Iterator[RawPair]:
         for index, frame in enumerate(self._frames):

@@ -16,7 +16,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.geometry.se3 import se3_inverse
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import StereoFrame, StereoSequence
-from sigmaslam.readers.images import RawPair
+from sigmaslam.readers.images import PairSource, RawPair
 from sigmaslam.readers.trajectory_files import read_trajectory
 from sigmaslam.runs.request import TrackerOptions
 from sigmaslam.slam.tracker import TrackerConfig
@@ -34,7 +34,7 @@ BLOCK = 500
 _BEYOND = 60  # frames of the second lap that the run without loops goes on for
 
 
-class LappedPairs:
+class LappedPairs(PairSource):
     """A lap over and over, in memory from the start; time goes on.
 
     Args:
@@ -49,14 +49,8 @@ class LappedPairs:
         step = self._frames[1].timestamp - self._frames[0].timestamp
         self.period = self._frames[-1].timestamp - self._frames[0].timestamp + 2.0 * step
         self.lap_frames = len(self._frames)
-        self.timestamps: list[float] | None = None
-        self.length: int | None = frames
-        self._count = frames
-
-    @property
-    def first_pair(self) -> RawPair:
-        """The first of the lap."""
-        return next(iter(self))
+        self.length = self._count = frames
+        self.source = lap.source
 
     def __iter__(self) -> Iterator[RawPair]:
         for number in range(self._count):

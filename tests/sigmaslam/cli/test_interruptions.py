@@ -223,8 +223,7 @@ def test_a_file_without_room_costs_a_message_and_not_the_others(
     sequence: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ):
     with monkeypatch.context() as disk:
-        for module in ("files", "runs.results", "run_record.relative_pose_file", "run_record.run_folder"):
-            disk.setattr(f"sigmaslam.{module}.atomic_path", full_for({name}))
+        disk.setattr("sigmaslam.files.atomic_path", full_for({name}))
         if name == "run.json":  # there was room for it when the run began
             disk.setattr("sigmaslam.run_record.run_folder.atomic_write_text", lambda path, text: path.write_text(text))
         result = run_here("track", sequence, "--out", tmp_path / "run", "--frontend", "klt")
