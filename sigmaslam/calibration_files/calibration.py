@@ -5,12 +5,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from sigmaslam.bounded_files import CALIBRATION_BYTES, read_text
-from sigmaslam.calibration_files.calibration_size import ImageSize, UnknownImageSizeError
 from sigmaslam.calibration_files.camera_infos import is_camera_info, read_camera_infos
 from sigmaslam.calibration_files.euroc_calibration import read_sensors
 from sigmaslam.calibration_files.four_seasons_calibration import UNDISTORTED, read_four_seasons
 from sigmaslam.calibration_files.kalibr_calibration import is_kalibr, read_kalibr
 from sigmaslam.calibration_files.kitti_calibration import GREY_PAIR, read_kitti_calibration
+from sigmaslam.calibration_files.lens_models import ImageSize, UnknownImageSizeError
 from sigmaslam.calibration_files.oak_calibration import read_oak
 from sigmaslam.calibration_files.opencv_calibration import is_file_storage, read_opencv
 from sigmaslam.calibration_files.zed_calibration import read_zed

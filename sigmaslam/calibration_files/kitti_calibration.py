@@ -6,9 +6,15 @@ from pathlib import Path
 import numpy as np
 
 from sigmaslam.bounded_files import CALIBRATION_BYTES, read_text, shorten
-from sigmaslam.calibration_files.calibration_size import ImageSize, UnknownImageSizeError, need_image_size
 from sigmaslam.calibration_files.camera_infos import right_position
-from sigmaslam.calibration_files.lens_models import camera_model, intrinsics_of, naming
+from sigmaslam.calibration_files.lens_models import (
+    ImageSize,
+    UnknownImageSizeError,
+    camera_model,
+    intrinsics_of,
+    naming,
+    need_image_size,
+)
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 

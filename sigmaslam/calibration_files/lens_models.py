@@ -12,6 +12,7 @@ from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, DistortionModel, StereoCamera
 from sigmaslam.geometry.checked_yaml import CalibrationYaml
 
+ImageSize = tuple[int, int]
 DISTORTION_MODELS: dict[str, DistortionModel] = {
     "radial-tangential": "radtan",
     "radtan": "radtan",
@@ -33,6 +34,21 @@ UNSUPPORTED_MODELS = {
 }
 # After k1 k2 p1 p2 k3 k4 k5 k6 OpenCV has thin prism and tilt, which are nearly always zero.
 _RADTAN_COEFFICIENTS = 8
+
+
+class UnknownImageSizeError(CalibrationError):
+    """A calibration file does not name the size of its images, and nothing else does."""
+
+
+def need_image_size(name: str, image_size: ImageSize | None) -> ImageSize:
+    """The image size that is given, (width, height).
+
+    Raises:
+        UnknownImageSizeError: none is.
+    """
+    if image_size is None:
+        raise UnknownImageSizeError(f"{name}: does not name the size of the images; give --size WIDTHxHEIGHT")
+    return image_size
 
 
 @contextmanager

@@ -10,9 +10,15 @@ import cv2
 import numpy as np
 
 from sigmaslam.bounded_files import CALIBRATION_BYTES, read_text
-from sigmaslam.calibration_files.calibration_size import ImageSize, need_image_size
 from sigmaslam.calibration_files.camera_infos import CameraInfo, stereo_from_infos
-from sigmaslam.calibration_files.lens_models import camera_model, intrinsics_of, naming, stereo_camera
+from sigmaslam.calibration_files.lens_models import (
+    ImageSize,
+    camera_model,
+    intrinsics_of,
+    naming,
+    need_image_size,
+    stereo_camera,
+)
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.geometry.checked_yaml import CalibrationYaml

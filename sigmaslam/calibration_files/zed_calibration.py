@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 
 from sigmaslam.bounded_files import CALIBRATION_BYTES, finite_number, read_text
-from sigmaslam.calibration_files.calibration_size import ImageSize, need_image_size
-from sigmaslam.calibration_files.lens_models import camera_model, stereo_camera
+from sigmaslam.calibration_files.lens_models import ImageSize, camera_model, need_image_size, stereo_camera
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 

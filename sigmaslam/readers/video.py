@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from sigmaslam.calibration_files.calibration import find_calibration, read_calibration
-from sigmaslam.calibration_files.calibration_size import ImageSize
+from sigmaslam.calibration_files.lens_models import ImageSize
 from sigmaslam.errors import CalibrationError, InputError
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.readers.images import IMAGE_SUFFIXES, PairSource, RawPair

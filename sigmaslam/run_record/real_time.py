@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from array import array
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -14,10 +14,23 @@ from sigmaslam.readers import StereoFrame
 POLICY = "the newest frame that has come is tracked; older ones that are still waiting are dropped"
 
 
-class Latency:
-    """Time from the arrival of each frame to its pose; the first frame arrives when it is handed over."""
+class FrameTiming:
+    """Whether frames come in real time, and how long their poses take from there.
 
-    def __init__(self) -> None:
+    Args:
+        is_live: they come from cameras.
+        is_played: recorded ones are handed over at their time stamps, always the newest one that has come.
+
+    Attributes:
+        is_real: frames do not wait for the tracker.
+        dropped: played frames that were still waiting when a newer one had come.
+        waited: seconds until the last played frame came, when it was the tracker that was early.
+    """
+
+    def __init__(self, is_live: bool = False, is_played: bool = False) -> None:
+        self.is_real = is_live or is_played
+        self.dropped, self.waited = 0, 0.0
+        self._is_played = is_played and not is_live
         self._first: float | None = None
         self._seconds = array("d")
 
@@ -31,11 +44,28 @@ class Latency:
         assert self._first is not None
         return time.perf_counter() - self._first - timestamp
 
+    def play(self, frames: Iterator[StereoFrame]) -> Iterator[StereoFrame]:
+        """The frames, in order, that are not dropped; cameras give them in real time anyway."""
+        waiting = next(frames, None)
+        while waiting is not None:
+            self.start(waiting.timestamp)
+            coming = None
+            if self._is_played:
+                self.waited = max(-self.age(waiting.timestamp), 0.0)
+                time.sleep(self.waited)
+                coming = next(frames, None)
+                while coming is not None and self.age(coming.timestamp) >= 0.0:
+                    self.dropped += 1
+                    waiting, coming = coming, next(frames, None)
+            yield waiting
+            waiting = coming if self._is_played else next(frames, None)
+
     def note(self, timestamp: float) -> None:
         """The pose of the frame of that time stamp is known now."""
-        self._seconds.append(self.age(timestamp))
+        if self.is_real:
+            self._seconds.append(self.age(timestamp))
 
-    def describe(self) -> dict[str, float]:
+    def latency_ms(self) -> dict[str, float]:
         """Percentiles in milliseconds by name; empty before the first pose."""
         if not self._seconds:
             return {}
@@ -44,45 +74,12 @@ class Latency:
         values = np.percentile(milliseconds, (50, 95, 99, 100))
         return {name: round(float(value), 1) for name, value in zip(names, values, strict=True)}
 
-
-class RealTimePlayer:
-    """Hands over recorded frames at their time stamps, always the newest one that has come.
-
-    Args:
-        frames: in order.
-        latency: tells when frames arrive.
-
-    Attributes:
-        dropped: frames that were still waiting when a newer one had come.
-        waited: seconds until the last frame came.
-    """
-
-    def __init__(self, frames: Iterator[StereoFrame], latency: Latency) -> None:
-        self.dropped = 0
-        self.waited = 0.0
-        self._frames = frames
-        self._latency = latency
-
-    def play(self) -> Generator[StereoFrame, None, None]:
-        """The frames that are not dropped."""
-        waiting = next(self._frames, None)
-        while waiting is not None:
-            self._latency.start(waiting.timestamp)
-            self.waited = max(-self._latency.age(waiting.timestamp), 0.0)
-            time.sleep(self.waited)
-            coming = next(self._frames, None)
-            while coming is not None and self._latency.age(coming.timestamp) >= 0.0:
-                self.dropped += 1
-                waiting, coming = coming, next(self._frames, None)
-            yield waiting
-            waiting = coming
+    def describe(self, dropped: int) -> dict[str, Any]:
+        """Entry of run.json: how many frames were dropped, and the latency; none where frames wait for the tracker."""
+        timing = {"policy": POLICY, "dropped": dropped, "latency_ms": self.latency_ms()}
+        return {"real_time": timing} if self.is_real else {}
 
 
 def format_latency(latency_ms: dict[str, float]) -> str:
-    """Percentiles as `Latency.describe` gives them, in words."""
+    """Percentiles as `FrameTiming.latency_ms` gives them, in words."""
     return ", ".join(f"{name} {value:.0f}" for name, value in latency_ms.items())
-
-
-def describe_real_time(latency: Latency, dropped: int) -> dict[str, Any]:
-    """Entry of run.json."""
-    return {"real_time": {"policy": POLICY, "dropped": dropped, "latency_ms": latency.describe()}}

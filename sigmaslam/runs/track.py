@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,7 +27,7 @@ from sigmaslam.progress import open_progress
 from sigmaslam.readers import StereoFrame, StereoSequence
 from sigmaslam.readers.trajectory_files import write_tum
 from sigmaslam.run_record.frame_pictures import PictureRecorder
-from sigmaslam.run_record.real_time import Latency, RealTimePlayer, describe_real_time
+from sigmaslam.run_record.real_time import FrameTiming
 from sigmaslam.run_record.run_folder import RunWriter, describe_camera, describe_weights
 from sigmaslam.runs.denoise import StereoFilter
 from sigmaslam.runs.request import TrackerOptions, TrackRequest
@@ -86,18 +85,19 @@ def track_sequence(request: TrackRequest) -> dict[str, Any]:
     writer = RunWriter(out, run, rectified, None if stopped is None else len(stopped.records))
     pictures = PictureRecorder(sequence.length)
     images = StereoFilter() if options.denoise else None
-    steps = _FrameSteps(images, tracker, _Timing(sequence, options.realtime), location, _feed(sequence, tracker))
+    timing = FrameTiming(sequence.format == "camera", options.realtime)
+    steps = _FrameSteps(images, tracker, timing, location, _feed(sequence, tracker))
     on_estimate = live.on_estimate
     listeners = [(lambda frame: on_estimate(frame.result))] if on_estimate else []
     listeners += [sink.add for sink in live.sinks]
-    if steps.timing.is_real:
+    if timing.is_real:
         tracker.warm_up()
     stopped_by: BaseException | None = None
     with StopSignals() as signals:
         try:
             # Cameras are released before the results are written, even after an error.
             with closing(sequence.frames()) as frames:
-                _track(steps.timing.play(frames), steps, _Rows(sequence, writer, stopped, listeners), pictures)
+                _track(timing.play(frames), steps, _Rows(sequence, writer, stopped, listeners), pictures)
             signals.hold()
         except BaseException as error:
             signals.hold()
@@ -108,15 +108,15 @@ def track_sequence(request: TrackRequest) -> dict[str, Any]:
         run = {
             **writer.run,
             "ended": _describe_end(stopped_by),
-            "dropped": steps.timing.dropped,
-            **steps.timing.describe(),
+            "dropped": timing.dropped + sequence.dropped,
+            **timing.describe(timing.dropped + sequence.dropped),
             **_describe_object(tracker, options.track_object),
             **_describe_location(location),
             **({} if images is None else {"noise": images.describe()}),
         }
         others = {"tracks.npz": writer.write_tracks} if writer.has_tracks else {}
-        if location is not None and location.T_sensor_world is not None:
-            others["trajectory_location.tum"] = lambda path: _write_location(path, location)
+        if location is not None and (placed := location.trajectory()) is not None:
+            others["trajectory_location.tum"] = lambda path: write_tum(path, placed)
         saved = request.outputs.save_calibration
         if saved is not None and writer.calibration is not None and isinstance(tracker, StereoTracker):
             focal_length = float(tracker.rectifier.describe()["intrinsics"][0])
@@ -135,7 +135,7 @@ def track_sequence(request: TrackRequest) -> dict[str, Any]:
         raise output_error(out, failed)
     if unfinished:
         raise OutputError(f"{', '.join(unfinished)} could not be written, as said above; the run itself is in {out}")
-    summary = {**summary, **steps.timing.describe()}
+    summary = {**summary, **timing.describe(timing.dropped + sequence.dropped)}
     return summary if location is None else {**summary, "location": asdict(location.summary)}
 
 
@@ -158,13 +158,6 @@ def _describe_settings(sequence: StereoSequence, options: TrackerOptions) -> dic
     }
 
 
-def _write_location(path: Path, location: LocationFilter) -> None:
-    """Writes the poses in the world of a sensor that is known."""
-    trajectory = location.trajectory()
-    assert trajectory is not None
-    write_tum(path, trajectory)
-
-
 def _describe_end(stopped_by: BaseException | None) -> str:
     """Of a run, for run.json."""
     match stopped_by:
@@ -177,50 +170,6 @@ def _describe_end(stopped_by: BaseException | None) -> str:
         case SigmaSlamError():
             return f"failed: {printable(str(stopped_by))}"
     return f"crashed: {stopped_by!r}"
-
-
-class _Timing:
-    """Whether frames come in real time, from cameras or played, and how long their poses take."""
-
-    def __init__(self, sequence: StereoSequence, real_time: bool) -> None:
-        self._sequence = sequence
-        self._live = sequence.format == "camera"
-        self._latency = Latency() if self._live or real_time else None
-        self._player: RealTimePlayer | None = None
-
-    @property
-    def is_real(self) -> bool:
-        """Frames do not wait for the tracker."""
-        return self._latency is not None
-
-    @property
-    def dropped(self) -> int:
-        """Frames that came while others were tracked."""
-        return self._sequence.dropped if self._player is None else self._player.dropped
-
-    @property
-    def waited(self) -> float:
-        """Seconds until the last frame came, when it was the tracker that was early."""
-        return 0.0 if self._player is None else self._player.waited
-
-    def play(self, frames: Iterator[StereoFrame]) -> Iterator[StereoFrame]:
-        """The frames as they come; cameras give them in real time anyway."""
-        if self._latency is not None and not self._live:
-            self._player = RealTimePlayer(frames, self._latency)
-            frames = self._player.play()
-        for frame in frames:
-            if self._latency is not None:
-                self._latency.start(frame.timestamp)
-            yield frame
-
-    def note(self, timestamp: float) -> None:
-        """The pose of that frame is known."""
-        if self._latency is not None:
-            self._latency.note(timestamp)
-
-    def describe(self) -> dict[str, Any]:
-        """Entries of run.json."""
-        return {} if self._latency is None else describe_real_time(self._latency, self.dropped)
 
 
 def _build_tracker(
@@ -265,7 +214,7 @@ class _FrameSteps:
 
     images: StereoFilter | None
     tracker: Tracker
-    timing: _Timing
+    timing: FrameTiming
     location: LocationFilter | None
     feed: Callable[[float], None]
 
@@ -373,9 +322,9 @@ def _track(frames: Iterator[StereoFrame], steps: _FrameSteps, rows: _Rows, pictu
             lost += result.status == "lost"
             since = time.perf_counter()
             note = _note(result.camera, lost, done / (since - began))
-            progress.update(task, completed=done + rows.skipped + timing.dropped, note=note)
+            progress.update(task, completed=done + rows.skipped + timing.dropped + rows.sequence.dropped, note=note)
         rows.add_skipped()
-        progress.update(task, completed=done + rows.skipped + timing.dropped)
+        progress.update(task, completed=done + rows.skipped + timing.dropped + rows.sequence.dropped)
 
 
 def _note(estimate: Estimate, lost: int, rate: float) -> str:

@@ -15,7 +15,7 @@ import pytest
 from sigmaslam.readers import StereoFrame
 from sigmaslam.run_record import real_time
 from sigmaslam.run_record.frame_table import read_frames
-from sigmaslam.run_record.real_time import POLICY, Latency, RealTimePlayer, describe_real_time
+from sigmaslam.run_record.real_time import POLICY, FrameTiming
 from tests.support.commands import run_here
 from tests.support.tracked import track
 
@@ -58,19 +58,19 @@ def haste(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def play(
-    clock: Clock, timestamps: Iterable[float], work: Iterable[float], latency: Latency | None = None
+    clock: Clock, timestamps: Iterable[float], work: Iterable[float], timing: FrameTiming | None = None
 ) -> tuple[list[int], list[float], int]:
     """Numbers of the frames that a consumer gets who works so long on each, seconds, when it gets them, and drops."""
-    latency = latency or Latency()
+    timing = timing or FrameTiming(is_played=True)
     frames = (StereoFrame(k, timestamp, BLANK, BLANK) for k, timestamp in enumerate(timestamps))
-    player, durations, began = RealTimePlayer(frames, latency), iter(work), clock.now
+    durations, began = iter(work), clock.now
     given, times = [], []
-    for frame in player.play():
+    for frame in timing.play(frames):
         given.append(frame.index)
         times.append(clock.now - began)
         clock.now += next(durations)
-        latency.note(frame.timestamp)
-    return given, times, player.dropped
+        timing.note(frame.timestamp)
+    return given, times, timing.dropped
 
 
 # The player
@@ -118,29 +118,29 @@ def test_hardly_any_frames_are_played_without_waiting(clock: Clock, count: int):
 
 
 def test_latency_counts_from_when_the_first_frame_was_handed_over(clock: Clock):
-    latency = Latency()
-    latency.start(50.0)
+    timing = FrameTiming(is_played=True)
+    timing.start(50.0)
     clock.now += 0.5
-    latency.start(50.1)  # the first one alone is taken
-    assert latency.age(50.0) == pytest.approx(0.5)
-    assert latency.age(50.8) == pytest.approx(-0.3)
+    timing.start(50.1)  # the first one alone is taken
+    assert timing.age(50.0) == pytest.approx(0.5)
+    assert timing.age(50.8) == pytest.approx(-0.3)
 
 
 def test_percentiles_of_the_latency_are_in_milliseconds(clock: Clock):
-    latency = Latency()
-    assert latency.describe() == {}
-    latency.start(0.0)
+    timing = FrameTiming(is_played=True)
+    assert timing.latency_ms() == {}
+    timing.start(0.0)
     for seconds in np.random.default_rng(0).permutation(np.arange(101)) / 1000.0:
         clock.now = 1234.5 + 9.0 + seconds
-        latency.note(9.0)
-    assert latency.describe() == {"p50": 50.0, "p95": 95.0, "p99": 99.0, "max": 100.0}
+        timing.note(9.0)
+    assert timing.latency_ms() == {"p50": 50.0, "p95": 95.0, "p99": 99.0, "max": 100.0}
 
 
 def test_the_latency_of_a_slow_consumer_has_the_time_that_frames_waited(clock: Clock):
     """Of frames 0, 2, 5, 8 and 9: 0.27, 0.34, 0.31, 0.28 and 0.45 seconds."""
-    latency = Latency()
-    _, _, dropped = play(clock, 0.1 * np.arange(10), [0.27] * 10, latency)
-    described = describe_real_time(latency, dropped)["real_time"]
+    timing = FrameTiming(is_played=True)
+    _, _, dropped = play(clock, 0.1 * np.arange(10), [0.27] * 10, timing)
+    described = timing.describe(dropped)["real_time"]
     assert described["policy"] == POLICY
     assert described["dropped"] == 5
     assert described["latency_ms"]["p50"] == pytest.approx(310.0, abs=0.1)
