@@ -22,8 +22,8 @@ from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import read_covariances, read_tum, write_kitti, write_tum
 from sigmaslam.report.report import write_report
 from sigmaslam.run_record.frame_table import FRAMES_NAME
-from sigmaslam.run_record.recorded_run import REFINE_NAME, REFINED_TRAJECTORY
-from sigmaslam.run_record.run_folder import FINAL_TRAJECTORY, check_has_trajectory, describe_versions, write_map_points
+from sigmaslam.run_record.recorded_run import REFINE_NAME, REFINED_TRAJECTORY, read_final_trajectory
+from sigmaslam.run_record.run_folder import check_has_trajectory, describe_versions, write_map_points
 from sigmaslam.slam.point_map import PointMap
 
 _LOGGER = logging.getLogger(__name__)
@@ -50,7 +50,7 @@ def refine_run(
     began = time.perf_counter()
     check_has_trajectory(run)
     check_new_folder(out)
-    trajectory = _read_trajectory(run)
+    _, trajectory = read_final_trajectory(run)
     tracks = read_tracks(run / TRACKS_NAME, len(trajectory))
     covariances = read_covariances(run / "covariance.npy", len(trajectory))
     make_folder(out)
@@ -132,17 +132,3 @@ def _add_to_report(run: Path, out: Path, content: str) -> None:
             write_report(run)
     except (OSError, InputError) as error:
         _LOGGER.warning("the result is not in the report of the run: %s", getattr(error, "strerror", None) or error)
-
-
-def _read_trajectory(run: Path) -> Trajectory:
-    """Where the adjustment begins: the frames after the fact, of a run that has them."""
-    said = read_tum(run / "trajectory.tum")
-    if not (run / FINAL_TRAJECTORY).is_file():
-        return said
-    final = read_tum(run / FINAL_TRAJECTORY)
-    if not np.array_equal(final.timestamps, said.timestamps):
-        raise InputError(
-            f"{run / FINAL_TRAJECTORY}: has {len(final)} poses at other times than the {len(said)} of trajectory.tum: "
-            "both must come from the same run"
-        )
-    return final

@@ -1,5 +1,6 @@
 """KITTI's calibration files: calib.txt and calib_cam_to_cam.txt."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from sigmaslam.calibration_files.lens_models import (
 )
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
+from sigmaslam.geometry.checked_yaml import CalibrationYaml
 
 GREY_PAIR = (0, 1)
 
@@ -31,22 +33,22 @@ def read_kitti_calibration(path: Path, image_size: ImageSize | None, cameras: tu
     Raises:
         CalibrationError: a matrix is missing or incomplete, or the image size fits neither S_rect nor S.
     """
-    entries = _read_entries(path, cameras)
+    content = _read_entries(path, cameras)
     left, right = cameras
-    if f"P{left}" in entries or f"P_rect_{left:02d}" not in entries:
-        return _from_projections(path, entries, (f"P{left}", f"P{right}"), image_size)
+    if f"P{left}" in content.entries or f"P_rect_{left:02d}" not in content.entries:
+        return _from_projections(content, (f"P{left}", f"P{right}"), image_size)
     sizes = {
-        name: tuple(int(n) for n in _matrix(path, entries, f"{name}_{left:02d}", (2,)))
+        name: tuple(int(n) for n in _matrix(content, f"{name}_{left:02d}", (2,)))
         for name in ("S_rect", "S")
-        if f"{name}_{left:02d}" in entries
+        if f"{name}_{left:02d}" in content.entries
     }
     known = ", ".join(f"{name}_{left:02d} {size[0]}x{size[1]}" for name, size in sizes.items())
     if image_size is None:
         raise UnknownImageSizeError(f"{path}: is for {known or 'images of a size it does not name'}; give --size")
     if not sizes or sizes.get("S_rect") == image_size:
-        return _from_projections(path, entries, (f"P_rect_{left:02d}", f"P_rect_{right:02d}"), image_size)
+        return _from_projections(content, (f"P_rect_{left:02d}", f"P_rect_{right:02d}"), image_size)
     if sizes.get("S") == image_size:
-        return _from_originals(path, entries, cameras, image_size)
+        return _from_originals(content, cameras, image_size)
     raise CalibrationError(
         f"{path}: images are {image_size[0]}x{image_size[1]}, the calibration is for {known}; "
         "use the calibration that belongs to these images"
@@ -59,9 +61,9 @@ def read_rigid(path: Path, rotation: str, translation: str) -> np.ndarray:
     Raises:
         CalibrationError: a matrix is missing or incomplete, or the first is no rotation.
     """
-    entries = _read_entries(path, GREY_PAIR)
+    content = _read_entries(path, GREY_PAIR)
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = _matrix(path, entries, rotation, (3, 3)), _matrix(path, entries, translation, (3,))
+    T[:3, :3], T[:3, 3] = _matrix(content, rotation, (3, 3)), _matrix(content, translation, (3,))
     # The files have seven digits.
     if not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3):
         raise CalibrationError(f"{path}: key '{rotation}' is no rotation; correct the numbers")
@@ -74,54 +76,41 @@ def read_rectification(path: Path, camera: int) -> np.ndarray:
     Raises:
         CalibrationError: a matrix is missing or incomplete.
     """
-    entries = _read_entries(path, GREY_PAIR)
-    P = _matrix(path, entries, f"P_rect_{camera:02d}", (3, 4))
+    content = _read_entries(path, GREY_PAIR)
+    P = _matrix(content, f"P_rect_{camera:02d}", (3, 4))
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = _matrix(path, entries, "R_rect_00", (3, 3)), np.linalg.solve(P[:, :3], P[:, 3])
+    T[:3, :3], T[:3, 3] = _matrix(content, "R_rect_00", (3, 3)), np.linalg.solve(P[:, :3], P[:, 3])
     return T
 
 
-def _read_entries(path: Path, cameras: tuple[int, int]) -> dict[str, str]:
+def _read_entries(path: Path, cameras: tuple[int, int]) -> CalibrationYaml:
     text = read_text(path, CALIBRATION_BYTES, "the calibration", CalibrationError)
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     if any(":" in line for line in lines):
-        return _without_doubles(path, lines)
-    if len(lines) == 2:
-        return {f"P{camera}": line for camera, line in zip(cameras, lines, strict=True)}
-    if len(lines) == 4:
-        return {f"P{camera}": line for camera, line in enumerate(lines)}
+        return CalibrationYaml(path, _without_doubles(path, lines))
+    if len(lines) in (2, 4):
+        numbers = cameras if len(lines) == 2 else range(4)
+        return CalibrationYaml(path, {f"P{camera}": line.split() for camera, line in zip(numbers, lines, strict=True)})
     raise CalibrationError(
         f"{path}: expected lines 'P{cameras[0]}: ' and 'P{cameras[1]}: ' with 12 numbers each, or two bare "
         f"lines of 12 numbers (left, right); found {len(lines)} lines without a key"
     )
 
 
-def _without_doubles(path: Path, lines: list[str]) -> dict[str, str]:
-    """Values by key of lines `key: value`; others are left out."""
-    entries: dict[str, str] = {}
+def _without_doubles(path: Path, lines: list[str]) -> dict[str, list[str]]:
+    """Words by key of lines `key: words`; others are left out."""
+    entries: dict[str, list[str]] = {}
     for line in lines:
         key, colon, value = line.partition(":")
         if colon and key.strip() in entries:
             raise CalibrationError(f"{path}: key '{shorten(key.strip())}' stands twice: remove the wrong line")
         if colon:
-            entries[key.strip()] = value
+            entries[key.strip()] = value.split()
     return entries
 
 
-def _matrix(path: Path, entries: dict[str, str], key: str, shape: tuple[int, ...]) -> np.ndarray:
-    count = int(np.prod(shape))
-    if key not in entries:
-        raise CalibrationError(f"{path}: key '{key}' is missing; expected '{key}: ' and {count} numbers")
-    words = entries[key].split()
-    try:
-        values = np.array([float(word) for word in words])
-    except ValueError as error:
-        raise CalibrationError(f"{path}: key '{key}' must be {count} numbers: {shorten(str(error))}") from None
-    if len(values) != count or not np.all(np.isfinite(values)):
-        raise CalibrationError(
-            f"{path}: key '{key}' must be {count} finite numbers, got {len(values)}: {shorten(entries[key])}"
-        )
-    return values.reshape(shape)
+def _matrix(content: CalibrationYaml, key: str, shape: tuple[int, ...]) -> np.ndarray:
+    return content.numbers(key, (math.prod(shape),)).reshape(shape)
 
 
 def _model(
@@ -134,31 +123,27 @@ def _model(
     return replace(camera, distortion_model="radtan", distortion=distortion) if distortion else camera
 
 
-def _from_projections(
-    path: Path, entries: dict[str, str], keys: tuple[str, str], image_size: ImageSize | None
-) -> StereoCamera:
+def _from_projections(content: CalibrationYaml, keys: tuple[str, str], image_size: ImageSize | None) -> StereoCamera:
     """From P = K [I | t], where t is the position of camera 0 in this camera's frame."""
-    image_size = need_image_size(str(path), image_size)
-    left, right = (_matrix(path, entries, key, (3, 4)) for key in keys)
-    models = [_model(path, key, P[:, :3], image_size) for key, P in zip(keys, (left, right), strict=True)]
+    image_size = need_image_size(str(content.path), image_size)
+    left, right = (_matrix(content, key, (3, 4)) for key in keys)
+    models = [_model(content.path, key, P[:, :3], image_size) for key, P in zip(keys, (left, right), strict=True)]
     T_left_right = np.eye(4)
-    with naming(f"{path}: keys '{keys[0]}' and '{keys[1]}'"):
+    with naming(f"{content.path}: keys '{keys[0]}' and '{keys[1]}'"):
         T_left_right[:3, 3] = right_position(left, right)
         return StereoCamera(models[0], models[1], T_left_right)
 
 
-def _from_originals(
-    path: Path, entries: dict[str, str], cameras: tuple[int, int], image_size: ImageSize
-) -> StereoCamera:
+def _from_originals(content: CalibrationYaml, cameras: tuple[int, int], image_size: ImageSize) -> StereoCamera:
     """From K, D and the pose R, T of camera 0 in each camera's frame."""
     models, poses = [], []
     for camera in cameras:
-        distortion = tuple(_matrix(path, entries, f"D_{camera:02d}", (5,)).tolist())
-        K = _matrix(path, entries, key := f"K_{camera:02d}", (3, 3))
-        models.append(_model(path, key, K, image_size, distortion))
+        distortion = tuple(_matrix(content, f"D_{camera:02d}", (5,)).tolist())
+        K = _matrix(content, key := f"K_{camera:02d}", (3, 3))
+        models.append(_model(content.path, key, K, image_size, distortion))
         T_camera_camera0 = np.eye(4)
-        T_camera_camera0[:3, :3] = _matrix(path, entries, f"R_{camera:02d}", (3, 3))
-        T_camera_camera0[:3, 3] = _matrix(path, entries, f"T_{camera:02d}", (3,))
+        T_camera_camera0[:3, :3] = _matrix(content, f"R_{camera:02d}", (3, 3))
+        T_camera_camera0[:3, 3] = _matrix(content, f"T_{camera:02d}", (3,))
         poses.append(T_camera_camera0)
-    with naming(f"{path}: R and T of cameras {cameras[0]} and {cameras[1]}"):
+    with naming(f"{content.path}: R and T of cameras {cameras[0]} and {cameras[1]}"):
         return StereoCamera(models[0], models[1], poses[0] @ np.linalg.inv(poses[1]))

@@ -94,13 +94,12 @@ def read_pinhole(section: CalibrationYaml, coefficients: str) -> CameraModel:
     """
     lens = section.text("distortion_model")
     values = [] if lens == "none" else section.numbers(coefficients, (None,)).tolist()
-    where = str(section.error("")).rstrip(": ")
-    with naming(where):
+    with naming(section.where):
         _reject_unsupported(section.text("camera_model"), "camera_model")
     if section.text("camera_model") != "pinhole":
         raise section.error(f"camera_model is {section.text('camera_model')!r}; only pinhole is supported")
     size, intrinsics = section.numbers("resolution", (2,)).tolist(), section.numbers("intrinsics", (4,)).tolist()
-    return camera_model(where, size, intrinsics, lens, values)
+    return camera_model(section.where, size, intrinsics, lens, values)
 
 
 def stereo_camera(where: str, eyes: Sequence[CameraModel], T_right_left: np.ndarray) -> StereoCamera:

@@ -90,5 +90,4 @@ def _camera_model(camera: CalibrationYaml) -> CameraModel:
     if _LENSES[kind] == "equidistant":
         coefficients = coefficients[:4]
     size, intrinsics = [camera.integer(name) for name in ("width", "height")], camera.numbers("intrinsicMatrix", (3, 3))
-    where = str(camera.error("")).rstrip(": ")
-    return camera_model(where, size, intrinsics_of(intrinsics), _LENSES[kind], coefficients, "distortionCoeff")
+    return camera_model(camera.where, size, intrinsics_of(intrinsics), _LENSES[kind], coefficients, "distortionCoeff")

@@ -37,9 +37,14 @@ class CalibrationYaml:
             raise CalibrationError(f"{path}: expected keys with values, found {found}: give a calibration file")
         return cls(path, entries)
 
+    @property
+    def where(self) -> str:
+        """File and section, for messages."""
+        return f"{self.path}: {self.prefix.rstrip('.')}" if self.prefix else str(self.path)
+
     def error(self, message: str) -> CalibrationError:
         """The error to raise about this section."""
-        return CalibrationError(f"{self.path}: {self.prefix.rstrip('.') + ': ' if self.prefix else ''}{message}")
+        return CalibrationError(f"{self.where}: {message}")
 
     def section(self, key: str) -> "CalibrationYaml":
         """The mapping under a key."""

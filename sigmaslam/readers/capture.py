@@ -5,7 +5,6 @@ import re
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -26,29 +25,10 @@ _BUFFERS = 4
 _MAX_AGE_S = 10.0
 
 
-class Capture(Protocol):
-    """The methods of cv2.VideoCapture that the readers use."""
-
-    def grab(self) -> bool:
-        """Wait for the next image and take it."""
-
-    def retrieve(self) -> tuple[bool, np.ndarray]:
-        """Decode the image that was taken."""
-
-    def get(self, prop: int, /) -> float:
-        """A property."""
-
-    def getBackendName(self) -> str:  # noqa: N802
-        """Name of the camera's driver."""
-
-    def release(self) -> None:
-        """Give the camera back."""
-
-
 class PlayedVideo:
     """A video file played as a camera: after the first image, `grab` waits until the next one is due."""
 
-    def __init__(self, capture: Capture) -> None:
+    def __init__(self, capture: cv2.VideoCapture) -> None:
         self._capture = capture
         self._period = 1.0 / rate_hz(capture)
         self._grabbed = 0
@@ -67,6 +47,9 @@ class PlayedVideo:
             time.sleep(max(0.0, due - time.monotonic()))
         self._grabbed += 1
         return self._capture.grab()
+
+
+Capture = cv2.VideoCapture | PlayedVideo
 
 
 def open_capture(device: str, size: tuple[int, int] | None = None) -> Capture:

@@ -34,7 +34,7 @@ Sensor = TypeVar("Sensor")
 Samples = TypeVar("Samples")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class SensorRecording(Generic[Sensor, Samples]):
     """What a sensor of motion measured beside the images.
 

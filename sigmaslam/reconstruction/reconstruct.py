@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Generator, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.progress import open_progress
 from sigmaslam.readers import StereoSequence
+from sigmaslam.readers.stereo_sequence import read_ahead
 from sigmaslam.reconstruction.cloud import DenseCloud, DepthPixels, VoxelCloud, write_cloud
 from sigmaslam.reconstruction.depth_fusion import SHARED, DepthView, FusedDepth, fuse_depth
 from sigmaslam.reconstruction.disparity import DisparityMap, Matcher, measure_disparity, semi_global_disparity
@@ -228,7 +228,7 @@ def fuse_keyframes(
             keyframes.disparity_offset_sigma,
         )
 
-    for number, left, view in _prefetched(_views(keyframes, sequence, rectifier, match)):
+    for number, left, view in read_ahead(lambda: _views(keyframes, sequence, rectifier, match), 1):
         kept[number] = left, view
         done = number - NEIGHBOURS
         if done >= 0 and keyframes.is_keyframe[done]:
@@ -241,7 +241,7 @@ def fuse_keyframes(
 
 def _views(
     keyframes: RecordedKeyframes, sequence: StereoSequence, rectifier: StereoRectifier, match: Matcher
-) -> Iterator[_NumberedView]:
+) -> Generator[_NumberedView, None, None]:
     """Number of each view, its rectified left image and its disparities, the disparity offset taken off; in order."""
     valid = None if rectifier.valid_mask is None else cv2.erode(rectifier.valid_mask, np.ones((7, 7), np.uint8))
     for number, frame in keyframes.images(sequence):
@@ -251,15 +251,6 @@ def _views(
         if valid is not None:
             disparity[valid == 0] = np.nan
         yield number, left, DepthView.of(left, replace(measured, disparity=disparity))
-
-
-def _prefetched(views: Iterator[_NumberedView]) -> Iterator[_NumberedView]:
-    """The same views; a thread makes the next one while the caller uses this one."""
-    with ThreadPoolExecutor(1) as thread:
-        coming = thread.submit(next, views, None)
-        while (view := coming.result()) is not None:
-            coming = thread.submit(next, views, None)
-            yield view
 
 
 def _default_voxel(depth: KeyframeDepth, camera: RectifiedStereo) -> float:

@@ -23,12 +23,12 @@ from sigmaslam.geometry.se3 import se3_adjoint, se3_inverse
 from sigmaslam.readers import StereoFrame, StereoSequence, open_sequence
 from sigmaslam.readers.open import FORMATS
 from sigmaslam.readers.selection import Selection
-from sigmaslam.readers.trajectory_files import read_covariances, read_tum
+from sigmaslam.readers.trajectory_files import read_covariances
 from sigmaslam.run_record.frame_table import FRAMES_NAME, read_frames
+from sigmaslam.run_record.recorded_run import read_final_trajectory
 from sigmaslam.run_record.relative_pose_file import RELATIVE_POSES_NAME, FramePairs, read_frame_pairs
 from sigmaslam.run_record.run_folder import (
     FINAL_COVARIANCE,
-    FINAL_TRAJECTORY,
     RUN_NAME,
     camera_of,
     check_has_trajectory,
@@ -141,11 +141,9 @@ def read_recorded_keyframes(run: Path, every: int = 1) -> RecordedKeyframes:
         raise InputError(f"{run}: follows an object before a camera at rest: give a run of a moving camera")
     if entries.get("format") == "camera":
         raise InputError(f"{run}: was tracked live and its images are not kept: track a recording")
-    said = read_tum(run / "trajectory.tum")
-    has_final = (run / FINAL_TRAJECTORY).is_file() and (run / FINAL_COVARIANCE).is_file()
-    trajectory = read_tum(run / FINAL_TRAJECTORY) if has_final else said
-    if not np.array_equal(trajectory.timestamps, said.timestamps):
-        raise InputError(f"{run / FINAL_TRAJECTORY}: has other times than trajectory.tum: both must be of the same run")
+    has_final = (run / FINAL_COVARIANCE).is_file()
+    said, final = read_final_trajectory(run)
+    trajectory = final if has_final else said
     covariances = read_covariances(run / (FINAL_COVARIANCE if has_final else "covariance.npy"), len(said))
     frames = read_frames(run / FRAMES_NAME)
     times = frames.columns["timestamp"][frames.columns["keyframe"] == 1]

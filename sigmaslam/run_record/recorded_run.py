@@ -137,6 +137,22 @@ def read_run(folder: Path) -> RecordedRun:
     )
 
 
+def read_final_trajectory(folder: Path) -> tuple[Trajectory, Trajectory]:
+    """Frames of a run as they were said, and after the fact; the same twice where there is none after the fact.
+
+    Raises:
+        InputError: a file is wrong, or the two have other times.
+    """
+    said, path = read_tum(folder / "trajectory.tum"), folder / FINAL_TRAJECTORY
+    final = read_tum(path) if path.is_file() else said
+    if not np.array_equal(final.timestamps, said.timestamps):
+        raise InputError(
+            f"{path}: has {len(final)} poses at other times than the {len(said)} of trajectory.tum: both must come "
+            "from the same run"
+        )
+    return said, final
+
+
 def _read_trajectory(path: Path) -> Trajectory | None:
     return read_tum(path) if path.is_file() else None
 

@@ -280,8 +280,8 @@ def test_ros_eyes_that_were_calibrated_one_by_one_are_refused(tmp_path: Path):
     ("old", "new", "message"),
     [
         ("LEFT_CAM_VGA", "LEFT_CAM_HD", r"images are 672x376, the calibration is for 1280x720"),
-        ("RX_VGA", "RX_HD", r"\[STEREO\]: key 'RX_VGA' must be a finite number, got None"),
-        ("Baseline=", "Baseline=long", r"key 'Baseline' must be a finite number, got long"),
+        ("RX_VGA", "RX_HD", "key 'STEREO.rx_vga' is missing; expected a number"),
+        ("Baseline=", "Baseline=long", "key 'STEREO.baseline' must be a number, got long"),
         ("Baseline=", "Baseline=-", r"\[STEREO\]: left and right look swapped"),
         ("[STEREO]", "STEREO]", "cannot read the calibration"),
     ],
