@@ -28,7 +28,9 @@ def time_error(motion: MotionFilter, step: np.ndarray, interval: float) -> float
     if visible <= CHI_SQUARE_999[1]:
         return 0.0
     frames, explained = float(across / visible), across**2 / visible
-    seen = explained > CHI_SQUARE_999[1] and explained > ACCEPTANCE.time_share * whole
+    # What the time does not explain is the motion's noise, or little.
+    left = max(CHI_SQUARE_999[5], (1.0 - ACCEPTANCE.time_share) * whole)
+    seen = explained > CHI_SQUARE_999[1] and whole - explained < left
     return frames if seen and abs(frames) >= ACCEPTANCE.time_error else 0.0
 
 

@@ -36,6 +36,14 @@ def test_a_brake_or_a_step_aside_is_no_wrong_time(frames: float, aside: float):
     assert time_error(motion, seen(motion, frames, aside), INTERVAL) == 0.0
 
 
+def test_noise_aside_does_not_hide_a_wrong_time():
+    motion = driving()
+    motion.set_twist(0.15 * FORWARD, np.full(6, 0.05))
+    aside = 4.0 * np.sqrt(motion.step_covariance[0, 0])
+    assert time_error(motion, seen(motion, 1.5, aside), INTERVAL) == pytest.approx(1.5, abs=0.1)
+    assert time_error(motion, seen(motion, 1.5, 2.0 * aside), INTERVAL) == 0.0
+
+
 def test_a_camera_at_rest_shows_no_time():
     motion = driving()
     motion.set_twist(0.001 * FORWARD, np.full(6, 0.05))
