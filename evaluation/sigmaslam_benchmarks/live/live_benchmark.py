@@ -1,13 +1,13 @@
-"""Faults of drivers on rendered and real recordings: how many poses are silently wrong, and what is said."""
+"""Faults of drivers and of calibrations on rendered and real recordings: what is silently wrong, and what is said."""
 
 from __future__ import annotations
 
 import json
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,10 @@ from sigmaslam import errors
 from sigmaslam.errors import InputError, OutputError
 from sigmaslam.files import atomic_write_text, make_folder
 from sigmaslam_benchmarks.code_hash import hash_code
+from sigmaslam_benchmarks.live.calibration_faults import CALIBRATION_FAULTS, injected_errors
+from sigmaslam_benchmarks.live.calibration_page import format_calibration_page
 from sigmaslam_benchmarks.live.driven_runs import METHODS, DrivenRun
-from sigmaslam_benchmarks.live.driver_faults import FAULTS, NO_FAULT, spoil
+from sigmaslam_benchmarks.live.driver_faults import FAULTS, NO_FAULT, Fault
 from sigmaslam_benchmarks.live.judge import Judgement, References, good_poses, judge
 from sigmaslam_benchmarks.live.live_page import LivePage, format_page
 from sigmaslam_benchmarks.live.recordings import GoodFrames, Recording, choose_recordings
@@ -26,7 +28,10 @@ from sigmaslam_benchmarks.tracking.page import check_names, write_page
 from sigmaslam_benchmarks.tracking.stereo_peers import MissingPeerError
 from sigmaslam_synthetic.parallel_jobs import list_failures, run_jobs
 
-_JUDGING = ("driver_faults.py", "driven_runs.py", "judge.py", "recordings.py")  # the page may change without a new run
+# The page may change without a new run.
+_JUDGING = ("driver_faults.py", "calibration_faults.py", "driven_runs.py", "judge.py", "recordings.py")
+
+_ALL = {**CALIBRATION_FAULTS, **FAULTS}
 
 
 def write_live(
@@ -42,6 +47,8 @@ def write_live(
     methods: Sequence[str] = ("ours",),
     workers: int = 1,
     note: Callable[[str], None] = lambda text: None,
+    table: Mapping[str, Fault] = FAULTS,
+    form_page: Callable[[LivePage], str] = format_page,
 ) -> str:
     """Tracks what is missing, writes the page, at first of what is there, and returns it; notes in it are kept.
 
@@ -52,19 +59,21 @@ def write_live(
         command: what the page says it was made by.
         first_seed, seeds: of the renders; the faults of real recordings have the first one.
         frames: of each recording.
-        cases, sequences, methods: names of `FAULTS`, `SEQUENCES` and `METHODS`; all cases and sequences unless given.
+        cases, sequences, methods: names of `table`, `SEQUENCES` and `METHODS`; all cases and sequences unless given.
         workers: processes; each takes a recording at a time.
         note: is told of progress.
+        table: of faults.
+        form_page: Markdown of what there is.
     Raises:
         InputError: a name is unknown, or the data are not there.
         OutputError: a recording failed; the page holds what there is.
     """
-    check_names("case", cases or (), list(FAULTS))
+    check_names("case", cases or (), list(table))
     check_names("method", methods, list(METHODS))
     note(f"seeds {first_seed} to {first_seed + seeds - 1}")
     chosen = choose_recordings(sequences, data, first_seed, seeds, frames)
     make_folder(runs)
-    wanted = [name for name in FAULTS if not cases or name in cases]
+    wanted = [name for name in table if not cases or name in cases]
     jobs = [
         LiveJob(recording, tuple(wanted), tuple(methods), runs.resolve(), data, _hash_code()) for recording in chosen
     ]
@@ -72,7 +81,7 @@ def write_live(
     failed: dict[str, Exception] = {}
 
     def form() -> str:
-        return write_page(path, format_page(LivePage(command, wanted, list(methods), _collect(jobs), frames, asked)))
+        return write_page(path, form_page(LivePage(command, wanted, list(methods), _collect(jobs), frames, asked)))
 
     def ended(job: LiveJob, outcome: str | Exception) -> None:
         if isinstance(outcome, Exception):
@@ -87,6 +96,10 @@ def write_live(
     if failed:
         raise OutputError(f"{path} lacks {list_failures(failed)}: the same command tries what is missing again")
     return page
+
+
+write_calibration = partial(write_live, table=CALIBRATION_FAULTS, form_page=format_calibration_page)
+"""The same with faults of the calibration."""
 
 
 @cache
@@ -137,18 +150,20 @@ class LiveJob:
         return f"{len(missing)} runs in {time.perf_counter() - began:.0f} s"
 
     def _judge(self, good: GoodFrames, method: str, case: str) -> dict[str, Any]:
-        if not FAULTS[case].fits(good.frames):
+        if not _ALL[case].fits(good.frames):
             return {"left_out": "longer than the recording"}
         try:
             reference = None if self.recording.exact or case == NO_FAULT else self._reference(good, method)
             run = self._run(good, method, case)
         except MissingPeerError as error:
             return {"left_out": str(error)}
-        return asdict(judge(run.poses, good.truth, reference, run.said, run.refused))
+        judgement = judge(run.poses, good.truth, reference, run.said, run.refused, run.learned)
+        return {**asdict(judgement), "true_errors": injected_errors(good.camera, case)}
 
     def _run(self, good: GoodFrames, method: str, case: str) -> DrivenRun:
+        frames = _ALL[case].spoil(good.frames, np.random.default_rng(self.recording.seed))
         with tempfile.TemporaryDirectory() as scratch:
-            return METHODS[method](spoil(case, good.frames, self.recording.seed), good.camera, Path(scratch) / "run")
+            return METHODS[method](frames, _ALL[case].miscalibrate(good.camera), Path(scratch) / "run")
 
     def _reference(self, good: GoodFrames, method: str) -> References:
         """The run with good frames, whose poses are kept beside the results."""

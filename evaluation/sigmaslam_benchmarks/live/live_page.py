@@ -66,7 +66,7 @@ def format_page(page: LivePage) -> str:
         methods=[(method, *_totals(page, method)) for method in page.methods],
         tables=[(method, list(_case_rows(page, method))) for method in page.methods],
         details=[(recording.name, list(_recording_rows(page, recording))) for recording in recordings],
-        words=[(recording.name, list(_words(page, recording))) for recording in _one_of_each(recordings)],
+        words=[(recording.name, list(words_of(page, recording))) for recording in _one_of_each(recordings)],
         left_out=sorted({each for each in page.found.values() if isinstance(each, str)}),
     )
 
@@ -131,7 +131,7 @@ def _statuses(results: Sequence[Judgement]) -> list[str]:
     return [*(str(counts[status]) for status in _COMMON), others or "-"]
 
 
-def _words(page: LivePage, recording: Recording) -> Iterator[tuple[str, str]]:
+def words_of(page: LivePage, recording: Recording) -> Iterator[tuple[str, str]]:
     """What the first method says of each case."""
     for case in page.cases:
         result = page.found.get((recording, page.methods[0], case))
