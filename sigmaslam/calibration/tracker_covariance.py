@@ -33,14 +33,13 @@ def tracker_covariance(rig: Rig, covariance: np.ndarray) -> tuple[CalibrationCov
     Returns:
         The covariance, and the share of the variance of (u, v, disparity) that the tracker's errors describe.
     """
-    rectifier = StereoRectifier(StereoCamera(*rig.eyes, rig.T_left_right))
+    rectifier = StereoRectifier(_pair(rig))
     view = rectifier.rectified
     uvd = _grid(view)
 
     def measured(step: np.ndarray) -> np.ndarray:
         """(M, 3) what the calibrated pair measures where the true one differs by a step."""
-        true = rig.moved(step)
-        return _measured(uvd, StereoCamera(*true.eyes, true.T_left_right), rectifier)
+        return _measured(uvd, _pair(rig.moved(step)), rectifier)
 
     intrinsics = [name.partition(".")[2] in INTRINSICS for name in rig.names]
     sizes = np.where(intrinsics, _STEP_PIXELS, _STEP)
@@ -70,6 +69,11 @@ def nearest_errors(calibrated: StereoCamera, true: StereoCamera) -> np.ndarray:
     usable = np.isfinite(wrong)
     by_error = measured_errors(rectifier.rectified, uvd).reshape(-1, len(ERRORS))[usable]
     return np.asarray(np.linalg.lstsq(by_error, wrong[usable], rcond=None)[0])
+
+
+def _pair(rig: Rig) -> StereoCamera:
+    left, right = rig.eyes
+    return StereoCamera(left, right, rig.T_left_right)
 
 
 def _grid(view: RectifiedStereo) -> np.ndarray:

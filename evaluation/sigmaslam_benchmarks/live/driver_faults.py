@@ -182,12 +182,13 @@ def lag_right(frames: Frames, rng: np.random.Generator) -> Frames:
 
 def delay_right(milliseconds: float, frames: Frames, rng: np.random.Generator) -> Frames:
     """The right eye is late: its image is moved along the optical flow to the next one; the last pair is left out."""
-    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    u, v = np.meshgrid(*(np.arange(size, dtype=np.float32) for size in reversed(frames[0].right.shape)))
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    none = np.zeros((*frames[0].right.shape, 2), np.float32)
+    u, v = np.meshgrid(*(np.arange(size, dtype=np.float32) for size in reversed(none.shape[:2])))
     delayed = []
     for frame, following in pairwise(frames):
         share = 1e-3 * milliseconds / (following.timestamp - frame.timestamp)
-        moved = np.float32(share) * flow.calc(frame.right, following.right, None)
+        moved = np.float32(share) * flow.calc(frame.right, following.right, none.copy())
         places = u - moved[..., 0], v - moved[..., 1]
         right = cv2.remap(frame.right, *places, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         delayed.append(replace(frame, right=right))
