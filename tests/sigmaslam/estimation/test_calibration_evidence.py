@@ -11,7 +11,7 @@ from sigmaslam.estimation.calibration_evidence import HYPOTHESES, CalibrationEvi
 from sigmaslam.estimation.window_state import WindowState
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.inference.backends import load_step
-from tests.support.dense_window import CAMERA
+from tests.support.dense_window import CAMERA, by_pair_with, unsolved, world
 
 USUAL = CalibrationPrior.of(CAMERA, CalibrationSigmas(), 0.5)
 SIZE, PRIOR = 0.01 * CAMERA.fx, 0.01
@@ -77,3 +77,27 @@ def test_errors_count_from_what_is_expected():
     # What is learned is about the window's prior mean, which is zero.
     assert weigh(slopes, slopes @ expected, expected) == {}
     assert weigh(slopes, slopes @ expected)["offset"].probability > 0.99
+
+
+# Of `dense_window`: considered errors of calibrations, of which it estimates the first three.
+CONSIDERED_SIGMA = USUAL.sigma[3:]
+
+
+@pytest.mark.parametrize("name", ["zoom", "lenses"])
+def test_a_window_takes_over_what_evidence_names(name: str):
+    k = ERRORS.index(name)
+    error = 6.0 * (np.arange(len(ERRORS)) == k)
+    given = world(1, 0.3, count=90)
+    right, wrong = (unsolved(each, considered_sigma=CONSIDERED_SIGMA) for each in (given, by_pair_with(given, error)))
+    right.solve()
+    assert right.causes == {}
+    np.testing.assert_allclose(right.posterior.calibration[3:], 0.0, atol=1e-15)
+    assert not right.corrected.any()
+    wrong.solve()
+    assert wrong.causes[name].probability > 0.95
+    # What was linearised about no error, is so about most of it the next time.
+    wrong.solve()
+    sigma = np.hypot(wrong.corrected[1, k], USUAL.sigma[k])
+    assert wrong.posterior.calibration[k] == pytest.approx(6.0, abs=3.0 * sigma)
+    assert sigma < 1.5
+    assert wrong.calibration.sigma[k] == pytest.approx(sigma)
