@@ -91,6 +91,17 @@ class Benchmark:
 
 
 _TRAIN = ("train",)
+_FAULTS = (
+    _DATA_IF_ANY,
+    _names("cases", "Names of faults, with commas: none, ..."),
+    _names("sequences", "room, street, drive or mh01, with commas."),
+    _names("methods", "ours, klt-pnp, cuvslam or orbslam3, with commas.", "ours"),
+    _RUNS,
+    _count("seeds", 3, "Renders of each kind."),
+    _FIRST_SEED,
+    _count("frames", 60, "Of each recording, at most.", least=20),
+    _count("workers", 1, "Processes."),
+)
 BENCHMARKS = {
     "sequences": Benchmark(
         "tracking.sequences",
@@ -205,17 +216,13 @@ BENCHMARKS = {
     "live": Benchmark(
         "live.live_benchmark",
         "Faults of live cameras: what is silently wrong. What drivers do to stamps, images and rig (extra 'train').",
-        (
-            _DATA_IF_ANY,
-            _names("cases", "Names of faults, with commas: none, jitter_20, ..."),
-            _names("sequences", "room, street, drive or mh01, with commas."),
-            _names("methods", "ours, klt-pnp, cuvslam or orbslam3, with commas.", "ours"),
-            _RUNS,
-            _count("seeds", 3, "Renders of each kind."),
-            _FIRST_SEED,
-            _count("frames", 60, "Of each recording, at most.", least=20),
-            _count("workers", 1, "Processes."),
-        ),
+        _FAULTS,
+        _TRAIN,
+    ),
+    "calibration": Benchmark(
+        "live.live_benchmark",
+        "Faults of calibrations: what is found and named. Three sizes of each, on renders and a drive (extra 'train').",
+        _FAULTS,
         _TRAIN,
     ),
     "inertial": Benchmark(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 
 from sigmaslam.geometry.calibration_covariance import CalibrationCovariance
@@ -14,18 +15,27 @@ from sigmaslam.slam.estimate import CalibrationEstimate
 def learned_calibration(camera: StereoCamera, learned: CalibrationEstimate, focal_length: float) -> StereoCamera:
     """The pair without its disparity offset, which is taken for one of the right principal point.
 
-    Where the offset was so large that the baseline must have made up for it, that is corrected, too. Other errors that
-    were estimated are not: which parameter they belong to is not known.
+    Where the offset was so large that the baseline must have made up for it, that is corrected, too, and so is what is
+    wrong by the evidence, in the right camera. Other errors that were estimated are not: which parameter they belong to
+    is not known.
 
     Args:
         camera: as calibrated.
         learned: what the images say.
         focal_length: of the rectified pair, pixels.
     """
-    offset = learned.disparity_offset
-    right = replace(camera.right, cx=camera.right.cx - offset * camera.right.fx / focal_length)
+    shares = {name: value for name, (_, value, _) in learned.causes.items()}
+    zoom, turn = 1.0 - shares.get("zoom", 0.0), (-shares.get("pitch", 0.0), shares.get("yaw", 0.0), 0.0)
+    # A turn about the vertical is part of the offset.
+    offset = learned.disparity_offset / focal_length - shares.get("yaw", 0.0)
+    right = replace(camera.right, fx=zoom * camera.right.fx, fy=zoom * camera.right.fy)
+    right = replace(right, cx=right.cx - offset * right.fx)
+    if "lenses" in shares and right.distortion_model != "equidistant":
+        first, *others = right.distortion or (0.0,) * 4
+        right = replace(right, distortion_model="radtan", distortion=(first - shares["lenses"], *others))
     variances = {"offset": (learned.disparity_offset_sigma / focal_length) ** 2}
     T_left_right = camera.T_left_right.copy()
+    T_left_right[:3, :3] = T_left_right[:3, :3] @ cv2.Rodrigues(np.array(turn))[0]
     if "baseline" in learned.errors:
         baseline, sigma = learned.errors["baseline"]
         T_left_right[:3, 3] *= 1.0 + baseline

@@ -8,7 +8,7 @@ from sigmaslam.calibration.board_bundle import INTRINSICS, Rig
 from sigmaslam.estimation.calibration_errors import ERRORS, measured_errors
 from sigmaslam.estimation.gaussian import matrix_root
 from sigmaslam.geometry.calibration_covariance import ERROR_NAMES, CalibrationCovariance
-from sigmaslam.geometry.camera import StereoCamera
+from sigmaslam.geometry.camera import RectifiedStereo, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import se3_inverse
 
@@ -33,25 +33,13 @@ def tracker_covariance(rig: Rig, covariance: np.ndarray) -> tuple[CalibrationCov
     Returns:
         The covariance, and the share of the variance of (u, v, disparity) that the tracker's errors describe.
     """
-    left, right = rig.eyes
-    rectifier = StereoRectifier(StereoCamera(left, right, rig.T_left_right))
+    rectifier = StereoRectifier(_pair(rig))
     view = rectifier.rectified
-    u = np.linspace(0.0, view.width - 1.0, _GRID[0])
-    v = np.linspace(0.0, view.height - 1.0, _GRID[1])
-    disparity = np.linspace(view.fx / _NEAREST / (_GRID[2] * 100), view.fx / _NEAREST, _GRID[2])
-    uvd = np.stack(np.meshgrid(u, v, disparity, indexing="ij"), axis=-1).reshape(-1, 3)
-    # Points that the right eye does not see say nothing.
-    uvd = uvd[uvd[:, 0] - uvd[:, 2] >= 0.0]
-    points = view.triangulate(uvd) @ rectifier.R_rectified_left
+    uvd = _grid(view)
 
     def measured(step: np.ndarray) -> np.ndarray:
         """(M, 3) what the calibrated pair measures where the true one differs by a step."""
-        true = rig.moved(step)
-        in_right = points @ se3_inverse(true.T_left_right)[:3, :3].T + se3_inverse(true.T_left_right)[:3, 3]
-        rays_left = left.unproject(true.eyes[0].project(points)) @ rectifier.R_rectified_left.T
-        rays_right = right.unproject(true.eyes[1].project(in_right)) @ rectifier.R_rectified_right.T
-        seen, seen_right = view.project(rays_left), view.project(rays_right)
-        return np.column_stack([seen[:, :2], seen[:, 0] - seen_right[:, 0]])
+        return _measured(uvd, _pair(rig.moved(step)), rectifier)
 
     intrinsics = [name.partition(".")[2] in INTRINSICS for name in rig.names]
     sizes = np.where(intrinsics, _STEP_PIXELS, _STEP)
@@ -71,3 +59,39 @@ def tracker_covariance(rig: Rig, covariance: np.ndarray) -> tuple[CalibrationCov
     units = np.array([1.0 if name in ("focal", "baseline") else view.fx for name in ERROR_NAMES])
     matrix = errors[np.ix_(rows, rows)] / np.outer(units, units)
     return CalibrationCovariance(ERROR_NAMES, 0.5 * (matrix + matrix.T)), 1.0 - missing / variance
+
+
+def nearest_errors(calibrated: StereoCamera, true: StereoCamera) -> np.ndarray:
+    """(12,) errors of the tracker that come nearest to what a calibration has wrong, fitted as a covariance is."""
+    rectifier = StereoRectifier(calibrated)
+    uvd = _grid(rectifier.rectified)
+    wrong = (_measured(uvd, true, rectifier) - uvd).ravel()
+    usable = np.isfinite(wrong)
+    by_error = measured_errors(rectifier.rectified, uvd).reshape(-1, len(ERRORS))[usable]
+    return np.asarray(np.linalg.lstsq(by_error, wrong[usable], rcond=None)[0])
+
+
+def _pair(rig: Rig) -> StereoCamera:
+    left, right = rig.eyes
+    return StereoCamera(left, right, rig.T_left_right)
+
+
+def _grid(view: RectifiedStereo) -> np.ndarray:
+    """(M, 3) places and disparities that both eyes of a rectified pair see."""
+    u = np.linspace(0.0, view.width - 1.0, _GRID[0])
+    v = np.linspace(0.0, view.height - 1.0, _GRID[1])
+    disparity = np.linspace(view.fx / _NEAREST / (_GRID[2] * 100), view.fx / _NEAREST, _GRID[2])
+    uvd = np.stack(np.meshgrid(u, v, disparity, indexing="ij"), axis=-1).reshape(-1, 3)
+    # Points that the right eye does not see say nothing.
+    return np.asarray(uvd[uvd[:, 0] - uvd[:, 2] >= 0.0])
+
+
+def _measured(uvd: np.ndarray, true: StereoCamera, rectifier: StereoRectifier) -> np.ndarray:
+    """(M, 3) what a calibrated pair measures of points that would be at (u, v, disparity) (M, 3) if it were right."""
+    view, calibrated, T_right_left = rectifier.rectified, rectifier.camera, se3_inverse(true.T_left_right)
+    points = view.triangulate(uvd) @ rectifier.R_rectified_left
+    in_right = points @ T_right_left[:3, :3].T + T_right_left[:3, 3]
+    rays_left = calibrated.left.unproject(true.left.project(points)) @ rectifier.R_rectified_left.T
+    rays_right = calibrated.right.unproject(true.right.project(in_right)) @ rectifier.R_rectified_right.T
+    seen, seen_right = view.project(rays_left), view.project(rays_right)
+    return np.column_stack([seen[:, :2], seen[:, 0] - seen_right[:, 0]])

@@ -24,6 +24,8 @@ _MAX_BEHIND, _WARN_BEHIND = 0.1, 0.02
 _EXPLAINED, _BETTER = 0.5, 2.0
 # A delay that moves the median place by less than this is within the noise of a match, pixels.
 _WARN_LAG = 0.5
+# And one that explains a smaller share of the variance of rows than this may stand for something else.
+_LAG_SHARE = 1 / 3
 # Rows in the stored images agree within this if these are rectified already, pixels.
 _RECTIFIED_ROWS = 0.5
 _SYNCHRONISATION = "synchronisation"
@@ -156,7 +158,7 @@ def _check_synchronisation(fit: RowFit, frame_interval: float | None) -> Finding
         )
     sigma = float(fit.sigmas[4])
     figure = f"{abs(fit.lag):.2f} ± {sigma:.2f} of a frame{_milliseconds(fit.lag, frame_interval)}"
-    explained = _BETTER * _spread(fit.residual) < _spread(fit.residual + fit.by_lag[:, 1])
+    explained = _spread(fit.residual) ** 2 < (1.0 - _LAG_SHARE) * _spread(fit.residual + fit.by_lag[:, 1]) ** 2
     if fit.lag_shift < _WARN_LAG or not explained:
         return Finding(_SYNCHRONISATION, "ok", f"the eyes are {figure} apart", fit.lag)
     message = (

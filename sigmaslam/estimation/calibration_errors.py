@@ -59,9 +59,9 @@ class CalibrationPrior:
         """(12,) standard deviations."""
         return np.sqrt(np.diag(self.covariance))
 
-    def widened(self, names: tuple[str, ...], sigma: float) -> CalibrationPrior:
-        """The same with independent errors more, of that standard deviation, by their names."""
-        return replace(self, covariance=self.covariance + np.diag(np.isin(ERRORS, names) * sigma**2))
+    def widened(self, sigma: np.ndarray) -> CalibrationPrior:
+        """The same with independent errors more, of standard deviations (12,)."""
+        return replace(self, covariance=self.covariance + np.diag(sigma**2))
 
     @property
     def estimated_covariance(self) -> np.ndarray:

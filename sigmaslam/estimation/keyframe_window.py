@@ -16,7 +16,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from sigmaslam.estimation.calibration_errors import ERRORS, TURNS, CalibrationPrior, measured_errors
+from sigmaslam.estimation.calibration_correction import judge_calibration
+from sigmaslam.estimation.calibration_errors import CalibrationPrior, measured_errors
+from sigmaslam.estimation.calibration_evidence import CalibrationEvidence, Cause
 from sigmaslam.estimation.chi_square import CHI_SQUARE_9999_OF_6
 from sigmaslam.estimation.estimator_graphs import EstimatorGraphs
 from sigmaslam.estimation.gaussian import matrix_root
@@ -28,10 +30,6 @@ from sigmaslam.estimation.window_equations import eliminate_landmarks, gate_view
 from sigmaslam.estimation.window_state import WindowState, loop_difference
 from sigmaslam.geometry.camera import RectifiedStereo
 
-# An error of the calibration beyond so many standard deviations of its prior is none that calibrations usually have.
-_CREDIBLE = 4.0
-# Boards are held within arm's reach: there depths are right, whatever else a calibration has wrong, metres.
-_REACH = 0.5
 # Errors of right matches have longer tails than a Gaussian's: degrees of freedom of the Student-t that is fitted.
 # 4 and 1 are no better on rendered streets.
 _STUDENT_FREEDOM = 2.0
@@ -45,14 +43,19 @@ class KeyframeWindow:
         calibration: prior of its errors.
         graphs: the equations.
         student_freedom: degrees of freedom of the errors' Student-t; infinite: Gaussian.
+        usual: prior of a calibration with which nothing is wrong; `calibration` by default.
 
     Attributes:
         prior: what is known without the landmarks of the window.
         posterior: what is known with them.
         landmarks: estimated with the posterior.
         depth: of the scene that the last keyframe sees, metres.
-        calibration: prior of its errors.
-        expected: (12,) errors of the calibration about which its prior holds: zero until the rig changes.
+        calibration: prior of its errors, as far as it is known.
+        expected: (12,) errors of the calibration about which its prior holds: zero until the rig changes, or something
+            else than an offset is found to be wrong.
+        evidence: weighs what may be wrong.
+        causes: of that, what is not hopeless, by its name.
+        corrected: (2, 12) what considered errors are taken to be, and their standard deviations beside the usual ones.
         held_offset: what the disparity offset is taken to be in poses that are published.
         board_disparity: pixels where a calibration that is off by more than most is right; None until one is.
         exceeded: (12,) bool, estimated errors beyond four standard deviations of their prior.
@@ -64,11 +67,15 @@ class KeyframeWindow:
         calibration: CalibrationPrior,
         graphs: EstimatorGraphs,
         student_freedom: float = _STUDENT_FREEDOM,
+        usual: CalibrationPrior | None = None,
     ) -> None:
         self.camera = camera
         self.graphs = graphs
         self.student_freedom = student_freedom
         self.calibration = calibration
+        self.evidence = CalibrationEvidence(usual or calibration, camera.fx, graphs.condition)
+        self.causes: dict[str, Cause] = {}
+        self.corrected = np.zeros((2, CALIBRATION_SIZE))
         self.expected, self.exceeded = np.zeros(CALIBRATION_SIZE), np.zeros(CALIBRATION_SIZE, bool)
         self.held_offset = HeldOffset()
         self.board_disparity: float | None = None
@@ -87,6 +94,7 @@ class KeyframeWindow:
         if past is not None:
             self.posterior = replace(self.posterior, past=past)
         self.prior = self.posterior
+        self.evidence.restart()
         self.landmarks = LandmarkTable.empty(CALIBRATION_SIZE)
         self._observations = KeyframeViews()
 
@@ -113,6 +121,7 @@ class KeyframeWindow:
         expected = self.prior.poses[-1] @ step if len(self.prior) else step
         self.prior = self.prior.grow(expected, step_covariance, walk, origin)
         self.posterior = self.posterior.grow(pose, step_covariance, walk, origin)
+        self.evidence.add_keyframe(step, step_covariance)
         self.depth = depth
         self.landmarks.dependence = np.pad(self.landmarks.dependence, ((0, 0), (0, 0), (0, 6)))
 
@@ -172,7 +181,8 @@ class KeyframeWindow:
         agree = gate_views(self, self._observations)
         if not agree.all():
             self._observations = self._observations.select(agree)
-        _judge_calibration(self)
+        self.evidence.learn(self.prior, information, vector)
+        judge_calibration(self)
 
     def add_loop_constraint(self, index: int, T_past_last: np.ndarray, covariance: np.ndarray) -> bool:
         """Closes a loop: the last keyframe sees what a past pose saw, and the past is corrected with the window.
@@ -208,6 +218,7 @@ class KeyframeWindow:
         observed = leaving[self._observations.views.landmark]
         information, vector, *_ = eliminate_landmarks(self, self._observations.select(observed))
         vector = vector + information @ self.posterior.minus(self.prior)
+        self.evidence.marginalise_oldest(self.prior, information, vector)
         self.prior = self.prior.given(information, vector, self.graphs.condition).marginalise_oldest()
         self.posterior = self.posterior.marginalise_oldest()
         new_row = np.where(leaving, -1, np.cumsum(~leaving) - 1)
@@ -230,39 +241,3 @@ class KeyframeWindow:
         uvd = measured[:, :3] - measured_errors(self.camera, measured[:, :3]) @ self.posterior.calibration
         uvd[:, 2] -= measured[:, 3:MODELLED].sum(axis=1)
         return np.asarray(uvd)
-
-
-def change_rig(window: KeyframeWindow, offset: float) -> None:
-    """The right camera was bumped, and disparities are larger by an offset; no keyframe is in the window.
-
-    The bump may have turned the camera, too.
-    """
-    assert not len(window)
-    window.expected[0] = window.posterior.calibration[0] + offset
-    window.exceeded[:], window.board_disparity = False, None
-    common, turns = window.posterior.common.copy(), [ERRORS.index(name) for name in TURNS]
-    common[turns, turns] = np.hypot(common[turns, turns], offset)
-    window.posterior = replace(window.posterior, calibration=window.expected.copy(), common=common)
-    window.prior = window.posterior
-
-
-def _judge_calibration(window: KeyframeWindow) -> None:
-    """Which offset poses stand on, and whether an error is larger than calibrations usually have."""
-    prior, before = window.calibration, window.held_offset
-    window.held_offset = before.following(window.posterior)
-    departure = np.abs(window.posterior.calibration - window.expected)
-    window.exceeded |= prior.estimated & (prior.sigma > 0.0) & (departure > _CREDIBLE * prior.sigma)
-    held = window.held_offset.value
-    if window.exceeded[0] and held is not None and (window.board_disparity is None or window.held_offset != before):
-        _move_baseline(window, held - float(window.expected[0]))
-
-
-def _move_baseline(window: KeyframeWindow, offset: float) -> None:
-    """Takes the baseline for one that made up for an offset when the rig was calibrated, as uncertain as that."""
-    if window.board_disparity is None:
-        seen = float(np.median(window.landmarks.estimate[:, 2]))
-        window.board_disparity = max(window.camera.focal_baseline / _REACH, seen)
-    change = ERRORS.index("baseline"), -offset / window.board_disparity, window.calibration
-    window.prior, _ = window.prior.with_error(*change)
-    window.posterior, step = window.posterior.with_error(*change)
-    window.landmarks.estimate += window.landmarks.dependence @ step

@@ -82,24 +82,25 @@ class WindowState:
         step, covariance, common = condition(learned)
         return replace(self.moved(step, covariance, common), past=past)
 
-    def with_error(self, index: int, value: float, prior: CalibrationPrior) -> tuple[WindowState, np.ndarray]:
-        """As if a considered error of the calibration had another mean, and a standard deviation as large as that.
+    def with_error(
+        self, index: int, value: float, before: CalibrationPrior, after: CalibrationPrior
+    ) -> tuple[WindowState, np.ndarray]:
+        """As if a considered error of the calibration had another mean, and all of them another covariance.
 
         Args:
             index: in `calibration_errors.ERRORS`.
             value: its mean.
-            prior: of the errors, with the disparity offset estimated, whose column of `common` is free.
+            before, after: prior of the errors.
         Returns:
             The state, and its step (n,).
         """
-        by_factor = np.linalg.pinv(prior.considered_factor)[:, index]
-        slope, past_slope = self.common @ by_factor, self.past.common @ by_factor
-        common, past_common = self.common.copy(), self.past.common.copy()
-        common[:, 0], past_common[:, 0] = value * slope, value * past_slope
-        change = value - self.calibration[index]
-        past = self.past.moved(change * past_slope, self.past.covariance, self.past.cross, past_common)
+        by_error = np.linalg.pinv(before.considered_factor)
+        slope, past_slope = self.common @ by_error[:, index], self.past.common @ by_error[:, index]
+        change, to_factor = value - self.calibration[index], by_error @ after.considered_factor
+        past_step, past_common = change * past_slope, self.past.common @ to_factor
+        past = self.past.moved(past_step, self.past.covariance, self.past.cross, past_common)
         step = change * slope
-        return replace(self.moved(step, self.covariance, common), past=past), step
+        return replace(self.moved(step, self.covariance, self.common @ to_factor), past=past), step
 
     def grow(
         self, pose: np.ndarray, step_covariance: np.ndarray, walk: np.ndarray, origin: int | None = None

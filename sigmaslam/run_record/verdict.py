@@ -20,6 +20,13 @@ _MAX_SIGMA = 0.2
 _MIN_OFFSET = 0.1
 # Share of the tracked frames that most matches may contradict without a word.
 _MAX_CONTRADICTED = 0.1
+# What evidence finds, as shares of the focal length: words, the factor of the figure, and its unit.
+_CAUSES = {
+    "yaw": ("the right camera is turned about the vertical, by", 180.0 / np.pi, "degrees"),
+    "pitch": ("the right camera is turned up or down, by", 180.0 / np.pi, "degrees"),
+    "zoom": ("the focal length of one camera is wrong, by", 100.0, "%"),
+    "lenses": ("the radial distortion of one lens is wrong, k1 by", 1.0, ""),
+}
 # Findings about the rig, which the disparity offset has its share of.
 _RIG = frozenset({"eyes", "mirrored", "rig", "distortion", "rows", "rotation", "scale", "infinity"})
 
@@ -116,6 +123,7 @@ def calibration_verdict(
             "poses are wrong while the camera moves."
         )
     causes = [each.message for each in faults if each.name in _RIG]
+    causes += [_describe_cause(name, *each) for name, each in calibration.causes.items() if name in _CAUSES]
     if causes:
         return "The images do not fit the calibration: " + "; ".join(causes) + "."
     offset, sigma = calibration.disparity_offset, calibration.disparity_offset_sigma
@@ -133,3 +141,13 @@ def calibration_verdict(
             "this calibration elsewhere is not: calibrate again."
         )
     return f"The disparity offset is {figure}: nothing wrong with the rectification can be seen."
+
+
+def _describe_cause(name: str, probability: float, value: float, sigma: float) -> str:
+    """What evidence says of one thing that is wrong."""
+    words, factor, unit = _CAUSES[name]
+    figure = f"{factor * value:+.2g} ± {factor * sigma:.1g} {unit}".rstrip()
+    return (
+        f"{words} {figure} (probability {min(100 * probability, 99):.0f} %): poses are corrected for it, depth that is "
+        "measured elsewhere is not: calibrate again"
+    )

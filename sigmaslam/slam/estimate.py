@@ -22,11 +22,14 @@ class CalibrationEstimate:
         disparity_offset_sigma: its standard deviation, pixels.
         errors: other errors that are estimated, and a baseline that made up for a large offset, by their
             names: value and standard deviation, in the units of `sigmaslam.estimation.calibration_errors.ERRORS`.
+        causes: what is wrong by the evidence, by the names of `sigmaslam.estimation.calibration_evidence.HYPOTHESES`:
+            its probability, above a half; its error and standard deviation, as shares of the focal length.
     """
 
     disparity_offset: float
     disparity_offset_sigma: float
     errors: dict[str, tuple[float, float]] = field(default_factory=dict)
+    causes: dict[str, tuple[float, float, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from sigmaslam.estimation.acceptance import ACCEPTANCE
+from sigmaslam.estimation.calibration_correction import change_rig
 from sigmaslam.estimation.constant_velocity import MotionFilter, dead_reckoning
-from sigmaslam.estimation.keyframe_window import KeyframeWindow, change_rig
+from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.frontend import StereoView
 from sigmaslam.frontend.motion_blur import is_blurred
 from sigmaslam.geometry.se3 import se3_body, turn_covariance

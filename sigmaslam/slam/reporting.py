@@ -20,6 +20,9 @@ from sigmaslam.slam.localisation import Prediction
 from sigmaslam.slam.mapping import KeyframeTracks
 from sigmaslam.slam.relative_poses import RelativePoseReporter
 
+# A cause is named when it is more likely than all others together.
+_LIKELY = 0.5
+
 
 @dataclass(frozen=True, slots=True)
 class Reporter:
@@ -125,8 +128,12 @@ class Reporter:
         chosen = [k for k in np.flatnonzero(self.window.calibration.estimated).tolist() if k]
         if self.window.board_disparity is not None:
             chosen.append(ERRORS.index("baseline"))
+        causes = {name: each for name, each in self.window.causes.items() if each.probability > _LIKELY}
+        chosen += [k for k in map(ERRORS.index, causes) if k and k not in chosen]
         others = {ERRORS[k]: (float(errors[k]), float(sigma[k])) for k in chosen}
-        return CalibrationEstimate(float(errors[0]), float(sigma[0]), others)
+        focal = self.window.camera.fx
+        shares = {k: (c.probability, c.mean / focal, float(np.sqrt(c.variance)) / focal) for k, c in causes.items()}
+        return CalibrationEstimate(float(errors[0]), float(sigma[0]), others, shares)
 
 
 def _within_half_turn(covariance: np.ndarray) -> np.ndarray:

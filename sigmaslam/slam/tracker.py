@@ -10,7 +10,7 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from sigmaslam.estimation.build_motion import build_motion
-from sigmaslam.estimation.calibration_errors import TURNS, CalibrationPrior
+from sigmaslam.estimation.calibration_errors import ERRORS, TURNS, CalibrationPrior
 from sigmaslam.estimation.clustered_errors import SharedErrors
 from sigmaslam.estimation.constant_velocity import dead_reckoning
 from sigmaslam.estimation.estimator_graphs import EstimatorGraphs
@@ -119,9 +119,8 @@ class StereoTracker:
         self._admission = admission = admission or AdmitAll(config.min_inliers)
         graphs = EstimatorGraphs(rectified, backend, config.linearisation == "unscented")
         prior = CalibrationPrior.of(rectified, camera.sigmas, config.offset_sigma, config.estimate, camera.covariance)
-        if disparity_error is not None:
-            prior = prior.widened(("offset", *TURNS), disparity_error)
-        self._window = window = KeyframeWindow(rectified, prior, graphs)
+        by_check = np.isin(ERRORS, ("offset", *TURNS)) * (disparity_error or 0.0)
+        self._window = window = KeyframeWindow(rectified, prior.widened(by_check), graphs, usual=prior)
         self._noise = noise = MeasurementNoise(config)
         self._motion = motion = build_motion(backend, imu, odometry, self._T_rectified_left)
         self._course = course = Course()

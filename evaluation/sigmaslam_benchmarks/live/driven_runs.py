@@ -5,7 +5,7 @@ import logging
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, redirect_stderr, redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,11 +38,13 @@ class DrivenRun:
         poses: of the frames that it was given, in order.
         said: sentences about the run.
         refused: why it broke off; empty where it did not.
+        learned: errors of the calibration by name: value and standard deviation.
     """
 
     poses: list[DrivenPose]
     said: list[str]
     refused: str = ""
+    learned: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
 Method = Callable[[Sequence[DrivenFrame], StereoCamera, Path], DrivenRun]
@@ -87,10 +89,13 @@ def track_ours(
 ) -> DrivenRun:
     """What `sigmaslam track` does and says, in one thread."""
     by_frame: dict[int, DrivenPose] = {}
+    learned: dict[str, tuple[float, float]] = {}
 
     def keep(result: Estimate | ObjectEstimate) -> None:
         estimate, moment = result.camera, frames[sequence.latest].moment
         by_frame[sequence.latest] = DrivenPose(moment, estimate.status, estimate.T_world_camera, estimate.covariance)
+        found = estimate.calibration
+        learned.update(offset=(found.disparity_offset, found.disparity_offset_sigma), **found.errors)
 
     warnings, refused, told = _Warnings(), "", io.StringIO()
     logger = logging.getLogger("sigmaslam")
@@ -113,7 +118,8 @@ def track_ours(
     ]
     poses = [by_frame.get(number, none) for number, none in enumerate(missing)]
     words = [*warnings.words, *(line.strip() for line in told.getvalue().splitlines())]
-    return DrivenRun(poses, [line for line in dict.fromkeys(words) if line and not line.startswith("Report:")], refused)
+    said = [line for line in dict.fromkeys(words) if line and not line.startswith("Report:")]
+    return DrivenRun(poses, said, refused, learned)
 
 
 def _tell(summary: dict[str, Any], out: Path, told: io.StringIO) -> None:

@@ -3,9 +3,12 @@
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 
 import cv2
 import numpy as np
+
+from sigmaslam.geometry.camera import StereoCamera
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,11 +38,13 @@ class Fault:
         words: what a reader of the table needs to know.
         spoil: makes the faulty frames of the good ones; images that do not change are shared with them.
         seconds: after `start_of` that a recording must last for the fault to show.
+        miscalibrate: the calibration that is given, of the true one.
     """
 
     words: str
     spoil: Callable[[Frames, np.random.Generator], Frames]
     seconds: float = 0.0
+    miscalibrate: Callable[[StereoCamera], StereoCamera] = lambda camera: camera
 
     def fits(self, frames: Sequence[DrivenFrame]) -> bool:
         """Whether some frames are left after the fault."""
@@ -171,6 +176,21 @@ def lag_right(frames: Frames, rng: np.random.Generator) -> Frames:
     """The right eye is a frame behind, all along."""
     number = np.arange(len(frames))
     return _show(frames, number, np.maximum(number - 1, 0))
+
+
+def delay_right(milliseconds: float, frames: Frames, rng: np.random.Generator) -> Frames:
+    """The right eye is late: its image is moved along the optical flow to the next one; the last pair is left out."""
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    none = np.zeros((*frames[0].right.shape, 2), np.float32)
+    u, v = np.meshgrid(*(np.arange(size, dtype=np.float32) for size in reversed(none.shape[:2])))
+    delayed = []
+    for frame, following in pairwise(frames):
+        share = 1e-3 * milliseconds / (following.timestamp - frame.timestamp)
+        moved = np.float32(share) * flow.calc(frame.right, following.right, none.copy())
+        places = u - moved[..., 0], v - moved[..., 1]
+        right = cv2.remap(frame.right, *places, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        delayed.append(replace(frame, right=right))
+    return delayed
 
 
 # Light.

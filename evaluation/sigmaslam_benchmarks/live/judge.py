@@ -11,10 +11,13 @@ import numpy as np
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999
 from sigmaslam.estimation.mahalanobis import squared_mahalanobis
 from sigmaslam.geometry.se3 import se3_inverse, se3_log
-from sigmaslam_evaluation.metrics.trajectory_errors import is_regular
+from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam_evaluation.metrics.trajectory_errors import absolute_trajectory_error, is_regular
 from sigmaslam_evaluation.metrics.truth_covariance import relative_truth_covariance
 
 _POSITION, _POSE = 3, 6
+# An alignment is determined by three; below ten its error says little.
+_FEWEST_POSES = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +90,11 @@ class Judgement:
         away_metres, away_sigmas: as `metres` and `sigmas`, against that run.
         said: sentences about the run, warnings first.
         refused: why the run broke off; empty where it did not.
+        ate: root mean square error of positions after the best alignment, metres.
+        length: of the path, relative to the true one, less one.
+        end_sigmas: as `end_metres`, in sigmas.
+        learned: errors of the calibration by name: value and standard deviation.
+        true_errors: by which the calibration that was given is off from the recording's, by their names.
     """
 
     statuses: Mapping[str, int]
@@ -101,6 +109,11 @@ class Judgement:
     away_sigmas: float
     said: Sequence[str]
     refused: str = ""
+    ate: float = float("nan")
+    length: float = float("nan")
+    end_sigmas: float = float("nan")
+    learned: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    true_errors: Mapping[str, float] = field(default_factory=dict)
 
     def silent(self, good: Judgement | None = None) -> int:
         """Frames called `tracking` that are wrong.
@@ -146,19 +159,21 @@ def judge(
     good: References | None = None,
     said: Sequence[str] = (),
     refused: str = "",
+    learned: Mapping[str, Sequence[float]] | None = None,
 ) -> Judgement:
     """Holds the poses of a run against the truth, and against the run with good frames.
 
     Args:
         poses: of the delivered frames, in order.
         truth, good: by moment; None: nothing is said of it.
-        said, refused: see `Judgement`.
+        said, refused, learned: see `Judgement`.
     """
     tracking = np.array([each.status == "tracking" for each in poses], bool)
     relocalised = np.array([each.status == "relocalised" for each in poses], bool)
     errors = pose_errors(poses, truth)
     away = errors if good is None else pose_errors(poses, good)
-    known = errors.metres[np.isfinite(errors.metres)]
+    known, sigmas = (each[np.isfinite(errors.metres)] for each in (errors.metres, errors.sigmas))
+    ate, length = _path_errors(poses, truth)
     return Judgement(
         statuses=dict(Counter(each.status for each in poses)),
         judged=int((tracking & np.isfinite(errors.pose)).sum()),
@@ -172,6 +187,10 @@ def judge(
         away_sigmas=float("nan") if good is None else _largest(away.sigmas[tracking]),
         said=list(said),
         refused=refused,
+        ate=ate,
+        length=length,
+        end_sigmas=float(sigmas[-1]) if len(sigmas) else float("nan"),
+        learned=learned or {},
     )
 
 
@@ -182,6 +201,18 @@ def good_poses(poses: Sequence[DrivenPose], count: int) -> References:
         if each.status == "tracking" or number == 0:
             by_moment[each.moment] = each.T_world_camera
     return References(by_moment)
+
+
+def _path_errors(poses: Sequence[DrivenPose], truth: References) -> tuple[float, float]:
+    """`ate` and `length` of a judgement."""
+    true = np.array([truth.poses[each.moment] for each in poses]).reshape(-1, 4, 4)
+    said = np.array([each.T_world_camera for each in poses]).reshape(-1, 4, 4)
+    usable = np.isfinite(true).all(axis=(1, 2)) & np.isfinite(said).all(axis=(1, 2))
+    if usable.sum() < _FEWEST_POSES:
+        return float("nan"), float("nan")
+    estimate, exact = (Trajectory(np.arange(float(usable.sum())), each[usable]) for each in (said, true))
+    ways = [np.linalg.norm(np.diff(each.positions, axis=0), axis=1).sum() for each in (estimate, exact)]
+    return absolute_trajectory_error(estimate, exact).rmse, float(ways[0] / ways[1] - 1.0)
 
 
 def _largest(values: np.ndarray) -> float:

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from sigmaslam.calibration.learned_calibration import learned_calibration
+from sigmaslam.calibration.tracker_covariance import nearest_errors
 from sigmaslam.calibration_files.calibration_writer import write_calibration
-from sigmaslam.estimation.calibration_errors import CalibrationPrior
+from sigmaslam.estimation.calibration_errors import ERRORS, CalibrationPrior
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.slam.estimate import CalibrationEstimate
+from sigmaslam_benchmarks.live.calibration_faults import CALIBRATION_FAULTS
 from tests.support.calibration_forms import raw_rig
 
 PINHOLE = CameraModel(640, 480, 500.0, 500.0, 319.5, 239.5)
@@ -61,3 +63,17 @@ def test_learning_once_more_keeps_what_else_is_known():
     sigmas = dict(zip(twice.covariance.names, np.sqrt(np.diag(twice.covariance.matrix)), strict=True))
     assert sigmas == {"baseline": pytest.approx(0.06), "offset": pytest.approx(0.02 / 500.0)}
     assert replace(twice, covariance=once.covariance).right.cx == pytest.approx(once.right.cx - 0.01)
+
+
+@pytest.mark.parametrize("name", ["yaw", "pitch", "zoom", "lenses"])
+def test_what_is_wrong_by_the_evidence_is_corrected(name: str):
+    """The errors of a pair that is given with one, as a run with no noise would find them, leave the true pair."""
+    true = rectified_pair()
+    fault = {"yaw": "yaw_0.1", "pitch": "pitch_0.12", "zoom": "zoom_1", "lenses": "k1_0.01"}[name]
+    given = CALIBRATION_FAULTS[fault].miscalibrate(true)
+    focal, errors = StereoRectifier(given).rectified.fx, nearest_errors(given, true)
+    share = float(errors[ERRORS.index(name)]) / focal
+    estimate = CalibrationEstimate(float(errors[0]), 0.01, {}, {name: (1.0, share, 1e-4)})
+    left = np.abs(nearest_errors(learned_calibration(given, estimate, focal), true))
+    assert left[1:7].max() < 0.1 * np.abs(errors[:7]).max()
+    assert left[0] < 0.1 * np.abs(errors[:7]).max()

@@ -218,15 +218,16 @@ def test_covariances_relative_to_a_pose_are_those_of_the_differences():
 
 
 def test_another_baseline_moves_poses_as_a_considered_one_would():
-    """Of variance one, it enters them as a column of `common`; with a mean the poses go along."""
+    """Of variance one, it enters them as a column of `common`; with a mean and more variance the poses go along."""
     prior = CalibrationPrior.independent(np.r_[0.5, np.full(10, 0.2), 0.001], "offset")
     state = random_state(3)
     state = replace(state, common=np.c_[np.zeros(len(state.common)), state.common[:, 1:]])
-    after, step = state.with_error(ERRORS.index("baseline"), 0.05, prior)
+    wider = prior.widened(np.isin(ERRORS, "baseline") * 0.05)
+    after, step = state.with_error(ERRORS.index("baseline"), 0.05, prior, wider)
     expected = state.common[:, -1] / 0.001
     np.testing.assert_allclose(step, expected * (0.05 - state.calibration[-1]), rtol=1e-9)
     np.testing.assert_allclose(after.minus(state), step, atol=1e-9 * np.abs(step).max())
-    np.testing.assert_allclose(after.common[:, 0], 0.05 * expected, rtol=1e-9)
-    np.testing.assert_allclose(after.past.common[:, 0], 50.0 * state.past.common[:, -1], rtol=1e-9)
-    np.testing.assert_array_equal(after.common[:, 1:], state.common[:, 1:])
+    np.testing.assert_allclose(after.common[:, -1], np.hypot(0.001, 0.05) * expected, rtol=1e-9)
+    np.testing.assert_allclose(after.past.common[:, -1], np.hypot(1.0, 50.0) * state.past.common[:, -1], rtol=1e-9)
+    np.testing.assert_allclose(after.common[:, 1:-1], state.common[:, 1:-1], rtol=1e-9)
     np.testing.assert_array_equal(after.covariance, state.covariance)

@@ -97,3 +97,11 @@ def test_stamps_that_jitter_and_images_that_repeat_are_said():
     assert times_verdict({"stamp_noise": 0.0, "repeated": 0}) is None
     assert "jitter by 31 ms" in times_verdict({"stamp_noise": 0.031, "repeated": 0})
     assert "10 frames" in times_verdict({"stamp_noise": 0.0, "repeated": 10})
+
+
+def test_a_cause_that_evidence_names_is_said_in_place_of_the_offset():
+    said = calibration_verdict(
+        CalibrationEstimate(-3.8, 0.1, {}, {"yaw": (0.9999, -0.005236, 0.0002)}), 100, 1000, EXPECTED
+    )
+    assert "turned about the vertical, by -0.3 ± 0.01 degrees (probability 99 %)" in said
+    assert "of disparity" not in said

@@ -1,0 +1,123 @@
+"""What is wrong with a pair, weighed by evidence: hypotheses about the calibration on the matches of the window.
+
+Beside the window, which considers most errors of the calibration, stands the same window with all of them estimated:
+the same views, linearised at the same place. Its errors have the prior N(0, S) of usual calibrations and the posterior
+N(m, P), so the views say exp(-x^T L x / 2 + y^T x) of them, L = P^-1 - S^-1 and y = P^-1 m. A hypothesis adds an error
+of standard deviation s in the direction w. As all is linear and Gaussian, its marginal likelihood over that of "nothing
+is wrong" is a ratio of Savage and Dickey in closed form (Dickey 1971; Bishop 2006, section 3.5): with
+
+    b = w^T S^-1 m,   a = w^T S^-1 (S - P) S^-1 w,   log ratio = (s^2 b^2 / (1 + s^2 a) - log(1 + s^2 a)) / 2,
+
+and what it makes of all errors is N(P' y, P') with P'^-1 = L + (S + s^2 w w^T)^-1. No view is linearised again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sigmaslam.estimation.calibration_errors import ERRORS, CalibrationPrior
+from sigmaslam.estimation.window_state import WindowState
+from sigmaslam.inference.onnx_graph import Step
+
+# Of a hundred rigs one has this wrong. Below one in twenty a hypothesis is hopeless, and changes nothing.
+_PRIOR, _HOPELESS = 0.01, 0.05
+# How large an error is that no calibration usually has, as a share of the focal length: half a degree, a per cent.
+_SIZE = 0.01
+# A file may claim that a calibration has no errors at all, as a share of the focal length.
+_LEAST_SIGMA = 1e-6
+HYPOTHESES = {
+    "offset": ("offset",),  # a principal point
+    "yaw": ("offset", "yaw"),
+    "pitch": ("pitch",),
+    "zoom": ("zoom",),  # one focal length
+    "lenses": ("lenses",),  # radial distortion of one lens
+}
+"""What each moves of the tracker's errors, all alike.
+
+Baseline and focal length of both eyes cannot be told from the scene, a roll and a bend not from patches of a road that
+are misplaced alike (docs/notebook/calibration.md).
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """A hypothesis as the views leave it.
+
+    Attributes:
+        probability: that this is wrong, and nothing else.
+        mean, variance: of the error of its name, if so.
+    """
+
+    probability: float = 0.0
+    mean: float = 0.0
+    variance: float = 0.0
+
+
+class CalibrationEvidence:
+    """Weighs what may be wrong with a pair; owns a window with all errors of the calibration estimated.
+
+    Args:
+        usual: prior of a calibration with which nothing is wrong.
+        focal_length: pixels.
+        condition: `sigmaslam_models.estimator.window_solution.Condition`.
+        expected: (12,) errors of the calibration about which the prior holds; zero by default.
+    """
+
+    def __init__(
+        self, usual: CalibrationPrior, focal_length: float, condition: Step, expected: np.ndarray | None = None
+    ) -> None:
+        units = np.where(np.isin(ERRORS, ("focal", "baseline")), 1.0, focal_length)
+        self._sigma = np.maximum(usual.sigma, _LEAST_SIGMA * units)
+        self._size = _SIZE * focal_length
+        self._condition = condition
+        self.expected = np.zeros(len(ERRORS)) if expected is None else expected.copy()
+        state = WindowState.initial(CalibrationPrior.independent(self._sigma, *ERRORS))
+        self._prior = self._posterior = replace(state, calibration=self.expected.copy())
+
+    def restart(self) -> None:
+        """Forgets all poses."""
+        self._prior = self._posterior = self._posterior.without_poses()
+
+    def add_keyframe(self, step: np.ndarray, step_covariance: np.ndarray) -> None:
+        """As of the window; errors of a rig do not walk."""
+        expected = self._prior.poses[-1] @ step if len(self._prior) else step
+        self._prior = self._prior.grow(expected, step_covariance, np.zeros(len(ERRORS)))
+
+    def learn(self, about: WindowState, information: np.ndarray, vector: np.ndarray) -> None:
+        """Takes what all views of the window say, about the mean of its prior."""
+        self._posterior = self._given(about, information, vector)
+
+    def marginalise_oldest(self, about: WindowState, information: np.ndarray, vector: np.ndarray) -> None:
+        """Takes what the views of leaving landmarks say, and forgets the oldest pose."""
+        state = self._given(about, information, vector).marginalise_oldest()
+        self._prior = replace(state, past=state.past.drop(0))
+
+    def _given(self, about: WindowState, information: np.ndarray, vector: np.ndarray) -> WindowState:
+        vector = vector + information @ about.minus(self._prior)
+        return self._prior.given(information, vector, self._condition)
+
+    def weigh(self) -> dict[str, Cause]:
+        """What may be wrong, by its name, unless it is hopeless; "nothing" has the rest of the probability."""
+        # In units of the usual standard deviations, in which S is the identity.
+        count = len(ERRORS)
+        mean = (self._posterior.calibration - self.expected) / self._sigma
+        covariance = self._posterior.covariance[:count, :count] / np.outer(self._sigma, self._sigma)
+        precision = np.linalg.inv(covariance)
+        slope = precision @ mean
+        found: dict[str, tuple[float, float, float]] = {}
+        for name, moved in HYPOTHESES.items():
+            spread = self._size * np.isin(ERRORS, moved) / self._sigma
+            growth = 1.0 + spread @ (np.eye(count) - covariance) @ spread
+            ratio = 0.5 * ((spread @ mean) ** 2 / growth - np.log(growth))
+            own = np.linalg.inv(np.eye(count) + np.outer(spread, spread))
+            posterior = np.linalg.inv(precision - np.eye(count) + own)
+            k = ERRORS.index(name)
+            value, variance = self._sigma[k] * (posterior @ slope)[k], self._sigma[k] ** 2 * posterior[k, k]
+            found[name] = float(ratio), float(value), float(variance)
+        top = max(0.0, *(ratio for ratio, _, _ in found.values()))
+        weights = {name: _PRIOR * np.exp(ratio - top) for name, (ratio, _, _) in found.items()}
+        total = (1.0 - _PRIOR * len(found)) * np.exp(-top) + sum(weights.values())
+        likely = {name: weights[name] / total for name in found if weights[name] > _HOPELESS * total}
+        return {name: Cause(probability, *found[name][1:]) for name, probability in likely.items()}

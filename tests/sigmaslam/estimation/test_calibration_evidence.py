@@ -1,0 +1,103 @@
+"""What may be wrong with a pair, against marginal likelihoods of the measurements themselves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from sigmaslam.estimation.calibration_errors import ERRORS, CalibrationPrior
+from sigmaslam.estimation.calibration_evidence import HYPOTHESES, CalibrationEvidence, Cause
+from sigmaslam.estimation.window_state import WindowState
+from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
+from sigmaslam.inference.backends import load_step
+from tests.support.dense_window import CAMERA, by_pair_with, unsolved, world
+
+USUAL = CalibrationPrior.of(CAMERA, CalibrationSigmas(), 0.5)
+SIZE, PRIOR = 0.01 * CAMERA.fx, 0.01
+COUNT, NOISE = 40, 0.3
+
+
+def weigh(slopes: np.ndarray, measured: np.ndarray, expected: np.ndarray | None = None) -> dict[str, Cause]:
+    """Of measurements (M,) with slopes (M, 12) by the errors and independent noise."""
+    evidence = CalibrationEvidence(USUAL, CAMERA.fx, load_step("window_condition"), expected)
+    evidence.learn(WindowState.initial(USUAL), slopes.T @ slopes / NOISE**2, slopes.T @ measured / NOISE**2)
+    return evidence.weigh()
+
+
+def measurements(seed: int, name: str, size: float) -> tuple[np.ndarray, np.ndarray]:
+    """Slopes, and what is measured with usual errors and one of a hypothesis."""
+    rng = np.random.default_rng(seed)
+    slopes = rng.normal(size=(COUNT, len(ERRORS)))
+    errors = rng.normal(size=len(ERRORS)) * USUAL.sigma + size * np.isin(ERRORS, HYPOTHESES[name])
+    return slopes, slopes @ errors + NOISE * rng.normal(size=COUNT)
+
+
+@pytest.mark.parametrize(("name", "size"), [("yaw", 0.6), ("zoom", 1.2), ("lenses", 1.0), ("pitch", -0.7)])
+def test_probabilities_and_errors_are_those_of_the_measurements(name: str, size: float):
+    slopes, measured = measurements(3, name, size)
+    densities, errors = {}, {}
+    for each, moved in {"nothing": (), **HYPOTHESES}.items():
+        prior = USUAL.covariance + SIZE**2 * np.outer(*2 * [np.isin(ERRORS, moved).astype(float)])
+        spread = slopes @ prior @ slopes.T + NOISE**2 * np.eye(COUNT)
+        odds = PRIOR if moved else 1.0 - PRIOR * len(HYPOTHESES)
+        densities[each] = odds * multivariate_normal(np.zeros(COUNT), spread).pdf(measured)
+        gain = prior @ slopes.T @ np.linalg.inv(spread)
+        errors[each] = gain @ measured, prior - gain @ slopes @ prior
+    causes = weigh(slopes, measured)
+    assert name in causes
+    for each, cause in causes.items():
+        k = ERRORS.index(each)
+        assert cause.probability == pytest.approx(densities[each] / sum(densities.values()), rel=1e-6)
+        assert cause.mean == pytest.approx(errors[each][0][k], rel=1e-6)
+        assert cause.variance == pytest.approx(errors[each][1][k, k], rel=1e-6)
+    hopeless = sum(densities[each] for each in HYPOTHESES if each not in causes)
+    assert hopeless < 0.05 * len(HYPOTHESES) * sum(densities.values())
+
+
+def test_nothing_is_wrong_until_evidence_speaks():
+    assert weigh(np.zeros((COUNT, len(ERRORS))), np.zeros(COUNT)) == {}
+    silent = [weigh(*measurements(seed, "yaw", 0.0)) for seed in range(40)]
+    assert sum(any(cause.probability > 0.5 for cause in causes.values()) for causes in silent) <= 1
+
+
+@pytest.mark.parametrize("name", list(HYPOTHESES))
+def test_a_large_error_is_named(name: str):
+    causes = weigh(*measurements(5, name, 8.0 if name == "offset" else 4.0))
+    assert max(causes, key=lambda each: causes[each].probability) == name
+    assert causes[name].probability > 0.99
+
+
+def test_errors_count_from_what_is_expected():
+    """After a bump the prior holds about another calibration."""
+    expected = np.zeros(len(ERRORS))
+    expected[0] = 5.0
+    rng = np.random.default_rng(7)
+    slopes = rng.normal(size=(COUNT, len(ERRORS)))
+    # What is learned is about the window's prior mean, which is zero.
+    assert weigh(slopes, slopes @ expected, expected) == {}
+    assert weigh(slopes, slopes @ expected)["offset"].probability > 0.99
+
+
+# Of `dense_window`: considered errors of calibrations, of which it estimates the first three.
+CONSIDERED_SIGMA = USUAL.sigma[3:]
+
+
+@pytest.mark.parametrize("name", ["zoom", "lenses"])
+def test_a_window_takes_over_what_evidence_names(name: str):
+    k = ERRORS.index(name)
+    error = 6.0 * (np.arange(len(ERRORS)) == k)
+    given = world(1, 0.3, count=90)
+    right, wrong = (unsolved(each, considered_sigma=CONSIDERED_SIGMA) for each in (given, by_pair_with(given, error)))
+    right.solve()
+    assert right.causes == {}
+    np.testing.assert_allclose(right.posterior.calibration[3:], 0.0, atol=1e-15)
+    assert not right.corrected.any()
+    wrong.solve()
+    assert wrong.causes[name].probability > 0.95
+    # What was linearised about no error, is so about most of it the next time.
+    wrong.solve()
+    sigma = np.hypot(wrong.corrected[1, k], USUAL.sigma[k])
+    assert wrong.posterior.calibration[k] == pytest.approx(6.0, abs=3.0 * sigma)
+    assert sigma < 1.5
+    assert wrong.calibration.sigma[k] == pytest.approx(sigma)
