@@ -38,6 +38,7 @@ class MotionFilter:
         step: (4, 4) T_keyframe_camera.
         twist: (6,) velocity of the camera in its own frame, m/s and rad/s.
         widened: by which factor since the last prediction.
+        turn: (3, 3) rotation R_last_current that a sensor has measured; None: none has.
         is_inertial, is_odometric: an inertial sensor or odometry predicts, which knows the velocity without images.
 
     Args:
@@ -50,6 +51,7 @@ class MotionFilter:
         self.twist = np.zeros(6)
         self._covariance = np.zeros((_STATE_SIZE, _STATE_SIZE))
         self.widened = 1.0
+        self.turn: np.ndarray | None = None
         self.is_inertial = self.is_odometric = False
 
     @property

@@ -11,9 +11,10 @@ from sigmaslam.estimation.constant_velocity import MotionFilter, MotionState
 from sigmaslam.estimation.gaussian import at_most, regression
 from sigmaslam.estimation.inertial_alignment import align, align_gyro, gyro_fits
 from sigmaslam.estimation.inertial_buffer import InertialBuffer, LearnedNoise
-from sigmaslam.estimation.preintegration import Preintegrated
+from sigmaslam.estimation.preintegration import GYRO_BIAS, TURN, Preintegrated
+from sigmaslam.estimation.standstill import WHILE, Standstill
 from sigmaslam.geometry.inertial_sensor import InertialSensor
-from sigmaslam.geometry.se3 import nearest_rigid, se3_exp, se3_inverse, se3_log, skew
+from sigmaslam.geometry.se3 import nearest_rigid, rotation_log, se3_body, se3_exp, se3_inverse, se3_log, skew
 from sigmaslam.inference.backends import load_step
 
 _LOGGER = logging.getLogger(__name__)
@@ -21,14 +22,14 @@ _LOGGER = logging.getLogger(__name__)
 # Order of the graph's error state, see sigmaslam_models.estimator.inertial_prediction.
 _POSE, _VELOCITY, _GRAVITY, _BIASES = slice(0, 6), slice(6, 9), slice(9, 12), slice(12, 18)
 # Delay and mounting of the sensor, and the size of all.
-_SENSOR, _SIZE = slice(18, 25), 25
+_SENSOR, _GYRO_BIAS, _SIZE = slice(18, 25), slice(12, 15), 25
 SENSOR_SIGMA = np.array([2e-3, *[5e-3] * 3, *[3.5e-3] * 3])
 """Prior standard deviations of delay (s), place (m) and rotation (rad) of the sensor. Those of careful calibrations:
 2 ms, 5 mm and 0.2 degrees."""
 # Seconds in which clocks drift and mounts bend, as they warm up, by as much as they are off at first.
 _WARM_UP = 600.0
 # Gravity is looked for in the poses of so many seconds, and in no fewer than so many poses.
-_ALIGNED_SECONDS, _ALIGNED_POSES = 1.0, 8
+_ALIGNED_SECONDS, _ALIGNED_POSES = 1.0, 5
 # Poses of a camera that is so slow that fewer fit into the seconds above are kept for so long, seconds.
 _LONGEST = 10.0
 # Seconds without samples after which the sensor is taken for dead.
@@ -58,6 +59,9 @@ class InertialMotion(MotionFilter):
         self._T_first_key, self._is_refused = np.eye(4), False
         self._time: float | None = None
         self._densities = np.zeros(2)
+        self._standstill, self._is_dark = Standstill(sensor), False
+        self.is_resting = False
+        """The last prediction was one of a body at rest."""
 
     @property
     def state(self) -> MotionState:
@@ -83,12 +87,12 @@ class InertialMotion(MotionFilter):
         self, seconds: float, densities: np.ndarray, sigma: float = 0.0, timestamp: float | None = None
     ) -> None:
         """Moves on to the frame of that time stamp, by the samples since the last one."""
-        start, self._time, self._densities = self._time, timestamp, densities
+        start, self._time, self._densities, self.turn = self._time, timestamp, densities, None
         if not self.is_inertial or start is None or timestamp is None:
             super().predict(seconds, densities, sigma)
             return
         sensor = self.samples.sensor
-        self.samples.forget(start + self.samples.time_shift)
+        self.samples.forget(start + self.samples.time_shift - WHILE)
         motion = self.samples.preintegrate(start, timestamp, self._biases, densities)
         if motion is None or motion.missing > _DEAD:
             self._leave(seconds, densities)
@@ -109,11 +113,12 @@ class InertialMotion(MotionFilter):
                 "walk": np.array([sensor.gyro_walk, sensor.accel_walk]) ** 2,
             }
         )
-        turned = se3_log(se3_inverse(self.step) @ step)[3:] / motion.seconds
+        self.turn = self.step[:3, :3].T @ step[:3, :3]
         self.step, self._velocity = nearest_rigid(step), velocity
         self._covariance, self._carried, self.widened = 0.5 * (covariance + covariance.T), carried, 1.0
         self._covariance[_SENSOR, _SENSOR] += np.diag(SENSOR_SIGMA**2 * motion.seconds / _WARM_UP)
-        self._note_twist(turned)
+        self._note_twist(rotation_log(self.turn) / motion.seconds)
+        self._rest(motion, timestamp)
         if sigma > 0.0:
             self.doubt_time(sigma)
 
@@ -137,18 +142,19 @@ class InertialMotion(MotionFilter):
         # What images leave of the prediction; where they know less of the pose than it, they teach nothing.
         kept = at_most(covariance, P[_POSE, _POSE])
         removed = P[_POSE, _POSE] - kept
-        self.noise.learn(departure, removed)
+        if not self.is_resting:  # vibrations come with motion
+            self.noise.learn(departure, removed)
         gain = regression(P[6:, _POSE], P[_POSE, _POSE])
-        change = gain @ departure
-        self._velocity = self._velocity + change[:3]
-        self._gravity = self._gravity + change[3:6]
-        self._biases = self._biases + change[6:12]
-        self.samples.time_shift += float(change[12])
-        self._T_camera_imu = nearest_rigid(se3_exp(change[13:]) @ self._T_camera_imu)
+        self._move(gain @ departure)
         others = P[6:, 6:] - gain @ removed @ gain.T
         self.step = nearest_rigid(step)
         self._covariance = np.block([[covariance, kept @ gain.T], [gain @ kept, 0.5 * (others + others.T)]])
         self._note_twist(self.twist[3:])
+        if self._time is not None:
+            recent = self.samples.around(self._time - WHILE, self._time)
+            pose, spread = self._T_first_key @ self.step, se3_body(self.step, covariance)
+            self._standstill.see(self._time, pose, spread, recent, self.noise.scale)
+        self._is_dark = False
 
     def start_keyframe(self) -> None:
         """The current pose is the keyframe's from now on: velocity and gravity turn into its frame."""
@@ -165,6 +171,46 @@ class InertialMotion(MotionFilter):
         super().start_keyframe()
 
     # ---- parts
+
+    def _move(self, change: np.ndarray) -> None:
+        """Adds (19,) to all but the pose."""
+        self._velocity = self._velocity + change[:3]
+        self._gravity = self._gravity + change[3:6]
+        self._biases = self._biases + change[6:12]
+        self.samples.time_shift += float(change[12])
+        self._T_camera_imu = nearest_rigid(se3_exp(change[13:]) @ self._T_camera_imu)
+
+    def _measure(self, residual: np.ndarray, slope: np.ndarray, noise: np.ndarray) -> None:
+        """Kalman update by what is measured without images.
+
+        Args:
+            residual: (m,) measured less predicted.
+            slope: (m, 25) of what is predicted, by the state.
+            noise: (m, m) covariance.
+        """
+        P = self._covariance
+        gain = regression(P @ slope.T, slope @ P @ slope.T + noise)
+        change, kept = gain @ residual, np.eye(_SIZE) - gain @ slope
+        self._covariance = kept @ P @ kept.T + gain @ noise @ gain.T
+        if self._carried is not None:
+            self._carried = self._carried @ kept.T
+        self.step = nearest_rigid(se3_exp(change[_POSE]) @ self.step)
+        self._move(change[6:])
+        self._note_twist(self.twist[3:])
+
+    def _rest(self, motion: Preintegrated, timestamp: float) -> None:
+        """A body at rest measures a velocity of zero and the gyro's bias."""
+        was_dark, self._is_dark = self._is_dark, True
+        recent, P = self.samples.around(timestamp - WHILE, timestamp), self._covariance[_VELOCITY, _VELOCITY]
+        self.is_resting = motion.missing == 0.0 and self._standstill.holds(recent, self._velocity, P, was_dark)
+        if not self.is_resting:
+            return
+        slope, noise = np.zeros((6, _SIZE)), np.zeros((6, 6))
+        slope[:3, _VELOCITY], slope[3:, _GYRO_BIAS] = np.eye(3), motion.slope[TURN, GYRO_BIAS]
+        # Successive frames share the images, or the lack of them, of that while.
+        noise[:3, :3] = self._standstill.speed_variance * max(WHILE / motion.seconds, 1.0)
+        noise[3:, 3:] = motion.seconds * np.diag(self._standstill.spectra[:3])
+        self._measure(np.r_[-self._velocity, -rotation_log(motion.turn)], slope, noise)
 
     def _align(self) -> None:
         """Looks for gravity in the last poses."""

@@ -116,7 +116,7 @@ def preintegrate(
     )
     missing = float(steps[is_missing].sum())
     slope = np.column_stack([slope, delay])
-    return Preintegrated(end - start, turn, velocity, position, slope, *noises, missing)
+    return Preintegrated(end - start, turn, velocity, position, slope, noises[0], noises[1], missing)
 
 
 def bridge_spectrum(t: np.ndarray, values: np.ndarray, gap: float) -> np.ndarray:
