@@ -29,6 +29,8 @@ _TURN_SHARE, _TURN_ERROR = 0.25, 3e-3
 _GYRO_BIAS_FLOOR = 2e-3
 # Residuals are no white noise: neighbours share landmarks, so that there are about so many times fewer of them.
 _SHARED = 4.0
+# In flight samples are about so many times noisier than a data sheet says, in variances.
+_SAMPLE_NOISE = 25.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +152,10 @@ def _solve(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> tuple[np.nda
         rows.append(place.copy())
         values.append(p[k + 1] - place_known)
     A, y = np.concatenate(rows), np.concatenate(values)
-    variance, direction, first = _LEAST_PLACE**2, np.zeros(3), 0.0
+    # Errors of the samples add up between poses that are far apart in time.
+    integrated = np.mean([np.trace(each.accel_noise[POSITION, POSITION]) / 3.0 for each in motions])
+    least = _LEAST_PLACE**2 + _SAMPLE_NOISE * integrated
+    variance, direction, first = least, np.zeros(3), 0.0
     for turn in range(3):  # without gravity's length, with it, and with the residuals' size
         information, vector = A.T @ A / variance, A.T @ y / variance
         information[unknown, unknown] += np.eye(3) / _ACCEL_BIAS**2
@@ -158,7 +163,7 @@ def _solve(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> tuple[np.nda
         vector[6:9] += direction * STANDARD_GRAVITY / _GRAVITY_LENGTH**2
         solution = np.linalg.solve(information, vector)
         residual = y - A @ solution
-        variance = _SHARED * max(float(residual @ residual) / max(len(y) - 12, 1), _LEAST_PLACE**2)
+        variance = _SHARED * max(float(residual @ residual) / max(len(y) - 12, 1), least)
         gravity = solution[6:9]
         length = np.linalg.norm(gravity)
         first = float(length) if not turn else first

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sigmaslam.estimation.acceptance import ACCEPTANCE
+from sigmaslam.estimation.chi_square import CHI_SQUARE_9999_OF_6
 from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.frame_update import FrameUpdate
@@ -79,16 +80,28 @@ class Localiser:
             prediction: of its pose.
             clock: takes the time of the stages `match` and `filter`.
         """
-        matches, excess = self.follower.follow(frame, keyframes, prediction.pose, prediction.covariance)
+        measured, turn = prediction, self.motion.turn
+        matches, excess = self.follower.follow(frame, keyframes, prediction.pose, prediction.covariance, turn)
         if excess > 1.0:
             self.motion.widen(excess)
             prediction = Prediction.of(self.window, self.motion)
         clock.lap("match")
         fit = self.fit_near(matches, prediction)
+        if excess > 1.0 and turn is not None:
+            fit = self._confirm(matches, fit, measured, excess)
         clock.lap("filter")
-        if fit is None or self._is_doubtful(fit) or self.follower.has_fallen(matches, fit.inliers):
+        if fit is None or self._is_doubtful(matches, fit) or self.follower.has_fallen(matches, fit.inliers):
             return matches, None
         return matches, fit
+
+    def _confirm(
+        self, matches: GuidedMatches, fit: FrameFit | None, measured: Prediction, excess: float
+    ) -> FrameFit | None:
+        """Takes back by what flow has widened the prediction of a sensor, unless the pose departs from it as well."""
+        if fit is not None and measured.squared_departure(fit.pose) > CHI_SQUARE_9999_OF_6:
+            return fit
+        self.motion.widen(1.0 / excess)
+        return None if fit is None else self.fit_again(matches, fit, measured)
 
     def localise(
         self, view: StereoView, keyframes: list[StereoView], prediction: Prediction, guided: bool, clock: Stopwatch
@@ -108,7 +121,7 @@ class Localiser:
             clock.lap("match")
             fit = self.fit_near(matches, prediction)
             clock.lap("filter")
-        if fit is None or self._is_doubtful(fit):
+        if fit is None or self._is_doubtful(matches, fit):
             other_matches, other = self._localise_anywhere(view, keyframes, prediction, clock)
             if fit is None or (other is not None and self._is_better(other, fit)):
                 matches, fit = other_matches, other
@@ -130,9 +143,13 @@ class Localiser:
         enough = max(ACCEPTANCE.jump_support * earlier.sum(), self.config.min_inliers)
         return len(self.window) == 1 or int(seen.sum()) >= enough
 
-    def _is_doubtful(self, fit: FrameFit) -> bool:
-        """Whether the pose may sit in a wrong place, or so little is left of the last frame that the search was off."""
-        return fit.nis_per_dof > ACCEPTANCE.doubtful_nis or fit.count < ACCEPTANCE.left_over * self.follower.count
+    def _is_doubtful(self, matches: GuidedMatches, fit: FrameFit) -> bool:
+        """Whether the pose may sit in a wrong place, or so little is left of the last frame that the search was off.
+
+        A sensor of motion knows how much of it is still in view.
+        """
+        before = self.follower.count if self.motion.turn is None else len(matches.searched)
+        return fit.nis_per_dof > ACCEPTANCE.doubtful_nis or fit.count < ACCEPTANCE.left_over * before
 
     def _is_better(self, other: FrameFit, fit: FrameFit) -> bool:
         """Whether another pose fits better than a doubtful one, or more agrees with it."""
