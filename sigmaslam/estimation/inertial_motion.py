@@ -7,12 +7,15 @@ from itertools import pairwise
 
 import numpy as np
 
+from sigmaslam.estimation.chi_square import CHI_SQUARE_999
 from sigmaslam.estimation.constant_velocity import MotionFilter, MotionState
 from sigmaslam.estimation.gaussian import at_most, regression
 from sigmaslam.estimation.inertial_alignment import align, align_gyro, gyro_fits
 from sigmaslam.estimation.inertial_buffer import InertialBuffer, LearnedNoise
+from sigmaslam.estimation.mahalanobis import squared_mahalanobis
 from sigmaslam.estimation.preintegration import GYRO_BIAS, TURN, Preintegrated
 from sigmaslam.estimation.standstill import WHILE, Standstill
+from sigmaslam.estimation.wheel_speed import WheelSpeed
 from sigmaslam.geometry.inertial_sensor import InertialSensor
 from sigmaslam.geometry.se3 import nearest_rigid, rotation_log, se3_body, se3_exp, se3_inverse, se3_log, skew
 from sigmaslam.inference.backends import load_step
@@ -46,12 +49,17 @@ class InertialMotion(MotionFilter):
         backend: "onnx" or "torch".
         sensor: its noise and clock.
         T_camera_imu: (4, 4) takes points of the sensor into the camera that is tracked.
+        wheels: measure the velocity besides.
     """
 
-    def __init__(self, backend: str, sensor: InertialSensor, T_camera_imu: np.ndarray) -> None:
+    def __init__(
+        self, backend: str, sensor: InertialSensor, T_camera_imu: np.ndarray, wheels: WheelSpeed | None = None
+    ) -> None:
         super().__init__(backend)
         self._predict_inertial = load_step("inertial_predict", backend)
         self.samples, self.noise, self._T_camera_imu = InertialBuffer(sensor), LearnedNoise(), T_camera_imu
+        self._wheels = wheels
+        self.sensors = {"imu": self.samples} | ({} if wheels is None else {"odometry": wheels.samples})
         self._velocity, self._gravity, self._biases = np.zeros(3), np.zeros(3), np.zeros(6)
         self._carried: np.ndarray | None = None
         # Poses by images, T_first_camera, with their times, and T_first_keyframe.
@@ -119,6 +127,7 @@ class InertialMotion(MotionFilter):
         self._covariance[_SENSOR, _SENSOR] += np.diag(SENSOR_SIGMA**2 * motion.seconds / _WARM_UP)
         self._note_twist(rotation_log(self.turn) / motion.seconds)
         self._rest(motion, timestamp)
+        self._roll(timestamp, motion.seconds)
         if sigma > 0.0:
             self.doubt_time(sigma)
 
@@ -154,6 +163,8 @@ class InertialMotion(MotionFilter):
             recent = self.samples.around(self._time - WHILE, self._time)
             pose, spread = self._T_first_key @ self.step, se3_body(self.step, covariance)
             self._standstill.see(self._time, pose, spread, recent, self.noise.scale)
+            if self._wheels is not None:
+                self._wheels.compare(self._time, self.twist, float(self._densities[0]))
         self._is_dark = False
 
     def start_keyframe(self) -> None:
@@ -211,6 +222,17 @@ class InertialMotion(MotionFilter):
         noise[:3, :3] = self._standstill.speed_variance * max(WHILE / motion.seconds, 1.0)
         noise[3:, 3:] = motion.seconds * np.diag(self._standstill.spectra[:3])
         self._measure(np.r_[-self._velocity, -rotation_log(motion.turn)], slope, noise)
+
+    def _roll(self, timestamp: float, seconds: float) -> None:
+        """Wheels measure the velocity, but for those that spin or slide."""
+        found = None if self._wheels is None else self._wheels.measure(timestamp, seconds, self.twist)
+        if found is None:
+            return
+        residual, R, noise = found
+        R, slope = R @ self.step[:3, :3].T, np.zeros((3, _SIZE))
+        slope[:, _VELOCITY], slope[:, 3:6] = R, R @ skew(self._velocity)
+        if squared_mahalanobis(residual, slope @ self._covariance @ slope.T + noise) < CHI_SQUARE_999[3]:
+            self._measure(residual, slope, noise)
 
     def _align(self) -> None:
         """Looks for gravity in the last poses."""
