@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.chi_square import CHI_SQUARE_9999_OF_6
-from sigmaslam.estimation.constant_velocity import MotionFilter
+from sigmaslam.estimation.constant_velocity import MotionFilter, dead_reckoning
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.frame_update import FrameUpdate
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
@@ -45,6 +46,10 @@ class Prediction:
         """Squared sigmas by which a pose (4, 4) departs from this one."""
         departure = se3_log(pose @ se3_inverse(self.pose))
         return float(departure @ np.linalg.lstsq(self.covariance, departure, rcond=1e-14)[0])
+
+    def excludes(self, pose: np.ndarray) -> bool:
+        """Whether a pose (4, 4) departs from this one by more than its noise."""
+        return self.squared_departure(pose) > CHI_SQUARE_9999_OF_6
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +103,7 @@ class Localiser:
         self, matches: GuidedMatches, fit: FrameFit | None, measured: Prediction, excess: float
     ) -> FrameFit | None:
         """Takes back by what flow has widened the prediction of a sensor, unless the pose departs from it as well."""
-        if fit is not None and measured.squared_departure(fit.pose) > CHI_SQUARE_9999_OF_6:
+        if fit is not None and measured.excludes(fit.pose):
             return fit
         self.motion.widen(1.0 / excess)
         return None if fit is None else self.fit_again(matches, fit, measured)
@@ -171,13 +176,18 @@ class Localiser:
         fit = self.update.fit(matches.views, pose, covariance, min_inliers)
         return fit if fit is not None and fit.count >= ACCEPTANCE.guided_share * count else None
 
+    def _is_excluded(self, back: int, prediction: Prediction, T_key_camera: np.ndarray) -> bool:
+        """Whether a sensor's prediction rules out a pose (4, 4) relative to one of the last keyframes."""
+        return prediction.excludes(self.window.posterior.poses[back] @ T_key_camera)
+
     def _localise_anywhere(
         self, view: StereoView, keyframes: list[StereoView], prediction: Prediction, clock: Stopwatch
     ) -> tuple[GuidedMatches, FrameFit | None]:
         """Without a prediction: the pose relative to one of the last keyframes, then landmarks near there."""
         matches = GuidedMatches.empty()
         for back in range(1, min(ACCEPTANCE.last_keyframes, len(keyframes)) + 1):
-            relative = self.unguided.relative_pose_to(keyframes[-back], view)
+            excludes = None if dead_reckoning(self.motion) is None else partial(self._is_excluded, -back, prediction)
+            relative = self.unguided.relative_pose_to(keyframes[-back], view, excludes)
             clock.lap("match")
             if relative is None:
                 continue
