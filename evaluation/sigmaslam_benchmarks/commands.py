@@ -214,7 +214,7 @@ BENCHMARKS = {
     ),
     "inertial": Benchmark(
         "inertial.inertial_benchmark",
-        "Dark stretches with and without an inertial sensor. And faults of its table that are named (extra 'train').",
+        "Dark stretches without an inertial sensor, with a gyro, and with both halves (extra 'train').",
         (
             _DATA_IF_ANY,
             _names("worlds", "room, street or mh01, with commas."),

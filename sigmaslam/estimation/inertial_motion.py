@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import logging
-from itertools import pairwise
 
 import numpy as np
 
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999
 from sigmaslam.estimation.constant_velocity import MotionFilter, MotionState
 from sigmaslam.estimation.gaussian import at_most, regression
-from sigmaslam.estimation.inertial_alignment import align, align_gyro, gyro_fits
+from sigmaslam.estimation.inertial_alignment import GravitySearch
 from sigmaslam.estimation.inertial_buffer import InertialBuffer, LearnedNoise
 from sigmaslam.estimation.mahalanobis import squared_mahalanobis
 from sigmaslam.estimation.preintegration import GYRO_BIAS, TURN, Preintegrated
@@ -31,10 +30,6 @@ SENSOR_SIGMA = np.array([2e-3, *[5e-3] * 3, *[3.5e-3] * 3])
 2 ms, 5 mm and 0.2 degrees."""
 # Seconds in which clocks drift and mounts bend, as they warm up, by as much as they are off at first.
 _WARM_UP = 600.0
-# Gravity is looked for in the poses of so many seconds, and in no fewer than so many poses.
-_ALIGNED_SECONDS, _ALIGNED_POSES = 1.0, 5
-# Poses of a camera that is so slow that fewer fit into the seconds above are kept for so long, seconds.
-_LONGEST = 10.0
 # Seconds without samples after which the sensor is taken for dead.
 _DEAD = 1.0
 
@@ -62,9 +57,7 @@ class InertialMotion(MotionFilter):
         self.sensors = {"imu": self.samples} | ({} if wheels is None else {"odometry": wheels.samples})
         self._velocity, self._gravity, self._biases = np.zeros(3), np.zeros(3), np.zeros(6)
         self._carried: np.ndarray | None = None
-        # Poses by images, T_first_camera, with their times, and T_first_keyframe.
-        self._poses: list[tuple[float, np.ndarray]] = []
-        self._T_first_key, self._is_refused = np.eye(4), False
+        self._search, self._T_first_key = GravitySearch(SENSOR_SIGMA), np.eye(4)
         self._time: float | None = None
         self._densities = np.zeros(2)
         self._standstill, self._is_dark = Standstill(sensor), False
@@ -79,17 +72,11 @@ class InertialMotion(MotionFilter):
         others = np.concatenate([self._velocity, self._gravity, self._biases, np.zeros(7)])
         return MotionState(self.step.copy(), others, self._covariance.copy(), self._carried)
 
-    @property
-    def gravity_and_biases(self) -> tuple[np.ndarray, np.ndarray]:
-        """Gravity in the keyframe's frame and both biases (9,), and the covariance (15, 15) of the pose and these."""
-        rows = np.r_[_POSE, _GRAVITY, _BIASES]
-        return np.r_[self._gravity, self._biases], self._covariance[np.ix_(rows, rows)]
-
     def set_twist(self, twist: np.ndarray, sigma: np.ndarray) -> None:
         """Of constant velocity alone: the sensor measures on where images are lost."""
         if not self.is_inertial:
             super().set_twist(twist, sigma)
-            self._poses = []
+            self._search.poses.clear()
 
     def predict(
         self, seconds: float, densities: np.ndarray, sigma: float = 0.0, timestamp: float | None = None
@@ -126,8 +113,7 @@ class InertialMotion(MotionFilter):
         self._covariance, self._carried, self.widened = 0.5 * (covariance + covariance.T), carried, 1.0
         self._covariance[_SENSOR, _SENSOR] += np.diag(SENSOR_SIGMA**2 * motion.seconds / _WARM_UP)
         self._note_twist(rotation_log(self.turn) / motion.seconds)
-        self._rest(motion, timestamp)
-        self._roll(timestamp, motion.seconds)
+        self._measure_speed(motion, timestamp)
         if sigma > 0.0:
             self.doubt_time(sigma)
 
@@ -144,7 +130,20 @@ class InertialMotion(MotionFilter):
         """Takes over the posterior of the pose, which knew the prediction; looks for gravity while it is unknown."""
         if not self.is_inertial:
             super().correct(step, covariance)
-            self._align()
+            found = None
+            if self._time is not None:
+                pose = self._T_first_key @ self.step
+                found = self._search.find(self._time, pose, self.samples, self._T_camera_imu, self._densities)
+            if found is not None:
+                R = self._T_first_key[:3, :3].T
+                self._velocity, self._gravity, self._biases = R @ found.velocity, R @ found.gravity, found.biases
+                turn, zero = np.eye(12), np.zeros((6, 19))
+                turn[:3, :3] = turn[3:6, 3:6] = R
+                shared = turn @ found.shared
+                others = [[turn @ found.covariance @ turn.T, shared], [shared.T, np.diag(SENSOR_SIGMA**2)]]
+                self._covariance = np.block([[self.step_covariance, zero], [zero.T, np.block(others)]])
+                self.is_inertial, self._carried, self.widened = True, None, 1.0
+                self._note_twist(self.twist[3:])
             return
         P = self._covariance
         departure = se3_log(step @ se3_inverse(self.step))
@@ -209,83 +208,25 @@ class InertialMotion(MotionFilter):
         self._move(change[6:])
         self._note_twist(self.twist[3:])
 
-    def _rest(self, motion: Preintegrated, timestamp: float) -> None:
-        """A body at rest measures a velocity of zero and the gyro's bias."""
+    def _measure_speed(self, motion: Preintegrated, timestamp: float) -> None:
+        """A body at rest measures a velocity of zero and the gyro's bias; wheels measure it unless they slip."""
         was_dark, self._is_dark = self._is_dark, True
         recent, P = self.samples.around(timestamp - WHILE, timestamp), self._covariance[_VELOCITY, _VELOCITY]
         self.is_resting = motion.missing == 0.0 and self._standstill.holds(recent, self._velocity, P, was_dark)
-        if not self.is_resting:
-            return
-        slope, noise = np.zeros((6, _SIZE)), np.zeros((6, 6))
-        slope[:3, _VELOCITY], slope[3:, _GYRO_BIAS] = np.eye(3), motion.slope[TURN, GYRO_BIAS]
-        # Successive frames share the images, or the lack of them, of that while.
-        noise[:3, :3] = self._standstill.speed_variance * max(WHILE / motion.seconds, 1.0)
-        noise[3:, 3:] = motion.seconds * np.diag(self._standstill.spectra[:3])
-        self._measure(np.r_[-self._velocity, -rotation_log(motion.turn)], slope, noise)
-
-    def _roll(self, timestamp: float, seconds: float) -> None:
-        """Wheels measure the velocity, but for those that spin or slide."""
-        found = None if self._wheels is None else self._wheels.measure(timestamp, seconds, self.twist)
-        if found is None:
-            return
-        residual, R, noise = found
-        R, slope = R @ self.step[:3, :3].T, np.zeros((3, _SIZE))
-        slope[:, _VELOCITY], slope[:, 3:6] = R, R @ skew(self._velocity)
-        if squared_mahalanobis(residual, slope @ self._covariance @ slope.T + noise) < CHI_SQUARE_999[3]:
-            self._measure(residual, slope, noise)
-
-    def _align(self) -> None:
-        """Looks for gravity in the last poses."""
-        if self._time is None:
-            return
-        self._poses.append((self._time, self._T_first_key @ self.step))
-        while self._poses[0][0] < self._time - _LONGEST or (
-            len(self._poses) > _ALIGNED_POSES and self._poses[1][0] <= self._time - _ALIGNED_SECONDS
-        ):
-            del self._poses[0]
-        times = [each[0] for each in self._poses]
-        if len(times) < _ALIGNED_POSES or times[-1] - times[0] < 0.9 * _ALIGNED_SECONDS:
-            return
-        poses = np.array([pose for _, pose in self._poses])
-        bodies = poses @ self._T_camera_imu
-        bias, whole = np.zeros(3), list[Preintegrated]()
-        for _ in range(2):  # long intervals are no longer linear in the bias
-            biases = np.r_[bias, np.zeros(3)]
-            motions = [self.samples.preintegrate(*pair, biases, self._densities) for pair in pairwise(times)]
-            whole = [each for each in motions if each is not None and each.missing == 0.0]
-            if len(whole) < len(motions):
-                return
-            bias = bias + align_gyro(bodies, whole)[0]
-        if not gyro_fits(bodies, whole):
-            if not self._is_refused:
-                _LOGGER.warning(
-                    "the inertial sensor is not used: its turns are not those of the images; are unit (rad/s), axes, "
-                    "T_cam_imu and clock right?"
-                )
-            self._is_refused, self._poses = True, []
-            return
-        found = align(poses, self._T_camera_imu, whole, SENSOR_SIGMA)
-        if found is None:
-            return
-        R = self._T_first_key[:3, :3].T
-        self._velocity, self._gravity = R @ found.velocity, R @ found.gravity
-        self._biases = np.r_[bias, np.zeros(3)] + found.biases
-        turn, covariance = np.eye(12), np.zeros((_SIZE, _SIZE))
-        turn[:3, :3] = turn[3:6, 3:6] = R
-        covariance[_POSE, _POSE] = self.step_covariance
-        covariance[6:18, 6:18] = turn @ found.covariance @ turn.T
-        covariance[6:18, _SENSOR] = turn @ found.shared
-        covariance[_SENSOR, 6:18] = covariance[6:18, _SENSOR].T
-        covariance[_SENSOR, _SENSOR] = np.diag(SENSOR_SIGMA**2)
-        self._covariance, self.is_inertial, self._carried, self.widened = covariance, True, None, 1.0
-        self._note_twist(se3_log(se3_inverse(self._poses[-2][1]) @ self._poses[-1][1])[3:] / (times[-1] - times[-2]))
-        way = np.linalg.norm(np.diff(bodies[:, :3, 3], axis=0), axis=1).sum()
-        _LOGGER.info(
-            "gravity is known to %.1f degrees, from %.1f s of images along %.2f m",
-            np.degrees(found.tilt),
-            times[-1] - times[0],
-            way,
-        )
+        if self.is_resting:
+            slope, noise = np.zeros((6, _SIZE)), np.zeros((6, 6))
+            slope[:3, _VELOCITY], slope[3:, _GYRO_BIAS] = np.eye(3), motion.slope[TURN, GYRO_BIAS]
+            # Successive frames share the images, or the lack of them, of that while.
+            noise[:3, :3] = self._standstill.speed_variance * max(WHILE / motion.seconds, 1.0)
+            noise[3:, 3:] = motion.seconds * np.diag(self._standstill.spectra[:3])
+            self._measure(np.r_[-self._velocity, -rotation_log(motion.turn)], slope, noise)
+        found = None if self._wheels is None else self._wheels.measure(timestamp, motion.seconds, self.twist)
+        if found is not None:
+            residual, R, noise = found
+            R, slope = R @ self.step[:3, :3].T, np.zeros((3, _SIZE))
+            slope[:, _VELOCITY], slope[:, 3:6] = R, R @ skew(self._velocity)
+            if squared_mahalanobis(residual, slope @ self._covariance @ slope.T + noise) < CHI_SQUARE_999[3]:
+                self._measure(residual, slope, noise)
 
     def _leave(self, seconds: float, densities: np.ndarray) -> None:
         """No samples come any more: constant velocity again, until gravity is found anew."""

@@ -6,7 +6,7 @@ IEEE Transactions on Robotics 33(1), 2017, eqs. (26) - (48); integrated by the m
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -45,6 +45,16 @@ class Preintegrated:
     gyro_noise: np.ndarray
     accel_noise: np.ndarray
     missing: float = 0.0
+
+    def corrected(self, change: np.ndarray) -> Preintegrated:
+        """With biases and delay changed by (7,), to the first order."""
+        step = self.slope @ change
+        return replace(
+            self,
+            turn=self.turn @ rotation_exp(step[TURN]),
+            velocity=self.velocity + step[VELOCITY],
+            position=self.position + step[POSITION],
+        )
 
 
 def preintegrate(

@@ -1,4 +1,4 @@
-"""Dark stretches on rendered and real recordings, without and with the inertial sensor, and faults of its table."""
+"""Dark stretches on rendered and real recordings, without and with the inertial sensor."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from sigmaslam.files import atomic_write_text, make_folder
 from sigmaslam_benchmarks.code_hash import hash_code
 from sigmaslam_benchmarks.inertial.dark_runs import METHODS, DarkCase, DarkResult, run_dark
 from sigmaslam_benchmarks.inertial.inertial_page import InertialPage, format_page
-from sigmaslam_benchmarks.inertial.table_faults import TABLE_FAULTS, FaultResult, judge_table
 from sigmaslam_benchmarks.live.recordings import REAL, RENDERED, Recording
 from sigmaslam_benchmarks.tracking.page import check_names, write_page
 from sigmaslam_synthetic.parallel_jobs import list_failures, run_jobs
@@ -24,10 +23,6 @@ from sigmaslam_synthetic.parallel_jobs import list_failures, run_jobs
 SECONDS = (0.5, 1.0, 2.0, 5.0)
 """Of darkness."""
 WORLDS = (*RENDERED, "mh01")
-FAULTS = 40
-"""Faulty tables that are drawn, of the kinds in turn."""
-# Recordings that they are put into, at most: one and three of each kind.
-_FAULTY = 7
 # Pairs of each recording: 8.5 s of a render, of which the first third is light, and all of MH_01 that is there.
 _FRAMES = {"room": 170, "street": 85, "mh01": 100}
 _RATE = 200.0
@@ -35,7 +30,6 @@ _RATE = 200.0
 # darkness, which goals are for, begins there at all of these frames, other stretches at every second one.
 _STARTS = {"room": (56,), "street": (28,), "mh01": (20, 30, 40, 50, 60, 70)}
 _LEAST_AFTER = 5
-_JUDGING = ("dark_runs.py", "table_faults.py")  # the page may change without a new run
 
 
 def write_inertial(
@@ -56,7 +50,7 @@ def write_inertial(
         data: folder of the real data sets; None: renders alone.
         runs: folder for renders and results; a result is used again when it comes from the same code.
         command: what the page says it was made by.
-        first_seed, seeds: of the renders; dark images and faults have the first one.
+        first_seed, seeds: of the renders; dark images have the first one.
         worlds: names of `WORLDS`; all that there are unless given.
         workers: processes; each takes a recording at a time.
         note: is told of progress.
@@ -71,7 +65,6 @@ def write_inertial(
     note(f"seeds {first_seed} to {first_seed + seeds - 1}")
     make_folder(runs)
     jobs = [InertialJob(each, runs.resolve(), data, _hash_code()) for each in _recordings(wanted, first_seed, seeds)]
-    _deal_faults(jobs, first_seed)
     failed: dict[str, Exception] = {}
 
     def form() -> str:
@@ -101,27 +94,14 @@ def _recordings(worlds: Sequence[str], first_seed: int, seeds: int) -> list[Reco
     return real + rendered
 
 
-def _deal_faults(jobs: Sequence[InertialJob], seed: int) -> None:
-    """Gives the first recordings their shares of the faults, and a good table each."""
-    faulty, kinds = jobs[:_FAULTY], list(TABLE_FAULTS)
-    for job in faulty:
-        job.faults.append(("", seed))
-    for number in range(FAULTS):
-        # Every round of the kinds begins with the next recording.
-        job = faulty[(number + number // len(kinds)) % len(faulty)]
-        job.faults.append((kinds[number % len(kinds)], seed + number))
-
-
 @cache
 def _hash_code() -> str:
     """Everything between the images and what is said, and the simulator."""
-    return hash_code(
-        *Path(errors.__file__).parent.rglob("*.py"), *(Path(__file__).with_name(name) for name in _JUDGING)
-    )
+    return hash_code(*Path(errors.__file__).parent.rglob("*.py"), Path(__file__).with_name("dark_runs.py"))
 
 
 class InertialJob:
-    """One recording with all its cases and faults, in a worker.
+    """One recording with all its cases, in a worker.
 
     Args:
         recording: what is tracked.
@@ -132,7 +112,6 @@ class InertialJob:
 
     def __init__(self, recording: Recording, runs: Path, data: Path | None, code: str) -> None:
         self.recording, self.runs, self.data, self.code = recording, runs, data, code
-        self.faults: list[tuple[str, int]] = []
 
     @property
     def cases(self) -> list[DarkCase]:
@@ -150,13 +129,7 @@ class InertialJob:
     @property
     def missing(self) -> list[str]:
         """Names of results that are not there."""
-        names = [case.name for case in self.cases] + [self.fault_name(*fault) for fault in self.faults]
-        return [name for name in names if self.read(name) is None]
-
-    @staticmethod
-    def fault_name(kind: str, seed: int) -> str:
-        """Of the result of a faulty table."""
-        return f"table-{(kind or 'good').replace('/', '_')}-{seed}"
+        return [case.name for case in self.cases if self.read(case.name) is None]
 
     def read(self, name: str) -> dict[str, Any] | None:
         """The figures; None where they are missing or of something else."""
@@ -175,9 +148,6 @@ class InertialJob:
         for case in self.cases:
             if case.name in missing:
                 self._write(case.name, asdict(run_dark(good, case, self.recording.seed)))
-        for kind, seed in self.faults:
-            if (name := self.fault_name(kind, seed)) in missing:
-                self._write(name, asdict(judge_table(good, kind, seed)))
         return f"{len(missing)} runs in {time.perf_counter() - began:.0f} s"
 
     def _write(self, name: str, result: Mapping[str, Any]) -> None:
@@ -193,12 +163,8 @@ class InertialJob:
 
 def _collect(jobs: Sequence[InertialJob], command: str, seconds: Sequence[float]) -> InertialPage:
     runs: dict[tuple[Recording, DarkCase], DarkResult] = {}
-    faults: list[tuple[Recording, FaultResult]] = []
     for job in jobs:
         for case in job.cases:
             if (found := job.read(case.name)) is not None:
                 runs[job.recording, case] = DarkResult(**found)
-        for fault in job.faults:
-            if (found := job.read(job.fault_name(*fault))) is not None:
-                faults.append((job.recording, FaultResult(**found)))
-    return InertialPage(command, seconds, runs, faults, sum(len(job.missing) for job in jobs))
+    return InertialPage(command, seconds, runs, sum(len(job.missing) for job in jobs))

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from sigmaslam_benchmarks.inertial.dark_runs import BOUND, METHODS, STATES, DarkCase, DarkResult
-from sigmaslam_benchmarks.inertial.table_faults import TABLE_FAULTS, FaultResult
 from sigmaslam_benchmarks.live.recordings import Recording
 from sigmaslam_benchmarks.tracking.page import fill_page, number, number_with_error
 from sigmaslam_evaluation.metrics.map_consistency import mean_with_error
@@ -29,14 +27,12 @@ class InertialPage:
         command: that makes the page.
         seconds: of darkness.
         runs: results by recording and case.
-        faults: what was said of faulty and good tables, with the recordings.
         missing: number of results that were asked for and are not there.
     """
 
     command: str
     seconds: Sequence[float]
     runs: Mapping[tuple[Recording, DarkCase], DarkResult]
-    faults: Sequence[tuple[Recording, FaultResult]]
     missing: int = 0
 
     @property
@@ -57,7 +53,6 @@ def format_page(page: InertialPage) -> str:
     """The page as Markdown."""
     goals, missed = _goals(page)
     recordings = dict.fromkeys(recording for recording, _ in page.runs)
-    faulty = [(recording, each) for recording, each in page.faults if each.kind]
     return fill_page(
         "inertial",
         page.command,
@@ -71,11 +66,6 @@ def format_page(page: InertialPage) -> str:
         dark=list(_dark_rows(page)),
         light=list(_light_rows(page)),
         states=list(_state_rows(page)),
-        faults=list(_fault_rows(page)),
-        drawn=len(faulty),
-        unnamed=[(recording.name, each.words, _said(each)) for recording, each in faulty if not each.named],
-        alarms=[(recording.name, _said(each)) for recording, each in page.faults if not each.kind and each.said],
-        good=sum(not each.kind for _, each in page.faults),
         details=list(_detail_rows(page)),
     )
 
@@ -113,10 +103,6 @@ def _goals(page: InertialPage) -> tuple[list[list[str]], list[str]]:
         if np.isfinite(values).any():
             nees = float(np.nanmean(values))
             judge(f"renders with images: NEES of {name}", "0.7 - 1.4", f"{nees:.2f}", 0.7 <= nees <= 1.4)
-    faulty = [each for _, each in page.faults if each.kind]
-    if faulty:
-        named = sum(each.named for each in faulty)
-        judge("faulty tables that are named", "all", f"{named} of {len(faulty)}", named == len(faulty))
     return rows, missed
 
 
@@ -180,14 +166,6 @@ def _state_rows(page: InertialPage) -> Iterator[list[str]]:
                 ]
 
 
-def _fault_rows(page: InertialPage) -> Iterator[list[str]]:
-    for kind in TABLE_FAULTS:
-        results = [each for _, each in page.faults if each.kind == kind]
-        if results:
-            named, said = (sum(map(bool, flags)) for flags in ([r.named for r in results], [r.said for r in results]))
-            yield [kind, str(len(results)), str(named), str(said)]
-
-
 def _detail_rows(page: InertialPage) -> Iterator[list[str]]:
     for (recording, case), result in page.runs.items():
         if case.seconds:
@@ -216,9 +194,3 @@ def _median_and_worst(values: Sequence[float], form: str) -> tuple[str, str]:
 def _mean(results: Sequence[DarkResult], name: str) -> float:
     values = [getattr(each, name) for each in results if np.isfinite(getattr(each, name))]
     return float(np.mean(values)) if values else float("nan")
-
-
-def _said(result: FaultResult) -> str:
-    # A page does not name folders of the machine that made it.
-    said = [re.sub(r"\S*/imu0/", "imu0/", line) for line in result.said]
-    return " / ".join(said).replace("|", "\\|").replace("\n", " ") or "nothing"
