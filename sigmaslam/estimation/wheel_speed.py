@@ -38,12 +38,15 @@ class WheelSpeed:
     def compare(self, timestamp: float, twist: np.ndarray, density: float) -> None:
         """Takes the camera's twist (6,) as images know it, and the density of unknown accelerations, m^2/s^3."""
         measured = self._at(timestamp)
-        if measured is not None:
-            self._departures.append(measured - self._of_base @ twist)
-            self._speeds.append(float(measured @ measured))
-        allowed = DEPARTURE**2 * max(float(np.mean(self._speeds or 0.0)), 3.0 * density)
-        is_refused = bool(self._departures) and float(self._variance.sum()) > allowed
-        if is_refused and not self._is_refused and len(self._departures) == COMPARED:
+        if measured is None:
+            return
+        self._departures.append(measured - self._of_base @ twist)
+        self._speeds.append(float(measured @ measured))
+        if len(self._departures) < COMPARED:
+            return
+        allowed = DEPARTURE**2 * max(float(np.mean(self._speeds)), 3.0 * density)
+        is_refused = float(self._variance.sum()) > allowed
+        if is_refused and not self._is_refused:
             _LOGGER.warning(
                 "the odometry is not used: its velocities are not those of the images; are unit (m/s), axes (forward, "
                 "left, up), T_cam_base and clock right?"
