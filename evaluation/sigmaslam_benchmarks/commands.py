@@ -227,7 +227,7 @@ BENCHMARKS = {
     ),
     "inertial": Benchmark(
         "inertial.inertial_benchmark",
-        "Dark stretches with and without an inertial sensor. And faults of its table that are named (extra 'train').",
+        "Dark stretches without an inertial sensor, with its gyro, with all of it; faults of its table (extra 'train').",
         (
             _DATA_IF_ANY,
             _names("worlds", "room, street or mh01, with commas."),

@@ -19,7 +19,7 @@ import numpy as np
 from sigmaslam.calibration.arrow_solver import ArrowSystem, Factor
 from sigmaslam.errors import CalibrationError
 from sigmaslam.estimation.inertial_turns import fit_turns
-from sigmaslam.estimation.preintegration import POSITION, TURN, VELOCITY, Preintegrated, preintegrate
+from sigmaslam.estimation.preintegration import POSITION, VELOCITY, Preintegrated, preintegrate
 from sigmaslam.geometry.inertial_sensor import STANDARD_GRAVITY, InertialSamples, InertialSensor
 from sigmaslam.geometry.se3 import nearest_rotation, rotation_exp, rotation_log, se3_exp, se3_inverse, se3_log, skew
 from sigmaslam.table import Table
@@ -151,7 +151,7 @@ def calibrate_imu(
             reference, whole = state, _integrate(times + state.shift, state.biases, samples, sensor)
         delay = state.shift - reference.shift
         motions = [
-            _corrected(each, np.r_[change, delay])
+            each.corrected(np.r_[change, delay])
             for each, change in zip(whole, state.biases - reference.biases, strict=False)
         ]
         factors = _factors(state, measured, roots, motions, sensor, scales)
@@ -306,17 +306,6 @@ def _inertial(state: _State, k: int, motion: Preintegrated) -> tuple[np.ndarray,
     border[:, _DELAY] = -motion.slope[:, 6]
     border[VELOCITY, _GRAVITY], border[POSITION, _GRAVITY] = -s * R.T, -0.5 * s * s * R.T
     return residual, J, K, border
-
-
-def _corrected(motion: Preintegrated, change: np.ndarray) -> Preintegrated:
-    """With biases and delay changed by (7,), to the first order."""
-    step = motion.slope @ change
-    return replace(
-        motion,
-        turn=motion.turn @ rotation_exp(step[TURN]),
-        velocity=motion.velocity + step[VELOCITY],
-        position=motion.position + step[POSITION],
-    )
 
 
 def _components(system: ArrowSystem, factors: list[Factor], steps: np.ndarray, shared: np.ndarray) -> np.ndarray:

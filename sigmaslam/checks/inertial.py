@@ -37,7 +37,8 @@ def check_inertial(recording: InertialRecording, timestamps: Sequence[float] | N
         message = f"{source}: T_cam_imu has the sensor {lever:.3g} m from the camera: is it in {where}? Give metres"
         return Finding(_NAME, "error", message, lever)
     length = float(np.median(np.linalg.norm(samples.accel, axis=1)))
-    if abs(length - STANDARD_GRAVITY) > _LENGTH_TOLERANCE:
+    is_whole = recording.sensor.has_accelerometer
+    if is_whole and abs(length - STANDARD_GRAVITY) > _LENGTH_TOLERANCE:
         factors = {"g": 1.0, "mg": 1e3, "cm/s^2": 1e2 * STANDARD_GRAVITY}
         unit = next((name for name, value in factors.items() if abs(length / value - 1.0) < 0.15), None)
         cure = f"it is in {unit}: give m/s^2" if unit else "are its columns those of the specific force in m/s^2?"
@@ -50,7 +51,8 @@ def check_inertial(recording: InertialRecording, timestamps: Sequence[float] | N
             message = f"{source}: the {name} stays at {peak:.3g} for {count} samples: saturated? Set a wider range"
             return Finding(_NAME, "warning", message, peak)
     if found.severity == "ok":
-        return Finding(_NAME, "ok", f"{found.message}, gravity {length:.2f} m/s^2", found.figure)
+        forces = f"gravity {length:.2f} m/s^2" if is_whole else "a gyro alone"
+        return Finding(_NAME, "ok", f"{found.message}, {forces}", found.figure)
     return found
 
 

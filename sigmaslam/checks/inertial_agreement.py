@@ -134,6 +134,8 @@ def _axes_of_forces(
     breaks = np.flatnonzero(np.r_[True, (np.diff(times) > _INTERVAL) | ~usable[1:] | ~usable[:-1], True])
     longest = int(np.argmax(np.diff(breaks)))
     first, last = int(breaks[longest]), int(breaks[longest + 1]) - 1
+    if not recording.sensor.has_accelerometer:
+        return None
     if times[last] - times[first] < 0.5 * _WINDOW or last - first < _LEAST_POSES:
         return None
     # The part of it with the longest way.

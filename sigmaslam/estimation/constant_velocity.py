@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sigmaslam.estimation.sample_buffer import SampleBuffer
 from sigmaslam.geometry.se3 import nearest_rigid, se3_adjoint, se3_inverse, se3_log
 from sigmaslam.inference.backends import load_step
 
@@ -38,11 +39,16 @@ class MotionFilter:
         step: (4, 4) T_keyframe_camera.
         twist: (6,) velocity of the camera in its own frame, m/s and rad/s.
         widened: by which factor since the last prediction.
+        turn: (3, 3) rotation R_last_current that a sensor has measured; None: none has.
         is_inertial, is_odometric: an inertial sensor or odometry predicts, which knows the velocity without images.
+        sensors: what takes their samples, by "imu" and "odometry".
 
     Args:
         backend: "onnx" or "torch".
     """
+
+    reckoning = "inertial"
+    """Status of frames that a sensor carries, while one predicts."""
 
     def __init__(self, backend: str = "onnx") -> None:
         self._predict = load_step("pose_predict", backend)
@@ -50,7 +56,9 @@ class MotionFilter:
         self.twist = np.zeros(6)
         self._covariance = np.zeros((_STATE_SIZE, _STATE_SIZE))
         self.widened = 1.0
+        self.turn: np.ndarray | None = None
         self.is_inertial = self.is_odometric = False
+        self.sensors: dict[str, SampleBuffer] = {}
 
     @property
     def state(self) -> MotionState:
@@ -139,4 +147,4 @@ class MotionFilter:
 
 def dead_reckoning(motion: MotionFilter) -> str | None:
     """Status of frames that a sensor alone carries; None where none predicts."""
-    return "inertial" if motion.is_inertial else "odometry" if motion.is_odometric else None
+    return motion.reckoning if motion.is_inertial or motion.is_odometric else None

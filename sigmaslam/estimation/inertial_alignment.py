@@ -6,15 +6,24 @@ the same equations hold.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
+from sigmaslam.estimation.inertial_buffer import InertialBuffer
 from sigmaslam.estimation.preintegration import ACCEL_BIAS, DELAY, GYRO_BIAS, POSITION, TURN, VELOCITY, Preintegrated
 from sigmaslam.geometry.inertial_sensor import STANDARD_GRAVITY
-from sigmaslam.geometry.se3 import rotation_exp, rotation_log, se3_exp
+from sigmaslam.geometry.se3 import rotation_log, se3_exp
 
+_LOGGER = logging.getLogger(__name__)
+
+# Gravity is looked for in the poses of so many seconds, and in no fewer than so many poses.
+_ALIGNED_SECONDS, _ALIGNED_POSES = 1.0, 5
+# Poses of a camera that is so slow that fewer fit into the seconds above are kept for so long, seconds.
+_LONGEST = 10.0
 # m/s^2, standard deviation of an accelerometer's bias: data sheets of small sensors say 0.02 to 0.5.
 _ACCEL_BIAS = 0.2
 # Of gravity's length on Earth with the scale error of an accelerometer, m/s^2.
@@ -29,6 +38,8 @@ _TURN_SHARE, _TURN_ERROR = 0.25, 3e-3
 _GYRO_BIAS_FLOOR = 2e-3
 # Residuals are no white noise: neighbours share landmarks, so that there are about so many times fewer of them.
 _SHARED = 4.0
+# In flight samples are about so many times noisier than a data sheet says, in variances.
+_SAMPLE_NOISE = 25.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +119,7 @@ def align(
     for k, sigma in enumerate(sensor_sigma):
         sides = []
         for error in (sigma, -sigma):
-            moved = [_delayed(each, error) for each in motions] if k == 0 else motions
+            moved = [each.corrected(error * np.eye(7)[DELAY]) for each in motions] if k == 0 else motions
             mounted = mounting if k == 0 else se3_exp(error * np.eye(6)[k - 1]) @ mounting
             sides.append(_solve(poses @ mounted, moved)[0])
         columns[:, k] = 0.5 * (sides[0] - sides[1])
@@ -118,17 +129,6 @@ def align(
 
 def _tilt(covariance: np.ndarray) -> float:
     return float(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1]) / STANDARD_GRAVITY)
-
-
-def _delayed(motion: Preintegrated, delay: float) -> Preintegrated:
-    """The motion between the same images where the sensor's clock is off."""
-    change = delay * motion.slope[:, DELAY]
-    return replace(
-        motion,
-        turn=motion.turn @ rotation_exp(change[TURN]),
-        velocity=motion.velocity + change[VELOCITY],
-        position=motion.position + change[POSITION],
-    )
 
 
 def _solve(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> tuple[np.ndarray, np.ndarray, float]:
@@ -150,7 +150,10 @@ def _solve(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> tuple[np.nda
         rows.append(place.copy())
         values.append(p[k + 1] - place_known)
     A, y = np.concatenate(rows), np.concatenate(values)
-    variance, direction, first = _LEAST_PLACE**2, np.zeros(3), 0.0
+    # Errors of the samples add up between poses that are far apart in time.
+    integrated = np.mean([np.trace(each.accel_noise[POSITION, POSITION]) / 3.0 for each in motions])
+    least = _LEAST_PLACE**2 + _SAMPLE_NOISE * integrated
+    variance, direction, first = least, np.zeros(3), 0.0
     for turn in range(3):  # without gravity's length, with it, and with the residuals' size
         information, vector = A.T @ A / variance, A.T @ y / variance
         information[unknown, unknown] += np.eye(3) / _ACCEL_BIAS**2
@@ -158,7 +161,7 @@ def _solve(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> tuple[np.nda
         vector[6:9] += direction * STANDARD_GRAVITY / _GRAVITY_LENGTH**2
         solution = np.linalg.solve(information, vector)
         residual = y - A @ solution
-        variance = _SHARED * max(float(residual @ residual) / max(len(y) - 12, 1), _LEAST_PLACE**2)
+        variance = _SHARED * max(float(residual @ residual) / max(len(y) - 12, 1), least)
         gravity = solution[6:9]
         length = np.linalg.norm(gravity)
         first = float(length) if not turn else first
@@ -168,3 +171,65 @@ def _solve(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> tuple[np.nda
     bias, covariance[6:9, 6:9] = align_gyro(bodies, motions)
     found = np.concatenate([speed @ solution + speed_known, direction * STANDARD_GRAVITY, bias, solution[unknown]])
     return found, 0.5 * (covariance + covariance.T), float(first)
+
+
+class GravitySearch:
+    """Looks for gravity in the last poses by images.
+
+    Attributes:
+        poses: T_first_camera (4, 4) with their times.
+
+    Args:
+        sensor_sigma: as of `align`.
+    """
+
+    def __init__(self, sensor_sigma: np.ndarray) -> None:
+        self.poses: list[tuple[float, np.ndarray]] = []
+        self._sensor_sigma, self._is_refused = sensor_sigma, False
+
+    def find(
+        self, time: float, pose: np.ndarray, samples: InertialBuffer, T_camera_imu: np.ndarray, densities: np.ndarray
+    ) -> Alignment | None:
+        """Takes the pose (4, 4) T_first_camera of a time; what is known with it, with the whole of the gyro's bias.
+
+        Args:
+            time, pose: of the last frame.
+            samples: of the sensor.
+            T_camera_imu: (4, 4) its mounting.
+            densities: as of `InertialBuffer.preintegrate`.
+        """
+        self.poses.append((time, pose))
+        while self.poses[0][0] < time - _LONGEST or (
+            len(self.poses) > _ALIGNED_POSES and self.poses[1][0] <= time - _ALIGNED_SECONDS
+        ):
+            del self.poses[0]
+        times, poses = [each[0] for each in self.poses], np.array([pose for _, pose in self.poses])
+        if len(times) < _ALIGNED_POSES or time - times[0] < 0.9 * _ALIGNED_SECONDS:
+            return None
+        bodies = poses @ T_camera_imu
+        bias, whole = np.zeros(3), list[Preintegrated]()
+        for _ in range(2):  # long intervals are no longer linear in the bias
+            motions = [samples.preintegrate(*pair, np.r_[bias, np.zeros(3)], densities) for pair in pairwise(times)]
+            whole = [each for each in motions if each is not None and each.missing == 0.0]
+            if len(whole) < len(motions):
+                return None
+            bias = bias + align_gyro(bodies, whole)[0]
+        if not gyro_fits(bodies, whole):
+            if not self._is_refused:
+                _LOGGER.warning(
+                    "the inertial sensor is not used: its turns are not those of the images; are unit (rad/s), axes, "
+                    "T_cam_imu and clock right?"
+                )
+            self._is_refused, self.poses = True, []
+            return None
+        found = align(poses, T_camera_imu, whole, self._sensor_sigma)
+        if found is None:
+            return None
+        way = np.linalg.norm(np.diff(bodies[:, :3, 3], axis=0), axis=1).sum()
+        _LOGGER.info(
+            "gravity is known to %.1f degrees, from %.1f s of images along %.2f m",
+            np.degrees(found.tilt),
+            time - times[0],
+            way,
+        )
+        return replace(found, biases=np.r_[bias, np.zeros(3)] + found.biases)

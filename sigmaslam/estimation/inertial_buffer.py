@@ -11,7 +11,7 @@ from sigmaslam.geometry.inertial_sensor import InertialSamples, InertialSensor
 
 # The noise that is learned begins at five times the densities of a data sheet, which hold at rest: in flight others
 # take 3 to 17 times as much. A frame changes it by this share, and none counts for more than so many variances.
-_FIRST_SCALE, _ADAPTATION, _MOST_SURPRISE = 25.0, 0.05, 9.0
+_FIRST_SCALE, _ADAPTATION, _MOST_SURPRISE = 25.0, 0.05, 3.0
 # So many times the densities' variance is no noise any more but another fault.
 _LARGEST_SCALE = 1e4
 

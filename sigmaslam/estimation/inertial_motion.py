@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import logging
-from itertools import pairwise
 
 import numpy as np
 
+from sigmaslam.estimation.chi_square import CHI_SQUARE_999
 from sigmaslam.estimation.constant_velocity import MotionFilter, MotionState
 from sigmaslam.estimation.gaussian import at_most, regression
-from sigmaslam.estimation.inertial_alignment import align, align_gyro, gyro_fits
+from sigmaslam.estimation.inertial_alignment import GravitySearch
 from sigmaslam.estimation.inertial_buffer import InertialBuffer, LearnedNoise
-from sigmaslam.estimation.preintegration import Preintegrated
+from sigmaslam.estimation.mahalanobis import squared_mahalanobis
+from sigmaslam.estimation.preintegration import GYRO_BIAS, TURN, Preintegrated
+from sigmaslam.estimation.standstill import WHILE, Standstill
+from sigmaslam.estimation.wheel_speed import WheelSpeed
 from sigmaslam.geometry.inertial_sensor import InertialSensor
-from sigmaslam.geometry.se3 import nearest_rigid, se3_exp, se3_inverse, se3_log, skew
+from sigmaslam.geometry.se3 import nearest_rigid, rotation_log, se3_body, se3_exp, se3_inverse, se3_log, skew
 from sigmaslam.inference.backends import load_step
 
 _LOGGER = logging.getLogger(__name__)
@@ -21,16 +24,12 @@ _LOGGER = logging.getLogger(__name__)
 # Order of the graph's error state, see sigmaslam_models.estimator.inertial_prediction.
 _POSE, _VELOCITY, _GRAVITY, _BIASES = slice(0, 6), slice(6, 9), slice(9, 12), slice(12, 18)
 # Delay and mounting of the sensor, and the size of all.
-_SENSOR, _SIZE = slice(18, 25), 25
+_SENSOR, _GYRO_BIAS, _SIZE = slice(18, 25), slice(12, 15), 25
 SENSOR_SIGMA = np.array([2e-3, *[5e-3] * 3, *[3.5e-3] * 3])
 """Prior standard deviations of delay (s), place (m) and rotation (rad) of the sensor. Those of careful calibrations:
 2 ms, 5 mm and 0.2 degrees."""
 # Seconds in which clocks drift and mounts bend, as they warm up, by as much as they are off at first.
 _WARM_UP = 600.0
-# Gravity is looked for in the poses of so many seconds, and in no fewer than so many poses.
-_ALIGNED_SECONDS, _ALIGNED_POSES = 1.0, 8
-# Poses of a camera that is so slow that fewer fit into the seconds above are kept for so long, seconds.
-_LONGEST = 10.0
 # Seconds without samples after which the sensor is taken for dead.
 _DEAD = 1.0
 
@@ -45,19 +44,25 @@ class InertialMotion(MotionFilter):
         backend: "onnx" or "torch".
         sensor: its noise and clock.
         T_camera_imu: (4, 4) takes points of the sensor into the camera that is tracked.
+        wheels: measure the velocity besides.
     """
 
-    def __init__(self, backend: str, sensor: InertialSensor, T_camera_imu: np.ndarray) -> None:
+    def __init__(
+        self, backend: str, sensor: InertialSensor, T_camera_imu: np.ndarray, wheels: WheelSpeed | None = None
+    ) -> None:
         super().__init__(backend)
         self._predict_inertial = load_step("inertial_predict", backend)
         self.samples, self.noise, self._T_camera_imu = InertialBuffer(sensor), LearnedNoise(), T_camera_imu
+        self._wheels = wheels
+        self.sensors = {"imu": self.samples} | ({} if wheels is None else {"odometry": wheels.samples})
         self._velocity, self._gravity, self._biases = np.zeros(3), np.zeros(3), np.zeros(6)
         self._carried: np.ndarray | None = None
-        # Poses by images, T_first_camera, with their times, and T_first_keyframe.
-        self._poses: list[tuple[float, np.ndarray]] = []
-        self._T_first_key, self._is_refused = np.eye(4), False
+        self._search, self._T_first_key = GravitySearch(SENSOR_SIGMA), np.eye(4)
         self._time: float | None = None
         self._densities = np.zeros(2)
+        self._standstill, self._is_dark = Standstill(sensor), False
+        self.is_resting = False
+        """The last prediction was one of a body at rest."""
 
     @property
     def state(self) -> MotionState:
@@ -67,28 +72,22 @@ class InertialMotion(MotionFilter):
         others = np.concatenate([self._velocity, self._gravity, self._biases, np.zeros(7)])
         return MotionState(self.step.copy(), others, self._covariance.copy(), self._carried)
 
-    @property
-    def gravity_and_biases(self) -> tuple[np.ndarray, np.ndarray]:
-        """Gravity in the keyframe's frame and both biases (9,), and the covariance (15, 15) of the pose and these."""
-        rows = np.r_[_POSE, _GRAVITY, _BIASES]
-        return np.r_[self._gravity, self._biases], self._covariance[np.ix_(rows, rows)]
-
     def set_twist(self, twist: np.ndarray, sigma: np.ndarray) -> None:
         """Of constant velocity alone: the sensor measures on where images are lost."""
         if not self.is_inertial:
             super().set_twist(twist, sigma)
-            self._poses = []
+            self._search.poses.clear()
 
     def predict(
         self, seconds: float, densities: np.ndarray, sigma: float = 0.0, timestamp: float | None = None
     ) -> None:
         """Moves on to the frame of that time stamp, by the samples since the last one."""
-        start, self._time, self._densities = self._time, timestamp, densities
+        start, self._time, self._densities, self.turn = self._time, timestamp, densities, None
         if not self.is_inertial or start is None or timestamp is None:
             super().predict(seconds, densities, sigma)
             return
         sensor = self.samples.sensor
-        self.samples.forget(start + self.samples.time_shift)
+        self.samples.forget(start + self.samples.time_shift - WHILE)
         motion = self.samples.preintegrate(start, timestamp, self._biases, densities)
         if motion is None or motion.missing > _DEAD:
             self._leave(seconds, densities)
@@ -109,11 +108,12 @@ class InertialMotion(MotionFilter):
                 "walk": np.array([sensor.gyro_walk, sensor.accel_walk]) ** 2,
             }
         )
-        turned = se3_log(se3_inverse(self.step) @ step)[3:] / motion.seconds
+        self.turn = self.step[:3, :3].T @ step[:3, :3]
         self.step, self._velocity = nearest_rigid(step), velocity
         self._covariance, self._carried, self.widened = 0.5 * (covariance + covariance.T), carried, 1.0
         self._covariance[_SENSOR, _SENSOR] += np.diag(SENSOR_SIGMA**2 * motion.seconds / _WARM_UP)
-        self._note_twist(turned)
+        self._note_twist(rotation_log(self.turn) / motion.seconds)
+        self._measure_speed(motion, timestamp)
         if sigma > 0.0:
             self.doubt_time(sigma)
 
@@ -130,25 +130,41 @@ class InertialMotion(MotionFilter):
         """Takes over the posterior of the pose, which knew the prediction; looks for gravity while it is unknown."""
         if not self.is_inertial:
             super().correct(step, covariance)
-            self._align()
+            found = None
+            if self._time is not None:
+                pose = self._T_first_key @ self.step
+                found = self._search.find(self._time, pose, self.samples, self._T_camera_imu, self._densities)
+            if found is not None:
+                R = self._T_first_key[:3, :3].T
+                self._velocity, self._gravity, self._biases = R @ found.velocity, R @ found.gravity, found.biases
+                turn, zero = np.eye(12), np.zeros((6, 19))
+                turn[:3, :3] = turn[3:6, 3:6] = R
+                shared = turn @ found.shared
+                others = [[turn @ found.covariance @ turn.T, shared], [shared.T, np.diag(SENSOR_SIGMA**2)]]
+                self._covariance = np.block([[self.step_covariance, zero], [zero.T, np.block(others)]])
+                self.is_inertial, self._carried, self.widened = True, None, 1.0
+                self._note_twist(self.twist[3:])
             return
         P = self._covariance
         departure = se3_log(step @ se3_inverse(self.step))
         # What images leave of the prediction; where they know less of the pose than it, they teach nothing.
         kept = at_most(covariance, P[_POSE, _POSE])
         removed = P[_POSE, _POSE] - kept
-        self.noise.learn(departure, removed)
+        if not self.is_resting:  # vibrations come with motion
+            self.noise.learn(departure, removed)
         gain = regression(P[6:, _POSE], P[_POSE, _POSE])
-        change = gain @ departure
-        self._velocity = self._velocity + change[:3]
-        self._gravity = self._gravity + change[3:6]
-        self._biases = self._biases + change[6:12]
-        self.samples.time_shift += float(change[12])
-        self._T_camera_imu = nearest_rigid(se3_exp(change[13:]) @ self._T_camera_imu)
+        self._move(gain @ departure)
         others = P[6:, 6:] - gain @ removed @ gain.T
         self.step = nearest_rigid(step)
         self._covariance = np.block([[covariance, kept @ gain.T], [gain @ kept, 0.5 * (others + others.T)]])
         self._note_twist(self.twist[3:])
+        if self._time is not None:
+            recent = self.samples.around(self._time - WHILE, self._time)
+            pose, spread = self._T_first_key @ self.step, se3_body(self.step, covariance)
+            self._standstill.see(self._time, pose, spread, recent, self.noise.scale)
+            if self._wheels is not None:
+                self._wheels.compare(self._time, self.twist, float(self._densities[0]))
+        self._is_dark = False
 
     def start_keyframe(self) -> None:
         """The current pose is the keyframe's from now on: velocity and gravity turn into its frame."""
@@ -166,58 +182,51 @@ class InertialMotion(MotionFilter):
 
     # ---- parts
 
-    def _align(self) -> None:
-        """Looks for gravity in the last poses."""
-        if self._time is None:
-            return
-        self._poses.append((self._time, self._T_first_key @ self.step))
-        while self._poses[0][0] < self._time - _LONGEST or (
-            len(self._poses) > _ALIGNED_POSES and self._poses[1][0] <= self._time - _ALIGNED_SECONDS
-        ):
-            del self._poses[0]
-        times = [each[0] for each in self._poses]
-        if len(times) < _ALIGNED_POSES or times[-1] - times[0] < 0.9 * _ALIGNED_SECONDS:
-            return
-        poses = np.array([pose for _, pose in self._poses])
-        bodies = poses @ self._T_camera_imu
-        bias, whole = np.zeros(3), list[Preintegrated]()
-        for _ in range(2):  # long intervals are no longer linear in the bias
-            biases = np.r_[bias, np.zeros(3)]
-            motions = [self.samples.preintegrate(*pair, biases, self._densities) for pair in pairwise(times)]
-            whole = [each for each in motions if each is not None and each.missing == 0.0]
-            if len(whole) < len(motions):
-                return
-            bias = bias + align_gyro(bodies, whole)[0]
-        if not gyro_fits(bodies, whole):
-            if not self._is_refused:
-                _LOGGER.warning(
-                    "the inertial sensor is not used: its turns are not those of the images; are unit (rad/s), axes, "
-                    "T_cam_imu and clock right?"
-                )
-            self._is_refused, self._poses = True, []
-            return
-        found = align(poses, self._T_camera_imu, whole, SENSOR_SIGMA)
-        if found is None:
-            return
-        R = self._T_first_key[:3, :3].T
-        self._velocity, self._gravity = R @ found.velocity, R @ found.gravity
-        self._biases = np.r_[bias, np.zeros(3)] + found.biases
-        turn, covariance = np.eye(12), np.zeros((_SIZE, _SIZE))
-        turn[:3, :3] = turn[3:6, 3:6] = R
-        covariance[_POSE, _POSE] = self.step_covariance
-        covariance[6:18, 6:18] = turn @ found.covariance @ turn.T
-        covariance[6:18, _SENSOR] = turn @ found.shared
-        covariance[_SENSOR, 6:18] = covariance[6:18, _SENSOR].T
-        covariance[_SENSOR, _SENSOR] = np.diag(SENSOR_SIGMA**2)
-        self._covariance, self.is_inertial, self._carried, self.widened = covariance, True, None, 1.0
-        self._note_twist(se3_log(se3_inverse(self._poses[-2][1]) @ self._poses[-1][1])[3:] / (times[-1] - times[-2]))
-        way = np.linalg.norm(np.diff(bodies[:, :3, 3], axis=0), axis=1).sum()
-        _LOGGER.info(
-            "gravity is known to %.1f degrees, from %.1f s of images along %.2f m",
-            np.degrees(found.tilt),
-            times[-1] - times[0],
-            way,
-        )
+    def _move(self, change: np.ndarray) -> None:
+        """Adds (19,) to all but the pose."""
+        self._velocity = self._velocity + change[:3]
+        self._gravity = self._gravity + change[3:6]
+        self._biases = self._biases + change[6:12]
+        self.samples.time_shift += float(change[12])
+        self._T_camera_imu = nearest_rigid(se3_exp(change[13:]) @ self._T_camera_imu)
+
+    def _measure(self, residual: np.ndarray, slope: np.ndarray, noise: np.ndarray) -> None:
+        """Kalman update by what is measured without images.
+
+        Args:
+            residual: (m,) measured less predicted.
+            slope: (m, 25) of what is predicted, by the state.
+            noise: (m, m) covariance.
+        """
+        P = self._covariance
+        gain = regression(P @ slope.T, slope @ P @ slope.T + noise)
+        change, kept = gain @ residual, np.eye(_SIZE) - gain @ slope
+        self._covariance = kept @ P @ kept.T + gain @ noise @ gain.T
+        if self._carried is not None:
+            self._carried = self._carried @ kept.T
+        self.step = nearest_rigid(se3_exp(change[_POSE]) @ self.step)
+        self._move(change[6:])
+        self._note_twist(self.twist[3:])
+
+    def _measure_speed(self, motion: Preintegrated, timestamp: float) -> None:
+        """A body at rest measures a velocity of zero and the gyro's bias; wheels measure it unless they slip."""
+        was_dark, self._is_dark = self._is_dark, True
+        recent, P = self.samples.around(timestamp - WHILE, timestamp), self._covariance[_VELOCITY, _VELOCITY]
+        self.is_resting = motion.missing == 0.0 and self._standstill.holds(recent, self._velocity, P, was_dark)
+        if self.is_resting:
+            slope, noise = np.zeros((6, _SIZE)), np.zeros((6, 6))
+            slope[:3, _VELOCITY], slope[3:, _GYRO_BIAS] = np.eye(3), motion.slope[TURN, GYRO_BIAS]
+            # Successive frames share the images, or the lack of them, of that while.
+            noise[:3, :3] = self._standstill.speed_variance * max(WHILE / motion.seconds, 1.0)
+            noise[3:, 3:] = motion.seconds * np.diag(self._standstill.spectra[:3])
+            self._measure(np.r_[-self._velocity, -rotation_log(motion.turn)], slope, noise)
+        found = None if self._wheels is None else self._wheels.measure(timestamp, motion.seconds, self.twist)
+        if found is not None:
+            residual, R, noise = found
+            R, slope = R @ self.step[:3, :3].T, np.zeros((3, _SIZE))
+            slope[:, _VELOCITY], slope[:, 3:6] = R, R @ skew(self._velocity)
+            if squared_mahalanobis(residual, slope @ self._covariance @ slope.T + noise) < CHI_SQUARE_999[3]:
+                self._measure(residual, slope, noise)
 
     def _leave(self, seconds: float, densities: np.ndarray) -> None:
         """No samples come any more: constant velocity again, until gravity is found anew."""

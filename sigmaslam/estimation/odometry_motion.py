@@ -18,15 +18,15 @@ _LOGGER = logging.getLogger(__name__)
 # Order of the error state, see `MotionFilter`.
 _POSE, _TWIST = slice(0, 6), slice(6, 12)
 # Frames with a pose over which velocities of wheels and images are compared before wheels predict.
-_COMPARED = 10
+COMPARED = 10
 # Wheels whose velocities depart by more than this share, or by more than this share of what constant velocity allows
 # in a second, are not of one body with the camera, or of another unit.
-_DEPARTURE = 0.25
+DEPARTURE = 0.25
 # Wheels are at first as noisy as this share of what constant velocity allows in a second; images have no less.
 _LEAST_SHARE = 0.01
 # Seconds over which the slowly changing part of an error, as of slip and worn tyres, grows as large as the white one:
 # at first, and at least and most, as it is learned by how successive errors resemble each other.
-_SLOW, _SHORTEST, _LONGEST = 1.0, 0.3, 30.0
+SLOW, _SHORTEST, _LONGEST = 1.0, 0.3, 30.0
 # A frame changes the noise that is learned by this share, and none counts for more than so many variances.
 _ADAPTATION, _MOST_SURPRISE = 0.05, 3.0
 # Seconds without samples after which the odometry is taken for dead.
@@ -46,9 +46,17 @@ class OdometryMotion(MotionFilter):
         T_camera_base: (4, 4) takes points of the vehicle's frame into the camera that is tracked.
     """
 
+    reckoning = "odometry"
+    _measures = np.ones(6)  # which axes are; the others move on at constant velocity
+    _name, _mend = (
+        "odometry",
+        ("its velocities are not those of the images; are units (m/s, rad/s), axes (forward, left, up), T_cam_base"),
+    )
+
     def __init__(self, backend: str, sensor: OdometrySensor, T_camera_base: np.ndarray) -> None:
         super().__init__(backend)
         self.samples = SampleBuffer(sensor.time_shift)
+        self.sensors = {"odometry": self.samples}
         self.spectrum, self.slow = np.zeros(6), np.zeros(6)
         """Of the velocities of the vehicle: white noise, m^2/s and rad^2/s, and random walks, m^2/s^3 and rad^2/s^3."""
         self._last = np.zeros(6)  # departure of the last frame
@@ -58,8 +66,8 @@ class OdometryMotion(MotionFilter):
         stays = np.array([1.0, 1.0, 1.0, *([0.0, 0.0] if sensor.is_planar else [1.0, 1.0]), 1.0])
         self._stays = self._adjoint @ np.diag(stays) @ np.linalg.inv(self._adjoint)
         self._measured: np.ndarray | None = None  # twist of the vehicle up to the last frame
-        self._departures: deque[np.ndarray] = deque(maxlen=_COMPARED)
-        self._compared: deque[np.ndarray] = deque(maxlen=_COMPARED)
+        self._departures: deque[np.ndarray] = deque(maxlen=COMPARED)
+        self._compared: deque[np.ndarray] = deque(maxlen=COMPARED)
         self._seconds, self._densities, self._is_refused = 0.0, np.zeros(2), False
 
     def set_twist(self, twist: np.ndarray, sigma: np.ndarray) -> None:
@@ -79,7 +87,7 @@ class OdometryMotion(MotionFilter):
             self.samples.forget(timestamp - seconds + self.samples.time_shift)
             self._measured, self._unsampled = self._mean_twist(timestamp - seconds, timestamp)
         if self._measured is None and self.is_odometric:
-            _LOGGER.warning("the odometry gives no samples: constant velocity goes on")
+            _LOGGER.warning("the %s gives no samples: constant velocity goes on", self._name)
             self.is_odometric = False
         if self._measured is None or before is None or not self.is_odometric:
             super().predict(seconds, densities, sigma)
@@ -88,7 +96,7 @@ class OdometryMotion(MotionFilter):
         kept = np.eye(12)
         kept[_TWIST, _TWIST] = self._stays
         self._covariance = kept @ self._covariance @ kept.T
-        super().predict(seconds, np.zeros(2))
+        super().predict(seconds, densities * (1.0 - self._measures[[0, 3]]))
         noise = (self._adjoint * (seconds * (self.spectrum + self._unsampled))) @ self._adjoint.T
         adjoint = se3_adjoint(self.step)
         self._covariance[_POSE, _POSE] += adjoint @ noise @ adjoint.T
@@ -104,7 +112,7 @@ class OdometryMotion(MotionFilter):
         if self._measured is not None and not self.is_odometric:
             self._departures.append(np.linalg.solve(self._adjoint, self.twist) - self._measured)
             self._compared.append(self._measured)
-            if len(self._compared) == _COMPARED:
+            if len(self._compared) == COMPARED:
                 self._begin()
 
     # ---- parts
@@ -122,8 +130,8 @@ class OdometryMotion(MotionFilter):
         gap, held = np.diff(t).max(initial=0.0), max(t[0] - start, end - t[-1], 0.0)
         if gap > _DEAD or held > _DEAD:
             return None, np.zeros(6)
-        values = np.hstack([table[:, 4:], table[:, 1:4]])
-        unsampled = self._densities * held**2 / 3.0 + bridge_spectrum(t, values, gap)
+        values = np.hstack([table[:, 4:], table[:, 1:4]]) * self._measures
+        unsampled = self._measures * (self._densities * held**2 / 3.0 + bridge_spectrum(t, values, gap))
         edges = np.r_[start, t[(t > start) & (t < end)], end]
         twists = interpolate(edges, t, values)
         T = np.eye(4)
@@ -136,24 +144,26 @@ class OdometryMotion(MotionFilter):
         departures, measured = np.array(self._departures), np.array(self._compared)
         least = _LEAST_SHARE**2 * self._densities
         for part in (slice(0, 3), slice(3, 6)):
+            if not self._measures[part].any():
+                continue
             squared = np.sum(departures[:, part] ** 2, axis=1).mean()
-            allowed = _DEPARTURE**2 * np.sum(measured[:, part] ** 2, axis=1).mean()
-            if squared > max(allowed, _DEPARTURE**2 * self._densities[part].sum()):
+            allowed = DEPARTURE**2 * np.sum(measured[:, part] ** 2, axis=1).mean()
+            if squared > max(allowed, DEPARTURE**2 * self._densities[part].sum()):
                 if not self._is_refused:
-                    _LOGGER.warning(
-                        "the odometry is not used: its velocities are not those of the images; are units (m/s, rad/s), "
-                        "axes (forward, left, up), T_cam_base and clock right?"
-                    )
+                    _LOGGER.warning("the %s is not used: %s and clock right?", self._name, self._mend)
                 self._is_refused = True
                 return
-        self.spectrum = departures.var(axis=0) * self._seconds + least
-        self.slow, self._last, self.is_odometric = self.spectrum / _SLOW**2, np.zeros(6), True
-        offset = self.spectrum / (_COMPARED * self._seconds)
+        self.spectrum = self._measures * (departures.var(axis=0) * self._seconds + least)
+        self.slow, self._last, self.is_odometric = self.spectrum / SLOW**2, np.zeros(6), True
+        offset = self.spectrum / (COMPARED * self._seconds)
+        free = np.diag(np.r_[np.zeros(6), 1.0 - self._measures])
+        unmeasured = free @ self._covariance @ free
         self._covariance[_TWIST, :] = self._covariance[:, _TWIST] = 0.0
         self._covariance[_TWIST, _TWIST] = (self._adjoint * offset) @ self._adjoint.T
+        self._covariance += unmeasured
         self._departures.clear()
         self._compared.clear()
-        _LOGGER.info("wheels predict: speed to %.3f m/s, yaw rate to %.4f rad/s", *np.sqrt(self.spectrum[[0, 5]]))
+        _LOGGER.info("%s predicts: to %.3f m/s and %.4f rad/s", self._name, *np.sqrt(self.spectrum[[0, 5]]))
 
     def _learn(self, step: np.ndarray, covariance: np.ndarray) -> None:
         """Noise of each axis, by how far a pose lies from its prediction."""
@@ -161,7 +171,7 @@ class OdometryMotion(MotionFilter):
         departure = back @ se3_log(step @ se3_inverse(self.step))
         # By so much the pose's covariance shrank, which is that of the departure, before this one made it wider.
         variance = np.diag(back @ (self.step_covariance - covariance) @ back.T) / self.widened
-        seen = (variance > 0.0) & (self._unsampled < self.spectrum)
+        seen = (variance > 0.0) & (self._unsampled < self.spectrum) & (self._measures > 0.0)
         normalised = np.where(seen, departure / np.sqrt(np.where(seen, variance, 1.0)), 0.0)
         normalised = np.clip(normalised, -_MOST_SURPRISE, _MOST_SURPRISE)
         self.spectrum = self.spectrum * np.exp(_ADAPTATION * np.where(seen, normalised**2 - 1.0, 0.0))
@@ -169,5 +179,5 @@ class OdometryMotion(MotionFilter):
         self.slow = np.clip(self.slow, self.spectrum / _LONGEST**2, self.spectrum / _SHORTEST**2)
         self._last = normalised
         if (self.spectrum > self._densities).any():
-            _LOGGER.warning("the odometry departs from the images: constant velocity goes on")
+            _LOGGER.warning("the %s departs from the images: constant velocity goes on", self._name)
             self.is_odometric = False

@@ -6,7 +6,7 @@ IEEE Transactions on Robotics 33(1), 2017, eqs. (26) - (48); integrated by the m
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -46,6 +46,16 @@ class Preintegrated:
     accel_noise: np.ndarray
     missing: float = 0.0
 
+    def corrected(self, change: np.ndarray) -> Preintegrated:
+        """With biases and delay changed by (7,), to the first order."""
+        step = self.slope @ change
+        return replace(
+            self,
+            turn=self.turn @ rotation_exp(step[TURN]),
+            velocity=self.velocity + step[VELOCITY],
+            position=self.position + step[POSITION],
+        )
+
 
 def preintegrate(
     samples: InertialSamples,
@@ -82,33 +92,27 @@ def preintegrate(
     is_gap = gaps > _GAP * period
     is_bridged = is_gap & (gaps <= _BRIDGED) & ~before_first & ~behind_last
     is_missing = is_gap & ~is_bridged
+    spectra = np.tile([sensor.gyro_density**2, sensor.accel_density**2], (len(steps), 1))
+    for k in np.flatnonzero(is_bridged):
+        spectra[k] += [bridge_spectrum(t, values, gaps[k]).mean() for values in (samples.gyro, samples.accel)]
+    # A rate that goes from end to end with an unknown angular acceleration, as a Brownian bridge.
+    unknown = np.column_stack([densities[1] * gaps**2 / 12.0, np.full(len(steps), densities[0])])
+    spectra[is_missing] += unknown[is_missing]
+    rates, forces = (0.5 * (values[1:] + values[:-1]) for values in (gyro, accel))
+    halves, crosses = rotation_exp(0.5 * steps[:, None] * rates), skew(forces)
     turn, velocity, position = np.eye(3), np.zeros(3), np.zeros(3)
-    slope, noises = np.zeros((9, 6)), [np.zeros((9, 9)), np.zeros((9, 9))]
-    for k, h in enumerate(steps):
-        rate, force = 0.5 * (gyro[k] + gyro[k + 1]), 0.5 * (accel[k] + accel[k + 1])
-        half = rotation_exp(0.5 * h * rate)
+    slope, noises, A, B = np.zeros((9, 6)), np.zeros((2, 9, 9)), np.eye(9), np.zeros((9, 6))
+    for h, half, force, cross, spectrum in zip(steps, halves, forces, crosses, spectra, strict=True):
         middle = turn @ half
         moved = middle @ force
-        A, B = np.eye(9), np.zeros((9, 6))
         A[TURN, TURN] = (half @ half).T
-        A[VELOCITY, TURN] = -h * middle @ skew(force) @ half.T
+        A[VELOCITY, TURN] = -h * middle @ cross @ half.T
         A[POSITION, TURN] = 0.5 * h * A[VELOCITY, TURN]
-        A[POSITION, VELOCITY] = h * np.eye(3)
-        B[TURN, GYRO_BIAS] = h * np.eye(3)
+        A[POSITION, VELOCITY] = B[TURN, GYRO_BIAS] = h * np.eye(3)
         B[VELOCITY, ACCEL_BIAS], B[POSITION, ACCEL_BIAS] = h * middle, 0.5 * h * h * middle
         slope = A @ slope - B
-        spectra = [sensor.gyro_density**2, sensor.accel_density**2]
-        if is_bridged[k]:
-            spectra = [
-                own + float(bridge_spectrum(t, values, gaps[k]).mean())
-                for own, values in zip(spectra, (samples.gyro, samples.accel), strict=True)
-            ]
-        elif is_missing[k]:
-            # A rate that goes from end to end with an unknown angular acceleration, as a Brownian bridge.
-            spectra = [spectra[0] + densities[1] * gaps[k] ** 2 / 12.0, spectra[1] + densities[0]]
-        for column, noise in enumerate(noises):
-            part = B[:, 3 * column : 3 * column + 3]
-            noises[column] = A @ noise @ A.T + spectra[column] / h * part @ part.T
+        parts = B.reshape(9, 2, 3).transpose(1, 0, 2)
+        noises = A @ noises @ A.T + (spectrum / h)[:, None, None] * parts @ parts.transpose(0, 2, 1)
         position = position + h * velocity + 0.5 * h * h * moved
         velocity = velocity + h * moved
         turn = middle @ half

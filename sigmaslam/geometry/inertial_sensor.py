@@ -21,6 +21,7 @@ class InertialSensor:
         gyro_density, accel_density: standard deviation of white noise, rad/s and m/s^2 per root hertz.
         gyro_walk, accel_walk: of the biases' random walks, rad/s^2 and m/s^3 per root hertz.
         time_shift: clock of the sensor minus that of the camera, seconds (Kalibr's `timeshift_cam_imu`).
+        has_accelerometer: False: a gyro alone, of whose samples and densities forces are left out.
     """
 
     T_left_imu: np.ndarray
@@ -29,6 +30,7 @@ class InertialSensor:
     gyro_walk: float
     accel_walk: float
     time_shift: float = 0.0
+    has_accelerometer: bool = True
 
 
 @dataclass(frozen=True, slots=True)

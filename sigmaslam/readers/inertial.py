@@ -66,6 +66,8 @@ def find_imu(folder: Path) -> Path | None:
 def read_imu(path: Path, is_mounted: bool = True) -> InertialRecording:
     """An inertial sensor's table of time, angular rate (rad/s) and specific force (m/s^2), with its YAML.
 
+    Columns of the force may be missing, or empty, for a gyro alone.
+
     Noise densities come from a YAML of the table's name, from sensor.yaml or from Kalibr's imu.yaml beside it; the
     mounting from T_cam_imu in the first, in Kalibr's camchain, or from T_BS of EuRoC's sensors.
 
@@ -78,7 +80,11 @@ def read_imu(path: Path, is_mounted: bool = True) -> InertialRecording:
     """
     path = path / "data.csv" if path.is_dir() else path
     seconds, values = _read_table(path)
-    return record(path, seconds, values, read_sensor(path, is_mounted))
+    lacking = np.isnan(values).any(axis=1)
+    if 0 < lacking.sum() < len(lacking):
+        raise InputError(f"{path}: {lacking.sum()} of {len(lacking)} rows lack the specific force: give all or none")
+    is_whole = not lacking.any()
+    return record(path, seconds, np.nan_to_num(values), read_sensor(path, is_mounted, is_whole))
 
 
 def record(source: Path, seconds: np.ndarray, values: np.ndarray, sensor: InertialSensor) -> InertialRecording:
@@ -122,19 +128,19 @@ def describe_lack(table: Path) -> str | None:
     return None
 
 
-def read_sensor(table: Path, is_mounted: bool = True) -> InertialSensor:
+def read_sensor(table: Path, is_mounted: bool = True, has_accelerometer: bool = True) -> InertialSensor:
     """Mounting and noise from the files beside a table or bag; CalibrationError where they are missing or wrong."""
     noise, mounting = _noise_file(table), _find_mounting(table) or (None if is_mounted else (np.eye(4), 0.0))
     if noise is None or mounting is None:
         raise CalibrationError(f"{table}: {describe_lack(table)}")
     values = []
     for name in _DENSITIES:
-        value = noise.number(name)
+        value = noise.number(name) if has_accelerometer or name.startswith("gyro") else np.inf
         if value <= 0.0:
             raise noise.error(f"{name} is {value:g}: give the density of the data sheet, above zero")
         values.append(value)
     gyro, accel, gyro_walk, accel_walk = values
-    return InertialSensor(mounting[0], gyro, accel, gyro_walk, accel_walk, mounting[1])
+    return InertialSensor(mounting[0], gyro, accel, gyro_walk, accel_walk, mounting[1], has_accelerometer)
 
 
 def _read_table(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -144,16 +150,16 @@ def _read_table(path: Path) -> tuple[np.ndarray, np.ndarray]:
         if not row or row[0].lstrip().startswith("#") or (number == 1 and np.isnan(finite_number(row[0]))):
             continue
         try:
-            seconds, values = parse_stamp(row[0]), [float(each) for each in row[1:7]]
+            seconds, values = parse_stamp(row[0]), [float(each) for each in [*row[1:4], *filter(str.strip, row[4:7])]]
         except ValueError:
             values, seconds = [], np.nan
-        if len(values) != 6 or not np.isfinite([seconds, *values]).all():
+        if len(values) not in (3, 6) or not np.isfinite([seconds, *values]).all():
             raise InputError(
                 f"{path}: line {number}: expected time, angular rate x, y, z in rad/s and specific force x, y, z in "
                 f"m/s^2, found {shorten(','.join(row))}"
             )
         stamps.append(seconds)
-        rows.append(values)
+        rows.append(values if len(values) == 6 else [*values, np.nan, np.nan, np.nan])
     return np.array(stamps), np.array(rows).reshape(-1, 6)
 
 

@@ -46,7 +46,6 @@ _REFUSED = (
         "--save-calibration is of the whole scene in images as they are: leave out {all}",
     ),
     ("--track-object", ("--imu", "--odometry"), "the camera is at rest with --track-object: leave out {all}"),
-    ("--odometry", ("--imu",), "one sensor predicts the motion: leave out --imu or --odometry"),
     (
         "--track-object",
         ("--map", "--tracks"),
@@ -66,7 +65,7 @@ class InputOptions:
         start, frames, every, scale: for `StereoSequence.select`.
         mask: for `StereoSequence.use_masks`.
         imu: for `open_imu`.
-        odometry: for `read_odometry`; an inertial sensor of the recording is not used then.
+        odometry: for `read_odometry`.
         findings: of a check; they are kept in run.json, and explain a run that fails.
     Raises:
         InputError: options do not go together.
@@ -106,7 +105,7 @@ class InputOptions:
         if self.mask is not None:
             sequence.use_masks(self.mask)
         if self.imu is not None or not isinstance(self.source, StereoSequence):
-            sequence.imu = open_imu(sequence, self.imu if self.odometry is None else "off")
+            sequence.imu = open_imu(sequence, self.imu)
         if self.odometry is not None:
             sequence.odometry = read_odometry(self.odometry)
         return sequence

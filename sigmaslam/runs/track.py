@@ -229,26 +229,27 @@ class _FrameSteps:
 
 
 def _feed(sequence: StereoSequence, tracker: Tracker) -> Callable[[float], None]:
-    """Gives the tracker the samples of its sensor up to a frame that it does not have yet, and the one behind it."""
-    add: Callable[[float, np.ndarray, np.ndarray], None]
+    """Gives the tracker the samples of its sensors up to a frame that it does not have yet, and the one behind it."""
     if not isinstance(tracker, StereoTracker):
         return lambda timestamp: None
+    columns: tuple[np.ndarray, np.ndarray, np.ndarray]
+    waiting = list[tuple[tuple[np.ndarray, np.ndarray, np.ndarray], float, Callable[..., None]]]()
     if sequence.odometry is not None:
-        moved, shift, add = sequence.odometry.samples, sequence.odometry.sensor.time_shift, tracker.add_odometry
+        moved = sequence.odometry.samples
         columns = moved.timestamp, moved.linear, moved.angular
-    elif sequence.imu is not None:
-        felt, shift, add = sequence.imu.samples, sequence.imu.sensor.time_shift, tracker.add_imu
+        waiting.append((columns, sequence.odometry.sensor.time_shift, tracker.add_odometry))
+    if sequence.imu is not None:
+        felt = sequence.imu.samples
         columns = felt.timestamp, felt.gyro, felt.accel
-    else:
-        return lambda timestamp: None
-    given = 0
+        waiting.append((columns, sequence.imu.sensor.time_shift, tracker.add_imu))
+    given = [0] * len(waiting)
 
     def feed(timestamp: float) -> None:
-        nonlocal given
-        end = int(np.searchsorted(columns[0], timestamp + shift)) + 1
-        for row in zip(*(each[given:end] for each in columns), strict=True):
-            add(*row)
-        given = max(given, end)
+        for number, (columns, shift, add) in enumerate(waiting):
+            end = int(np.searchsorted(columns[0], timestamp + shift)) + 1
+            for row in zip(*(each[given[number] : end] for each in columns), strict=True):
+                add(*row)
+            given[number] = max(given[number], end)
 
     return feed
 

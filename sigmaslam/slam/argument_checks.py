@@ -9,8 +9,7 @@ import numpy as np
 
 from sigmaslam.bounded_files import shorten
 from sigmaslam.errors import FrameError, InputError
-from sigmaslam.estimation.inertial_motion import InertialMotion
-from sigmaslam.estimation.odometry_motion import OdometryMotion
+from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.sample_buffer import SampleBuffer
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.inference.backends import ONNX, backend_names
@@ -44,7 +43,7 @@ def check_tracker_arguments(
         raise InputError(f"weights {weights} are for a front-end by name: give the networks to your own one instead")
 
 
-def check_sample(motion: object, name: str, timestamp: float, one: Any, other: Any) -> SampleBuffer:
+def check_sample(motion: MotionFilter, name: str, timestamp: float, one: Any, other: Any) -> SampleBuffer:
     """A sample of an inertial sensor or of odometry; what takes it.
 
     Args:
@@ -54,13 +53,12 @@ def check_sample(motion: object, name: str, timestamp: float, one: Any, other: A
     Raises:
         InputError: the tracker knows no such sensor, or the sample is no time and two vectors of finite numbers.
     """
-    kinds: dict[str, type[InertialMotion] | type[OdometryMotion]] = {"imu": InertialMotion, "odometry": OdometryMotion}
-    if not isinstance(motion, kinds[name]):
+    if name not in motion.sensors:
         raise InputError(f"add_{name}: the tracker knows no such sensor: make it with {name}=...")
     if np.shape(one) != (3,) or np.shape(other) != (3,) or not np.isfinite([timestamp, *one, *other]).all():
         given = shorten(f"{timestamp!r}, {one!r}, {other!r}")
         raise InputError(f"add_{name}: expected seconds and two vectors of three finite numbers, found {given}")
-    return motion.samples
+    return motion.sensors[name]
 
 
 def check_region(region: Any, camera: StereoCamera) -> None:

@@ -71,13 +71,15 @@ def describe_inertial(
     """
     if not isinstance(motion, InertialMotion) or not motion.is_inertial:
         return None
-    values, covariance = motion.gravity_and_biases
+    state = motion.state
+    values, covariance = state.twist[3:12], state.covariance
     up = -values[:3] / np.linalg.norm(values[:3])
     # By a turn of the camera from the left in the keyframe's frame, and by gravity there.
     by_gravity = (np.outer(up, up) - np.eye(3)) / np.linalg.norm(values[:3])
     turn = (motion.step[:3, :3] @ R_rectified_left).T
     slope = turn @ np.concatenate([skew(up), by_gravity], axis=1)
-    spread, sigmas = slope @ covariance[3:9, 3:9] @ slope.T, np.sqrt(np.diag(covariance)[9:])
+    rows = np.r_[3:6, 9:12]  # the turn and gravity
+    spread, sigmas = slope @ covariance[np.ix_(rows, rows)] @ slope.T, np.sqrt(np.diag(covariance)[12:18])
     up = turn @ up
     T_gravity = level_world(T_world_camera, up)
     return InertialEstimate(up, spread, T_gravity, values[3:6], values[6:], sigmas[:3], sigmas[3:])

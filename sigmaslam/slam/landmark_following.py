@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+from functools import partial
+
+import cv2
 import numpy as np
 
 from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.frontend.followed_patches import FLOW_LEVELS, FLOW_WINDOW
 from sigmaslam.frontend.lucas_kanade import lucas_kanade
+from sigmaslam.geometry.se3 import rotation_log
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.guided_matching import GuidedMatcher, GuidedMatches
 from sigmaslam.slam.keyframe import Keyframe
 from sigmaslam.slam.mapping import KeyframeTracks
+
+# Radians. Optical flow takes patches for shifted alone; turned by more, their corners are a pixel off.
+_LARGE_TURN = 0.1
 
 
 class LandmarkFollower:
@@ -70,7 +77,12 @@ class LandmarkFollower:
             self.forget()
 
     def follow(
-        self, frame: Frame, keyframes: list[Keyframe], pose: np.ndarray, covariance: np.ndarray
+        self,
+        frame: Frame,
+        keyframes: list[Keyframe],
+        pose: np.ndarray,
+        covariance: np.ndarray,
+        turn: np.ndarray | None = None,
     ) -> tuple[GuidedMatches, float]:
         """Finds the window's landmarks by optical flow from the last frame, aligned to their keyframes' patches.
 
@@ -78,11 +90,12 @@ class LandmarkFollower:
             frame: the current one.
             keyframes: of the window.
             pose, covariance: predicted, as of `GuidedMatcher.match_guided`.
+            turn: (3, 3) rotation R_last_current that a sensor has measured; None: unknown.
         Returns:
             As of `GuidedMatcher.follow`.
         """
         views = [keyframe.view for keyframe in keyframes]
-        return self._guided.follow(frame, views, pose, covariance, self._carry)
+        return self._guided.follow(frame, views, pose, covariance, partial(self._carry, turn))
 
     def has_fallen(self, matches: GuidedMatches, inliers: np.ndarray) -> bool:
         """Whether suddenly fewer of the landmarks have a disparity than usual.
@@ -100,7 +113,9 @@ class LandmarkFollower:
         self._usual = usual + ACCEPTANCE.stereo_usual_gain * (share - usual)
         return share < ACCEPTANCE.stereo_fall * usual
 
-    def _carry(self, left: np.ndarray, landmark_id: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+    def _carry(
+        self, turn: np.ndarray | None, left: np.ndarray, landmark_id: np.ndarray, predicted: np.ndarray
+    ) -> np.ndarray:
         """(K, 2) where optical flow takes landmarks; NaN for those that the last frame did not see."""
         start = np.full(predicted.shape, np.nan)
         if self._left is None or not len(self._id):
@@ -109,6 +124,12 @@ class LandmarkFollower:
         rows = np.flatnonzero(self._id[at] == landmark_id)
         height, width = left.shape
         guess = np.clip(predicted[rows], 0, (width - 1, height - 1))
-        places, found = lucas_kanade(self._left, left, self._places[at[rows]], guess, FLOW_WINDOW, FLOW_LEVELS)
+        last, before = self._left, self._places[at[rows]]
+        if turn is not None and np.linalg.norm(rotation_log(turn)) > _LARGE_TURN:
+            K = self._guided.camera.matrix
+            homography = K @ turn.T @ np.linalg.inv(K)
+            last = cv2.warpPerspective(last, homography, (width, height))
+            before = cv2.perspectiveTransform(before[:, None], homography)[:, 0]
+        places, found = lucas_kanade(last, left, before, guess, FLOW_WINDOW, FLOW_LEVELS)
         start[rows[found]] = places[found]
         return start

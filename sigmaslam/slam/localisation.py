@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from sigmaslam.estimation.acceptance import ACCEPTANCE
-from sigmaslam.estimation.constant_velocity import MotionFilter
+from sigmaslam.estimation.chi_square import CHI_SQUARE_9999_OF_6
+from sigmaslam.estimation.constant_velocity import MotionFilter, dead_reckoning
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.frame_update import FrameUpdate
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
@@ -46,6 +48,10 @@ class Prediction:
         departure = se3_log(pose @ se3_inverse(self.pose))
         return float(departure @ np.linalg.lstsq(self.covariance, departure, rcond=1e-14)[0])
 
+    def excludes(self, pose: np.ndarray) -> bool:
+        """Whether a pose (4, 4) departs from this one by more than its noise."""
+        return self.squared_departure(pose) > CHI_SQUARE_9999_OF_6
+
 
 @dataclass(frozen=True, slots=True)
 class Localiser:
@@ -80,16 +86,28 @@ class Localiser:
             prediction: of its pose.
             clock: takes the time of the stages `match` and `filter`.
         """
-        matches, excess = self.follower.follow(frame, keyframes, prediction.pose, prediction.covariance)
+        measured, turn = prediction, self.motion.turn
+        matches, excess = self.follower.follow(frame, keyframes, prediction.pose, prediction.covariance, turn)
         if excess > 1.0:
             self.motion.widen(excess)
             prediction = Prediction.of(self.window, self.motion)
         clock.lap("match")
         fit = self.fit_near(matches, prediction)
+        if excess > 1.0 and turn is not None:
+            fit = self._confirm(matches, fit, measured, excess)
         clock.lap("filter")
-        if fit is None or self._is_doubtful(fit) or self.follower.has_fallen(matches, fit.inliers):
+        if fit is None or self._is_doubtful(matches, fit) or self.follower.has_fallen(matches, fit.inliers):
             return matches, None
         return matches, fit
+
+    def _confirm(
+        self, matches: GuidedMatches, fit: FrameFit | None, measured: Prediction, excess: float
+    ) -> FrameFit | None:
+        """Takes back by what flow has widened the prediction of a sensor, unless the pose departs from it as well."""
+        if fit is not None and measured.excludes(fit.pose):
+            return fit
+        self.motion.widen(1.0 / excess)
+        return None if fit is None else self.fit_again(matches, fit, measured)
 
     def localise(
         self, view: StereoView, keyframes: list[StereoView], prediction: Prediction, guided: bool, clock: Stopwatch
@@ -109,7 +127,7 @@ class Localiser:
             clock.lap("match")
             fit = self.fit_near(matches, prediction)
             clock.lap("filter")
-        if fit is None or self._is_doubtful(fit):
+        if fit is None or self._is_doubtful(matches, fit):
             other_matches, other = self._localise_anywhere(view, keyframes, prediction, clock)
             if fit is None or (other is not None and self._is_better(other, fit)):
                 matches, fit = other_matches, other
@@ -131,9 +149,13 @@ class Localiser:
         enough = max(ACCEPTANCE.jump_support * earlier.sum(), self.config.min_inliers)
         return len(self.window) == 1 or int(seen.sum()) >= enough
 
-    def _is_doubtful(self, fit: FrameFit) -> bool:
-        """Whether the pose may sit in a wrong place, or so little is left of the last frame that the search was off."""
-        return fit.nis_per_dof > ACCEPTANCE.doubtful_nis or fit.count < ACCEPTANCE.left_over * self.follower.count
+    def _is_doubtful(self, matches: GuidedMatches, fit: FrameFit) -> bool:
+        """Whether the pose may sit in a wrong place, or so little is left of the last frame that the search was off.
+
+        A sensor of motion knows how much of it is still in view.
+        """
+        before = self.follower.count if self.motion.turn is None else len(matches.searched)
+        return fit.nis_per_dof > ACCEPTANCE.doubtful_nis or fit.count < ACCEPTANCE.left_over * before
 
     def _is_better(self, other: FrameFit, fit: FrameFit) -> bool:
         """Whether another pose fits better than a doubtful one, or more agrees with it."""
@@ -155,13 +177,18 @@ class Localiser:
         fit = self.update.fit(matches.views, pose, covariance, min_inliers)
         return fit if fit is not None and fit.count >= ACCEPTANCE.guided_share * count else None
 
+    def _is_excluded(self, back: int, prediction: Prediction, T_key_camera: np.ndarray) -> bool:
+        """Whether a sensor's prediction rules out a pose (4, 4) relative to one of the last keyframes."""
+        return prediction.excludes(self.window.posterior.poses[back] @ T_key_camera)
+
     def _localise_anywhere(
         self, view: StereoView, keyframes: list[StereoView], prediction: Prediction, clock: Stopwatch
     ) -> tuple[GuidedMatches, FrameFit | None]:
         """Without a prediction: the pose relative to one of the last keyframes, then landmarks near there."""
         matches = GuidedMatches.empty()
         for back in range(1, min(ACCEPTANCE.last_keyframes, len(keyframes)) + 1):
-            relative = self.unguided.relative_pose_to(keyframes[-back], view)
+            excludes = None if dead_reckoning(self.motion) is None else partial(self._is_excluded, -back, prediction)
+            relative = self.unguided.relative_pose_to(keyframes[-back], view, excludes)
             clock.lap("match")
             if relative is None:
                 continue

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sigmaslam.estimation.constant_velocity import MotionFilter
+from sigmaslam.estimation.constant_velocity import MotionFilter, dead_reckoning
 from sigmaslam.estimation.frame_clock import FrameClock
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.gaussian import step_with
@@ -13,7 +13,8 @@ from sigmaslam.estimation.prediction_errors import surprise, time_error
 from sigmaslam.geometry.se3 import se3_adjoint, se3_inverse, se3_log
 from sigmaslam.slam.doubt import Doubt, Doubts
 from sigmaslam.slam.guided_matching import GuidedMatches
-from sigmaslam.slam.second_motion import find_second_motion
+from sigmaslam.slam.localisation import Prediction
+from sigmaslam.slam.second_motion import SecondMotion, find_second_motion
 
 
 class Scrutiny:
@@ -40,10 +41,17 @@ class Scrutiny:
         self._doubt_prediction(doubts, fit)
         second = find_second_motion(self._window, matches, fit)
         # A body before the scene that never stood still is no rival of it.
-        if second is not None and (second.stood_still or not second.stands_before):
+        if second is not None and (second.stood_still or not second.stands_before) and not self._is_other(second, fit):
             doubts.add(Doubt.MOTIONS, se3_log(second.pose @ se3_inverse(fit.pose)))
             doubts.is_ambiguous = True
         return doubts
+
+    def _is_other(self, second: SecondMotion, fit: FrameFit) -> bool:
+        """Whether a sensor of motion rules the second motion out, and not the pose."""
+        if dead_reckoning(self._motion) is None:
+            return False
+        prediction = Prediction.of(self._window, self._motion)
+        return prediction.excludes(second.pose) and not prediction.excludes(fit.pose)
 
     def _doubt_prediction(self, doubts: Doubts, fit: FrameFit) -> None:
         key = self._window.posterior.poses[-1]

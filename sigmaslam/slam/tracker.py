@@ -81,7 +81,7 @@ class StereoTracker:
         disparity_error: pixels by which disparities may be off, as a check found that the eyes do not fit: all poses
             are doubtful then, and less certain; None: nothing was found.
         imu: an inertial sensor on the rig, whose samples `add_imu` takes.
-        odometry: wheels under the rig, whose samples `add_odometry` takes; an inertial sensor is not used then.
+        odometry: wheels under the rig, whose samples `add_odometry` takes.
 
     Attributes:
         rectifier: of the images that are tracked.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,8 +35,15 @@ class UnguidedMatcher:
     noise: MeasurementNoise
     config: TrackerConfig
 
-    def relative_pose_to(self, key: StereoView, view: StereoView) -> RelativePose | None:
-        """Pose of a view relative to a keyframe by all of its stereo features; None where too few agree."""
+    def relative_pose_to(
+        self, key: StereoView, view: StereoView, excludes: Callable[[np.ndarray], bool] | None = None
+    ) -> RelativePose | None:
+        """Pose of a view relative to a keyframe by all of its stereo features; None where too few agree.
+
+        Args:
+            key, view: the keyframe's and the current one.
+            excludes: as of `estimate_scene_pose`.
+        """
         index = np.flatnonzero(np.isfinite(key.disparity))
         if len(index) < self.config.min_inliers:
             return None
@@ -49,6 +57,7 @@ class UnguidedMatcher:
             self.window.as_calibrated(matches.measured),
             self.noise.of_matches(matches),
             matches.probability,
+            excludes,
         )
         if relative is None:
             return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -40,8 +41,11 @@ def estimate_scene_pose(
     measurement: np.ndarray,
     noise: np.ndarray,
     probability: np.ndarray,
+    excludes: Callable[[np.ndarray], bool] | None = None,
 ) -> RelativePose | None:
     """Pose of the current view in the keyframe, relative to what stands still; arguments as `estimate_relative_pose`.
+
+    `excludes` tells whether a sensor of motion rules a pose T_key_camera (4, 4) out: what moves is that one's.
 
     Matches that disagree with the first pose are asked for a second one. A bus ahead has more texture than the road
     around it, so of two motions not the one with more matches is the scene's but the one that explains more of the
@@ -66,6 +70,10 @@ def estimate_scene_pose(
     other = replace(other, inliers=agreeing)
     cells = image_cells(landmarks[:, :2], camera.width, camera.height)
     motions = [_Motion.of(each, cells, landmarks[:, 2], probability) for each in (pose, other)]
+    if excludes is not None:
+        possible = [motion.pose for motion in motions if not excludes(motion.pose.T_key_camera)]
+        if len(possible) == 1:
+            return possible[0]
     lesser, greater = sorted(motions, key=lambda motion: motion.area)
     if lesser.area < ACCEPTANCE.rival_area * greater.area or _are_alike(camera, landmarks, pose, other):
         return greater.pose

@@ -47,6 +47,18 @@ class Motion:
         return InertialSamples(t, rate, force)
 
 
+class Halt(Motion):
+    """The same, which slows down from 1.5 s on and rests from 2.5 s on."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__(seed)
+        t = np.arange(-1.0, 6.5, 0.01)
+        share = np.clip(t - 1.5, 0.0, 1.0)
+        rate = 1.0 - share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+        passed = np.r_[0.0, np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(t))] - 1.0
+        self.place, self.rotation = CubicSpline(t, self.place(passed)), RotationSpline(t, self.rotation(passed))
+
+
 def turned(R: np.ndarray, vector: np.ndarray) -> np.ndarray:
     """A rotation (3, 3) turned from the right."""
     return np.asarray(R @ rotation_exp(vector))

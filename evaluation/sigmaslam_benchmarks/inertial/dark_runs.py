@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -18,8 +18,8 @@ from sigmaslam_benchmarks.live.recordings import GoodFrames
 from sigmaslam_evaluation.metrics.trajectory_errors import absolute_trajectory_error
 from sigmaslam_evaluation.metrics.truth_covariance import relative_truth_covariance
 
-METHODS = ("images", "both sensors")
-"""Images alone, and with gyro and accelerometer."""
+METHODS = ("images", "gyro", "both sensors")
+"""Images alone, with a gyro, and with gyro and accelerometer."""
 STATES = ("velocity", "gravity", "gyro bias", "accelerometer bias")
 BOUND = 2.5
 """Sigmas within which the end of the dark is to be."""
@@ -123,7 +123,9 @@ def run_dark(good: GoodFrames, case: DarkCase, seed: int) -> DarkResult:
     frames = blacken(good.frames, first, count, np.random.default_rng(seed))
     if count:
         frames = frames[: first + count + _AFTER]
-    imu = good.imu if case.method == METHODS[1] else None
+    imu = None if case.method == METHODS[0] else good.imu
+    if imu is not None and case.method == METHODS[1]:
+        imu = replace(imu, sensor=replace(imu.sensor, has_accelerometer=False))
     tracked = list(_track(frames, good, imu))
     statuses = [each.status for each in tracked]
     dark = range(first, first + count)

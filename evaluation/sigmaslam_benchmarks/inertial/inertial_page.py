@@ -16,7 +16,7 @@ from sigmaslam_evaluation.metrics.map_consistency import mean_with_error
 _MH01_METRES, _MH01_MEDIAN, _MH01_ATE = 0.05, 0.03, 0.0039
 _MH01_NEES, _STATE_NEES = (0.5, 2.0), (0.7, 1.4)
 _WITHIN = 0.95
-_IMAGES, _SENSORS = METHODS
+_IMAGES, _, _SENSORS = METHODS
 
 
 @dataclass(frozen=True, slots=True)

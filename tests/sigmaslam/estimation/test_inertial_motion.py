@@ -6,7 +6,7 @@ import pytest
 from sigmaslam.estimation.inertial_motion import InertialMotion
 from sigmaslam.geometry.inertial_sensor import InertialSamples
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
-from tests.support.inertial import GRAVITY, SENSOR, Motion
+from tests.support.inertial import GRAVITY, SENSOR, Halt, Motion
 
 FRAME = 0.05
 DENSITIES = np.array([0.25, 0.25])
@@ -116,6 +116,21 @@ def test_at_rest_gravity_is_found_as_well():
     flight.fly(20, dark=True)
     assert np.linalg.norm(flight.filter.step[:3, 3]) < 0.03
     assert flight.nees()["pose"] < 3
+
+
+@pytest.mark.long
+def test_a_body_that_stops_stays_where_it_is_in_the_dark():
+    for seed in range(3):
+        flight = Flight(seed, Halt(seed), noise=1.0, wrong=True)
+        flight.fly(44)
+        assert flight.filter.is_inertial
+        assert not flight.filter.is_resting
+        flight.fly(60, dark=True)
+        assert flight.filter.is_resting
+        # Without that it is 0.2 m off.
+        assert np.linalg.norm((flight.truth - flight.filter.step)[:3, 3]) < 0.01
+        assert flight.nees()["pose"] < 2.0
+        assert flight.nees()["gyro"] < 3.0
 
 
 def test_without_samples_it_is_constant_velocity():

@@ -84,6 +84,21 @@ def test_a_sensor_whose_place_nobody_knows_is_not_used_by_itself(asl):
         read_imu(asl / "mav0" / "imu0")
 
 
+@pytest.mark.parametrize("force", ["", ",,,"])
+def test_a_gyro_alone_has_no_columns_of_force(tmp_path, force):
+    rows = [f"{100 + 0.01 * k:.3f},0.1,0.2,{k}{force}\n" for k in range(5)]
+    (tmp_path / "rig.csv").write_text("t,wx,wy,wz\n" + "".join(rows))
+    own = "gyroscope_noise_density: 1e-3\ngyroscope_random_walk: 1e-5\n"
+    (tmp_path / "rig.yaml").write_text(f"{own}T_cam_imu: {matrix(np.eye(4))}\n")
+    recording = read_imu(tmp_path / "rig.csv")
+    assert not recording.sensor.has_accelerometer
+    np.testing.assert_array_equal(recording.samples.gyro[3], [0.1, 0.2, 3])
+    np.testing.assert_array_equal(recording.samples.accel, 0.0)
+    (tmp_path / "rig.csv").write_text("".join([*rows, "101,0,0,0,0,0,9.8\n"]))
+    with pytest.raises(InputError, match="5 of 6 rows lack the specific force"):
+        read_imu(tmp_path / "rig.csv")
+
+
 def test_real_recordings_have_a_sensor(real_data):
     for name, count in (("euroc_mh01_f000_099", 1290), ("euroc_v1_01_keyframes_a", 21051)):
         assert len(read_imu(find_imu(real_data / name)).samples) == count

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sigmaslam.estimation.constant_velocity import MotionFilter
+from sigmaslam.estimation.constant_velocity import MotionFilter, MotionState
 from sigmaslam.estimation.inertial_motion import InertialMotion
 from sigmaslam.geometry.se3 import rotation_exp, se3_exp
 from sigmaslam.slam.inertial_estimate import InertialEstimate, describe_inertial, level_world
@@ -13,10 +13,13 @@ class Held(InertialMotion):
     """A motion whose state is given."""
 
     def __init__(self, step: np.ndarray, values: np.ndarray, covariance: np.ndarray) -> None:
-        self.step, self.is_inertial, self._held = step, True, (values, covariance)
+        whole, rows = np.eye(25), np.r_[0:6, 9:18]
+        whole[np.ix_(rows, rows)] = covariance
+        others = np.r_[np.zeros(3), values, np.zeros(7)]
+        self.step, self.is_inertial, self._held = step, True, MotionState(step, others, whole)
 
     @property
-    def gravity_and_biases(self) -> tuple[np.ndarray, np.ndarray]:
+    def state(self) -> MotionState:
         return self._held
 
 

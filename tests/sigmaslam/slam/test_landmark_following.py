@@ -7,12 +7,15 @@ from concurrent.futures import ThreadPoolExecutor
 from threading import Event
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from sigmaslam import StereoTracker
 from sigmaslam.estimation.landmark_table import LandmarkViews
 from sigmaslam.frontend import Frontend, KeypointSearch, StereoView, TemporalMatches, build_frontend
+from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam.geometry.se3 import rotation_exp
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.deferred import Deferred
 from sigmaslam.slam.frame import Frame
@@ -32,6 +35,8 @@ class CarryingOnly:
     Args:
         landmark_id, predicted: (K,), (K, 2) of the landmarks that are searched for.
     """
+
+    camera = RectifiedStereo(200.0, 200.0, 160.0, 120.0, 0.1, 320, 240)
 
     def __init__(self, landmark_id: np.ndarray, predicted: np.ndarray) -> None:
         self._landmark_id, self._predicted = landmark_id, predicted
@@ -157,6 +162,26 @@ def test_landmarks_of_the_last_frame_are_carried_along_with_their_image(demo: De
     assert np.isnan(start[-20:]).all()
     follower.forget()
     assert np.isnan(carried()).all()
+
+
+def test_a_measured_turn_of_the_camera_is_followed(demo: Demo, learned: Frontend):
+    """Optical flow alone takes patches for shifted ones."""
+    left, camera = cv2.resize(demo[1][0].left, (320, 240)), CarryingOnly.camera
+    rows, columns = np.mgrid[60:180:20, 60:260:20]
+    places = np.column_stack([columns.ravel(), rows.ravel()]).astype(float)
+    turn = rotation_exp(np.array([0.03, -0.05, 0.5]))
+    homography = camera.matrix @ turn.T @ np.linalg.inv(camera.matrix)
+    turned = cv2.warpPerspective(left, homography, (320, 240))
+    expected = cv2.perspectiveTransform(places[:, None], homography)[:, 0]
+    guided = CarryingOnly(np.arange(len(places)), expected + 4.0)
+    follower = LandmarkFollower(guided)
+    follower.remember(left, np.arange(len(places)), places)
+    shares = []
+    for measured in (None, turn):
+        follower.follow(Frame(turned, turned, learned), [], np.eye(4), np.eye(6), measured)
+        shares.append(np.mean(np.linalg.norm(guided.start - expected, axis=1) < 0.5))
+    assert shares[0] < 0.3
+    assert shares[1] > 0.9
 
 
 def test_a_frame_without_landmarks_carries_none(learned: Frontend):

@@ -1,5 +1,7 @@
 """Two motions in one pair of views: which of them is the scene's."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -68,6 +70,20 @@ def test_nobody_knows_where_two_halves_as_far_away_move_apart():
     rng = np.random.default_rng(0)
     left, right = points(rng, 150, 10, 315, 4.0, 8.0), points(rng, 150, 325, 630, 4.0, 8.0)
     assert estimate(estimate_scene_pose, [(left, BODY_MOTION), (right, CAMERA_MOTION)]) is None
+
+
+@pytest.mark.parametrize("of_body", [150, 400])
+def test_a_sensor_of_motion_knows_which_part_moves(of_body):
+    def excludes(T_key_camera: np.ndarray) -> bool:
+        return bool(np.linalg.norm(se3_log(se3_inverse(CAMERA_MOTION) @ T_key_camera)) > 0.2)
+
+    rng = np.random.default_rng(0)
+    left, right = points(rng, of_body, 10, 315, 4.0, 8.0), points(rng, 60, 325, 630, 4.0, 8.0)
+    parts = [(left, BODY_MOTION), (right, CAMERA_MOTION)]
+    assert is_pose(estimate(partial(estimate_scene_pose, excludes=excludes), parts), CAMERA_MOTION)
+    for says in (True, False):
+        undecided = estimate(partial(estimate_scene_pose, excludes=lambda pose, says=says: says), parts)
+        assert (undecided is None) == (estimate(estimate_scene_pose, parts) is None)
 
 
 def test_the_greater_part_decides_where_the_other_one_is_small():

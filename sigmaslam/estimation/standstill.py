@@ -1,0 +1,87 @@
+"""Whether a body is at rest: images and inertial sensor must agree, and in the dark nothing may speak against it."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from sigmaslam.estimation.chi_square import CHI_SQUARE_95, CHI_SQUARE_999
+from sigmaslam.estimation.mahalanobis import squared_mahalanobis
+from sigmaslam.geometry.inertial_sensor import InertialSensor
+from sigmaslam.geometry.se3 import se3_inverse, se3_log
+
+# Seconds for which nothing may move, and the least number of samples in them that a variance can be told from.
+WHILE, _LEAST_SAMPLES = 0.5, 10
+# The variance of samples at rest is at most so many times the expected one: twice the standard deviation.
+_QUIET = 4.0
+
+
+class Standstill:
+    """Images say that nothing moves where poses half a second apart differ by no more than their noise.
+
+    Elevators and trains are at rest for an inertial sensor, and drones with running motors for images: both must agree.
+    In the dark the sensor must be as quiet as it was when both agreed, or as its data sheet says, and the velocity may
+    be zero; where images have last shown a motion that the sensor does not feel, darkness is no rest.
+
+    Attributes:
+        speed_variance: (3, 3) of the velocity that images cannot tell from zero, in the camera's frame, (m/s)^2.
+        spectra: (6,) of gyro and accelerometer at rest, as of white noise.
+
+    Args:
+        sensor: its noise.
+    """
+
+    def __init__(self, sensor: InertialSensor) -> None:
+        self._sheet = np.repeat([sensor.gyro_density, sensor.accel_density], 3) ** 2
+        self.spectra = self._sheet
+        self._poses: deque[tuple[float, np.ndarray, np.ndarray]] = deque()
+        self.speed_variance = np.eye(3)
+        self._is_seen, self._glides = False, False
+
+    def see(
+        self, timestamp: float, pose: np.ndarray, covariance: np.ndarray, samples: np.ndarray, scale: np.ndarray
+    ) -> None:
+        """Takes a pose by images.
+
+        Args:
+            timestamp: seconds.
+            pose: (4, 4) of the camera in any frame that stays.
+            covariance: (6, 6) of it in its own frame.
+            samples: (N, 7) of the sensor in the last half second.
+            scale: (2,) by which its noise is larger than the data sheet says, in variances.
+        """
+        self._poses.append((timestamp, pose, covariance))
+        while len(self._poses) > 1 and self._poses[1][0] <= timestamp - WHILE:
+            self._poses.popleft()
+        since, before, spread = self._poses[0]
+        self._is_seen = False
+        if timestamp - since < WHILE:
+            return
+        departure, spread = se3_log(se3_inverse(before) @ pose), spread + covariance
+        self.speed_variance = spread[:3, :3] / (timestamp - since) ** 2
+        stays, spectrum = squared_mahalanobis(departure, spread) < CHI_SQUARE_95[6], _spectrum(samples)
+        quiet = bool((spectrum < _QUIET * np.repeat(scale, 3) * self._sheet).all())
+        self._is_seen, self._glides = bool(stays) and quiet, quiet and not stays
+        if self._is_seen:
+            self.spectra = np.maximum(spectrum, self._sheet)
+
+    def holds(self, samples: np.ndarray, velocity: np.ndarray, covariance: np.ndarray, is_dark: bool) -> bool:
+        """Whether the body is at rest.
+
+        Args:
+            samples: (N, 7) of the sensor in the last half second.
+            velocity, covariance: (3,) and (3, 3) as predicted.
+            is_dark: the last frame had no pose by images.
+        """
+        if self._glides or not (is_dark or self._is_seen) or (_spectrum(samples) > _QUIET * self.spectra).any():
+            return False
+        return bool(squared_mahalanobis(velocity, covariance + self.speed_variance) < CHI_SQUARE_999[3])
+
+
+def _spectrum(samples: np.ndarray) -> np.ndarray:
+    """(6,) of samples (N, 7) as of white noise; infinite where they are too few."""
+    if len(samples) < _LEAST_SAMPLES:
+        return np.full(6, np.inf)
+    t = samples[:, 0]
+    return np.asarray(samples[:, 1:].var(axis=0) * (t[-1] - t[0]) / (len(t) - 1))
