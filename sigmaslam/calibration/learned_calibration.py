@@ -25,9 +25,9 @@ def learned_calibration(camera: StereoCamera, learned: CalibrationEstimate, foca
         focal_length: of the rectified pair, pixels.
     """
     shares = {name: value for name, (_, value, _) in learned.causes.items()}
-    zoom, turn = 1.0 - shares.get("zoom", 0.0), (-shares.get("pitch", 0.0), shares.get("yaw", 0.0), 0.0)
+    zoom, yaw = 1.0 - shares.get("zoom", 0.0), shares.get("yaw", 0.0)
     # A turn about the vertical is part of the offset.
-    offset = learned.disparity_offset / focal_length - shares.get("yaw", 0.0)
+    offset = learned.disparity_offset / focal_length - yaw
     right = replace(camera.right, fx=zoom * camera.right.fx, fy=zoom * camera.right.fy)
     right = replace(right, cx=right.cx - offset * right.fx)
     if "lenses" in shares and right.distortion_model != "equidistant":
@@ -35,7 +35,7 @@ def learned_calibration(camera: StereoCamera, learned: CalibrationEstimate, foca
         right = replace(right, distortion_model="radtan", distortion=(first - shares["lenses"], *others))
     variances = {"offset": (learned.disparity_offset_sigma / focal_length) ** 2}
     T_left_right = camera.T_left_right.copy()
-    T_left_right[:3, :3] = T_left_right[:3, :3] @ cv2.Rodrigues(np.array(turn))[0]
+    T_left_right[:3, :3] = T_left_right[:3, :3] @ cv2.Rodrigues(np.array([0.0, yaw, 0.0]))[0]
     if "baseline" in learned.errors:
         baseline, sigma = learned.errors["baseline"]
         T_left_right[:3, 3] *= 1.0 + baseline

@@ -30,14 +30,13 @@ _LEAST_SIGMA = 1e-6
 HYPOTHESES = {
     "offset": ("offset",),  # a principal point
     "yaw": ("offset", "yaw"),
-    "pitch": ("pitch",),
     "zoom": ("zoom",),  # one focal length
     "lenses": ("lenses",),  # radial distortion of one lens
 }
 """What each moves of the tracker's errors, all alike.
 
 Baseline and focal length of both eyes cannot be told from the scene, a roll and a bend not from patches of a road that
-are misplaced alike (docs/notebook/calibration.md).
+are misplaced alike (docs/notebook/calibration.md). A pitch that disparities show moves rows beyond what is tracked.
 """
 
 

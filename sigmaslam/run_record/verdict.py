@@ -23,7 +23,6 @@ _MAX_CONTRADICTED = 0.1
 # What evidence finds, as shares of the focal length: words, the factor of the figure, and its unit.
 _CAUSES = {
     "yaw": ("the right camera is turned about the vertical, by", 180.0 / np.pi, "degrees"),
-    "pitch": ("the right camera is turned up or down, by", 180.0 / np.pi, "degrees"),
     "zoom": ("the focal length of one camera is wrong, by", 100.0, "%"),
     "lenses": ("the radial distortion of one lens is wrong, k1 by", 1.0, ""),
 }
