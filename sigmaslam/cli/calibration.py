@@ -1,4 +1,4 @@
-"""`sigmaslam calibration`."""
+"""`sigmaslam calibrate show` and `sigmaslam calibrate convert`."""
 
 from __future__ import annotations
 
@@ -19,8 +19,6 @@ from sigmaslam.geometry.camera import StereoCamera
 Form = StrEnum("Form", list(FORMS))  # type: ignore[misc]
 """Forms that can be written."""
 
-calibration = typer.Typer(name="calibration", no_args_is_help=True, help="Show or convert a stereo calibration.")
-
 Source = Annotated[
     Path,
     typer.Argument(
@@ -39,13 +37,11 @@ Rectified = Annotated[
 ]
 
 
-@calibration.command()
 def show(file: Source, size: Size = None, rectified: Rectified = False) -> None:
     """Print baseline, rotation, lens models and fields of view."""
     typer.echo(describe_calibration(read_sized(file, size, rectified)))
 
 
-@calibration.command(short_help="Write a calibration of any form in another one.")
 def convert(
     file: Source,
     out: Annotated[

@@ -1,38 +1,145 @@
-"""All commands under one name, and the entry point of the console script."""
+"""All commands under one name, read when one is asked for, and the entry point of the console script."""
 
 from __future__ import annotations
 
 import logging
 import sys
+from collections import UserDict
+from importlib import import_module
 from importlib.metadata import entry_points, version
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.logging import RichHandler
+from typer.core import TyperGroup
 
-from sigmaslam.cli.calibrate import calibrate
-from sigmaslam.cli.calibration import calibration
-from sigmaslam.cli.check import check
-from sigmaslam.cli.denoise import denoise
-from sigmaslam.cli.evaluate import evaluate
-from sigmaslam.cli.export import export
-from sigmaslam.cli.finish import finish
-from sigmaslam.cli.geometry import geometry
-from sigmaslam.cli.localize import localize
-from sigmaslam.cli.match import match
-from sigmaslam.cli.points import orient, triangulate
-from sigmaslam.cli.reconstruct import reconstruct
-from sigmaslam.cli.rectify import rectify
-from sigmaslam.cli.refine import refine
-from sigmaslam.cli.render import render
-from sigmaslam.cli.track import demo, track
-from sigmaslam.cli.train import train, train_scorer
+from sigmaslam.cli.panels import PanelCommand
 from sigmaslam.errors import SigmaSlamError
 from sigmaslam.files import printable
 
-# Plain help: rich's tables cut long words and give flags a type.
-app = typer.Typer(name="sigmaslam", no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
+# A line each, short enough for 80 columns. The first ones are what a user needs to know; a group has its own table.
+FIRST = {
+    "demo": "Track the sequence that ships with the package.",
+    "check": "Look at an input before it is tracked.",
+    "track": "Track a stereo sequence, recorded or live.",
+    "evaluate": "Compare a trajectory with the truth.",
+    "report": "Make the report of a run anew, or of one that was killed.",
+    "calibrate": "Calibrate cameras; show, convert or use a calibration.",
+}
+GROUPS = {
+    "sigmaslam": FIRST
+    | {
+        "images": "Match, measure and denoise single images.",
+        "map": "Make more of a run: a dense cloud, an adjusted map.",
+        "train": "Render sequences, train networks, export them (extra 'train').",
+        "localize": "Localise robots among known landmarks (extra 'train').",
+    },
+    "calibrate": {
+        "board": "From images of a board, or an inertial sensor by a run.",
+        "show": "Print baseline, rotation, lens models and fields of view.",
+        "convert": "Write a calibration of any form in another one.",
+        "rectify": "Write rectified pairs.",
+    },
+    "images": {
+        "match": "Match two images.",
+        "geometry": "Find how two views lie to each other.",
+        "triangulate": "Points of a stereo pair from pixels in both images.",
+        "orient": "Find how two frames lie from points in both.",
+        "denoise": "Filter noise out of images.",
+    },
+    "map": {
+        "reconstruct": "Make a dense cloud, and a mesh, of a run.",
+        "refine": "Adjust all of a run at once (extra 'graph').",
+    },
+    "train": {
+        "network": "Train the correspondence network.",
+        "scorer": "Train the probability of matches.",
+        "export": "Export trained weights to ONNX.",
+        "render": "Render a stereo sequence with exact truth.",
+    },
+}
+# Commands whose function stands elsewhere than in `sigmaslam.cli.NAME:NAME`.
+PLACES = {
+    "demo": "track:demo",
+    "board": "calibrate:calibrate",
+    "show": "calibration:show",
+    "convert": "calibration:convert",
+    "triangulate": "points:triangulate",
+    "orient": "points:orient",
+    "network": "train:train",
+    "scorer": "train:train_scorer",
+}
+# What a group does whose first word is none of its commands.
+DEFAULTS = {"calibrate": "board", "train": "network"}
+# Names of the release before.
+RENAMED = {
+    "calibration": "calibrate",
+    "rectify": "calibrate rectify",
+    **{name: f"images {name}" for name in GROUPS["images"]},
+    **{name: f"map {name}" for name in GROUPS["map"]},
+    "train-scorer": "train scorer",
+    "export": "train export",
+    "render": "train render",
+    "finish": "report",
+}
+
+
+class _Commands(UserDict[str, Any]):
+    """Commands by name; the module of one of `GROUPS` is imported when the command is asked for."""
+
+    def __getitem__(self, name: str) -> Any:
+        found = self.data[name]
+        if not isinstance(found, str):
+            return found
+        if name in GROUPS:
+            return CommandGroup(name=name, help=found, no_args_is_help=True, rich_markup_mode=None)
+        module, function = PLACES.get(name, f"{name}:{name}").split(":")
+        # Plain help: rich's tables cut long words and give flags a type.
+        alone = typer.Typer(add_completion=False, rich_markup_mode=None)
+        function = getattr(import_module(f"sigmaslam.cli.{module}"), function)
+        alone.command(name, cls=PanelCommand, short_help=found)(function)
+        return typer.main.get_command(alone)
+
+
+class CommandGroup(TyperGroup):
+    """A group of `GROUPS`, with the names of the release before."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.commands: Any = _Commands(GROUPS[str(self.name)] | dict(self.commands))
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The command of the first words; those of the release before are understood, with a word on stderr."""
+        name = str(self.name)
+        if name == "sigmaslam" and args[0] in RENAMED:
+            now = RENAMED[args[0]]
+            typer.echo(f"`sigmaslam {args[0]}` is `sigmaslam {now}` now", err=True)
+            args = [*now.split(), *args[1:]]
+        elif name in DEFAULTS and args[0] not in self.commands:
+            args = [DEFAULTS[name], *args]
+        return super().resolve_command(ctx, args)
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Options before a command's name are those of the group's own command."""
+        if str(self.name) in DEFAULTS and args and args[0].startswith("-") and args[0] != "--help":
+            args = [DEFAULTS[str(self.name)], *args]
+        return super().parse_args(ctx, args)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """The list of commands, from the tables alone."""
+        found = self.commands.data.items()
+        lines = {name: each if isinstance(each, str) else each.get_short_help_str() for name, each in found}
+        first = FIRST if self.name == "sigmaslam" else {}
+        for title, names in (("First of all", first), ("Commands", lines.keys() - first.keys())):
+            if names:
+                with formatter.section(title):
+                    formatter.write_dl([(name, line) for name, line in lines.items() if name in names])
+
+
+app = typer.Typer(
+    name="sigmaslam", cls=CommandGroup, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False
+)
 
 
 def _show_version(wanted: bool) -> None:
@@ -50,30 +157,6 @@ def _root(
     """Stereo visual SLAM: poses with an honest covariance and a sparse map, on a plain CPU."""
 
 
-# A line each for the list of commands, short enough for 80 columns.
-for _command, _line in (
-    (demo, "Track the sequence that ships with the package."),
-    (check, "Look at an input before it is tracked."),
-    (track, "Track a stereo sequence, recorded or live."),
-    (finish, "Make the results of a run that was killed."),
-    (evaluate, "Compare a trajectory with the truth."),
-    (refine, "Adjust all of a run at once (extra 'graph')."),
-    (reconstruct, "Make a dense cloud, and a mesh, of a run."),
-    (localize, "Localise robots among known landmarks (extra 'train')."),
-    (match, "Match two images."),
-    (denoise, "Filter noise out of images."),
-    (geometry, "Find how two views lie to each other."),
-    (triangulate, "Points of a stereo pair from pixels in both images."),
-    (orient, "Find how two frames lie from points in both."),
-    (calibrate, "Calibrate one or two cameras from images of a board."),
-    (rectify, "Write rectified pairs."),
-    (render, "Render a stereo sequence with exact truth (extra 'train')."),
-    (train, "Train the correspondence network (extra 'train')."),
-    (train_scorer, "Train the probability of matches (extra 'train')."),
-    (export, "Export trained weights to ONNX (extra 'train')."),
-):
-    app.command(short_help=_line)(_command)
-app.add_typer(calibration)
 # Commands of packages that are installed beside this one: `benchmark`, in a checkout.
 for _entry in entry_points(group="sigmaslam.commands"):
     app.add_typer(_entry.load())

@@ -1,4 +1,4 @@
-"""`sigmaslam denoise`."""
+"""`sigmaslam images denoise`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`sigmaslam export`."""
+"""`sigmaslam train export`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`sigmaslam geometry`."""
+"""`sigmaslam images geometry`."""
 
 from __future__ import annotations
 

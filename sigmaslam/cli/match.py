@@ -1,4 +1,4 @@
-"""`sigmaslam match`."""
+"""`sigmaslam images match`."""
 
 from __future__ import annotations
 

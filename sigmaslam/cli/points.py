@@ -1,4 +1,4 @@
-"""`sigmaslam triangulate` and `sigmaslam orient`."""
+"""`sigmaslam images triangulate` and `sigmaslam images orient`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`sigmaslam reconstruct`."""
+"""`sigmaslam map reconstruct`."""
 
 from __future__ import annotations
 

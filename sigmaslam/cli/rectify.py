@@ -1,4 +1,4 @@
-"""`sigmaslam rectify`."""
+"""`sigmaslam calibrate rectify`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`sigmaslam refine`."""
+"""`sigmaslam map refine`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`sigmaslam render`."""
+"""`sigmaslam train render`."""
 
 from __future__ import annotations
 

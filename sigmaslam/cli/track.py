@@ -16,6 +16,7 @@ import typer
 from sigmaslam.checks.check import SAMPLES_BEFORE_TRACKING, check_sequence
 from sigmaslam.checks.finding import Finding, wrong
 from sigmaslam.cli.extras import need_train_extra
+from sigmaslam.cli.panels import HelpAll
 from sigmaslam.cli.run_summary import tell_summary
 from sigmaslam.cli.track_sinks import open_sinks
 from sigmaslam.errors import InputError
@@ -67,7 +68,7 @@ Weights = Annotated[
     Path | None,
     typer.Option(
         metavar="FOLDER",
-        help="Your own networks, as `sigmaslam export` writes them; of those that it lacks, the ones that ship.",
+        help="Your own networks, as `sigmaslam train export` writes them; of those that it lacks, the ones that ship.",
         show_default="what ships",
     ),
 ]
@@ -100,10 +101,7 @@ def track(
     format: Annotated[InputFormat, typer.Option(help="Kind of input.")] = InputFormat["auto"],
     calibration: Annotated[
         Path | None,
-        typer.Option(
-            help="Calibration of any form (sigmaslam calibration show --help), or two as left.yaml,right.yaml, instead "
-            "of the input's own."
-        ),
+        typer.Option(help="Calibration of any form, or two as left.yaml,right.yaml, instead of the input's own."),
     ] = None,
     frontend: Annotated[Frontend, typer.Option(help="Where correspondences come from.")] = Frontend["learned"],
     backend: Annotated[
@@ -130,7 +128,7 @@ def track(
         typer.Option(help="map.npz of an earlier run with the same camera and front-end: poses are in its world."),
     ] = None,
     tracks: Annotated[
-        bool, typer.Option("--tracks", help="Also write tracks.npz, what keyframes saw, for `sigmaslam refine`.")
+        bool, typer.Option("--tracks", help="Also write tracks.npz, what keyframes saw, for `sigmaslam map refine`.")
     ] = False,
     save_calibration: Annotated[
         Path | None,
@@ -144,7 +142,7 @@ def track(
         str | None,
         typer.Option(
             metavar="LEFT,RIGHT",
-            help="Live cameras in place of INPUT: numbers, paths or URLs; side-by-side:0 is one that gives both eyes.",
+            help="Live cameras in place of INPUT: numbers, paths or URLs; side-by-side:0 gives both eyes.",
         ),
     ] = None,
     seconds: Annotated[
@@ -156,8 +154,8 @@ def track(
         str | None,
         typer.Option(
             metavar="MASK|BOX",
-            help="The camera is at rest and follows one rigid body: x,y,width,height in pixels of the first left "
-            "image, or an image of its size that is not zero on the body. Poses are then T_camera_object.",
+            help="Follow one rigid body, the camera at rest: x,y,width,height in the first left image, or an image "
+            "that is not zero on the body; poses are T_camera_object.",
         ),
     ] = None,
     location: Annotated[
@@ -179,8 +177,7 @@ def track(
         Path | None,
         typer.Option(
             metavar="FILE|FOLDER",
-            help="Image of the left images' size, or a folder with one named as each: where it is black (0) nothing of "
-            "the left image is used, such as the robot itself, or people that a detector found.",
+            help="Image, or a folder with one named as each left image: where it is black (0) nothing is used.",
         ),
     ] = None,
     imu: Imu = None,
@@ -188,8 +185,8 @@ def track(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="CSV of wheels with a head timestamp, speed, yaw_rate (m/s, rad/s), or vx, vy, vz, wx, wy, wz, with "
-            "T_cam_base in the YAML beside.",
+            help="CSV of wheels: timestamp, speed, yaw_rate (m/s, rad/s), or vx, vy, vz, wx, wy, wz; T_cam_base in the "
+            "YAML beside.",
         ),
     ] = None,
     denoise: Annotated[
@@ -231,12 +228,13 @@ def track(
             help="Show the run in a window of Rerun while it goes on, or write what it would show (extra 'viewer').",
         ),
     ] = None,
+    help_all: HelpAll = False,
 ) -> None:
     """Track a stereo sequence, recorded or live: trajectory, covariance, map and report.
 
     Ctrl-C, SIGTERM and SIGHUP end it with what was tracked until then (exit codes 130, 143, 129). After a kill -9
-    `sigmaslam finish` makes the results, and --resume goes on with the run. Exit code 3: less than half of the frames
-    were tracked, and the last line says why. 2: the input cannot be used, or a result not be written.
+    `sigmaslam report` makes the results, and --resume goes on. Exit code 3: less than half of the frames were tracked.
+    2: the input cannot be used, or a result not be written.
     """
     request = _read_request(locals())
     if request.tracker.backend == "torch":

@@ -1,4 +1,4 @@
-"""`sigmaslam train` and `sigmaslam train-scorer`."""
+"""`sigmaslam train` and `sigmaslam train scorer`."""
 
 from __future__ import annotations
 

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
+from sigmaslam.cli.commands import RENAMED
 from sigmaslam.readers.trajectory_files import read_tum
 from sigmaslam.run_record.relative_pose_file import read_frame_pairs
 from tests.support.commands import Finished, assert_refused, command_line, environment, run_here, run_process
@@ -307,21 +308,25 @@ def test_training_without_its_extra_says_how_to_install_it(tmp_path: Path):
         "demo",
         "check",
         "track",
-        "finish",
+        "report",
         "evaluate",
-        "match",
-        "geometry",
         "calibrate",
-        "rectify",
+        "calibrate board",
+        "calibrate show",
+        "calibrate convert",
+        "calibrate rectify",
+        "images",
+        "images match",
+        "images geometry",
+        "images denoise",
+        "map",
+        "map refine",
         "localize",
-        "refine",
-        "calibration",
-        "calibration show",
-        "calibration convert",
-        "render",
         "train",
-        "train-scorer",
-        "export",
+        "train network",
+        "train scorer",
+        "train export",
+        "train render",
         "benchmark",
         "benchmark sequences",
         "benchmark filters",
@@ -341,8 +346,44 @@ def test_every_command_has_help_that_80_columns_do_not_cut(command: str, monkeyp
 
 def test_the_list_of_columns_is_whole_in_80_columns(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("COLUMNS", "80")
-    words = re.findall(r"\w+", run_here("track", "--help").stdout)
+    words = re.findall(r"\w+", run_here("track", "--help-all").stdout)
     assert {"timestamp", "qx", "qy", "qz", "qw", "sigma_position", "sigma_rotation"} <= set(words)
+
+
+def test_help_of_track_is_a_screen_and_all_of_it_is_longer(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    short, whole = (run_here("track", option).stdout for option in ("--help", "--help-all"))
+    assert len(short.splitlines()) <= 60
+    assert "--denoise" not in short
+    assert set(re.findall(r"--[a-z-]+", short)) < set(re.findall(r"--[a-z-]+", whole))
+
+
+@pytest.mark.parametrize(("old", "new"), RENAMED.items())
+def test_a_name_of_the_release_before_is_understood_with_a_word(old: str, new: str):
+    result = run_here(old, "--help")
+    assert result.stdout == run_here(*new.split(), "--help").stdout
+    assert result.stderr == f"`sigmaslam {old}` is `sigmaslam {new}` now\n"
+
+
+def test_a_group_with_a_command_of_its_own_goes_without_the_commands_name(tmp_path: Path):
+    named, short = (run_here("calibrate", *board, tmp_path, "--out", "a.txt") for board in (["board"], []))
+    assert_refused(short, "ends in .yaml")
+    assert named.stderr == short.stderr
+    assert "--recipe" in run_here("train", "--out", tmp_path, "--help").stdout
+
+
+def test_the_list_of_commands_imports_none():
+    code = "import sys; from sigmaslam.cli import main; main()"
+    result = subprocess.run(
+        [sys.executable, "-X", "importtime", "-c", code, "--help"],
+        capture_output=True,
+        text=True,
+        env=environment(),
+        check=True,
+        timeout=60,
+    )
+    assert "reconstruct" not in result.stdout
+    assert not re.search(r"\| +(numpy|cv2|onnxruntime|torch)$", result.stderr, re.MULTILINE)
 
 
 @pytest.mark.long
