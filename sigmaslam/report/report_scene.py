@@ -150,5 +150,6 @@ def _labels(run: RecordedRun, seconds: np.ndarray, shown: np.ndarray) -> list[st
     position, rotation = run.sigmas
     status = run.pose_status
     return [
-        f"{seconds[k]:.2f} s, {status[k]}\nsigma {position[k]:.3g} m, {np.degrees(rotation[k]):.3g} deg" for k in shown
+        f"{seconds[k]:.2f} s, {status[k]}\nsigma {1e3 * position[k]:.3g} mm, {np.degrees(rotation[k]):.3g} deg"
+        for k in shown
     ]

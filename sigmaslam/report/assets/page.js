@@ -10,11 +10,12 @@ function unpacked(_, value) {
 }
 
 const page = JSON.parse(document.getElementById("data").textContent, unpacked);
-let scene = null, frames = null;
+let scene = null, frames = null, timeline = null;
 const plots = [];
 
 function select(seconds, from) {
-  if (scene) scene.select(seconds);
+  if (scene) scene.select(seconds, document.getElementById("follow").checked);
+  if (timeline && from !== "timeline") timeline.select(seconds);
   if (frames && from !== "frames") frames.select(seconds);
   for (const plot of plots) plot.setCursor({ left: plot.valToPos(seconds, "x"), top: 10 }, false);
 }
@@ -34,6 +35,9 @@ if (page.scene) {
     document.querySelectorAll("[data-colour]").forEach((each) => press(each, each === button));
     scene?.colourBy(button.dataset.colour);
   }));
+  if (scene && page.scene.path_seconds.length) {
+    timeline = buildTimeline(page.scene.path_seconds, page.scene.labels, (seconds) => select(seconds, "timeline"));
+  }
   const magnification = document.getElementById("magnification");
   magnification.addEventListener("change", () => scene?.magnify(+magnification.value));
 }
@@ -44,4 +48,5 @@ if (page.pictures.length) {
 page.plots.forEach((plot, k) => {
   plots.push(buildPlot(document.getElementById(`plot-${k}`), page.seconds, page.intervals, plot, select));
 });
-window.report = { page, scene, frames, plots };
+if (timeline) select(page.scene.path_seconds.at(-1));
+window.report = { page, scene, frames, plots, timeline };

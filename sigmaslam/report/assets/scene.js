@@ -66,6 +66,24 @@ function mapPoints(scene, by) {
   return colours;
 }
 
+// Lines of the first camera's horizontal plane below the path, a round number of metres apart.
+function grid(scene) {
+  const decade = 10 ** Math.floor(Math.log10(scene.size / 8));
+  const spacing = decade * [5, 2, 1].find((factor) => factor * decade <= scene.size / 8);
+  const [x, , z] = scene.centre.map((value) => spacing * Math.round(value / spacing));
+  let floor = -Infinity;
+  for (let k = 1; k < scene.path.length; k += 3) floor = Math.max(floor, scene.path[k]);
+  floor += scene.size / 30;
+  const positions = [];
+  for (let k = -6; k <= 6; k++) {
+    const [a, b] = [k * spacing, 6 * spacing];
+    positions.push(x + a, floor, z - b, x + a, floor, z + b, x - b, floor, z + a, x + b, floor, z + a);
+  }
+  const made = lineSegments(positions, null, { linewidth: 1, color: "#33404c" });
+  made.spacing = spacing;
+  return made;
+}
+
 function frustums(scene, size) {
   const corners = [[-1, -0.6, 1.2], [1, -0.6, 1.2], [1, 0.6, 1.2], [-1, 0.6, 1.2]].map((c) => c.map((v) => v * size));
   const positions = [];
@@ -147,6 +165,8 @@ function buildScene(box, scene, select) {
   layers.points = new THREE.Points(cloud, new THREE.PointsMaterial({ size: 2.6 * renderer.getPixelRatio(),
     sizeAttenuation: false, vertexColors: true }));
   if (scene.dense) layers.dense = surfaces(scene);
+  layers.grid = grid(scene);
+  box.querySelector(".scale").textContent = `grid: ${length(layers.grid.spacing)}`;
   layers.keyframes = frustums(scene, scene.size / 130);
   layers.loops = lineSegments(scene.loops, null, { linewidth: 2, color: "#ffb000" });
   for (const [name, colour] of [["truth", "#00c08a"], ["final", "#f0e442"], ["refined", "#e0aaff"]]) {
@@ -230,13 +250,18 @@ function buildScene(box, scene, select) {
     show: (name, visible) => { if (layers[name]) layers[name].visible = visible; redraw(); },
     colourBy: (by) => { colourBy(by); redraw(); },
     magnify: (factor) => { layers.ellipsoids.magnify(factor); redraw(); },
-    select: (seconds) => {
+    select: (seconds, follow) => {
       const times = scene.path_seconds;
       let k = 0;
       while (k + 1 < times.length && Math.abs(times[k + 1] - seconds) <= Math.abs(times[k] - seconds)) k++;
       if (!times.length) return;
       marker.position.fromArray(scene.path, 3 * k);
       marker.visible = true;
+      if (follow) {
+        camera.position.add(marker.position).sub(controls.target);
+        controls.target.copy(marker.position);
+        controls.update();
+      }
       redraw();
     },
   };

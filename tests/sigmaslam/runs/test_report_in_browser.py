@@ -165,3 +165,26 @@ def test_a_browser_without_webgl_shows_the_rest(browser: Any, report: Path):
     assert "no WebGL" in opened.locator("#scene").text_content()
     assert opened.evaluate("report.plots.length") == 7
     opened.close()
+
+
+def test_one_time_line_moves_marker_picture_and_plots_and_plays(page: Any):
+    slider, text = page.locator("#time"), page.locator("#time-text")
+    slider.fill("30")
+    seconds = page.evaluate("report.page.scene.path_seconds[30]")
+    assert text.text_content().startswith(f"{seconds:.2f} s")
+    assert float(page.locator("#frame-text").text_content().split(" s,")[0]) == pytest.approx(seconds, abs=0.5)
+    cursor = page.evaluate("report.plots[0].posToVal(report.plots[0].cursor.left, 'x')")
+    assert cursor == pytest.approx(seconds, abs=0.2)
+    page.locator("h1").click()
+    page.keyboard.press("ArrowRight")
+    assert slider.input_value() == "31"
+    page.locator("#speed").select_option("16")
+    page.locator("#follow").check()
+    before = page.evaluate("report.scene.camera.position.toArray()")
+    page.locator("#play").click()
+    page.wait_for_function("+document.getElementById('time').value > 40")
+    assert page.evaluate("report.scene.camera.position.toArray()") != before
+    page.locator("#play").click()
+    stopped = slider.input_value()
+    page.wait_for_timeout(300)
+    assert slider.input_value() == stopped
