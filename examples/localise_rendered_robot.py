@@ -1,11 +1,11 @@
 """A robot with four wheels and a stereo camera in a rendered room: localised among landmarks at known places.
 
-    sigmaslam render room --motion planar --frames 160 --width 320 --height 240 --seed 3 --out room
+    sigmaslam train render room --motion planar --frames 160 --width 320 --height 240 --seed 3 --out room
     python examples/localise_rendered_robot.py room
 
 Once a second an image is a survey: its keypoints are landmarks, whose places come from the render's exact depth and
-pose. In between, four times a second, they are matched in both images of a pair, `sigmaslam match`; (9.34) makes of
-that where they stand before the robot, (9.35) how exactly, and the unscented filter of (9.43)-(9.45) where the robot
+pose. In between, four times a second, they are matched in both images of a pair, `sigmaslam images match`; (9.34) makes
+of that where they stand before the robot, (9.35) how exactly, and the unscented filter of (9.43)-(9.45) where the robot
 is. Wheel odometry is simulated: the true motion, with errors that are drawn from `RobotNoise`.
 """
 
@@ -38,7 +38,7 @@ ROWS = 3.0  # sigmas that both rows of a landmark may differ by
 
 @dataclass(frozen=True, slots=True)
 class Render:
-    """A folder of `sigmaslam render`.
+    """A folder of `sigmaslam train render`.
 
     Attributes:
         folder: of the files.

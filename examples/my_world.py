@@ -2,7 +2,7 @@
 
     python examples/my_world.py bench.png  # a picture of it
     sigmaslam train --recipe fine-tune --world examples/my_world.py --worlds leaves --out my_features
-    sigmaslam render organ --world examples/my_world.py --out bench --frames 20
+    sigmaslam train render organ --world examples/my_world.py --out bench --frames 20
 
 The program calls `generate` with a generator of random numbers and a wish, once for every scene. What it returns is a
 scene, bodies of a few shapes with materials (`sigmaslam_synthetic.scene`, `.rendering.shapes`), and the camera's path

@@ -4,8 +4,8 @@
 
 Shares say what pairs are made of: worlds and textures by name (`sigmaslam_training.sources.SOURCES`), Python files that
 make a world, folders of photographs. Leaves keep the network from forgetting the rest. This run is tiny: give 800 steps
-and the sizes that are the defaults of `TrainingConfig`, then `sigmaslam export my_features --out graphs`. The command
-line does the same: docs/matching.md.
+and the sizes that are the defaults of `TrainingConfig`, then `sigmaslam train export my_features --out graphs`. The
+command line does the same: docs/matching.md.
 """
 
 import sys

@@ -127,7 +127,7 @@ def test_there_are_commands_on_the_pages():
         "sigmaslam track FOLDER --out run --frontend surf",
         "sigmaslam track FOLDER OTHER --out run",
         "sigmaslam calibration invert a.yaml",
-        "sigmaslam render street --out drive --frames many",
+        "sigmaslam train render street --out drive --frames many",
     ],
 )
 def test_a_command_that_is_wrong_is_found(command: str):

@@ -11,7 +11,7 @@ import yaml
 from sigmaslam.errors import InputError
 from sigmaslam_models.model_card import fill_template
 
-PAGE_COMMAND = "sigmaslam export --page docs/onnx.md"
+PAGE_COMMAND = "sigmaslam train export --page docs/onnx.md"
 _UNKNOWN = {"purpose": "No text yet: `models/sigmaslam_models/graph_texts.yaml`.", "meanings": {}}
 
 
@@ -32,7 +32,7 @@ def graph_page(folder: Path, command: str) -> str:
     """
     paths = {path.stem: path for path in sorted(folder.glob("*.onnx"))}
     if not paths:
-        raise InputError(f"{folder} has no .onnx files: give the folder that `sigmaslam export` wrote")
+        raise InputError(f"{folder} has no .onnx files: give the folder that `sigmaslam train export` wrote")
     names = [*(name for name in graph_texts() if name in paths), *(name for name in paths if name not in graph_texts())]
     graphs = [_describe(name, paths[name]) for name in names]
     return fill_template("onnx.md", command=command, graphs=graphs)
@@ -74,4 +74,4 @@ def _load(path: Path) -> onnx.ModelProto:
     try:
         return onnx.load(path)
     except Exception as error:  # of the parser of protocol buffers, which raises its own
-        raise InputError(f"{path} is no ONNX graph ({error}): export it again with `sigmaslam export`") from error
+        raise InputError(f"{path} is no ONNX graph ({error}): export it again with `sigmaslam train export`") from error

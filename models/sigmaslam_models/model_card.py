@@ -15,8 +15,8 @@ _CARD_FIELDS = (
     *("duration_s", "hardware"),
 )
 _CARD_BYTES = 1 << 24
-REFINED_NAME = " + sigmaslam match"
-"""Follows the name of an extractor in the row of what `sigmaslam match` makes of its features."""
+REFINED_NAME = " + sigmaslam images match"
+"""Follows the name of an extractor in the row of what `sigmaslam images match` makes of its features."""
 PEER_NAMES = ("sift", "orb", "klt")
 """Rows of `sigmaslam benchmark features` that are always beside ours."""
 
@@ -44,7 +44,7 @@ def read_card(card: Path) -> dict[str, Any]:
 def read_scores(path: Path) -> dict[str, dict[str, float]]:
     """Scores of one extractor by set, as `sigmaslam benchmark features` writes them beside its page.
 
-    Those of SIFT, ORB and KLT are left out; those with what `sigmaslam match` makes of the features get its name.
+    SIFT, ORB and KLT are left out; those with what `sigmaslam images match` makes of the features get its name.
 
     Raises:
         InputError: the file cannot be read, or holds the scores of no or several extractors.

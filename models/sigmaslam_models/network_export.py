@@ -60,7 +60,7 @@ def export_features(weights: Path, out: Path) -> float:
 
 
 def export_scoring(run: Path, out: Path) -> dict[str, float]:
-    """Graphs, weights and card of a run of `sigmaslam train-scorer`, into one folder.
+    """Graphs, weights and card of a run of `sigmaslam train scorer`, into one folder.
 
     Args:
         run: folder with scorer.safetensors, verifier.safetensors, place_verifier.safetensors and matching.json.

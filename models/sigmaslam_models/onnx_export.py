@@ -42,7 +42,7 @@ def check_graphs(folder: Path) -> dict[str, float]:
     """Compares every graph of a folder with torch, on inputs that are the same each time, and returns the differences.
 
     Args:
-        folder: with the graphs and the weights, as `sigmaslam export` writes it and as it ships.
+        folder: with the graphs and the weights, as `sigmaslam train export` writes it and as it ships.
     Raises:
         InputError: a file is missing or not the one of the manifest, or there is a graph of which torch knows nothing.
         SigmaSlamError: a graph differs from torch by more than its tolerance.
@@ -51,7 +51,9 @@ def check_graphs(folder: Path) -> dict[str, float]:
     graphs = estimator_graphs() | network_graphs(folder)
     if not present or present - graphs.keys():
         strangers = ", ".join(f"{name}.onnx" for name in sorted(present - graphs.keys())) or "no .onnx file"
-        raise InputError(f"{folder}: {strangers}, but only what `sigmaslam export` writes can be compared with torch")
+        raise InputError(
+            f"{folder}: {strangers}, but only what `sigmaslam train export` writes can be compared with torch"
+        )
     differences = {}
     for name in sorted(present):
         compare = feature_difference if name == "features" else relative_difference
@@ -60,6 +62,6 @@ def check_graphs(folder: Path) -> dict[str, float]:
         if not differences[name] <= tolerance:
             raise SigmaSlamError(
                 f"{folder / name}.onnx differs from torch by {differences[name]:.2e}, more than {tolerance:.0e}: "
-                "export it again with `sigmaslam export`"
+                "export it again with `sigmaslam train export`"
             )
     return differences

@@ -86,7 +86,7 @@ def read_calibration(
         raise content.error(
             f"no stereo calibration of a known form (keys: {', '.join(map(str, content.entries))}); looked for left + "
             "right + T_left_right, for cam0 + cam1 of Kalibr, and for OpenCV's matrices (all forms: "
-            "sigmaslam calibration show --help)"
+            "sigmaslam calibrate show --help)"
         )
     return StereoCamera.from_yaml(path)
 

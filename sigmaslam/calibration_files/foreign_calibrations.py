@@ -130,7 +130,7 @@ def _write_kitti(path: Path, camera: StereoCamera) -> None:
     if any(eye.distortion_model != "none" for eye in eyes) or np.abs(T[:3, :3] - np.eye(3)).max() > _RECTIFIED:
         raise CalibrationError(
             "the form kitti (calib.txt) is of rectified images, these are raw: write rectified ones by "
-            "`sigmaslam rectify`, and convert the calibration.yaml beside them"
+            "`sigmaslam calibrate rectify`, and convert the calibration.yaml beside them"
         )
     _need_alike(camera, "kitti")
     lines = []

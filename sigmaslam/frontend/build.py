@@ -24,7 +24,7 @@ def own_networks(name: str, weights: WeightsFolder, backend: str = "onnx") -> tu
 
     Args:
         name: one of FRONTENDS.
-        weights: folder, as `sigmaslam export` writes it.
+        weights: folder, as `sigmaslam train export` writes it.
         backend: "onnx" or "torch".
     Raises:
         InputError: there is no such front-end or folder, or the front-end has no use for what is in it.
@@ -52,8 +52,8 @@ def build_frontend(
         backend: "onnx" or "torch", of the networks.
         threads: of the feature network.
         provider: where ONNX Runtime computes them.
-        weights: folder of networks of one's own, as `sigmaslam export` writes it; for those that it lacks, the ones
-            that ship.
+        weights: folder of networks of one's own, as `sigmaslam train export` writes it; for those that it lacks,
+            the ones that ship.
     Raises:
         InputError: there is no front-end of that name, the provider is not installed, or the folder holds no network
             of this front-end, or one that does not fit.

@@ -1,4 +1,4 @@
-"""Two images in, matches with a probability and a covariance out: `sigmaslam match`."""
+"""Two images in, matches with a probability and a covariance out: `sigmaslam images match`."""
 
 from __future__ import annotations
 
@@ -97,8 +97,8 @@ def match_images(
         min_probability: of a match; 0 keeps every mutual nearest neighbour, among all keypoints or among those near its
             epipolar line, that the scorer does not refuse.
         provider: where ONNX Runtime computes the networks, one of `sigmaslam.inference.session.PROVIDERS`.
-        weights: folder of networks of one's own, as `sigmaslam export` writes it; for those that it lacks, the ones
-            that ship.
+        weights: folder of networks of one's own, as `sigmaslam train export` writes it; for those that it lacks,
+            the ones that ship.
     Raises:
         InputError: an image has another shape or type or is too small, an option is out of range, the provider is
             not installed, or the folder holds no network of the front-end, or one that does not fit.

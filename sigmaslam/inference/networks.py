@@ -1,4 +1,4 @@
-"""The networks: those that ship, or those of a folder that `sigmaslam export` wrote."""
+"""The networks: those that ship, or those of a folder that `sigmaslam train export` wrote."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ def network_path(name: str, weights: WeightsFolder = None, backend: str = "onnx"
     for other in SUFFIXES.values():
         if path.with_suffix(other).is_file():
             raise InputError(
-                f"{path.parent}: holds {name}{other}, but no {path.name}: give a folder that `sigmaslam export RUN "
-                "--out FOLDER` wrote"
+                f"{path.parent}: holds {name}{other}, but no {path.name}: give a folder that `sigmaslam train export "
+                "RUN --out FOLDER` wrote"
             )
     return shipped_weights(name + suffix)
 
@@ -62,7 +62,8 @@ def networks_in(weights: WeightsFolder, backend: str = "onnx", names: Sequence[s
     if not found:
         files = ", ".join(name + SUFFIXES[backend] for name in names)
         raise InputError(
-            f"--weights {folder}: holds none of {files}: give a folder that `sigmaslam export RUN --out FOLDER` wrote"
+            f"--weights {folder}: holds none of {files}: give a folder that `sigmaslam train export RUN --out "
+            "FOLDER` wrote"
         )
     return found
 
@@ -87,7 +88,7 @@ def open_graph(name: str, weights: WeightsFolder = None, threads: int = 1, provi
 
 def _check_same_signature(path: Path, graph: OnnxGraph, shipped: OnnxGraph) -> None:
     """Names, types and shapes of the inputs, and names of the outputs, are those of the graph that ships."""
-    mend = "export it again with `sigmaslam export` of this version"
+    mend = "export it again with `sigmaslam train export` of this version"
     if graph.inputs != shipped.inputs:
         raise InputError(
             f"{path}: takes {shorten(_describe(graph), 200)}, and not {_describe(shipped)} as the graph that ships: "

@@ -82,7 +82,7 @@ class OnnxGraph:
         except Exception as error:  # as above; ValueError where an input is missing
             raise InputError(
                 f"{self._path}: the graph does not take {', '.join(feed)} ({shorten(str(error), 200)}): reinstall the "
-                "package, or export the graph again with `sigmaslam export`"
+                "package, or export the graph again with `sigmaslam train export`"
             ) from error
         return outputs
 

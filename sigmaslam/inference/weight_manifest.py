@@ -13,7 +13,7 @@ from sigmaslam.files import atomic_write_text
 
 MANIFEST_NAME = "manifest.json"
 _MANIFEST_BYTES = 1 << 20
-_MEND = "reinstall the package, or export the graphs again with `sigmaslam export`"
+_MEND = "reinstall the package, or export the graphs again with `sigmaslam train export`"
 
 
 def check_weights(path: Path, content: bytes) -> None:

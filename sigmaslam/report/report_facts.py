@@ -171,7 +171,7 @@ def list_evaluation(run: RecordedRun) -> tuple[list[str], list[list[str]]]:
 
 
 def list_refinement(run: RecordedRun) -> Facts:
-    """Label and value of what `sigmaslam refine` found."""
+    """Label and value of what `sigmaslam map refine` found."""
     found = run.refinement
     if not found:
         return []

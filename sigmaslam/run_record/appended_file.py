@@ -48,7 +48,7 @@ class AppendedFile:
         except OSError as error:
             raise OutputError(
                 f"{self._path}: cannot be written ({error.strerror}): make room on the disk; "
-                f"`sigmaslam finish {self._path.parent}` then writes the results that are not there"
+                f"`sigmaslam report {self._path.parent}` then writes the results that are not there"
             ) from error
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""dense.npz and reconstruction.json of a run: points of `sigmaslam reconstruct` that its report shows."""
+"""dense.npz and reconstruction.json of a run: points of `sigmaslam map reconstruct` that its report shows."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sigmaslam.files import save_arrays
 DENSE_NAME, RECONSTRUCTION_NAME = "dense.npz", "reconstruction.json"
 MAX_POINTS = 150_000
 """Of a denser cloud an even selection is kept, so that the report has 2.6 MB of it."""
-_MEND = "run `sigmaslam reconstruct` again"
+_MEND = "run `sigmaslam map reconstruct` again"
 
 
 @dataclass(frozen=True, slots=True)

@@ -147,7 +147,7 @@ class RunWriter:
         return bool(self._tracks)
 
     def write_tracks(self, path: Path) -> None:
-        """Writes what keyframes saw, for `sigmaslam refine`; there is something only if `has_tracks` says so."""
+        """Writes what keyframes saw, for `sigmaslam map refine`; there is something only if `has_tracks` says so."""
         assert self._rectified is not None
         assert self.calibration is not None
         seen = KeyframeTracks.concatenate([tracks for _, tracks in self._tracks])
@@ -178,7 +178,7 @@ def check_has_trajectory(run: Path) -> None:
     if (run / PARTIAL_POSES).is_file() and is_in_use(run / PARTIAL_POSES):
         reason = "it still goes on; wait for its end, or stop it"
     elif (run / PARTIAL_POSES).is_file():
-        reason = f"it was stopped before its results were written; `sigmaslam finish {run}` writes them"
+        reason = f"it was stopped before its results were written; `sigmaslam report {run}` writes them"
     elif (run / FRAMES_NAME).is_file():
         reason = "none of its frames has a pose, so there is nothing to compare; its report.html says why"
     else:

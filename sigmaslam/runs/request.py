@@ -32,7 +32,7 @@ _REFUSED = (
     (
         "--camera",
         ("no --calibration",),
-        "--camera needs --calibration: any file that `sigmaslam calibration show` reads",
+        "--camera needs --calibration: any file that `sigmaslam calibrate show` reads",
     ),
     ("--camera", ("--format", "--topic-left", "--topic-right"), "{all} go with INPUT, not with --camera"),
     ("--camera", ("--start", "--frames", "--every", "--scale"), "{all} go with INPUT, not with --camera"),
@@ -117,7 +117,7 @@ class OutputOptions:
 
     Attributes:
         out: the folder, new or empty.
-        tracks: write tracks.npz, too, the observations of keyframes for `sigmaslam refine`.
+        tracks: write tracks.npz, too, the observations of keyframes for `sigmaslam map refine`.
         overwrite: the command removes the run in the folder first.
         resume: `out` holds a run of the same input that was stopped or killed, which goes on where it was. The map is
             then that of the frames from its last keyframe on, and there is no trajectory after the fact.

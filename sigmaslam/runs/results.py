@@ -133,7 +133,7 @@ def write_results(
 
 def output_error(folder: Path, failed: list[str]) -> OutputError:
     """What to say where these files could not be written."""
-    mend = f"`sigmaslam finish {folder}`" if (folder / PARTIAL_POSES).is_file() else "track again"
+    mend = f"`sigmaslam report {folder}`" if (folder / PARTIAL_POSES).is_file() else "track again"
     return OutputError(f"{folder}: could not write {', '.join(failed)}; make room on the disk, then {mend}")
 
 

@@ -165,7 +165,7 @@ def read_stopped_run(folder: Path, run: dict[str, Any]) -> StoppedRun:
 def _check_entries(folder: Path, entries: dict[str, Any], run: dict[str, Any]) -> None:
     """The run in the folder is of the kind that goes on, and had the same input and settings."""
     if entries.get("ended") == "complete":
-        mend = f"; `sigmaslam finish {folder}` writes its results" if (folder / PARTIAL_POSES).is_file() else ""
+        mend = f"; `sigmaslam report {folder}` writes its results" if (folder / PARTIAL_POSES).is_file() else ""
         raise InputError(f"{folder}: the run is complete, there is nothing to go on with{mend}")
     for name, option in (("map", "--map"), ("object", "--track-object"), ("location", "--location")):
         if entries.get(name) is not None:

@@ -76,8 +76,8 @@ class StereoTracker:
         start: pose of the first frame in the world of an earlier run, in which it was a keyframe; by default the left
             camera of the first frame is the world.
         provider: where ONNX Runtime computes the networks, "cpu", "cuda" or "openvino"; the estimator stays on the CPU.
-        weights: folder of networks of one's own, as `sigmaslam export` writes it; for those that it lacks, the ones
-            that ship.
+        weights: folder of networks of one's own, as `sigmaslam train export` writes it; for those that it lacks,
+            the ones that ship.
         disparity_error: pixels by which disparities may be off, as a check found that the eyes do not fit: all poses
             are doubtful then, and less certain; None: nothing was found.
         imu: an inertial sensor on the rig, whose samples `add_imu` takes.

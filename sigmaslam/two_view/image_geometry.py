@@ -1,4 +1,4 @@
-"""The geometry of two image files: `sigmaslam geometry`."""
+"""The geometry of two image files: `sigmaslam images geometry`."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -27,7 +27,7 @@ def triangulate_file(source: Path, camera: StereoCamera, out: Path, method: str,
 
     Args:
         source: CSV with a header: u0,v0,u1,v1, pixels of the raw left and right image, and if wanted `id` and `sigma`;
-            or an .npz of `sigmaslam match`, left image first, of which the covariance of the right pixels is taken.
+            or an .npz of `sigmaslam images match`, left image first, whose covariance of right pixels is taken.
         camera: the pair.
         out: CSV to write: id,x,y,z in metres and the upper triangle of the covariance.
         method: of `two_view.triangulation.METHODS`; parallel rectifies the pixels.
@@ -145,7 +145,7 @@ def _read_pairs(path: Path, sigma: float) -> tuple[list[str], np.ndarray, np.nda
     """Names (N,), pixels (N, 4) and covariances (N, 4, 4)."""
     if path.suffix.lower() == ".npz":
         shapes = {"keypoints0": ("M", 2), "keypoints1": ("M", 2), "covariance": ("M", 2, 2)}
-        arrays = load_columns(path, "write it by `sigmaslam match`", shapes, {})
+        arrays = load_columns(path, "write it by `sigmaslam images match`", shapes, {})
         pixels = np.column_stack([arrays["keypoints0"], arrays["keypoints1"]]).astype(float)
         covariance = np.zeros((len(pixels), 4, 4))
         # What is known is the covariance of the difference; each image is given half of it.

@@ -1,4 +1,4 @@
-"""What `sigmaslam render` offers: a domain, its stereo camera, its clock and the folder layout of its field."""
+"""What `sigmaslam train render` offers: a domain, its stereo camera, its clock and the folder layout of its field."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -90,7 +90,7 @@ _ROWS = 4
 
 
 def _stopped(*numbers: signal.Signals, finish: bool = False) -> Callable[..., Outcome]:
-    """Signals to a run in its fifth frame; where it is to be finished, what `sigmaslam finish` makes of it."""
+    """Signals to a run in its fifth frame; where it is to be finished, what `sigmaslam report` makes of it."""
 
     def attempt(folder: Path, run: Runner) -> Outcome:
         process = start(good(folder, 8), folder / "run", rows=_ROWS)
@@ -98,7 +98,7 @@ def _stopped(*numbers: signal.Signals, finish: bool = False) -> Callable[..., Ou
             process.send_signal(number)
             time.sleep(0.1)
         code, output, errors = end(process)
-        return run("finish", folder / "run") if finish else Outcome(code, one_line(output, errors))
+        return run("report", folder / "run") if finish else Outcome(code, one_line(output, errors))
 
     return attempt
 
@@ -157,7 +157,7 @@ def _full_disk(folder: Path, run: Runner) -> Outcome:
 def _finished_on_a_disk_with_room(folder: Path, run: Runner) -> Outcome:
     good(folder)
     _run_script(folder, _FULL_DISK)
-    return run("finish", folder / "run")
+    return run("report", folder / "run")
 
 
 def _without_memory(script: str) -> Callable[..., Outcome]:
@@ -179,7 +179,7 @@ def _two_runs(folder: Path, run: Runner) -> Outcome:
 
 def _finish_while_it_runs(folder: Path, run: Runner) -> Outcome:
     process = start(good(folder), folder / "run", rows=_ROWS)
-    outcome = run("finish", folder / "run")
+    outcome = run("report", folder / "run")
     process.terminate()
     end(process)
     return outcome
@@ -251,7 +251,7 @@ _SIGNAL_CASES = [
         "full in the midst of a run",
         _full_disk,
         2,
-        ("poses.partial", "make room", "sigmaslam finish"),
+        ("poses.partial", "make room", "sigmaslam report"),
         slow=True,
         first=Verdict.LOSS,
     ),

@@ -23,19 +23,19 @@ CALIBRATION = "stereo.yaml"
 NOT_RUN = {
     "sigmaslam track --camera": "needs cameras",
     "sigmaslam train": "half an hour and more",
-    "sigmaslam export": "needs what `train` makes",
+    "sigmaslam train export": "needs what `train` makes",
     "sigmaslam benchmark": "an hour and more",
     "sigmaslam track FOLDER --out run --start 100": "the stand-in has ten pairs",
-    "sigmaslam render street --seeds": "ten drives",
-    "sigmaslam render street --out drives": "ten drives",
+    "sigmaslam train render street --seeds": "ten drives",
+    "sigmaslam train render street --out drives": "ten drives",
     "sigmaslam calibrate IMAGES --board charuco": "the stand-in is a chessboard",
     "sigmaslam calibrate IMAGES --board aprilgrid": "the stand-in is a chessboard",
     "sigmaslam calibrate mav0": "the stand-in has no inertial sensor",
     "sigmaslam calibrate run --imu": "the stand-in has no inertial sensor",
     "sigmaslam localize MRCLAM_Dataset6": "a recording of others",
     "sigmaslam localize dataset": "a recording of others",
-    "sigmaslam reconstruct run --out cloud.ply --mesh": "needs the extra `mesh`",
-    "sigmaslam reconstruct run --out cloud.ply --network": "needs a network of the user's",
+    "sigmaslam map reconstruct run --out cloud.ply --mesh": "needs the extra `mesh`",
+    "sigmaslam map reconstruct run --out cloud.ply --network": "needs a network of the user's",
 }
 
 

@@ -37,7 +37,7 @@ class Simulation:
     exact: np.ndarray = field(repr=False)
 
     def write(self, run: Path) -> Path:
-        """Writes what `sigmaslam refine` reads; returns the folder."""
+        """Writes what `sigmaslam map refine` reads; returns the folder."""
         run.mkdir(parents=True)
         write_tum(run / "trajectory.tum", self.tracked)
         np.save(run / "covariance.npy", self.covariances)

@@ -14,7 +14,7 @@ from tests.support.commands import ROOT, run_here
 PAGE = ROOT / "docs" / "matching.md"
 # What is added to commands, by how they begin; of options that are given twice the last one counts.
 SMALL = {
-    "sigmaslam render": ["--frames", "12", "--width", "192", "--height", "160"],
+    "sigmaslam train render": ["--frames", "12", "--width", "192", "--height", "160"],
     "sigmaslam train": ["--steps", "2", "--workers", "0"],
 }
 

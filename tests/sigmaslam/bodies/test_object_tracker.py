@@ -205,7 +205,7 @@ def test_the_command_line_refuses_a_wrong_region_before_it_writes(
 @pytest.mark.slow
 @pytest.mark.usefixtures("without_report")
 def test_a_rendered_tool_is_followed_and_a_sensor_on_it_takes_drift_away(tmp_path: Path):
-    """`sigmaslam render tool --frames 75 --seed 1` with the box of docs/object.md; a sensor of 0.17 mm, 0.2 deg.
+    """`sigmaslam train render tool --frames 75 --seed 1` with the box of docs/object.md; a sensor of 0.17 mm, 0.2 deg.
 
     Means of five draws: noise of one grey level in 5 % of the pixels moves the rotation between 0.2 and 0.3 degrees.
     """

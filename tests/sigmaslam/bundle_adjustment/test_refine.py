@@ -196,7 +196,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_command_writes_what_evaluate_reads(run_folder: Path, tmp_path: Path):
     run, out = simulate(0), tmp_path / "refined"
-    result = CliRunner().invoke(app, ["refine", str(run_folder), "--out", str(out)])
+    result = CliRunner().invoke(app, ["map", "refine", str(run_folder), "--out", str(out)])
     assert result.exit_code == 0, result.output
     printed = json.loads(result.stdout)
     assert printed == json.loads((out / "refine.json").read_text())

@@ -112,8 +112,8 @@ def test_two_eyes_of_other_lenses_and_sizes_are_read_back(tmp_path: Path):
 def test_the_command_writes_what_it_is_asked_for(tmp_path: Path):
     source = tmp_path / "own.yaml"
     write_foreign_calibration(source, raw_rig("radtan"), "own")
-    result = run_here("calibration", "convert", source, tmp_path / "ros", "--to", "ros")
+    result = run_here("calibrate", "convert", source, tmp_path / "ros", "--to", "ros")
     assert result.returncode == 0, result.stderr
     assert_same_rig(read_calibration(tmp_path / "ros"), raw_rig("radtan"))
-    assert_refused(run_here("calibration", "convert", source, tmp_path / "k.yaml", "--to", "kalibr"), "4 coefficients")
-    assert_refused(run_here("calibration", "convert", source, tmp_path / "k.txt", "--to", "kalibr"), "ends in .yaml")
+    assert_refused(run_here("calibrate", "convert", source, tmp_path / "k.yaml", "--to", "kalibr"), "4 coefficients")
+    assert_refused(run_here("calibrate", "convert", source, tmp_path / "k.txt", "--to", "kalibr"), "ends in .yaml")

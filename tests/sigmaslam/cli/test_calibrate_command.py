@@ -1,4 +1,4 @@
-"""`sigmaslam calibrate` and `sigmaslam rectify` on rendered boards and real ones."""
+"""`sigmaslam calibrate` and `sigmaslam calibrate rectify` on rendered boards and real ones."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_a_rendered_pair_is_calibrated_and_rectified(rendered: Path, tmp_path: P
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), content["parameters"]["sigmas"], rtol=1e-6)
 
     rectified = tmp_path / "rectified"
-    result = run_here("rectify", rendered, "--calibration", out, "--out", rectified)
+    result = run_here("calibrate", "rectify", rendered, "--calibration", out, "--out", rectified)
     assert result.returncode == 0, result.stderr
     sequence = open_sequence(rectified)
     assert sequence.camera.is_rectified
@@ -74,7 +74,9 @@ def test_a_rendered_pair_is_calibrated_and_rectified(rendered: Path, tmp_path: P
             rows.append(left.pixels[:, 1] - right.pixels[:, 1])
     assert len(rows) >= 5
     assert np.sqrt(np.mean(np.square(rows))) < 0.3
-    assert_refused(run_here("rectify", rendered, "--calibration", out, "--out", rectified), "is not an empty folder")
+    assert_refused(
+        run_here("calibrate", "rectify", rendered, "--calibration", out, "--out", rectified), "is not an empty folder"
+    )
 
 
 @pytest.mark.long

@@ -16,13 +16,13 @@ FRAMES = 8
 
 def test_show_prints_baseline_models_and_fields_of_view(tmp_path: Path):
     rig = forms.raw_rig("radtan")
-    result = run_here("calibration", "show", forms.write_kalibr(rig, tmp_path))
+    result = run_here("calibrate", "show", forms.write_kalibr(rig, tmp_path))
     assert result.returncode == 0, result.stderr
     assert f"{1e3 * rig.baseline:.3f} mm" in result.stdout
     assert "672x376" in result.stdout
     assert "radtan (5)" in result.stdout
     assert "raw" in result.stdout
-    result = run_here("calibration", "show", forms.write_kitti(forms.rectified_rig(), tmp_path), "--size", "672x376")
+    result = run_here("calibrate", "show", forms.write_kitti(forms.rectified_rig(), tmp_path), "--size", "672x376")
     # 2 atan(w / 2f) of the known rig, to the pixel that the centre is off.
     assert f"{2 * np.degrees(np.arctan(336 / 358.6)):.0f}." in result.stdout
     assert "images    rectified" in result.stdout
@@ -32,19 +32,19 @@ def test_show_prints_baseline_models_and_fields_of_view(tmp_path: Path):
 def test_convert_writes_the_same_rig(tmp_path: Path, form: str):
     rig = forms.raw_rig("radtan")
     path, out = forms.RAW_FORMS[form](rig, tmp_path), tmp_path / "out.yaml"
-    result = run_here("calibration", "convert", path, out, "--size", "672x376")
+    result = run_here("calibrate", "convert", path, out, "--size", "672x376")
     assert result.returncode == 0, result.stderr
     forms.assert_same_rig(StereoCamera.from_yaml(out), rig)
 
 
 def test_bad_requests_are_refused(tmp_path: Path):
     path = forms.write_kitti(forms.rectified_rig(), tmp_path)
-    assert_refused(run_here("calibration", "show", path), "calib.txt", "give --size")
-    assert_refused(run_here("calibration", "show", path, "--size", "big"), "--size is 'big'", "752x480")
+    assert_refused(run_here("calibrate", "show", path), "calib.txt", "give --size")
+    assert_refused(run_here("calibrate", "show", path, "--size", "big"), "--size is 'big'", "752x480")
     out = tmp_path / "out.txt"
-    assert_refused(run_here("calibration", "convert", path, out, "--size", "672x376"), "out.txt", ".yaml")
+    assert_refused(run_here("calibrate", "convert", path, out, "--size", "672x376"), "out.txt", ".yaml")
     assert not out.exists()
-    assert_refused(run_here("calibration", "show", tmp_path / "none.yaml"), "none.yaml", "cannot read")
+    assert_refused(run_here("calibrate", "show", tmp_path / "none.yaml"), "none.yaml", "cannot read")
 
 
 @pytest.mark.long
@@ -60,7 +60,7 @@ def test_tracking_with_a_converted_calibration_gives_the_same_trajectory(
     lines = (demo_sequence / "times.txt").read_text().splitlines(keepends=True)
     (folder / "times.txt").write_text("".join(lines[:FRAMES]))
     own = tmp_path / "own.yaml"
-    result = run_here("calibration", "convert", folder / "calib.txt", own, "--size", "320x240")
+    result = run_here("calibrate", "convert", folder / "calib.txt", own, "--size", "320x240")
     assert result.returncode == 0, result.stderr
     rig = StereoCamera.from_yaml(own)
     monkeypatch.setattr(forms, "SIZE", (rig.left.width, rig.left.height))

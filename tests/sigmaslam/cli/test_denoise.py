@@ -1,4 +1,4 @@
-"""`sigmaslam denoise` and `track --denoise`, on files."""
+"""`sigmaslam images denoise` and `track --denoise`, on files."""
 
 import json
 import shutil
@@ -38,7 +38,7 @@ def rmse(path: Path, truth: Path) -> float:
 
 @pytest.mark.parametrize("options", [[], ["--single"], ["--sigma", "20"]])
 def test_the_images_of_a_folder_lose_most_of_their_noise(noisy_pairs: Path, tmp_path: Path, options: list[str]):
-    done = run_here("denoise", noisy_pairs / "image_0", "--out", tmp_path / "out", *options)
+    done = run_here("images", "denoise", noisy_pairs / "image_0", "--out", tmp_path / "out", *options)
     assert done.returncode == 0, done.stderr
     sigma = float(done.stdout.split("sigma ")[1].split()[0].strip(","))
     assert sigma == pytest.approx(SIGMA, rel=0.2)
@@ -53,13 +53,13 @@ def test_a_video_becomes_images(tmp_path: Path):
     for k in range(3):
         video.write(np.full((48, 64), 50 * (k + 1), np.uint8))
     video.release()
-    assert run_here("denoise", tmp_path / "one.avi", "--out", tmp_path / "out").returncode == 0
+    assert run_here("images", "denoise", tmp_path / "one.avi", "--out", tmp_path / "out").returncode == 0
     means = [cv2.imread(str(path), 0).mean() for path in sorted((tmp_path / "out").iterdir())]
     assert means == pytest.approx([50.0, 100.0, 150.0], abs=2.0)
 
 
 def test_a_stereo_sequence_becomes_one_that_can_be_tracked(noisy_pairs: Path, tmp_path: Path):
-    done = run_here("denoise", noisy_pairs, "--stereo", "--out", tmp_path / "out")
+    done = run_here("images", "denoise", noisy_pairs, "--stereo", "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     before, after = open_sequence(noisy_pairs), open_sequence(tmp_path / "out")
     assert after.timestamps == pytest.approx(before.timestamps)
@@ -81,11 +81,13 @@ def test_the_tracker_sees_filtered_images_and_the_run_says_so(noisy_pairs: Path,
 def test_what_cannot_be_filtered_is_refused(noisy_pairs: Path, tmp_path: Path):
     images = noisy_pairs / "image_0"
     cv2.imwrite(str(images / "000003.png"), np.zeros((64, 64), np.uint8))
-    assert_refused(run_here("denoise", images, "--out", tmp_path / "a"), "000003.png", "--single")
+    assert_refused(run_here("images", "denoise", images, "--out", tmp_path / "a"), "000003.png", "--single")
     cv2.imwrite(str(images / "000003.png"), np.zeros((20, 64), np.uint8))
-    assert_refused(run_here("denoise", images, "--single", "--out", tmp_path / "b"), "000003.png", "64x20")
+    assert_refused(run_here("images", "denoise", images, "--single", "--out", tmp_path / "b"), "000003.png", "64x20")
     shutil.copy(images / "000000.png", images / "000000.bmp")
-    assert_refused(run_here("denoise", images, "--single", "--out", tmp_path / "c"), "000000.png", "rename")
-    assert_refused(run_here("denoise", tmp_path / "none", "--out", tmp_path / "d"), "no such file")
-    assert_refused(run_here("denoise", noisy_pairs, "--stereo", "--single", "--out", tmp_path / "e"), "--single")
-    assert_refused(run_here("denoise", images, "--format", "kitti", "--out", tmp_path / "f"), "--stereo")
+    assert_refused(run_here("images", "denoise", images, "--single", "--out", tmp_path / "c"), "000000.png", "rename")
+    assert_refused(run_here("images", "denoise", tmp_path / "none", "--out", tmp_path / "d"), "no such file")
+    assert_refused(
+        run_here("images", "denoise", noisy_pairs, "--stereo", "--single", "--out", tmp_path / "e"), "--single"
+    )
+    assert_refused(run_here("images", "denoise", images, "--format", "kitti", "--out", tmp_path / "f"), "--stereo")

@@ -1,4 +1,4 @@
-"""`sigmaslam geometry` on two rendered views whose motion is known."""
+"""`sigmaslam images geometry` on two rendered views whose motion is known."""
 
 from importlib.resources import files
 from pathlib import Path
@@ -29,7 +29,7 @@ def calibration(tmp_path: Path) -> Path:
 
 
 def run(*arguments: object) -> str:
-    result = CliRunner().invoke(app, ["geometry", *map(str, arguments)], catch_exceptions=False)
+    result = CliRunner().invoke(app, ["images", "geometry", *map(str, arguments)], catch_exceptions=False)
     assert result.exit_code == 0
     return result.stdout
 

@@ -86,7 +86,7 @@ def test_a_signal_ends_a_run_with_its_results(
     assert described["ended"] == "interrupted" + ("" if number == signal.SIGINT else f" by {number.name}")
     assert described["summary"]["poses"] == len(read_tum(run / "trajectory_final.tum")) == 4
     assert {path.name for path in whole.iterdir()} == {path.name for path in run.iterdir()}
-    assert "nothing to do" in run_here("finish", run).stdout
+    assert "nothing to do" in run_here("report", run).stdout
 
 
 @pytest.mark.long
@@ -107,16 +107,16 @@ def test_poses_of_a_run_whose_folder_is_removed_are_kept(sequence: Path, whole: 
 def test_finish_makes_the_results_of_a_killed_run(sequence: Path, whole: Path, tmp_path: Path):
     run = tmp_path / "run"
     process = start(sequence, run)
-    refused = run_here("finish", run)
+    refused = run_here("report", run)
     assert_refused(refused, "still goes on")
     assert_refused(run_here("evaluate", run, "--truth", sequence / "poses.txt"), "it still goes on")
     process.kill()
     assert end(process)[0] == -signal.SIGKILL
     assert not (run / "trajectory.tum").exists()
     (run / ".poses.0123456789ab.csv").write_text("cut off")
-    assert_refused(run_here("evaluate", run, "--truth", sequence / "poses.txt"), f"`sigmaslam finish {run}`")
+    assert_refused(run_here("evaluate", run, "--truth", sequence / "poses.txt"), f"`sigmaslam report {run}`")
 
-    result = run_here("finish", run)
+    result = run_here("report", run)
     assert result.returncode == 0, result.stderr
     assert "3 of 4 frames tracked, 1 starting, 0 lost, 0 skipped" in result.stdout
     assert_first_poses_of(whole, run, 4)
@@ -129,7 +129,7 @@ def test_finish_makes_the_results_of_a_killed_run(sequence: Path, whole: Path, t
     evaluated = run_here("evaluate", run, "--truth", sequence / "poses.txt", "--json")
     assert json.loads(evaluated.stdout)["matched"] == 4
 
-    again = run_here("finish", run)
+    again = run_here("report", run)
     assert (again.returncode, again.stdout) == (0, f"{run} is finished: there is nothing to do.\n")
 
 
@@ -182,7 +182,7 @@ def test_finish_of_a_run_that_did_not_track_ends_like_it(demo_sequence: Path, tm
     process = start(swapped, tmp_path / "killed", rows=3)
     process.kill()
     end(process)
-    finished = run_here("finish", tmp_path / "killed")
+    finished = run_here("report", tmp_path / "killed")
     assert finished.returncode == 3
     assert "left and right are exchanged" in finished.stderr
 
@@ -192,13 +192,13 @@ def test_finish_of_a_run_without_a_frame_says_so(killed: Path):
     for name in ("frames.csv", *PARTIAL):
         content = (killed / name).read_bytes()
         (killed / name).write_bytes(content[: content.find(b"\n") + 1] if name == "frames.csv" else b"")
-    finished = run_here("finish", killed)
+    finished = run_here("report", killed)
     assert finished.returncode == 3
     assert "There was no frame" in finished.stderr
 
 
 def test_finish_refuses_what_is_no_run(tmp_path: Path):
-    assert_refused(run_here("finish", tmp_path), "holds no run.json and frames.csv")
+    assert_refused(run_here("report", tmp_path), "holds no run.json and frames.csv")
 
 
 # ---- a full disk
@@ -234,8 +234,8 @@ def test_a_file_without_room_costs_a_message_and_not_the_others(
     can_be_made = name in (*POSES, "run.json")
     assert left & set(PARTIAL) == (set(PARTIAL) if can_be_made else set())
     if can_be_made:
-        assert "sigmaslam finish" in result.stderr
-        assert run_here("finish", tmp_path / "run").returncode == 0
+        assert "sigmaslam report" in result.stderr
+        assert run_here("report", tmp_path / "run").returncode == 0
         summary = json.loads((tmp_path / "run" / "run.json").read_text())["summary"]
         undisturbed = json.loads((whole / "run.json").read_text())["summary"]
         assert summary == undisturbed
@@ -264,7 +264,7 @@ def test_a_disk_that_is_full_in_the_midst_of_a_run_keeps_what_was_said(sequence:
     assert_refused(result, "poses.partial: cannot be written")
     count = len(statuses(run))
     assert 3 <= count < FRAMES
-    finished = run_here("finish", run)
+    finished = run_here("report", run)
     assert finished.returncode == 0, finished.stderr
     assert_first_poses_of(whole, run, count)
 

@@ -1,4 +1,4 @@
-"""`sigmaslam render --seeds`: a sequence of each seed, and ranges that are none."""
+"""`sigmaslam train render --seeds`: a sequence of each seed, and ranges that are none."""
 
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,9 @@ def rendered(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 def test_each_seed_has_its_folder_and_the_options_of_all(rendered: list[Any], tmp_path: Path):
     out = tmp_path / "out"
-    done = run_here("render", "room", "--seeds", "100-102", "--out", out, "--frames", "5", "--ray", "host:6379")
+    done = run_here(
+        "train", "render", "room", "--seeds", "100-102", "--out", out, "--frames", "5", "--ray", "host:6379"
+    )
     assert done.returncode == 0
     assert [job.out for job, _ in rendered] == [out / f"room{seed}" for seed in (100, 101, 102)]
     assert {(job.recipe.frames, job.truth, ray) for job, ray in rendered} == {(5, "dense", "host:6379")}
@@ -33,7 +35,7 @@ def test_each_seed_has_its_folder_and_the_options_of_all(rendered: list[Any], tm
 
 
 def test_a_sequence_that_fails_is_named_after_the_others(rendered: list[Any], tmp_path: Path):
-    done = run_here("render", "room", "--seeds", "12-14", "--out", tmp_path)
+    done = run_here("train", "render", "room", "--seeds", "12-14", "--out", tmp_path)
     assert done.returncode == 2
     assert "lacks room13 (ValueError: unlucky)" in " ".join(done.stderr.split())
     assert len(rendered) == 3
@@ -41,13 +43,13 @@ def test_a_sequence_that_fails_is_named_after_the_others(rendered: list[Any], tm
 
 @pytest.mark.parametrize("seeds", ["5", "9-7", "a-b", "1-2-3", "-1-4"])
 def test_what_is_no_range_is_refused(rendered: list[Any], seeds: str, tmp_path: Path):
-    done = run_here("render", "room", f"--seeds={seeds}", "--out", tmp_path)
+    done = run_here("train", "render", "room", f"--seeds={seeds}", "--out", tmp_path)
     assert done.returncode == 2
     assert "give the first and the last one, as 100-109" in " ".join(done.stderr.split())
     assert rendered == []
 
 
 def test_seed_and_seeds_exclude_each_other(rendered: list[Any], tmp_path: Path):
-    done = run_here("render", "room", "--seed", "3", "--seeds", "1-2", "--out", tmp_path)
+    done = run_here("train", "render", "room", "--seed", "3", "--seeds", "1-2", "--out", tmp_path)
     assert done.returncode == 2
     assert "leave one out" in " ".join(done.stderr.split())

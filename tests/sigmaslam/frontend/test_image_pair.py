@@ -339,7 +339,7 @@ def test_the_command_writes_what_the_library_finds(pair: Pair, tmp_path: Path, o
     files = [write(tmp_path / name, image) for name, image in zip(("a.png", "b.pgm"), pair, strict=True)]
     out, picture = tmp_path / "matches.npz", tmp_path / "matches.png"
     options = ("--frontend", "sift", "--max-keypoints", "300", "--picture", picture)
-    result = run_process("match", *files, "--out", out, *options, *option)
+    result = run_process("images", "match", *files, "--out", out, *options, *option)
     assert result.returncode == 0, result.stderr
     expected = sigmaslam.match_images(*pair, "sift", 300, least)
     with np.load(out) as archive:
@@ -376,7 +376,9 @@ def test_colours_and_depths_match_as_their_grey_image(pair: Pair, tmp_path: Path
         "16-bit": grey.astype(np.uint16) * 257,
     }[kind]
     files = write(tmp_path / "a.png", grey), write(tmp_path / "b.png", stored)
-    result = run_process("match", *files, "--out", tmp_path / "m.npz", "--frontend", "sift", "--min-probability", "0")
+    result = run_process(
+        "images", "match", *files, "--out", tmp_path / "m.npz", "--frontend", "sift", "--min-probability", "0"
+    )
     assert result.returncode == 0, result.stderr
     assert result.stderr == ""
     expected = sigmaslam.match_images(grey, grey, "sift", min_probability=0.0)
@@ -415,7 +417,7 @@ def test_bad_input_is_refused_with_its_name(
     write(tmp_path / "float.tiff", np.full((100, 120), 0.5, np.float32))
     (tmp_path / "text.png").write_text("no image at all")
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    result = run_here("match", "--frontend", "sift", *arguments)
+    result = run_here("images", "match", "--frontend", "sift", *arguments)
     assert_refused(result, *words)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
@@ -433,7 +435,7 @@ def test_the_library_refuses_what_it_cannot_match(pair: Pair):
 
 
 def test_the_help_names_files_and_options():
-    result = run_here("match", "--help")
+    result = run_here("images", "match", "--help")
     assert result.returncode == 0
     for word in (
         "IMAGE0",

@@ -93,8 +93,10 @@ def test_a_copy_of_what_ships_matches_as_it_does(tmp_path: Path, image: np.ndarr
 def test_match_says_other_covariances_with_other_weights(folder: Path, image: np.ndarray, tmp_path: Path):
     for k, each in enumerate((image, np.roll(image, 5, axis=1))):
         cv2.imwrite(str(tmp_path / f"{k}.png"), each)
-    run_here("match", tmp_path / "0.png", tmp_path / "1.png", "--out", tmp_path / "shipped.npz")
-    run_here("match", tmp_path / "0.png", tmp_path / "1.png", "--out", tmp_path / "own.npz", "--weights", folder)
+    run_here("images", "match", tmp_path / "0.png", tmp_path / "1.png", "--out", tmp_path / "shipped.npz")
+    run_here(
+        "images", "match", tmp_path / "0.png", tmp_path / "1.png", "--out", tmp_path / "own.npz", "--weights", folder
+    )
     shipped, own = np.load(tmp_path / "shipped.npz"), np.load(tmp_path / "own.npz")
     assert len(own["covariance"]) > 20
     assert not np.array_equal(own["probability"], shipped["probability"])

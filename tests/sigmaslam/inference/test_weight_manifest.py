@@ -37,7 +37,7 @@ def test_a_changed_byte_is_refused_by_name(folder: Path):
     content[len(content) // 2] ^= 1
     (folder / GRAPH).write_bytes(content)
     with pytest.raises(
-        InputError, match=r"place_verifier\.onnx: is not the file.*SHA-256.*reinstall.*sigmaslam export"
+        InputError, match=r"place_verifier\.onnx: is not the file.*SHA-256.*reinstall.*sigmaslam train export"
     ):
         OnnxGraph(folder / GRAPH)
 

@@ -29,7 +29,7 @@ def tracked(demo_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 @pytest.mark.long
 def test_a_run_becomes_a_cloud_and_its_report_shows_it(tracked: Path):
-    done = run_here("reconstruct", tracked / "run", "--out", tracked / "cloud.ply")
+    done = run_here("map", "reconstruct", tracked / "run", "--out", tracked / "cloud.ply")
     assert done.returncode == 0, done.stderr
     summary = json.loads((tracked / "run" / "reconstruction.json").read_text())
     assert f"{summary['points']} points of {summary['keyframes']} keyframes" in done.stdout
@@ -67,7 +67,7 @@ def test_an_input_that_has_moved_is_asked_for_and_taken(tracked: Path, tmp_path:
     shutil.copytree(tracked / "run", tmp_path / "run")
     entries = json.loads((tmp_path / "run" / "run.json").read_text())
     (tmp_path / "run" / "run.json").write_text(json.dumps({**entries, "input": str(tmp_path / "gone")}))
-    refused = run_here("reconstruct", tmp_path / "run", "--out", tmp_path / "cloud.ply")
+    refused = run_here("map", "reconstruct", tmp_path / "run", "--out", tmp_path / "cloud.ply")
     assert refused.returncode == 2
     assert "gone" in refused.stderr
     assert "--input" in refused.stderr
@@ -86,7 +86,7 @@ def test_another_input_is_refused(tracked: Path, demo_sequence: Path, tmp_path: 
 
 @pytest.mark.parametrize("name", ["cloud.xyz", "missing/cloud.ply"])
 def test_a_place_that_cannot_be_written_is_refused_before_the_work(tracked: Path, tmp_path: Path, name: str):
-    refused = run_here("reconstruct", tracked / "run", "--out", tmp_path / name)
+    refused = run_here("map", "reconstruct", tracked / "run", "--out", tmp_path / name)
     assert refused.returncode == 2
     assert name.rpartition("/")[2] in refused.stderr
 

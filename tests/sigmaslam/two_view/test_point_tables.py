@@ -1,4 +1,4 @@
-"""`sigmaslam triangulate` and `sigmaslam orient`: from files to files."""
+"""`sigmaslam images triangulate` and `sigmaslam images orient`: from files to files."""
 
 from __future__ import annotations
 
@@ -95,7 +95,9 @@ def test_matches_are_taken_with_their_covariance(tmp_path: Path):
     covariance = np.tile(np.diag([0.04, 0.01]), (8, 1, 1))
     np.savez(tmp_path / "m.npz", keypoints0=pixels[:, :2], keypoints1=pixels[:, 2:], covariance=covariance)
     out = tmp_path / "points.csv"
-    result = run_here("triangulate", tmp_path / "m.npz", "--calibration", write_own(rig, tmp_path), "--out", out)
+    result = run_here(
+        "images", "triangulate", tmp_path / "m.npz", "--calibration", write_own(rig, tmp_path), "--out", out
+    )
     assert result.returncode == 0, result.stderr
     _, values = read_csv(out)
     expected = values[:, 3] ** 2 / (rig.left.fx * rig.baseline) * 0.2
@@ -113,7 +115,7 @@ def test_control_points_give_the_frame(tmp_path: Path, scale: float):
     rows = np.column_stack([ids, target, np.full(7, 0.01)])[::-1]
     rows = np.vstack([rows, [99.0, 0.0, 0.0, 0.0, 0.01]])
     control, out = write_csv(tmp_path / "b.csv", "id,x,y,z,sigma", rows), tmp_path / "pose.json"
-    result = run_here("orient", source, control, "--out", out, *(["--scale"] if scale != 1.0 else []))
+    result = run_here("images", "orient", source, control, "--out", out, *(["--scale"] if scale != 1.0 else []))
     assert result.returncode == 0, result.stderr
     content = json.loads(out.read_text())
     found = np.array(content["T_target_source"])
@@ -128,12 +130,12 @@ def test_bad_tables_are_refused(tmp_path: Path):
     rig = write_own(rectified_rig(), tmp_path)
     rest = ("--calibration", rig, "--out", tmp_path / "out.csv")
     wrong = write_csv(tmp_path / "a.csv", "u0,v0,u1", np.ones((1, 3)))
-    assert_refused(run_here("triangulate", wrong, *rest), "no column v1: give a header with u0,v0,u1,v1")
+    assert_refused(run_here("images", "triangulate", wrong, *rest), "no column v1: give a header with u0,v0,u1,v1")
     wrong = write_csv(tmp_path / "a.csv", "u0,v0,u1,v1", np.array([[1.0, 2.0, np.nan, 4.0]]))
-    assert_refused(run_here("triangulate", wrong, *rest), "a.csv, line 2: not finite numbers")
+    assert_refused(run_here("images", "triangulate", wrong, *rest), "a.csv, line 2: not finite numbers")
     swapped = write_csv(tmp_path / "a.csv", "u0,v0,u1,v1", seen(rectified_rig(), scene(3, 7))[:, [2, 3, 0, 1]])
-    assert_refused(run_here("triangulate", swapped, *rest), "none of 3 pairs meets in front of the cameras")
+    assert_refused(run_here("images", "triangulate", swapped, *rest), "none of 3 pairs meets in front of the cameras")
     two = write_csv(tmp_path / "b.csv", "id,x,y,z", np.arange(8.0).reshape(2, 4))
-    assert_refused(run_here("orient", two, two, "--out", tmp_path / "p.json"), "have 2 ids in common")
+    assert_refused(run_here("images", "orient", two, two, "--out", tmp_path / "p.json"), "have 2 ids in common")
     line = write_csv(tmp_path / "b.csv", "id,x,y,z", np.outer(np.arange(4.0), [1, 1, 1, 1]))
-    assert_refused(run_here("orient", line, line, "--out", tmp_path / "p.json"), "on a line")
+    assert_refused(run_here("images", "orient", line, line, "--out", tmp_path / "p.json"), "on a line")
