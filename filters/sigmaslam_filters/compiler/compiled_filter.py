@@ -209,7 +209,7 @@ class CompiledFilter:
                 with torch.no_grad():
                     step(*ones)  # says what does not fit
                 try:
-                    self._scalar_steps[key] = CompiledStep(ScalarStep(step, ones), group.kind.slots)
+                    self._scalar_steps[key] = CompiledStep.of(ScalarStep(step, ones), group.kind.slots)
                 except ScalarStepError as error:
                     _log.info("a loop around compiled steps, because %s", error)
                     self._scalar_steps[key] = None
