@@ -10,6 +10,7 @@ import hashlib
 import logging
 import os
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -23,8 +24,8 @@ from sigmaslam_filters import Gaussian
 from sigmaslam_localisation.robot_step import RobotStep
 
 _log = logging.getLogger(__name__)
-SHORTEST = 2000
-"""Steps of torch that take about as long as tracing and compiling."""
+SHORTEST = 3500
+"""Steps of torch, in two passes, that take about as long as tracing and compiling do the first time: a minute."""
 WIDTHS = (0, 2, 8)
 """Sightings at a time that there is a program for: of ten steps that see anything nine see one or two."""
 _MOST_OPERATIONS = 200_000
@@ -60,16 +61,16 @@ def run_compiled(
     sights = [_padded(each, WIDTHS[-1], fill) for each, fill in zip(sights, fills, strict=True)]
     from torch._inductor.exc import CppCompileError, InvalidCxxCompiler
 
-    from sigmaslam_filters.compiler.scalar_sequence import CompiledStep, Plan, run_sequence
+    from sigmaslam_filters.compiler.scalar_sequence import CompiledStep, Plan, load_driver, run_sequence
     from sigmaslam_filters.compiler.scalar_step import ScalarStepError
 
     seen = (~value.isnan().any(dim=-1)).sum(dim=-1)
     kind = torch.bucketize(seen, torch.tensor(WIDTHS))
     sizes = [(p + m,), (n, n), (), WIDTHS[-1:], WIDTHS[-1:], (WIDTHS[-1], m), ()]
-    flag = torch.bool
-    results = [(size, flag if k == 2 else torch.float64) for k, size in enumerate(sizes)]
+    results = [(size, torch.bool if k == 2 else torch.float64) for k, size in enumerate(sizes)]
     state = torch.cat([prior.mean, scale], dim=-1)
     try:
+        load_driver()  # says at once whether there is a compiler
         steps = []
         for width in WIDTHS:
             given = [each[0, 0] for each in moves] + [each[0, 0, :width] for each in sights if width]
@@ -118,8 +119,9 @@ def _source(robot: RobotStep, points: int, arguments: list[Tensor]) -> str:
         return path.read_text()
     # What is there once takes no time to write: the compiler need not think of it for minutes.
     source = '#pragma GCC optimize("O1")\n' + ScalarStep(_flat(robot, points), arguments, _MOST_OPERATIONS).source()
-    folder.mkdir(parents=True, exist_ok=True)
-    atomic_write_text(path, source)
+    with suppress(OSError):  # the next run writes it anew
+        folder.mkdir(parents=True, exist_ok=True)
+        atomic_write_text(path, source)
     return source
 
 

@@ -37,7 +37,7 @@ def compile_filter(
 ) -> CompiledFilter:
     """`filter_events` as machine code, and `filter` of a motion and a measurement, for any number of steps.
 
-    For up to `LARGEST_SCALAR_BATCH` filters of up to 8 states each kind of event is a function of scalars, see
+    For up to `LARGEST_SCALAR_BATCH` filters each kind of event is a function of scalars, see
     `sigmaslam_filters.compiler.scalar_step`; otherwise it is a step from `compile_step`. Events are of one kind if
     their models have the same functions, and tensors of the same shapes.
 

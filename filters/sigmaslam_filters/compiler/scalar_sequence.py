@@ -199,7 +199,7 @@ def _call(
         return (_Array * 2)(*map(_Array.of, tensors))
 
     given, slopes = by_kind(inputs), None if gradients is None else by_kind(gradients[1])
-    _driver().run(
+    load_driver().run(
         ctypes.c_int64(len(plan.kind)),
         ctypes.c_int64(before[0].shape[1]),
         ctypes.c_void_p(plan.kind.data_ptr()),
@@ -216,5 +216,6 @@ def _call(
 
 
 @lru_cache(maxsize=1)
-def _driver() -> Any:
+def load_driver() -> Any:
+    """The loop over time, compiled."""
     return CppCodeCache.load(_DRIVER)
