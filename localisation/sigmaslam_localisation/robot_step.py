@@ -70,7 +70,7 @@ class RobotStep:
             value: (..., L, m); NaN for none.
             position: (..., L, d) inputs of the measurement.
             growth: (..., L) of the variances of repetitions.
-            nominal: (..., L, m) variances of sightings that are none; anything where there is no sighting.
+            nominal: (..., L, m) variances at a scale of 1; anything where there is no sighting.
         """
         m, noise = value.shape[-1], NoiseScale(scale)
         there = ~value.isnan().any(dim=-1)

@@ -110,7 +110,7 @@ def write_program(
     """
     with torch.no_grad():
         table = dict(core_aten_decompositions().items())
-        # Of real tensors each operation would make a record of its own for hours.
+        # With real tensors torch records a stack trace for each operation, which is most of the time.
         module = make_fx(function, table, tracing_mode="fake", _allow_non_fake_inputs=True)(*arguments)
     returned: Any = list(module.graph.nodes)[-1].args[0]
     nodes = list(returned) if isinstance(returned, tuple | list) else [returned]
