@@ -25,7 +25,7 @@ from scipy.special import chdtri
 from torch import Tensor
 
 from sigmaslam_filters.core.columns import Columns
-from sigmaslam_filters.core.factors import apply, cholesky, multiply, solve_lower, square
+from sigmaslam_filters.core.factors import apply, cholesky, is_traced, multiply, solve_lower, square
 from sigmaslam_filters.core.noise_covariance import BlockDiagonal, Noise
 from sigmaslam_filters.core.solve import TangentPosterior
 from sigmaslam_filters.core.unrolled_factors import join
@@ -236,7 +236,7 @@ def _student(distance: Tensor, count: Tensor) -> Tensor:
 def _quantiles(probability: float, count: Tensor, size: int, like: Tensor) -> Tensor:
     """Chi-square quantiles (..., b) for blocks of that size of which some components are missing."""
     known = _quantiles_up_to(probability, size)
-    if not torch.compiler.is_compiling():
+    if not is_traced():
         return torch.tensor(known, dtype=like.dtype, device=like.device)[count]
     # A table is no arithmetic.
     found = torch.full_like(like, known[0])
@@ -245,10 +245,13 @@ def _quantiles(probability: float, count: Tensor, size: int, like: Tensor) -> Te
     return found
 
 
-@torch.compiler.assume_constant_result
 def _quantiles_up_to(probability: float, size: int) -> tuple[float, ...]:
     # A compiler looks through the cache, but takes the function around it for a constant.
     return _cached_quantiles(probability, size)
+
+
+# What torch.compiler.assume_constant_result does, without loading the compiler, which takes a second.
+_quantiles_up_to._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
 @lru_cache(maxsize=16)

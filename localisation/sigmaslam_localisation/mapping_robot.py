@@ -56,14 +56,7 @@ class MappingRobot:
         def see(state: Tensor, landmark: Tensor) -> Tensor:
             return known.function(state, _places(state, landmark))
 
-        def slope(state: Tensor, landmark: Tensor) -> Tensor:
-            by_robot, by_landmark = self.robot.slopes(state, _places(state, landmark))
-            # Of all places that of one landmark alone is seen.
-            this = torch.arange(self.landmarks) == landmark
-            by_places = by_landmark[..., None, :] * this[..., None, :, None]
-            return torch.cat([by_robot, by_places.flatten(-2)], dim=-1)
-
-        return MeasurementModel(see, known.noise, residual=known.residual, jacobian=slope)
+        return MeasurementModel(see, known.noise, residual=known.residual)
 
     def variance(self, value: Tensor) -> Tensor:
         """As the robot's."""

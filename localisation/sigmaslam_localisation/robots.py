@@ -11,9 +11,10 @@ from torch import Tensor
 
 from sigmaslam.errors import InputError
 from sigmaslam_filters import Gaussian, degree_of_belief
-from sigmaslam_localisation.localise import FilterName, Localisation, Platform, localise, make_filter
+from sigmaslam_localisation.localise import FilterName, Localisation, localise, make_filter
 from sigmaslam_localisation.mapping_robot import ROBOT_SIZE, MappingRobot
 from sigmaslam_localisation.recording import PlanarTruth, Recording
+from sigmaslam_localisation.robot_step import Platform
 from sigmaslam_localisation.smoothing import Smoother
 from sigmaslam_localisation.steps import Steps, make_steps
 from sigmaslam_localisation.wheeled_robot import BODY, CONSTANTS, SPACE, WheeledRobot

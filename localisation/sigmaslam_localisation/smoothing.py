@@ -18,33 +18,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sigmaslam_filters import BayesFilter, Gaussian
+from sigmaslam_filters import Gaussian
 from sigmaslam_filters.manifolds import Space
 from sigmaslam_filters.results import TimeUpdate
 
 # Of central differences, in units of the tangent: metres, radians and shares, all of the order of one.
 _STEP = 1e-5
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Prediction:
-    """A predicted belief and what it has in common with the one before, of a batch (B,) of robots.
-
-    Attributes:
-        mean: (B, p).
-        covariance: (B, n, n).
-        cross: (B, n, n) of the belief before with the predicted one.
-    """
-
-    mean: Tensor
-    covariance: Tensor
-    cross: Tensor
-
-    @classmethod
-    def of(cls, moved: TimeUpdate) -> Prediction:
-        """What `BayesFilter.predict` returned."""
-        odd, _, root = moved.joint_root()
-        return cls(moved.belief.mean, moved.belief.covariance, root @ odd.mT)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,22 +49,23 @@ class Smoother:
     conditional: np.ndarray
 
     @classmethod
-    def of(cls, bayes: BayesFilter, filtered: Gaussian, predictions: list[Prediction], robot: int) -> Smoother:
-        """The steps of one robot of the batch.
+    def of(cls, space: Space, filtered: Gaussian, moved: TimeUpdate) -> list[Smoother]:
+        """Of each robot.
 
         Args:
-            bayes: the filter on a manifold.
+            space: of the states.
             filtered: (K + 1, B) beliefs.
-            predictions: (K) of the steps between.
-            robot: its place in the batch.
+            moved: (K, B) what `BayesFilter.predict` makes of all but the last of them.
         """
-        assert bayes.space is not None
-        space = bayes.space
-        predicted, spread, cross = (
-            torch.stack([getattr(each, name)[robot] for each in predictions])
-            for name in ("mean", "covariance", "cross")
-        )
-        mean, covariance = filtered.mean[:, robot], filtered.covariance[:, robot]
+        odd, _, root = moved.joint_root()
+        predicted = moved.belief
+        columns = filtered.mean, filtered.covariance, predicted.mean, predicted.covariance, root @ odd.mT
+        return [cls._of_one(space, *(each[:, b] for each in columns)) for b in range(filtered.mean.shape[1])]
+
+    @classmethod
+    def _of_one(
+        cls, space: Space, mean: Tensor, covariance: Tensor, predicted: Tensor, spread: Tensor, cross: Tensor
+    ) -> Smoother:
         # In units of the predicted deviations, as metres and shares differ by orders of magnitude.
         deviation = torch.diagonal(spread, dim1=-2, dim2=-1).sqrt()
         units = deviation[:, :, None] * deviation[:, None, :]

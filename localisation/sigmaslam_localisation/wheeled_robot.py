@@ -29,7 +29,6 @@ from sigmaslam_filters import (
     stack,
     wrap_angle,
 )
-from sigmaslam_localisation.derivatives import motion_slope, polar_slope, sighting_slope
 from sigmaslam_localisation.recording import Recording
 
 BODY = SE2("right")
@@ -93,26 +92,14 @@ class WheeledRobot:
             for i, rates in enumerate((self.noise.drive, self.noise.turn))
         ]
         noise = Diagonal(torch.stack(variance, dim=-1))
-        return MotionModel(_drive, noise, additive=False, jacobian=motion_slope)
+        return MotionModel(_drive, noise, additive=False)
 
     def measurement(self) -> MeasurementModel:
         """Sighting of one landmark (..., 2), of unit noise."""
         unit = Diagonal(torch.ones(2, dtype=torch.float64))
         if self.kind == "cartesian":
-            return MeasurementModel(self._seen_at, unit, jacobian=self._slope)
-        return MeasurementModel(self._distance_and_bearing, unit, residual=_wrapped_difference, jacobian=self._slope)
-
-    def slopes(self, state: Tensor, landmark: Tensor) -> tuple[Tensor, Tensor]:
-        """Derivatives of a sighting by the first ten components' tangents (..., 2, 10), and by the landmark."""
-        seen = self._seen_at(state, landmark)
-        by_state, by_landmark = sighting_slope(state, landmark, seen, self.lever)
-        if self.kind == "cartesian":
-            return by_state, by_landmark
-        polar = polar_slope(seen)
-        return polar @ by_state, polar @ by_landmark
-
-    def _slope(self, state: Tensor, landmark: Tensor) -> Tensor:
-        return self.slopes(state, landmark)[0]
+            return MeasurementModel(self._seen_at, unit)
+        return MeasurementModel(self._distance_and_bearing, unit, residual=_wrapped_difference)
 
     def variance(self, value: Tensor) -> Tensor:
         """Variances (..., 2) of sightings (..., 2), from the distance that was measured."""

@@ -24,14 +24,15 @@ def squared_sigmas(estimate, truth: np.ndarray) -> float:
 
 def test_an_example_says_how_to_run_it_and_stands_in_the_list():
     listed = (EXAMPLES / "README.md").read_text()
-    for path in EXAMPLES.glob("*.py"):
-        assert f"python examples/{path.name}" in path.read_text(), f"{path.name} does not say how to run it"
-        assert f"[{path.name}]({path.name})" in listed, f"{path.name} is not in examples/README.md"
+    for path in EXAMPLES.rglob("*.py"):
+        name = path.relative_to(EXAMPLES).as_posix()
+        assert f"python examples/{name}" in path.read_text(), f"{name} does not say how to run it"
+        assert f"({name})" in listed, f"{name} is not in examples/README.md"
 
 
 @pytest.mark.parametrize("name", FIRST)
 def test_the_first_examples_are_short(name: str):
-    assert len((EXAMPLES / f"{name}.py").read_text().splitlines()) <= 60
+    assert len(next(EXAMPLES.rglob(f"{name}.py")).read_text().splitlines()) <= 60
 
 
 def test_matches_of_a_rectified_pair_lie_in_one_row(demo_sequence: Path):

@@ -159,7 +159,7 @@ def test_a_sequence_that_fails_raises_or_holds_as_filter_does():
 @pytest.mark.slow
 @pytest.mark.parametrize("case", ["large batch", "many states", "special function"])
 def test_what_is_no_small_arithmetic_is_a_loop_around_compiled_steps(case, caplog):
-    size, batch = (10, 2) if case == "many states" else (2, 200 if case == "large batch" else 3)
+    size, batch = (24, 2) if case == "many states" else (2, 200 if case == "large batch" else 3)
     motion, see = bent_motion(size), bent_measurement(size, 2)
     if case == "special function":
         noise = filters.Diagonal(tensor(0.1, 0.1))
@@ -207,7 +207,7 @@ def test_every_operation_is_that_of_torch(dtype):
     x[0, 0], x[1, 0], y[2, 1], x[3, 0], y[4, 0] = torch.nan, torch.inf, torch.nan, 0.0, x[4, 0]
     state = random_numbers(2, seed=2).to(dtype)
     scalar = ScalarStep(step, [state[0], state[0], x[0, 0], y[0, 0]])
-    plan = Plan([CompiledStep(scalar, range(5))], torch.zeros(7).long(), torch.arange(7), [2], scalar.outputs)
+    plan = Plan([CompiledStep.of(scalar, range(5))], torch.zeros(7).long(), torch.arange(7), [2], scalar.outputs)
     states, _, numbers, flags, counts = run_sequence(plan, [state, state], [[x, y]])
     tolerance = 1e-13 if dtype == torch.float64 else 1e-5
     for k in range(7):
@@ -221,11 +221,9 @@ def test_every_operation_is_that_of_torch(dtype):
 @pytest.mark.parametrize(
     ("step", "message"),
     [
-        (lambda state, x: (state + x.mean(dim=0), x + 1.0), "not done number by number"),
-        (lambda state, x: (state + x, x), "share their memory"),
         (lambda state, x: (state + torch.special.i0(x), x + 1.0), "no form"),
         (lambda state, x: (state + x.to(torch.float16).to(x), x + 1.0), "float16"),
-        (lambda state, x: (x[:, None] * state, x + 1.0), "meet each other"),
+        (lambda state, x: (state + (x if x > 0 else -x), x + 1.0), "no arithmetic"),
     ],
 )
 def test_a_step_that_is_no_arithmetic_by_element_is_refused(step, message):
@@ -256,7 +254,7 @@ def test_every_derivative_is_that_of_torch(dtype):
     state = random_numbers(2, seed=2).to(dtype)
     given = [each.clone().requires_grad_() for each in (state, state, x, y)]
     scalar = ScalarStep(step, [state[0], state[0], x[0, 0], y[0, 0]])
-    plan = Plan([CompiledStep(scalar, range(3))], torch.zeros(6).long(), torch.arange(6), [2], scalar.outputs)
+    plan = Plan([CompiledStep.of(scalar, range(3))], torch.zeros(6).long(), torch.arange(6), [2], scalar.outputs)
     found = run_sequence(plan, given[:2], [given[2:]])
     first, second, rows = given[0], given[1], []
     for k in range(6):

@@ -23,10 +23,7 @@ PRIVATE = {
     "torch._inductor.custom_graph_pass.CustomInferenceAwareGraphPass.uuid": ("self",),
     "torch._inductor.custom_graph_pass.get_hash_for_files": ("paths",),
     "torch._subclasses.fake_tensor.FakeTensorMode.__enter__": ("self",),
-    "torch._dynamo.backends.common.aot_autograd": ("fw_compiler", "inference_compiler", "decompositions"),
-    "torch._dynamo.exc.TorchDynamoException": None,
     "torch._inductor.codecache.CppCodeCache.load": ("source",),
-    "torch._inductor.decomposition.select_decomp_table": (),
     "torch._decomp.core_aten_decompositions": (),
 }
 PRIVATE_OPERATORS = {"_efficientzerotensor", "_to_copy"}

@@ -19,7 +19,7 @@ from sigmaslam_filters.models import several
 from tests.support.filter_assertions import assert_close, assert_same_update
 from tests.support.filter_builders import beliefs, bent_measurement, bent_motion, covariances, random_numbers, tensor
 
-EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "export_my_filter.py"
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "filters" / "export_my_filter.py"
 
 
 @pytest.mark.parametrize("size", [1, 5, 24])

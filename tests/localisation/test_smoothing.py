@@ -10,7 +10,7 @@ from sigmaslam_filters import Euclidean, Gaussian, MeasurementModel, MotionModel
 from sigmaslam_filters.manifolds import Space
 from sigmaslam_localisation.robots import localise_robots
 from sigmaslam_localisation.scores import score
-from sigmaslam_localisation.smoothing import Prediction, Smoother
+from sigmaslam_localisation.smoothing import Smoother
 from sigmaslam_localisation.wheeled_robot import SPACE, WheeledRobot
 from tests.support.wheeled_world import World, drive
 
@@ -26,15 +26,15 @@ def smoothed_both_ways(
     track = bayes.filter(prior, motion, measurement, values, *given)
     moves, places = given or ([], [])
     belief = bayes.update(prior, measurement, values[0], *(each[0] for each in places)).belief
-    beliefs, predictions = [belief], []
+    beliefs = [belief]
     for k in range(1, len(values)):
         moved = bayes.predict(belief, motion, *(each[k - 1] for each in moves))
         belief = bayes.update(moved.belief, measurement, values[k], *(each[k] for each in places)).belief
-        predictions.append(Prediction.of(moved))
         beliefs.append(belief)
     filtered = Gaussian(torch.stack([b.mean for b in beliefs]), torch.stack([b.covariance for b in beliefs]))
     torch.testing.assert_close(filtered.mean, track.filtered.mean)
-    return bayes.smooth(track), Smoother.of(bayes, filtered, predictions, 0)
+    moved = bayes.predict(Gaussian(filtered.mean[:-1], filtered.covariance[:-1]), motion, *moves)
+    return bayes.smooth(track), Smoother.of(space, filtered, moved)[0]
 
 
 def test_a_linear_model_is_smoothed_exactly():

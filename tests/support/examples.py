@@ -12,7 +12,8 @@ EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 def load_example(name: str) -> ModuleType:
     """The module of a script, by its name without .py; its `__main__` part does not run."""
-    specification = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    (path,) = EXAMPLES.rglob(f"{name}.py")
+    specification = importlib.util.spec_from_file_location(name, path)
     assert specification
     assert specification.loader
     example = importlib.util.module_from_spec(specification)

@@ -37,7 +37,7 @@ def compile_filter(
 ) -> CompiledFilter:
     """`filter_events` as machine code, and `filter` of a motion and a measurement, for any number of steps.
 
-    For up to `LARGEST_SCALAR_BATCH` filters of up to 8 states each kind of event is a function of scalars, see
+    For up to `LARGEST_SCALAR_BATCH` filters each kind of event is a function of scalars, see
     `sigmaslam_filters.compiler.scalar_step`; otherwise it is a step from `compile_step`. Events are of one kind if
     their models have the same functions, and tensors of the same shapes.
 
@@ -209,7 +209,7 @@ class CompiledFilter:
                 with torch.no_grad():
                     step(*ones)  # says what does not fit
                 try:
-                    self._scalar_steps[key] = CompiledStep(ScalarStep(step, ones), group.kind.slots)
+                    self._scalar_steps[key] = CompiledStep.of(ScalarStep(step, ones), group.kind.slots)
                 except ScalarStepError as error:
                     _log.info("a loop around compiled steps, because %s", error)
                     self._scalar_steps[key] = None

@@ -63,18 +63,6 @@ class TooLongError(Exception):
     """The program would take too long to compile."""
 
 
-def entries_of(graph: fx.Graph, batch: int, most: int) -> list[Any]:
-    """Rewrites a graph of functions of a batch in place; returns what it returns, by `Entries` where it has the batch.
-
-    Raises:
-        TooLongError: there are more operations than `most`.
-    """
-    _fill_symbolic_zeros(graph)
-    nodes = list(graph.nodes)
-    with graph.inserting_before(nodes[-1]):
-        return _Rewriter(graph, batch, most, with_products=True).results(nodes)
-
-
 def _fill_symbolic_zeros(graph: fx.Graph) -> None:
     """Makes tensors of what forward derivatives know to be zero, which have no memory and crash in compiled code."""
     for node in graph.nodes:
@@ -114,9 +102,8 @@ class _Rewriter:
         kept: operations of the graph that stay, though nothing may use them: a check raises.
     """
 
-    def __init__(self, graph: fx.Graph, batch: int, most: int, with_products: bool = False) -> None:
+    def __init__(self, graph: fx.Graph, batch: int, most: int) -> None:
         self._graph = graph
-        self._with_products = with_products
         self._batch = batch
         self._most = most
         self.kept: set[fx.Node] = set()
@@ -129,15 +116,9 @@ class _Rewriter:
 
     def run(self, nodes: Sequence[fx.Node]) -> Any:
         """The arguments of the output node, which is the last, written anew."""
-        self.results(nodes)
-        return fx.map_arg(nodes[-1].args[0], lambda each: self._whole(self._made[each]))
-
-    def results(self, nodes: Sequence[fx.Node]) -> list[Any]:
-        """What the arguments of the output node have become."""
         for node in nodes[:-1]:
             self._made[node] = self._value(node)
-        returned: Any = nodes[-1].args[0]
-        return [self._given(each) for each in returned]
+        return fx.map_arg(nodes[-1].args[0], lambda each: self._whole(self._made[each]))
 
     def _value(self, node: fx.Node) -> Any:
         if node.op != "call_function":
@@ -160,8 +141,6 @@ class _Rewriter:
             return self._pointwise(node)
         if target in _REDUCTIONS:
             return self._reduced(node)
-        if target is aten.bmm.default and self._with_products:
-            return self._product(node)
         moved = MOVES.get(target)
         if moved is not None and node.args and isinstance(self._given(node.args[0]), Entries):
             result = moved(self._batch, node, self._given(node.args[0]), *node.args[1:])
@@ -342,24 +321,6 @@ class _Rewriter:
                 parts = np.squeeze(parts, dim)
                 axis = axis - 1 if axis is not None and dim < axis else axis
         return Entries(parts, axis, dtype)
-
-    def _product(self, node: fx.Node) -> Any:
-        """Products of matrices (B, r, k) and (B, k, c)."""
-        given = [self._given(each) for each in node.args]
-        left, right = (each if isinstance(each, Entries) else self._split(each) for each in given)
-        if left.axis not in (0, None) or right.axis not in (0, None):
-            return self._kept(node)
-        dtype, parts = node.meta["val"].dtype, np.empty((1, left.parts.shape[1], right.parts.shape[2]), dtype=object)
-        for _, i, j in np.ndindex(*parts.shape):
-            terms = [
-                self._combine(aten.mul.Tensor, a, b, dtype)
-                for a, b in zip(left.parts[0, i], right.parts[0, :, j], strict=True)
-            ]
-            total = terms[0]
-            for term in terms[1:]:
-                total = self._combine(aten.add.Tensor, total, term, dtype)
-            parts[0, i, j] = total
-        return Entries(parts, 0, dtype)
 
     def _converted(self, given: Entries, dtype: torch.dtype) -> Entries:
         parts = np.empty(given.parts.shape, dtype=object)

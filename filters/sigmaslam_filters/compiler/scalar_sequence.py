@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -60,11 +60,21 @@ class _Array(ctypes.Structure):
 class CompiledStep:
     """A kind of step as machine code: the state's two arrays and inputs -> results that begin with the next state."""
 
-    def __init__(self, scalar: ScalarStep, slots: Sequence[int]) -> None:
-        """Takes the step, and for each of its results the place among those of the sequence."""
+    def __init__(
+        self,
+        source: Callable[[], str],
+        slots: Sequence[int],
+        adjoint_source: Callable[[Sequence[bool]], str] | None = None,
+    ) -> None:
+        """Takes what `ScalarStep` writes, and for each of the step's results the place among the sequence's."""
         self.slots = slots
-        self._scalar = scalar
+        self._source, self._adjoint_source = source, adjoint_source
         self._functions: dict[tuple[bool, ...], Any] = {}
+
+    @classmethod
+    def of(cls, scalar: ScalarStep, slots: Sequence[int]) -> CompiledStep:
+        """Of a step that was traced, with derivatives."""
+        return cls(scalar.source, slots, scalar.adjoint_source)
 
     def step(self) -> Any:
         """The C function."""
@@ -80,7 +90,10 @@ class CompiledStep:
 
     def _function(self, key: tuple[bool, ...], name: str) -> Any:
         if key not in self._functions:
-            source = self._scalar.adjoint_source(key) if key else self._scalar.source()
+            source = self._source()
+            if key:
+                assert self._adjoint_source is not None
+                source = self._adjoint_source(key)
             library = CppCodeCache.load(source)
             self._functions[key] = library, ctypes.cast(getattr(library, name), ctypes.c_void_p)
         return self._functions[key][1]
@@ -186,7 +199,7 @@ def _call(
         return (_Array * 2)(*map(_Array.of, tensors))
 
     given, slopes = by_kind(inputs), None if gradients is None else by_kind(gradients[1])
-    _driver().run(
+    load_driver().run(
         ctypes.c_int64(len(plan.kind)),
         ctypes.c_int64(before[0].shape[1]),
         ctypes.c_void_p(plan.kind.data_ptr()),
@@ -203,5 +216,6 @@ def _call(
 
 
 @lru_cache(maxsize=1)
-def _driver() -> Any:
+def load_driver() -> Any:
+    """The loop over time, compiled."""
     return CppCodeCache.load(_DRIVER)

@@ -1,6 +1,6 @@
 """Maximum likelihood of a pendulum's noise: 500 readings of its shadow, gradients through the compiled filter.
 
-`python examples/learn_noise.py` prints what a gradient costs, compiled and not, and what was learned.
+`python examples/filters/learn_noise.py` prints what a gradient costs, compiled and not, and what was learned.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A filter on a manifold of one's own, with a motion and a sensor of one's own, as an ONNX graph.
 
 A dial turns at a rate that drifts; a camera sees the cosine and the sine of its angle. Run it with
-`python examples/export_my_filter.py dial.onnx`; the second half needs numpy and onnxruntime only.
+`python examples/filters/export_my_filter.py dial.onnx`; the second half needs numpy and onnxruntime only.
 """
 
 from __future__ import annotations

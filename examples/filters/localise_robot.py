@@ -1,6 +1,6 @@
 """Five robots among known landmarks (MRCLAM), all as one batch; what gates and robust weights are worth.
 
-Run it with `python examples/localise_robot.py MRCLAM_Dataset6`. The noise is a first guess.
+Run it with `python examples/filters/localise_robot.py MRCLAM_Dataset6`. The noise is a first guess.
 """
 
 import sys

@@ -2,8 +2,8 @@
 
 Every reading is an event: a motion since the event before, by the IMU's acceleration and turn rate, then a sensor. The
 IMU's rate is between 12 and 50 Hz, and one GPS fix in twenty is 20 m off. `late` is for fixes that come half a second
-late: the filter goes back to the belief before them. `python examples/fuse_vehicle.py FOLDER` writes a C++ header for
-each sensor; call them in the order of the events.
+late: the filter goes back to the belief before them. `python examples/filters/fuse_vehicle.py FOLDER` writes a C++
+header for each sensor; call them in the order of the events.
 """
 
 from __future__ import annotations
