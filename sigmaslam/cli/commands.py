@@ -3,36 +3,18 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
+from importlib import import_module
 from importlib.metadata import entry_points, version
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.logging import RichHandler
 
-from sigmaslam.cli.calibrate import calibrate
-from sigmaslam.cli.calibration import calibration
-from sigmaslam.cli.check import check
-from sigmaslam.cli.denoise import denoise
-from sigmaslam.cli.evaluate import evaluate
-from sigmaslam.cli.export import export
-from sigmaslam.cli.finish import finish
-from sigmaslam.cli.geometry import geometry
-from sigmaslam.cli.localize import localize
-from sigmaslam.cli.match import match
-from sigmaslam.cli.points import orient, triangulate
-from sigmaslam.cli.reconstruct import reconstruct
-from sigmaslam.cli.rectify import rectify
-from sigmaslam.cli.refine import refine
-from sigmaslam.cli.render import render
-from sigmaslam.cli.track import demo, track
-from sigmaslam.cli.train import train, train_scorer
 from sigmaslam.errors import SigmaSlamError
 from sigmaslam.files import printable
-
-# Plain help: rich's tables cut long words and give flags a type.
-app = typer.Typer(name="sigmaslam", no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
 
 
 def _show_version(wanted: bool) -> None:
@@ -41,7 +23,6 @@ def _show_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
 def _root(
     show_version: Annotated[
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and exit.")
@@ -50,33 +31,56 @@ def _root(
     """Stereo visual SLAM: poses with an honest covariance and a sparse map, on a plain CPU."""
 
 
-# A line each for the list of commands, short enough for 80 columns.
-for _command, _line in (
-    (demo, "Track the sequence that ships with the package."),
-    (check, "Look at an input before it is tracked."),
-    (track, "Track a stereo sequence, recorded or live."),
-    (finish, "Make the results of a run that was killed."),
-    (evaluate, "Compare a trajectory with the truth."),
-    (refine, "Adjust all of a run at once (extra 'graph')."),
-    (reconstruct, "Make a dense cloud, and a mesh, of a run."),
-    (localize, "Localise robots among known landmarks (extra 'train')."),
-    (match, "Match two images."),
-    (denoise, "Filter noise out of images."),
-    (geometry, "Find how two views lie to each other."),
-    (triangulate, "Points of a stereo pair from pixels in both images."),
-    (orient, "Find how two frames lie from points in both."),
-    (calibrate, "Calibrate one or two cameras from images of a board."),
-    (rectify, "Write rectified pairs."),
-    (render, "Render a stereo sequence with exact truth (extra 'train')."),
-    (train, "Train the correspondence network (extra 'train')."),
-    (train_scorer, "Train the probability of matches (extra 'train')."),
-    (export, "Export trained weights to ONNX (extra 'train')."),
-):
-    app.command(short_help=_line)(_command)
-app.add_typer(calibration)
-# Commands of packages that are installed beside this one: `benchmark`, in a checkout.
-for _entry in entry_points(group="sigmaslam.commands"):
-    app.add_typer(_entry.load())
+# Each with its module and a line for the list of commands, short enough for 80 columns.
+_COMMANDS = (
+    ("demo", "track", "Track the sequence that ships with the package."),
+    ("check", "check", "Look at an input before it is tracked."),
+    ("track", "track", "Track a stereo sequence, recorded or live."),
+    ("finish", "finish", "Make the results of a run that was killed."),
+    ("evaluate", "evaluate", "Compare a trajectory with the truth."),
+    ("refine", "refine", "Adjust all of a run at once (extra 'graph')."),
+    ("reconstruct", "reconstruct", "Make a dense cloud, and a mesh, of a run."),
+    ("localize", "localize", "Localise robots among known landmarks (extra 'train')."),
+    ("match", "match", "Match two images."),
+    ("denoise", "denoise", "Filter noise out of images."),
+    ("geometry", "geometry", "Find how two views lie to each other."),
+    ("triangulate", "points", "Points of a stereo pair from pixels in both images."),
+    ("orient", "points", "Find how two frames lie from points in both."),
+    ("calibrate", "calibrate", "Calibrate one or two cameras from images of a board."),
+    ("rectify", "rectify", "Write rectified pairs."),
+    ("render", "render", "Render a stereo sequence with exact truth (extra 'train')."),
+    ("train", "train", "Train the correspondence network (extra 'train')."),
+    ("train-scorer", "train", "Train the probability of matches (extra 'train')."),
+    ("export", "export", "Export trained weights to ONNX (extra 'train')."),
+)
+_GROUPS = (("calibration", "Show or convert a stereo calibration."),)
+
+
+def build_app(chosen: str | None = None) -> typer.Typer:
+    """All commands; of those that are not chosen nothing is loaded but their names. None: all are loaded."""
+    # Plain help: rich's tables cut long words and give flags a type.
+    app = typer.Typer(name="sigmaslam", no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
+    app.callback()(_root)
+
+    def load(name: str, module: str) -> Any:
+        return getattr(import_module(f"sigmaslam.cli.{module}"), name.replace("-", "_"))
+
+    for name, module, line in _COMMANDS:
+        app.command(name, short_help=line)(load(name, module) if chosen in (None, name) else lambda: None)
+    for name, line in _GROUPS:
+        app.add_typer(load(name, name) if chosen in (None, name) else typer.Typer(name=name, help=line))
+    # Commands of packages that are installed beside this one: `benchmark`, in a checkout.
+    for entry in entry_points(group="sigmaslam.commands"):
+        if chosen in (None, "", entry.name):
+            app.add_typer(entry.load())
+    return app
+
+
+def __getattr__(name: str) -> typer.Typer:
+    """`app`, whole."""
+    if name != "app":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return build_app()
 
 
 def main() -> None:
@@ -89,8 +93,10 @@ def main() -> None:
         format="%(message)s",
         handlers=[RichHandler(console=Console(stderr=True), show_time=False, show_path=False)],
     )
+    # A shell that completes a line asks for options of any command.
+    words = [word for word in sys.argv[1:] if not word.startswith("-")]
     try:
-        app()
+        build_app(None if "_SIGMASLAM_COMPLETE" in os.environ else "".join(words[:1]))()
     except SigmaSlamError as error:
         Console(stderr=True).print(
             f"error: {printable(str(error))}", style="red", highlight=False, markup=False, soft_wrap=True
