@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sigmaslam.frontend.knn import nearest_points
-from sigmaslam.frontend.patch_kernels import MAX_ZOOM, align
+from sigmaslam.frontend.patch_kernels import MAX_ZOOM, Images, align
 from sigmaslam.frontend.types import Refinement
 
 # Three matches fix a map. Where 60 % are wrong, 24 find 0.60 of the maps, 12 only 0.40 (docs/notebook, following).
@@ -78,7 +78,7 @@ def local_maps(points0: np.ndarray, points1: np.ndarray, weight: np.ndarray) -> 
 
 
 def align_patches(
-    image0: np.ndarray,
+    image0: Images,
     image1: np.ndarray,
     points0: np.ndarray,
     points1: np.ndarray,
@@ -88,6 +88,7 @@ def align_patches(
     radius: int = _RADIUS,
     iterations: int = _ITERATIONS,
     taper: float = _TAPER,
+    source: np.ndarray | None = None,
 ) -> AlignedPatches:
     """Places in image 1 where the patches around points of image 0, warped by their maps, fit best.
 
@@ -95,7 +96,7 @@ def align_patches(
     free, on patches of 2 radius + 1 pixels of the coarser image.
 
     Args:
-        image0, image1: (H, W) uint8.
+        image0, image1: (H, W) uint8; of image 0 there may be several.
         points0, points1: (M, 2) matched pixels.
         A: (M, 2, 2) as `local_maps` gives it.
         tilt: (M, 2) how the maps depart from affine ones, as of `PatchMaps`; not at all by default.
@@ -103,6 +104,7 @@ def align_patches(
         radius: of the patches, pixels of the coarser image.
         iterations: Gauss-Newton steps.
         taper: standard deviation of the patches' Gaussian window, radii.
+        source: (M,) which of the images 0 each match comes from; None: there is one.
     """
     places, moved = points1.astype(np.float64), np.zeros(len(points1), bool)
     # No opaque surface shows its mirror image: a negative determinant is as bad as none.
@@ -110,13 +112,16 @@ def align_patches(
         np.isfinite(A).all(axis=(1, 2)), np.linalg.det(np.nan_to_num(A, posinf=0.0, neginf=0.0)), 0.0
     )
     zoom = np.sqrt(np.maximum(determinant, 0.0))
-    usable = (zoom > 1.0 / MAX_ZOOM) & (zoom < MAX_ZOOM) & _inside(image0, points0) & _inside(image1, points1)
+    usable = (zoom > 1.0 / MAX_ZOOM) & (zoom < MAX_ZOOM) & _inside(image1, points1)
+    usable &= _inside(image0 if isinstance(image0, np.ndarray) else image0[0], points0)
     rows = np.flatnonzero(usable)
     # The finer image is smoothed as much as the coarser one's pixels do, in steps of half an octave.
     half_octaves = np.round(2.0 * np.log2(zoom[rows])).astype(int)
     back = np.linalg.inv(A[rows])
     tilts = np.zeros((len(rows), 2)) if tilt is None else tilt[rows]
-    found = align(image0, image1, points0[rows], places[rows], back, tilts, half_octaves, radius, iterations, taper)
+    given = points0[rows], places[rows], back, tilts, half_octaves
+    of_rows = None if source is None else source[rows]
+    found = align(image0, image1, *given, radius, iterations, taper, of_rows)
     shift, correlation = found[:, :2], found[:, 2]
     spacing = np.maximum(1.0, 2.0 ** (0.5 * half_octaves))
     fits = (correlation > _MIN_CORRELATION) & (np.linalg.norm(shift, axis=1) <= reach * spacing)

@@ -24,7 +24,7 @@ from sigmaslam.frontend.row_search import (
     align_in_rows,
     search_rows,
 )
-from sigmaslam.frontend.types import Features, KeypointSearch, Refinement, StereoView, TemporalMatches
+from sigmaslam.frontend.types import Features, KeypointSearch, PatchMaps, Refinement, StereoView, TemporalMatches
 from sigmaslam.frontend.verifier_inputs import PlaceSearch
 from sigmaslam.table import Table
 
@@ -200,14 +200,7 @@ class DescriptorFrontend:
         """Patches aligned to where they were followed, or to where their neighbours went."""
         if not searches:
             return []
-        starts = [_inside(search, start) for search, start in zip(searches, starts, strict=True)]
-        corrected = correct_by_neighbours(
-            np.concatenate([search.predicted for search in searches]), np.concatenate(starts)
-        )
-        ends = np.cumsum([len(start) for start in starts])
-        small = shrink(left)
-        parts = zip(searches, starts, np.split(corrected, ends[:-1]), strict=True)
-        found = _FollowedPatches.concatenate([_find(number, *part, left, small) for number, part in enumerate(parts)])
+        found = _find(searches, np.concatenate(starts), left)
         verified = self._estimator.verify_places(
             found.places, found.predicted, found.evidence, found.sigma0, PlaceSearch.IN_TIME
         )
@@ -261,36 +254,28 @@ class _FollowedPatches(Table):
     evidence: Evidence
 
 
-def _inside(search: KeypointSearch, start: np.ndarray) -> np.ndarray:
-    """The starts (K, 2) that lie in the ellipses of their predictions; NaN for the others."""
-    assert search.covariance is not None
-    offset = np.nan_to_num(start - search.predicted, nan=_NOWHERE)
-    return np.where(within_ellipses(offset, search.covariance)[:, None], start, np.nan)
-
-
-def _find(
-    number: int,
-    search: KeypointSearch,
-    start: np.ndarray,
-    corrected: np.ndarray,
-    left: np.ndarray,
-    small: tuple[np.ndarray, ...],
-) -> _FollowedPatches:
-    """The keypoints of a keyframe that are found in an image."""
-    key, maps, covariance, disparity = search.key, search.maps, search.covariance, search.disparity
-    if maps is None or covariance is None or disparity is None:
-        raise ValueError("keypoints are followed with a prediction of their places, patches and disparities")
-    points = key.features.keypoints[search.index].astype(np.float64)
-    targets = PatchTargets(points, maps, search.predicted, covariance, start, corrected)
-    places, found = find_patches(key.left, left, key.small, small, targets)
+def _find(searches: list[KeypointSearch], start: np.ndarray, left: np.ndarray) -> _FollowedPatches:
+    """The keypoints of keyframes that are found in an image; start: (K, 2) of all, NaN where that is not known."""
+    views = [search.key for search in searches]
+    counts = [len(search.index) for search in searches]
+    parts = []
+    for search in searches:
+        if search.maps is None or search.covariance is None or search.disparity is None:
+            raise ValueError("keypoints are followed with a prediction of their places, patches and disparities")
+        features = search.key.features
+        keypoints, sigma = features.keypoints[search.index], features.sigma[search.index]
+        parts.append((search.index, keypoints, sigma, search.predicted, search.covariance, search.disparity))
+    index, keypoints, sigma, predicted, covariance, disparity = map(np.concatenate, zip(*parts, strict=True))
+    # Starts outside of the ellipses of their predictions are none.
+    offset = np.nan_to_num(start - predicted, nan=_NOWHERE)
+    start = np.where(within_ellipses(offset, covariance)[:, None], start, np.nan)
+    maps = PatchMaps.concatenate([search.maps for search in searches if search.maps is not None])
+    points, source = keypoints.astype(np.float64), np.repeat(np.arange(len(views), dtype=np.int32), counts)
+    corrected = correct_by_neighbours(predicted, start)
+    targets = PatchTargets(points, maps, predicted, covariance, start, corrected, source)
+    images, small = [view.left for view in views], tuple(zip(*(view.small for view in views), strict=True))
+    places, found = find_patches(images, left, small, shrink(left), targets)
     rows = np.flatnonzero(found)
-    index, places = search.index[rows], places[rows]
-    return _FollowedPatches(
-        np.full(len(rows), number),
-        index,
-        search.predicted[rows],
-        disparity[rows],
-        key.features.sigma[index],
-        places,
-        examine_patches(key.left, left, points[rows], places, maps.A[rows]),
-    )
+    places, source = places[rows], source[rows]
+    evidence = examine_patches(images, left, points[rows], places, maps.A[rows], source)
+    return _FollowedPatches(source, index[rows], predicted[rows], disparity[rows], sigma[rows], places, evidence)

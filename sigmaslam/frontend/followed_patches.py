@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from sigmaslam.frontend.affine_alignment import AlignedPatches, align_patches
 from sigmaslam.frontend.knn import nearest_points
 from sigmaslam.frontend.nearest_neighbours import within_ellipses
+from sigmaslam.frontend.patch_kernels import Images, compiled
 from sigmaslam.frontend.types import PatchMaps
 from sigmaslam.table import Table
 
@@ -29,7 +30,7 @@ _COMPARED = 12
 
 @dataclass(frozen=True, slots=True)
 class PatchTargets(Table):
-    """Patches of one image that are wanted in another one.
+    """Patches of one image or several that are wanted in another one.
 
     Attributes:
         points: (K, 2) float64 their centres, pixels.
@@ -38,6 +39,7 @@ class PatchTargets(Table):
         covariance: (K, 2, 2) of that, pixels squared; only its 99 % ellipse counts.
         start: (K, 2) where they were followed to; NaN where that is not known.
         corrected: (K, 2) where they are expected by what their neighbours were followed to.
+        source: (K,) which of several images each patch is of; None: there is one.
     """
 
     points: np.ndarray
@@ -46,6 +48,7 @@ class PatchTargets(Table):
     covariance: np.ndarray
     start: np.ndarray
     corrected: np.ndarray
+    source: np.ndarray | None = None
 
 
 def correct_by_neighbours(predicted: np.ndarray, start: np.ndarray) -> np.ndarray:
@@ -59,7 +62,9 @@ def correct_by_neighbours(predicted: np.ndarray, start: np.ndarray) -> np.ndarra
     if len(known) < _MIN_CORRECTING:
         return predicted
     near = known[nearest_points(predicted[known], predicted, min(_CORRECTING, len(known)))]
-    return np.asarray(predicted + np.median(start[near] - predicted[near], axis=1))
+    kernels, departure = compiled(), start[near] - predicted[near]
+    usual = np.median(departure, axis=1) if kernels is None else kernels.neighbour_medians(departure)[:, :2]
+    return np.asarray(predicted + usual)
 
 
 def shrink(image: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -71,16 +76,16 @@ def shrink(image: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def find_patches(
-    image0: np.ndarray,
+    image0: Images,
     image1: np.ndarray,
-    small0: tuple[np.ndarray, ...],
+    small0: tuple[Images, ...],
     small1: tuple[np.ndarray, ...],
     targets: PatchTargets,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Aligns patches, from their starts or, where there is none or it fits badly, from coarse to fine.
 
     Args:
-        image0, image1: (H, W) uint8.
+        image0, image1: (H, W) uint8; of image 0 there may be several.
         small0, small1: the same, shrunk by `shrink`.
         targets: the patches of image 0.
     Returns:
@@ -88,13 +93,13 @@ def find_patches(
     """
     followed = np.isfinite(targets.start[:, 0])
     start = np.where(followed[:, None], targets.start, targets.corrected)
-    first = _align(image0, image1, targets.points, targets.maps, start)
+    first = _align(image0, image1, targets, start)
     places, found = first.places, first.moved & within_ellipses(first.places - targets.predicted, targets.covariance)
     again = np.flatnonzero(~found | ~followed | (first.correlation < _MIN_AGREEMENT))
     if len(again):
         wanted = targets.select(again)
         start = _coarse_to_fine(small0, small1, wanted)
-        second = _align(image0, image1, wanted.points, wanted.maps, start)
+        second = _align(image0, image1, wanted, start)
         better = second.moved & within_ellipses(second.places - wanted.predicted, wanted.covariance)
         better &= ~found[again] | (second.correlation > first.correlation[again])
         places[again[better]] = second.places[better]
@@ -124,35 +129,36 @@ def compare_with_neighbours(
     if slope is not None:
         apart = predicted[near] - predicted[:, None]
         neighbours[..., 0] += np.einsum("mkj,mj->mk", apart, slope)
+    kernels = compiled()
+    if kernels is not None:
+        usual, spread = np.split(kernels.neighbour_medians(neighbours), [2], axis=1)
+        return departure - usual, spread[:, 0]
     usual = np.median(neighbours, axis=1)
     spread = np.median(np.linalg.norm(neighbours - usual[:, None], axis=2), axis=1)
     return departure - usual, spread
 
 
-def _align(
-    image0: np.ndarray, image1: np.ndarray, points: np.ndarray, maps: PatchMaps, start: np.ndarray
-) -> AlignedPatches:
+def _align(image0: Images, image1: np.ndarray, targets: PatchTargets, start: np.ndarray) -> AlignedPatches:
     return align_patches(
         image0,
         image1,
-        points,
+        targets.points,
         start,
-        maps.A,
-        maps.tilt,
+        targets.maps.A,
+        targets.maps.tilt,
         radius=_RADIUS,
         iterations=_ITERATIONS,
         taper=_TAPER,
+        source=targets.source,
     )
 
 
-def _coarse_to_fine(
-    small0: tuple[np.ndarray, ...], small1: tuple[np.ndarray, ...], targets: PatchTargets
-) -> np.ndarray:
+def _coarse_to_fine(small0: tuple[Images, ...], small1: tuple[np.ndarray, ...], targets: PatchTargets) -> np.ndarray:
     """(K, 2) places by alignment at a quarter and half of the size, from where the neighbours went."""
     places = targets.corrected
     for scale, image0, image1 in zip(_SCALES, small0, small1, strict=True):
         maps = PatchMaps(targets.maps.A, targets.maps.tilt * scale)
         points, start = ((pixels + 0.5) / scale - 0.5 for pixels in (targets.points, places))
-        aligned = _align(image0, image1, points, maps, start)
+        aligned = _align(image0, image1, replace(targets, points=points, maps=maps), start)
         places = np.where(aligned.moved[:, None], (aligned.places + 0.5) * scale - 0.5, places)
     return places

@@ -5,6 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from sigmaslam.frontend.patch_kernels import compiled
+
 # Smoothing before derivatives are taken: standard deviation and reach, pixels.
 _BLUR, _REACH = 0.7, 3
 # Half the side of patches that are compared, as those that are aligned, and what derivatives need beside them, pixels.
@@ -32,6 +34,9 @@ def patch_energies(image: np.ndarray, places: np.ndarray) -> np.ndarray:
     """
     if not len(places):
         return np.zeros((0, 2))
+    kernels = compiled()
+    if kernels is not None:
+        return np.asarray(kernels.energies(image, _pixels(image, places), _KERNEL))
     patches, smooth = _smooth_patches(image, places)
     across, down = (cv2.Sobel(smooth, cv2.CV_32F, *axes, ksize=1) for axes in ((1, 0), (0, 1)))
     maps = across * across + down * down, cv2.Laplacian(smooth, cv2.CV_32F) ** 2
@@ -57,12 +62,17 @@ def gradient_moments(image: np.ndarray, places: np.ndarray) -> np.ndarray:
 def _smooth_patches(image: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(M, S, S) grey values around places with what derivatives need, and the same smoothed, (M S, S) in one column."""
     reach = _RADIUS + _MARGIN
-    corner = np.rint(places).astype(np.int64)[:, ::-1]
     framed = np.pad(image, reach, mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(framed, (2 * reach + 1, 2 * reach + 1))
-    patches = windows[tuple(np.clip(corner, 0, np.array(image.shape) - 1).T)]
+    patches = windows[tuple(_pixels(image, places)[:, ::-1].T)]
     # One below the other, so that one call filters all; what their margins share is cut off.
     return patches, cv2.sepFilter2D(patches.reshape(-1, 2 * reach + 1), cv2.CV_32F, _KERNEL, _KERNEL)
+
+
+def _pixels(image: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """(M, 2) whole numbers: the pixels of the image next to places (M, 2)."""
+    height, width = image.shape
+    return np.clip(np.rint(places), 0, (width - 1, height - 1)).astype(np.int32)
 
 
 def _inner_mean(values: np.ndarray, patches: np.ndarray) -> np.ndarray:

@@ -1,11 +1,13 @@
-// Patches of grey images, aligned and compared: the compiled twin of patch_kernels.py, which says what is computed.
+// The compiled twins of patch_kernels.py, which says what is computed, and of functions that its docstring names.
 //
 // Every sum has a fixed order that does not depend on the instruction set: eight partial sums, added pairwise.
 // The compiler may not contract or reorder (-ffp-contract=off, no -ffast-math), so the bits are the same on every run.
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
+#include <pybind11/stl.h>
 
 #include <algorithm>
+#include <array>
 #include <climits>
 #include <cmath>
 #include <cstdint>
@@ -15,7 +17,7 @@
 #include <vector>
 
 #if defined(__SSE2__)
-#include <emmintrin.h>
+#include <immintrin.h>
 #endif
 
 namespace py = pybind11;
@@ -96,6 +98,11 @@ void window(double sigma, int side, float* out) {
     for (int k = 0; k < side * ROW; ++k) out[k] = static_cast<float>(w[k] / sum);
 }
 
+constexpr int REACH = 3, BEYOND = 4;  // of the smoothing before derivatives are summed, and of both, pixels
+
+constexpr int NOWHERE = -1000;  // nothing is found
+constexpr int ABOVE = 5, TALL = 11, BEFORE = 8, BROAD = 16;  // of the patches that are searched for along rows
+
 struct Alignment {
     double shift_u, shift_v;
     float correlation;
@@ -106,56 +113,9 @@ struct Alignment {
 
 const auto align_one = HAS_AVX2 ? wide::align_one : plain::align_one;
 const auto examine_one = HAS_AVX2 ? wide::examine_one : plain::examine_one;
-
-constexpr int NOWHERE = -1000;  // nothing is found
-constexpr int ABOVE = 5, TALL = 11, BEFORE = 8, BROAD = 16;  // of the patches that are searched for along rows
-
-// Sum of absolute differences of two patches, exact in whole numbers on any processor.
-INLINE int sum_differences(const uint8_t* a, const uint8_t* b, int width) {
-#if defined(__SSE2__)
-    __m128i sums = _mm_setzero_si128();
-    for (int r = 0; r < TALL; ++r) {
-        const __m128i row_a = _mm_loadu_si128(reinterpret_cast<const __m128i*>(a + r * width));
-        const __m128i row_b = _mm_loadu_si128(reinterpret_cast<const __m128i*>(b + r * width));
-        sums = _mm_add_epi64(sums, _mm_sad_epu8(row_a, row_b));
-    }
-    return _mm_cvtsi128_si32(sums) + _mm_extract_epi16(sums, 4);
-#else
-    int sum = 0;
-    for (int r = 0; r < TALL; ++r)
-        for (int c = 0; c < BROAD; ++c) sum += std::abs(a[r * width + c] - b[r * width + c]);
-    return sum;
-#endif
-}
-
-int search_row(const Image& left, const Image& right, int u, int v, int lowest, int highest, float ratio) {
-    const int width = left.width;
-    if (u < BEFORE || u + BROAD - BEFORE > width || v < ABOVE || v + TALL - ABOVE > left.height) return NOWHERE;
-    const uint8_t* wanted = left.pixels + static_cast<size_t>(v - ABOVE) * width + u - BEFORE;
-    const uint8_t* row = right.pixels + static_cast<size_t>(v - ABOVE) * width - BEFORE;
-    const int first = std::max(lowest, u + BROAD - BEFORE - width), last = std::min(highest, u - BEFORE);
-    int best = INT_MAX, disparity = NOWHERE, second = INT_MAX;
-    std::vector<int> costs(std::max(last - first + 1, 0));
-    for (int d = first; d <= last; ++d) {
-        const int cost = costs[d - first] = sum_differences(wanted, row + u - d, width);
-        if (cost < best) best = cost, disparity = d;
-    }
-    for (int d = first; d <= last; ++d)
-        if (std::abs(d - disparity) > 2) second = std::min(second, costs[d - first]);
-    if (disparity == NOWHERE || second == INT_MAX || static_cast<float>(best) > ratio * static_cast<float>(second)) return NOWHERE;
-    // And back.
-    const uint8_t* found = row + u - disparity;
-    const uint8_t* line = left.pixels + static_cast<size_t>(v - ABOVE) * width - BEFORE;
-    int back = NOWHERE;
-    best = INT_MAX;
-    for (int d = lowest; d <= highest; ++d) {
-        const int there = u - disparity + d;
-        if (there < BEFORE || there + BROAD - BEFORE > width) continue;
-        const int cost = sum_differences(found, line + there, width);
-        if (cost < best) best = cost, back = d;
-    }
-    return std::abs(back - disparity) <= 1 ? disparity : NOWHERE;
-}
+const auto search_row = HAS_AVX2 ? wide::search_row : plain::search_row;
+const auto patch_energies = HAS_AVX2 ? wide::patch_energies : plain::patch_energies;
+const auto sum_derivatives = HAS_AVX2 ? wide::sum_derivatives : plain::sum_derivatives;
 
 Image view(const Grey& image) {
     if (image.ndim() != 2) throw std::invalid_argument("an image must be (H, W)");
@@ -168,13 +128,32 @@ void check(py::ssize_t count, std::initializer_list<py::ssize_t> sizes, int side
     if (side < 3 || side > MOST_SIDE || side % 2 == 0) throw std::invalid_argument("a patch has 3 to 15 samples a side");
 }
 
+// The images that patches come from, and of each patch which one: the first where that is not said.
+struct Sources {
+    std::vector<Image> images;
+    const int32_t* which;
+
+    Sources(const std::vector<Grey>& greys, const Steps& source, py::ssize_t count) {
+        for (const Grey& grey : greys) images.push_back(view(grey));
+        which = source.size() ? source.data() : nullptr;
+        if (which && source.size() != count) throw std::invalid_argument("all arrays must have a row for each match");
+        const int most = static_cast<int>(images.size());
+        if (!which && !most) throw std::invalid_argument("no image is given");
+        for (py::ssize_t k = 0; which && k < count; ++k)
+            if (which[k] < 0 || which[k] >= most) throw std::invalid_argument("there is no image of that number");
+    }
+
+    const Image& operator[](py::ssize_t k) const { return images[which ? which[k] : 0]; }
+};
+
 // (M, 3): shift of image 1's place, and correlation there.
-py::array_t<double> align(const Grey& grey0, const Grey& grey1, const Reals& points0, const Reals& points1,
-                          const Reals& back, const Reals& tilt, const Steps& half_octaves, int side, int iterations,
-                          double taper) {
-    const Image image0 = view(grey0), image1 = view(grey1);
+py::array_t<double> align(const std::vector<Grey>& greys0, const Steps& source, const Grey& grey1, const Reals& points0,
+                          const Reals& points1, const Reals& back, const Reals& tilt, const Steps& half_octaves,
+                          int side, int iterations, double taper) {
+    const Image image1 = view(grey1);
     const py::ssize_t count = half_octaves.size();
     check(count, {points0.size() / 2, points1.size() / 2, back.size() / 4, tilt.size() / 2}, side);
+    const Sources images0(greys0, source, count);
     py::array_t<double> result({count, py::ssize_t{3}});
     double* out = result.mutable_data();
     const double *p0 = points0.data(), *p1 = points1.data(), *b = back.data(), *t = tilt.data();
@@ -183,7 +162,7 @@ py::array_t<double> align(const Grey& grey0, const Grey& grey1, const Reals& poi
     alignas(64) float weights[MOST_SIDE * ROW] = {0};
     window(taper, side, weights);
     for (py::ssize_t k = 0; k < count; ++k) {
-        const Alignment found = align_one(image0, image1, p0 + 2 * k, p1 + 2 * k, b + 4 * k, t + 2 * k,
+        const Alignment found = align_one(images0[k], image1, p0 + 2 * k, p1 + 2 * k, b + 4 * k, t + 2 * k,
                                           std::clamp(steps[k], -5, 5), side, iterations, weights);
         out[3 * k] = found.shift_u, out[3 * k + 1] = found.shift_v, out[3 * k + 2] = found.correlation;
     }
@@ -191,11 +170,13 @@ py::array_t<double> align(const Grey& grey0, const Grey& grey1, const Reals& poi
 }
 
 // (M, 6): correlation, variance of either patch, and uu, uv, vv of the mean patch's gradients.
-py::array_t<double> examine(const Grey& grey0, const Grey& grey1, const Reals& points0, const Reals& points1,
-                            const Reals& back, const Steps& half_octaves, int side, double taper, float flat) {
-    const Image image0 = view(grey0), image1 = view(grey1);
+py::array_t<double> examine(const std::vector<Grey>& greys0, const Steps& source, const Grey& grey1,
+                            const Reals& points0, const Reals& points1, const Reals& back, const Steps& half_octaves,
+                            int side, double taper, float flat) {
+    const Image image1 = view(grey1);
     const py::ssize_t count = half_octaves.size();
     check(count, {points0.size() / 2, points1.size() / 2, back.size() / 4}, side);
+    const Sources images0(greys0, source, count);
     py::array_t<double> result({count, py::ssize_t{6}});
     double* out = result.mutable_data();
     const double *p0 = points0.data(), *p1 = points1.data(), *b = back.data();
@@ -204,7 +185,7 @@ py::array_t<double> examine(const Grey& grey0, const Grey& grey1, const Reals& p
     alignas(64) float weights[MOST_SIDE * ROW] = {0};
     window(taper, side, weights);
     for (py::ssize_t k = 0; k < count; ++k)
-        examine_one(image0, image1, p0 + 2 * k, p1 + 2 * k, b + 4 * k, std::clamp(steps[k], -5, 5), side, flat,
+        examine_one(images0[k], image1, p0 + 2 * k, p1 + 2 * k, b + 4 * k, std::clamp(steps[k], -5, 5), side, flat,
                     weights, out + 6 * k);
     return result;
 }
@@ -225,11 +206,183 @@ py::array_t<int32_t> search_rows(const Grey& grey_left, const Grey& grey_right, 
     return result;
 }
 
+using Taps = std::array<float, 2 * REACH + 1>;
+
+// (M, 2): mean squared first and second derivatives in patches around pixels (M, 2).
+py::array_t<double> energies(const Grey& grey, const Steps& places, const Taps& taps) {
+    const Image image = view(grey);
+    const py::ssize_t count = places.size() / 2;
+    py::array_t<double> result({count, py::ssize_t{2}});
+    double* out = result.mutable_data();
+    const int32_t* at = places.data();
+    py::gil_scoped_release release;
+    for (py::ssize_t k = 0; k < count; ++k) patch_energies(image, at[2 * k], at[2 * k + 1], taps.data(), out + 2 * k);
+    return result;
+}
+
+// (9,): sums of products of derivatives, as of `sum_derivatives`.
+py::array_t<double> derivative_products(const Grey& grey, const Taps& taps) {
+    const Image image = view(grey);
+    py::array_t<double> result(9);
+    double* out = result.mutable_data();
+    std::fill(out, out + 9, 0.0);
+    py::gil_scoped_release release;
+    if (image.width > 2 * BEYOND) sum_derivatives(image, taps.data(), out);
+    return result;
+}
+
+// The median of an even or odd number of values, which it puts in another order.
+double median(double* values, int count) {
+    double* middle = values + count / 2;
+    std::nth_element(values, middle, values + count);
+    return count % 2 ? *middle : (*std::max_element(values, middle) + *middle) / 2.0;
+}
+
+// (M, 3): median (u, v) of the vectors of near ones, and the median distance of these from that.
+py::array_t<double> neighbour_medians(const Reals& vectors) {
+    if (vectors.ndim() != 3 || vectors.shape(2) != 2) throw std::invalid_argument("vectors must be (M, K, 2)");
+    const py::ssize_t count = vectors.shape(0);
+    const int near = static_cast<int>(vectors.shape(1));
+    py::array_t<double> result({count, py::ssize_t{3}});
+    const double* from = vectors.data();
+    double* out = result.mutable_data();
+    py::gil_scoped_release release;
+    std::vector<double> values(near);
+    for (py::ssize_t k = 0; near && k < count; ++k, from += 2 * near, out += 3) {
+        for (int axis = 0; axis < 2; ++axis) {
+            for (int i = 0; i < near; ++i) values[i] = from[2 * i + axis];
+            out[axis] = median(values.data(), near);
+        }
+        for (int i = 0; i < near; ++i) {
+            const double u = from[2 * i] - out[0], v = from[2 * i + 1] - out[1];
+            values[i] = std::sqrt(u * u + v * v);
+        }
+        out[2] = median(values.data(), near);
+    }
+    return result;
+}
+
+// (K, 2): gradients of a disparity that rises by (K, N) towards neighbours (K, N, 2) pixels apart: `disparity_slopes`.
+py::array_t<double> fit_slopes(const Reals& offsets, const Reals& rises, double rough, double steep,
+                               const std::vector<double>& scales) {
+    if (rises.ndim() != 2 || offsets.size() != 2 * rises.size()) throw std::invalid_argument("rises must be (K, N)");
+    const py::ssize_t count = rises.shape(0), near = rises.shape(1);
+    py::array_t<double> result({count, py::ssize_t{2}});
+    const double *apart = offsets.data(), *rise = rises.data();
+    double* out = result.mutable_data();
+    py::gil_scoped_release release;
+    for (py::ssize_t k = 0; k < count; ++k, apart += 2 * near, rise += near, out += 2) {
+        out[0] = out[1] = 0.0;
+        for (const double scale : scales) {
+            double uu = 1.0 / (steep * steep), vv = uu, uv = 0.0, u = 0.0, v = 0.0;
+            for (py::ssize_t i = 0; i < near; ++i) {
+                const double du = apart[2 * i], dv = apart[2 * i + 1];
+                const double rest = (rise[i] - (du * out[0] + dv * out[1])) / (rough * scale);
+                const double bend = (1.0 + rest * rest) * rough, weight = 1.0 / (bend * bend);
+                uu += weight * du * du, uv += weight * du * dv, vv += weight * dv * dv;
+                u += weight * du * rise[i], v += weight * dv * rise[i];
+            }
+            const double determinant = uu * vv - uv * uv;
+            out[0] = (vv * u - uv * v) / determinant;
+            out[1] = (uu * v - uv * u) / determinant;
+        }
+    }
+    return result;
+}
+
+// Inverse of the part of a symmetric matrix whose rows are measured; the rest of it is zero. False where it is singular.
+bool invert_measured(const double (&matrix)[3][3], const bool* measured, double (&inverse)[3][3]) {
+    double m[3][3];
+    for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) m[i][j] = measured[i] && measured[j] ? matrix[i][j] : i == j;
+    for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) {
+            const int a = (j + 1) % 3, b = (j + 2) % 3, c = (i + 1) % 3, d = (i + 2) % 3;
+            inverse[i][j] = m[a][c] * m[b][d] - m[a][d] * m[b][c];
+        }
+    const double determinant = m[0][0] * inverse[0][0] + m[0][1] * inverse[1][0] + m[0][2] * inverse[2][0];
+    for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) inverse[i][j] = measured[i] && measured[j] ? inverse[i][j] / determinant : 0.0;
+    return determinant > 0.0;
+}
+
+// Stereo points (M, 3) of a key view as they were measured (M, 3) in another one: `linearise` of stereo_pose.py.
+// Returns squared errors (M,), and by robust weights of the scale `loss` (squared) the normal matrix and gradient, (42,).
+py::tuple stereo_equations(const std::array<double, 5>& camera, const Reals& landmarks, const Reals& sigmas,
+                           const Reals& measurements, const Reals& noises, const Reals& weights, const Reals& pose,
+                           double loss) {
+    const py::ssize_t count = weights.size();
+    check(count, {landmarks.size() / 3, sigmas.size() / 3, measurements.size() / 3, noises.size() / 9}, 3);
+    if (pose.size() != 16) throw std::invalid_argument("a pose must be (4, 4)");
+    const auto [fx, fy, cx, cy, focal] = camera;
+    const double *T = pose.data(), *landmark = landmarks.data(), *sigma = sigmas.data();
+    const double *measurement = measurements.data(), *noise = noises.data(), *weight = weights.data();
+    py::array_t<double> squared(count), equations(42);
+    double *error = squared.mutable_data(), *sums = equations.mutable_data();
+    std::fill(sums, sums + 42, 0.0);
+    for (py::ssize_t k = 0; k < count; ++k, landmark += 3, sigma += 3, measurement += 3, noise += 9) {
+        const double ray[3] = {(landmark[0] - cx) / fx, (landmark[1] - cy) / fy, 1.0}, nearness = landmark[2] / focal;
+        double seen[3];
+        for (int i = 0; i < 3; ++i)
+            seen[i] = T[4 * i] * ray[0] + T[4 * i + 1] * ray[1] + T[4 * i + 2] * ray[2] + nearness * T[4 * i + 3];
+        error[k] = INFINITY;
+        const auto [x, y, z] = seen;
+        if (!(z > 1e-6)) continue;
+        const double predicted[3] = {fx * x / z + cx, fy * y / z + cy, focal * nearness / z};
+        const double by_seen[3][3] = {{fx / z, 0.0, -fx * x / (z * z)},
+                                      {0.0, fy / z, -fy * y / (z * z)},
+                                      {0.0, 0.0, -focal * nearness / (z * z)}};
+        double residual[3], J[3][6], by_landmark[3][3], spread[3][3], information[3][3];
+        bool measured[3];
+        for (int i = 0; i < 3; ++i) {
+            const double* row = by_seen[i];
+            residual[i] = measurement[i] - predicted[i];
+            measured[i] = std::isfinite(residual[i]);
+            if (!measured[i]) residual[i] = 0.0;
+            for (int j = 0; j < 3; ++j) {
+                J[i][j] = row[j] * nearness;
+                const double scale = j == 0 ? fx : j == 1 ? fy : focal;
+                const int column = j == 2 ? 3 : j;
+                by_landmark[i][j] = (row[0] * T[column] + row[1] * T[4 + column] + row[2] * T[8 + column]) / scale;
+            }
+            J[i][3] = row[2] * y - row[1] * z;
+            J[i][4] = row[0] * z - row[2] * x;
+            J[i][5] = row[1] * x - row[0] * y;
+        }
+        by_landmark[2][2] += 1.0 / z;
+        for (int i = 0; i < 3; ++i)
+            for (int j = 0; j < 3; ++j) {
+                spread[i][j] = noise[3 * i + j];
+                for (int l = 0; l < 3; ++l) spread[i][j] += by_landmark[i][l] * sigma[l] * sigma[l] * by_landmark[j][l];
+            }
+        if (!(measured[0] || measured[1] || measured[2]) || !invert_measured(spread, measured, information)) continue;
+        double whitened[3], total = 0.0;
+        for (int i = 0; i < 3; ++i) {
+            whitened[i] = information[i][0] * residual[0] + information[i][1] * residual[1] + information[i][2] * residual[2];
+            total += residual[i] * whitened[i];
+        }
+        error[k] = total;
+        const double share = 1.0 + total / loss, robust = weight[k] / (share * share);
+        for (int a = 0; a < 6; ++a) {
+            for (int i = 0; i < 3; ++i) sums[36 + a] += robust * J[i][a] * whitened[i];
+            for (int b = 0; b < 6; ++b)
+                for (int i = 0; i < 3; ++i)
+                    for (int j = 0; j < 3; ++j) sums[6 * a + b] += robust * J[i][a] * information[i][j] * J[j][b];
+        }
+    }
+    return py::make_tuple(squared, equations);
+}
+
 }  // namespace
 
 PYBIND11_MODULE(_kernels, module) {
-    module.doc() = "Compiled patch alignment and evidence; sigmaslam.frontend.patch_kernels is the reference.";
+    module.doc() = "Compiled twins of functions that sigmaslam.frontend.patch_kernels names.";
     module.def("align", &align);
     module.def("examine", &examine);
     module.def("search_rows", &search_rows);
+    module.def("energies", &energies);
+    module.def("derivative_products", &derivative_products);
+    module.def("fit_slopes", &fit_slopes);
+    module.def("stereo_equations", &stereo_equations);
+    module.def("neighbour_medians", &neighbour_medians);
 }

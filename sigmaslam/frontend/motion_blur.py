@@ -12,6 +12,7 @@ import numpy as np
 
 from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.frontend.image_sharpness import gradient_moments
+from sigmaslam.frontend.patch_kernels import compiled
 
 # In the mean of so many patches what single ones show of the scene evens out; more cost time.
 _MOST, _FEWEST = 60, 8
@@ -20,7 +21,7 @@ _MOST, _FEWEST = 60, 8
 _SHARP_EDGE = 4.3
 # Smoothing before second derivatives are compared, pixels of an image of half the size: without it noise hides the blur
 # of dark rooms.
-_SMOOTHING = 0.75
+_SMOOTHER = cv2.getGaussianKernel(7, 0.75, cv2.CV_32F)
 # Directions that are compared, and what derivatives need beside them, pixels.
 _DIRECTIONS, _MARGIN = 12, 4
 
@@ -42,21 +43,32 @@ def extreme_sharpness(image: np.ndarray) -> tuple[float, float]:
     the image. Infinite where nothing varies.
     """
     half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    smooth = cv2.GaussianBlur(half.astype(np.float32), (0, 0), _SMOOTHING)
-    orders = ((1, 0), (0, 1)), ((2, 0), (1, 1), (0, 2))
-    inner = slice(_MARGIN, -_MARGIN)
-    first, second = (
-        np.stack([cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3)[inner, inner].ravel() for order in each])
-        for each in orders
-    )
+    kernels = compiled()
+    products = _products(half) if kernels is None else kernels.derivative_products(half, _SMOOTHER.ravel())
+    first, second = np.zeros((2, 2)), np.zeros((3, 3))
+    for matrix, values in ((first, products[:3]), (second, products[3:])):
+        rows, columns = np.triu_indices(len(matrix))
+        matrix[rows, columns] = matrix[columns, rows] = values
     angle = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS
     cosine, sine = np.cos(angle), np.sin(angle)
     once, twice = np.stack([cosine, sine]), np.stack([cosine**2, 2.0 * cosine * sine, sine**2])
-    energies = [np.einsum("id,ij,jd->d", each, maps @ maps.T, each) for each, maps in ((once, first), (twice, second))]
+    energies = [np.einsum("id,ij,jd->d", each, moments, each) for each, moments in ((once, first), (twice, second))]
     if not (np.array(energies) > 0.0).all():
         return np.inf, np.inf
     sharpness = energies[1] / energies[0]
     return float(sharpness.min()), float(sharpness.max())
+
+
+def _products(half: np.ndarray) -> np.ndarray:
+    """(9,) sums of the products of first derivatives, then of second ones; the compiled function's reference."""
+    smooth = cv2.sepFilter2D(half, cv2.CV_32F, _SMOOTHER, _SMOOTHER)
+    orders = ((1, 0), (0, 1)), ((2, 0), (1, 1), (0, 2))
+    inner = slice(_MARGIN, -_MARGIN)
+    maps = [
+        np.stack([cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3)[inner, inner].ravel() for order in each])
+        for each in orders
+    ]
+    return np.concatenate([(each @ each.T)[np.triu_indices(len(each))] for each in maps])
 
 
 def streak_covariance(

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sigmaslam.frontend.patch_kernels import MAX_ZOOM, examine
+from sigmaslam.frontend.patch_kernels import MAX_ZOOM, Images, examine
 from sigmaslam.table import Table
 
 # Of a patch in samples, and of its Gaussian window in radii: those that the verifiers were trained on.
@@ -39,15 +39,21 @@ class Evidence(Table):
 
 
 def examine_patches(
-    image0: np.ndarray, image1: np.ndarray, points0: np.ndarray, points1: np.ndarray, A: np.ndarray | None = None
+    image0: Images,
+    image1: np.ndarray,
+    points0: np.ndarray,
+    points1: np.ndarray,
+    A: np.ndarray | None = None,
+    source: np.ndarray | None = None,
 ) -> Evidence:
     """Compares the patches around matched points.
 
     Args:
-        image0, image1: (H, W) uint8.
+        image0, image1: (H, W) uint8; of image 0 there may be several.
         points0, points1: (M, 2) pixels.
         A: (M, 2, 2), the affine map of image 0 to image 1 around each match; None, or entries that no surface shows
             (mirrored, or a zoom beyond 5), stand for the identity.
+        source: (M,) which of the images 0 each match comes from; None: there is one.
     """
     count = len(points0)
     zoom, back = np.ones(count), np.tile(np.eye(2), (count, 1, 1))
@@ -60,7 +66,7 @@ def examine_patches(
     # The finer image is smoothed as the coarser one's pixels do it.
     half_octaves = np.round(2.0 * np.log2(zoom)).astype(int)
     spacing = np.maximum(1.0, 2.0 ** (0.5 * half_octaves))
-    found = examine(image0, image1, points0, points1, back, half_octaves, _RADIUS, _TAPER, _MIN_VARIANCE)
+    found = examine(image0, image1, points0, points1, back, half_octaves, _RADIUS, _TAPER, _MIN_VARIANCE, source)
     correlation, variance0, variance1 = found[:, :3].T
     uu, uv, vv = found[:, 3:].T / spacing**2
     middle, half = 0.5 * (uu + vv), np.hypot(0.5 * (uu - vv), uv)

@@ -1,5 +1,8 @@
 """Patches of grey images, aligned and compared: compiled where a compiler was at hand, in NumPy else.
 
+Other compiled functions stand beside their twins: `motion_blur`, `image_sharpness`, `followed_patches`,
+`plane_alignment`, `row_search` and `two_view.stereo_pose`.
+
 Both compute the same formula, so that results agree to rounding. Samples come straight from the 8-bit image by a
 separable Gaussian, whose weights are tabulated by the fraction of a pixel: exact at every place, where bilinear samples
 of the pixels would be off by up to 0.015 px, alike where all move alike.
@@ -8,11 +11,15 @@ of the pixels would be off by up to 0.015 px, alike where all move alike.
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable, Sequence
 from functools import cache
 from importlib import import_module
 from types import ModuleType
 
 import numpy as np
+
+Images = np.ndarray | Sequence[np.ndarray]
+"""An image (H, W) uint8, or several of one size, of which a match may come from any."""
 
 _kernels: ModuleType | None
 try:
@@ -39,7 +46,7 @@ _CHUNK = 128
 
 
 def align(
-    image0: np.ndarray,
+    image0: Images,
     image1: np.ndarray,
     points0: np.ndarray,
     points1: np.ndarray,
@@ -49,11 +56,12 @@ def align(
     radius: int,
     iterations: int,
     taper: float,
+    source: np.ndarray | None = None,
 ) -> np.ndarray:
     """Inverse compositional Lucas-Kanade over a shift (Baker & Matthews 2004), gain and offset of grey values free.
 
     Args:
-        image0, image1: (H, W) uint8.
+        image0, image1: (H, W) uint8; of image 0 there may be several.
         points0, points1: (M, 2) float64 matched pixels, inside the images.
         back: (M, 2, 2) linear part of the map from image 1 to image 0 around the match.
         tilt: (M, 2) its perspective part, as of `PatchMaps`.
@@ -61,20 +69,21 @@ def align(
         radius: of the patches, samples.
         iterations: Gauss-Newton steps, each at most one sample long.
         taper: standard deviation of the patches' Gaussian window, radii.
+        source: (M,) which of the images 0 each match comes from; None: there is one.
     Returns:
         (M, 3) float64: shift of the place in image 1, pixels, and the correlation of the patches there.
     """
     kernels = compiled()
+    rows = points0, points1, back, tilt, half_octaves
     if kernels is None:
-        return align_reference(image0, image1, points0, points1, back, tilt, half_octaves, radius, iterations, taper)
-    found: np.ndarray = kernels.align(
-        image0, image1, points0, points1, back, tilt, half_octaves, 2 * radius + 1, iterations, taper * radius
-    )
+        return _by_source(align_reference, image0, source, image1, rows, (radius, iterations, taper))
+    images = _sources(image0, source)
+    found: np.ndarray = kernels.align(*images, image1, *rows, 2 * radius + 1, iterations, taper * radius)
     return found
 
 
 def examine(
-    image0: np.ndarray,
+    image0: Images,
     image1: np.ndarray,
     points0: np.ndarray,
     points1: np.ndarray,
@@ -83,6 +92,7 @@ def examine(
     radius: int,
     taper: float,
     flat: float,
+    source: np.ndarray | None = None,
 ) -> np.ndarray:
     """Compares patches; arguments as of `align`, and `flat`: variance of grey values that a flat patch has.
 
@@ -91,11 +101,10 @@ def examine(
         normalised patches' mean, by samples.
     """
     kernels = compiled()
+    rows = points0, points1, back, half_octaves
     if kernels is None:
-        return examine_reference(image0, image1, points0, points1, back, half_octaves, radius, taper, flat)
-    found: np.ndarray = kernels.examine(
-        image0, image1, points0, points1, back, half_octaves, 2 * radius + 1, taper * radius, flat
-    )
+        return _by_source(examine_reference, image0, source, image1, rows, (radius, taper, flat))
+    found: np.ndarray = kernels.examine(*_sources(image0, source), image1, *rows, 2 * radius + 1, taper * radius, flat)
     return found
 
 
@@ -106,7 +115,32 @@ def compiled() -> ModuleType | None:
     return _kernels
 
 
+def _sources(image0: Images, source: np.ndarray | None) -> tuple[list[np.ndarray], np.ndarray]:
+    """Images and numbers as the compiled functions take them."""
+    images = [image0] if isinstance(image0, np.ndarray) else list(image0)
+    return images, np.zeros(0, np.int32) if source is None else source
+
+
 # ---- the reference
+
+
+def _by_source(
+    kernel: Callable[..., np.ndarray],
+    image0: Images,
+    source: np.ndarray | None,
+    image1: np.ndarray,
+    rows: tuple[np.ndarray, ...],
+    settings: tuple[float, ...],
+) -> np.ndarray:
+    """What a function of two images and the rows of their matches gives where there are several images 0."""
+    if source is None:
+        return kernel(image0, image1, *rows, *settings)
+    parts = [np.flatnonzero(source == number) for number in range(len(image0))]
+    found = [
+        kernel(image, image1, *(each[some] for each in rows), *settings)
+        for image, some in zip(image0, parts, strict=True)
+    ]
+    return np.concatenate(found)[np.argsort(np.concatenate(parts))]
 
 
 def align_reference(

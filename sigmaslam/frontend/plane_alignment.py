@@ -14,6 +14,7 @@ import numpy as np
 from sigmaslam.frontend.affine_alignment import align_patches
 from sigmaslam.frontend.knn import nearest_points
 from sigmaslam.frontend.lucas_kanade import refine
+from sigmaslam.frontend.patch_kernels import compiled
 from sigmaslam.frontend.types import PatchMaps, Refinement
 from sigmaslam.geometry.camera import RectifiedStereo
 
@@ -30,38 +31,40 @@ _REACH = 2.0
 _NEIGHBOURS = 16
 # Of a disparity about the plane through its neighbours, and of a slope beforehand: standard deviations, pixels, 1.
 _ROUGH, _STEEP = 0.2, 0.5
-# Scale of the robust weight, sigmas: from the first fit to the last.
-_FIRST_SCALE, _LAST_SCALE = 8.0, 2.0
-# The scale, times 0.6 each time, has come down after three; eight fits are no better than three.
-_FITS = 5
+# Scales of the robust weight, sigmas, fit by fit. They have come down after three; eight fits are no better.
+_SCALES = (8.0, 4.8, 2.88, 2.0, 2.0)
 # Of what is seen from elsewhere, over its depth in the keyframe.
 _MIN_DEPTH = 1e-3
 
 
-def disparity_slopes(points: np.ndarray, disparity: np.ndarray) -> np.ndarray:
+def disparity_slopes(points: np.ndarray, disparity: np.ndarray, wanted: np.ndarray | None = None) -> np.ndarray:
     """Gradients (N, 2) of the disparity around (N, 2) points, from their neighbours on the same surface.
 
     Args:
         points: pixels of the left image.
         disparity: (N,) there, NaN where there is none; the slope is zero there.
+        wanted: (K,) ascending, of which points; it is zero at the others. None: of all.
     """
     slope = np.zeros((len(points), 2))
     known = np.flatnonzero(np.isfinite(disparity))
     if len(known) < 4:
         return slope
     points, disparity = points[known].astype(np.float64), disparity[known]
-    near = nearest_points(points, points, min(_NEIGHBOURS + 1, len(points)))[:, 1:]
-    apart, rise = points[near] - points[:, None], disparity[near] - disparity[:, None]
-    fitted = np.zeros((len(points), 2))
-    scale = _FIRST_SCALE
-    for _ in range(_FITS):
+    chosen = np.arange(len(known)) if wanted is None else np.flatnonzero(np.isin(known, wanted))
+    near = nearest_points(points, points[chosen], min(_NEIGHBOURS + 1, len(points)))[:, 1:]
+    apart, rise = points[near] - points[chosen, None], disparity[near] - disparity[chosen, None]
+    kernels = compiled()
+    if kernels is not None:
+        slope[known[chosen]] = kernels.fit_slopes(apart, rise, _ROUGH, _STEEP, _SCALES)
+        return slope
+    fitted = np.zeros((len(chosen), 2))
+    for scale in _SCALES:
         rest = (rise - (apart @ fitted[..., None])[..., 0]) / _ROUGH
         # Geman-McClure: neighbours on another surface do not tilt this one.
         weighted = apart / ((1.0 + (rest / scale) ** 2) ** 2 * _ROUGH**2)[..., None]
         normal = weighted.transpose(0, 2, 1) @ apart + np.eye(2) / _STEEP**2
         fitted = np.linalg.solve(normal, weighted.transpose(0, 2, 1) @ rise[..., None])[..., 0]
-        scale = max(0.6 * scale, _LAST_SCALE)
-    slope[known] = fitted
+    slope[known[chosen]] = fitted
     return slope
 
 
@@ -72,14 +75,14 @@ def plane_maps(camera: RectifiedStereo, measured: np.ndarray, slope: np.ndarray,
         camera: the rectified pair.
         measured: (M, 3) (u, v, disparity) in the keyframe, the disparity without what the calibration adds.
         slope: (M, 2) gradients of the disparity there.
-        T_view_key: (4, 4).
+        T_view_key: (4, 4), or (M, 4, 4) of each.
     """
     focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
-    rotation, nearness = T_view_key[:3, :3], T_view_key[:3, 3] / (camera.fx * camera.baseline)
+    rotation, nearness = T_view_key[..., :3, :3], T_view_key[..., :3, 3] / (camera.fx * camera.baseline)
     ray = np.column_stack([(measured[:, :2] - centre) / focal, np.ones(len(measured))])
     # A point of inverse depth rho on a ray r is seen along R r + rho t, and rho is linear in the pixels of a plane.
-    seen = ray @ rotation.T + measured[:, 2:] * nearness
-    by_pixel = (rotation[:, :2] / focal) + nearness[:, None] * slope[:, None, :]
+    seen = (rotation @ ray[..., None])[..., 0] + measured[:, 2:] * nearness
+    by_pixel = (rotation[..., :2] / focal) + nearness[..., None] * slope[:, None, :]
     depth = np.maximum(seen[:, 2:], _MIN_DEPTH)
     tilt = by_pixel[:, 2] / depth
     A = focal[:, None] * (by_pixel[:, :2] / depth[..., None] - (seen[:, :2] / depth)[..., None] * tilt[:, None, :])

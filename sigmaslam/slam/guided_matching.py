@@ -53,18 +53,6 @@ class GuidedMatches:
         """No match, and no search."""
         return cls(LandmarkViews.empty(), np.zeros(0), np.zeros(0, np.int64))
 
-    @classmethod
-    def concatenate(cls, parts: list[GuidedMatches]) -> GuidedMatches:
-        """The matches of all keyframes."""
-        if not parts:
-            return cls.empty()
-        return cls(
-            LandmarkViews.concatenate([part.views for part in parts]),
-            np.concatenate([part.probability for part in parts]),
-            np.concatenate([part.searched for part in parts]),
-            any(part.streaked for part in parts),
-        )
-
 
 class _Image:
     """The left image (H, W) uint8 that landmarks are searched for in, and whether it is blurred, asked for once."""
@@ -113,13 +101,14 @@ class GuidedMatcher:
             reference: the last one by default.
             alone: the view is too far from the keyframes' to share errors with them.
         """
-        parts, count, left = [], self.config.min_inliers, _Image(view.left)
+        count, left = self.config.min_inliers, _Image(view.left)
+        parts: list[tuple[np.ndarray, KeypointSearch, TemporalMatches]] = []
         for anchor, rows, search in self._searches(view.usable, keyframes, pose, covariance, reference):
             matches = self.frontend.match(search, view).within(view.usable)
             if alone and anchor != reference % len(keyframes) and len(matches) < count:
                 continue  # a few that agree by chance would connect keyframes that hardly see each other
-            parts.append(self._measured(rows, search, matches, left, alone))
-        return GuidedMatches.concatenate(parts)
+            parts.append((rows, search, matches))
+        return self._measured(parts, left, alone)
 
     def follow(
         self,
@@ -155,12 +144,11 @@ class GuidedMatcher:
         searches = [(each, search.widened(excess)) for each, search in searches]
         starts = np.split(start, np.cumsum([len(each) for each, _ in searches])[:-1])
         found = self.frontend.follow([search for _, search in searches], starts, frame.left, frame.right)
-        left = _Image(frame.left)
         parts = [
-            self._measured(rows, search, matches.within(frame.usable), left, alone=False)
+            (rows, search, matches.within(frame.usable))
             for (rows, search), matches in zip(searches, found, strict=True)
         ]
-        return GuidedMatches.concatenate(parts), excess
+        return self._measured(parts, _Image(frame.left), alone=False), excess
 
     def _searches(
         self,
@@ -182,38 +170,46 @@ class GuidedMatcher:
         if usable is not None:
             inside[inside] = pixels_in(usable, predicted[inside, :2])
         rows, predicted, S = rows[inside], predicted[inside], S[inside]
-        T_view_key = se3_inverse(pose) @ self.window.posterior.poses
-        for anchor, key in enumerate(keyframes):
-            chosen = np.flatnonzero(landmarks.anchor[rows] == anchor)
-            if len(chosen) < _MIN_LANDMARKS:
-                continue
-            feature = landmarks.feature[rows[chosen]]
-            maps = None
+        anchors, feature = landmarks.anchor[rows], landmarks.feature[rows]
+        chosen = [np.flatnonzero(anchors == anchor) for anchor in range(len(keyframes))]
+        slope = np.zeros((len(rows), 2))
+        for key, some in zip(keyframes, chosen, strict=True):
             if key.slope is not None:
-                measured = self.window.as_calibrated(landmarks.estimate[rows[chosen]])
-                maps = plane_maps(self.camera, measured, key.slope[feature], T_view_key[anchor])
-            places = predicted[chosen]
-            yield anchor, rows[chosen], KeypointSearch(key, feature, places[:, :2], S[chosen], maps, places[:, 2])
+                slope[some] = key.slope[feature[some]]
+        T_view_key = se3_inverse(pose) @ self.window.posterior.poses
+        measured = self.window.as_calibrated(landmarks.estimate[rows])
+        maps = plane_maps(self.camera, measured, slope, T_view_key[anchors])
+        for anchor, (key, some) in enumerate(zip(keyframes, chosen, strict=True)):
+            if len(some) < _MIN_LANDMARKS:
+                continue
+            own, places = None if key.slope is None else maps.select(some), predicted[some]
+            search = KeypointSearch(key, feature[some], places[:, :2], S[some], own, places[:, 2])
+            yield anchor, rows[some], search
 
     def _measured(
-        self, rows: np.ndarray, search: KeypointSearch, matches: TemporalMatches, left: _Image, alone: bool
+        self, parts: list[tuple[np.ndarray, KeypointSearch, TemporalMatches]], left: _Image, alone: bool
     ) -> GuidedMatches:
-        """Matches of one keyframe as views of landmarks."""
-        # Features of a keyframe ascend with the rows of its landmarks.
-        place = np.searchsorted(search.index, matches.key_index)
-        noise, common = self.noise.of_matches(matches), np.zeros((len(place), 3, 2))
-        key = search.key
-        streak = None
-        if key.is_blurred or left.is_blurred.get():
-            streak = streak_covariance(key.left, left.pixels, key.features.keypoints[matches.key_index], matches.points)
-        streaked = streak is not None
-        if streak is not None:
-            # They share it: all of them say no more of it than one.
-            noise[:, :2, :2] += len(place) * streak
+        """Matches of keyframes, each with the rows that were searched for, as views of landmarks."""
+        if not parts:
+            return GuidedMatches.empty()
+        matches = TemporalMatches.concatenate([found for _, _, found in parts])
+        noise, common = self.noise.of_matches(matches), np.zeros((len(matches), 3, 2))
+        landmarks, streaked, end = [], False, 0
+        for rows, search, found in parts:
+            # Features of a keyframe ascend with the rows of its landmarks.
+            landmarks.append(rows[np.searchsorted(search.index, found.key_index)])
+            key, begin, end = search.key, end, end + len(found)
+            if not (key.is_blurred or left.is_blurred.get()):
+                continue
+            streak = streak_covariance(key.left, left.pixels, key.features.keypoints[found.key_index], found.points)
+            if streak is not None:
+                # They share it: all of them say no more of it than one.
+                noise[begin:end, :2, :2] += len(found) * streak
+                streaked = True
         if not alone:
             noise, common = self.noise.split(noise)
-        views = LandmarkViews(rows[place], matches.measured, noise, common)
-        return GuidedMatches(views, matches.probability, rows, streaked)
+        views = LandmarkViews(np.concatenate(landmarks), matches.measured, noise, common)
+        return GuidedMatches(views, matches.probability, np.concatenate([rows for rows, _, _ in parts]), streaked)
 
     def _in_image(self, predicted: np.ndarray) -> np.ndarray:
         u, v = predicted[:, 0], predicted[:, 1]

@@ -21,7 +21,8 @@ class Keyframe:
         id: number that no other keyframe of the tracker has.
         timestamp: seconds.
         view: what it saw; the right image is given up with the window.
-        energies: (N, 2) of its features' patches, as of `patch_energies`; none once it has left the window.
+        energies: (N, 2) of patches as of `patch_energies`, of the features that became landmarks; none once it has left
+            the window.
         blur: of its image, as of `Keyframes.blur`.
         dense: disparities as of `dense_disparity`, while it is in the window; None where there are none.
         points: landmarks that it was the anchor of, in its frame, once it has left the window.

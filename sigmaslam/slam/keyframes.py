@@ -72,12 +72,15 @@ class Keyframes:
         recent = max(self._first_id, self.active[0].id - count)
         return [keyframe for keyframe in self.remembered if keyframe.id < recent]
 
-    def append(self, view: StereoView, timestamp: float, blur: float = 1.0) -> None:
-        """Takes the newest keyframe of the window, with its blur."""
+    def append(
+        self, view: StereoView, timestamp: float, blur: float = 1.0, landmarks: np.ndarray | slice = slice(None)
+    ) -> None:
+        """Takes the newest keyframe of the window, with its blur and which of its features (K,) are landmarks."""
         dense = Deferred(lambda: dense_disparity(view))
         if self._executor is not None:
             dense.begin(self._executor)
-        energies = patch_energies(view.left, view.features.keypoints)
+        energies = np.zeros((len(view.features.keypoints), 2))
+        energies[landmarks] = patch_energies(view.left, view.features.keypoints[landmarks])
         self.active.append(Keyframe(self._next_id, timestamp, view, energies, blur, dense))
         self._next_id += 1
 

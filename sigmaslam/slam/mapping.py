@@ -166,19 +166,23 @@ class Mapper:
         disparity = max(float(np.nanmedian(new.view.disparity)), _MIN_DISPARITY)
         depth = self.camera.focal_baseline / disparity
         window.add_keyframe(new.pose, new.step, step_covariance, walk, depth, new.origin)
-        slope = disparity_slopes(new.view.features.keypoints, new.view.disparity)
-        view = replace(new.view, slope=slope, is_blurred=is_blurred(new.view.left))
-        keyframes.append(view, new.timestamp, new.blur)
         window.add_views(views)
-        self._add_landmarks(view, views, new.blur)
+        index = self._add_landmarks(new.view, views, new.blur)
+        slope = disparity_slopes(new.view.features.keypoints, new.view.disparity, index)
+        view = replace(new.view, slope=slope, is_blurred=is_blurred(new.view.left))
+        keyframes.append(view, new.timestamp, new.blur, index)
         seen = LandmarkViews.concatenate([views, window.landmarks.anchor_views(len(window) - 1)])
         window.solve()
         self.motion.start_keyframe()
         self._landmarks_in_keyframe = self._last_count = len(seen)
         return KeyframeTracks(window.landmarks.id[seen.landmark], seen.measurement, seen.covariance)
 
-    def _add_landmarks(self, view: StereoView, views: LandmarkViews, blur: float) -> None:
-        """Makes landmarks of the stereo points that no landmark has been found at, less certain where it is blurred."""
+    def _add_landmarks(self, view: StereoView, views: LandmarkViews, blur: float) -> np.ndarray:
+        """Makes landmarks of the stereo points that no landmark has been found at, less certain where it is blurred.
+
+        Returns:
+            (K,) which of the view's features they are.
+        """
         index = np.flatnonzero(np.isfinite(view.disparity))
         taken = views.measurement[:, :2]
         scale = np.clip(np.sqrt(view.left.size / _FULL_SPACING_FROM), _LEAST_SPACING, 1.0)
@@ -186,3 +190,4 @@ class Mapper:
         index = index[select_spaced(view.features.select(index), taken, spacing, view.left.shape)]
         measured = view.measured(index)
         self.window.add_landmarks(index, measured, blur * self.noise.of_keypoints(view, index))
+        return index

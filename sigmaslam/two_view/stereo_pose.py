@@ -7,6 +7,7 @@ import numpy as np
 
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999, CHI_SQUARE_MEDIAN
 from sigmaslam.estimation.clustered_errors import clustering
+from sigmaslam.frontend.patch_kernels import compiled
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, skew
 from sigmaslam.two_view.epipolar import estimate_epipolar_pose
@@ -190,6 +191,29 @@ class _StereoMatches:
         information = np.where(present, np.linalg.inv(np.where(present, spread, np.eye(3))), 0.0)
         return np.where(measured, residual, 0.0), by_pose, information
 
+    def equations(self, T_camera_key: np.ndarray, loss: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Squared errors (M,) in sigmas, infinite for points behind the camera, and the equations of Gauss-Newton.
+
+        Args:
+            T_camera_key: (4, 4) where they are linearised.
+            loss: square of the robust loss' scale.
+        Returns:
+            The errors, the normal matrix (6, 6) and the gradient (6,).
+        """
+        kernels = compiled()
+        if kernels is not None:
+            camera = self.camera
+            intrinsics = camera.fx, camera.fy, camera.cx, camera.cy, camera.focal_baseline
+            given = self.landmarks, self.landmark_sigma, self.measurement, self.noise, self.weight
+            squared, sums = kernels.stereo_equations(intrinsics, *given, T_camera_key, loss)
+            return squared, sums[:36].reshape(6, 6), sums[36:]
+        residual, by_pose, information = self.linearise(T_camera_key)
+        squared = np.einsum("mi,mij,mj->m", residual, information, residual)
+        weight = self.weight / (1.0 + squared / loss) ** 2
+        weighted = by_pose.transpose(0, 2, 1) @ (information * weight[:, None, None])
+        squared = np.where(np.trace(information, axis1=1, axis2=2) > 0, squared, np.inf)
+        return squared, (weighted @ by_pose).sum(axis=0), np.einsum("mij,mj->i", weighted, residual)
+
 
 def _refine_pose(matches: _StereoMatches, T_camera_key: np.ndarray, variance: float) -> np.ndarray | None:
     """Gauss-Newton on the stereo points with a robust loss whose scale shrinks from step to step.
@@ -201,12 +225,7 @@ def _refine_pose(matches: _StereoMatches, T_camera_key: np.ndarray, variance: fl
     """
     scale = _FIRST_SCALE
     for _ in range(_STEPS):
-        residual, by_pose, information = matches.linearise(T_camera_key)
-        squared = np.einsum("mi,mij,mj->m", residual, information, residual)
-        weight = matches.weight / (1.0 + squared / (variance * scale**2)) ** 2
-        weighted = by_pose.transpose(0, 2, 1) @ (information * weight[:, None, None])
-        normal = (weighted @ by_pose).sum(axis=0)
-        gradient = np.einsum("mij,mj->i", weighted, residual)
+        _, normal, gradient = matches.equations(T_camera_key, variance * scale**2)
         if not np.linalg.cond(normal) < _MAX_CONDITION:
             return None
         T_camera_key = se3_exp(np.linalg.solve(normal, gradient)) @ T_camera_key
@@ -216,9 +235,7 @@ def _refine_pose(matches: _StereoMatches, T_camera_key: np.ndarray, variance: fl
 
 def _squared_errors(matches: _StereoMatches, T_camera_key: np.ndarray) -> np.ndarray:
     """Squared errors (M,) in sigmas; infinite for points behind the camera."""
-    residual, _, information = matches.linearise(T_camera_key)
-    squared = np.einsum("mi,mij,mj->m", residual, information, residual)
-    return np.where(np.trace(information, axis1=1, axis2=2) > 0, squared, np.inf)
+    return matches.equations(T_camera_key, 1.0)[0]
 
 
 def _variance_scale(weight: np.ndarray, squared: np.ndarray) -> float:

@@ -9,9 +9,14 @@ import numpy as np
 import pytest
 
 from sigmaslam.frontend import patch_kernels
+from sigmaslam.frontend.followed_patches import compare_with_neighbours
+from sigmaslam.frontend.image_sharpness import patch_energies
+from sigmaslam.frontend.motion_blur import extreme_sharpness
 from sigmaslam.frontend.patch_kernels import align_reference, examine_reference, sample
+from sigmaslam.frontend.plane_alignment import disparity_slopes
 
 WIDTH, HEIGHT = 160, 120
+ONE = np.zeros(0, np.int32)  # of images 0
 Matches = tuple[np.ndarray, ...]
 
 
@@ -69,7 +74,7 @@ def test_waves_are_what_a_gaussian_leaves_of_them_wherever_they_are_sampled():
 @pytest.mark.parametrize(("radius", "taper", "zoom"), [(5, 1.0, 1.0), (5, 1.0, 1.5), (7, 0.6, 4.5)])
 def test_compiled_alignment_equals_its_twin(kernels, images, radius: int, taper: float, zoom: float):
     given = matches(zoom=zoom)
-    found = kernels.align(*images, *given, 2 * radius + 1, 3, taper * radius)
+    found = kernels.align([images[0]], ONE, images[1], *given, 2 * radius + 1, 3, taper * radius)
     expected = align_reference(*images, *given, radius, 3, taper)
     np.testing.assert_allclose(found[:, 2], expected[:, 2], atol=1e-4)
     # Where patches fit; a step from a patch without texture may be anything.
@@ -82,13 +87,13 @@ def test_compiled_alignment_equals_its_twin(kernels, images, radius: int, taper:
 @pytest.mark.parametrize("zoom", [1.0, 4.5])
 def test_compiled_evidence_equals_its_twin(kernels, images, zoom: float):
     points0, points1, back, _, half_octaves = matches(zoom=zoom)
-    found = kernels.examine(*images, points0, points1, back, half_octaves, 11, 3.0, 1.0)
+    found = kernels.examine([images[0]], ONE, images[1], points0, points1, back, half_octaves, 11, 3.0, 1.0)
     expected = examine_reference(*images, points0, points1, back, half_octaves, 5, 0.6, 1.0)
     np.testing.assert_allclose(found, expected, rtol=2e-4, atol=2e-5)
 
 
 def test_every_run_gives_the_same_bits(kernels, images):
-    first, again = (kernels.align(*images, *matches(), 11, 3, 5.0) for _ in range(2))
+    first, again = (kernels.align([images[0]], ONE, images[1], *matches(), 11, 3, 5.0) for _ in range(2))
     assert first.tobytes() == again.tobytes()
 
 
@@ -113,7 +118,58 @@ def test_without_a_compiler_the_twin_serves_and_says_so_once(images, monkeypatch
 @pytest.mark.parametrize("side", [4, 17])
 def test_patches_of_other_sizes_are_refused(kernels, images, side: int):
     with pytest.raises(ValueError, match="samples a side"):
-        kernels.align(*images, *matches(5), side, 3, 5.0)
+        kernels.align([images[0]], ONE, images[1], *matches(5), side, 3, 5.0)
     points0, *others = matches(5)
     with pytest.raises(ValueError, match="a row for each match"):
-        kernels.align(*images, points0[:4], *others, 11, 3, 5.0)
+        kernels.align([images[0]], ONE, images[1], points0[:4], *others, 11, 3, 5.0)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_matches_of_several_images_are_those_of_each(images, monkeypatch, compiled: bool):
+    if not compiled:
+        monkeypatch.setattr(patch_kernels, "_kernels", None)
+    several, given = (images[0], 255 - images[0], images[1]), matches(60)
+    points0, points1, back, _, half_octaves = given
+    source = np.random.default_rng(3).integers(0, 3, 60).astype(np.int32)
+    aligned = patch_kernels.align(several, images[1], *given, 5, 3, 1.0, source)
+    examined = patch_kernels.examine(several, images[1], points0, points1, back, half_octaves, 5, 0.6, 1.0, source)
+    for number, image in enumerate(several):
+        rows = source == number
+        alone = patch_kernels.align(image, images[1], *(each[rows] for each in given), 5, 3, 1.0)
+        np.testing.assert_array_equal(aligned[rows], alone)
+        some = (each[rows] for each in (points0, points1, back, half_octaves))
+        np.testing.assert_array_equal(examined[rows], patch_kernels.examine(image, images[1], *some, 5, 0.6, 1.0))
+
+
+def test_images_that_are_not_there_are_refused(kernels, images):
+    for source in (np.full(5, 2, np.int32), np.full(5, -1, np.int32)):
+        with pytest.raises(ValueError, match="no image of that number"):
+            kernels.align(list(images), source, images[1], *matches(5), 11, 3, 5.0)
+    with pytest.raises(ValueError, match="no image is given"):
+        kernels.align([], ONE, images[1], *matches(5), 11, 3, 5.0)
+
+
+def test_compiled_medians_equal_their_twin(kernels):
+    vectors = np.random.default_rng(4).normal(size=(50, 12, 2))
+    for count in (1, 7, 12):
+        some = np.ascontiguousarray(vectors[:, :count])
+        usual = np.median(some, axis=1)
+        spread = np.median(np.linalg.norm(some - usual[:, None], axis=2), axis=1)
+        np.testing.assert_array_equal(kernels.neighbour_medians(some), np.column_stack([usual, spread]))
+
+
+TWINS = {
+    "energies": lambda images: patch_energies(images[0], matches(30)[0] * 1.2 - 10.0),
+    "sharpness": lambda images: np.array(extreme_sharpness(images[0])),
+    "slopes": lambda _: disparity_slopes(matches()[0], 20.0 + 0.1 * matches()[0][:, 0] + matches()[3][:, 0]),
+    "slopes of some": lambda _: disparity_slopes(matches()[0], 20.0 + matches()[1][:, 1], np.arange(3, 90, 2)),
+    "neighbours": lambda _: np.column_stack(compare_with_neighbours(*matches()[:2])),
+}
+
+
+@pytest.mark.parametrize("name", TWINS)
+def test_what_is_compiled_equals_its_twin(kernels, images, monkeypatch, name: str):
+    found = TWINS[name](images)
+    monkeypatch.setattr(patch_kernels, "_kernels", None)
+    np.testing.assert_allclose(found, TWINS[name](images), rtol=1e-4, atol=1e-9)
+    assert np.abs(found).max() > 1e-3

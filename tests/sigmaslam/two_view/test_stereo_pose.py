@@ -1,10 +1,11 @@
 import numpy as np
 import pytest
 
+from sigmaslam.frontend import patch_kernels
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.image_cells import CELLS, image_cells
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
-from sigmaslam.two_view.stereo_pose import RelativePose, estimate_relative_pose
+from sigmaslam.two_view.stereo_pose import RelativePose, _StereoMatches, estimate_relative_pose
 
 CAMERA = RectifiedStereo(fx=400.0, fy=400.0, cx=319.5, cy=239.5, baseline=0.2, width=640, height=480)
 
@@ -178,3 +179,26 @@ def test_clustering_says_by_how_much_errors_that_neighbours_share_exceed_the_cov
         factors.append(found.clustering)
     assert 0.5 * np.mean(squared) < np.mean(factors) < 2.0 * np.mean(squared), (np.mean(squared), np.mean(factors))
     assert (np.mean(factors) > 2.0) == (shared > 0.0)
+
+
+def test_compiled_equations_equal_their_twin(monkeypatch):
+    """Of far points, unknown disparities and points behind the camera, too."""
+    pytest.importorskip("sigmaslam.frontend._kernels", reason="installed without a compiler")
+    rng = np.random.default_rng(0)
+    landmarks = points_in_view(60)
+    landmarks[::7, 2] = rng.uniform(-0.5, 0.5, 9)
+    measurement = landmarks + rng.normal(0.0, 2.0, landmarks.shape)
+    measurement[::5, 2], measurement[3] = np.nan, np.nan
+    noise = rng.normal(size=(60, 3, 3))
+    noise = noise @ noise.transpose(0, 2, 1) + 0.1 * np.eye(3)
+    sigma, weight = rng.uniform(0.1, 0.5, (60, 3)), rng.uniform(size=60)
+    matches = _StereoMatches(CAMERA, landmarks, sigma, measurement, noise, weight)
+    for motion in ([0.2, -0.1, 0.4, 0.05, -0.1, 0.03], [0.0, 0.0, -7.0, 0.0, 0.0, 0.0]):
+        T = se3_exp(motion)
+        found = matches.equations(T, 3.0)
+        with monkeypatch.context() as without:
+            without.setattr(patch_kernels, "_kernels", None)
+            expected = matches.equations(T, 3.0)
+        assert np.isinf(expected[0]).any()
+        for each, twin in zip(found, expected, strict=True):
+            np.testing.assert_allclose(each, twin, rtol=1e-7, atol=1e-9)
