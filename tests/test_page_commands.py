@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from sigmaslam.cli.commands import app
+from sigmaslam.cli.commands import DEFAULTS, app
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [page for folder in (ROOT, ROOT / "docs", ROOT / "examples") for page in sorted(folder.glob("*.md"))]
@@ -58,6 +58,8 @@ def parse(command: str) -> None:
     """
     group, words = COMMANDS, [word for word in shlex.split(command)[1:] if word not in EAGER]
     while words and not words[0].startswith("-") and hasattr(group, "commands"):
+        if words[0] not in group.commands and group.name in DEFAULTS:
+            words = [DEFAULTS[group.name], *words]
         if words[0] not in group.commands:
             raise UsageError(f"there is no command {words[0]}")
         group, words = group.commands[words[0]], words[1:]
@@ -112,8 +114,7 @@ def test_there_are_commands_on_the_pages():
     assert {command.split()[1] for _, command in BLOCKS} >= {
         "track",
         "evaluate",
-        "match",
-        "render",
+        "images",
         "train",
         "localize",
     }

@@ -55,9 +55,10 @@ def test_what_a_row_names_is_there(row: list[str]):
     assert names
     for name in names:
         assert resolved(name) is not None, name
-    known = {*typer.main.get_command(app).commands, "benchmark"}
-    for command in re.findall(r"`sigmaslam ([a-z-]+)[^`]*`", commands):
-        assert command in known
+    known = typer.main.get_command(app).commands
+    for first, second in re.findall(r"`sigmaslam ([a-z-]+)(?: ([a-z-]+))?[^`]*`", commands):
+        assert first in known
+        assert not second or second in known[first].commands
     paths = re.findall(r"`([^`]+)`", tests)
     assert paths
     for path in paths:

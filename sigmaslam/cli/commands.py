@@ -16,7 +16,6 @@ from typer.core import TyperGroup
 
 from sigmaslam.cli.panels import PanelCommand
 from sigmaslam.errors import SigmaSlamError
-from sigmaslam.files import printable
 
 # A line each, short enough for 80 columns. The first ones are what a user needs to know; a group has its own table.
 FIRST = {
@@ -175,6 +174,8 @@ def main() -> None:
     try:
         app()
     except SigmaSlamError as error:
+        from sigmaslam.files import printable
+
         Console(stderr=True).print(
             f"error: {printable(str(error))}", style="red", highlight=False, markup=False, soft_wrap=True
         )

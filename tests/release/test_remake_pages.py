@@ -23,7 +23,7 @@ def test_pages_name_benchmarks_that_exist():
     names = {words[2] for words in commands if words[:2] == ["sigmaslam", "benchmark"]}
     assert {"sequences", "runtime", "filters", "claims"} <= names <= BENCHMARKS.keys()
     others = {tuple(words[:3]) for words in commands if words[1] != "benchmark"}
-    assert others == {("sigmaslam", "export", "--page"), ("python", "-m", "tests.faults")}
+    assert others == {("sigmaslam", "train", "export"), ("python", "-m", "tests.faults")}
 
 
 def test_benchmarks_that_take_data_and_peers_are_known():
