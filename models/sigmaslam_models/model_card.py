@@ -15,7 +15,7 @@ _CARD_FIELDS = (
     *("duration_s", "hardware"),
 )
 _CARD_BYTES = 1 << 24
-REFINED_NAME = " + sigmaslam images match"
+REFINED_NAME = " + sigmaslam match"
 """Follows the name of an extractor in the row of what `sigmaslam images match` makes of its features."""
 PEER_NAMES = ("sift", "orb", "klt")
 """Rows of `sigmaslam benchmark features` that are always beside ours."""

@@ -15,7 +15,7 @@ PAGE = ROOT / "docs" / "matching.md"
 # What is added to commands, by how they begin; of options that are given twice the last one counts.
 SMALL = {
     "sigmaslam train render": ["--frames", "12", "--width", "192", "--height", "160"],
-    "sigmaslam train": ["--steps", "2", "--workers", "0"],
+    "sigmaslam train --": ["--steps", "2", "--workers", "0"],
 }
 
 
@@ -26,8 +26,8 @@ def commands() -> list[list[str]]:
 
 
 def test_the_page_goes_from_a_render_to_matches():
-    verbs = [words[1] for words in commands()]
-    assert verbs == ["render", "train", "export", "track", "evaluate", "match"]
+    verbs = [words[2] if words[1] in ("train", "images") else words[1] for words in commands()]
+    assert verbs == ["render", "--recipe", "export", "track", "evaluate", "match"]
 
 
 def test_the_page_tells_the_steps_and_size_of_the_batches():

@@ -213,7 +213,7 @@ def test_the_command_line_plays_in_real_time(demo_sequence: Path, tmp_path: Path
 
 
 def test_the_command_line_offers_real_time_and_threads():
-    result = run_here("track", "--help")
+    result = run_here("track", "--help-all")
     assert result.returncode == 0
     assert "--realtime" in result.stdout
     assert "--threads" in result.stdout

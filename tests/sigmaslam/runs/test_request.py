@@ -17,8 +17,8 @@ from sigmaslam.runs.request import _REFUSED, InputOptions, LiveOptions, OutputOp
 PARTS = (InputOptions, OutputOptions, TrackerOptions, LiveOptions)
 RECORDING = InputOptions(Path("recording"))
 RUN = Path("run")
-# Of the command alone: one becomes settings, the other is about a check before the run; and of Python alone.
-OF_THE_COMMAND, OF_PYTHON = {"estimate", "strict"}, {"findings", "on_estimate", "sinks"}
+# Of the command alone: one becomes settings, others are about a check before the run and help; and of Python alone.
+OF_THE_COMMAND, OF_PYTHON = {"estimate", "strict", "help_all"}, {"findings", "on_estimate", "sinks"}
 
 
 def test_options_of_the_command_are_the_fields_of_the_request():

@@ -284,7 +284,11 @@ def test_no_place_is_found_that_the_motion_excludes(away: float, inliers: int, i
     window.add_keyframe(looking(0.1), looking(0.1), 1e-4 * np.eye(6), NO_WALK, 1.0)
     keyframes.append(view_of(1, 80), 0.5)
     motion = SimpleNamespace(
-        step=np.eye(4), step_covariance=1e-2 * np.eye(6), is_inertial=is_measured, is_odometric=False
+        step=np.eye(4),
+        step_covariance=1e-2 * np.eye(6),
+        is_inertial=is_measured,
+        is_odometric=False,
+        reckoning="inertial",
     )
     found = RelativePose(looking(0.1 + away), np.arange(80) < inliers, 1e-4 * np.eye(6), 1.0)
     matcher = SimpleNamespace(relative_pose_to=lambda key, view: found, is_beyond_chance=lambda found: inliers > 45)

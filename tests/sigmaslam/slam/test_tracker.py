@@ -126,11 +126,11 @@ def test_dropped_frames_are_bridged_by_their_time(demo: Demo):
 
 def test_a_camera_that_stands_still_does_not_drift(demo: Demo):
     camera, frames, _ = demo
-    # No sensor gives the same image twice.
+    # No sensor gives the same row twice.
     images = [(frames[0].left.copy(), frames[0].right.copy()) for _ in range(8)]
     for k, pair in enumerate(images):
         for image in pair:
-            image[0, 0] = k
+            image[:, 0] = k
     still = [StereoFrame(k, 0.05 * k, *pair) for k, pair in enumerate(images)]
     for estimate in track(StereoTracker(camera), still)[1:]:
         assert estimate.status == "tracking"
