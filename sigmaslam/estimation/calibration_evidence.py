@@ -36,7 +36,7 @@ HYPOTHESES = {
 """What each moves of the tracker's errors, all alike.
 
 Baseline and focal length of both eyes cannot be told from the scene, a roll and a bend not from patches of a road that
-are misplaced alike (docs/notebook/calibration.md). A pitch that disparities show moves rows beyond what is tracked.
+are misplaced alike (docs/notebook/README.md). A pitch that disparities show moves rows beyond what is tracked.
 """
 
 
