@@ -86,7 +86,7 @@ def test_a_signal_ends_a_run_with_its_results(
     assert described["ended"] == "interrupted" + ("" if number == signal.SIGINT else f" by {number.name}")
     assert described["summary"]["poses"] == len(read_tum(run / "trajectory_final.tum")) == 4
     assert {path.name for path in whole.iterdir()} == {path.name for path in run.iterdir()}
-    assert "nothing to do" in run_here("report", run).stdout
+    assert run_here("report", run).stdout == f"Report: {run / 'report.html'}\n"
 
 
 @pytest.mark.long
@@ -130,7 +130,7 @@ def test_finish_makes_the_results_of_a_killed_run(sequence: Path, whole: Path, t
     assert json.loads(evaluated.stdout)["matched"] == 4
 
     again = run_here("report", run)
-    assert (again.returncode, again.stdout) == (0, f"{run} is finished: there is nothing to do.\n")
+    assert (again.returncode, again.stdout) == (0, f"Report: {run / 'report.html'}\n")
 
 
 @pytest.fixture
