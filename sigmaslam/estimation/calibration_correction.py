@@ -27,9 +27,13 @@ def change_rig(window: KeyframeWindow, offset: float) -> None:
     assert not len(window)
     window.expected[0] = window.posterior.calibration[0] + offset
     window.exceeded[:], window.board_disparity = False, None
-    turned = window.calibration.widened(np.isin(ERRORS, TURNS) * offset)
-    state, _ = window.posterior.with_error(0, 0.0, window.calibration, turned)
-    window.prior = window.posterior = replace(state, calibration=window.expected.copy())
+    turns = np.isin(ERRORS, TURNS)
+    turned = window.calibration.widened(turns * offset)
+    # Of poses after it alone, and where a file claims that there is no error at all, too.
+    common, rows = window.posterior.common.copy(), np.flatnonzero(turns)
+    common[rows, rows] = np.hypot(common[rows, rows], offset)
+    state = replace(window.posterior, calibration=window.expected.copy(), common=common)
+    window.prior = window.posterior = state
     window.calibration = turned
     window.evidence = CalibrationEvidence(turned, window.camera.fx, window.graphs.condition, window.expected)
 

@@ -22,7 +22,8 @@ CALIBRATION = "stereo.yaml"
 # What is not run, by how it begins, and why.
 NOT_RUN = {
     "sigmaslam track --camera": "needs cameras",
-    "sigmaslam train": "half an hour and more",
+    "sigmaslam train --": "half an hour and more",
+    "sigmaslam train scorer": "half an hour",
     "sigmaslam train export": "needs what `train` makes",
     "sigmaslam benchmark": "an hour and more",
     "sigmaslam track FOLDER --out run --start 100": "the stand-in has ten pairs",

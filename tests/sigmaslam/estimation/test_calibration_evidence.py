@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from sigmaslam.estimation.calibration_errors import ERRORS, CalibrationPrior
+from sigmaslam.estimation.calibration_correction import change_rig
+from sigmaslam.estimation.calibration_errors import ERRORS, TURNS, CalibrationPrior
 from sigmaslam.estimation.calibration_evidence import HYPOTHESES, CalibrationEvidence, Cause
 from sigmaslam.estimation.window_state import WindowState
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.inference.backends import load_step
-from tests.support.dense_window import CAMERA, by_pair_with, unsolved, world
+from tests.support.dense_window import CAMERA, by_pair_with, make_window, unsolved, world
 
 USUAL = CalibrationPrior.of(CAMERA, CalibrationSigmas(), 0.5)
 SIZE, PRIOR = 0.01 * CAMERA.fx, 0.01
@@ -101,3 +102,14 @@ def test_a_window_takes_over_what_evidence_names(name: str):
     assert wrong.posterior.calibration[k] == pytest.approx(6.0, abs=3.0 * sigma)
     assert sigma < 1.5
     assert wrong.calibration.sigma[k] == pytest.approx(sigma)
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.3])
+def test_a_bump_may_have_turned_the_camera_whatever_its_file_claims(sigma: float):
+    window = make_window(np.full(3, 0.5), considered_sigma=np.full(9, sigma))
+    turns = [ERRORS.index(name) for name in TURNS]
+    before, covariance = window.posterior.common, window.calibration.covariance
+    change_rig(window, 2.0)
+    after = window.posterior.common
+    np.testing.assert_allclose(np.diag(after @ after.T - before @ before.T)[turns], 4.0)
+    np.testing.assert_allclose(np.diag(window.calibration.covariance - covariance)[turns], 4.0)
