@@ -78,8 +78,8 @@ def test_a_whole_card_is_read(tmp_path, tiny):
 def test_scores_for_the_card_are_those_of_the_one_extractor_that_is_ours(tmp_path):
     path = tmp_path / "features.json"
     scores = {"ours": {"boat": {"mma_1": 0.123456}, "kitti": {"rows_1": 0.5}}, "sift": {"boat": {"mma_1": 0.9}}}
-    path.write_text(json.dumps({**scores, "ours + sigmaslam images match": {"boat": {"mma_1": 0.7}}, "klt": {}}))
-    expected = {"boat": {"mma_1": 0.1235}, "boat + sigmaslam images match": {"mma_1": 0.7}, "kitti": {"rows_1": 0.5}}
+    path.write_text(json.dumps({**scores, "ours + sigmaslam match": {"boat": {"mma_1": 0.7}}, "klt": {}}))
+    expected = {"boat": {"mma_1": 0.1235}, "boat + sigmaslam match": {"mma_1": 0.7}, "kitti": {"rows_1": 0.5}}
     assert read_scores(path) == expected
     path.write_text(json.dumps({**scores, "xfeat.onnx": {}}))
     with pytest.raises(InputError, match=r"features\.json holds the scores of ours, xfeat\.onnx"):
