@@ -13,7 +13,6 @@ from sigmaslam.estimation.constant_velocity import MotionFilter, dead_reckoning
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.frame_update import FrameUpdate
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
-from sigmaslam.estimation.prediction_errors import surprise
 from sigmaslam.frontend import StereoView
 from sigmaslam.geometry.se3 import se3_inverse, se3_log, turn_covariance
 from sigmaslam.slam.config import TrackerConfig
@@ -198,10 +197,9 @@ class Localiser:
             uncertain = turn_covariance(start, relative.covariance + margin)
             matches = self.guided.match_guided(view, keyframes, start, uncertain, -back, alone=True)
             clock.lap("match")
-            # Found without the prediction, which would otherwise drag it along where the two contradict each other.
-            excess = surprise(self.motion, se3_inverse(self.window.posterior.poses[-1]) @ start)
-            spread, min_inliers = excess * prediction.covariance, self.config.min_inliers
-            fit = self.update.fit(matches.views, prediction.pose, spread, min_inliers, start, relative.scale)
+            fit = self.update.fit(
+                matches.views, prediction.pose, prediction.covariance, self.config.min_inliers, start, relative.scale
+            )
             clock.lap("filter")
             enough = fit is not None and fit.count >= ACCEPTANCE.unguided_share * len(matches.probability)
             if fit is not None and enough and self._is_reachable(matches, fit, prediction):
