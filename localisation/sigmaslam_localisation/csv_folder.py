@@ -13,16 +13,17 @@ LONGEST_GAP = 0.5
 """Seconds between poses of the truth above which nothing is interpolated."""
 
 
-def read_csv_folder(folder: Path, mapping: bool = False) -> Recording:
+def read_csv_folder(folder: Path, mapping: bool = False, associated: bool = True) -> Recording:
     """One robot's recording.
 
     The files are landmarks.csv (landmark,x,y), controls.csv (time,speed,turn_rate), sightings.csv
-    (time,landmark,range,bearing or time,landmark,ahead,left) and, if there is a truth, truth.csv (time,x,y,heading):
-    seconds, metres, radians.
+    (time,landmark,range,bearing or time,landmark,ahead,left; without landmark where it is to be found) and, if there is
+    a truth, truth.csv (time,x,y,heading): seconds, metres, radians.
 
     Args:
         folder: of the files.
         mapping: the landmarks are to be found, so landmarks.csv need not be there, nor name them all.
+        associated: sightings must say which landmark they are of.
     Raises:
         InputError: a file is missing, or has other columns, or names a landmark that is not in the map.
     """
@@ -32,12 +33,14 @@ def read_csv_folder(folder: Path, mapping: bool = False) -> Recording:
         names, places = _read(folder / "landmarks.csv", ["landmark", "x", "y"], named=0)
     _, controls = _read(folder / "controls.csv", ["time", "speed", "turn_rate"])
     path = folder / "sightings.csv"
-    kind = next((kind for kind, columns in KINDS.items() if columns == _header(path)[2:]), None)
-    if kind is None:
-        raise InputError(
-            f"{path}: the header is {','.join(_header(path))}, not time,landmark,range,bearing or ..,ahead,left"
-        )
-    seen, sightings = _read(path, ["time", "landmark", *KINDS[kind]], named=1)
+    header = _header(path)
+    kind = next((kind for kind, columns in KINDS.items() if columns == header[-2:]), None)
+    if kind is not None and not associated and "landmark" not in header:
+        seen, sightings = _read(path, ["time", *KINDS[kind]])
+    elif kind is not None:
+        seen, sightings = _read(path, ["time", "landmark", *KINDS[kind]], named=1)
+    else:
+        raise InputError(f"{path}: the header is {','.join(header)}, not time,landmark,range,bearing or ..,ahead,left")
     unknown = sorted(set(seen) - set(names))
     if unknown and not mapping:
         raise InputError(
@@ -59,7 +62,7 @@ def read_csv_folder(folder: Path, mapping: bool = False) -> Recording:
         controls[:, 0],
         controls[:, 1:],
         sightings[order, 0],
-        np.array([index[seen[place]] for place in order], int),
+        np.array([index[seen[place]] if seen else -1 for place in order], int),
         sightings[order, 1:],
         kind,
         places,

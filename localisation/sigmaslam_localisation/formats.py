@@ -28,8 +28,12 @@ def detect_format(path: Path) -> str:
     )
 
 
-def read_recordings(path: Path, kind: str, robot: int | None, mapping: bool = False) -> list[Recording]:
-    """The recordings of a path of wheeled robots: of one robot, or of all; for mapping, landmarks need no places.
+def read_recordings(
+    path: Path, kind: str, robot: int | None, mapping: bool = False, associated: bool = True
+) -> list[Recording]:
+    """The recordings of a path of wheeled robots: of one robot, or of all.
+
+    For mapping, landmarks need no places; sightings need no landmarks if these are not yet `associated`.
 
     Raises:
         InputError: a file is wrong, or there is no such robot.
@@ -41,4 +45,4 @@ def read_recordings(path: Path, kind: str, robot: int | None, mapping: bool = Fa
         return [read_mrclam(path, number) for number in ([robot] if robot is not None else robots)]
     if robot is not None:
         raise InputError(f"{path}: a recording of this format has one robot: leave out --robot")
-    return [read_tubes(path) if kind == "tubes" else read_csv_folder(path, mapping)]
+    return [read_tubes(path) if kind == "tubes" else read_csv_folder(path, mapping, associated)]

@@ -29,7 +29,7 @@ def write_robots(
     Returns:
         The summary of the second pass by robot, as in run.json, with the errors of the smoothers.
     """
-    names = recordings[0].landmark_names
+    names = max((each.landmark_names for each in recordings), key=len)
     write_trajectories(folder / "trajectory.csv", second)
     write_trajectories(folder / "trajectory_first_pass.csv", first)
     _write_innovations(folder / "innovations.csv", second)

@@ -42,7 +42,7 @@ class Recording:
         control_seconds: (C,) increasing; a control holds until the next.
         controls: (C, 2) speed in m/s and turn rate in rad/s.
         seconds: (S,) of the sightings, increasing; several may share a time.
-        landmark: (S,) index of the landmark seen.
+        landmark: (S,) index of the landmark seen; -1 where that is not known.
         sightings: (S, 2) of the kind's components.
         kind: "range-bearing" (metres, radians, anticlockwise from ahead) or "cartesian" (metres ahead and to the left).
         landmarks: (L, 2) in the world, metres; NaN where that is not known.

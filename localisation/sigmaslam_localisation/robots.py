@@ -112,7 +112,7 @@ def localise_robots(
     bayes = make_filter(filter_name, SPACE if mapper is None else mapper.space)
     count = len(DELAYS)
     steps = make_steps([each for each in recordings for _ in DELAYS], [*DELAYS] * len(recordings))
-    prior = (robot if mapper is None else mapper).prior(_starts(recordings, steps.seconds[0, ::count], start))
+    prior = (robot if mapper is None else mapper).prior(first_poses(recordings, steps.seconds[0, ::count], start))
     repeated = _pick(prior, torch.arange(len(recordings)).repeat_interleave(count))
     first = localise(
         bayes, platform, repeated, steps, None, lambda done: tell(f"first pass: {done:.0%}"), admit, ROBOT_SIZE
@@ -158,7 +158,14 @@ def _with_smoothed(estimate: RobotEstimate, smoother: Smoother, lag: float) -> R
     return replace(estimate, smoothed=found[0], lagged=found[1])
 
 
-def _starts(recordings: Sequence[Recording], seconds: np.ndarray, start: tuple[float, float, float] | None) -> Tensor:
+def first_poses(
+    recordings: Sequence[Recording], seconds: np.ndarray, start: tuple[float, float, float] | None
+) -> Tensor:
+    """Poses (B, 3) of the robots at these times (B,): `start`, or where that is None those of the truth.
+
+    Raises:
+        InputError: there is no truth then.
+    """
     if start is not None:
         return torch.tensor(start, dtype=torch.float64).expand(len(recordings), 3)
     poses = []

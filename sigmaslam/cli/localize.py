@@ -37,8 +37,8 @@ class FilterKind(StrEnum):
     iterated = "iterated"
 
 
-class MapKind(StrEnum):
-    """Whether the places of the landmarks are known."""
+class Knowledge(StrEnum):
+    """Whether the places of the landmarks are known, or which of them a sighting is of."""
 
     known = "known"
     unknown = "unknown"
@@ -51,8 +51,11 @@ def localize(
     robot: Annotated[int | None, typer.Option(help="Number of a robot.", show_default="all, as one batch")] = None,
     filter: Annotated[FilterKind, typer.Option(help="Unscented, extended or iterated unscented.")] = FilterKind["ukf"],
     map: Annotated[
-        MapKind, typer.Option(help="Places of the landmarks: as the recording has them, or to be found on the way.")
-    ] = MapKind["known"],
+        Knowledge, typer.Option(help="Places of the landmarks: as the recording has them, or to be found on the way.")
+    ] = Knowledge["known"],
+    association: Annotated[
+        Knowledge, typer.Option(help="Landmark of each sighting: as the recording has it, or to be found.")
+    ] = Knowledge["known"],
     compare: Annotated[
         bool, typer.Option("--compare", help="All filters one after the other, each in a folder of its name.")
     ] = False,
@@ -73,9 +76,9 @@ def localize(
     Writes trajectory.csv with covariance and belief, trajectory_first_pass.csv, innovations.csv, run.json, map.png and
     report.html; with --smooth trajectory_smoothed.csv and trajectory_lagged.csv as well.
     Noise, delay and systematic errors are found from the recording's innovations, not from its truth.
-    With --map unknown the landmarks are found as well, and landmarks.csv is written (SLAM; which landmark a sighting is
-    of is known). With --compare there is such a folder for each filter, and comparison.csv with errors, consistency and
-    time of all.
+    With --map unknown the landmarks are found as well, and landmarks.csv is written (SLAM). With --association unknown
+    nothing but the sightings themselves says which landmark they are of. With --compare there is such a folder for each
+    filter, and comparison.csv with errors, consistency and time of all.
     """
     need_torch()
     from sigmaslam_filters import FilterError
@@ -88,12 +91,12 @@ def localize(
     kind = detect_format(path) if format is RecordingFormat.auto else format.value
     if kind == "starry" and (robot is not None or first_pose is not None or max_range is not None):
         raise InputError("--robot, --start and --max-range are for robots in the plane: leave them out here")
-    if kind == "starry" and map is MapKind.unknown:
-        raise InputError("--map unknown is for robots in the plane: leave it out here")
-    if smooth and map is MapKind.unknown:
+    if kind == "starry" and Knowledge.unknown in (map, association):
+        raise InputError("--map unknown and --association unknown are for robots in the plane: leave them out here")
+    if smooth and map is Knowledge.unknown:
         raise InputError("--smooth does not go with --map unknown: leave one of them out")
     settings = {"source": str(path), "format": kind, "max_range": max_range, "start": start, "map": map.value}
-    settings["lag"] = lag if smooth else None
+    settings |= {"association": association.value, "lag": lag if smooth else None}
     rows: list[_Row] = []
     with Console(stderr=True).status("reading") as status:
         for name in [each.value for each in FilterKind] if compare else [filter.value]:
@@ -124,15 +127,18 @@ def _localise_robots(
     settings: dict[str, Any],
     tell: Callable[[str], None],
 ) -> dict[str, dict[str, Any]]:
+    from sigmaslam_localisation.association import associate
     from sigmaslam_localisation.formats import read_recordings
     from sigmaslam_localisation.output import write_robots
     from sigmaslam_localisation.robots import localise_robots
 
-    mapping = settings["map"] == MapKind.unknown
-    recordings = read_recordings(path, kind, robot, mapping)
+    mapping, associated = settings["map"] == Knowledge.unknown, settings["association"] == Knowledge.known
+    recordings = read_recordings(path, kind, robot, mapping, associated)
     if max_range is not None:
         recordings = [recording.within(max_range) for recording in recordings]
     begin = time.process_time()
+    if not associated:
+        recordings = associate(recordings, settings["filter"], start, tell, mapping)
     first, second = localise_robots(recordings, settings["filter"], start, tell, mapping, settings["lag"])
     seconds = time.process_time() - begin
     make_folder(out)
