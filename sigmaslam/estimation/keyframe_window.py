@@ -12,6 +12,7 @@ same vector everywhere, so that no linearisation point can leak information into
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 
 import numpy as np
@@ -29,6 +30,8 @@ from sigmaslam.estimation.state_layout import CALIBRATION_SIZE, LANDMARK_SIZE, M
 from sigmaslam.estimation.window_equations import eliminate_landmarks, gate_views
 from sigmaslam.estimation.window_state import WindowState, loop_difference
 from sigmaslam.geometry.camera import RectifiedStereo
+
+_LOGGER = logging.getLogger(__name__)
 
 # Errors of right matches have longer tails than a Gaussian's: degrees of freedom of the Student-t that is fitted.
 # 4 and 1 are no better on rendered streets.
@@ -184,13 +187,17 @@ class KeyframeWindow:
         self.evidence.learn(self.prior, information, vector)
         judge_calibration(self)
 
-    def add_loop_constraint(self, index: int, T_past_last: np.ndarray, covariance: np.ndarray) -> bool:
+    def add_loop_constraint(
+        self, index: int, T_past_last: np.ndarray, covariance: np.ndarray, confirmed: bool = False
+    ) -> bool:
         """Closes a loop: the last keyframe sees what a past pose saw, and the past is corrected with the window.
 
         Args:
             index: of the past pose.
             T_past_last: (4, 4) the last keyframe's pose relative to that one.
             covariance: (6, 6) of that, perturbed from the left in the world.
+            confirmed: another loop says the same: where it contradicts what is known, all that is known of poses is
+                less certain than it seemed, by the variance of unit weight.
         Returns:
             False, and nothing is changed, where it contradicts what is known, or says less than is known already.
         """
@@ -203,7 +210,10 @@ class KeyframeWindow:
         difference = loop_difference(posterior, index, T_past_last)
         squared = difference @ np.linalg.lstsq(known + covariance, difference, rcond=1e-12)[0]
         if squared > CHI_SQUARE_9999_OF_6:
-            return False
+            if not confirmed:
+                return False
+            _LOGGER.warning("two loops contradict the poses by %.1f of their standard deviations", np.sqrt(squared / 6))
+            self.prior = self.prior.scaled(squared / 6)
         self.prior = self.prior.add_loop_constraint(index, T_past_last, covariance)
         self.solve()
         return True

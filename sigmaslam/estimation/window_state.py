@@ -152,6 +152,11 @@ class WindowState:
         )
         return replace(self.moved(step, posterior, common), past=past)
 
+    def scaled(self, factor: float) -> WindowState:
+        """The same means with so many times the variance, but for considered errors."""
+        past = replace(self.past, covariance=factor * self.past.covariance, cross=factor * self.past.cross)
+        return replace(self, covariance=factor * self.covariance, past=past)
+
     def without_poses(self) -> WindowState:
         """What is known of the calibration alone."""
         covariance, common = self.covariance[CALIBRATION, CALIBRATION], self.common[CALIBRATION]

@@ -7,12 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sigmaslam.estimation.chi_square import CHI_SQUARE_9999_OF_6
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.state_layout import pose_slice
+from sigmaslam.estimation.window_state import loop_difference
 from sigmaslam.geometry.se3 import se3_body, se3_inverse, turn_covariance
 from sigmaslam.slam.keyframe import Keyframe
 from sigmaslam.slam.keyframes import Keyframes
-from sigmaslam.slam.place_recognition import retrieve
+from sigmaslam.slam.place_recognition import count_votes
 from sigmaslam.slam.unguided_matching import UnguidedMatcher
 
 _LOGGER = logging.getLogger(__name__)
@@ -22,8 +24,25 @@ _LOGGER = logging.getLogger(__name__)
 _RECENT, _LOOP_COSINE = 10, 0.5
 # Seconds from one look to the next, which teaches hardly more, unless the place is as uncertain as the scene is deep.
 _PAUSE = 1.0
-# And are nearer than the scene is deep and so many standard deviations of where they are.
-_REACH_SIGMAS = 3.0
+# And are nearer than the scene is deep and so many standard deviations of where they are, or such a share of the way
+# since, whatever the covariance says: four times what KITTI's drives are off by.
+_REACH_SIGMAS, _DRIFT = 3.0, 0.03
+# A place that the covariance excludes has more votes than most, by so many standard deviations of a Poisson count.
+_STANDS_OUT = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Contradiction:
+    """A loop that the covariance excludes: by what the pose should move (6,), and the covariance of that."""
+
+    difference: np.ndarray
+    covariance: np.ndarray
+
+    def agrees_with(self, other: _Contradiction) -> bool:
+        """Whether both say the same (99.99 %)."""
+        apart = self.difference - other.difference
+        squared = apart @ np.linalg.lstsq(self.covariance + other.covariance, apart, rcond=1e-12)[0]
+        return bool(squared < CHI_SQUARE_9999_OF_6)
 
 
 @dataclass(slots=True)
@@ -35,12 +54,14 @@ class LoopCloser:
         keyframes: of the window and its past.
         matcher: finds keyframes in views.
         looked: when a keyframe was last held against others, time stamp in seconds.
+        refused: the last loop that was not used. A second one that agrees with it outweighs the covariance.
     """
 
     window: KeyframeWindow
     keyframes: Keyframes
     matcher: UnguidedMatcher
     looked: float = -np.inf
+    refused: _Contradiction | None = None
 
     def close(self) -> float | None:
         """Closes a loop where the newest keyframe sees what one of long ago saw.
@@ -48,32 +69,48 @@ class LoopCloser:
         Returns:
             The time stamp of that one, seconds; None where there is no loop.
         """
-        closed, newest = None, self.keyframes.active[-1]
-        view = newest.view
-        for keyframe in retrieve(view, 1, self._revisited()):
-            self.looked = newest.timestamp
-            relative = self.matcher.relative_pose_to(keyframe.view, view)
-            if relative is None:
-                continue
-            pose = self.keyframes.pose(keyframe) @ relative.T_key_camera
-            covariance = turn_covariance(pose, relative.covariance)
-            index = self.keyframes.index(keyframe.id)
-            if self.window.add_loop_constraint(index, relative.T_key_camera, covariance):
-                _LOGGER.info("loop closed with the keyframe of %.3f s", keyframe.timestamp)
-                closed = keyframe.timestamp
-        return closed
+        newest, state = self.keyframes.active[-1], self.window.posterior
+        keyframe, drift = self._revisited(newest)
+        if keyframe is None:
+            return None
+        self.looked = newest.timestamp
+        relative = self.matcher.relative_pose_to(keyframe.view, newest.view)
+        if relative is None:
+            return None
+        pose, index, measured = self.keyframes.pose(keyframe), self.keyframes.index(keyframe.id), relative.T_key_camera
+        covariance = turn_covariance(pose @ measured, relative.covariance)
+        loop = _Contradiction(loop_difference(state, index, measured), covariance)
+        departure = np.linalg.norm((se3_inverse(pose) @ state.poses[-1] - measured)[:3, 3])
+        confirmed = self.refused is not None and loop.agrees_with(self.refused)
+        confirmed = confirmed and bool(departure < drift) and self.matcher.is_beyond_chance(relative)
+        used = self.window.add_loop_constraint(index, measured, covariance, confirmed)
+        self.refused = None if used else loop
+        if not used:
+            return None
+        _LOGGER.info("loop closed with the keyframe of %.3f s", keyframe.timestamp)
+        return keyframe.timestamp
 
-    def _revisited(self) -> list[Keyframe]:
-        """Keyframes that left the window long ago and should see what its newest one sees."""
+    def _revisited(self, newest: Keyframe) -> tuple[Keyframe | None, float]:
+        """Of the keyframes that left the window long ago the one that looks most like the newest, or is nearest.
+
+        And by how much odometry may be off since, metres.
+        """
         state = self.window.posterior
         pose, place = state.poses[-1], pose_slice(len(state) - 1)
         sigma = np.sqrt(np.trace(se3_body(pose, state.whole_covariance[place, place])[:3, :3]))
         reach = self.window.depth + _REACH_SIGMAS * sigma
-        if self.keyframes.active[-1].timestamp < self.looked + _PAUSE and reach < 2.0 * self.window.depth:
-            return []
-
-        def is_near(keyframe: Keyframe) -> bool:
-            between = se3_inverse(pose) @ self.keyframes.pose(keyframe)
-            return bool(np.linalg.norm(between[:3, 3]) < reach and between[2, 2] > _LOOP_COSINE)
-
-        return [keyframe for keyframe in self.keyframes.left_long_ago(_RECENT) if is_near(keyframe)]
+        if newest.timestamp < self.looked + _PAUSE and reach < 2.0 * self.window.depth:
+            return None, 0.0
+        left = self.keyframes.left_long_ago(_RECENT)
+        places = np.concatenate([state.past.poses[:, :3, 3], pose[None, :3, 3]])
+        drift = _DRIFT * np.linalg.norm(np.diff(places, axis=0), axis=1)[::-1].cumsum()[::-1][: len(left)]
+        between = se3_inverse(pose) @ state.past.poses[: len(left)]
+        away, ahead = np.linalg.norm(between[:, :3, 3], axis=1), between[:, 2, 2] > _LOOP_COSINE
+        near, possible = ahead & (away < reach), ahead & (away < self.window.depth + drift)
+        if not (near | possible).any():
+            return None, 0.0
+        votes = count_votes(newest.view, left)
+        usual = np.median(votes)
+        allowed = near | (possible & (votes >= usual + _STANDS_OUT * np.sqrt(usual)))
+        chosen = max(np.flatnonzero(allowed), key=lambda k: (votes[k], -away[k]), default=None)
+        return (None, 0.0) if chosen is None else (left[chosen], float(drift[chosen]))

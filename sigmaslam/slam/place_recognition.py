@@ -12,20 +12,22 @@ _VOTERS = 300
 
 
 def retrieve(view: StereoView, count: int, among: list[Keyframe]) -> list[Keyframe]:
-    """Up to `count` keyframes that look most like the view, by mutual nearest descriptors, best first."""
+    """Up to `count` keyframes that look most like the view, best first; the latest where nothing tells them apart."""
+    latest_first = among[::-1]
+    order = np.argsort(-count_votes(view, latest_first), kind="stable")
+    return [latest_first[k] for k in order[:count]]
+
+
+def count_votes(view: StereoView, among: list[Keyframe]) -> np.ndarray:
+    """(K,) mutual nearest descriptors of the view and each keyframe; zero without descriptors."""
     wanted = view.features.descriptors[:_VOTERS]
-    if not wanted.shape[1]:
-        return among[-count:][::-1]
-    votes = []
-    for keyframe in among:
+    votes = np.zeros(len(among), np.int64)
+    for k, keyframe in enumerate(among):
         similarity = keyframe.view.features.descriptors[:_VOTERS] @ wanted.T
-        if not similarity.size:
-            votes.append(0)
-            continue
-        forward, back = similarity.argmax(axis=1), similarity.argmax(axis=0)
-        votes.append(int((back[forward] == np.arange(len(forward))).sum()))
-    order = np.argsort(-np.array(votes, np.int64), kind="stable")[:count]
-    return [among[k] for k in order]
+        if similarity.size and wanted.shape[1]:
+            forward, back = similarity.argmax(axis=1), similarity.argmax(axis=0)
+            votes[k] = (back[forward] == np.arange(len(forward))).sum()
+    return votes
 
 
 def closest_pair(poses: np.ndarray) -> tuple[int, int]:
