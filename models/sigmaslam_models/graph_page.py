@@ -1,5 +1,6 @@
 """The page of the graphs that ship: what each takes and gives, read from the files, and a short text of ours."""
 
+from collections import Counter
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -12,6 +13,8 @@ from sigmaslam.errors import InputError
 from sigmaslam_models.model_card import fill_template
 
 PAGE_COMMAND = "sigmaslam train export --page docs/onnx.md"
+SHARED = 3
+"""Graphs with the same input from which on it is told once, ahead of them all."""
 _UNKNOWN = {"purpose": "No text yet: `models/sigmaslam_models/graph_texts.yaml`.", "meanings": {}}
 
 
@@ -35,7 +38,9 @@ def graph_page(folder: Path, command: str) -> str:
         raise InputError(f"{folder} has no .onnx files: give the folder that `sigmaslam train export` wrote")
     names = [*(name for name in graph_texts() if name in paths), *(name for name in paths if name not in graph_texts())]
     graphs = [_describe(name, paths[name]) for name in names]
-    return fill_template("onnx.md", command=command, graphs=graphs)
+    counts = Counter(row for graph in graphs for row in graph["rows"])
+    shared = [row for row, count in counts.items() if count >= SHARED]
+    return fill_template("onnx.md", command=command, graphs=graphs, shared=shared)
 
 
 def _describe(name: str, path: Path) -> dict[str, Any]:
