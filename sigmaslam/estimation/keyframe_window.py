@@ -28,7 +28,7 @@ from sigmaslam.estimation.landmark_table import KeyframeViews, LandmarkTable, La
 from sigmaslam.estimation.marginalised_poses import PastPoses, point_lever
 from sigmaslam.estimation.state_layout import CALIBRATION_SIZE, LANDMARK_SIZE, MODELLED, pose_slice
 from sigmaslam.estimation.window_equations import eliminate_landmarks, gate_views
-from sigmaslam.estimation.window_state import WindowState, loop_difference
+from sigmaslam.estimation.window_state import WindowState, loop_difference, scale_variances
 from sigmaslam.geometry.camera import RectifiedStereo
 
 _LOGGER = logging.getLogger(__name__)
@@ -213,7 +213,7 @@ class KeyframeWindow:
             if not confirmed:
                 return False
             _LOGGER.warning("two loops contradict the poses by %.1f of their standard deviations", np.sqrt(squared / 6))
-            self.prior = self.prior.scaled(squared / 6)
+            self.prior = scale_variances(self.prior, squared / 6)
         self.prior = self.prior.add_loop_constraint(index, T_past_last, covariance)
         self.solve()
         return True

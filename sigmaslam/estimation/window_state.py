@@ -152,11 +152,6 @@ class WindowState:
         )
         return replace(self.moved(step, posterior, common), past=past)
 
-    def scaled(self, factor: float) -> WindowState:
-        """The same means with so many times the variance, but for considered errors."""
-        past = replace(self.past, covariance=factor * self.past.covariance, cross=factor * self.past.cross)
-        return replace(self, covariance=factor * self.covariance, past=past)
-
     def without_poses(self) -> WindowState:
         """What is known of the calibration alone."""
         covariance, common = self.covariance[CALIBRATION, CALIBRATION], self.common[CALIBRATION]
@@ -166,3 +161,9 @@ class WindowState:
 def loop_difference(state: WindowState, index: int, T_past_last: np.ndarray) -> np.ndarray:
     """(6,) by which the last pose must move in the world to agree with a measurement from a marginalised one."""
     return np.asarray(se3_log(state.past.poses[index] @ T_past_last @ se3_inverse(state.poses[-1])))
+
+
+def scale_variances(state: WindowState, factor: float) -> WindowState:
+    """The same means with so many times the variance, but for considered errors."""
+    past = replace(state.past, covariance=factor * state.past.covariance, cross=factor * state.past.cross)
+    return replace(state, covariance=factor * state.covariance, past=past)
