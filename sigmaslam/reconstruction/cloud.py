@@ -16,6 +16,8 @@ from sigmaslam.table import Table
 _ROWS, _COLUMNS = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
 # Pixels are exact to half of one: a point is anywhere in its square.
 _PIXEL_VARIANCE = 1.0 / 12.0
+# What a small step of the camera, translation before rotation, moves a point by: linear in 1, x, y and z.
+_BY_POSE = np.concatenate([np.eye(3, 6)[None], [np.hstack([np.zeros((3, 3)), -skew(axis)]) for axis in np.eye(3)]])
 # One number for the four of a voxel: different ones of voxels fewer than half a million apart, and of all levels.
 _ONE_KEY = np.array([1, 1 << 19, 1 << 38, 1 << 57])
 _MOST_LEVEL = 15
@@ -121,18 +123,19 @@ class DepthPixels(Table):
                 translation (metres) before rotation (radians).
         """
         points = self.points(camera)
-        # (9.35): along the ray by the disparity, across it by the pixel, and with the camera.
-        along = points / self.disparity[:, None]
-        across = points[:, 2] ** 2 * (_PIXEL_VARIANCE / camera.fx**2)
-        lever = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -skew(points)], axis=2)
-        covariance = (lever.reshape(-1, 6) @ pose_covariance).reshape(-1, 3, 6) @ lever.transpose(0, 2, 1)
-        covariance += self.variance[:, None, None] * along[:, :, None] * along[:, None, :]
-        covariance[:, 0, 0] += across
-        covariance[:, 1, 1] += across
         rotation = pose[:3, :3]
+        # (9.35): along the ray by the disparity, across it by the pixel, and with the camera, quadratic in the point.
+        along = points @ rotation.T / self.disparity[:, None]
+        across = points[:, 2] ** 2 * (_PIXEL_VARIANCE / camera.fx**2)
+        terms = np.column_stack([np.ones(len(points)), points])
+        levers = rotation @ _BY_POSE
+        factors = np.einsum("mik,kl,njl->mnij", levers, pose_covariance, levers)[..., _ROWS, _COLUMNS]
+        covariances = (terms[:, :, None] * terms[:, None]).reshape(-1, 16) @ factors.reshape(16, 6)
+        covariances += self.variance[:, None] * along[:, _ROWS] * along[:, _COLUMNS]
+        covariances += across[:, None] * (rotation[:, :2] @ rotation[:, :2].T)[_ROWS, _COLUMNS]
         return DenseCloud(
             transform_points(pose, points),
-            (rotation @ covariance @ rotation.T)[:, _ROWS, _COLUMNS].astype(np.float32),
+            covariances.astype(np.float32),
             self.intensity.astype(np.float32),
             np.ones(len(points), np.int32),
         )
@@ -142,9 +145,11 @@ class DepthPixels(Table):
         points = self.points(camera)
         sigma = np.linalg.norm(points, axis=1) * np.sqrt(self.variance) / self.disparity
         keys = _voxels(points, sigma, size) @ _ONE_KEY
-        order = np.argsort(self.variance / self.disparity**2, kind="stable")
-        _, first = np.unique(keys[order], return_index=True)
-        return self.select(order[first])
+        order, first = _groups(keys)
+        relative = (self.variance / self.disparity**2)[order]
+        count = np.diff(np.r_[first, len(order)])
+        best = relative == np.repeat(np.minimum.reduceat(relative, first), count)
+        return self.select(np.minimum.reduceat(np.where(best, order, len(order)), first))
 
 
 class VoxelCloud:
@@ -239,9 +244,19 @@ def _times(six: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 
 def _sum_by_key(keys: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows with the same key (N, 4) summed."""
-    if not len(keys):
-        return keys, sums
-    order = np.argsort(keys @ _ONE_KEY)
-    keys, sums = keys[order], sums[order]
-    first = np.flatnonzero(np.r_[True, (keys[1:] != keys[:-1]).any(axis=1)])
-    return keys[first], np.add.reduceat(sums, first, axis=0)
+    order, first = _groups(keys @ _ONE_KEY)
+    count = np.diff(np.r_[first, len(order)])
+    summed = sums[order[first]]
+    # Few have many: rows are added by their rank in the voxel.
+    more = np.flatnonzero(count > 1)
+    for rank in range(1, int(count.max(initial=0))):
+        summed[more] += sums[order[first[more] + rank]]
+        more = more[count[more] > rank + 1]
+    return keys[order[first]], summed
+
+
+def _groups(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) order that sorts keys (N,), and where in it those of each value begin."""
+    order = np.argsort(keys)
+    found = keys[order]
+    return order, np.flatnonzero(np.r_[np.ones(min(len(keys), 1), bool), found[1:] != found[:-1]])

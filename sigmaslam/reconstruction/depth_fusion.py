@@ -8,6 +8,7 @@ the scalar form of the Kalman filter in `sigmaslam_filters`, to which a test hol
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -29,13 +30,18 @@ _MIN_DEPTH = 1e-2
 _FREEDOM = np.float32(4.0)
 # Windows in which images are compared: side, variance of what resampling moves them by, pixels squared, and of the
 # rounding of two grey values.
-_WINDOW, _RESAMPLING, _ROUNDING = 7, np.float32(1.0 / 12.0), np.float32(1.0 / 6.0)
+_WINDOW, _RESAMPLING, _ROUNDING = np.full(7, 1.0 / 7.0, np.float32), np.float32(1.0 / 12.0), np.float32(1.0 / 6.0)
 # Variance of each component of dense optical flow, pixels squared, and 99 % of chi-square with two degrees of freedom.
 _FLOW_VARIANCE, _GATE_2D = np.float32(0.3**2), 9.21
 # Of the pixels whose depth is as expected, at least this share must also be where the pose says.
 _LEAST_SHARE = 0.5
-# Pixels whose derivatives by a pose are computed at a time.
+# Pixels whose variances by a pose are computed at a time.
 _PART = 8192
+# What a small step, translation before rotation, adds to normalised coordinates x, y and to the relative depth of a
+# point (a, b, 1) of inverse depth q: linear in q, 1, a and b, the second axis.
+_BY_STEP = np.zeros((3, 4, 6))
+_BY_STEP[range(3), 0, range(3)] = 1.0
+_BY_STEP[(0, 1, 1, 0, 2, 2), (1, 1, 2, 3, 3, 2), (4, 3, 5, 5, 3, 4)] = (1.0, -1.0, 1.0, -1.0, 1.0, -1.0)
 # Confirmations that a point needs where there are so many other views.
 _MIN_SUPPORT = 2
 
@@ -47,17 +53,18 @@ class DepthView:
     Attributes:
         image: (H, W) float32 rectified left image.
         measured: disparities with the disparity offset taken off.
-        slope: (H, W, 2) float32 derivatives of the disparity by u and v; zero where there are none.
+        sampled: (H, W, 4) float32 disparity, its variance, and its derivatives by u and v, zero where there are none.
     """
 
     image: np.ndarray
     measured: DisparityMap
-    slope: np.ndarray
+    sampled: np.ndarray
 
     @classmethod
     def of(cls, image: np.ndarray, measured: DisparityMap) -> DepthView:
         """The view of a keyframe with such an image (H, W) uint8 and disparities."""
-        return cls(image.astype(np.float32), measured, disparity_slope(measured.disparity))
+        sampled = np.dstack([measured.disparity, measured.variance, disparity_slope(measured.disparity)])
+        return cls(image.astype(np.float32), measured, sampled)
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,24 +140,24 @@ def fuse_depth(
     variance = np.float32(1.0 - shared) * reference.variance.ravel()[known]
     support, contradictions = np.zeros((2, len(known)), np.uint8)
     cost = np.zeros_like(mean)
-    grey = image.astype(np.float32)
-    texture = _texture(grey)
+    texture = _texture(image.astype(np.float32)).reshape(2, -1)[:, known]
     for view, pose, covariance in others:
         seen = _measure(view, pose, covariance, rays, mean, variance, camera)
+        rows = seen.rows
         noise = np.float32(1.0 - shared) * seen.noise + seen.pose
         # What is common does not cancel in the difference unless the views are alike: the gate allows for it.
-        spread = seen.derivative**2 * variance + noise
-        expected = spread + np.float32(shared) * seen.noise + common
+        expected = seen.derivative**2 * variance[rows] + noise + np.float32(shared) * seen.noise + common[rows]
         squared = seen.innovation**2
         there = squared <= GATE * expected
-        agrees = there & _looks_alike(grey, texture, view.image, seen, known)
+        agrees = there & _looks_alike(image, texture, seen, known)
         if np.count_nonzero(agrees) < _LEAST_SHARE * np.count_nonzero(there):
             # Most of the image moves against the pose: it is that of a moving body, and confirms nothing at rest.
             agrees[:] = False
-        cost += np.where(agrees, squared / expected, 0.0)
-        support += agrees
-        contradictions += (there & ~agrees) | ((squared > GATE * expected) & (seen.innovation < 0.0))
-        mean, variance = kalman_update(mean, variance, seen.innovation, seen.derivative, noise, agrees)
+        cost[rows] += np.where(agrees, squared / expected, 0.0)
+        support[rows] += agrees
+        contradictions[rows] += (there & ~agrees) | (~there & (seen.innovation < 0.0))
+        prior = mean[rows], variance[rows]
+        mean[rows], variance[rows] = kalman_update(*prior, seen.innovation, seen.derivative, noise, agrees)
     # Where the views differ by more than they should, or less, variances are scaled: the mean of the posterior of a
     # scale that has an inverse gamma distribution. That they agree says nothing of what they have in common.
     scale = (_FREEDOM + cost) / (_FREEDOM + support)
@@ -192,22 +199,23 @@ def kalman_update(
 
 @dataclass(frozen=True, slots=True)
 class _Seen:
-    """A measurement of N pixels by another view; NaN where the point is not in it, or nothing is known there.
+    """A measurement of N pixels by another view.
 
     Attributes:
-        innovation: (N,) disparity seen there minus the predicted one, pixels.
-        derivative: (N,) of the latter less the former by the state.
-        noise, pose: (N,) variance of the disparity seen, and of what the pose between the views adds, pixels squared.
-        u, v: (N,) where the point appears, pixels.
-        place: (2, N) variance of u and v by the state and the pose, pixels squared.
+        grey: (N,) grey value where the point appears; NaN where it is not in the view.
+        rows: (M,) of the pixels whose disparity is known there.
+        innovation: (M,) that disparity minus the predicted one, pixels.
+        derivative: (M,) of the latter less the former by the state.
+        noise, pose: (M,) variance of the disparity seen, and of what the pose between the views adds, pixels squared.
+        place: (2, M) variance of u and v by the state and the pose, pixels squared.
     """
 
+    grey: np.ndarray
+    rows: np.ndarray
     innovation: np.ndarray
     derivative: np.ndarray
     noise: np.ndarray
     pose: np.ndarray
-    u: np.ndarray
-    v: np.ndarray
     place: np.ndarray
 
 
@@ -231,25 +239,26 @@ def _measure(
     a, b = x * inverse, y * inverse
     u, v = camera.fx * a + np.float32(camera.cx), camera.fy * b + np.float32(camera.cy)
     predicted = state * inverse
-    disparity, noise = (_sample(image, u, v) for image in (view.measured.disparity, view.measured.variance))
-    slope_u, slope_v = _sample(np.ascontiguousarray(view.slope), u, v).T
+    sampled, grey = _sample((view.sampled, view.image), u, v)
+    rows = np.flatnonzero(np.isfinite(sampled[0]))
+    disparity, noise, slope_u, slope_v = sampled[:, rows]
+    a, b, inverse, predicted, variance, ahead = (each[rows] for each in (a, b, inverse, predicted, variance, turned[2]))
     # By the state: of the predicted disparity, and of the one seen where the prediction moves to.
     moves_u = np.float32(camera.fx) * (shift[0] - a * shift[2]) * inverse
     moves_v = np.float32(camera.fy) * (shift[1] - b * shift[2]) * inverse
-    derivative = turned[2] * inverse**2 - slope_u * moves_u - slope_v * moves_v
+    derivative = ahead * inverse**2 - slope_u * moves_u - slope_v * moves_v
     place = np.stack([moves_u**2 * variance, moves_v**2 * variance])
-    values, vectors = np.linalg.eigh(covariance)
-    root = (vectors * np.sqrt(np.maximum(values, 0.0))).T.astype(np.float32)
-    pose_variance = np.empty_like(state)
-    for part in _parts(len(state)):
-        by_pose, du, dv = _moved_by_pose(a[part], b[part], predicted[part], slope_u[part], slope_v[part], camera)
-        pose_variance[part] = _squared_length(root @ by_pose)
-        place[0, part] += _squared_length(root @ du)
-        place[1, part] += _squared_length(root @ dv)
-    return _Seen(disparity - predicted, derivative, noise, pose_variance, u, v, place)
+    factors = np.einsum("kmi,ij,lnj->klmn", _BY_STEP, covariance, _BY_STEP)[*np.triu_indices(3)].astype(np.float32)
+    by_pose = np.empty_like(predicted)
+    for part in _parts(len(rows)):
+        slopes = slope_u[part], slope_v[part]
+        by_pose[part], *by_place = _pose_variances(factors, a[part], b[part], predicted[part], *slopes, camera)
+        place[:, part] += by_place
+    return _Seen(grey, rows, disparity - predicted, derivative, noise, by_pose, place)
 
 
-def _moved_by_pose(
+def _pose_variances(
+    factors: np.ndarray,
     a: np.ndarray,
     b: np.ndarray,
     disparity: np.ndarray,
@@ -257,27 +266,24 @@ def _moved_by_pose(
     slope_v: np.ndarray,
     camera: RectifiedStereo,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Derivatives (6, N) of an innovation and of the place (u, v) by the step, translation before rotation.
+    """Variances (M,) of an innovation and of the place u and v by the step, pixels squared.
 
     Args:
-        a, b: (N,) normalised coordinates of the place.
-        disparity: (N,) predicted there.
-        slope_u, slope_v: (N,) of the disparities seen there.
+        factors: (6, 4, 4) of the products of q, 1, a and b in the covariance of what `_BY_STEP` moves, xx to zz.
+        a, b: (M,) normalised coordinates of the place.
+        disparity: (M,) predicted there.
+        slope_u, slope_v: (M,) of the disparities seen there.
         camera: the rectified pair.
     """
-    inverse_depth = disparity / np.float32(camera.focal_baseline)
-    none, product = np.zeros_like(a), a * b
-    dz = np.stack([none, none, inverse_depth, b, -a, none])
-    du = np.stack([inverse_depth, none, -a * inverse_depth, -product, 1.0 + a * a, -b])
-    dv = np.stack([none, inverse_depth, -b * inverse_depth, -1.0 - b * b, product, a])
-    du *= np.float32(camera.fx)
-    dv *= np.float32(camera.fy)
-    return disparity * dz + slope_u * du + slope_v * dv, du, dv
-
-
-def _squared_length(vectors: np.ndarray) -> np.ndarray:
-    """(N,) of the columns (K, N)."""
-    return np.asarray(np.einsum("kn,kn->n", vectors, vectors))
+    terms = np.stack([disparity / np.float32(camera.focal_baseline), np.ones_like(a), a, b])
+    xx, xy, xz, yy, yz, zz = factors.reshape(6, 16) @ (terms[:, None] * terms).reshape(16, -1)
+    # The depth moves the place, too, and the slopes there the disparity: it changes by e x + f y + g z.
+    e, f = np.float32(camera.fx) * slope_u, np.float32(camera.fy) * slope_v
+    g = disparity - e * a - f * b
+    innovation = e * (e * xx + 2.0 * (f * xy + g * xz)) + f * (f * yy + 2.0 * g * yz) + g * g * zz
+    place_u = np.float32(camera.fx**2) * (xx + a * (a * zz - 2.0 * xz))
+    place_v = np.float32(camera.fy**2) * (yy + b * (b * zz - 2.0 * yz))
+    return innovation, place_u, place_v
 
 
 def _parts(count: int) -> list[slice]:
@@ -285,41 +291,37 @@ def _parts(count: int) -> list[slice]:
     return [slice(first, first + _PART) for first in range(0, count, _PART)]
 
 
-def _looks_alike(
-    image: np.ndarray, texture: np.ndarray, other: np.ndarray, seen: _Seen, known: np.ndarray
-) -> np.ndarray:
-    """(N,) bool, pixels whose windows show the same where the points appear in the other image.
+def _looks_alike(image: np.ndarray, texture: np.ndarray, seen: _Seen, known: np.ndarray) -> np.ndarray:
+    """(M,) bool, measured pixels whose windows show the same where the points appear in the other image.
 
     What moves along its own surface has the depth that is expected, and another texture. The variance of the difference
     is held against what noise, the resampling and an uncertain place make of the texture, scaled by the median pixel.
 
     Args:
-        image: (H, W) float32 of the reference.
-        texture: (2, H, W) as of `_texture`.
-        other: (H, W) float32.
+        image: (H, W) uint8 of the reference.
+        texture: (2, N) as of `_texture`.
         seen: of the N points.
         known: (N,) their flat indices in the reference.
     """
-    shape = image.shape
-    inside = np.isfinite(seen.u) & np.isfinite(seen.v)
-    u, v = (_spread(np.where(inside, each, -1e4).astype(np.float32), known, shape, -1e4) for each in (seen.u, seen.v))
-    warped = cv2.remap(other, u, v, cv2.INTER_LINEAR, borderValue=np.nan)
-    there = np.isfinite(warped)
-    weight = there.astype(np.float32)
-    share = np.maximum(_mean(weight), 1e-3)
-    difference = np.where(there, image - warped, 0.0).astype(np.float32)
-    varies = (_mean(difference**2) / share - (_mean(difference) / share) ** 2).ravel()[known]
-    place = np.where(np.isfinite(seen.place), seen.place, 0.0) + _RESAMPLING
-    expected = _ROUNDING + (texture.reshape(2, -1)[:, known] * place).sum(axis=0)
-    ratio = np.where(there.ravel()[known], varies / expected, np.inf)
-    finite = ratio[np.isfinite(ratio)]
-    alike = ratio <= GATE * (float(np.median(finite)) if len(finite) else 0.0)
+    there = np.isfinite(seen.grey)
+    pixels, grey, measured = known[there], seen.grey[there], known[seen.rows]
+    weight, difference = np.zeros((2, *image.shape), np.float32)
+    weight.ravel()[pixels] = 1.0
+    difference.ravel()[pixels] = image.ravel()[pixels] - grey
+    share, mean, square = (_mean(each).ravel()[measured] for each in (weight, difference, difference**2))
+    share = np.maximum(share, np.float32(1e-3))
+    place_u, place_v = seen.place + _RESAMPLING
+    expected = _ROUNDING + texture[0, seen.rows] * place_u + texture[1, seen.rows] * place_v
+    ratio = (square / share - (mean / share) ** 2) / expected
+    alike = ratio <= GATE * (np.median(ratio) if len(ratio) else 0.0)
     # What the warp leaves of the motion: a window of a smooth texture looks alike after several pixels.
-    warped_grey = np.where(there, warped, image).clip(0, 255).astype(np.uint8)
-    nothing = np.zeros((*shape, 2), np.float32)
-    flow = _optical_flow().calc(image.astype(np.uint8), warped_grey, nothing).reshape(-1, 2)[known]
-    rests = (flow.T**2 / (place + _FLOW_VARIANCE)).sum(axis=0) <= _GATE_2D
-    return np.asarray(alike & rests)
+    warped = image.copy()
+    warped.ravel()[pixels] = grey.clip(0, 255).astype(np.uint8)
+    nothing = np.zeros((*image.shape, 2), np.float32)
+    flow_u, flow_v = cv2.split(_optical_flow().calc(image, warped, nothing))
+    rests = flow_u.ravel()[measured] ** 2 / (place_u + _FLOW_VARIANCE)
+    rests += flow_v.ravel()[measured] ** 2 / (place_v + _FLOW_VARIANCE)
+    return np.asarray(alike & (rests <= _GATE_2D))
 
 
 def _optical_flow() -> cv2.DISOpticalFlow:
@@ -335,20 +337,24 @@ def _texture(image: np.ndarray) -> np.ndarray:
 
 def _mean(values: np.ndarray) -> np.ndarray:
     """Means over the window of each pixel."""
-    return np.asarray(cv2.blur(values, (_WINDOW, _WINDOW)))
+    return np.asarray(cv2.sepFilter2D(values, -1, _WINDOW, _WINDOW))
 
 
-def _sample(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Bilinear values of (H, W) or (H, W, C) at N pixels, NaN where one around is; (N,) or (N, C)."""
+def _sample(images: Sequence[np.ndarray], u: np.ndarray, v: np.ndarray) -> list[np.ndarray]:
+    """Bilinear values of images (H, W) or (H, W, C) at N pixels, NaN where one around is; (N,) or (C, N) of each."""
     # OpenCV takes maps of at most 32767 columns.
     columns = 1024
     rows = -(-len(u) // columns)
     maps = np.full((2, rows * columns), -1e4, np.float32)
-    maps[:, : len(u)] = np.where(np.isfinite(u) & np.isfinite(v), [u, v], -1e4)
-    map_u, map_v = maps.reshape(2, rows, columns)
-    nothing = (np.nan,) * 4
-    sampled = cv2.remap(image, map_u, map_v, cv2.INTER_LINEAR, borderValue=nothing)
-    return np.asarray(sampled.reshape(rows * columns, *image.shape[2:])[: len(u)])
+    inside = np.isfinite(u) & np.isfinite(v)
+    for line, values in zip(maps, (u, v), strict=True):
+        line[: len(u)][inside] = values[inside]
+    sampled = []
+    for image in images:
+        found = cv2.remap(image, *maps.reshape(2, rows, columns), cv2.INTER_LINEAR, borderValue=(np.nan,) * 4)
+        channels = [each.ravel()[: len(u)] for each in cv2.split(found)]
+        sampled.append(channels[0] if image.ndim == 2 else np.stack(channels))
+    return sampled
 
 
 def _spread(values: np.ndarray, known: np.ndarray, shape: tuple[int, ...], missing: float) -> np.ndarray:

@@ -27,6 +27,7 @@ _LEAST, _BEYOND = -4, 8
 _WIDEST, _NEARLY_ALL = 0.4, 99.8
 # Alignment: radius of the window, steps, and how far one may go, pixels.
 _RADIUS, _STEPS, _LONGEST = 3, 2, 0.5
+_WINDOW = np.full(2 * _RADIUS + 1, 1.0 / (2 * _RADIUS + 1), np.float32)
 # Smoothing before each step: diameter, what disparities may differ by, and spread, all pixels.
 _DIAMETER, _SAME_SURFACE, _SPREAD = 7, 1.0, 3.0
 # A pixel this far from the mean of its window is at an edge, and farther makes no difference, pixels.
@@ -223,23 +224,24 @@ def align_disparity(left: np.ndarray, right: np.ndarray, disparity: np.ndarray) 
     share = _mean(weight)
     inverse = np.float32(1.0) / np.maximum(share, np.float32(1e-3))
 
-    def mean(values: np.ndarray) -> np.ndarray:
-        return _mean(values * weight) * inverse
+    def mean(weighted: np.ndarray) -> np.ndarray:
+        return _mean(weighted) * inverse
 
     pixels = (2 * _RADIUS + 1) ** 2 * np.maximum(share, np.float32(1e-3))
-    mean_reference = mean(reference)
-    spread_reference = mean(reference * reference) - mean_reference**2
+    counted = reference * weight
+    mean_reference = mean(counted)
+    spread_reference = mean(counted * counted) - mean_reference**2
     for step in range(_STEPS):
         smooth = smooth if step == 0 else _smooth(found)
-        relief = np.where(known, np.minimum(np.abs(found - smooth), _SAME_SURFACE), np.float32(0.0)) ** 2
         warped = cv2.remap(other, u - smooth, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         slope = cv2.remap(gradient, u - smooth, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        mean_warped = mean(warped)
-        spread = mean(warped * warped) - mean_warped**2
+        counted = warped * weight
+        mean_warped = mean(counted)
+        spread = mean(counted * counted) - mean_warped**2
         gain = np.sqrt((spread_reference + _ROUNDING) / np.maximum(spread + _ROUNDING, _ROUNDING))
         gain = np.clip(gain, 1.0 / _MOST_GAIN, _MOST_GAIN)
-        difference = (reference - mean_reference) - gain * (warped - mean_warped)
-        slope *= gain
+        difference = ((reference - mean_reference) - gain * (warped - mean_warped)) * weight
+        slope *= gain * weight
         mean_slope, mean_difference = mean(slope), mean(difference)
         texture = np.maximum(mean(slope * slope) - mean_slope**2, np.float32(1e-6))
         product = mean(slope * difference) - mean_slope * mean_difference
@@ -247,16 +249,17 @@ def align_disparity(left: np.ndarray, right: np.ndarray, disparity: np.ndarray) 
         # Grey values are whole numbers: their rounding is noise where nothing else is.
         noise = (np.maximum(unexplained, 0.0) + _ROUNDING) / pixels
         moved = product / (texture + noise / _PRIOR_VARIANCE)
-        found = np.where(known, smooth - np.clip(moved, -_LONGEST, _LONGEST), _NOWHERE)
+        departs, found = found, np.where(known, smooth - np.clip(moved, -_LONGEST, _LONGEST), _NOWHERE)
+    # What the last step began with, about the smooth surface.
+    relief = np.where(known, np.minimum(np.abs(departs - smooth), _SAME_SURFACE), np.float32(0.0)) ** 2
     bound = np.minimum(noise / texture, _WIDEST_BOUND)
-    weight = known.astype(np.float32)
-    inverse = np.float32(1.0) / np.maximum(_mean(weight), np.float32(1e-3))
-    aligned = np.where(known, found, 0.0).astype(np.float32)
+    inverse = np.float32(1.0) / np.maximum(_mean(known.astype(np.float32)), np.float32(1e-3))
+    aligned = np.where(known, found, np.float32(0.0))
     edge = np.minimum(np.abs(aligned - mean(aligned)), _WIDEST_EDGE) ** 2
     return Alignment(
         np.where(known, aligned, np.float32(np.nan)),
         bound,
-        mean(relief.astype(np.float32)),
+        mean(relief),
         edge.astype(np.float32),
         float(np.mean(offset**2)),
     )
@@ -272,8 +275,8 @@ def row_offset(left: np.ndarray, right: np.ndarray, disparity: np.ndarray) -> np
         disparity: (H, W) float32, NaN where there is none.
     """
     height, width = left.shape
-    u, v = pixel_grid(height, width)
-    across, down = u / width - np.float32(0.5), v / height - np.float32(0.5)
+    across = np.arange(width, dtype=np.float32) / width - np.float32(0.5)
+    down = (np.arange(height, dtype=np.float32) / height - np.float32(0.5))[:, None]
     rows = slice(None, None, _ROW_STRIDE)
     known = np.isfinite(disparity[rows])
     plane = np.zeros(3, np.float32)
@@ -282,16 +285,22 @@ def row_offset(left: np.ndarray, right: np.ndarray, disparity: np.ndarray) -> np
     # Brightness differs in what is smooth.
     left, right = (image - cv2.blur(image, _ROW_WINDOW) for image in (left, right))
     gradient = cv2.filter2D(right, -1, np.array([[-0.5], [0.0], [0.5]], np.float32))
+    u, v = pixel_grid(height, width)
     columns = u[rows] - np.where(known, disparity[rows], np.float32(0.0))
+    # Moments of slopes by powers of both coordinates give the normal equations.
+    powers = np.stack([np.ones_like(across), across, across**2], axis=1)
+    heights = np.stack([np.ones_like(down[rows, 0]), down[rows, 0], down[rows, 0] ** 2])
     for _ in range(_ROW_STEPS):
-        lines = v[rows] + (plane[0] + plane[1] * across[rows] + plane[2] * down[rows])
+        lines = v[rows] + (plane[0] + plane[1] * across + plane[2] * down[rows])
         warped, slope = (cv2.remap(image, columns, lines, cv2.INTER_LINEAR) for image in (right, gradient))
         difference = left[rows] - warped
         size = np.abs(difference)
-        chosen = known & (size < _OUTLYING * np.median(size[known]))
-        by_plane = np.stack([np.ones_like(slope), across[rows], down[rows]])[:, chosen] * slope[chosen]
-        normal = by_plane @ by_plane.T + _ROW_INFORMATION * np.eye(3, dtype=np.float32)
-        plane += np.linalg.solve(normal, by_plane @ difference[chosen])
+        slope *= known & (size < _OUTLYING * np.median(size[known]))
+        normal, product = (heights @ each @ powers for each in (slope * slope, slope * difference))
+        (one, by_u, by_uu), (by_v, by_uv, _), (by_vv, _, _) = normal
+        normal = np.array([[one, by_u, by_v], [by_u, by_uu, by_uv], [by_v, by_uv, by_vv]])
+        moments = np.array([product[0, 0], product[0, 1], product[1, 0]])
+        plane += np.linalg.solve(normal + _ROW_INFORMATION * np.eye(3, dtype=np.float32), moments)
     return np.clip(plane[0] + plane[1] * across + plane[2] * down, -_MOST_ROWS, _MOST_ROWS)
 
 
@@ -307,4 +316,4 @@ def pixel_grid(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _mean(values: np.ndarray) -> np.ndarray:
     """Means over the window of each pixel."""
-    return np.asarray(cv2.blur(values, (2 * _RADIUS + 1, 2 * _RADIUS + 1)))
+    return np.asarray(cv2.sepFilter2D(values, -1, _WINDOW, _WINDOW))
