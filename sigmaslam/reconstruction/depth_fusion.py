@@ -351,7 +351,9 @@ def _sample(images: Sequence[np.ndarray], u: np.ndarray, v: np.ndarray) -> list[
         line[: len(u)][inside] = values[inside]
     sampled = []
     for image in images:
-        found = cv2.remap(image, *maps.reshape(2, rows, columns), cv2.INTER_LINEAR, borderValue=(np.nan,) * 4)
+        found = cv2.remap(
+            image, maps[0].reshape(rows, -1), maps[1].reshape(rows, -1), cv2.INTER_LINEAR, borderValue=(np.nan,) * 4
+        )
         channels = [each.ravel()[: len(u)] for each in cv2.split(found)]
         sampled.append(channels[0] if image.ndim == 2 else np.stack(channels))
     return sampled

@@ -86,7 +86,7 @@ def track_sequence(request: TrackRequest) -> dict[str, Any]:
     pictures = PictureRecorder(sequence.length)
     images = StereoFilter() if options.denoise else None
     timing = FrameTiming(sequence.format == "camera", options.realtime)
-    steps = _FrameSteps(images, tracker, timing, location, _feed(sequence, tracker))
+    steps = _FrameSteps(images, tracker, timing, location, _sensors(sequence, tracker))
     on_estimate = live.on_estimate
     listeners = [(lambda frame: on_estimate(frame.result))] if on_estimate else []
     listeners += [sink.add for sink in live.sinks]
@@ -216,42 +216,47 @@ class _FrameSteps:
     tracker: Tracker
     timing: FrameTiming
     location: LocationFilter | None
-    feed: Callable[[float], None]
+    sensors: list[_Samples]
 
     def step(self, frame: StereoFrame) -> Estimate | ObjectEstimate:
         """What is said of the frame."""
         if self.images is not None:
             frame = self.images.step(frame)
-        self.feed(frame.timestamp)
+        for samples in self.sensors:
+            samples.feed(frame.timestamp)
         estimate = self.tracker.step(frame.left, frame.right, frame.timestamp, frame.mask)
         self.timing.note(frame.timestamp)
         return estimate if self.location is None else estimate.map_camera(self.location.fuse)
 
 
-def _feed(sequence: StereoSequence, tracker: Tracker) -> Callable[[float], None]:
-    """Gives the tracker the samples of its sensors up to a frame that it does not have yet, and the one behind it."""
-    if not isinstance(tracker, StereoTracker):
-        return lambda timestamp: None
-    columns: tuple[np.ndarray, np.ndarray, np.ndarray]
-    waiting = list[tuple[tuple[np.ndarray, np.ndarray, np.ndarray], float, Callable[..., None]]]()
-    if sequence.odometry is not None:
-        moved = sequence.odometry.samples
+@dataclass(slots=True)
+class _Samples:
+    """Samples of a sensor of motion: columns (N, ...), the times first, and what takes them one by one."""
+
+    columns: Sequence[np.ndarray]
+    shift: float
+    add: Callable[..., None]
+    given: int = 0
+
+    def feed(self, timestamp: float) -> None:
+        """Gives those up to a frame that were not given yet, and the one behind it."""
+        end = int(np.searchsorted(self.columns[0], timestamp + self.shift)) + 1
+        for row in zip(*(each[self.given : end] for each in self.columns), strict=True):
+            self.add(*row)
+        self.given = max(self.given, end)
+
+
+def _sensors(sequence: StereoSequence, tracker: Tracker) -> list[_Samples]:
+    """Of those that the tracker can use."""
+    found = list[_Samples]()
+    if isinstance(tracker, StereoTracker) and (odometry := sequence.odometry) is not None:
+        moved = odometry.samples
         columns = moved.timestamp, moved.linear, moved.angular
-        waiting.append((columns, sequence.odometry.sensor.time_shift, tracker.add_odometry))
-    if sequence.imu is not None:
-        felt = sequence.imu.samples
-        columns = felt.timestamp, felt.gyro, felt.accel
-        waiting.append((columns, sequence.imu.sensor.time_shift, tracker.add_imu))
-    given = [0] * len(waiting)
-
-    def feed(timestamp: float) -> None:
-        for number, (columns, shift, add) in enumerate(waiting):
-            end = int(np.searchsorted(columns[0], timestamp + shift)) + 1
-            for row in zip(*(each[given[number] : end] for each in columns), strict=True):
-                add(*row)
-            given[number] = max(given[number], end)
-
-    return feed
+        found.append(_Samples(columns, odometry.sensor.time_shift, tracker.add_odometry))
+    if isinstance(tracker, StereoTracker) and (imu := sequence.imu) is not None:
+        felt = imu.samples
+        found.append(_Samples((felt.timestamp, felt.gyro, felt.accel), imu.sensor.time_shift, tracker.add_imu))
+    return found
 
 
 class _Rows:
