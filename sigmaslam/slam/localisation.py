@@ -10,10 +10,13 @@ import numpy as np
 from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.chi_square import CHI_SQUARE_9999_OF_6
 from sigmaslam.estimation.constant_velocity import MotionFilter, dead_reckoning
+from sigmaslam.estimation.frame_clock import FrameClock
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.frame_update import FrameUpdate
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
+from sigmaslam.estimation.prediction_errors import surprise, time_error
 from sigmaslam.frontend import StereoView
+from sigmaslam.geometry.image_cells import explained_area, image_cells
 from sigmaslam.geometry.se3 import se3_inverse, se3_log, turn_covariance
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.frame import Frame
@@ -64,6 +67,7 @@ class Localiser:
         follower: finds them without features.
         unguided: finds keyframes anywhere.
         config: settings.
+        frame_clock: knows the interval of the frames.
     """
 
     window: KeyframeWindow
@@ -73,6 +77,7 @@ class Localiser:
     follower: LandmarkFollower
     unguided: UnguidedMatcher
     config: TrackerConfig
+    frame_clock: FrameClock
 
     def follow(
         self, frame: Frame, keyframes: list[Keyframe], prediction: Prediction, clock: Stopwatch
@@ -127,7 +132,7 @@ class Localiser:
             fit = self.fit_near(matches, prediction)
             clock.lap("filter")
         if fit is None or self._is_doubtful(matches, fit):
-            other_matches, other = self._localise_anywhere(view, keyframes, prediction, clock)
+            other_matches, other = self._localise_anywhere(view, keyframes, prediction, matches, clock)
             if fit is None or (other is not None and self._is_better(other, fit)):
                 matches, fit = other_matches, other
         min_inliers = ACCEPTANCE.doubtful_inliers * self.config.min_inliers
@@ -136,11 +141,15 @@ class Localiser:
         return matches, fit
 
     def _is_reachable(self, matches: GuidedMatches, fit: FrameFit, prediction: Prediction) -> bool:
-        """Whether the motion allows the pose, or most landmarks of earlier keyframes in view confirm it.
+        """Whether the motion allows the pose, if in another moment, or most landmarks of earlier keyframes in view
+        confirm it.
 
         Repeated texture of one keyframe agrees on wrong poses, hundreds of matches strong.
         """
         if prediction.squared_departure(fit.pose) <= ACCEPTANCE.jump**2:
+            return True
+        step = se3_inverse(self.window.posterior.poses[-1]) @ fit.pose
+        if time_error(self.motion, step, self.frame_clock.interval) != 0.0:
             return True
         anchor = self.window.landmarks.anchor
         earlier = anchor[matches.searched] < len(self.window) - 1
@@ -181,9 +190,18 @@ class Localiser:
         return prediction.excludes(self.window.posterior.poses[back] @ T_key_camera)
 
     def _localise_anywhere(
-        self, view: StereoView, keyframes: list[StereoView], prediction: Prediction, clock: Stopwatch
+        self,
+        view: StereoView,
+        keyframes: list[StereoView],
+        prediction: Prediction,
+        near: GuidedMatches,
+        clock: Stopwatch,
     ) -> tuple[GuidedMatches, FrameFit | None]:
-        """Without a prediction: the pose relative to one of the last keyframes, then landmarks near there."""
+        """Without a prediction: the pose relative to one of the last keyframes, then landmarks near there.
+
+        The prediction gives way where it contradicts what the last keyframe says, and little of what was found `near`
+        it agrees with it: behind a mover that fills the view, the scene does.
+        """
         matches = GuidedMatches.empty()
         for back in range(1, min(ACCEPTANCE.last_keyframes, len(keyframes)) + 1):
             excludes = None if dead_reckoning(self.motion) is None else partial(self._is_excluded, -back, prediction)
@@ -201,7 +219,32 @@ class Localiser:
                 matches.views, prediction.pose, prediction.covariance, self.config.min_inliers, start, relative.scale
             )
             clock.lap("filter")
+            if back == 1 and prediction.excludes(start):
+                alone = self._fit_alone(matches, near, prediction, start, relative.scale)
+                if alone is not None and (fit is None or fit.count < ACCEPTANCE.guided_share * alone.count):
+                    fit = alone
+                clock.lap("filter")
             enough = fit is not None and fit.count >= ACCEPTANCE.unguided_share * len(matches.probability)
             if fit is not None and enough and self._is_reachable(matches, fit, prediction):
                 return matches, fit
         return matches, None
+
+    def _fit_alone(
+        self, matches: GuidedMatches, near: GuidedMatches, prediction: Prediction, start: np.ndarray, scale: float
+    ) -> FrameFit | None:
+        """The pose of what was found around `start` (4, 4), by a prediction as uncertain as it asks for.
+
+        None where what agrees with the prediction itself explains a rival's part of the image.
+        """
+        excess = surprise(self.motion, se3_inverse(self.window.posterior.poses[-1]) @ start)
+        pose, covariance, least = prediction.pose, prediction.covariance, self.config.min_inliers
+        fit = self.update.fit(matches.views, pose, excess * covariance, least, start, scale)
+        rival = self.update.fit(near.views, pose, covariance, least) if len(near.probability) >= least else None
+        if fit is None or rival is None or rival.nis_per_dof > ACCEPTANCE.doubtful_nis:
+            return fit
+        explained, rivalled = (self._explained_area(*each) for each in ((matches, fit), (near, rival)))
+        return fit if rivalled < ACCEPTANCE.rival_area * explained else None
+
+    def _explained_area(self, matches: GuidedMatches, fit: FrameFit) -> float:
+        camera, places = self.window.camera, matches.views.measurement[:, :2]
+        return explained_area(image_cells(places, camera.width, camera.height), fit.inliers, np.ones(len(places)))

@@ -131,7 +131,7 @@ class StereoTracker:
         guided = GuidedMatcher(rectified, frontend, window, update, noise, config)
         self._unguided = unguided = UnguidedMatcher(rectified, frontend, window, noise, config)
         self._follower = follower = LandmarkFollower(guided)
-        self._localiser = Localiser(window, motion, update, guided, follower, unguided, config)
+        self._localiser = Localiser(window, motion, update, guided, follower, unguided, config, self._clock)
         self._rig_watch = RigWatch(window, self._localiser)
         self._mapper = Mapper(rectified, window, keyframes, motion, noise, admission, config)
         self._loops = LoopCloser(window, keyframes, unguided)

@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999
-from sigmaslam.geometry.se3 import se3_inverse
+from sigmaslam.geometry.se3 import se3_inverse, se3_log
 from sigmaslam.slam.doubt import Doubt
+from sigmaslam.slam.frame import Frame
+from sigmaslam.slam.localisation import Prediction
+from sigmaslam.slam.stopwatch import Stopwatch
 from sigmaslam.slam.tracker import Estimate, StereoTracker
 from sigmaslam_benchmarks.live.driver_faults import DrivenFrame, spoil
-from tests.support.estimates import Demo, squared_error
+from tests.support.estimates import Demo, squared_error, track
 
 FRAMES = 40
 
@@ -102,3 +105,20 @@ def test_eyes_that_do_not_fit_make_all_poses_doubtful_and_less_certain(demo: Dem
         assert (one.status, other.status) in [("starting", "starting"), ("tracking", "doubtful")]
     assert list(other.doubts) == [Doubt.INPUT]
     assert np.trace(other.covariance[:3, :3]) > 2.0 * np.trace(one.covariance[:3, :3])
+
+
+def test_a_wrong_prediction_does_not_drag_along_a_pose_that_is_found_without_it(demo: Demo):
+    camera, frames, truth = demo
+    tracker = StereoTracker(camera)
+    track(tracker, frames[:12])
+    tracker._motion.set_twist(np.array([0.0, 0.0, 10.0, 0.0, 0.0, 0.0]), np.full(6, 1e-3))
+    tracker._motion.predict(0.05, np.full(2, 1e-4))
+    frame = Frame(*tracker.rectifier.rectify(frames[12].left, frames[12].right), tracker._frontend)
+    prediction = Prediction.of(tracker._window, tracker._motion)
+    views = [each.view for each in tracker._keyframes.active]
+    matches, fit = tracker._localiser.localise(frame.view, views, prediction, False, Stopwatch())
+    assert fit is not None
+    assert fit.count > 0.8 * len(matches.probability)
+    turned = tracker.rectifier.T_rectified_left
+    true = turned @ se3_inverse(truth[0]) @ truth[12] @ se3_inverse(turned)
+    assert np.linalg.norm(se3_log(fit.pose @ se3_inverse(true))) < 0.005
