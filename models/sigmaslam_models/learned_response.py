@@ -9,6 +9,8 @@ from sigmaslam_models.detector import CELL, MIN_RESPONSE, second_derivatives, su
 _WIDTH = 16
 # Where the Hessian has no blob: a fiftieth of a usual keypoint's response, which the head can raise.
 _FLOOR = 0.02
+# Largest logarithm of the gain: the floor rises to a usual keypoint's response, and no blob is out of reach.
+_MOST = 4.0
 
 
 class LearnedResponse(nn.Module):
@@ -29,10 +31,9 @@ class LearnedResponse(nn.Module):
         super().__init__()
         self.see_features = nn.Conv2d(features, _WIDTH, 1)
         self.see_derivatives = nn.Conv2d(3 * CELL * CELL, _WIDTH, 1, bias=False)
-        self.decide = nn.Conv2d(_WIDTH, CELL * CELL, 3, padding=1)
+        # A response is as good as any multiple of it: no bias.
+        self.decide = nn.Conv2d(_WIDTH, CELL * CELL, 3, padding=1, bias=False)
         nn.init.zeros_(self.decide.weight)
-        assert self.decide.bias is not None
-        nn.init.zeros_(self.decide.bias)
 
     def forward(self, cells: Tensor, features: Tensor) -> Tensor:
         """Responses of all pixels."""
@@ -41,6 +42,6 @@ class LearnedResponse(nn.Module):
         determinant = uu * vv - uv * uv
         level = surroundings(determinant)
         seen = self.see_features(features) + self.see_derivatives(derivatives) * level.rsqrt()
-        gain = self.decide(functional.relu(seen)).exp()
-        response = (functional.relu(determinant / level) + _FLOOR) * gain
+        gain = _MOST * (self.decide(functional.relu(seen)) / _MOST).tanh()
+        response = (functional.relu(determinant / level) + _FLOOR) * gain.exp()
         return torch.where(determinant.abs() > MIN_RESPONSE, response, torch.zeros_like(response))

@@ -106,8 +106,8 @@ def _depth_by_stereo(
     mirrored = T[0, 3] < 0  # then the neighbour is the left eye: seen in a mirror it is the right one
     if mirrored:
         M = np.diag([-1.0, 1.0, 1.0, 1.0])
-        image, other, T = (np.ascontiguousarray(each[:, ::-1]) for each in (image, other)), None, M @ T @ M
-        image, other = image
+        T = M @ T @ M
+        image, other = (np.ascontiguousarray(each[:, ::-1]) for each in (image, other))
     centres = [width - 1 - each[0, 2] if mirrored else each[0, 2] for each in (K, K_other)]
     eyes = [
         CameraModel(width, height, each[0, 0], each[1, 1], centre, each[1, 2])

@@ -18,7 +18,8 @@ Transfer = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 _RIGHT = 3.0
 # Pixels a keypoint: 1,024 in an image of 640x480.
 _PIXELS = 300
-# A place is drawn from each of so many squares of so many pixels a side, this often.
+# A place is drawn from each of so many squares of so many pixels a side, this often. As many keypoints of the other
+# image are asked whether they match: were they as few as are kept, being kept would be its own reward.
 _SQUARE, _SQUARES_PER_KEYPOINT, _DRAWS = 8, 2, 4
 # Of keypoints nearer than this the stronger one alone is a maximum.
 _SUPPRESSED = 1.5
@@ -41,7 +42,7 @@ class _Nearest(NamedTuple):
 def detector_loss(
     network: FeatureNetwork, image0: Tensor, image1: Tensor, transfer: Transfer, generator: torch.Generator
 ) -> Tensor:
-    """Minus the right matches expected of the keypoints of image 0, whose gradient reaches the response alone.
+    """Minus the worth of the matches of image 0's keypoints that are seen; its gradient reaches the response alone.
 
     In each square of pixels places are drawn by their response, as in DISK (Tyszkiewicz 2020), and those that match
     better than the others drawn there are made more likely: each draw's baseline is the mean of the others. Squares
@@ -63,7 +64,7 @@ def detector_loss(
     # The extractor ranks by the root of the response times the quality.
     strength = network.response(cells, maps.fine) * quality.sigmoid().square()
     with torch.no_grad():
-        keypoints, strongest = pick_peaks(strength, strength, count)
+        keypoints, strongest = pick_peaks(strength, strength, _SQUARES_PER_KEYPOINT * count)
         descriptors = network.describe(maps, keypoints)
         known = strongest > 0
     squares = _squares(functional.pixel_shuffle(strength[:1], CELL)[0, 0])
@@ -90,13 +91,17 @@ def detector_loss(
         advantage = torch.where(seen[:, 1:], drawn - others, 0.0)
     drawing = (advantage * likelihood.gather(1, draws)).sum()
     level = largest[chosen].clamp_min(1e-12).log()
-    threshold = level.detach().topk(min(count, len(level))).values[-1]
-    part = (level - threshold).sigmoid()
+    with torch.no_grad():
+        threshold = level.topk(min(count, len(level))).values[-1]
+        spread = level.std().clamp_min(1e-3)
+    part = ((level - threshold) / spread).sigmoid()
     with torch.no_grad():
         weight = torch.where(seen[:, 0], part * (1.0 - part), 0.0)
         worth = (weight * reward[:, 0]).sum() / weight.sum().clamp_min(1e-6)
         gain = torch.where(seen[:, 0], reward[:, 0] - worth, 0.0)
-    return -(drawing + (part * gain).sum()) / count
+        mean = (part * reward[:, 0]).sum() / (part * seen[:, 0]).sum().clamp_min(1e-6)
+    surrogate = (drawing + (part * gain).sum()) / count
+    return surrogate.detach() - surrogate - mean
 
 
 def _squares(image: Tensor) -> _Squares:

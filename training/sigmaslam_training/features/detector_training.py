@@ -48,7 +48,7 @@ class DetectorConfig:
     steps: int = 3000
     batch_size: int = 4
     size: int = 320
-    learning_rate: float = 5e-3
+    learning_rate: float = 3e-3
     seed: int = 0
 
 
