@@ -54,6 +54,7 @@ GROUPS = {
     "train": {
         "network": "Train the correspondence network.",
         "scorer": "Train the probability of matches.",
+        "detector": "Train where keypoints are.",
         "export": "Export trained weights to ONNX.",
         "render": "Render a stereo sequence with exact truth.",
     },
@@ -68,6 +69,7 @@ PLACES = {
     "orient": "points:orient",
     "network": "train:train",
     "scorer": "train:train_scorer",
+    "detector": "train:train_detector",
 }
 # What a group does whose first word is none of its commands.
 DEFAULTS = {"calibrate": "board", "train": "network"}

@@ -88,21 +88,26 @@ def churchill(folder: Path) -> list[ImagePair]:
 
 def fountain(folder: Path) -> list[ImagePair]:
     """All six pairs of the four calibrated photographs."""
-    numbers = ("0002", "0003", "0004", "0005")
-    images, cameras = {}, {}
-    for number in numbers:
-        images[number], S = resize(read_grey(folder / "images" / f"{number}.jpg"))
+    pairs = []
+    for (first, (image0, K, T_world_0)), (second, (image1, _, T_world_1)) in combinations(
+        fountain_views(folder).items(), 2
+    ):
+        motion = Motion(K, se3_inverse(T_world_1) @ T_world_0)
+        pairs.append(ImagePair(f"{first} {second}", image0, image1, motion))
+    return pairs
+
+
+def fountain_views(folder: Path) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Of the four photographs from left to right: the image, K (3, 3) and T_world_camera (4, 4)."""
+    views = {}
+    for number in ("0002", "0003", "0004", "0005"):
+        image, S = resize(read_grey(folder / "images" / f"{number}.jpg"))
         rows = _read_numbers(folder / "gt_dense_cameras" / f"{number}.jpg.camera", 26)
         # K, distortion, R (camera to world), centre, size: x_camera = R^T (X - C).
         T_world_camera = np.eye(4)
         T_world_camera[:3, :3], T_world_camera[:3, 3] = rows[12:21].reshape(3, 3), rows[21:24]
-        cameras[number] = (S @ rows[:9].reshape(3, 3), T_world_camera)
-    pairs = []
-    for first, second in combinations(numbers, 2):
-        (K, T_world_0), (_, T_world_1) = cameras[first], cameras[second]
-        motion = Motion(K, se3_inverse(T_world_1) @ T_world_0)
-        pairs.append(ImagePair(f"{first} {second}", images[first], images[second], motion))
-    return pairs
+        views[number] = image, S @ rows[:9].reshape(3, 3), T_world_camera
+    return views
 
 
 def _homographies(folder: Path, image_name: str, homography_name: str) -> list[ImagePair]:

@@ -48,7 +48,7 @@ def sequence_pairs(sequence: StereoSequence, truth: Path, step: int, gaps: Mappi
     """
     views = {
         view.index: view
-        for view in _views(sequence, truth)
+        for view in views_of(sequence, truth)
         if any((view.index - gap) % step == 0 for gap in (0, *gaps))
     }
     begins = [index for index in views if index % step == 0]
@@ -69,7 +69,7 @@ def sequence_steps(sequence: StereoSequence, truth: Path, step: int = 1, gap: in
         step: every so many frames one begins.
         gap: frames from one to the other.
     """
-    views = {view.index: view for view in _views(sequence, truth) if view.index % step in (0, gap % step)}
+    views = {view.index: view for view in views_of(sequence, truth) if view.index % step in (0, gap % step)}
     pairs = [(view, views[index + gap]) for index, view in views.items() if index % step == 0 and index + gap in views]
     return [
         StereoStep(
@@ -95,7 +95,8 @@ class _View:
     T_world_camera: np.ndarray
 
 
-def _views(sequence: StereoSequence, truth: Path) -> Iterator[_View]:
+def views_of(sequence: StereoSequence, truth: Path) -> Iterator[_View]:
+    """The frames of a sequence with the poses of a trajectory file."""
     rectifier = StereoRectifier(sequence.camera)
     T_camera_rectified = np.eye(4)
     T_camera_rectified[:3, :3] = rectifier.R_rectified_left.T
