@@ -10,7 +10,7 @@ import numpy as np
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.state_layout import pose_slice
 from sigmaslam.geometry.se3 import se3_body, se3_inverse, turn_covariance
-from sigmaslam.slam.keyframe import Keyframe
+from sigmaslam.slam.keyframe import KnownKeyframe, from_origin
 from sigmaslam.slam.keyframes import Keyframes
 from sigmaslam.slam.place_recognition import retrieve
 from sigmaslam.slam.unguided_matching import UnguidedMatcher
@@ -50,20 +50,20 @@ class LoopCloser:
         """
         closed, newest = None, self.keyframes.active[-1]
         view = newest.view
-        for keyframe in retrieve(view, 1, self._revisited()):
+        for keyframe in retrieve(view, 1, self._revisited(), self.keyframes.appearance):
             self.looked = newest.timestamp
             relative = self.matcher.relative_pose_to(keyframe.view, view)
             if relative is None:
                 continue
-            pose = self.keyframes.pose(keyframe) @ relative.T_key_camera
+            index, relative = self.keyframes.index(keyframe.origin), from_origin(keyframe, relative)
+            pose = self.window.posterior.past.poses[index] @ relative.T_key_camera
             covariance = turn_covariance(pose, relative.covariance)
-            index = self.keyframes.index(keyframe.id)
             if self.window.add_loop_constraint(index, relative.T_key_camera, covariance):
                 _LOGGER.info("loop closed with the keyframe of %.3f s", keyframe.timestamp)
                 closed = keyframe.timestamp
         return closed
 
-    def _revisited(self) -> list[Keyframe]:
+    def _revisited(self) -> list[KnownKeyframe]:
         """Keyframes that left the window long ago and should see what its newest one sees."""
         state = self.window.posterior
         pose, place = state.poses[-1], pose_slice(len(state) - 1)
@@ -72,8 +72,7 @@ class LoopCloser:
         if self.keyframes.active[-1].timestamp < self.looked + _PAUSE and reach < 2.0 * self.window.depth:
             return []
 
-        def is_near(keyframe: Keyframe) -> bool:
-            between = se3_inverse(pose) @ self.keyframes.pose(keyframe)
-            return bool(np.linalg.norm(between[:3, 3]) < reach and between[2, 2] > _LOOP_COSINE)
-
-        return [keyframe for keyframe in self.keyframes.left_long_ago(_RECENT) if is_near(keyframe)]
+        candidates = self.keyframes.left_long_ago(_RECENT)
+        between = se3_inverse(pose) @ self.keyframes.poses(candidates)
+        is_near = (np.linalg.norm(between[:, :3, 3], axis=1) < reach) & (between[:, 2, 2] > _LOOP_COSINE)
+        return [keyframe for keyframe, near in zip(candidates, is_near, strict=True) if near]

@@ -5,20 +5,34 @@ from __future__ import annotations
 import numpy as np
 
 from sigmaslam.frontend import StereoView
-from sigmaslam.slam.keyframe import Keyframe
+from sigmaslam.slam.appearance import AppearanceIndex
+from sigmaslam.slam.keyframe import KnownKeyframe
 
-# Descriptors of a keyframe and of a view that vote on whether they show the same place.
-_VOTERS = 300
+# Descriptors of a keyframe and of a view that vote on whether they show the same place; of more keyframes only so
+# many vote, which look most like the view.
+_VOTERS, _VOTING = 300, 60
 
 
-def retrieve(view: StereoView, count: int, among: list[Keyframe]) -> list[Keyframe]:
-    """Up to `count` keyframes that look most like the view, by mutual nearest descriptors, best first."""
+def retrieve(
+    view: StereoView, count: int, among: list[KnownKeyframe], appearance: AppearanceIndex
+) -> list[KnownKeyframe]:
+    """Up to `count` keyframes that look most like the view, by mutual nearest descriptors, best first.
+
+    Args:
+        view: the current one.
+        count: at most so many.
+        among: the keyframes, by their numbers upwards.
+        appearance: of these, and perhaps of others.
+    """
+    if len(among) > _VOTING:
+        alike = set(appearance.rank(view, _VOTING, [keyframe.id for keyframe in among]))
+        among = [keyframe for keyframe in among if keyframe.id in alike]
     wanted = view.features.descriptors[:_VOTERS]
     if not wanted.shape[1]:
         return among[-count:][::-1]
     votes = []
     for keyframe in among:
-        similarity = keyframe.view.features.descriptors[:_VOTERS] @ wanted.T
+        similarity = keyframe.descriptors[:_VOTERS] @ wanted.T
         if not similarity.size:
             votes.append(0)
             continue
