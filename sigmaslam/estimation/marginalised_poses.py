@@ -13,7 +13,7 @@ import numpy as np
 
 from sigmaslam.estimation.gaussian import matrix_root
 from sigmaslam.estimation.state_layout import CALIBRATION_SIZE
-from sigmaslam.geometry.se3 import nearest_rigid, se3_exp, skew
+from sigmaslam.geometry.se3 import nearest_rigid, se3_exp, se3_inverse, skew, turn_covariance
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,12 +55,24 @@ class PastPoses:
         across = blocks[:, :, index]
         return np.asarray(each + whole[place, place] - across - across.transpose(0, 2, 1))
 
-    def closest(self, index: int, others: list[int] | None = None) -> int:
-        """Of the other poses (of all by default) the one relative to which the place of this one is known best."""
+    def closest(self, index: int, others: list[int] | None = None, per_metre: float = 0.0) -> int:
+        """Of the other poses (of all by default) the one relative to which the place of this one is known best.
+
+        Args:
+            index: of this pose.
+            others: indices of others.
+            per_metre: standard deviation that is added for every metre between the two: of several the nearest.
+        """
         lever = point_lever(self.poses[index, :3, 3][None])[0]
         doubt = np.trace(lever @ self.relative(index) @ lever.T, axis1=1, axis2=2)
+        doubt = doubt + per_metre**2 * ((self.poses[:, :3, 3] - self.poses[index, :3, 3]) ** 2).sum(axis=1)
         candidates = np.array([k for k in (range(len(self)) if others is None else others) if k != index])
         return int(candidates[doubt[candidates].argmin()])
+
+    def step(self, heir: int, leaving: int) -> tuple[np.ndarray, np.ndarray]:
+        """(4, 4) T_heir_leaving of two poses, and its covariance (6, 6), perturbed from the left in the heir."""
+        back = se3_inverse(self.poses[heir])
+        return back @ self.poses[leaving], turn_covariance(back, self.relative(leaving)[heir])
 
     def relative_to(self, window: np.ndarray, common: np.ndarray, index: int) -> np.ndarray:
         """(6, 6) covariance of the window's last pose relative to the pose `index`, with the considered errors' part.

@@ -60,7 +60,8 @@ class TrackerConfig:
         shared_disparity: share of the variance of a landmark's disparities that is the same in all views.
         shared_place: share of the variance of its places, relative to the keyframe's, that is the same in all views.
         max_points: of the map; when there are twice as many, the least confirmed half goes.
-        max_keyframes: keyframes that are kept to find the way back to.
+        max_keyframes: keyframes that are kept to find the way back to; poses of sixty are corrected by loops, the
+            others move with these.
         max_misses: after so many frames in a row in which it was not found a landmark is no longer looked for.
         min_inliers: fewer is no pose; without a prediction and a fair share of the matches, fewer than three times as
             many.
@@ -88,7 +89,7 @@ class TrackerConfig:
     shared_disparity: float = 0.8
     shared_place: float = 0.6
     max_points: int = 100_000
-    max_keyframes: int = 60
+    max_keyframes: int = 2400
     max_misses: int = 3
     min_inliers: int = 15
     keyframe_ratio: float = 0.75

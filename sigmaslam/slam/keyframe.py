@@ -9,8 +9,11 @@ import numpy as np
 from sigmaslam.estimation.landmark_table import LandmarkTable
 from sigmaslam.frontend import StereoView
 from sigmaslam.frontend.patch_disparity_range import patch_disparity_range
+from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.slam.deferred import Deferred
+from sigmaslam.slam.packed_view import PackedView
 from sigmaslam.slam.point_map import PointMap
+from sigmaslam.two_view.stereo_pose import RelativePose
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +39,26 @@ class Keyframe:
     dense: Deferred[np.ndarray] | None = None
     points: PointMap = field(default_factory=PointMap.empty)
 
+    @property
+    def origin(self) -> int:
+        """Number of the keyframe whose pose gives its own: itself."""
+        return self.id
+
+    @property
+    def step(self) -> np.ndarray:
+        """(4, 4) T_origin_keyframe."""
+        return np.eye(4)
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """(6, 6) of that."""
+        return np.zeros((6, 6))
+
+    @property
+    def descriptors(self) -> np.ndarray:
+        """(N, D) of its features."""
+        return self.view.features.descriptors
+
     def leave_window(self, points: PointMap) -> Keyframe:
         """The keyframe as it is remembered, with the points (in its frame) that leave with it."""
         view = replace(self.view, right=np.zeros((0, 0), np.uint8), small=(), usable=None)
@@ -49,3 +72,50 @@ class Keyframe:
         index = landmarks.feature[rows]
         measured, slope = self.view.measured(index), self.view.slope[index]
         landmarks.disparity_range[rows] = patch_disparity_range(self.dense.get(), measured, slope)
+
+
+@dataclass(frozen=True, slots=True)
+class HangingKeyframe:
+    """A keyframe without a pose of its own in the past: it hangs at a neighbour whose pose is remembered.
+
+    Attributes:
+        id, timestamp: as of `Keyframe`.
+        packed: what it saw.
+        origin: number of the neighbour.
+        step: (4, 4) T_origin_keyframe.
+        covariance: (6, 6) of that, perturbed from the left, as independent of all else.
+    """
+
+    id: int
+    timestamp: float
+    packed: PackedView
+    origin: int
+    step: np.ndarray
+    covariance: np.ndarray
+
+    @property
+    def view(self) -> StereoView:
+        """What it saw, unpacked."""
+        return self.packed.unpack()
+
+    @property
+    def descriptors(self) -> np.ndarray:
+        """(N, D) of its features."""
+        return self.packed.descriptors
+
+    def handed_over(self, heir: int, T_heir_origin: np.ndarray, covariance: np.ndarray) -> HangingKeyframe:
+        """The keyframe at another neighbour; covariance: (6, 6) of the step to it, perturbed from the left there."""
+        pose = T_heir_origin @ self.step
+        own = turn_covariance(T_heir_origin, self.covariance)
+        return replace(self, origin=heir, step=pose, covariance=covariance + own)
+
+
+KnownKeyframe = Keyframe | HangingKeyframe
+"""One that left the window."""
+
+
+def from_origin(keyframe: KnownKeyframe, relative: RelativePose) -> RelativePose:
+    """A pose relative to a keyframe, as it is relative to the one whose pose is remembered."""
+    pose = keyframe.step @ relative.T_key_camera
+    own = turn_covariance(se3_inverse(pose), keyframe.covariance)
+    return replace(relative, T_key_camera=pose, covariance=relative.covariance + own)

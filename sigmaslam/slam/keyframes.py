@@ -16,8 +16,10 @@ from sigmaslam.frontend import StereoView
 from sigmaslam.frontend.image_sharpness import patch_energies
 from sigmaslam.frontend.patch_disparity_range import dense_disparity
 from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam.slam.appearance import AppearanceIndex
 from sigmaslam.slam.deferred import Deferred
-from sigmaslam.slam.keyframe import Keyframe
+from sigmaslam.slam.hanging_keyframes import HangingKeyframes
+from sigmaslam.slam.keyframe import Keyframe, KnownKeyframe
 from sigmaslam.slam.map_file import pack_keyframes, read_keyframes
 from sigmaslam.slam.place_recognition import closest_pair
 from sigmaslam.slam.point_map import (
@@ -32,6 +34,10 @@ from sigmaslam.slam.point_map import (
 
 # Patches that are compared for blur: in the mean of so many what single ones show of the scene evens out.
 _COMPARED = 30
+# Poses that are remembered together; time and memory of their joint covariance grow with the square.
+_REMEMBERED = 60
+# What is as well known relative to many of them, as after a loop, hangs at a near one: by the drift of a good track.
+_PER_METRE = 0.01
 
 
 class Keyframes:
@@ -39,13 +45,16 @@ class Keyframes:
 
     Args:
         window: owns the poses.
-        max_keyframes: more than so many that left the window are not remembered.
+        max_keyframes: of those that left the window no more are known. Poses are remembered of the first sixty; the
+            others hang at these.
         max_points: of the map; when there are twice as many, the least confirmed half goes.
         executor: makes what only the map needs beside the tracking, if there is one.
 
     Attributes:
         active: keyframes of the window, in its order.
         remembered: keyframes that left it, in the order of its past.
+        hanging: those without a pose in the past.
+        appearance: of both, by their numbers.
     """
 
     def __init__(
@@ -53,24 +62,30 @@ class Keyframes:
     ) -> None:
         self._window = window
         self._executor = executor
-        self._max_keyframes = max(max_keyframes, 1)
+        self._most_remembered = min(max(max_keyframes, 1), _REMEMBERED)
         self._max_points = max_points
         self._next_id = self._first_id = 0
         self.active: list[Keyframe] = []
         self.remembered: list[Keyframe] = []
+        self.hanging = HangingKeyframes(max_keyframes // self._most_remembered - 1)
+        self.appearance = AppearanceIndex()
 
     def index(self, id: int) -> int:
         """Where a remembered keyframe stands in the past."""
         return next(k for k, keyframe in enumerate(self.remembered) if keyframe.id == id)
 
-    def pose(self, keyframe: Keyframe) -> np.ndarray:
-        """(4, 4) T_world_keyframe of a remembered one."""
-        return np.asarray(self._window.posterior.past.poses[self.index(keyframe.id)])
+    def poses(self, keyframes: list[KnownKeyframe]) -> np.ndarray:
+        """(K, 4, 4) T_world_keyframe of some that left the window."""
+        place = {keyframe.id: index for index, keyframe in enumerate(self.remembered)}
+        origin = np.array([place[keyframe.origin] for keyframe in keyframes], np.int64)
+        steps = np.array([keyframe.step for keyframe in keyframes]).reshape(-1, 4, 4)
+        return np.asarray(self._window.posterior.past.poses[origin] @ steps)
 
-    def left_long_ago(self, count: int) -> list[Keyframe]:
-        """Remembered keyframes but for the last `count` that left the window."""
-        recent = max(self._first_id, self.active[0].id - count)
-        return [keyframe for keyframe in self.remembered if keyframe.id < recent]
+    def left_long_ago(self, count: int = 0) -> list[KnownKeyframe]:
+        """Keyframes that left the window, but for the last `count`, by their numbers upwards."""
+        recent = max(self._first_id, self.active[0].id - count) if self.active else self._next_id
+        known = [keyframe for keyframe in (*self.remembered, *self.hanging) if keyframe.id < recent]
+        return sorted(known, key=lambda keyframe: keyframe.id)
 
     def append(
         self, view: StereoView, timestamp: float, blur: float = 1.0, landmarks: np.ndarray | slice = slice(None)
@@ -108,11 +123,11 @@ class Keyframes:
         own = 1.0 if share >= ACCEPTANCE.sharpness else 1.0 / max(share, ACCEPTANCE.least_sharpness)
         return own, own + float(blurs.mean()) - 1.0
 
-    def marginalise_oldest(self, spare: Keyframe | None = None) -> np.ndarray:
+    def marginalise_oldest(self, spare: KnownKeyframe | None = None) -> np.ndarray:
         """Moves the oldest keyframe to the past, and its landmarks to the map.
 
         Args:
-            spare: a remembered one that must not be forgotten for it.
+            spare: one whose pose must stay remembered, or that of the one that it hangs at.
         Returns:
             New row of each landmark, as of `KeyframeWindow.marginalise_oldest`.
         """
@@ -120,13 +135,14 @@ class Keyframes:
         points = anchor_points(self._window, 0, _times(self.active))
         points = points.shade(self.active[0].view.left, self.active[0].timestamp)
         new_row = self._window.marginalise_oldest()
-        self._remember(self.active.pop(0).leave_window(points), spare)
+        self._remember([self.active.pop(0).leave_window(points)], spare)
         return new_row
 
     def restart(self) -> None:
         """Forgets all keyframes and their poses, but not the calibration."""
         self._window.restart()
         self.active, self.remembered = [], []
+        self.hanging, self.appearance = HangingKeyframes(self.hanging.most), AppearanceIndex()
         self._first_id = self._next_id
 
     def map(self) -> PointMap:
@@ -145,36 +161,46 @@ class Keyframes:
         Raises:
             InputError: the file is no map, or made with another front-end or camera.
         """
-        keyframes, past = read_keyframes(path, frontend, camera)
+        keyframes, past, hanging = read_keyframes(path, frontend, camera)
         self._window.restart(past)
-        for keyframe in keyframes:
-            self._remember(keyframe)
-        self._next_id = self._first_id = len(keyframes)
+        for each in hanging:
+            self.hanging.add(each)
+            self.appearance.add(each.id, each.view)
+        self._next_id = self._first_id = len(keyframes) + len(hanging)
+        self._remember(keyframes)
 
     def pack(self, frontend: str, camera: RectifiedStereo) -> dict[str, Any]:
         """All of them as arrays by name, by which a later run finds its place in the map."""
-        return pack_keyframes([*self.remembered, *self.active], self._window.posterior.all_poses, frontend, camera)
+        keyframes = [*self.remembered, *self.active]
+        return pack_keyframes(keyframes, self._window.posterior.all_poses, frontend, camera, self.hanging)
 
-    def _remember(self, keyframe: Keyframe, spare: Keyframe | None = None) -> None:
-        """Takes a keyframe of the window's past, and forgets a superfluous one for it, but not the one to spare."""
-        self.remembered.append(keyframe)
+    def _remember(self, keyframes: list[Keyframe], spare: KnownKeyframe | None = None) -> None:
+        """Takes keyframes of the window's past, and hangs superfluous ones at others, but not the one to spare."""
+        self.remembered.extend(keyframes)
+        for keyframe in keyframes:
+            self.appearance.add(keyframe.id, keyframe.view)
         if sum(len(each.points) for each in self.remembered) > 2 * self._max_points:
             kept = most_confirmed([each.points for each in self.remembered], self._max_points)
             self.remembered = [replace(each, points=points) for each, points in zip(self.remembered, kept, strict=True)]
-        if len(self.remembered) <= self._max_keyframes:
-            return
-        # Of the two that are closest to each other the later one.
-        past = self._window.posterior.past
-        earlier, leaving = closest_pair(past.poses[: len(self.remembered)])
-        if spare is not None and self.remembered[leaving].id == spare.id:
-            leaving = earlier
-        if len(self.remembered[leaving].points):
-            heir = past.closest(leaving)
-            points = hand_over_points(self.remembered[leaving].points, past, leaving, heir)
-            inherited = merge_maps([self.remembered[heir].points, points])
-            self.remembered[heir] = replace(self.remembered[heir], points=inherited)
-        del self.remembered[leaving]
-        self._window.forget_past(leaving)
+        while len(self.remembered) > self._most_remembered:
+            # Of the two that are closest to each other the later one.
+            past = self._window.posterior.past
+            earlier, leaving = closest_pair(past.poses[: len(self.remembered)])
+            if spare is not None and self.remembered[leaving].id == spare.origin:
+                leaving = earlier
+            gone = self.remembered[leaving]
+            if len(gone.points):
+                index = past.closest(leaving)
+                points = merge_maps(
+                    [self.remembered[index].points, hand_over_points(gone.points, *past.step(index, leaving))]
+                )
+                self.remembered[index] = replace(self.remembered[index], points=points)
+            index = past.closest(leaving, per_metre=_PER_METRE)
+            heir = self.remembered[index].id
+            for id in self.hanging.hand_over(gone, heir, *past.step(index, leaving)):
+                self.appearance.remove(id)
+            del self.remembered[leaving]
+            self._window.forget_past(leaving)
 
 
 def _times(keyframes: list[Keyframe]) -> np.ndarray:

@@ -12,9 +12,9 @@ from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.state_layout import pose_slice
 from sigmaslam.estimation.window_state import loop_difference
 from sigmaslam.geometry.se3 import se3_body, se3_inverse, turn_covariance
-from sigmaslam.slam.keyframe import Keyframe
+from sigmaslam.slam.keyframe import Keyframe, KnownKeyframe, from_origin
 from sigmaslam.slam.keyframes import Keyframes
-from sigmaslam.slam.place_recognition import count_votes
+from sigmaslam.slam.place_recognition import VOTING, count_votes, most_alike
 from sigmaslam.slam.unguided_matching import UnguidedMatcher
 
 _LOGGER = logging.getLogger(__name__)
@@ -77,7 +77,8 @@ class LoopCloser:
         relative = self.matcher.relative_pose_to(keyframe.view, newest.view)
         if relative is None:
             return None
-        pose, index, measured = self.keyframes.pose(keyframe), self.keyframes.index(keyframe.id), relative.T_key_camera
+        index, relative = self.keyframes.index(keyframe.origin), from_origin(keyframe, relative)
+        pose, measured = state.past.poses[index], relative.T_key_camera
         covariance = turn_covariance(pose @ measured, relative.covariance)
         loop = _Contradiction(loop_difference(state, index, measured), covariance)
         departure = np.linalg.norm((se3_inverse(pose) @ state.poses[-1] - measured)[:3, 3])
@@ -90,7 +91,7 @@ class LoopCloser:
         _LOGGER.info("loop closed with the keyframe of %.3f s", keyframe.timestamp)
         return keyframe.timestamp
 
-    def _revisited(self, newest: Keyframe) -> tuple[Keyframe | None, float]:
+    def _revisited(self, newest: Keyframe) -> tuple[KnownKeyframe | None, float]:
         """Of the keyframes that left the window long ago the one that looks most like the newest, or is nearest.
 
         And by how much odometry may be off since, metres.
@@ -102,15 +103,20 @@ class LoopCloser:
         if newest.timestamp < self.looked + _PAUSE and reach < 2.0 * self.window.depth:
             return None, 0.0
         left = self.keyframes.left_long_ago(_RECENT)
-        places = np.concatenate([state.past.poses[:, :3, 3], pose[None, :3, 3]])
+        poses = self.keyframes.poses(self.keyframes.left_long_ago())
+        places = np.concatenate([poses[:, :3, 3], pose[None, :3, 3]])
         drift = _DRIFT * np.linalg.norm(np.diff(places, axis=0), axis=1)[::-1].cumsum()[::-1][: len(left)]
-        between = se3_inverse(pose) @ state.past.poses[: len(left)]
+        between = se3_inverse(pose) @ poses[: len(left)]
         away, ahead = np.linalg.norm(between[:, :3, 3], axis=1), between[:, 2, 2] > _LOOP_COSINE
         near, possible = ahead & (away < reach), ahead & (away < self.window.depth + drift)
         if not (near | possible).any():
             return None, 0.0
-        votes = count_votes(newest.view, left)
-        usual = np.median(votes)
-        allowed = near | (possible & (votes >= usual + _STANDS_OUT * np.sqrt(usual)))
-        chosen = max(np.flatnonzero(allowed), key=lambda k: (votes[k], -away[k]), default=None)
+        # Of thousands of keyframes a sample tells what is usual, and those that look most like the newest are asked.
+        usual = np.median(count_votes(newest.view, left[:: -(-len(left) // VOTING)]))
+        asked = [keyframe for keyframe, is_asked in zip(left, near | possible, strict=True) if is_asked]
+        asked = most_alike(newest.view, asked, self.keyframes.appearance)
+        votes = dict(zip((each.id for each in asked), count_votes(newest.view, asked), strict=True))
+        stands_out = usual + _STANDS_OUT * np.sqrt(usual)
+        rows = [k for k, each in enumerate(left) if each.id in votes and (near[k] or votes[each.id] >= stands_out)]
+        chosen = max(rows, key=lambda k: (votes[left[k].id], -away[k]), default=None)
         return (None, 0.0) if chosen is None else (left[chosen], float(drift[chosen]))

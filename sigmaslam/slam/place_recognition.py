@@ -5,25 +5,47 @@ from __future__ import annotations
 import numpy as np
 
 from sigmaslam.frontend import StereoView
-from sigmaslam.slam.keyframe import Keyframe
+from sigmaslam.slam.appearance import AppearanceIndex
+from sigmaslam.slam.keyframe import KnownKeyframe
 
 # Descriptors of a keyframe and of a view that vote on whether they show the same place.
 _VOTERS = 300
+VOTING = 60
+"""Keyframes that vote, of thousands that are known: half a millisecond each."""
 
 
-def retrieve(view: StereoView, count: int, among: list[Keyframe]) -> list[Keyframe]:
-    """Up to `count` keyframes that look most like the view, best first; the latest where nothing tells them apart."""
-    latest_first = among[::-1]
+def retrieve(
+    view: StereoView, count: int, among: list[KnownKeyframe], appearance: AppearanceIndex
+) -> list[KnownKeyframe]:
+    """Up to `count` keyframes that look most like the view, best first; the latest where nothing tells them apart.
+
+    Args:
+        view: the current one.
+        count: at most so many.
+        among: the keyframes, by their numbers upwards.
+        appearance: of these, and perhaps of others.
+    """
+    latest_first = most_alike(view, among, appearance)[::-1]
     order = np.argsort(-count_votes(view, latest_first), kind="stable")
     return [latest_first[k] for k in order[:count]]
 
 
-def count_votes(view: StereoView, among: list[Keyframe]) -> np.ndarray:
+def most_alike(
+    view: StereoView, among: list[KnownKeyframe], appearance: AppearanceIndex, count: int = VOTING
+) -> list[KnownKeyframe]:
+    """The keyframes that look most like the view by one vector each, at most `count`, in their order."""
+    if len(among) <= count:
+        return among
+    alike = set(appearance.rank(view, count, [keyframe.id for keyframe in among]))
+    return [keyframe for keyframe in among if keyframe.id in alike]
+
+
+def count_votes(view: StereoView, among: list[KnownKeyframe]) -> np.ndarray:
     """(K,) mutual nearest descriptors of the view and each keyframe; zero without descriptors."""
     wanted = view.features.descriptors[:_VOTERS]
     votes = np.zeros(len(among), np.int64)
     for k, keyframe in enumerate(among):
-        similarity = keyframe.view.features.descriptors[:_VOTERS] @ wanted.T
+        similarity = keyframe.descriptors[:_VOTERS] @ wanted.T
         if similarity.size and wanted.shape[1]:
             forward, back = similarity.argmax(axis=1), similarity.argmax(axis=0)
             votes[k] = (back[forward] == np.arange(len(forward))).sum()

@@ -12,7 +12,7 @@ from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.marginalised_poses import PastPoses, past_slice, point_lever
 from sigmaslam.estimation.state_layout import CALIBRATION, LANDMARK_SIZE, MODELLED, pose_slice
 from sigmaslam.geometry.camera import RectifiedStereo
-from sigmaslam.geometry.se3 import se3_inverse, transform_points, turn_covariance
+from sigmaslam.geometry.se3 import se3_inverse, transform_points
 from sigmaslam.table import Table
 
 # A keypoint may lie on either end of what its patch shows: standard deviation of its disparity, over that range.
@@ -68,18 +68,16 @@ class PointMap(Table):
         return replace(self, points=transform_points(T, self.points), covariances=R @ self.covariances @ R.T)
 
 
-def hand_over_points(points: PointMap, past: PastPoses, leaving: int, heir: int) -> PointMap:
+def hand_over_points(points: PointMap, step: np.ndarray, covariance: np.ndarray) -> PointMap:
     """Points in the frame of a past pose that is about to be forgotten, in that of another one.
 
     Args:
-        points: in the frame of the pose `leaving`, covariances given it.
-        past: with both.
-        leaving, heir: their indices.
+        points: in the frame of the pose that leaves, covariances given it.
+        step: (4, 4) takes them into that of the heir.
+        covariance: (6, 6) of the step, perturbed from the left in the heir.
     """
-    moved = points.transform(se3_inverse(past.poses[heir]) @ past.poses[leaving])
-    # In the heir's frame, where the covariance of the step between them is wanted.
-    step = turn_covariance(se3_inverse(past.poses[heir]), past.relative(leaving)[heir])
-    return replace(moved, covariances=moved.covariances + project_covariance(point_lever(moved.points), step))
+    moved = points.transform(step)
+    return replace(moved, covariances=moved.covariances + project_covariance(point_lever(moved.points), covariance))
 
 
 def points_in_world(parts: list[PointMap], past: PastPoses) -> PointMap:

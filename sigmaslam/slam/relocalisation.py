@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from sigmaslam.estimation.constant_velocity import MotionFilter, dead_reckoning
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.frontend import StereoView
 from sigmaslam.geometry.se3 import nearest_rigid
+from sigmaslam.slam.keyframe import from_origin
 from sigmaslam.slam.keyframes import Keyframes
 from sigmaslam.slam.landmark_admission import LandmarkAdmission
 from sigmaslam.slam.localisation import Prediction
@@ -64,11 +65,11 @@ class Relocaliser:
         if not view.has_stereo(min_points, self.min_inliers):
             return None
         keyframes = self.keyframes
-        for keyframe in retrieve(view, _RETRIEVED, keyframes.remembered):
+        for keyframe in retrieve(view, _RETRIEVED, keyframes.left_long_ago(), keyframes.appearance):
             relative = self.matcher.relative_pose_to(keyframe.view, view)
             if relative is None:
                 continue
-            pose = nearest_rigid(keyframes.pose(keyframe) @ relative.T_key_camera)
+            pose = nearest_rigid(keyframes.poses([keyframe])[0] @ relative.T_key_camera)
             # Repeated texture agrees on other places: by a few dozens of matches, which the motion since the last image
             # excludes if that was guessed, or by hundreds, which it excludes if that was measured.
             trusts_motion = dead_reckoning(self.motion) is not None or not self.matcher.is_beyond_chance(relative)
@@ -79,8 +80,9 @@ class Relocaliser:
                 continue
             while keyframes.active:
                 keyframes.marginalise_oldest(spare=keyframe)
-            covariance = max(relative.clustering, 1.0) * relative.covariance
-            return Relocalisation(admitted, pose, covariance, keyframes.index(keyframe.id))
+            shared = replace(relative, covariance=max(relative.clustering, 1.0) * relative.covariance)
+            covariance = from_origin(keyframe, shared).covariance
+            return Relocalisation(admitted, pose, covariance, keyframes.index(keyframe.origin))
         return None
 
     def _is_expected(self, pose: np.ndarray) -> bool:

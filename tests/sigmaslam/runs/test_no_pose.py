@@ -12,7 +12,9 @@ from matplotlib.figure import Figure
 from sigmaslam.bundle_adjustment.track_file import read_tracks
 from sigmaslam.checks.finding import Finding
 from sigmaslam.errors import InputError
+from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.readers import open_sequence
 from sigmaslam.readers.trajectory_files import read_kitti, read_tum, write_kitti
 from sigmaslam.report.figures import plot_trajectory
 from sigmaslam.run_record.frame_table import STATUSES, TRACKED, predicted_poses, read_frames
@@ -78,7 +80,9 @@ def test_the_table_of_poses_says_what_the_other_files_say(late: tuple[Path, Path
 def test_map_points_have_the_grey_values_of_their_images(late: tuple[Path, Path]):
     with np.load(late[1] / "map.npz") as content:
         pixels, intensity, timestamps = (content[name] for name in ("pixels", "intensity", "timestamps"))
-        images = dict(zip(content["keyframe_timestamps"].tolist(), content["keyframe_images"], strict=True))
+    sequence = open_sequence(late[0])
+    rectify = StereoRectifier(sequence.camera).rectify
+    images = {frame.timestamp: rectify(frame.left, frame.right)[0] for frame in sequence.frames()}
     assert len(pixels)
     for (u, v), grey, timestamp in zip(np.rint(pixels).astype(int), intensity, timestamps.tolist(), strict=True):
         assert images[timestamp][v, u] == grey

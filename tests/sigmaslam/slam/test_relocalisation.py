@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -15,13 +16,15 @@ from sigmaslam.estimation.marginalised_poses import PastPoses
 from sigmaslam.estimation.state_layout import CALIBRATION_SIZE
 from sigmaslam.frontend import Features, StereoView
 from sigmaslam.geometry.camera import RectifiedStereo
-from sigmaslam.geometry.se3 import se3_inverse, se3_log
+from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
 from sigmaslam.readers.trajectory_files import read_kitti
+from sigmaslam.slam.appearance import AppearanceIndex
 from sigmaslam.slam.doubt import Doubt
-from sigmaslam.slam.keyframe import Keyframe
+from sigmaslam.slam.keyframe import HangingKeyframe, Keyframe, from_origin
 from sigmaslam.slam.keyframes import Keyframes
 from sigmaslam.slam.landmark_admission import AdmitAll
 from sigmaslam.slam.map_file import pack_keyframes, read_keyframes
+from sigmaslam.slam.packed_view import PackedView
 from sigmaslam.slam.place_recognition import retrieve
 from sigmaslam.slam.relocalisation import Relocaliser
 from sigmaslam.slam.tracker import TrackerConfig
@@ -100,7 +103,7 @@ def test_thinning_spares_places_visited_once():
     places = [0.0, 5.0, 0.01, 0.02, 10.0, 0.03, 0.04, 15.0, 0.05, 0.06, 0.07, 0.08]
     keyframes = visited([looking(x) for x in places], 6)
     assert {1, 4, 7} <= {each.id for each in keyframes.remembered}
-    assert [keyframes.pose(each)[0, 3] for each in keyframes.remembered] == [
+    assert [T[0, 3] for T in keyframes.poses(keyframes.remembered)] == [
         places[each.id] for each in keyframes.remembered
     ]
 
@@ -121,34 +124,44 @@ def test_keyframes_of_one_time_stamp_are_told_apart():
         keyframes.append(view_of(number), 0.0)
         keyframes.marginalise_oldest()
     assert [keyframes.index(each.id) for each in keyframes.remembered] == [0, 1, 2]
-    assert [keyframes.pose(each)[0, 3] for each in keyframes.remembered] == [0.0, 1.0, 2.0]
+    assert [T[0, 3] for T in keyframes.poses(keyframes.remembered)] == [0.0, 1.0, 2.0]
 
 
-@pytest.mark.parametrize("wanted", [0, 3, 7])
+def indexed(keyframes: list[Keyframe]) -> AppearanceIndex:
+    index = AppearanceIndex()
+    for each in keyframes:
+        index.add(each.id, each.view)
+    return index
+
+
+@pytest.mark.parametrize("wanted", [0, 3, 7, 150])
 def test_the_most_similar_keyframe_is_the_one_that_shows_the_place(wanted: int):
-    kept = [keyframe(number) for number in range(8)]
-    best = retrieve(jittered(kept[wanted].view, np.random.default_rng(99)), 3, kept)
+    kept = [keyframe(number) for number in range(8 if wanted < 8 else 200)]
+    best = retrieve(jittered(kept[wanted].view, np.random.default_rng(99)), 3, kept, indexed(kept))
     assert len(best) == 3
     assert best[0] is kept[wanted]
 
 
 def test_nothing_is_similar_to_nothing():
-    assert retrieve(view_of(0), 3, []) == []
+    assert retrieve(view_of(0), 3, [], indexed([])) == []
     kept = [keyframe(1, features=0), keyframe(2)]
-    assert retrieve(view_of(2), 1, kept)[0] is kept[1]
+    assert retrieve(view_of(2), 1, kept, indexed(kept))[0] is kept[1]
 
 
 # ---- map files
 
 
 def test_keyframes_round_trip_through_a_file(tmp_path: Path):
-    kept = [keyframe(0, 40), keyframe(1, 0), keyframe(2, 17)]
+    kept = [keyframe(0, 40), keyframe(3, 0), keyframe(4, 17)]
     rng, none = np.random.default_rng(0), np.zeros((18, CALIBRATION_SIZE))
     joint, common = rng.normal(size=(18, 18)), rng.normal(size=none.shape)
     past = PastPoses(np.stack([looking(x) for x in (0.0, 1.0, 2.0)]), joint @ joint.T, none, common)
-    np.savez_compressed(tmp_path / "map.npz", **pack_keyframes(kept, past, "learned", CAMERA))
-    read, past_read = read_keyframes(tmp_path / "map.npz", "learned", CAMERA)
-    assert len(read) == 3
+    hung = [
+        HangingKeyframe(1, 0.5, PackedView.of(view_of(1)), 4, se3_exp(rng.normal(size=6)), np.diag(rng.uniform(size=6)))
+    ]
+    np.savez_compressed(tmp_path / "map.npz", **pack_keyframes(kept, past, "learned", CAMERA, hung))
+    read, past_read, hung_read = read_keyframes(tmp_path / "map.npz", "learned", CAMERA)
+    assert [each.id for each in read] == [0, 1, 2]
     np.testing.assert_array_equal(past_read.poses, past.poses)
     # The next run may have another calibration: errors of this one are no longer told apart.
     np.testing.assert_array_equal(past_read.covariance, past.whole_covariance)
@@ -156,13 +169,113 @@ def test_keyframes_round_trip_through_a_file(tmp_path: Path):
     np.testing.assert_array_equal(past_read.common, none)
     for before, after in zip(kept, read, strict=True):
         assert after.timestamp == before.timestamp
-        np.testing.assert_array_equal(after.view.left, before.view.left)
-        np.testing.assert_array_equal(after.view.disparity, before.view.disparity)
-        np.testing.assert_array_equal(after.view.disparity_sigma, before.view.disparity_sigma)
-        for name in ("keypoints", "descriptors", "scores", "sigma"):
-            stored, expected = getattr(after.view.features, name), getattr(before.view.features, name)
-            np.testing.assert_array_equal(stored, expected)
-            assert stored.dtype == expected.dtype
+        _assert_close(PackedView.of(before.view).unpack(), after.view)
+    (one,) = hung_read
+    assert (one.id, one.timestamp, one.origin) == (3, 0.5, 2)
+    np.testing.assert_allclose(one.step, hung[0].step, atol=1e-12)
+    np.testing.assert_array_equal(one.covariance, hung[0].covariance)
+    _assert_close(one.view, hung[0].view)
+
+
+def _assert_close(one: StereoView, other: StereoView) -> None:
+    np.testing.assert_array_equal(one.left, other.left)
+    for name in ("disparity", "disparity_sigma"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    for name, array in one.features.arrays().items():
+        np.testing.assert_array_equal(getattr(other.features, name), array)
+        assert getattr(other.features, name).dtype == np.float32
+
+
+def test_a_packed_view_is_about_the_view():
+    """What has a disparity stays, best first; places are exact, descriptors within their steps, images within noise."""
+    view = view_of(3, 400)
+    smooth = cv2.GaussianBlur(view.left, (0, 0), 3.0)
+    stereo = np.flatnonzero(np.isfinite(view.disparity))
+    packed = PackedView.of(replace(view, left=smooth), 200)
+    again = packed.unpack()
+    assert len(again.disparity) == 200
+    np.testing.assert_array_equal(again.features.keypoints, view.features.keypoints[stereo[:200]])
+    np.testing.assert_allclose(again.disparity, view.disparity[stereo[:200]], rtol=1e-6)
+    np.testing.assert_allclose(again.disparity_sigma, view.disparity_sigma[stereo[:200]], rtol=1e-3)
+    similarity = np.sum(again.features.descriptors * view.features.descriptors[stereo[:200]], axis=1)
+    assert similarity.min() > 0.98
+    np.testing.assert_allclose(np.linalg.norm(again.features.descriptors, axis=1), 1.0, rtol=1e-5)
+    assert np.abs(again.left.astype(int) - smooth).mean() < 3.0
+
+
+# ---- more keyframes than poses are remembered together
+
+
+def walked(
+    places: np.ndarray, max_keyframes: int = 2400, path: Path | None = None, first: int = 0, sigma: float = 0.01
+) -> Keyframes:
+    """Keyframes at places (K,) along x that left the window, each known relative to the one before; in a map."""
+    window = make_window(np.zeros(3), camera=CAMERA)
+    keyframes = Keyframes(window, max_keyframes, 100)
+    if path is not None:
+        keyframes.load(path, "learned", CAMERA)
+    for number, x in enumerate(places):
+        step = looking(x - (places[number - 1] if number else 0.0))
+        window.add_keyframe(looking(x), step, sigma**2 * np.eye(6), NO_WALK, 1.0)
+        keyframes.append(view_of(first + number), 0.5 * number)
+        if number:
+            keyframes.marginalise_oldest()
+    return keyframes
+
+
+@pytest.mark.long
+def test_keyframes_beyond_the_remembered_poses_hang_at_neighbours():
+    """All stay known, each where it was, and what is uncertain between it and its neighbour is kept."""
+    places = 0.1 * np.arange(151)
+    keyframes = walked(places, 600)
+    assert len(keyframes.remembered) == 60
+    known = keyframes.left_long_ago()
+    assert [each.id for each in known] == list(range(150))
+    np.testing.assert_allclose(keyframes.poses(known)[:, 0, 3], places[:150], atol=1e-9)
+    assert len(keyframes.appearance) == 150
+    past = keyframes._window.posterior.past
+    for each in keyframes.hanging:
+        # Each step adds 0.01^2 to every variance.
+        steps = abs(each.id - each.origin)
+        assert 1 <= steps <= 4
+        assert each.covariance[0, 0] >= 0.99 * steps * 0.01**2
+        assert each.covariance[0, 0] <= 7 * 0.01**2
+        seen = from_origin(each, RelativePose(looking(0.2), np.ones(3, bool), 1e-6 * np.eye(6), 1.0))
+        T = past.poses[keyframes.index(each.origin)] @ seen.T_key_camera
+        np.testing.assert_allclose(T, looking(places[each.id] + 0.2), atol=1e-9)
+        assert seen.covariance[0, 0] == pytest.approx(each.covariance[0, 0] + 1e-6)
+
+
+@pytest.mark.long
+def test_what_is_as_well_known_to_all_hangs_at_a_near_one():
+    """Steps without error: every neighbour is as good, and the nearest is taken."""
+    keyframes = walked(0.1 * np.arange(151), 2400, sigma=1e-9)
+    assert max(abs(each.id - each.origin) for each in keyframes.hanging) <= 4
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("most", [60, 180])
+def test_no_more_keyframes_hang_than_are_asked_for(most: int):
+    keyframes = walked(0.1 * np.arange(221), most)
+    known = keyframes.left_long_ago()
+    assert 0.6 * most <= len(known) <= most
+    assert len(keyframes.appearance) == len(known)
+    assert {each.origin for each in known} <= {each.id for each in keyframes.remembered}
+
+
+@pytest.mark.long
+def test_maps_of_several_runs_grow(tmp_path: Path):
+    """A run in the map of a run in the map of a run: all of their keyframes are known, where they were."""
+    path, places = tmp_path / "map.npz", 0.1 * np.arange(50)
+    for run in range(3):
+        keyframes = walked(5.0 * run + places, path=path if run else None, first=100 * run)
+        np.savez_compressed(path, **keyframes.pack("learned", CAMERA))
+    again = Keyframes(make_window(np.zeros(3), camera=CAMERA), 2400, 100)
+    again.load(path, "learned", CAMERA)
+    known = again.left_long_ago()
+    np.testing.assert_allclose(np.sort(again.poses(known)[:, 0, 3]), 0.1 * np.arange(150), atol=1e-6)
+    (best,) = retrieve(jittered(view_of(103), np.random.default_rng(0)), 1, known, again.appearance)
+    np.testing.assert_allclose(again.poses([best])[0], looking(5.3), atol=1e-6)
 
 
 def test_a_map_without_descriptors_says_that_it_is_weak(tmp_path: Path, caplog: pytest.LogCaptureFixture):
@@ -236,12 +349,16 @@ def changed(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[
         (changed("poses", lambda a: a.astype(str)), "keyframe_poses is <U32 (2, 4, 4) and must be floating"),
         (changed("poses", lambda a: a * np.nan), "keyframe_poses has a value that is not finite"),
         (changed("poses", lambda a: 2 * a), "keyframe_poses are not rigid"),
-        (changed("counts", lambda a: a + 1), "keyframe_counts are not of the 57 keypoints"),
-        (changed("counts", lambda a: a * [-1, 1]), "keyframe_counts are not of the 57 keypoints"),
+        (changed("counts", lambda a: a + 1), "keyframe_counts are not of the 42 keypoints"),
+        (changed("counts", lambda a: a * [-1, 1]), "keyframe_counts are not of the 42 keypoints"),
+        (changed("image_bytes", lambda a: a + 1), "keyframe_image_bytes are not of the"),
+        (changed("origins", lambda a: a[::-1]), "keyframe_origins are not the first 2 keyframes"),
+        (changed("origins", lambda a: a * 1.0), "keyframe_origins is float64"),
+        (changed("descriptors", lambda a: a.astype(np.int16)), "keyframe_descriptors are int16, not int8"),
         (changed("images", lambda a: a.astype(np.uint16)), "keyframe_images are uint16, not uint8"),
         (changed("counts", lambda a: a * 1.0), "keyframe_counts is float64"),
-        (changed("keypoints", lambda a: a[1:]), "keyframe_descriptors is float32 (57, 64) and must be"),
-        (changed("images", lambda a: a[:, 1:]), "keyframe_images have 64x47 pixels, the camera 64x48"),
+        (changed("keypoints", lambda a: a[1:]), "keyframe_descriptors is int8 (42, 64) and must be"),
+        (changed("images", lambda a: a[::-1]), "keyframe_images are not all images of the camera's size"),
         (changed("sigma", lambda a: a + np.inf), "keyframe_sigma has a value that is not finite"),
         (lambda arrays: arrays | {"intrinsics": np.zeros(3)}, "intrinsics is float64 (3,) and must be floating (7)"),
         (lambda arrays: arrays | {"intrinsics": np.full(7, np.nan)}, "a map serves the camera that made it"),
