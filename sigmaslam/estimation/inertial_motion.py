@@ -162,7 +162,7 @@ class InertialMotion(MotionFilter):
                 self.is_inertial, self._carried, self.widened = True, None, 1.0
                 self._note_twist(self.twist[3:])
             return
-        P = self._covariance
+        P: np.ndarray = self._covariance
         departure = se3_log(step @ se3_inverse(self.step))
         # What images leave of the prediction; where they know less of the pose than it, they teach nothing.
         kept = at_most(covariance, P[_POSE, _POSE])
@@ -222,7 +222,7 @@ class InertialMotion(MotionFilter):
             slope: (m, 31) of what is predicted, by the state.
             noise: (m, m) covariance.
         """
-        P = self._covariance
+        P: np.ndarray = self._covariance
         gain = regression(P @ slope.T, slope @ P @ slope.T + noise)
         change, kept = gain @ residual, np.eye(_SIZE) - gain @ slope
         self._covariance = kept @ P @ kept.T + gain @ noise @ gain.T
