@@ -82,6 +82,10 @@ class FrameClock:
         if noise == 0.0:
             return interval, 0.0
         mean = float(steps.mean())
+        at_once = steps < _LEAST_STEP * mean
+        if (at_once[1:] & at_once[:-1]).any():
+            # Bursts of three or more: how many frames came in a time is known, not when each was taken.
+            return mean, float(steps.std())
         own = max(float(steps.var()) - 2.0 * noise**2, 0.0)
         # Times relative to a regular clock that starts with the first stamp.
         stamp = ahead = before = 0.0

@@ -25,6 +25,7 @@ from sigmaslam.slam.keyframe import Keyframe
 from sigmaslam.slam.landmark_following import LandmarkFollower
 from sigmaslam.slam.stopwatch import Stopwatch
 from sigmaslam.slam.unguided_matching import UnguidedMatcher
+from sigmaslam.two_view.scene_pose import is_rival
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,8 +243,7 @@ class Localiser:
         rival = self.update.fit(near.views, pose, covariance, least) if len(near.probability) >= least else None
         if fit is None or rival is None or rival.nis_per_dof > ACCEPTANCE.doubtful_nis:
             return fit
-        explained, rivalled = (self._explained_area(*each) for each in ((matches, fit), (near, rival)))
-        return fit if rivalled < ACCEPTANCE.rival_area * explained else None
+        return None if is_rival(self._explained_area(near, rival), self._explained_area(matches, fit)) else fit
 
     def _explained_area(self, matches: GuidedMatches, fit: FrameFit) -> float:
         camera, places = self.window.camera, matches.views.measurement[:, :2]

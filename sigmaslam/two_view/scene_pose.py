@@ -75,10 +75,15 @@ def estimate_scene_pose(
         if len(possible) == 1:
             return possible[0]
     lesser, greater = sorted(motions, key=lambda motion: motion.area)
-    if lesser.area < ACCEPTANCE.rival_area * greater.area or _are_alike(camera, landmarks, pose, other):
+    if not is_rival(lesser.area, greater.area) or _are_alike(camera, landmarks, pose, other):
         return greater.pose
     nearer, farther = sorted(motions, key=lambda motion: -motion.disparity)
     return farther.pose if stands_before(nearer.disparity, farther.disparity) else None
+
+
+def is_rival(area: float, greater: float) -> bool:
+    """Whether what explains a share of the image may be the scene beside what explains a greater one."""
+    return area >= ACCEPTANCE.rival_area * greater
 
 
 def stands_before(disparity: float, other: float) -> bool:

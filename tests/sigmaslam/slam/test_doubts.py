@@ -11,6 +11,7 @@ from sigmaslam.estimation.chi_square import CHI_SQUARE_999
 from sigmaslam.geometry.se3 import se3_inverse, se3_log
 from sigmaslam.slam.doubt import Doubt
 from sigmaslam.slam.frame import Frame
+from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.localisation import Prediction
 from sigmaslam.slam.stopwatch import Stopwatch
 from sigmaslam.slam.tracker import Estimate, StereoTracker
@@ -105,6 +106,20 @@ def test_eyes_that_do_not_fit_make_all_poses_doubtful_and_less_certain(demo: Dem
         assert (one.status, other.status) in [("starting", "starting"), ("tracking", "doubtful")]
     assert list(other.doubts) == [Doubt.INPUT]
     assert np.trace(other.covariance[:3, :3]) > 2.0 * np.trace(one.covariance[:3, :3])
+
+
+def test_a_prediction_that_explains_the_image_does_not_give_way(demo: Demo):
+    """What agrees with it may be the scene behind a mover that fills the view."""
+    camera, frames, _ = demo
+    tracker = StereoTracker(camera)
+    track(tracker, frames[:12])
+    tracker._motion.predict(frames[12].timestamp - frames[11].timestamp, np.full(2, 1e-4))
+    frame = Frame(*tracker.rectifier.rectify(frames[12].left, frames[12].right), tracker._frontend)
+    prediction, localiser = Prediction.of(tracker._window, tracker._motion), tracker._localiser
+    views = [each.view for each in tracker._keyframes.active]
+    near = localiser.guided.match_guided(frame.view, views, prediction.pose, prediction.covariance)
+    assert localiser._fit_alone(near, near, prediction, prediction.pose, 1.0) is None
+    assert localiser._fit_alone(near, GuidedMatches.empty(), prediction, prediction.pose, 1.0) is not None
 
 
 def test_a_wrong_prediction_does_not_drag_along_a_pose_that_is_found_without_it(demo: Demo):
