@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -13,9 +12,10 @@ class Table:
     """Rows of a dataclass whose fields are arrays (M, ...) or tables; None stands for a column that is not there."""
 
     __slots__ = ()
+    __dataclass_fields__: ClassVar[dict[str, Any]]
 
     def __len__(self) -> int:
-        return len(getattr(self, fields(self)[0].name))  # type: ignore[arg-type]
+        return len(getattr(self, next(iter(self.__dataclass_fields__))))
 
     def select(self, rows: np.ndarray) -> Self:
         """The rows of that index or mask."""
@@ -23,11 +23,11 @@ class Table:
 
     def columns(self) -> list[Any]:
         """The columns in the order of the fields."""
-        return list(self.arrays().values())
+        return [getattr(self, name) for name in self.__dataclass_fields__]
 
     def arrays(self) -> dict[str, Any]:
         """The columns by the names of the fields."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
     @classmethod
     def concatenate(cls, parts: Sequence[Self]) -> Self:

@@ -39,9 +39,9 @@ def clustering(places: np.ndarray, size: tuple[int, int], scores: np.ndarray, in
     # In units of what the views say one by one, which is the identity then.
     root = np.linalg.cholesky(one_by_one)
     scores = np.linalg.solve(root, scores.T).T
-    sums, share = np.zeros((CELLS, freedom)), np.zeros((CELLS, freedom, freedom))
-    np.add.at(sums, cell, scores)
-    np.add.at(share, cell, scores[:, :, None] * scores[:, None, :])
+    members = (cell == np.arange(CELLS)[:, None]).astype(float)
+    sums, products = members @ scores, (scores[:, :, None] * scores[:, None, :]).reshape(len(cell), -1)
+    share = (members @ products).reshape(CELLS, freedom, freedom)
     left, along = np.linalg.eigh(np.eye(freedom) - share)
     scale = 1.0 / np.sqrt(np.maximum(left, _LEAST_LEFT))
     sums = (along @ (scale[..., None] * (along.transpose(0, 2, 1) @ sums[..., None])))[..., 0]

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sigmaslam.frontend.knn import nearest_points
-from sigmaslam.frontend.patch_kernels import MAX_ZOOM, Images, align
+from sigmaslam.frontend.patch_kernels import Images, align, invert_maps
 from sigmaslam.frontend.types import Refinement
 
 # Three matches fix a map. Where 60 % are wrong, 24 find 0.60 of the maps, 12 only 0.40 (docs/notebook, following).
@@ -107,24 +107,19 @@ def align_patches(
         source: (M,) which of the images 0 each match comes from; None: there is one.
     """
     places, moved = points1.astype(np.float64), np.zeros(len(points1), bool)
-    # No opaque surface shows its mirror image: a negative determinant is as bad as none.
-    determinant = np.where(
-        np.isfinite(A).all(axis=(1, 2)), np.linalg.det(np.nan_to_num(A, posinf=0.0, neginf=0.0)), 0.0
-    )
-    zoom = np.sqrt(np.maximum(determinant, 0.0))
-    usable = (zoom > 1.0 / MAX_ZOOM) & (zoom < MAX_ZOOM) & _inside(image1, points1)
+    determinant, back = invert_maps(A)
+    usable = np.isfinite(determinant) & _inside(image1, points1)
     usable &= _inside(image0 if isinstance(image0, np.ndarray) else image0[0], points0)
     rows = np.flatnonzero(usable)
     # The finer image is smoothed as much as the coarser one's pixels do, in steps of half an octave.
-    half_octaves = np.round(2.0 * np.log2(zoom[rows])).astype(int)
-    back = np.linalg.inv(A[rows])
+    half_octaves = np.round(np.log2(determinant[rows])).astype(np.int32)
     tilts = np.zeros((len(rows), 2)) if tilt is None else tilt[rows]
-    given = points0[rows], places[rows], back, tilts, half_octaves
+    given = points0[rows], places[rows], back[rows], tilts, half_octaves
     of_rows = None if source is None else source[rows]
     found = align(image0, image1, *given, radius, iterations, taper, of_rows)
     shift, correlation = found[:, :2], found[:, 2]
     spacing = np.maximum(1.0, 2.0 ** (0.5 * half_octaves))
-    fits = (correlation > _MIN_CORRELATION) & (np.linalg.norm(shift, axis=1) <= reach * spacing)
+    fits = (correlation > _MIN_CORRELATION) & (np.hypot(*shift.T) <= reach * spacing)
     places[rows[fits]] += shift[fits]
     moved[rows[fits]] = True
     agreement = np.zeros(len(points1))

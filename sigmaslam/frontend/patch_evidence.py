@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sigmaslam.frontend.patch_kernels import MAX_ZOOM, Images, examine
+from sigmaslam.frontend.patch_kernels import Images, examine, invert_maps
 from sigmaslam.table import Table
 
 # Of a patch in samples, and of its Gaussian window in radii: those that the verifiers were trained on.
@@ -58,13 +58,10 @@ def examine_patches(
     count = len(points0)
     zoom, back = np.ones(count), np.tile(np.eye(2), (count, 1, 1))
     if A is not None:
-        A = np.where(np.isfinite(A).all(axis=(1, 2))[:, None, None], A, np.eye(2))
-        determinant = np.linalg.det(A)
-        sane = (determinant > MAX_ZOOM**-2) & (determinant < MAX_ZOOM**2)
-        back = np.linalg.inv(np.where(sane[:, None, None], A, np.eye(2)))
-        zoom = np.sqrt(np.where(sane, determinant, 1.0))
+        determinant, back = invert_maps(A)
+        zoom = np.sqrt(np.nan_to_num(determinant, nan=1.0))
     # The finer image is smoothed as the coarser one's pixels do it.
-    half_octaves = np.round(2.0 * np.log2(zoom)).astype(int)
+    half_octaves = np.round(2.0 * np.log2(zoom)).astype(np.int32)
     spacing = np.maximum(1.0, 2.0 ** (0.5 * half_octaves))
     found = examine(image0, image1, points0, points1, back, half_octaves, _RADIUS, _TAPER, _MIN_VARIANCE, source)
     correlation, variance0, variance1 = found[:, :3].T
@@ -72,6 +69,6 @@ def examine_patches(
     middle, half = 0.5 * (uu + vv), np.hypot(0.5 * (uu - vv), uv)
     angle = 0.5 * np.arctan2(2.0 * uv, uu - vv)
     cosine, sine = np.cos(angle), np.sin(angle)
-    axes = np.stack([np.stack([cosine, -sine], axis=1), np.stack([sine, cosine], axis=1)], axis=1)
+    axes = np.stack([cosine, -sine, sine, cosine], axis=1).reshape(-1, 2, 2)
     sharpness = np.stack([middle + half, np.maximum(middle - half, 0.0)], axis=1)
     return Evidence(correlation, np.sqrt(variance0), np.sqrt(variance1), sharpness, axes, spacing, zoom)

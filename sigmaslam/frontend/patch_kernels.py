@@ -108,6 +108,20 @@ def examine(
     return found
 
 
+def invert_maps(A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Determinants (M,) of maps (M, 2, 2) and their inverses; NaN and the identity for maps that no surface shows.
+
+    No opaque surface shows its mirror image, and none a zoom beyond `MAX_ZOOM`; nor do entries that are not finite.
+    """
+    a, b, c, d = A.reshape(-1, 4).T
+    with np.errstate(invalid="ignore"):
+        determinant = a * d - b * c
+        determinant[~((determinant > MAX_ZOOM**-2) & (determinant < MAX_ZOOM**2))] = np.nan
+        back = (np.stack([d, -b, -c, a], axis=1) / determinant[:, None]).reshape(-1, 2, 2)
+    back[np.isnan(determinant)] = np.eye(2)
+    return determinant, back
+
+
 def compiled() -> ModuleType | None:
     """The compiled functions, or None where NumPy must do, which is said once."""
     if _kernels is None:

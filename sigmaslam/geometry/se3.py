@@ -4,6 +4,8 @@ Quaternions are (x, y, z, w), Hamilton convention. The tangent of SE(3) is (tran
 Barfoot, "State Estimation for Robotics", chapter 8.
 """
 
+import math
+
 import numpy as np
 
 
@@ -158,6 +160,8 @@ def se3_body(T: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 def se3_exp(tangent: np.ndarray) -> np.ndarray:
     """Rigid transforms of tangent vectors (translation, rotation); (..., 6) -> (..., 4, 4)."""
     xi = np.asarray(tangent, dtype=np.float64)
+    if xi.ndim == 1:
+        return _exp_of_one(xi[:3], xi[3:])
     phi = xi[..., 3:]
     angle = np.linalg.norm(phi, axis=-1)[..., None, None]
     square = angle * angle
@@ -176,6 +180,8 @@ def se3_exp(tangent: np.ndarray) -> np.ndarray:
 def se3_log(T: np.ndarray) -> np.ndarray:
     """Tangent vectors (translation, rotation) of rigid transforms; (..., 4, 4) -> (..., 6)."""
     T = np.asarray(T, dtype=np.float64)
+    if T.ndim == 2 and np.trace(T) > 2.0:
+        return _log_of_one(T[:3, :3], T[:3, 3])
     phi = rotation_log(T[..., :3, :3])
     angle = np.linalg.norm(phi, axis=-1)[..., None, None]
     square = angle * angle
@@ -186,3 +192,31 @@ def se3_log(T: np.ndarray) -> np.ndarray:
     inverse_jacobian = np.eye(3) - 0.5 * cross + second * (cross @ cross)
     rho = (inverse_jacobian @ T[..., :3, 3:])[..., 0]
     return np.concatenate([rho, phi], axis=-1)
+
+
+def _exp_of_one(rho: np.ndarray, phi: np.ndarray) -> np.ndarray:
+    """`se3_exp` of one vector, whose parts are (3,): a fifth of the time."""
+    square = float(phi @ phi)
+    angle = math.sqrt(square)
+    cross = skew(phi)
+    across = cross @ cross
+    sine, half = (math.sin(angle) / angle, math.sin(0.5 * angle) / (0.5 * angle)) if angle > 0.0 else (1.0, 1.0)
+    series = 1 / 6 - square / 120 + square**2 / 5040 - square**3 / 362880
+    second = (1.0 - sine) / square if angle > 0.1 else series
+    T = np.eye(4)
+    T[:3, :3] += sine * cross + 0.5 * half * half * across
+    T[:3, 3] = rho + 0.5 * half * half * (cross @ rho) + second * (across @ rho)
+    return T
+
+
+def _log_of_one(R: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """`se3_log` of one transform (3, 3), (3,) that turns by less than a right angle."""
+    phi = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    sine = math.sqrt(float(phi @ phi))
+    angle = math.atan2(sine, 0.5 * (float(np.trace(R)) - 1.0))
+    phi *= angle / sine if sine > 0.0 else 1.0
+    square = angle * angle
+    series = 1 / 12 + square / 720 + square**2 / 30240 + square**3 / 1209600
+    second = (1.0 - 0.5 * angle / math.tan(0.5 * angle)) / square if angle > 0.1 else series
+    cross = skew(phi)
+    return np.concatenate([position - 0.5 * (cross @ position) + second * (cross @ (cross @ position)), phi])

@@ -166,7 +166,9 @@ class GuidedMatcher:
         predicted, S, in_front = self.update.predict(rows, pose, covariance, reference)
         S = S[:, :2, :2] + np.eye(2)
         inside = in_front & self._in_image(predicted)
-        inside &= np.linalg.eigvalsh(S)[:, 1] < self.config.search_limit**2
+        # The larger eigenvalue.
+        across = np.hypot(0.5 * (S[:, 0, 0] - S[:, 1, 1]), S[:, 0, 1])
+        inside &= 0.5 * (S[:, 0, 0] + S[:, 1, 1]) + across < self.config.search_limit**2
         if usable is not None:
             inside[inside] = pixels_in(usable, predicted[inside, :2])
         rows, predicted, S = rows[inside], predicted[inside], S[inside]

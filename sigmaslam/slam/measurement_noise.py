@@ -48,9 +48,12 @@ class MeasurementNoise:
         """
         place, disparity = self._config.shared_place, self._config.shared_disparity
         common = np.zeros((len(noise), 3, 2))
-        # The symmetric root: the errors keep to the image's axes from view to view.
-        values, vectors = np.linalg.eigh(noise[:, :2, :2])
-        common[:, :2] = (vectors * np.sqrt(place * values)[:, None, :]) @ vectors.transpose(0, 2, 1)
+        # The symmetric root, (A + sqrt(det A) I) / sqrt(tr A + 2 sqrt(det A)): the errors keep to the image's axes from
+        # view to view.
+        of_place = noise[:, :2, :2]
+        area = np.sqrt(np.linalg.det(of_place))[:, None, None]
+        length = np.sqrt((of_place[:, 0, 0] + of_place[:, 1, 1])[:, None, None] + 2.0 * area)
+        common[:, :2] = np.sqrt(place) * (of_place + area * np.eye(2)) / length
         alone = noise.copy()
         alone[:, :2, :2] *= 1.0 - place
         alone[:, 2, 2] *= 1.0 - disparity
