@@ -228,6 +228,10 @@ def track(
             help="Show the run in a window of Rerun while it goes on, or write what it would show (extra 'viewer').",
         ),
     ] = None,
+    dense: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.ply", help="Also make the cloud of `map reconstruct` while the run goes on."),
+    ] = None,
     help_all: HelpAll = False,
 ) -> None:
     """Track a stereo sequence, recorded or live: trajectory, covariance, map and report.

@@ -29,7 +29,7 @@ def open_sinks(options: LiveOptions, out: Path, camera: StereoCamera) -> Iterato
     """The sinks that the command line names; with a stream on the standard output all else goes to the standard error.
 
     Args:
-        options: stream, video and viewer.
+        options: stream, video, viewer and dense cloud.
         out: folder of the run.
         camera: of its images.
     Raises:
@@ -43,6 +43,8 @@ def open_sinks(options: LiveOptions, out: Path, camera: StereoCamera) -> Iterato
         sinks.append(_open_video(options.video, out, camera))
     if options.viewer is not None:
         sinks.append(_open_viewer(options.viewer, out, camera))
+    if options.dense is not None:
+        sinks.append(_open_cloud(options.dense, out, camera))
     if options.stream is None:
         yield sinks
         return
@@ -86,3 +88,12 @@ def _open_viewer(viewer: str, out: Path, camera: StereoCamera) -> FrameSink:
     if path is not None:
         check_sink_path("--viewer", path, out, RERUN_NAME)
     return ThreadedSink(RerunSink(path, camera))
+
+
+def _open_cloud(path: Path, out: Path, camera: StereoCamera) -> FrameSink:
+    from sigmaslam.live.frame_sink import ThreadedSink, check_sink_path
+    from sigmaslam.reconstruction.live_cloud import CloudSink
+    from sigmaslam.run_record.dense_points import CLOUD_NAME
+
+    check_sink_path("--dense", path, out, CLOUD_NAME)
+    return ThreadedSink(CloudSink(path, out, camera))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -162,12 +163,17 @@ class VoxelCloud:
     intersection with equal weights is consistent whatever it is: the mean of the information, and the mean weighted by
     it.
 
+    Memory is bounded until `cloud` is asked for: when there are more voxels than that they are written to a temporary
+    folder, and others begin.
+
     Args:
         size: of the finest voxel, metres.
+        most: voxels in memory, of 120 bytes; up to as many points wait to be merged.
     """
 
-    def __init__(self, size: float) -> None:
+    def __init__(self, size: float, most: int = 1_000_000) -> None:
         self.size = size
+        self._most, self._folder, self._written = most, TemporaryDirectory(), list[Path]()
         self._merged: tuple[np.ndarray, np.ndarray] = np.zeros((0, 4), np.int64), np.zeros((0, 11))
         self._pending: list[tuple[np.ndarray, np.ndarray]] = []
 
@@ -182,9 +188,17 @@ class VoxelCloud:
         # Amortised: each point is sorted about as many times as the cloud doubles.
         if sum(len(part[0]) for part in self._pending) > len(self._merged[0]):
             self._merge()
+            if len(self._merged[0]) > self._most:
+                self._written.append(Path(self._folder.name) / f"{len(self._written)}.npz")
+                np.savez(self._written[-1], *self._merged)
+                self._merged = self._merged[0][:0], self._merged[1][:0]
 
     def cloud(self, min_views: int = 1) -> DenseCloud:
         """The points that so many keyframes gave, or more, without those in whose voxels there are finer ones."""
+        for path in self._written:
+            with np.load(path) as parts:
+                self._pending.append((parts["arr_0"], parts["arr_1"]))
+        self._written = []
         self._merge()
         keys, sums = self._merged
         seen = sums[:, 10] >= min_views

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -140,49 +140,80 @@ def reconstruct_run(
     match: Matcher = semi_global_disparity if network is None else StereoNetwork(network)
     rectifier = StereoRectifier(keyframes.camera)
     camera = rectifier.rectified
-    cloud: VoxelCloud | None = None
+    builder = CloudBuilder(camera, voxel)
     volume: DepthVolume | None = None
     posed = None if export is None else PosedImages(export, camera)
-    measured = confirmed = 0
-    began = time.perf_counter()
     with open_progress() as progress:
         task = progress.add_task("keyframes", total=keyframes.count, note="")
         for depth in fuse_keyframes(keyframes, sequence, rectifier, match):
-            chosen = depth.is_point
-            if cloud is None:
-                cloud = VoxelCloud(voxel or _default_voxel(depth, camera))
-                volume = None if mesh is None else DepthVolume(cloud.size, camera)
-            cloud.add(depth.cloud(camera, cloud.size))
+            size = builder.add(depth)
             if posed is not None:
                 posed.add(depth.image, depth.pose)
-            if volume is not None:
+            if mesh is not None:
+                volume = volume or DepthVolume(size, camera)
+                chosen = depth.is_point
                 z = np.where(chosen, camera.focal_baseline / np.where(chosen, depth.fused.disparity, 1.0), 0.0)
                 volume.integrate(z.astype(np.float32), depth.image, depth.pose)
-            measured += int(np.isfinite(depth.measured.disparity).sum())
-            confirmed += int(chosen.sum())
-            progress.update(task, advance=1, note=f"{confirmed / max(measured, 1):.0%} confirmed")
-    seconds = time.perf_counter() - began
-    assert cloud is not None
-    points = cloud.cloud(min(min_views, max(keyframes.count // 2, 1)))
-    if max_sigma is not None:
-        points = points.select(points.sigma <= max_sigma)
+            progress.update(task, advance=1, note=f"{builder.confirmed:.0%} confirmed")
+    points, summary = builder.finish(min_views, max_sigma)
     write_cloud(out, points)
     if posed is not None:
         posed.write(points)
     if mesh is not None and volume is not None:
         volume.write(mesh)
-    pixels = keyframes.count * camera.width * camera.height
-    summary = ReconstructionSummary(
-        keyframes.count,
-        len(points),
-        cloud.size,
-        measured / pixels,
-        confirmed / max(measured, 1),
-        float(np.median(points.sigma)) if len(points) else float("nan"),
-        seconds / keyframes.count,
-    )
-    _add_to_report(run, points, summary)
+    add_to_run(run, points, summary)
+    write_report(run)
     return summary
+
+
+class CloudBuilder:
+    """A cloud that grows keyframe by keyframe, with its figures.
+
+    Args:
+        camera: the rectified pair.
+        voxel: side of the finest voxels, metres; None: three pixels at the median depth of the first keyframe.
+    """
+
+    def __init__(self, camera: RectifiedStereo, voxel: float | None = None) -> None:
+        self._camera, self._voxel = camera, voxel
+        self._cloud: VoxelCloud | None = None
+        self._keyframes = self._measured = self._points = 0
+        self._began = time.perf_counter()
+
+    @property
+    def confirmed(self) -> float:
+        """Share of the disparities so far that became points."""
+        return self._points / max(self._measured, 1)
+
+    def add(self, depth: KeyframeDepth) -> float:
+        """Takes a keyframe; the side of the finest voxels, metres."""
+        if self._cloud is None:
+            self._cloud = VoxelCloud(self._voxel or _default_voxel(depth, self._camera))
+        self._cloud.add(depth.cloud(self._camera, self._cloud.size))
+        self._keyframes += 1
+        self._measured += int(np.isfinite(depth.measured.disparity).sum())
+        self._points += int(depth.is_point.sum())
+        return self._cloud.size
+
+    def finish(
+        self, min_views: int = MIN_VIEWS, max_sigma: float | None = None
+    ) -> tuple[DenseCloud, ReconstructionSummary]:
+        """The points, as `reconstruct_run` chooses them, and what they are; InputError where no keyframe came."""
+        seconds = time.perf_counter() - self._began
+        if self._cloud is None:
+            raise InputError("no keyframe has a pose: track a longer sequence")
+        points = self._cloud.cloud(min(min_views, max(self._keyframes // 2, 1)))
+        if max_sigma is not None:
+            points = points.select(points.sigma <= max_sigma)
+        return points, ReconstructionSummary(
+            self._keyframes,
+            len(points),
+            self._cloud.size,
+            self._measured / (self._keyframes * self._camera.width * self._camera.height),
+            self.confirmed,
+            float(np.median(points.sigma)) if len(points) else float("nan"),
+            seconds / self._keyframes,
+        )
 
 
 def fuse_keyframes(
@@ -196,61 +227,77 @@ def fuse_keyframes(
         rectifier: for the run's calibration.
         match: finds disparities to a pixel.
     """
-    T_left_rectified = se3_inverse(rectifier.T_rectified_left)
     kept: dict[int, tuple[np.ndarray, DepthView]] = {}
 
-    def fuse(number: int) -> KeyframeDepth:
-        image, view = kept[number]
-        with np.errstate(invalid="ignore"):
-            # Fusion does not take the common part away: what is too uncertain by that part alone becomes no point.
-            hopeless = SHARED * view.measured.variance > (_MAX_SIGMA * view.measured.disparity) ** 2
-        reference = replace(view.measured, disparity=np.where(hopeless, np.nan, view.measured.disparity))
-        others = []
-        # The nearest first: it says most of what is seen, and sets what the others must agree with.
-        for other in sorted((k for k in kept if k != number), key=lambda k: (abs(k - number), k)):
-            if abs(other - number) > NEIGHBOURS:
-                continue
-            step, covariance = keyframes.step(number, other)
-            others.append(
-                (
-                    kept[other][1],
-                    rectifier.T_rectified_left @ step @ T_left_rectified,
-                    turn_covariance(rectifier.T_rectified_left, covariance),
-                )
-            )
-        return KeyframeDepth(
-            number,
-            image,
-            view.measured,
-            fuse_depth(image, reference, others, rectifier.rectified),
-            keyframes.poses[number] @ T_left_rectified,
-            turn_covariance(rectifier.T_rectified_left, keyframes.covariances[number]),
-            keyframes.disparity_offset_sigma,
-        )
+    def views() -> Generator[_NumberedView, None, None]:
+        for number, frame in keyframes.images(sequence):
+            left, right = rectifier.rectify(frame.left, frame.right)
+            yield number, left, measure_view(left, right, rectifier, match, keyframes.disparity_offset)
 
-    for number, left, view in read_ahead(lambda: _views(keyframes, sequence, rectifier, match), 1):
+    for number, left, view in read_ahead(views, 1):
         kept[number] = left, view
         done = number - NEIGHBOURS
         if done >= 0 and keyframes.is_keyframe[done]:
-            yield fuse(done)
+            yield fuse_keyframe(done, kept, keyframes, rectifier)
         kept.pop(done - NEIGHBOURS, None)
     for number in range(max(len(keyframes) - NEIGHBOURS, 0), len(keyframes)):
         if keyframes.is_keyframe[number]:
-            yield fuse(number)
+            yield fuse_keyframe(number, kept, keyframes, rectifier)
 
 
-def _views(
-    keyframes: RecordedKeyframes, sequence: StereoSequence, rectifier: StereoRectifier, match: Matcher
-) -> Generator[_NumberedView, None, None]:
-    """Number of each view, its rectified left image and its disparities, the disparity offset taken off; in order."""
-    valid = None if rectifier.valid_mask is None else cv2.erode(rectifier.valid_mask, np.ones((7, 7), np.uint8))
-    for number, frame in keyframes.images(sequence):
-        left, right = rectifier.rectify(frame.left, frame.right)
-        measured = measure_disparity(left, right, match)
-        disparity = measured.disparity - np.float32(keyframes.disparity_offset)
-        if valid is not None:
-            disparity[valid == 0] = np.nan
-        yield number, left, DepthView.of(left, replace(measured, disparity=disparity))
+def fuse_keyframe(
+    number: int,
+    views: Mapping[int, tuple[np.ndarray, DepthView]],
+    keyframes: RecordedKeyframes,
+    rectifier: StereoRectifier,
+) -> KeyframeDepth:
+    """Depths of a keyframe, fused with the views around it.
+
+    Args:
+        number: of the keyframe.
+        views: by their numbers, rectified left images and views; those around the keyframe that there are.
+        keyframes: poses of the views.
+        rectifier: for their calibration.
+    """
+    T_left_rectified = se3_inverse(rectifier.T_rectified_left)
+    image, view = views[number]
+    with np.errstate(invalid="ignore"):
+        # Fusion does not take the common part away: what is too uncertain by that part alone becomes no point.
+        hopeless = SHARED * view.measured.variance > (_MAX_SIGMA * view.measured.disparity) ** 2
+    reference = replace(view.measured, disparity=np.where(hopeless, np.nan, view.measured.disparity))
+    others = []
+    # The nearest first: it says most of what is seen, and sets what the others must agree with.
+    for other in sorted((k for k in views if k != number), key=lambda k: (abs(k - number), k)):
+        if abs(other - number) > NEIGHBOURS:
+            continue
+        step, covariance = keyframes.step(number, other)
+        others.append(
+            (
+                views[other][1],
+                rectifier.T_rectified_left @ step @ T_left_rectified,
+                turn_covariance(rectifier.T_rectified_left, covariance),
+            )
+        )
+    return KeyframeDepth(
+        number,
+        image,
+        view.measured,
+        fuse_depth(image, reference, others, rectifier.rectified),
+        keyframes.poses[number] @ T_left_rectified,
+        turn_covariance(rectifier.T_rectified_left, keyframes.covariances[number]),
+        keyframes.disparity_offset_sigma,
+    )
+
+
+def measure_view(
+    left: np.ndarray, right: np.ndarray, rectifier: StereoRectifier, match: Matcher, offset: float
+) -> DepthView:
+    """The disparities of a rectified pair (H, W) uint8 that are not at its border, a disparity offset taken off."""
+    measured = measure_disparity(left, right, match)
+    disparity = measured.disparity - np.float32(offset)
+    if rectifier.valid_mask is not None:
+        disparity[cv2.erode(rectifier.valid_mask, np.ones((7, 7), np.uint8)) == 0] = np.nan
+    return DepthView.of(left, replace(measured, disparity=disparity))
 
 
 def _default_voxel(depth: KeyframeDepth, camera: RectifiedStereo) -> float:
@@ -272,8 +319,7 @@ def _check_writable(path: Path | None) -> None:
         raise InputError(f"{path}: the folder {path.parent} does not exist: create it, or choose another")
 
 
-def _add_to_report(run: Path, points: DenseCloud, summary: ReconstructionSummary) -> None:
-    """Leaves an even selection of the points, and the summary, in the run's folder and writes its report anew."""
+def add_to_run(run: Path, points: DenseCloud, summary: ReconstructionSummary) -> None:
+    """Leaves an even selection of the points, and the summary, in the run's folder for its report."""
     write_dense_points(run / DENSE_NAME, points.points, points.sigma, points.intensity)
     atomic_write_text(run / RECONSTRUCTION_NAME, json.dumps(asdict(summary), indent=2) + "\n")
-    write_report(run)

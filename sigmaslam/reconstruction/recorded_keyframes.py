@@ -34,8 +34,8 @@ from sigmaslam.run_record.run_folder import (
     check_has_trajectory,
 )
 
-# At most so many frames from one view to the next.
-_MOST_FRAMES = 5
+MOST_FRAMES = 5
+"""From one view to the next, at the most."""
 # Time stamps of run and input agree to this, seconds; frames.csv and trajectory.tum round them.
 _SAME_TIME = 1e-4
 
@@ -212,7 +212,7 @@ def _with_frames_between(keyframes: np.ndarray, count: int) -> np.ndarray:
     """
     ends = np.unique(np.r_[keyframes, count - 1])
     parts = [
-        np.linspace(first, last, -(-(last - first) // _MOST_FRAMES) + 1).round().astype(np.int64)
+        np.linspace(first, last, -(-(last - first) // MOST_FRAMES) + 1).round().astype(np.int64)
         for first, last in pairwise(ends)
     ]
     return np.unique(np.concatenate([ends, *parts]))

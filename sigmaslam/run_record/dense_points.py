@@ -10,7 +10,7 @@ import numpy as np
 from sigmaslam.bounded_files import load_columns
 from sigmaslam.files import save_arrays
 
-DENSE_NAME, RECONSTRUCTION_NAME = "dense.npz", "reconstruction.json"
+DENSE_NAME, RECONSTRUCTION_NAME, CLOUD_NAME = "dense.npz", "reconstruction.json", "cloud.ply"
 MAX_POINTS = 150_000
 """Of a denser cloud an even selection is kept, so that the report has 2.6 MB of it."""
 _MEND = "run `sigmaslam map reconstruct` again"

@@ -7,7 +7,7 @@ from pathlib import Path
 from sigmaslam.errors import InputError
 from sigmaslam.files import check_new_folder, left_behind
 from sigmaslam.run_record.appended_file import check_not_in_use
-from sigmaslam.run_record.dense_points import DENSE_NAME, RECONSTRUCTION_NAME
+from sigmaslam.run_record.dense_points import CLOUD_NAME, DENSE_NAME, RECONSTRUCTION_NAME
 from sigmaslam.run_record.evaluated_frames import EVALUATED_FRAMES_NAME, EVALUATION_NAME
 from sigmaslam.run_record.frame_pictures import PICTURES_NAME
 from sigmaslam.run_record.frame_table import FRAMES_NAME
@@ -24,7 +24,7 @@ _NAMES = (
     *(FINAL_TRAJECTORY, FINAL_COVARIANCE, "trajectory_location.tum", "tracks.npz", "map.npz", "map.ply"),
     *(EVALUATION_NAME, EVALUATED_FRAMES_NAME, "evaluation.png", REFINE_NAME, REFINED_TRAJECTORY, "report.html"),
     *(VIDEO_NAME, RERUN_NAME, INERTIAL_NAME),
-    *(DENSE_NAME, RECONSTRUCTION_NAME),
+    *(DENSE_NAME, RECONSTRUCTION_NAME, CLOUD_NAME),
     RUN_NAME,  # the last one, by which the folder is known
 )
 

@@ -38,7 +38,7 @@ _REFUSED = (
     ("--camera", ("--start", "--frames", "--every", "--scale"), "{all} go with INPUT, not with --camera"),
     ("--camera", ("--imu", "--odometry"), "{all} go with INPUT, not with --camera"),
     ("--resume", ("--overwrite",), "--resume goes on with the run in the folder, {all} removes it: give one of them"),
-    ("--resume", ("--video", "--viewer"), "--resume does not go with {all}, which show a whole run: leave them out"),
+    ("--resume", ("--video", "--viewer", "--dense"), "--resume does not go with {all}, of a whole run: leave them out"),
     ("--resume", _FORGOTTEN, "--resume does not go with {given}: leave one of them out"),
     (
         "--save-calibration",
@@ -48,7 +48,7 @@ _REFUSED = (
     ("--track-object", ("--imu", "--odometry"), "the camera is at rest with --track-object: leave out {all}"),
     (
         "--track-object",
-        ("--map", "--tracks"),
+        ("--map", "--tracks", "--dense"),
         "{all} are of a moving camera's world: leave them out with --track-object",
     ),
 )
@@ -170,7 +170,7 @@ class LiveOptions:
     """Who is told of frames while the run goes on.
 
     Attributes:
-        stream, video, viewer: sinks that the command opens.
+        stream, video, viewer, dense: sinks that the command opens.
         on_estimate: called with the estimate of each frame when it is on disk; an error that it raises ends the run.
         sinks: take each frame after that, and are closed in the end.
     """
@@ -178,6 +178,7 @@ class LiveOptions:
     stream: str | None = None
     video: Path | None = None
     viewer: str | None = None
+    dense: Path | None = None
     on_estimate: Callable[[Estimate | ObjectEstimate], None] | None = None
     sinks: Sequence[FrameSink] = ()
 

@@ -8,7 +8,7 @@ from sigmaslam_benchmarks.tracking.page import fill_page, write_page
 
 def test_a_page_says_which_command_and_commit_made_it():
     command = "sigmaslam benchmark reconstruction --out page.md"
-    empty = {name: [] for name in ("sequences", "goals", "worlds", "missing")}
+    empty = {name: [] for name in ("sequences", "goals", "worlds", "organs", "missing")}
     page = fill_page("reconstruction", command, machine="a machine", seeds=1, **empty)
     assert f"Made by `{command}` {describe_source()} on a machine." in page
 

@@ -20,6 +20,8 @@ class JudgedPixels(Table):
         fused_error, single_error: (N,) of the depth after fusion and of the single view's, as a share of the true one;
             NaN where there is none.
         sigmas: (N,) error of the fused inverse depth, in its standard deviations; NaN where there is none.
+        error_mm, sigma_mm: (N,) of the fused depth along the optical axis, millimetres; the sigma holds that of the
+            disparity offset. NaN where there is none.
         is_point: (N,) bool, the pixel became a point of the cloud.
         moves: (N,) bool, it shows a body that moves.
     """
@@ -27,6 +29,8 @@ class JudgedPixels(Table):
     fused_error: np.ndarray
     single_error: np.ndarray
     sigmas: np.ndarray
+    error_mm: np.ndarray
+    sigma_mm: np.ndarray
     is_point: np.ndarray
     moves: np.ndarray
 
@@ -42,6 +46,7 @@ class DepthFigures:
         completeness: share of the pixels at rest seen by both eyes that became points.
         gross: share of the points whose depth is off by more than a tenth.
         ghosts: share of the pixels on moving bodies that became points; NaN where nothing moves.
+        error_mm, sigma_mm: medians of the absolute errors and of the sigmas of the points' depths, millimetres.
         keyframes: that were judged.
     """
 
@@ -51,6 +56,8 @@ class DepthFigures:
     completeness: float
     gross: float
     ghosts: float
+    error_mm: float
+    sigma_mm: float
     keyframes: int
 
 
@@ -80,6 +87,8 @@ def judge_pixels(
             true / fused - 1.0,
             true / alone - 1.0,
             (fused - true) / np.sqrt(depth.variance[rows]),
+            1e3 * truth[rows] * (true / fused - 1.0),
+            1e3 * truth[rows] * np.sqrt(depth.variance[rows]) / fused,
             depth.is_point[rows],
             moves[rows],
         )
@@ -97,5 +106,7 @@ def summarise(pixels: JudgedPixels, keyframes: int) -> DepthFigures:
         float(pixels.is_point[~pixels.moves].mean()) if (~pixels.moves).any() else none,
         float(np.mean(np.abs(points.fused_error) > 0.1)) if len(points) else none,
         float(pixels.is_point[pixels.moves].mean()) if pixels.moves.any() else none,
+        float(np.median(np.abs(points.error_mm))) if len(points) else none,
+        float(np.median(points.sigma_mm)) if len(points) else none,
         keyframes,
     )

@@ -41,6 +41,7 @@ def format_page(
         missing=missing,
         goals=_goals(sequences),
         worlds=[_world(world, sequences) for world in dict.fromkeys(each.world for each in sequences)],
+        organs=_rigid_organs(sequences),
         sequences=len(sequences),
     )
 
@@ -60,6 +61,15 @@ def _goals(sequences: Sequence[ReconstructedSequence]) -> list[list[str]]:
 def _world(world: str, sequences: Sequence[ReconstructedSequence]) -> list[str]:
     of_world = [each for each in sequences if each.world == world]
     return [world, str(len(of_world)), *_cells(_medians(of_world))]
+
+
+def _rigid_organs(sequences: Sequence[ReconstructedSequence]) -> list[list[str]]:
+    """Of each organ in which nothing moves on its own, in millimetres."""
+    rigid = [(str(each.seed), each.figures) for each in sequences if each.world == "organ" and not each.movers]
+    return [
+        [seed, f"{of.error_mm:.2f}", f"{of.sigma_mm:.2f}", f"{of.inside:.1%}", f"{of.completeness:.0%}"]
+        for seed, of in rigid
+    ]
 
 
 def _medians(sequences: Sequence[ReconstructedSequence]) -> DepthFigures:

@@ -88,13 +88,16 @@ def test_the_order_in_which_keyframes_come_does_not_matter():
     rng = np.random.default_rng(2)
     parts = [_points(rng.uniform(0, 4, (60, 3)).tolist(), rng.uniform(0.1, 1, 60).tolist()) for _ in range(4)]
     clouds = []
-    for order in (parts, parts[::-1]):
-        voxels = VoxelCloud(0.7)
+    # Few voxels in memory, too.
+    for order, most in ((parts, 1000), (parts[::-1], 1000), (parts, 20)):
+        voxels = VoxelCloud(0.7, most)
         for part in order:
             voxels.add(part)
+            assert len(voxels._merged[0]) <= most
         clouds.append(voxels.cloud())
-    for first, second in zip(clouds[0].columns(), clouds[1].columns(), strict=True):
-        np.testing.assert_allclose(first, second, rtol=1e-5)
+    for other in clouds[1:]:
+        for first, second in zip(clouds[0].columns(), other.columns(), strict=True):
+            np.testing.assert_allclose(first, second, rtol=1e-5)
 
 
 def test_a_voxel_keeps_the_most_certain_pixel_of_a_keyframe():

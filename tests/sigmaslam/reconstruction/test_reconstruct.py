@@ -8,6 +8,7 @@ import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto, helper
+from scipy.spatial import cKDTree
 
 from sigmaslam.errors import InputError
 from sigmaslam.reconstruction.recorded_keyframes import _with_frames_between, read_recorded_keyframes
@@ -61,6 +62,23 @@ def test_every_second_keyframe_certain_points_and_poses_for_others(tracked: Path
     # The first pose is that of the run: nerfstudio's axes are turned about x.
     first = np.array(transforms["frames"][0]["transform_matrix"]) @ np.diag([1.0, -1.0, -1.0, 1.0])
     np.testing.assert_allclose(first[:3, 3], keyframes.poses[0][:3, 3], atol=1e-9)
+
+
+@pytest.mark.long
+def test_a_cloud_made_while_tracking_is_near_that_of_later_and_changes_no_pose(tracked: Path, tmp_path: Path):
+    done = run_here("track", tracked / "input", "--out", tmp_path / "run", "--dense", tmp_path / "run" / "cloud.ply")
+    assert done.returncode == 0, done.stderr
+    for name in ("trajectory.tum", "covariance.npy", "trajectory_final.tum"):
+        assert (tmp_path / "run" / name).read_bytes() == (tracked / "run" / name).read_bytes()
+    live = read_dense_points(tmp_path / "run" / "dense.npz")
+    assert '"dense_grey"' in (tmp_path / "run" / "report.html").read_text()
+    assert run_here("map", "reconstruct", tmp_path / "run", "--out", tmp_path / "cloud.ply").returncode == 0
+    later = read_dense_points(tmp_path / "run" / "dense.npz")
+    assert len(live.points) == pytest.approx(len(later.points), rel=0.2)
+    distance = cKDTree(later.points).query(live.points)[0]
+    assert np.median(distance / live.sigma) < 0.5
+    assert run_here("track", tracked / "input", "--out", tmp_path / "run", "--overwrite").returncode == 0
+    assert not (tmp_path / "run" / "cloud.ply").exists()
 
 
 def test_an_input_that_has_moved_is_asked_for_and_taken(tracked: Path, tmp_path: Path):
