@@ -31,25 +31,12 @@ _MULTIPLE = 32  # of sides, which all networks take
 _PIXELS = 256
 _NEAR, _FAR = 1.0, 3.0
 
-Find = Callable[[np.ndarray, int], np.ndarray]
-"""Keypoints (N, 2) of an image (H, W) uint8, at most so many."""
 Describe = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Unit descriptors (N, C) of keypoints (N, 2) of an image (H, W) uint8."""
-Exchanged = Mapping[tuple[str, str], KeypointsAndDescriptors]
-"""By whose the keypoints and whose the descriptors are."""
 
 
 class ExchangeScore(NamedTuple):
-    """Of one pair, numbers of keypoints and of matches.
-
-    Attributes:
-        known: keypoints of image 0 whose place in image 1 is known and seen.
-        repeated_1, repeated_3: most of them that have a keypoint of their own within 1 and 3 px of their place: no
-            matcher finds more.
-        mutual: mutual nearest neighbours within 3 px.
-        right: of what `sigmaslam match` makes of them in two rounds, those within 3 px ...
-        near_lines: ... and those within 1 px of their true epipolar line, NaN where parts of the scene move.
-    """
+    """Numbers of a pair: keypoints and matches, as the page describes them; NaN where they are not known."""
 
     known: float
     repeated_1: float
@@ -69,12 +56,7 @@ def write_exchange(
         checkout: of EdgePoint2, see `peer_exports`; None: without it.
         sets: of SETS.
     """
-    names = {
-        "ours": str(shipped_weights("features.onnx")),
-        **{each.stem: str(each) for each in weights},
-        "sift": "sift",
-    }
-    finders, describers = _peer(checkout)
+    find, describers = _extractors(weights, checkout)
     tables = {}
     with open_progress() as progress:
         for name in sets:
@@ -82,13 +64,12 @@ def write_exchange(
             task = progress.add_task(name, total=len(pairs), note="")
             scores: dict[tuple[str, str, str], list[ExchangeScore]] = {}
             images = {id(image): image for pair in pairs for image in (pair.image0, pair.image1)}
-            found: dict[int, Exchanged] = {}
+            found: dict[int, dict[tuple[str, str], KeypointsAndDescriptors]] = {}
             for pair in pairs:
                 both = id(pair.image0), id(pair.image1)
-                found |= {k: exchange(images[k], names, finders, describers) for k in both if k not in found}
-                features0, features1 = (found[k] for k in both)
-                for whose in features0:
-                    score = score_exchange(pair, features0[whose], features1[whose])
+                found |= {k: _exchange(images[k], find(images[k]), describers) for k in both if k not in found}
+                for whose, features0 in found[both[0]].items():
+                    score = score_exchange(pair, features0, found[both[1]][whose])
                     scores.setdefault((pair.part, *whose), []).append(score)
                 progress.advance(task)
             tables[name] = [
@@ -98,24 +79,17 @@ def write_exchange(
     return write_page(path, fill_page("exchange", command, tables=tables, pixels=_PIXELS))
 
 
-def exchange(
-    image: np.ndarray, names: Mapping[str, str], finders: Mapping[str, Find], describers: Mapping[str, Describe]
-) -> Exchanged:
-    """All keypoints of an image with all descriptors.
-
-    Args:
-        names: of extractors, as `load_extractor` takes them; they also have descriptors of their own.
-    """
-    count = min(MAX_KEYPOINTS, image.size // _PIXELS)
-    found = {(name, "own"): load_extractor(extractor, count)(image) for name, extractor in names.items()}
-    keypoints = {name: points for (name, _), (points, _) in found.items()}
-    keypoints |= {name: find(image, count) for name, find in finders.items()}
-    exchanged = {
-        (who, whose): (keypoints[who], describers[whose](image, keypoints[who]))
-        for who in keypoints
-        for whose in describers
+def _exchange(
+    image: np.ndarray, found: Mapping[str, KeypointsAndDescriptors], describers: Mapping[str, Describe]
+) -> dict[tuple[str, str], KeypointsAndDescriptors]:
+    """All keypoints with all descriptors, by whose the keypoints and whose the descriptors are."""
+    own = {(name, "own"): features for name, features in found.items()}
+    described = {
+        (name, whose): (features[0], describe(image, features[0]))
+        for name, features in found.items()
+        for whose, describe in describers.items()
     }
-    return found | exchanged
+    return own | described
 
 
 def score_exchange(
@@ -145,30 +119,40 @@ def count_partners(near: np.ndarray) -> int:
     return int((maximum_bipartite_matching(csr_matrix(near), perm_type="column") >= 0).sum())
 
 
-def _peer(checkout: Path | None) -> tuple[dict[str, Find], dict[str, Describe]]:
-    """Who finds keypoints alone, and who describes any: our network, from the full scale alone, and EdgePoint2."""
+def _extractors(
+    weights: Sequence[Path], checkout: Path | None
+) -> tuple[Callable[[np.ndarray], dict[str, KeypointsAndDescriptors]], dict[str, Describe]]:
+    """What finds the features of everyone in an image, and who describes any keypoints."""
     network = load_network(shipped_weights("features.safetensors"))
+    peer = None if checkout is None else load_edgepoint2(checkout)
+    names = {
+        "ours": str(shipped_weights("features.onnx")),
+        "sift": "sift",
+        **{each.stem: str(each) for each in weights},
+    }
 
     @torch.inference_mode()
     def describe(image: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
         points = torch.from_numpy(keypoints.astype(np.float32))
         return np.asarray(network.describe(network(to_cells(_padded(image))), points[None])[0].numpy())
 
-    if checkout is None:
-        return {}, {"ours": describe}
-    peer = load_edgepoint2(checkout)
-
-    @torch.inference_mode()
-    def find(image: np.ndarray, count: int) -> np.ndarray:
-        places, scores, _ = (each.numpy() for each in peer(_padded(image)))
-        return np.asarray(places[(scores > 0) & (places <= np.array(image.shape[::-1]) - 1).all(axis=1)][:count])
-
     @torch.inference_mode()
     def describe_peer(image: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
+        assert peer is not None
         padded, points = _padded(image), torch.from_numpy(keypoints.astype(np.float32))
         return np.asarray(peer.describe(padded, peer.network(padded)[0], points).numpy())
 
-    return {_PEER: find}, {"ours": describe, _PEER: describe_peer}
+    @torch.inference_mode()
+    def find(image: np.ndarray) -> dict[str, KeypointsAndDescriptors]:
+        count = min(MAX_KEYPOINTS, image.size // _PIXELS)
+        found = {name: load_extractor(extractor, count)(image) for name, extractor in names.items()}
+        if peer is not None:
+            places, scores, descriptors = (each.numpy() for each in peer(_padded(image)))
+            kept = np.flatnonzero((scores > 0) & (places <= np.array(image.shape[::-1]) - 1).all(axis=1))[:count]
+            found[_PEER] = places[kept], descriptors[kept]
+        return found
+
+    return find, {"ours": describe} if peer is None else {"ours": describe, _PEER: describe_peer}
 
 
 def _padded(image: np.ndarray) -> torch.Tensor:

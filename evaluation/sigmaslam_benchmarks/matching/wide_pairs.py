@@ -92,9 +92,11 @@ def renders(data: Path) -> list[WidePair]:
     from sigmaslam_synthetic.scene_pairs import ScenePairs
 
     stream = ScenePairs(_SEED, _SIZE, _WORLDS, wide=True)
-    pairs = [stream.pair(index) for index in range(_RENDERS)]
-    images = [[np.round(255.0 * each).astype(np.uint8) for each in (pair.image0, pair.image1)] for pair in pairs]
-    return [WidePair("renders", *both, pair.transfer, None) for pair, both in zip(pairs, images, strict=True)]
+    pairs = []
+    for pair in map(stream.pair, range(_RENDERS)):
+        image0, image1 = (np.round(255.0 * image).astype(np.uint8) for image in (pair.image0, pair.image1))
+        pairs.append(WidePair("renders", image0, image1, pair.transfer, None))
+    return pairs
 
 
 def stereo_cloud(left: View, right: View) -> np.ndarray:
