@@ -21,23 +21,28 @@ def test_partners_are_one_to_one():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_depth_of_a_slanted_plane_is_found_from_either_neighbour(side: float):
-    """Of a neighbour to the left, too, which is seen in a mirror."""
+def test_a_slanted_plane_has_its_depth_in_both_photographs_and_a_screen_hides_it():
     height, width, focal, baseline = 240, 320, 300.0, 0.5
     u, v = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
     disparity = 24.0 + 0.02 * u + 0.01 * v
-    image, other = textured_pair(disparity, 1.0)
-    K = np.array([[focal, 0, 150.0], [0, focal, 120.0], [0, 0, 1]])
-    T = np.eye(4)
-    T[0, 3] = side * baseline
-    if side < 0:
-        image, other = (np.ascontiguousarray(each[:, ::-1]) for each in (image, other))
-    pixels = np.array([[60.0, 50.0], [160.3, 120.2], [250.0, 200.0]])
-    seen = pixels if side > 0 else np.column_stack([width - 1 - pixels[:, 0], pixels[:, 1]])
-    depth = wide_pairs._depth_by_stereo(image, K, other, K, T)(seen)
-    expected = focal * baseline / (24.0 + 0.02 * pixels[:, 0] + 0.01 * pixels[:, 1])
-    np.testing.assert_allclose(depth, expected, rtol=0.01)
+    left, right = textured_pair(disparity, 1.0)
+    K, eye = np.array([[focal, 0, 150.0], [0, focal, 120.0], [0, 0, 1]]), np.eye(4)
+    eye[0, 3] = baseline
+    views = [wide_pairs.View(left, K, np.eye(4)), wide_pairs.View(right, K, eye)]
+    cloud = wide_pairs.stereo_cloud(*views)
+    depths = [wide_pairs.depth_map([cloud], view) for view in views]
+    points = np.array([[80.0, 50.0], [160.3, 120.2], [250.0, 200.0]])
+    expected = 24.0 + 0.02 * points[:, 0] + 0.01 * points[:, 1]
+    index = np.round(points).astype(int).T[::-1]
+    np.testing.assert_allclose(depths[0][tuple(index)], focal * baseline / expected, rtol=0.01)
+    pair = wide_pairs._related("plane", *views, *depths)
+    places, seen = pair.transfer(points)
+    assert seen.all()
+    np.testing.assert_allclose(places, points - np.column_stack([expected, np.zeros(3)]), atol=0.2)
+    screen = np.full_like(depths[1], 0.5 * depths[1].min())
+    hidden = wide_pairs._related("plane", *views, depths[0], screen)
+    assert not hidden.transfer(points)[1].any()
+    assert not pair.transfer(np.array([[5.0, 100.0]]))[1].any()  # leaves the image
 
 
 def test_an_image_and_itself_have_all_partners(monkeypatch: pytest.MonkeyPatch):
