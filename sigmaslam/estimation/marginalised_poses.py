@@ -58,10 +58,7 @@ class PastPoses:
     def closest(self, index: int, others: list[int] | None = None, per_metre: float = 0.0) -> int:
         """Of the other poses (of all by default) the one relative to which the place of this one is known best.
 
-        Args:
-            index: of this pose.
-            others: indices of others.
-            per_metre: standard deviation that is added for every metre between the two: of several the nearest.
+        Where many know it as well, the nearest: a standard deviation of `per_metre` is added by distance.
         """
         lever = point_lever(self.poses[index, :3, 3][None])[0]
         doubt = np.trace(lever @ self.relative(index) @ lever.T, axis1=1, axis2=2)

@@ -11,8 +11,6 @@ from sigmaslam.frontend import StereoView
 # The best features of a view that its vector is made of, and the number of their dimensions: of longer descriptors a
 # random projection, which keeps their angles.
 _FEATURES, _DIMENSIONS = 300, 64
-# Rows that are made room for at once.
-_ROOM = 256
 
 
 class AppearanceIndex:
@@ -24,28 +22,18 @@ class AppearanceIndex:
     """
 
     def __init__(self) -> None:
-        self._ids = np.zeros(0, np.int64)
-        self._vectors = np.zeros((0, 0), np.float32)
+        self._vectors: dict[int, np.ndarray] = {}
 
     def __len__(self) -> int:
-        return len(self._ids)
+        return len(self._vectors)
 
     def add(self, id: int, view: StereoView) -> None:
         """Takes a keyframe by a number that no other one has."""
-        vector, count = describe(view), len(self)
-        if count == len(self._vectors):
-            grown = np.zeros((count + _ROOM, len(vector)), np.float32)
-            grown[:count] = self._vectors[:, : len(vector)] if count else 0.0
-            self._vectors = grown
-        self._vectors[count] = vector
-        self._ids = np.append(self._ids, id)
+        self._vectors[id] = describe(view)
 
     def remove(self, id: int) -> None:
-        """Forgets a keyframe; the last row takes its place."""
-        row = int(np.flatnonzero(self._ids == id)[0])
-        last = len(self) - 1
-        self._vectors[row], self._ids[row] = self._vectors[last], self._ids[last]
-        self._ids = self._ids[:-1]
+        """Forgets a keyframe."""
+        del self._vectors[id]
 
     def rank(self, view: StereoView, count: int, among: Collection[int] | None = None) -> list[int]:
         """Numbers of up to `count` keyframes that look most like the view, best first; of equals the newest first.
@@ -55,13 +43,11 @@ class AppearanceIndex:
             count: at most so many.
             among: numbers of those that are asked for; None: all.
         """
-        if not len(self):
+        ids = np.array([id for id in self._vectors if among is None or id in among], np.int64)
+        if not len(ids):
             return []
-        similarity = self._vectors[: len(self)] @ describe(view)
-        order = np.lexsort((-self._ids, -similarity))
-        if among is not None:
-            order = order[np.isin(self._ids[order], list(among))]
-        return [int(id) for id in self._ids[order[:count]]]
+        similarity = np.stack([self._vectors[id] for id in ids.tolist()]) @ describe(view)
+        return [int(id) for id in ids[np.lexsort((-ids, -similarity))[:count]]]
 
 
 def describe(view: StereoView) -> np.ndarray:

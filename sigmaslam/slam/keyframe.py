@@ -39,20 +39,13 @@ class Keyframe:
     dense: Deferred[np.ndarray] | None = None
     points: PointMap = field(default_factory=PointMap.empty)
 
+    # As of `HangingKeyframe`: it hangs at itself.
+    step, covariance = np.eye(4), np.zeros((6, 6))
+
     @property
     def origin(self) -> int:
-        """Number of the keyframe whose pose gives its own: itself."""
+        """Its own number."""
         return self.id
-
-    @property
-    def step(self) -> np.ndarray:
-        """(4, 4) T_origin_keyframe."""
-        return np.eye(4)
-
-    @property
-    def covariance(self) -> np.ndarray:
-        """(6, 6) of that."""
-        return np.zeros((6, 6))
 
     @property
     def descriptors(self) -> np.ndarray:

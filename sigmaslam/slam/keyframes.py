@@ -18,8 +18,8 @@ from sigmaslam.frontend.patch_disparity_range import dense_disparity
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.slam.appearance import AppearanceIndex
 from sigmaslam.slam.deferred import Deferred
-from sigmaslam.slam.hanging_keyframes import HangingKeyframes
-from sigmaslam.slam.keyframe import Keyframe, KnownKeyframe
+from sigmaslam.slam.hanging_keyframes import hang_over
+from sigmaslam.slam.keyframe import HangingKeyframe, Keyframe, KnownKeyframe
 from sigmaslam.slam.map_file import pack_keyframes, read_keyframes
 from sigmaslam.slam.place_recognition import closest_pair
 from sigmaslam.slam.point_map import (
@@ -53,7 +53,7 @@ class Keyframes:
     Attributes:
         active: keyframes of the window, in its order.
         remembered: keyframes that left it, in the order of its past.
-        hanging: those without a pose in the past.
+        hanging: those without a pose in the past, by their numbers.
         appearance: of both, by their numbers.
     """
 
@@ -67,7 +67,8 @@ class Keyframes:
         self._next_id = self._first_id = 0
         self.active: list[Keyframe] = []
         self.remembered: list[Keyframe] = []
-        self.hanging = HangingKeyframes(max_keyframes // self._most_remembered - 1)
+        self._most_hanging = max_keyframes // self._most_remembered - 1
+        self.hanging: dict[int, HangingKeyframe] = {}
         self.appearance = AppearanceIndex()
 
     def index(self, id: int) -> int:
@@ -84,8 +85,8 @@ class Keyframes:
     def left_long_ago(self, count: int = 0) -> list[KnownKeyframe]:
         """Keyframes that left the window, but for the last `count`, by their numbers upwards."""
         recent = max(self._first_id, self.active[0].id - count) if self.active else self._next_id
-        known = [keyframe for keyframe in (*self.remembered, *self.hanging) if keyframe.id < recent]
-        return sorted(known, key=lambda keyframe: keyframe.id)
+        known: dict[int, KnownKeyframe] = {keyframe.id: keyframe for keyframe in self.remembered} | self.hanging
+        return [known[id] for id in sorted(known) if id < recent]
 
     def append(
         self, view: StereoView, timestamp: float, blur: float = 1.0, landmarks: np.ndarray | slice = slice(None)
@@ -141,8 +142,7 @@ class Keyframes:
     def restart(self) -> None:
         """Forgets all keyframes and their poses, but not the calibration."""
         self._window.restart()
-        self.active, self.remembered = [], []
-        self.hanging, self.appearance = HangingKeyframes(self.hanging.most), AppearanceIndex()
+        self.active, self.remembered, self.hanging, self.appearance = [], [], {}, AppearanceIndex()
         self._first_id = self._next_id
 
     def map(self) -> PointMap:
@@ -164,7 +164,7 @@ class Keyframes:
         keyframes, past, hanging = read_keyframes(path, frontend, camera)
         self._window.restart(past)
         for each in hanging:
-            self.hanging.add(each)
+            self.hanging[each.id] = each
             self.appearance.add(each.id, each.view)
         self._next_id = self._first_id = len(keyframes) + len(hanging)
         self._remember(keyframes)
@@ -172,7 +172,7 @@ class Keyframes:
     def pack(self, frontend: str, camera: RectifiedStereo) -> dict[str, Any]:
         """All of them as arrays by name, by which a later run finds its place in the map."""
         keyframes = [*self.remembered, *self.active]
-        return pack_keyframes(keyframes, self._window.posterior.all_poses, frontend, camera, self.hanging)
+        return pack_keyframes(keyframes, self._window.posterior.all_poses, frontend, camera, self.hanging.values())
 
     def _remember(self, keyframes: list[Keyframe], spare: KnownKeyframe | None = None) -> None:
         """Takes keyframes of the window's past, and hangs superfluous ones at others, but not the one to spare."""
@@ -197,7 +197,7 @@ class Keyframes:
                 self.remembered[index] = replace(self.remembered[index], points=points)
             index = past.closest(leaving, per_metre=_PER_METRE)
             heir = self.remembered[index].id
-            for id in self.hanging.hand_over(gone, heir, *past.step(index, leaving)):
+            for id in hang_over(self.hanging, self._most_hanging, gone, heir, *past.step(index, leaving)):
                 self.appearance.remove(id)
             del self.remembered[leaving]
             self._window.forget_past(leaving)

@@ -234,7 +234,7 @@ def test_keyframes_beyond_the_remembered_poses_hang_at_neighbours():
     np.testing.assert_allclose(keyframes.poses(known)[:, 0, 3], places[:150], atol=1e-9)
     assert len(keyframes.appearance) == 150
     past = keyframes._window.posterior.past
-    for each in keyframes.hanging:
+    for each in keyframes.hanging.values():
         # Each step adds 0.01^2 to every variance.
         steps = abs(each.id - each.origin)
         assert 1 <= steps <= 4
@@ -250,7 +250,7 @@ def test_keyframes_beyond_the_remembered_poses_hang_at_neighbours():
 def test_what_is_as_well_known_to_all_hangs_at_a_near_one():
     """Steps without error: every neighbour is as good, and the nearest is taken."""
     keyframes = walked(0.1 * np.arange(151), 2400, sigma=1e-9)
-    assert max(abs(each.id - each.origin) for each in keyframes.hanging) <= 4
+    assert max(abs(each.id - each.origin) for each in keyframes.hanging.values()) <= 4
 
 
 @pytest.mark.long
