@@ -156,13 +156,13 @@ class InertialMotion(MotionFilter):
                 turn, zero = np.eye(12), np.zeros((6, 19))
                 turn[:3, :3] = turn[3:6, 3:6] = R
                 shared = turn @ found.shared
-                others = [[turn @ found.covariance @ turn.T, shared], [shared.T, np.diag(SENSOR_SIGMA**2)]]
+                unknown = [[turn @ found.covariance @ turn.T, shared], [shared.T, np.diag(SENSOR_SIGMA**2)]]
                 self._covariance, known = np.zeros((_SIZE, _SIZE)), self.step_covariance
-                self._covariance[_STATE, _STATE] = np.block([[known, zero], [zero.T, np.block(others)]])
+                self._covariance[_STATE, _STATE] = np.block([[known, zero], [zero.T, np.block(unknown)]])
                 self.is_inertial, self._carried, self.widened = True, None, 1.0
                 self._note_twist(self.twist[3:])
             return
-        P: np.ndarray = self._covariance
+        P = self._covariance
         departure = se3_log(step @ se3_inverse(self.step))
         # What images leave of the prediction; where they know less of the pose than it, they teach nothing.
         kept = at_most(covariance, P[_POSE, _POSE])
@@ -222,7 +222,7 @@ class InertialMotion(MotionFilter):
             slope: (m, 31) of what is predicted, by the state.
             noise: (m, m) covariance.
         """
-        P: np.ndarray = self._covariance
+        P = self._covariance
         gain = regression(P @ slope.T, slope @ P @ slope.T + noise)
         change, kept = gain @ residual, np.eye(_SIZE) - gain @ slope
         self._covariance = kept @ P @ kept.T + gain @ noise @ gain.T
