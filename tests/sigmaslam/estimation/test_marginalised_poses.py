@@ -10,6 +10,7 @@ import pytest
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.marginalised_poses import PastPoses, step_between
 from sigmaslam.estimation.state_layout import CALIBRATION, CALIBRATION_SIZE, pose_slice
+from sigmaslam.estimation.window_state import loop_difference
 from sigmaslam.geometry.se3 import se3_body, se3_exp, se3_inverse, se3_log, turn_covariance
 from sigmaslam.slam.point_map import PointMap, hand_over_points, merge_maps, most_confirmed, points_in_world
 from tests.support.dense_window import (
@@ -90,6 +91,30 @@ def test_past_and_window_together_are_the_dense_solution(seed: int):
     assert in_sigmas(joint(window), dense.covariance()) < 1e-3
     error = se3_log(window.posterior.past.poses[0] @ se3_inverse(dense.poses[0]))
     assert np.abs(error / np.sqrt(np.diag(dense.covariance())[dense_slice(0)])).max() < 1e-3
+
+
+def test_a_loop_that_another_confirms_scales_what_it_contradicts():
+    """By the variance of unit weight: the same loop to steps that claim so much less closes it the same way."""
+    truth, steps = drive(0)
+    aside = se3_exp(np.array([0.004, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    edge = loop(truth, 1, 0)
+    edge = replace(edge, T_i_j=edge.T_i_j @ aside)
+    window = follow(steps)
+    match = turn_covariance(window.posterior.past.poses[1] @ edge.T_i_j, edge.covariance)
+    difference = loop_difference(window.posterior, 1, edge.T_i_j)
+    known = window.posterior.past.relative_to(window.posterior.covariance, window.posterior.common, 1)
+    factor = difference @ np.linalg.solve(known + match, difference) / 6
+    assert factor > 5.0
+    before = joint(window)
+    assert not window.add_loop_constraint(1, edge.T_i_j, match)
+    np.testing.assert_array_equal(joint(window), before)
+    assert window.add_loop_constraint(1, edge.T_i_j, match, confirmed=True)
+    wider = follow([replace(step, covariance=factor * step.covariance) for step in steps])
+    assert wider.add_loop_constraint(1, edge.T_i_j, match)
+    np.testing.assert_allclose(window.posterior.poses, wider.posterior.poses, atol=1e-7)
+    np.testing.assert_allclose(
+        joint(window)[6:, 6:], joint(wider)[6:, 6:], atol=1e-3 * np.abs(joint(wider)[6:, 6:]).max()
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))
