@@ -9,13 +9,14 @@ import numpy as np
 
 from sigmaslam.frontend.affine_alignment import AlignedPatches, align_patches
 from sigmaslam.frontend.knn import nearest_points
+from sigmaslam.frontend.lucas_kanade import lucas_kanade
 from sigmaslam.frontend.nearest_neighbours import within_ellipses
 from sigmaslam.frontend.patch_kernels import Images, compiled
 from sigmaslam.frontend.types import PatchMaps
 from sigmaslam.table import Table
 
-FLOW_WINDOW, FLOW_LEVELS = 15, 3
-"""Of the optical flow that gives starts: side of its patches, pixels, and levels above the image itself."""
+# Of the optical flow that gives starts, in images of half the size: side of its patches, pixels, and levels above.
+_FLOW_WINDOW, _FLOW_LEVELS = 11, 2
 # Patches in samples, Gauss-Newton steps, and the window's standard deviation in radii.
 _RADIUS, _ITERATIONS, _TAPER = 5, 5, 1.0
 # A patch that agrees less than this where it was followed to is searched for again.
@@ -67,12 +68,27 @@ def correct_by_neighbours(predicted: np.ndarray, start: np.ndarray) -> np.ndarra
     return np.asarray(predicted + usual)
 
 
+def follow_flow(
+    image0: np.ndarray, image1: np.ndarray, points: np.ndarray, guess: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Starts for `find_patches` by optical flow between images of half the size, which alignment makes exact.
+
+    Args:
+        image0, image1: (H, W) uint8.
+        points, guess: (M, 2) in image 0, and about where they are in image 1, pixels.
+    Returns:
+        As of `lucas_kanade`.
+    """
+    half0, half1 = shrink(image0)[-1], shrink(image1)[-1]
+    found, inside = lucas_kanade(half0, half1, 0.5 * points - 0.25, 0.5 * guess - 0.25, _FLOW_WINDOW, _FLOW_LEVELS)
+    return 2.0 * found + 0.5, inside
+
+
 def shrink(image: np.ndarray) -> tuple[np.ndarray, ...]:
     """The (H, W) uint8 image at a quarter and half of the size, as `find_patches` takes it."""
-    height, width = image.shape
-    return tuple(
-        cv2.resize(image, (width // scale, height // scale), interpolation=cv2.INTER_AREA) for scale in _SCALES
-    )
+    # By exactly two, for which OpenCV has a fast way: odd sizes are rounded.
+    half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    return cv2.resize(half, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), half
 
 
 def find_patches(

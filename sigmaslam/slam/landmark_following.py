@@ -9,8 +9,7 @@ import numpy as np
 
 from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.frame_fit import FrameFit
-from sigmaslam.frontend.followed_patches import FLOW_LEVELS, FLOW_WINDOW
-from sigmaslam.frontend.lucas_kanade import lucas_kanade
+from sigmaslam.frontend.followed_patches import follow_flow
 from sigmaslam.geometry.se3 import rotation_log
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.guided_matching import GuidedMatcher, GuidedMatches
@@ -130,6 +129,6 @@ class LandmarkFollower:
             homography = K @ turn.T @ np.linalg.inv(K)
             last = cv2.warpPerspective(last, homography, (width, height))
             before = cv2.perspectiveTransform(before[:, None], homography)[:, 0]
-        places, found = lucas_kanade(last, left, before, guess, FLOW_WINDOW, FLOW_LEVELS)
+        places, found = follow_flow(last, left, before, guess)
         start[rows[found]] = places[found]
         return start

@@ -118,9 +118,9 @@ class FlowingFrontend(SimulatedFrontend):
         return [self._match_within(search, view) for search in searches]
 
     def flow(
-        self, left0: np.ndarray, left1: np.ndarray, points0: np.ndarray, guess1: np.ndarray, window: int, levels: int
+        self, left0: np.ndarray, left1: np.ndarray, points0: np.ndarray, guess1: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """In place of `lucas_kanade`: where the nearest point of the world goes."""
+        """In place of `follow_flow`: where the nearest point of the world goes."""
         before, visible = self._project(frame_of(left0))
         candidates = np.flatnonzero(visible)
         apart = np.linalg.norm(points0[:, None] - before[candidates, :2], axis=2)
@@ -164,7 +164,7 @@ def widened(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[float]]:
 
 
 def tracked(frontend: FlowingFrontend, monkeypatch: pytest.MonkeyPatch) -> list[Estimate]:
-    monkeypatch.setattr(landmark_following, "lucas_kanade", frontend.flow)
+    monkeypatch.setattr(landmark_following, "follow_flow", frontend.flow)
     return run_simulated(StereoTracker(frontend.camera, frontend, threads=1), frontend, SCALE).estimates
 
 

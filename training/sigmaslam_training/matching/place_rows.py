@@ -7,15 +7,13 @@ import numpy as np
 from sigmaslam.errors import SigmaSlamError
 from sigmaslam.frontend.affine_alignment import local_maps
 from sigmaslam.frontend.followed_patches import (
-    FLOW_LEVELS,
-    FLOW_WINDOW,
     PatchTargets,
     compare_with_neighbours,
     correct_by_neighbours,
     find_patches,
+    follow_flow,
     shrink,
 )
-from sigmaslam.frontend.lucas_kanade import lucas_kanade
 from sigmaslam.frontend.nearest_neighbours import within_ellipses
 from sigmaslam.frontend.patch_evidence import examine_patches
 from sigmaslam.frontend.row_search import REACH_PREDICTED, REACH_SEARCHED, align_in_rows, search_rows
@@ -112,7 +110,7 @@ def _starts(
 ) -> np.ndarray:
     """Where keypoints were followed to: by Lucas-Kanade over the whole way, or carried on from a frame before."""
     if rng.random() < 0.5:
-        places, found = lucas_kanade(*pair, points, predicted, FLOW_WINDOW, FLOW_LEVELS)
+        places, found = follow_flow(*pair, points, predicted)
     else:
         noise = np.where(visible, _CARRIED, _DRIFT)[:, None] * rng.standard_normal(points.shape)
         places, found = expected + noise, rng.random(len(points)) > _FORGOTTEN
