@@ -22,7 +22,7 @@ _SMALL_STEP, _LARGE_STEP = 8 * _BLOCK**2, 32 * _BLOCK**2
 # By how many percent the best must win, and how many pixels must depart together to be believed: OpenCV's advice.
 _UNIQUE, _SPECKLE = 10, 50
 # Disparities searched: from behind infinity, for the sake of a disparity offset, to nearer than all keypoints.
-_LEAST, _BEYOND = -4, 16
+_LEAST, _BEYOND = -4, 8
 
 
 def dense_disparity(view: StereoView) -> np.ndarray:
