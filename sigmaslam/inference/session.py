@@ -60,6 +60,8 @@ def open_session(content: bytes, threads: int, provider: str = "cpu") -> onnxrun
     options.inter_op_num_threads = 1
     # Several sessions take turns. A session that spins while it waits halves the speed of the others.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    # What a run of the largest network needs is given back: an arena would keep it beside what else a frame needs.
+    options.enable_cpu_mem_arena = False
     options.log_severity_level = 3
     providers = [(PROVIDERS[provider], _OPTIONS.get(provider, {}))]
     if provider != "cpu":

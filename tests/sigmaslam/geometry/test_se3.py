@@ -126,3 +126,15 @@ def test_a_turned_covariance_is_that_of_moved_tangents():
     np.testing.assert_allclose(turned, moved @ moved.transpose(0, 2, 1), rtol=0, atol=1e-9 * np.abs(turned).max())
     one_by_one = [rotation.turn_covariance(each, root[0] @ root[0].T) for each in T]
     np.testing.assert_allclose(rotation.turn_covariance(T, root[0] @ root[0].T), one_by_one, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-3, 0.09, 0.11, 1.0, 1.5, 1.6, 3.0, np.pi])
+def test_one_transform_equals_its_row_of_many(angle: float):
+    """Single ones are computed in another way, up to a right angle their logarithms too."""
+    tangents = np.random.default_rng(0).normal(size=(20, 6))
+    tangents[:, 3:] *= angle / np.linalg.norm(tangents[:, 3:], axis=1, keepdims=True)
+    transforms = rotation.se3_exp(tangents)
+    np.testing.assert_allclose([rotation.se3_exp(each) for each in tangents], transforms, rtol=0, atol=5e-15)
+    np.testing.assert_allclose(
+        [rotation.se3_log(each) for each in transforms], rotation.se3_log(transforms), rtol=0, atol=5e-15
+    )

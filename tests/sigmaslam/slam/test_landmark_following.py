@@ -158,7 +158,7 @@ def test_landmarks_of_the_last_frame_are_carried_along_with_their_image(demo: De
     start = carried()
     assert np.isfinite(start[:-20]).mean() > 0.95
     error = np.linalg.norm(start[:-20] - places[searched] - shift, axis=1)
-    assert np.nanmax(error) < 0.1
+    assert np.nanmax(error) < 0.5  # starts, from images of half the size
     assert np.isnan(start[-20:]).all()
     follower.forget()
     assert np.isnan(carried()).all()
