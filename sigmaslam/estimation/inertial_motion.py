@@ -49,9 +49,9 @@ class InertialMotion(MotionFilter):
     Everything is in the frame of the last keyframe, so that nothing is far from zero. Delay and mounting of the sensor
     are part of the state: a sensor that is mounted as believed to 0.2 degrees would fall aside by 17 mm in a second.
 
-    The velocity was learned from the keyframe's pose, so both are off together; and images measure the next frame from
-    where the keyframe was thought to be. Its error therefore stays, with what it has in common with all others. As new
-    noise in each keyframe it would pass for noise of the sensor, where each frame or two is one.
+    The velocity was learned from the keyframe's pose, so both are off together; and landmarks of the whole window
+    measure the next frame from where the keyframe is believed to be. Its error therefore stays, with what it has in
+    common with all others: as new noise of each keyframe it would pass for noise of the sensor.
 
     Args:
         backend: "onnx" or "torch".
@@ -86,10 +86,12 @@ class InertialMotion(MotionFilter):
         return MotionState(self.step.copy(), others, self._covariance[_STATE, _STATE].copy(), self._carried)
 
     def set_twist(self, twist: np.ndarray, sigma: np.ndarray) -> None:
-        """Of constant velocity alone: the sensor measures on where images are lost."""
-        if not self.is_inertial:
-            super().set_twist(twist, sigma)
-            self._search.poses.clear()
+        """Of constant velocity alone: the sensor measures on where images are lost, but the keyframe is a new one."""
+        if self.is_inertial:
+            self._covariance[_KEY] = self._covariance[:, _KEY] = 0.0
+            return
+        super().set_twist(twist, sigma)
+        self._search.poses.clear()
 
     def predict(
         self, seconds: float, densities: np.ndarray, sigma: float = 0.0, timestamp: float | None = None
@@ -166,10 +168,11 @@ class InertialMotion(MotionFilter):
         departure = se3_log(step @ se3_inverse(self.step))
         # What images leave of the prediction; where they know less of the pose than it, they teach nothing.
         kept = at_most(covariance, P[_POSE, _POSE])
-        # They draw the pose to where they see it from the keyframe, and so the keyframe's error is in it.
-        drawn, slope = regression(P[_POSE, _POSE] - kept, P[_POSE, _POSE]), np.zeros((6, _SIZE))
-        slope[:, _POSE] = slope[:, _KEY] = drawn
-        noise = 0.5 * (kept @ drawn.T + drawn @ kept)
+        # They draw the pose to where they see it from the believed keyframe, and so the keyframe's error is in it.
+        both, slope = P[_POSE, _POSE] + P[_KEY, _KEY], np.zeros((6, _SIZE))
+        seen = both @ (np.linalg.pinv(kept, hermitian=True) - np.linalg.inv(P[_POSE, _POSE]))
+        drawn = slope[:, _POSE] = slope[:, _KEY] = np.linalg.solve(np.eye(6) + seen, seen)
+        noise = (np.eye(6) - drawn) @ both @ drawn.T
         innovation = slope @ P @ slope.T + noise
         if not self.is_resting:  # vibrations come with motion
             self.noise.learn(departure, innovation)
@@ -196,7 +199,7 @@ class InertialMotion(MotionFilter):
             super().start_keyframe()
             return
         turn = np.eye(_SIZE)
-        turn[_KEY, _POSE], turn[_KEY, _KEY] = se3_adjoint(se3_inverse(self.step)), 0.0
+        turn[_KEY, _POSE] = turn[_KEY, _KEY] = se3_adjoint(se3_inverse(self.step))
         R = self.step[:3, :3].T
         for part, vector in ((_VELOCITY, self._velocity), (_GRAVITY, self._gravity)):
             turn[part, part], turn[part, 3:6] = R, R @ skew(vector)

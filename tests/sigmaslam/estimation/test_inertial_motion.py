@@ -5,7 +5,7 @@ import pytest
 
 from sigmaslam.estimation.inertial_motion import InertialMotion
 from sigmaslam.geometry.inertial_sensor import InertialSamples
-from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
+from sigmaslam.geometry.se3 import se3_body, se3_exp, se3_inverse, se3_log
 from tests.support.inertial import GRAVITY, SENSOR, Halt, Motion
 
 FRAME = 0.05
@@ -34,6 +34,7 @@ class Flight:
             exact.accel + ACCEL_BIAS + scale * SENSOR.accel_density * self.rng.normal(size=size),
         )
         self.given, self.frame, self.key = 0, 0, self.camera(0)
+        self.believed_key, self.key_covariance = self.key, np.zeros((6, 6))
         self.filter.forget_twist(np.repeat([1.0, 1.0], 3))
 
     def camera(self, frame: int) -> np.ndarray:
@@ -45,6 +46,7 @@ class Flight:
         return np.asarray(se3_inverse(self.key) @ self.camera(self.frame))
 
     def fly(self, frames: int, dark: bool = False, keyframes: int = 7, samples: bool = True) -> None:
+        """Images measure from where the keyframe is believed to be, as landmarks of earlier ones do."""
         for _ in range(frames):
             self.frame += 1
             t = self.frame * FRAME
@@ -55,12 +57,16 @@ class Flight:
             self.filter.predict(FRAME, DENSITIES, timestamp=t)
             if dark:
                 continue
-            P, seen = self.filter.step_covariance, se3_exp(SIGMA * self.rng.normal(size=6)) @ self.truth
-            gain = P @ np.linalg.inv(P + np.diag(SIGMA**2))
-            change = gain @ se3_log(seen @ se3_inverse(self.filter.step))
-            self.filter.correct(se3_exp(change) @ self.filter.step, P - gain @ P)
+            P, E = self.filter.step_covariance, self.key_covariance
+            seen = se3_inverse(self.believed_key) @ self.camera(self.frame)
+            innovation = se3_log(se3_exp(SIGMA * self.rng.normal(size=6)) @ seen @ se3_inverse(self.filter.step))
+            gain = np.linalg.inv(P + E + np.diag(SIGMA**2))
+            change, after = (P + E) @ gain @ innovation, P + E - (P + E) @ gain @ (P + E)
+            self.filter.correct(se3_exp(change) @ self.filter.step, P - P @ gain @ P)
             if self.frame % keyframes == 0:
-                self.key = self.camera(self.frame)
+                self.key, step = self.camera(self.frame), self.filter.step
+                self.believed_key = self.believed_key @ step
+                self.key_covariance = se3_body(step, after)
                 self.filter.start_keyframe()
 
     def nees(self) -> dict[str, float]:
@@ -107,6 +113,19 @@ def test_a_dark_second_stays_within_what_is_claimed():
     assert np.median(errors) < 0.04, errors
     assert np.max(errors) < 0.1, errors
     assert all(0.5 < each < 1.6 for each in mean.values()), mean
+
+
+@pytest.mark.long
+def test_errors_of_keyframes_are_no_noise_of_the_sensor():
+    scales, nees = [], []
+    for seed in range(6):
+        flight = Flight(seed, wrong=True)
+        flight.fly(60, keyframes=3)
+        scales.append(flight.filter.noise.scale[1])
+        nees.append(flight.nees()["velocity"])
+    # Five times the density's; where each keyframe adds an error of its own fifteen times as much is learned.
+    assert np.median(scales) < 3 * 5.0**2, scales
+    assert 0.4 < np.mean(nees) < 1.8, nees
 
 
 def test_at_rest_gravity_is_found_as_well():
