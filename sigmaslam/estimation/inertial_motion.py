@@ -16,24 +16,15 @@ from sigmaslam.estimation.preintegration import GYRO_BIAS, TURN, Preintegrated
 from sigmaslam.estimation.standstill import WHILE, Standstill
 from sigmaslam.estimation.wheel_speed import WheelSpeed
 from sigmaslam.geometry.inertial_sensor import InertialSensor
-from sigmaslam.geometry.se3 import (
-    nearest_rigid,
-    rotation_log,
-    se3_adjoint,
-    se3_body,
-    se3_exp,
-    se3_inverse,
-    se3_log,
-    skew,
-)
+from sigmaslam.geometry.se3 import nearest_rigid, rotation_log, se3_body, se3_exp, se3_inverse, se3_log, skew
 from sigmaslam.inference.backends import load_step
 
 _LOGGER = logging.getLogger(__name__)
 
 # Order of the graph's error state, see sigmaslam_models.estimator.inertial_prediction.
 _POSE, _VELOCITY, _GRAVITY, _BIASES = slice(0, 6), slice(6, 9), slice(9, 12), slice(12, 18)
-# Delay and mounting of the sensor; the graph knows so many numbers, the filter the error of the last keyframe besides.
-_SENSOR, _GYRO_BIAS, _STATE, _KEY, _SIZE = slice(18, 25), slice(12, 15), slice(0, 25), slice(25, 31), 31
+# Delay and mounting of the sensor, and the size of all.
+_SENSOR, _GYRO_BIAS, _SIZE = slice(18, 25), slice(12, 15), 25
 SENSOR_SIGMA = np.array([2e-3, *[5e-3] * 3, *[3.5e-3] * 3])
 """Prior standard deviations of delay (s), place (m) and rotation (rad) of the sensor. Those of careful calibrations:
 2 ms, 5 mm and 0.2 degrees."""
@@ -48,10 +39,6 @@ class InertialMotion(MotionFilter):
 
     Everything is in the frame of the last keyframe, so that nothing is far from zero. Delay and mounting of the sensor
     are part of the state: a sensor that is mounted as believed to 0.2 degrees would fall aside by 17 mm in a second.
-
-    The velocity was learned from the keyframe's pose, so both are off together; and images measure the next frame from
-    where the keyframe was thought to be. Its error therefore stays, with what it has in common with all others. As new
-    noise in each keyframe it would pass for noise of the sensor, where each frame or two is one.
 
     Args:
         backend: "onnx" or "torch".
@@ -83,7 +70,7 @@ class InertialMotion(MotionFilter):
         if not self.is_inertial:
             return super().state
         others = np.concatenate([self._velocity, self._gravity, self._biases, np.zeros(7)])
-        return MotionState(self.step.copy(), others, self._covariance[_STATE, _STATE].copy(), self._carried)
+        return MotionState(self.step.copy(), others, self._covariance.copy(), self._carried)
 
     def set_twist(self, twist: np.ndarray, sigma: np.ndarray) -> None:
         """Of constant velocity alone: the sensor measures on where images are lost."""
@@ -105,14 +92,13 @@ class InertialMotion(MotionFilter):
         if motion is None or motion.missing > _DEAD:
             self._leave(seconds, densities)
             return
-        before = self._covariance
         step, velocity, covariance, carried = self._predict_inertial(
             {
                 "pose": self.step,
                 "velocity": self._velocity,
                 "gravity": self._gravity,
                 "mounting": self._T_camera_imu,
-                "covariance": before[_STATE, _STATE],
+                "covariance": self._covariance,
                 "seconds": np.array(motion.seconds),
                 "turn": motion.turn,
                 "velocity_change": motion.velocity,
@@ -124,9 +110,7 @@ class InertialMotion(MotionFilter):
         )
         self.turn = self.step[:3, :3].T @ step[:3, :3]
         self.step, self._velocity = nearest_rigid(step), velocity
-        key = regression(carried.T, before[_STATE, _STATE]) @ before[_STATE, _KEY]
-        self._covariance = np.block([[0.5 * (covariance + covariance.T), key], [key.T, before[_KEY, _KEY]]])
-        self._carried, self.widened = carried, 1.0
+        self._covariance, self._carried, self.widened = 0.5 * (covariance + covariance.T), carried, 1.0
         self._covariance[_SENSOR, _SENSOR] += np.diag(SENSOR_SIGMA**2 * motion.seconds / _WARM_UP)
         self._note_twist(rotation_log(self.turn) / motion.seconds)
         self._measure_speed(motion, timestamp)
@@ -156,9 +140,8 @@ class InertialMotion(MotionFilter):
                 turn, zero = np.eye(12), np.zeros((6, 19))
                 turn[:3, :3] = turn[3:6, 3:6] = R
                 shared = turn @ found.shared
-                unknown = [[turn @ found.covariance @ turn.T, shared], [shared.T, np.diag(SENSOR_SIGMA**2)]]
-                self._covariance, known = np.zeros((_SIZE, _SIZE)), self.step_covariance
-                self._covariance[_STATE, _STATE] = np.block([[known, zero], [zero.T, np.block(unknown)]])
+                others = [[turn @ found.covariance @ turn.T, shared], [shared.T, np.diag(SENSOR_SIGMA**2)]]
+                self._covariance = np.block([[self.step_covariance, zero], [zero.T, np.block(others)]])
                 self.is_inertial, self._carried, self.widened = True, None, 1.0
                 self._note_twist(self.twist[3:])
             return
@@ -166,20 +149,14 @@ class InertialMotion(MotionFilter):
         departure = se3_log(step @ se3_inverse(self.step))
         # What images leave of the prediction; where they know less of the pose than it, they teach nothing.
         kept = at_most(covariance, P[_POSE, _POSE])
-        # They draw the pose to where they see it from the keyframe, and so the keyframe's error is in it.
-        drawn, slope = regression(P[_POSE, _POSE] - kept, P[_POSE, _POSE]), np.zeros((6, _SIZE))
-        slope[:, _POSE] = slope[:, _KEY] = drawn
-        noise = 0.5 * (kept @ drawn.T + drawn @ kept)
-        innovation = slope @ P @ slope.T + noise
+        removed = P[_POSE, _POSE] - kept
         if not self.is_resting:  # vibrations come with motion
-            self.noise.learn(departure, innovation)
-        gain = regression(P @ slope.T, innovation)
-        gain[_POSE] = np.eye(6)
-        others = np.eye(_SIZE) - gain @ slope
-        P = others @ P @ others.T + gain @ noise @ gain.T
-        P[_POSE, _POSE] += covariance - kept
-        self._move(gain[_POSE.stop : _STATE.stop] @ departure)
-        self.step, self._covariance = nearest_rigid(step), P
+            self.noise.learn(departure, removed)
+        gain = regression(P[6:, _POSE], P[_POSE, _POSE])
+        self._move(gain @ departure)
+        others = P[6:, 6:] - gain @ removed @ gain.T
+        self.step = nearest_rigid(step)
+        self._covariance = np.block([[covariance, kept @ gain.T], [gain @ kept, 0.5 * (others + others.T)]])
         self._note_twist(self.twist[3:])
         if self._time is not None:
             recent = self.samples.around(self._time - WHILE, self._time)
@@ -196,7 +173,6 @@ class InertialMotion(MotionFilter):
             super().start_keyframe()
             return
         turn = np.eye(_SIZE)
-        turn[_KEY, _POSE], turn[_KEY, _KEY] = se3_adjoint(se3_inverse(self.step)), 0.0
         R = self.step[:3, :3].T
         for part, vector in ((_VELOCITY, self._velocity), (_GRAVITY, self._gravity)):
             turn[part, part], turn[part, 3:6] = R, R @ skew(vector)
@@ -219,7 +195,7 @@ class InertialMotion(MotionFilter):
 
         Args:
             residual: (m,) measured less predicted.
-            slope: (m, 31) of what is predicted, by the state.
+            slope: (m, 25) of what is predicted, by the state.
             noise: (m, m) covariance.
         """
         P = self._covariance
@@ -227,9 +203,9 @@ class InertialMotion(MotionFilter):
         change, kept = gain @ residual, np.eye(_SIZE) - gain @ slope
         self._covariance = kept @ P @ kept.T + gain @ noise @ gain.T
         if self._carried is not None:
-            self._carried = self._carried @ kept[_STATE, _STATE].T
+            self._carried = self._carried @ kept.T
         self.step = nearest_rigid(se3_exp(change[_POSE]) @ self.step)
-        self._move(change[_POSE.stop : _STATE.stop])
+        self._move(change[6:])
         self._note_twist(self.twist[3:])
 
     def _measure_speed(self, motion: Preintegrated, timestamp: float) -> None:

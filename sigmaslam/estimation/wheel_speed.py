@@ -17,6 +17,8 @@ _LOGGER = logging.getLogger(__name__)
 
 # Seconds to the nearest sample; a vehicle that brakes changes its speed by less than 1 m/s in it.
 _NEAR = 0.1
+# Comparisons that are remembered. Errors of wheels last for a second, in which ten frames have one of them in common.
+_REMEMBERED = 10 * COMPARED
 
 
 class WheelSpeed:
@@ -31,8 +33,8 @@ class WheelSpeed:
         self.samples = SampleBuffer(sensor.time_shift)
         self._R_base_camera = T_camera_base[:3, :3].T
         self._of_base = se3_adjoint(se3_inverse(T_camera_base))[:3]
-        self._departures: deque[np.ndarray] = deque(maxlen=COMPARED)
-        self._speeds: deque[float] = deque(maxlen=COMPARED)
+        self._departures: deque[np.ndarray] = deque(maxlen=_REMEMBERED)
+        self._speeds: deque[float] = deque(maxlen=_REMEMBERED)
         self._is_refused = False
 
     def compare(self, timestamp: float, twist: np.ndarray, density: float) -> None:

@@ -73,7 +73,6 @@ def format_page(page: InertialPage) -> str:
         unnamed=[(recording.name, each.words, _said(each)) for recording, each in faulty if not each.named],
         alarms=[(recording.name, _said(each)) for recording, each in page.faults if not each.kind and each.said],
         good=sum(not each.kind for _, each in page.faults),
-        details=list(_detail_rows(page)),
     )
 
 
@@ -183,26 +182,6 @@ def _fault_rows(page: InertialPage) -> Iterator[list[str]]:
         if results:
             named, said = (sum(map(bool, flags)) for flags in ([r.named for r in results], [r.said for r in results]))
             yield [kind, str(len(results)), str(named), str(said)]
-
-
-def _detail_rows(page: InertialPage) -> Iterator[list[str]]:
-    for (recording, case), result in page.runs.items():
-        if case.seconds:
-            yield [
-                recording.name,
-                f"{case.seconds:g}",
-                str(case.first),
-                case.method,
-                str(result.inertial),
-                str(result.lost),
-                str(result.dark - result.inertial - result.lost),
-                str(result.lost_after),
-                str(result.back) if result.back >= 0 else "never",
-                number(result.end_metres, ".3f"),
-                number(result.end_sigmas, ".2f"),
-                number(result.after_metres, ".3f"),
-                number(result.nees, ".2f"),
-            ]
 
 
 def _median_and_worst(values: Sequence[float], form: str) -> tuple[str, str]:

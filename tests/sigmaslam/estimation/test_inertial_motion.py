@@ -6,6 +6,9 @@ import pytest
 from sigmaslam.estimation.inertial_motion import InertialMotion
 from sigmaslam.geometry.inertial_sensor import InertialSamples
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
+from sigmaslam_synthetic.inertial import measure_exactly
+from sigmaslam_synthetic.motion.paths import with_stops
+from sigmaslam_synthetic.motion.random_motions import FreeSpace, hand_held
 from tests.support.inertial import GRAVITY, SENSOR, Halt, Motion
 
 FRAME = 0.05
@@ -14,6 +17,18 @@ DENSITIES = np.array([0.25, 0.25])
 SIGMA = np.repeat([0.002, 0.0005], 3)
 MOUNTING = se3_exp(np.array([0.06, -0.02, 0.01, 0.3, -1.2, 0.5]))
 GYRO_BIAS, ACCEL_BIAS = np.array([-0.003, 0.02, 0.08]), np.array([0.05, -0.1, 0.07])
+
+
+class Walk(Motion):
+    """A walk of renders with a stop in it, as `sigmaslam train render room --motion stops` has it."""
+
+    def __init__(self, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        self.path = with_stops(hand_held(rng, 3.5, FreeSpace((0, 0, 1.5), (2.0, 2.0, 0.4))), rng, 1)
+        self.poses = self.path.poses
+
+    def measure(self, t: np.ndarray) -> InertialSamples:
+        return measure_exactly(self.path, np.eye(4), t)[0]
 
 
 class Flight:
@@ -131,6 +146,26 @@ def test_a_body_that_stops_stays_where_it_is_in_the_dark():
         assert np.linalg.norm((flight.truth - flight.filter.step)[:3, 3]) < 0.01
         assert flight.nees()["pose"] < 2.0
         assert flight.nees()["gyro"] < 3.0
+
+
+@pytest.mark.long
+def test_rests_of_walks_are_found_and_few_slow_frames_besides():
+    found, wrong = [], []
+    for seed in range(4):
+        walk, still = Walk(seed), 0
+        flight = Flight(seed, walk, noise=1.0, wrong=True)
+        for frame in range(110):
+            flight.fly(1)
+            speed = walk.path.motion(np.array([flight.frame * FRAME])).velocity[0]
+            still = 0 if np.linalg.norm(speed) > 1e-6 else still + 1
+            if still > 13 and frame > 40:  # half a second of images, and gravity is known
+                found.append(flight.filter.is_resting)
+            elif not still and flight.filter.is_resting:
+                wrong.append(np.linalg.norm(speed))
+    print(f"{np.mean(found):.2f} of {len(found)} found, {len(wrong)} wrong, at up to {max(wrong):.3f} m/s")
+    assert np.mean(found) > 0.6
+    assert len(wrong) <= 4 * 12
+    assert max(wrong) < 0.1
 
 
 def test_without_samples_it_is_constant_velocity():
