@@ -236,17 +236,11 @@ def fuse_keyframe(
     reference = replace(view.measured, disparity=np.where(hopeless, np.nan, view.measured.disparity))
     others = []
     # The nearest first: it says most of what is seen, and sets what the others must agree with.
-    for other in sorted((k for k in views if k != number), key=lambda k: (abs(k - number), k)):
-        if abs(other - number) > NEIGHBOURS:
-            continue
+    near = [k for k in views if 0 < abs(k - number) <= NEIGHBOURS]
+    for other in sorted(near, key=lambda k: (abs(k - number), k)):
         step, covariance = keyframes.step(number, other)
-        others.append(
-            (
-                views[other][1],
-                rectifier.T_rectified_left @ step @ T_left_rectified,
-                turn_covariance(rectifier.T_rectified_left, covariance),
-            )
-        )
+        pose = rectifier.T_rectified_left @ step @ T_left_rectified
+        others.append((views[other][1], pose, turn_covariance(rectifier.T_rectified_left, covariance)))
     return KeyframeDepth(
         number,
         image,
