@@ -54,14 +54,6 @@ class DenseCloud(Table):
         return np.sqrt(np.maximum(largest_eigenvalue(self.covariances.astype(np.float64)), 0.0)).astype(np.float32)
 
 
-def symmetric(six: np.ndarray) -> np.ndarray:
-    """Matrices (..., 3, 3) of their numbers (..., 6)."""
-    matrix = np.empty((*six.shape[:-1], 3, 3), six.dtype)
-    matrix[..., _ROWS, _COLUMNS] = six
-    matrix[..., _COLUMNS, _ROWS] = six
-    return matrix
-
-
 def inverse(six: np.ndarray) -> np.ndarray:
     """The six numbers (..., 6) of the inverses of positive definite matrices of such, from their cofactors."""
     xx, xy, xz, yy, yz, zz = np.moveaxis(six, -1, 0)
@@ -259,14 +251,7 @@ def _times(six: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 def _sum_by_key(keys: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows with the same key (N, 4) summed."""
     order, first = _groups(keys @ _ONE_KEY)
-    count = np.diff(np.r_[first, len(order)])
-    summed = sums[order[first]]
-    # Few have many: rows are added by their rank in the voxel.
-    more = np.flatnonzero(count > 1)
-    for rank in range(1, int(count.max(initial=0))):
-        summed[more] += sums[order[first[more] + rank]]
-        more = more[count[more] > rank + 1]
-    return keys[order[first]], summed
+    return keys[order[first]], np.add.reduceat(sums[order], first, axis=0) if len(first) else sums
 
 
 def _groups(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -35,7 +35,7 @@ _WINDOW, _RESAMPLING, _ROUNDING = np.full(7, 1.0 / 7.0, np.float32), np.float32(
 _FLOW_VARIANCE, _GATE_2D = np.float32(0.3**2), 9.21
 # Of the pixels whose depth is as expected, at least this share must also be where the pose says.
 _LEAST_SHARE = 0.5
-# Pixels whose variances by a pose are computed at a time.
+# Pixels whose variances by a pose are computed at a time: arrays of them stay in the cache of a core.
 _PART = 8192
 # What a small step, translation before rotation, adds to normalised coordinates x, y and to the relative depth of a
 # point (a, b, 1) of inverse depth q: linear in q, 1, a and b, the second axis.
@@ -250,7 +250,8 @@ def _measure(
     place = np.stack([moves_u**2 * variance, moves_v**2 * variance])
     factors = np.einsum("kmi,ij,lnj->klmn", _BY_STEP, covariance, _BY_STEP)[*np.triu_indices(3)].astype(np.float32)
     by_pose = np.empty_like(predicted)
-    for part in _parts(len(rows)):
+    for first in range(0, len(rows), _PART):
+        part = slice(first, first + _PART)
         slopes = slope_u[part], slope_v[part]
         by_pose[part], *by_place = _pose_variances(factors, a[part], b[part], predicted[part], *slopes, camera)
         place[:, part] += by_place
@@ -286,11 +287,6 @@ def _pose_variances(
     return innovation, place_u, place_v
 
 
-def _parts(count: int) -> list[slice]:
-    """Slices of so many pixels that temporary arrays of them stay in the cache of a core."""
-    return [slice(first, first + _PART) for first in range(0, count, _PART)]
-
-
 def _looks_alike(image: np.ndarray, texture: np.ndarray, seen: _Seen, known: np.ndarray) -> np.ndarray:
     """(M,) bool, measured pixels whose windows show the same where the points appear in the other image.
 
@@ -318,15 +314,11 @@ def _looks_alike(image: np.ndarray, texture: np.ndarray, seen: _Seen, known: np.
     warped = image.copy()
     warped.ravel()[pixels] = grey.clip(0, 255).astype(np.uint8)
     nothing = np.zeros((*image.shape, 2), np.float32)
-    flow_u, flow_v = cv2.split(_optical_flow().calc(image, warped, nothing))
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
+    flow_u, flow_v = cv2.split(flow.calc(image, warped, nothing))
     rests = flow_u.ravel()[measured] ** 2 / (place_u + _FLOW_VARIANCE)
     rests += flow_v.ravel()[measured] ** 2 / (place_v + _FLOW_VARIANCE)
     return np.asarray(alike & (rests <= _GATE_2D))
-
-
-def _optical_flow() -> cv2.DISOpticalFlow:
-    """Dense flow between an image and the warped other one, which differ by little where all is at rest."""
-    return cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
 
 
 def _texture(image: np.ndarray) -> np.ndarray:
@@ -346,14 +338,11 @@ def _sample(images: Sequence[np.ndarray], u: np.ndarray, v: np.ndarray) -> list[
     columns = 1024
     rows = -(-len(u) // columns)
     maps = np.full((2, rows * columns), -1e4, np.float32)
-    inside = np.isfinite(u) & np.isfinite(v)
-    for line, values in zip(maps, (u, v), strict=True):
-        line[: len(u)][inside] = values[inside]
+    maps[:, : len(u)] = np.where(np.isfinite(u) & np.isfinite(v), [u, v], -1e4)
+    map_u, map_v = maps.reshape(2, rows, columns)
     sampled = []
     for image in images:
-        found = cv2.remap(
-            image, maps[0].reshape(rows, -1), maps[1].reshape(rows, -1), cv2.INTER_LINEAR, borderValue=(np.nan,) * 4
-        )
+        found = cv2.remap(image, map_u, map_v, cv2.INTER_LINEAR, borderValue=(np.nan,) * 4)
         channels = [each.ravel()[: len(u)] for each in cv2.split(found)]
         sampled.append(channels[0] if image.ndim == 2 else np.stack(channels))
     return sampled

@@ -2,36 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from sigmaslam.bodies.object_tracker import ObjectEstimate
+from sigmaslam.errors import InputError
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.live.frame_sink import TrackedFrame
-from sigmaslam.reconstruction.cloud import write_cloud
+from sigmaslam.reconstruction.cloud import VoxelCloud, write_cloud
 from sigmaslam.reconstruction.depth_fusion import DepthView
 from sigmaslam.reconstruction.disparity import semi_global_disparity
-from sigmaslam.reconstruction.reconstruct import NEIGHBOURS, CloudBuilder, add_to_run, fuse_keyframe, measure_view
+from sigmaslam.reconstruction.reconstruct import NEIGHBOURS, default_voxel, fuse_keyframe, least_views, measure_view
 from sigmaslam.reconstruction.recorded_keyframes import MOST_FRAMES, RecordedKeyframes
+from sigmaslam.run_record.dense_points import DENSE_NAME, write_dense_points
 from sigmaslam.run_record.relative_pose_file import FramePairs
 from sigmaslam.slam.estimate import Estimate
 from sigmaslam.slam.relative_poses import SPANS, RelativePoses
 
 
-@dataclass(frozen=True, slots=True)
-class _LiveView:
-    """A keyframe, or a frame between two that are far apart, with what was said of it."""
-
-    said: Estimate
-    image: np.ndarray
-    view: DepthView
-
-
 class CloudSink:
-    """Makes the cloud of `sigmaslam map reconstruct` of the poses as they are said, and reads nothing back.
+    """Makes the cloud of `sigmaslam map reconstruct` of the poses as they are said.
 
     A few views and a bounded number of voxels are in memory; a pose far from the one before it begins anew.
 
@@ -45,9 +37,9 @@ class CloudSink:
         self.name = str(path)
         self._path, self._run, self._camera = path, run, camera
         self._rectifier = StereoRectifier(camera)
-        self._builder = CloudBuilder(self._rectifier.rectified)
-        self._views: list[_LiveView] = []
-        self._since = 0
+        self._cloud: VoxelCloud | None = None
+        self._views: list[tuple[Estimate, np.ndarray, DepthView]] = []
+        self._keyframes = self._since = 0
 
     def add(self, frame: TrackedFrame) -> None:
         """Takes a frame."""
@@ -55,7 +47,6 @@ class CloudSink:
         if isinstance(said, ObjectEstimate) or seen is None or not said.has_pose:
             return
         if said.status in ("lost", "relocalised") or said.loop is not None:
-            # The poses before are in another place of the world than those that come.
             self._fuse_last()
         self._since += 1
         if said.status in ("lost", "skipped") or (said.tracks is None and self._since < MOST_FRAMES):
@@ -63,47 +54,46 @@ class CloudSink:
         self._since = 0
         offset = said.calibration.disparity_offset
         view = measure_view(seen.left, seen.right, self._rectifier, semi_global_disparity, offset)
-        self._views = [*self._views[-2 * NEIGHBOURS :], _LiveView(said, seen.left.copy(), view)]
+        self._views = [*self._views[-2 * NEIGHBOURS :], (said, seen.left.copy(), view)]
         if len(self._views) > NEIGHBOURS:
             self._fuse(len(self._views) - 1 - NEIGHBOURS)
 
     def close(self) -> None:
         """Writes the cloud, and what the report shows of it."""
         self._fuse_last()
-        points, summary = self._builder.finish()
+        if self._cloud is None:
+            raise InputError("no keyframe has a pose: track a longer sequence")
+        points = self._cloud.cloud(least_views(self._keyframes))
         write_cloud(self._path, points)
-        add_to_run(self._run, points, summary)
+        write_dense_points(self._run / DENSE_NAME, points.points, points.sigma, points.intensity)
 
     def _fuse_last(self) -> None:
-        """Fuses the views that wait for others, which do not come."""
+        """Fuses the views that wait for others: none come, or from another place of the world."""
         for number in range(max(len(self._views) - NEIGHBOURS, 0), len(self._views)):
             self._fuse(number)
         self._views = []
 
     def _fuse(self, number: int) -> None:
-        if self._views[number].said.tracks is None:
+        if self._views[number][0].tracks is None:
             return
-        images = {k: (each.image, each.view) for k, each in enumerate(self._views)}
-        self._builder.add(fuse_keyframe(number, images, self._keyframes(), self._rectifier))
+        views = {k: (image, view) for k, (_, image, view) in enumerate(self._views)}
+        depth = fuse_keyframe(number, views, self._recorded(), self._rectifier)
+        self._cloud = self._cloud or VoxelCloud(default_voxel(depth, self._rectifier.rectified))
+        self._cloud.add(depth.cloud(self._rectifier.rectified, self._cloud.size))
+        self._keyframes += 1
 
-    def _keyframes(self) -> RecordedKeyframes:
+    def _recorded(self) -> RecordedKeyframes:
         """The views in memory, as if they were read from the folder of a run."""
-        said = [each.said for each in self._views]
+        said = [each for each, _, _ in self._views]
         relative = RelativePoses.concatenate([each.relative_poses for each in said])
         times = np.array([each.timestamp for each in said])
         later = np.repeat(np.arange(len(said)), [len(each.relative_poses) for each in said])
-        earlier = np.zeros_like(later)
+        last = said[-1].calibration
         return RecordedKeyframes(
-            self._run,
-            "",
-            self._camera,
-            np.array([each.tracks is not None for each in said]),
-            times,
+            *(self._run, "", self._camera, np.array([each.tracks is not None for each in said]), times),
             np.array([each.T_world_camera for each in said]),
             np.array([each.covariance for each in said]),
-            said[-1].calibration.disparity_offset,
-            said[-1].calibration.disparity_offset_sigma,
-            np.arange(len(said)),
-            FramePairs(np.array(SPANS)[relative.span], earlier, later, relative.pose, relative.covariance),
+            *(last.disparity_offset, last.disparity_offset_sigma, np.arange(len(said))),
+            FramePairs(np.array(SPANS)[relative.span], 0 * later, later, relative.pose, relative.covariance),
             np.stack([relative.timestamp, times[later]], axis=1),
         )

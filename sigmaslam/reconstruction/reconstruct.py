@@ -140,80 +140,49 @@ def reconstruct_run(
     match: Matcher = semi_global_disparity if network is None else StereoNetwork(network)
     rectifier = StereoRectifier(keyframes.camera)
     camera = rectifier.rectified
-    builder = CloudBuilder(camera, voxel)
+    cloud: VoxelCloud | None = None
     volume: DepthVolume | None = None
     posed = None if export is None else PosedImages(export, camera)
+    measured = confirmed = 0
+    began = time.perf_counter()
     with open_progress() as progress:
         task = progress.add_task("keyframes", total=keyframes.count, note="")
         for depth in fuse_keyframes(keyframes, sequence, rectifier, match):
-            size = builder.add(depth)
+            chosen = depth.is_point
+            if cloud is None:
+                cloud = VoxelCloud(voxel or default_voxel(depth, camera))
+                volume = None if mesh is None else DepthVolume(cloud.size, camera)
+            cloud.add(depth.cloud(camera, cloud.size))
             if posed is not None:
                 posed.add(depth.image, depth.pose)
-            if mesh is not None:
-                volume = volume or DepthVolume(size, camera)
-                chosen = depth.is_point
+            if volume is not None:
                 z = np.where(chosen, camera.focal_baseline / np.where(chosen, depth.fused.disparity, 1.0), 0.0)
                 volume.integrate(z.astype(np.float32), depth.image, depth.pose)
-            progress.update(task, advance=1, note=f"{builder.confirmed:.0%} confirmed")
-    points, summary = builder.finish(min_views, max_sigma)
+            measured += int(np.isfinite(depth.measured.disparity).sum())
+            confirmed += int(chosen.sum())
+            progress.update(task, advance=1, note=f"{confirmed / max(measured, 1):.0%} confirmed")
+    seconds = time.perf_counter() - began
+    assert cloud is not None
+    points = cloud.cloud(least_views(keyframes.count, min_views))
+    if max_sigma is not None:
+        points = points.select(points.sigma <= max_sigma)
     write_cloud(out, points)
     if posed is not None:
         posed.write(points)
     if mesh is not None and volume is not None:
         volume.write(mesh)
-    add_to_run(run, points, summary)
-    write_report(run)
+    pixels = keyframes.count * camera.width * camera.height
+    summary = ReconstructionSummary(
+        keyframes.count,
+        len(points),
+        cloud.size,
+        measured / pixels,
+        confirmed / max(measured, 1),
+        float(np.median(points.sigma)) if len(points) else float("nan"),
+        seconds / keyframes.count,
+    )
+    _add_to_report(run, points, summary)
     return summary
-
-
-class CloudBuilder:
-    """A cloud that grows keyframe by keyframe, with its figures.
-
-    Args:
-        camera: the rectified pair.
-        voxel: side of the finest voxels, metres; None: three pixels at the median depth of the first keyframe.
-    """
-
-    def __init__(self, camera: RectifiedStereo, voxel: float | None = None) -> None:
-        self._camera, self._voxel = camera, voxel
-        self._cloud: VoxelCloud | None = None
-        self._keyframes = self._measured = self._points = 0
-        self._began = time.perf_counter()
-
-    @property
-    def confirmed(self) -> float:
-        """Share of the disparities so far that became points."""
-        return self._points / max(self._measured, 1)
-
-    def add(self, depth: KeyframeDepth) -> float:
-        """Takes a keyframe; the side of the finest voxels, metres."""
-        if self._cloud is None:
-            self._cloud = VoxelCloud(self._voxel or _default_voxel(depth, self._camera))
-        self._cloud.add(depth.cloud(self._camera, self._cloud.size))
-        self._keyframes += 1
-        self._measured += int(np.isfinite(depth.measured.disparity).sum())
-        self._points += int(depth.is_point.sum())
-        return self._cloud.size
-
-    def finish(
-        self, min_views: int = MIN_VIEWS, max_sigma: float | None = None
-    ) -> tuple[DenseCloud, ReconstructionSummary]:
-        """The points, as `reconstruct_run` chooses them, and what they are; InputError where no keyframe came."""
-        seconds = time.perf_counter() - self._began
-        if self._cloud is None:
-            raise InputError("no keyframe has a pose: track a longer sequence")
-        points = self._cloud.cloud(min(min_views, max(self._keyframes // 2, 1)))
-        if max_sigma is not None:
-            points = points.select(points.sigma <= max_sigma)
-        return points, ReconstructionSummary(
-            self._keyframes,
-            len(points),
-            self._cloud.size,
-            self._measured / (self._keyframes * self._camera.width * self._camera.height),
-            self.confirmed,
-            float(np.median(points.sigma)) if len(points) else float("nan"),
-            seconds / self._keyframes,
-        )
 
 
 def fuse_keyframes(
@@ -267,17 +236,11 @@ def fuse_keyframe(
     reference = replace(view.measured, disparity=np.where(hopeless, np.nan, view.measured.disparity))
     others = []
     # The nearest first: it says most of what is seen, and sets what the others must agree with.
-    for other in sorted((k for k in views if k != number), key=lambda k: (abs(k - number), k)):
-        if abs(other - number) > NEIGHBOURS:
-            continue
+    near = [k for k in views if 0 < abs(k - number) <= NEIGHBOURS]
+    for other in sorted(near, key=lambda k: (abs(k - number), k)):
         step, covariance = keyframes.step(number, other)
-        others.append(
-            (
-                views[other][1],
-                rectifier.T_rectified_left @ step @ T_left_rectified,
-                turn_covariance(rectifier.T_rectified_left, covariance),
-            )
-        )
+        pose = rectifier.T_rectified_left @ step @ T_left_rectified
+        others.append((views[other][1], pose, turn_covariance(rectifier.T_rectified_left, covariance)))
     return KeyframeDepth(
         number,
         image,
@@ -300,13 +263,18 @@ def measure_view(
     return DepthView.of(left, replace(measured, disparity=disparity))
 
 
-def _default_voxel(depth: KeyframeDepth, camera: RectifiedStereo) -> float:
+def default_voxel(depth: KeyframeDepth, camera: RectifiedStereo) -> float:
     """A few pixels at the median depth of a keyframe, of two digits, metres."""
     chosen = depth.is_point if depth.is_point.any() else depth.measured.disparity > 0.0
     if not chosen.any():
         raise InputError("nothing was matched between the eyes in the first keyframe: give --voxel, or check the input")
     median = camera.focal_baseline / float(np.median(depth.fused.disparity[chosen]))
     return float(f"{_VOXEL_PIXELS * median / camera.fx:.2g}")
+
+
+def least_views(keyframes: int, wanted: int = MIN_VIEWS) -> int:
+    """Keyframes that a point needs where there are so many."""
+    return min(wanted, max(keyframes // 2, 1))
 
 
 def _check_writable(path: Path | None) -> None:
@@ -319,7 +287,8 @@ def _check_writable(path: Path | None) -> None:
         raise InputError(f"{path}: the folder {path.parent} does not exist: create it, or choose another")
 
 
-def add_to_run(run: Path, points: DenseCloud, summary: ReconstructionSummary) -> None:
-    """Leaves an even selection of the points, and the summary, in the run's folder for its report."""
+def _add_to_report(run: Path, points: DenseCloud, summary: ReconstructionSummary) -> None:
+    """Leaves an even selection of the points, and the summary, in the run's folder and writes its report anew."""
     write_dense_points(run / DENSE_NAME, points.points, points.sigma, points.intensity)
     atomic_write_text(run / RECONSTRUCTION_NAME, json.dumps(asdict(summary), indent=2) + "\n")
+    write_report(run)

@@ -38,7 +38,7 @@ _REFUSED = (
     ("--camera", ("--start", "--frames", "--every", "--scale"), "{all} go with INPUT, not with --camera"),
     ("--camera", ("--imu", "--odometry"), "{all} go with INPUT, not with --camera"),
     ("--resume", ("--overwrite",), "--resume goes on with the run in the folder, {all} removes it: give one of them"),
-    ("--resume", ("--video", "--viewer", "--dense"), "--resume does not go with {all}, of a whole run: leave them out"),
+    ("--resume", ("--video", "--viewer", "--dense"), "--resume does not go with {all}, of whole runs: leave them out"),
     ("--resume", _FORGOTTEN, "--resume does not go with {given}: leave one of them out"),
     (
         "--save-calibration",

@@ -67,7 +67,7 @@ def test_live_cameras_have_no_parts_and_no_format(part: dict[str, Any]):
     ("outputs", "tracker", "live", "words"),
     [
         ({"overwrite": True, "resume": True}, {}, {}, "give one of them"),
-        ({"resume": True}, {}, {"video": Path("a.mp4")}, "go with --video and --viewer, which show a whole run"),
+        ({"resume": True}, {}, {"video": Path("a.mp4")}, "go with --video, --viewer and --dense, of whole runs"),
         ({"resume": True}, {"map": Path("map.npz")}, {}, "--resume does not go with --map: leave one"),
         ({"resume": True, "tracks": True}, {}, {}, "--resume does not go with --tracks"),
         ({"resume": True}, {"realtime": True}, {}, "--resume does not go with --realtime"),
