@@ -14,7 +14,7 @@ from sigmaslam_models.feature_network import FeatureNetwork
 Transfer = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """From points (N, 2) of image 0 to places (N, 2) in image 1, and whether they are seen there (N,) bool."""
 
-# A match is right within so many pixels, and worth half as much there as at its very place.
+# A match is right within so many pixels, and worth the less the farther it is from its place.
 _RIGHT = 3.0
 # Pixels a keypoint: 1,024 in an image of 640x480.
 _PIXELS = 300
@@ -84,7 +84,7 @@ def detector_loss(
         places, seen = (torch.from_numpy(each) for each in transfer(points.double().numpy()))
         distance = (keypoints[1][known[1]][mutual.partner] - places.float()).norm(dim=1)
         right = mutual.best & seen & (distance < _RIGHT)
-        reward = torch.where(right, 1.0 - 0.5 * distance / _RIGHT, 0.0).view(picked.shape)
+        reward = torch.where(right, 1.0 - distance / _RIGHT, 0.0).view(picked.shape)
         seen = seen.view(picked.shape)
         drawn = reward[:, 1:]
         others = (drawn.sum(dim=1, keepdim=True) - drawn) / (_DRAWS - 1)
