@@ -13,7 +13,7 @@ _SADDLES, _MOST = -2.0, 4.0
 
 
 class LearnedResponse(nn.Module):
-    """How well each pixel would serve as a keypoint; before it is trained, what the Hessian says.
+    """How well each pixel would serve as a keypoint; before it is trained, nearly what the Hessian says.
 
     The Hessian was chosen on warped planes. Between wide views of relief other places repeat, corners among them, which
     are saddles beside blobs. Weights change smoothly from cell to cell: a gain of each pixel's own locks keypoints to
