@@ -44,7 +44,9 @@ class LearnedResponse(nn.Module):
         weights = (_MOST * (self.decide(seen) / _MOST).tanh() + first).exp()
         blob, saddle = _at_pixels(weights / level).split(CELL * CELL, dim=1)
         # What is flat stays zero: round-off is of neither kind.
-        return functional.relu(determinant - MIN_RESPONSE) * blob + functional.relu(-determinant - MIN_RESPONSE) * saddle
+        return (
+            functional.relu(determinant - MIN_RESPONSE) * blob + functional.relu(-determinant - MIN_RESPONSE) * saddle
+        )
 
 
 def _at_pixels(values: Tensor) -> Tensor:
