@@ -51,13 +51,9 @@ def hessian_response(cells: Tensor) -> Tensor:
     Positive on blobs, bright or dark, negative on saddles (Beaudet 1978; Lindeberg 1998). Near the border of the image
     it is meaningless.
     """
-    uu, vv, uv = second_derivatives(cells).split(CELL * CELL, dim=1)
+    size = CELL * CELL
+    uu, vv, uv = functional.conv2d(cells, _HESSIAN_KERNELS.to(cells), padding=1).split(size, dim=1)
     return uu * vv - uv * uv
-
-
-def second_derivatives(cells: Tensor) -> Tensor:
-    """Of the image smoothed by 1.4 px, times 1.4^2: uu, vv, uv of each pixel, (B, 16, h, w) -> (B, 48, h, w)."""
-    return functional.conv2d(cells, _HESSIAN_KERNELS.to(cells), padding=1)
 
 
 def _hessian_kernels() -> Tensor:

@@ -14,7 +14,7 @@ from sigmaslam_models.feature_network import FeatureNetwork
 Transfer = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """From points (N, 2) of image 0 to places (N, 2) in image 1, and whether they are seen there (N,) bool."""
 
-# A match is right within so many pixels, and worth half as much there as at its very place.
+# A match is right within so many pixels, and worth the less the farther it is from its place.
 _RIGHT = 3.0
 # Pixels a keypoint: 1,024 in an image of 640x480.
 _PIXELS = 300
@@ -42,7 +42,7 @@ class _Nearest(NamedTuple):
 def detector_loss(
     network: FeatureNetwork, image0: Tensor, image1: Tensor, transfer: Transfer, generator: torch.Generator
 ) -> Tensor:
-    """Minus the worth of the matches of image 0's keypoints that are seen; its gradient reaches the response alone.
+    """Minus the mean worth of keypoints of image 0 that lie in image 1; its gradient reaches the response alone.
 
     In each square of pixels places are drawn by their response, as in DISK (Tyszkiewicz 2020), and those that match
     better than the others drawn there are made more likely: each draw's baseline is the mean of the others. Squares
@@ -84,11 +84,13 @@ def detector_loss(
         places, seen = (torch.from_numpy(each) for each in transfer(points.double().numpy()))
         distance = (keypoints[1][known[1]][mutual.partner] - places.float()).norm(dim=1)
         right = mutual.best & seen & (distance < _RIGHT)
-        reward = torch.where(right, 1.0 - 0.5 * distance / _RIGHT, 0.0).view(picked.shape)
-        seen = seen.view(picked.shape)
+        reward = torch.where(right, 1.0 - distance / _RIGHT, 0.0).view(picked.shape)
+        # What is hidden there is no match; what leaves the image is nobody's fault.
+        last = torch.tensor([image1.shape[-1] - 1, image1.shape[-2] - 1])
+        inside = ((places >= 0) & (places <= last)).all(dim=1).view(picked.shape)
         drawn = reward[:, 1:]
         others = (drawn.sum(dim=1, keepdim=True) - drawn) / (_DRAWS - 1)
-        advantage = torch.where(seen[:, 1:], drawn - others, 0.0)
+        advantage = torch.where(inside[:, 1:], drawn - others, 0.0)
     drawing = (advantage * likelihood.gather(1, draws)).sum()
     level = largest[chosen].clamp_min(1e-12).log()
     with torch.no_grad():
@@ -96,10 +98,10 @@ def detector_loss(
         spread = level.std().clamp_min(1e-3)
     part = ((level - threshold) / spread).sigmoid()
     with torch.no_grad():
-        weight = torch.where(seen[:, 0], part * (1.0 - part), 0.0)
+        weight = torch.where(inside[:, 0], part * (1.0 - part), 0.0)
         worth = (weight * reward[:, 0]).sum() / weight.sum().clamp_min(1e-6)
-        gain = torch.where(seen[:, 0], reward[:, 0] - worth, 0.0)
-        mean = (part * reward[:, 0]).sum() / (part * seen[:, 0]).sum().clamp_min(1e-6)
+        gain = torch.where(inside[:, 0], reward[:, 0] - worth, 0.0)
+        mean = (part * reward[:, 0]).sum() / (part * inside[:, 0]).sum().clamp_min(1e-6)
     surrogate = (drawing + (part * gain).sum()) / count
     return surrogate.detach() - surrogate - mean
 
