@@ -66,11 +66,6 @@ class PastPoses:
         candidates = np.array([k for k in (range(len(self)) if others is None else others) if k != index])
         return int(candidates[doubt[candidates].argmin()])
 
-    def step(self, heir: int, leaving: int) -> tuple[np.ndarray, np.ndarray]:
-        """(4, 4) T_heir_leaving of two poses, and its covariance (6, 6), perturbed from the left in the heir."""
-        back = se3_inverse(self.poses[heir])
-        return back @ self.poses[leaving], turn_covariance(back, self.relative(leaving)[heir])
-
     def relative_to(self, window: np.ndarray, common: np.ndarray, index: int) -> np.ndarray:
         """(6, 6) covariance of the window's last pose relative to the pose `index`, with the considered errors' part.
 
@@ -191,3 +186,9 @@ def past_slice(index: int) -> slice:
 def point_lever(points: np.ndarray) -> np.ndarray:
     """(M, 3, 6) how points (M, 3) of the world move with a perturbation from the left."""
     return np.asarray(np.concatenate([np.tile(np.eye(3), (len(points), 1, 1)), -skew(points)], axis=2))
+
+
+def step_between(past: PastPoses, heir: int, leaving: int) -> tuple[np.ndarray, np.ndarray]:
+    """(4, 4) T_heir_leaving of two poses, and its covariance (6, 6), perturbed from the left in the heir."""
+    back = se3_inverse(past.poses[heir])
+    return back @ past.poses[leaving], turn_covariance(back, past.relative(leaving)[heir])

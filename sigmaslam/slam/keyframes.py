@@ -12,6 +12,7 @@ import numpy as np
 from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
+from sigmaslam.estimation.marginalised_poses import step_between
 from sigmaslam.frontend import StereoView
 from sigmaslam.frontend.image_sharpness import patch_energies
 from sigmaslam.frontend.patch_disparity_range import dense_disparity
@@ -165,7 +166,7 @@ class Keyframes:
         self._window.restart(past)
         for each in hanging:
             self.hanging[each.id] = each
-            self.appearance.add(each.id, each.view)
+            self.appearance.add(each.id, each.descriptors)
         self._next_id = self._first_id = len(keyframes) + len(hanging)
         self._remember(keyframes)
 
@@ -178,7 +179,7 @@ class Keyframes:
         """Takes keyframes of the window's past, and hangs superfluous ones at others, but not the one to spare."""
         self.remembered.extend(keyframes)
         for keyframe in keyframes:
-            self.appearance.add(keyframe.id, keyframe.view)
+            self.appearance.add(keyframe.id, keyframe.descriptors)
         if sum(len(each.points) for each in self.remembered) > 2 * self._max_points:
             kept = most_confirmed([each.points for each in self.remembered], self._max_points)
             self.remembered = [replace(each, points=points) for each, points in zip(self.remembered, kept, strict=True)]
@@ -192,12 +193,12 @@ class Keyframes:
             if len(gone.points):
                 index = past.closest(leaving)
                 points = merge_maps(
-                    [self.remembered[index].points, hand_over_points(gone.points, *past.step(index, leaving))]
+                    [self.remembered[index].points, hand_over_points(gone.points, *step_between(past, index, leaving))]
                 )
                 self.remembered[index] = replace(self.remembered[index], points=points)
             index = past.closest(leaving, per_metre=_PER_METRE)
             heir = self.remembered[index].id
-            for id in hang_over(self.hanging, self._most_hanging, gone, heir, *past.step(index, leaving)):
+            for id in hang_over(self.hanging, self._most_hanging, gone, heir, *step_between(past, index, leaving)):
                 self.appearance.remove(id)
             del self.remembered[leaving]
             self._window.forget_past(leaving)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
-from sigmaslam.estimation.marginalised_poses import PastPoses
+from sigmaslam.estimation.marginalised_poses import PastPoses, step_between
 from sigmaslam.estimation.state_layout import CALIBRATION, CALIBRATION_SIZE, pose_slice
 from sigmaslam.geometry.se3 import se3_body, se3_exp, se3_inverse, se3_log, turn_covariance
 from sigmaslam.slam.point_map import PointMap, hand_over_points, merge_maps, most_confirmed, points_in_world
@@ -216,7 +216,7 @@ def test_points_of_a_forgotten_keyframe_stay_and_hang_at_the_closest_one():
     past, parts = chained(4), [some_points(count, 3) for count in (4, 5, 6, 7)]
     before = points_in_world(parts, past)
     assert past.closest(3) == 2
-    inherited = merge_maps([parts[2], hand_over_points(parts[3], *past.step(2, 3))])
+    inherited = merge_maps([parts[2], hand_over_points(parts[3], *step_between(past, 2, 3))])
     after = points_in_world([*parts[:2], inherited], past.drop(3))
     assert len(after) == 22
     np.testing.assert_allclose(after.points, before.points, atol=1e-12)
