@@ -17,7 +17,7 @@ BUILD := pyproject.toml evaluation/pyproject.toml setup.py requirements.lock sig
          sigmaslam/frontend/kernels.cpp sigmaslam/frontend/kernels.inc sigmaslam/estimation/estimator.cpp \
          sigmaslam/estimation/estimator.inc sigmaslam/estimation/views.inc
 
-.PHONY: demo test test-long test-slow lint docs results dist wheel sbom clean
+.PHONY: demo test test-long test-slow lint docs results dist publish wheel sbom clean
 
 demo: $(VENV)/.runtime
 	$(VENV)/bin/sigmaslam demo
@@ -49,6 +49,15 @@ results: $(VENV)/.dev
 dist: $(VENV)/bin/python
 	rm -rf dist
 	$(VENV)/bin/python release/build_dist.py dist $(PYTHONS)
+
+# The same for a package index: wheels for x86-64 and aarch64 (manylinux_2_28), compiled by zig whatever the machine, and
+# handed over, which asks for the index's token. docs/release.md comes first.
+publish: $(VENV)/bin/python
+	rm -rf dist
+	$(VENV)/bin/python release/build_dist.py --many-linux dist $(PYTHONS)
+	$(VENV)/bin/python -m pip install --quiet twine
+	$(VENV)/bin/python -m twine check --strict dist/*.whl dist/*.tar.gz
+	$(VENV)/bin/python -m twine upload dist/*.whl dist/*.tar.gz
 
 # The demo run from the wheel, in an environment of its own for each Python.
 wheel: dist

@@ -1,10 +1,16 @@
 """The compiled modules; everything else is in pyproject.toml."""
 
+import os
+import sysconfig
+
 import pybind11
 from setuptools import Extension, setup
 
 # No -ffast-math and no contraction: the same bits on every run. AVX2 is chosen when the module is loaded.
 FLAGS = ["-std=c++17", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden", "-Wno-psabi", "-g0"]
+# Clang, which zig is too, vectorises with -O2 and does not know the flags for it.
+CXX = os.environ.get("CXX") or sysconfig.get_config_var("CXX") or ""
+VECTORISED = [] if "zig" in CXX or "clang" in CXX else ["-ftree-loop-vectorize", "-fvect-cost-model=dynamic"]
 
 
 def compiled(name: str, folder: str, source: str, included: list[str], optimised: list[str]) -> Extension:
@@ -27,7 +33,7 @@ ESTIMATOR = compiled(
     "sigmaslam/estimation",
     "estimator.cpp",
     ["estimator.inc", "views.inc"],
-    ["-O2", "-ftree-loop-vectorize", "-fvect-cost-model=dynamic"],
+    ["-O2", *VECTORISED],
 )
 
 setup(ext_modules=[KERNELS, ESTIMATOR])

@@ -1,10 +1,11 @@
 """Build what is handed out: the sdist, a wheel without kernels, and a wheel with kernels for each Python.
 
-    python release/build_dist.py OUT [PYTHON ...]
+    python release/build_dist.py OUT [PYTHON ...] [--many-linux]
 
 The same commit gives the same bytes in any folder: sources come from `git archive HEAD`, tools from requirements.lock,
 times from the commit (or SOURCE_DATE_EPOCH), and archives are sorted and name no user. The compiler is that of the
-machine: kernels are the same where it is.
+machine: kernels are the same where it is. With --many-linux it is that of the package index's `ziglang`, for x86-64
+and aarch64 and glibc 2.28 (manylinux_2_28), whatever the machine; `auditwheel` agrees that they need nothing newer.
 """
 
 import argparse
@@ -12,6 +13,7 @@ import gzip
 import hashlib
 import io
 import os
+import re
 import subprocess
 import sys
 import tarfile
@@ -21,6 +23,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 TOOLS = ("build", "setuptools", "pybind11")
+CROSS_TOOLS = ("ziglang", "wheel", "auditwheel")
+MANY_LINUX, GLIBC = ("x86_64", "aarch64"), "2.28"
 COMPILED = ("sigmaslam/frontend/_kernels.", "sigmaslam/estimation/_estimator.")
 
 
@@ -29,16 +33,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("out", type=Path, help="folder for the archives and their SHA256SUMS")
     parser.add_argument("pythons", nargs="*", default=[sys.executable], help="interpreters to compile kernels for")
+    parser.add_argument("--many-linux", action="store_true", help=f"wheels for {' and '.join(MANY_LINUX)}, glibc 2.28")
     arguments = parser.parse_args()
     try:
-        for path in build_dist(arguments.out, arguments.pythons):
+        for path in build_dist(arguments.out, arguments.pythons, arguments.many_linux):
             print(path)
     except (RuntimeError, subprocess.CalledProcessError) as error:
         sys.exit(f"error: {error}")
 
 
-def build_dist(out: Path, pythons: list[str]) -> list[Path]:
+def build_dist(out: Path, pythons: list[str], many_linux: bool = False) -> list[Path]:
     """Build all archives; the first Python makes the sdist and the wheel without kernels.
+
+    Args:
+        out: folder for them.
+        pythons: interpreters to compile for.
+        many_linux: compile for the machines of `MANY_LINUX` in place of this one.
 
     Returns:
         The archives, and SHA256SUMS.
@@ -53,18 +63,24 @@ def build_dist(out: Path, pythons: list[str]) -> list[Path]:
     environment.pop("PYTHONPATH", None)
     with tempfile.TemporaryDirectory() as name:
         work = Path(name)
-        builders = [_install_tools(python, work / f"tools{number}") for number, python in enumerate(pythons)]
+        tools = TOOLS + CROSS_TOOLS * many_linux
+        builders = [_install_tools(python, work / f"tools{number}", tools) for number, python in enumerate(pythons)]
+        machines = MANY_LINUX if many_linux else ("",)
         _unpack(_git("archive", "--format=tar", "HEAD"), work / "commit")
         raw = _build(builders[0], "sdist", work / "commit", work / "raw", environment)
         sdist = out / raw.name
         sdist.write_bytes(normalise_tar(raw.read_bytes(), int(epoch)))
         archives = [sdist]
-        for number, builder in enumerate([builders[0], *builders]):
+        wheels = [(builders[0], ""), *((builder, machine) for builder in builders for machine in machines)]
+        for number, (builder, machine) in enumerate(wheels):
             _unpack(gzip.decompress(sdist.read_bytes()), work / f"sources{number}")
             sources = work / f"sources{number}" / sdist.name.removesuffix(".tar.gz")
             if number == 0:
                 (sources / "setup.py").unlink()  # which holds the kernels alone
-            wheel = _build(builder, "wheel", sources, out, environment)
+            settings = environment | (_cross_settings(builder, machine, work / "zig") if machine else {})
+            wheel = _build(builder, "wheel", sources, out, settings)
+            if machine:
+                wheel = _as_many_linux(builder, wheel, machine, settings)
             with zipfile.ZipFile(wheel) as content:
                 compiled = [each for each in content.namelist() if each.startswith(COMPILED)]
             if len(compiled) != (len(COMPILED) if number > 0 else 0):
@@ -97,12 +113,46 @@ def normalise_tar(archive: bytes, seconds: int) -> bytes:
     return gzip.compress(written.getvalue(), mtime=seconds)
 
 
-def _install_tools(python: str, folder: Path) -> Path:
+def _cross_settings(builder: Path, machine: str, cache: Path) -> dict[str, str]:
+    """The environment in which setuptools compiles for another machine; libraries that zig builds stay in `cache`."""
+    compiler = f"{builder} -m ziglang {{}} -target {machine}-linux-gnu.{GLIBC}"
+    abi = subprocess.run(
+        [builder, "-c", "import sys; print(sys.implementation.cache_tag)"], capture_output=True, text=True
+    )
+    return {
+        "CC": compiler.format("cc"),
+        "CXX": compiler.format("c++"),
+        "LDSHARED": f"{compiler.format('c++')} -shared -s",
+        "LDCXXSHARED": f"{compiler.format('c++')} -shared -s",
+        "SETUPTOOLS_EXT_SUFFIX": f".{abi.stdout.strip()}-{machine}-linux-gnu.so",
+        "_PYTHON_HOST_PLATFORM": f"linux-{machine}",
+        "ZIG_GLOBAL_CACHE_DIR": os.environ.get("ZIG_GLOBAL_CACHE_DIR", str(cache)),
+    }
+
+
+def _as_many_linux(builder: Path, wheel: Path, machine: str, environment: dict[str, str]) -> Path:
+    """The wheel by the name of the systems that it runs on, which `auditwheel` confirms.
+
+    Raises:
+        RuntimeError: it needs a newer glibc, or a library that such systems may lack.
+    """
+    tag = f"manylinux_{GLIBC.replace('.', '_')}_{machine}"
+    _run(builder, "-m", "wheel", "tags", "--remove", "--platform-tag", tag, wheel, environment=environment)
+    named = wheel.with_name(wheel.name.replace(f"linux_{machine}", tag))
+    shown = subprocess.run([builder, "-m", "auditwheel", "show", named], capture_output=True, text=True, check=True)
+    # The oldest systems that it runs on.
+    oldest = re.search(r'tag:\s+"manylinux_2_(\d+)_', shown.stdout)
+    if oldest is None or int(oldest[1]) > int(GLIBC.removeprefix("2.")):
+        raise RuntimeError(f"{named} does not run on all systems of {tag}: {shown.stdout}")
+    return named
+
+
+def _install_tools(python: str, folder: Path, tools: tuple[str, ...]) -> Path:
     """An environment of that Python with the tools of requirements.lock; its interpreter."""
     _run(python, "-m", "venv", folder)
     interpreter = folder / "bin" / "python"
     lock = ROOT / "requirements.lock"
-    _run(interpreter, "-m", "pip", "install", "--quiet", "--constraint", lock, *TOOLS)
+    _run(interpreter, "-m", "pip", "install", "--quiet", "--constraint", lock, *tools)
     return interpreter
 
 

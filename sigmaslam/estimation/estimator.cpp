@@ -13,6 +13,10 @@
 #include <numeric>
 #include <vector>
 
+#if defined(__x86_64__)
+#include <cpuid.h>
+#endif
+
 namespace py = pybind11;
 using Reals = py::array_t<double, py::array::c_style | py::array::forcecast>;
 using Integers = py::array_t<int64_t, py::array::c_style | py::array::forcecast>;

@@ -19,6 +19,9 @@
 #if defined(__SSE2__)
 #include <immintrin.h>
 #endif
+#if defined(__x86_64__)
+#include <cpuid.h>
+#endif
 
 namespace py = pybind11;
 using Grey = py::array_t<uint8_t, py::array::c_style | py::array::forcecast>;

@@ -27,9 +27,9 @@ class AppearanceIndex:
     def __len__(self) -> int:
         return len(self._vectors)
 
-    def add(self, id: int, view: StereoView) -> None:
-        """Takes a keyframe by a number that no other one has."""
-        self._vectors[id] = describe(view)
+    def add(self, id: int, descriptors: np.ndarray) -> None:
+        """Takes a keyframe by a number that no other one has, with descriptors (N, D) of its features, best first."""
+        self._vectors[id] = describe(descriptors)
 
     def remove(self, id: int) -> None:
         """Forgets a keyframe."""
@@ -46,13 +46,13 @@ class AppearanceIndex:
         ids = np.array([id for id in self._vectors if among is None or id in among], np.int64)
         if not len(ids):
             return []
-        similarity = np.stack([self._vectors[id] for id in ids.tolist()]) @ describe(view)
+        similarity = np.stack([self._vectors[id] for id in ids.tolist()]) @ describe(view.features.descriptors)
         return [int(id) for id in ids[np.lexsort((-ids, -similarity))[:count]]]
 
 
-def describe(view: StereoView) -> np.ndarray:
-    """(C,) float32 of unit length, alike for views of one place; C = 0 where descriptors are empty."""
-    descriptors = view.features.descriptors[:_FEATURES]
+def describe(descriptors: np.ndarray) -> np.ndarray:
+    """(C,) float32 of unit length, alike for descriptors (N, D) of one place; C = 0 where D = 0."""
+    descriptors = descriptors[:_FEATURES]
     if descriptors.shape[1] > _DIMENSIONS:
         projection = np.random.default_rng(0).normal(size=(descriptors.shape[1], _DIMENSIONS))
         descriptors = descriptors @ projection.astype(np.float32)

@@ -166,7 +166,7 @@ class Keyframes:
         self._window.restart(past)
         for each in hanging:
             self.hanging[each.id] = each
-            self.appearance.add(each.id, each.view)
+            self.appearance.add(each.id, each.descriptors)
         self._next_id = self._first_id = len(keyframes) + len(hanging)
         self._remember(keyframes)
 
@@ -179,7 +179,7 @@ class Keyframes:
         """Takes keyframes of the window's past, and hangs superfluous ones at others, but not the one to spare."""
         self.remembered.extend(keyframes)
         for keyframe in keyframes:
-            self.appearance.add(keyframe.id, keyframe.view)
+            self.appearance.add(keyframe.id, keyframe.descriptors)
         if sum(len(each.points) for each in self.remembered) > 2 * self._max_points:
             kept = most_confirmed([each.points for each in self.remembered], self._max_points)
             self.remembered = [replace(each, points=points) for each, points in zip(self.remembered, kept, strict=True)]

@@ -2,14 +2,17 @@
 
 import io
 import os
+import runpy
 import shutil
 import subprocess
 import sys
 import tarfile
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import setuptools
 
 from release.build_dist import normalise_tar
 
@@ -38,6 +41,23 @@ def test_order_user_time_and_umask_leave_no_trace_in_an_archive():
         }
         assert {(each.mtime, each.mode, each.uname) for each in archive.getmembers()} == {(1000, 0o644, "")}
     assert normalise_tar(pack(["p/a", "p/b"], "ann", 1, 0o700), 1000) != one
+
+
+@pytest.mark.parametrize(
+    ("compiler", "is_clang"),
+    [("g++ -pthread", False), ("clang++", True), ("/tmp/python -m ziglang c++ -target aarch64-linux-gnu.2.28", True)],
+)
+def test_each_compiler_gets_the_flags_that_it_knows(compiler: str, is_clang: bool, monkeypatch: pytest.MonkeyPatch):
+    """Kernels are optional: with a flag that it refuses a wheel would come out without them."""
+    modules: list[setuptools.Extension] = []
+    monkeypatch.setenv("CXX", compiler)
+    monkeypatch.setitem(sys.modules, "pybind11", SimpleNamespace(get_include=str))
+    monkeypatch.setattr(setuptools, "setup", lambda ext_modules: modules.extend(ext_modules))
+    runpy.run_path(str(ROOT / "setup.py"))
+    assert [module.name for module in modules] == ["sigmaslam.frontend._kernels", "sigmaslam.estimation._estimator"]
+    flags = {flag for module in modules for flag in module.extra_compile_args}
+    assert {"-ffp-contract=off", "-O2", "-O3"} <= flags
+    assert bool({"-ftree-loop-vectorize", "-fvect-cost-model=dynamic"} & flags) != is_clang
 
 
 @pytest.mark.slow

@@ -84,6 +84,7 @@ class SimulatedFrontend:
         self._place_errors: dict[int, np.ndarray] = {}
         self._priority = self._random.permutation(len(self._points))
         self._seen: dict[int, np.ndarray] = {}
+        self._frames: dict[bytes, int] = {}
 
     def images(self, frame: int) -> np.ndarray:
         """A black image whose first two pixels are the frame's number."""
@@ -96,18 +97,25 @@ class SimulatedFrontend:
         seen = np.flatnonzero(visible)
         seen = np.sort(seen[np.argsort(self._priority[seen])[: self._most]])
         self._seen[frame] = seen
-        return self._errors.view(left, right, truth, seen, np.random.default_rng((self._seed, frame)))
+        view = self._errors.view(left, right, truth, seen, np.random.default_rng((self._seed, frame)))
+        if len(seen):
+            self._frames[view.features.keypoints[0].tobytes()] = frame
+        return view
+
+    def frame_of_key(self, key: StereoView) -> int:
+        """Of a keyframe, whose image may have been packed since: by the errors of its first keypoint."""
+        return self._frames[key.features.keypoints[0].tobytes()]
 
     def match(self, search: KeypointSearch, view: StereoView) -> TemporalMatches:
         """The points that both see, wherever they were predicted; the same whenever they are matched."""
         frame = frame_of(view.left)
-        random = np.random.default_rng((self._seed, frame_of(search.key.left), frame))
-        wanted, seen = self._seen[frame_of(search.key.left)][search.index], self._seen[frame]
+        random = np.random.default_rng((self._seed, self.frame_of_key(search.key), frame))
+        wanted, seen = self._seen[self.frame_of_key(search.key)][search.index], self._seen[frame]
         both = np.isin(wanted, seen)
         points, count = wanted[both], int(both.sum())
         truth, _ = self._project(frame)
         # Of a keyframe's points in all views alike, and of this view alone.
-        key = frame_of(search.key.left)
+        key = self.frame_of_key(search.key)
         if key not in self._place_errors:
             of_key = np.random.default_rng((self._seed, key, len(self._points)))
             self._place_errors[key] = of_key.standard_normal((len(self._points), 2))

@@ -130,7 +130,7 @@ def test_keyframes_of_one_time_stamp_are_told_apart():
 def indexed(keyframes: list[Keyframe]) -> AppearanceIndex:
     index = AppearanceIndex()
     for each in keyframes:
-        index.add(each.id, each.view)
+        index.add(each.id, each.descriptors)
     return index
 
 
