@@ -55,6 +55,7 @@ class BodyAdmission:
     """
 
     restarts_anywhere = False  # what is seen then may be anything: the body is looked for until it is found
+    moving = None
 
     def __init__(self, camera: RectifiedStereo, region: np.ndarray, frontend: Frontend, config: TrackerConfig) -> None:
         self.min_points = config.min_inliers

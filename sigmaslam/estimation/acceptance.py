@@ -29,6 +29,8 @@ class Acceptance:
         scaled_agreement: share of the views that agree at the frame's own noise scale; with fewer they are outliers.
         max_noise_scale: of variances; right matches err by no more than three times what they claim, all together.
         second_motion: share of the image that another motion explains, of what both do; from there on nobody knows.
+        mover: share of the image that what moves before the scene explains, of what both do; below it is chance.
+        mover_points: times the least that make a pose; fewer are chance.
         time_error: frames by which an image is another moment's; drives that brake stay below a tenth.
         time_share: of a pose's departure that goes as the velocity does, where the stamp is wrong and not the pose.
         bump: pixels; by more the right eye sees all landmarks elsewhere than before, and by less each for itself.
@@ -68,6 +70,8 @@ class Acceptance:
     scaled_agreement: float = 0.95
     max_noise_scale: float = 9.0
     second_motion: float = 0.2
+    mover: float = 0.05
+    mover_points: int = 3
     time_error: float = 0.5
     time_share: float = 0.8
     bump: float = 1.0

@@ -36,6 +36,8 @@ _LOGGER = logging.getLogger(__name__)
 # Errors of right matches have longer tails than a Gaussian's: degrees of freedom of the Student-t that is fitted.
 # 4 and 1 are no better on rendered streets.
 _STUDENT_FREEDOM = 2.0
+NEVER_AGAIN = np.iinfo(np.int64).max // 2
+"""Misses of a landmark that is not to be searched for."""
 
 
 class KeyframeWindow:
@@ -159,8 +161,14 @@ class KeyframeWindow:
         self._next_id += count
         self.landmarks = LandmarkTable.concatenate([self.landmarks, new])
 
-    def count_sightings(self, searched: np.ndarray, seen: np.ndarray) -> None:
-        """Notes which landmarks a frame searched for and which of them it saw, both by row."""
+    def count_sightings(self, searched: np.ndarray, seen: np.ndarray, moving: np.ndarray | None = None) -> None:
+        """Notes which landmarks a frame searched for and which of them it saw, all by row.
+
+        Those that move on their own are not searched for again, nor in the map, and their views leave the window.
+        """
+        if moving is not None:
+            self.landmarks.misses[moving], self.landmarks.views[moving] = NEVER_AGAIN, 0
+            self._observations = self._observations.select(~np.isin(self._observations.views.landmark, moving))
         self.landmarks.misses[searched] += 1
         self.landmarks.misses[seen] = 0
         self.landmarks.views[seen] += 1

@@ -192,9 +192,3 @@ def past_slice(index: int) -> slice:
 def point_lever(points: np.ndarray) -> np.ndarray:
     """(M, 3, 6) how points (M, 3) of the world move with a perturbation from the left."""
     return np.asarray(np.concatenate([np.tile(np.eye(3), (len(points), 1, 1)), -skew(points)], axis=2))
-
-
-def step_between(past: PastPoses, heir: int, leaving: int) -> tuple[np.ndarray, np.ndarray]:
-    """(4, 4) T_heir_leaving of two poses, and its covariance (6, 6), perturbed from the left in the heir."""
-    back = se3_inverse(past.poses[heir])
-    return back @ past.poses[leaving], turn_covariance(back, past.relative(leaving)[heir])

@@ -7,6 +7,8 @@ from enum import StrEnum
 
 import numpy as np
 
+from sigmaslam.geometry.se3 import se3_inverse, se3_log
+
 
 class Doubt(StrEnum):
     """Reasons why a pose may be wrong; the words stand in frames.csv."""
@@ -40,6 +42,11 @@ class Doubts:
             self.reasons.append(reason)
         if error is not None:
             self.spread = self.spread + np.outer(error, error)
+
+    def add_motion(self, pose: np.ndarray, other: np.ndarray) -> None:
+        """Two poses (4, 4), T_world_camera, explain the image about as well."""
+        self.add(Doubt.MOTIONS, se3_log(pose @ se3_inverse(other)))
+        self.is_ambiguous = True
 
     @property
     def status(self) -> str:

@@ -2,49 +2,104 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from sigmaslam.estimation.constant_velocity import MotionFilter, dead_reckoning
+from sigmaslam.estimation.constant_velocity import dead_reckoning
 from sigmaslam.estimation.frame_clock import FrameClock
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.gaussian import step_with
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.prediction_errors import surprise, time_error
-from sigmaslam.geometry.se3 import se3_adjoint, se3_inverse, se3_log
+from sigmaslam.geometry.se3 import se3_adjoint, se3_inverse, transform_points
 from sigmaslam.slam.doubt import Doubt, Doubts
 from sigmaslam.slam.guided_matching import GuidedMatches
-from sigmaslam.slam.localisation import Prediction
+from sigmaslam.slam.localisation import Localiser, Prediction
+from sigmaslam.slam.moving_region import MovingRegion
 from sigmaslam.slam.second_motion import SecondMotion, find_second_motion
+
+# So many bodies, or parts of one, are left out of an image one by one.
+_MOST_MOVERS = 3
 
 
 class Scrutiny:
     """Collects doubts in poses, frame by frame.
 
     Args:
-        window, motion, clock: of the tracker.
+        localiser, clock: of the tracker.
+        moving: where the scene moves on its own; None: all of it may.
         input_is_wrong: a check of the input found that the eyes do not fit.
     """
 
-    def __init__(self, window: KeyframeWindow, motion: MotionFilter, clock: FrameClock, input_is_wrong: bool) -> None:
-        self._window, self._motion, self._clock = window, motion, clock
+    def __init__(
+        self, localiser: Localiser, clock: FrameClock, moving: MovingRegion | None, input_is_wrong: bool
+    ) -> None:
+        self._localiser, self._window, self._motion = localiser, localiser.window, localiser.motion
+        self._clock, self._moving = clock, moving
+        # Places are all that is asked of it; a torn image leaves none in the next one.
+        self._rival = MovingRegion(0.0, patience=0)
+        self._T_rival_fit = np.eye(4)
         self._last_error = 0.0
         self._input_is_wrong = input_is_wrong
 
-    def doubt(self, matches: GuidedMatches, fit: FrameFit) -> Doubts:
-        """What speaks against a pose, before motion and map learn from it; the prediction becomes less certain by a
-        wrong time."""
+    def doubt(self, left: np.ndarray, matches: GuidedMatches, fit: FrameFit) -> tuple[GuidedMatches, FrameFit, Doubts]:
+        """What speaks against a pose, before motion and map learn from it, and the pose without what is found to be
+        wrong: matches on what moves are left out, and a contradicted prediction becomes less certain.
+
+        Args:
+            left: (H, W) uint8.
+            matches, fit: of the image.
+        """
         doubts = Doubts()
+        moving = self._moving
+        for region in (moving, self._rival):
+            if region is not None:
+                region.carry(left, fit.pose, self._window.camera)
+        second = find_second_motion(self._window, matches, fit, moving)
+        for _ in range(_MOST_MOVERS):
+            if moving is None or second is None or not second.is_mover:
+                break
+            drawn = fit.pose
+            matches, fit = self._leave_out(matches, fit, second, moving)
+            doubts.add_motion(drawn, fit.pose)
+            second = find_second_motion(self._window, matches, fit, moving)
         if self._input_is_wrong:
             doubts.add(Doubt.INPUT)
         for index in np.flatnonzero(self._window.exceeded).tolist():
             doubts.add(Doubt.OFFSET, _without_error(self._window, fit, index))
         self._doubt_prediction(doubts, fit)
-        second = find_second_motion(self._window, matches, fit)
-        # A body before the scene that never stood still is no rival of it.
-        if second is not None and (second.stood_still or not second.stands_before) and not self._is_other(second, fit):
-            doubts.add(Doubt.MOTIONS, se3_log(second.pose @ se3_inverse(fit.pose)))
-            doubts.is_ambiguous = True
-        return doubts
+        if second is not None and not second.is_mover and not self._is_other(second, fit):
+            self._take_rival(matches, fit, second)
+            doubts.add_motion(second.pose, fit.pose)
+        elif self._rival:
+            doubts.add_motion(self._T_rival_fit @ fit.pose, fit.pose)
+        if doubts.prediction_is_wrong:
+            fit = self._localiser.fit_again(matches, fit, Prediction.of(self._window, self._motion))
+        return matches, fit, doubts
+
+    def _leave_out(
+        self, matches: GuidedMatches, fit: FrameFit, second: SecondMotion, moving: MovingRegion
+    ) -> tuple[GuidedMatches, FrameFit]:
+        """Takes what moves out of window and matches, and poses that it drew along back."""
+        window, views = self._window, matches.views
+        self._add(moving, matches, fit, second)
+        moves = moving.covers(views.measurement[:, :2])
+        window.count_sightings(views.landmark[:0], views.landmark[:0], views.landmark[moves])
+        window.solve()
+        still = replace(matches, views=views.select(~moves), probability=matches.probability[~moves])
+        again = self._localiser.fit_again(still, fit, Prediction.of(window, self._motion))
+        return (matches, fit) if again is fit else (still, again)
+
+    def _take_rival(self, matches: GuidedMatches, fit: FrameFit, second: SecondMotion) -> None:
+        """Remembers a pose between which and that of the fit nothing decides, as long as what asks for it moves."""
+        self._T_rival_fit = second.pose @ se3_inverse(fit.pose)
+        if self._moving is not None:
+            self._add(self._rival, matches, fit, second)
+
+    def _add(self, region: MovingRegion, matches: GuidedMatches, fit: FrameFit, second: SecondMotion) -> None:
+        points = transform_points(fit.pose, self._window.camera.triangulate(second.expected))
+        region.add(matches.views.measurement[second.agreeing, :2], points, second.departure)
 
     def _is_other(self, second: SecondMotion, fit: FrameFit) -> bool:
         """Whether a sensor of motion rules the second motion out, and not the pose."""

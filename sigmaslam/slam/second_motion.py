@@ -12,6 +12,7 @@ from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.geometry.image_cells import explained_area, image_cells
 from sigmaslam.slam.guided_matching import CONFIRMED, GuidedMatches
 from sigmaslam.slam.landmark_places import seen_from
+from sigmaslam.slam.moving_region import MovingRegion
 from sigmaslam.two_view.scene_pose import see_the_same, stands_before
 from sigmaslam.two_view.stereo_pose import MIN_POINTS, estimate_relative_pose
 
@@ -22,20 +23,43 @@ class SecondMotion:
 
     Attributes:
         pose: (4, 4) T_world_camera as if these landmarks stood still.
+        agreeing: (K,) numbers of the matches.
+        expected: (K, 3) (u, v, disparity) where the first pose sees them.
+        departure: (K, 2) pixels from there to where they are.
+        share: of the image that both explain.
         stands_before: they stand before what the first pose explains.
         stood_still: most of them agreed with earlier poses.
     """
 
     pose: np.ndarray
+    agreeing: np.ndarray
+    expected: np.ndarray
+    departure: np.ndarray
+    share: float
     stands_before: bool
     stood_still: bool
 
+    @property
+    def is_mover(self) -> bool:
+        """Something before the scene, too small for a rival of it or never at rest.
 
-def find_second_motion(window: KeyframeWindow, matches: GuidedMatches, fit: FrameFit) -> SecondMotion | None:
+        What lies behind may be the scene, and the first pose that of what moves before it.
+        """
+        return self.stands_before and (self.share < ACCEPTANCE.second_motion or not self.stood_still)
+
+
+def find_second_motion(
+    window: KeyframeWindow, matches: GuidedMatches, fit: FrameFit, moving: MovingRegion | None
+) -> SecondMotion | None:
     """The pose of most matches that disagree with `fit`.
 
-    None where they have none in common, or one like that of it, or where it explains too little of the image.
+    None where they have none in common, or one like that of it, or where it explains too little of the image. What
+    stands before the scene needs neither once something has been seen to move.
     They are held against where the fit's pose sees the landmarks, as if that were a keyframe: `estimate_relative_pose`.
+
+    Args:
+        window, matches, fit: of the frame.
+        moving: where the scene moves on its own; None: all of it may, but for one body.
     """
     views, camera = matches.views, window.camera
     rows = views.landmark
@@ -46,9 +70,9 @@ def find_second_motion(window: KeyframeWindow, matches: GuidedMatches, fit: Fram
     if len(others) < MIN_POINTS:
         return None
     cells, equal = image_cells(views.measurement[:, :2], camera.width, camera.height), np.ones(len(rows))
-    # What the other pose explains of the image must be so much, for each that the first one explains.
-    least = ACCEPTANCE.second_motion / (1.0 - ACCEPTANCE.second_motion) * explained_area(cells, fit.inliers, equal)
-    if explained_area(cells, _among(others, len(rows)), equal) < least:
+    first, most = (explained_area(cells, each, equal) for each in (fit.inliers, _among(others, len(rows))))
+    least = ACCEPTANCE.second_motion if moving is None else 0.0 if moving else ACCEPTANCE.mover
+    if most < least * (first + most):
         return None
     covariance = window.landmarks.covariance[rows[others], :3, :3]
     relative = estimate_relative_pose(
@@ -62,12 +86,19 @@ def find_second_motion(window: KeyframeWindow, matches: GuidedMatches, fit: Fram
     if relative is None:
         return None
     agreeing = others[relative.inliers]
-    apart = np.linalg.norm(views.measurement[agreeing, :2] - expected[agreeing, :2], axis=1)
-    if see_the_same(apart) or explained_area(cells, _among(agreeing, len(rows)), equal) < least:
-        return None
+    area = explained_area(cells, _among(agreeing, len(rows)), equal)
+    share = area / (first + area)
+    departure = views.measurement[agreeing, :2] - expected[agreeing, :2]
+    apart = np.linalg.norm(departure, axis=1)
     nearer = stands_before(*(float(np.median(expected[chosen, 2])) for chosen in (agreeing, fit.inliers)))
     stood_still = bool(np.median(window.landmarks.views[rows[agreeing]]) >= CONFIRMED)
-    return SecondMotion(fit.pose @ relative.T_key_camera, nearer, stood_still)
+    differs, many = not see_the_same(apart), len(agreeing) >= ACCEPTANCE.mover_points * MIN_POINTS
+    is_rival = differs and share >= ACCEPTANCE.second_motion
+    moves = moving is not None and nearer and (bool(moving) or (differs and many and share >= ACCEPTANCE.mover))
+    if not (is_rival or moves):
+        return None
+    pose = fit.pose @ relative.T_key_camera
+    return SecondMotion(pose, agreeing, expected[agreeing], departure, share, nearer, stood_still)
 
 
 def _among(chosen: np.ndarray, count: int) -> np.ndarray:

@@ -116,7 +116,7 @@ class StereoTracker:
         self._frontend = frontend
         self._blas = ThreadpoolController()
         self._beside = ThreadPoolExecutor(1, "keyframe") if threads > 1 else None
-        self._admission = admission = admission or AdmitAll(config.min_inliers)
+        self._admission = admission = admission or AdmitAll(config.min_inliers, config.spacing)
         graphs = EstimatorGraphs(rectified, backend, config.linearisation == "unscented")
         prior = CalibrationPrior.of(rectified, camera.sigmas, config.offset_sigma, config.estimate, camera.covariance)
         by_check = np.isin(ERRORS, ("offset", *TURNS)) * (disparity_error or 0.0)
@@ -126,12 +126,13 @@ class StereoTracker:
         self._course = course = Course()
         self._shared_errors, self._clock, self._last_pairs = SharedErrors(), FrameClock(), LastPairs()
         self._keyframes = keyframes = Keyframes(window, config.max_keyframes, config.max_points, self._beside)
-        self._scrutiny = Scrutiny(window, motion, self._clock, disparity_error is not None)
         update = FrameUpdate(window, config.iterations)
         guided = GuidedMatcher(rectified, frontend, window, update, noise, config)
         self._unguided = unguided = UnguidedMatcher(rectified, frontend, window, noise, config)
         self._follower = follower = LandmarkFollower(guided)
-        self._localiser = Localiser(window, motion, update, guided, follower, unguided, config, self._clock)
+        localiser = Localiser(window, motion, update, guided, follower, unguided, config, self._clock)
+        self._localiser = localiser
+        self._scrutiny = Scrutiny(localiser, self._clock, admission.moving, disparity_error is not None)
         self._rig_watch = RigWatch(window, self._localiser)
         self._mapper = Mapper(rectified, window, keyframes, motion, noise, admission, config)
         self._loops = LoopCloser(window, keyframes, unguided)
@@ -207,9 +208,7 @@ class StereoTracker:
         predicted = filtered = self._motion.state
         doubts = Doubts()
         if fit is not None:
-            doubts = self._scrutiny.doubt(matches, fit)
-            if doubts.prediction_is_wrong:
-                fit = self._localiser.fit_again(matches, fit, Prediction.of(self._window, self._motion))
+            matches, fit, doubts = self._scrutiny.doubt(frame.left, matches, fit)
             status = doubts.status
             expected = self._motion.step, self._motion.step_covariance
             blur, of_matches = self._keyframes.blur(frame.left, matches.views.select(fit.inliers))

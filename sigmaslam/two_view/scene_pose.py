@@ -93,7 +93,12 @@ def stands_before(disparity: float, other: float) -> bool:
 
 def see_the_same(apart: np.ndarray) -> bool:
     """Whether two poses see most points (K,) at the same places, so many pixels apart."""
-    return float(np.median(apart)) < ACCEPTANCE.same_motion
+    return bool(are_one_place(np.median(apart)))
+
+
+def are_one_place(apart: np.ndarray | np.floating) -> np.ndarray | np.bool_:
+    """Whether places so many pixels apart are taken for the same."""
+    return apart < ACCEPTANCE.same_motion
 
 
 def _are_alike(camera: RectifiedStereo, landmarks: np.ndarray, one: RelativePose, other: RelativePose) -> bool:

@@ -38,8 +38,8 @@ def give_sensor(sequence: StereoSequence, folder: Path, sensor: str) -> None:
         sequence.odometry = OdometryRecording(packets, mounting, samples)
 
 
-# Open: 0.36 m at the goal of 0.3. The way by images alone is 1.4 % too short here, 0.12 m of a dark second, and noise that
-# keyframes have in common passes for the accelerometer's, so that its error of 0.15 m/s^2 is not learned: 0.08 m.
+# Open: 0.36 m at the goal of 0.3. The way by images alone is 1.4 % too short here, 0.12 m of a dark second, and noise
+# that keyframes have in common passes for the accelerometer's, so its error of 0.15 m/s^2 is not learned: 0.08 m.
 _OPEN = pytest.mark.xfail(reason="0.36 m, goal 0.3", raises=AssertionError)
 
 

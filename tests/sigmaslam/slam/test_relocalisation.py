@@ -409,7 +409,7 @@ def test_no_place_is_found_that_the_motion_excludes(away: float, inliers: int, i
     )
     found = RelativePose(looking(0.1 + away), np.arange(80) < inliers, 1e-4 * np.eye(6), 1.0)
     matcher = SimpleNamespace(relative_pose_to=lambda key, view: found, is_beyond_chance=lambda found: inliers > 45)
-    relocaliser = Relocaliser(window, keyframes, motion, matcher, AdmitAll(10), 15)
+    relocaliser = Relocaliser(window, keyframes, motion, matcher, AdmitAll(10, 12.0), 15)
     assert (relocaliser.relocalise(view_of(0, 80)) is not None) == is_found
     assert len(window) == (0 if is_found else 1)
 
