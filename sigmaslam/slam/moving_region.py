@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 
+from sigmaslam.frontend.knn import nearest_points
 from sigmaslam.frontend.lucas_kanade import lucas_kanade
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import se3_inverse, transform_points
@@ -57,7 +57,8 @@ class MovingRegion:
         """(N,) bool, which places (N, 2) lie within that share of the radius of one of the region's."""
         if not len(self._places):
             return np.zeros(len(places), bool)
-        return np.asarray(cKDTree(self._places).query(places)[0] <= share * self._radius)
+        nearest = self._places[nearest_points(self._places, places, 1)[:, 0]]
+        return np.asarray(np.linalg.norm(places - nearest, axis=1) <= share * self._radius)
 
     def _keep(self, chosen: np.ndarray) -> None:
         self._places, self._points = self._places[chosen], self._points[chosen]
