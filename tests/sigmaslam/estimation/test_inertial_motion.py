@@ -25,7 +25,9 @@ class Walk(Motion):
     def __init__(self, seed: int) -> None:
         rng = np.random.default_rng(seed)
         self.path = with_stops(hand_held(rng, 3.5, FreeSpace((0, 0, 1.5), (2.0, 2.0, 0.4))), rng, 1)
-        self.poses = self.path.poses
+
+    def poses(self, t: np.ndarray) -> np.ndarray:
+        return self.path.poses(t)
 
     def measure(self, t: np.ndarray) -> InertialSamples:
         return measure_exactly(self.path, np.eye(4), t)[0]
