@@ -92,7 +92,7 @@ def test_descent_finds_the_half_of_an_image_that_matches():
     assert share() > before + 0.05
     # Minus the worth of the keypoints: about half of them match before.
     assert losses[0] > -0.5
-    assert losses[-1] < losses[0] - 0.1
+    assert losses[-1] < losses[0] - 0.05
 
 
 @pytest.mark.long

@@ -112,9 +112,7 @@ def _with_response(network: FeatureNetwork) -> FeatureNetwork:
     if network.response is not None:
         return network
     detecting = FeatureNetwork(detects=True)
-    assert detecting.response is not None
-    own = {f"response.{name}": value for name, value in detecting.response.state_dict().items()}
-    detecting.load_state_dict({**network.state_dict(), **own})
+    detecting.load_state_dict({**detecting.state_dict(), **network.state_dict()})
     return detecting.requires_grad_(False).eval()
 
 
