@@ -28,7 +28,6 @@ from sigmaslam_synthetic.rendering.textures import dead_leaves
 # ONNX Runtime and torch may order sums differently; more than this is a wrong graph.
 NETWORK_TOLERANCE = 1e-4
 _TIMED_CALLS = 9
-_MISFIT = "{} does not hold the weights of this network: {}"
 
 _Module = TypeVar("_Module", bound=nn.Module)
 
@@ -42,8 +41,7 @@ def load_network(weights: Path, descriptor_size: int = DESCRIPTOR_SIZE, stride: 
     Raises:
         InputError: the file is missing, not the one that its manifest names, or holds another network.
     """
-    detects = weights.is_file() and any(name.startswith("response.") for name in _tensors(weights))
-    return _load(FeatureNetwork(descriptor_size, stride, detects), weights)
+    return _load(FeatureNetwork(descriptor_size, stride), weights)
 
 
 def load_scorer(weights: Path) -> MatchScorer:
@@ -204,17 +202,10 @@ def _load(module: _Module, weights: Path) -> _Module:
         raise InputError(f"{weights} does not exist: train first, or give the path of a .safetensors file")
     check_weights(weights, weights.read_bytes())
     try:
-        module.load_state_dict(_tensors(weights))
-    except (RuntimeError, ValueError) as error:
-        raise InputError(_MISFIT.format(weights, error)) from error
+        module.load_state_dict(load_file(weights))
+    except (RuntimeError, ValueError, SafetensorError) as error:
+        raise InputError(f"{weights} does not hold the weights of this network: {error}") from error
     return module.eval()
-
-
-def _tensors(weights: Path) -> dict[str, Tensor]:
-    try:
-        return load_file(weights)
-    except SafetensorError as error:
-        raise InputError(_MISFIT.format(weights, error)) from error
 
 
 def _scoring_graphs(

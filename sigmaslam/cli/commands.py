@@ -54,7 +54,6 @@ GROUPS = {
     "train": {
         "network": "Train the correspondence network.",
         "scorer": "Train the probability of matches.",
-        "detector": "Train where keypoints are.",
         "export": "Export trained weights to ONNX.",
         "render": "Render a stereo sequence with exact truth.",
     },
@@ -69,7 +68,6 @@ PLACES = {
     "orient": "points:orient",
     "network": "train:train",
     "scorer": "train:train_scorer",
-    "detector": "train:train_detector",
 }
 # What a group does whose first word is none of its commands.
 DEFAULTS = {"calibrate": "board", "train": "network"}

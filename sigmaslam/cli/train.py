@@ -1,4 +1,4 @@
-"""`sigmaslam train`, `sigmaslam train scorer` and `sigmaslam train detector`."""
+"""`sigmaslam train` and `sigmaslam train scorer`."""
 
 from __future__ import annotations
 
@@ -113,27 +113,4 @@ def train_scorer(
     from sigmaslam_training.matching.scoring import ScoringConfig, train_scoring
 
     card = train_scoring(out, ScoringConfig(pairs, steps, verifier_steps, seed), workers)
-    typer.echo(json.dumps(card, indent=2))
-
-
-def train_detector(
-    out: Annotated[Path, typer.Option(help="Folder for checkpoint, weights and card; new, or left to go on.")],
-    start: Annotated[
-        Path | None,
-        typer.Option("--from", help="Weights (.safetensors) of the network.", show_default="those that ship"),
-    ] = None,
-    steps: Annotated[int, typer.Option(min=1, help="Optimiser steps, 4 rendered pairs each.")] = 3000,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of pairs, weights and draws.")] = 0,
-) -> None:
-    """Train where keypoints are, on renders alone; descriptors stay as they are (needs the extra 'train').
-
-    An hour on one core; stopped by Ctrl-C, the same command goes on. 'train export' makes the graph.
-    """
-    need_train_extra()
-    from sigmaslam.inference.onnx_graph import shipped_weights
-    from sigmaslam_training.features.detector_training import DetectorConfig
-    from sigmaslam_training.features.detector_training import train_detector as run_training
-
-    weights = shipped_weights("features.safetensors") if start is None else start
-    card = run_training(out, DetectorConfig(steps=steps, seed=seed), weights)
     typer.echo(json.dumps(card, indent=2))

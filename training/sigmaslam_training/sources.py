@@ -13,7 +13,7 @@ from sigmaslam_training.mixes import MIXES
 
 WORLDS = PRESET_NAMES
 """Rendered 3D worlds, each of which is a source."""
-SOURCES = (*WORLDS, *KINDS, "turned leaves", "patterns", "scenes", "wide scenes", "endoscopy")
+SOURCES = (*WORLDS, *KINDS, "turned leaves", "patterns", "scenes", "endoscopy")
 """Names of sources; others are the path of a Python file that makes a world, or of a folder of photographs."""
 Mix = str | Mapping[str, float]
 """A key of `mixes.MIXES`, or shares by source, which sum to 1."""

@@ -325,7 +325,6 @@ def test_training_without_its_extra_says_how_to_install_it(tmp_path: Path):
         "train",
         "train network",
         "train scorer",
-        "train detector",
         "train export",
         "train render",
         "benchmark",

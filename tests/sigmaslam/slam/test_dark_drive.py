@@ -15,7 +15,7 @@ from sigmaslam.readers.odometry import OdometryRecording
 from sigmaslam.readers.open_inertial import open_imu
 from sigmaslam.readers.oxts import read_packets
 from sigmaslam.runs.request import TrackerOptions
-from sigmaslam.runs.track import _build_tracker, _feed
+from sigmaslam.runs.track import _build_tracker, _sensors
 
 STARTS, LENGTH = (40, 65, 90, 115, 140, 165), 10
 DRIVE = "kitti_raw_0926_0039_a"
@@ -61,14 +61,15 @@ def test_a_dark_second_at_8_metres_a_second(real_data, sensor):
     sequence, rng = open_sequence(folder), np.random.default_rng(7)
     give_sensor(sequence, folder, sensor)
     tracker = _build_tracker(sequence, TrackerOptions(frontend="klt", threads=1), None, None)
-    feed, estimates = _feed(sequence, tracker), []
+    sensors, estimates = _sensors(sequence, tracker), []
     errors, again, nees = [], [], []
     for k, frame in enumerate(sequence.frames()):
         images = frame.left, frame.right
         begun = next((start for start in STARTS if start <= k <= start + LENGTH), None)
         if begun is not None and k < begun + LENGTH:
             images = tuple(np.clip(rng.normal(3, 1.5, each.shape), 0, 255).astype(np.uint8) for each in images)
-        feed(frame.timestamp)
+        for samples in sensors:
+            samples.feed(frame.timestamp)
         estimates.append(tracker.step(*images, frame.timestamp))
         if begun is None or k < begun + LENGTH - 1:
             continue

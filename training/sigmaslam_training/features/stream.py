@@ -48,17 +48,14 @@ class PairStream(Protocol):
 def open_stream(source: str, seed: int, size: int) -> PairStream:
     """A stream by name.
 
-    'scenes', 'wide scenes' (from directions up to 60 degrees apart), 'endoscopy' (scenes inside a body), the name of a
-    world or a Python file that makes one, 'patterns' (every texture but leaves), a texture's kind or a folder of
-    photographs under homographies, or 'turned leaves', which are warped further: by up to 90 degrees and e^1 between
-    the views.
+    'scenes', 'endoscopy' (scenes inside a body), the name of a world or a Python file that makes one, 'patterns' (every
+    texture but leaves), a texture's kind or a folder of photographs under homographies, or 'turned leaves', which are
+    warped further: by up to 90 degrees and e^1 between the views.
     """
     # Derive a seed for each source: sources with the same kind of texture must show different ones.
     seed = int(np.random.SeedSequence((seed, *label(source).encode())).generate_state(1)[0])
     if source == "scenes":
         return ScenePairs(seed, size)
-    if source == "wide scenes":
-        return ScenePairs(seed, size, ("room", "street", "drone"), wide=True)
     if source == "endoscopy":
         return ScenePairs(seed, size, ("colon", "organ"))
     if source in WORLDS or source.endswith(SUFFIX):
