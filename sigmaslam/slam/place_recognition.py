@@ -36,7 +36,7 @@ def most_alike(
     """The keyframes that look most like the view by one vector each, at most `count`, in their order."""
     if len(among) <= count:
         return among
-    alike = set(appearance.rank(view, count, [keyframe.id for keyframe in among]))
+    alike = set(appearance.rank(view, count, {keyframe.id for keyframe in among}))
     return [keyframe for keyframe in among if keyframe.id in alike]
 
 
