@@ -62,7 +62,7 @@ def tracker_covariance(rig: Rig, covariance: np.ndarray) -> tuple[CalibrationCov
 
 
 def nearest_errors(calibrated: StereoCamera, true: StereoCamera) -> np.ndarray:
-    """(12,) errors of the tracker that come nearest to what a calibration has wrong, fitted as a covariance is."""
+    """(15,) errors of the tracker that come nearest to what a calibration has wrong, fitted as a covariance is."""
     rectifier = StereoRectifier(calibrated)
     uvd = _grid(rectifier.rectified)
     wrong = (_measured(uvd, true, rectifier) - uvd).ravel()

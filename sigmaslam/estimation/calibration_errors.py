@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sigmaslam.estimation.state_layout import VIEW_TURNS
 from sigmaslam.geometry.calibration_covariance import CalibrationCovariance
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.geometry.camera import RectifiedStereo
@@ -29,6 +30,9 @@ ERRORS = (
     "centre_v",
     "lens",  # of both: places, with r^3 along their rays, and disparity
     "baseline",  # disparity, relative
+    "view_pitch",  # all images turned against those where their landmarks were seen first
+    "view_yaw",
+    "view_roll",
 )
 """In the order of the state. `focal` and `baseline` are relative, the others pixels at unit normalised coordinates.
 
@@ -37,14 +41,18 @@ What is the right camera's alone depends on the place in the right image.
 TURNS = ("yaw", "pitch", "roll")
 """Of the right camera."""
 
+# Errors of following are alike all over an image, a little, and keep their sign from keyframe to keyframe. Pixels: of
+# rendered streets, whose turns they add up to.
+_VIEW_TURN = 0.01
+
 
 @dataclass(frozen=True, slots=True)
 class CalibrationPrior:
     """What is known of the errors of a calibration before any image; their mean is zero.
 
     Attributes:
-        covariance: (12, 12), in the units and order of `ERRORS`; zero between errors that are estimated and others.
-        estimated: (12,) bool, those that images may move; the others are considered.
+        covariance: (15, 15), in the units and order of `ERRORS`; zero between errors that are estimated and others.
+        estimated: (15,) bool, those that images may move; the others are considered.
     """
 
     covariance: np.ndarray
@@ -56,21 +64,21 @@ class CalibrationPrior:
 
     @property
     def sigma(self) -> np.ndarray:
-        """(12,) standard deviations."""
+        """(15,) standard deviations."""
         return np.sqrt(np.diag(self.covariance))
 
     def widened(self, sigma: np.ndarray) -> CalibrationPrior:
-        """The same with independent errors more, of standard deviations (12,)."""
+        """The same with independent errors more, of standard deviations (15,)."""
         return replace(self, covariance=self.covariance + np.diag(sigma**2))
 
     @property
     def estimated_covariance(self) -> np.ndarray:
-        """(12, 12) of those that are estimated, zero for the others."""
+        """(15, 15) of those that are estimated, zero for the others."""
         return np.where(np.outer(self.estimated, self.estimated), self.covariance, 0.0)
 
     @property
     def considered_factor(self) -> np.ndarray:
-        """(12, 12) factor of the covariance of those that are considered, zero for the others."""
+        """(15, 15) factor of the covariance of those that are considered, zero for the others."""
         sigma = self.sigma
         scale = np.where(sigma > 0.0, sigma, 1.0)
         considered = np.where(np.outer(self.estimated, self.estimated), 0.0, self.covariance)
@@ -99,7 +107,8 @@ class CalibrationPrior:
         turn, lens = camera.fx * sigmas.rotation, camera.fx * sigmas.distortion
         centre = camera.fx * sigmas.principal_point
         in_disparity = (offset_sigma, turn, turn, turn, lens, lens, lens)
-        sigma = np.array([*in_disparity, sigmas.focal, centre, centre, lens, sigmas.baseline])
+        in_places = (sigmas.focal, centre, centre, lens)
+        sigma = np.array([*in_disparity, *in_places, sigmas.baseline, *[_VIEW_TURN] * VIEW_TURNS])
         prior = cls.independent(sigma, "offset", *estimate)
         if covariance is None:
             return prior
@@ -111,12 +120,13 @@ class CalibrationPrior:
 
     @classmethod
     def independent(cls, sigma: np.ndarray, *estimated: str) -> CalibrationPrior:
-        """Independent errors with standard deviations (12,); `estimated` are names of `ERRORS`."""
-        return cls(np.diag(np.asarray(sigma, float) ** 2), np.isin(ERRORS, estimated))
+        """Independent errors with standard deviations of the first of `ERRORS`, in which `estimated` are names."""
+        variance = np.pad(np.square(sigma), (0, len(ERRORS) - len(sigma)))
+        return cls(np.diag(variance), np.isin(ERRORS, estimated))
 
 
 def measured_errors(camera: RectifiedStereo, uvd: np.ndarray) -> np.ndarray:
-    """(M, 3, 12) by how much each error, of size one, changes what is measured of points, to first order.
+    """(M, 3, 15) by how much each error, of size one, changes what is measured of points, to first order.
 
     Args:
         camera: as calibrated.

@@ -61,7 +61,7 @@ class CalibrationEvidence:
         usual: prior of a calibration with which nothing is wrong.
         focal_length: pixels.
         condition: `sigmaslam_models.estimator.window_solution.Condition`.
-        expected: (12,) errors of the calibration about which the prior holds; zero by default.
+        expected: (15,) errors of the calibration about which the prior holds; zero by default.
     """
 
     def __init__(

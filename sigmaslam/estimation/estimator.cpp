@@ -25,6 +25,9 @@ using Integers = py::array_t<int64_t, py::array::c_style | py::array::forcecast>
 
 namespace {
 
+// Errors of the calibration in the state; with both poses what a view says something of.
+constexpr int CALIBRATION = 15, VIEW_TURNS = 3, PART = CALIBRATION + 12;
+
 // Rows and columns are filled up with zeros to multiples of eight.
 struct Matrix {
     int rows = 0, width = 0;
@@ -109,7 +112,7 @@ void read_scene(Feed& feed, Scene& scene, bool measured) {
     scene.pair = feed.numbers<Integers>("pair");
     scene.depth = feed.number("depth"), scene.unscented = feed.number("unscented");
     scene.pairs = feed.length("anchors"), scene.count = feed.length("pair");
-    scene.state = 12 + 6 * feed.length("poses");
+    scene.state = CALIBRATION + 6 * feed.length("poses");
     scene.measurement = measured ? feed.numbers("measurement") : nullptr;
     scene.noise = measured ? feed.numbers("noise") : nullptr;
 }

@@ -14,7 +14,7 @@ class FramePosterior:
     Attributes:
         step: (n + 6,) from the window's posterior and the predicted pose.
         covariance: (n + 6, n + 6) of both, as far as it comes from matches and motion.
-        common: (n + 6, 12) how considered errors of the calibration, of variance one, enter the errors of both.
+        common: (n + 6, 15) how considered errors of the calibration, of variance one, enter the errors of both.
         information: (n + 6, n + 6) of the views alone.
         score: (n + 6,) slope of the views' log-likelihood at the posterior mean.
     """
@@ -35,7 +35,7 @@ class FrameFit:
         relative: (6, 6) covariance of the pose relative to the last keyframe, perturbed from the left in the world, as
             far as it comes from matches and motion.
         covariance: (6, 6) of the pose, likewise.
-        calibration: (12,) its errors as this frame has them.
+        calibration: (15,) its errors as this frame has them.
         joint: of the window and the frame, without `inflation`.
         inliers: (M,) bool, the views that agree.
         nis, dof: of the inliers.

@@ -56,14 +56,14 @@ class KeyframeWindow:
         landmarks: estimated with the posterior.
         depth: of the scene that the last keyframe sees, metres.
         calibration: prior of its errors, as far as it is known.
-        expected: (12,) errors of the calibration about which its prior holds: zero until the rig changes, or something
+        expected: (15,) errors of the calibration about which its prior holds: zero until the rig changes, or something
             else than an offset is found to be wrong.
         evidence: weighs what may be wrong.
         causes: of that, what is not hopeless, by its name.
-        corrected: (2, 12) what considered errors are taken to be, and their standard deviations beside the usual ones.
+        corrected: (2, 15) what considered errors are taken to be, and their standard deviations beside the usual ones.
         held_offset: what the disparity offset is taken to be in poses that are published.
         board_disparity: pixels where a calibration that is off by more than most is right; None until one is.
-        exceeded: (12,) bool, estimated errors beyond four standard deviations of their prior.
+        exceeded: (15,) bool, estimated errors beyond four standard deviations of their prior.
     """
 
     def __init__(
@@ -118,7 +118,7 @@ class KeyframeWindow:
             pose: (4, 4) estimate of T_world_camera.
             step: (4, 4) T_last_new as it was expected without its images; of the first one T_world_camera.
             step_covariance: (6, 6) of that, perturbed from the left in the world.
-            walk: (12,) variances by which the calibration may have moved since the last keyframe.
+            walk: (15,) variances by which the calibration may have moved since the last keyframe.
             depth: of the scene that it sees, metres.
             origin: of the first one, the past pose relative to which `step_covariance` is; the world by default.
         """

@@ -25,7 +25,7 @@ class PastPoses:
         covariance: (6 K, 6 K) of them, perturbed from the left in the world, as far as it comes from matches and
             motion.
         cross: (6 K, n) covariance with the window's state.
-        common: (6 K, 12) how considered errors of the calibration, of variance one, enter their errors.
+        common: (6 K, 15) how considered errors of the calibration, of variance one, enter their errors.
     """
 
     poses: np.ndarray
@@ -70,7 +70,7 @@ class PastPoses:
         """(6, 6) covariance of the window's last pose relative to the pose `index`, with the considered errors' part.
 
         Args:
-            window, common: (n, n), (n, 12) of its state.
+            window, common: (n, n), (n, 15) of its state.
             index: of the past pose.
         """
         place, last = past_slice(index), slice(len(window) - 6, len(window))
@@ -85,7 +85,7 @@ class PastPoses:
         Args:
             window: (n, n) covariance before.
             step_covariance: (6, 6) of the new pose relative to the last one.
-            walk: (12,) variances that the calibration gains.
+            walk: (15,) variances that the calibration gains.
             origin: the pose of these that takes the place of the last one, where the window has none.
         """
         size = len(window)
@@ -110,12 +110,12 @@ class PastPoses:
         """Posterior when the window's last pose has been measured relative to the pose `index`.
 
         Args:
-            window, common: (n, n), (n, 12) of its state before.
+            window, common: (n, n), (n, 15) of its state before.
             index: of the old pose.
             difference: (6,) by which the two should move against each other.
             covariance: (6, 6) of that.
         Returns:
-            (n,) step of the window's state, its covariance (n, n) and `common` (n, 12), and these.
+            (n,) step of the window's state, its covariance (n, n) and `common` (n, 15), and these.
         """
         old, last = past_slice(index), slice(len(window) - 6, len(window))
         # Covariances of the states with the difference that is measured: the last pose less the old one.
@@ -141,7 +141,7 @@ class PastPoses:
         return PastPoses(poses, self.covariance[np.ix_(rest, rest)], self.cross[rest], self.common[rest])
 
     def append(self, pose: np.ndarray, window: np.ndarray, common: np.ndarray, place: slice) -> PastPoses:
-        """These and a pose of the window, which stays there; window (n, n) and common (n, 12) are of its state."""
+        """These and a pose of the window, which stays there; window (n, n) and common (n, 15) are of its state."""
         across = self.cross[:, place]
         covariance = np.block([[self.covariance, across], [across.T, window[place, place]]])
         return PastPoses(
@@ -160,7 +160,7 @@ class PastPoses:
         """Their posterior when something is learned about the window.
 
         Args:
-            window, common: (n, n), (n, 12) of its state before.
+            window, common: (n, n), (n, 15) of its state before.
             information, vector: (n, n), (n,) of what is learned: a factor exp(-x^T information x / 2 + vector^T x).
         """
         if not len(self):

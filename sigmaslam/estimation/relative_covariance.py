@@ -80,7 +80,7 @@ class _Earlier:
         poses: (M, 4, 4) T_world_keyframe.
         own: (M, 6, 6) covariances.
         cross: (M, 6, n) covariances with the window's state.
-        common: (M, 6, 12) how considered errors of the calibration enter their errors.
+        common: (M, 6, 15) how considered errors of the calibration enter their errors.
     """
 
     poses: np.ndarray
@@ -108,7 +108,7 @@ class _Earlier:
         return cls(np.array(poses), np.array(own), np.array(cross), np.array(common))
 
     def common_apart(self, state: WindowState) -> np.ndarray:
-        """(M, 6, 12) how considered errors enter these poses relative to the window's last one."""
+        """(M, 6, 15) how considered errors enter these poses relative to the window's last one."""
         return np.asarray(self.common - state.common[pose_slice(len(state) - 1)])
 
     def covariance_of_last(self, state: WindowState) -> np.ndarray:

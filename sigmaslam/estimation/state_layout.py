@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-# Errors of the calibration, see `calibration_errors.ERRORS`. The measurement model knows the first ones; the others
-# enter linearly.
-CALIBRATION_SIZE, CALIBRATION_MODELLED = 12, 3
+# Errors of the calibration and of views, see `calibration_errors.ERRORS`. The measurement model knows the first ones;
+# the others enter linearly. The last ones enter views alone, not the places where landmarks are seen first.
+CALIBRATION_SIZE, CALIBRATION_MODELLED, VIEW_TURNS = 15, 3, 3
 # They come first in the state.
 CALIBRATION = slice(0, CALIBRATION_SIZE)
 # Of a landmark: (u, v, disparity) in its anchor keyframe, the error that its disparities share, the two that its places

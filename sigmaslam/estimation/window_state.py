@@ -19,10 +19,10 @@ class WindowState:
     """Mean and covariance of calibration and poses, which are perturbed from the left in the world.
 
     Attributes:
-        calibration: (12,) errors of the calibration, see `calibration_errors.ERRORS`.
+        calibration: (15,) errors of the calibration, see `calibration_errors.ERRORS`.
         poses: (K, 4, 4) T_world_keyframe, the oldest first.
-        covariance: (12 + 6 K, 12 + 6 K) of both, as far as it comes from matches and motion.
-        common: (12 + 6 K, 12) how considered errors of the calibration, of variance one, enter the errors of both.
+        covariance: (15 + 6 K, 15 + 6 K) of both, as far as it comes from matches and motion.
+        common: (15 + 6 K, 15) how considered errors of the calibration, of variance one, enter the errors of both.
         past: marginalised poses, jointly Gaussian with the state.
     """
 
@@ -110,7 +110,7 @@ class WindowState:
         Args:
             pose: (4, 4) mean of T_world_keyframe.
             step_covariance: (6, 6) of it relative to the last keyframe, perturbed from the left in the world.
-            walk: (12,) variances by which the calibration may have moved since.
+            walk: (15,) variances by which the calibration may have moved since.
             origin: in an empty window, the marginalised pose that takes the place of the last keyframe; the world by
                 default.
         """

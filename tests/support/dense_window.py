@@ -14,9 +14,9 @@ from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.frame_update import FrameUpdate
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
-from sigmaslam.estimation.state_layout import CALIBRATION_SIZE
+from sigmaslam.estimation.state_layout import CALIBRATION_SIZE, VIEW_TURNS
 from sigmaslam.geometry.camera import RectifiedStereo
-from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
+from sigmaslam.geometry.se3 import rotation_exp, se3_exp, se3_inverse, se3_log
 
 CAMERA = RectifiedStereo(fx=400.0, fy=410.0, cx=319.5, cy=239.5, baseline=0.2, width=640, height=480)
 # Standard deviations of the prior and of the noise; of the calibration offset, yaw and pitch are estimated.
@@ -107,13 +107,22 @@ def world(seed: int = 0, scale: float = 1.0, count: int = 12, hosts: int = KEYFR
 
 
 def by_pair_with(given: World, errors: np.ndarray) -> World:
-    """The same world seen by a pair with errors (12,) of its calibration, beside those that the world has anyway."""
+    """The same world seen by a pair with errors (15,), beside those that the world has anyway."""
 
     def off(uvd: np.ndarray) -> np.ndarray:
         return np.asarray(uvd + measured_errors(CAMERA, uvd) @ errors)
 
+    def turned(uvd: np.ndarray, keyframes: np.ndarray) -> np.ndarray:
+        """As seen by cameras that turn from keyframe to keyframe, and nobody knows."""
+        rays = np.c_[(uvd[:, 0] - CAMERA.cx) / CAMERA.fx, (uvd[:, 1] - CAMERA.cy) / CAMERA.fy, np.ones(len(uvd))]
+        x, y, z = (rotation_exp(keyframes[:, None] * errors[-VIEW_TURNS:] / CAMERA.fx) @ rays[..., None])[..., 0].T
+        return np.c_[CAMERA.fx * x / z + CAMERA.cx, CAMERA.fy * y / z + CAMERA.cy, uvd[:, 2] / z]
+
     measured = np.c_[off(given.measured[:, :3]), given.measured[:, 3:]]
-    views = [replace(views, measurement=off(views.measurement)) for views in given.views]
+    views = [
+        replace(views, measurement=turned(off(views.measurement), k - given.host[views.landmark]))
+        for k, views in enumerate(given.views)
+    ]
     return replace(given, measured=measured, views=views)
 
 
@@ -129,7 +138,7 @@ def make_window(
         calibration_sigma: (3,) of the errors that are estimated.
         linearisation: "extended" or "unscented".
         camera: the rectified pair.
-        considered_sigma: (9,) of those that are considered; none by default.
+        considered_sigma: (12,) of those that are considered; none by default.
     """
     graphs = EstimatorGraphs(camera, "onnx", linearisation == "unscented")
     others = np.zeros(len(ERRORS) - len(ESTIMATED)) if considered_sigma is None else considered_sigma

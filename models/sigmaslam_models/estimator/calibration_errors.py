@@ -25,3 +25,20 @@ def unmodelled_errors(intrinsics: Tensor, uvd: Tensor) -> Tensor:
     in_v = [zero] * 4 + [down, zero, one, down * squared / fx, zero]
     in_disparity = [y, x_right, y_squared, right_lens, disparity, zero, zero, lens - right_lens, disparity]
     return torch.stack([*in_u, *in_v, *in_disparity], dim=-1).unflatten(-1, (3, len(in_u)))
+
+
+def view_turns(intrinsics: Tensor, uvd: Tensor) -> Tensor:
+    """By how much a turn of the view about its axes, of one pixel in the centre, changes what is measured of points.
+
+    Args:
+        intrinsics: (5,) fx, fy, cx, cy, fx baseline.
+        uvd: (M, 3) (u, v, disparity).
+    Returns:
+        (M, 3, 3) to first order.
+    """
+    fx, fy, cx, cy = intrinsics[:4].unbind(0)
+    u, v, disparity = uvd.unbind(-1)
+    x, y = (u - cx) / fx, (v - cy) / fy
+    share, zero, ratio = disparity / fx, torch.zeros_like(x), fy / fx
+    in_u, in_v = [-x * y, 1.0 + x * x, -y], [-ratio * (1.0 + y * y), ratio * x * y, ratio * x]
+    return torch.stack([*in_u, *in_v, -share * y, share * x, zero], dim=-1).unflatten(-1, (3, 3))

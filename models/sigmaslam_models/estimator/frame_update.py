@@ -26,14 +26,14 @@ NOISE_SCALE_RULES = ACCEPTANCE.scaled_agreement, ACCEPTANCE.max_noise_scale
 
 
 class FrameViews(NamedTuple):
-    """What a frame sees, and what is known before; K keyframes and the frame, n = 12 + 6 K + 6, M views.
+    """What a frame sees, and what is known before; K keyframes and the frame, n = 15 + 6 K + 6, M views.
 
     Attributes:
         intrinsics, depth, unscented, anchors, views, pair, common, covariance: as of `stereo_views.Scene`.
         estimate: (M, 6) the landmark that is seen, in its anchor keyframe.
         dependence: (M, 6, n) how it moves with the state; not with the frame's pose.
         poses: (K + 1, 4, 4) T_world_camera of the window's posterior, and as expected of the frame.
-        calibration: (12,) its errors, of the window's posterior.
+        calibration: (15,) its errors, of the window's posterior.
         factor: (n, k) of the prior covariance, factor factor^T.
     """
 
@@ -162,10 +162,10 @@ class GatedStep(nn.Module):
     Shapes:
         measurement (M, 3), noise (M, 3, 3), offset (n,), spread (n, n), moved (M, 6), noise_scale () what the variances
         of all views are multiplied by, zero to find it, scale () as of `RobustStep`, freedom () of the Student-t, prior
-        (n, 12) how considered errors enter the state, fields of `FrameViews` ->
+        (n, 15) how considered errors enter the state, fields of `FrameViews` ->
         agree (M,) bool, of the usable views those that pass, their number (), number of usable views (), squared (M,)
         lengths of the residuals, noise_scale (), and after the step: offset (n,), spread (n, n), moved (M, 6), common
-        (n, 12), information (n, n) of the views, scores (M, 6) slope of each view's log-likelihood by the frame's pose,
+        (n, 15), information (n, n) of the views, scores (M, 6) slope of each view's log-likelihood by the frame's pose,
         score (n,) slope of all views' by the state, cost () of the prior.
     """
 
@@ -304,7 +304,7 @@ def linearised(
     residual, noise, components = mask_missing(measurement, linear.mean, noise + linear.nonlinearity + through)
     pieces = [linear.by_pair, linear.by_landmark, residual[..., None]]
     stacked = whiten(torch.cat(pieces, dim=2), noise)
-    by_pair, by_landmark, residual = stacked[..., :18], stacked[..., 18:24], stacked[..., 24]
+    by_pair, by_landmark, residual = stacked[..., :-7], stacked[..., -7:-1], stacked[..., -1]
     derivatives = frame.by_state(by_pair, by_landmark, linear.chain)
     squared = _lengths(residual)
     anywhere = torch.tensor(UNKNOWN_VARIANCE, dtype=noise.dtype, device=noise.device)

@@ -96,7 +96,9 @@ def frame_example(seed: int, keyframes: int, count: int, *inputs: str) -> tuple[
         return torch.rand(*shape, generator=generator, dtype=torch.float64)
 
     size = CALIBRATION_SIZE + 6 * (keyframes + 1)
-    sigma = torch.cat([torch.tensor([0.3]), torch.zeros(CALIBRATION_SIZE - 1), torch.full((size - 12,), 0.003)])
+    sigma = torch.cat(
+        [torch.tensor([0.3]), torch.zeros(CALIBRATION_SIZE - 1), torch.full((size - CALIBRATION_SIZE,), 0.003)]
+    )
     factor = torch.diag(sigma.double())
     for k in range(CALIBRATION_SIZE + 6, size):  # a pose is known relative to the one before
         factor[k] += factor[k - 6]
@@ -121,7 +123,7 @@ def frame_example(seed: int, keyframes: int, count: int, *inputs: str) -> tuple[
         "estimate": torch.nn.functional.pad(landmarks, (0, 3)) + 0.1 * normal(count, LANDMARK_SIZE),
         "dependence": dependence,
         "poses": poses,
-        "calibration": torch.nn.functional.pad(0.1 * normal(3), (0, 9)),
+        "calibration": torch.nn.functional.pad(0.1 * normal(3), (0, CALIBRATION_SIZE - 3)),
         "factor": factor[:, sigma > 0.0],
     }
     # What is seen from about there: the exact place does not matter, but some views must agree.

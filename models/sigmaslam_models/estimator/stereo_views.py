@@ -8,7 +8,7 @@ from torch import Tensor
 from sigmaslam.estimation.state_layout import CALIBRATION_MODELLED, CALIBRATION_SIZE, MODELLED
 from sigmaslam_filters.core.plain_factors import definite_cholesky
 from sigmaslam_filters.manifolds.se3_matrices import adjoint_se3, invert_se3
-from sigmaslam_models.estimator.calibration_errors import unmodelled_errors
+from sigmaslam_models.estimator.calibration_errors import unmodelled_errors, view_turns
 from sigmaslam_models.estimator.stereo_window import StereoTransfer
 
 # Least spread of sigma points: share of the scene's depth, radians, pixels; with it alone slopes are derivatives.
@@ -46,7 +46,7 @@ class Slopes(NamedTuple):
     Attributes:
         mean: (M, 3) expected (u, v, disparity), without the landmark's errors of place.
         by_pair: (M, 3, 9) derivatives by what `chain` makes of the state, and those by the calibration's other errors,
-            (M, 3, 9), side by side: (M, 3, 18).
+            (M, 3, 12), side by side: (M, 3, 21).
         by_landmark: (M, 3, 6) derivatives.
         chain: (p, 9, n) whitened relative pose and modelled calibration of a pair, by the state.
         nonlinearity: (M, 3, 3) covariance of what is not linear.
@@ -67,8 +67,8 @@ def linearise(scene: Scene, poses: Tensor, calibration: Tensor, covariance: Tens
     Args:
         scene: what they have in common.
         poses: (K, 4, 4) T_world_camera.
-        calibration: (12,) its errors.
-        covariance: (12 + 6 K, 12 + 6 K) of calibration and poses, which sigma points are drawn from.
+        calibration: (15,) its errors.
+        covariance: (15 + 6 K, 15 + 6 K) of calibration and poses, which sigma points are drawn from.
         landmarks: (M, 6) the landmark that each view sees, in its anchor keyframe.
     """
     T_view_world = invert_se3(poses.index_select(0, scene.views))
@@ -92,7 +92,10 @@ def linearise(scene: Scene, poses: Tensor, calibration: Tensor, covariance: Tens
     by_landmark = slopes[:, :, 9:] @ torch.linalg.inv_ex(landmark_spread).inverse
     # A pair that is off sees each point as the calibrated pair sees another one, in the anchor and in the view.
     in_anchor, in_view = unmodelled_errors(scene.intrinsics, torch.stack([landmarks[:, :3], mean])).unbind(0)
-    by_error = in_view - by_landmark[:, :, :3] @ in_anchor
+    # Following goes on from keyframe to keyframe, and so does its error.
+    followed = (scene.views - scene.anchors).to(poses.dtype).index_select(0, scene.pair)
+    turns = view_turns(scene.intrinsics, mean) * followed[:, None, None]
+    by_error = torch.cat([in_view - by_landmark[:, :, :3] @ in_anchor, turns], dim=2)
     shift = by_error.flatten(0, 1) @ calibration[CALIBRATION_MODELLED:, None]
     return Slopes(
         mean + shift.unflatten(0, (-1, 3))[..., 0],

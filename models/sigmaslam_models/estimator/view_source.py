@@ -1,6 +1,6 @@
 """What the estimator's graphs do for each view, as C++ from the same modules: `sigmaslam/estimation/views.inc`.
 
-A view is traced with two poses alone, those that its landmark is anchored to and that see it, so the state has 24
+A view is traced with two poses alone, those that its landmark is anchored to and that see it, so the state has 27
 numbers: of the calibration and of both poses. `estimator.cpp` puts them where they belong in the whole state.
 """
 

@@ -19,14 +19,14 @@ from sigmaslam_models.estimator.stereo_views import Scene, Slopes, by_state, lin
 
 
 class WindowViews(NamedTuple):
-    """Views of L landmarks by K keyframes, O views in all, n = 12 + 6 K, at the posterior.
+    """Views of L landmarks by K keyframes, O views in all, n = 15 + 6 K, at the posterior.
 
     Attributes:
         intrinsics, depth, unscented, anchors, views, pair, common: as of `stereo_views.Scene`, for O views.
         owner: (O,) int64, which of the landmarks a view sees.
         estimate, covariance: (L, 6), (L, 6, 6) of the landmarks given poses and calibration.
         poses: (K, 4, 4) T_world_camera.
-        calibration: (12,) its errors.
+        calibration: (15,) its errors.
         spread: (n, n) covariance of both, which sigma points are drawn from.
         measurement: (O, 3) (u, v, disparity), NaN for a missing disparity.
         noise: (O, 3, 3) covariance of a view's own errors.
@@ -103,8 +103,8 @@ class Condition(nn.Module):
 
     Shapes:
         factor (n, k) of the prior covariance, factor factor^T, information (n, n) and vector (n,) of the likelihood
-        exp(-x^T information x / 2 + vector^T x) for x from the prior's mean, common (n, 12) how considered errors enter
-        the state -> mean (n,), covariance (n, n), common (n, 12), by the same gain.
+        exp(-x^T information x / 2 + vector^T x) for x from the prior's mean, common (n, 15) how considered errors enter
+        the state -> mean (n,), covariance (n, n), common (n, 15), by the same gain.
     """
 
     def forward(self, factor: Tensor, information: Tensor, vector: Tensor, common: Tensor) -> tuple[Tensor, ...]:
@@ -135,8 +135,8 @@ def whitened(window: WindowViews, freedom: Tensor) -> tuple[Tensor, Tensor]:
     squared = (stacked[..., -1] * stacked[..., -1]).sum(dim=1)
     weight = student_weight(squared, components, freedom, consistent=True)
     stacked = stacked * torch.sqrt(weight)[:, None, None]
-    rows = by_state(stacked[..., :18], linear.chain, window.pair)
-    return torch.cat([rows, stacked[..., 24].flatten()[:, None]], dim=1), stacked[..., 18:24]
+    rows = by_state(stacked[..., :-7], linear.chain, window.pair)
+    return torch.cat([rows, stacked[..., -1].flatten()[:, None]], dim=1), stacked[..., -7:-1]
 
 
 def _prior_precision(departure: Tensor, variance: Tensor, freedom: Tensor) -> Tensor:

@@ -9,20 +9,21 @@ import pytest
 
 from sigmaslam.estimation.calibration_errors import CalibrationPrior
 from sigmaslam.estimation.held_offset import HeldOffset
+from sigmaslam.estimation.state_layout import CALIBRATION_SIZE
 from sigmaslam.estimation.window_state import WindowState
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
 
-PRIOR = CalibrationPrior.independent(np.r_[0.5, np.zeros(11)], "offset")
+PRIOR = CalibrationPrior.independent(np.array([0.5]), "offset")
 
 
 def state(offset: float, sigma: float, keyframes: int = 2) -> WindowState:
     """A window that knows its offset so well."""
     grown = WindowState.initial(PRIOR)
     for _ in range(keyframes):
-        grown = grown.grow(np.eye(4), np.eye(6), np.zeros(12))
+        grown = grown.grow(np.eye(4), np.eye(6), np.zeros(CALIBRATION_SIZE))
     covariance = grown.covariance.copy()
     covariance[0, 0] = sigma**2
-    return replace(grown, calibration=np.r_[offset, np.zeros(11)], covariance=covariance)
+    return replace(grown, calibration=np.r_[offset, np.zeros(CALIBRATION_SIZE - 1)], covariance=covariance)
 
 
 def test_a_pose_for_another_offset_is_the_mean_given_that_offset():
