@@ -36,6 +36,8 @@ def stamp_noise(intervals: Sequence[float] | np.ndarray) -> float:
         intervals: seconds between successive stamps, in order.
     """
     steps = np.asarray(intervals, float)
+    if len(steps) and np.ptp(steps) <= _BELIEVED * steps.mean():
+        return 0.0  # no noise is larger than the range
     others = np.delete(steps, np.argmax(steps)) if len(steps) else steps
     if len(others) >= _REGULAR and steps.max() > 3.0 * np.median(steps) >= others.max():
         steps = others

@@ -34,6 +34,7 @@ class FrameUpdate:
         self._window = window
         self._iterations = iterations
         self._rooted: tuple[WindowState, np.ndarray] | None = None
+        self._padded: tuple[WindowState, np.ndarray, np.ndarray] | None = None
 
     def predict(
         self, rows: np.ndarray, pose: np.ndarray, step_covariance: np.ndarray, reference: int = -1
@@ -145,8 +146,10 @@ class FrameUpdate:
     ) -> dict[str, np.ndarray]:
         """The fields of `sigmaslam_models.estimator.frame_update.FrameViews` for landmarks (M,) by row."""
         window, state, landmarks = self._window, self._window.posterior, self._window.landmarks
-        dependence = np.zeros((len(rows), LANDMARK_SIZE, len(factor)))
-        dependence[:, :, :-6] = landmarks.dependence[rows]
+        if self._padded is None or self._padded[0] is not state or self._padded[1] is not landmarks.dependence:
+            # The frame's pose moves no landmark; a solution ends with another state.
+            padded = np.pad(landmarks.dependence, ((0, 0), (0, 0), (0, 6)))
+            self._padded = state, landmarks.dependence, padded
         anchors, pair = np.unique(landmarks.anchor[rows], return_inverse=True)
         return {
             **window.graphs.constants(window.depth),
@@ -156,7 +159,7 @@ class FrameUpdate:
             "common": common,
             "covariance": landmarks.covariance[rows],
             "estimate": landmarks.estimate[rows],
-            "dependence": dependence,
+            "dependence": self._padded[2][rows],
             "poses": np.concatenate([state.poses, pose[None]]),
             "calibration": state.calibration,
             "factor": factor,

@@ -79,16 +79,20 @@ def follow_flow(
     Returns:
         As of `lucas_kanade`.
     """
-    half0, half1 = shrink(image0)[-1], shrink(image1)[-1]
+    half0, half1 = _half(image0), _half(image1)
     found, inside = lucas_kanade(half0, half1, 0.5 * points - 0.25, 0.5 * guess - 0.25, _FLOW_WINDOW, _FLOW_LEVELS)
     return 2.0 * found + 0.5, inside
 
 
 def shrink(image: np.ndarray) -> tuple[np.ndarray, ...]:
     """The (H, W) uint8 image at a quarter and half of the size, as `find_patches` takes it."""
+    half = _half(image)
+    return _half(half), half
+
+
+def _half(image: np.ndarray) -> np.ndarray:
     # By exactly two, for which OpenCV has a fast way: odd sizes are rounded.
-    half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    return cv2.resize(half, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), half
+    return cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
 
 
 def find_patches(

@@ -24,6 +24,11 @@ _SHARP_EDGE = 4.3
 _SMOOTHER = cv2.getGaussianKernel(7, 0.75, cv2.CV_32F)
 # Directions that are compared, and what derivatives need beside them, pixels.
 _DIRECTIONS, _MARGIN = 12, 4
+_ANGLE = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS
+_COSINE, _SINE = np.cos(_ANGLE), np.sin(_ANGLE)
+# Of first and second derivatives: how they follow from those along the axes, and which products are given.
+_ONCE, _TWICE = np.stack([_COSINE, _SINE]), np.stack([_COSINE**2, 2.0 * _COSINE * _SINE, _SINE**2])
+_UPPER = np.triu_indices(2), np.triu_indices(3)
 
 
 def is_blurred(image: np.ndarray) -> bool:
@@ -46,13 +51,9 @@ def extreme_sharpness(image: np.ndarray) -> tuple[float, float]:
     kernels = compiled()
     products = _products(half) if kernels is None else kernels.derivative_products(half, _SMOOTHER.ravel())
     first, second = np.zeros((2, 2)), np.zeros((3, 3))
-    for matrix, values in ((first, products[:3]), (second, products[3:])):
-        rows, columns = np.triu_indices(len(matrix))
+    for matrix, values, (rows, columns) in ((first, products[:3], _UPPER[0]), (second, products[3:], _UPPER[1])):
         matrix[rows, columns] = matrix[columns, rows] = values
-    angle = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS
-    cosine, sine = np.cos(angle), np.sin(angle)
-    once, twice = np.stack([cosine, sine]), np.stack([cosine**2, 2.0 * cosine * sine, sine**2])
-    energies = [np.einsum("id,ij,jd->d", each, moments, each) for each, moments in ((once, first), (twice, second))]
+    energies = [np.einsum("id,ij,jd->d", each, moments, each) for each, moments in ((_ONCE, first), (_TWICE, second))]
     if not (np.array(energies) > 0.0).all():
         return np.inf, np.inf
     sharpness = energies[1] / energies[0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -25,7 +26,7 @@ class LastPairs:
     """The raw images of the last frames."""
 
     def __init__(self) -> None:
-        self._pairs: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=_REMEMBERED)
+        self._pairs: deque[tuple[_Probed, _Probed]] = deque(maxlen=_REMEMBERED)
         self._was_old = False
 
     def is_repeated(self, left: np.ndarray, right: np.ndarray) -> bool:
@@ -38,9 +39,9 @@ class LastPairs:
         Args:
             left, right: (H, W) uint8.
         """
-        same = [_shows(left, other[0]) or _shows(right, other[1]) for other in self._pairs]
-        # Callers may fill the same arrays again.
-        self._pairs.append((left.copy(), right.copy()))
+        pair = _Probed(left), _Probed(right)
+        same = [any(map(_shows, pair, other)) for other in self._pairs]
+        self._pairs.append(pair)
         is_last, is_old = bool(same and same[-1]), any(same[:-1])
         is_repeated = is_last or (is_old and not self._was_old)
         self._was_old = is_old and not is_last
@@ -63,15 +64,26 @@ def is_noise(image: np.ndarray) -> bool:
     return bool(is_possible and tall * broad * between < ACCEPTANCE.noise_contrast * within)
 
 
-def _shows(image: np.ndarray, other: np.ndarray) -> bool:
+class _Probed:
+    """A copy of an image (H, W) uint8, for callers may fill the same array again, and some of its rows as bytes."""
+
+    def __init__(self, image: np.ndarray) -> None:
+        self.pixels = image.copy()
+        self.step = max(len(image) // _PROBES, 1)
+        self.rows = [row.tobytes() for row in self.pixels[:: self.step]]
+
+
+def _shows(image: _Probed, other: _Probed) -> bool:
     """Whether an eighth of the image or more, in rows one below another, is as in another one, to the byte."""
-    if image.shape != other.shape:
+    if image.pixels.shape != other.pixels.shape:
         return False
-    step = max(len(image) // _PROBES, 1)
-    same = (image[::step] == other[::step]).all(axis=1)
-    for probe in np.flatnonzero(same[1:] & same[:-1]).tolist():
-        rows = slice(probe * step, (probe + 1) * step + 1)
-        varied = np.count_nonzero(np.diff(image[rows], axis=1)) > _VARIED * image[rows].size
-        if varied and np.array_equal(image[rows], other[rows]):
+    same = [one == another for one, another in zip(image.rows, other.rows, strict=True)]
+    for probe, pair in enumerate(pairwise(same)):
+        if not all(pair):
+            continue
+        some = slice(probe * image.step, (probe + 1) * image.step + 1)
+        pixels = image.pixels[some]
+        varied = np.count_nonzero(np.diff(pixels, axis=1)) > _VARIED * pixels.size
+        if varied and np.array_equal(pixels, other.pixels[some]):
             return True
     return False

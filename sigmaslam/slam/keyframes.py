@@ -117,13 +117,19 @@ class Keyframes:
         # Compared with the sharpest keyframes that share enough with the image.
         by_sharpness = np.argsort(blurs, kind="stable")
         sharp = np.flatnonzero(blurs <= blurs[by_sharpness[:_COMPARED]].max())
-        energies = np.array([self.active[anchor[k]].energies[feature[k]] for k in sharp]).sum(axis=0)
+        first = np.cumsum([0] + [len(keyframe.energies) for keyframe in self.active])[anchor[sharp]]
+        energies = np.concatenate([keyframe.energies for keyframe in self.active])[first + feature[sharp]].sum(axis=0)
         here = patch_energies(left, seen.measurement[sharp, :2]).sum(axis=0)
         reference = here[0] * energies[1] * blurs[sharp].mean()
         # Where nothing varies there is nothing to compare.
         share = float(here[1] * energies[0] / reference) if reference > 0.0 else 1.0
         own = 1.0 if share >= ACCEPTANCE.sharpness else 1.0 / max(share, ACCEPTANCE.least_sharpness)
         return own, own + float(blurs.mean()) - 1.0
+
+    def prepare_oldest(self) -> None:
+        """Makes what the oldest keyframe takes to the map, in a frame that has time for it."""
+        if self.active[0].dense is not None:
+            self.active[0].dense.get()
 
     def marginalise_oldest(self, spare: KnownKeyframe | None = None) -> np.ndarray:
         """Moves the oldest keyframe to the past, and its landmarks to the map.

@@ -13,7 +13,7 @@ from sigmaslam.geometry.image_cells import explained_area, image_cells
 from sigmaslam.slam.guided_matching import CONFIRMED, GuidedMatches
 from sigmaslam.slam.landmark_places import seen_from
 from sigmaslam.slam.moving_region import MovingRegion
-from sigmaslam.two_view.scene_pose import see_the_same, stands_before
+from sigmaslam.two_view.scene_pose import are_one_place, see_the_same, stands_before
 from sigmaslam.two_view.stereo_pose import MIN_POINTS, estimate_relative_pose
 
 
@@ -70,9 +70,14 @@ def find_second_motion(
     if len(others) < MIN_POINTS:
         return None
     cells, equal = image_cells(views.measurement[:, :2], camera.width, camera.height), np.ones(len(rows))
-    first, most = (explained_area(cells, each, equal) for each in (fit.inliers, _among(others, len(rows))))
-    least = ACCEPTANCE.second_motion if moving is None else 0.0 if moving else ACCEPTANCE.mover
-    if most < least * (first + most):
+    possible, least = _among(others, len(rows)), 0.0
+    if not moving:
+        departs = np.linalg.norm(views.measurement[others, :2] - expected[others, :2], axis=1)
+        possible = _most_departing(cells, others, departs)
+        is_many = possible.sum() >= ACCEPTANCE.mover_points * MIN_POINTS
+        least = ACCEPTANCE.mover if is_many and moving is not None else ACCEPTANCE.second_motion
+    first, most = (explained_area(cells, each, equal) for each in (fit.inliers, possible))
+    if possible.sum() < MIN_POINTS or most < least * (first + most):
         return None
     covariance = window.landmarks.covariance[rows[others], :3, :3]
     relative = estimate_relative_pose(
@@ -99,6 +104,22 @@ def find_second_motion(
         return None
     pose = fit.pose @ relative.T_key_camera
     return SecondMotion(pose, agreeing, expected[agreeing], departure, share, nearer, stood_still)
+
+
+def _most_departing(cells: np.ndarray, others: np.ndarray, departs: np.ndarray) -> np.ndarray:
+    """(M,) bool, as much of the image as matches explain of which the median departs from a pose.
+
+    Those are at most all that depart and, with them, as many that do not: of these the ones that explain the most.
+
+    Args:
+        cells: (M,) of all matches.
+        others: (K,) numbers of those that may agree.
+        departs: (K,) pixels from where the pose sees them.
+    """
+    share = 1.0 / np.bincount(cells)[cells[others]]
+    same = are_one_place(departs)
+    order = np.lexsort((-share, same))
+    return _among(others[order[: 2 * (~same).sum()]], len(cells))
 
 
 def _among(chosen: np.ndarray, count: int) -> np.ndarray:

@@ -272,6 +272,19 @@ def test_predictions_are_where_the_frame_then_sees_the_landmarks():
     assert 0.6 < np.mean(values) < 1.5
 
 
+def test_an_update_sees_what_the_window_learns():
+    """What it keeps between frames is not that of the window before."""
+    window = unsolved(world(0, count=30), "unscented")
+    update, rows = FrameUpdate(window, ITERATIONS), np.arange(30)
+    before = update.predict(rows, window.posterior.poses[-1] @ STEP, np.diag(STEP_SIGMA**2))
+    window.solve()
+    asked = rows, window.posterior.poses[-1] @ STEP, np.diag(STEP_SIGMA**2)
+    after = update.predict(*asked)
+    assert np.abs(after[1] - before[1]).max() > 1e-3
+    for found, expected in zip(after, FrameUpdate(window, ITERATIONS).predict(*asked), strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("linearisation", ["extended", "unscented"])
 def test_errors_are_as_large_as_the_covariance_says(linearisation: str):
