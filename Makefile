@@ -51,7 +51,7 @@ dist: $(VENV)/bin/python
 	$(VENV)/bin/python release/build_dist.py dist $(PYTHONS)
 
 # The same for a package index: wheels for x86-64 and aarch64 (manylinux_2_28), compiled by zig whatever the machine, and
-# handed over, which asks for the index's token. docs/release.md comes first.
+# handed over, which asks for the index's token. CONTRIBUTING.md, "A release", comes first.
 publish: $(VENV)/bin/python
 	rm -rf dist
 	$(VENV)/bin/python release/build_dist.py --many-linux dist $(PYTHONS)

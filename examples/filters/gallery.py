@@ -1,6 +1,6 @@
 """The filters' gallery: runs each example, draws it, and prints lines, processor seconds and results as a table.
 
-`python examples/filters/gallery.py docs/images/filters MRCLAM_Dataset6` makes all that docs/filter-gallery.md shows;
+`python examples/filters/gallery.py docs/images/filters MRCLAM_Dataset6` makes the gallery of docs/filters.md;
 without the second folder the robots are left out.
 """
 

@@ -9,10 +9,10 @@ import pytest
 from tests.support.examples import EXAMPLES, load_example
 
 pytest.importorskip("torch")
-PAGE = Path(__file__).parents[2] / "docs" / "filter-gallery.md"
+PAGE = Path(__file__).parents[2] / "docs" / "filters.md"
 
 
-def test_every_example_has_a_section_with_its_picture():
+def test_every_example_has_its_row_and_picture():
     text = PAGE.read_text()
     names = {path.stem for path in (EXAMPLES / "filters").glob("*.py")} - {"gallery"}
     assert len(names) == 12
