@@ -1,15 +1,12 @@
 """Where a run works: a processor or a GPU."""
 
 import os
-from typing import cast
 
 import torch
 from torch import Tensor, nn
 
 from sigmaslam.errors import InputError
 from sigmaslam_models.feature_network import FeatureMaps, FeatureNetwork
-from sigmaslam_training.features.batch_loss import pair_loss
-from sigmaslam_training.features.losses import PairLoss
 from sigmaslam_training.features.stream import TrainingPair
 
 
@@ -43,25 +40,8 @@ def describe_hardware(device: torch.device) -> str:
     return f"{gpu}{os.cpu_count()} CPU cores, torch {torch.__version__}"
 
 
-class NetworkLoss(nn.Module):
-    """The network and its losses as one module.
-
-    Args:
-        network: in training.
-        bfloat16: whether the network runs in it, as on a GPU; the losses are float32 always.
-    """
-
-    def __init__(self, network: FeatureNetwork, bfloat16: bool = False) -> None:
-        super().__init__()
-        self.network: nn.Module = Bfloat16Network(network) if bfloat16 else network
-
-    def forward(self, batch: TrainingPair, generator: torch.Generator) -> PairLoss:
-        """Losses of a batch; see `pair_loss`."""
-        return pair_loss(cast(FeatureNetwork, self.network), *batch, generator)
-
-
 class Bfloat16Network(nn.Module):
-    """A network that computes in bfloat16 and answers in float32."""
+    """A network that computes in bfloat16, as on a GPU, and answers in float32, as the losses are."""
 
     def __init__(self, network: FeatureNetwork) -> None:
         super().__init__()
@@ -74,7 +54,7 @@ class Bfloat16Network(nn.Module):
         return FeatureMaps(*(each.float() for each in maps))
 
     def describe(self, maps: FeatureMaps, keypoints: Tensor) -> Tensor:
-        """Descriptors, as `FeatureNetwork` gives them; in float32, as the losses."""
+        """Descriptors, as `FeatureNetwork` gives them; in float32."""
         return self.network.describe(maps, keypoints)
 
 

@@ -13,7 +13,8 @@ from torch import nn
 
 from sigmaslam.files import atomic_path, atomic_write_text, make_folder
 from sigmaslam.progress import open_progress
-from sigmaslam_training.devices import NetworkLoss, choose_device, to_device
+from sigmaslam_training.devices import Bfloat16Network, choose_device, to_device
+from sigmaslam_training.features.batch_loss import pair_loss
 from sigmaslam_training.features.checkpoint import (
     CHECKPOINT_NAME,
     TrainingState,
@@ -110,7 +111,7 @@ class _Run:
         self._state, self._device, self._journal = state, device, journal
         self._checkpoint = out / CHECKPOINT_NAME
         self._saved = state.step
-        self._loss = NetworkLoss(state.network, bfloat16=device.type == "cuda")
+        self._network = Bfloat16Network(state.network) if device.type == "cuda" else state.network
         self._began = time.monotonic() - state.seconds
         self._logged = (state.step, time.monotonic())
         self._progress = open_progress()
@@ -153,7 +154,7 @@ class _Run:
         state, config = self._state, self._state.config
         seed = (config.seed * 1_000_000_007 + state.step) % 2**63
         state.network.train()
-        loss: PairLoss = self._loss(batch, torch.Generator().manual_seed(seed))
+        loss = pair_loss(self._network, *batch, torch.Generator().manual_seed(seed))
         state.optimizer.zero_grad(set_to_none=True)
         (loss.descriptor + config.quality_weight * loss.quality + config.place_weight * loss.place).backward()
         nn.utils.clip_grad_norm_(state.network.parameters(), 1.0)
