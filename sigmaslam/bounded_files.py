@@ -81,7 +81,7 @@ def read_json(path: Path, what: str, mend: str, error: type[InputError] = InputE
         raise error(f"{path}: is no JSON ({shorten(str(problem))}): {mend}") from None
 
 
-def check_regular(path: Path, limit: int, what: str, error: type[InputError] = InputError) -> None:
+def check_regular(path: Path, limit: int, what: str) -> None:
     """Refuses what `read_bytes` would refuse by its kind and size, where a library reads the file.
 
     Raises:
@@ -90,8 +90,8 @@ def check_regular(path: Path, limit: int, what: str, error: type[InputError] = I
     try:
         status = path.stat()
     except (OSError, ValueError) as problem:
-        raise _unreadable(path, what, problem, error) from None
-    _check_regular(path, status, limit, error)
+        raise _unreadable(path, what, problem, InputError) from None
+    _check_regular(path, status, limit, InputError)
 
 
 def list_folder(folder: Path) -> list[Path]:

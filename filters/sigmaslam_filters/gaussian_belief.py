@@ -128,17 +128,11 @@ class Gaussian:
 
     def __getitem__(self, index: Any) -> Gaussian:
         """Elements of the batch: `belief[3]`, `belief[:, -1]`."""
-        mean = self.mean[_of_batch(index, 1)]
-        if self._covariance is not None:
-            return Gaussian(mean, self._covariance[_of_batch(index, 2)], is_symmetric=True)
-        return self._like(mean, lambda matrix: matrix[_of_batch(index, 2)])
+        return self._like(self.mean[_of_batch(index, 1)], lambda matrix: matrix[_of_batch(index, 2)])
 
     def expand(self, batch: Sequence[int]) -> Gaussian:
         """The same belief in every element of a larger batch."""
-        mean = self.mean.expand(*batch, -1)
-        if self._covariance is not None:
-            return Gaussian(mean, self._covariance.expand(*batch, -1, -1), is_symmetric=True)
-        return self._like(mean, lambda matrix: matrix.expand(*batch, -1, -1))
+        return self._like(self.mean.expand(*batch, -1), lambda matrix: matrix.expand(*batch, -1, -1))
 
     def where(self, chosen: Tensor, other: Gaussian) -> Gaussian:
         """This belief where chosen (...,) bool is true, the other elsewhere; held as this one is."""
@@ -158,17 +152,11 @@ class Gaussian:
 
     def to(self, *arguments: Any, **options: Any) -> Gaussian:
         """Another dtype or device, as `Tensor.to`."""
-        mean = self.mean.to(*arguments, **options)
-        if self._covariance is not None:
-            return Gaussian(mean, self._covariance.to(*arguments, **options), is_symmetric=True)
-        return self._like(mean, lambda matrix: matrix.to(*arguments, **options))
+        return self._like(self.mean.to(*arguments, **options), lambda matrix: matrix.to(*arguments, **options))
 
     def batch_last(self) -> Gaussian:
         """The same belief with batch-last memory: `mean[..., i]` is contiguous, and large batches run much faster."""
-        mean = _with_batch_last_memory(self.mean, 1)
-        if self._covariance is not None:
-            return Gaussian(mean, _with_batch_last_memory(self._covariance, 2), is_symmetric=True)
-        return self._like(mean, lambda matrix: _with_batch_last_memory(matrix, 2))
+        return self._like(_with_batch_last_memory(self.mean, 1), lambda matrix: _with_batch_last_memory(matrix, 2))
 
     def sample(self, number: int, generator: torch.Generator | None = None, space: Space | None = None) -> Tensor:
         """States (number, ..., p) drawn from the belief; on a manifold of its space."""
@@ -210,7 +198,9 @@ class Gaussian:
         return found
 
     def _like(self, mean: Tensor, change: Callable[[Tensor], Tensor]) -> Gaussian:
-        """With another mean, and the root changed; what has no root changes likewise."""
+        """With another mean, and the covariance or root changed; what has no root changes likewise."""
+        if self._covariance is not None:
+            return Gaussian(mean, change(self._covariance), is_symmetric=True)
         assert self._factor is not None
         changed = Gaussian(mean, factor=change(self._factor), factor_is_lower=self._is_lower)
         changed._unrooted = None if self._unrooted is None else change(self._unrooted)

@@ -1,8 +1,6 @@
-"""The trained networks: read from their weights, exported to ONNX, and checked where ONNX Runtime computes them."""
+"""The trained networks: read from their weights, and exported to ONNX."""
 
 import json
-import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
@@ -12,14 +10,12 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from sigmaslam.errors import InputError, SigmaSlamError
+from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path, atomic_write_text, make_folder
-from sigmaslam.inference.onnx_graph import OnnxGraph
-from sigmaslam.inference.session import check_provider
 from sigmaslam.inference.weight_manifest import check_weights, update_manifest
 from sigmaslam_models.extractor import EXTRACTOR_SIZE_MULTIPLE, FeatureExtractor
-from sigmaslam_models.feature_network import DESCRIPTOR_SIZE, STRIDE, FeatureNetwork
-from sigmaslam_models.graph_export import TracedModule, export_graph, feed_of, relative_difference
+from sigmaslam_models.feature_network import FeatureNetwork
+from sigmaslam_models.graph_export import TracedModule, export_graph
 from sigmaslam_models.model_card import read_card, scoring_page
 from sigmaslam_models.scorer_network import NEIGHBOURS, SIDE_CHANNELS, MatchScorer, ScoredMatches
 from sigmaslam_models.verifier_network import PLACE_COLUMNS, VERIFIER_COLUMNS, MatchCovariance, MatchVerifier
@@ -27,21 +23,19 @@ from sigmaslam_synthetic.rendering.textures import dead_leaves
 
 # ONNX Runtime and torch may order sums differently; more than this is a wrong graph.
 NETWORK_TOLERANCE = 1e-4
-_TIMED_CALLS = 9
 
 _Module = TypeVar("_Module", bound=nn.Module)
 
 
-def load_network(weights: Path, descriptor_size: int = DESCRIPTOR_SIZE, stride: int = STRIDE) -> FeatureNetwork:
+def load_network(weights: Path) -> FeatureNetwork:
     """The network with trained weights, in evaluation mode.
 
     Args:
         weights: safetensors file.
-        descriptor_size, stride: of the network that was trained.
     Raises:
         InputError: the file is missing, not the one that its manifest names, or holds another network.
     """
-    return _load(FeatureNetwork(descriptor_size, stride), weights)
+    return _load(FeatureNetwork(), weights)
 
 
 def load_scorer(weights: Path) -> MatchScorer:
@@ -87,59 +81,6 @@ def export_scoring(run: Path, out: Path) -> dict[str, float]:
     return differences
 
 
-@dataclass(frozen=True, slots=True)
-class CallTime:
-    """Medians of a graph's calls.
-
-    Attributes:
-        wall_ms: milliseconds.
-        process_ms: of CPU time, of all threads.
-    """
-
-    wall_ms: float
-    process_ms: float
-
-
-@dataclass(frozen=True, slots=True)
-class ProviderCheck:
-    """A network on an execution provider beside the same on the CPU.
-
-    Attributes:
-        difference: largest one of the outputs.
-        on_cpu, on_provider: what a call takes.
-    """
-
-    difference: float
-    on_cpu: CallTime
-    on_provider: CallTime
-
-
-def check_networks(folder: Path, provider: str) -> dict[str, ProviderCheck]:
-    """Runs the networks of a folder on an execution provider and on the CPU, on the inputs of `check_graphs`.
-
-    Args:
-        folder: as of `check_graphs`.
-        provider: one of `sigmaslam.inference.session.PROVIDERS`.
-    Raises:
-        InputError: the provider is not installed or does not start, or a file is missing.
-        SigmaSlamError: a network differs by more than its tolerance.
-    """
-    check_provider(provider)
-    checks = {}
-    for name, graph in network_graphs(folder).items():
-        path, feed = folder / f"{name}.onnx", feed_of(graph)
-        expected, on_cpu = _timed(OnnxGraph(path), feed)
-        actual, on_provider = _timed(OnnxGraph(path, provider=provider), feed)
-        difference = (feature_difference if name == "features" else relative_difference)(actual, expected)
-        if not difference <= NETWORK_TOLERANCE:
-            raise SigmaSlamError(
-                f"{name}.onnx on the provider {provider} differs from the CPU by {difference:.2e}, more than "
-                f"{NETWORK_TOLERANCE:.0e}: track without it"
-            )
-        checks[name] = ProviderCheck(difference, on_cpu, on_provider)
-    return checks
-
-
 def network_graphs(folder: Path) -> dict[str, TracedModule]:
     """The networks of which the folder has graphs."""
     graphs = {}
@@ -168,17 +109,6 @@ def feature_difference(actual: list[np.ndarray], expected: list[np.ndarray]) -> 
     return max(
         float(np.abs(a[nearest[common]] - b[:count][common]).max()) for a, b in zip(actual, expected, strict=True)
     )
-
-
-def _timed(graph: OnnxGraph, feed: dict[str, np.ndarray]) -> tuple[list[np.ndarray], CallTime]:
-    """Outputs of a graph, and what a call takes."""
-    outputs = graph(feed)  # the first call makes what the others use
-    seconds = []
-    for _ in range(_TIMED_CALLS):
-        wall, process = time.perf_counter(), time.process_time()
-        graph(feed)
-        seconds.append((time.perf_counter() - wall, time.process_time() - process))
-    return outputs, CallTime(*(1e3 * float(median) for median in np.median(seconds, axis=0)))
 
 
 def _feature_graph(network: FeatureNetwork) -> TracedModule:

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.console import Console
 
 from sigmaslam.cli.extras import need_train_extra
-from sigmaslam.cli.track import Provider
 from sigmaslam.errors import InputError
-from sigmaslam.inference.session import check_provider
-
-if TYPE_CHECKING:
-    from sigmaslam_models.network_export import CallTime
 
 
 def export(
@@ -26,9 +21,6 @@ def export(
     check: Annotated[
         bool, typer.Option("--check", help="Compare the graphs that ship with torch; without RUN.")
     ] = False,
-    provider: Annotated[
-        Provider, typer.Option(help="With --check: compare the networks on it with the CPU instead.")
-    ] = Provider["cpu"],
     page: Annotated[
         Path | None, typer.Option(help="Write a page (Markdown) of the graphs that ship; without RUN.")
     ] = None,
@@ -38,14 +30,11 @@ def export(
     A run of 'train' gives the features' graph and those of the tracker's estimator, a run of 'train-scorer' scorer and
     verifier.
     """
-    check_provider(provider.value)
     need_train_extra()
-    if provider.value != "cpu" and not check:
-        raise InputError("--provider goes with --check: nothing is exported for a provider")
     if check or page is not None:
         if run is not None or out is not None:
             raise InputError("--check and --page are of the graphs that ship: leave out RUN and --out")
-        _tell_of_shipped(check, page, provider.value)
+        _tell_of_shipped(check, page)
         return
     if run is None or out is None:
         raise InputError("give the folder of a run and --out, or --check, or --page")
@@ -70,28 +59,17 @@ def export(
     _tell_differences(differences)
 
 
-def _tell_of_shipped(check: bool, page: Path | None, provider: str) -> None:
+def _tell_of_shipped(check: bool, page: Path | None) -> None:
     from sigmaslam.files import atomic_write_text
     from sigmaslam.inference.onnx_graph import shipped_weights
     from sigmaslam_models.graph_page import PAGE_COMMAND, graph_page
-    from sigmaslam_models.network_export import check_networks
     from sigmaslam_models.onnx_export import check_graphs
 
     folder = shipped_weights("features.onnx").parent
     if page is not None:
         atomic_write_text(page, graph_page(folder, PAGE_COMMAND))
-    if check and provider != "cpu":
-        for name, found in check_networks(folder, provider).items():
-            typer.echo(
-                f"{name}.onnx on {provider} differs from the CPU by {found.difference:.1e}; "
-                f"{_tell_time(found.on_provider)} instead of {_tell_time(found.on_cpu)}"
-            )
-    elif check:
+    if check:
         _tell_differences(check_graphs(folder))
-
-
-def _tell_time(time: CallTime) -> str:
-    return f"{time.wall_ms:.2f} ms ({time.process_ms:.2f} ms of CPU time)"
 
 
 def _tell_differences(differences: dict[str, float]) -> None:

@@ -18,30 +18,12 @@ from sigmaslam.cli.extras import need_torch
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text, check_new_folder, make_folder
 
-
-class RecordingFormat(StrEnum):
-    """Kinds of recordings; auto tells by the files."""
-
-    auto = "auto"
-    mrclam = "mrclam"
-    tubes = "tubes"
-    csv = "csv"
-    starry = "starry"
-
-
-class FilterKind(StrEnum):
-    """Filters to localise with."""
-
-    ukf = "ukf"
-    ekf = "ekf"
-    iterated = "iterated"
-
-
-class Knowledge(StrEnum):
-    """Whether the places of the landmarks are known, or which of them a sighting is of."""
-
-    known = "known"
-    unknown = "unknown"
+RecordingFormat = StrEnum("RecordingFormat", ["auto", "mrclam", "tubes", "csv", "starry"])
+"""Kinds of recordings; auto tells by the files."""
+FilterKind = StrEnum("FilterKind", ["ukf", "ekf", "iterated"])
+"""Filters to localise with."""
+Knowledge = StrEnum("Knowledge", ["known", "unknown"])
+"""Whether the places of the landmarks are known, or which of them a sighting is of."""
 
 
 def localize(

@@ -21,11 +21,13 @@ def tell_summary(summary: dict[str, Any], out: Path) -> None:
     Raises:
         typer.Exit: less than half of the frames were tracked; the last line says why.
     """
+    verdicts = [times_verdict(summary), contradiction_verdict(summary), *doubts_verdict(summary)]
+    said = "".join(f"{each}\n" for each in verdicts if each)
     typer.echo(
         f"{summary['tracked']} of {summary['frames']} frames tracked{_doubted(summary)}, "
         f"{_reckoned(summary)}{summary['starting']} starting, {summary['lost']} lost, {summary['skipped']} skipped; "
         f"{summary['median_inliers']:.0f} inliers in the median frame, {summary['map_points']} map points.\n"
-        f"{_world(summary)}{_times(summary)}{_contradiction(summary)}{_doubts(summary)}{summary['calibration_verdict']}\n"
+        f"{_world(summary)}{said}{summary['calibration_verdict']}\n"
         f"{_imu_verdict(summary)}{_location_verdict(summary)}{_real_time_verdict(summary)}"
         f"Report: {printable(out / 'report.html')}"
     )
@@ -41,18 +43,6 @@ def _world(summary: dict[str, Any]) -> str:
     return f"The world is {summary['world']}; frames before it have no pose.\n"
 
 
-def _times(summary: dict[str, Any]) -> str:
-    """A line where stamps jitter or images repeat."""
-    verdict = times_verdict(summary)
-    return "" if verdict is None else f"{verdict}\n"
-
-
-def _contradiction(summary: dict[str, Any]) -> str:
-    """A line where most matches contradict many poses."""
-    verdict = contradiction_verdict(summary)
-    return "" if verdict is None else f"{verdict}\n"
-
-
 def _doubted(summary: dict[str, Any]) -> str:
     """How many of the poses are in doubt; empty where none is."""
     counts = [f"{summary[status]} {status}" for status in ("doubtful", "ambiguous") if summary[status]]
@@ -63,11 +53,6 @@ def _reckoned(summary: dict[str, Any]) -> str:
     """How many frames a sensor of motion carried through the dark; empty where none."""
     names = {"inertial": "the inertial sensor", "odometry": "odometry"}
     return "".join(f"{summary[key]} by {name} alone, " for key, name in names.items() if summary.get(key))
-
-
-def _doubts(summary: dict[str, Any]) -> str:
-    """Lines about what speaks against poses."""
-    return "".join(f"{each}\n" for each in doubts_verdict(summary))
 
 
 def _imu_verdict(summary: dict[str, Any]) -> str:

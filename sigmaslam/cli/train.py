@@ -60,11 +60,9 @@ def train(
 ) -> None:
     """Train the correspondence network on renders (needs the extra 'train').
 
-    Ctrl-C saves the last step; the same command with --resume goes on. On several GPUs: torchrun --nproc-per-node N
-    -m sigmaslam train ...
+    Ctrl-C saves the last step; the same command with --resume goes on.
     """
     need_train_extra()
-    from sigmaslam_training.devices import leads
     from sigmaslam_training.features.loop import TrainingStopped
     from sigmaslam_training.features.loop import train as run_training
     from sigmaslam_training.features.recipes import choose_config, starting_weights
@@ -77,11 +75,9 @@ def train(
     try:
         card = run_training(out, config, workers, resume, recipe.value, weights, device)
     except TrainingStopped as stop:
-        if leads():
-            _tell_stop(out, stop.saved, stop.steps)
+        _tell_stop(out, stop.saved, stop.steps)
         raise
-    if leads():
-        typer.echo(json.dumps(card, indent=2))
+    typer.echo(json.dumps(card, indent=2))
 
 
 def _tell_stop(out: Path, saved: int, steps: int) -> None:

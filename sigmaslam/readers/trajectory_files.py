@@ -110,15 +110,12 @@ def kitti_times_path(path: str | Path) -> Path | None:
     return times if times.is_file() else None
 
 
-def read_kitti(path: str | Path, times_path: str | Path | None = None) -> Trajectory:
+def read_kitti(path: str | Path) -> Trajectory:
     """Read rows of 3x4 matrices T_world_camera (12 columns).
 
-    The rotations, which KITTI writes with seven digits, are made orthonormal.
+    The rotations, which KITTI writes with seven digits, are made orthonormal. Times are those of times.txt beside the
+    file, seconds, and 10 Hz from zero where there is none.
 
-    Args:
-        path: the pose file.
-        times_path: one timestamp in seconds a row; by default times.txt beside the pose file, and 10 Hz from
-            zero where there is none.
     Raises:
         InputError: a file cannot be read, a line is wrong, or there are not as many times as poses.
     """
@@ -137,7 +134,7 @@ def read_kitti(path: str | Path, times_path: str | Path | None = None) -> Trajec
     poses[:, :3, :3] = rotations
     poses[:, :3, 3] = matrices[:, :, 3]
 
-    times = Path(times_path) if times_path is not None else kitti_times_path(path)
+    times = kitti_times_path(path)
     if times is None:
         return Trajectory(np.arange(len(rows)) / KITTI_FRAME_RATE, poses)
     stamps, stamp_numbers = _numbers(times, columns=1, form="one time in seconds")

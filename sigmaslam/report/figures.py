@@ -69,27 +69,24 @@ def plot_trajectory(
     return horizontal, vertical, height
 
 
-def save_png(figure: Figure, path: str | Path, dots_per_inch: int = 130) -> None:
+def save_png(figure: Figure, path: str | Path) -> None:
     """Write the figure as PNG, whole or not at all."""
     with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=dots_per_inch)
+        figure.savefig(temporary, format="png", dpi=130)
 
 
-def to_svg(figure: Figure, name: str, dots_per_inch: int = 100) -> str:
+def to_svg(figure: Figure, name: str) -> str:
     """The figure as an `<svg>` element to put into a page; the same figure gives the same text.
 
     Args:
         figure: what to draw; rasterised artists become a PNG inside.
         name: unique among the figures of one page, as it makes their identifiers unique.
-        dots_per_inch: of rasterised artists.
     """
     import matplotlib
 
     target = io.StringIO()
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
-        figure.savefig(
-            target, format="svg", dpi=dots_per_inch, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type"))
-        )
+        figure.savefig(target, format="svg", dpi=100, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     text = target.getvalue()
     text = text[text.index("<svg") :]
     # Matplotlib writes six digits; a screen does not resolve a hundredth of a point.

@@ -23,6 +23,7 @@ PRIVATE = {
     "torch._inductor.custom_graph_pass.CustomInferenceAwareGraphPass.uuid": ("self",),
     "torch._inductor.custom_graph_pass.get_hash_for_files": ("paths",),
     "torch._subclasses.fake_tensor.FakeTensorMode.__enter__": ("self",),
+    "torch._subclasses.fake_tensor.unset_fake_temporarily": (),
     "torch._inductor.codecache.CppCodeCache.load": ("source",),
     "torch._decomp.core_aten_decompositions": (),
 }

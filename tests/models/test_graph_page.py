@@ -9,9 +9,7 @@ import pytest
 
 from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.inference.onnx_graph import shipped_weights
-from sigmaslam_models import network_export
 from sigmaslam_models.graph_page import PAGE_COMMAND, graph_page, graph_texts
-from sigmaslam_models.network_export import check_networks
 from sigmaslam_models.onnx_export import check_graphs
 
 WEIGHTS = shipped_weights("features.onnx").parent
@@ -55,27 +53,3 @@ def test_a_graph_that_nobody_knows_is_named(tmp_path):
     with pytest.raises(InputError, match=r"other\.onnx"):
         check_graphs(tmp_path)
     assert "## other.onnx" in graph_page(tmp_path, "command")
-
-
-@pytest.mark.long
-def test_the_cpu_is_checked_against_itself():
-    checks = check_networks(WEIGHTS, "cpu")
-    assert set(checks) == {"features", "scorer", "verifier", "place_verifier"}
-    for check in checks.values():
-        assert check.difference == 0.0
-        assert min(check.on_cpu.wall_ms, check.on_provider.process_ms) > 0.0
-
-
-@pytest.mark.long
-def test_a_provider_that_computes_something_else_is_found(monkeypatch):
-    calls = []
-    right = network_export._timed
-
-    def wrong_on_the_provider(graph, feed):
-        outputs, times = right(graph, feed)
-        calls.append(graph)
-        return [each * (1.0 + 1e-3 * (len(calls) % 2 == 0)) for each in outputs], times
-
-    monkeypatch.setattr(network_export, "_timed", wrong_on_the_provider)
-    with pytest.raises(SigmaSlamError, match=r"features\.onnx on the provider cpu differs from the CPU by"):
-        check_networks(WEIGHTS, "cpu")

@@ -7,10 +7,10 @@ import pytest
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.se3 import rotation_log
 from sigmaslam.readers.trajectory_files import read_kitti
+from sigmaslam_synthetic.motion.paths import Path, with_stops
 from sigmaslam_synthetic.motion.random_motions import (
     CAMERA_HEIGHT,
     FreeSpace,
-    Path,
     closed_loop,
     drive,
     drive_profile,
@@ -21,7 +21,6 @@ from sigmaslam_synthetic.motion.random_motions import (
     pure_rotation,
     rolling,
     tool,
-    with_stops,
 )
 from sigmaslam_synthetic.simulation import Recipe
 

@@ -9,7 +9,8 @@ import pytest
 
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.se3 import rotation_log
-from sigmaslam_synthetic.motion.random_motions import FreeSpace, Path, drone, hand_held
+from sigmaslam_synthetic.motion.paths import Path
+from sigmaslam_synthetic.motion.random_motions import FreeSpace, drone, hand_held
 from sigmaslam_synthetic.motion.shaken import shaken, slowed
 from sigmaslam_synthetic.presets import PRESETS
 from sigmaslam_synthetic.render_choices import CARRIED, PRESET_NAMES

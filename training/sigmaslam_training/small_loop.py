@@ -7,7 +7,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from sigmaslam_training.devices import Workplace
 from sigmaslam_training.interruption import Interruption
 from sigmaslam_training.snapshot import check_same, read_snapshot, restore, write_snapshot
 
@@ -50,7 +49,7 @@ def train_steps(
     def save() -> None:
         write_snapshot(checkpoint, network, optimizer, schedule, step, {"made_of": made_of})
 
-    interruption = Interruption(Workplace(torch.device("cpu")))
+    interruption = Interruption()
     with interruption.listening():
         try:
             while step < steps:

@@ -6,16 +6,17 @@ passes `tests/filters/test_compiler_contract.py` before the range is widened.
 Private parts of torch that are used, each listed with its signature in that test, and none besides:
 
 - `components`: `torch._inductor.custom_graph_pass` (`CustomInferenceAwareGraphPass`, `get_hash_for_files`),
-  `torch._subclasses.fake_tensor.FakeTensorMode`, `aten._efficientzerotensor`, `aten._to_copy`.
+  `torch._subclasses.fake_tensor` (`FakeTensorMode`, `unset_fake_temporarily`), `aten._efficientzerotensor`,
+  `aten._to_copy`.
 - `scalar_sequence`, `header_export`: `torch._inductor.codecache.CppCodeCache`.
 - `number_program`: `torch._decomp.core_aten_decompositions`.
 - `compiled_step`: settings of `torch._inductor.config`, given as options of `torch.compile`.
 
 What is rewritten: `components` writes the traced aten graph of a step anew, one array (B,) for each number, where the
-batch is on a CPU, has 64 elements or more and no derivative is asked for; `component_moves` says what moves of memory
-do to these numbers. `number_program` makes a program of numbers of a function of small tensors; `scalar_step` writes
-it and its derivative backward as C++ functions of one element, `item_source` as a loop's body. `event_kinds` says which
-events share one, `scalar_sequence` calls them over time, `header_export` hands them out.
+batch is on a CPU, has 64 elements or more and no derivative is asked for. `number_program` makes a program of numbers
+of a function of small tensors; `scalar_step` writes it and its derivative backward as C++ functions of one element,
+`item_source` as a loop's body. `event_kinds` says which events share one, `scalar_sequence` calls them over time,
+`header_export` hands them out.
 
 What is guaranteed: the arithmetic is the library's, operation by operation, so results agree to 3e-14 of the largest
 value in float64. A model is taken as it is when the step is compiled. What fails is said as the library says it.

@@ -2,26 +2,25 @@
 
 What a filter computes is written with small matrices (..., n, n), which a compiler assembles in memory and takes apart
 again: some 25 passes over the batch where one would do. Here every operation of the traced graph is done entry by
-entry, so that assembling, slicing and transposing are bookkeeping that is over when the graph is compiled, and all that
-is left is arithmetic on arrays (B,), which fuses into one loop. Zeros and ones that are known take no part.
+entry: what assembles, slices and transposes is done by torch itself on the entries' numbers while the graph is
+compiled, and all that is left is arithmetic on arrays (B,), which fuses into one loop. Zeros and ones that are known
+take no part.
 
 Nothing is asked of what was traced: the arithmetic is the same, operation by operation, whoever wrote it.
 """
 
 from __future__ import annotations
 
+import math
 import operator
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
-from torch import fx
+from torch import Tensor, fx
 from torch._inductor.custom_graph_pass import CustomInferenceAwareGraphPass, get_hash_for_files
-from torch._subclasses.fake_tensor import FakeTensorMode
-
-from sigmaslam_filters.compiler import component_moves
-from sigmaslam_filters.compiler.component_moves import MOVES, RESHAPES, Entries, InRow, reshape, shape_of
+from torch._subclasses.fake_tensor import FakeTensorMode, unset_fake_temporarily
 
 aten = torch.ops.aten
 
@@ -45,7 +44,7 @@ class InComponents(CustomInferenceAwareGraphPass):
             return
         nodes = list(graph.nodes)
         rewriter = _Rewriter(graph, batch, MOST_OPERATIONS)
-        with graph.inserting_before(nodes[-1]):
+        with graph.inserting_before(nodes[-1]), unset_fake_temporarily():
             try:
                 nodes[-1].args = (rewriter.run(nodes),)
             except TooLongError:
@@ -56,7 +55,7 @@ class InComponents(CustomInferenceAwareGraphPass):
 
     def uuid(self) -> Any:
         """What the compiler's cache knows the rewriting by."""
-        return get_hash_for_files((__file__, component_moves.__file__))
+        return get_hash_for_files((__file__,))
 
 
 class TooLongError(Exception):
@@ -75,12 +74,12 @@ def _fill_symbolic_zeros(graph: fx.Graph) -> None:
 
 def _batch_size(graph: fx.Graph) -> int | None:
     """The length of the longest dimension of what goes in, if it is a batch: of no tensor is it the length twice."""
-    inputs = [shape_of(node) for node in graph.nodes if node.op == "placeholder"]
+    inputs = [_shape_of(node) for node in graph.nodes if node.op == "placeholder"]
     size = max((length for shape in inputs if shape is not None for length in shape), default=0)
     if not isinstance(size, int) or size < SMALLEST_BATCH:
         return None
     for node in graph.nodes:
-        shape = shape_of(node)
+        shape = _shape_of(node)
         if shape is not None and node.meta["val"].device.type != "cpu":
             return None
         if shape is not None and (any(type(length) is not int for length in shape) or shape.count(size) > 1):
@@ -93,6 +92,46 @@ def _batch_size(graph: fx.Graph) -> int | None:
 def _changes_arguments(node: fx.Node) -> bool:
     schema = getattr(node.target, "_schema", None)
     return schema is not None and schema.is_mutable
+
+
+def _shape_of(node: fx.Node) -> tuple[int, ...] | None:
+    """Shape of what an operation gives; None if that is no tensor."""
+    value = node.meta.get("val")
+    return tuple(value.shape) if isinstance(value, Tensor) else None
+
+
+@dataclass(frozen=True, slots=True)
+class _Entries:
+    """A tensor by its entries.
+
+    Attributes:
+        numbers: of its shape, but of length 1 along the batch: which of the rewriter's entries stands there.
+        axis: the batch's dimension, None if there is none.
+        dtype: of the tensor.
+        source: the tensor itself, if it is there.
+    """
+
+    numbers: Tensor
+    axis: int | None
+    dtype: torch.dtype
+    source: fx.Node | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _InRow:
+    """Tensors end to end along the batch: half of what `torch.stack` is made of, the other half is a reshape.
+
+    Attributes:
+        pieces: of one shape.
+    """
+
+    pieces: list[_Entries]
+
+    def stacked(self) -> _Entries:
+        """With a dimension for the pieces, before that of the batch."""
+        first = self.pieces[0]
+        assert first.axis is not None
+        return _Entries(torch.stack([each.numbers for each in self.pieces], first.axis), first.axis + 1, first.dtype)
 
 
 class _Rewriter:
@@ -109,8 +148,10 @@ class _Rewriter:
         self.kept: set[fx.Node] = set()
         self._made: dict[fx.Node, Any] = {}
         self._known: dict[Any, fx.Node] = {}
-        self._count = 0
-        likes = [node.meta["val"] for node in graph.nodes if shape_of(node) is not None]
+        # Nodes (B,) or (), or numbers that are known.
+        self._entries: list[Any] = []
+        self._number_of: dict[Any, int] = {}
+        likes = [node.meta["val"] for node in graph.nodes if _shape_of(node) is not None]
         self._device = likes[0].device
         self._fake: FakeTensorMode = likes[0].fake_mode
 
@@ -122,36 +163,45 @@ class _Rewriter:
 
     def _value(self, node: fx.Node) -> Any:
         if node.op != "call_function":
-            return self._entries(node)
+            return self._taken(node)
         given = [self._made[each] for each in node.all_input_nodes]
         target: Any = node.target
         if target is operator.getitem:
             index: Any = node.args[1]
             return given[0][index] if isinstance(given[0], list) else self._kept(node)
+        result: Any = None
         if target is aten.full.default:
-            return self._filled(node)
-        if target is aten.expand.default and isinstance(given[0], fx.Node) and self._batch in (shape_of(node) or ()):
-            return MOVES[target](self._batch, node, self._split(given[0]), *node.args[1:])
-        if target in RESHAPES and isinstance(given[0], InRow):
-            result = reshape(self._batch, node, given[0].stacked(), None)
-            return self._kept(node) if result is None else result
-        if not any(isinstance(each, Entries) for each in given) or any(isinstance(each, InRow) for each in given):
-            return self._kept(node)
-        if torch.Tag.pointwise in getattr(target, "tags", ()) or target in _COPIES:
-            return self._pointwise(node)
-        if target in _REDUCTIONS:
-            return self._reduced(node)
-        moved = MOVES.get(target)
-        if moved is not None and node.args and isinstance(self._given(node.args[0]), Entries):
-            result = moved(self._batch, node, self._given(node.args[0]), *node.args[1:])
-            if result is not None:
-                return result
-        joined = self._concatenated(node) if target is aten.cat.default else None
-        return self._kept(node) if joined is None else joined
+            result = self._filled(node)
+        elif target is aten.expand.default and isinstance(given[0], fx.Node) and self._batch in (_shape_of(node) or ()):
+            result = self._moved(node, self._split(given[0]))
+        elif target in _RESHAPES and isinstance(given[0], _InRow):
+            result = self._moved(node, given[0].stacked())
+        elif not any(isinstance(each, _Entries) for each in given) or any(isinstance(each, _InRow) for each in given):
+            pass
+        elif torch.Tag.pointwise in getattr(target, "tags", ()) or target in _COPIES:
+            result = self._pointwise(node)
+        elif target in _REDUCTIONS:
+            result = self._reduced(node)
+        elif target is aten.cat.default:
+            result = self._concatenated(node)
+        elif (target in _MOVES or target in _RESHAPES) and isinstance(self._given(node.args[0]), _Entries):
+            result = self._moved(node, self._given(node.args[0]))
+        return self._kept(node) if result is None else result
 
     def _given(self, argument: Any) -> Any:
         """What an argument has become; numbers are themselves."""
         return self._made[argument] if isinstance(argument, fx.Node) else argument
+
+    def _number(self, entry: Any) -> int:
+        """Of an entry, which may be there already."""
+        key = entry if isinstance(entry, fx.Node) else (type(entry), repr(entry))
+        if key not in self._number_of:
+            self._number_of[key] = len(self._entries)
+            self._entries.append(entry)
+        return self._number_of[key]
+
+    def _without_batch(self, shape: Sequence[int]) -> list[int]:
+        return [1 if length == self._batch else length for length in shape]
 
     # What is as it was
 
@@ -166,78 +216,73 @@ class _Rewriter:
             whole = self._call(target, *arguments, **named)
         if whole.is_impure():
             self.kept.add(whole)
-        return self._entries(whole)
+        return self._taken(whole)
 
-    def _entries(self, node: fx.Node) -> Any:
+    def _taken(self, node: fx.Node) -> Any:
         """A whole tensor by its entries if it has a batch."""
-        shape = shape_of(node)
-        if shape is None or self._batch not in shape:
-            return node
-        return self._split(node)
+        shape = _shape_of(node)
+        return node if shape is None or self._batch not in shape else self._split(node)
 
-    def _split(self, node: fx.Node) -> Entries:
-        shape = shape_of(node)
+    def _split(self, node: fx.Node) -> _Entries:
+        shape = _shape_of(node)
         assert shape is not None
         axis = shape.index(self._batch) if self._batch in shape else None
-        parts = np.empty([1 if k == axis else length for k, length in enumerate(shape)], dtype=object)
-        if parts.size > self._most:
+        sizes = self._without_batch(shape)
+        if math.prod(sizes) > self._most:
             raise TooLongError
-        for index in np.ndindex(*parts.shape):
+        numbers = torch.zeros(sizes, dtype=torch.int64)
+        for index in torch.cartesian_prod(*map(torch.arange, [*sizes, 1, 1])).tolist():
             part = node
             for k in reversed(range(len(shape))):
                 if k != axis:
                     part = self._call(aten.select.int, part, k, index[k])
-            parts[index] = part
-        return Entries(parts, axis, node.meta["val"].dtype, node)
+            numbers[tuple(index[: len(shape)])] = self._number(part)
+        return _Entries(numbers, axis, node.meta["val"].dtype, node)
 
-    def _filled(self, node: fx.Node) -> Any:
-        shape, value = shape_of(node), node.args[1]
+    def _filled(self, node: fx.Node) -> _Entries | None:
+        shape, value = _shape_of(node), node.args[1]
         assert shape is not None
         if self._batch not in shape or not isinstance(value, int | float):
-            return self._kept(node)
-        axis = shape.index(self._batch)
-        parts = np.full([1 if k == axis else length for k, length in enumerate(shape)], value, dtype=object)
-        return Entries(parts, axis, node.meta["val"].dtype)
+            return None
+        numbers = torch.full(self._without_batch(shape), self._number(value))
+        return _Entries(numbers, shape.index(self._batch), node.meta["val"].dtype)
 
     def _whole(self, value: Any) -> Any:
         """The tensor of some entries, with the batch last in memory."""
         if isinstance(value, list):
             return [self._whole(each) for each in value]
-        if isinstance(value, InRow):
+        if isinstance(value, _InRow):
             return self._call(aten.cat.default, [self._whole(each) for each in value.pieces], value.pieces[0].axis)
-        if not isinstance(value, Entries):
+        if not isinstance(value, _Entries):
             return value
         if value.source is not None:
             return value.source
-        parts = [self._node(part, value.dtype) for part in value.parts.ravel()]
-        shape = list(value.parts.shape)
-        if value.axis is None:
-            pieces = [self._call(aten.reshape.default, part, [1]) for part in parts]
-            joined = self._call(aten.cat.default, pieces) if len(pieces) > 1 else pieces[0]
-            return self._call(aten.reshape.default, joined, shape)
+        assert value.axis is not None
         rows = []
-        for part in parts:
-            row = part if shape_of(part) else self._call(aten.expand.default, part, [self._batch])
+        for number in value.numbers.flatten().tolist():
+            row = self._node(number, value.dtype)
+            row = row if _shape_of(row) else self._call(aten.expand.default, row, [self._batch])
             rows.append(self._call(aten.unsqueeze.default, row, 0))
         joined = self._call(aten.cat.default, rows) if len(rows) > 1 else rows[0]
-        others = [length for k, length in enumerate(shape) if k != value.axis]
+        others = [length for k, length in enumerate(value.numbers.shape) if k != value.axis]
         joined = self._call(aten.reshape.default, joined, [*others, self._batch])
         order = [*range(len(others))]
         order.insert(value.axis, len(others))
         return self._call(aten.permute.default, joined, order)
 
-    def _node(self, part: Any, dtype: torch.dtype) -> fx.Node:
-        if isinstance(part, fx.Node):
-            return part
-        return self._call(aten.full.default, [], part, dtype=dtype, layout=torch.strided, device=self._device)
+    def _node(self, number: int, dtype: torch.dtype) -> fx.Node:
+        """An entry as an operation, also if it is known."""
+        entry = self._entries[number]
+        if isinstance(entry, fx.Node):
+            return entry
+        return self._call(aten.full.default, [], entry, dtype=dtype, layout=torch.strided, device=self._device)
 
     def _call(self, target: Any, *arguments: Any, **named: Any) -> fx.Node:
         """One more operation, or the one that is there if it is the same."""
         key = (target, repr(arguments), repr(named))
         if key in self._known:
             return self._known[key]
-        self._count += 1
-        if self._count > self._most:
+        if len(self._known) >= self._most:
             raise TooLongError
         node = self._graph.call_function(target, arguments, named)
         values = fx.map_arg((arguments, named), lambda each: each.meta["val"])
@@ -248,30 +293,40 @@ class _Rewriter:
 
     # Arithmetic
 
-    def _pointwise(self, node: fx.Node) -> Any:
+    def _each(self, compute: Callable[..., Any], *operands: Tensor) -> Tensor:
+        """Numbers of what `compute` makes of the numbers of the operands' entries."""
+        shaped = torch.broadcast_tensors(*operands)
+        rows = zip(*(each.flatten().tolist() for each in shaped), strict=True)
+        return torch.tensor([self._number(compute(*row)) for row in rows]).reshape(shaped[0].shape)
+
+    def _pointwise(self, node: fx.Node) -> _Entries | None:
         target: Any = node.target
         named = {key: value for key, value in node.kwargs.items() if key != "memory_format"}
         places = [k for k, each in enumerate(node.args) if isinstance(each, fx.Node)]
         if any(isinstance(each, fx.Node | list | tuple) for each in named.values()):
-            return self._kept(node)
+            return None
         given = [self._given(node.args[k]) for k in places]
-        given = [each if isinstance(each, Entries) else self._split(each) for each in given]
+        given = [each if isinstance(each, _Entries) else self._split(each) for each in given]
         dtype = node.meta["val"].dtype
-        grids = np.broadcast_arrays(*(each.parts for each in given))
-        parts = np.empty(grids[0].shape, dtype=object)
-        for index in np.ndindex(*parts.shape):
+        dtypes = dict(zip(places, (each.dtype for each in given), strict=True))
+        same = dtype.is_floating_point and set(dtypes.values()) == {dtype}
+
+        def compute(*numbers: int) -> Any:
             arguments: list[Any] = list(node.args)
-            for k, grid in zip(places, grids, strict=True):
-                arguments[k] = grid[index]
-            parts[index] = self._entry(target, arguments, named, dict(zip(places, given, strict=True)), dtype)
-        axis = next(each.axis - each.parts.ndim + parts.ndim for each in given if each.axis is not None)
-        return Entries(parts, axis, dtype)
+            for k, number in zip(places, numbers, strict=True):
+                arguments[k] = self._entries[number]
+            return self._entry(target, arguments, named, dict(dtypes), same)
+
+        numbers = self._each(compute, *(each.numbers for each in given))
+        axis = next(each.axis - each.numbers.ndim + numbers.ndim for each in given if each.axis is not None)
+        return _Entries(numbers, axis, dtype)
 
     def _entry(
-        self, target: Any, arguments: list[Any], named: dict[str, Any], given: dict[int, Entries], dtype: torch.dtype
+        self, target: Any, arguments: list[Any], named: dict[str, Any], given: dict[int, torch.dtype], same: bool
     ) -> Any:
-        """One entry of a pointwise operation; what is known takes no part."""
-        if not named and all(each.dtype == dtype for each in given.values()) and dtype.is_floating_point:
+        """One entry of a pointwise operation on entries of these dtypes; where these are the `same` as that of the
+        result, what is known takes no part."""
+        if same and not named:
             simple = _simplified(target, arguments)
             if simple is not None:
                 return simple
@@ -283,65 +338,78 @@ class _Rewriter:
             # The compiler has no vector instruction for it, but for this.
             target, arguments, given = aten.ne.Tensor, [arguments[0]] * 2, {0: given[0], 1: given[0]}
         for k, each in given.items():
-            arguments[k] = self._node(arguments[k], each.dtype)
+            arguments[k] = self._node(self._number(arguments[k]), each)
         return self._call(target, *arguments, **named)
 
-    def _combine(self, target: Any, first: Any, second: Any, dtype: torch.dtype) -> Any:
-        """Two entries of one dtype."""
-        simple = _simplified(target, [first, second]) if dtype.is_floating_point else None
-        if simple is not None:
-            return simple
-        return self._call(target, self._node(first, dtype), self._node(second, dtype))
-
-    def _reduced(self, node: fx.Node) -> Any:
+    def _reduced(self, node: fx.Node) -> _Entries | None:
         """Sums and their like over dimensions other than the batch's."""
         given = self._given(node.args[0])
-        if not isinstance(given, Entries) or node.kwargs or len(node.args) < 2:
-            return self._kept(node)
+        if not isinstance(given, _Entries) or node.kwargs or len(node.args) < 2:
+            return None
         wanted: Any = node.args[1]
         dims = [wanted] if isinstance(wanted, int) else list(wanted or [])
-        dims = sorted({dim % given.parts.ndim for dim in dims})
+        dims = sorted({dim % given.numbers.ndim for dim in dims})
         dtype = node.meta["val"].dtype
         if not dims or given.axis in dims:
-            return self._kept(node)
-        if dtype != given.dtype:  # a count
-            given = self._converted(given, dtype)
-        keep = len(node.args) > 2 and bool(node.args[2])
-        parts, axis = given.parts, given.axis
-        for dim in reversed(dims):
-            rows = np.moveaxis(parts, dim, 0)
-            total = rows[0:1]
-            for row in rows[1:]:
-                pairs = np.empty(total.shape, dtype=object)
-                for index in np.ndindex(*pairs.shape):
-                    pairs[index] = self._combine(_REDUCTIONS[node.target], total[index], row[index[1:]], dtype)
-                total = pairs
-            parts = np.moveaxis(total, 0, dim)
-            if not keep:
-                parts = np.squeeze(parts, dim)
-                axis = axis - 1 if axis is not None and dim < axis else axis
-        return Entries(parts, axis, dtype)
+            return None
+        numbers, before = given.numbers, given.dtype
+        if dtype != before:  # a count
+            convert = torch.ops.prims.convert_element_type.default
+            numbers = self._each(lambda number: self._call(convert, self._node(number, before), dtype), numbers)
 
-    def _converted(self, given: Entries, dtype: torch.dtype) -> Entries:
-        parts = np.empty(given.parts.shape, dtype=object)
-        for index in np.ndindex(*parts.shape):
-            part = self._node(given.parts[index], given.dtype)
-            parts[index] = self._call(torch.ops.prims.convert_element_type.default, part, dtype)
-        return Entries(parts, given.axis, dtype)
+        def combine(first: int, second: int) -> Any:
+            target, entries = _REDUCTIONS[node.target], [self._entries[first], self._entries[second]]
+            simple = _simplified(target, entries) if dtype.is_floating_point else None
+            return self._call(target, self._node(first, dtype), self._node(second, dtype)) if simple is None else simple
+
+        for dim in reversed(dims):
+            total, *rows = numbers.split(1, dim)
+            for row in rows:
+                total = self._each(combine, total, row)
+            numbers = total
+        shape = _shape_of(node)
+        assert shape is not None
+        return _Entries(numbers.reshape(self._without_batch(shape)), shape.index(self._batch), dtype)
 
     # Moves
 
-    def _concatenated(self, node: fx.Node) -> Entries | InRow | None:
+    def _moved(self, node: fx.Node, given: _Entries) -> Any:
+        """What a move makes of the entries' numbers; None where these do not tell."""
+        target: Any = node.target
+        values: Any = node.meta["val"]
+        shapes = [tuple(each.shape) for each in (values if isinstance(values, list | tuple) else [values])]
+        if given.axis is not None and any(self._batch not in shape for shape in shapes):
+            return None
+        sizes = [self._without_batch(shape) for shape in shapes]
+        if target is aten.expand.default:
+            found: Any = given.numbers.expand(sizes[0])
+        elif target in _RESHAPES:
+            axis = shapes[0].index(self._batch)
+            if given.axis is None or math.prod(shapes[0][:axis]) != math.prod(given.numbers.shape[: given.axis]):
+                return None
+            found = given.numbers.reshape(sizes[0])
+        elif target is aten.constant_pad_nd.default:
+            found = target(given.numbers, node.args[1], self._number(float((*node.args, 0.0)[2])))  # type: ignore[arg-type]
+        else:
+            found = target(given.numbers, *node.args[1:], **node.kwargs)
+        pieces = list(found) if isinstance(found, list | tuple) else [found]
+        if [list(each.shape) for each in pieces] != sizes:
+            return None
+        pairs = zip(pieces, shapes, strict=True)
+        results = [_Entries(each, shape.index(self._batch), given.dtype) for each, shape in pairs]
+        return results if isinstance(found, list | tuple) else results[0]
+
+    def _concatenated(self, node: fx.Node) -> _Entries | _InRow | None:
         pieces: Any = node.args[0]
         dim: Any = node.args[1] if len(node.args) > 1 else node.kwargs.get("dim", 0)
         given = [self._given(each) for each in pieces]
-        given = [each if isinstance(each, Entries) else self._split(each) for each in given]
+        given = [each if isinstance(each, _Entries) else self._split(each) for each in given]
         axes = {each.axis for each in given}
         if len(axes) != 1:
             return None
-        if dim % given[0].parts.ndim in axes:
-            return InRow(given)
-        return Entries(np.concatenate([each.parts for each in given], axis=dim), given[0].axis, given[0].dtype)
+        if dim % given[0].numbers.ndim in axes:
+            return _InRow(given)
+        return _Entries(torch.cat([each.numbers for each in given], dim), given[0].axis, given[0].dtype)
 
 
 def _simplified(target: Any, arguments: Sequence[Any]) -> Any:
@@ -381,3 +449,10 @@ _REDUCTIONS: dict[Any, Any] = {
     aten.amin.default: aten.minimum.default,
 }
 _COPIES = {aten._to_copy.default, aten.clone.default, torch.ops.prims.convert_element_type.default}
+_RESHAPES = {aten.reshape.default, aten.view.default, aten.squeeze.dim, aten.squeeze.dims}
+# What only moves entries, and is done by torch itself on their numbers.
+_MOVES = {
+    *(aten.permute.default, aten.select.int, aten.slice.Tensor, aten.unsqueeze.default, aten.expand.default),
+    *(aten.constant_pad_nd.default, aten.diagonal.default, aten.split.Tensor, aten.split_with_sizes.default),
+    *(aten.unbind.int, aten.alias.default),
+}

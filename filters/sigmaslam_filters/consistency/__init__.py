@@ -1,4 +1,4 @@
-"""Does a filter's covariance describe its errors? The tests, and plots of them in `plots`."""
+"""Does a filter's covariance describe its errors?"""
 
 from sigmaslam_filters.consistency.statistics import (
     LEVELS,

@@ -22,7 +22,6 @@ from sigmaslam_synthetic.motion.paths import (
     KNOT_INTERVAL,
     LARGEST_NOISE,
     Path,
-    at_rest,
     carried_frames,
     integral,
     interval,
@@ -33,25 +32,7 @@ from sigmaslam_synthetic.motion.paths import (
     smooth_to_rate,
     view_rotations,
     wandering_curve,
-    with_stops,
 )
-
-__all__ = [
-    "FreeSpace",
-    "Path",
-    "at_rest",
-    "closed_loop",
-    "drive",
-    "drive_profile",
-    "drone",
-    "hand_held",
-    "insertion",
-    "inspect",
-    "pure_rotation",
-    "rolling",
-    "tool",
-    "with_stops",
-]
 
 CAMERA_HEIGHT = 1.65
 """Of KITTI's cameras above the road, metres."""

@@ -7,11 +7,12 @@ from scipy.ndimage import gaussian_filter1d
 
 from sigmaslam_synthetic.motion import random_motions
 from sigmaslam_synthetic.motion.paths import Path, at_rest, with_stops
+from sigmaslam_synthetic.motion.random_motions import CAMERA_HEIGHT
 from sigmaslam_synthetic.scene import Scene
 from sigmaslam_synthetic.worlds.episode import Episode, Wish, daylight
 from sigmaslam_synthetic.worlds.palette import Palette
 from sigmaslam_synthetic.worlds.street_layout import Street
-from sigmaslam_synthetic.worlds.street_road import CAMERA_HEIGHT, Road
+from sigmaslam_synthetic.worlds.street_road import Road
 from sigmaslam_synthetic.worlds.street_traffic import add_traffic
 
 _SHORTEST = 12.0  # seconds of drive along which a street is laid out

@@ -8,11 +8,9 @@ from scipy.spatial import cKDTree
 
 from sigmaslam_synthetic.geometry import arc_length
 from sigmaslam_synthetic.motion.paths import noise
+from sigmaslam_synthetic.motion.random_motions import CAMERA_HEIGHT
 from sigmaslam_synthetic.rendering.shapes import Panel, Terrain
 from sigmaslam_synthetic.scene import Body
-
-CAMERA_HEIGHT = 1.65
-"""Of the camera above the road, metres."""
 
 _STEP = 0.5  # metres between points of the lane
 _CELL = 6.0  # metres between grid lines of the ground

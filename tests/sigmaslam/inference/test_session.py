@@ -85,7 +85,6 @@ def test_operators_that_a_provider_lacks_run_on_the_cpu(monkeypatch: pytest.Monk
     [
         ["track", str(DEMO), "--out", "OUT/run"],
         ["match", str(DEMO / "image_0" / "000000.png"), str(DEMO / "image_0" / "000001.png"), "--out", "OUT/a.npz"],
-        ["export", "--check"],
     ],
     ids=lambda words: words[0],
 )

@@ -5,6 +5,7 @@ from torch import Tensor
 
 from sigmaslam_models.detector import to_cells
 from sigmaslam_models.feature_network import FeatureMaps, FeatureNetwork, sample_map
+from sigmaslam_training.devices import Bfloat16Network
 from sigmaslam_training.features.losses import PairLoss, match_loss, place_loss
 
 # A keypoint has a partner if one was found this near to its true place in image 1, pixels.
@@ -19,7 +20,7 @@ _MARGIN = 4.0
 
 
 def pair_loss(
-    network: FeatureNetwork,
+    network: FeatureNetwork | Bfloat16Network,
     image0: Tensor,
     image1: Tensor,
     keypoints0: Tensor,
