@@ -7,6 +7,7 @@ from pathlib import Path
 from sigmaslam.bounded_files import CALIBRATION_BYTES, read_text
 from sigmaslam.calibration_files.camera_infos import is_camera_info, read_camera_infos
 from sigmaslam.calibration_files.euroc_calibration import read_sensors
+from sigmaslam.calibration_files.four_seasons_calibration import UNDISTORTED, read_four_seasons
 from sigmaslam.calibration_files.kalibr_calibration import is_kalibr, read_kalibr
 from sigmaslam.calibration_files.kitti_calibration import GREY_PAIR, read_kitti_calibration
 from sigmaslam.calibration_files.lens_models import ImageSize, UnknownImageSizeError
@@ -24,6 +25,8 @@ FOLDER_FILES = (
     ("mav0/cam0/sensor.yaml", "mav0/cam1/sensor.yaml"),
     ("cam0/sensor.yaml", "cam1/sensor.yaml"),
     ("cam0_sensor.yaml", "cam1_sensor.yaml"),
+    # Beside a camchain.yaml, which is of 4Seasons' distorted images.
+    UNDISTORTED,
     ("*camchain*.yaml",),
     ("dso/camchain.yaml",),
     ("intrinsics.yml", "extrinsics.yml"),
@@ -43,7 +46,7 @@ def read_calibration(
     """Read a calibration; its content says what it is.
 
     Known are the project's YAML, Kalibr's camchain, OpenCV's FileStorage (stereo_calib, ORB-SLAM2 and 3), two camera
-    infos of ROS, two sensor.yaml of EuRoC, KITTI's two text forms, a ZED's SN*.conf, an OAK's JSON.
+    infos of ROS, two sensor.yaml of EuRoC, KITTI's two text forms, a ZED's SN*.conf, an OAK's JSON, 4Seasons' three.
 
     Args:
         path: a file, a folder with one of `FOLDER_FILES`, or two files with a comma between them, left first.
@@ -56,6 +59,8 @@ def read_calibration(
         UnknownImageSizeError: the image size is needed.
     """
     paths = _files(Path(path))
+    if len(paths) == len(UNDISTORTED):
+        return read_four_seasons(paths)
     texts = [_read_text(each) for each in paths]
     if len(paths) == 2:
         return _read_pair((paths[0], paths[1]), texts, image_size, rectified)
@@ -119,7 +124,7 @@ def _files(path: Path) -> list[Path]:
             raise CalibrationError(f"{path}: a folder without a calibration; looked for {looked}")
         return found
     names = str(path).split(",")
-    if not path.exists() and len(names) == 2 and all(names):
+    if not path.exists() and len(names) in (2, len(UNDISTORTED)) and all(names):
         return [Path(name) for name in names]
     return [path]
 

@@ -1,4 +1,4 @@
-"""Kalibr's camchain.yaml, which TUM-VI has, too."""
+"""Kalibr's camchain.yaml, which TUM-VI and 4Seasons have, too."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -23,7 +23,7 @@ Source = Annotated[
     Path,
     typer.Argument(
         metavar="FILE",
-        help="Kalibr, OpenCV, ORB-SLAM, ROS, KITTI, EuRoC, ZED or OAK file, our YAML, a folder with one, or "
+        help="Kalibr, OpenCV, ORB-SLAM, ROS, KITTI, EuRoC, ZED, OAK or 4Seasons file, our YAML, a folder with one, or "
         "two files as left.yaml,right.yaml.",
     ),
 ]

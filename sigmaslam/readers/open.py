@@ -5,12 +5,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from sigmaslam.errors import InputError
-from sigmaslam.readers import bag, euroc, folder, kitti, video
+from sigmaslam.readers import bag, euroc, folder, four_seasons, kitti, video
 from sigmaslam.readers.stereo_sequence import StereoSequence
 
 _OPENERS: dict[str, Callable[[Path, Path | None], StereoSequence]] = {
     "kitti": kitti.open_kitti,
     "euroc": euroc.open_euroc,
+    "4seasons": four_seasons.open_four_seasons,
     "folder": folder.open_folder,
     "video": video.open_video,
 }
@@ -26,7 +27,7 @@ def open_sequence(
     """Open a stereo sequence; everything that needs no reading of images is checked at once.
 
     Args:
-        path: a folder (KITTI, EuRoC, TUM-VI, plain, or with two videos), a side-by-side video or a ROS bag.
+        path: a folder (KITTI, EuRoC, TUM-VI, 4Seasons, plain, or with two videos), a side-by-side video or a ROS bag.
         format: one of `FORMATS`; 'auto' tries them in that order.
         calibration: replaces the calibration of the format; any that `read_calibration` reads.
         topics: left and right image topic of a bag; None finds the only one whose name tells the eye.
@@ -70,6 +71,8 @@ def _detect(path: Path) -> str:
         return "kitti"
     if euroc.find_asl_root(path) or euroc.is_flat(path):
         return "euroc"
+    if four_seasons.has_undistorted_images(path):
+        return "4seasons"
     if folder.find_eyes(path):
         return "folder"
     if video.find_videos(path):
@@ -78,6 +81,6 @@ def _detect(path: Path) -> str:
         raise InputError(f"{path}: holds {single[0]} and no {single[1]}, the images of the other eye: put them there")
     looked_for = "".join(
         f"\n  {format}: {module.LOOKED_FOR}"
-        for format, module in zip(FORMATS[1:], (kitti, euroc, folder, video, bag), strict=True)
+        for format, module in zip(FORMATS[1:], (kitti, euroc, four_seasons, folder, video, bag), strict=True)
     )
     raise InputError(f"{path}: no stereo sequence of a known format; looked for{looked_for}")

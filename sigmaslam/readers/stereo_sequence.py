@@ -62,7 +62,7 @@ class StereoSequence:
     Attributes:
         camera: calibration of the frames: of the images as stored, or of those that `select` makes smaller.
         source: the file or folder, or the name of a camera.
-        format: 'kitti', 'euroc', 'folder', 'video', 'bag' or 'camera'.
+        format: 'kitti', 'euroc', '4seasons', 'folder', 'video', 'bag' or 'camera'.
         timestamps: seconds, one per pair, or None if only reading gives them (videos).
         length: number of pairs, or None if the file does not give it.
         skipped: the pairs that the latest run of `frames` could not use.

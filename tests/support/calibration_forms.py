@@ -329,6 +329,17 @@ def write_oak(rig: StereoCamera, folder: Path) -> Path:
     return folder / "calib.json"
 
 
+def write_four_seasons(rig: StereoCamera, folder: Path) -> Path:
+    """Undistorted images: two pinhole files and the matrix from left to right."""
+    for k, eye in enumerate((rig.left, rig.right)):
+        line = f"Pinhole {eye.fx!r} {eye.fy!r} {eye.cx!r} {eye.cy!r} 0.0 0.0 0.0 0.0\n"
+        size = f"{SIZE[0]} {SIZE[1]}\n"
+        (folder / f"undistorted_calib_{k}.txt").write_text(f"{line}{size}crop\n{size}")
+    rows = [" ".join(repr(float(value)) for value in row) for row in _right_left(rig)]
+    (folder / "undistorted_calib_stereo.txt").write_text("\n".join(rows) + "\n")
+    return folder
+
+
 RAW_FORMS: dict[str, Callable[[StereoCamera, Path], Path]] = {
     "own": write_own,
     "Kalibr": write_kalibr,
@@ -355,4 +366,5 @@ RECTIFIED_FORMS: dict[str, Callable[[StereoCamera, Path], Path]] = {
     "EuRoC": write_euroc,
     "KITTI": write_kitti,
     "OAK": write_oak,
+    "4Seasons": write_four_seasons,
 }

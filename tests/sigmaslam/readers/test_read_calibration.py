@@ -145,6 +145,12 @@ def test_folders_may_have_commas_in_their_names(tmp_path: Path):
     assert_same_rig(read_calibration(found), raw_rig("radtan"))
 
 
+def test_of_4seasons_the_undistorted_calibration_is_taken(tmp_path: Path):
+    forms.write_kalibr(raw_rig("equidistant"), tmp_path)
+    forms.write_four_seasons(rectified_rig(), tmp_path)
+    assert_same_rig(read_calibration(tmp_path), rectified_rig())
+
+
 def test_a_folder_without_a_calibration_says_what_it_looked_for(tmp_path: Path):
     assert find_calibration(tmp_path) is None
     with pytest.raises(CalibrationError) as caught:
@@ -308,6 +314,23 @@ def test_oak_errors(tmp_path: Path, change, message: str):
     with pytest.raises(CalibrationError, match=message) as caught:
         read_calibration(path)
     assert str(caught.value).startswith(str(path))
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("undistorted_calib_0.txt", "RadTan 1 2 3 4\n10 10\n", "must begin with a line 'Pinhole"),
+        ("undistorted_calib_1.txt", "Pinhole 1 2 3 4 0.1\n10 10\n", "then zeros as the images are undistorted"),
+        ("undistorted_calib_stereo.txt", "1 0 0\n", "must be 4 lines of 4 numbers"),
+        ("undistorted_calib_stereo.txt", "one\n", "could not convert"),
+    ],
+)
+def test_four_seasons_errors(tmp_path: Path, name: str, text: str, message: str):
+    forms.write_four_seasons(rectified_rig(), tmp_path)
+    (tmp_path / name).write_text(text)
+    with pytest.raises(CalibrationError, match=message) as caught:
+        read_calibration(tmp_path)
+    assert str(caught.value).startswith(str(tmp_path / name))
 
 
 def test_rectified_goes_with_forms_that_have_p(tmp_path: Path):

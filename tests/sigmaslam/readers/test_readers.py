@@ -333,7 +333,9 @@ def test_float_images_are_refused(tmp_path):
 def test_missing_folder_and_unknown_format(tmp_path):
     with pytest.raises(InputError, match="no such file or folder"):
         open_sequence(tmp_path / "nothing")
-    with pytest.raises(InputError, match="'ros' is unknown; use one of auto, kitti, euroc, folder, video, bag"):
+    with pytest.raises(
+        InputError, match="'ros' is unknown; use one of auto, kitti, euroc, 4seasons, folder, video, bag"
+    ):
         open_sequence(tmp_path, format="ros")
 
 
@@ -344,6 +346,7 @@ def test_auto_lists_what_it_looked_for(tmp_path):
     for text in (
         "kitti: folders image_0 + image_1",
         "euroc: (also TUM-VI) folders cam0/data",
+        "4seasons: folders undistorted_images",
         "folder: folders left",
         "video: one",
         "bag: a ROS bag",

@@ -1,4 +1,4 @@
-"""Folders as TUM-VI, ZED, RealSense and OAK write them, with images of the demo: found out and read alike."""
+"""Folders as TUM-VI, 4Seasons, ZED, RealSense and OAK write them, with images of the demo: found out and read alike."""
 
 import logging
 import shutil
@@ -73,6 +73,31 @@ def test_tum_vi_folder(tmp_path: Path, demo_sequence: Path, rig: StereoCamera):
 def test_tum_vi_folder_without_a_calibration(tmp_path: Path, demo_sequence: Path):
     copy_images(demo_sequence, tmp_path / "mav0/cam0/data", tmp_path / "mav0/cam1/data", "{stamp}.png")
     with pytest.raises(CalibrationError, match=r"cam0/sensor\.yaml: cannot read"):
+        open_sequence(tmp_path)
+
+
+@pytest.mark.parametrize("place", ["recording", "recording/calibration", "calibration", "Calibration"])
+def test_four_seasons_recording(tmp_path: Path, demo_sequence: Path, rig: StereoCamera, place: str, monkeypatch):
+    images = tmp_path / "recording" / "undistorted_images"
+    copy_images(demo_sequence, images / "cam0", images / "cam1", "{stamp}.png")
+    lines = [f"{START + k * STEP} {(START + k * STEP) / 1e9:.9f} 5.0\n" for k in range(FRAMES)]
+    (tmp_path / "recording" / "times.txt").write_text("".join(lines))
+    (tmp_path / place).mkdir(exist_ok=True)
+    monkeypatch.setattr(forms, "SIZE", (rig.left.width, rig.left.height))
+    forms.write_four_seasons(rig, tmp_path / place)
+    assert_is_the_demo(tmp_path / "recording", demo_sequence, rig, "4seasons")
+    np.testing.assert_allclose(np.diff(open_sequence(tmp_path / "recording").timestamps), 0.05, atol=1e-6)
+
+
+def test_four_seasons_errors(tmp_path: Path, demo_sequence: Path):
+    with pytest.raises(InputError, match="not a recording of 4Seasons"):
+        open_sequence(tmp_path, "4seasons")
+    images = tmp_path / "undistorted_images"
+    copy_images(demo_sequence, images / "cam0", images / "cam1", "{stamp}.png")
+    with pytest.raises(CalibrationError, match=r"no undistorted_calib_0\.txt, .* give one with --calibration"):
+        open_sequence(tmp_path)
+    copy_images(demo_sequence, images / "cam0", images / "cam1", "{k:06d}.png")
+    with pytest.raises(InputError, match="times in nanoseconds"):
         open_sequence(tmp_path)
 
 
