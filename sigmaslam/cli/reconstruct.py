@@ -15,6 +15,13 @@ def reconstruct(
     input: Annotated[
         Path | None, typer.Option(help="Where the run's input is now.", show_default="where the run found it")
     ] = None,
+    network: Annotated[
+        Path | None,
+        typer.Option(
+            help="ONNX file of a stereo network: two images (1, C, H, W), grey values 0 to 255, to a disparity.",
+            show_default="semi-global matching",
+        ),
+    ] = None,
     voxel: Annotated[
         float | None,
         typer.Option(
@@ -41,7 +48,7 @@ def reconstruct(
     """
     from sigmaslam.reconstruction.reconstruct import reconstruct_run
 
-    summary = reconstruct_run(run, out, mesh, input, voxel, max_sigma, min_views, every, export)
+    summary = reconstruct_run(run, out, mesh, input, network, voxel, max_sigma, min_views, every, export)
     typer.echo(
         f"{summary.points} points of {summary.keyframes} keyframes in {out}, voxels of {summary.voxel:g} m and more, "
         f"sigma {summary.median_sigma:.2g} m in the median.\n"

@@ -8,6 +8,7 @@ is off by in truth was fitted on renders.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -48,14 +49,31 @@ _SAME_AT_HALF, _SURE, _UNSURE = 2.0, 0.5, 2.0
 # Marks pixels without a disparity where NaN would spread.
 _NOWHERE = np.float32(-1000.0)
 
+Matcher = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Disparities (H, W) float32 of a rectified pair of (H, W) uint8 images, NaN where there is none."""
 
-# The variance of a disparity: of the best ones, pixels squared, and factors of the Cramer-Rao bound, of the variance of
-# the disparities around the pixel about a smooth surface, and of the squared distance from their mean, which is large
-# where surfaces meet. Fitted on renders of room, street and organ with seeds below 1000 by the likelihood of Student's
-# t distribution with five degrees of freedom, then all times 2.35, which brings 95.4 % of their pixels inside two
-# sigma. The renders are as unlike eyes see them: exposure, gain, gamma, vignetting, blur and noise differ, and rows are
-# off by 0.15 pixels.
-_FLOOR, _BOUND, _RELIEF, _EDGE = 0.01**2, 0.83, 37.0, 8.0
+
+@dataclass(frozen=True, slots=True)
+class DisparityModel:
+    """The variance of a disparity as a sum of what it depends on.
+
+    Attributes:
+        floor: variance of the best disparities, pixels squared.
+        bound: factor of the Cramer-Rao bound.
+        relief: factor of the variance of the disparities around the pixel about a smooth surface.
+        edge: factor of the squared distance from their mean, which is large where surfaces meet.
+    """
+
+    floor: float
+    bound: float
+    relief: float
+    edge: float
+
+
+# Fitted on renders of room, street and organ with seeds below 1000 by the likelihood of Student's t distribution with
+# five degrees of freedom, then all times 2.35, which brings 95.4 % of their pixels inside two sigma. The renders are as
+# unlike eyes see them: exposure, gain, gamma, vignetting, blur and noise differ, and rows are off by 0.15 pixels.
+FITTED = DisparityModel(floor=0.01**2, bound=0.83, relief=37.0, edge=8.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +108,9 @@ class Alignment:
     row_variance: float
 
 
-def measure_disparity(left: np.ndarray, right: np.ndarray) -> DisparityMap:
+def measure_disparity(
+    left: np.ndarray, right: np.ndarray, match: Matcher, model: DisparityModel = FITTED
+) -> DisparityMap:
     """Disparities with their variances.
 
     A disparity stays if the images at half their size say the same, or the alignment is sure of it: where neither is
@@ -98,12 +118,14 @@ def measure_disparity(left: np.ndarray, right: np.ndarray) -> DisparityMap:
 
     Args:
         left, right: (H, W) uint8 rectified images.
+        match: finds disparities to a pixel, such as `semi_global_disparity`.
+        model: of the variance.
     """
-    matched = semi_global_disparity(left, right)
+    matched = match(left, right)
     aligned = align_disparity(left, right, matched)
     # Rectification leaves as much along the rows as across them, where it can be seen.
-    floor = _FLOOR + aligned.row_variance
-    variance = floor + _BOUND * aligned.bound + _RELIEF * aligned.relief + _EDGE * aligned.edge
+    floor = model.floor + aligned.row_variance
+    variance = floor + model.bound * aligned.bound + model.relief * aligned.relief + model.edge * aligned.edge
     with np.errstate(invalid="ignore"):
         confirmed = np.abs(_half_size_disparity(left, right, matched) - matched) <= _SAME_AT_HALF
     stays = (confirmed | (variance < _SURE**2)) & (variance < _UNSURE**2) & np.isfinite(matched)

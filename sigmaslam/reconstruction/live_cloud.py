@@ -13,6 +13,7 @@ from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.live.frame_sink import TrackedFrame
 from sigmaslam.reconstruction.cloud import VoxelCloud, write_cloud
 from sigmaslam.reconstruction.depth_fusion import DepthView
+from sigmaslam.reconstruction.disparity import semi_global_disparity
 from sigmaslam.reconstruction.reconstruct import NEIGHBOURS, default_voxel, fuse_keyframe, least_views, measure_view
 from sigmaslam.reconstruction.recorded_keyframes import MOST_FRAMES, RecordedKeyframes
 from sigmaslam.run_record.dense_points import DENSE_NAME, write_dense_points
@@ -52,7 +53,7 @@ class CloudSink:
             return
         self._since = 0
         offset = said.calibration.disparity_offset
-        view = measure_view(seen.left, seen.right, self._rectifier, offset)
+        view = measure_view(seen.left, seen.right, self._rectifier, semi_global_disparity, offset)
         self._views = [*self._views[-2 * NEIGHBOURS :], (said, seen.left.copy(), view)]
         if len(self._views) > NEIGHBOURS:
             self._fuse(len(self._views) - 1 - NEIGHBOURS)

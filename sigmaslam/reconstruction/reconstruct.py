@@ -21,10 +21,11 @@ from sigmaslam.readers import StereoSequence
 from sigmaslam.readers.stereo_sequence import read_ahead
 from sigmaslam.reconstruction.cloud import DenseCloud, DepthPixels, VoxelCloud, write_cloud
 from sigmaslam.reconstruction.depth_fusion import SHARED, DepthView, FusedDepth, fuse_depth
-from sigmaslam.reconstruction.disparity import DisparityMap, measure_disparity
+from sigmaslam.reconstruction.disparity import DisparityMap, Matcher, measure_disparity, semi_global_disparity
 from sigmaslam.reconstruction.mesh import DepthVolume, need_open3d
 from sigmaslam.reconstruction.posed_images import PosedImages, check_export
 from sigmaslam.reconstruction.recorded_keyframes import RecordedKeyframes, open_input, read_recorded_keyframes
+from sigmaslam.reconstruction.stereo_network import StereoNetwork
 from sigmaslam.report.report import write_report
 from sigmaslam.run_record.dense_points import DENSE_NAME, RECONSTRUCTION_NAME, write_dense_points
 
@@ -106,6 +107,7 @@ def reconstruct_run(
     out: Path,
     mesh: Path | None = None,
     moved_to: Path | None = None,
+    network: Path | None = None,
     voxel: float | None = None,
     max_sigma: float | None = None,
     min_views: int = MIN_VIEWS,
@@ -119,6 +121,7 @@ def reconstruct_run(
         out: PLY file of the cloud.
         mesh: PLY file of a mesh; needs Open3D.
         moved_to: where the run's input is, if it has moved.
+        network: ONNX file of a stereo network in place of semi-global matching.
         voxel: side of the finest voxels that points are merged in, metres; None: three pixels at the median depth.
         max_sigma: points with a larger sigma are left out, metres; None: with one of a twentieth of their distance.
         min_views: keyframes that must have given a point.
@@ -134,6 +137,7 @@ def reconstruct_run(
     check_export(export)
     keyframes = read_recorded_keyframes(run, every)
     sequence = open_input(keyframes, moved_to)
+    match: Matcher = semi_global_disparity if network is None else StereoNetwork(network)
     rectifier = StereoRectifier(keyframes.camera)
     camera = rectifier.rectified
     cloud: VoxelCloud | None = None
@@ -143,7 +147,7 @@ def reconstruct_run(
     began = time.perf_counter()
     with open_progress() as progress:
         task = progress.add_task("keyframes", total=keyframes.count, note="")
-        for depth in fuse_keyframes(keyframes, sequence, rectifier):
+        for depth in fuse_keyframes(keyframes, sequence, rectifier, match):
             chosen = depth.is_point
             if cloud is None:
                 cloud = VoxelCloud(voxel or default_voxel(depth, camera))
@@ -182,7 +186,7 @@ def reconstruct_run(
 
 
 def fuse_keyframes(
-    keyframes: RecordedKeyframes, sequence: StereoSequence, rectifier: StereoRectifier
+    keyframes: RecordedKeyframes, sequence: StereoSequence, rectifier: StereoRectifier, match: Matcher
 ) -> Iterator[KeyframeDepth]:
     """Depths of the keyframes, in order; images and disparities of a few of them are in memory at a time.
 
@@ -190,13 +194,14 @@ def fuse_keyframes(
         keyframes: of a run.
         sequence: its input.
         rectifier: for the run's calibration.
+        match: finds disparities to a pixel.
     """
     kept: dict[int, tuple[np.ndarray, DepthView]] = {}
 
     def views() -> Generator[_NumberedView, None, None]:
         for number, frame in keyframes.images(sequence):
             left, right = rectifier.rectify(frame.left, frame.right)
-            yield number, left, measure_view(left, right, rectifier, keyframes.disparity_offset)
+            yield number, left, measure_view(left, right, rectifier, match, keyframes.disparity_offset)
 
     for number, left, view in read_ahead(views, 1):
         kept[number] = left, view
@@ -247,9 +252,11 @@ def fuse_keyframe(
     )
 
 
-def measure_view(left: np.ndarray, right: np.ndarray, rectifier: StereoRectifier, offset: float) -> DepthView:
+def measure_view(
+    left: np.ndarray, right: np.ndarray, rectifier: StereoRectifier, match: Matcher, offset: float
+) -> DepthView:
     """The disparities of a rectified pair (H, W) uint8 that are not at its border, a disparity offset taken off."""
-    measured = measure_disparity(left, right)
+    measured = measure_disparity(left, right, match)
     disparity = measured.disparity - np.float32(offset)
     if rectifier.valid_mask is not None:
         disparity[cv2.erode(rectifier.valid_mask, np.ones((7, 7), np.uint8)) == 0] = np.nan

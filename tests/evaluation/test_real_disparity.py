@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sigmaslam.errors import InputError
-from sigmaslam.reconstruction.disparity import DisparityMap, measure_disparity, row_offset
+from sigmaslam.reconstruction.disparity import DisparityMap, measure_disparity, row_offset, semi_global_disparity
 from sigmaslam_benchmarks.tracking import real_disparity
 from sigmaslam_benchmarks.tracking.disparity_pairs import DisparityPair, real_pairs, worse_camera
 from sigmaslam_benchmarks.tracking.real_disparity import edge_distance, judge, scan_shift, write_real
@@ -57,7 +57,7 @@ def test_errors_of_a_known_size_are_inside_as_a_normal_law_says():
 def test_a_worse_camera_moves_rows_and_keeps_the_disparities():
     pair = _pair()
     worse = worse_camera(pair, np.random.default_rng(3))
-    found = measure_disparity(worse.left, worse.right).disparity - pair.truth
+    found = measure_disparity(worse.left, worse.right, semi_global_disparity).disparity - pair.truth
     assert abs(np.nanmedian(found[10:-10, 30:-10])) < 0.05
     rows = [
         row_offset(each.left.astype(np.float32), each.right.astype(np.float32), pair.truth) for each in (pair, worse)

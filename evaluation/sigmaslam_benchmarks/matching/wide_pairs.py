@@ -13,7 +13,7 @@ from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import se3_inverse, transform_points
 from sigmaslam.readers import open_sequence
-from sigmaslam.reconstruction.disparity import measure_disparity, pixel_grid
+from sigmaslam.reconstruction.disparity import measure_disparity, pixel_grid, semi_global_disparity
 from sigmaslam_benchmarks.matching import photographs, sequence_pairs
 from sigmaslam_benchmarks.matching.image_pairs import Motion
 
@@ -108,7 +108,7 @@ def stereo_cloud(left: View, right: View) -> np.ndarray:
     T_left_right = se3_inverse(left.T_world_camera) @ right.T_world_camera
     rectifier = StereoRectifier(StereoCamera(eyes[0], eyes[1], T_left_right))
     images = rectifier.rectify(left.image, right.image)
-    disparity = measure_disparity(*images).disparity
+    disparity = measure_disparity(*images, semi_global_disparity).disparity
     u, v = pixel_grid(*disparity.shape)
     found = disparity > 0.0  # not where it is NaN
     points = rectifier.rectified.triangulate(np.stack([u, v, disparity], axis=-1)[found].astype(np.float64))

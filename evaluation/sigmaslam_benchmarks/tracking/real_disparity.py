@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from sigmaslam.progress import open_progress
-from sigmaslam.reconstruction.disparity import DisparityMap, measure_disparity
+from sigmaslam.reconstruction.disparity import DisparityMap, measure_disparity, semi_global_disparity
 from sigmaslam.table import Table
 from sigmaslam_benchmarks.tracking.disparity_pairs import DisparityPair, real_pairs, rendered_pairs, worse_camera
 from sigmaslam_benchmarks.tracking.page import fill_page, number, write_page
@@ -69,7 +69,7 @@ def write_real(path: Path, data: Path, command: str) -> str:
     sets |= {f"{name}, worse camera": [worse_camera(pair, rng) for pair in rendered[name]] for name in rendered}
     block, mode = best_setting(rendered_pairs((SWEEP_SEED,)))
     methods: dict[str, Method] = {
-        "ours": lambda left, right: measure_disparity(left, right),
+        "ours": lambda left, right: measure_disparity(left, right, semi_global_disparity),
         "SGBM, block 5, 5 paths": lambda left, right: opencv_matching(left, right, 5, cv2.STEREO_SGBM_MODE_SGBM),
         f"SGBM, best on renders: block {block}, {_MODES[mode]}": lambda left, right: opencv_matching(
             left, right, block, mode

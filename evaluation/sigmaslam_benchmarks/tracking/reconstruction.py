@@ -102,19 +102,23 @@ def judge_reconstruction(source: Path) -> DepthFigures:
             track_ours(sequence, run, TrackerOptions(threads=1))
         keyframes = read_recorded_keyframes(run)
         rectifier = StereoRectifier(keyframes.camera)
-        frames = keyframes.images(open_input(keyframes))
-        matched = {k: semi_global_disparity(*rectifier.rectify(each.left, each.right)) for k, each in frames}
+        pairs: list[np.ndarray] = []
+
+        def match(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+            pairs.append(semi_global_disparity(left, right))
+            return pairs[-1]
+
         assert sequence.timestamps is not None
         times = np.asarray(sequence.timestamps)
         numbers = np.flatnonzero(keyframes.is_keyframe)
         spread = np.linspace(0, len(numbers) - 1, min(len(numbers), MAX_KEYFRAMES)).round().astype(np.int64)
         judged = []
-        for depth in fuse_keyframes(keyframes, open_input(keyframes), rectifier):
+        for depth in fuse_keyframes(keyframes, open_input(keyframes), rectifier, match):
             if depth.number not in numbers[spread]:
                 continue
             index = int(np.abs(times - keyframes.timestamps[depth.number]).argmin())
             truth = studio.frames(np.array([index]))[0]
-            single = matched[depth.number] - np.float32(keyframes.disparity_offset)
+            single = pairs[depth.number] - np.float32(keyframes.disparity_offset)
             # A body of -1 is the sky, and the last one of the table.
             moves = moving[truth.body]
             judged.append(judge_pixels(depth, single, truth.depth, truth.stereo_visible, moves, rectifier.rectified))

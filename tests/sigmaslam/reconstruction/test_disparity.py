@@ -37,7 +37,7 @@ def test_brightness_that_differs_by_an_offset_changes_nothing():
 @pytest.mark.parametrize("noise", [2.0, 6.0])
 def test_noise_makes_the_errors_and_the_claimed_variance_grow_alike(noise: float):
     true = np.full((HEIGHT, WIDTH), 7.4, np.float32)
-    measured = measure_disparity(*textured_pair(true, noise))
+    measured = measure_disparity(*textured_pair(true, noise), semi_global_disparity)
     inner = np.zeros_like(true, bool)
     inner[10:-10, 30:-10] = True
     inner &= np.isfinite(measured.disparity)
@@ -49,7 +49,10 @@ def test_noise_makes_the_errors_and_the_claimed_variance_grow_alike(noise: float
 
 def test_more_noise_is_more_variance():
     true = np.full((HEIGHT, WIDTH), 7.4, np.float32)
-    medians = [np.nanmedian(measure_disparity(*textured_pair(true, noise)).variance) for noise in (1.0, 4.0, 8.0)]
+    medians = [
+        np.nanmedian(measure_disparity(*textured_pair(true, noise), semi_global_disparity).variance)
+        for noise in (1.0, 4.0, 8.0)
+    ]
     assert medians == sorted(medians)
     assert medians[2] > 3.0 * medians[0]
 
@@ -57,7 +60,7 @@ def test_more_noise_is_more_variance():
 def test_without_a_match_there_is_neither_disparity_nor_variance():
     rng = np.random.default_rng(3)
     left, right = rng.integers(0, 255, (2, HEIGHT, WIDTH)).astype(np.uint8)
-    measured = measure_disparity(left, right)
+    measured = measure_disparity(left, right, semi_global_disparity)
     assert np.isnan(measured.disparity).mean() > 0.8
     assert np.array_equal(np.isnan(measured.disparity), np.isnan(measured.variance))
 
@@ -107,6 +110,6 @@ def test_what_is_saturated_is_no_disparity():
     true = np.full((HEIGHT, WIDTH), 7.4, np.float32)
     left, right = textured_pair(true, noise=1.0)
     left[:, 90:150], right[:, 80:144] = 255, 255
-    measured = measure_disparity(left, right)
+    measured = measure_disparity(left, right, semi_global_disparity)
     assert np.isfinite(measured.disparity[10:-10, 110:130]).mean() < 0.05
     assert np.isfinite(measured.disparity[10:-10, 30:80]).mean() > 0.5

@@ -5,10 +5,14 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
+from onnx import TensorProto, helper
 from scipy.spatial import cKDTree
 
+from sigmaslam.errors import InputError
 from sigmaslam.reconstruction.recorded_keyframes import _with_frames_between, read_recorded_keyframes
+from sigmaslam.reconstruction.stereo_network import StereoNetwork
 from sigmaslam.run_record.dense_points import read_dense_points
 from sigmaslam.run_record.recorded_run import read_run
 from tests.support.commands import run_here
@@ -116,3 +120,45 @@ def test_steps_between_keyframes_go_both_ways(tracked: Path):
 def test_long_ways_between_keyframes_are_divided():
     assert _with_frames_between(np.array([0, 2, 14]), 18).tolist() == [0, 2, 6, 10, 14, 17]
     assert _with_frames_between(np.array([0]), 1).tolist() == [0]
+
+
+def _network(path: Path, channels: int, inputs: int = 2, size: int | str = "side") -> Path:
+    """A graph whose disparity is the mean difference of the images."""
+    names = [f"image{k}" for k in range(inputs)]
+    shape = [1, channels, size, size]
+    nodes = [
+        helper.make_node("Sub", [names[0], names[-1]], ["difference"]),
+        helper.make_node("ReduceMean", ["difference", "axes"], ["disparity"], keepdims=1),
+    ]
+    graph = helper.make_graph(
+        nodes,
+        "stereo",
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name in names],
+        [helper.make_tensor_value_info("disparity", TensorProto.FLOAT, None)],
+        [helper.make_tensor("axes", TensorProto.INT64, [1], [1])],
+    )
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9), path)
+    return path
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_network_gives_the_disparity_of_the_first_image(tmp_path: Path, channels: int):
+    left, right = np.full((40, 40), 50, np.uint8), np.full((40, 40), 30, np.uint8)
+    right[:10] = 60
+    found = StereoNetwork(_network(tmp_path / "net.onnx", channels))(left, right)
+    assert np.isnan(found[:10]).all()
+    assert (found[10:] == 20.0).all()
+
+
+def test_a_network_of_one_size_gives_disparities_of_the_image_s_pixels(tmp_path: Path):
+    left, right = np.full((40, 80), 50, np.uint8), np.full((40, 80), 30, np.uint8)
+    found = StereoNetwork(_network(tmp_path / "net.onnx", 1, size=20))(left, right)
+    assert found.shape == (40, 80)
+    np.testing.assert_allclose(found, 80.0)
+
+
+def test_what_is_no_stereo_network_is_refused(tmp_path: Path):
+    with pytest.raises(InputError, match="two float32 images"):
+        StereoNetwork(_network(tmp_path / "one.onnx", 1, inputs=1))
+    with pytest.raises(InputError, match="no such file"):
+        StereoNetwork(tmp_path / "none.onnx")
