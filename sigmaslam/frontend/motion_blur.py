@@ -26,8 +26,9 @@ _SMOOTHER = cv2.getGaussianKernel(7, 0.75, cv2.CV_32F)
 _DIRECTIONS, _MARGIN = 12, 4
 _ANGLE = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS
 _COSINE, _SINE = np.cos(_ANGLE), np.sin(_ANGLE)
-# Of first and second derivatives: how they follow from those along the axes, and which products are given.
+# First and second derivatives along them from those along the axes.
 _ONCE, _TWICE = np.stack([_COSINE, _SINE]), np.stack([_COSINE**2, 2.0 * _COSINE * _SINE, _SINE**2])
+# Where the products of these stand in a symmetric matrix.
 _UPPER = np.triu_indices(2), np.triu_indices(3)
 
 

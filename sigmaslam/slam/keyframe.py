@@ -52,6 +52,11 @@ class Keyframe:
         """(N, D) of its features."""
         return self.view.features.descriptors
 
+    def prepare_to_leave(self) -> None:
+        """Makes what `measure_surfaces` needs, in a frame that has time for it."""
+        if self.dense is not None:
+            self.dense.get()
+
     def leave_window(self, points: PointMap) -> Keyframe:
         """The keyframe as it is remembered, with the points (in its frame) that leave with it."""
         view = replace(self.view, right=np.zeros((0, 0), np.uint8), small=(), usable=None)

@@ -126,11 +126,6 @@ class Keyframes:
         own = 1.0 if share >= ACCEPTANCE.sharpness else 1.0 / max(share, ACCEPTANCE.least_sharpness)
         return own, own + float(blurs.mean()) - 1.0
 
-    def prepare_oldest(self) -> None:
-        """Makes what the oldest keyframe takes to the map, in a frame that has time for it."""
-        if self.active[0].dense is not None:
-            self.active[0].dense.get()
-
     def marginalise_oldest(self, spare: KnownKeyframe | None = None) -> np.ndarray:
         """Moves the oldest keyframe to the past, and its landmarks to the map.
 

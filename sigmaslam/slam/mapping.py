@@ -132,7 +132,7 @@ class Mapper:
         share = fit.count / max(self._landmarks_in_keyframe, 1)
         if share >= self.config.keyframe_ratio:
             if len(self.window) == self.config.window:
-                self.keyframes.prepare_oldest()
+                self.keyframes.active[0].prepare_to_leave()
             return None
         # A blurred or ambiguous keyframe would spoil what comes after it, too few landmarks spoil more. A sharp view
         # that scatters is one: no keyframes at all for 20 frames lost the KITTI drive.
