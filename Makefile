@@ -45,16 +45,15 @@ docs: $(VENV)/.docs
 results: $(VENV)/.dev
 	$(VENV)/bin/python release/remake_pages.py $(PAGES)
 
-# What is handed out, of the last commit: sdist, wheel without kernels, a wheel with kernels for each Python.
+# What is handed out, of the last commit: sdist, wheel without kernels, a wheel with kernels for each Python; with
+# DIST_FLAGS=--many-linux for x86-64 and aarch64 (manylinux_2_28), compiled by zig whatever the machine.
 dist: $(VENV)/bin/python
 	rm -rf dist
-	$(VENV)/bin/python release/build_dist.py dist $(PYTHONS)
+	$(VENV)/bin/python release/build_dist.py $(DIST_FLAGS) dist $(PYTHONS)
 
-# The same for a package index: wheels for x86-64 and aarch64 (manylinux_2_28), compiled by zig whatever the machine, and
-# handed over, which asks for the index's token. CONTRIBUTING.md, "A release", comes first.
-publish: $(VENV)/bin/python
-	rm -rf dist
-	$(VENV)/bin/python release/build_dist.py --many-linux dist $(PYTHONS)
+# Build, try, list and hand over to a package index, which asks for its token. CONTRIBUTING.md, "A release", comes first.
+publish: DIST_FLAGS := --many-linux
+publish: wheel sbom
 	$(VENV)/bin/python -m pip install --quiet twine
 	$(VENV)/bin/python -m twine check --strict dist/*.whl dist/*.tar.gz
 	$(VENV)/bin/python -m twine upload dist/*.whl dist/*.tar.gz
@@ -65,19 +64,23 @@ wheel: dist
 	    rm -rf build/check; $$python -m venv build/check; \
 	    build/check/bin/python -m pip install --quiet --no-index --no-deps --find-links dist sigmaslam; \
 	    build/check/bin/python -m pip install --quiet $(INSTALL_FLAGS) sigmaslam; \
-	    (cd build && check/bin/python -c "import sigmaslam.frontend._kernels" && check/bin/sigmaslam demo); \
+	    (cd build && check/bin/python -c "import sigmaslam.frontend._kernels, sigmaslam.estimation._estimator" \
+	        && check/bin/sigmaslam demo); \
 	done
 
-# The runtime's packages, versions and licences as CycloneDX JSON: dist/sbom.cdx.json.
+# The runtime's packages, and what is compiled into the kernels (pybind11, zig's libc++), with versions and licences as
+# CycloneDX JSON: dist/sbom.cdx.json.
 sbom: dist
 	rm -rf build/sbom build/runtime
 	$(PYTHON) -m venv build/sbom
 	build/sbom/bin/python -m pip install --quiet --constraint requirements.lock cyclonedx-bom
 	$(PYTHON) -m venv --without-pip build/runtime
 	build/sbom/bin/python -m pip --python build/runtime install --quiet --no-index --no-deps --find-links dist sigmaslam
-	build/sbom/bin/python -m pip --python build/runtime install --quiet $(INSTALL_FLAGS) sigmaslam
+	build/sbom/bin/python -m pip --python build/runtime install --quiet $(INSTALL_FLAGS) sigmaslam pybind11 \
+	    $(if $(DIST_FLAGS),ziglang)
 	SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) build/sbom/bin/cyclonedx-py environment build/runtime \
 	    --pyproject pyproject.toml --output-reproducible --output-file dist/sbom.cdx.json
+	cd dist && sha256sum sbom.cdx.json >> SHA256SUMS
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info

@@ -7,7 +7,8 @@ import pybind11
 from setuptools import Extension, setup
 
 # No -ffast-math and no contraction: the same bits on every run. AVX2 is chosen when the module is loaded.
-FLAGS = ["-std=c++17", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden", "-Wno-psabi", "-g0"]
+FLAGS = ["-std=c++17", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden", "-g0"]
+FLAGS += ["-Wno-psabi", "-Wno-unknown-pragmas"]
 # Clang, which zig is too, vectorises with -O2 and does not know the flags for it.
 CXX = os.environ.get("CXX") or sysconfig.get_config_var("CXX") or ""
 VECTORISED = [] if "zig" in CXX or "clang" in CXX else ["-ftree-loop-vectorize", "-fvect-cost-model=dynamic"]
@@ -20,6 +21,8 @@ def compiled(name: str, folder: str, source: str, included: list[str], optimised
         [f"{folder}/{source}"],
         depends=["sigmaslam/both_ways.inc", *(f"{folder}/{each}" for each in included)],
         include_dirs=[pybind11.get_include()],
+        # Nothing is shared between modules: zig links a C++ library to each, which knows its own exceptions alone.
+        define_macros=[("PYBIND11_STDLIB", f'"_sigmaslam{name.rpartition(".")[2]}"')],
         extra_compile_args=[*optimised, *FLAGS],
         language="c++",
         optional=True,

@@ -26,6 +26,10 @@ TOOLS = ("build", "setuptools", "pybind11")
 CROSS_TOOLS = ("ziglang", "wheel", "auditwheel")
 MANY_LINUX, GLIBC = ("x86_64", "aarch64"), "2.28"
 COMPILED = ("sigmaslam/frontend/_kernels.", "sigmaslam/estimation/_estimator.")
+WITHOUT_KERNELS = (
+    "what the compiler said stands above; if there is none, apt install g++; if it lacks Python's headers, name an "
+    "interpreter that has them, for --many-linux not Debian's, whose pyconfig.h is of one machine"
+)
 
 
 def main() -> None:
@@ -80,11 +84,11 @@ def build_dist(out: Path, pythons: list[str], many_linux: bool = False) -> list[
             settings = environment | (_cross_settings(builder, machine, work / "zig") if machine else {})
             wheel = _build(builder, "wheel", sources, out, settings)
             if machine:
-                wheel = _as_many_linux(builder, wheel, machine, settings)
+                wheel = as_many_linux(builder, wheel, machine, settings)
             with zipfile.ZipFile(wheel) as content:
                 compiled = [each for each in content.namelist() if each.startswith(COMPILED)]
             if len(compiled) != (len(COMPILED) if number > 0 else 0):
-                raise RuntimeError(f"{wheel} holds no compiled kernels: install a C++ compiler (apt install g++)")
+                raise RuntimeError(f"{wheel} holds no compiled kernels: {WITHOUT_KERNELS}")
             archives.append(wheel)
     sums = out / "SHA256SUMS"
     lines = sorted(f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.name}\n" for path in archives)
@@ -113,26 +117,16 @@ def normalise_tar(archive: bytes, seconds: int) -> bytes:
     return gzip.compress(written.getvalue(), mtime=seconds)
 
 
-def _cross_settings(builder: Path, machine: str, cache: Path) -> dict[str, str]:
-    """The environment in which setuptools compiles for another machine; libraries that zig builds stay in `cache`."""
-    compiler = f"{builder} -m ziglang {{}} -target {machine}-linux-gnu.{GLIBC}"
-    abi = subprocess.run(
-        [builder, "-c", "import sys; print(sys.implementation.cache_tag)"], capture_output=True, text=True
-    )
-    return {
-        "CC": compiler.format("cc"),
-        "CXX": compiler.format("c++"),
-        "LDSHARED": f"{compiler.format('c++')} -shared -s",
-        "LDCXXSHARED": f"{compiler.format('c++')} -shared -s",
-        "SETUPTOOLS_EXT_SUFFIX": f".{abi.stdout.strip()}-{machine}-linux-gnu.so",
-        "_PYTHON_HOST_PLATFORM": f"linux-{machine}",
-        "ZIG_GLOBAL_CACHE_DIR": os.environ.get("ZIG_GLOBAL_CACHE_DIR", str(cache)),
-    }
-
-
-def _as_many_linux(builder: Path, wheel: Path, machine: str, environment: dict[str, str]) -> Path:
+def as_many_linux(builder: Path, wheel: Path, machine: str, environment: dict[str, str]) -> Path:
     """The wheel by the name of the systems that it runs on, which `auditwheel` confirms.
 
+    Args:
+        builder: an interpreter with `CROSS_TOOLS`.
+        wheel: by the name of a machine alone, which it loses.
+        machine: that machine.
+        environment: for the tools.
+    Returns:
+        Its new path.
     Raises:
         RuntimeError: it needs a newer glibc, or a library that such systems may lack.
     """
@@ -145,6 +139,22 @@ def _as_many_linux(builder: Path, wheel: Path, machine: str, environment: dict[s
     if oldest is None or int(oldest[1]) > int(GLIBC.removeprefix("2.")):
         raise RuntimeError(f"{named} does not run on all systems of {tag}: {shown.stdout}")
     return named
+
+
+def _cross_settings(builder: Path, machine: str, cache: Path) -> dict[str, str]:
+    """The environment in which setuptools compiles for another machine; libraries that zig builds stay in `cache`."""
+    compiler = f"{builder} -m ziglang {{}} -target {machine}-linux-gnu.{GLIBC}"
+    show_abi = [builder, "-c", "import sys; print(sys.implementation.cache_tag)"]
+    abi = subprocess.run(show_abi, capture_output=True, text=True, check=True)
+    return {
+        "CC": compiler.format("cc"),
+        "CXX": compiler.format("c++"),
+        "LDSHARED": f"{compiler.format('c++')} -shared -s",
+        "LDCXXSHARED": f"{compiler.format('c++')} -shared -s",
+        "SETUPTOOLS_EXT_SUFFIX": f".{abi.stdout.strip()}-{machine}-linux-gnu.so",
+        "_PYTHON_HOST_PLATFORM": f"linux-{machine}",
+        "ZIG_GLOBAL_CACHE_DIR": os.environ.get("ZIG_GLOBAL_CACHE_DIR", str(cache)),
+    }
 
 
 def _install_tools(python: str, folder: Path, tools: tuple[str, ...]) -> Path:

@@ -52,7 +52,7 @@ class EstimatorGraphs:
 
 
 def open_step(name: str, backend: str = ONNX) -> Step:
-    """A step by its graph's name: compiled where that and AVX2 are at hand, else the graph."""
+    """A step by its graph's name: compiled where that is faster, else the graph."""
     if backend != ONNX:
         return load_step(name, backend)
     if _compiled is None or not _compiled.FAST:
@@ -65,6 +65,6 @@ def open_step(name: str, backend: str = ONNX) -> Step:
 def _tell_slow() -> None:
     """Once."""
     _LOGGER.warning(
-        "poses are estimated by graphs, which takes four times longer: with AVX2, install the wheel of this "
-        "Python and platform, or a C++ compiler and then sigmaslam from its sources"
+        "poses are estimated by graphs, which takes four times longer: install the wheel of this Python and "
+        "platform, or a C++ compiler (without AVX2: clang) and then sigmaslam from its sources"
     )

@@ -1,7 +1,9 @@
 """What is handed out is the same, byte for byte, wherever and whenever it is built."""
 
+import hashlib
 import io
 import os
+import platform
 import runpy
 import shutil
 import subprocess
@@ -14,7 +16,7 @@ from types import SimpleNamespace
 import pytest
 import setuptools
 
-from release.build_dist import normalise_tar
+from release.build_dist import as_many_linux, normalise_tar
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -55,9 +57,54 @@ def test_each_compiler_gets_the_flags_that_it_knows(compiler: str, is_clang: boo
     monkeypatch.setattr(setuptools, "setup", lambda ext_modules: modules.extend(ext_modules))
     runpy.run_path(str(ROOT / "setup.py"))
     assert [module.name for module in modules] == ["sigmaslam.frontend._kernels", "sigmaslam.estimation._estimator"]
+    assert len({value for module in modules for _, value in module.define_macros}) == len(modules)
     flags = {flag for module in modules for flag in module.extra_compile_args}
     assert {"-ffp-contract=off", "-O2", "-O3"} <= flags
     assert bool({"-ftree-loop-vectorize", "-fvect-cost-model=dynamic"} & flags) != is_clang
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("library", "version", "refused"),
+    [("libc.so.6", "2.28", False), ("libc.so.6", "2.29", True), ("libhere.so.1", "2.28", True)],
+)
+def test_a_wheel_that_needs_more_than_its_systems_have_is_refused(
+    library: str, version: str, refused: bool, tmp_path: Path
+):
+    """A newer glibc, or a library of one's own; both stand-ins here."""
+    pytest.importorskip("auditwheel")
+    wheelfile = pytest.importorskip("wheel.wheelfile")
+    machine = platform.machine()
+    (tmp_path / "versions").write_text(f"GLIBC_{version} {{ global: newest; }};")
+    (tmp_path / "library.c").write_text("void newest(void) {}")
+    (tmp_path / "module.c").write_text("void newest(void); void PyInit_module(void) { newest(); }")
+    for code in (
+        ["library.c", f"-Wl,-soname,{library},--version-script=versions", "-o", library],
+        ["module.c", library, "-o", "module.so"],
+    ):
+        subprocess.run(["gcc", "-shared", "-fPIC", "-nostdlib", *code], cwd=tmp_path, check=True)
+    wheel = tmp_path / f"p-1-py3-none-linux_{machine}.whl"
+    with wheelfile.WheelFile(wheel, "w") as content:
+        content.write(tmp_path / "module.so", "p/module.so")
+        content.writestr("p-1.dist-info/METADATA", "Metadata-Version: 2.1\nName: p\nVersion: 1\n")
+        content.writestr("p-1.dist-info/WHEEL", f"Wheel-Version: 1.0\nTag: py3-none-linux_{machine}\n")
+    if refused:
+        with pytest.raises(RuntimeError, match="does not run on all systems of manylinux_2_28"):
+            as_many_linux(Path(sys.executable), wheel, machine, dict(os.environ))
+    else:
+        named = as_many_linux(Path(sys.executable), wheel, machine, dict(os.environ))
+        assert [named] == list(tmp_path.glob("*.whl"))
+        assert named.name == f"p-1-py3-none-manylinux_2_28_{machine}.whl"
+
+
+def test_what_is_published_was_built_once_for_many_linux_and_tried_before():
+    command = ["make", "--dry-run", "publish", "PYTHONS=one another"]
+    plan = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    steps = [
+        plan.index(each) for each in ("build_dist.py --many-linux dist one another", "sigmaslam demo", "twine upload")
+    ]
+    assert steps == sorted(steps)
+    assert plan.count("build_dist.py") == plan.count("rm -rf dist") == 1
 
 
 @pytest.mark.slow
@@ -77,9 +124,41 @@ def test_two_folders_give_the_same_archives(tmp_path: Path):
         if name.endswith(".whl"):
             with zipfile.ZipFile(out / name) as wheel:
                 content = b"".join(map(wheel.read, wheel.namelist()))
-                assert any(each.endswith("licenses/LICENSE") for each in wheel.namelist())
+                licences = {each.rpartition("licenses/")[2] for each in wheel.namelist() if "/licenses/" in each}
+                assert licences == {"LICENSE", "LICENSE.pybind11"}
                 assert any(each.endswith("docs/object.md") for each in wheel.namelist())
             assert str(tmp_path).encode() not in content
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3000)  # zig compiles its C++ library for each machine first
+def test_wheels_for_many_linux_are_of_their_machines(tmp_path: Path):
+    """Which their names say, those of their modules and those modules themselves."""
+    command = [sys.executable, str(ROOT / "release" / "build_dist.py"), "--many-linux", str(tmp_path)]
+    subprocess.run(command, check=True)
+    sums = dict(reversed(line.split()) for line in (tmp_path / "SHA256SUMS").read_text().splitlines())
+    assert sums == {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in tmp_path.glob("sigmaslam*")}
+    for machine, number in {"x86_64": 62, "aarch64": 183}.items():  # of ELF
+        (path,) = tmp_path.glob(f"*manylinux_2_28_{machine}.whl")
+        with zipfile.ZipFile(path) as wheel:
+            modules = [name for name in wheel.namelist() if name.endswith(".so")]
+            assert sorted(Path(name).name for name in modules) == [
+                f"_{name}.{sys.implementation.cache_tag}-{machine}-linux-gnu.so" for name in ("estimator", "kernels")
+            ]
+            assert {int.from_bytes(wheel.read(name)[18:20], "little") for name in modules} == {number}
+            wheel.extractall(tmp_path / machine)
+    code = (
+        "import numpy, sigmaslam.estimation._estimator as estimator, sigmaslam.frontend._kernels as kernels\n"
+        "print(kernels.__file__, estimator.__file__, estimator.FAST)\n"
+        "kernels.neighbour_medians(numpy.zeros(3))"
+    )
+    command = [sys.executable, "-c", code]
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path / platform.machine())}
+    ran = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    # An exception has its kind, whichever module was loaded first.
+    assert ran.stderr.splitlines()[-1] == "ValueError: vectors must be (M, K, 2)"
+    assert ran.stdout.count(str(tmp_path)) == 2
+    assert ran.stdout.endswith("True\n")
 
 
 @pytest.mark.slow
