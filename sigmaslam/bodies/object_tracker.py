@@ -17,7 +17,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.frontend import Frontend, build_frontend
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
-from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
+from sigmaslam.geometry.se3 import rigid_motion, se3_inverse, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.inference.networks import WeightsFolder
 from sigmaslam.slam.argument_checks import check_region, check_tracker_arguments
@@ -212,6 +212,4 @@ class ObjectTracker:
         return {}
 
     def _T_body_left(self) -> np.ndarray:  # noqa: N802
-        T = np.eye(4)
-        T[:3, 3] = -self.origin
-        return T
+        return rigid_motion(np.eye(3), -self.origin)

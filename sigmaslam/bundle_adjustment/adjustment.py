@@ -21,7 +21,7 @@ from sigmaslam.bundle_adjustment.structure import (
 )
 from sigmaslam.bundle_adjustment.track_file import Tracks
 from sigmaslam.errors import InputError
-from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
+from sigmaslam.geometry.se3 import rigid_motion, se3_inverse, turn_covariance
 
 # A smaller share of inliers is no solution.
 _MIN_SHARE = 0.5
@@ -111,8 +111,7 @@ def adjust(
     observations, frames = collect(tracks)
     if len(frames) < 2:
         raise InputError("all observations are of one keyframe: there is no motion to adjust; track more frames")
-    T_left_rectified = np.eye(4)
-    T_left_rectified[:3, :3] = tracks.R_rectified_left.T
+    T_left_rectified = rigid_motion(tracks.R_rectified_left.T, np.zeros(3))
     tracked = poses[frames] @ T_left_rectified
     offset = float(tracks.disparity_offset[0])
     rectified = turn_covariance(se3_inverse(T_left_rectified), covariances[frames])

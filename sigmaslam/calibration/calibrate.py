@@ -12,7 +12,7 @@ from sigmaslam.calibration.board_bundle import BoardBundle, Corners, Rig, projec
 from sigmaslam.calibration.boards import DetectedCorners
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, DistortionModel
-from sigmaslam.geometry.se3 import rotation_log, se3_inverse
+from sigmaslam.geometry.se3 import rigid_motion, rotation_log, se3_inverse
 
 LENSES: dict[str, tuple[DistortionModel, int]] = {
     "none": ("none", 0),
@@ -240,8 +240,7 @@ def _board_poses(rig: Rig, corners: Corners) -> dict[int, tuple[float, np.ndarra
             continue
         found = cv2.solvePnP(corners.points[mine], rays[mine, :2].copy(), np.eye(3), None)
         if found[0] and found[2][2, 0] > 0.0:
-            T = np.eye(4)
-            T[:3, :3], T[:3, 3] = cv2.Rodrigues(found[1])[0], found[2][:, 0]
+            T = rigid_motion(cv2.Rodrigues(found[1])[0], found[2][:, 0])
             seen = eye.project(corners.points[mine] @ T[:3, :3].T + T[:3, 3])
             poses[image] = (_rms(seen - corners.pixels[mine]), T)
     return poses

@@ -13,15 +13,14 @@ from sigmaslam.calibration_files.calibration_writer import write_calibration
 from sigmaslam.files import atomic_write_bytes, atomic_write_text, check_new_folder, make_folder
 from sigmaslam.geometry.camera import CameraModel, RectifiedStereo, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
+from sigmaslam.geometry.se3 import rigid_motion
 from sigmaslam.readers.stereo_sequence import StereoSequence
 
 
 def rectified_camera(camera: StereoCamera, view: RectifiedStereo) -> StereoCamera:
     """The calibration of a pair after rectification, known as well as before."""
     eye = CameraModel(view.width, view.height, view.fx, view.fy, view.cx, view.cy)
-    T_left_right = np.eye(4)
-    T_left_right[0, 3] = view.baseline
-    return replace(camera, left=eye, right=eye, T_left_right=T_left_right)
+    return replace(camera, left=eye, right=eye, T_left_right=rigid_motion(np.eye(3), [view.baseline, 0.0, 0.0]))
 
 
 def write_rectified(sequence: StereoSequence, out: Path, done: Callable[[int], object]) -> int:

@@ -10,6 +10,7 @@ from sigmaslam.calibration_files.lens_models import camera_model, intrinsics_of,
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.checked_yaml import CalibrationYaml
+from sigmaslam.geometry.se3 import rigid_motion
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,16 +56,14 @@ def stereo_from_infos(left: CameraInfo, right: CameraInfo, rectified: bool) -> S
         for key, matrix in (("P", info.P), *((("K", info.K), ("R", info.R)) if not rectified else ())):
             if not np.all(np.isfinite(matrix)) or np.linalg.det(matrix[:, :3]) == 0.0:
                 raise CalibrationError(f"{info.name}: not calibrated, {key} is {matrix.tolist()}; give --calibration")
-    T_left_right = np.eye(4)
-    T_left_right[:3, 3] = right_position(left.P, right.P)
+    T_left_right = rigid_motion(np.eye(3), right_position(left.P, right.P))
     if not np.any(T_left_right[:3, 3]):
         raise CalibrationError(
             f"{right.name}: no baseline (P[0, 3] is 0): the eyes were calibrated one by one; calibrate them as a "
             "stereo pair, or give --calibration"
         )
     if not rectified:
-        R_left, R_right = np.eye(4), np.eye(4)
-        R_left[:3, :3], R_right[:3, :3] = left.R, right.R
+        R_left, R_right = (rigid_motion(info.R, np.zeros(3)) for info in infos)
         T_left_right = R_left.T @ T_left_right @ R_right
     eyes = [
         camera_model(info.name, (info.width, info.height), intrinsics_of(info.P))

@@ -19,6 +19,7 @@ from sigmaslam.calibration_files.lens_models import (
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.geometry.checked_yaml import CalibrationYaml
+from sigmaslam.geometry.se3 import rigid_motion
 
 GREY_PAIR = (0, 1)
 
@@ -62,8 +63,7 @@ def read_rigid(path: Path, rotation: str, translation: str) -> np.ndarray:
         CalibrationError: a matrix is missing or incomplete, or the first is no rotation.
     """
     content = _read_entries(path, GREY_PAIR)
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = _matrix(content, rotation, (3, 3)), _matrix(content, translation, (3,))
+    T = rigid_motion(_matrix(content, rotation, (3, 3)), _matrix(content, translation, (3,)))
     # The files have seven digits.
     if not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3):
         raise CalibrationError(f"{path}: key '{rotation}' is no rotation; correct the numbers")
@@ -78,9 +78,7 @@ def read_rectification(path: Path, camera: int) -> np.ndarray:
     """
     content = _read_entries(path, GREY_PAIR)
     P = _matrix(content, f"P_rect_{camera:02d}", (3, 4))
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = _matrix(content, "R_rect_00", (3, 3)), np.linalg.solve(P[:, :3], P[:, 3])
-    return T
+    return rigid_motion(_matrix(content, "R_rect_00", (3, 3)), np.linalg.solve(P[:, :3], P[:, 3]))
 
 
 def _read_entries(path: Path, cameras: tuple[int, int]) -> CalibrationYaml:
@@ -128,10 +126,8 @@ def _from_projections(content: CalibrationYaml, keys: tuple[str, str], image_siz
     image_size = need_image_size(str(content.path), image_size)
     left, right = (_matrix(content, key, (3, 4)) for key in keys)
     models = [_model(content.path, key, P[:, :3], image_size) for key, P in zip(keys, (left, right), strict=True)]
-    T_left_right = np.eye(4)
     with naming(f"{content.path}: keys '{keys[0]}' and '{keys[1]}'"):
-        T_left_right[:3, 3] = right_position(left, right)
-        return StereoCamera(models[0], models[1], T_left_right)
+        return StereoCamera(models[0], models[1], rigid_motion(np.eye(3), right_position(left, right)))
 
 
 def _from_originals(content: CalibrationYaml, cameras: tuple[int, int], image_size: ImageSize) -> StereoCamera:
@@ -141,9 +137,7 @@ def _from_originals(content: CalibrationYaml, cameras: tuple[int, int], image_si
         distortion = tuple(_matrix(content, f"D_{camera:02d}", (5,)).tolist())
         K = _matrix(content, key := f"K_{camera:02d}", (3, 3))
         models.append(_model(content.path, key, K, image_size, distortion))
-        T_camera_camera0 = np.eye(4)
-        T_camera_camera0[:3, :3] = _matrix(content, f"R_{camera:02d}", (3, 3))
-        T_camera_camera0[:3, 3] = _matrix(content, f"T_{camera:02d}", (3,))
-        poses.append(T_camera_camera0)
+        R, t = _matrix(content, f"R_{camera:02d}", (3, 3)), _matrix(content, f"T_{camera:02d}", (3,))
+        poses.append(rigid_motion(R, t))  # T_camera_camera0
     with naming(f"{content.path}: R and T of cameras {cameras[0]} and {cameras[1]}"):
         return StereoCamera(models[0], models[1], poses[0] @ np.linalg.inv(poses[1]))

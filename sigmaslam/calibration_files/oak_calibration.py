@@ -10,6 +10,7 @@ from sigmaslam.calibration_files.lens_models import camera_model, intrinsics_of,
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.geometry.checked_yaml import CalibrationYaml
+from sigmaslam.geometry.se3 import rigid_motion
 
 # depthai's numbers of the two eyes, CAM_B and CAM_C, where the file does not name them.
 _EYES = {"leftCameraSocket": 1, "rightCameraSocket": 2}
@@ -73,11 +74,8 @@ def _chain(path: Path, cameras: dict[int, CalibrationYaml], socket: int) -> dict
         target = extrinsics.integer("toCameraSocket")
         if target < 0 or target in transforms:
             return transforms
-        step = np.eye(4)
-        step[:3, :3] = extrinsics.numbers("rotationMatrix", (3, 3))
-        translation = extrinsics.section("translation")
-        step[:3, 3] = [_CENTIMETRE * translation.number(axis) for axis in "xyz"]
-        T = step @ T
+        R, translation = extrinsics.numbers("rotationMatrix", (3, 3)), extrinsics.section("translation")
+        T = rigid_motion(R, [_CENTIMETRE * translation.number(axis) for axis in "xyz"]) @ T
         transforms[target] = T
         socket = target
 

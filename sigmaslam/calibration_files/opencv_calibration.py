@@ -22,6 +22,7 @@ from sigmaslam.calibration_files.lens_models import (
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.geometry.checked_yaml import CalibrationYaml
+from sigmaslam.geometry.se3 import rigid_motion
 
 logger = logging.getLogger(__name__)
 
@@ -160,9 +161,8 @@ def _from_matrices(
         K, where = _matrix(storage, key, (3, 3)), str(storage.path)
         models.append(camera_model(where, size, intrinsics_of(K), *_lens(storage, D), key=D))
     rotation = _matrix(storage, "R")
-    T_right_left = np.eye(4)
-    T_right_left[:3, :3] = cv2.Rodrigues(rotation)[0] if rotation.size == 3 else _matrix(storage, "R", (3, 3))
-    T_right_left[:3, 3] = _matrix(storage, "T", (3,))
+    R = cv2.Rodrigues(rotation)[0] if rotation.size == 3 else _matrix(storage, "R", (3, 3))
+    T_right_left = rigid_motion(R, _matrix(storage, "T", (3,)))
     camera = stereo_camera(f"{storage.path}: R and T", models, T_right_left)
     if camera.baseline > _LONGEST_BASELINE:
         logger.warning(
@@ -222,6 +222,4 @@ def _pinhole(
 
 
 def _beside(baseline: float) -> np.ndarray:
-    T = np.eye(4)
-    T[0, 3] = baseline
-    return T
+    return rigid_motion(np.eye(3), [baseline, 0.0, 0.0])

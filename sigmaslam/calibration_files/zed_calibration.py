@@ -12,6 +12,7 @@ from sigmaslam.calibration_files.lens_models import ImageSize, camera_model, nee
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.geometry.checked_yaml import CalibrationYaml
+from sigmaslam.geometry.se3 import rigid_motion
 
 logger = logging.getLogger(__name__)
 
@@ -55,13 +56,11 @@ def read_zed(path: Path, image_size: ImageSize | None) -> StereoCamera:
         )
     models = [_camera_model(content, eye, resolution, (width, height)) for eye in ("LEFT", "RIGHT")]
     stereo, suffix = content.section("STEREO"), resolution.lower()
-    T_right_left = np.eye(4)
     rotation = np.array([stereo.number(f"{axis}_{suffix}") for axis in ("rx", "cv", "rz")])
-    T_right_left[:3, :3] = cv2.Rodrigues(rotation)[0]
     # TY and TZ of the resolution, else of all, else zero.
     aside = [stereo.number(f"{axis}_{suffix}", stereo.number(axis, 0.0)) for axis in ("ty", "tz")]
-    T_right_left[:3, 3] = [-stereo.number("baseline"), *aside]
-    T_right_left[:3, 3] *= _MILLIMETRE
+    translation = _MILLIMETRE * np.array([-stereo.number("baseline"), *aside])
+    T_right_left = rigid_motion(cv2.Rodrigues(rotation)[0], translation)
     logger.warning(
         "%s: the calibration of raw images; what the ZED SDK exports is rectified, unless it is asked for UNRECTIFIED: "
         "then write its calibration_parameters into a YAML",

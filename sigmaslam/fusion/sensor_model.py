@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sigmaslam.estimation.gaussian import project_covariance
-from sigmaslam.geometry.se3 import nearest_rotation, rotation_log, se3_exp, se3_inverse
+from sigmaslam.geometry.se3 import nearest_rotation, rigid_motion, rotation_log, se3_exp, se3_inverse
 
 # Slices of the error states. The tracker's drift and the error of the last frame perturb from the left in the tracker's
 # world; A and B are perturbed from the right.
@@ -154,9 +154,7 @@ def _guesses(readings: PosedReadings, G: np.ndarray) -> list[tuple[np.ndarray, n
         rotations.append(_rotation_between(of_carrier, of_sensor))
     guesses = []
     for R in rotations:
-        A, B = np.eye(4), np.eye(4)
-        A[:3, :3] = R
-        A[:3, 3] = positions.mean(axis=0) - R @ places.mean(axis=0)
+        A, B = rigid_motion(R, positions.mean(axis=0) - R @ places.mean(axis=0)), np.eye(4)
         if readings.rotations is not None:
             mounts = np.swapaxes(R @ G[:, :3, :3], 1, 2) @ readings.rotations
             B[:3, :3] = nearest_rotation(mounts.mean(axis=0))

@@ -5,6 +5,7 @@ import numpy as np
 
 from sigmaslam.errors import CalibrationError, FrameError
 from sigmaslam.geometry.camera import CameraModel, RectifiedStereo, StereoCamera
+from sigmaslam.geometry.se3 import rigid_motion
 
 # The rectified image ends at 60 degrees from the axis, as a fisheye image would be stretched without limit.
 MAX_TANGENT = float(np.tan(np.radians(60.0)))
@@ -54,9 +55,7 @@ class StereoRectifier:
     @property
     def T_rectified_left(self) -> np.ndarray:  # noqa: N802
         """(4, 4) takes points of the left camera into the rectified one: both eyes turn about their centres."""
-        T = np.eye(4)
-        T[:3, :3] = self.R_rectified_left
-        return T
+        return rigid_motion(self.R_rectified_left, np.zeros(3))
 
     def describe(self) -> dict[str, np.ndarray]:
         """The rectified pair: intrinsics (5,) fx, fy, cx, cy, baseline, and R_rectified_left (3, 3)."""

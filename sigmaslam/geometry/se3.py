@@ -5,6 +5,7 @@ Barfoot, "State Estimation for Robotics", chapter 8.
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -92,6 +93,14 @@ def nearest_rotation(matrices: np.ndarray) -> np.ndarray:
     sign = np.ones((*u.shape[:-2], 3))
     sign[..., 2] = np.sign(np.linalg.det(u @ vt))
     return np.asarray((u * sign[..., None, :]) @ vt)
+
+
+def rigid_motion(rotation: np.ndarray, translation: np.ndarray | Sequence[float]) -> np.ndarray:
+    """Matrices (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3)."""
+    translation = np.asarray(translation)
+    T = np.zeros((*np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1]), 4, 4))
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = rotation, translation, 1.0
+    return T
 
 
 def se3_inverse(T: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from sigmaslam.bounded_files import TABLE_BYTES, finite_number, load_array, read
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text
 from sigmaslam.geometry.checked_yaml import CalibrationYaml
-from sigmaslam.geometry.se3 import matrix_to_quaternion, nearest_rotation, quaternion_to_matrix
+from sigmaslam.geometry.se3 import matrix_to_quaternion, nearest_rotation, quaternion_to_matrix, rigid_motion
 from sigmaslam.geometry.trajectory import Trajectory
 
 TrajectoryFormat = Literal["tum", "kitti", "euroc"]
@@ -130,10 +130,7 @@ def read_kitti(path: str | Path) -> Trajectory:
             f"{path}: line {numbers[wrong[0]]} holds no rotation matrix (off by {deviation[wrong[0]]:.3g}): "
             "each row must be the upper 3x4 part of T_world_camera, by rows"
         )
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3] = rotations
-    poses[:, :3, 3] = matrices[:, :, 3]
-
+    poses = rigid_motion(rotations, matrices[:, :, 3])
     times = kitti_times_path(path)
     if times is None:
         return Trajectory(np.arange(len(rows)) / KITTI_FRAME_RATE, poses)
@@ -259,7 +256,4 @@ def _poses(path: Path, positions: np.ndarray, quaternions: np.ndarray, numbers: 
             f"{path}: line {numbers[k]}: the quaternion has length {length[k]:.4g}, not 1; "
             "check the order of the columns"
         )
-    poses = np.tile(np.eye(4), (len(positions), 1, 1))
-    poses[:, :3, :3] = quaternion_to_matrix(quaternions)
-    poses[:, :3, 3] = positions
-    return poses
+    return rigid_motion(quaternion_to_matrix(quaternions), positions)

@@ -12,7 +12,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
-from sigmaslam.geometry.se3 import se3_inverse
+from sigmaslam.geometry.se3 import rigid_motion, se3_inverse
 from sigmaslam.geometry.uncertainty import propagate
 from sigmaslam.two_view.absolute_orientation import absolute_orientation
 from sigmaslam.two_view.triangulation import TwoViews, triangulate
@@ -92,8 +92,7 @@ def _views(camera: StereoCamera, rectified: bool) -> tuple[TwoViews, np.ndarray,
     if not rectified:
         return TwoViews(camera.left.matrix, camera.right.matrix, se3_inverse(camera.T_left_right)), np.eye(3), np.eye(3)
     rectifier = StereoRectifier(camera)
-    K, T_right_left = rectifier.rectified.matrix, np.eye(4)
-    T_right_left[0, 3] = -rectifier.rectified.baseline
+    K, T_right_left = rectifier.rectified.matrix, rigid_motion(np.eye(3), [-rectifier.rectified.baseline, 0.0, 0.0])
     return TwoViews(K, K, T_right_left), rectifier.R_rectified_left, rectifier.R_rectified_right
 
 
@@ -121,8 +120,7 @@ def orient_files(source: Path, target: Path, out: Path, with_scale: bool, sigma:
     found = absolute_orientation(points, control, weight, with_scale, 1.0 if given else sigma)
     if not np.isfinite(found.covariance[:6, :6]).all():
         raise InputError(f"{source}: {len(names)} points lie on a line or are too few to tell how well they fit")
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = found.scale * found.R, found.translation
+    T = rigid_motion(found.scale * found.R, found.translation)
     residuals = np.linalg.norm(found.apply(points) - control, axis=1)
     content = {
         "T_target_source": T.tolist(),

@@ -9,7 +9,7 @@ from sigmaslam.estimation.chi_square import CHI_SQUARE_999, CHI_SQUARE_MEDIAN
 from sigmaslam.estimation.clustered_errors import clustering
 from sigmaslam.frontend.patch_kernels import compiled
 from sigmaslam.geometry.camera import RectifiedStereo
-from sigmaslam.geometry.se3 import se3_exp, se3_inverse, skew
+from sigmaslam.geometry.se3 import rigid_motion, se3_exp, se3_inverse, skew
 from sigmaslam.two_view.epipolar import estimate_epipolar_pose
 
 # P3P runs once with each inlier threshold, pixels. The second separates slow movers from the static scene.
@@ -119,10 +119,7 @@ def _from_essential(
     slope = np.cross(rays, direction)
     strength = np.einsum("ij,ij->i", slope, slope)
     scales = -np.einsum("ij,ij->i", slope, constant) / np.maximum(strength, 1e-12)
-    T = np.eye(4)
-    T[:3, :3] = R
-    T[:3, 3] = max(float(np.median(scales)), 0.0) * direction
-    return T
+    return rigid_motion(R, max(float(np.median(scales)), 0.0) * direction)
 
 
 def _from_points(
@@ -263,7 +260,4 @@ def _pose_with_inliers(
 
 
 def _pose(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, :3] = cv2.Rodrigues(rotation)[0]
-    T[:3, 3] = translation.ravel()
-    return T
+    return rigid_motion(cv2.Rodrigues(rotation)[0], translation.ravel())

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from sigmaslam.geometry.camera import RectifiedStereo
-from sigmaslam.geometry.se3 import skew
+from sigmaslam.geometry.se3 import rigid_motion, skew
 from sigmaslam.geometry.uncertainty import propagate
 
 # Gauss-Newton from the linear solution; it converges quadratically where a point has any parallax.
@@ -53,8 +53,7 @@ def triangulate_parallel(views: TwoViews, pixels: np.ndarray) -> np.ndarray:
         ValueError: the views are not parallel, or a disparity is not positive.
     """
     K, baseline = views.K0, -float(views.T_1_0[0, 3])
-    ideal = np.eye(4)
-    ideal[0, 3] = -baseline
+    ideal = rigid_motion(np.eye(3), [-baseline, 0.0, 0.0])
     off = np.abs(views.T_1_0 - ideal).max() / abs(baseline) + np.abs(views.K1 - K).max() / K[0, 0]
     if off > _PARALLEL or baseline <= 0.0:
         raise ValueError("the views are not a rectified pair: rectify them first, or use another method")

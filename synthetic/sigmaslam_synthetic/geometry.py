@@ -1,16 +1,6 @@
-"""Curves and rigid motions."""
-
-from collections.abc import Sequence
+"""Curves."""
 
 import numpy as np
-
-
-def rigid_motion(rotation: np.ndarray, translation: np.ndarray | Sequence[float]) -> np.ndarray:
-    """Matrices (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3)."""
-    translation = np.asarray(translation)
-    T = np.zeros((*np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1]), 4, 4))
-    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = rotation, translation, 1.0
-    return T
 
 
 def arc_length(curve: np.ndarray) -> np.ndarray:

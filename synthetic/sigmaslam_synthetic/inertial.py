@@ -6,8 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sigmaslam.geometry.inertial_sensor import STANDARD_GRAVITY, InertialSamples, InertialSensor
-from sigmaslam.geometry.se3 import rotation_exp
-from sigmaslam_synthetic.geometry import rigid_motion
+from sigmaslam.geometry.se3 import rigid_motion, rotation_exp
 from sigmaslam_synthetic.motion.paths import Path
 
 GRAVITY = np.array([0.0, 0.0, -STANDARD_GRAVITY])

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sigmaslam.errors import InputError
-from sigmaslam_synthetic.geometry import rigid_motion
+from sigmaslam.geometry.se3 import rigid_motion
 from sigmaslam_synthetic.motion.paths import Path
 from sigmaslam_synthetic.rendering.shapes import SHAPES, Shape
 

@@ -8,8 +8,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from sigmaslam.geometry.camera import CameraModel
+from sigmaslam.geometry.se3 import rigid_motion
 from sigmaslam_synthetic.camera.sensor import Sensor, expose, random_sensor
-from sigmaslam_synthetic.geometry import rigid_motion
 from sigmaslam_synthetic.rendering.renderer import RenderedViews, Renderer
 from sigmaslam_synthetic.rendering.visibility import Eye
 from sigmaslam_synthetic.truth import at_pixels, transfer
@@ -214,9 +214,7 @@ def _median_depth(views: RenderedViews) -> float:
 
 def _to_right_eye(rng: np.random.Generator, depth: float) -> np.ndarray:
     """Pose of the right eye in the left one, (4, 4)."""
-    T = np.eye(4)
-    T[0, 3] = depth * np.exp(rng.uniform(*np.log(_BASELINES)))
-    return T
+    return rigid_motion(np.eye(3), [depth * np.exp(rng.uniform(*np.log(_BASELINES))), 0.0, 0.0])
 
 
 def _advance(rng: np.random.Generator, depth: float) -> np.ndarray:

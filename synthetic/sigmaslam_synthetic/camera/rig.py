@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
-from sigmaslam_synthetic.geometry import rigid_motion
+from sigmaslam.geometry.se3 import rigid_motion
 
 # Standard deviations of a loose pair: of the angles between its axes, and of the relative differences in focal length,
 # centre and distortion.
@@ -90,9 +90,7 @@ class Rig:
 
 def parallel_rig(camera: CameraModel, baseline: float, errors: Miscalibration = Miscalibration()) -> Rig:
     """Two equal cameras with parallel axes, the right one `baseline` metres along x of the left one."""
-    T = np.eye(4)
-    T[0, 3] = baseline
-    return Rig(camera, camera, _rows(T), errors)
+    return Rig(camera, camera, _rows(rigid_motion(np.eye(3), [baseline, 0.0, 0.0])), errors)
 
 
 def loose_rig(

@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from sigmaslam.errors import InputError
-from sigmaslam.geometry.se3 import rotation_log
+from sigmaslam.geometry.se3 import rigid_motion, rotation_log
 from sigmaslam_synthetic.geometry import carried_normals
 
 
@@ -110,15 +110,13 @@ class Path:
         """T_world_body at times t (...,), seconds -> (..., 4, 4) float64."""
         t = np.asarray(t, dtype=np.float64)
         clock = np.clip(self._knot_clock(t.ravel()), self.times[0], self.times[-1])
-        T = np.tile(np.eye(4), (clock.size, 1, 1))
         if self._splines is None:
-            T[:, :3, :3] = Rotation.from_rotvec(self.rotations[0].copy()).as_matrix()
-            T[:, :3, 3] = self.positions[0]
+            R = Rotation.from_rotvec(self.rotations[0].copy()).as_matrix()
+            place = np.tile(self.positions, (clock.size, 1))
         else:
             position, rotation = self._splines
-            T[:, :3, :3] = rotation(clock).as_matrix()
-            T[:, :3, 3] = position(clock)
-        return T.reshape(*t.shape, 4, 4)
+            R, place = rotation(clock).as_matrix(), position(clock)
+        return rigid_motion(R, place).reshape(*t.shape, 4, 4)
 
     def motion(self, t: np.ndarray) -> BodyMotion:
         """Exact derivatives of `poses` at times t (N,), seconds; zero outside of the path's time."""

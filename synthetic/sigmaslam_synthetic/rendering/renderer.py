@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from sigmaslam.geometry.camera import CameraModel
-from sigmaslam_synthetic.geometry import rigid_motion
+from sigmaslam.geometry.se3 import rigid_motion
 from sigmaslam_synthetic.rendering.facets import join
 from sigmaslam_synthetic.rendering.shading import Samples, Shader, meet
 from sigmaslam_synthetic.rendering.visibility import Eye, Sight, Surfaces, move

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sigmaslam_synthetic.geometry import rigid_motion
+from sigmaslam.geometry.se3 import rigid_motion
 from sigmaslam_synthetic.motion import random_motions
 from sigmaslam_synthetic.motion.paths import Path, at_rest, with_stops
 from sigmaslam_synthetic.motion.shaken import shaken, slowed

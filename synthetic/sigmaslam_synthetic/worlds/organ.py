@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sigmaslam.geometry.se3 import rigid_motion
 from sigmaslam_synthetic.motion.paths import Path
 from sigmaslam_synthetic.motion.random_motions import inspect
 from sigmaslam_synthetic.rendering.shapes import Sheet
@@ -45,8 +46,7 @@ def generate(rng: np.random.Generator, wish: Wish) -> Episode:
         for _ in range(int(rng.integers(4, 10))):
             radii = rng.uniform(0.006, 0.014) * np.append(rng.uniform(0.8, 1.6, 2), 1.0)
             lay(radii, middle + rng.normal(0, 0.014, 2), 3, 8)
-    tilt = np.eye(4)
-    tilt[:3, :3] = Rotation.from_euler("x", rng.uniform(0.0, 0.3)).as_matrix()
+    tilt = rigid_motion(Rotation.from_euler("x", rng.uniform(0.0, 0.3)).as_matrix(), np.zeros(3))
 
     def look(seconds: float) -> Path:
         return tissue.mounted(inspect(rng, seconds, height, 0.5 * height), tilt)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sigmaslam_synthetic.geometry import rigid_motion
+from sigmaslam.geometry.se3 import rigid_motion
 from sigmaslam_synthetic.motion.paths import Path, noise
 from sigmaslam_synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel
 from sigmaslam_synthetic.scene import Body

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sigmaslam_synthetic.geometry import rigid_motion
+from sigmaslam.geometry.se3 import rigid_motion
 from sigmaslam_synthetic.motion.paths import Path
 from sigmaslam_synthetic.motion.random_motions import FreeSpace, pure_rotation
 from sigmaslam_synthetic.motion.shaken import shaken

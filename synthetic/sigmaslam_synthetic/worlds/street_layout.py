@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sigmaslam_synthetic.geometry import rigid_motion
+from sigmaslam.geometry.se3 import rigid_motion
 from sigmaslam_synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel
 from sigmaslam_synthetic.scene import Body
 from sigmaslam_synthetic.worlds.palette import Palette

@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sigmaslam.geometry.se3 import rigid_motion
 from sigmaslam_synthetic.motion.paths import Path, noise
 from sigmaslam_synthetic.scene import Body
 from sigmaslam_synthetic.worlds.episode import Wish
@@ -79,11 +80,9 @@ def _drive(road: Road, s: np.ndarray, left: np.ndarray, turn: float) -> np.ndarr
     (rear, _), (front, _) = (road.at(s + d, left) for d in (-1.5, 1.5))
     yaw = np.unwrap(np.arctan2(*(front - rear).T[::-1]))
     slope = np.arctan2(road.smooth_ground(front) - road.smooth_ground(rear), 3.0)
-    T = np.tile(np.eye(4), (len(s), 1, 1))
     pitch = -slope if turn == 0.0 else slope
-    T[:, :3, :3] = Rotation.from_euler("ZY", np.stack([yaw + turn, pitch], axis=-1)).as_matrix()
-    T[:, :2, 3], T[:, 2, 3] = place, road.smooth_ground(place)
-    return T
+    R = Rotation.from_euler("ZY", np.stack([yaw + turn, pitch], axis=-1)).as_matrix()
+    return rigid_motion(R, np.column_stack([place, road.smooth_ground(place)]))
 
 
 def _rounding(rng: np.random.Generator, wish: Wish, path: Path, road: Road, palette: Palette) -> list[Body]:
@@ -102,11 +101,9 @@ def _rounding(rng: np.random.Generator, wish: Wish, path: Path, road: Road, pale
         for k, model in enumerate(models):
             angle = view + aside[k]
             away = np.maximum(radius * sway[k], 1.0 if make is person else 2.2)[:, None]
-            T = np.tile(np.eye(4), (len(times), 1, 1))
-            T[:, :2, 3] = camera[:, :2, 3] + away * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-            T[:, 2, 3] = road.smooth_ground(T[:, :2, 3])
-            T[:, :3, :3] = Rotation.from_euler("z", angle[:, None] + np.pi / 2).as_matrix()
-            result.append((model, T))
+            place = camera[:, :2, 3] + away * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+            R = Rotation.from_euler("z", angle[:, None] + np.pi / 2).as_matrix()
+            result.append((model, rigid_motion(R, np.column_stack([place, road.smooth_ground(place)]))))
         return result
 
     def error(radius: float) -> float:

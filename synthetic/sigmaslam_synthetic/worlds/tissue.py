@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sigmaslam.geometry.se3 import rotation_exp
-from sigmaslam_synthetic.geometry import rigid_motion
+from sigmaslam.geometry.se3 import rigid_motion, rotation_exp
 from sigmaslam_synthetic.motion.paths import Path, at_rest, noise, with_stops
 from sigmaslam_synthetic.motion.random_motions import tool as tool_motion
 from sigmaslam_synthetic.rendering.shapes import Box, Cylinder, Ellipsoid

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sigmaslam.geometry.se3 import rigid_motion
 from sigmaslam_synthetic.motion.paths import Path, at_rest, view_rotations
 from sigmaslam_synthetic.rendering.shapes import Box, Cylinder, Panel, Sheet
 from sigmaslam_synthetic.scene import Body, Lights, Material, Scene
@@ -20,10 +21,9 @@ def generate(rng: np.random.Generator, wish: Wish) -> Episode:
     surgical = rng.random() < 0.6
     distance = float(rng.uniform(0.1, 0.135))
     ground = float(rng.uniform(1.45, 1.7)) * distance
-    T = np.eye(4)
-    T[:3, :3] = view_rotations(rng.uniform(-np.pi, np.pi, 1), -rng.uniform(1.05, 1.45, 1), rng.uniform(-0.5, 0.5, 1))[0]
+    R = view_rotations(rng.uniform(-np.pi, np.pi, 1), -rng.uniform(1.05, 1.45, 1), rng.uniform(-0.5, 0.5, 1))[0]
     # The view's axis meets the ground, z = 0, at the origin.
-    T[:3, 3] = -ground * T[:3, 2]
+    T = rigid_motion(R, -ground * R[:, 2])
     bodies, materials, lights = (_tissue if surgical else _bench)(rng, wish, ground)
     around = rng.uniform(0, 2 * np.pi)
     port = 0.9 * distance * np.array([np.cos(around), np.sin(around), 0.6])
