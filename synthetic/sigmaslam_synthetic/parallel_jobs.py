@@ -5,7 +5,8 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
+from threading import Thread
 from typing import Any, TypeVar
 
 import cv2
@@ -61,7 +62,7 @@ def _run_in_pool(
 ) -> None:
     for retries in range(RETRIES, -1, -1):
         unfinished = []
-        with ProcessPoolExecutor(min(workers, len(jobs)), get_context("spawn")) as pool:
+        with ProcessPoolExecutor(min(workers, len(jobs)), get_context("spawn"), _end_with_parent) as pool:
             try:
                 futures = {pool.submit(_do, work, job): job for job in jobs}
                 for future in as_completed(futures):
@@ -118,6 +119,18 @@ def _outcome(result: Callable[[], Result]) -> Result | Exception:
         return result()
     except Exception as error:
         return getattr(error, "cause", None) or error
+
+
+def _end_with_parent() -> None:
+    """Ends this worker when its parent is killed: nobody would take what it makes."""
+
+    def wait() -> None:
+        parent = parent_process()
+        assert parent is not None
+        parent.join()
+        os._exit(1)
+
+    Thread(target=wait, daemon=True).start()
 
 
 def _do(work: Callable[[Job], Result], job: Job) -> Result:

@@ -43,3 +43,10 @@ def sleep_beside_another(folder: Path) -> tuple[float, float]:
     begin = time.monotonic()
     time.sleep(0.5)
     return begin, time.monotonic()
+
+
+def sleep_under_own_number(path: Path) -> None:
+    """Writes the number of its process, and sleeps for a minute."""
+    path.with_suffix(".part").write_text(str(os.getpid()))
+    path.with_suffix(".part").rename(path)
+    time.sleep(60.0)

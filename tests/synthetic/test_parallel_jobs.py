@@ -1,6 +1,9 @@
 """Jobs in processes and on Ray: each ends once, whatever becomes of a worker."""
 
+import os
+import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -101,6 +104,41 @@ def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(InputError, match=r"ray is not installed: pip install 'sigmaslam\[scale\]'"):
         outcomes(square, [0], "local")
+
+
+@pytest.mark.long
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+def test_a_worker_ends_with_its_parent(tmp_path: Path):
+    """Killed at once, the parent tells it nothing."""
+    script = (
+        "import sys; from pathlib import Path; from sigmaslam_synthetic.parallel_jobs import run_jobs;"
+        "from tests.support.parallel_work import sleep_under_own_number as work;"
+        "run_jobs(work, [Path(sys.argv[1])], 1, lambda job, outcome: None)"
+    )
+    number = tmp_path / "number"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    parent = subprocess.Popen([sys.executable, "-c", script, str(number)], env=environment)
+    wait_until(number.exists, 60.0)
+    parent.kill()
+    parent.wait()
+    wait_until(lambda: not is_running(int(number.read_text())), 20.0)
+
+
+def wait_until(done: Callable[[], bool], seconds: float) -> None:
+    until = time.monotonic() + seconds
+    while not done():
+        assert time.monotonic() < until
+        time.sleep(0.05)
+
+
+def is_running(number: int) -> bool:
+    """A process that nobody has waited for yet has ended, too."""
+    try:
+        os.kill(number, 0)
+        status = Path(f"/proc/{number}/stat")
+        return not status.exists() or status.read_text().rpartition(")")[2].split()[0] != "Z"
+    except (ProcessLookupError, FileNotFoundError):
+        return False
 
 
 def files_of(folder: Path) -> dict[str, bytes]:
