@@ -1,7 +1,5 @@
 """Files read in bounded memory: regular files alone, of limited size, and numpy archives whose headers are checked."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -1,7 +1,5 @@
 """Which state of the sources runs, for what it makes: weights and pages."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 from functools import cache

@@ -1,7 +1,5 @@
 """Dataclasses whose fields are columns of equal length."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, ClassVar, Self
 

@@ -1,7 +1,5 @@
 """Measurement noise that follows what the innovations say."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

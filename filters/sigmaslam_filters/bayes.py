@@ -1,7 +1,5 @@
 """Kalman, extended and unscented filters: one Bayes filter (9.21) that differs in how a Gaussian meets a function."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal

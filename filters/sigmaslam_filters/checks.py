@@ -1,7 +1,5 @@
 """Arguments that do not fit are refused here, by messages that name the model, the argument and the mend."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

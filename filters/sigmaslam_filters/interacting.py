@@ -1,7 +1,5 @@
 """Several motions of which one holds at a time, and which one may change: the interacting multiple model."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Noise of linear models by expectation maximisation; for any other model maximise the track's likelihood."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch

@@ -1,7 +1,5 @@
 """The Bayes filter (9.21) in its general form, by samples: the bootstrap particle filter (Gordon et al. 1993)."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

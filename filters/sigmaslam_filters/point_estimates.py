@@ -6,8 +6,6 @@ itself: Z = [z; x^-], g(x) = [h(x); x], C = diag(R, P). `sigmaslam_filters.gauss
 (9.15) and (9.17) are printed with the wrong sign: the correction is + K (z - h(x)).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal

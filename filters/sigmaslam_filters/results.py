@@ -1,7 +1,5 @@
 """What `predict` and `update` return."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 

@@ -8,8 +8,6 @@ A time step is an input of each step, (..., 1) in seconds: sensors need not be r
 alike.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Protocol
 

@@ -5,8 +5,6 @@ one by one are paired so that as many as possible are, and the most likely ones;
 as well is left out, and so is the worst while all together are not compatible (Neira and Tardos 2001).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

@@ -4,8 +4,6 @@ A step is traced once for each number of sightings that is usual. What was trace
 by all that it is made of, so that later runs neither trace nor compile.
 """
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import os

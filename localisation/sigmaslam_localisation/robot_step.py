@@ -1,7 +1,5 @@
 """One step of a robot: predict, look at the sightings, learn their noise, update; for a batch, or compiled for one."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Protocol
 

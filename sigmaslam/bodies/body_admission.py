@@ -5,8 +5,6 @@ background; from then on a new landmark must be where the body's own points say,
 where a background that stands still has been seen.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from sigmaslam.bodies.object_region import BodyShape, inner_half

@@ -1,7 +1,5 @@
 """Where a followed body is in the image: what the user says of the first frame, and the body's own points later."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

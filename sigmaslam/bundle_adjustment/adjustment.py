@@ -1,7 +1,5 @@
 """Bundle adjustment of a run's tracks (extra `graph`)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

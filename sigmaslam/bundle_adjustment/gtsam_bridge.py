@@ -1,7 +1,5 @@
 """Access to GTSAM, an optional extra that is imported on use, and its order of tangents, rotation first."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Refining a run folder into another one."""
 
-from __future__ import annotations
-
 import json
 import logging
 import time

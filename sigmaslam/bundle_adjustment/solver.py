@@ -4,8 +4,6 @@ GTSAM solves for keyframes and landmarks at a fixed offset, which its stereo fac
 the profile of the cost, in which everything else is optimal: there the gradient by the offset is zero.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Observations and landmarks at fixed poses: residuals, the best points, and the selection of inliers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

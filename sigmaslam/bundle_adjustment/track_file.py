@@ -1,7 +1,5 @@
 """Observations of a run: the file tracks.npz."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

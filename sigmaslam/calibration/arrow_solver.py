@@ -4,8 +4,6 @@ The normal equations are block tridiagonal with a border (an arrow), so that the
 the number of states (T. Barfoot: State Estimation for Robotics, sections 3.2 and 9.2).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

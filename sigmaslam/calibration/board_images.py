@@ -1,7 +1,5 @@
 """Images of a board: which belong together, and the corners in them."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

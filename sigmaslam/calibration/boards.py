@@ -1,7 +1,5 @@
 """Calibration boards: chessboard, ChArUco, AprilGrid; their points, and how images of them are read."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

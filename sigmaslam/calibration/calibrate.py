@@ -1,7 +1,5 @@
 """From corners of a board to a calibration: start, bundle adjustment, outliers, covariance."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Which eye an image is of, by the names of its file and folders."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Sigmas of a calibration beside those of a bootstrap over its images."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

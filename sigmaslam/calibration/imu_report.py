@@ -1,7 +1,5 @@
 """A calibration of an inertial sensor in words, and as Kalibr's camchain-imucam.yaml."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

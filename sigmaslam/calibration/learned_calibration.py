@@ -1,7 +1,5 @@
 """What a run learned of its calibration, as a calibration for the next one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

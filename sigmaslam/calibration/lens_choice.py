@@ -1,7 +1,5 @@
 """A lens model that describes the whole image."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

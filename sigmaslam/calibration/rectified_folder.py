@@ -1,7 +1,5 @@
 """A sequence as a folder of rectified pairs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """From the covariance of a calibration's parameters to that of the errors that the tracker considers."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sigmaslam.calibration.board_bundle import INTRINSICS, Rig

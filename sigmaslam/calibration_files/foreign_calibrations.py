@@ -1,7 +1,5 @@
 """Writes a stereo calibration in the forms of other programs; what a form cannot say is refused."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any

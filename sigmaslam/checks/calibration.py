@@ -1,7 +1,5 @@
 """What a calibration shows without images: lengths, principal points and focal lengths that no rig has."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sigmaslam.checks.finding import Finding

@@ -1,7 +1,5 @@
 """All checks of a stereo sequence from a few of its frames."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

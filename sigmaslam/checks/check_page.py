@@ -1,7 +1,5 @@
 """The page of a check: one HTML file with its findings and the pairs that it looked at."""
 
-from __future__ import annotations
-
 import base64
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What a check of the input found, and the reason that findings give for a failed run."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal

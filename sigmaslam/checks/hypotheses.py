@@ -1,7 +1,5 @@
 """The same matches as other mistakes of the user would have them: eyes exchanged, no rectification, a vertical rig."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

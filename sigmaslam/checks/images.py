@@ -1,7 +1,5 @@
 """What single images show, without matching: light, contrast, sharpness, and one image given for both eyes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

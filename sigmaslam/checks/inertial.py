@@ -1,7 +1,5 @@
 """What is wrong with the tables of sensors of motion: their times, and the unit of force."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

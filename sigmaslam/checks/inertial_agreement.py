@@ -1,7 +1,5 @@
 """Whether an inertial sensor moves as the cameras do: unit and axes of both halves, T_cam_imu, and the clock."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sigmaslam.checks.finding import Finding

@@ -1,7 +1,5 @@
 """What matches between the eyes say about the rig: order of the eyes, rows, rotation, scale and synchronisation."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Row differences between the eyes in terms of what causes them: a shift, a turned or enlarged eye, a delay."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Whether time stamps are in seconds, and as regular as a camera."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`sigmaslam calibrate show` and `sigmaslam calibrate convert`."""
 
-from __future__ import annotations
-
 import re
 from enum import StrEnum
 from pathlib import Path

@@ -1,7 +1,5 @@
 """All commands under one name, read when one is asked for, and the entry point of the console script."""
 
-from __future__ import annotations
-
 import logging
 import sys
 from collections import UserDict

@@ -1,7 +1,5 @@
 """`sigmaslam images denoise`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Optional parts of the package: what a command says when one is not installed, and the option of Ray."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

@@ -1,7 +1,5 @@
 """`sigmaslam localize`."""
 
-from __future__ import annotations
-
 import csv
 import io
 import time

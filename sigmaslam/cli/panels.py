@@ -1,7 +1,5 @@
 """Help of a command in panels, at most a screen: what experts alone need is told by `--help-all`."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any
 
 import typer

@@ -1,7 +1,5 @@
 """`sigmaslam train render`."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from enum import StrEnum

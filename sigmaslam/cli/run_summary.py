@@ -1,7 +1,5 @@
 """What commands print of a run, and how they end after one that has failed."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """`sigmaslam train` and `sigmaslam train scorer`."""
 
-from __future__ import annotations
-
 import json
 from enum import StrEnum
 from pathlib import Path

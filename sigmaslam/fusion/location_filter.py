@@ -11,8 +11,6 @@ uses all readings and is repeated with each new one until the rotation is accura
 each reading is one unscented update of 24 error states: drift, the sensor's world, its mount, the frame error.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Files of a location sensor: GPS, motion capture, an electromagnetic tracker."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math

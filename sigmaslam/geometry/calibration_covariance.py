@@ -1,7 +1,5 @@
 """The covariance of the errors of a stereo calibration, where a calibration has measured it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
 

@@ -1,7 +1,5 @@
 """How well a stereo calibration is known."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, fields
 from typing import Self
 

@@ -1,7 +1,5 @@
 """Regions of an image, and cells: what is crowded in one place counts no more than what covers as much of the image."""
 
-from __future__ import annotations
-
 import numpy as np
 
 # Along the image's longer and its shorter side.

@@ -1,7 +1,5 @@
 """An inertial sensor beside the cameras: where it sits, how noisy it is, and what it measured."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

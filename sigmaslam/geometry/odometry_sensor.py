@@ -1,7 +1,5 @@
 """Wheels, or whatever measures the velocity of a vehicle beside the cameras."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

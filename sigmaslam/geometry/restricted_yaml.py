@@ -1,7 +1,5 @@
 """YAML as calibrations and settings need it: no key twice, and limits on depth, aliases and digits."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a function makes of uncertainty: means and covariances to first and second order (9.35), (9.36)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """The image before a lens that is out of focus blurred it: maximum a posteriori with the patches' prior."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sigmaslam.image_filtering.patch_filter import filter_patches

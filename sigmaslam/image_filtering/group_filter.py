@@ -3,8 +3,6 @@
 Empirical Bayes after Lebrun, Buades and Morel, "A nonlocal Bayesian image denoising algorithm", 2013, second step.
 """
 
-from __future__ import annotations
-
 from itertools import product
 
 import cv2

@@ -1,7 +1,5 @@
 """What a sensor adds to an image: Gaussian and shot noise, quantisation, pixels that are stuck; and how to tell."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

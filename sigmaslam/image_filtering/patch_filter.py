@@ -1,7 +1,5 @@
 """Every overlapping patch of an image estimated in the basis of the cosine transform, and the estimates averaged."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import cv2

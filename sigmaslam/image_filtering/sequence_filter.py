@@ -1,7 +1,5 @@
 """A Kalman filter for every pixel of a sequence, whose state moves along with what the pixel shows."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

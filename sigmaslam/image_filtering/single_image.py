@@ -1,7 +1,5 @@
 """One image, freed of noise: the prior comes from the image itself, patch by patch."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

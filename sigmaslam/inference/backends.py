@@ -4,8 +4,6 @@ A package registers a back end as an entry point of the group `sigmaslam.backend
 torch.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Protocol
 

@@ -1,7 +1,5 @@
 """The networks: those that ship, or those of a folder that `sigmaslam train export` wrote."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from pathlib import Path

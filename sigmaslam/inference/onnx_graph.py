@@ -1,7 +1,5 @@
 """Graphs that are called with named arrays, and those that ship."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import as_file, files

@@ -1,7 +1,5 @@
 """ONNX Runtime sessions: their options, and where they compute."""
 
-from __future__ import annotations
-
 import onnxruntime
 
 from sigmaslam.errors import InputError

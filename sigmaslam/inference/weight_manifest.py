@@ -1,7 +1,5 @@
 """manifest.json beside weights and graphs: their SHA-256, as they were exported."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterable

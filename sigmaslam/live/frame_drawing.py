@@ -1,7 +1,5 @@
 """A frame of a run as a picture: the left image with its tracks, the path from above beside it, and sigma in words."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterable, Sequence
 

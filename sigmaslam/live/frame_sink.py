@@ -1,7 +1,5 @@
 """Where the frames of a run go while it goes on, beside its folder: streams, videos, viewers."""
 
-from __future__ import annotations
-
 import logging
 import queue
 import threading

@@ -1,7 +1,5 @@
 """Points that keyframes see, for views of a run that goes on; the map itself is known in the end."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sigmaslam.geometry.camera import StereoCamera

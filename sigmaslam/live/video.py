@@ -1,7 +1,5 @@
 """A run as a video: every frame with its tracks, and the path from above beside it."""
 
-from __future__ import annotations
-
 from contextlib import ExitStack
 from pathlib import Path
 

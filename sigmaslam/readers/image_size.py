@@ -1,7 +1,5 @@
 """Size of an image from the header of its file, before anything is decoded."""
 
-from __future__ import annotations
-
 import re
 import struct
 

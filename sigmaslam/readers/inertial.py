@@ -1,7 +1,5 @@
 """Inertial sensors of recordings: EuRoC's and TUM-VI's imu0, Kalibr's files, and CSV with a YAML beside."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Masks of what may be used of left images: not zero where it may, as OpenCV and COLMAP have it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Odometry beside the images: CSV of velocities with a YAML of the vehicle's frame."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 

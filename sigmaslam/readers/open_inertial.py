@@ -1,7 +1,5 @@
 """The inertial sensor of a recording: a table beside it, OXTS packets, or a topic of the bag."""
 
-from __future__ import annotations
-
 import logging
 from contextlib import closing
 from pathlib import Path

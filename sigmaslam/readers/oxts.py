@@ -1,7 +1,5 @@
 """Packets of an OXTS RT3003 as KITTI raw has them, in a folder oxts or in one table, as an inertial sensor."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A part of a recording: pairs from one on, every so many of them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import islice

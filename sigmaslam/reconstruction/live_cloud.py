@@ -1,7 +1,5 @@
 """A dense cloud that is made while a run goes on, of keyframes as soon as two views behind them are there."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A mesh from depth maps: Open3D's truncated signed distance function and marching cubes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Images with poses for other people's tools: nerfstudio's transforms.json and COLMAP's text model."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A run folder becomes a dense cloud, and a mesh: disparities of each keyframe, fused with its neighbours', merged."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Generator, Iterator, Mapping

@@ -3,8 +3,6 @@
 Where keyframes are far apart in time, as in slow motion, frames between them help to see what they saw.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Iterator
 from contextlib import closing

@@ -1,7 +1,5 @@
 """Files that grow while a run goes on, and that a killed run leaves behind, whole up to its last piece."""
 
-from __future__ import annotations
-
 import io
 import logging
 import math

@@ -1,7 +1,5 @@
 """dense.npz and reconstruction.json of a run: points of `sigmaslam map reconstruct` that its report shows."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """evaluation.json and evaluation.npz of a run: its errors, in all and frame by frame."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """pictures.npz of a run: small pictures of some frames and of the worst ones, with what was matched in them."""
 
-from __future__ import annotations
-
 import heapq
 from collections import deque
 from dataclasses import dataclass, fields

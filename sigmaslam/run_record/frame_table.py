@@ -1,7 +1,5 @@
 """The table of frames that a run folder holds: frames.csv."""
 
-from __future__ import annotations
-
 import csv
 import io
 import re

@@ -1,7 +1,5 @@
 """inertial.csv of a run: roll and pitch, the upward direction and biases of each frame, from when gravity is known."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

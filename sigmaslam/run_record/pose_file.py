@@ -1,7 +1,5 @@
 """poses.partial of a run: what was said of each frame with a pose, on disk as it came; gone when the run is written."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """poses.csv of a run: time, status, pose and covariance of each frame with a pose, in one table."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Recordings played as if they came from cameras, and how long poses take from there."""
 
-from __future__ import annotations
-
 import time
 from array import array
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """What a run folder holds, read back."""
 
-from __future__ import annotations
-
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """relative_poses.npz of a run: poses of frames relative to earlier ones, with the covariance between the two."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

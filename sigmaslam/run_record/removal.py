@@ -1,7 +1,5 @@
 """Removing a run to make room for another one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from sigmaslam.errors import InputError

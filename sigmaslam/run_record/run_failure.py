@@ -1,7 +1,5 @@
 """Why a run has failed, in words."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The folder of a run: what is known of each frame is written there as it comes."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import io

@@ -1,7 +1,5 @@
 """What a run says about the calibration and about what moves, in words."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Calibration of an inertial sensor by the path of a run of `sigmaslam track`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

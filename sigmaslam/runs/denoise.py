@@ -1,7 +1,5 @@
 """Filtering images from disk: one by one, as a sequence, or both eyes of a stereo sequence."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import closing

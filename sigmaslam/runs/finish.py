@@ -1,7 +1,5 @@
 """Results of a run that was killed, or whose disk was full, from what it left in its folder."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The results of a run, made from what it left on disk as it went; each is tried on its own."""
 
-from __future__ import annotations
-
 import json
 import logging
 from collections.abc import Callable, Mapping

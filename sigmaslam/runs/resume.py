@@ -4,8 +4,6 @@ The new tracker begins at the last keyframe, with the pose and covariance that w
 after it again. Those of which something is on disk are not said again.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass

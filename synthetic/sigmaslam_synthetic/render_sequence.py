@@ -4,8 +4,6 @@ A folder holds the images in KITTI's or EuRoC's layout with calibration, times a
 everything can be made again; `truth/NNNNNN.npz` for each frame; `landmarks.npz`; and, if asked for, an inertial sensor.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """torch.compile with the settings that suit a filter's step."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import wraps
 from types import FunctionType

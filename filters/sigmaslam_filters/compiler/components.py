@@ -9,8 +9,6 @@ take no part.
 Nothing is asked of what was traced: the arithmetic is the same, operation by operation, whoever wrote it.
 """
 
-from __future__ import annotations
-
 import math
 import operator
 from collections.abc import Callable, Sequence

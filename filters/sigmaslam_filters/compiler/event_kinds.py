@@ -1,7 +1,5 @@
 """Events that one compiled step serves: models of one structure, whose tensors are constants or inputs of the step."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """A filter's predict and update as one C++17 header, which needs neither torch nor a heap."""
 
-from __future__ import annotations
-
 import ctypes
 import keyword
 import re

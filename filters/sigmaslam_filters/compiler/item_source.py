@@ -4,8 +4,6 @@ What does not depend on the item itself but only on what many items have in comm
 called once for all of them. The item's function is a template: a number may be a vector, one item a lane.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 
 import torch

@@ -4,8 +4,6 @@ The function is traced, and the trace is run on places in a program instead of n
 by torch itself, on places. Zeros and ones that are known take no part, and what is computed twice is computed once.
 """
 
-from __future__ import annotations
-
 import operator
 from collections.abc import Callable, Sequence
 from typing import Any

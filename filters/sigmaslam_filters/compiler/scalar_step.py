@@ -5,8 +5,6 @@ nearly all of it. Here the step of one element is traced (`number_program`) and 
 `scalar_sequence` runs such steps over time, `header_export` hands one out.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 

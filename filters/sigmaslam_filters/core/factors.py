@@ -3,8 +3,6 @@
 No function here raises for one bad element of a batch or adds anything to a diagonal (R8).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """What happens when an element of a batch cannot be filtered: one policy, one flag, one message (R8, R14)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Literal
 

@@ -5,8 +5,6 @@ microseconds for `state + constant` or `2.0 * state`, as much as a hundred other
 that are numbers instead, and Python's numbers go to the operators that take a scalar.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 

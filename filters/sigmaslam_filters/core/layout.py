@@ -4,8 +4,6 @@ Arithmetic on components of vectors in the usual memory order steps over n - 1 n
 it does not, which makes large batches several times faster.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -4,8 +4,6 @@ ONNX has no linear algebra beyond products. For matrices of up to about 64 rows 
 length is the number of rows, does as well, for any batch.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

@@ -6,8 +6,6 @@ the rest the *even* part (the error of that linearisation). Their outer products
 and odd alone is the cross-covariance with the state. Weights are computed in float64 and cast (R3).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import ClassVar, Protocol

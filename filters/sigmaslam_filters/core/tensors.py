@@ -1,7 +1,5 @@
 """What counts as an array here: tensors in float32 or float64; how they are given and shown."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any

@@ -5,8 +5,6 @@ A function is given as `evaluate`, from tangent offsets (k, ..., n) about the me
 the reference, and columns of deviations. KF, EKF and UKF differ in nothing else.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol

@@ -6,8 +6,6 @@ Shapes are (..., rows, columns) as everywhere, but the memory of what is made he
 is contiguous.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 

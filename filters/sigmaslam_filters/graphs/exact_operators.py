@@ -4,8 +4,6 @@ The exporter takes Python's numbers through float32, ONNX Runtime has no arc tan
 functions have no counterpart at all. All of it is mended while a graph is traced, whoever wrote the function.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """A filter's step as an ONNX graph: predict, update or both, of any filter and model, checked against torch."""
 
-from __future__ import annotations
-
 import logging
 import warnings
 from collections.abc import Callable, Mapping, Sequence

@@ -8,8 +8,6 @@ The closed forms are those of J. Solà et al., "A micro Lie theory for state est
 https://arxiv.org/abs/1812.01537, written in half angles.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -6,8 +6,6 @@ its arc tangent, which ONNX Runtime lacks in float64, the tracker's graphs take 
 from Newton steps on sine and cosine. Tangent order: (translation, rotation).
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -15,8 +15,6 @@ Functions are differentiable everywhere, and go through torch.func, vmap and tor
 ValueError; arguments are never changed.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Protocol

@@ -1,5 +1,0 @@
-"""`python -m sigmaslam.cli`."""
-
-from sigmaslam.cli import main
-
-main()
