@@ -84,6 +84,11 @@ class CalibrationEvidence:
         expected = self._prior.poses[-1] @ step if len(self._prior) else step
         self._prior = self._prior.grow(expected, step_covariance, np.zeros(len(ERRORS)))
 
+    def move_poses(self, step: np.ndarray) -> None:
+        """Lets the poses follow a loop (n,), which says nothing of views; where they stay, it looks like an error."""
+        step = np.r_[np.zeros(len(ERRORS)), step[len(ERRORS) :]]
+        self._prior = self._prior.moved(step, self._prior.covariance, self._prior.common)
+
     def learn(self, about: WindowState, information: np.ndarray, vector: np.ndarray) -> None:
         """Takes what all views of the window say, about the mean of its prior."""
         self._posterior = self._given(about, information, vector)

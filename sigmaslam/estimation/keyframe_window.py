@@ -222,7 +222,9 @@ class KeyframeWindow:
                 return False
             _LOGGER.warning("two loops contradict the poses by %.1f of their standard deviations", np.sqrt(squared / 6))
             self.prior = scale_variances(self.prior, squared / 6)
-        self.prior = self.prior.add_loop_constraint(index, T_past_last, covariance)
+        before = self.prior
+        self.prior = before.add_loop_constraint(index, T_past_last, covariance)
+        self.evidence.move_poses(self.prior.minus(before))
         self.solve()
         return True
 
