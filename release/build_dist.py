@@ -67,8 +67,9 @@ def build_dist(out: Path, pythons: list[str], many_linux: bool = False) -> list[
     environment.pop("PYTHONPATH", None)
     with tempfile.TemporaryDirectory() as name:
         work = Path(name)
-        tools = TOOLS + CROSS_TOOLS * many_linux
-        builders = [_install_tools(python, work / f"tools{number}", tools) for number, python in enumerate(pythons)]
+        # The first compiles for all: zig would make its C++ library anew for each place that it lies in.
+        tools = [TOOLS + CROSS_TOOLS * many_linux, *[TOOLS] * (len(pythons) - 1)]
+        builders = [_install_tools(each, work / f"tools{i}", tools[i]) for i, each in enumerate(pythons)]
         machines = MANY_LINUX if many_linux else ("",)
         _unpack(_git("archive", "--format=tar", "HEAD"), work / "commit")
         raw = _build(builders[0], "sdist", work / "commit", work / "raw", environment)
@@ -81,10 +82,10 @@ def build_dist(out: Path, pythons: list[str], many_linux: bool = False) -> list[
             sources = work / f"sources{number}" / sdist.name.removesuffix(".tar.gz")
             if number == 0:
                 (sources / "setup.py").unlink()  # which holds the kernels alone
-            settings = environment | (_cross_settings(builder, machine, work / "zig") if machine else {})
+            settings = environment | (_cross_settings(builders[0], builder, machine, work / "zig") if machine else {})
             wheel = _build(builder, "wheel", sources, out, settings)
             if machine:
-                wheel = as_many_linux(builder, wheel, machine, settings)
+                wheel = as_many_linux(builders[0], wheel, machine, settings)
             with zipfile.ZipFile(wheel) as content:
                 compiled = [each for each in content.namelist() if each.startswith(COMPILED)]
             if len(compiled) != (len(COMPILED) if number > 0 else 0):
@@ -141,9 +142,12 @@ def as_many_linux(builder: Path, wheel: Path, machine: str, environment: dict[st
     return named
 
 
-def _cross_settings(builder: Path, machine: str, cache: Path) -> dict[str, str]:
-    """The environment in which setuptools compiles for another machine; libraries that zig builds stay in `cache`."""
-    compiler = f"{builder} -m ziglang {{}} -target {machine}-linux-gnu.{GLIBC}"
+def _cross_settings(zig: Path, builder: Path, machine: str, cache: Path) -> dict[str, str]:
+    """The environment in which `builder` compiles for another machine by the zig that interpreter `zig` has.
+
+    Libraries that zig builds stay in `cache`.
+    """
+    compiler = f"{zig} -m ziglang {{}} -target {machine}-linux-gnu.{GLIBC}"
     show_abi = [builder, "-c", "import sys; print(sys.implementation.cache_tag)"]
     abi = subprocess.run(show_abi, capture_output=True, text=True, check=True)
     return {
