@@ -213,8 +213,9 @@ class Class:
 
 
 @pytest.mark.long
-def test_the_filters_load_neither_opencv_nor_onnxruntime():
-    code = "import sys, sigmaslam_filters; print(*sorted({name.split('.')[0] for name in sys.modules}))"
+@pytest.mark.parametrize("module", ["sigmaslam_filters", "sigmaslam_filters.consistency.plots"])
+def test_the_filters_load_neither_opencv_nor_onnxruntime(module: str):
+    code = f"import sys, {module}; print(*sorted({{name.split('.')[0] for name in sys.modules}}))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     loaded = set(done.stdout.split())
     assert {"sigmaslam_filters", "torch"} <= loaded

@@ -1,4 +1,6 @@
+import io
 import math
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -6,10 +8,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from matplotlib.figure import Figure
 from scipy.stats import binomtest, chi2, norm, t
 from torch import Tensor
 
 from sigmaslam_filters import consistency
+from sigmaslam_filters.consistency.plots import plot_coverage, plot_nees, plot_whiteness
 from tests.support.filter_builders import covariances, random_numbers
 
 axis_coverage = partial(consistency.coverage, by_axis=True)
@@ -491,3 +495,85 @@ def test_coverage_refuses_levels_that_are_no_probabilities():
     for levels in ((), (0.5, 1.0), (0.0,), (95.0,)):
         with pytest.raises(ValueError, match="levels must be probabilities"):
             consistency.coverage(torch.zeros(3), torch.eye(3), levels=levels)
+
+
+# Figures
+
+
+def some_check(runs: int = 20, scale: float = 1.0) -> consistency.Consistency:
+    values = scale * random_numbers(runs, 30, 3).square().sum(dim=-1)
+    values[:, 12] = math.nan
+    return consistency.check_nees(values, 3)
+
+
+def band_of(figure: Figure) -> np.ndarray:
+    """Corners of the shaded band, (N, 2)."""
+    (band,) = figure.axes[0].collections[:1]
+    return np.concatenate([path.vertices for path in band.get_paths()])
+
+
+def line_of(figure: Figure, label: str) -> np.ndarray:
+    (line,) = [line for line in figure.axes[0].get_lines() if line.get_label() == label]
+    return np.asarray(line.get_xydata())
+
+
+def test_nees_is_drawn_with_its_band():
+    check = some_check()
+    figure = plot_nees(check, seconds=0.1 * torch.arange(30), quantity="NIS")
+    corners = band_of(figure)
+    assert (corners[:, 1].min(), corners[:, 1].max()) == pytest.approx(consistency.chi_square_band(3, 20))
+    # There is no band at the step without a value.
+    assert not ((corners[:, 0] > 1.15 + 1e-6) & (corners[:, 0] < 1.25 - 1e-6)).any()
+    np.testing.assert_allclose(line_of(figure, "mean NIS")[:, 1], check.mean_per_step.numpy())
+    assert figure.axes[0].get_xlabel() == "time [s]"
+    assert figure.axes[0].get_yscale() == "linear"
+    assert "20 NaN" in figure.axes[0].get_title()
+
+
+def test_nees_far_off_is_drawn_on_a_logarithmic_axis():
+    assert plot_nees(some_check(scale=30.0)).axes[0].get_yscale() == "log"
+
+
+def test_autocorrelation_is_drawn_with_its_band():
+    found = consistency.whiteness(random_numbers(10, 50, 2), 12)
+    figure = plot_whiteness(found)
+    assert np.abs(band_of(figure)[:, 1]).max() == pytest.approx(float(found.band.max()))
+    points = line_of(figure, "innovations")
+    np.testing.assert_allclose(points[:, 0], np.arange(1, 13))
+    np.testing.assert_allclose(points[:, 1], found.autocorrelation.numpy())
+
+
+def test_coverage_is_drawn_with_its_interval():
+    found = axis_coverage(random_numbers(80, 2), torch.eye(2, dtype=torch.float64))
+    figure = plot_coverage(found, labels=["x", "y"], title="Position, metres")
+    axes = figure.axes[0]
+    for row, container in enumerate(axes.containers):
+        points, _, (bars,) = container.lines
+        np.testing.assert_allclose(np.asarray(points.get_ydata()), found.share[row].numpy())
+        ends = np.array([path[:, 1] for path in bars.get_segments()])
+        np.testing.assert_allclose(ends, torch.stack([found.low[row], found.high[row]], dim=-1).numpy(), atol=1e-9)
+    assert [text.get_text() for text in axes.get_legend().get_texts()][1:] == ["x", "y"]
+    assert axes.get_title() == "Position, metres"
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        lambda: plot_nees(some_check(runs=1)),
+        lambda: plot_nees(consistency.check_nees(torch.full((2, 1), math.nan), 3)),
+        lambda: plot_whiteness(consistency.whiteness(random_numbers(2, 5, 1), 1)),
+        lambda: plot_coverage(consistency.coverage(torch.full((4, 2), math.nan), torch.eye(2))),
+    ],
+    ids=["one run", "nothing but NaN", "one lag", "no samples"],
+)
+def test_edge_cases_are_drawn(draw: Callable[[], Figure]):
+    target = io.BytesIO()
+    draw().savefig(target, format="svg")
+    assert target.tell() > 0
+
+
+def test_figures_refuse_what_does_not_fit():
+    with pytest.raises(ValueError, match=r"seconds must be \(30,\)"):
+        plot_nees(some_check(), seconds=torch.arange(5.0))
+    with pytest.raises(ValueError, match="labels must be 2"):
+        plot_coverage(axis_coverage(random_numbers(8, 2), torch.eye(2, dtype=torch.float64)), labels=["x"])

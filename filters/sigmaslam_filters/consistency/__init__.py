@@ -1,4 +1,4 @@
-"""Does a filter's covariance describe its errors?"""
+"""Does a filter's covariance describe its errors? The tests, and plots of them in `plots`."""
 
 from sigmaslam_filters.consistency.statistics import (
     LEVELS,

@@ -4,7 +4,7 @@ A filter is consistent where its errors have zero mean and the covariance that i
 covariance, x^T P^-1 x is then chi-square; too large a mean tells of overconfidence, too small a one of modesty.
 
 Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, Estimation with Applications to Tracking and Navigation, Wiley 2001,
-section 5.4.
+section 5.4. For plots see `sigmaslam_filters.consistency.plots`.
 """
 
 import math
