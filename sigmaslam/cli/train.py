@@ -1,5 +1,7 @@
 """`sigmaslam train` and `sigmaslam train scorer`."""
 
+from __future__ import annotations
+
 import json
 from enum import StrEnum
 from pathlib import Path
@@ -58,9 +60,11 @@ def train(
 ) -> None:
     """Train the correspondence network on renders (needs the extra 'train').
 
-    Ctrl-C saves the last step; the same command with --resume goes on.
+    Ctrl-C saves the last step; the same command with --resume goes on. On several GPUs: torchrun --nproc-per-node N
+    -m sigmaslam train ...
     """
     need_train_extra()
+    from sigmaslam_training.devices import leads
     from sigmaslam_training.features.loop import TrainingStopped
     from sigmaslam_training.features.loop import train as run_training
     from sigmaslam_training.features.recipes import choose_config, starting_weights
@@ -73,9 +77,11 @@ def train(
     try:
         card = run_training(out, config, workers, resume, recipe.value, weights, device)
     except TrainingStopped as stop:
-        _tell_stop(out, stop.saved, stop.steps)
+        if leads():
+            _tell_stop(out, stop.saved, stop.steps)
         raise
-    typer.echo(json.dumps(card, indent=2))
+    if leads():
+        typer.echo(json.dumps(card, indent=2))
 
 
 def _tell_stop(out: Path, saved: int, steps: int) -> None:

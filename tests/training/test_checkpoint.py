@@ -6,9 +6,10 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from sigmaslam.errors import InputError
+from sigmaslam_training.devices import Workplace
 from sigmaslam_training.features.checkpoint import TrainingState, begin, resume_checkpoint, save_checkpoint
 
-PLACE = torch.device("cpu")
+PLACE = Workplace(torch.device("cpu"))
 
 
 def walk(state: TrainingState, steps: int) -> None:

@@ -15,7 +15,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from sigmaslam.errors import InputError
 from sigmaslam_models.network_export import load_network
-from sigmaslam_training.features import loop
+from sigmaslam_training import devices
 from sigmaslam_training.features.checkpoint import CHECKPOINT_NAME
 from sigmaslam_training.features.loop import WEIGHTS_NAME, train
 from sigmaslam_training.features.recipes import TrainingConfig
@@ -28,7 +28,7 @@ pytestmark = pytest.mark.usefixtures("small")
 
 def in_step(step: int, happens, monkeypatch: pytest.MonkeyPatch) -> None:
     """Something happens in the middle of the step after `step` whole ones."""
-    calls, pair_loss = [], loop.pair_loss
+    calls, pair_loss = [], devices.pair_loss
 
     def counted(*arguments):
         calls.append(1)
@@ -36,7 +36,7 @@ def in_step(step: int, happens, monkeypatch: pytest.MonkeyPatch) -> None:
             happens()
         return pair_loss(*arguments)
 
-    monkeypatch.setattr(loop, "pair_loss", counted)
+    monkeypatch.setattr(devices, "pair_loss", counted)
 
 
 def fail() -> None:
@@ -140,6 +140,13 @@ def test_an_existing_checkpoint_is_not_overwritten(finished, tiny):
     with pytest.raises(InputError, match=r"checkpoint\.safetensors exists.*--resume"):
         train(finished, tiny, workers=0, recipe="quick")
     assert (finished / WEIGHTS_NAME).read_bytes() == before
+
+
+def test_a_checkpoint_of_an_older_version_is_refused(tmp_path, tiny):
+    (tmp_path / "checkpoint.pt").touch()
+    for resume in (False, True):
+        with pytest.raises(InputError, match=r"older version.*another --out"):
+            train(tmp_path, tiny, workers=0, resume=resume)
 
 
 def test_resuming_without_a_checkpoint_is_refused(tmp_path, tiny):

@@ -70,6 +70,17 @@ def test_an_unknown_mix_is_refused():
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("ranks", [2, 4])
+def test_shares_of_the_processes_make_up_the_batches_of_one(ranks):
+    whole = list(pair_loader("leaves", 0, 96, 4, 12, 16, 4, workers=0))
+    shares = [list(pair_loader("leaves", 0, 96, 4, 12, 16, 4, 0, rank, ranks)) for rank in range(ranks)]
+    for index, batch in enumerate(whole):
+        for part, expected in enumerate(batch):
+            found = torch.stack([share[index][part] for share in shares], dim=1).flatten(0, 1)
+            assert torch.equal(found, expected)
+
+
+@pytest.mark.long
 def test_turned_leaves_are_turned_further():
     def turns(source: str) -> np.ndarray:
         """Degrees by which the middle of the second view is turned against the first."""

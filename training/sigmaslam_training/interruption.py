@@ -6,18 +6,26 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+from sigmaslam_training.devices import Workplace
+
 
 class Interruption:
     """Turns SIGINT and SIGTERM into a KeyboardInterrupt that never tears a step apart.
 
-    Between steps it comes at once.
+    Between steps it comes at once. With several processes it comes after a step alone, in all of them after the same.
+
+    Args:
+        place: of this process.
 
     Attributes:
         torn: a step was left in its middle (another error than the signals): its state is worth nothing.
     """
 
-    def __init__(self) -> None:
-        self._asked = self._held = self.torn = False
+    def __init__(self, place: Workplace) -> None:
+        self._place = place
+        self._asked = False
+        self._held = place.ranks > 1
+        self.torn = False
 
     @contextmanager
     def listening(self) -> Iterator[None]:
@@ -41,8 +49,8 @@ class Interruption:
             yield
             self.torn = False
         finally:
-            self._held = False
-        if self._asked:
+            self._held = self._place.ranks > 1
+        if self._place.agree(self._asked):
             raise KeyboardInterrupt
 
     def _handle(self, number: int, frame: FrameType | None) -> None:

@@ -6,11 +6,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from sigmaslam.source_commit import current_commit
 from sigmaslam_synthetic.worlds.own import SUFFIX
-from sigmaslam_training.devices import describe_hardware
+from sigmaslam_training.devices import Workplace, describe_hardware
 from sigmaslam_training.features.checkpoint import TrainingState
 from sigmaslam_training.features.recipes import TrainingConfig
 from sigmaslam_training.sources import SOURCES, label, turns_of
@@ -38,12 +36,12 @@ def describe_origin(hidden: list[Path]) -> dict[str, str]:
     return {"commit": current_commit(), "command": " ".join(["sigmaslam", *map(shortened, sys.argv[1:])])}
 
 
-def make_card(state: TrainingState, device: torch.device) -> dict[str, Any]:
+def make_card(state: TrainingState, place: Workplace) -> dict[str, Any]:
     """The card of a finished run.
 
     Args:
         state: at its end.
-        device: where it ended.
+        place: where it ended.
     """
     return {
         "recipe": state.recipe,
@@ -52,7 +50,7 @@ def make_card(state: TrainingState, device: torch.device) -> dict[str, Any]:
         "seed": state.config.seed,
         **state.origin,
         "duration_s": round(state.seconds, 1),
-        "hardware": describe_hardware(device),
+        "hardware": describe_hardware(place),
         "parameters": sum(p.numel() for p in state.network.parameters()),
         "data": _describe_data(state.config),
         "limits": _LIMITS,

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from sigmaslam_training.devices import Workplace
 from sigmaslam_training.interruption import Interruption
 from sigmaslam_training.snapshot import check_same, read_snapshot, restore, write_snapshot
 
@@ -49,7 +50,7 @@ def train_steps(
     def save() -> None:
         write_snapshot(checkpoint, network, optimizer, schedule, step, {"made_of": made_of})
 
-    interruption = Interruption()
+    interruption = Interruption(Workplace(torch.device("cpu")))
     with interruption.listening():
         try:
             while step < steps:

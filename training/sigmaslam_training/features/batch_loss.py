@@ -5,7 +5,6 @@ from torch import Tensor
 
 from sigmaslam_models.detector import to_cells
 from sigmaslam_models.feature_network import FeatureMaps, FeatureNetwork, sample_map
-from sigmaslam_training.devices import Bfloat16Network
 from sigmaslam_training.features.losses import PairLoss, match_loss, place_loss
 
 # A keypoint has a partner if one was found this near to its true place in image 1, pixels.
@@ -20,7 +19,7 @@ _MARGIN = 4.0
 
 
 def pair_loss(
-    network: FeatureNetwork | Bfloat16Network,
+    network: FeatureNetwork,
     image0: Tensor,
     image1: Tensor,
     keypoints0: Tensor,

@@ -9,10 +9,12 @@ import torch
 from sigmaslam.errors import InputError
 from sigmaslam_models.feature_network import FeatureNetwork
 from sigmaslam_models.network_export import load_network
+from sigmaslam_training.devices import Workplace, place_network
 from sigmaslam_training.features.recipes import TrainingConfig
 from sigmaslam_training.snapshot import check_same, read_snapshot, restore, write_snapshot
 
 CHECKPOINT_NAME = "checkpoint.safetensors"
+_OLD_NAME = "checkpoint.pt"
 
 
 @dataclass(slots=True)
@@ -50,24 +52,27 @@ def check_run_folder(out: Path, resume: bool) -> None:
     """Refuses to overwrite a run, and to go on with one that is not there.
 
     Raises:
-        InputError: `out` holds a checkpoint and `resume` is off, or the other way round.
+        InputError: `out` holds a checkpoint and `resume` is off, or the other way round, or one of an older version.
     """
     path = out / CHECKPOINT_NAME
+    if (out / _OLD_NAME).exists() and not path.exists():
+        raise InputError(
+            f"{out / _OLD_NAME} was written by an older version, which alone can go on with it: give another --out"
+        )
     if path.exists() and not resume:
         raise InputError(f"{path} exists: give --resume to go on with it, or another --out")
     if resume and not path.exists():
         raise InputError(f"{path} does not exist: there is nothing to resume; leave --resume out")
 
 
-def begin(config: TrainingConfig, recipe: str | None, start: Path | None, device: torch.device) -> TrainingState:
+def begin(config: TrainingConfig, recipe: str | None, start: Path | None, place: Workplace) -> TrainingState:
     """A run before its first step, from random weights or from those of `start`.
 
     Raises:
         InputError: the weights of `start` are missing or of another network.
     """
     torch.manual_seed(config.seed)
-    network = (FeatureNetwork() if start is None else _load_start(start)).to(device)
-    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    network = place_network(FeatureNetwork() if start is None else _load_start(start), place)
     optimizer = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
     # The rate rises for a tenth of the steps; a rise of one step, that of ten steps, is a division by zero in torch.
     rising = 0.1 if config.steps < 3 else max(0.1, 2 / config.steps)
@@ -92,7 +97,7 @@ def save_checkpoint(path: Path, state: TrainingState) -> None:
 
 
 def resume_checkpoint(
-    path: Path, config: TrainingConfig, recipe: str | None, start: Path | None, device: torch.device
+    path: Path, config: TrainingConfig, recipe: str | None, start: Path | None, place: Workplace
 ) -> TrainingState:
     """The state that `save_checkpoint` wrote.
 
@@ -100,7 +105,7 @@ def resume_checkpoint(
         path: of the checkpoint.
         config, recipe: of the run, as it was begun.
         start: the weights that it was begun from; None: whatever they were.
-        device: where it goes on.
+        place: where it goes on.
     Raises:
         InputError: the file cannot be read, or the run was begun with something else.
     """
@@ -110,7 +115,7 @@ def resume_checkpoint(
     check_same(path, "", {**asdict(config), "recipe": recipe}, written)
     if start is not None:
         check_same(path, "weights with ", _identify(start) or {}, facts["started_from"] or {})
-    state = begin(config, recipe, None, device)
+    state = begin(config, recipe, None, place)
     state.step = restore(snapshot, state.network, state.optimizer, state.schedule)
     state.started_from, state.origin = facts["started_from"], facts["origin"]
     state.seconds, state.metrics = float(facts["seconds"]), dict(facts["metrics"])

@@ -1,8 +1,8 @@
-"""The training loop: resumable at any step, the same result whether it was interrupted or not."""
+"""The training loop: resumable at any step, the same result on as many processes whether it was interrupted or not."""
 
 import json
 import time
-from contextlib import closing
+from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from safetensors.torch import save_file
 from torch import nn
+from torch.utils.data import DataLoader
 
 from sigmaslam.files import atomic_path, atomic_write_text, make_folder
 from sigmaslam.progress import open_progress
-from sigmaslam_training.devices import Bfloat16Network, choose_device, to_device
-from sigmaslam_training.features.batch_loss import pair_loss
+from sigmaslam_training.devices import Workplace, loss_module, open_workplace, to_device
 from sigmaslam_training.features.checkpoint import (
     CHECKPOINT_NAME,
     TrainingState,
@@ -48,13 +48,14 @@ def train(
 ) -> dict[str, Any]:
     """Trains the correspondence network on renders and writes weights and card into `out`.
 
-    Ctrl-C or SIGTERM: the step under way is finished and saved, then TrainingStopped, a KeyboardInterrupt, is raised.
+    Under torchrun each process takes its share of every batch. Ctrl-C or SIGTERM: the step under way is finished and
+    saved, then TrainingStopped, a KeyboardInterrupt, is raised.
 
     Args:
         out: run folder; gets checkpoint.safetensors, log.jsonl, tensorboard/, samples/, features.safetensors and
             features.json.
         config: what the run is made of.
-        workers: processes that make pairs.
+        workers: processes that make pairs, for each process that trains.
         resume: go on from the checkpoint in `out`.
         recipe: name of the configuration, for the card.
         start: weights to go on from; None: random ones, or what the resumed run began with.
@@ -67,20 +68,20 @@ def train(
     """
     check_config(config)
     check_run_folder(out, resume)
-    place = choose_device(device)
-    if resume:
-        state = resume_checkpoint(out / CHECKPOINT_NAME, config, recipe, start, place)
-    else:
-        state = begin(config, recipe, start, place)
-        # Before the run: the tree may move on while it lasts.
-        state.origin = describe_origin([out] if start is None else [out, start])
-    make_folder(out)
-    with closing(Journal(out, state.step)) as journal:
-        _Run(state, place, out, journal).finish(workers)
-    card = make_card(state, place)
-    with atomic_path(out / WEIGHTS_NAME) as path:
-        save_file({name: value.cpu().contiguous() for name, value in state.network.state_dict().items()}, path)
-    atomic_write_text(out / CARD_NAME, json.dumps(card, indent=2) + "\n")
+    with open_workplace(device, config.batch_size) as place:
+        path = out / CHECKPOINT_NAME
+        if resume:
+            state = resume_checkpoint(path, config, recipe, start, place)
+        else:
+            state = begin(config, recipe, start, place)
+            # Before the run: the tree may move on while it lasts.
+            state.origin = describe_origin([out] if start is None else [out, start])
+        make_folder(out)
+        with closing(Journal(out, state.step)) if place.leads else nullcontext() as journal:
+            _Run(state, place, out, journal).finish(workers)
+        card = make_card(state, place)
+        if place.leads:
+            _write_result(out, state, card)
     return card
 
 
@@ -102,23 +103,23 @@ class _Run:
 
     Args:
         state: goes on changing.
-        device: of the network.
+        place: of this process.
         out: run folder.
-        journal: of the run.
+        journal: of the process that leads.
     """
 
-    def __init__(self, state: TrainingState, device: torch.device, out: Path, journal: Journal) -> None:
-        self._state, self._device, self._journal = state, device, journal
+    def __init__(self, state: TrainingState, place: Workplace, out: Path, journal: Journal | None) -> None:
+        self._state, self._place, self._journal = state, place, journal
         self._checkpoint = out / CHECKPOINT_NAME
         self._saved = state.step
-        self._network = Bfloat16Network(state.network) if device.type == "cuda" else state.network
+        self._loss = loss_module(state.network, place)
         self._began = time.monotonic() - state.seconds
         self._logged = (state.step, time.monotonic())
-        self._progress = open_progress()
+        self._progress = open_progress(hidden=not place.leads)
 
     def finish(self, workers: int) -> None:
         """Trains to the end; stopped, it saves the last whole step and raises TrainingStopped."""
-        interruption = Interruption()
+        interruption = Interruption(self._place)
         with interruption.listening():
             try:
                 with self._progress:
@@ -132,13 +133,11 @@ class _Run:
         state, config = self._state, self._state.config
         task = self._progress.add_task("training", total=config.steps, completed=state.step, note="")
         # The workers begin while this process validates.
-        first, last = state.step * config.batch_size, config.steps * config.batch_size
-        pairs = config.mix, config.seed, config.size, first, last, config.points, config.batch_size
-        batches = iter(pair_loader(*pairs, workers, pinned=self._device.type == "cuda"))
+        batches = iter(self._loader(workers))
         self._validate_if_due()
         for batch in batches:
             with interruption.whole_step():
-                loss = self._step(to_device(batch, self._device))
+                loss = self._step(to_device(batch, self._place))
             self._progress.update(task, completed=state.step)
             last = state.step == config.steps
             if state.step % _SHOW_EVERY == 0 or last:
@@ -149,12 +148,28 @@ class _Run:
             if state.step % config.checkpoint_every == 0 or last:
                 self._save()
 
+    def _loader(self, workers: int) -> DataLoader[TrainingPair]:
+        config, place = self._state.config, self._place
+        return pair_loader(
+            config.mix,
+            config.seed,
+            config.size,
+            self._state.step * config.batch_size,
+            config.steps * config.batch_size,
+            config.points,
+            config.batch_size,
+            workers,
+            place.rank,
+            place.ranks,
+            pinned=place.on_gpu,
+        )
+
     def _step(self, batch: TrainingPair) -> PairLoss:
         """One step of the optimiser."""
         state, config = self._state, self._state.config
-        seed = (config.seed * 1_000_000_007 + state.step) % 2**63
+        seed = (config.seed * 1_000_000_007 + state.step + self._place.rank * 500_000_003) % 2**63
         state.network.train()
-        loss = pair_loss(self._network, *batch, torch.Generator().manual_seed(seed))
+        loss: PairLoss = self._loss(batch, torch.Generator().manual_seed(seed))
         state.optimizer.zero_grad(set_to_none=True)
         (loss.descriptor + config.quality_weight * loss.quality + config.place_weight * loss.place).backward()
         nn.utils.clip_grad_norm_(state.network.parameters(), 1.0)
@@ -164,6 +179,8 @@ class _Run:
         return loss
 
     def _log(self, loss: PairLoss) -> None:
+        if self._journal is None:
+            return
         step, now = self._state.step, time.monotonic()
         before, then = self._logged
         self._logged = (step, now)
@@ -175,7 +192,7 @@ class _Run:
     def _validate_if_due(self) -> None:
         """Validates and draws a sample; before the first step it draws alone."""
         state, config = self._state, self._state.config
-        if config.validate_every == 0:
+        if self._journal is None or config.validate_every == 0:
             return
         due = state.step % config.validate_every == 0 or state.step == config.steps
         if not due or state.validated == state.step:
@@ -191,9 +208,16 @@ class _Run:
         state.validated = state.step
 
     def _save(self) -> None:
-        self._state.seconds = time.monotonic() - self._began
-        save_checkpoint(self._checkpoint, self._state)
-        self._saved = self._state.step
+        if self._place.leads:
+            self._state.seconds = time.monotonic() - self._began
+            save_checkpoint(self._checkpoint, self._state)
+            self._saved = self._state.step
+
+
+def _write_result(out: Path, state: TrainingState, card: dict[str, Any]) -> None:
+    with atomic_path(out / WEIGHTS_NAME) as path:
+        save_file({name: value.cpu().contiguous() for name, value in state.network.state_dict().items()}, path)
+    atomic_write_text(out / CARD_NAME, json.dumps(card, indent=2) + "\n")
 
 
 def _note(loss: PairLoss) -> str:

@@ -16,7 +16,7 @@ class TrainingConfig:
     Attributes:
         steps: optimiser steps.
         data: what the pairs are made of, a key of `mixes.MIXES`.
-        batch_size: pairs a step.
+        batch_size: pairs a step, of all processes together.
         size: side of the training images, pixels.
         points: keypoints per image in the loss.
         learning_rate: peak of the one-cycle schedule.

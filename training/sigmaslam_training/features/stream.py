@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader, Dataset, Subset
 
 from sigmaslam_models.detector import detect, to_cells
 from sigmaslam_synthetic.homography_pairs import HomographyPairs
@@ -154,19 +154,23 @@ def pair_loader(
     keypoints: int,
     batch_size: int,
     workers: int,
+    rank: int = 0,
+    ranks: int = 1,
     pinned: bool = False,
 ) -> DataLoader[TrainingPair]:
     """Batches of pairs in order of their index.
 
     Args:
         mix, seed, size, first, last, keypoints: as `PairDataset` takes them; a batch begins at `first`.
-        batch_size: pairs of a batch.
+        batch_size: pairs of a batch, a multiple of `ranks`.
         workers: processes that make pairs.
+        rank, ranks: this process takes pairs rank, rank + ranks, ... of every batch.
         pinned: batches lie where a GPU can fetch them.
     """
+    dataset = PairDataset(mix, seed, size, first, last, keypoints)
     return DataLoader(
-        PairDataset(mix, seed, size, first, last, keypoints),
-        batch_size=batch_size,
+        Subset(dataset, range(rank, len(dataset), ranks)),
+        batch_size=batch_size // ranks,
         num_workers=workers,
         worker_init_fn=prepare_worker if workers else None,
         # A fork of a process that has used OpenCV or torch may wait for ever for threads that it lacks.

@@ -20,7 +20,7 @@ from sigmaslam_evaluation.metrics import probability_calibration as calibration
 from sigmaslam_evaluation.metrics.probability_calibration import RIGHT
 from sigmaslam_models.scorer_network import MatchScorer
 from sigmaslam_models.verifier_network import MatchVerifier
-from sigmaslam_training.devices import describe_hardware
+from sigmaslam_training.devices import describe_processor
 from sigmaslam_training.features.validation import held_out_seed
 from sigmaslam_training.matching.match_sets import PairRecord, load_record, record_path, write_records
 from sigmaslam_training.matching.place_rows import collect_place_rows
@@ -232,7 +232,7 @@ def _make_card(
         "seed": config.seed,
         **origin,
         "duration_s": round(seconds, 1),
-        "hardware": describe_hardware(torch.device("cpu")),
+        "hardware": describe_processor(),
         "parameters": {name: sum(p.numel() for p in network.parameters()) for name, network in networks.items()},
         "data": "renders alone, no photograph: planes, scenes, stereo pairs, video; our features, SIFT and ORB",
         "limits": _LIMITS,
