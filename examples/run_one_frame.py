@@ -84,8 +84,8 @@ def run(weights: Path, folder: Path, index: int) -> tuple[np.ndarray, np.ndarray
     landmark_covariance = np.zeros((count, 6, 6))
     landmark_covariance[:, :3, :3] = hosted_covariance[rows]
 
-    # Update: the state is 12 errors of the calibration and the first pose, which are known here, and the frame's pose.
-    size = 12 + 6 + 6
+    # Update: the state is 15 errors of calibration and views and the first pose, which are known here, and the frame's pose.
+    size = 15 + 6 + 6
     factor = np.zeros((size, 6))
     factor[-6:] = np.linalg.cholesky(covariance[:6, :6])
     known = {
@@ -100,7 +100,7 @@ def run(weights: Path, folder: Path, index: int) -> tuple[np.ndarray, np.ndarray
         "estimate": np.column_stack([hosted[rows], np.zeros((count, 3))]),
         "dependence": np.zeros((count, 6, size)),
         "poses": np.stack([np.eye(4), pose]),
-        "calibration": np.zeros(12),
+        "calibration": np.zeros(15),
         "factor": factor,
         "measurement": seen[others],
         "noise": noise[others],
@@ -110,7 +110,7 @@ def run(weights: Path, folder: Path, index: int) -> tuple[np.ndarray, np.ndarray
     for first in (1.0, 0.0):
         at = {"offset": offset, "spread": spread, "moved": moved, "gated": np.array(first)}
         offset, spread, moved, _ = robust.run(None, {**known, **at})
-    noise_scale, student = np.array(0.0), {"freedom": np.array(FREEDOM), "prior": np.zeros((size, 12))}
+    noise_scale, student = np.array(0.0), {"freedom": np.array(FREEDOM), "prior": np.zeros((size, 15))}
     for _ in range(2):
         at = {"offset": offset, "spread": spread, "moved": moved, "noise_scale": noise_scale}
         found = dict(zip(OUTPUTS, gated.run(None, {**known, **student, **at})[: len(OUTPUTS)], strict=True))

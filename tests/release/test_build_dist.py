@@ -78,9 +78,11 @@ def test_a_wheel_that_needs_more_than_its_systems_have_is_refused(
     (tmp_path / "versions").write_text(f"GLIBC_{version} {{ global: newest; }};")
     (tmp_path / "library.c").write_text("void newest(void) {}")
     (tmp_path / "module.c").write_text("void newest(void); void PyInit_module(void) { newest(); }")
+    # Not where gcc runs: with an empty entry in LD_LIBRARY_PATH it would load the stand-in.
+    (tmp_path / "lib").mkdir()
     for code in (
-        ["library.c", f"-Wl,-soname,{library},--version-script=versions", "-o", library],
-        ["module.c", library, "-o", "module.so"],
+        ["library.c", f"-Wl,-soname,{library},--version-script=versions", "-o", f"lib/{library}"],
+        ["module.c", f"lib/{library}", "-o", "module.so"],
     ):
         subprocess.run(["gcc", "-shared", "-fPIC", "-nostdlib", *code], cwd=tmp_path, check=True)
     wheel = tmp_path / f"p-1-py3-none-linux_{machine}.whl"

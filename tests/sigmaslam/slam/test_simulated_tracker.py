@@ -103,18 +103,17 @@ def test_coverage_over_sixty_worlds(kind: str):
 @pytest.mark.long
 @pytest.mark.parametrize("kind", SCALES)
 def test_errors_of_the_calibration_widen_the_covariance_and_nothing_else(kind: str):
-    """The same frames by a calibration without errors, and by one as good as most."""
+    """The same frames by a calibration without errors, of which views are left, and by one as good as most."""
     scale, runs = SCALES[kind], []
     for sigmas in (CalibrationSigmas.none(), CalibrationSigmas()):
         frontend = SimulatedFrontend(scale, 0, 25, offset=OFFSET)
         tracker = StereoTracker(replace(frontend.camera, sigmas=sigmas), frontend)
         runs.append(run_simulated(tracker, frontend, scale).estimates)
     for exact, usual in zip(*runs, strict=True):
-        np.testing.assert_array_equal(exact.covariance, exact.matching_covariance)
         np.testing.assert_allclose(usual.T_world_camera, exact.T_world_camera, atol=1e-9)
         np.testing.assert_allclose(usual.matching_covariance, exact.matching_covariance, rtol=1e-6, atol=1e-15)
         assert usual.calibration.disparity_offset == pytest.approx(exact.calibration.disparity_offset, abs=1e-9)
-        gained = np.linalg.eigvalsh(usual.covariance - usual.matching_covariance)
-        assert gained[0] >= -1e-9 * gained[-1]
+        for less, more in ((exact.matching_covariance, exact.covariance), (exact.covariance, usual.covariance)):
+            assert np.linalg.eigvalsh(more - less)[0] >= -1e-6 * np.trace(more)
     np.testing.assert_array_equal(runs[1][0].covariance, runs[1][0].matching_covariance)  # the first one is the world
     assert np.trace(runs[1][-1].covariance[:3, :3]) > 1.1 * np.trace(runs[0][-1].covariance[:3, :3])
