@@ -84,7 +84,7 @@ def run(weights: Path, folder: Path, index: int) -> tuple[np.ndarray, np.ndarray
     landmark_covariance = np.zeros((count, 6, 6))
     landmark_covariance[:, :3, :3] = hosted_covariance[rows]
 
-    # Update: the state is 15 errors of calibration and views and the first pose, which are known here, and the frame's pose.
+    # Update: the state is 15 errors of calibration and views, the first pose, all known here, and the frame's pose.
     size = 15 + 6 + 6
     factor = np.zeros((size, 6))
     factor[-6:] = np.linalg.cholesky(covariance[:6, :6])
