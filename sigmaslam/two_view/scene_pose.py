@@ -60,7 +60,12 @@ def estimate_scene_pose(
     if pose is None:
         return None
     rest = np.flatnonzero(~pose.inliers)
-    if len(rest) < MIN_POINTS:
+    cells = image_cells(landmarks[:, :2], camera.width, camera.height)
+    first = _Motion.of(pose, cells, landmarks[:, 2], probability)
+    is_possible = excludes is None or not excludes(pose.T_key_camera)
+    # All that disagree together may be too little for a rival.
+    could_rival = is_rival(explained_area(cells, ~pose.inliers, probability), first.area)
+    if len(rest) < MIN_POINTS or (is_possible and not could_rival):
         return pose
     other = estimate_relative_pose(camera, *(each[rest] for each in matched))
     if other is None:
@@ -68,16 +73,13 @@ def estimate_scene_pose(
     agreeing = np.zeros(len(landmarks), bool)
     agreeing[rest[other.inliers]] = True
     other = replace(other, inliers=agreeing)
-    cells = image_cells(landmarks[:, :2], camera.width, camera.height)
-    motions = [_Motion.of(each, cells, landmarks[:, 2], probability) for each in (pose, other)]
-    if excludes is not None:
-        possible = [motion.pose for motion in motions if not excludes(motion.pose.T_key_camera)]
-        if len(possible) == 1:
-            return possible[0]
-    lesser, greater = sorted(motions, key=lambda motion: motion.area)
+    second = _Motion.of(other, cells, landmarks[:, 2], probability)
+    if excludes is not None and is_possible == excludes(other.T_key_camera):
+        return pose if is_possible else other
+    lesser, greater = sorted((first, second), key=lambda motion: motion.area)
     if not is_rival(lesser.area, greater.area) or _are_alike(camera, landmarks, pose, other):
         return greater.pose
-    nearer, farther = sorted(motions, key=lambda motion: -motion.disparity)
+    nearer, farther = sorted((first, second), key=lambda motion: -motion.disparity)
     return farther.pose if stands_before(nearer.disparity, farther.disparity) else None
 
 

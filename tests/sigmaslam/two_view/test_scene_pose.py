@@ -93,6 +93,26 @@ def test_the_greater_part_decides_where_the_other_one_is_small():
     assert is_pose(found, CAMERA_MOTION)
 
 
+def test_a_second_motion_is_sought_only_where_it_could_matter(monkeypatch):
+    calls = []
+
+    def count(*arguments):
+        calls.append(len(arguments[1]))
+        return estimate_relative_pose(*arguments)
+
+    monkeypatch.setattr("sigmaslam.two_view.scene_pose.estimate_relative_pose", count)
+    rng = np.random.default_rng(0)
+    parts = [
+        (points(rng, 150, 10, 520, 4.0, 8.0), CAMERA_MOTION),
+        (points(rng, 30, 540, 630, 4.0, 8.0), BODY_MOTION),
+    ]
+    assert is_pose(estimate(estimate_scene_pose, parts), CAMERA_MOTION)
+    assert len(calls) == 1, "a seventh of the image is no rival"
+    excludes = partial(estimate_scene_pose, excludes=lambda pose: np.allclose(pose, CAMERA_MOTION, atol=0.03))
+    assert is_pose(estimate(excludes, parts), BODY_MOTION)
+    assert len(calls) == 3, "what a sensor excludes gives way to a small rest"
+
+
 def test_motions_that_see_points_at_the_same_places_are_one():
     """Half of the image is off by half a pixel, as with a wrong calibration: no other motion."""
     rng = np.random.default_rng(0)
