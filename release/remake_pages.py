@@ -1,9 +1,10 @@
 """Remake the pages that commands make, each by the command that it names: hours for all of them.
 
-    python release/remake_pages.py [PAGE ...]
+    python release/remake_pages.py [PAGE ...] [--ages]
 
 A page whose data or peers are absent would lose rows: it is skipped, and said so. Renders go to build/results and are
-used again. Records of commands that are gone, or of work by hand, name no command and stay.
+used again. Records of commands that are gone, or of work by hand, name no command and stay. --ages makes nothing: it
+tells how old the pages are, and how much of the code that they measure has changed since.
 """
 
 import argparse
@@ -13,11 +14,13 @@ import re
 import shlex
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterable
 from importlib.util import find_spec
 from pathlib import Path
 
-from sigmaslam_benchmarks.commands import reads_data
+from sigmaslam_benchmarks.code_hash import code_files
+from sigmaslam_benchmarks.commands import BENCHMARKS, reads_data
 
 ROOT = Path(__file__).resolve().parents[1]
 RENDERS = "build/results"
@@ -34,7 +37,12 @@ def main() -> None:
     """Entry point; exit code 1 if a command failed."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("pages", nargs="*", type=Path, help="all by default")
-    chosen = [page.resolve() for page in parser.parse_args().pages] or sorted((ROOT / "docs").rglob("*.md"))
+    parser.add_argument("--ages", action="store_true", help="tell how old the pages are, and make none")
+    arguments = parser.parse_args()
+    chosen = [page.resolve() for page in arguments.pages] or sorted((ROOT / "docs").rglob("*.md"))
+    if arguments.ages:
+        print(*(describe_age(page) for page in chosen if command_of(page)), sep="\n")
+        return
     failed = remake(chosen, lambda words: subprocess.run(words, cwd=ROOT, check=False).returncode)
     sys.exit(f"failed: {', '.join(failed)}" if failed else 0)
 
@@ -65,6 +73,36 @@ def command_of(page: Path) -> list[str]:
     """Words of the command that a page was made by; none if it names none."""
     found = re.search(r"^Made by `([^`]+)`", page.read_text(encoding="utf-8"), re.MULTILINE)
     return shlex.split(found[1]) if found else []
+
+
+def describe_age(page: Path, root: Path = ROOT) -> str:
+    """When a page was made, and how many files that its figures depend on have changed since.
+
+    Args:
+        page: Markdown of the repository `root`, made by a command.
+    """
+    named = re.search(r"\bat commit ([0-9a-f]{7,})", page.read_text(encoding="utf-8"))
+    commit = named[1] if named else _git(root, "log", "-1", "--format=%h", "--", str(page))
+    name = page.relative_to(root).as_posix()
+    try:
+        days = (time.time() - int(_git(root, "show", "--no-patch", "--format=%ct", commit))) / 86400
+        changed = set(_git(root, "diff", "--name-only", commit).splitlines())
+    except subprocess.CalledProcessError:
+        return f"{name}: of commit {commit}, which is not in this history"
+    measured = {path.relative_to(root).as_posix() for path in _measured(command_of(page), root)}
+    stale = len(changed & measured)
+    return f"{name}: commit {commit}, {days:.0f} days, {stale} of {len(measured)} files that it measures changed since"
+
+
+def _measured(words: list[str], root: Path) -> list[Path]:
+    """Files that the figures of a command depend on; without a benchmark all of our Python."""
+    if words[2] not in BENCHMARKS:
+        return [path for path in root.glob("*/**/*.py") if not path.is_relative_to(root / "tests")]
+    return code_files(ROOT / f"evaluation/sigmaslam_benchmarks/{BENCHMARKS[words[2]].module.replace('.', '/')}.py")
+
+
+def _git(root: Path, *arguments: str) -> str:
+    return subprocess.run(["git", "-C", root, *arguments], capture_output=True, text=True, check=True).stdout.strip()
 
 
 def absent(words: list[str]) -> str:

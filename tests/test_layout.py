@@ -235,23 +235,29 @@ def test_imports_are_absolute():
         assert not re.search(r"^from \.", path.read_text(), re.MULTILINE), path
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "tests").rglob("*.py")), ids=lambda path: path.name)
-def test_tests_share_through_the_support_package_alone(path: Path):
-    """No test imports another one, nor a file beside it by its bare name."""
+@pytest.mark.long
+def test_tests_share_through_the_support_package_alone():
+    for path in (ROOT / "tests").rglob("*.py"):
+        assert_shares_through_support(path)
+
+
+def assert_shares_through_support(path: Path):
+    """A test imports no other one, nor a file beside it by its bare name."""
     siblings = {each.stem for each in path.parent.iterdir() if each.suffix == ".py" or each.is_dir()} - {"sigmaslam"}
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"line {node.lineno}: import from the root on, as tests.support"
+            assert node.level == 0, f"{path}: import from the root on, as tests.support"
             modules = [node.module or "", *(f"{node.module}.{name.name}" for name in node.names)]
         elif isinstance(node, ast.Import):
             modules = [name.name for name in node.names]
         else:
             continue
+        line = f"{path}, line {node.lineno}"
         for module in modules:
             parts = module.split(".")
-            assert parts[0] not in siblings, f"line {node.lineno} imports {module}, a file beside it: use tests.support"
+            assert parts[0] not in siblings, f"{line} imports {module}, a file beside it: use tests.support"
             parts = parts[1:] if parts[0] == "tests" else parts[:1]
-            assert not any(part.startswith("test_") for part in parts), f"line {node.lineno} imports the test {module}"
+            assert not any(part.startswith("test_") for part in parts), f"{line} imports the test {module}"
 
 
 def _numbers_without_a_word(source: str) -> Iterator[str]:

@@ -45,6 +45,7 @@ def test_headings_become_anchors_as_github_makes_them():
     assert anchor_of("[results.md](results.md) of *ours*") == "resultsmd-of-ours"
 
 
+@pytest.mark.long
 def test_messages_and_help_name_no_page_that_an_installed_package_lacks():
     named = []
     for path in (ROOT / "sigmaslam").rglob("*.py"):

@@ -86,6 +86,7 @@ def test_an_image_larger_than_a_fixed_size_is_refused(tmp_path: Path):
         extractor(image())
 
 
+@pytest.mark.long
 def test_a_peer_that_is_too_small_for_a_set_is_left_out_there(tmp_path: Path, real_data: Path):
     graph = str(write_graph(tmp_path / "peer.onnx", (1, 1, 64, 64)))
     notes: list[str] = []

@@ -168,6 +168,7 @@ def test_all_extractors_are_scored_and_progress_is_told(real_data: Path, weights
     assert any(note.startswith(f"middlebury: {graph}, 2 pairs") for note in notes)
 
 
+@pytest.mark.long
 def test_klt_has_a_row_among_the_tracks_alone(monkeypatch: pytest.MonkeyPatch, demo_sequence: Path):
     pairs = sequence_pairs(open_sequence(demo_sequence), demo_sequence / "poses.txt", 40, {1: "gap1"})
     steps = sequence_steps(open_sequence(demo_sequence), demo_sequence / "poses.txt")[:1]

@@ -292,6 +292,7 @@ def test_nees_is_in_the_body_frame():
     assert nees.mean_rotation == pytest.approx(0.0, abs=1e-20)
 
 
+@pytest.mark.long
 def test_errors_of_the_truth_are_part_of_the_nees_where_they_are_known():
     rng = np.random.default_rng(0)
     of_truth, covariance = truth_covariance(0.05, 0.5), np.diag([1e-2, 1e-2, 4e-2, 1e-5, 4e-5, 1e-5])

@@ -19,7 +19,7 @@ from tests.support.commands import assert_refused, run_here
 KITTI = ("04", "05", "07", "10")
 
 
-@pytest.fixture(params=["demo", "drive", *KITTI])
+@pytest.fixture(params=["demo", "drive", *(pytest.param(name, marks=pytest.mark.long) for name in KITTI)])
 def truth(request: pytest.FixtureRequest, demo_sequence: Path) -> Trajectory:
     """The rendered demo, a real drive, and real roads: 04 is straight."""
     if request.param == "demo":

@@ -223,6 +223,7 @@ def demo(demo_sequence: Path) -> tuple[StereoSequence, list[StereoFrame]]:
     return sequence, [frame for frame, _ in zip(sequence.frames(), range(8), strict=False)]
 
 
+@pytest.mark.long
 def test_frames_without_a_pose_give_diagnostics_alone(start: Callable[..., Any], demo: Any):
     sequence, frames = demo
     node, black = start(), np.zeros_like(frames[0].left)

@@ -118,9 +118,7 @@ def _another_place(folder: Path, run: Runner) -> Outcome:
 
 
 def _map_case(name: str, attempt: Callable[..., Outcome], says: str = "", first: Verdict | None = None) -> Case:
-    return Case(
-        "map", name, attempt, 2, ("map.npz", says), poses=0, first=first, slow=name not in ("text", "wrong counts")
-    )
+    return Case("map", name, attempt, 2, ("map.npz", says), poses=0, first=first, slow=name != "text")
 
 
 def _nan_poses(poses: np.ndarray) -> np.ndarray:
@@ -214,7 +212,7 @@ def _of_other_run(*files: str) -> Callable[..., Outcome]:
 
 _TRUTH_CASES = [
     *(
-        Case("truth", name, _evaluated(make), 0, says, first=first, slow=name != "T_camera_world")
+        Case("truth", name, _evaluated(make), 0, says, first=first, slow=True)
         for name, make, says, first in (
             ("of a body with x ahead", lambda: _truth_lines(_body()), ("--truth-frame body",), Verdict.SILENT),
             ("T_camera_world", lambda: _truth_lines(se3_inverse(_truth())), ("--truth-inverse",), Verdict.SILENT),

@@ -142,6 +142,7 @@ def test_a_filter_on_a_manifold_is_rewritten():
     check_same(step, (mean, root, random(BATCH, 3), random(BATCH, 2)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "function",
     [

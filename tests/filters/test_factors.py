@@ -223,6 +223,7 @@ def outputs(form: str, mean: Tensor, root: Tensor, variance: Tensor, z: Tensor, 
     return total + (update.belief.mean * weights[0]).sum(-1) + (update.belief.covariance * weights).sum((-2, -1))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("measurements", [2, 9])
 @pytest.mark.parametrize("by_root", [False, True])
 @pytest.mark.parametrize("form", FORMS)

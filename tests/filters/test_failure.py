@@ -11,7 +11,7 @@ from tests.support.filter_assertions import assert_close, assert_same_belief, as
 from tests.support.filter_builders import beliefs, bent_measurement, bent_motion, covariances, random_numbers, tensor
 
 BAD = 7
-BATCHES = {"large": 10_000, "few": 20}
+BATCHES = {"large": 1_000, "few": 20}
 
 
 def with_negative_eigenvalue(covariance: Tensor, share: float) -> Tensor:

@@ -182,6 +182,7 @@ def test_negative_weights_on_a_manifold_keep_the_covariance_of_the_posterior():
     assert_same_belief(bayes.update(prior, measurement, prior.mean[:2]).belief, prior, 1e-9)
 
 
+@pytest.mark.long
 def test_second_iteration_makes_many_precise_points_consistent():
     """R10: 200 stereo points from a prior of 0.04 m and 0.06 rad, 12 states, so the mean NEES should be 12."""
     runs, generator = 120, torch.Generator().manual_seed(1)

@@ -167,6 +167,7 @@ def test_stereo_pose_filter_is_consistent_in_twenty_experiments() -> None:
     assert_stereo_pose_is_consistent(20)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("pixel_sigma", [0.1, 0.5])
 def test_many_points_from_a_vague_prior_leave_the_default_filter_consistent(pixel_sigma: float) -> None:
     outcome = run(vague_prior(300, seeded(), pixel_sigma=pixel_sigma), filters.UnscentedKalmanFilter())
@@ -174,6 +175,7 @@ def test_many_points_from_a_vague_prior_leave_the_default_filter_consistent(pixe
     assert float(outcome.nees.median()) == pytest.approx(11.34, rel=0.1)
 
 
+@pytest.mark.long
 def test_one_linearisation_is_overconfident_from_a_vague_prior_and_two_are_not() -> None:
     scenario = vague_prior(200, seeded(1))
     once, twice = (run(scenario, filters.UnscentedKalmanFilter(iterations=k)).nees.mean() for k in (1, 2))
@@ -270,6 +272,7 @@ def kept_runs(outcome: Outcome) -> Tensor:
     return outcome.rmse_by_run[outcome.healthy.all(dim=0)]
 
 
+@pytest.mark.long
 def test_coordinated_turn_is_followed_better_by_sigma_points() -> None:
     scenario = coordinated_turn(500, seeded())
     assert_reproduces(run(scenario, CUBATURE).rmse_by_run, 18.3, 0.3)

@@ -79,6 +79,7 @@ def test_three_in_four_come_from_the_image_and_one_from_half_of_it():
     assert sorted(sigma.tolist()) == [1.0] * 76 + [2.0] * 25
 
 
+@pytest.mark.long
 def test_keypoints_at_half_scale_lie_on_blobs_of_double_size(extractor):
     """Pixel k of the half-size image is the mean of pixels 2 k and 2 k + 1: its centre is 2 k + 0.5."""
     rng = np.random.default_rng(0)

@@ -144,6 +144,7 @@ def test_the_graph_of_one_set_gives_the_logits_of_the_last_round(scorer):
     torch.testing.assert_close(logits, logits_of(scorer, inputs)[-1, 0])
 
 
+@pytest.mark.long
 def test_matches_that_agree_with_their_neighbours_are_learned_to_be_right():
     """Nothing but the field of the matches tells; in the held-out sets it turns and zooms otherwise."""
     torch.manual_seed(0)

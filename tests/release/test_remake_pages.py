@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from release import remake_pages
-from release.remake_pages import PEERS, ROOT, absent, command_of, remake, runnable
+from release.remake_pages import PEERS, ROOT, absent, command_of, describe_age, remake, runnable
 from sigmaslam_benchmarks.commands import BENCHMARKS, reads_data
 from sigmaslam_benchmarks.filters import peer_filters
 
@@ -26,6 +26,7 @@ def test_pages_name_benchmarks_that_exist():
     assert others == {("sigmaslam", "train", "export"), ("python", "-m", "tests.faults")}
 
 
+@pytest.mark.long
 def test_benchmarks_that_take_data_and_peers_are_known():
     assert reads_data("sequences")
     assert not reads_data("claims")
@@ -101,6 +102,28 @@ def test_renders_go_where_git_does_not_see_them():
     assert words[3:] == ["benchmark", "shake", "--out", "docs/a.md", "--runs", "build/results/shk", "--seeds", "20"]
     assert words[:3] == [sys.executable, "-m", "sigmaslam"]
     assert runnable(["python", "-m", "tests.faults", "--out", "a.md"])[1:] == ["-m", "tests.faults", "--out", "a.md"]
+
+
+def test_a_page_that_is_older_than_what_it_measures_is_told(tmp_path: Path):
+    """One command that is no benchmark: it depends on all code."""
+
+    def git(*words: str) -> str:
+        user = ["-c", "user.name=a", "-c", "user.email=a@b"]
+        return subprocess.run(["git", *user, *words], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+
+    git("init", "--quiet")
+    code = tmp_path / "sigmaslam" / "tracker.py"
+    code.parent.mkdir()
+    code.write_text("one = 1\n")
+    git("add", ".")
+    git("commit", "--quiet", "--message", "code")
+    page = tmp_path / "page.md"
+    page.write_text(f"Made by `python -m tests.faults` at commit {git('rev-parse', '--short=7', 'HEAD')}.")
+    assert "0 days, 0 of 1 files" in describe_age(page, tmp_path)
+    code.write_text("one = 2\n")
+    assert "0 days, 1 of 1 files" in describe_age(page, tmp_path)
+    page.write_text("Made by `python -m tests.faults` at commit 1234567.")
+    assert describe_age(page, tmp_path) == "page.md: of commit 1234567, which is not in this history"
 
 
 def test_the_benchmarks_can_be_imported_before_the_command_line():

@@ -19,9 +19,9 @@ from tests.support.simulated_board import CHESSBOARD, board_poses, draw_board, s
 from tests.support.videos import write_video
 from tests.support.wheeled_world import World, drive, write_csv_folder
 
-FRAMES, SECONDS = 10, 0.5
+FRAMES, SECONDS = 8, 0.5
 # The demo, enlarged until the box on the pages lies in its images.
-ZOOM = 3
+ZOOM = 2.25
 # Axes of a body, x ahead and z up, in a camera.
 AHEAD = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
@@ -62,7 +62,7 @@ def write_stand_ins(demo: Path, folder: Path) -> None:
     (folder / "wheels.yaml").write_text(yaml.safe_dump({"T_cam_base": AHEAD.tolist()}))
     (folder / "settings.yaml").write_text(yaml.safe_dump({"keyframe_ratio": 0.75}))
     mask = np.zeros_like(pairs[0][0])
-    mask[200:500, 300:700] = 255
+    mask[200:450, 400:700] = 255
     cv2.imwrite(str(folder / "mask.png"), mask)
     bumper = np.full_like(mask, 255)
     bumper[-100:] = 0

@@ -59,6 +59,7 @@ def first_hit(facets: Facets, origin: np.ndarray, rays: np.ndarray) -> tuple[np.
     return which, best
 
 
+@pytest.mark.long
 @CAMERAS
 def test_what_a_pixel_sees_is_the_first_facet_that_its_ray_meets(renderer: Renderer, camera: CameraModel) -> None:
     views = render(renderer, camera, (T_0, 0.8))
@@ -93,6 +94,7 @@ def test_flow_is_the_reprojected_depth(renderer: Renderer, camera: CameraModel) 
         np.testing.assert_allclose(field[chosen], camera.project(there) - pixels[chosen], atol=1e-5)
 
 
+@pytest.mark.long
 @CAMERAS
 def test_visible_points_are_those_no_facet_stands_before(renderer: Renderer, camera: CameraModel) -> None:
     first, second = render(renderer, camera, (T_0, 0.8)), render(renderer, camera, (T_1, 0.8))

@@ -37,7 +37,10 @@ def quick_textures() -> Iterator[None]:
     atlas._block.cache_clear()
 
 
-@pytest.fixture(scope="module", params=sorted(PRESETS))
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(name, marks=[pytest.mark.long] if name != "tool" else []) for name in sorted(PRESETS)],
+)
 def rendered(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two frames of a preset, with moving things and a badly calibrated pair."""
     out = tmp_path_factory.mktemp("sequence") / str(request.param)
@@ -208,6 +211,7 @@ def test_a_render_killed_before_its_scene_is_written_goes_on_to_the_same_bytes(
     assert files_of(out) == files_of(organ)
 
 
+@pytest.mark.long
 def test_another_seed_is_another_sequence(organ: Path) -> None:
     other = Studio(simulate(replace(RECIPE, seed=6))).frames(np.array([0]))[0].left
     first = cv2.imread(str(organ / "image_0" / "000000.png"), cv2.IMREAD_UNCHANGED)
@@ -241,6 +245,7 @@ def test_a_wrong_recipe_is_named_before_any_work(change: dict[str, object], mess
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.long
 def test_the_disparity_offset_shifts_the_right_image_alone() -> None:
     recipe = Recipe("organ", 1, seed=4, sensor="ideal", **SIZE)
     plain, shifted = (

@@ -86,6 +86,7 @@ def test_a_stopped_run_ends_as_one_that_was_not_stopped(finished, tiny, tmp_path
     assert logged_steps(tmp_path) == [4]
 
 
+@pytest.mark.long
 def test_run_folder_holds_weights_card_log_curves_and_samples(finished, tiny):
     load_network(finished / WEIGHTS_NAME)
     card = json.loads((finished / CARD_NAME).read_text())

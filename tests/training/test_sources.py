@@ -124,6 +124,7 @@ def test_a_world_of_one_s_own_gives_pairs_with_truth():
     assert isinstance(open_stream("rubble", 0, 96), ScenePairs)
 
 
+@pytest.mark.long
 def test_a_rendered_sequence_shows_the_world_of_the_file():
     simulation = simulate(Recipe("organ", 2, 5, width=64, height=48, world=str(BENCH)))
     kinds = {layer.kind for material in simulation.scene.materials for layer in material.layers}

@@ -174,6 +174,7 @@ def test_calibration_leaves_the_weights():
 # Training
 
 
+@pytest.mark.long
 def test_training_finds_the_sigma_and_the_probability_of_each_kind_of_match(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):

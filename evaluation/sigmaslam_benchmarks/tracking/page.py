@@ -1,7 +1,10 @@
 """Pages that benchmarks write and people annotate, and what their tables are made of."""
 
+import csv
+import io
 import os
 import platform
+import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -14,17 +17,33 @@ from sigmaslam.files import atomic_write_text
 from sigmaslam.source_commit import describe_source
 
 _MARK = "<!-- notes -->"
+_ASIDE = re.compile(r"<!-- rows ([\w-]+) -->\n(.*?)<!-- end -->\n", re.DOTALL)
 
 T = TypeVar("T")
 
 
 def write_page(path: Path, page: str) -> str:
-    """Writes a page and returns it; what is below a line `<!-- notes -->` in the one that is there is kept."""
+    """Writes a page and returns it; what is below a line `<!-- notes -->` in the one that is there is kept.
+
+    Tables between `<!-- rows NAME -->` and `<!-- end -->` go to PAGE.NAME.csv; the page links to that.
+    """
+    page = _ASIDE.sub(lambda found: _put_aside(path, *found.groups()), page)
     if path.exists():
         _, mark, notes = path.read_text(encoding="utf-8").partition(_MARK)
         page += mark + notes
     atomic_write_text(path, page)
     return page
+
+
+def _put_aside(path: Path, name: str, part: str) -> str:
+    """Writes the tables of a part of a page, one below the other, and returns what the page says of them."""
+    target = path.with_suffix(f".{name}.csv")
+    lines = [line for line in part.splitlines() if line.startswith("|") and not set(line) <= set("|-: ")]
+    written = io.StringIO()
+    cells = ([cell.strip().replace("\\|", "|") for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines)
+    csv.writer(written, lineterminator="\n").writerows(cells)
+    atomic_write_text(target, written.getvalue())
+    return f"[{target.name}]({target.name}), {len(lines) - 1} rows.\n"
 
 
 def fill_page(template: str, command: str, **values: Any) -> str:

@@ -33,34 +33,8 @@ _QUANTITIES = (
     "Disparity offset, pixels",
     "Milliseconds a frame",
 )
-_RELATIVE_COLUMNS = ("sequence", "span", "pairs", "NEES, mean", "inside 95 %", "truth's share %")
-_WORDS = """\
-All methods in turn in one run, with {threads} threads in OpenCV and 2 in the network. Accuracy is the same in every run
-on one machine, but for ORB-SLAM3's; times are wall milliseconds, means over all frames, keyframes in them. No setting
-of any method differs between sequences.
-
-- *demo*, *street*, *room* and *organ* are rendered, their truth is exact. Disparities of the last three are 0.3 px
-  larger than the calibration says; *street-calibrated* has the same images with their right calibration. Sigmas of the
-  other truths: KITTI drive 0.21 m and 0.05 degrees, KITTI 01 0.1 m and 0.05, MH01 2 mm and 0.2, V1 3 mm and 0.1.
-- *ours*: learned features, unscented updates, two linearisations: what `sigmaslam track` does. *Our EKF*: the same with
-  Jacobians, linearised once. *Ours with*: other features under the same filter.
-- *SIFT + PnP*, *KLT + PnP*: from OpenCV alone (`sigmaslam_benchmarks.tracking.pnp_baselines`). Landmarks count as
-  known, the noise as 1 px.
-- *cuVSLAM*: on the CPU, by the package dim-odom (extra `peers`), given rectified pairs. Its covariance
-  (`pose_covariance`) is turned into the camera's frame; it is of the fit of one frame to its map. *NEES* takes it for
-  that of the pose relative to the first; a line below for that of the step from the frame before.
-- *ORB-SLAM3*: by the package pyorbslam3 (extra `peers`), given rectified pairs at their time stamps, with the
-  vocabulary that `PYORBSLAM3_VOCAB` names. It gives no covariance.
-- *bundle adjustment*: of the tracks of *ours* (`track --tracks`, then `refine`). Its time is that of the optimisation,
-  its NEES that of the keyframes.
-- *Tracked*: frames with a pose from the images. *ATE*: root mean square position error after the best rigid alignment.
-  *t_rel*: KITTI segments, of 100 m where the path allows, else of 10 to 50 m.
-- *Step error*: median error from frame to frame. *Forward noise*: standard deviation of the error along the true step;
-  steps shorter than the truth's sigma are left out.
-- *NEES*: per degree of freedom, 1 is right, more is overconfident; where the truth is exact.
-- *Relative poses*: of frames a span apart, which overlap, with the truth's covariance; *truth's share*: median.
-- *Disparity offset*: measured minus true disparity, of the methods that estimate it.
-"""
+# Tables beside the page, by their names.
+_ASIDE = {"Step error, mm": "steps", "Disparity offset, pixels": "offsets"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,6 +102,7 @@ def format_results(results: Sequence[SequenceResult | Omission], command: str, c
         labels=_LABELS,
         left_out=[result for result in results if isinstance(result, Omission)],
         quantities=quantities,
+        aside=_ASIDE,
         steps=steps,
         relative=[row for result in found if result.method == "ours" for row in _relative_rows(result)],
     )

@@ -99,6 +99,7 @@ def test_outliers_are_found_and_do_no_harm():
     assert dirty.cost_after < 1.1
 
 
+@pytest.mark.long
 def test_scipy_finds_the_same_optimum():
     run = simulate(2, keyframes=4, per_keyframe=18, noise=0.5, depths=(2.0, 8.0), without_disparity=0.1)
     config = RefineConfig(offset_sigma=0.5)

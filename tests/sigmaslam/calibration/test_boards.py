@@ -14,6 +14,7 @@ from tests.support.simulated_board import APRIL_GRID, CHARUCO, CHESSBOARD, FISHE
 UPRIGHT = se3_exp(np.array([0.0, 0.0, 0.0, np.pi, 0.0, 0.0]))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("board", [CHESSBOARD, CHARUCO, APRIL_GRID], ids=lambda board: type(board).__name__)
 @pytest.mark.parametrize("eye", [RADTAN, FISHEYE], ids=lambda eye: eye.distortion_model)
 def test_corners_are_where_the_board_was_drawn(board: Board, eye):

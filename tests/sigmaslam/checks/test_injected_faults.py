@@ -26,6 +26,7 @@ def assert_named(fault: Fault, frames: Frames, camera) -> None:
     assert all("\n" not in message for message in named.values())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [*FAULTS, *RECTIFIED_FAULTS])
 def test_a_fault_in_the_demo_is_named(name: str, demo: Demo):
     camera, frames, _ = demo

@@ -42,6 +42,7 @@ from tests.support.dense_window import (
 # ---- the joint solution
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("scale", "tolerance"), [(NARROW, 1e-4), (0.1, 1e-2), (1.0, 0.1)])
 def test_the_solution_is_that_of_dense_least_squares(scale: float, tolerance: float):
     """Exactly so while rotations are small: their prior is not bent into the chart at the estimate."""
@@ -55,6 +56,7 @@ def test_the_solution_is_that_of_dense_least_squares(scale: float, tolerance: fl
         assert np.abs(found).max() < tolerance
 
 
+@pytest.mark.long
 def test_landmarks_given_the_state_have_the_dense_covariance_and_follow_it():
     given = world(3, NARROW)
     window, dense = solved(given), Dense(given, KEYFRAMES).solve()
@@ -315,6 +317,7 @@ def test_errors_are_as_large_as_the_covariance_says(linearisation: str):
 # ---- leaving keyframes
 
 
+@pytest.mark.long
 def test_what_a_retired_keyframe_leaves_is_the_dense_marginal():
     """All landmarks are the first keyframe's: with it they go, and Schur's complement is the prior of the rest."""
     for scale, tolerance in ((NARROW, 1e-4), (0.1, 1e-2)):

@@ -79,6 +79,7 @@ def loop(truth: np.ndarray, i: int, seed: int) -> PoseEdge:
     return PoseEdge(i, COUNT - 1, se3_inverse(truth[i]) @ truth[-1] @ error, np.diag(LOOP_SIGMA**2), doubtful=True)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_past_and_window_together_are_the_dense_solution(seed: int):
     """One keyframe has left, some of its landmarks' views are in the prior, the other views in the window."""

@@ -133,6 +133,7 @@ def test_a_forgotten_twist_is_independent_of_the_pose():
     np.testing.assert_array_equal(joint_covariance(motion)[6:, 6:], 0.25 * np.eye(6))
 
 
+@pytest.mark.long
 def test_velocity_is_found_from_noisy_poses_and_its_error_is_as_large_as_it_says():
     """A camera on a screw for 10 frames, 40 times: NEES of pose and twist."""
     rng = np.random.default_rng(3)
@@ -163,6 +164,7 @@ def test_velocity_is_found_from_noisy_poses_and_its_error_is_as_large_as_it_says
     assert 9.6 < np.mean(values) < 14.7
 
 
+@pytest.mark.long
 def test_long_sequences_stay_rigid_and_symmetric():
     """Predicted alone for 300 frames, and corrected in each by products with inverses by transposition."""
     free, corrected = moving(), moving()

@@ -489,6 +489,7 @@ def test_a_large_image_is_matched_as_the_same_shrunk():
     np.testing.assert_allclose(found.covariance, 4.0 * expected.covariance, rtol=1e-6)
 
 
+@pytest.mark.long
 def test_a_pair_of_two_sizes_shrinks_the_large_one_alone():
     image0, image1, H = large_pair(2400)
     small1 = cv2.resize(image1, (960, 720), interpolation=cv2.INTER_AREA)

@@ -70,6 +70,7 @@ def test_the_posterior_of_a_group_equals_the_dense_formula():
         assert weight[k] == pytest.approx(1.0 / (250.0 * np.trace(gain @ gain)), rel=1e-3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sigma", [15.0, 50.0])
 def test_ours_beats_non_local_means_and_the_thorough_one_beats_ours(truth: np.ndarray, sigma: float):
     noisy = truth + np.random.default_rng(0).normal(0.0, sigma, truth.shape)

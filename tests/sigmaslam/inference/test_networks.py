@@ -79,6 +79,7 @@ def test_features_come_from_the_folder_and_the_rest_from_the_package(folder: Pat
     ConfidenceEstimator(weights=folder)
 
 
+@pytest.mark.long
 def test_a_copy_of_what_ships_matches_as_it_does(tmp_path: Path, image: np.ndarray):
     for name in NETWORKS:
         shutil.copy(shipped_weights(f"{name}.onnx"), tmp_path)
@@ -135,6 +136,7 @@ def test_every_shipped_network_passes_its_own_check(tmp_path: Path):
         assert open_graph(name, tmp_path).inputs == OnnxGraph(shipped_weights(f"{name}.onnx")).inputs
 
 
+@pytest.mark.long
 def test_a_graph_with_other_inputs_is_refused_when_it_is_opened(tmp_path: Path):
     # The two verifiers differ in the number of columns alone.
     shutil.copy(shipped_weights("verifier.onnx"), tmp_path / "place_verifier.onnx")

@@ -99,6 +99,7 @@ def test_a_gyro_alone_has_no_columns_of_force(tmp_path, force):
         read_imu(tmp_path / "rig.csv")
 
 
+@pytest.mark.long
 def test_real_recordings_have_a_sensor(real_data):
     for name, count in (("euroc_mh01_f000_099", 1290), ("euroc_v1_01_keyframes_a", 21051)):
         assert len(read_imu(find_imu(real_data / name)).samples) == count

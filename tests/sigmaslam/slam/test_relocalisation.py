@@ -509,6 +509,7 @@ def test_a_view_that_is_nowhere_in_the_map_has_no_pose(demo: Demo, demo_run: Pat
     np.testing.assert_allclose(covariances[0], estimate.covariance, atol=1e-9)
 
 
+@pytest.mark.long
 def test_tracks_begin_with_their_hosts_and_are_read_by_refine(demo_run: Path):
     with np.load(demo_run / "tracks.npz") as archive:
         tracks = {name: archive[name] for name in archive.files}

@@ -180,6 +180,7 @@ def test_covariances_told_as_they_are_beat_equal_ones(translation: np.ndarray):
     assert told < 0.5 * equal
 
 
+@pytest.mark.long
 def test_ellipses_told_as_they_are_beat_circles_and_those_that_lie_across():
     """Matches as on edges: ten times as uncertain along a direction of their own."""
     exact = scene()
@@ -320,6 +321,7 @@ def test_float32_matches_are_taken():
 # Covariance
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("translation", [SIDEWAYS, FORWARD])
 def test_errors_are_as_the_covariance_says(translation: np.ndarray):
     squared = []
