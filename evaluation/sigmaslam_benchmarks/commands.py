@@ -167,9 +167,9 @@ BENCHMARKS = {
         _TRAIN,
     ),
     "noise": Benchmark(
-        "tracking.match_noise",
-        "A covariance for each match beside one for all. The tracker with both (extra 'train').",
-        (_RUNS, _DATA),
+        "tracking.consistency",
+        "A covariance for each match beside one for all. On the runs of 'consistency' (extra 'train').",
+        (_RUNS, _count("seeds", 30, "Sequences a scale."), _RAY),
         _TRAIN,
     ),
     "consistency": Benchmark(

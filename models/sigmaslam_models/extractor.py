@@ -49,7 +49,7 @@ class FeatureExtractor(nn.Module):
         return keypoints[order], scores, descriptors, sigma[order]
 
     def _level(self, cells: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        candidates, strength = self._detect(cells, _CANDIDATES_PER_KEYPOINT * count)
+        candidates, strength = detect(cells, _CANDIDATES_PER_KEYPOINT * count)
         maps = self.network(cells)
         quality = sample_map(maps.quality, candidates).squeeze(-1).sigmoid()
         strength = strength / strength.amax(dim=1, keepdim=True).clamp_min(1e-12)
@@ -58,9 +58,6 @@ class FeatureExtractor(nn.Module):
         keypoints = candidates.gather(1, order.unsqueeze(-1).expand(-1, -1, 2))
         descriptors = self.network.describe(maps, keypoints)
         return keypoints[0], scores[0], descriptors[0], sigma.gather(1, order)[0]
-
-    def _detect(self, cells: Tensor, count: int) -> tuple[Tensor, Tensor]:
-        return detect(cells, count)
 
     def _rank(self, strength: Tensor, quality: Tensor, sigma: Tensor) -> Tensor:
         """Scores (B, N). Relative strength of the blob and learned quality count alike; of strength zero is no blob."""

@@ -38,6 +38,8 @@ ERRORS = (
 
 What is the right camera's alone depends on the place in the right image.
 """
+OF_PAIR = ERRORS[:-VIEW_TURNS]
+"""What is wrong with the pair; the others are of views."""
 TURNS = ("yaw", "pitch", "roll")
 """Of the right camera."""
 

@@ -10,8 +10,7 @@ import numpy as np
 
 from sigmaslam.bounded_files import CALIBRATION_BYTES, read_text, shorten
 from sigmaslam.errors import InputError
-from sigmaslam.estimation.calibration_errors import ERRORS
-from sigmaslam.estimation.state_layout import VIEW_TURNS
+from sigmaslam.estimation.calibration_errors import OF_PAIR
 from sigmaslam.geometry.restricted_yaml import parse_yaml
 
 LINEARISATIONS = ("unscented", "extended")
@@ -128,11 +127,10 @@ def check_estimated(place: str, names: list[str]) -> tuple[str, ...]:
     Raises:
         InputError: there is no such error; the message begins with `place`.
     """
-    known = ERRORS[:-VIEW_TURNS]
     for name in names:
-        if not isinstance(name, str) or name not in known:
+        if not isinstance(name, str) or name not in OF_PAIR:
             raise InputError(
-                f"{place}: a calibration has no error {shorten(repr(name))}: choose among {', '.join(known)}"
+                f"{place}: a calibration has no error {shorten(repr(name))}: choose among {', '.join(OF_PAIR)}"
             )
     return tuple(names)
 

@@ -9,7 +9,13 @@ import torch
 
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam_benchmarks.tracking.consistency import depths_around
-from sigmaslam_benchmarks.tracking.consistency_page import ConsistencyResult, Scale, format_page
+from sigmaslam_benchmarks.tracking.consistency_page import (
+    DRAWN,
+    ConsistencyResult,
+    Scale,
+    format_noise,
+    format_page,
+)
 from sigmaslam_evaluation.metrics.map_consistency import (
     coverage,
     depth_edges,
@@ -125,3 +131,21 @@ def test_the_page_names_the_goals_that_are_missed():
     assert "| EKF | 1.10 ± 0.00 | 94 ± 0 | 0.90 ± 0.00 | 96 ± 0 |" in rows
     widths = {line.count("|") for line in page.splitlines() if line.startswith(("| EKF |", "| ours |"))}
     assert widths == {5, 6, 9}
+
+
+def test_the_page_of_noise_compares_own_covariances_with_one_on_the_same_sequence():
+    own, worse = (
+        [replace(GOOD, ate=0.001), replace(GOOD, ate=0.004)],
+        [replace(GOOD, ate=0.002), replace(GOOD, ate=0.002)],
+    )
+    methods = {"ours": own, "one covariance": worse, f"one covariance, {DRAWN}": worse, f"ours, {DRAWN}": own[:1] * 2}
+    page = format_noise({Scale("driving", "street", 64, 48): methods}, 0.3, 30, (1000, 2), "the command")
+    rows = [line for line in page.splitlines() if line.startswith(("| driving", "| **all**"))]
+    assert [row.split(" | ")[1:3] for row in rows] == [
+        ["exact", "1.00 ± 0.69"],
+        ["drawn", "0.50 ± 0.00"],
+        ["exact", "1.00 ± 0.69"],
+        ["drawn", "0.50 ± 0.00"],
+        ["both", "0.71 ± 0.25"],
+    ]
+    assert {row.count("|") for row in rows} == {8}

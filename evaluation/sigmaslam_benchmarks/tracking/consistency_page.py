@@ -1,4 +1,4 @@
-"""The page of the benchmark `consistency`."""
+"""The pages of the benchmarks `consistency` and `noise`, of the same runs."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -58,7 +58,8 @@ class ConsistencyResult:
 
 
 Results: TypeAlias = Mapping[Scale, Mapping[str, Sequence[ConsistencyResult]]]
-"""By scale and method, in the order of seeds; the last method has a calibration that is drawn."""
+"""By scale and method, in the order of seeds; methods whose name ends with `DRAWN` have a calibration that is drawn."""
+DRAWN = "calibration drawn"
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +82,7 @@ class Goal:
 
 
 GOALS = (
-    Goal("NEES of poses per dof", "nees", 0.7, 1.5),
+    Goal("NEES of poses per dof", "nees", 0.7, 1.4),
     Goal("poses inside 95 %", "inside", 0.90, 0.98, percent=True),
     Goal("NIS per dof", "nis", 0.9, 1.1),
     Goal("NEES of map points per dof", "point_nees", 0.7, 1.5),
@@ -121,6 +122,36 @@ def format_page(
             for scale, methods in results.items()
         ],
     )
+
+
+def format_noise(
+    results: Results, offset: float, frames: int, seeds: tuple[int, int], command: str, missing: Sequence[str] = ()
+) -> str:
+    """The page of own covariances of matches beside one for all; arguments as of `format_page`."""
+    pairs = {"exact": ("ours", "one covariance"), "drawn": (f"ours, {DRAWN}", f"one covariance, {DRAWN}")}
+    rows, total = [], {calibration: ([], []) for calibration in pairs}
+    for scale, methods in results.items():
+        for calibration, names in pairs.items():
+            own, one = (methods[name] for name in names)
+            rows.append([scale.name, calibration, *_compared(own, one)])
+            for found, trials in zip(total[calibration], (own, one), strict=True):
+                found += trials
+    rows += [["**all**", calibration, *_compared(own, one)] for calibration, (own, one) in total.items()]
+    own, one = ([*exact, *drawn] for exact, drawn in zip(*total.values(), strict=True))
+    rows.append(["**all**", "both", *_compared(own, one)])
+    first, count = seeds
+    return fill_page(
+        "noise", command, first=first, count=count, frames=frames, offset=offset, rows=rows, missing=missing
+    )
+
+
+def _compared(own: Sequence[ConsistencyResult], one: Sequence[ConsistencyResult]) -> list[str]:
+    """Cells: quotient of the errors; what both say of themselves; frames lost."""
+    ratio = ratio_with_error([result.ate for result in own], [result.ate for result in one])
+    cells = [number_with_error(*ratio, ".2f")]
+    for value, form in ((lambda r: r.nees, ".2f"), (lambda r: 100 * r.inside, ".0f"), (lambda r: r.nis, ".2f")):
+        cells.append(f"{_cell(own, value, form)} / {_cell(one, value, form)}")
+    return [*cells, " / ".join(str(sum(result.lost for result in trials)) for trials in (own, one))]
 
 
 def _goals(results: Results, method: int, goals: Sequence[Goal]) -> tuple[list[list[str]], list[str]]:

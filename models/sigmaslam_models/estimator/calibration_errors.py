@@ -13,10 +13,8 @@ def unmodelled_errors(intrinsics: Tensor, uvd: Tensor) -> Tensor:
     Returns:
         (..., 3, 9) to first order, in the order of `sigmaslam.estimation.calibration_errors.ERRORS`.
     """
-    fx, fy, cx, cy = intrinsics[:4].unbind(0)
-    u, v, disparity = uvd.unbind(-1)
-    across, down = u - cx, v - cy
-    x, y = across / fx, down / fy
+    fx = intrinsics[0]
+    across, down, x, y, disparity = _places(intrinsics, uvd)
     x_right, y_squared = x - disparity / fx, y * y
     squared = x * x + y_squared
     zero, one = torch.zeros_like(x), torch.ones_like(x)
@@ -36,9 +34,16 @@ def view_turns(intrinsics: Tensor, uvd: Tensor) -> Tensor:
     Returns:
         (M, 3, 3) to first order.
     """
-    fx, fy, cx, cy = intrinsics[:4].unbind(0)
-    u, v, disparity = uvd.unbind(-1)
-    x, y = (u - cx) / fx, (v - cy) / fy
+    fx, fy = intrinsics[:2].unbind(0)
+    _, _, x, y, disparity = _places(intrinsics, uvd)
     share, zero, ratio = disparity / fx, torch.zeros_like(x), fy / fx
     in_u, in_v = [-x * y, 1.0 + x * x, -y], [-ratio * (1.0 + y * y), ratio * x * y, ratio * x]
     return torch.stack([*in_u, *in_v, -share * y, share * x, zero], dim=-1).unflatten(-1, (3, 3))
+
+
+def _places(intrinsics: Tensor, uvd: Tensor) -> tuple[Tensor, ...]:
+    """Columns and rows from the centre, pixels and normalised, and disparities."""
+    fx, fy, cx, cy = intrinsics[:4].unbind(0)
+    u, v, disparity = uvd.unbind(-1)
+    across, down = u - cx, v - cy
+    return across, down, across / fx, down / fy, disparity

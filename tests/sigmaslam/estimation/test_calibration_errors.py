@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sigmaslam.estimation.calibration_errors import ERRORS, CalibrationPrior, measured_errors
-from sigmaslam.estimation.state_layout import VIEW_TURNS
+from sigmaslam.estimation.calibration_errors import ERRORS, OF_PAIR, CalibrationPrior, measured_errors
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.geometry.camera import CameraModel
 from sigmaslam.geometry.se3 import rotation_exp
@@ -47,8 +46,6 @@ def moved(u: float = 0.0, v: float = 0.0) -> CameraModel:
     """An eye with its principal point so many pixels elsewhere."""
     return replace(EYE, cx=EYE.cx + u, cy=EYE.cy + v)
 
-
-OF_PAIR = ERRORS[:-VIEW_TURNS]
 
 # By name: the pair with an error of that size, and the errors of the table that are as large as one of size one.
 FX = CAMERA.fx

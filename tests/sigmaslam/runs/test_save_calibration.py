@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from sigmaslam.geometry.camera import StereoCamera
+from sigmaslam.readers import open_sequence
 from sigmaslam.run_record.frame_table import read_frames
+from sigmaslam_evaluation.run_evaluation import evaluate_run
 from tests.support.commands import assert_refused, run_here
 
 
@@ -25,6 +28,18 @@ def test_a_second_run_begins_with_what_the_first_one_learned(demo_sequence: Path
     assert known < 0.3
     assert second["disparity_offset_sigma"][0] == pytest.approx(known, rel=0.02)
     assert abs(second["disparity_offset"][-1]) < known
+
+
+@pytest.mark.slow
+def test_the_jump_of_a_loop_is_no_wrong_calibration(real_data: Path, tmp_path: Path):
+    """It was corrected as a yaw of 0.27 degrees, four frames after the first loop: 0.18 m."""
+    folder, learned = real_data / "euroc_v1_01_keyframes_a", tmp_path / "learned.yaml"
+    run_here("track", folder, "--imu", "off", "--out", tmp_path / "run", "--save-calibration", learned)
+    covariance, before = StereoCamera.from_yaml(learned).covariance, open_sequence(folder).camera.T_left_right
+    assert covariance is not None
+    assert covariance.names == ("offset",)
+    np.testing.assert_array_equal(StereoCamera.from_yaml(learned).T_left_right, before)
+    assert evaluate_run(tmp_path / "run", folder / "groundtruth.csv", plot=False).ate.rmse < 0.06
 
 
 def test_a_file_that_is_there_is_not_overwritten(demo_sequence: Path, tmp_path: Path):
