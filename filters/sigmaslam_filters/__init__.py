@@ -14,7 +14,7 @@ from sigmaslam_filters.learning import FittedNoise, fit_noise
 from sigmaslam_filters.manifolds import SE2, SE3, SO2, SO3, Euclidean, Manifold, Product
 from sigmaslam_filters.manifolds.lie_groups import wrap_angle
 from sigmaslam_filters.models import LinearMeasurement, LinearMotion, MeasurementModel, MotionModel, several
-from sigmaslam_filters.particles import ParticleFilter, Particles
+from sigmaslam_filters.particles import EnsembleKalmanFilter, ParticleFilter, Particles
 from sigmaslam_filters.point_estimates import Observation, PointEstimate, maximum_a_posteriori, maximum_likelihood
 from sigmaslam_filters.results import TimeUpdate, Update
 from sigmaslam_filters.time_series import Event, Track, interleaved
@@ -28,6 +28,7 @@ __all__ = [
     "BlockDiagonal",
     "Dense",
     "Diagonal",
+    "EnsembleKalmanFilter",
     "Euclidean",
     "Event",
     "ExportError",

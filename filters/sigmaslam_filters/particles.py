@@ -1,4 +1,4 @@
-"""The Bayes filter (9.21) in its general form, by samples: the bootstrap particle filter (Gordon et al. 1993)."""
+"""Beliefs by samples: the bootstrap particle filter (Gordon et al. 1993), (9.21), and the ensemble Kalman filter."""
 
 import math
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from sigmaslam_filters.core.factors import apply
-from sigmaslam_filters.core.noise_covariance import as_noise
+from sigmaslam_filters.core.noise_covariance import Noise, as_noise
 from sigmaslam_filters.core.tensors import shapes_of
 from sigmaslam_filters.gaussian_belief import Gaussian
 from sigmaslam_filters.manifolds import Space, is_flat
@@ -82,17 +82,8 @@ class ParticleFilter:
         Raises:
             ValueError: the noise is not additive, so that its density is not known.
         """
-        if not isinstance(measurement, LinearMeasurement) and not measurement.additive:
-            raise ValueError("particles need the density of the measurement's noise: declare it additive")
-        present = ~torch.isnan(value)
-        if measurement.mask is not None:
-            present = present & measurement.mask
-        noise = as_noise(measurement.noise).masked(present)
-        residual = None if isinstance(measurement, LinearMeasurement) else measurement.residual
-        seen = measurement.evaluate(particles.states, *inputs)
-        filled = torch.where(present, value, 0.0)
-        difference = filled - seen if residual is None else residual(filled, seen)
-        white = noise.whitened(torch.where(present, difference, 0.0).unsqueeze(-1)).squeeze(-1)
+        difference, noise, present = _differences(particles.states, measurement, value, inputs)
+        white = noise.whitened(difference.unsqueeze(-1)).squeeze(-1)
         constant = noise.log_determinant() + present.sum(dim=-1) * math.log(2.0 * math.pi)
         log_weights = particles.log_weights - 0.5 * (white.square().sum(dim=-1) + constant)
         likelihood = torch.logsumexp(log_weights, dim=0)
@@ -100,18 +91,21 @@ class ParticleFilter:
 
     def gaussian(self, particles: Particles) -> Gaussian:
         """Mean and covariance of the particles, in the chart at the mean."""
+        mean, offsets = self._spread(particles)
+        weighted = (torch.exp(0.5 * particles.log_weights).unsqueeze(-1) * offsets).movedim(0, -1)
+        return Gaussian(mean, weighted @ weighted.mT, is_symmetric=True)
+
+    def _spread(self, particles: Particles) -> tuple[Tensor, Tensor]:
+        """Mean (..., p), and tangents (N, ..., n) from it to the particles."""
         weights, states = torch.exp(particles.log_weights).unsqueeze(-1), particles.states
         if self.space is None or is_flat(self.space):
             mean = (weights * states).sum(dim=0)
-            offsets = states - mean
-        else:
-            mean = states[0]
-            for _ in range(_ROUNDS_OF_THE_MEAN):
-                offsets = self.space.local(mean.expand_as(states), states)
-                mean = self.space.retract(mean, (weights * offsets).sum(dim=0))
+            return mean, states - mean
+        mean = states[0]
+        for _ in range(_ROUNDS_OF_THE_MEAN):
             offsets = self.space.local(mean.expand_as(states), states)
-        weighted = (weights.sqrt() * offsets).movedim(0, -1)
-        return Gaussian(mean, weighted @ weighted.mT, is_symmetric=True)
+            mean = self.space.retract(mean, (weights * offsets).sum(dim=0))
+        return mean, self.space.local(mean.expand_as(states), states)
 
     def _resampled(self, particles: Particles) -> Particles:
         """Systematic resampling (Kitagawa 1996) of the elements whose effective number is low."""
@@ -133,3 +127,44 @@ class ParticleFilter:
 
     def _retract(self, points: Tensor, tangents: Tensor) -> Tensor:
         return points + tangents if self.space is None else self.space.retract(points, tangents)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EnsembleKalmanFilter(ParticleFilter):
+    """Corrects each sample by the gain of their common covariance (Evensen 1994; Burgers et al. 1998).
+
+    Weights stay equal, so that a hundred samples serve a hundred dimensions; beliefs stay near to Gaussian.
+    """
+
+    def update(
+        self, particles: Particles, measurement: AnyMeasurement, value: Tensor, *inputs: Tensor
+    ) -> tuple[Particles, Tensor]:
+        """The samples after a measurement, each given its own draw of the noise, and its log-likelihood (...,)."""
+        difference, noise, present = _differences(particles.states, measurement, value, inputs)
+        _, offsets = self._spread(particles)
+        innovation = difference.mean(dim=0)
+        spread, freedom = innovation - difference, len(difference) - 1
+        own, cross = (torch.einsum("n...i,n...j->...ij", spread, each) / freedom for each in (spread, offsets))
+        root = torch.linalg.cholesky(own + noise.covariance())
+        gain = torch.cholesky_solve(cross, root).mT
+        drawn = apply(noise.factor(), self._normal(tuple(difference.shape), difference))
+        states = self._retract(particles.states, apply(gain, difference + torch.where(present, drawn, 0.0)))
+        white = torch.linalg.solve_triangular(root, innovation.unsqueeze(-1), upper=False).squeeze(-1)
+        squared = white.square().sum(dim=-1) + present.sum(dim=-1) * math.log(2.0 * math.pi)
+        likelihood = -0.5 * squared - torch.diagonal(root, dim1=-2, dim2=-1).log().sum(dim=-1)
+        return Particles(states, particles.log_weights), likelihood
+
+
+def _differences(
+    states: Tensor, measurement: AnyMeasurement, value: Tensor, inputs: tuple[Tensor, ...]
+) -> tuple[Tensor, Noise, Tensor]:
+    """Measured minus predicted (N, ..., m), zero where nothing was measured; the noise; what was measured (..., m)."""
+    if not isinstance(measurement, LinearMeasurement) and not measurement.additive:
+        raise ValueError("particles need the density of the measurement's noise: declare it additive")
+    present = ~torch.isnan(value)
+    if measurement.mask is not None:
+        present = present & measurement.mask
+    residual = None if isinstance(measurement, LinearMeasurement) else measurement.residual
+    seen, filled = measurement.evaluate(states, *inputs), torch.where(present, value, 0.0)
+    difference = filled - seen if residual is None else residual(filled, seen)
+    return torch.where(present, difference, 0.0), as_noise(measurement.noise).masked(present), present

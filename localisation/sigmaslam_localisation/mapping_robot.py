@@ -33,7 +33,7 @@ class MappingRobot:
 
     @property
     def space(self) -> Product:
-        """SE(2) x R^(7 + 2 landmarks)."""
+        """SE(2) x R^(9 + 2 landmarks)."""
         return Product(BODY, Euclidean(len(CONSTANTS) + 2 * self.landmarks))
 
     def prior(self, start: Tensor) -> Gaussian:

@@ -5,7 +5,7 @@ import numpy as np
 from sigmaslam_localisation.robots import LandmarkMap, RobotEstimate
 
 RATE = 10.0
-"""Poses are compared so often a second, each time with the latest estimate."""
+"""The latest pose is compared so often a second, with the truth at its own time."""
 
 
 def score(estimate: RobotEstimate) -> dict[str, float]:
@@ -13,8 +13,8 @@ def score(estimate: RobotEstimate) -> dict[str, float]:
     if estimate.truth is None:
         return {}
     seconds = np.arange(estimate.seconds[0], estimate.seconds[-1], 1 / RATE)
-    true = estimate.truth.at(seconds)
     latest = np.searchsorted(estimate.seconds, seconds, side="right") - 1
+    true = estimate.truth.at(estimate.seconds[latest])
     usable = np.isfinite(true).all(axis=1)
     if not usable.any():
         return {}

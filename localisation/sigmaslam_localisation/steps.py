@@ -9,8 +9,6 @@ from sigmaslam_localisation.recording import Recording
 
 LONGEST_STEP = 0.2
 """Seconds. Within a step the robot is taken to drive an arc."""
-LONGEST_STEPS = 2_000_000
-"""More steps than this are a mistake in the time stamps."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

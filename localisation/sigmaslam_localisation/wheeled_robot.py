@@ -1,6 +1,6 @@
 """A robot with wheels in the plane, (9.43) and (9.44), with what is not known about its wheels and its sensor.
 
-The state is the pose on SE(2), then seven constants that the filter estimates on the way:
+The state is the pose on SE(2), then nine constants that the filter estimates on the way:
 
 | component | unit | what it is |
 |---|---|---|
@@ -9,6 +9,7 @@ The state is the pose on SE(2), then seven constants that the filter estimates o
 | drift | rad | direction of driving, seen from the heading: slip, or wheels that are not square to the sensor |
 | bearing offset | rad | how the sensor is turned on the robot |
 | range scale | 1 | relative error of the sensor's distances |
+| sensor ahead, sensor left | m | where the sensor stands, beside where it is said to |
 """
 
 from __future__ import annotations
@@ -32,7 +33,10 @@ from sigmaslam_filters import (
 from sigmaslam_localisation.recording import Recording
 
 BODY = SE2("right")
-CONSTANTS = ("speed scale", "turn scale", "speed offset", "turn offset", "drift", "bearing offset", "range scale")
+CONSTANTS = (
+    *("speed scale", "turn scale", "speed offset", "turn offset", "drift"),
+    *("bearing offset", "range scale", "sensor ahead", "sensor left"),
+)
 SPACE = Product(BODY, Euclidean(len(CONSTANTS)))
 
 
@@ -50,7 +54,7 @@ class RobotNoise:
     """
 
     start: tuple[float, float, float] = (0.01, 0.01, 0.01)
-    constants: tuple[float, ...] = (0.05, 0.05, 0.02, 0.005, 0.05, 0.01, 0.03)
+    constants: tuple[float, ...] = (0.05, 0.05, 0.02, 0.005, 0.05, 0.01, 0.03, 0.02, 0.02)
     drive: tuple[float, float] = (0.01, 0.1)
     turn: tuple[float, float] = (0.02, 0.1)
     distance: tuple[float, float] = (0.03, 0.05)
@@ -117,7 +121,8 @@ class WheeledRobot:
             ahead, left = value[..., 0] * torch.cos(value[..., 1]), value[..., 0] * torch.sin(value[..., 1])
         scale = 1.0 / (1.0 + state[..., 9])
         sine, cosine = torch.sin(state[..., 8]), torch.cos(state[..., 8])
-        ahead, left = scale * (cosine * ahead + sine * left) + self.lever, scale * (cosine * left - sine * ahead)
+        ahead, left = scale * (cosine * ahead + sine * left), scale * (cosine * left - sine * ahead)
+        ahead, left = ahead + self.lever + state[..., 10], left + state[..., 11]
         sine, cosine = torch.sin(state[..., 2]), torch.cos(state[..., 2])
         return stack([state[..., 0] + cosine * ahead - sine * left, state[..., 1] + sine * ahead + cosine * left])
 
@@ -125,7 +130,7 @@ class WheeledRobot:
         """Metres ahead of the sensor and to its left (..., 2), (9.45)."""
         x, y = landmark[..., 0] - state[..., 0], landmark[..., 1] - state[..., 1]
         sine, cosine = torch.sin(state[..., 2]), torch.cos(state[..., 2])
-        ahead, left = cosine * x + sine * y - self.lever, cosine * y - sine * x
+        ahead, left = cosine * x + sine * y - self.lever - state[..., 10], cosine * y - sine * x - state[..., 11]
         sine, cosine = torch.sin(state[..., 8]), torch.cos(state[..., 8])
         scale = 1.0 + state[..., 9]
         return stack([scale * (cosine * ahead - sine * left), scale * (sine * ahead + cosine * left)])

@@ -8,12 +8,10 @@ import numpy as np
 from sigmaslam.estimation.clustered_errors import clustering
 from sigmaslam.geometry.se3 import skew
 
-# Five fix the pose; three more must say so, too.
-_MIN_MATCHES = 8
-# What is more likely wrong than right has no vote.
-_MIN_PROBABILITY = 0.5
-# The sampling consensus accepts this epipolar distance, pixels: within a pixel keypoints are found.
-_THRESHOLD = 1.0
+MIN_MATCHES, MIN_PROBABILITY = 8, 0.5
+"""Five fix the pose; three more must say so, too. What is more likely wrong than right has no vote."""
+THRESHOLD = 1.0
+"""The sampling consensus accepts this epipolar distance, pixels: within a pixel keypoints are found."""
 # Of five matches: 0.999 sure of a right one where 0.43 of the probable matches are right.
 _SAMPLES = 500
 # Gauss-Newton stops after so many steps; the loss slows it down from quadratic to linear convergence.
@@ -29,8 +27,6 @@ _PLANE_SHARE, _PLANE_THRESHOLD, _MIN_PARALLAX = 0.8, 2.0, 1e-3
 _ROBUST = 2.0
 # Of an inlier, likewise: 0.997 of the right matches are within it.
 _INLIER = 3.0
-# Beyond this condition number the matches leave something free.
-_MAX_CONDITION = 1e14
 SIGMA0 = 0.1
 """Keypoints in image 0 have this standard deviation, pixels."""
 
@@ -44,14 +40,11 @@ class EpipolarPose:
         direction: (3,) unit vector, translation of the points of camera 0 in camera 1.
         inliers: (M,) bool, probable matches within three standard deviations of their epipolar lines whose rays meet
             in front of both cameras, or are parallel within their errors.
-        covariance: (6, 6) of direction before rotation, from the inliers' noise: direction + d, of rank 2, and
-            exp(r) R, radians; infinite where they leave it free.
     """
 
     R: np.ndarray
     direction: np.ndarray
     inliers: np.ndarray
-    covariance: np.ndarray
 
 
 def estimate_epipolar_pose(
@@ -70,8 +63,8 @@ def estimate_epipolar_pose(
     Returns:
         The pose; None with fewer than 8 probable matches, or if the 5-point method fails.
     """
-    probable = np.flatnonzero(probability >= _MIN_PROBABILITY)
-    if len(probable) < _MIN_MATCHES:
+    probable = np.flatnonzero(probability >= MIN_PROBABILITY)
+    if len(probable) < MIN_MATCHES:
         return None
     points0, points1 = points0.astype(np.float64), points1.astype(np.float64)
     essential, mask = cv2.findEssentialMat(
@@ -80,7 +73,7 @@ def estimate_epipolar_pose(
         K,
         method=cv2.USAC_FAST,
         prob=0.999,
-        threshold=_THRESHOLD,
+        threshold=THRESHOLD,
         maxIters=_SAMPLES,
     )
     # OpenCV returns None on failure, although its type hints exclude None.
@@ -94,13 +87,13 @@ def estimate_epipolar_pose(
     rays = MatchedRays(rays0, rays1, SIGMA0**2 * J @ J.T, J @ covariance.astype(np.float64) @ J.T)
     subset = agreeing[:: max(1, len(agreeing) // _SUBSET)]
     starts = [pose_of_essential(essential, rays0[subset], rays1[subset])]
-    starts += _poses_of_plane(K, points0[subset], points1[subset])
+    starts += poses_of_plane(K, points0[subset], points1[subset], cv2.USAC_FAST, _SAMPLES, _PLANE_SHARE * len(subset))
     best: EpipolarPose | None = None
     for start in starts:
         R, direction = _refine_pose(rays, probability, *start)
-        near = (np.abs(rays.whitened(essential_matrix(R, direction))[0]) < _INLIER) & (probability >= _MIN_PROBABILITY)
+        near = (np.abs(rays.whitened(essential_matrix(R, direction))[0]) < _INLIER) & (probability >= MIN_PROBABILITY)
         inliers = near & rays.in_front(R, direction)
-        pose = EpipolarPose(R, direction, inliers, _pose_covariance(rays, inliers, R, direction))
+        pose = EpipolarPose(R, direction, inliers)
         if best is None or pose.inliers.sum() > best.inliers.sum():
             best = pose
     return best
@@ -142,21 +135,18 @@ def pose_of_essential(essential: np.ndarray, rays0: np.ndarray, rays1: np.ndarra
     return max(poses, key=lambda pose: int(_depths_positive(rays0, rays1, *pose)[0].sum()))
 
 
-def _poses_of_plane(K: np.ndarray, points0: np.ndarray, points1: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Poses that a plane allows, if one homography explains the matches (M, 2), (M, 2); else none.
+def poses_of_plane(
+    K: np.ndarray, points0: np.ndarray, points1: np.ndarray, method: int, samples: int, least: float
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Rotations and directions that a plane allows, if one homography explains so many of the matches; else none.
 
-    Two poses explain the matches of a plane, and the 5-point method gives either.
+    Two poses explain the matches of a plane, and the 5-point method gives either. A homography may be that of a turn.
     """
-    if len(points0) < _MIN_MATCHES:
+    if len(points0) < MIN_MATCHES:
         return []
-    H, mask = cv2.findHomography(points0, points1, cv2.USAC_FAST, _PLANE_THRESHOLD, maxIters=_SAMPLES)
-    if np.shape(H) != (3, 3) or mask.mean() < _PLANE_SHARE:
+    H, near = cv2.findHomography(points0, points1, method, _PLANE_THRESHOLD, maxIters=samples)
+    if np.shape(H) != (3, 3) or near.sum() < least:
         return []
-    return poses_of_homography(K, H)
-
-
-def poses_of_homography(K: np.ndarray, H: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Rotations and directions by which a plane makes the homography H of pixels; none if it is that of a rotation."""
     _, rotations, translations, _ = cv2.decomposeHomographyMat(H, K)
     lengths = [float(np.linalg.norm(translation)) for translation in translations]
     return [
@@ -194,15 +184,6 @@ def _slopes(rays: MatchedRays, R: np.ndarray, direction: np.ndarray) -> tuple[np
     return residual, np.concatenate([by_rotation, by_direction], axis=1) / sigma[:, None], tangent
 
 
-def _pose_covariance(rays: MatchedRays, inliers: np.ndarray, R: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """(6, 6) of direction and rotation, from the inliers."""
-    residual, J, tangent = _slopes(rays, R, direction)
-    covariance = robust_covariance(residual[inliers], J[inliers])
-    expand = np.zeros((6, 5))
-    expand[:3, 3:], expand[3:, :3] = tangent, np.eye(3)
-    return np.asarray(expand @ covariance @ expand.T) if np.isfinite(covariance).all() else np.full((6, 6), np.inf)
-
-
 def essential_matrix(R: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """E (3, 3) with ray1^T E ray0 = 0 (9.32)."""
     return np.asarray(skew(direction) @ R)
@@ -221,20 +202,6 @@ def soft_weight(squared: np.ndarray) -> np.ndarray:
 def log_gain(squared: np.ndarray) -> np.ndarray:
     """What a match that is right adds to the log-likelihood; its slope has the weights of `soft_weight`."""
     return np.log1p(np.exp(np.minimum(0.5 * (_INLIER**2 - squared), 50.0)))
-
-
-def robust_covariance(residual: np.ndarray, J: np.ndarray) -> np.ndarray:
-    """Covariance (n, n) of what minimises that loss, from whitened residuals (M,) and derivatives (M, n) of inliers.
-
-    It is the inverse information times what the loss wastes: the mean of its squared slope over the square of its mean
-    curvature (Huber 1981); infinite where the inliers leave something free.
-    """
-    information = J.T @ J
-    bend = 1.0 + (residual / _ROBUST) ** 2
-    slope, curvature = residual / bend**2, (1.0 - 3.0 * (residual / _ROBUST) ** 2) / bend**3
-    if len(J) <= J.shape[1] or np.linalg.cond(information) > _MAX_CONDITION or curvature.mean() <= 0.0:
-        return np.full(information.shape, np.inf)
-    return np.asarray(np.linalg.inv(information) * (slope**2).mean() / curvature.mean() ** 2)
 
 
 def neighbours_factor(pixels: np.ndarray, scores: np.ndarray, information: np.ndarray) -> float:

@@ -9,24 +9,25 @@ import numpy as np
 
 from sigmaslam.geometry.se3 import rotation_exp, rotation_log
 from sigmaslam.two_view.epipolar import (
+    MIN_MATCHES,
+    MIN_PROBABILITY,
     SIGMA0,
+    THRESHOLD,
     EpipolarPose,
     MatchedRays,
     log_gain,
     neighbours_factor,
     pose_of_essential,
-    poses_of_homography,
+    poses_of_plane,
     robust_weight,
     soft_weight,
 )
 
-# Five fix the pose; three more must say so, too. What is more likely wrong than right has no vote.
-_MIN_MATCHES, _MIN_PROBABILITY = 8, 0.5
-# The sampling consensus accepts this epipolar distance, pixels. It stops when it is this sure of a right sample, which
-# takes 3,800 of them where 0.3 of the matches are right; 0.2 would take 29,000.
-_THRESHOLD, _CONFIDENCE, _MAX_SAMPLES = 1.0, 0.9999, 20_000
-# A homography may be that of a plane if it has this share of the matches of the essential matrix, this near, pixels.
-_PLANE_SHARE, _PLANE_THRESHOLD, _PLANE_SAMPLES = 0.5, 2.0, 2000
+# The sampling consensus stops when it is this sure of a right sample, which takes 3,800 of them where 0.3 of the
+# matches are right; 0.2 would take 29,000.
+_CONFIDENCE, _MAX_SAMPLES = 0.9999, 20_000
+# A homography may be that of a plane if it has this share of the matches of the essential matrix.
+_PLANE_SHARE, _PLANE_SAMPLES = 0.5, 2000
 # Standard deviations up to which a match counts in full: 0.997 of the right ones are within.
 _GATE = 3.0
 # A match is not counted where its parallax is so many times the median: wrong ones have the largest by far, and with
@@ -59,10 +60,12 @@ class RelativeOrientation(EpipolarPose):
     uniform one.
 
     Attributes:
+        covariance: (6, 6) of direction before rotation: direction + d, of rank 2, and exp(r) R, radians.
         rival: probability that another pose, which is not near, is the right one, from 0 to 1.
         rival_angles: of the most probable such pose: differences in rotation and direction, radians; 0 without one.
     """
 
+    covariance: np.ndarray
     rival: float
     rival_angles: tuple[float, float]
 
@@ -87,8 +90,8 @@ def estimate_relative_orientation(
     Returns:
         The pose; None with fewer than 8 probable matches, or if the 5-point method fails.
     """
-    probable = np.flatnonzero(probability >= _MIN_PROBABILITY)
-    if len(probable) < _MIN_MATCHES:
+    probable = np.flatnonzero(probability >= MIN_PROBABILITY)
+    if len(probable) < MIN_MATCHES:
         return None
     K = np.ascontiguousarray(K, np.float64)  # OpenCV misreads a view of a projection matrix
     pixels0, pixels1 = points0[probable].astype(np.float64), points1[probable].astype(np.float64)
@@ -102,7 +105,7 @@ def estimate_relative_orientation(
     weight = probability[probable].astype(np.float64)
     first = [_refine(rays, weight, *start) for start in starts]
     hopeful = np.min([_at(rays, *pose).squared for pose in first], axis=0) < _HOPELESS**2
-    if hopeful.sum() < _MIN_MATCHES:
+    if hopeful.sum() < MIN_MATCHES:
         return None
     probable, pixels0, weight = probable[hopeful], pixels0[hopeful], weight[hopeful]
     rays = MatchedRays(rays0[hopeful], rays1[hopeful], rays.spread0, rays.spread1[hopeful])
@@ -134,17 +137,15 @@ def _starts(
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Poses of the essential matrix that the matches agree on, and of the homography if most of them follow one."""
     E, mask = cv2.findEssentialMat(
-        points0, points1, K, method=cv2.USAC_ACCURATE, prob=_CONFIDENCE, threshold=_THRESHOLD, maxIters=_MAX_SAMPLES
+        points0, points1, K, method=cv2.USAC_ACCURATE, prob=_CONFIDENCE, threshold=THRESHOLD, maxIters=_MAX_SAMPLES
     )
     # OpenCV returns None on failure, although its type hints exclude None.
     if np.shape(E) != (3, 3):
         return []
     agreeing = mask.ravel() > 0
     starts = [pose_of_essential(E, rays.rays0[agreeing], rays.rays1[agreeing])]
-    H, near = cv2.findHomography(points0, points1, cv2.USAC_ACCURATE, _PLANE_THRESHOLD, maxIters=_PLANE_SAMPLES)
-    if np.shape(H) != (3, 3) or near.sum() < _PLANE_SHARE * agreeing.sum():
-        return starts
-    return starts + poses_of_homography(K, H)
+    least = _PLANE_SHARE * float(agreeing.sum())
+    return starts + poses_of_plane(K, points0, points1, cv2.USAC_ACCURATE, _PLANE_SAMPLES, least)
 
 
 @dataclass(frozen=True, slots=True)

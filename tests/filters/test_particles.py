@@ -10,10 +10,12 @@ from tests.support.filter_builders import beliefs, covariances, random_numbers, 
 NUMBER = 40000
 
 
-def test_particles_of_a_linear_model_converge_to_the_kalman_filter():
+@pytest.mark.long
+@pytest.mark.parametrize("make", [filters.ParticleFilter, filters.EnsembleKalmanFilter])
+def test_particles_of_a_linear_model_converge_to_the_kalman_filter(make):
     motion = filters.LinearMotion(torch.eye(2, dtype=torch.float64) * 0.9, covariances(2, seed=2, scale=0.3))
     see = filters.LinearMeasurement(random_numbers(2, 2, seed=3), covariances(2, seed=4))
-    bayes, cloud = filters.KalmanFilter(), filters.ParticleFilter(torch.Generator().manual_seed(0))
+    bayes, cloud = filters.KalmanFilter(), make(torch.Generator().manual_seed(0))
     belief = beliefs(3, 2)
     particles = cloud.sample(belief, NUMBER)
     values = random_numbers(4, 3, 2, seed=5)
@@ -63,3 +65,32 @@ def test_two_peaks_stay_two():
     assert 0.45 < float(right) < 0.55
     assert_close(cloud.gaussian(particles).covariance, tensor(4.0)[None], 0.1)
     assert float(particles.effective_number) > 0.5 * NUMBER
+
+
+def test_an_ensemble_follows_forty_states_that_particles_lose():
+    """A hundred samples of forty random walks, each measured."""
+    unit = filters.Diagonal(torch.ones(40, dtype=torch.float64))
+    walk, see = filters.MotionModel(lambda x: x, unit), filters.MeasurementModel(lambda x: x, unit)
+    generator, errors = torch.Generator().manual_seed(5), []
+    for make in (filters.EnsembleKalmanFilter, filters.ParticleFilter):
+        cloud, truth = make(torch.Generator().manual_seed(4)), torch.zeros(40, dtype=torch.float64)
+        belief = filters.Gaussian(truth, torch.eye(40, dtype=torch.float64))
+        particles, squares = cloud.sample(belief, 100), []
+        for _ in range(20):
+            draws = torch.randn(2, 40, generator=generator, dtype=torch.float64)
+            truth, particles = truth + draws[0], cloud.predict(particles, walk)
+            particles, _ = cloud.update(particles, see, truth + draws[1])
+            squares.append((cloud.gaussian(particles).mean - truth).square().mean())
+        errors.append(float(torch.stack(squares).mean().sqrt()))
+    assert errors[0] < 1.0 < 1.5 * errors[0] < errors[1]  # 1 is the error of the measurement
+
+
+def test_an_ensemble_s_heading_crosses_the_cut():
+    space, noise = filters.SE2(), filters.Diagonal(tensor(0.01, 0.01, 0.01))
+    see = filters.MeasurementModel(lambda x: x, noise, residual=lambda measured, seen: space.local(seen, measured))
+    cloud = filters.EnsembleKalmanFilter(torch.Generator().manual_seed(6), space)
+    belief = filters.Gaussian(tensor(1.0, 2.0, 3.1), 0.01 * torch.eye(3, dtype=torch.float64))
+    value = tensor(1.1, 2.0, -3.1)
+    found = cloud.gaussian(cloud.update(cloud.sample(belief, NUMBER), see, value)[0])
+    expected = filters.UnscentedKalmanFilter(space).update(belief, see, value).belief
+    assert_close(space.local(expected.mean, found.mean), tensor(0.0, 0.0, 0.0), 0.02)

@@ -22,7 +22,7 @@ def seen_place(pose, constants, lever, value):
     offset, scale = constants[5], constants[6]
     in_sensor = value[0] / (1 + scale) * np.array([np.cos(value[1] - offset), np.sin(value[1] - offset)])
     turn = np.array([[np.cos(pose[2]), -np.sin(pose[2])], [np.sin(pose[2]), np.cos(pose[2])]])
-    return pose[:2] + turn @ (in_sensor + [lever, 0.0])
+    return pose[:2] + turn @ (in_sensor + [lever, 0.0] + constants[7:9])
 
 
 def correlated_belief(generator, mapping, batch=()):
@@ -32,6 +32,7 @@ def correlated_belief(generator, mapping, batch=()):
     return Gaussian(torch.from_numpy(mean), torch.from_numpy(root @ np.swapaxes(root, -1, -2)))
 
 
+@pytest.mark.long
 def test_a_landmark_enters_with_its_cross_covariance():
     """Against derivatives by central differences of an independent inverse of the sensor."""
     mapping = MappingRobot(WheeledRobot("range-bearing", 0.2), 3)

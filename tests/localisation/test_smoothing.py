@@ -58,7 +58,7 @@ def test_a_linear_model_is_smoothed_exactly():
 def test_a_robot_is_smoothed_as_by_the_library():
     robot, rng = WheeledRobot("range-bearing", 0.1), np.random.default_rng(1)
     places = torch.from_numpy(rng.uniform(-4.0, 4.0, (STEPS, 1, 2)))
-    true = torch.zeros(STEPS, 1, 10, dtype=torch.float64)
+    true = torch.zeros(STEPS, 1, 12, dtype=torch.float64)
     true[:, 0, 0], true[:, 0, 2] = 0.1 * torch.arange(STEPS), 0.02 * torch.arange(STEPS)
     seen = robot.measurement().function(true, places)
     values = seen + torch.from_numpy(rng.standard_normal((STEPS, 1, 2))) * torch.tensor([0.1, 0.05])

@@ -23,6 +23,7 @@ class World:
         late: seconds by which its sightings are stamped late, beside controls that are odometry.
         drift: direction of driving, seen from the heading.
         speed_scale: metres driven for each that the controls say, less 1.
+        left: metres by which the sensor stands to the left of the middle, which nobody says.
         outliers: share of the sightings that are wrong by metres and radians.
         seed: of the noise.
     """
@@ -33,6 +34,7 @@ class World:
     late: float = 0.0
     drift: float = 0.0
     speed_scale: float = 0.0
+    left: float = 0.0
     outliers: float = 0.0
     seed: int = 0
 
@@ -57,7 +59,8 @@ def drive(world: World) -> Recording:
     seconds, landmark = np.repeat(times[seen], 2), generator.integers(0, len(LANDMARKS), 2 * len(seen))
     landmark[1::2] = (landmark[::2] + 1) % len(LANDMARKS)
     pose = poses[np.repeat(seen, 2)]
-    offset = LANDMARKS[landmark] - pose[:, :2]
+    sideways = np.column_stack([-np.sin(pose[:, 2]), np.cos(pose[:, 2])])
+    offset = LANDMARKS[landmark] - pose[:, :2] - world.left * sideways
     distance = np.hypot(*offset.T)
     bearing = np.arctan2(offset[:, 1], offset[:, 0]) - pose[:, 2]
     distance = distance * (1 + 0.03 * generator.normal(size=len(distance)))
