@@ -6,6 +6,7 @@ import logging
 
 import numpy as np
 
+from sigmaslam.estimation.blows import find_blow
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999
 from sigmaslam.estimation.constant_velocity import MotionFilter, MotionState
 from sigmaslam.estimation.gaussian import at_most, regression
@@ -209,9 +210,16 @@ class InertialMotion(MotionFilter):
         self._note_twist(self.twist[3:])
 
     def _measure_speed(self, motion: Preintegrated, timestamp: float) -> None:
-        """A body at rest measures a velocity of zero and the gyro's bias; wheels measure it unless they slip."""
+        """A body at rest measures a velocity of zero and the gyro's bias; wheels measure it unless they slip.
+
+        A blow leaves the mounting unknown, before that.
+        """
         was_dark, self._is_dark = self._is_dark, True
         recent, P = self.samples.around(timestamp - WHILE, timestamp), self._covariance[_VELOCITY, _VELOCITY]
+        blow = find_blow(recent, timestamp + self.samples.time_shift - motion.seconds)
+        if blow is not None:
+            _LOGGER.warning("the inertial sensor felt a blow at %.3f s, %.0f m/s^2: do the cameras still fit?", *blow)
+            self._covariance[_SENSOR, _SENSOR] += np.diag(SENSOR_SIGMA**2)  # as after a warm-up
         self.is_resting = motion.missing == 0.0 and self._standstill.holds(recent, self._velocity, P, was_dark)
         if self.is_resting:
             slope, noise = np.zeros((6, _SIZE)), np.zeros((6, 6))
