@@ -59,11 +59,6 @@ class Alignment:
     covariance: np.ndarray
     shared: np.ndarray
 
-    @property
-    def tilt(self) -> float:
-        """Standard deviation of gravity's direction, radians, of the less certain axis."""
-        return _tilt(self.covariance)
-
 
 def gyro_fits(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> bool:
     """Whether the gyro's turns are those of the images, so that unit, axes and clock are right.
@@ -128,6 +123,7 @@ def align(
 
 
 def _tilt(covariance: np.ndarray) -> float:
+    """Standard deviation of gravity's direction, radians, of the less certain axis."""
     return float(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1]) / STANDARD_GRAVITY)
 
 
@@ -228,8 +224,6 @@ class GravitySearch:
         way = np.linalg.norm(np.diff(bodies[:, :3, 3], axis=0), axis=1).sum()
         _LOGGER.info(
             "gravity is known to %.1f degrees, from %.1f s of images along %.2f m",
-            np.degrees(found.tilt),
-            time - times[0],
-            way,
+            *(np.degrees(_tilt(found.covariance)), time - times[0], way),
         )
         return replace(found, biases=np.r_[bias, np.zeros(3)] + found.biases)

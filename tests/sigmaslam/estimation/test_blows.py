@@ -1,23 +1,23 @@
 """Blows: each one is found when it comes, and none in flight."""
 
-import logging
-
 import numpy as np
 import pytest
 
-from sigmaslam.estimation.blows import find_blow
+from sigmaslam.estimation.standstill import find_blow
 from sigmaslam.readers.inertial import find_imu, read_imu
-from tests.sigmaslam.estimation.test_inertial_motion import FRAME, Flight
+from tests.support.inertial import SENSOR, Motion
 
 
 def of_flight(seed: int) -> np.ndarray:
-    samples = Flight(seed).samples
-    return np.column_stack(samples.columns())
+    table = np.column_stack(Motion(seed).measure(np.arange(0.0, 1.0, 0.005)).columns())
+    scale = 5.0 * SENSOR.accel_density / np.sqrt(0.005)
+    table[:, 4:] += scale * np.random.default_rng(seed).standard_normal((len(table), 3))
+    return table
 
 
 def test_a_knock_of_some_milliseconds_is_found_when_it_comes():
-    for seed in range(4):
-        table, rng = of_flight(seed)[:200], np.random.default_rng(seed)
+    for seed in range(10):
+        table, rng = of_flight(seed), np.random.default_rng(seed)
         hit = int(rng.integers(185, 195))
         force = rng.standard_normal(3)
         since = table[180, 0]
@@ -37,18 +37,3 @@ def test_motors_and_shaking_hands_are_no_blows(name: str, real_data):
     table = np.column_stack(samples.columns())
     for end in range(100, len(table), 10):
         assert find_blow(table[end - 100 : end], table[end - 11, 0]) is None
-
-
-@pytest.mark.long
-def test_a_blow_is_said_and_leaves_the_mounting_less_certain(caplog):
-    flights = [Flight(3), Flight(3)]
-    for flight in flights:
-        flight.fly(40)
-    hit = int(np.searchsorted(flights[0].samples.timestamp, flights[0].frame * FRAME + 0.02))
-    flights[0].samples.accel[hit] += 30.0
-    with caplog.at_level(logging.WARNING):
-        for flight in flights:
-            flight.fly(1)
-    assert caplog.text.count("felt a blow at") == 1
-    hurt, well = (np.sqrt(np.diag(flight.filter.state.covariance)[19:25]) for flight in flights)
-    assert (hurt > 1.2 * well).all()
