@@ -65,7 +65,7 @@ def write_inertial(
 
 
 def dark_cases(recording: Recording, methods: Sequence[str]) -> list[DarkCase]:
-    """Without darkness, and with all that fits."""
+    """Without darkness, and with all that fits; of methods that are compared the first start alone."""
     kind, rate = recording.kind, 10.0 if recording.kind == "street" else 20.0
     last = recording.frames - _LEAST_AFTER
     dark = [
@@ -74,7 +74,13 @@ def dark_cases(recording: Recording, methods: Sequence[str]) -> list[DarkCase]:
         for first in (_STARTS[kind] if marks[-1] == 1.0 else _STARTS[kind][::2] if marks[-1] else (0,))
         if first + round(marks[-1] * rate) <= last
     ]
-    return [DarkCase(method, *each) for each in dark for method in methods]
+    compared = dict(reversed(dark))
+    return [
+        DarkCase(method, marks, first)
+        for marks, first in dark
+        for method in methods
+        if method == METHODS[-1] or first == compared[marks]
+    ]
 
 
 def _judge(job: RecordingJob, good: GoodFrames, case: DarkCase) -> dict[str, Any]:
