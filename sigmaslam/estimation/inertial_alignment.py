@@ -129,7 +129,7 @@ def _tilt(covariance: np.ndarray) -> float:
 
 
 def _solve(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> tuple[np.ndarray, np.ndarray, float]:
-    """(12,) velocity, gravity and biases, their covariance (12, 12), and the error of gravity's length less 3 sigmas."""
+    """(12,) velocity, gravity and biases, their covariance, and by how much gravity's length errs."""
     R, p = bodies[:, :3, :3], bodies[:, :3, 3]
     # Unknown: first place, first velocity, gravity, bias. Place and velocity of each pose as maps of these.
     identity, unknown = np.eye(12), slice(9, 12)

@@ -1,5 +1,7 @@
 """Gravity in a second of poses: found where its length agrees as well as it is known."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -21,7 +23,7 @@ def align_noisy(seed: int, force: float = 1.0) -> tuple[Alignment | None, np.nda
     poses = np.array([se3_exp(sigma * rng.normal(size=6)) @ pose for pose in motion.poses(TIMES)])
     motions = [
         preintegrate(samples, start, end, np.zeros(3), np.zeros(3), SENSOR, np.zeros(2))
-        for start, end in zip(TIMES[:-1], TIMES[1:], strict=True)
+        for start, end in pairwise(TIMES)
     ]
     assert all(motions)
     return align(poses, np.eye(4), motions, np.full(7, 1e-6)), GRAVITY
